@@ -1,0 +1,242 @@
+"""Checkpoint folders: written whole or not at all, read with every byte checked.
+
+A checkpoint is a folder named after the number of updates (eight digits, `-1`, `-2`... behind it
+when one of that number exists already) with `manifest.json` and one safetensors file for each
+group of tensors. It is written under a temporary name beside, synced, and renamed, so that a
+folder with a checkpoint's name is complete unless the disk itself lost bytes; those are found by
+the checksums in the manifest.
+"""
+
+import hashlib
+import json
+import os
+import re
+import shutil
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import safetensors
+import safetensors.numpy
+
+from tangram_sim.errors import RunError
+
+FORMAT_VERSION = 1
+MANIFEST = "manifest.json"
+_NAME = re.compile(r"(\d{8,})(?:-(\d+))?")
+_TEMPORARY = ".writing-"
+_SET_ASIDE = ".corrupt"
+
+Tensors = dict[str, npt.NDArray[Any]]
+
+
+class CorruptError(RunError):
+    """A checkpoint that is not as it was written.
+
+    Attributes:
+        path: the checkpoint.
+        why: the file and what is wrong with it.
+    """
+
+    def __init__(self, path: Path, why: str) -> None:
+        super().__init__(f"checkpoint {path} is corrupt ({why}): delete it to use the one before")
+        self.path, self.why = path, why
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """What one checkpoint folder holds.
+
+    Attributes:
+        path: the folder.
+        updates: of the learner when it was written.
+        arrays: file stem -> tensor name -> array; only the stems that were asked for.
+        counters: everything that is no tensor, as it was passed to `save_checkpoint`.
+    """
+
+    path: Path
+    updates: int
+    arrays: dict[str, Tensors]
+    counters: dict[str, Any]
+
+
+def save_checkpoint(
+    folder: Path,
+    updates: int,
+    arrays: Mapping[str, Mapping[str, npt.NDArray[Any]]],
+    counters: Mapping[str, Any],
+    keep: int,
+) -> Path:
+    """Write a checkpoint and drop all but the newest `keep`.
+
+    Args:
+        folder: holds all checkpoints of a run; made if it is missing.
+        arrays: file stem -> tensor name -> array.
+        counters: JSON values.
+
+    Raises:
+        RunError: the folder cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _drop_temporary(folder)
+        aside = folder / f"{_TEMPORARY}{updates:08d}"
+        aside.mkdir()
+        _write_content(aside, updates, arrays, counters)
+        final = _free_name(folder, updates)
+        # From here on it counts; a crash before leaves the older ones as they are.
+        aside.rename(final)
+        _sync(folder)
+        for old in list_checkpoints(folder)[:-keep]:
+            shutil.rmtree(old)
+    except OSError as error:
+        raise RunError(
+            f"cannot write a checkpoint to {folder} ({error}): make room there or choose another "
+            "run_dir"
+        ) from None
+    return final
+
+
+def list_checkpoints(folder: Path) -> list[Path]:
+    """The checkpoint folders, oldest first; none where there is no such folder."""
+    if not folder.is_dir():
+        return []
+    found = [path for path in folder.iterdir() if _NAME.fullmatch(path.name) and path.is_dir()]
+    return sorted(found, key=_order)
+
+
+def newest_checkpoint(folder: Path) -> Path:
+    """The newest checkpoint, whether or not its content is whole.
+
+    Raises:
+        RunError: there is none.
+    """
+    found = list_checkpoints(folder)
+    if not found:
+        raise RunError(f"no checkpoint in {folder}: train the run first, or name another run_dir")
+    return found[-1]
+
+
+def load_checkpoint(path: Path, stems: Collection[str] | None = None) -> Checkpoint:
+    """Read a checkpoint, or only the named files of it.
+
+    Raises:
+        CorruptError: a file is missing or changed; names it.
+        RunError: it cannot be read, is of another format, or never had a named file.
+    """
+    manifest = _read_manifest(path)
+    names = manifest["files"] if stems is None else stems
+    arrays = {stem: _read_tensors(path, stem, manifest["files"]) for stem in names}
+    return Checkpoint(path, manifest["updates"], arrays, manifest["counters"])
+
+
+def set_aside(path: Path) -> Path:
+    """Rename a corrupt checkpoint, so that it no longer counts as one but is not lost."""
+    target = path.with_name(path.name + _SET_ASIDE)
+    if target.exists():
+        shutil.rmtree(target)
+    return path.rename(target)
+
+
+def _order(path: Path) -> tuple[int, int]:
+    match = _NAME.fullmatch(path.name)
+    if match is None:
+        raise RunError(f"{path} is no checkpoint: its name is not a number of updates")
+    return int(match[1]), int(match[2] or 0)
+
+
+def _free_name(folder: Path, updates: int) -> Path:
+    """A folder cannot be renamed onto a full one, and deleting that first would risk both."""
+    name, again = f"{updates:08d}", 0
+    while (folder / name).exists():
+        again += 1
+        name = f"{updates:08d}-{again}"
+    return folder / name
+
+
+def _drop_temporary(folder: Path) -> None:
+    for path in folder.glob(f"{_TEMPORARY}*"):
+        shutil.rmtree(path)
+
+
+def _write_content(
+    aside: Path,
+    updates: int,
+    arrays: Mapping[str, Mapping[str, npt.NDArray[Any]]],
+    counters: Mapping[str, Any],
+) -> None:
+    files = {}
+    for stem, tensors in arrays.items():
+        # safetensors writes a view's memory as it lies, so the order must be C.
+        content = {name: np.asarray(value, order="C") for name, value in tensors.items()}
+        data = safetensors.numpy.save(content)
+        _write(aside / f"{stem}.safetensors", data)
+        files[stem] = hashlib.sha256(data).hexdigest()
+    # Through JSON first: keys become texts, and the reader's digest is of what it can read.
+    body = json.loads(json.dumps({"updates": updates, "files": files, "counters": counters}))
+    manifest = {"format_version": FORMAT_VERSION, "sha256": _digest(body), **body}
+    _write(aside / MANIFEST, json.dumps(manifest, indent=1).encode())
+    _sync(aside)
+
+
+def _write(path: Path, data: bytes) -> None:
+    with path.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _sync(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _digest(body: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()
+
+
+def _read_manifest(path: Path) -> dict[str, Any]:
+    try:
+        manifest = json.loads((path / MANIFEST).read_bytes())
+    except FileNotFoundError:
+        raise CorruptError(path, f"{MANIFEST} is missing") from None
+    except OSError as error:
+        raise RunError(f"cannot read checkpoint {path} ({error})") from None
+    except ValueError:
+        raise CorruptError(path, f"{MANIFEST} is not JSON") from None
+    version = manifest.get("format_version") if isinstance(manifest, dict) else None
+    if version is None:
+        raise CorruptError(path, f"{MANIFEST} has no format_version")
+    if version != FORMAT_VERSION:
+        raise RunError(
+            f"checkpoint {path} has format {version}, this version reads {FORMAT_VERSION}: use "
+            "the version of tangram-rl that wrote it, or start a new run"
+        )
+    body = {name: manifest.get(name) for name in ("updates", "files", "counters")}
+    if manifest.get("sha256") != _digest(body):
+        raise CorruptError(path, f"checksum of {MANIFEST} differs")
+    return body
+
+
+def _read_tensors(path: Path, stem: str, files: Mapping[str, str]) -> Tensors:
+    name = f"{stem}.safetensors"
+    if stem not in files:
+        raise RunError(f"checkpoint {path} has no {name}: it was written by another kind of run")
+    try:
+        data = (path / name).read_bytes()
+    except FileNotFoundError:
+        raise CorruptError(path, f"{name} is missing") from None
+    except OSError as error:
+        raise RunError(f"cannot read checkpoint {path} ({error})") from None
+    if hashlib.sha256(data).hexdigest() != files[stem]:
+        raise CorruptError(path, f"checksum of {name} differs")
+    try:
+        return safetensors.numpy.load(data)
+    except safetensors.SafetensorError as error:
+        raise CorruptError(path, f"{name}: {error}") from None

@@ -1,0 +1,198 @@
+"""Settings of the networks, of the agent and of the service that trains it."""
+
+from dataclasses import dataclass
+
+from tangram_sim.checks import check_choice, check_range
+from tangram_sim.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class NetConfig:
+    """Size and kind of actor and critic.
+
+    Attributes:
+        kind: mha (Eqs. 8-13) or mlp.
+        hidden: mlp: widths of the hidden layers.
+        width: mha: size of a node's embedding.
+        layers: mha: rounds of message passing.
+        heads: mha: M in Eq. 12; each has the key width `width / heads`.
+        feed_forward: mha: hidden width of g in Eq. 13; 0 is the literal single layer of Eq. 8.
+        scale: mha: divide the scores of Eq. 10 by d (the paper) or by sqrt_d (learn2assemble).
+    """
+
+    kind: str = "mha"
+    hidden: tuple[int, ...] = (64, 64)
+    width: int = 64
+    layers: int = 3
+    heads: int = 4
+    feed_forward: int = 512
+    scale: str = "d"
+
+    def __post_init__(self) -> None:
+        check_choice("net.kind", self.kind, ("mha", "mlp"))
+        check_choice("net.scale", self.scale, ("d", "sqrt_d"))
+        check_range("net.layers", self.layers, 1, 64)
+        check_range("net.heads", self.heads, 1, 64)
+        check_range("net.width", self.width, 1, 4096)
+        check_range("net.feed_forward", self.feed_forward, 0, 65536)
+        if self.width % self.heads:
+            raise ConfigError(
+                f"net.width must be a multiple of net.heads, got {self.width} and {self.heads}"
+            )
+        if not self.hidden:
+            raise ConfigError("net.hidden must name at least one layer, got []")
+        for size in self.hidden:
+            check_range("net.hidden", size, 1, 65536)
+
+
+STRATEGIES = ("final", "future", "near", "none")
+
+
+@dataclass(frozen=True)
+class TwinConfig:
+    """One kind of hindsight twin that is added for every transition played.
+
+    Attributes:
+        strategy: final, future, near (the final pose moved by Gaussian noise), or none.
+        copies: twins of this kind for each transition.
+        position: near: standard deviation of the goal's shift, in arena units.
+        angle: near: standard deviation of the goal's turn, in radians.
+    """
+
+    strategy: str
+    copies: int = 1
+    position: float = 0.0
+    angle: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_choice("agent.hindsight.strategy", self.strategy, STRATEGIES)
+        check_range("agent.hindsight.copies", self.copies, 1, 64)
+        check_range("agent.hindsight.position", self.position, 0.0)
+        check_range("agent.hindsight.angle", self.angle, 0.0)
+
+
+@dataclass(frozen=True)
+class AgentConfig:
+    """DDPG, hindsight and the ways in which an agent may see the graph.
+
+    Attributes:
+        name: preset's name, for reports.
+        egocentric: coordinates relative to the moving token, in its own orientation.
+        offsets: each corner's displacement from its token's centre as node features.
+        orientation: (cos k*theta, sin k*theta) of each target relative to the moving token.
+        afterstate: the critic sees the graph as the action would leave it.
+        angle_head: plain (one output) or kfold (two outputs, angle = atan2 / k).
+        squash: of the actor's outputs: tanh (the paper) or clamp.
+        saturation_penalty: weight of mean(relu(|z| - saturation_limit)^2) in the actor's loss.
+        saturation_limit: pre-activation beyond which the penalty starts.
+        gamma: discount, Eq. 5.
+        polyak: rho of the target networks, Eq. 4.
+        acting_average: Polyak average of the actor that plays and is scored; 0 is the actor.
+        actor_lr, critic_lr: Adam's learning rates at the start.
+        lr_decay: none or cosine over the run's budget.
+        lr_final: share of the learning rate that cosine decay ends at.
+        grad_clip: largest norm of a gradient; 0 is no clipping.
+        batch_size: transitions in one update.
+        replay_capacity: transitions kept.
+        updates_per_transition: pace: updates for each transition played.
+        learning_starts: transitions in the replay before the first update.
+        noise: standard deviation of the Gaussian exploration noise on actions.
+        uniform_share: share of actions drawn uniformly.
+        hindsight: the twins added for every transition.
+    """
+
+    name: str = "tangram"
+    egocentric: bool = True
+    offsets: bool = True
+    orientation: bool = True
+    afterstate: bool = True
+    angle_head: str = "kfold"
+    squash: str = "clamp"
+    saturation_penalty: float = 1.0
+    saturation_limit: float = 2.0
+    gamma: float = 0.0
+    polyak: float = 0.995
+    acting_average: float = 0.99
+    actor_lr: float = 1e-3
+    critic_lr: float = 1e-3
+    lr_decay: str = "cosine"
+    lr_final: float = 0.01
+    grad_clip: float = 0.0
+    batch_size: int = 64
+    replay_capacity: int = 200_000
+    updates_per_transition: float = 0.1
+    learning_starts: int = 512
+    noise: float = 0.05
+    uniform_share: float = 0.2
+    hindsight: tuple[TwinConfig, ...] = (TwinConfig("final"),)
+
+    def __post_init__(self) -> None:
+        check_choice("agent.angle_head", self.angle_head, ("plain", "kfold"))
+        check_choice("agent.squash", self.squash, ("tanh", "clamp"))
+        check_choice("agent.lr_decay", self.lr_decay, ("none", "cosine"))
+        for name in ("gamma", "polyak", "acting_average", "lr_final", "uniform_share"):
+            check_range(f"agent.{name}", getattr(self, name), 0.0, 1.0)
+        for name in ("saturation_penalty", "saturation_limit", "grad_clip", "noise"):
+            check_range(f"agent.{name}", getattr(self, name), 0.0)
+        for name in ("actor_lr", "critic_lr", "updates_per_transition"):
+            check_range(f"agent.{name}", getattr(self, name), 1e-9, 1e3)
+        for name in ("batch_size", "replay_capacity", "learning_starts"):
+            check_range(f"agent.{name}", getattr(self, name), 1)
+        if self.batch_size > self.replay_capacity:
+            raise ConfigError(
+                f"agent.batch_size ({self.batch_size}) must not exceed "
+                f"agent.replay_capacity ({self.replay_capacity})"
+            )
+
+
+@dataclass(frozen=True)
+class ServiceConfig:
+    """How the processes work together; the same values serve master and workers.
+
+    Attributes:
+        bind: address that the master listens on.
+        port: of the master's ROUTER socket, 0 for any free one; PUB takes any free one.
+        publish_seconds: least time between two broadcasts of weights.
+        every_update: broadcast after every update instead, as the paper does.
+        envs: environments that one worker plays at a time.
+        batch_episodes: episodes in one message.
+        window: messages of a worker that may be unacknowledged; a full window pauses play.
+        lag_updates: updates that the learner may lag behind before workers must wait.
+        eval_seconds: least time between two evaluations.
+        eval_episodes: fixed test episodes of one evaluation.
+        log_seconds: time between two lines of progress and TensorBoard scalars.
+        checkpoint_minutes: time between two checkpoints.
+        keep_checkpoints: newest checkpoints kept.
+        device: auto, cpu or cuda.
+        threads: torch threads of the master.
+    """
+
+    bind: str = "127.0.0.1"
+    port: int = 0
+    publish_seconds: float = 0.5
+    every_update: bool = False
+    envs: int = 32
+    batch_episodes: int = 32
+    window: int = 4
+    lag_updates: int = 64
+    eval_seconds: float = 10.0
+    eval_episodes: int = 100
+    log_seconds: float = 2.0
+    checkpoint_minutes: float = 5.0
+    keep_checkpoints: int = 2
+    device: str = "auto"
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        check_range("service.port", self.port, 0, 65535)
+        check_range("service.envs", self.envs, 1, 512)
+        check_range("service.batch_episodes", self.batch_episodes, 1, 4096)
+        check_range("service.window", self.window, 1, 1024)
+        check_range("service.eval_episodes", self.eval_episodes, 1, 100_000)
+        check_range("service.keep_checkpoints", self.keep_checkpoints, 1, 1000)
+        check_range("service.threads", self.threads, 1, 1024)
+        for name in ("lag_updates", "publish_seconds", "eval_seconds"):
+            check_range(f"service.{name}", getattr(self, name), 0)
+        for name in ("log_seconds", "checkpoint_minutes"):
+            check_range(f"service.{name}", getattr(self, name), 1e-3)
+        check_choice("service.device", self.device, ("auto", "cpu", "cuda"))

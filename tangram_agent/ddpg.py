@@ -1,0 +1,240 @@
+"""Deep deterministic policy gradient, Eqs. 3-6, with the parts that make it learn the angle.
+
+Legend: B batch, K tokens, A entries of an action.
+"""
+
+import copy
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+
+from tangram_agent.config import AgentConfig
+from tangram_agent.graph import TokenGraph
+from tangram_agent.networks import Actor, Critic, initialise, parameter_count
+from tangram_agent.setup import Setup
+from tangram_agent.types import Transitions, Weights
+from tangram_sim.errors import RunError
+
+Array = npt.NDArray[Any]
+PARTS = ("actor", "critic", "target_actor", "target_critic", "acting")
+_COUNTER = "updates"
+
+
+def next_token(placed: Tensor) -> Tensor:
+    """Which token moves, (B,): the first that is not placed (B, K); 0 where all are."""
+    return (placed == 0).int().argmax(dim=-1)
+
+
+def split_action(action: Tensor, tokens: int) -> tuple[Tensor, Tensor]:
+    """Token (B,) and velocity (B, 3) of an action (B, A) of the environment."""
+    if tokens == 1:
+        return torch.zeros(len(action), dtype=torch.long, device=action.device), action
+    token = ((action[:, 0] + 1.0) / 2.0 * tokens).long().clamp(0, tokens - 1)
+    return token, action[:, 1:]
+
+
+def critic_target(reward: Tensor, done: Tensor, next_value: Tensor, gamma: float) -> Tensor:
+    """Eq. 5, the target y (B,). The paper's equation lacks (1 - d); after the end nothing can follow."""
+    return reward + gamma * (1.0 - done) * next_value
+
+
+def saturation(raw: Tensor, limit: float) -> Tensor:
+    """Mean of relu(|z| - limit)^2 over pre-activations z: keeps tanh or clamp from going flat."""
+    return torch.relu(raw.abs() - limit).square().mean()
+
+
+def polyak_update(target: nn.Module, source: nn.Module, rho: float) -> None:
+    """Eq. 4: target <- rho * target + (1 - rho) * source."""
+    with torch.no_grad():
+        targets: list[Tensor] = list(target.parameters())
+        sources: list[Tensor] = list(source.parameters())
+        torch._foreach_lerp_(targets, sources, 1.0 - rho)
+
+
+class Learner:
+    """Actor, critic, their targets and optimisers.
+
+    Attributes:
+        updates: number of updates made.
+        acting: the actor that plays: a running average of the actor's weights.
+    """
+
+    def __init__(self, setup: Setup, seed: int, device: str = "cpu") -> None:
+        self.config: AgentConfig = setup.agent
+        self.device = torch.device(device)
+        self.tokens = setup.layout.tokens
+        self.updates = 0
+        self.graph = TokenGraph(setup.layout, setup.sim.arena, setup.agent)
+        self.actor = Actor(self.graph, setup.agent, setup.net)
+        self.critic = Critic(self.graph, setup.agent, setup.net)
+        generator = torch.Generator().manual_seed(seed)
+        initialise(self.actor, generator)
+        initialise(self.critic, generator)
+        self.parameters = parameter_count(self.actor, self.critic)
+        for module in (self.actor, self.critic):
+            module.to(self.device)
+        self.target_actor, self.target_critic = _frozen(self.actor), _frozen(self.critic)
+        self.acting = _frozen(self.actor)
+        self.actor_optimiser = _adam(self.actor, self.config.actor_lr)
+        self.critic_optimiser = _adam(self.critic, self.config.critic_lr)
+
+    def update(self, batch: Transitions, progress: float = 0.0) -> dict[str, float]:
+        """One step of both networks on a batch.
+
+        Args:
+            batch: B transitions.
+            progress: used share of the run's budget, in [0, 1]; decides the learning rate.
+
+        Returns:
+            critic_loss, actor_loss, q (mean value of the batch's actions), saturation.
+        """
+        tensors = {name: self._tensor(column) for name, column in vars(batch).items()}
+        self._set_learning_rate(progress)
+        critic_loss, q = self._critic_step(tensors)
+        actor_loss, penalty = self._actor_step(tensors)
+        if self.config.gamma > 0.0:
+            polyak_update(self.target_critic, self.critic, self.config.polyak)
+            polyak_update(self.target_actor, self.actor, self.config.polyak)
+        polyak_update(self.acting, self.actor, self.config.acting_average)
+        self.updates += 1
+        values = torch.stack([critic_loss, actor_loss, q, penalty]).tolist()
+        return dict(zip(("critic_loss", "actor_loss", "q", "saturation"), values, strict=True))
+
+    def critic_loss(self, t: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Mean squared Bellman error of Eq. 3, and the values (B,)."""
+        with torch.no_grad():
+            y = self._target(t)
+        token, velocity = split_action(t["action"], self.tokens)
+        q = self.critic(t["state"], t["placed"], t["goal"], token, velocity)
+        return (q - y).square().mean(), q
+
+    def actor_loss(self, t: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Minus the value of the actor's own actions (Eq. 6), and the saturation penalty."""
+        token = next_token(t["placed"])
+        velocity, raw = self.actor(t["state"], t["placed"], t["goal"], token)
+        q = self.critic(t["state"], t["placed"], t["goal"], token, velocity)
+        return -q.mean(), saturation(raw, self.config.saturation_limit)
+
+    def _target(self, t: dict[str, Tensor]) -> Tensor:
+        """Eq. 5; the target networks are not asked where no transition goes on."""
+        if self.config.gamma == 0.0 or bool(t["done"].all()):
+            return t["reward"]
+        after = (t["next_state"], t["next_placed"], t["goal"], next_token(t["next_placed"]))
+        velocity, _ = self.target_actor(*after)
+        return critic_target(
+            t["reward"], t["done"], self.target_critic(*after, velocity), self.config.gamma
+        )
+
+    def _critic_step(self, t: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        loss, q = self.critic_loss(t)
+        _step(self.critic, self.critic_optimiser, loss, self.config.grad_clip)
+        return loss.detach(), q.detach().mean()
+
+    def _actor_step(self, t: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        self.critic.requires_grad_(False)
+        value_loss, penalty = self.actor_loss(t)
+        loss = value_loss + self.config.saturation_penalty * penalty
+        _step(self.actor, self.actor_optimiser, loss, self.config.grad_clip)
+        self.critic.requires_grad_(True)
+        return value_loss.detach(), penalty.detach()
+
+    def _set_learning_rate(self, progress: float) -> None:
+        factor = 1.0
+        if self.config.lr_decay == "cosine":
+            share = min(max(progress, 0.0), 1.0)
+            low = self.config.lr_final
+            factor = low + (1.0 - low) * 0.5 * (1.0 + math.cos(math.pi * share))
+        self.actor_optimiser.param_groups[0]["lr"] = self.config.actor_lr * factor
+        self.critic_optimiser.param_groups[0]["lr"] = self.config.critic_lr * factor
+
+    def _tensor(self, column: Array) -> Tensor:
+        return torch.from_numpy(np.asarray(column, np.float32)).to(self.device)
+
+    def acting_weights(self, version: int) -> Weights:
+        """A copy of the weights that workers play with."""
+        return Weights(version, _arrays(self.acting))
+
+    def state(self) -> dict[str, Array]:
+        """Everything that the next update depends on, as arrays for a checkpoint."""
+        state: dict[str, Array] = {_COUNTER: np.array([self.updates], np.int64)}
+        for part in PARTS:
+            for name, value in _arrays(getattr(self, part)).items():
+                state[f"{part}.{name}"] = value
+        for part, optimiser in self._optimisers().items():
+            for i, slots in optimiser.state_dict()["state"].items():
+                for name, value in slots.items():
+                    state[f"{part}_optimiser.{i}.{name}"] = value.cpu().numpy().copy()
+        return state
+
+    def load_state(self, state: dict[str, Array]) -> None:
+        """Take over a state from `state()`.
+
+        Raises:
+            RunError: tensors are missing or have other shapes: another layout or another net.
+        """
+        if _COUNTER not in state:
+            raise RunError("learner state: no counter of updates: not a learner's checkpoint")
+        for part in PARTS:
+            load_arrays(getattr(self, part), _under(f"{part}.", state))
+        for part, optimiser in self._optimisers().items():
+            slots = _under(f"{part}_optimiser.", state)
+            content: dict[int, dict[str, Tensor]] = {}
+            for key, value in slots.items():
+                i, name = key.split(".", 1)
+                content.setdefault(int(i), {})[name] = torch.from_numpy(np.array(value))
+            groups = optimiser.state_dict()["param_groups"]
+            optimiser.load_state_dict({"state": content, "param_groups": groups})
+        self.updates = int(state[_COUNTER][0])
+
+    def _optimisers(self) -> dict[str, torch.optim.Adam]:
+        return {"actor": self.actor_optimiser, "critic": self.critic_optimiser}
+
+
+def load_arrays(module: nn.Module, arrays: dict[str, Array]) -> None:
+    """Copy named arrays into a module's parameters.
+
+    Raises:
+        RunError: names or shapes differ; says which first.
+    """
+    own = dict(module.named_parameters())
+    if set(own) != set(arrays):
+        odd = min(set(own) ^ set(arrays))
+        raise RunError(f"weights of another network: '{odd}' is on one side only")
+    with torch.no_grad():
+        for name, parameter in own.items():
+            if tuple(parameter.shape) != arrays[name].shape:
+                raise RunError(
+                    f"weights of another layout: '{name}' is {arrays[name].shape}, "
+                    f"this setup needs {tuple(parameter.shape)}: start with the run's own tokens, "
+                    "agent and net"
+                )
+            parameter.copy_(torch.from_numpy(np.array(arrays[name])))
+
+
+def _arrays(module: nn.Module) -> dict[str, Array]:
+    named = module.named_parameters()
+    return {name: p.detach().cpu().numpy().copy() for name, p in named}
+
+
+def _under(prefix: str, state: dict[str, Array]) -> dict[str, Array]:
+    return {name.removeprefix(prefix): v for name, v in state.items() if name.startswith(prefix)}
+
+
+def _frozen(module: nn.Module) -> nn.Module:
+    return copy.deepcopy(module).requires_grad_(False)
+
+
+def _adam(module: nn.Module, rate: float) -> torch.optim.Adam:
+    return torch.optim.Adam(module.parameters(), lr=rate, fused=True)
+
+
+def _step(module: nn.Module, optimiser: torch.optim.Adam, loss: Tensor, clip: float) -> None:
+    optimiser.zero_grad(set_to_none=True)
+    loss.backward()  # type: ignore[no-untyped-call]
+    if clip > 0.0:
+        nn.utils.clip_grad_norm_(module.parameters(), clip)
+    optimiser.step()

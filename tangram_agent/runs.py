@@ -1,0 +1,81 @@
+"""Loading a finished run: its config, its setup and the policy that it learned.
+
+`load_run("runs/my-run").policy.act(corners, placed, goals)` gives actions; docs/inference.md shows
+a whole example.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from tangram_agent.checkpoints import load_checkpoint, newest_checkpoint
+from tangram_agent.policy import Policy
+from tangram_agent.setup import Setup, make_setup
+from tangram_agent.types import Weights
+from tangram_sim.errors import RunError
+
+CONFIG = "config.yaml"
+CHECKPOINTS = "checkpoints"
+ACTING = "weights"  # the checkpoint's file of acting weights
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A run that was read from its folder.
+
+    Attributes:
+        folder: the run folder.
+        config: the resolved config that it was trained with.
+        setup: the task and the agent.
+        updates: of the checkpoint that was loaded.
+        policy: acts with the checkpoint's weights; see `Policy.act` for shapes.
+    """
+
+    folder: Path
+    config: dict[str, Any]
+    setup: Setup
+    updates: int
+    policy: Policy
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """A run's resolved config.
+
+    Raises:
+        RunError: the file is missing or not a YAML mapping.
+    """
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise RunError(f"cannot read {path} ({error.strerror}): is this a run folder?") from None
+    except (yaml.YAMLError, UnicodeDecodeError):
+        raise RunError(f"{path} is not valid YAML: mend it or name another run_dir") from None
+    if not isinstance(content, dict):
+        raise RunError(f"{path} holds no settings: it must be a mapping of sections")
+    return content
+
+
+def load_run(run_dir: str | Path, checkpoint: str | None = None) -> Run:
+    """A run with the weights of its newest checkpoint, or of the one that is named.
+
+    Args:
+        run_dir: the run folder.
+        checkpoint: name of a folder under `checkpoints`, such as 00004000.
+
+    Raises:
+        RunError: the folder, its config or the checkpoint is missing or corrupt, or the weights
+            do not fit the config.
+    """
+    folder = Path(run_dir)
+    if not folder.is_dir():
+        raise RunError(f"no run folder {folder}: give the folder that tangram-train printed")
+    config = read_config(folder / CONFIG)
+    setup = make_setup(config)
+    checkpoints = folder / CHECKPOINTS
+    path = checkpoints / checkpoint if checkpoint else newest_checkpoint(checkpoints)
+    content = load_checkpoint(path, [ACTING])
+    policy = Policy(setup)
+    policy.load(Weights(content.updates, content.arrays[ACTING]))
+    return Run(folder, config, setup, content.updates, policy)

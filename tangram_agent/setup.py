@@ -1,0 +1,85 @@
+"""Everything that a master and its workers must agree on, from plain mappings."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import Any, TypeVar
+
+import dacite
+
+from tangram_agent.config import AgentConfig, NetConfig
+from tangram_sim.config import RewardConfig, SimConfig
+from tangram_sim.errors import ConfigError
+from tangram_sim.layout import Layout, TokensConfig, make_layout
+
+Settings = TypeVar("Settings")
+
+SECTIONS = ("tokens", "sim", "reward", "agent", "net")
+
+
+@dataclass(frozen=True)
+class Setup:
+    """The task and the agent of one run."""
+
+    tokens: TokensConfig
+    sim: SimConfig
+    reward: RewardConfig
+    agent: AgentConfig
+    net: NetConfig
+
+    @cached_property
+    def layout(self) -> Layout:
+        """The token set's fixed structure."""
+        return make_layout(self.tokens)
+
+    @property
+    def horizon(self) -> int:
+        """T: actions in one episode."""
+        return self.layout.tokens * self.sim.actions_per_token
+
+    @property
+    def action_size(self) -> int:
+        """A: x, y and angular velocity, with more than one token its number before them."""
+        return 3 if self.layout.tokens == 1 else 4
+
+    def fingerprints(self) -> dict[str, str]:
+        """A digest of each section: two processes with the same ones play the same task."""
+        sections = {"tokens": self.layout.fingerprint()}
+        for name in SECTIONS[1:]:
+            content = json.dumps(asdict(getattr(self, name)), sort_keys=True)
+            sections[name] = hashlib.sha256(content.encode()).hexdigest()[:16]
+        return sections
+
+
+def make_setup(config: Mapping[str, Any]) -> Setup:
+    """The setup in the sections tokens, sim, reward, agent and net of a resolved config.
+
+    Raises:
+        ConfigError: a section is missing, a key is unknown, or a value has a wrong type or range.
+    """
+    missing = [name for name in SECTIONS if name not in config]
+    if missing:
+        raise ConfigError(f"the config has no section {', '.join(missing)}")
+    return from_mapping(Setup, {name: config[name] for name in SECTIONS})
+
+
+def from_mapping(kind: type[Settings], mapping: Mapping[str, Any]) -> Settings:
+    """A settings dataclass from a plain mapping; unknown keys and wrong types are refused.
+
+    Raises:
+        ConfigError: names the key and what is wrong with it.
+    """
+    rules = dacite.Config(strict=True, cast=[tuple], type_hooks={float: _as_float})
+    try:
+        return dacite.from_dict(kind, mapping, rules)
+    except dacite.DaciteError as error:
+        raise ConfigError(f"wrong config: {error}") from None
+
+
+def _as_float(value: object) -> object:
+    """Whole numbers are welcome where a float is expected; texts and booleans are not."""
+    if isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    return value

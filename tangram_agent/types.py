@@ -1,0 +1,90 @@
+"""What travels between play and learning: small immutable tuples of arrays.
+
+Legend: E episodes, T steps of an episode, B batch, K tokens, V corners of all tokens together,
+A entries of an action (3 for one token: x, y and angular velocity; 4 for more, the token first).
+Goals and states are corners in the order of `tangram_sim.layout.Layout`.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from tangram_sim.arrays import Singles
+
+Flags = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class Episodes:
+    """Whole episodes of equal length, as played: what a worker sends.
+
+    Attributes:
+        corners: (E, T + 1, V, 2) float32, tokens' corners before each step and after the last.
+        placed: (E, T + 1, K) uint8, 1 where a token is placed.
+        actions: (E, T, A) float32 in [-1, 1].
+        rewards: (E, T) float32 of the goal that was played.
+        goals: (E, V, 2) float32, target corners.
+    """
+
+    corners: Singles
+    placed: Flags
+    actions: Singles
+    rewards: Singles
+    goals: Singles
+
+    @property
+    def count(self) -> int:
+        """E."""
+        return len(self.corners)
+
+    @property
+    def steps(self) -> int:
+        """T."""
+        return int(self.actions.shape[1])
+
+    @property
+    def transitions(self) -> int:
+        """E * T."""
+        return self.count * self.steps
+
+
+@dataclass(frozen=True, eq=False)
+class Transitions:
+    """A flat batch of (s, a, r, s', d, g).
+
+    Attributes:
+        state, next_state: (B, V, 2) float32 token corners.
+        placed, next_placed: (B, K) uint8.
+        action: (B, A) float32.
+        reward: (B,) float32.
+        done: (B,) uint8, 1 where next_state is terminal.
+        goal: (B, V, 2) float32 target corners.
+    """
+
+    state: Singles
+    placed: Flags
+    action: Singles
+    reward: Singles
+    next_state: Singles
+    next_placed: Flags
+    done: Flags
+    goal: Singles
+
+    @property
+    def count(self) -> int:
+        """B."""
+        return len(self.state)
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """The weights that workers play with.
+
+    Attributes:
+        version: number of the broadcast, rising within an epoch.
+        tensors: name -> float32 array of the acting network.
+    """
+
+    version: int
+    tensors: dict[str, Singles]

@@ -1,0 +1,185 @@
+"""A token set: which corners belong to which token, the order of nodes, and the edges.
+
+All tokens' corners are stacked into one array (V, 2), token after token; the target uses the same
+order. The graph of Sec. IV-A has N = 2V + K nodes: token corners (V), bases (K), target corners
+(V). Nothing of it but the corners and the flags ever travels or is stored.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tangram_sim.arrays import Bools, Floats, Ints
+from tangram_sim.errors import ConfigError
+from tangram_sim.shapes import Shape, polygon, tan
+
+MAX_TOKENS = 16
+
+
+@dataclass(frozen=True)
+class TokensConfig:
+    """The pieces of a puzzle.
+
+    Attributes:
+        shapes: names of tans, or mappings {name, corners} that define a convex polygon.
+        scale: side of the full square that the tans are cut from, in arena units; a polygon of
+            the user's own is scaled by the same number.
+    """
+
+    shapes: tuple[Any, ...]
+    scale: float
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.shapes) <= MAX_TOKENS:
+            raise ConfigError(
+                f"tokens.shapes must list 1 to {MAX_TOKENS} shapes, got {len(self.shapes)}"
+            )
+        if not (np.isfinite(self.scale) and self.scale > 0):
+            raise ConfigError(f"tokens.scale must be positive, got {self.scale}")
+
+
+def make_layout(config: TokensConfig) -> "Layout":
+    """The layout of a token set.
+
+    Raises:
+        ConfigError: an unknown shape, or a polygon that is not convex.
+    """
+    return Layout([_shape(entry).scaled(config.scale) for entry in config.shapes])
+
+
+def _shape(entry: object) -> Shape:
+    if isinstance(entry, str):
+        return tan(entry)
+    if not isinstance(entry, Mapping) or set(entry) != {"name", "corners"}:
+        raise ConfigError(
+            f"a shape is a name or a mapping with the keys name and corners, got {entry!r}"
+        )
+    return polygon(str(entry["name"]), entry["corners"])
+
+
+class Layout:
+    """The fixed structure of a token set, and the maps between poses, corners and nodes.
+
+    Attributes:
+        shapes: the K scaled shapes.
+        body: (V, 2) corners of all tokens in their body frames.
+        starts: (K + 1,) token k owns the corners starts[k]:starts[k + 1].
+        token_of_corner: (V,) index of the owning token.
+        base_weights: (K, V) centre of token k as an affine combination of the corners.
+        adjacency: (N, N) edges of the graph, E(i, i) = 0.
+    """
+
+    def __init__(self, shapes: Sequence[Shape]) -> None:
+        self.shapes = tuple(shapes)
+        sizes = [len(shape.corners) for shape in self.shapes]
+        self.starts: Ints = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+        self.body: Floats = np.concatenate([shape.corners for shape in self.shapes])
+        self.token_of_corner: Ints = np.repeat(np.arange(len(sizes)), sizes)
+        self.base_weights: Floats = self._base_weights()
+        self.adjacency: Bools = self._adjacency()
+
+    @property
+    def tokens(self) -> int:
+        """K."""
+        return len(self.shapes)
+
+    @property
+    def corner_count(self) -> int:
+        """V."""
+        return len(self.body)
+
+    @property
+    def nodes(self) -> int:
+        """N = 2V + K."""
+        return 2 * self.corner_count + self.tokens
+
+    def corners_of(self, token: int) -> slice:
+        """The corners of one token, as a slice of V."""
+        return slice(int(self.starts[token]), int(self.starts[token + 1]))
+
+    def corners(self, poses: Floats) -> Floats:
+        """Corners (..., V, 2) of poses (..., K, 3), each x, y and angle in radians."""
+        pose = np.asarray(poses)[..., self.token_of_corner, :]
+        cos, sin = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+        x, y = self.body.T
+        return np.stack(
+            [pose[..., 0] + cos * x - sin * y, pose[..., 1] + sin * x + cos * y], axis=-1
+        )
+
+    def bases(self, corners: Floats) -> Floats:
+        """Centres of area (..., K, 2) of tokens with the given corners (..., V, 2)."""
+        centres: Floats = self.base_weights @ corners
+        return centres
+
+    def poses(self, corners: Floats) -> Floats:
+        """Poses (..., K, 3) of corners (..., V, 2): least-squares rotation, angle in (-pi, pi]."""
+        centres = self.bases(corners)
+        offset = corners - centres[..., self.token_of_corner, :]
+        dot = np.sum(self.body * offset, axis=-1)
+        cross = self.body[:, 0] * offset[..., 1] - self.body[:, 1] * offset[..., 0]
+        angle = np.arctan2(
+            np.add.reduceat(cross, self.starts[:-1], axis=-1),
+            np.add.reduceat(dot, self.starts[:-1], axis=-1),
+        )
+        return np.concatenate([centres, angle[..., None]], axis=-1)
+
+    def node_features(self, corners: Floats, placed: Bools, goal: Floats) -> Floats:
+        """The 4 features per node of Sec. IV-A: x, y, part of the target, placed.
+
+        Args:
+            corners: (..., V, 2) of the tokens.
+            placed: (..., K) which tokens are placed.
+            goal: (..., V, 2) corners of the target; its nodes always count as placed.
+
+        Returns:
+            (..., N, 4)
+        """
+        positions = np.concatenate([corners, self.bases(corners), goal], axis=-2)
+        lead, v = positions.shape[:-2], self.corner_count
+        target = np.zeros((*lead, self.nodes))
+        target[..., v + self.tokens :] = 1.0
+        flags = np.concatenate(
+            [placed[..., self.token_of_corner], placed, np.ones((*lead, v))], axis=-1
+        )
+        return np.concatenate([positions, target[..., None], flags[..., None]], axis=-1)
+
+    def state_matrix(self, corners: Floats, placed: Bools, goal: Floats) -> Floats:
+        """Nodes and adjacency stacked, as the paper passes them on: (..., N, 4 + N)."""
+        nodes = self.node_features(corners, placed, goal)
+        edges = np.broadcast_to(self.adjacency, (*nodes.shape[:-1], self.nodes))
+        return np.concatenate([nodes, edges], axis=-1)
+
+    def fingerprint(self) -> str:
+        """A short digest of the shapes: two processes with the same one agree on every index."""
+        content = [[s.name, s.symmetry, np.round(s.corners, 9).tolist()] for s in self.shapes]
+        return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
+
+    def _base_weights(self) -> Floats:
+        """Minimum-norm weights with sum 1 that give the origin from the body corners.
+
+        A rigid motion is affine, so the same weights give the centre of area in every pose, also
+        for polygons whose centre of area is not the mean of the corners.
+        """
+        weights = np.zeros((self.tokens, self.corner_count))
+        for k, shape in enumerate(self.shapes):
+            system = np.vstack([shape.corners.T / shape.radius, np.ones(len(shape.corners))])
+            weights[k, self.corners_of(k)] = np.linalg.pinv(system) @ np.array([0.0, 0.0, 1.0])
+        return weights
+
+    def _adjacency(self) -> Bools:
+        """Edges of Sec. IV-A: within a token, corner to its base, base to every target node."""
+        v, k = self.corner_count, self.tokens
+        same = self.token_of_corner[:, None] == self.token_of_corner[None, :]
+        edges = np.zeros((self.nodes, self.nodes), dtype=np.bool_)
+        edges[:v, :v] = same
+        edges[v + k :, v + k :] = same
+        own = np.arange(k)[:, None] == self.token_of_corner[None, :]
+        edges[v : v + k, :v] = own
+        edges[v : v + k, v + k :] = True
+        edges |= edges.T
+        np.fill_diagonal(edges, False)
+        return edges

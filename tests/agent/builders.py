@@ -1,0 +1,80 @@
+"""Small setups, layouts and episodes that the tests of the agent share."""
+
+from typing import Any
+
+import numpy as np
+
+from tangram_agent.setup import Setup, make_setup
+from tangram_agent.types import Episodes, Transitions
+
+SQUARE = {"shapes": ["square"], "scale": 1.131370849898476}  # side 0.4
+PAIR = {"shapes": ["square", "large_triangle"], "scale": 0.8}
+
+PAPER = {
+    "egocentric": False,
+    "offsets": False,
+    "orientation": False,
+    "afterstate": False,
+    "angle_head": "plain",
+    "squash": "tanh",
+    "saturation_penalty": 0.0,
+    "gamma": 0.99,
+    "acting_average": 0.0,
+    "lr_decay": "none",
+}
+SMALL = {"width": 16, "layers": 2, "heads": 2, "feed_forward": 32}
+
+
+def setup(
+    tokens: dict[str, Any] = SQUARE,
+    agent: dict[str, Any] | None = None,
+    net: dict[str, Any] = SMALL,
+    **sim: Any,
+) -> Setup:
+    """A setup on the kinematic backend with a small network."""
+    return make_setup(
+        {
+            "tokens": tokens,
+            "sim": {"backend": "kinematic", **sim},
+            "reward": {},
+            "agent": agent or {},
+            "net": net,
+        }
+    )
+
+
+def random_episodes(made: Setup, count: int, seed: int = 0) -> Episodes:
+    """Episodes of random poses and actions; poses do not follow from actions."""
+    rng = np.random.default_rng(seed)
+    layout, steps = made.layout, made.horizon
+    poses = rng.uniform([-0.7, -0.7, -3], [0.7, 0.7, 3], (count, steps + 2, layout.tokens, 3))
+    corners = layout.corners(poses).astype(np.float32)
+    actions = rng.uniform(-1, 1, (count, steps, made.action_size))
+    placed = np.zeros((count, steps + 1, layout.tokens), np.uint8)
+    placed[:, -1] = 1
+    return Episodes(
+        corners=corners[:, : steps + 1],
+        placed=placed,
+        actions=actions.astype(np.float32),
+        rewards=rng.uniform(-1, 1, (count, steps)).astype(np.float32),
+        goals=corners[:, -1],
+    )
+
+
+def random_transitions(made: Setup, count: int, seed: int = 0, done: int | None = 1) -> Transitions:
+    """Transitions of random poses, unplaced before and placed after."""
+    rng = np.random.default_rng(seed)
+    layout = made.layout
+    poses = rng.uniform([-0.7, -0.7, -3], [0.7, 0.7, 3], (count, 3, layout.tokens, 3))
+    corners = layout.corners(poses).astype(np.float32)
+    ends = rng.integers(0, 2, count) if done is None else np.full(count, done)
+    return Transitions(
+        state=corners[:, 0],
+        placed=np.zeros((count, layout.tokens), np.uint8),
+        action=rng.uniform(-1, 1, (count, made.action_size)).astype(np.float32),
+        reward=rng.uniform(-1, 1, count).astype(np.float32),
+        next_state=corners[:, 1],
+        next_placed=np.repeat(ends[:, None], layout.tokens, axis=1).astype(np.uint8),
+        done=ends.astype(np.uint8),
+        goal=corners[:, 2],
+    )

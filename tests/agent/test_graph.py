@@ -1,0 +1,108 @@
+"""Features against the layout's own, and hand-made scenes."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from tangram_agent.graph import TokenGraph
+from tangram_agent.setup import Setup
+from tangram_sim.layout import Layout
+from tests.agent.builders import PAIR, PAPER, SQUARE, random_transitions, setup
+
+pytestmark = pytest.mark.fast
+
+NO_TOKEN = torch.zeros(1, dtype=torch.long)
+
+
+def graph_of(made: Setup) -> TokenGraph:
+    return TokenGraph(made.layout, made.sim.arena, made.agent)
+
+
+def corners(layout: Layout, *poses: tuple[float, float, float]) -> torch.Tensor:
+    return torch.from_numpy(layout.corners(np.array([poses]))).float()
+
+
+@pytest.mark.parametrize("tokens", [SQUARE, PAIR])
+def test_paper_features_equal_those_of_the_layout(tokens: dict[str, object]) -> None:
+    made = setup(tokens, agent=PAPER)
+    batch = random_transitions(made, 6)
+    placed = np.random.default_rng(0).integers(0, 2, batch.placed.shape)
+    parts = (np.asarray(part, np.float32) for part in (batch.state, placed, batch.goal))
+    found = graph_of(made).node_features(
+        *(torch.from_numpy(part) for part in parts), torch.zeros(6, dtype=torch.long)
+    )
+    expected = made.layout.node_features(batch.state, placed, batch.goal)
+    np.testing.assert_allclose(found.numpy(), expected, atol=1e-6)
+
+
+def test_offsets_are_corner_directions_of_every_piece() -> None:
+    """The square's corners lie on the diagonals; its base has no offset."""
+    made = setup(agent={**PAPER, "offsets": True})
+    scene = corners(made.layout, (0.3, -0.2, 0.0)), corners(made.layout, (-0.5, 0.1, math.pi / 4))
+    features = graph_of(made).node_features(scene[0], torch.zeros(1, 1), scene[1], NO_TOKEN)
+    half = math.sqrt(0.5)
+    expected = [
+        *([-half, -half], [half, -half], [half, half], [-half, half]),
+        [0, 0],
+        *([0, -1], [1, 0], [0, 1], [-1, 0]),
+    ]
+    np.testing.assert_allclose(features[0, :, 4:6].numpy(), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("shape", "symmetry"), [("square", 4), ("parallelogram", 2), ("large_triangle", 1)]
+)
+def test_orientation_is_k_times_the_angle_to_the_token(shape: str, symmetry: int) -> None:
+    made = setup({"shapes": [shape], "scale": 1}, agent={**PAPER, "orientation": True})
+    scene = corners(made.layout, (0, 0, 0.5)), corners(made.layout, (1, 0, 0.8))
+    features = graph_of(made).node_features(scene[0], torch.zeros(1, 1), scene[1], NO_TOKEN)
+    count = made.layout.corner_count
+    angle = 0.3 * symmetry
+    expected = np.array([[1.0, 0.0]] * (count + 1) + [[math.cos(angle), math.sin(angle)]] * count)
+    np.testing.assert_allclose(features[0, :, 4:6].numpy(), expected, atol=1e-5)
+
+
+def test_the_egocentric_frame_is_the_moving_tokens() -> None:
+    made = setup(PAIR, agent={**PAPER, "egocentric": True})
+    layout = made.layout
+    scene = corners(layout, (0.3, 0.1, 0.4), (-0.6, 0.2, -1.0))
+    goal = corners(layout, (0.0, 0.5, 2.0), (0.4, -0.3, 0.1))
+    second = torch.tensor([1])
+    features = graph_of(made).node_features(scene, torch.zeros(1, 2), goal, second)[0]
+    own = layout.corners_of(1)
+    np.testing.assert_allclose(features[own, :2].numpy(), layout.body[own], atol=1e-6)
+    cos, sin = math.cos(1.0), math.sin(1.0)
+    point = goal[0, 0].numpy() - [-0.6, 0.2]
+    expected = [cos * point[0] - sin * point[1], sin * point[0] + cos * point[1]]
+    first_goal_node = layout.corner_count + layout.tokens
+    np.testing.assert_allclose(features[first_goal_node, :2].numpy(), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("velocity", [(0.2, -0.3, 0.0), (0.0, 0.0, 1.0), (-0.4, 0.1, -0.35)])
+def test_move_is_the_rigid_motion_of_the_simulation(velocity: tuple[float, float, float]) -> None:
+    made = setup(PAIR)
+    layout, poses = made.layout, np.array([[0.3, 0.1, 0.4], [-0.6, 0.2, -1.0]])
+    moved = graph_of(made).move(
+        corners(layout, *map(tuple, poses)), torch.tensor([1]), torch.tensor([velocity])
+    )
+    poses[1] += np.array(velocity) * [2.0, 2.0, math.pi]
+    np.testing.assert_allclose(moved[0].numpy(), layout.corners(poses), atol=1e-6)
+
+
+def test_frames_of_world_and_token_are_inverse() -> None:
+    made = setup()
+    graph = graph_of(made)
+    state = torch.from_numpy(random_transitions(made, 8).state)
+    token = torch.zeros(8, dtype=torch.long)
+    shift = torch.rand(8, 2, generator=torch.Generator().manual_seed(0))
+    there = graph.to_world(state, token, shift)
+    assert (there - shift).abs().max() > 0.1
+    torch.testing.assert_close(graph.to_token(state, token, there), shift)
+
+
+def test_constants_are_no_weights() -> None:
+    graph = graph_of(setup())
+    assert graph.state_dict() == {}
+    assert list(graph.parameters()) == []

@@ -1,0 +1,121 @@
+"""The ring against a naive oracle, and its state in and out."""
+
+from collections import deque
+
+import numpy as np
+import pytest
+
+from tangram_agent.replay import ReplayBuffer
+from tangram_agent.types import Transitions
+from tangram_sim.errors import RunError
+from tests.agent.builders import PAIR, random_transitions, setup
+
+pytestmark = pytest.mark.fast
+
+MADE = setup(PAIR)
+
+
+def buffer(capacity: int) -> ReplayBuffer:
+    return ReplayBuffer(capacity, MADE.layout.corner_count, 2, 4)
+
+
+def numbered(first: int, count: int) -> Transitions:
+    """Transitions whose reward is their number."""
+    batch = random_transitions(MADE, count, seed=first)
+    return Transitions(**{**vars(batch), "reward": np.arange(first, first + count, dtype="f4")})
+
+
+def rewards(replay: ReplayBuffer) -> list[float]:
+    return sorted(replay.state()["reward"].tolist())
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_equals_a_naive_oracle_under_random_operations(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    capacity = int(rng.integers(1, 20))
+    replay, oracle, number = buffer(capacity), deque(maxlen=capacity), 0
+    rows: dict[float, Transitions] = {}
+    for _ in range(60):
+        match rng.integers(3):
+            case 0:
+                count = int(rng.integers(1, 2 * capacity + 2))
+                batch = numbered(number, count)
+                replay.add(batch)
+                for i in range(count):
+                    oracle.append(float(number + i))
+                    parts = {name: column[i : i + 1] for name, column in vars(batch).items()}
+                    rows[float(number + i)] = Transitions(**parts)
+                number += count
+            case 1 if oracle:
+                drawn = replay.sample(7, rng)
+                assert drawn.count == 7
+                for i, reward in enumerate(drawn.reward.tolist()):
+                    assert reward in oracle
+                    for name, column in vars(drawn).items():
+                        np.testing.assert_array_equal(column[i], getattr(rows[reward], name)[0])
+            case _:
+                fresh = buffer(capacity)
+                fresh.load_state({k: v.copy() for k, v in replay.state().items()})
+                replay = fresh
+        replay.check_valid()
+        assert len(replay) == len(oracle)
+        assert replay.added == number
+        assert rewards(replay) == sorted(oracle)
+
+
+def test_samples_every_kept_transition_alike() -> None:
+    replay = buffer(10)
+    replay.add(numbered(0, 14))
+    drawn = replay.sample(20_000, np.random.default_rng(0)).reward
+    values, counts = np.unique(drawn, return_counts=True)
+    assert values.tolist() == list(range(4, 14))
+    assert counts.min() > 1800
+    assert counts.max() < 2200
+
+
+def test_an_empty_buffer_cannot_be_sampled() -> None:
+    with pytest.raises(ValueError, match="empty replay buffer"):
+        buffer(4).sample(1, np.random.default_rng(0))
+
+
+def test_a_smaller_buffer_takes_over_the_newest() -> None:
+    large, small = buffer(8), buffer(3)
+    large.add(numbered(0, 13))
+    small.load_state(large.state())
+    assert rewards(small) == [10, 11, 12]
+    small.add(numbered(13, 1))
+    assert rewards(small) == [11, 12, 13]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "reason"),
+    [
+        ("reward", np.nan, "'reward' holds numbers that are not finite"),
+        ("goal", np.inf, "'goal' holds numbers that are not finite"),
+        ("done", 2, "'done' holds flags other than 0 and 1"),
+    ],
+)
+def test_check_valid_finds_bad_numbers(name: str, value: float, reason: str) -> None:
+    replay = buffer(4)
+    replay.add(numbered(0, 2))
+    replay.check_valid()
+    replay.state()[name].reshape(-1)[0] = value
+    with pytest.raises(RunError, match=reason):
+        replay.check_valid()
+
+
+@pytest.mark.parametrize("name", ["reward", "state", "counters"])
+def test_a_state_with_a_missing_column_is_refused(name: str) -> None:
+    replay = buffer(4)
+    replay.add(numbered(0, 2))
+    state = replay.state()
+    del state[name]
+    with pytest.raises(RunError, match="does not fit the layout"):
+        buffer(4).load_state(state)
+
+
+def test_a_state_of_another_layout_is_refused() -> None:
+    replay = buffer(4)
+    replay.add(numbered(0, 2))
+    with pytest.raises(RunError, match="'state' does not fit the layout"):
+        ReplayBuffer(4, 4, 1, 3).load_state(replay.state())

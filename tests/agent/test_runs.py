@@ -1,0 +1,85 @@
+"""Loading a run from its folder, and each way in which that can fail."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from tangram_agent.checkpoints import save_checkpoint
+from tangram_agent.ddpg import Learner
+from tangram_agent.policy import Policy
+from tangram_agent.runs import load_run
+from tangram_sim.errors import RunError, TangramError
+from tests.agent.builders import SMALL, SQUARE, random_transitions, setup
+
+pytestmark = pytest.mark.fast
+
+MADE = setup()
+CONFIG = {
+    "tokens": SQUARE,
+    "sim": {"backend": "kinematic"},
+    "reward": {},
+    "agent": {},
+    "net": SMALL,
+}
+
+
+@pytest.fixture
+def run_dir(tmp_path: Path) -> Path:
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(CONFIG))
+    for updates in (10, 20):
+        arrays = {"weights": Learner(MADE, seed=updates).acting_weights(1).tensors}
+        save_checkpoint(tmp_path / "checkpoints", updates, arrays, {}, keep=2)
+    return tmp_path
+
+
+@pytest.mark.parametrize(("checkpoint", "updates"), [(None, 20), ("00000010", 10)])
+def test_a_run_acts_as_it_was_saved(run_dir: Path, checkpoint: str | None, updates: int) -> None:
+    run = load_run(run_dir, checkpoint)
+    assert run.updates == updates
+    assert run.config == CONFIG
+    expected = Policy(MADE)
+    expected.load(Learner(MADE, seed=updates).acting_weights(1))
+    batch = random_transitions(MADE, 4)
+    scene = (batch.state, batch.placed, batch.goal)
+    np.testing.assert_array_equal(run.policy.act(*scene), expected.act(*scene))
+
+
+def spoil(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.write_bytes(bytes(data))
+
+
+@pytest.mark.parametrize(
+    ("harm", "reason"),
+    [
+        (lambda run: (run / "config.yaml").unlink(), "is this a run folder"),
+        (lambda run: (run / "config.yaml").write_text("a: [1"), "not valid YAML"),
+        (lambda run: (run / "config.yaml").write_text("- 1"), "holds no settings"),
+        (lambda run: (run / "config.yaml").write_text("tokens: {}"), "no section sim"),
+        (lambda run: (run / "checkpoints").rename(run / "gone"), "no checkpoint in"),
+        (
+            lambda run: spoil(run / "checkpoints/00000020/weights.safetensors"),
+            "checksum of weights.safetensors differs",
+        ),
+    ],
+)
+def test_a_broken_run_is_refused_in_clear_words(run_dir: Path, harm: object, reason: str) -> None:
+    harm(run_dir)
+    with pytest.raises(TangramError, match=reason) as caught:
+        load_run(run_dir)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="no run folder"):
+        load_run(tmp_path / "nowhere")
+
+
+def test_weights_of_another_net_are_refused(run_dir: Path) -> None:
+    config = CONFIG | {"net": {**SMALL, "width": 32}}
+    (run_dir / "config.yaml").write_text(yaml.safe_dump(config))
+    with pytest.raises(RunError, match="weights of another layout"):
+        load_run(run_dir)

@@ -1,0 +1,96 @@
+"""Settings: what is refused, in which words, and what a fingerprint covers."""
+
+from typing import Any
+
+import pytest
+
+from tangram_agent.setup import make_setup
+from tangram_sim.errors import ConfigError
+
+pytestmark = pytest.mark.fast
+
+BASE: dict[str, dict[str, Any]] = {
+    "tokens": {"shapes": ["square"], "scale": 1.0},
+    "sim": {},
+    "reward": {},
+    "agent": {},
+    "net": {},
+}
+
+
+def changed(section: str, **values: Any) -> dict[str, dict[str, Any]]:
+    return {**BASE, section: {**BASE[section], **values}}
+
+
+@pytest.mark.parametrize(
+    ("config", "reason"),
+    [
+        (changed("tokens", shapes=["pentagon"]), "unknown shape 'pentagon': choose from large_tri"),
+        (changed("tokens", shapes=[]), "must list 1 to 16 shapes, got 0"),
+        (changed("tokens", scale=0), "tokens.scale must be positive, got 0"),
+        (changed("tokens", shapes=[{"name": "x"}]), "a mapping with the keys name and corners"),
+        (changed("sim", substeps=2), "sim.substeps must be between 4 and 1000, got 2"),
+        (changed("sim", backend="bullet"), "sim.backend must be one of physics, kinematic"),
+        (changed("sim", arena="wide"), 'wrong value type for field "sim.arena"'),
+        (changed("sim", speed=1), '"speed"'),
+        (changed("reward", source="camera", name="dense"), "source=camera measures Eq. 14 only"),
+        (changed("agent", gamma=1.5), "agent.gamma must be between 0 and 1, got 1.5"),
+        (changed("agent", batch_size=0), "agent.batch_size must be at least 1, got 0"),
+        (
+            changed("agent", batch_size=10, replay_capacity=5),
+            r"batch_size \(10\) must not exceed agent.replay_capacity \(5\)",
+        ),
+        (changed("agent", squash="relu"), "agent.squash must be one of tanh, clamp, got 'relu'"),
+        (changed("agent", angle_head="x"), "agent.angle_head must be one of plain, kfold"),
+        (changed("agent", lr_decay="x"), "agent.lr_decay must be one of none, cosine"),
+        (changed("agent", hindsight=[{"strategy": "x"}]), "must be one of final, future, near"),
+        (
+            changed("agent", hindsight=[{"strategy": "near", "copies": 0}]),
+            "hindsight.copies must be between 1 and 64, got 0",
+        ),
+        (changed("net", kind="cnn"), "net.kind must be one of mha, mlp, got 'cnn'"),
+        (changed("net", width=65), "net.width must be a multiple of net.heads, got 65 and 4"),
+        (changed("net", hidden=[]), "net.hidden must name at least one layer"),
+        (changed("net", hidden=[0]), "net.hidden must be between 1 and 65536, got 0"),
+        (changed("net", scale="none"), "net.scale must be one of d, sqrt_d"),
+        ({"tokens": BASE["tokens"]}, "no section sim, reward, agent, net"),
+    ],
+)
+def test_wrong_settings_are_refused_in_clear_words(config: dict[str, Any], reason: str) -> None:
+    with pytest.raises(ConfigError, match=reason):
+        made = make_setup(config)
+        assert made.layout
+
+
+@pytest.mark.parametrize(
+    ("section", "values"),
+    [
+        ("tokens", {"scale": 2.0}),
+        ("tokens", {"shapes": ["parallelogram"]}),
+        ("sim", {"arena": 3.0}),
+        ("reward", {"name": "dense"}),
+        ("agent", {"gamma": 0.5}),
+        ("net", {"layers": 2}),
+    ],
+)
+def test_a_fingerprint_names_the_section_that_differs(section: str, values: dict[str, Any]) -> None:
+    ours = make_setup(BASE).fingerprints()
+    theirs = make_setup(changed(section, **values)).fingerprints()
+    assert [name for name in ours if ours[name] != theirs[name]] == [section]
+    assert make_setup(BASE).fingerprints() == ours
+
+
+def test_whole_numbers_are_welcome_as_floats() -> None:
+    assert make_setup(changed("sim", arena=3)).sim.arena == 3.0
+
+
+@pytest.mark.parametrize(
+    ("shapes", "actions", "horizon", "action_size"),
+    [(["square"], 1, 1, 3), (["square"], 3, 3, 3), (["square", "parallelogram"], 2, 4, 4)],
+)
+def test_sizes_follow_from_tokens_and_actions(
+    shapes: list[str], actions: int, horizon: int, action_size: int
+) -> None:
+    config = changed("tokens", shapes=shapes) | {"sim": {"actions_per_token": actions}}
+    made = make_setup(config)
+    assert (made.horizon, made.action_size) == (horizon, action_size)
