@@ -23,7 +23,7 @@ class SimConfig:
         substeps: simulation steps in one action of one second (physics only).
         camera: take the pictures and report Eq. 14 from them at every step.
         pixels: side of the camera's square picture.
-        max_tries: random layouts tried before sampling gives up.
+        max_tries: random poses tried for a token before sampling gives up.
     """
 
     backend: str = "physics"

@@ -113,14 +113,21 @@ def overlap_share(tokens: Floats, targets: Floats, layout: Layout) -> Floats:
     return share
 
 
+def pairs_overlap(first: Floats, second: Floats, tolerance: float = 1e-9) -> Bools:
+    """(B,), whether polygons (B, M, 2) and (B, C, 2) overlap by more than `tolerance` in area."""
+    found: Bools = _boxes_meet(first, second)
+    # Most pairs are too far apart to meet: only the rest is worth clipping.
+    rows = np.flatnonzero(found)
+    if len(rows):
+        found[rows] = area(clip(first[rows], second[rows])) > tolerance
+    return found
+
+
 def any_overlap(corners: Floats, layout: Layout, tolerance: float = 1e-9) -> Bools:
     """Whether any two tokens of a layout overlap by more than `tolerance` in area: (B,)."""
     found = np.zeros(len(corners), dtype=np.bool_)
     for i in range(layout.tokens):
         for j in range(i + 1, layout.tokens):
             first, second = corners[:, layout.corners_of(i)], corners[:, layout.corners_of(j)]
-            # Most pairs are too far apart to meet: only the rest is worth clipping.
-            rows = np.flatnonzero(_boxes_meet(first, second) & ~found)
-            if len(rows):
-                found[rows] = area(clip(first[rows], second[rows])) > tolerance
+            found |= pairs_overlap(first, second, tolerance)
     return found

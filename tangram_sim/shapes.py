@@ -14,7 +14,7 @@ from tangram_sim.arrays import Floats
 from tangram_sim.errors import ConfigError
 
 MAX_CORNERS = 16
-_TOLERANCE = 1e-9
+_TOLERANCE = 1e-9  # radians
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +94,7 @@ def _check_convex(name: str, points: Floats) -> None:
     ahead = np.roll(edge, -1, axis=0)
     turn = edge[:, 0] * ahead[:, 1] - edge[:, 1] * ahead[:, 0]
     angles = np.arctan2(turn, np.sum(edge * ahead, axis=1))
-    if (turn <= _TOLERANCE).any() or not np.isclose(angles.sum(), 2 * np.pi):
+    if (angles <= _TOLERANCE).any() or not np.isclose(angles.sum(), 2 * np.pi):
         raise ConfigError(
             f"shape '{name}' is not a strictly convex polygon: list its corners in order around "
             f"the outline, without repeated or collinear ones, got {points.tolist()}"

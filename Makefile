@@ -1,0 +1,44 @@
+# The commands of the house; .ci/run calls the same ones.
+
+SHELL := /bin/bash
+BIN := .venv/bin
+ARGS ?=
+
+.DEFAULT_GOAL := help
+.PHONY: help train test lint format bench clean
+
+help:  ## list these commands
+	@sed -nE 's/^([a-z]+):.*## (.*)/  make \1\t\2/p' Makefile | expand -t 16
+
+train: .venv/.installed-run  ## train an agent on this machine; settings go into ARGS="seed=1 tokens=parallelogram"
+	@$(BIN)/tangram-train $(ARGS)
+
+# Ends with pytest's own summary line.
+test: lint  ## lint, then all tests, a short training through real processes included
+	@$(BIN)/python -m pytest $(ARGS)
+
+lint: .venv/.installed-dev  ## ruff, mypy and import-linter; changes nothing
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports --no-logo
+
+format: .venv/.installed-dev  ## sort and lay out the code
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: .venv/.installed-dev  ## measure speed; options go into ARGS
+	@$(BIN)/python -m benchmarks $(ARGS)
+
+clean:  ## remove caches and build products; .venv and runs/ stay
+	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	find . -name .venv -prune -o -name __pycache__ -type d -exec rm -rf {} +
+
+# A stamp is older than these files only when something new may be needed.
+.venv/.installed-run: pyproject.toml constraints.txt
+	@.ci/install .venv
+	@touch $@
+
+.venv/.installed-dev: pyproject.toml constraints.txt
+	@.ci/install .venv dev,sb3
+	@touch .venv/.installed-run $@

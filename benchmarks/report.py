@@ -1,0 +1,48 @@
+"""Tables on the terminal and JSON files that say where their numbers come from."""
+
+import json
+import os
+import platform
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from master.result import commit, processor, versions
+
+
+def show(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Print rows with equal keys as a table."""
+    table = Table(title=title, title_justify="left")
+    for name in rows[0]:
+        table.add_column(name, justify="left" if name in {"stage", "unit"} else "right")
+    for row in rows:
+        table.add_row(*(_text(value) for value in row.values()))
+    # Wide enough for all columns also where the output goes into a file.
+    Console(width=None if sys.stdout.isatty() else 160).print(table)
+
+
+def write(path: Path | None, content: Mapping[str, Any]) -> None:
+    """Write results with the command, the commit, the machine and the versions; None: nothing."""
+    if path is None:
+        return
+    source = {
+        "command": " ".join(["python -m benchmarks", *sys.argv[1:]]),
+        "commit": commit(),
+        "processor": processor(),
+        "cores": len(os.sched_getaffinity(0)),
+        "system": platform.platform(),
+        "versions": versions(),
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({**source, **content}, indent=1) + "\n")
+    Console().print(f"written: {path}", highlight=False)
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, float):
+        return f"{value:,}" if isinstance(value, int) else str(value)
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"

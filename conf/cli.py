@@ -1,0 +1,221 @@
+"""The entry of every command: config, overrides, --help, and errors as one line.
+
+Only `yaml` is loaded before the command line is known to be in order, so --help is instant.
+"""
+
+import difflib
+import os
+import re
+import sys
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from conf.help import Plain, command_name, help_text, setting_names
+from tangram_sim.errors import ConfigError, TangramError
+
+USAGE_STATUS = 2
+INTERRUPT_STATUS = 130
+CFG_KINDS = ("job", "hydra", "all")
+FLAGS = ("--cfg", "--multirun", "-m")
+MISSING_HINTS = {
+    "run_dir": "say which run: run_dir=runs/...",
+    "connect": "say which master: connect=tcp://host:port or connect=runs/.../connection.json",
+}
+
+
+def entry(config_name: str, task: Callable[[Plain], int]) -> int:
+    """Run a command and return its exit status.
+
+    Args:
+        config_name: primary config in this package, without .yaml.
+        task: takes the resolved config as plain containers and returns the exit status.
+
+    Returns:
+        The task's status; 2 after a TangramError or a wrong command line, which are told in one
+        line on stderr; 130 after an interrupt.
+    """
+    command = command_name(config_name)
+    arguments = sys.argv[1:]
+    if {"-h", "--help"} & set(arguments):
+        print(help_text(config_name))
+        return 0
+    if "--version" in arguments:
+        print(f"{command} {version('tangram-rl')}")
+        return 0
+    try:
+        sys.argv[1:] = _options_first(arguments)
+        return _run(config_name, task)
+    except TangramError as error:
+        print(f"{command}: {error}", file=sys.stderr)
+        return USAGE_STATUS
+    except KeyboardInterrupt:
+        return INTERRUPT_STATUS
+
+
+def _options_first(arguments: Sequence[str]) -> list[str]:
+    """The arguments in the order that hydra's parser insists on."""
+    options: list[str] = []
+    overrides: list[str] = []
+    for argument in arguments:
+        if options[-1:] == ["--cfg"]:
+            if argument not in CFG_KINDS:
+                raise ConfigError(f"--cfg takes {', '.join(CFG_KINDS)}, got '{argument}'")
+            options.append(argument)
+        elif argument in FLAGS:
+            options.append(argument)
+        elif argument.startswith("-"):
+            name = argument.lstrip("-")
+            raise ConfigError(
+                f"unknown option '{argument}': settings carry no dashes, as in "
+                f"{name if '=' in name else name + '=...'}; --help lists them"
+            )
+        else:
+            overrides.append(argument)
+    if options[-1:] == ["--cfg"]:
+        options.append("job")
+    if len({"--cfg", "--multirun", "-m"} & set(options)) > 1:
+        raise ConfigError("--cfg and --multirun do not go together: leave one out")
+    return [*options, *overrides]
+
+
+def _run(config_name: str, task: Callable[[Plain], int]) -> int:
+    """Hand over to hydra, so that its --multirun and --cfg work as everywhere."""
+    import hydra
+    from hydra.errors import HydraException
+    from omegaconf import DictConfig
+    from omegaconf.errors import OmegaConfBaseException
+
+    statuses = [0]
+    errors: list[TangramError] = []
+
+    def job(config: DictConfig) -> None:
+        try:
+            statuses.append(task(_plain(config)))
+        except TangramError as error:
+            # An exception that hydra sees costs two more lines; an exit passes through it.
+            errors.append(error)
+            raise SystemExit(USAGE_STATUS) from None
+
+    # Without it hydra prints errors of the command line itself, over several lines.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    try:
+        hydra.main(version_base="1.3", config_path="pkg://conf", config_name=config_name)(job)()
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(_explain(error, config_name)) from error
+    except SystemExit:
+        if not errors:
+            raise
+        raise errors[0] from None
+    return max(statuses)
+
+
+def _plain(config: Any) -> Plain:
+    """Hydra's config as plain containers, with nothing missing and everything resolved.
+
+    Raises:
+        ConfigError: a setting without a default was not given, or an interpolation fails.
+    """
+    from hydra.core.hydra_config import HydraConfig
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    try:
+        missing = sorted(OmegaConf.missing_keys(config))
+        settings = OmegaConf.to_container(config, resolve=True)
+    except OmegaConfBaseException as error:
+        raise ConfigError(f"cannot resolve the config: {_first_line(error)}") from None
+    if missing:
+        raise ConfigError(MISSING_HINTS.get(missing[0], f"set {missing[0]}=..., it has no default"))
+    return with_run_config(_mapping(settings), list(HydraConfig.get().overrides.task))
+
+
+def _mapping(container: object) -> Plain:
+    if not isinstance(container, dict):
+        raise ConfigError(f"a config must be a mapping, got {type(container).__name__}")
+    return {str(name): value for name, value in container.items()}
+
+
+# A run's config in place of the groups
+
+
+def with_run_config(settings: Plain, overrides: Sequence[str]) -> Plain:
+    """Replace the groups by those of the run that `from_config` names; the key itself goes.
+
+    Single values that were set on the command line still win.
+
+    Raises:
+        ConfigError: no such file, not a run's config, or an override chooses a whole group.
+    """
+    from omegaconf import OmegaConf
+
+    path = settings.pop("from_config", None)
+    if path is None:
+        return settings
+    sections = [name for name, value in settings.items() if isinstance(value, dict)]
+    stored = _read_run_config(Path(path), sections)
+    chosen, result = OmegaConf.create(settings), OmegaConf.create({**settings, **stored})
+    for override in overrides:
+        key = override.lstrip("+~").partition("=")[0]
+        section = key.partition(".")[0]
+        if section not in stored:
+            continue
+        if key == section or override.startswith("~"):
+            raise ConfigError(
+                f"from_config chooses {section} already: leave out {override}, "
+                f"or set single values as in {section}.name=value"
+            )
+        OmegaConf.update(result, key, OmegaConf.select(chosen, key))
+    return _mapping(OmegaConf.to_container(result))
+
+
+def _read_run_config(path: Path, sections: Sequence[str]) -> Plain:
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"from_config={path}: {error.strerror or error}") from None
+    except (yaml.YAMLError, UnicodeDecodeError):
+        raise ConfigError(f"from_config={path} is not a YAML file") from None
+    lacking = [n for n in sections if not isinstance(content, dict) or n not in content]
+    if lacking:
+        raise ConfigError(
+            f"from_config={path} lacks {', '.join(lacking)}: name the config.yaml of a run"
+        )
+    return {name: content[name] for name in sections}
+
+
+# Errors of the command line in one line
+
+
+def _explain(error: Exception, config_name: str) -> str:
+    """What is wrong with the command line and what to write instead."""
+    from hydra.errors import MissingConfigException, OverrideParseException
+
+    if isinstance(error, MissingConfigException) and error.options:
+        group, _, name = str(error.missing_cfg_file).rpartition("/")
+        return f"unknown {group} '{name}': choose from {', '.join(error.options)}"
+    if isinstance(error, OverrideParseException):
+        return f"cannot read '{error.override}': write name=value, and quote texts with '...'"
+    if "Ambiguous value" in str(error):
+        return (
+            f"{_first_line(error)}: a list is [1,2], a text is '1,2', several runs are --multirun"
+        )
+    unknown = re.search(r"Could not override '([^']+)'|'([^']+)' does not exist", str(error))
+    if unknown:
+        name = unknown.group(1) or unknown.group(2)
+        return _unknown_setting(name, setting_names(config_name))
+    return _first_line(error)
+
+
+def _unknown_setting(name: str, known: Sequence[str]) -> str:
+    same_ending = [key for key in known if key.rpartition(".")[2] == name]
+    close = same_ending or difflib.get_close_matches(name, known, n=1)
+    hint = f"did you mean '{close[0]}'?" if close else "--help and --cfg job list them"
+    return f"unknown setting '{name}' ({hint})"
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().partition("\n")[0]

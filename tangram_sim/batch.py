@@ -1,0 +1,200 @@
+"""B environments that play in step: every episode has exactly `horizon` actions.
+
+Episodes of equal length keep everything an array: geometry and rewards are computed once for the
+whole batch, and a batch of episodes travels as a few raw frames.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tangram_sim.arrays import Bools, Floats, Ints, Pixels
+from tangram_sim.config import RewardConfig, SimConfig
+from tangram_sim.geometry import overlap_share
+from tangram_sim.layout import Layout
+from tangram_sim.rewards import make_reward, picture_reward, scaled_overlap
+from tangram_sim.sampling import sample_batch
+from tangram_sim.world import make_world
+
+_ROUNDING = 1.0 + 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class StepResult:
+    """What one step of all environments gave.
+
+    Attributes:
+        rewards: (B,) of the configured reward.
+        overlap: (B,) raw overlap in [0, 1] on exact polygons.
+        camera_rewards: (B,) Eq. 14 from the pictures, or None with the camera off.
+        refused: (B,) where the action named a placed token: nothing moved.
+        done: whether the episodes are over, all at once.
+    """
+
+    rewards: Floats
+    overlap: Floats
+    camera_rewards: Floats | None
+    refused: Bools
+    done: bool
+
+
+def action_size(tokens: int) -> int:
+    """A: 3 velocities, and before them which token to move if there are several."""
+    return 3 if tokens == 1 else 4
+
+
+def chosen_tokens(actions: Floats, tokens: int) -> Ints:
+    """(B,) the token that each action (B, A) moves: the first entry cuts [-1, 1] into K parts."""
+    if tokens == 1:
+        return np.zeros(len(actions), dtype=np.int64)
+    share = (np.asarray(actions)[:, 0] + 1.0) / 2.0
+    return np.clip(np.floor(share * tokens), 0, tokens - 1).astype(np.int64)
+
+
+def velocities(actions: Floats, sim: SimConfig) -> Floats:
+    """(B, 3) of actions (B, A): full scale crosses the arena and makes half a turn in a second.
+
+    So one action can reach every pose of the arena from every other.
+    """
+    scale = np.array([sim.arena, sim.arena, np.pi])
+    scaled: Floats = np.asarray(actions, dtype=np.float64)[:, -3:] * scale
+    return scaled
+
+
+class BatchedEnv:
+    """`count` environments in one process.
+
+    An action is (x, y, angular velocity) in [-1, 1], with one entry before them that names the
+    token if there are several. A token that had its `actions_per_token` actions is placed. An
+    action that names a placed token is refused: it moves nothing, but uses up its step.
+
+    Attributes:
+        count: B.
+        horizon: steps of an episode, K * actions_per_token.
+        action_size: A.
+        bound: largest |coordinate| that a corner can reach, arena units.
+        steps_done: steps taken in this episode.
+        corners: (B, V, 2) of the tokens.
+        placed: (B, K) which tokens are placed.
+        goals: (B, V, 2) corners of the targets.
+    """
+
+    def __init__(
+        self, layout: Layout, sim: SimConfig, reward: RewardConfig, count: int = 1
+    ) -> None:
+        if count < 1:
+            raise ValueError(f"count must be at least 1, got {count}")
+        self.layout = layout
+        self.sim = sim
+        self._reward = reward
+        self.reward_fn = make_reward(reward, layout, sim)
+        self.count = count
+        self.horizon = layout.tokens * sim.actions_per_token
+        self.action_size = action_size(layout.tokens)
+        # A start lies inside the arena, and each action moves a token by at most the arena's
+        # width in x and in y; turning keeps a corner within the start's margin for every angle.
+        self.bound = sim.arena * (0.5 + sim.actions_per_token) * _ROUNDING
+        self._worlds = [make_world(layout, sim) for _ in range(count)]
+        self._pictures: list[Pixels] = []
+        self._moves: Ints = np.zeros((count, layout.tokens), dtype=np.int64)
+        self.steps_done = self.horizon  # no episode yet
+        self.corners: Floats = np.zeros((count, layout.corner_count, 2))
+        self.goals: Floats = np.zeros((count, layout.corner_count, 2))
+
+    @property
+    def placed(self) -> Bools:
+        """(B, K), see the class."""
+        placed: Bools = self._moves >= self.sim.actions_per_token
+        return placed
+
+    def reset(self, generators: Sequence[np.random.Generator]) -> None:
+        """Begin an episode in every environment: a new target and a new start.
+
+        Args:
+            generators: one per environment; all of the episode's randomness comes from it.
+
+        Raises:
+            SamplingError: no layout without overlap was found.
+        """
+        if len(generators) != self.count:
+            raise ValueError(f"need {self.count} generators, got {len(generators)}")
+        targets = sample_batch(self.layout, self.sim, generators)
+        starts = sample_batch(self.layout, self.sim, generators)
+        if self.sim.camera:
+            self._pictures = self._photograph(targets)
+        for world, start in zip(self._worlds, starts, strict=True):
+            world.place(start)
+        self.goals = self.layout.corners(targets)
+        self.corners = self._read_corners()
+        self._moves[:] = 0
+        self.steps_done = 0
+
+    def step(self, actions: Floats) -> StepResult:
+        """Play one action in every environment.
+
+        Args:
+            actions: (B, A); entries beyond [-1, 1] count as the bound.
+
+        Raises:
+            ValueError: wrong shape, or not finite.
+            RuntimeError: the episodes are over, or none was begun.
+        """
+        if self.steps_done >= self.horizon:
+            raise RuntimeError(f"the episode of {self.horizon} steps is over: call reset first")
+        actions = self._checked(actions)
+        tokens = chosen_tokens(actions, self.layout.tokens)
+        refused = self.placed[np.arange(self.count), tokens]
+        velocity = velocities(actions, self.sim)
+        for b in np.flatnonzero(~refused):
+            self._worlds[b].move(int(tokens[b]), velocity[b])
+            self._moves[b, tokens[b]] += 1
+        self.steps_done += 1
+        self.corners = self._read_corners()
+        return self._result(refused)
+
+    def close(self) -> None:
+        """Close all worlds; calling it twice does no harm."""
+        for world in self._worlds:
+            world.close()
+
+    def _result(self, refused: Bools) -> StepResult:
+        camera = self._camera_rewards() if self.sim.camera else None
+        share = overlap_share(self.corners, self.goals, self.layout)
+        if camera is not None and self._reward.source == "camera":
+            rewards = camera
+        elif self._reward.name == "overlap":
+            rewards = scaled_overlap(share)  # what reward_fn gives, without doing it twice
+        else:
+            rewards = self.reward_fn(self.corners, self.goals)
+        return StepResult(
+            rewards=rewards,
+            overlap=share,
+            camera_rewards=camera,
+            refused=refused,
+            done=self.steps_done == self.horizon,
+        )
+
+    def _checked(self, actions: Floats) -> Floats:
+        actions = np.asarray(actions, dtype=np.float64)
+        if actions.shape != (self.count, self.action_size):
+            raise ValueError(
+                f"actions must have shape {(self.count, self.action_size)}, got {actions.shape}"
+            )
+        if not np.isfinite(actions).all():
+            raise ValueError("actions must be finite")
+        return np.clip(actions, -1.0, 1.0)
+
+    def _photograph(self, poses: Floats) -> list[Pixels]:
+        pictures = []
+        for world, pose in zip(self._worlds, poses, strict=True):
+            world.place(pose)
+            pictures.append(world.picture())
+        return pictures
+
+    def _camera_rewards(self) -> Floats:
+        pairs = zip(self._pictures, self._worlds, strict=True)
+        return np.array([picture_reward(target, world.picture()) for target, world in pairs])
+
+    def _read_corners(self) -> Floats:
+        return self.layout.corners(np.stack([world.poses() for world in self._worlds]))

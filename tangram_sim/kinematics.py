@@ -1,0 +1,45 @@
+"""The exact rigid motion without an engine: for tests, oracles and machines without pybullet."""
+
+import numpy as np
+
+from tangram_sim.arrays import Floats, Pixels
+from tangram_sim.config import SimConfig
+from tangram_sim.layout import Layout
+from tangram_sim.pictures import rasterise
+
+
+class KinematicWorld:
+    """Tokens that go exactly where their velocity takes them. See `World`."""
+
+    def __init__(self, layout: Layout, sim: SimConfig) -> None:
+        self._layout = layout
+        self._sim = sim
+        self._poses: Floats = np.zeros((layout.tokens, 3))
+
+    def place(self, poses: Floats) -> None:
+        """See `World.place`."""
+        self._poses[:] = poses
+        self._poses[:, 2] = wrap(self._poses[:, 2])
+
+    def move(self, token: int, velocity: Floats) -> None:
+        """See `World.move`."""
+        self._poses[token] += velocity
+        self._poses[token, 2] = wrap(self._poses[token, 2])
+
+    def poses(self) -> Floats:
+        """See `World.poses`."""
+        return self._poses.copy()
+
+    def picture(self) -> Pixels:
+        """See `World.picture`."""
+        corners = self._layout.corners(self._poses)
+        return rasterise(corners, self._layout, self._sim.arena, self._sim.pixels)
+
+    def close(self) -> None:
+        """See `World.close`."""
+
+
+def wrap(angle: Floats) -> Floats:
+    """The same angle in (-pi, pi]."""
+    wrapped: Floats = np.pi - np.mod(np.pi - angle, 2.0 * np.pi)
+    return wrapped

@@ -1,0 +1,34 @@
+"""The convention of grayscale pictures, and Eq. 14's pixels.
+
+Pixel (row, column) of a picture of P x P pixels shows the point x = (column + 1/2) * arena / P -
+arena / 2, y = arena / 2 - (row + 1/2) * arena / P: rows run down, as in every image file.
+"""
+
+import numpy as np
+
+from tangram_sim.arrays import Bools, Floats, Pixels
+from tangram_sim.layout import Layout
+
+BACKGROUND = 255
+TOKEN_GRAY = 80
+
+
+def token_pixels(picture: Pixels) -> Bools:
+    """(P, P), where a picture shows a token: px = 1 of Eq. 14."""
+    mask: Bools = np.not_equal(picture, BACKGROUND)
+    return mask
+
+
+def rasterise(corners: Floats, layout: Layout, arena: float, pixels: int) -> Pixels:
+    """Picture (P, P) of tokens with corners (V, 2): a pixel is a token's if its centre is."""
+    centres = (np.arange(pixels) + 0.5) * (arena / pixels) - arena / 2.0
+    x, y = centres[None, :], -centres[:, None]
+    picture = np.full((pixels, pixels), BACKGROUND, dtype=np.uint8)
+    for token in range(layout.tokens):
+        outline = corners[layout.corners_of(token)]
+        inside = np.ones((pixels, pixels), dtype=np.bool_)
+        for start, end in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+            edge = end - start
+            inside &= edge[0] * (y - start[1]) - edge[1] * (x - start[0]) >= 0.0
+        picture[inside] = TOKEN_GRAY
+    return picture

@@ -1,0 +1,169 @@
+"""What a state is worth: pure functions of achieved and desired corners, vectorised.
+
+Every reward lies in about [-1, 1] and is +1 exactly where the goal is reached. Legend as in
+arrays.py: achieved and desired are (B, V, 2) corners, rewards are (B,).
+"""
+
+import importlib
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from tangram_sim.arrays import Floats, Pixels
+from tangram_sim.config import RewardConfig, SimConfig
+from tangram_sim.errors import ConfigError
+from tangram_sim.geometry import overlap_share
+from tangram_sim.layout import Layout
+from tangram_sim.pictures import token_pixels
+
+RewardFn = Callable[[Floats, Floats], Floats]
+UserReward = Callable[[Floats, Floats, Layout], Any]
+
+
+def make_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> RewardFn:
+    """The configured reward as a function (achieved, desired) -> (B,).
+
+    With source=camera it is Eq. 14 on polygons too: a goal that was relabelled has no picture.
+    `BatchedEnv` replaces it by the camera's value while playing.
+
+    Raises:
+        ConfigError: the camera is to be the source but is off, or a user's function that cannot
+            be loaded; later, when called, one whose output has the wrong shape or is not finite.
+    """
+    if config.source == "camera" and not sim.camera:
+        raise ConfigError("reward.source=camera needs the camera: set sim.camera=true")
+    # The longest distance of two points of the arena.
+    reach = sim.arena * np.sqrt(2.0)
+    if config.name == "overlap":
+        return lambda achieved, desired: overlap(achieved, desired, layout)
+    if config.name == "dense":
+        return lambda achieved, desired: dense(achieved, desired, layout, reach, config.sharpness)
+    if config.name == "pose":
+        return lambda achieved, desired: pose(achieved, desired, layout, reach, config.sharpness)
+    function = _load(config.name)
+    return lambda achieved, desired: _checked(config.name, function, achieved, desired, layout)
+
+
+def overlap(achieved: Floats, desired: Floats, layout: Layout) -> Floats:
+    """Eq. 14 on exact polygons, from [0, 1] to [-1, 1]: r = 2 * covered share of the target - 1."""
+    return scaled_overlap(overlap_share(achieved, desired, layout))
+
+
+def scaled_overlap(share: Floats) -> Floats:
+    """The reward (B,) in [-1, 1] of a raw overlap (B,) in [0, 1]."""
+    return 2.0 * share - 1.0
+
+
+def picture_reward(target: Pixels, state: Pixels) -> float:
+    """Eq. 14 on two pictures (P, P) of the camera, from [0, 1] to [-1, 1].
+
+    Raises:
+        ConfigError: the target covers no pixel.
+    """
+    wanted = token_pixels(target)
+    total = int(np.count_nonzero(wanted))
+    if total == 0:
+        raise ConfigError(
+            f"the target covers no pixel of a picture of {len(target)} x {len(target)}: raise "
+            "sim.pixels or tokens.scale, or lower sim.arena"
+        )
+    return 2.0 * float(np.count_nonzero(wanted & token_pixels(state))) / total - 1.0
+
+
+def dense(
+    achieved: Floats, desired: Floats, layout: Layout, reach: float, sharpness: float
+) -> Floats:
+    """Eq. 15: the distance of each token's centre from its target's, as `closeness`.
+
+    The paper scales the distance "across all possible distances" and gives no constants. Here the
+    scale is the arena's diagonal. Several tokens: the mean of their rewards, so that one that is
+    far away does not flatten the slope for one that is near.
+    """
+    gap = layout.bases(achieved) - layout.bases(desired)
+    mean: Floats = closeness(np.linalg.norm(gap, axis=-1), reach, sharpness).mean(axis=-1)
+    return mean
+
+
+def pose(
+    achieved: Floats, desired: Floats, layout: Layout, reach: float, sharpness: float
+) -> Floats:
+    """The reward with emphasis on orientation that Sec. VIII asks for: corner distances.
+
+    For each token the mean distance of its corners from the target's, at the best of the turns
+    that map the shape onto itself, as `closeness`. A turn by t moves a corner at radius r by
+    2 r sin(t / 2), nearly r t, which counts exactly as much as shifting the token that far: so a
+    wrong angle costs as much as the wrong position that is as visible. Eq. 14 is blind there: a
+    square on its target's centre, turned by 45 degrees, still scores 0.66.
+    """
+    rewards = [
+        closeness(_corner_distance(achieved, desired, layout, token), reach, sharpness)
+        for token in range(layout.tokens)
+    ]
+    mean: Floats = np.mean(rewards, axis=0)
+    return mean
+
+
+def closeness(distance: Floats, reach: float, sharpness: float) -> Floats:
+    """+1 at distance 0, -1 at `reach`: r = 1 - 2 log(1 + s d / reach) / log(1 + s).
+
+    The slope at the target is s / log(1 + s) times that of a straight line, and the reward is 0
+    at about reach / sqrt(s). With the default s = 100 half of the scale is spent on the nearest
+    tenth of the arena's diagonal, about the size of a token, and the slope at the target is 22
+    times the straight line's. Beyond `reach`, outside the arena, the logarithm goes on below -1,
+    so that a token that left still has a way back.
+    """
+    scaled: Floats = 1.0 - 2.0 * np.log1p(sharpness * distance / reach) / np.log1p(sharpness)
+    return scaled
+
+
+def _corner_distance(achieved: Floats, desired: Floats, layout: Layout, token: int) -> Floats:
+    """(B,) mean corner distance at the best of the symmetric turns."""
+    own = layout.corners_of(token)
+    here, there = achieved[:, own], desired[:, own]
+    shape = layout.shapes[token]
+    step = len(shape.corners) // shape.symmetry
+    means = [
+        np.linalg.norm(here - np.roll(there, turn * step, axis=1), axis=-1).mean(axis=-1)
+        for turn in range(shape.symmetry)
+    ]
+    best: Floats = np.min(means, axis=0)
+    return best
+
+
+def _load(name: str) -> UserReward:
+    module_name, _, attribute = name.partition(":")
+    try:
+        module = importlib.import_module(module_name)
+    except ImportError as error:
+        raise ConfigError(
+            f"reward.name={name}: cannot import '{module_name}' ({error}): install it, or put its "
+            "folder on PYTHONPATH"
+        ) from error
+    function = getattr(module, attribute, None)
+    if function is None:
+        raise ConfigError(f"reward.name={name}: module '{module_name}' has no '{attribute}'")
+    if not callable(function):
+        raise ConfigError(
+            f"reward.name={name}: '{attribute}' is not a function (achieved, desired, layout)"
+        )
+    loaded: UserReward = function
+    return loaded
+
+
+def _checked(
+    name: str, function: UserReward, achieved: Floats, desired: Floats, layout: Layout
+) -> Floats:
+    """What the user's function returns, if it is one finite number per row."""
+    try:
+        rewards = np.asarray(function(achieved, desired, layout), dtype=np.float64)
+    except ValueError as error:
+        raise ConfigError(f"reward.name={name} failed: {error}") from error
+    if rewards.shape != (len(achieved),):
+        raise ConfigError(
+            f"reward.name={name} must return one number per row, shape ({len(achieved)},), "
+            f"got shape {rewards.shape}"
+        )
+    if not np.isfinite(rewards).all():
+        raise ConfigError(f"reward.name={name} must return finite numbers, got {rewards}")
+    return rewards

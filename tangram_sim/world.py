@@ -1,0 +1,56 @@
+"""One arena with K tokens, whatever moves them."""
+
+from typing import Protocol
+
+from tangram_sim.arrays import Floats, Pixels
+from tangram_sim.config import SimConfig
+from tangram_sim.errors import ConfigError
+from tangram_sim.kinematics import KinematicWorld
+from tangram_sim.layout import Layout
+
+
+class World(Protocol):
+    """K tokens on the plane, in a square arena around the origin.
+
+    Both backends keep this contract; one test module holds them to it. Tokens do not collide yet:
+    they pass through each other. Nothing stops one at the arena's edge.
+    """
+
+    def place(self, poses: Floats) -> None:
+        """Put every token at rest at its pose: (K, 3) of x, y (arena units) and angle (rad)."""
+
+    def move(self, token: int, velocity: Floats) -> None:
+        """Move one token for one second and stop it.
+
+        Args:
+            token: its index.
+            velocity: (3,) x, y in arena units a second; angular velocity about z in rad/s.
+        """
+
+    def poses(self) -> Floats:
+        """(K, 3) x, y and angle in (-pi, pi]."""
+
+    def picture(self) -> Pixels:
+        """(P, P) grayscale picture of the tokens as they lie; see pictures.py."""
+
+    def close(self) -> None:
+        """Free what the world holds; calling it twice does no harm."""
+
+
+def make_world(layout: Layout, sim: SimConfig) -> World:
+    """A world of the configured backend.
+
+    Raises:
+        ConfigError: the engine is asked for and not installed.
+    """
+    if sim.backend == "kinematic":
+        return KinematicWorld(layout, sim)
+    try:
+        # Only here: the master and machines without an engine must never load it.
+        from tangram_sim.physics import PhysicsWorld  # noqa: PLC0415
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"sim.backend=physics needs PyBullet ({error}): install pybullet, or set "
+            "sim.backend=kinematic"
+        ) from error
+    return PhysicsWorld(layout, sim)

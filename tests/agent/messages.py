@@ -1,0 +1,53 @@
+"""A task, messages of it, and the ways to break them."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from tangram_agent.payloads import EpisodeSpec
+from tangram_agent.types import Episodes, Weights
+from tangram_agent.wire import EpisodeBatch, Hello, Scores
+from tests.agent.builders import PAIR, random_episodes, setup
+
+BOUND = 4.0
+TASK = setup(PAIR, actions_per_token=2)  # K 2, V 7, T 4, A 4
+SPEC = EpisodeSpec.of(TASK, BOUND)
+SHAPES = {"actor.weight": (3, 2), "actor.bias": (3,), "scale": ()}
+FINGERPRINTS = {"tokens": "aaaa", "sim": "bbbb"}
+
+
+def episodes(count: int = 3, seed: int = 0) -> Episodes:
+    return random_episodes(TASK, count, seed)
+
+
+def batch(sequence: int = 1, count: int = 3) -> EpisodeBatch:
+    return EpisodeBatch(sequence, weights_version=7, episodes=episodes(count, sequence))
+
+
+def weights(version: int = 5, value: float = 0.5) -> Weights:
+    return Weights(version, {n: np.full(s, value, np.float32) for n, s in SHAPES.items()})
+
+
+def scores(count: int = 2) -> Scores:
+    corners = np.zeros((count, SPEC.corners, 2), np.float32)
+    return Scores(7, {"mean_reward": 0.25, "raw/overlap": 0.5}, corners, corners + 1, corners - 1)
+
+
+def hello(
+    index: int = -1,
+    incarnation: int = 0,
+    process: str = "p1",
+    first: int = 1,
+    role: str = "player",
+    fingerprints: Mapping[str, str] = FINGERPRINTS,
+) -> Hello:
+    return Hello(role, index, incarnation, process, first, fingerprints)
+
+
+def with_header(frames: list[bytes], **changes: Any) -> list[bytes]:
+    """The same message with other header fields; None takes a field away."""
+    values = msgpack.unpackb(frames[0]) | changes
+    kept = {name: value for name, value in values.items() if value is not None}
+    return [msgpack.packb(kept), *frames[1:]]

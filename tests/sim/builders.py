@@ -1,0 +1,50 @@
+"""Small worlds for the tests of tangram_sim."""
+
+from typing import Any
+
+import numpy as np
+
+from tangram_sim.arrays import Floats
+from tangram_sim.layout import Layout, TokensConfig, make_layout
+from tangram_sim.shapes import polygon_area
+
+SQUARE_SCALE = 0.8 * 2.0**0.5  # the square's side is then 0.4
+SEVEN = (
+    "large_triangle",
+    "large_triangle",
+    "medium_triangle",
+    "small_triangle",
+    "small_triangle",
+    "square",
+    "parallelogram",
+)
+TRIO = ("square", "small_triangle", "parallelogram")
+# Its centre of area is not the mean of its corners.
+LOPSIDED = {"name": "lopsided", "corners": [[0, 0], [4, 0], [3, 1], [0, 2]]}
+
+
+def layout_of(*shapes: Any, scale: float = SQUARE_SCALE) -> Layout:
+    return make_layout(TokensConfig(shapes, scale))
+
+
+def random_poses(rng: np.random.Generator, size: int, tokens: int, spread: float) -> Floats:
+    """(size, K, 3), positions uniform within +-spread, any angle; tokens may overlap."""
+    unit = rng.uniform(-1.0, 1.0, (size, tokens, 3))
+    return unit * np.array([spread, spread, np.pi])
+
+
+def perimeter(polygons: Floats) -> Floats:
+    """(B,) of polygons (B, M, 2)."""
+    edges = np.roll(polygons, -1, axis=1) - polygons
+    total: Floats = np.linalg.norm(edges, axis=-1).sum(axis=1)
+    return total
+
+
+def angle_gap(first: Floats, second: Floats) -> Floats:
+    """Absolute difference of angles in radians, in [0, pi]."""
+    gap: Floats = np.abs(np.angle(np.exp(1j * (np.asarray(first) - np.asarray(second)))))
+    return gap
+
+
+def total_area(layout: Layout) -> float:
+    return sum(polygon_area(shape.corners) for shape in layout.shapes)

@@ -1,0 +1,50 @@
+"""Settings that cannot work are refused with the value, the bound and what to do."""
+
+import math
+from typing import Any
+
+import pytest
+
+from tangram_sim.config import RewardConfig, SimConfig
+from tangram_sim.errors import ConfigError
+
+pytestmark = pytest.mark.fast
+
+
+@pytest.mark.parametrize(
+    ("settings", "reason"),
+    [
+        ({"backend": "mujoco"}, "sim.backend must be one of physics, kinematic, got 'mujoco'"),
+        ({"arena": 0.0}, "sim.arena must be between 0.001 and 1000"),
+        ({"arena": math.nan}, "sim.arena must be between"),
+        ({"actions_per_token": 0}, "sim.actions_per_token must be between 1 and 100, got 0"),
+        ({"substeps": 3}, "sim.substeps must be between 4 and 1000, got 3"),
+        ({"pixels": 15}, "sim.pixels must be between 16 and 1024, got 15"),
+        ({"pixels": 1025}, "sim.pixels must be between 16 and 1024, got 1025"),
+        ({"max_tries": 0}, "sim.max_tries must be between 1"),
+    ],
+)
+def test_refused_sim(settings: dict[str, Any], reason: str) -> None:
+    with pytest.raises(ConfigError, match=reason):
+        SimConfig(**settings)
+
+
+@pytest.mark.parametrize(
+    ("settings", "reason"),
+    [
+        ({"name": "overlapp"}, "overlap, dense, pose or package.module:function, got 'overlapp'"),
+        ({"name": ":function"}, "got ':function'"),
+        ({"name": "module:"}, "got 'module:'"),
+        ({"source": "eyes"}, "reward.source must be one of polygon, camera"),
+        ({"sharpness": 0.0}, "reward.sharpness must be between"),
+        ({"name": "dense", "source": "camera"}, "set reward.source=polygon"),
+    ],
+)
+def test_refused_reward(settings: dict[str, Any], reason: str) -> None:
+    with pytest.raises(ConfigError, match=reason):
+        RewardConfig(**settings)
+
+
+def test_defaults_work() -> None:
+    assert SimConfig().substeps >= 4
+    assert RewardConfig().name == "overlap"

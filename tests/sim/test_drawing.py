@@ -1,0 +1,126 @@
+"""Pictures for people: colours where they belong, sizes, files that open."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tangram_sim.drawing import contact_sheet, draw_scene, episode_sheet, save_gif
+from tests.sim.builders import SEVEN, layout_of
+
+pytestmark = pytest.mark.fast
+
+PAIR = layout_of("square", "square")
+
+
+def scene(size: int = 120, active: int | None = None) -> Image.Image:
+    """Tokens upper right and upper left, the targets below them."""
+    corners = PAIR.corners(np.array([[0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]]))
+    goal = PAIR.corners(np.array([[0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]]))
+    return draw_scene(PAIR, 2.0, corners, goal, size, active)
+
+
+def at(image: Image.Image, x: float, y: float) -> tuple[int, ...]:
+    """Colour at a point of the arena of width 2, whose margin is 4 % of the picture."""
+    side = image.size[0]
+    pixel = image.getpixel((side * (0.5 + 0.46 * x), side * (0.5 - 0.46 * y)))
+    assert isinstance(pixel, tuple)
+    return pixel
+
+
+@pytest.mark.parametrize("size", [60, 120, 241])
+def test_tokens_and_targets_lie_where_they_should(size: int) -> None:
+    image = scene(size)
+    assert image.size == (size, size)
+    first, second, target, table = (
+        at(image, x, y) for x, y in [(0.5, 0.5), (-0.5, 0.5), (0.5, -0.5), (0.0, 0.0)]
+    )
+    assert table == (255, 255, 255)
+    assert len({first, second, target, table}) == 4
+    assert at(image, -0.5, -0.5) == target
+    assert min(target) > 200  # pale
+
+
+def test_edges_are_smooth() -> None:
+    square = layout_of("square")
+    corners = square.corners(np.array([[0.0, 0.0, 0.3]]))
+    away = square.corners(np.array([[5.0, 5.0, 0.0]]))
+    image = draw_scene(square, 2.0, corners, away, 100)
+    assert len(set(image.get_flattened_data())) > 20
+
+
+def test_the_active_token_is_marked() -> None:
+    plain, marked = np.asarray(scene()), np.asarray(scene(active=1))
+    changed = np.nonzero((plain != marked).any(axis=-1))
+    assert len(changed[0]) > 0
+    assert changed[1].max() < 60  # all in the left half
+
+
+def test_every_tan_has_its_own_colour() -> None:
+    layout = layout_of(*SEVEN, scale=0.3)
+    poses = np.zeros((7, 3))
+    poses[:, 0] = np.linspace(-0.85, 0.85, 7)
+    away = layout.corners(poses + [0.0, 0.5, 0.0])
+    image = draw_scene(layout, 2.0, layout.corners(poses), away, 400)
+    colours = {at(image, x, 0.0) for x in poses[:, 0]}
+    assert len(colours) == 7
+
+
+def test_tokens_outside_the_arena_are_cut() -> None:
+    square = layout_of("square")
+    far = square.corners(np.array([[50.0, -50.0, 0.0]]))
+    assert draw_scene(square, 2.0, far, far, 64).size == (64, 64)
+
+
+def test_contact_sheet_of_twelve() -> None:
+    sheet = contact_sheet([scene(240)] * 12, columns=4, captions=[f"test {i}" for i in range(12)])
+    assert sheet.size[0] == 1000
+    assert contact_sheet([scene(240)] * 2, columns=4).size[0] < 600
+    # Each picture stands where it should, whole.
+    first = sheet.crop((8, 8, 248, 248))
+    assert np.array_equal(np.asarray(first), np.asarray(scene(240)))
+
+
+def test_refused_sheets_and_films(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="at least one picture"):
+        contact_sheet([])
+    with pytest.raises(ValueError, match="1 captions for 2 pictures"):
+        contact_sheet([scene(), scene()], captions=["one"])
+    with pytest.raises(ValueError, match="at least one picture"):
+        save_gif([], tmp_path / "film.gif")
+
+
+def test_gif_keeps_pictures_and_pace(tmp_path: Path) -> None:
+    path = tmp_path / "film.gif"
+    frames = [scene(), scene(active=0), scene(active=1)]
+    save_gif(frames, path, 250)
+    with Image.open(path) as film:
+        assert getattr(film, "n_frames", 1) == 3
+        assert film.info["duration"] == 250
+        assert film.info["loop"] == 0
+        film.seek(2)
+        shown = np.asarray(film.convert("RGB")).astype(int)
+    assert np.abs(shown - np.asarray(frames[2]).astype(int)).mean() < 3
+
+
+def test_where_a_token_started_is_a_pale_ghost_with_a_way() -> None:
+    square = layout_of("square")
+    start, end, away = (square.corners(np.array([[x, 0.0, 0.0]])) for x in (-0.6, 0.6, 5.0))
+    plain = draw_scene(square, 2.0, end, away, 200)
+    shown = draw_scene(square, 2.0, end, away, 200, start=start)
+    assert at(plain, -0.6, 0.05) == (255, 255, 255)
+    assert 200 < min(at(shown, -0.6, 0.05)) < 255
+    changed = np.nonzero((np.asarray(plain) != np.asarray(shown)).any(axis=-1))
+    assert changed[1].max() > 120  # the way goes on towards the end
+
+
+def test_an_episode_sheet_says_how_much_is_covered() -> None:
+    square = layout_of("square")
+    ends = square.corners(np.array([[[0.0, 0.0, 0.0]], [[0.5, 0.5, 0.3]]]))
+    sheet = episode_sheet(square, 2.0, ends[::-1], ends, ends, columns=2, size=120)
+    plain = contact_sheet([draw_scene(square, 2.0, e, e, 120) for e in ends], columns=2)
+    assert sheet.width == plain.width
+    assert sheet.height > plain.height  # captions
+    ink = np.asarray(sheet.convert("L"))[-16:]
+    assert ink.min() < 120

@@ -1,0 +1,241 @@
+"""Tangram-v0 as gymnasium and Stable-Baselines3 see it."""
+
+import subprocess
+import sys
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from tangram_sim.config import RewardConfig
+from tangram_sim.env import TangramEnv
+from tangram_sim.errors import ConfigError, SamplingError
+from tangram_sim.register import ENV_ID, register
+from tests.sim.builders import TRIO
+
+pytestmark = pytest.mark.fast
+
+BACKENDS = ("physics", "kinematic")
+
+
+@pytest.fixture
+def made() -> Iterator[list[gymnasium.Env[Any, Any]]]:
+    envs: list[gymnasium.Env[Any, Any]] = []
+    yield envs
+    for env in envs:
+        env.close()
+
+
+def kinematic(**settings: Any) -> TangramEnv:
+    return TangramEnv(backend="kinematic", **settings)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"shapes": TRIO, "scale": 0.8, "camera": True, "actions_per_token": 2, "reward": "pose"}],
+)
+def test_gymnasium_checks_it_without_a_warning(
+    backend: str, settings: dict[str, Any], made: list[Any]
+) -> None:
+    env = gymnasium.make(ENV_ID, backend=backend, render_mode="rgb_array", **settings)
+    made.append(env)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped)
+
+
+def test_registration_loads_no_engine() -> None:
+    script = (
+        "import gymnasium, sys, tangram_sim.register as r; r.register(); "
+        "assert 'Tangram-v0' in gymnasium.registry; "
+        "assert not {'pybullet', 'tangram_sim.env'} & set(sys.modules); "
+        "gymnasium.make('Tangram-v0', backend='kinematic').reset(); "
+        "assert 'pybullet' not in sys.modules; "
+        "gymnasium.make('Tangram-v0').reset(); "
+        "assert 'pybullet' in sys.modules"
+    )
+    subprocess.run([sys.executable, "-W", "error", "-c", script], check=True, timeout=100)
+
+
+def test_made_by_module_and_name(made: list[Any]) -> None:
+    register()  # a second time does no harm
+    env = gymnasium.make(
+        "tangram_sim.register:Tangram-v0", shapes=["square"], scale=1.0, backend="kinematic"
+    )
+    made.append(env)
+    assert isinstance(env.unwrapped, TangramEnv)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_seed_fixes_whole_episodes_and_those_that_follow(backend: str, made: list[Any]) -> None:
+    def play(seed: int) -> list[float]:
+        env = TangramEnv(TRIO, 0.8, backend=backend)
+        made.append(env)
+        env.action_space.seed(seed)
+        numbers: list[float] = []
+        observation, _ = env.reset(seed=seed)
+        for _ in range(3):
+            done = False
+            while not done:
+                numbers += [*observation["observation"], *observation["desired_goal"]]
+                observation, reward, done, _, info = env.step(env.action_space.sample())
+                numbers += [reward, info["overlap"]]
+            observation, _ = env.reset()
+        return numbers
+
+    assert play(5) == play(5)
+    assert play(5) != play(6)
+
+
+def test_observation() -> None:
+    env = kinematic(shapes=("square", "small_triangle"))
+    observation, info = env.reset(seed=0)
+    assert info == {}
+    assert {k: v.shape for k, v in observation.items()} == {
+        "observation": (16,),
+        "achieved_goal": (14,),
+        "desired_goal": (14,),
+    }
+    corners = env.batch.corners[0].ravel()
+    np.testing.assert_array_equal(observation["achieved_goal"], corners)
+    np.testing.assert_array_equal(observation["observation"], [*corners, 0, 0])
+    np.testing.assert_array_equal(observation["desired_goal"], env.batch.goals[0].ravel())
+    after, *_ = env.step(np.array([1.0, 0, 0, 0], dtype=np.float32))
+    np.testing.assert_array_equal(after["observation"][-2:], [0, 1])
+    np.testing.assert_array_equal(observation["observation"][-2:], [0, 0])  # its own arrays
+
+
+def test_horizon_refusal_and_info() -> None:
+    env = kinematic(shapes=("square", "small_triangle"))
+    env.reset(seed=0)
+    action = np.array([-1.0, 0.1, 0, 0], dtype=np.float32)
+    _, _, terminated, truncated, info = env.step(action)
+    assert (terminated, truncated) == (False, False)
+    assert set(info) == {"overlap", "is_success"}
+    _, _, terminated, truncated, info = env.step(action)
+    assert (terminated, truncated) == (True, False)
+    assert info["refused"] == "token 0 is placed already: it had its 1 actions"
+    env.reset()
+    assert "refused" not in env.step(action)[-1]
+
+
+def test_success_is_the_overlap_that_was_asked_for() -> None:
+    for bound, expected in ((0.9, True), (0.95, False)):
+        env = kinematic(success_overlap=bound)
+        env.reset(seed=0)
+        layout, batch = env.layout, env.batch
+        motion = (layout.poses(batch.goals) - layout.poses(batch.corners))[0, 0]
+        motion[2] = np.angle(np.exp(1j * motion[2]))
+        motion[:2] += 0.03 * 0.4 * np.array([1.0, 1.0])  # about 6 % of the square is missed
+        action = (motion / [2.0, 2.0, np.pi]).astype(np.float32)
+        *_, info = env.step(action)
+        assert 0.9 < info["overlap"] < 0.95
+        assert info["is_success"] is expected
+
+
+@pytest.mark.parametrize("reward", ["overlap", "dense", "pose"])
+def test_compute_reward_is_the_reward_of_the_step(reward: str) -> None:
+    env = kinematic(shapes=TRIO, reward=reward)
+    achieved, desired, rewards = [], [], []
+    env.action_space.seed(0)
+    for seed in range(5):
+        env.reset(seed=seed)
+        done = False
+        while not done:
+            observation, paid, done, _, info = env.step(env.action_space.sample() * 0.3)
+            achieved.append(observation["achieved_goal"])
+            desired.append(observation["desired_goal"])
+            rewards.append(paid)
+            single = env.compute_reward(achieved[-1], desired[-1], info)
+            assert isinstance(single, float)
+            assert single == pytest.approx(paid, abs=1e-12)
+    together = env.compute_reward(np.stack(achieved), np.stack(desired), [{}] * len(rewards))
+    assert together.shape == (15,)
+    np.testing.assert_allclose(together, rewards, atol=1e-12)
+
+
+def test_camera_is_reported_and_may_pay() -> None:
+    seen = kinematic(camera=True)
+    seen.reset(seed=0)
+    _, _, _, _, info = seen.step(np.zeros(3, dtype=np.float32))
+    assert -1.0 <= info["reward_camera"] <= 1.0
+    paid = kinematic(camera=True, reward=RewardConfig(source="camera"))
+    paid.reset(seed=0)
+    _, reward, _, _, info = paid.step(np.zeros(3, dtype=np.float32))
+    assert reward == info["reward_camera"]
+
+
+def test_state_matrix_is_the_papers() -> None:
+    env = kinematic()
+    env.reset(seed=0)
+    state = env.state_matrix()
+    assert state.shape == (9, 13)
+    np.testing.assert_array_equal(state[:4, :2], env.batch.corners[0])
+    np.testing.assert_array_equal(state[:, 3], [0] * 5 + [1] * 4)
+    env.step(np.zeros(3, dtype=np.float32))
+    np.testing.assert_array_equal(env.state_matrix()[:, 3], np.ones(9))
+
+
+def test_render() -> None:
+    env = kinematic(render_mode="rgb_array", render_size=100)
+    env.reset(seed=0)
+    before = env.render()
+    assert before is not None
+    assert (before.shape, before.dtype) == ((100, 100, 3), np.uint8)
+    env.step(np.array([0.3, 0.3, 0.3], dtype=np.float32))
+    assert not np.array_equal(before, env.render())
+    env.reset(seed=0)
+    np.testing.assert_array_equal(before, env.render())  # the mark of the last move is gone
+    assert kinematic().render() is None
+
+
+@pytest.mark.parametrize(
+    ("settings", "reason"),
+    [
+        ({"shapes": ("hexagon",)}, "unknown shape 'hexagon'"),
+        ({"shapes": ()}, "1 to 16 shapes"),
+        ({"scale": -1.0}, "tokens.scale must be positive"),
+        ({"reward": "luck"}, "reward.name must be one of"),
+        ({"render_mode": "human"}, "render_mode must be None or rgb_array, got 'human'"),
+        ({"gravity": 9.81}, "unknown setting 'gravity' of the environment: .* backend, arena"),
+        ({"arena": -1.0}, "sim.arena must be"),
+    ],
+)
+def test_refused_settings(settings: dict[str, Any], reason: str) -> None:
+    with pytest.raises(ConfigError, match=reason):
+        kinematic(**settings)
+
+
+def test_an_impossible_layout_is_told_at_reset() -> None:
+    env = kinematic(arena=0.4)
+    with pytest.raises(SamplingError, match=r"raise sim\.arena"):
+        env.reset(seed=0)
+
+
+def test_stable_baselines3_runs_unchanged(made: list[Any]) -> None:
+    pytest.importorskip("torch").set_num_threads(1)
+    sb3 = pytest.importorskip("stable_baselines3", reason="pip install '.[sb3]'")
+    env = gymnasium.make(ENV_ID, shapes=["square", "small_triangle"], actions_per_token=2)
+    made.append(env)
+    model = sb3.DDPG(
+        "MultiInputPolicy",
+        env,
+        replay_buffer_class=sb3.HerReplayBuffer,
+        replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "future"},
+        learning_starts=40,
+        batch_size=32,
+        policy_kwargs={"net_arch": [32]},
+        seed=0,
+        device="cpu",
+    )
+    model.learn(240)
+    assert model.num_timesteps >= 240
+    assert model._n_updates > 100
+    observation, _ = env.reset(seed=0)
+    action, _ = model.predict(observation, deterministic=True)
+    assert env.action_space.contains(action)

@@ -1,0 +1,178 @@
+"""Overlap areas against shapely and against what geometry demands."""
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tangram_sim.arrays import Floats
+from tangram_sim.config import SimConfig
+from tangram_sim.geometry import any_overlap, area, clip, overlap_area, overlap_share
+from tangram_sim.layout import Layout
+from tangram_sim.sampling import sample_batch
+from tangram_sim.shapes import SHAPE_NAMES, polygon, tan
+from tests.sim.builders import SEVEN, TRIO, layout_of, random_poses, total_area
+
+pytestmark = pytest.mark.fast
+
+quick = settings(deadline=None, max_examples=60)
+names = st.sampled_from(SHAPE_NAMES)
+poses = st.tuples(*[st.floats(-1.0, 1.0)] * 2, st.floats(-np.pi, np.pi))
+
+
+def pieces(layout: Layout, corners: Floats) -> list[shapely.Polygon]:
+    return [shapely.Polygon(corners[layout.corners_of(k)]) for k in range(layout.tokens)]
+
+
+def oracle_overlap(layout: Layout, tokens: Floats, targets: Floats) -> float:
+    # A grid: without it GEOS may return a whole piece for two that only touch.
+    union = shapely.union_all(pieces(layout, tokens), grid_size=1e-9)
+    whole = shapely.union_all(pieces(layout, targets), grid_size=1e-9)
+    return float(shapely.intersection(union, whole, grid_size=1e-9).area)
+
+
+@pytest.mark.parametrize(
+    ("shapes", "scale", "size"),
+    [
+        (("square",), 2.0, 100),
+        (("small_triangle",), 2.0, 100),
+        (TRIO, 1.4, 60),
+        (SEVEN, 0.8, 30),  # tokens overlap each other: counted once
+    ],
+)
+def test_overlap_area_equals_shapely(shapes: tuple[str, ...], scale: float, size: int) -> None:
+    layout = layout_of(*shapes, scale=scale)
+    rng = np.random.default_rng(0)
+    tokens = layout.corners(random_poses(rng, size, layout.tokens, 0.6))
+    targets = layout.corners(sample_batch(layout, SimConfig(), [rng] * size))
+    got = overlap_area(tokens, targets, layout)
+    expected = [oracle_overlap(layout, t, g) for t, g in zip(tokens, targets, strict=True)]
+    np.testing.assert_allclose(got, expected, atol=1e-7)
+    assert np.count_nonzero(got > 0.01) > size / 4
+
+
+def test_any_overlap_equals_shapely() -> None:
+    layout = layout_of(*TRIO, scale=1.0)
+    corners = layout.corners(random_poses(np.random.default_rng(1), 200, 3, 0.7))
+    expected = []
+    for tokens in corners:
+        a, b, c = pieces(layout, tokens)
+        pairs = ((a, b), (a, c), (b, c))
+        expected.append(
+            any(shapely.intersection(p, q, grid_size=1e-9).area > 1e-8 for p, q in pairs)
+        )
+    assert any_overlap(corners, layout).tolist() == expected
+    assert 20 < sum(expected) < 180
+
+
+@given(names, names, poses, poses)
+@quick
+def test_intersection_is_symmetric_and_bounded(
+    first: str, second: str, pose: tuple[float, ...], other: tuple[float, ...]
+) -> None:
+    a, b = _placed(first, pose), _placed(second, other)
+    forth, back = area(clip(a, b))[0], area(clip(b, a))[0]
+    assert forth == pytest.approx(back, abs=1e-12)
+    assert -1e-12 <= forth <= min(area(a)[0], area(b)[0]) + 1e-12
+
+
+@given(names, names, poses, poses, poses)
+@quick
+def test_intersection_is_invariant_to_rigid_motion(
+    first: str,
+    second: str,
+    pose: tuple[float, ...],
+    other: tuple[float, ...],
+    motion: tuple[float, ...],
+) -> None:
+    a, b = _placed(first, pose), _placed(second, other)
+    moved = area(clip(_moved(a, motion), _moved(b, motion)))[0]
+    assert moved == pytest.approx(area(clip(a, b))[0], abs=1e-12)
+
+
+@given(names, poses)
+@quick
+def test_a_piece_meets_itself_in_its_whole_area(name: str, pose: tuple[float, ...]) -> None:
+    piece = _placed(name, pose)
+    assert area(clip(piece, piece))[0] == pytest.approx(tan(name).area, abs=1e-12)
+
+
+@given(names, poses, st.integers(0, 3))
+@quick
+def test_pieces_that_share_an_edge_only_touch(
+    name: str, pose: tuple[float, ...], edge: int
+) -> None:
+    """The mirror image at one of its edges lies on the other side of a coincident edge."""
+    piece = _placed(name, pose)
+    start = piece[0, edge % piece.shape[1]]
+    along = piece[0, (edge + 1) % piece.shape[1]] - start
+    along = along / np.linalg.norm(along)
+    offset = piece[0] - start
+    mirrored = start + 2.0 * (offset @ along)[:, None] * along - offset
+    neighbour = mirrored[::-1][None]  # mirroring turned the direction
+    assert area(neighbour)[0] == pytest.approx(tan(name).area)
+    assert area(clip(piece, neighbour))[0] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_coincident_edges_inside() -> None:
+    """A corner piece of a square, both on the grid: two edges coincide, the rest is inside."""
+    unit = np.array([[[0, 0], [1, 0], [1, 1], [0, 1]]], dtype=float)
+    assert area(clip(unit, unit * 0.5))[0] == 0.25
+    assert area(clip(unit * 0.5, unit))[0] == 0.25
+    assert area(clip(unit, unit + np.array([1.0, 0.0])))[0] == 0.0
+    assert area(clip(unit, unit + np.array([3.0, 0.0])))[0] == 0.0
+
+
+def test_batch_rows_do_not_influence_each_other() -> None:
+    layout = layout_of(*SEVEN, scale=0.6)
+    rng = np.random.default_rng(3)
+    tokens = layout.corners(random_poses(rng, 16, 7, 0.5))
+    targets = layout.corners(random_poses(rng, 16, 7, 0.5))
+    together = overlap_area(tokens, targets, layout)
+    alone = [
+        overlap_area(t[None], g[None], layout)[0] for t, g in zip(tokens, targets, strict=True)
+    ]
+    np.testing.assert_allclose(together, alone, atol=1e-12)
+
+
+def test_tokens_that_cover_each_other_count_once() -> None:
+    layout = layout_of("square", "square", scale=1.0)
+    goal = layout.corners(np.array([[[0.0, 0, 0], [2, 0, 0]]]))
+    both_on_one = layout.corners(np.array([[[0.0, 0, 0], [0, 0, 0]]]))
+    swapped = layout.corners(np.array([[[2.0, 0, 0], [0, 0, 0]]]))
+    assert overlap_share(both_on_one, goal, layout)[0] == pytest.approx(0.5)
+    assert overlap_share(swapped, goal, layout)[0] == pytest.approx(1.0)
+    assert overlap_share(goal, goal, layout)[0] == pytest.approx(1.0)
+
+
+def test_share_is_of_the_targets_area() -> None:
+    layout = layout_of("square", "small_triangle", scale=1.0)
+    goal = layout.corners(np.array([[[0.0, 0, 0], [2, 0, 0]]]))
+    only_square = layout.corners(np.array([[[0.0, 0, 0], [9, 9, 0]]]))
+    assert total_area(layout) == pytest.approx(3 / 16)
+    assert overlap_share(only_square, goal, layout)[0] == pytest.approx(2 / 3)
+
+
+def test_any_overlap_of_touching_and_crossing() -> None:
+    layout = layout_of("square", "square", scale=np.sqrt(8.0))  # side 1
+    gaps = np.array([0.0, 0.5, 1.0 - 1e-6, 1.0, 1.5])
+    poses = np.zeros((5, 2, 3))
+    poses[:, 1, 0] = gaps
+    assert any_overlap(layout.corners(poses), layout).tolist() == [True, True, True, False, False]
+
+
+def test_area_of_own_polygon() -> None:
+    own = polygon("own", [[0, 0], [4, 0], [3, 1], [0, 2]])
+    assert area(own.corners[None])[0] == pytest.approx(own.area) == pytest.approx(5.0)
+
+
+def _placed(name: str, pose: tuple[float, ...]) -> Floats:
+    return _moved(tan(name).corners[None], pose)
+
+
+def _moved(polygons: Floats, pose: tuple[float, ...]) -> Floats:
+    x, y, angle = pose
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    moved: Floats = polygons @ turn.T + [x, y]
+    return moved

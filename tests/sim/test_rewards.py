@@ -1,0 +1,259 @@
+"""Rewards against tables, against brute force, and the user's own."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tangram_sim.config import RewardConfig, SimConfig
+from tangram_sim.errors import ConfigError
+from tangram_sim.layout import Layout
+from tangram_sim.pictures import BACKGROUND, TOKEN_GRAY
+from tangram_sim.rewards import RewardFn, closeness, make_reward, picture_reward
+from tangram_sim.sampling import sample_batch
+from tests.sim.builders import LOPSIDED, SEVEN, TRIO, layout_of, random_poses
+
+pytestmark = pytest.mark.fast
+
+SIM = SimConfig(backend="kinematic")
+REACH = 2.0 * math.sqrt(2.0)
+
+
+def reward_of(name: str, layout: Layout, sharpness: float = 100.0) -> RewardFn:
+    return make_reward(RewardConfig(name=name, sharpness=sharpness), layout, SIM)
+
+
+@pytest.mark.parametrize(
+    ("shape", "degrees", "expected"),
+    [
+        ("square", 0, 1.0),
+        ("square", 5, 0.920),
+        ("square", 10, 0.853),
+        ("square", 20, 0.753),
+        ("square", 45, 0.657),
+        ("square", 90, 1.0),
+        ("small_triangle", 5, 0.836),
+        ("small_triangle", 10, 0.704),
+        ("small_triangle", 20, 0.512),
+        ("small_triangle", 45, 0.273),
+        ("parallelogram", 180, 1.0),
+    ],
+)
+def test_overlap_at_an_angle_error(shape: str, degrees: float, expected: float) -> None:
+    layout = layout_of(shape)
+    poses = np.array([[[0.3, -0.2, 0.4]], [[0.3, -0.2, 0.4 + math.radians(degrees)]]])
+    desired, achieved = layout.corners(poses)
+    got = reward_of("overlap", layout)(achieved[None], desired[None])
+    assert got[0] == pytest.approx(expected, abs=6e-4)
+
+
+@pytest.mark.parametrize(
+    ("shape", "expected"),
+    [("square", 0.765), ("small_triangle", 0.376), ("parallelogram", 0.264)],
+)
+def test_mean_overlap_of_a_right_place_at_any_angle(shape: str, expected: float) -> None:
+    """What an agent gets that solves position only: the plateaus of the paper's figures."""
+    layout = layout_of(shape)
+    poses = np.zeros((7200, 1, 3))
+    poses[:, 0, 2] = np.linspace(0.0, 2.0 * math.pi, 7200, endpoint=False)
+    desired = np.broadcast_to(layout.corners(np.zeros((1, 3))), (7200, layout.corner_count, 2))
+    got = reward_of("overlap", layout)(layout.corners(poses), desired)
+    assert got.mean() == pytest.approx(expected, abs=6e-4)
+
+
+@pytest.mark.parametrize(
+    ("share", "sharpness", "expected"),
+    [  # of the reach
+        (0.0, 100.0, 1.0),
+        (0.001, 100.0, 0.958696),
+        (0.01, 100.0, 0.699619),
+        ((math.sqrt(101.0) - 1.0) / 100.0, 100.0, 0.0),
+        (0.1, 100.0, -0.039147),
+        (1.0, 100.0, -1.0),
+        (1.5, 100.0, -1.174280),
+        (0.0, 1.0, 1.0),
+        (0.5, 1.0, -0.169925),
+        (1.0, 1.0, -1.0),
+        (0.1, 1e4, -0.500201),
+    ],
+)
+def test_closeness(share: float, sharpness: float, expected: float) -> None:
+    got = closeness(np.array([share * 3.0]), 3.0, sharpness)
+    assert got[0] == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ["dense", "pose"])
+def test_a_shift_counts_by_its_length(name: str) -> None:
+    """Without a turn both rewards see the same distance."""
+    layout = layout_of(LOPSIDED, scale=0.1)
+    poses = np.zeros((4, 1, 3))
+    poses[1:, 0, :2] = [[0.3, 0.4], [2.0, -2.0], [0.0, 0.001]]
+    corners = layout.corners(poses)
+    got = reward_of(name, layout)(corners, np.repeat(corners[:1], 4, axis=0))
+    expected = closeness(np.array([0.0, 0.5, REACH, 0.001]), REACH, 100.0)
+    np.testing.assert_allclose(got, expected, atol=1e-9)
+
+
+def test_dense_is_the_mean_over_tokens_and_blind_to_the_angle() -> None:
+    layout = layout_of("square", "small_triangle")
+    goal = layout.corners(np.zeros((1, 2, 3)))
+    state = layout.corners(np.array([[[0.5, 0.0, 1.0], [0.0, 0.0, 2.0]]]))
+    got = reward_of("dense", layout)(state, goal)[0]
+    assert got == pytest.approx((closeness(np.array(0.5), REACH, 100.0) + 1.0) / 2.0)
+
+
+@given(st.floats(-math.pi, math.pi))
+@settings(deadline=None, max_examples=50)
+def test_pose_counts_a_turn_like_the_shift_that_is_as_visible(angle: float) -> None:
+    """A square's corners lie at one radius: a turn by t moves each by 2 r sin(t / 2)."""
+    layout = layout_of("square")
+    goal = layout.corners(np.zeros((1, 1, 3)))
+    turned = layout.corners(np.array([[[0.0, 0.0, angle]]]))
+    error = abs(math.remainder(angle, math.pi / 2.0))
+    shift = 2.0 * layout.shapes[0].radius * math.sin(error / 2.0)
+    shifted = layout.corners(np.array([[[0.0, shift, 0.0]]]))
+    reward = reward_of("pose", layout)
+    assert reward(turned, goal)[0] == pytest.approx(reward(shifted, goal)[0], abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("shape", "degrees", "solved"),
+    [
+        ("square", 90, True),
+        ("square", 180, True),
+        ("square", 45, False),
+        ("parallelogram", 180, True),
+        ("parallelogram", 90, False),
+        ("small_triangle", 90, False),
+        ("small_triangle", 180, False),
+    ],
+)
+def test_pose_modulo_symmetry(shape: str, degrees: float, solved: bool) -> None:
+    layout = layout_of(shape)
+    goal = layout.corners(np.array([[[0.1, 0.2, 0.3]]]))
+    turned = layout.corners(np.array([[[0.1, 0.2, 0.3 + math.radians(degrees)]]]))
+    got = reward_of("pose", layout)(turned, goal)[0]
+    assert (got == pytest.approx(1.0)) == solved
+    assert solved or got < 0.3
+
+
+def test_pose_equals_brute_force_over_the_turns_of_each_shape() -> None:
+    layout = layout_of(*TRIO, LOPSIDED)
+    rng = np.random.default_rng(0)
+    poses, goals = (random_poses(rng, 40, 4, 1.0) for _ in range(2))
+    rewards = []
+    for k, shape in enumerate(layout.shapes):
+        distances = []
+        for turn in range(shape.symmetry):
+            turned = goals.copy()
+            turned[:, k, 2] += 2.0 * math.pi * turn / shape.symmetry
+            gap = layout.corners(poses) - layout.corners(turned)
+            distances.append(np.linalg.norm(gap[:, layout.corners_of(k)], axis=-1).mean(axis=1))
+        rewards.append(closeness(np.min(distances, axis=0), REACH, 100.0))
+    got = reward_of("pose", layout)(layout.corners(poses), layout.corners(goals))
+    np.testing.assert_allclose(got, np.mean(rewards, axis=0), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["overlap", "dense", "pose"])
+def test_reached_goals_give_one_and_others_less(name: str) -> None:
+    layout = layout_of(*SEVEN, scale=0.6)
+    rng = np.random.default_rng(0)
+    goals = layout.corners(sample_batch(layout, SIM, [rng] * 8))
+    others = layout.corners(sample_batch(layout, SIM, [rng] * 8))
+    reward = reward_of(name, layout)
+    np.testing.assert_allclose(reward(goals, goals), 1.0, atol=1e-9)
+    got = reward(others, goals)
+    assert got.shape == (8,)
+    assert ((got >= -1.0) & (got < 0.2)).all()
+
+
+def test_picture_reward() -> None:
+    target = np.full((4, 4), BACKGROUND, dtype=np.uint8)
+    state = target.copy()
+    target[0, :] = TOKEN_GRAY
+    assert picture_reward(target, state) == -1.0
+    state[:, 0] = TOKEN_GRAY
+    assert picture_reward(target, state) == -0.5
+    state[0, :] = 0  # any gray but the background's
+    assert picture_reward(target, state) == 1.0
+
+
+def test_a_target_without_pixels_is_refused() -> None:
+    empty = np.full((16, 16), BACKGROUND, dtype=np.uint8)
+    with pytest.raises(ConfigError, match=r"no pixel of a picture of 16 x 16: raise sim\.pixels"):
+        picture_reward(empty, empty)
+
+
+def test_camera_as_source_needs_the_camera() -> None:
+    config = RewardConfig(source="camera")
+    with pytest.raises(ConfigError, match=r"set sim\.camera=true"):
+        make_reward(config, layout_of("square"), SIM)
+    make_reward(config, layout_of("square"), SimConfig(backend="kinematic", camera=True))
+
+
+OWN = """
+import numpy as np
+
+number = 3
+
+def near(achieved, desired, layout):
+    assert achieved.shape == desired.shape == (len(achieved), layout.corner_count, 2)
+    return -np.abs(achieved - desired).mean(axis=(1, 2))
+
+def table(achieved, desired, layout):
+    return np.zeros((len(achieved), 1))
+
+def text(achieved, desired, layout):
+    return ["much"] * len(achieved)
+
+def lost(achieved, desired, layout):
+    return np.full(len(achieved), np.nan)
+"""
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "own_rewards_of_a_test.py").write_text(OWN)
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+
+@pytest.mark.usefixtures("own")
+def test_a_reward_of_the_users_own() -> None:
+    layout = layout_of("square")
+    reward = reward_of("own_rewards_of_a_test:near", layout)
+    corners = layout.corners(random_poses(np.random.default_rng(0), 5, 1, 1.0))
+    np.testing.assert_allclose(reward(corners, corners + 0.25), -0.25)
+
+
+@pytest.mark.usefixtures("own")
+@pytest.mark.parametrize(
+    ("function", "reason"),
+    [
+        ("table", r"one number per row, shape \(5,\), got shape \(5, 1\)"),
+        ("text", "failed: could not convert string"),
+        ("lost", "must return finite numbers"),
+    ],
+)
+def test_what_the_users_own_returns_is_checked(function: str, reason: str) -> None:
+    layout = layout_of("square")
+    reward = reward_of(f"own_rewards_of_a_test:{function}", layout)
+    corners = layout.corners(random_poses(np.random.default_rng(0), 5, 1, 1.0))
+    with pytest.raises(ConfigError, match=reason):
+        reward(corners, corners)
+
+
+@pytest.mark.usefixtures("own")
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("no_such_module:near", "cannot import 'no_such_module'"),
+        ("own_rewards_of_a_test:far", "module 'own_rewards_of_a_test' has no 'far'"),
+        ("own_rewards_of_a_test:number", "'number' is not a function"),
+    ],
+)
+def test_an_own_reward_that_cannot_be_loaded(name: str, reason: str) -> None:
+    with pytest.raises(ConfigError, match=reason):
+        reward_of(name, layout_of("square"))

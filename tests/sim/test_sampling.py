@@ -1,0 +1,85 @@
+"""Layouts without overlap, inside the arena, bounded and reproducible."""
+
+import numpy as np
+import pytest
+import shapely
+
+from tangram_sim.config import SimConfig
+from tangram_sim.errors import SamplingError
+from tangram_sim.layout import Layout
+from tangram_sim.sampling import sample_batch, sample_poses
+from tangram_sim.seeding import evaluation_generators
+from tests.sim.builders import LOPSIDED, SEVEN, SQUARE_SCALE, TRIO, layout_of
+
+pytestmark = pytest.mark.fast
+
+
+@pytest.mark.parametrize(
+    ("layout", "arena"),
+    [
+        (layout_of("square"), 2.0),
+        (layout_of(*TRIO, LOPSIDED, scale=0.2), 2.0),
+        (layout_of(*SEVEN, scale=0.6), 2.0),
+        (layout_of(*SEVEN, scale=0.9), 2.0),  # a fifth of the arena is filled
+        (layout_of("square", "square", scale=0.01), 0.02),
+    ],
+)
+def test_tokens_lie_inside_and_apart(layout: Layout, arena: float) -> None:
+    sim = SimConfig(arena=arena)
+    poses = sample_batch(layout, sim, evaluation_generators(40))
+    corners = layout.corners(poses)
+    assert poses.shape == (40, layout.tokens, 3)
+    assert np.abs(corners).max() <= arena / 2.0
+    for tokens in corners / arena:
+        pieces = [shapely.Polygon(tokens[layout.corners_of(k)]) for k in range(layout.tokens)]
+        union = shapely.union_all(pieces, grid_size=1e-9)
+        assert union.area == pytest.approx(sum(p.area for p in pieces), abs=1e-6)
+
+
+def test_same_generator_gives_the_same_layout_in_any_company() -> None:
+    """Rejected draws of one environment must not shift the others."""
+    layout, sim = layout_of(*SEVEN, scale=0.8), SimConfig()
+    together = sample_batch(layout, sim, evaluation_generators(20))
+    alone = [sample_poses(layout, sim, rng) for rng in evaluation_generators(20)]
+    np.testing.assert_array_equal(together, alone)
+    assert len(np.unique(together.reshape(20, -1), axis=0)) == 20
+
+
+def test_positions_and_angles_are_uniform() -> None:
+    layout, sim = layout_of("square"), SimConfig()
+    rng = np.random.default_rng(0)
+    poses = sample_batch(layout, sim, [rng] * 20_000)[:, 0]
+    reach = 1.0 - layout.shapes[0].radius
+    for column, bound in zip(poses.T, (reach, reach, np.pi), strict=True):
+        counts, _ = np.histogram(column, bins=10, range=(-bound, bound))
+        assert counts.sum() == 20_000  # nothing outside
+        # Expected 2000 each with a deviation of 42.
+        assert np.abs(counts - 2000).max() < 5 * 42
+    assert np.abs(np.corrcoef(poses.T) - np.eye(3)).max() < 0.04
+
+
+def test_an_arena_that_is_too_small_is_refused() -> None:
+    layout = layout_of("small_triangle", "square", scale=SQUARE_SCALE)
+    sim = SimConfig(arena=0.5)
+    with pytest.raises(SamplingError, match=r"arena to at least 0\.596, or lower tokens\.scale"):
+        sample_poses(layout, sim, np.random.default_rng(0))
+    # What the message says is enough for each token alone.
+    sample_poses(layout_of("small_triangle"), SimConfig(arena=0.6), np.random.default_rng(0))
+
+
+def test_giving_up_names_the_numbers() -> None:
+    layout, sim = layout_of("square", "square"), SimConfig(arena=0.6, max_tries=37)
+    with pytest.raises(
+        SamplingError, match=r"'square' beside 1 others in 37 tries .* 0\.6: raise sim\.arena"
+    ):
+        sample_poses(layout, sim, np.random.default_rng(0))
+
+
+def test_tries_are_bounded_exactly() -> None:
+    """The last chunk is cut: 5 tries are 4 and 1, whatever the chunk."""
+    layout, sim = layout_of("square", "square"), SimConfig(arena=0.6, max_tries=5)
+    rng, twin = np.random.default_rng(0), np.random.default_rng(0)
+    with pytest.raises(SamplingError):
+        sample_poses(layout, sim, rng)
+    twin.random((1 + 5, 3))
+    assert rng.random() == twin.random()

@@ -1,0 +1,138 @@
+"""The seven tans, exactly, and polygons of the user's own."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tangram_sim.errors import ConfigError
+from tangram_sim.shapes import SHAPE_NAMES, Shape, polygon, polygon_area, polygon_centroid, tan
+from tests.sim.builders import SEVEN
+
+pytestmark = pytest.mark.fast
+
+R = math.sqrt(2.0)
+# name: area, symmetry order, corners for a full square of side 1, centre of area at the origin
+TANS = {
+    "large_triangle": (1 / 4, 1, [(-R / 6, -R / 6), (R / 3, -R / 6), (-R / 6, R / 3)]),
+    "medium_triangle": (1 / 8, 1, [(-1 / 6, -1 / 6), (1 / 3, -1 / 6), (-1 / 6, 1 / 3)]),
+    "small_triangle": (1 / 16, 1, [(-R / 12, -R / 12), (R / 6, -R / 12), (-R / 12, R / 6)]),
+    "square": (1 / 8, 4, [(-R / 8, -R / 8), (R / 8, -R / 8), (R / 8, R / 8), (-R / 8, R / 8)]),
+    "parallelogram": (
+        1 / 8,
+        2,
+        [(-0.375, -0.125), (0.125, -0.125), (0.375, 0.125), (-0.125, 0.125)],
+    ),
+    "parallelogram_mirrored": (
+        1 / 8,
+        2,
+        [(-0.125, -0.125), (0.375, -0.125), (0.125, 0.125), (-0.375, 0.125)],
+    ),
+}
+
+
+def test_table_names_every_tan() -> None:
+    assert set(TANS) == set(SHAPE_NAMES)
+
+
+@pytest.mark.parametrize("name", TANS)
+def test_tan(name: str) -> None:
+    area, symmetry, corners = TANS[name]
+    shape = tan(name)
+    assert shape.name == name
+    assert shape.area == pytest.approx(area, abs=1e-15)
+    assert shape.symmetry == symmetry
+    np.testing.assert_allclose(shape.corners, corners, atol=1e-15)
+    np.testing.assert_allclose(polygon_centroid(shape.corners), 0.0, atol=1e-15)
+    assert shape.radius == pytest.approx(max(math.hypot(x, y) for x, y in corners))
+
+
+def test_seven_tans_fill_the_full_square() -> None:
+    assert sum(tan(name).area for name in SEVEN) == pytest.approx(1.0, abs=1e-15)
+
+
+def test_mirrored_parallelogram_is_the_mirror_image() -> None:
+    mirrored = tan("parallelogram").corners * [-1.0, 1.0]
+    assert {tuple(np.round(c, 12)) for c in mirrored} == {
+        tuple(np.round(c, 12)) for c in tan("parallelogram_mirrored").corners
+    }
+
+
+def test_scaled_keeps_form() -> None:
+    shape = tan("parallelogram").scaled(3.0)
+    assert (shape.symmetry, shape.area) == (2, pytest.approx(9 / 8))
+
+
+def _regular(corners: int) -> list[list[float]]:
+    angles = [2 * math.pi * i / corners for i in range(corners)]
+    return [[math.cos(a), math.sin(a)] for a in angles]
+
+
+@pytest.mark.parametrize(
+    ("corners", "symmetry"),
+    [
+        (_regular(3), 3),
+        (_regular(4), 4),
+        (_regular(6), 6),
+        (_regular(16), 16),
+        ([[0, 0], [2, 0], [2, 1], [0, 1]], 2),
+        ([[0, 0], [4, 0], [3, 1], [0, 2]], 1),
+        ([[0, -1], [1, 0], [0, 3], [-1, 0]], 1),  # a kite
+        # Threefold, with corners at two radii.
+        ([[c * r for c in p] for p, r in zip(_regular(6), [1, 0.9] * 3, strict=True)], 3),
+    ],
+)
+def test_symmetry_order_of_own_polygons(corners: list[list[float]], symmetry: int) -> None:
+    assert polygon("own", corners).symmetry == symmetry
+
+
+def test_clockwise_and_shifted_polygon_becomes_the_same_shape() -> None:
+    corners = np.array([[0, 0], [4, 0], [3, 1], [0, 2]], dtype=float)
+    shifted = polygon("own", (corners[::-1] + np.array([7.0, -3.0])).tolist())
+    assert polygon_area(shifted.corners) > 0
+    np.testing.assert_allclose(polygon_centroid(shifted.corners), 0.0, atol=1e-12)
+    assert shifted.area == pytest.approx(polygon("own", corners.tolist()).area)
+
+
+def test_unit_of_a_polygon_does_not_matter() -> None:
+    tiny = polygon("own", [[0, 0], [1e-6, 0], [0, 1e-6]])
+    assert tiny.area == pytest.approx(5e-13)
+
+
+@pytest.mark.parametrize(
+    ("corners", "reason"),
+    [
+        ([[0, 0], [1, 0]], "3 to 16 pairs"),
+        (_regular(17), "3 to 16 pairs"),
+        ([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "3 to 16 pairs"),
+        ([[0, 0], [1, 0], [0]], "3 to 16 pairs"),
+        ("square", "3 to 16 pairs"),
+        (None, "3 to 16 pairs"),
+        ([[0, 0], [1, 0], [0, math.nan]], "finite"),
+        ([[0, 0], [1, 0], [0, math.inf]], "finite"),
+        ([[0, 0], [2, 0], [0.5, 0.5], [0, 2]], "strictly convex"),  # concave
+        ([[0, 0], [1, 0], [1, 0], [0, 1]], "strictly convex"),  # repeated
+        ([[0, 0], [1, 0], [2, 0], [0, 1]], "strictly convex"),  # collinear
+        ([[0, 0], [1, 1], [1, 0], [0, 1]], "strictly convex"),  # crossing
+        ([_regular(5)[i] for i in (0, 2, 4, 1, 3)], "strictly convex"),  # a star turns left only
+    ],
+)
+def test_refused_polygon(corners: list[list[float]], reason: str) -> None:
+    with pytest.raises(ConfigError, match=reason):
+        polygon("own", corners)
+
+
+def test_unknown_shape_lists_the_known() -> None:
+    with pytest.raises(ConfigError, match="'hexagon': choose from large_triangle"):
+        tan("hexagon")
+
+
+@given(st.floats(-math.pi, math.pi), st.sampled_from(SHAPE_NAMES))
+@settings(deadline=None, max_examples=50)
+def test_a_turned_polygon_is_the_same_shape(angle: float, name: str) -> None:
+    shape: Shape = tan(name)
+    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    turned = polygon("own", (shape.corners @ turn.T).tolist())
+    assert (turned.symmetry, turned.area) == (shape.symmetry, pytest.approx(shape.area))

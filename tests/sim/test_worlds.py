@@ -1,0 +1,202 @@
+"""What every backend must do, and what the engine must not get wrong."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tangram_sim.arrays import Floats
+from tangram_sim.config import SimConfig
+from tangram_sim.errors import ConfigError
+from tangram_sim.layout import Layout
+from tangram_sim.pictures import BACKGROUND, TOKEN_GRAY, rasterise
+from tangram_sim.world import World, make_world
+from tests.sim.builders import LOPSIDED, TRIO, angle_gap, layout_of, random_poses
+
+pytestmark = pytest.mark.fast
+
+WorldMaker = Callable[..., World]
+ANGLES = (-180, -179.9, -150, -120, -90, -60, -45, -10, -1, 0, 0.5, 5, 30, 75, 135, 170, 179, 180)
+VELOCITIES = ((0.0, 0.0), (1.0, 1.0), (-1.0, 0.3), (0.01, -0.02), (0.0, 1.0))  # widths a second
+
+
+@pytest.fixture(params=["physics", "kinematic"])
+def make(request: pytest.FixtureRequest) -> Iterator[WorldMaker]:
+    worlds = []
+
+    def maker(layout: Layout, **settings: Any) -> World:
+        worlds.append(make_world(layout, SimConfig(backend=request.param, **settings)))
+        return worlds[-1]
+
+    yield maker
+    for world in worlds:
+        world.close()
+
+
+def errors(world: World, arena: float) -> tuple[float, float]:
+    """Largest error of position (arena widths) and angle (degrees) over a table of actions."""
+    start = np.array([[0.2 * arena, -0.3 * arena, 0.7]])
+    position, angle = 0.0, 0.0
+    for x, y in VELOCITIES:
+        for degrees in ANGLES:
+            velocity = np.array([x * arena, y * arena, np.radians(degrees)])
+            world.place(start)
+            world.move(0, velocity)
+            wanted, got = start[0] + velocity, world.poses()[0]
+            position = max(position, float(np.abs(got - wanted)[:2].max()) / arena)
+            angle = max(angle, float(np.degrees(angle_gap(got[2], wanted[2]))))
+    return position, angle
+
+
+@pytest.mark.parametrize("shape", ["square", "small_triangle", "parallelogram", LOPSIDED])
+def test_commanded_pose_is_reached(make: WorldMaker, shape: object) -> None:
+    position, angle = errors(make(layout_of(shape, scale=0.3)), 2.0)
+    assert position < 1e-9
+    assert angle < 1e-3
+
+
+@pytest.mark.parametrize("arena", [1e-3, 1.0, 1e3])
+def test_commanded_pose_is_reached_in_every_unit(make: WorldMaker, arena: float) -> None:
+    """The engine limits velocities to 100 units a second: it must not see the arena's unit."""
+    position, angle = errors(make(layout_of("square", scale=0.3 * arena), arena=arena), arena)
+    assert position < 1e-9
+    assert angle < 1e-3
+
+
+@pytest.mark.parametrize("substeps", [4, 5, 8, 32])
+def test_enough_substeps_turn_fully(substeps: int) -> None:
+    world = make_world(layout_of("square"), SimConfig(substeps=substeps))
+    assert errors(world, 2.0)[1] < 1e-3
+    world.close()
+
+
+@pytest.mark.parametrize(("substeps", "missing"), [(1, 60), (2, 20), (3, 5)])
+def test_fewer_substeps_than_the_bound_turn_too_little(substeps: int, missing: float) -> None:
+    """Why `SimConfig` refuses them: Bullet turns a body by at most 45 degrees in a step."""
+    sim = SimConfig()
+    object.__setattr__(sim, "substeps", substeps)  # past the guard
+    world = make_world(layout_of("square"), sim)
+    assert errors(world, 2.0)[1] > missing
+    world.close()
+
+
+def test_poses_are_what_was_placed(make: WorldMaker) -> None:
+    layout = layout_of(*TRIO)
+    world = make(layout)
+    for poses in random_poses(np.random.default_rng(0), 50, 3, 1.0):
+        world.place(poses)
+        np.testing.assert_allclose(world.poses(), poses, atol=1e-12)
+
+
+@pytest.mark.parametrize("turns", [-2, -1, 1, 2])
+def test_angles_are_told_between_minus_pi_and_pi(make: WorldMaker, turns: int) -> None:
+    world = make(layout_of("square"))
+    world.place(np.array([[0.0, 0.0, 1.0 + 2.0 * np.pi * turns]]))
+    assert world.poses()[0, 2] == pytest.approx(1.0)
+    world.place(np.array([[0.0, 0.0, 3.0]]))
+    world.move(0, np.array([0.0, 0.0, 1.0]))
+    assert world.poses()[0, 2] == pytest.approx(4.0 - 2.0 * np.pi)
+
+
+def test_only_the_named_token_moves_and_it_stops(make: WorldMaker) -> None:
+    """The tokens lie upon each other: they pass through, without a touch."""
+    world = make(layout_of("square", "square", "small_triangle"))
+    start = np.zeros((3, 3))
+    world.place(start)
+    first, second = np.array([0.5, -0.25, 2.0]), np.array([-0.1, 0.2, -3.0])
+    world.move(1, first)
+    np.testing.assert_allclose(world.poses(), [start[0], first, start[2]], atol=1e-9)
+    world.move(2, second)
+    np.testing.assert_allclose(world.poses(), [start[0], first, second], atol=1e-9)
+    world.move(1, -first)
+    np.testing.assert_allclose(world.poses(), [start[0], start[1], second], atol=1e-9)
+
+
+def test_placing_stops_and_forgets(make: WorldMaker) -> None:
+    world = make(layout_of("square"))
+    world.move(0, np.array([1.0, 1.0, 1.0]))
+    world.place(np.array([[0.1, 0.2, 0.3]]))
+    world.move(0, np.zeros(3))
+    np.testing.assert_allclose(world.poses(), [[0.1, 0.2, 0.3]], atol=1e-12)
+
+
+def test_poses_are_a_copy(make: WorldMaker) -> None:
+    world = make(layout_of("square"))
+    world.poses()[:] = 9.0
+    np.testing.assert_array_equal(world.poses(), np.zeros((1, 3)))
+
+
+def test_nothing_stops_a_token_at_the_arenas_edge(make: WorldMaker) -> None:
+    world = make(layout_of("square"))
+    world.place(np.array([[0.8, 0.0, 0.0]]))
+    world.move(0, np.array([2.0, 0.0, 0.0]))
+    assert world.poses()[0, 0] == pytest.approx(2.8)
+    assert (world.picture() == BACKGROUND).all()
+
+
+def test_picture_of_a_token_in_the_upper_right(make: WorldMaker) -> None:
+    """Its corners lie on borders of pixels: which pixels it covers can be counted."""
+    world = make(layout_of("square"), pixels=20)  # a pixel is 0.1 wide, the square 4 pixels
+    world.place(np.array([[0.6 + 1e-6, 0.3 + 1e-6, 0.0]]))
+    picture = world.picture()
+    expected = np.full((20, 20), BACKGROUND, dtype=np.uint8)
+    expected[5:9, 14:18] = TOKEN_GRAY
+    assert picture.dtype == np.uint8
+    np.testing.assert_array_equal(picture, expected)
+
+
+@pytest.mark.parametrize("pixels", [16, 63, 64, 200])
+@pytest.mark.parametrize("arena", [0.02, 2.0])
+def test_pictures_show_pixel_centres(make: WorldMaker, pixels: int, arena: float) -> None:
+    """Pixel for pixel: half a pixel of shift would show, and so would a wrong field of view."""
+    layout = layout_of(*TRIO, scale=0.4 * arena)
+    world = make(layout, pixels=pixels, arena=arena)
+    wrong = 0
+    for poses in random_poses(np.random.default_rng(0), 25, 3, 0.5 * arena):
+        world.place(poses)
+        exact = rasterise(layout.corners(poses), layout, arena, pixels)
+        wrong += int(np.count_nonzero(world.picture() != exact))
+    # A pixel whose centre lies on an edge to rounding may fall on either side.
+    assert wrong <= 10 * pixels / 64
+
+
+def test_closing_twice_does_no_harm(make: WorldMaker) -> None:
+    world = make(layout_of("square"))
+    world.close()
+    world.close()
+
+
+def test_worlds_do_not_share_bodies(make: WorldMaker) -> None:
+    layout = layout_of("square")
+    first, second = make(layout), make(layout)
+    first.move(0, np.array([0.5, 0.0, 0.0]))
+    np.testing.assert_array_equal(second.poses(), np.zeros((1, 3)))
+    first.close()
+    second.move(0, np.array([0.0, 0.5, 0.0]))
+    np.testing.assert_allclose(second.poses(), [[0.0, 0.5, 0.0]], atol=1e-12)
+
+
+def test_backends_agree_over_a_long_walk() -> None:
+    layout = layout_of(*TRIO)
+    worlds = [make_world(layout, SimConfig(backend=name)) for name in ("physics", "kinematic")]
+    rng = np.random.default_rng(5)
+    start: Floats = random_poses(rng, 1, 3, 1.0)[0]
+    for world in worlds:
+        world.place(start)
+    for _ in range(200):
+        token = int(rng.integers(3))
+        velocity = rng.uniform(-1.0, 1.0, 3) * [2.0, 2.0, np.pi]
+        for world in worlds:
+            world.move(token, velocity)
+    engine, exact = (world.poses() for world in worlds)
+    np.testing.assert_allclose(engine[:, :2], exact[:, :2], atol=1e-9)
+    assert angle_gap(engine[:, 2], exact[:, 2]).max() < 1e-9
+    worlds[0].close()
+
+
+def test_a_missing_engine_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "pybullet", None)
+    monkeypatch.delitem(__import__("sys").modules, "tangram_sim.physics", raising=False)
+    with pytest.raises(ConfigError, match=r"set\s+sim\.backend=kinematic"):
+        make_world(layout_of("square"), SimConfig())

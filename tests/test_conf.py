@@ -1,0 +1,273 @@
+"""Config groups, presets, overrides and help."""
+
+import dataclasses
+import sys
+from collections.abc import Callable
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import hydra
+import pytest
+import yaml
+from omegaconf import OmegaConf
+
+from conf.cli import entry, with_run_config
+from conf.help import Plain, choices, group_defaults, help_text, setting_names
+from master.config import LaunchConfig, MasterConfig
+from tangram_agent.config import AgentConfig, NetConfig, ServiceConfig, TwinConfig
+from tangram_agent.setup import SECTIONS, Setup, from_mapping, make_setup
+from tangram_sim.config import RewardConfig, SimConfig
+from tangram_sim.errors import ConfigError, TangramError
+from tangram_sim.layout import TokensConfig
+from worker.config import EvalConfig, PlayConfig, WorkerConfig
+
+pytestmark = pytest.mark.fast
+
+GROUPS = {
+    "tokens": TokensConfig,
+    "sim": SimConfig,
+    "reward": RewardConfig,
+    "net": NetConfig,
+    "agent": AgentConfig,
+    "service": ServiceConfig,
+}
+PRIMARIES = ("train", "master", "worker", "eval", "play")
+WITH_GROUPS = ("train", "master", "worker")
+PRESETS = [(group, name) for group in GROUPS for name in choices(group)]
+
+
+def compose(primary: str, *overrides: str) -> dict[str, Any]:
+    with hydra.initialize_config_module("conf", version_base="1.3"):
+        config = hydra.compose(primary, list(overrides))
+    plain = OmegaConf.to_container(config)
+    assert isinstance(plain, dict)
+    return {str(name): value for name, value in plain.items()}
+
+
+def field_names(kind: Any) -> set[str]:
+    return {field.name for field in dataclasses.fields(kind)}
+
+
+# Config and dataclasses say the same
+
+
+@pytest.mark.parametrize(("group", "name"), PRESETS)
+def test_preset_writes_out_every_field(group: str, name: str) -> None:
+    section = compose("train", f"{group}={name}")[group]
+    assert set(section) == field_names(GROUPS[group])
+    from_mapping(GROUPS[group], section)
+
+
+@pytest.mark.parametrize("name", choices("agent"))
+def test_first_twin_of_a_preset_writes_out_every_field(name: str) -> None:
+    twins = compose("train", f"agent={name}")["agent"]["hindsight"]
+    assert set(twins[0]) == field_names(TwinConfig)
+
+
+@pytest.mark.parametrize(
+    ("primary", "kinds", "extra"),
+    [
+        ("train", (LaunchConfig, MasterConfig), {"master"}),
+        ("master", (MasterConfig,), set()),
+        ("worker", (WorkerConfig,), set()),
+        ("eval", (EvalConfig,), set()),
+        ("play", (PlayConfig,), set()),
+    ],
+)
+def test_primary_has_every_field(primary: str, kinds: tuple[Any, ...], extra: set[str]) -> None:
+    names = set(compose(primary)) - set(SECTIONS) - {"from_config"}
+    assert names == set().union(*map(field_names, kinds)) - extra
+
+
+@pytest.mark.parametrize("primary", WITH_GROUPS)
+def test_primaries_with_groups_make_a_setup(primary: str) -> None:
+    setup = make_setup(compose(primary))
+    assert setup == make_setup(compose("train"))
+    assert setup.layout.tokens == 1
+
+
+@pytest.mark.parametrize(("group", "name"), PRESETS)
+def test_preset_says_what_it_is_for(group: str, name: str) -> None:
+    text = (files("conf") / group / f"{name}.yaml").read_text("utf-8")
+    assert text.startswith("# ")
+
+
+@pytest.mark.parametrize(
+    "name", [name for name in choices("tokens") if name not in ("pair", "hexagon")]
+)
+def test_preset_of_each_shape_has_the_same_area(name: str) -> None:
+    layout = make_setup(compose("train", f"tokens={name}")).layout
+    assert [shape.name for shape in layout.shapes] == [name]
+    assert layout.shapes[0].area == pytest.approx(0.16, abs=1e-12)
+
+
+def test_presets_of_more_and_of_own_shapes() -> None:
+    pair = make_setup(compose("train", "tokens=pair")).layout
+    assert [shape.area for shape in pair.shapes] == pytest.approx([0.16, 0.16], abs=1e-12)
+    (hexagon,) = make_setup(compose("train", "tokens=hexagon")).layout.shapes
+    assert hexagon.area == pytest.approx(0.16, abs=1e-6)
+    assert hexagon.symmetry == 6
+
+
+# Agents bring their nets
+
+
+@pytest.mark.parametrize(
+    ("overrides", "net"),
+    [
+        ((), "mha_narrow"),
+        (("agent=tangram",), "mha_narrow"),
+        (("agent=paper",), "mha"),
+        (("agent=mlp",), "mlp"),
+        (("agent=mlp", "net=mlp_large"), "mlp_large"),
+        (("net=mlp_large", "agent=paper"), "mlp_large"),
+    ],
+)
+@pytest.mark.parametrize("primary", WITH_GROUPS)
+def test_net_is_the_agents_unless_it_is_chosen(
+    primary: str, overrides: tuple[str, ...], net: str
+) -> None:
+    expected = yaml.safe_load((files("conf") / "net" / f"{net}.yaml").read_text("utf-8"))
+    assert compose(primary, *overrides)["net"] == expected
+
+
+def test_paper_preset_adds_nothing_to_the_text() -> None:
+    agent = make_setup(compose("train", "agent=paper")).agent
+    assert not any((agent.egocentric, agent.offsets, agent.orientation, agent.afterstate))
+    assert (agent.angle_head, agent.squash, agent.lr_decay) == ("plain", "tanh", "none")
+    assert agent.saturation_penalty == agent.grad_clip == agent.acting_average == 0.0
+    assert [twin.strategy for twin in agent.hindsight] == ["final"]
+
+
+# A run's config in place of the groups
+
+
+@pytest.fixture
+def stored(tmp_path: Path) -> Path:
+    path = tmp_path / "config.yaml"
+    path.write_text(yaml.safe_dump(compose("train", "agent=mlp", "tokens=pair", "seed=7")))
+    return path
+
+
+def apply(path: Path, *overrides: str) -> dict[str, Any]:
+    settings = compose("worker", "connect=tcp://127.0.0.1:1", f"from_config='{path}'", *overrides)
+    return with_run_config(settings, overrides)
+
+
+def test_run_config_replaces_the_groups(stored: Path) -> None:
+    settings = apply(stored)
+    setup: Setup = make_setup(settings)
+    assert (setup.agent.name, setup.layout.tokens, setup.net.kind) == ("mlp", 2, "mlp")
+    assert "from_config" not in settings
+    assert "seed" not in settings
+
+
+def test_single_values_still_override_a_run_config(stored: Path) -> None:
+    settings = apply(stored, "service.envs=7", "agent.hindsight.0.copies=3")
+    assert settings["service"]["envs"] == 7
+    assert settings["agent"]["hindsight"][0]["copies"] == 3
+    assert settings["agent"]["name"] == "mlp"
+
+
+@pytest.mark.parametrize("override", ["agent=paper", "~agent.noise", "tokens=square"])
+def test_choosing_a_group_beside_a_run_config_is_refused(stored: Path, override: str) -> None:
+    with pytest.raises(ConfigError, match="from_config chooses"):
+        apply(stored, override)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "No such file"),
+        (b"a: [", "not a YAML file"),
+        (b"\xff\xfe\xfa", "not a YAML file"),
+        (b"3", "lacks tokens"),
+        (b"{agent: {}, net: {}}", "lacks tokens, sim, reward, service"),
+    ],
+)
+def test_wrong_run_config_is_refused(tmp_path: Path, content: bytes | None, message: str) -> None:
+    path = tmp_path / "wrong.yaml"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ConfigError, match=message):
+        apply(path)
+
+
+# Help
+
+
+@pytest.mark.parametrize("primary", PRIMARIES)
+def test_examples_of_the_help_compose(primary: str) -> None:
+    text = help_text(primary)
+    examples = [line.split() for line in text.partition("Examples:")[2].strip().splitlines()]
+    assert len(examples) == 3
+    for command, *overrides in examples:
+        assert command == text.split()[0]
+        compose(primary, *overrides)
+
+
+@pytest.mark.parametrize("primary", PRIMARIES)
+def test_help_explains_every_setting(primary: str) -> None:
+    lines = help_text(primary).splitlines()
+    for name in set(compose(primary)) - set(group_defaults(primary)):
+        (line,) = [line for line in lines if line.startswith(f"  {name}: ")]
+        assert "  # " in line
+
+
+def test_known_settings_are_those_that_compose() -> None:
+    names = set(setting_names("train"))
+    top = compose("train")
+    dotted = {f"{group}.{key}" for group in GROUPS for key in top[group]}
+    assert names == set(top) | dotted
+
+
+# The entry of every command
+
+
+def start(monkeypatch: pytest.MonkeyPatch, task: Callable[[Plain], int], *overrides: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["tangram-eval", "run_dir=x", *overrides])
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "")  # restores what the entry sets
+    return entry("eval", task)
+
+
+def test_entry_hands_over_plain_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[Plain] = []
+    assert start(monkeypatch, lambda settings: seen.append(settings) or 5, "seed=3") == 5
+    assert seen == [{"run_dir": "x", "episodes": 100, "actions": None, "seed": 3, "out": None}]
+    assert type(seen[0]) is dict
+
+
+def test_entry_runs_once_for_each_value(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    seeds: list[int] = []
+    status = start(
+        monkeypatch, lambda s: seeds.append(s["seed"]) or s["seed"] % 3, "-m", "seed=1,2,3", "out=y"
+    )
+    assert (seeds, status) == ([1, 2, 3], 2)
+
+
+@pytest.mark.parametrize(
+    ("raised", "status", "line"),
+    [
+        (TangramError("port 5 is taken"), 2, "tangram-eval: port 5 is taken\n"),
+        (KeyboardInterrupt(), 130, ""),
+    ],
+)
+def test_entry_turns_errors_into_a_line_and_a_status(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    raised: BaseException,
+    status: int,
+    line: str,
+) -> None:
+    def task(settings: Plain) -> int:
+        raise raised
+
+    assert start(monkeypatch, task) == status
+    assert capsys.readouterr() == ("", line)
+
+
+def test_entry_does_not_hide_a_fault_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ZeroDivisionError):
+        start(monkeypatch, lambda settings: 1 // 0)

@@ -1,0 +1,114 @@
+"""The rules of the house: arrows, packaging, tiers of tests."""
+
+import shutil
+import subprocess
+import sys
+import tomllib
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.fast
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("conf", "master", "tangram_agent", "tangram_sim", "worker")
+
+
+def run(command: list[str], cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False, timeout=60)
+
+
+def run_python(code: str) -> str:
+    result = run([sys.executable, "-c", code])
+    assert result.returncode == 0, result.stderr
+    return result.stdout.strip()
+
+
+# Arrows
+
+
+def lint_imports(folder: Path) -> subprocess.CompletedProcess[str]:
+    tool = Path(sys.executable).with_name("lint-imports")
+    return run([str(tool), "--no-cache", "--no-logo"], cwd=folder)
+
+
+def test_import_contracts_hold() -> None:
+    result = lint_imports(ROOT)
+    assert result.returncode == 0, result.stdout + result.stderr
+
+
+def test_import_contracts_catch_every_wrong_arrow(tmp_path: Path) -> None:
+    for name in PACKAGES:
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("*.pyc"))
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    wrong = {
+        "tangram_sim/wrong.py": "import torch, pybullet, zmq, omegaconf",
+        "tangram_agent/wrong.py": "import worker.config, conf.help",
+        "master/wrong.py": "import tangram_sim.wrong",
+    }
+    for path, code in wrong.items():
+        (tmp_path / path).write_text(code)
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]
+    result = lint_imports(tmp_path)
+    assert f"0 kept, {len(contracts['contracts'])} broken" in result.stdout, result.stdout
+
+
+def test_master_and_registration_never_load_the_engine() -> None:
+    loaded = run_python(
+        "import gymnasium, master.cli, master.launch, master.loop, tangram_sim.register, sys\n"
+        "assert 'Tangram-v0' in gymnasium.registry\n"
+        "print([name for name in sys.modules if name.startswith('pybullet')])"
+    )
+    assert loaded == "[]"
+
+
+def test_command_lines_load_nothing_heavy() -> None:
+    loaded = run_python(
+        "import master.cli, worker.cli, sys\n"
+        "print({'torch', 'numpy', 'hydra', 'zmq', 'gymnasium'} & set(sys.modules))"
+    )
+    assert loaded == "set()"
+
+
+# Packaging
+
+
+@pytest.mark.parametrize("command", ["master", "train", "worker", "eval", "play"])
+def test_console_scripts_are_declared(command: str) -> None:
+    (script,) = entry_points(group="console_scripts", name=f"tangram-{command}")
+    assert callable(script.load())
+
+
+def test_constraints_pin_every_requirement() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    wanted = [*project["dependencies"], *extras["dev"], *extras["sb3"]]
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pinned = {line.partition("==")[0].lower().replace("_", "-") for line in lines if "==" in line}
+    names = {text.partition(";")[0].partition(">=")[0].strip().lower() for text in wanted}
+    assert names <= pinned
+
+
+def test_every_file_of_conf_is_package_data() -> None:
+    patterns = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"][
+        "package-data"
+    ]["conf"]
+    packed = {path for pattern in patterns for path in (ROOT / "conf").glob(pattern)}
+    assert packed == set((ROOT / "conf").rglob("*.yaml"))
+
+
+# Tiers
+
+
+@pytest.mark.parametrize(
+    ("marks", "status"),
+    [("", 4), ("@pytest.mark.fast", 0), ("@pytest.mark.fast\n@pytest.mark.slow", 4)],
+)
+def test_each_test_carries_one_tier(tmp_path: Path, marks: str, status: int) -> None:
+    (tmp_path / "test_it.py").write_text(f"import pytest\n\n{marks}\ndef test_it(): pass\n")
+    options = ["-p", "tests.conftest", "-p", "no:cacheprovider", "-c", "pyproject.toml"]
+    result = run([sys.executable, "-m", "pytest", *options, f"--rootdir={tmp_path}", str(tmp_path)])
+    assert result.returncode == status, result.stdout + result.stderr
+    if status:
+        assert "test_it.py::test_it must carry exactly one of the markers" in result.stderr
