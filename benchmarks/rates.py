@@ -85,7 +85,10 @@ def preset(agent: str) -> Setup:
 
     agent_file = yaml.safe_load((folder / "agent" / f"{agent}.yaml").read_text())
     (net,) = (
-        value for line in agent_file["defaults"] if isinstance(line, dict) for value in line.values()
+        value
+        for line in agent_file["defaults"]
+        if isinstance(line, dict)
+        for value in line.values()
     )
     choices = dict(zip(SECTIONS, ("square", "physics", "overlap", agent, net), strict=True))
     return make_setup({name: group(name, choice) for name, choice in choices.items()})

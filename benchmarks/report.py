@@ -22,7 +22,7 @@ def show(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     for row in rows:
         table.add_row(*(_text(value) for value in row.values()))
     # Wide enough for all columns also where the output goes into a file.
-    Console(width=None if sys.stdout.isatty() else 160).print(table)
+    Console(width=None if sys.stdout.isatty() else 220).print(table)
 
 
 def write(path: Path | None, content: Mapping[str, Any]) -> None:

@@ -171,7 +171,7 @@ class ServiceConfig:
     port: int = 0
     publish_seconds: float = 0.5
     every_update: bool = False
-    envs: int = 32
+    envs: int = 16
     batch_episodes: int = 32
     window: int = 4
     lag_updates: int = 64

@@ -38,7 +38,10 @@ def split_action(action: Tensor, tokens: int) -> tuple[Tensor, Tensor]:
 
 
 def critic_target(reward: Tensor, done: Tensor, next_value: Tensor, gamma: float) -> Tensor:
-    """Eq. 5, the target y (B,). The paper's equation lacks (1 - d); after the end nothing can follow."""
+    """The target y of Eq. 5, (B,).
+
+    The paper's equation lacks (1 - d), but after the end of an episode nothing can follow.
+    """
     return reward + gamma * (1.0 - done) * next_value
 
 

@@ -46,9 +46,7 @@ class PerceptronReadout(nn.Module):
     def __init__(self, graph: TokenGraph, net: NetConfig, outputs: int) -> None:
         super().__init__()
         self.tokens = graph.tokens
-        self.layers = perceptron(
-            graph.nodes * graph.features, net.hidden, outputs * graph.tokens
-        )
+        self.layers = perceptron(graph.nodes * graph.features, net.hidden, outputs * graph.tokens)
 
     def forward(self, features: Tensor, token: Tensor) -> Tensor:
         """(B, N, F), (B,) -> (B, outputs) of the token."""

@@ -54,15 +54,10 @@ class Policy:
             placed: (B, K) which tokens are placed.
             goals: (B, V, 2) corners of the targets.
         """
-        flags = torch.from_numpy(np.asarray(placed, np.float32))
+        flags = _tensor(placed)
         token = next_token(flags)
         with torch.inference_mode():
-            velocity, _ = self._actor(
-                torch.from_numpy(np.asarray(corners, np.float32)),
-                flags,
-                torch.from_numpy(np.asarray(goals, np.float32)),
-                token,
-            )
+            velocity, _ = self._actor(_tensor(corners), flags, _tensor(goals), token)
         action: Singles = velocity.numpy()
         if self.tokens == 1:
             return action
@@ -88,3 +83,8 @@ class Policy:
             else:
                 velocity += self.config.noise * generator.standard_normal(3)
         return np.clip(actions, -1.0, 1.0)
+
+
+def _tensor(array: Floats | Singles | Flags) -> torch.Tensor:
+    """A copy: arrays that came over the wire are read-only."""
+    return torch.from_numpy(np.array(array, np.float32))

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import dacite
 
 from tangram_agent.config import AgentConfig, NetConfig
+from tangram_sim.batch import action_size, corner_bound, horizon
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import Layout, TokensConfig, make_layout
@@ -37,12 +38,17 @@ class Setup:
     @property
     def horizon(self) -> int:
         """T: actions in one episode."""
-        return self.layout.tokens * self.sim.actions_per_token
+        return horizon(self.layout.tokens, self.sim)
 
     @property
     def action_size(self) -> int:
         """A: x, y and angular velocity, with more than one token its number before them."""
-        return 3 if self.layout.tokens == 1 else 4
+        return action_size(self.layout.tokens)
+
+    @property
+    def bound(self) -> float:
+        """The largest |coordinate| that a corner can reach."""
+        return corner_bound(self.sim)
 
     def fingerprints(self) -> dict[str, str]:
         """A digest of each section: two processes with the same ones play the same task."""

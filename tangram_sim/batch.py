@@ -44,6 +44,20 @@ def action_size(tokens: int) -> int:
     return 3 if tokens == 1 else 4
 
 
+def horizon(tokens: int, sim: SimConfig) -> int:
+    """T: the actions of an episode, which is over when every token has had its own."""
+    return tokens * sim.actions_per_token
+
+
+def corner_bound(sim: SimConfig) -> float:
+    """The largest |coordinate| that a corner can reach in an episode, arena units.
+
+    A start lies inside the arena, and each action moves a token by at most the arena's width in x
+    and in y; turning keeps a corner within the start's margin for every angle.
+    """
+    return sim.arena * (0.5 + sim.actions_per_token) * _ROUNDING
+
+
 def chosen_tokens(actions: Floats, tokens: int) -> Ints:
     """(B,) the token that each action (B, A) moves: the first entry cuts [-1, 1] into K parts."""
     if tokens == 1:
@@ -90,11 +104,9 @@ class BatchedEnv:
         self._reward = reward
         self.reward_fn = make_reward(reward, layout, sim)
         self.count = count
-        self.horizon = layout.tokens * sim.actions_per_token
+        self.horizon = horizon(layout.tokens, sim)
         self.action_size = action_size(layout.tokens)
-        # A start lies inside the arena, and each action moves a token by at most the arena's
-        # width in x and in y; turning keeps a corner within the start's margin for every angle.
-        self.bound = sim.arena * (0.5 + sim.actions_per_token) * _ROUNDING
+        self.bound = corner_bound(sim)
         self._worlds = [make_world(layout, sim) for _ in range(count)]
         self._pictures: list[Pixels] = []
         self._moves: Ints = np.zeros((count, layout.tokens), dtype=np.int64)

@@ -5,6 +5,7 @@ Tokens are drawn filled over the pale target; whole episodes come as contact she
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -137,7 +138,9 @@ def contact_sheet(
     return sheet
 
 
-def save_gif(images: Sequence[Image.Image], path: Path, milliseconds: int = 400) -> None:
+def save_gif(
+    images: Sequence[Image.Image], target: Path | BinaryIO, milliseconds: int = 400
+) -> None:
     """An endless animation, every picture shown for `milliseconds`.
 
     Raises:
@@ -150,7 +153,13 @@ def save_gif(images: Sequence[Image.Image], path: Path, milliseconds: int = 400)
     palette = strip.quantize(128, dither=Image.Dither.NONE)
     frames = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     frames[0].save(
-        path, save_all=True, append_images=frames[1:], duration=milliseconds, loop=0, disposal=1
+        target,
+        format="GIF",
+        save_all=True,
+        append_images=frames[1:],
+        duration=milliseconds,
+        loop=0,
+        disposal=1,
     )
 
 

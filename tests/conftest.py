@@ -1,6 +1,10 @@
 """Rules that hold for every test."""
 
 import pytest
+import torch
+
+# The sizes are small: a second thread costs more than it brings, the more so on a busy machine.
+torch.set_num_threads(1)
 
 TIERS = ("fast", "cluster", "slow")
 

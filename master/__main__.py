@@ -1,0 +1,7 @@
+"""`python -m master` is tangram-master."""
+
+import sys
+
+from master.cli import master
+
+sys.exit(master())

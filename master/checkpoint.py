@@ -1,0 +1,76 @@
+"""Checkpoints of a whole run: what is in one, and going on from the newest that is whole."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from master.record import Record
+from master.trainer import Trainer
+from tangram_agent.checkpoints import (
+    Checkpoint,
+    CorruptError,
+    list_checkpoints,
+    load_checkpoint,
+    save_checkpoint,
+    set_aside,
+)
+from tangram_sim.errors import RunError
+
+
+def save_run(
+    folder: Path, trainer: Trainer, record: Record, hub: Mapping[str, Any], keep: int
+) -> Path:
+    """Write a checkpoint from which `restore_run` goes on.
+
+    Args:
+        folder: of all checkpoints.
+        trainer: networks, replay, counters and generators.
+        record: what the run has been through.
+        hub: the hub's table of what was inserted, so that nothing is inserted twice.
+        keep: newest checkpoints that stay.
+
+    Raises:
+        RunError: the weights are not finite, or the folder cannot be written.
+    """
+    arrays, counters = trainer.state()
+    counters |= {"record": record.state(), "hub": dict(hub)}
+    return save_checkpoint(folder, trainer.updates, arrays, counters, keep)
+
+
+def restore_run(
+    folder: Path, trainer: Trainer, warn: Callable[[str], None]
+) -> tuple[Record, dict[str, Any]] | None:
+    """Take over the newest checkpoint that is whole; corrupt ones are renamed, with a warning.
+
+    Returns:
+        The record and the hub's state, or None where there is nothing to go on from.
+
+    Raises:
+        RunError: the checkpoint is of another format, task or network.
+    """
+    found = _newest_whole(folder, warn)
+    if found is None:
+        return None
+    try:
+        trainer.load_state(found.arrays, found.counters)
+        return Record.of(found.counters["record"]), dict(found.counters["hub"])
+    except RunError as error:
+        raise RunError(f"cannot go on from {found.path}: {error}") from None
+    except (KeyError, TypeError, ValueError) as error:
+        raise RunError(
+            f"cannot go on from {found.path}: its content is not that of a run "
+            f"({type(error).__name__}: {error}); start a new run with another run_dir"
+        ) from error
+
+
+def _newest_whole(folder: Path, warn: Callable[[str], None]) -> Checkpoint | None:
+    for path in reversed(list_checkpoints(folder)):
+        try:
+            return load_checkpoint(path)
+        except CorruptError as error:
+            aside = set_aside(path)
+            warn(
+                f"warning: checkpoint {path} is corrupt ({error.why}): it is {aside.name} now, and "
+                "the one before is taken"
+            )
+    return None

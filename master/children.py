@@ -1,0 +1,156 @@
+"""Child processes that end with their parent, and are started again when they fail."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Thread
+
+from tangram_agent.lifeline import Lifeline
+
+# A process that lived for so long starts with a clean record.
+STEADY_S = 60.0
+MAX_RESTARTS = 5
+FIRST_DELAY_S = 0.5
+MAX_DELAY_S = 30.0
+USAGE_STATUS = 2
+TAIL_LINES = 12
+THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@dataclass(eq=False)
+class Child:
+    """One process, or several one after another in the same place.
+
+    Attributes:
+        name: for messages.
+        arguments: of this Python.
+        log: file that its output is appended to, None for the terminal.
+        nice: added to its niceness.
+        restarts: in a row, without a steady time between.
+        next_start_s: monotonic time of the next start, None while nothing is planned.
+    """
+
+    name: str
+    arguments: Sequence[str]
+    log: Path | None = None
+    nice: int = 0
+    restarts: int = 0
+    next_start_s: float | None = 0.0
+    _process: "subprocess.Popen[bytes] | None" = field(default=None, init=False)
+    _lifeline: Lifeline | None = field(default=None, init=False)
+    _started_s: float = field(default=0.0, init=False)
+
+    @property
+    def alive(self) -> bool:
+        """Whether a process runs here."""
+        return self._process is not None and self._process.poll() is None
+
+    def start(self, ended: Callable[["Child"], None]) -> None:
+        """Start a process; `ended` is called with this, in another thread, when it ends."""
+        self.next_start_s, self._started_s = None, time.monotonic()
+        self._lifeline = Lifeline()
+        output = None if self.log is None else self.log.open("ab")
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, *self.arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                env=self._lifeline.environment(environment()),
+                pass_fds=[self._lifeline.read_end],
+                # Ctrl-C reaches the whole terminal; the parent decides who ends when.
+                start_new_session=True,
+            )
+        finally:
+            self._lifeline.started()
+            if output is not None:
+                output.close()
+        self._be_nice()
+        Thread(target=self._wait, args=(self._process, ended), daemon=True).start()
+
+    def clear(self) -> int:
+        """Forget a process that has ended; returns its exit status, 0 where there is none."""
+        status = 0 if self._process is None else self._process.wait()
+        if self._lifeline is not None:
+            self._lifeline.cut()
+        self._process, self._lifeline = None, None
+        return status
+
+    def plan_restart(self, status: int) -> bool:
+        """Plan the next start with a growing delay; False to give up.
+
+        Status 2 is wrong input, which does not mend itself.
+        """
+        now_s = time.monotonic()
+        if now_s - self._started_s >= STEADY_S:
+            self.restarts = 0
+        if status == USAGE_STATUS or self.restarts >= MAX_RESTARTS:
+            return False
+        delay_s = min(FIRST_DELAY_S * 2.0**self.restarts, MAX_DELAY_S)
+        self.restarts += 1
+        self.next_start_s = now_s + delay_s
+        return True
+
+    def tell(self, line: str) -> bool:
+        """Send a line to the process; False where it cannot take it."""
+        return self._lifeline is not None and self._lifeline.tell(line)
+
+    def signal(self, number: signal.Signals) -> None:
+        """Send a signal, if the process still runs."""
+        if self._process is not None:
+            self._process.send_signal(number)
+
+    def tail(self) -> str:
+        """The last lines of its log."""
+        if self.log is None or not self.log.exists():
+            return ""
+        lines = self.log.read_text(encoding="utf-8", errors="replace").splitlines()
+        return "\n".join(lines[-TAIL_LINES:])
+
+    def _wait(self, process: "subprocess.Popen[bytes]", ended: Callable[["Child"], None]) -> None:
+        process.wait()
+        ended(self)
+
+    def _be_nice(self) -> None:
+        if self.nice and self._process is not None:
+            try:
+                current = os.getpriority(os.PRIO_PROCESS, self._process.pid)
+                os.setpriority(os.PRIO_PROCESS, self._process.pid, current + self.nice)
+            except ProcessLookupError:
+                return  # ended already; the waiting thread tells
+
+
+def describe(status: int) -> str:
+    """An exit status in words."""
+    if status >= 0:
+        return f"status {status}"
+    try:
+        return signal.Signals(-status).name
+    except ValueError:
+        return f"signal {-status}"
+
+
+def module(name: str) -> list[str]:
+    """Run a module of this installation, not one of that name in the current folder."""
+    return ["-P", "-m", name]
+
+
+def override(name: str, value: str) -> str:
+    """A setting whose value may hold anything, such as a path with blanks or `=`."""
+    escaped = value.replace("'", "\\'")
+    return f"{name}='{escaped}'"
+
+
+def environment() -> dict[str, str]:
+    """One thread each, since several processes share the cores, and the same packages as here."""
+    variables = dict.fromkeys(THREADS, "1") | dict(os.environ)
+    if (ROOT / "pyproject.toml").exists():  # a source tree, which need not be installed
+        paths = [variables.get("PYTHONPATH", ""), str(ROOT)]
+        variables["PYTHONPATH"] = os.pathsep.join(path for path in paths if path)
+    return variables | {"PYTHONUNBUFFERED": "1"}

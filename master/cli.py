@@ -1,0 +1,59 @@
+"""The commands tangram-train and tangram-master.
+
+Everything heavy is imported after the config was composed, so --help and wrong input are instant.
+"""
+
+from pathlib import Path
+
+from conf.cli import entry
+from conf.help import Plain
+
+
+def train() -> int:
+    """tangram-train: a master, an evaluator and workers on this machine."""
+    return entry("train", _train)
+
+
+def master() -> int:
+    """tangram-master: the one process that learns."""
+    return entry("master", _master)
+
+
+def _train(settings: Plain) -> int:
+    from master.config import LaunchConfig, MasterConfig
+    from tangram_agent.setup import SECTIONS, from_mapping, make_setup
+
+    settings["run_dir"] = absolute(settings["run_dir"])
+    rest = {name: value for name, value in settings.items() if name not in SECTIONS}
+    workers = rest.pop("workers", None)
+    config = from_mapping(
+        LaunchConfig, {"workers": workers, "master": from_mapping(MasterConfig, rest)}
+    )
+    # The children check it again; a wrong task is refused before any of them starts.
+    _ = make_setup(settings).layout
+
+    from master.launch import run_training
+
+    return run_training(config, settings)
+
+
+def _master(settings: Plain) -> int:
+    from master.config import MasterConfig
+    from tangram_agent.setup import SECTIONS, from_mapping, make_setup
+
+    settings["run_dir"] = absolute(settings["run_dir"])
+    rest = {name: value for name, value in settings.items() if name not in SECTIONS}
+    config = from_mapping(MasterConfig, rest)
+    setup = make_setup(settings)
+    _ = setup.layout
+
+    from master.loop import run_master
+
+    return run_master(config, setup, settings)
+
+
+def absolute(run_dir: object) -> object:
+    """The run folder seen from where the command was started; what is no text is left alone."""
+    if not isinstance(run_dir, str) or not run_dir.strip():
+        return run_dir
+    return str(Path(run_dir).expanduser().absolute())

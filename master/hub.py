@@ -1,0 +1,318 @@
+"""The master's sockets: ROUTER for episodes, scores and control, PUB for weights.
+
+Whatever a peer sends, `poll` does not raise: what is wrong is answered with a reason, counted by
+name, and forgotten. A peer that does not read its answers loses them and nobody waits for it: the
+worker asks again.
+
+Delivery: see `peers`. A batch is acknowledged only by `acknowledge`, after its insert (a journal
+has its place between the two), and the unacknowledged batches of one peer are bounded by `window`.
+"""
+
+import logging
+import secrets
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+from master.ledger import Verdict
+from master.peers import FullError, Peer, Registry, SupersededError, differing
+from master.sockets import Sockets
+from tangram_agent.decoding import BatchError, decode_from_worker
+from tangram_agent.frames import ProtocolError
+from tangram_agent.payloads import EpisodeSpec, encode_weights
+from tangram_agent.types import Episodes, Weights
+from tangram_agent.wire import (
+    Ack,
+    Alive,
+    Bye,
+    EpisodeBatch,
+    Greet,
+    Heartbeat,
+    Hello,
+    Plain,
+    Refused,
+    Reject,
+    Scores,
+    Stop,
+    ToMaster,
+    WantWeights,
+    WeightsMessage,
+    Welcome,
+)
+from tangram_sim.errors import WireError
+
+log = logging.getLogger(__name__)
+
+# Most messages taken in one poll, so that the loop gets its turn under any load.
+MAX_DRAIN = 256
+
+
+@dataclass(frozen=True)
+class WelcomeInfo:
+    """What the master tells, and asks of, a process that joins.
+
+    Attributes:
+        run_id: of the run.
+        seed: of the run.
+        fingerprints: section of the settings -> digest; a worker's must be equal.
+        spec: the task that arrays are checked against.
+        window: most unacknowledged batches of one peer.
+    """
+
+    run_id: str
+    seed: int
+    fingerprints: Mapping[str, str]
+    spec: EpisodeSpec
+    window: int = 4
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodesArrived:
+    """A new batch that waits for its insert; its arrays are read-only."""
+
+    role: str
+    index: int
+    incarnation: int
+    sequence: int
+    weights_version: int
+    episodes: Episodes
+
+
+@dataclass(frozen=True, eq=False)
+class ScoresArrived:
+    """Results of an evaluator."""
+
+    index: int
+    incarnation: int
+    scores: Scores
+
+
+Arrival = EpisodesArrived | ScoresArrived
+
+
+class Hub:
+    """The master's end of all conversations.
+
+    Attributes:
+        endpoint: of the ROUTER socket, as bound.
+        weights_endpoint: of the PUB socket, as bound.
+        epoch: random id of this life of the master.
+        counters: traffic and refusals by name.
+    """
+
+    def __init__(self, bind: str, port: int, info: WelcomeInfo, silence_s: float = 30.0) -> None:
+        self.counters: Counter[str] = Counter()
+        self.epoch = secrets.token_hex(8)
+        self._info, self._silence_s = info, silence_s
+        self._registry = Registry(silence_s)
+        self._weights: bytes | None = None
+        self._version = -1
+        self._stop_reason: str | None = None
+        self._sockets = Sockets(bind, port, self.counters)
+        self.endpoint = self._sockets.endpoint
+        self.weights_endpoint = self._sockets.weights_endpoint
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def peers(self) -> list[Peer]:
+        """Processes that take part, by role and index."""
+        return self._registry.peers
+
+    def poll(self, timeout_s: float) -> list[Arrival]:
+        """Wait for a message, then take and answer what is there.
+
+        Returns:
+            New batches and scores, in the order of their arrival.
+        """
+        arrivals: list[Arrival] = []
+        if self._sockets.wait(timeout_s):
+            for _ in range(MAX_DRAIN):
+                received = self._sockets.receive()
+                if received is None:
+                    break
+                arrivals.extend(self._receive(*received))
+            else:  # more is waiting, perhaps from those who seem silent
+                return arrivals
+        for peer in self._registry.drop_silent(time.monotonic(), self._silence_s):
+            self._count("lost_peers", f"{peer.name} was silent for {self._silence_s:g} s")
+        return arrivals
+
+    def acknowledge(self, arrival: EpisodesArrived) -> None:
+        """Tell the worker that its batch is safe; once for each arrival, after its insert."""
+        key = (arrival.role, arrival.index)
+        ledger = self._registry.ledger(key, arrival.incarnation)
+        if ledger is None or arrival.sequence not in ledger.held:
+            return  # a newer process has the index, so nobody waits for this answer
+        ledger.held.discard(arrival.sequence)
+        peer = self._registry.at(key)
+        if peer is not None:
+            peer.batches += 1
+            peer.episodes += arrival.episodes.count
+            peer.transitions += arrival.episodes.transitions
+            self._send(peer.identity, Ack(arrival.sequence, duplicate=False))
+
+    def publish(self, weights: Weights) -> None:
+        """Broadcast weights, and keep them for those who join later.
+
+        Raises:
+            WireError: they are not finite or too large; nothing is sent.
+        """
+        self._weights, self._version = encode_weights(self.epoch, weights), weights.version
+        self._sockets.publish(self._weights)
+        self.counters["published"] += 1
+
+    def stop(self, reason: str) -> None:
+        """Tell all peers to end, and from now on whoever says anything.
+
+        They leave with BYE: poll until `peers` is empty or your patience ends.
+        """
+        self._stop_reason = reason
+        for peer in self.peers:
+            self._send(peer.identity, Stop(reason))
+
+    def state(self) -> dict[str, dict[str, int]]:
+        """The table of duplicates, for a checkpoint."""
+        return self._registry.state()
+
+    def load_state(self, state: Mapping[str, Mapping[str, int]]) -> None:
+        """Take the table of duplicates of a checkpoint, before the first poll.
+
+        Raises:
+            RunError: malformed.
+        """
+        self._registry.load_state(state, time.monotonic())
+
+    def close(self) -> None:
+        """Close the sockets; answers that are on their way get a second."""
+        self._sockets.close()
+
+    def _receive(self, identity: bytes, frames: Sequence[bytes]) -> Sequence[Arrival]:
+        try:
+            message = decode_from_worker(frames, self._info.spec)
+        except ProtocolError as error:
+            self._refuse(identity, "refused_protocol", Refused(str(error)))
+        except BatchError as error:
+            self._broken_batch(identity, error)
+        except WireError as error:
+            reject = Reject(reason=str(error), sequence=0, final=True)
+            self._refuse(identity, "malformed", reject)
+        else:
+            return self._dispatch(identity, message)
+        return ()
+
+    def _dispatch(self, identity: bytes, message: ToMaster) -> Sequence[Arrival]:
+        peer = self._registry.find(identity)
+        if isinstance(message, Bye):
+            self.counters["byes"] += 1
+            if peer is not None:
+                self._registry.leave(peer)
+        elif self._stop_reason is not None:
+            self._send(identity, Stop(self._stop_reason))
+        elif isinstance(message, Hello):
+            self._hello(identity, message)
+        elif peer is None:
+            self._refuse(identity, "strangers", Greet())
+        else:
+            peer.last_seen = time.monotonic()
+            return self._talk(peer, message)
+        return ()
+
+    def _talk(self, peer: Peer, message: Any) -> Sequence[Arrival]:
+        match message:
+            case EpisodeBatch():
+                return self._batch(peer, message)
+            case Scores():
+                self.counters["scores"] += 1
+                return [ScoresArrived(peer.index, peer.incarnation, message)]
+            case Heartbeat(stats):
+                self.counters["heartbeats"] += 1
+                peer.stats = dict(stats)
+                self._send(peer.identity, Alive(self._version))
+            case WantWeights(epoch, version):
+                if self._weights is not None and (epoch, version) != (self.epoch, self._version):
+                    self._sockets.send(peer.identity, WeightsMessage.wrap(self._weights))
+        return ()
+
+    def _hello(self, identity: bytes, hello: Hello) -> None:
+        odd = differing(self._info.fingerprints, hello.fingerprints)
+        if odd:
+            counter = "refused_tokens" if "tokens" in odd else "refused_settings"
+            listed = ", ".join(odd)
+            reason = (
+                f"its settings of {listed} differ from the master's: start both with the same "
+                f"overrides of {listed}"
+            )
+            self._refuse(identity, counter, Refused(reason))
+            return
+        try:
+            peer, older = self._registry.admit(identity, hello, time.monotonic())
+        except SupersededError as error:
+            self._refuse(identity, "superseded", Stop(str(error)))
+            return
+        except FullError as error:
+            self._refuse(identity, "refused_full", Refused(str(error)))
+            return
+        if older is not None:
+            reason = f"{peer.name} was taken over by a newer process"
+            self._refuse(older.identity, "superseded", Stop(reason))
+        self.counters["welcomed"] += 1
+        self.counters["lost_batches"] = self._registry.lost_batches
+        self._send(identity, self._welcome(peer))
+
+    def _welcome(self, peer: Peer) -> Welcome:
+        return Welcome(
+            epoch=self.epoch,
+            run_id=self._info.run_id,
+            seed=self._info.seed,
+            index=peer.index,
+            incarnation=peer.incarnation,
+            weights_endpoint=self.weights_endpoint,
+            window=self._info.window,
+        )
+
+    def _batch(self, peer: Peer, batch: EpisodeBatch) -> Sequence[Arrival]:
+        verdict = peer.ledger.judge(batch.sequence, self._info.window)
+        if verdict is not Verdict.NEW:
+            self.counters[verdict.value] += 1
+            answer = peer.ledger.answer(verdict, batch.sequence)
+            if answer is not None:
+                self._send(peer.identity, answer)
+            return ()
+        peer.ledger.take(batch.sequence)
+        peer.weights_version = batch.weights_version
+        self.counters["batches"] += 1
+        self.counters["episodes"] += batch.episodes.count
+        key = (peer.role, peer.index, peer.incarnation)
+        return [EpisodesArrived(*key, batch.sequence, batch.weights_version, batch.episodes)]
+
+    def _broken_batch(self, identity: bytes, error: BatchError) -> None:
+        peer = self._registry.find(identity)
+        if peer is None:
+            self._refuse(identity, "strangers", Greet())
+            return
+        final = peer.ledger.judge(error.sequence, self._info.window) is Verdict.NEW
+        if final:  # it must not come again, and those after it need not wait for it
+            peer.ledger.consume(error.sequence)
+        reason = f"{peer.name}: batch {error.sequence}: {error}"
+        answer = Reject(reason=reason, sequence=error.sequence, final=final)
+        self._refuse(identity, "rejected", answer)
+
+    def _refuse(self, identity: bytes, counter: str, answer: Plain) -> None:
+        self._count(counter, getattr(answer, "reason", "a connection without HELLO"))
+        self._send(identity, answer)
+
+    def _count(self, counter: str, reason: str) -> None:
+        self.counters[counter] += 1
+        count = self.counters[counter]
+        if count & (count - 1) == 0:  # the 1st, 2nd, 4th, ...: a flood must not fill the log
+            log.warning("%s (number %d): %s", counter, count, reason)
+
+    def _send(self, identity: bytes, answer: Plain) -> None:
+        self._sockets.send(identity, answer.encode())

@@ -1,0 +1,245 @@
+"""The master: one process, one loop, from what workers played to the weights they play with."""
+
+import sys
+import time
+from collections import deque
+from collections.abc import Mapping
+from contextlib import closing
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+import torch
+
+from master.checkpoint import save_run
+from master.config import MasterConfig
+from master.console import sturdy_console
+from master.hub import EpisodesArrived, ScoresArrived
+from master.metrics import Metrics
+from master.parts import Parts, make_parts
+from master.progress import make_progress, notices_from
+from master.record import Clock
+from master.report import Every, Reporter, scores_picture
+from master.result import make_result, show_result
+from master.rundir import RunFolder
+from master.signals import StopSignals
+from tangram_agent import lifeline
+from tangram_agent.setup import Setup
+from tangram_agent.wire import Scores
+
+# Between two looks at the sockets: learning goes on for so long, or idleness lasts.
+LEARN_S = 0.05
+IDLE_S = 0.05
+# A clean end after the parent's death; a large replay takes seconds to write.
+GRACE_S = 30.0
+# At the end: for the scores of the final weights, the same after a signal, and for goodbyes.
+SCORES_S = 60.0
+SIGNALLED_SCORES_S = 8.0
+LEAVE_S = 5.0
+MINUTE_S = 60.0
+PICTURE_PIXELS = 240
+
+
+def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) -> int:
+    """Learn until a bound is reached or a signal comes, and leave a finished run folder.
+
+    Args:
+        config: the master's settings.
+        setup: the task and the agent.
+        resolved: the whole config as plain values, for config.yaml.
+
+    Returns:
+        Exit status 0, also after SIGINT and SIGTERM.
+
+    Raises:
+        TangramError: the folder, the port or a checkpoint cannot be used, or the weights are no
+            longer finite.
+    """
+    news: SimpleQueue[str] = SimpleQueue()
+    launched = lifeline.watch(news.put, GRACE_S)
+    torch.set_num_threads(config.service.threads)
+    folder, console = RunFolder(config.run_dir), sturdy_console(sys.stdout)
+    folder.prepare(config.resume)
+    with folder.lock(), StopSignals() as signals:
+        if not launched:  # the launcher wrote it, with settings of its own
+            folder.write_config(resolved)
+        with (
+            closing(make_progress(console, f"tangram · {folder.path.name}")) as progress,
+            notices_from("master", progress),
+            closing(make_parts(config, setup, folder, progress.notice)) as parts,
+            closing(Metrics(folder.tensorboard, parts.trainer.updates)) as metrics,
+            closing(
+                Loop(parts, Reporter(progress, metrics, config.service), signals, news)
+            ) as loop,
+        ):
+            metrics.settings(resolved)
+            reason = loop.run()
+            loop.finish(launched)
+            result = make_result(parts, reason, loop.clock.wall_s())
+            folder.write_result(result)
+            metrics.hyperparameters(resolved, parts.record.scores)
+            loop.dismiss(f"the run has ended ({reason})")
+    show_result(console, folder, result)
+    return 0
+
+
+class Loop:
+    """Moves the parts until a bound or a signal ends it; `news` are a launcher's lines.
+
+    Attributes:
+        parts: of the run.
+        clock: adds up its time.
+    """
+
+    def __init__(
+        self, parts: Parts, reporter: Reporter, signals: StopSignals, news: "SimpleQueue[str]"
+    ) -> None:
+        service = parts.config.service
+        self.parts, self.clock = parts, Clock(parts.record)
+        self._reporter, self._signals, self._news = reporter, signals, news
+        self._arrived: deque[EpisodesArrived] = deque()
+        self._latest: Scores | None = None
+        self._published, self._dismissed = -1, False
+        self._publish = Every(service.publish_seconds)
+        self._checkpoint = Every(service.checkpoint_minutes * MINUTE_S)
+
+    def run(self) -> str:
+        """Learn until a bound or a signal ends it; returns which."""
+        self.publish()
+        self.parts.folder.write_connection(self.parts.connection())
+        while (reason := self.over()) is None:
+            self.receive(0.0 if self.parts.trainer.pace.may_update() else IDLE_S)
+            self.clock.advance(training=self.parts.trainer.episodes > 0)
+            self.insert()
+            self.learn()
+            if self._publish.due():
+                self.publish()
+            if self._checkpoint.due():
+                self.save()
+            self.tell()
+        return reason
+
+    def over(self) -> str | None:
+        """Why the loop ends now, or None."""
+        if self._signals.reason is not None:
+            return self._signals.reason
+        parts, trainer = self.parts, self.parts.trainer
+        reason = parts.budget.spent(parts.record.loop_s, trainer.updates)
+        if reason is None and not parts.budget.takes_episodes(trainer.episodes):
+            # The updates that these episodes are worth come first.
+            return (
+                None if trainer.pace.may_update() else f"max_episodes={parts.budget.max_episodes}"
+            )
+        return reason
+
+    def receive(self, patience_s: float) -> None:
+        """Take what has arrived, and answer the peers."""
+        parts = self.parts
+        for arrival in parts.hub.poll(patience_s):
+            if isinstance(arrival, ScoresArrived):
+                self._latest = arrival.scores
+                parts.record.score(arrival.scores.scalars, arrival.scores.weights_version)
+                self._reporter.scored(arrival.scores, parts)
+            else:
+                self._arrived.append(arrival)
+        parts.record.workers = max(parts.record.workers, parts.count("player"))
+
+    def insert(self) -> None:
+        """Move batches into the replay while the learner keeps up; senders of others wait."""
+        trainer, budget = self.parts.trainer, self.parts.budget
+        while (
+            self._arrived and trainer.pace.may_insert() and budget.takes_episodes(trainer.episodes)
+        ):
+            arrival = self._arrived.popleft()
+            trainer.insert(arrival.episodes)
+            # Only now: a worker forgets what is acknowledged.
+            self.parts.hub.acknowledge(arrival)
+            self._reporter.inserted(arrival, trainer.updates)
+
+    def learn(self) -> None:
+        """Updates that are due, for a short while, so that the sockets are served in between."""
+        parts, trainer = self.parts, self.parts.trainer
+        until_s = time.monotonic() + LEARN_S
+        while trainer.pace.may_update() and time.monotonic() < until_s:
+            if parts.budget.spent(parts.record.loop_s, trainer.updates):
+                return
+            self._reporter.updated(trainer.update(parts.share))
+            if parts.config.service.every_update:
+                self.publish()
+
+    def publish(self) -> None:
+        """Send the acting weights, unless these were sent before.
+
+        Raises:
+            RunError: they are not finite; nothing was sent.
+        """
+        if self.parts.trainer.updates > self._published:
+            weights = self.parts.trainer.weights()
+            self.parts.hub.publish(weights)
+            self._published = weights.version
+            self._reporter.published(weights.version)
+
+    def save(self) -> Path:
+        """Write a checkpoint."""
+        parts = self.parts
+        parts.record.wall_s = self.clock.wall_s()
+        keep = parts.config.service.keep_checkpoints
+        state = parts.hub.state()
+        return save_run(parts.folder.checkpoints, parts.trainer, parts.record, state, keep)
+
+    def tell(self) -> None:
+        """Show where the run stands."""
+        while not self._news.empty():
+            self._reporter.progress.notice(self._news.get())
+        self._reporter.tick(self.parts)
+
+    def finish(self, launched: bool) -> None:
+        """Send and keep the final weights, have them scored, draw the test episodes.
+
+        Args:
+            launched: an evaluator is known to come, even if it has not joined yet.
+
+        Raises:
+            RunError: the final weights are not finite, or the disk is full.
+        """
+        self.publish()
+        # Before anything that takes time: what was learned is safe from here on.
+        self.save()
+        self._wait_for_scores(launched)
+        self.tell()
+        self._reporter.flush(self.parts)
+        if self._latest is not None and len(self._latest.ends):
+            picture = scores_picture(self._latest, self.parts.setup, PICTURE_PIXELS)
+            picture.save(self.parts.folder.picture)
+
+    def dismiss(self, reason: str) -> None:
+        """Send all peers home and wait a moment for them to leave."""
+        self._dismissed = True
+        # First: it would bring new ones, and a launcher restarts who ends while it is there.
+        self.parts.folder.connection.unlink(missing_ok=True)
+        hub, until_s = self.parts.hub, time.monotonic() + LEAVE_S
+        hub.stop(reason)
+        while hub.peers and time.monotonic() < until_s:
+            hub.poll(IDLE_S)
+
+    def close(self) -> None:
+        """Let nobody wait for a master that failed."""
+        if not self._dismissed:
+            self.dismiss("the master failed")
+
+    def _wait_for_scores(self, launched: bool) -> None:
+        """Bounded, and not where nobody could score the weights."""
+        parts, signalled = self.parts, self._signals.reason is not None
+        limit_s = SCORES_S + parts.config.service.eval_seconds
+        until_s = time.monotonic() + (SIGNALLED_SCORES_S if signalled else limit_s)
+        told = False
+        while parts.record.scored_version != parts.trainer.updates and time.monotonic() < until_s:
+            hurried = self._signals.reason is not None and not signalled
+            hopeless = not parts.count("evaluator") and (signalled or not launched)
+            if hurried or hopeless:
+                return
+            if not told:
+                self._reporter.progress.notice("waiting for the scores of the final weights")
+                told = True
+            self.receive(IDLE_S)
+            self.tell()

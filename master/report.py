@@ -1,0 +1,150 @@
+"""What goes on in the loop, told to the user and to TensorBoard at bounded rates."""
+
+import time
+from collections import OrderedDict
+from collections.abc import Mapping
+
+import numpy as np
+from PIL import Image
+
+from master.budget import Rates
+from master.hub import EpisodesArrived
+from master.metrics import Means, Metrics
+from master.parts import Parts
+from master.progress import Progress, Status
+from master.trainer import Trainer
+from tangram_agent.config import ServiceConfig
+from tangram_agent.setup import Setup
+from tangram_agent.wire import Scores
+from tangram_sim.drawing import episode_sheet
+
+REMEMBERED_VERSIONS = 4096
+PICTURE_COLUMNS = 4
+CURVE_PIXELS = 120
+PICTURE_S = 30.0
+TICK_S = 0.1
+
+
+class Every:
+    """True at most once in an interval."""
+
+    def __init__(self, seconds: float, at_once: bool = False) -> None:
+        self._seconds = seconds
+        self._next_s = 0.0 if at_once else time.monotonic() + seconds
+
+    def due(self) -> bool:
+        """Whether the interval has passed; starts the next one if so."""
+        now_s = time.monotonic()
+        if now_s < self._next_s:
+            return False
+        self._next_s = now_s + self._seconds
+        return True
+
+
+class Reporter:
+    """Collects what happens between two reports."""
+
+    def __init__(self, progress: Progress, metrics: Metrics, service: ServiceConfig) -> None:
+        self.progress, self.metrics = progress, metrics
+        self._losses, self._play = Means(), Means()
+        self._rates = Rates()
+        self._tick = Every(TICK_S, at_once=True)
+        self._log, self._picture = Every(service.log_seconds), Every(PICTURE_S, at_once=True)
+        self._published: OrderedDict[int, float] = OrderedDict()
+
+    def published(self, version: int) -> None:
+        """Note when weights were sent, to tell the age of those that played a batch."""
+        self._published.setdefault(version, time.monotonic())
+        while len(self._published) > REMEMBERED_VERSIONS:
+            self._published.popitem(last=False)
+
+    def updated(self, losses: Mapping[str, float]) -> None:
+        """Note one update."""
+        self._losses.add(losses)
+
+    def inserted(self, arrival: EpisodesArrived, updates: int) -> None:
+        """Note a batch that went into the replay."""
+        episodes = arrival.episodes
+        values = {
+            "play/reward": float(np.mean(episodes.rewards[:, -1])),
+            "weights/age_updates": float(updates - arrival.weights_version),
+        }
+        sent_s = self._published.get(arrival.weights_version)
+        if sent_s is not None:
+            values["weights/age_seconds"] = time.monotonic() - sent_s
+        self._play.add(values, episodes.count)
+
+    def scored(self, scores: Scores, parts: Parts) -> None:
+        """Curves and a picture of an evaluation."""
+        values = {name: value for name, value in scores.scalars.items() if name != "episodes"}
+        updates = scores.weights_version
+        self.metrics.scores(values, updates, parts.trainer.episodes, parts.record.loop_s)
+        # Drawing takes time from learning.
+        if len(scores.ends) and self._picture.due():
+            picture = scores_picture(scores, parts.setup, CURVE_PIXELS)
+            self.metrics.picture(np.asarray(picture), updates)
+
+    def tick(self, parts: Parts) -> None:
+        """Show the state of the run, and write the curves when it is time."""
+        if not self._tick.due():
+            return
+        trainer = parts.trainer
+        self._rates.mark(time.monotonic(), trainer.transitions, trainer.updates, parts.share)
+        if self._log.due():
+            self.flush(parts)
+        else:
+            self.progress.show(self._status(parts))
+
+    def flush(self, parts: Parts) -> None:
+        """Write the curves now, and show what they say."""
+        self.progress.show(self._status(parts))
+        trainer, rates = parts.trainer, self._rates
+        values = {f"train/{name}": value for name, value in self._losses.take().items()}
+        values |= self._play.take()
+        values |= {
+            "run/episodes": trainer.episodes,
+            "run/seconds": parts.record.loop_s,
+            "run/budget_share": parts.share,
+            "run/workers": parts.count("player"),
+            "replay/fill": len(trainer.replay) / trainer.replay.capacity,
+            "rates/transitions_per_s": rates.transitions_per_s(),
+            "rates/updates_per_s": rates.updates_per_s(),
+            "pace/lag": trainer.pace.lag,
+        }
+        values |= {f"hub/{name}": value for name, value in parts.hub.counters.items()}
+        self.metrics.scalars(values, trainer.updates)
+
+    def _status(self, parts: Parts) -> Status:
+        trainer, rates, bounded = parts.trainer, self._rates, parts.budget.bounded
+        return Status(
+            episodes=trainer.episodes,
+            transitions=trainer.transitions,
+            updates=trainer.updates,
+            elapsed_s=parts.record.loop_s,
+            share=parts.share if bounded else None,
+            left_s=rates.left_s() if bounded else None,
+            transitions_per_s=rates.transitions_per_s(),
+            updates_per_s=rates.updates_per_s(),
+            players=parts.count("player"),
+            evaluators=parts.count("evaluator"),
+            activity=activity(trainer, parts.count("player")),
+            scores=parts.record.scores,
+        )
+
+
+def activity(trainer: Trainer, players: int) -> str:
+    """What happens, or what is waited for."""
+    pace, starts = trainer.pace, trainer.setup.agent.learning_starts
+    if pace.may_update():
+        return "learning, workers wait" if players and not pace.may_insert() else "learning"
+    if not players:
+        return "waiting for workers to join"
+    if pace.transitions < starts:
+        return f"filling the replay, {pace.transitions:,} of {starts:,}"
+    return "waiting for episodes"
+
+
+def scores_picture(scores: Scores, setup: Setup, pixels: int) -> Image.Image:
+    """The test episodes of an evaluation, each `pixels` wide, with its overlap."""
+    corners = (scores.starts, scores.ends, scores.goals)
+    return episode_sheet(setup.layout, setup.sim.arena, *corners, PICTURE_COLUMNS, pixels)

@@ -1,0 +1,156 @@
+"""What a run has come to: result.json and the last words to the user."""
+
+import os
+import platform
+import re
+import shlex
+import subprocess
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from master.children import override
+from master.parts import Parts
+from master.progress import duration
+from master.rundir import RunFolder
+
+PLAIN = re.compile(r"run_dir=[\w./-]+")
+ROOT = Path(__file__).resolve().parent.parent
+SCORES = (
+    "mean_reward",
+    "mean_reward_camera",
+    "raw_overlap",
+    "raw_overlap_p10",
+    "angle_error_deg_median",
+    "angle_error_deg_p90",
+    "position_error_median",
+    "position_error_p90",
+)
+PACKAGES = ("tangram-rl", "torch", "numpy", "pyzmq", "pybullet")
+
+
+def make_result(parts: Parts, reason: str, wall_s: float) -> dict[str, Any]:
+    """The content of result.json; scores are null where no evaluator was there.
+
+    `scored_updates` tells which weights the scores are of: the final ones if it equals `updates`.
+    """
+    record, setup, trainer = parts.record, parts.setup, parts.trainer
+    scored = record.scored_version >= 0
+    return {
+        **{name: record.scores.get(name) for name in SCORES},
+        "test_episodes": record.scores.get("episodes"),
+        "scored_updates": record.scored_version if scored else None,
+        "episodes": trainer.episodes,
+        "transitions": trainer.transitions,
+        "updates": trainer.updates,
+        "wall_s": round(wall_s, 3),
+        "train_s": round(record.train_s, 3),
+        "ended_by": reason,
+        "seed": parts.config.seed,
+        "agent": setup.agent.name,
+        "net": setup.net.kind,
+        "tokens": [shape.name for shape in setup.layout.shapes],
+        "actions_per_token": setup.sim.actions_per_token,
+        "reward": setup.reward.name,
+        "backend": setup.sim.backend,
+        "device": str(trainer.learner.device),
+        "workers": record.workers,
+        "parameters": trainer.learner.parameters,
+        "run_id": record.run_id,
+        "versions": versions(),
+        "commit": commit(),
+        "host": platform.node(),
+        "processor": processor(),
+        "cores": len(os.sched_getaffinity(0)),
+    }
+
+
+def show_result(console: Console, folder: RunFolder, result: Mapping[str, Any]) -> None:
+    """The final table, and where everything lies."""
+    table = Table(show_header=False, box=None, padding=(0, 2))
+    table.add_column(style="dim", no_wrap=True)
+    table.add_column(no_wrap=True)
+    for name, text in _rows(result):
+        table.add_row(name, text)
+    console.print()
+    console.print(table)
+    console.print()
+    paths = [("run folder", str(folder.path))]
+    if folder.picture.exists():
+        paths.append(("picture", str(folder.picture)))
+    paths += [
+        ("curves", f"tensorboard --logdir {shlex.quote(str(folder.tensorboard))}"),
+        ("watch it play", f"tangram-play {_run_argument(folder.path)} out=play.gif"),
+    ]
+    for name, text in paths:
+        # Long paths stay whole, so that they can be copied.
+        console.print(f"  {name:<15} {text}", soft_wrap=True, markup=False, highlight=False)
+
+
+def _run_argument(path: Path) -> str:
+    """What names the run on a command line; quoted for the shell and for the config if needed."""
+    plain = f"run_dir={path}"
+    return plain if PLAIN.fullmatch(plain) else shlex.quote(override("run_dir", str(path)))
+
+
+def _rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
+    rows = [
+        ("mean reward", f"{_text(result, 'mean_reward', '{:.3f}')} on exact polygons"),
+        ("", f"{_text(result, 'mean_reward_camera', '{:.3f}')} in the camera's pictures"),
+        ("raw overlap", _text(result, "raw_overlap", "{:.3f}")),
+        ("angle error", _text(result, "angle_error_deg_median", "{:.2f}°") + " (median)"),
+        ("position error", _text(result, "position_error_median", "{:.4f}") + " (median)"),
+    ]
+    if result["scored_updates"] is None:
+        rows = [("scores", "none: no evaluator took part")]
+    elif result["scored_updates"] != result["updates"]:
+        rows.append(("scored", f"weights after {result['scored_updates']:,} updates"))
+    return [
+        *rows,
+        ("episodes", f"{result['episodes']:,}"),
+        ("updates", f"{result['updates']:,}"),
+        ("time", f"{duration(result['train_s'])} of training, {duration(result['wall_s'])} in all"),
+        ("ended by", result["ended_by"]),
+    ]
+
+
+def _text(result: Mapping[str, Any], name: str, pattern: str) -> str:
+    value = result[name]
+    return "-" if value is None else pattern.format(value)
+
+
+def versions() -> dict[str, str]:
+    """Python and the packages that decide the numbers."""
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def commit(root: Path = ROOT) -> str | None:
+    """The commit of the source tree that runs, `-dirty` if it was changed; None elsewhere."""
+    if not (root / ".git").exists():
+        return None
+    command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=40"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() or None
+
+
+def processor() -> str:
+    """The processor's name, where the system tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor()

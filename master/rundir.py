@@ -1,0 +1,92 @@
+"""The folder of one run: its files, who may write there, and writing them whole."""
+
+import fcntl
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, Any
+
+import yaml
+
+from tangram_agent.checkpoints import list_checkpoints
+from tangram_agent.files import write_whole
+from tangram_sim.errors import ConfigError
+
+PRIVATE = 0o600
+
+
+class RunFolder:
+    """Paths of a run folder.
+
+    Attributes:
+        path: the folder.
+        config: the resolved config.
+        connection: where the master can be reached; there while it runs.
+        checkpoints: folder of the checkpoints.
+        tensorboard: folder of the curves.
+        logs: folder of the output of workers and evaluator.
+        result: the scores of the final weights.
+        picture: the test episodes, played with the final weights.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path).expanduser()
+        self.config = self.path / "config.yaml"
+        self.connection = self.path / "connection.json"
+        self.checkpoints = self.path / "checkpoints"
+        self.tensorboard = self.path / "tensorboard"
+        self.logs = self.path / "logs"
+        self.result = self.path / "result.json"
+        self.picture = self.path / "test_episodes.png"
+
+    def prepare(self, resume: str) -> None:
+        """Make the folder.
+
+        Raises:
+            ConfigError: it holds a run and `resume` is none, or it cannot be made.
+        """
+        if resume == "none" and self.holds_run():
+            raise ConfigError(
+                f"run_dir {self.path} holds a run already: choose another run_dir, or go on with "
+                "resume=auto"
+            )
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(
+                f"run_dir {self.path} cannot be made ({error.strerror}): choose another run_dir"
+            ) from None
+
+    def holds_run(self) -> bool:
+        """Whether a run has left something here that a new one would mix with."""
+        curves = self.tensorboard.is_dir() and any(self.tensorboard.iterdir())
+        return self.result.exists() or bool(list_checkpoints(self.checkpoints)) or curves
+
+    def lock(self) -> IO[bytes]:
+        """Claim the folder for one master; the claim ends with the process or with `close`.
+
+        Raises:
+            ConfigError: another master runs here.
+        """
+        claim = (self.path / ".lock").open("ab")
+        try:
+            fcntl.flock(claim, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            claim.close()
+            raise ConfigError(
+                f"run_dir {self.path} is in use by another master: choose another run_dir, or stop "
+                "that one first"
+            ) from None
+        return claim
+
+    def write_config(self, resolved: Mapping[str, Any]) -> None:
+        """Write the resolved config as plain YAML."""
+        write_whole(self.config, yaml.safe_dump(dict(resolved), sort_keys=False).encode())
+
+    def write_connection(self, connection: Mapping[str, str]) -> None:
+        """Write what a worker needs to find this master; only the user may read it."""
+        write_whole(self.connection, json.dumps(dict(connection), indent=1).encode(), PRIVATE)
+
+    def write_result(self, result: Mapping[str, Any]) -> None:
+        """Write the scores of the run."""
+        write_whole(self.result, (json.dumps(dict(result), indent=1) + "\n").encode())

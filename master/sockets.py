@@ -1,0 +1,94 @@
+"""The master's two sockets: bounded queues, bounded lingering, and sends that never wait."""
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+
+import zmq
+
+from tangram_agent.payloads import MAX_BATCH_BYTES
+from tangram_sim.errors import ConfigError
+
+LINGER_MS = 1000
+# Messages queued for each peer and direction; what a peer has no room for it must ask for again.
+HIGH_WATER = 64
+# ZMTP pings find connections that died without a word.
+PING_MS = 5000
+
+
+class Sockets:
+    """A bound ROUTER and a bound PUB.
+
+    Attributes:
+        endpoint: of the ROUTER.
+        weights_endpoint: of the PUB.
+    """
+
+    def __init__(self, bind: str, port: int, counters: Counter[str]) -> None:
+        self._counters = counters
+        self._context = zmq.Context()
+        try:
+            self._router = self._open(zmq.ROUTER, bind, port)
+            self._pub = self._open(zmq.PUB, bind, 0)
+        except ConfigError:
+            self._context.destroy(linger=0)
+            raise
+        self.endpoint = self._router.getsockopt_string(zmq.LAST_ENDPOINT)
+        self.weights_endpoint = self._pub.getsockopt_string(zmq.LAST_ENDPOINT)
+
+    def wait(self, timeout_s: float) -> bool:
+        """Whether a message came within this time."""
+        return bool(self._router.poll(math.ceil(max(0.0, timeout_s) * 1000)))
+
+    def receive(self) -> tuple[bytes, Sequence[bytes]] | None:
+        """The identity and the frames of the next message, None if there is none."""
+        try:
+            identity, *frames = self._router.recv_multipart(zmq.NOBLOCK)
+        except zmq.Again:
+            return None
+        return identity, frames
+
+    def send(self, identity: bytes, frames: Sequence[bytes]) -> None:
+        """Send to a peer, unless it is gone or does not read: counted, and forgotten."""
+        try:
+            self._router.send_multipart([identity, *frames], zmq.NOBLOCK)
+        except zmq.Again:
+            self._counters["congested"] += 1
+        except zmq.ZMQError as error:
+            if error.errno != zmq.EHOSTUNREACH:
+                raise
+            self._counters["unreachable"] += 1
+
+    def publish(self, frame: bytes) -> None:
+        """Send to all subscribers that have room."""
+        self._pub.send(frame, zmq.NOBLOCK)
+
+    def close(self) -> None:
+        """Close; what is on its way gets a second."""
+        self._context.destroy(linger=LINGER_MS)
+
+    def _open(self, kind: int, bind: str, port: int) -> zmq.Socket[bytes]:
+        socket = self._context.socket(kind)
+        socket.setsockopt(zmq.LINGER, LINGER_MS)
+        socket.setsockopt(zmq.SNDHWM, HIGH_WATER)
+        socket.setsockopt(zmq.RCVHWM, HIGH_WATER)
+        socket.setsockopt(zmq.MAXMSGSIZE, MAX_BATCH_BYTES)
+        socket.setsockopt(zmq.HEARTBEAT_IVL, PING_MS)
+        socket.setsockopt(zmq.IPV6, int(":" in bind))
+        if kind == zmq.ROUTER:
+            # Else answers to those who are gone vanish without a word.
+            socket.setsockopt(zmq.ROUTER_MANDATORY, 1)
+        host = f"[{bind}]" if ":" in bind else bind
+        try:
+            socket.bind(f"tcp://{host}:{port or '*'}")
+        except zmq.ZMQError as error:
+            if error.errno == zmq.EADDRINUSE:
+                raise ConfigError(
+                    f"port {port} of {bind} is in use: choose another with service.port=..., "
+                    "or 0 for any free one"
+                ) from None
+            raise ConfigError(
+                f"cannot listen on {bind}, port {port} ({error.strerror}): set service.bind to an "
+                "address of this machine, such as 127.0.0.1, and service.port to one you may use"
+            ) from None
+        return socket

@@ -1,0 +1,154 @@
+"""What learns, without sockets: replay, hindsight, pace and the networks, and their state."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from master.pace import Pace
+from tangram_agent.ddpg import Learner
+from tangram_agent.hindsight import with_twins
+from tangram_agent.replay import ReplayBuffer
+from tangram_agent.runs import ACTING
+from tangram_agent.setup import Setup
+from tangram_agent.types import Episodes, Weights
+from tangram_sim.errors import ConfigError, RunError
+from tangram_sim.rewards import make_reward
+
+STREAMS = ("replay", "hindsight")
+
+Arrays = dict[str, dict[str, npt.NDArray[Any]]]
+
+
+class Trainer:
+    """The learner and everything that its next update depends on.
+
+    Attributes:
+        setup: the task and the agent.
+        learner: networks and optimisers.
+        replay: transitions played and their hindsight twins.
+        pace: decides whether to learn or to take in episodes.
+        episodes: taken in since the run began.
+        last: losses of the last update.
+    """
+
+    def __init__(self, setup: Setup, seed: int, device: str, lag_updates: int) -> None:
+        agent, layout = setup.agent, setup.layout
+        self.setup = setup
+        self.reward = make_reward(setup.reward, layout, setup.sim)
+        self.learner = Learner(setup, seed, device)
+        self.replay = ReplayBuffer(
+            agent.replay_capacity, layout.corner_count, layout.tokens, setup.action_size
+        )
+        self.pace = Pace(agent.updates_per_transition, agent.learning_starts, lag_updates)
+        self.episodes = 0
+        self.last: dict[str, float] = {}
+        self._generators = {
+            name: np.random.default_rng([seed, stream]) for stream, name in enumerate(STREAMS)
+        }
+
+    @property
+    def updates(self) -> int:
+        """Updates since the run began."""
+        return self.learner.updates
+
+    @property
+    def transitions(self) -> int:
+        """Transitions played that were taken in, without their twins."""
+        return self.episodes * self.setup.horizon
+
+    def insert(self, episodes: Episodes) -> None:
+        """Take in episodes as they were played, with their hindsight twins."""
+        twins = self.setup.agent.hindsight
+        generator = self._generators["hindsight"]
+        self.replay.add(with_twins(episodes, twins, self.setup.layout, self.reward, generator))
+        self.pace.inserted(episodes.transitions)
+        self.episodes += episodes.count
+
+    def update(self, share: float) -> dict[str, float]:
+        """One update, at the used share of the budget; returns its losses."""
+        batch = self.replay.sample(self.setup.agent.batch_size, self._generators["replay"])
+        self.last = self.learner.update(batch, share)
+        self.pace.updated()
+        return self.last
+
+    def weights(self) -> Weights:
+        """The acting weights; their version is the number of updates.
+
+        Raises:
+            RunError: they are not finite, so nobody may play with them or keep them.
+        """
+        weights = self.learner.acting_weights(self.updates)
+        for name, tensor in weights.tensors.items():
+            if not np.isfinite(tensor).all():
+                losses = ", ".join(f"{key}={value:g}" for key, value in self.last.items())
+                raise RunError(
+                    f"the weights are not finite after {self.updates} updates ('{name}'; "
+                    f"{losses}); they were neither sent nor kept: lower agent.actor_lr and "
+                    "agent.critic_lr or set agent.grad_clip=1, and start again or go on from the "
+                    "last checkpoint with resume=auto"
+                )
+        return weights
+
+    def state(self) -> tuple[Arrays, dict[str, Any]]:
+        """Arrays by file, and JSON values, for a checkpoint.
+
+        Raises:
+            RunError: the weights are not finite.
+        """
+        arrays = {
+            ACTING: dict(self.weights().tensors),
+            "learner": self.learner.state(),
+            "replay": self.replay.state(),
+        }
+        generators = {name: g.bit_generator.state for name, g in self._generators.items()}
+        counters = {
+            "episodes": self.episodes,
+            "pace": self.pace.state(),
+            "generators": generators,
+            "fingerprints": self.setup.fingerprints(),
+        }
+        return arrays, counters
+
+    def load_state(self, arrays: Mapping[str, Any], counters: Mapping[str, Any]) -> None:
+        """Take over a state from `state()`; settings stay those of this process.
+
+        Raises:
+            RunError: the state belongs to another task or network.
+        """
+        self._check_same_task(counters["fingerprints"])
+        self.learner.load_state(arrays["learner"])
+        self.replay.load_state(arrays["replay"])
+        self.pace.load_state(counters["pace"])
+        self.episodes = int(counters["episodes"])
+        for name, generator in self._generators.items():
+            generator.bit_generator.state = counters["generators"][name]
+
+    def _check_same_task(self, theirs: Mapping[str, str]) -> None:
+        own = self.setup.fingerprints()
+        # The agent's rates may change on the way; what shapes its networks shows when they load.
+        odd = [name for name in own if name != "agent" and own[name] != theirs.get(name)]
+        if odd:
+            raise RunError(
+                f"the run was made with other settings of {', '.join(odd)}: resume it with its own "
+                "(config.yaml in its folder), or choose another run_dir"
+            )
+
+
+def choose_device(wanted: str) -> str:
+    """`auto` is a GPU where there is one.
+
+    Raises:
+        ConfigError: a GPU is wanted and there is none.
+    """
+    if wanted == "cpu":
+        return "cpu"
+    if torch.cuda.is_available():
+        return "cuda"
+    if wanted == "cuda":
+        raise ConfigError(
+            "service.device=cuda needs a GPU, none is visible: set service.device=cpu"
+        )
+    return "cpu"

@@ -1,0 +1,38 @@
+"""Writing a file at once: a reader sees the old content or the new, never a part."""
+
+import os
+from pathlib import Path
+
+from tangram_sim.errors import RunError
+
+PUBLIC = 0o644
+
+
+def write_whole(path: Path, data: bytes, mode: int = PUBLIC) -> None:
+    """Replace a file, or make it and its folders; nothing is left behind when that fails.
+
+    Args:
+        path: the file.
+        data: its whole content.
+        mode: its permissions.
+
+    Raises:
+        RunError: the disk is full or the folder cannot be written.
+    """
+    aside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            aside.unlink(missing_ok=True)
+            handle = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+            with os.fdopen(handle, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(handle)
+            aside.replace(path)
+        finally:
+            aside.unlink(missing_ok=True)
+    except OSError as error:
+        raise RunError(
+            f"cannot write {path} ({error.strerror}): make room there or choose another folder"
+        ) from None

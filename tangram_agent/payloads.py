@@ -1,0 +1,249 @@
+"""Arrays on the wire: raw little-endian frames for episodes and pictures, safetensors for weights.
+
+Array frames carry neither shape nor dtype: both follow from the number of episodes and from the
+task that sender and receiver agreed on in HELLO. What arrives is checked for its exact size, and
+every value for its bounds; decoding copies nothing, so the arrays are read-only.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
+
+from tangram_agent.frames import MAX_HEADER, MAX_ID, pack_map, unpack_map
+from tangram_agent.setup import Setup
+from tangram_agent.types import Episodes, Weights
+from tangram_sim.checks import check_range
+from tangram_sim.errors import ConfigError, WireError
+
+WeightShapes = Mapping[str, tuple[int, ...]]
+
+MAX_EPISODES = 4096
+MAX_BATCH_BYTES = 32 * 2**20
+MAX_WEIGHTS_BYTES = 64 * 2**20
+MAX_REWARD = 1e6
+# Corners and actions are computed in float64; their bounds may be passed by rounding to float32.
+ROUNDING = 1e-6
+
+
+@dataclass(frozen=True)
+class Column:
+    """What one array frame must hold.
+
+    Attributes:
+        name: in front of every reason.
+        dtype: little-endian.
+        shape: exact.
+        low, high: bounds of every value, which thereby is finite.
+    """
+
+    name: str
+    dtype: str
+    shape: tuple[int, ...]
+    low: float
+    high: float
+
+    @property
+    def size(self) -> int:
+        """Bytes."""
+        return int(np.prod(self.shape)) * np.dtype(self.dtype).itemsize
+
+    def encode(self, array: npt.NDArray[Any]) -> bytes:
+        """The array's frame.
+
+        Raises:
+            WireError: another shape, or a value out of bounds.
+        """
+        if array.shape != self.shape:
+            raise WireError(f"{self.name} must have the shape {self.shape}, got {array.shape}")
+        self._check(array)
+        return array.astype(self.dtype).tobytes()
+
+    def decode(self, frame: bytes) -> npt.NDArray[Any]:
+        """The array in a frame, as a read-only view.
+
+        Raises:
+            WireError: another size, or a value out of bounds.
+        """
+        if len(frame) != self.size:
+            raise WireError(
+                f"{self.name} must have {self.size} bytes for the shape {self.shape}, "
+                f"got {len(frame)}"
+            )
+        native = np.dtype(self.dtype).newbyteorder("=")
+        array = np.frombuffer(frame, self.dtype).reshape(self.shape).astype(native, copy=False)
+        self._check(array)
+        return array
+
+    def _check(self, array: npt.NDArray[Any]) -> None:
+        # Extremes of an array with a NaN are NaN, and comparisons with NaN are false.
+        if array.size == 0 or (array.min() >= self.low and array.max() <= self.high):
+            return
+        where = np.argwhere(~((array >= self.low) & (array <= self.high)))[0].tolist()
+        raise WireError(
+            f"{self.name} holds {array[tuple(where)]:g} at {where}, must be finite and between "
+            f"{self.low:g} and {self.high:g}"
+        )
+
+
+@dataclass(frozen=True)
+class EpisodeSpec:
+    """The task as the wire sees it: what the arrays of every message are checked against.
+
+    Attributes:
+        tokens: K.
+        corners: V.
+        horizon: T, steps of every episode.
+        action_size: A.
+        bound: largest |coordinate| that a corner can reach.
+    """
+
+    tokens: int
+    corners: int
+    horizon: int
+    action_size: int
+    bound: float
+
+    def __post_init__(self) -> None:
+        for name in ("tokens", "corners", "horizon", "action_size"):
+            check_range(name, getattr(self, name), 1)
+        check_range("bound", self.bound, 0.0, 1e9)
+        self.check_batch_size(1)
+
+    @staticmethod
+    def of(setup: Setup, bound: float) -> "EpisodeSpec":
+        """The spec of a run's task."""
+        layout = setup.layout
+        return EpisodeSpec(
+            layout.tokens, layout.corner_count, setup.horizon, setup.action_size, bound
+        )
+
+    @property
+    def max_count(self) -> int:
+        """Most episodes in one message, bounded in number and in bytes."""
+        return min(MAX_EPISODES, MAX_BATCH_BYTES // sum(c.size for c in self.columns(1)))
+
+    def check_batch_size(self, count: int) -> None:
+        """Raise ConfigError if batches of so many episodes cannot be sent."""
+        if count > self.max_count:
+            raise ConfigError(
+                f"{count} episodes of {self.horizon} steps with {self.corners} corners are too "
+                f"many for one message, at most {self.max_count}: lower service.batch_episodes "
+                "or sim.actions_per_token"
+            )
+
+    def columns(self, count: int) -> tuple[Column, ...]:
+        """The frames of `count` episodes, in the order of the fields of Episodes."""
+        e, t, v, k = count, self.horizon, self.corners, self.tokens
+        reach, one = self.bound * (1 + ROUNDING), 1 + ROUNDING
+        return (
+            Column("corners", "<f4", (e, t + 1, v, 2), -reach, reach),
+            Column("placed", "u1", (e, t + 1, k), 0, 1),
+            Column("actions", "<f4", (e, t, self.action_size), -one, one),
+            Column("rewards", "<f4", (e, t), -MAX_REWARD, MAX_REWARD),
+            Column("goals", "<f4", (e, v, 2), -reach, reach),
+        )
+
+    def pictures(self, count: int) -> tuple[Column, ...]:
+        """The frames of `count` test episodes: corners at the start, at the end and of the goal."""
+        reach = self.bound * (1 + ROUNDING)
+        names = ("starts", "ends", "goals")
+        return tuple(Column(n, "<f4", (count, self.corners, 2), -reach, reach) for n in names)
+
+
+def encode_episodes(episodes: Episodes, spec: EpisodeSpec) -> list[bytes]:
+    """One raw frame per array.
+
+    Raises:
+        WireError: too many episodes, or a field that a receiver would refuse.
+    """
+    if not 1 <= episodes.count <= spec.max_count:
+        raise WireError(f"a batch holds 1 to {spec.max_count} episodes, got {episodes.count}")
+    columns = spec.columns(episodes.count)
+    return [column.encode(getattr(episodes, column.name)) for column in columns]
+
+
+def decode_episodes(frames: Sequence[bytes], count: int, spec: EpisodeSpec) -> Episodes:
+    """The episodes in one raw frame per array; `count` must be within the spec's limit.
+
+    Raises:
+        WireError: names the field and what is wrong with it.
+    """
+    return Episodes(**decode_columns(frames, spec.columns(count)))
+
+
+def decode_columns(
+    frames: Sequence[bytes], columns: Sequence[Column]
+) -> dict[str, npt.NDArray[Any]]:
+    """Arrays by name.
+
+    Raises:
+        WireError: another number of frames, or a frame that breaks its column.
+    """
+    if len(frames) != len(columns):
+        raise WireError(f"there must be {len(columns)} array frames, got {len(frames)}")
+    return {c.name: c.decode(f) for c, f in zip(columns, frames, strict=True)}
+
+
+def encode_weights(epoch: str, weights: Weights) -> bytes:
+    """Weights as one frame, because a CONFLATE socket keeps only the last frame of a message.
+
+    Raises:
+        WireError: a tensor is not finite, or they are too large.
+    """
+    tensors = {name: np.array(t, np.float32, order="C") for name, t in weights.tensors.items()}
+    _check_finite(tensors)
+    data = save(tensors)
+    if len(data) > MAX_WEIGHTS_BYTES:
+        raise WireError(
+            f"weights: {len(data)} bytes, at most {MAX_WEIGHTS_BYTES}: choose a smaller net"
+        )
+    return pack_map("weights", {"epoch": epoch, "version": weights.version, "data": data})
+
+
+def decode_weights(frame: bytes, shapes: WeightShapes | None) -> tuple[str, Weights]:
+    """The master's epoch and its weights.
+
+    Args:
+        frame: as made by `encode_weights`.
+        shapes: what the tensors must be; None takes any.
+
+    Raises:
+        WireError: names the field or tensor and what is wrong with it.
+    """
+    fields = unpack_map(frame, MAX_WEIGHTS_BYTES + MAX_HEADER, max_bin=MAX_WEIGHTS_BYTES)
+    if fields.kind != "weights":
+        raise WireError(f"expected weights, got a message of kind '{fields.kind}'")
+    epoch, version = fields.text("epoch", MAX_ID), fields.integer("version", 0)
+    data = fields.data("data")
+    fields.end()
+    try:
+        tensors = load(data)
+    # KeyError: a dtype that numpy has not; ValueError: an empty tensor.
+    except (SafetensorError, KeyError, ValueError) as error:
+        raise WireError(f"weights: not safetensors: {error}") from None
+    _check_tensors(tensors, shapes)
+    return epoch, Weights(version, tensors)
+
+
+def _check_tensors(tensors: dict[str, npt.NDArray[Any]], shapes: WeightShapes | None) -> None:
+    for name, tensor in tensors.items():
+        if tensor.dtype != np.float32:
+            raise WireError(f"weights: {name!r} must be float32, got {tensor.dtype}")
+    if shapes is not None:
+        found = {name: tensor.shape for name, tensor in tensors.items()}
+        for name in sorted(found.keys() | shapes.keys()):
+            wanted, got = shapes.get(name, "no such tensor"), found.get(name, "none")
+            if wanted != got:
+                raise WireError(f"weights: {name[:80]!r} must be {wanted}, got {got}")
+    _check_finite(tensors)
+
+
+def _check_finite(tensors: dict[str, npt.NDArray[Any]]) -> None:
+    for name, tensor in tensors.items():
+        if not np.isfinite(tensor).all():
+            raise WireError(f"weights: {name!r} is not finite")

@@ -1,0 +1,55 @@
+"""Files that are whole at any moment."""
+
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from tangram_agent.files import write_whole
+from tangram_sim.errors import RunError
+
+pytestmark = pytest.mark.fast
+
+
+def test_a_file_appears_in_folders_that_are_made(tmp_path: Path) -> None:
+    target = tmp_path / "some" / "folder" / "scores.json"
+    write_whole(target, b"new")
+    assert target.read_bytes() == b"new"
+    assert list(target.parent.iterdir()) == [target]
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = tmp_path / "result.json"
+    write_whole(target, b"old")
+
+    def full(handle: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(RunError, match=r"cannot write .*result\.json \(No space left"):
+            write_whole(target, b"new")
+    assert target.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [target]
+    write_whole(target, b"new")
+    assert target.read_bytes() == b"new"
+
+
+def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunError, match=r"cannot write .*scores\.json"):
+        write_whole(tmp_path / "file" / "scores.json", b"")
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o644])
+def test_permissions_hold_from_the_first_byte_on(tmp_path: Path, mode: int) -> None:
+    target = tmp_path / "connection.json"
+    before = os.umask(0)
+    try:
+        write_whole(target, b"", mode)
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(target.stat().st_mode) == mode

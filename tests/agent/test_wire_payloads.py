@@ -1,0 +1,327 @@
+"""Arrays and weights on the wire: exact sizes, bounds on every value, names of what is wrong."""
+
+from dataclasses import fields, replace
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from safetensors.numpy import save
+
+from tangram_agent.frames import PROTOCOL, pack_map
+from tangram_agent.payloads import (
+    MAX_BATCH_BYTES,
+    MAX_REWARD,
+    MAX_WEIGHTS_BYTES,
+    EpisodeSpec,
+    decode_episodes,
+    decode_weights,
+    encode_episodes,
+    encode_weights,
+)
+from tangram_agent.types import Episodes, Weights
+from tangram_sim.errors import ConfigError, WireError
+from tests.agent.builders import PAIR, setup
+from tests.agent.messages import BOUND, SHAPES, SPEC, episodes, weights
+
+pytestmark = pytest.mark.fast
+
+NAMES = ("corners", "placed", "actions", "rewards", "goals")
+NAN, INF = float("nan"), float("inf")
+
+
+def same(left: Episodes, right: Episodes) -> bool:
+    return all(
+        np.array_equal(getattr(left, f.name), getattr(right, f.name)) for f in fields(Episodes)
+    )
+
+
+@st.composite
+def tasks(draw: st.DrawFn) -> tuple[EpisodeSpec, Episodes]:
+    """A task and episodes within its bounds."""
+    size = st.integers(1, 4)
+    spec = EpisodeSpec(draw(size), draw(size), draw(size), draw(size), draw(st.floats(0.5, 100)))
+    count = draw(st.integers(1, 3))
+
+    def array(dtype: type[Any], shape: tuple[int, ...], bound: float) -> Any:
+        if dtype is np.uint8:
+            return draw(hnp.arrays(dtype, shape, elements=st.integers(0, 1)))
+        limit = float(np.float32(bound))
+        return draw(hnp.arrays(dtype, shape, elements=st.floats(-limit, limit, width=32)))
+
+    columns = {c.name: c for c in spec.columns(count)}
+    bounds = {"corners": spec.bound, "goals": spec.bound, "actions": 1.0, "rewards": MAX_REWARD}
+    arrays = {
+        name: array(np.uint8 if name == "placed" else np.float32, c.shape, bounds.get(name, 1.0))
+        for name, c in columns.items()
+    }
+    return spec, Episodes(**arrays)
+
+
+@given(tasks())
+def test_episodes_come_back_as_they_were_sent(task: tuple[EpisodeSpec, Episodes]) -> None:
+    spec, sent = task
+    received = decode_episodes(encode_episodes(sent, spec), sent.count, spec)
+    assert same(sent, received)
+    assert [getattr(received, name).dtype for name in NAMES] == [
+        np.float32,
+        np.uint8,
+        np.float32,
+        np.float32,
+        np.float32,
+    ]
+
+
+def test_frames_are_raw_little_endian_bytes_in_the_order_of_the_fields() -> None:
+    sent = episodes(2)
+    frames = encode_episodes(sent, SPEC)
+    assert [len(f) for f in frames] == [2 * 5 * 7 * 2 * 4, 2 * 5 * 2, 2 * 4 * 4 * 4, 2 * 4 * 4, 112]
+    assert frames == [getattr(sent, n).astype(getattr(sent, n).dtype).tobytes() for n in NAMES]
+
+
+def test_decoding_copies_nothing() -> None:
+    frames = encode_episodes(episodes(2), SPEC)
+    received = decode_episodes(frames, 2, SPEC)
+    for name, frame in zip(NAMES, frames, strict=True):
+        array = getattr(received, name)
+        assert np.shares_memory(array, np.frombuffer(frame, np.uint8))
+        assert not array.flags.writeable
+
+
+def test_other_memory_orders_and_dtypes_are_sent_as_what_they_mean() -> None:
+    sent = episodes(2)
+    odd = replace(sent, corners=np.asfortranarray(sent.corners.astype(np.float64)))
+    assert encode_episodes(odd, SPEC) == encode_episodes(sent, SPEC)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("change", [-1, 1, None])
+def test_each_frame_has_its_exact_size(name: str, change: int | None) -> None:
+    frames = encode_episodes(episodes(2), SPEC)
+    number = NAMES.index(name)
+    size = len(frames[number])
+    frames[number] = b"" if change is None else (frames[number] + b"\0")[: size + change]
+    with pytest.raises(WireError) as caught:
+        decode_episodes(frames, 2, SPEC)
+    shape = SPEC.columns(2)[number].shape
+    assert str(caught.value) == (
+        f"{name} must have {size} bytes for the shape {shape}, got {len(frames[number])}"
+    )
+
+
+@pytest.mark.parametrize("frames", [[], [b""] * 4, [b""] * 6])
+def test_there_is_one_frame_for_each_array(frames: list[bytes]) -> None:
+    with pytest.raises(WireError, match=f"there must be 5 array frames, got {len(frames)}"):
+        decode_episodes(frames, 2, SPEC)
+
+
+BAD_VALUES = [
+    ("corners", NAN, "corners holds nan at [1, 0, 0, 0], must be finite and between -4 and 4"),
+    ("corners", INF, "corners holds inf at [1, 0, 0, 0], must be finite and between -4 and 4"),
+    ("corners", -INF, "corners holds -inf at [1, 0, 0, 0], must be finite and between -4 and 4"),
+    ("corners", 4.001, "corners holds 4.001 at [1, 0, 0, 0], must be finite and between -4 and 4"),
+    ("corners", -4.001, "corners holds -4.001 at [1, 0, 0, 0], must be finite and between -4 an"),
+    ("goals", NAN, "goals holds nan at [1, 0, 0], must be finite and between -4 and 4"),
+    ("goals", 4.001, "goals holds 4.001 at [1, 0, 0], must be finite and between -4 and 4"),
+    ("placed", 2, "placed holds 2 at [1, 0, 0], must be finite and between 0 and 1"),
+    ("placed", 255, "placed holds 255 at [1, 0, 0], must be finite and between 0 and 1"),
+    ("actions", NAN, "actions holds nan at [1, 0, 0], must be finite and between -1 and 1"),
+    ("actions", 1.00001, "actions holds 1.00001 at [1, 0, 0], must be finite and between -1 and"),
+    ("actions", -1.00001, "actions holds -1.00001 at [1, 0, 0], must be finite and between -1 a"),
+    ("rewards", NAN, "rewards holds nan at [1, 0], must be finite and between -1e+06 and 1e+06"),
+    ("rewards", INF, "rewards holds inf at [1, 0], must be finite and between -1e+06 and 1e+06"),
+    ("rewards", 1.1e6, "rewards holds 1.1e+06 at [1, 0], must be finite and between -1e+06 and "),
+    ("rewards", -1.1e6, "rewards holds -1.1e+06 at [1, 0], must be finite and between -1e+06 an"),
+]
+
+
+def spoiled(name: str, value: float) -> Episodes:
+    sent = episodes(2)
+    array = getattr(sent, name).copy()
+    array[(1, *[0] * (array.ndim - 1))] = value
+    return replace(sent, **{name: array})
+
+
+@pytest.mark.parametrize(("name", "value", "reason"), BAD_VALUES)
+def test_values_out_of_bounds_are_named(name: str, value: float, reason: str) -> None:
+    bad = spoiled(name, value)
+    frames = [getattr(bad, n).tobytes() for n in NAMES]
+    with pytest.raises(WireError) as caught:
+        decode_episodes(frames, 2, SPEC)
+    assert str(caught.value).startswith(reason)
+    with pytest.raises(WireError) as caught:
+        encode_episodes(bad, SPEC)
+    assert str(caught.value).startswith(reason)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("corners", BOUND), ("goals", -BOUND), ("actions", 1 + 5e-7), ("rewards", -MAX_REWARD)],
+)
+def test_values_at_their_bounds_pass(name: str, value: float) -> None:
+    sent = spoiled(name, value)
+    assert same(decode_episodes(encode_episodes(sent, SPEC), 2, SPEC), sent)
+
+
+def test_arrays_of_another_task_are_not_sent() -> None:
+    sent = episodes(2)
+    with pytest.raises(WireError, match=r"rewards must have the shape \(2, 4\), got \(2, 3\)"):
+        encode_episodes(replace(sent, rewards=sent.rewards[:, :3]), SPEC)
+
+
+def test_a_batch_holds_a_bounded_number_of_episodes() -> None:
+    none = Episodes(*[getattr(episodes(1), name)[:0] for name in NAMES])
+    with pytest.raises(WireError, match="a batch holds 1 to 4096 episodes, got 0"):
+        encode_episodes(none, SPEC)
+    long = EpisodeSpec(16, 64, 1600, 4, BOUND)
+    bytes_each = 4 * (1601 * 128 + 1600 * 5 + 128) + 1601 * 16
+    assert long.max_count == MAX_BATCH_BYTES // bytes_each
+    long.check_batch_size(long.max_count)
+    with pytest.raises(ConfigError) as caught:
+        long.check_batch_size(long.max_count + 1)
+    assert str(caught.value) == (
+        "39 episodes of 1600 steps with 64 corners are too many for one message, at most 38: "
+        "lower service.batch_episodes or sim.actions_per_token"
+    )
+
+
+def test_a_task_of_which_no_episode_fits_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"1 episodes of 100000 steps .* at most 0: lower"):
+        EpisodeSpec(16, 64, 100_000, 4, BOUND)
+
+
+def test_the_spec_of_a_setup() -> None:
+    made = setup(PAIR, actions_per_token=2)
+    assert EpisodeSpec.of(made, 3.0) == EpisodeSpec(2, 7, 4, 4, 3.0)
+    assert EpisodeSpec.of(setup(), 3.0) == EpisodeSpec(1, 4, 1, 3, 3.0)
+
+
+@pytest.mark.parametrize("bound", [-1.0, NAN, INF])
+def test_the_spec_has_a_finite_bound(bound: float) -> None:
+    with pytest.raises(ConfigError, match="bound must be between 0 and 1e"):
+        EpisodeSpec(1, 4, 1, 3, bound)
+
+
+names = st.text(min_size=1, max_size=8)
+tensors = hnp.arrays(
+    np.float32,
+    hnp.array_shapes(min_dims=0, max_dims=3, max_side=4),
+    elements=st.floats(-1e6, 1e6, width=32),
+)
+
+
+@given(st.dictionaries(names, tensors, min_size=1, max_size=4), st.integers(0, 2**63 - 1))
+def test_weights_come_back_as_they_were_sent(sent: dict[str, Any], version: int) -> None:
+    shapes = {name: tensor.shape for name, tensor in sent.items()}
+    epoch, received = decode_weights(encode_weights("e", Weights(version, sent)), shapes)
+    assert (epoch, received.version) == ("e", version)
+    assert {n: t.shape for n, t in received.tensors.items()} == shapes
+    assert all(np.array_equal(t, sent[n]) for n, t in received.tensors.items())
+
+
+def frame_of(data: bytes, /, **changes: Any) -> bytes:
+    return pack_map("weights", {"epoch": "e", "version": 1, "data": data} | changes)
+
+
+def tensor_frame(**arrays: Any) -> bytes:
+    good = {name: np.zeros(shape, np.float32) for name, shape in SHAPES.items()}
+    given_arrays = {name.replace("__", "."): array for name, array in arrays.items()}
+    kept = {n: t for n, t in (good | given_arrays).items() if t is not None}
+    return frame_of(save(kept))
+
+
+DATA = save({name: np.zeros(shape, np.float32) for name, shape in SHAPES.items()})
+HUGE_HEADER = (10**15).to_bytes(8, "little") + b"{}"
+
+
+@pytest.mark.parametrize(
+    ("frame", "reason"),
+    [
+        (b"", "the header is not msgpack"),
+        (frame_of(DATA)[:-1], "the header is not msgpack"),
+        (frame_of(b""), "weights: not safetensors: "),
+        (frame_of(DATA[:-1]), "weights: not safetensors: "),
+        (frame_of(DATA + b"\0"), "weights: not safetensors: "),
+        (frame_of(HUGE_HEADER), "weights: not safetensors: "),
+        (frame_of(b"\x80\x04N."), "weights: not safetensors: "),  # a pickle
+        (frame_of(DATA, version=-1), "weights: version must be an integer between 0 and"),
+        (frame_of(DATA, epoch=3), "weights: epoch must be a text of at most 64 characters, got 3"),
+        (frame_of(DATA, data="text"), "weights: data must be bytes, got 'text'"),
+        (frame_of(DATA, more=1), "weights: unknown field 'more'"),
+        (pack_map("other", {"data": DATA}), "expected weights, got a message of kind 'other'"),
+        (msgpack.packb({"v": PROTOCOL + 1}), f"the other side speaks protocol {PROTOCOL + 1}"),
+        (
+            tensor_frame(actor__bias=np.zeros(4, np.float32)),
+            "weights: 'actor.bias' must be (3,), got (4,)",
+        ),
+        (tensor_frame(actor__bias=None), "weights: 'actor.bias' must be (3,), got none"),
+        (
+            tensor_frame(other=np.zeros(4, np.float32)),
+            "weights: 'other' must be no such tensor, got (4,)",
+        ),
+        (tensor_frame(scale=np.zeros((), np.float64)), "weights: 'scale' must be float32, got flo"),
+        (tensor_frame(scale=np.array(NAN, np.float32)), "weights: 'scale' is not finite"),
+        (tensor_frame(scale=np.array(INF, np.float32)), "weights: 'scale' is not finite"),
+        (
+            frame_of(DATA.replace(b'"dtype":"F32"', b'"dtype":"BF16"')),
+            "weights: not safetensors: ",
+        ),
+    ],
+)
+def test_wrong_weights_are_refused(frame: bytes, reason: str) -> None:
+    with pytest.raises(WireError) as caught:
+        decode_weights(frame, SHAPES)
+    assert str(caught.value).startswith(reason)
+
+
+def test_tensors_of_a_dtype_that_numpy_has_not_are_refused() -> None:
+    entry = b'{"a":{"dtype":"BF16","shape":[2],"data_offsets":[0,4]}}'
+    data = len(entry).to_bytes(8, "little") + entry + bytes(4)
+    with pytest.raises(WireError, match="weights: not safetensors: 'BF16'"):
+        decode_weights(frame_of(data), {"a": (2,)})
+
+
+def test_weights_of_any_shape_pass_where_none_is_expected() -> None:
+    assert decode_weights(tensor_frame(), None)[1].tensors.keys() == SHAPES.keys()
+    with pytest.raises(WireError, match="'scale' is not finite"):
+        decode_weights(tensor_frame(scale=np.array(NAN, np.float32)), None)
+
+
+@pytest.mark.parametrize("value", [NAN, INF, -INF])
+def test_weights_that_are_not_finite_are_not_sent(value: float) -> None:
+    bad = weights()
+    bad.tensors["actor.bias"][1] = value
+    with pytest.raises(WireError, match=r"weights: 'actor.bias' is not finite"):
+        encode_weights("e", bad)
+
+
+def test_weights_too_large_to_be_received_are_not_sent() -> None:
+    large = Weights(1, {"a": np.zeros(MAX_WEIGHTS_BYTES // 4, np.float32)})
+    with pytest.raises(WireError, match=r"weights: .* bytes, at most .*: choose a smaller net"):
+        encode_weights("e", large)
+
+
+def test_transposed_tensors_are_sent_as_what_they_mean() -> None:
+    matrix = np.arange(6, dtype=np.float32).reshape(2, 3)
+    _, received = decode_weights(encode_weights("e", Weights(1, {"a": matrix.T})), {"a": (3, 2)})
+    assert np.array_equal(received.tensors["a"], matrix.T)
+
+
+@given(st.binary(max_size=300))
+def test_random_data_raise_nothing_but_wire_errors(data: bytes) -> None:
+    for frame in (data, frame_of(data)):
+        with pytest.raises(WireError):
+            decode_weights(frame, SHAPES)
+
+
+@given(st.integers(0, len(DATA) - 1), st.integers(0, 255))
+def test_mutated_weights_raise_nothing_but_wire_errors(position: int, byte: int) -> None:
+    data = DATA[:position] + bytes([byte]) + DATA[position + 1 :]
+    try:
+        _, received = decode_weights(frame_of(data), SHAPES)
+    except WireError:
+        return
+    assert {n: t.shape for n, t in received.tensors.items()} == SHAPES

@@ -1,0 +1,97 @@
+"""The five commands as processes, started from another folder."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.cluster
+
+COMMANDS = ("tangram-train", "tangram-master", "tangram-worker", "tangram-eval", "tangram-play")
+WITH_GROUPS = COMMANDS[:3]
+LIMIT_S = 60
+
+
+def run(folder: Path, *command: str) -> subprocess.CompletedProcess[str]:
+    """A console script of this environment, started in a folder of its own."""
+    script, *arguments = command
+    environment = {
+        k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "HYDRA_FULL_ERROR")
+    }
+    return subprocess.run(
+        [str(Path(sys.executable).with_name(script)), *arguments],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=LIMIT_S,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help(tmp_path: Path, command: str) -> None:
+    result = run(tmp_path, command, "--help")
+    assert (result.returncode, result.stderr) == (0, "")
+    text, _, examples = result.stdout.partition("Examples:\n")
+    assert [line.split()[0] for line in examples.strip().splitlines()] == [command] * 3
+    if command in WITH_GROUPS:
+        assert "  agent    mlp, paper, tangram*\n" in text
+        for group in ("tokens", "sim", "reward", "net", "service"):
+            assert f"\n  {group} " in text
+    assert "seed: 0" in text or command == "tangram-worker"
+
+
+WRONG = [
+    ("tangram-train sed=1", "unknown setting 'sed' (did you mean 'seed'?)"),
+    ("tangram-train noise=1", "unknown setting 'noise' (did you mean 'agent.noise'?)"),
+    ("tangram-train agent.gama=0", "unknown setting 'agent.gama' (did you mean 'agent.gamma'?)"),
+    ("tangram-train ~zzz", "unknown setting 'zzz' (--help and --cfg job list them)"),
+    ("tangram-train --seed=1", "unknown option '--seed=1': settings carry no dashes, as in seed=1"),
+    ("tangram-train seed=1 --cfg jobs", "--cfg takes job, hydra, all, got 'jobs'"),
+    ("tangram-train -m seed=1 --cfg job", "--cfg and --multirun do not go together"),
+    ("tangram-train seed", "cannot read 'seed': write name=value"),
+    ("tangram-train tokens.shapes=[square", "cannot read 'tokens.shapes=[square'"),
+    ("tangram-train seed=1,2", "Ambiguous value for argument 'seed=1,2': a list is [1,2]"),
+    ("tangram-train run_dir=${foo}", "cannot resolve the config: Interpolation key 'foo'"),
+    ("tangram-train agent=best", "unknown agent 'best': choose from mlp, paper, tangram"),
+    ("tangram-train tokens=pentagon", "unknown tokens 'pentagon': choose from hexagon, large_tri"),
+    ("tangram-train tokens.shapes=[blob]", "unknown shape 'blob': choose from large_triangle"),
+    ("tangram-master tokens.shapes=[blob]", "unknown shape 'blob': choose from large_triangle"),
+    ("tangram-train workers=0", "workers must be at least 1, got 0"),
+    ("tangram-train seed=abc", 'field "seed" - should be "int"'),
+    ("tangram-train run_dir=", "run_dir must name a folder"),
+    ("tangram-master +sim.colour=1", 'can not match "colour"'),
+    ("tangram-master from_config=nowhere.yaml", "from_config=nowhere.yaml: No such file"),
+    ("tangram-worker", "say which master: connect=tcp://host:port"),
+    ("tangram-worker connect=tcp://127.0.0.1:1 role=judge", "role must be one of player, evalu"),
+    ("tangram-eval", "say which run: run_dir=runs/..."),
+    ("tangram-eval run_dir=runs/x episodes=0", "episodes must be between 1 and"),
+    ("tangram-play", "say which run: run_dir=runs/..."),
+    ("tangram-play runs_dir=x", "unknown setting 'runs_dir' (did you mean 'run_dir'?)"),
+]
+
+
+@pytest.mark.parametrize(("line", "message"), WRONG)
+def test_wrong_input_is_one_line(tmp_path: Path, line: str, message: str) -> None:
+    command, *arguments = line.split()
+    result = run(tmp_path, command, *arguments)
+    assert result.returncode == 2
+    assert result.stdout == ""
+    assert result.stderr.startswith(f"{command}: ")
+    assert message in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_config_and_version_are_shown_and_leave_nothing_behind(
+    tmp_path: Path, command: str
+) -> None:
+    assert run(tmp_path, command, "--version").stdout.startswith(f"{command} 0.")
+    result = run(tmp_path, command, "hydra.verbose=false", "--cfg", "job")
+    assert (result.returncode, result.stderr) == (0, "")
+    assert "hydra" not in result.stdout
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,155 @@
+"""Small runs that the tests of the master share: everything real but the sockets."""
+
+from collections import Counter, deque
+from collections.abc import Iterable
+from pathlib import Path
+from queue import SimpleQueue
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+
+from master.budget import Budget
+from master.config import MasterConfig
+from master.hub import EpisodesArrived, ScoresArrived
+from master.loop import Loop
+from master.metrics import Metrics
+from master.parts import Parts
+from master.progress import Status
+from master.record import Record
+from master.report import Reporter
+from master.rundir import RunFolder
+from master.signals import StopSignals
+from master.trainer import Trainer
+from tangram_agent.config import ServiceConfig
+from tangram_agent.setup import Setup
+from tangram_agent.types import Weights
+from tangram_agent.wire import Scores
+from tests.agent.builders import random_episodes, setup
+
+# Small tensors on several threads wait for cores that others use, a hundred times longer.
+torch.set_num_threads(1)
+
+AGENT: dict[str, Any] = {
+    "batch_size": 4,
+    "replay_capacity": 64,
+    "learning_starts": 4,
+    "updates_per_transition": 0.5,
+    "hindsight": [
+        {"strategy": "final"},
+        {"strategy": "near", "position": 0.1, "angle": 0.5},
+    ],
+}
+
+
+def arrival(made: Setup, sequence: int, count: int = 4, version: int = 0) -> EpisodesArrived:
+    """A batch of random episodes from player 0."""
+    episodes = random_episodes(made, count, seed=sequence)
+    return EpisodesArrived("player", 0, 1, sequence, version, episodes)
+
+
+def scores(made: Setup, version: int, reward: float = 0.5) -> ScoresArrived:
+    """An evaluation with two pictures."""
+    corners = random_episodes(made, 2).goals
+    scalars = {"mean_reward": reward, "raw_overlap": 0.75, "episodes": 100.0}
+    return ScoresArrived(0, 1, Scores(version, scalars, corners, corners, corners))
+
+
+class FakeHub:
+    """Scripted arrivals in place of sockets; notes what the loop does, in order.
+
+    Attributes:
+        script: what the next polls return; afterwards nothing comes.
+        log: ("publish", version), ("acknowledge", sequence), ("stop", reason).
+        scored: evaluate every published version like an evaluator would.
+    """
+
+    endpoint, weights_endpoint = "tcp://127.0.0.1:1", "tcp://127.0.0.1:2"
+
+    def __init__(
+        self, made: Setup, script: Iterable[list[Any]] = (), roles: Iterable[str] = ("player",)
+    ) -> None:
+        self.made = made
+        self.script = deque(script)
+        self.peers = [SimpleNamespace(role=role) for role in roles]
+        self.counters: Counter[str] = Counter()
+        self.log: list[tuple[str, Any]] = []
+        self.polls = 0
+        self.on_poll = lambda: None
+
+    def poll(self, timeout_s: float) -> list[Any]:
+        self.polls += 1
+        assert self.polls < 10_000, "the loop does not end"
+        self.on_poll()
+        return self.script.popleft() if self.script else []
+
+    def acknowledge(self, arrived: EpisodesArrived) -> None:
+        self.log.append(("acknowledge", arrived.sequence))
+
+    def publish(self, weights: Weights) -> None:
+        assert all(np.isfinite(tensor).all() for tensor in weights.tensors.values())
+        self.log.append(("publish", weights.version))
+
+    def stop(self, reason: str) -> None:
+        self.log.append(("stop", reason))
+        self.peers = []
+
+    def state(self) -> dict[str, dict[str, int]]:
+        return {"player/0": {"incarnation": 1, "sequence": len(self.values("acknowledge"))}}
+
+    def close(self) -> None:
+        self.log.append(("close", None))
+
+    def values(self, kind: str) -> list[Any]:
+        """What was done of one kind, in order."""
+        return [value for name, value in self.log if name == kind]
+
+
+class ShownProgress:
+    """Keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.notices: list[str] = []
+        self.statuses: list[Status] = []
+
+    def show(self, status: Status) -> None:
+        self.statuses.append(status)
+
+    def notice(self, line: str) -> None:
+        self.notices.append(line)
+
+    def close(self) -> None:
+        pass
+
+
+def small_setup(**agent: Any) -> Setup:
+    """A setup whose updates take milliseconds."""
+    return setup(agent=AGENT | agent)
+
+
+def trainer(made: Setup, seed: int = 0, lag_updates: int = 2) -> Trainer:
+    """A trainer on the CPU."""
+    return Trainer(made, seed, "cpu", lag_updates)
+
+
+def loop(
+    folder: Path, made: Setup, hub: FakeHub, service: dict[str, Any] | None = None, **config: Any
+) -> Loop:
+    """A loop around a fake hub, in a run folder that exists."""
+    lag = {"lag_updates": 2, "publish_seconds": 1000.0}
+    settings = MasterConfig(str(folder), service=ServiceConfig(**lag | (service or {})), **config)
+    run_folder = RunFolder(folder)
+    run_folder.prepare("auto")
+    parts = Parts(
+        settings,
+        made,
+        run_folder,
+        trainer(made, lag_updates=settings.service.lag_updates),
+        Record(),
+        Budget(settings),
+        hub,  # type: ignore[arg-type]
+    )
+    metrics = Metrics(run_folder.tensorboard)
+    reporter = Reporter(ShownProgress(), metrics, settings.service)
+    return Loop(parts, reporter, StopSignals(), SimpleQueue())

@@ -1,0 +1,201 @@
+"""Checkpoint folders: written whole or not at all, and every changed byte is found."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tangram_agent.checkpoints import (
+    CorruptError,
+    list_checkpoints,
+    load_checkpoint,
+    newest_checkpoint,
+    save_checkpoint,
+    set_aside,
+)
+from tangram_sim.errors import RunError
+
+pytestmark = pytest.mark.fast
+
+ARRAYS = {
+    "weights": {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "scalar": np.float64(3)},
+    "replay": {
+        "flags": np.array([0, 1], np.uint8),
+        "count": np.array([7], np.int64),
+        "none": np.zeros((0, 2), np.float32),
+        "turned": np.arange(6, dtype=np.float32).reshape(2, 3).T,
+    },
+}
+COUNTERS = {
+    "episodes": 12,
+    "generator": {"state": 2**127 + 1},
+    "by_number": {10: "ten", 9: "nine"},
+    "nothing": None,
+    "loss": 0.1 + 0.2,
+}
+READ_BACK = COUNTERS | {"by_number": {"10": "ten", "9": "nine"}}
+FILES = ("manifest.json", "weights.safetensors", "replay.safetensors")
+
+
+def save(folder: Path, updates: int = 5, keep: int = 2) -> Path:
+    return save_checkpoint(folder, updates, ARRAYS, COUNTERS, keep)
+
+
+def names(folder: Path) -> list[str]:
+    return [path.name for path in list_checkpoints(folder)]
+
+
+def test_what_is_read_is_what_was_written(tmp_path: Path) -> None:
+    path = save(tmp_path / "deep" / "checkpoints")
+    found = load_checkpoint(path)
+    assert (found.path, found.updates, found.counters) == (path, 5, READ_BACK)
+    assert set(found.arrays) == set(ARRAYS)
+    for stem, tensors in ARRAYS.items():
+        assert set(found.arrays[stem]) == set(tensors)
+        for name, value in tensors.items():
+            got = found.arrays[stem][name]
+            assert got.dtype == np.asarray(value).dtype
+            np.testing.assert_array_equal(got, value)
+
+
+def test_only_the_named_files_are_read(tmp_path: Path) -> None:
+    path = save(tmp_path)
+    (path / "replay.safetensors").unlink()
+    assert set(load_checkpoint(path, ["weights"]).arrays) == {"weights"}
+
+
+@pytest.mark.parametrize(
+    ("keep", "kept"),
+    [(1, ["00000003"]), (2, ["00000002", "00000003"]), (9, [f"0000000{i}" for i in range(4)])],
+)
+def test_the_newest_are_kept(tmp_path: Path, keep: int, kept: list[str]) -> None:
+    for updates in range(4):
+        save(tmp_path, updates, keep)
+    assert names(tmp_path) == kept
+
+
+def test_names_are_ordered_as_numbers(tmp_path: Path) -> None:
+    for updates in (999_999_999, 100_000_000_0, 7, 7, 7):
+        save(tmp_path, updates, keep=9)
+    expected = ["00000007", "00000007-1", "00000007-2", "999999999", "1000000000"]
+    assert names(tmp_path) == expected
+    assert newest_checkpoint(tmp_path).name == "1000000000"
+
+
+def test_the_same_number_again_replaces_nothing_before_it_is_whole(tmp_path: Path) -> None:
+    first = save(tmp_path, keep=1)
+    second = save(tmp_path, keep=1)
+    assert (first.name, second.name, names(tmp_path)) == ("00000005", "00000005-1", ["00000005-1"])
+
+
+def test_a_crash_before_the_rename_leaves_the_old_one_valid(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old = save(tmp_path, updates=5)
+
+    def crash(self: Path, target: Path) -> Path:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", crash)
+        with pytest.raises(KeyboardInterrupt):
+            save(tmp_path, updates=6)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".writing-00000006", "00000005"]
+    assert newest_checkpoint(tmp_path) == old
+    assert load_checkpoint(old).updates == 5
+    save(tmp_path, updates=6)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["00000005", "00000006"]
+
+
+def test_a_half_written_folder_is_no_checkpoint(tmp_path: Path) -> None:
+    (tmp_path / ".writing-00000009").mkdir()
+    (tmp_path / "00000009.corrupt").mkdir()
+    (tmp_path / "00000009").write_text("a file")
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize("file", FILES)
+@pytest.mark.parametrize("position", [0, 300, -1])
+def test_every_changed_byte_is_found(tmp_path: Path, file: str, position: int) -> None:
+    path = save(tmp_path)
+    data = bytearray((path / file).read_bytes())
+    data[min(position, len(data) - 1)] ^= 0x01
+    (path / file).write_bytes(data)
+    with pytest.raises(CorruptError) as caught:
+        load_checkpoint(path)
+    assert file in caught.value.why
+    assert str(caught.value) == (
+        f"checkpoint {path} is corrupt ({caught.value.why}): delete it to use the one before"
+    )
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_a_cut_file_is_found(tmp_path: Path, file: str) -> None:
+    path = save(tmp_path)
+    data = (path / file).read_bytes()
+    (path / file).write_bytes(data[: len(data) // 2])
+    with pytest.raises(CorruptError, match=file):
+        load_checkpoint(path)
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_a_missing_file_is_found(tmp_path: Path, file: str) -> None:
+    path = save(tmp_path)
+    (path / file).unlink()
+    with pytest.raises(CorruptError, match=f"corrupt \\({file} is missing\\)"):
+        load_checkpoint(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"format_version": 2}, "has format 2, this version reads 1: use the version"),
+        ({"format_version": None}, "manifest.json has no format_version"),
+        ({"updates": 6}, "checksum of manifest.json differs"),
+        ({"counters": {}}, "checksum of manifest.json differs"),
+        ({"files": {}}, "checksum of manifest.json differs"),
+    ],
+)
+def test_a_changed_manifest_is_refused(
+    tmp_path: Path, change: dict[str, object], reason: str
+) -> None:
+    path = save(tmp_path)
+    manifest = json.loads((path / "manifest.json").read_text())
+    (path / "manifest.json").write_text(json.dumps(manifest | change))
+    with pytest.raises(RunError, match=reason):
+        load_checkpoint(path)
+
+
+def test_another_format_is_not_taken_for_corrupt(tmp_path: Path) -> None:
+    path = save(tmp_path)
+    (path / "manifest.json").write_text('{"format_version": 99}')
+    with pytest.raises(RunError) as caught:
+        load_checkpoint(path)
+    assert not isinstance(caught.value, CorruptError)
+
+
+def test_a_stem_that_was_never_there(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"has no optimiser\.safetensors"):
+        load_checkpoint(save(tmp_path), ["optimiser"])
+
+
+@pytest.mark.parametrize("made", [False, True])
+def test_no_checkpoint_is_told(tmp_path: Path, made: bool) -> None:
+    folder = tmp_path / "checkpoints"
+    if made:
+        folder.mkdir()
+    with pytest.raises(RunError, match=f"no checkpoint in {folder}: train the run first"):
+        newest_checkpoint(folder)
+
+
+def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+    (tmp_path / "checkpoints").write_text("a file is in the way")
+    with pytest.raises(RunError, match=r"cannot write a checkpoint to .*: make room there"):
+        save(tmp_path / "checkpoints")
+
+
+def test_a_corrupt_one_is_set_aside_and_no_longer_counts(tmp_path: Path) -> None:
+    for _ in range(2):
+        assert set_aside(save(tmp_path)).name == "00000005.corrupt"
+    assert names(tmp_path) == []

@@ -1,0 +1,416 @@
+"""Starting, restarting and ending children, with small real processes in place of the commands."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from queue import SimpleQueue
+
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hypothesis import given
+from hypothesis import strategies as st
+
+from master import children as children_module
+from master import launch as launch_module
+from master.children import MAX_RESTARTS, Child, describe, environment, override
+from master.config import LaunchConfig, MasterConfig
+from master.launch import Launcher, master_arguments, run_training
+from master.rundir import RunFolder
+from master.signals import SIGNALS, StopSignals, heeded
+from tangram_sim.errors import ConfigError
+
+LIMIT_S = 30.0
+
+
+def child(code: str, log: Path | None = None) -> Child:
+    return Child("worker 0", ["-c", code], log)
+
+
+def run_once(made: Child) -> int:
+    ended: SimpleQueue[Child] = SimpleQueue()
+    made.start(ended.put)
+    assert ended.get(timeout=LIMIT_S) is made
+    return made.clear()
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize(
+    ("status", "words"),
+    [(0, "status 0"), (2, "status 2"), (-9, "SIGKILL"), (-15, "SIGTERM"), (-200, "signal 200")],
+)
+def test_statuses_in_words(status: int, words: str) -> None:
+    assert describe(status) == words
+
+
+@pytest.mark.fast
+@given(st.text(st.characters(blacklist_categories=["Cs", "Cc"], blacklist_characters="\\$")))
+def test_any_path_is_read_back_from_an_override(value: str) -> None:
+    (parsed,) = OverridesParser.create().parse_overrides([override("run_dir", value)])
+    assert (parsed.key_or_group, parsed.value()) == ("run_dir", value)
+
+
+@pytest.mark.fast
+def test_the_master_gets_its_settings(tmp_path: Path) -> None:
+    master = MasterConfig(str(tmp_path), seed=3, max_hours=0.5, max_updates=7, resume="auto")
+    arguments = master_arguments(LaunchConfig(2, master), RunFolder(tmp_path))
+    assert arguments == [
+        "-P",
+        "-m",
+        "master",
+        f"from_config='{tmp_path}/config.yaml'",
+        f"run_dir='{tmp_path}'",
+        "seed=3",
+        "max_hours=0.5",
+        "max_episodes=0",
+        "max_updates=7",
+        "resume=auto",
+    ]
+
+
+@pytest.mark.fast
+def test_restarts_come_later_and_later_and_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    made, starts = child(""), []
+    made._started_s = 50.0
+    monkeypatch.setattr(children_module.time, "monotonic", lambda: 100.0)
+    for _ in range(MAX_RESTARTS):
+        assert made.plan_restart(1)
+        starts.append(made.next_start_s)
+    assert starts == [100.5, 101.0, 102.0, 104.0, 108.0]
+    assert not made.plan_restart(1)
+
+
+@pytest.mark.fast
+def test_wrong_input_is_not_tried_again() -> None:
+    assert not child("").plan_restart(2)
+
+
+@pytest.mark.fast
+def test_a_steady_life_clears_the_record(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = child("")
+    made.restarts = MAX_RESTARTS
+    monkeypatch.setattr(children_module, "STEADY_S", -1.0)
+    assert made.plan_restart(1)
+    assert made.restarts == 1
+
+
+@pytest.mark.cluster
+def test_output_and_status_of_a_child(tmp_path: Path) -> None:
+    made = child("print('said'); raise SystemExit(7)", tmp_path / "log")
+    assert [run_once(made), run_once(made)] == [7, 7]
+    assert made.tail() == "said\nsaid"
+    assert not made.alive
+
+
+@pytest.mark.cluster
+def test_a_child_has_its_own_session_niceness_and_one_thread(tmp_path: Path) -> None:
+    code = (
+        "import os, json, sys; sys.stdin.read(); "
+        "print(json.dumps([os.getsid(0) == os.getpid(), os.environ['OMP_NUM_THREADS']]))"
+    )
+    made = child(code, tmp_path / "log")
+    assert run_once(made) == 0
+    assert json.loads(made.tail()) == [True, environment()["OMP_NUM_THREADS"]]
+
+    polite = Child("polite", ["-c", "import signal; signal.pause()"], tmp_path / "log", nice=3)
+    ended: SimpleQueue[Child] = SimpleQueue()
+    polite.start(ended.put)
+    assert polite._process is not None
+    nice = os.getpriority(os.PRIO_PROCESS, polite._process.pid)
+    assert nice == min(os.getpriority(os.PRIO_PROCESS, 0) + 3, 19)
+    polite.signal(signal.SIGKILL)
+    ended.get(timeout=LIMIT_S)
+    assert polite.clear() == -signal.SIGKILL
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize(("given", "expected"), [(None, "1"), ("4", "4")])
+def test_the_users_own_number_of_threads_wins(
+    monkeypatch: pytest.MonkeyPatch, given: str | None, expected: str
+) -> None:
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    if given is not None:
+        monkeypatch.setenv("OMP_NUM_THREADS", given)
+    assert environment()["OMP_NUM_THREADS"] == expected
+
+
+@pytest.mark.fast
+def test_a_folder_with_a_run_is_refused_before_anything_starts(tmp_path: Path) -> None:
+    RunFolder(tmp_path).write_result({})
+    with pytest.raises(ConfigError, match="holds a run already"):
+        run_training(LaunchConfig(1, MasterConfig(str(tmp_path))), {})
+    assert not (tmp_path / "logs").exists()
+
+
+@pytest.mark.fast
+def test_a_folder_in_use_is_left_alone(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    folder.connection.touch()
+    with folder.lock(), pytest.raises(ConfigError, match="in use by another master"):
+        run_training(LaunchConfig(1, MasterConfig(str(tmp_path), resume="auto")), {})
+    assert folder.connection.exists()
+    assert not folder.config.exists()
+
+
+# A master of a few lines: it says where it can be reached, and ends when it is told to.
+MASTER = """
+import os, signal, sys, threading
+from pathlib import Path
+from tangram_agent import lifeline
+folder = Path({folder!r})
+news = open(folder / "news", "w")
+heard = threading.Event()
+lifeline.watch(lambda line: (print(line, file=news, flush=True), heard.set()))
+def end():
+    (folder / "connection.json").unlink()
+    sys.exit(0)
+def told(*_):
+    heard.wait(30)  # the reason was sent before the signal
+    end()
+signal.signal(signal.SIGTERM, told)
+(folder / "connection.json").touch()
+while {condition}:
+    signal.sigtimedwait([], 0.05)
+{ending}
+"""
+WORKER = """
+import signal
+from tangram_agent import lifeline
+lifeline.watch()
+signal.pause()
+"""
+
+
+def launcher(
+    folder: Path,
+    ending: str = "end()",
+    condition: str = "True",
+    players: Sequence[str] = (WORKER, WORKER),
+) -> Launcher:
+    """A launcher whose children run the given code."""
+    run = RunFolder(folder)
+    run.logs.mkdir()
+    console = launch_module.Console(file=(folder / "said").open("w"), width=100)
+    made = Launcher(LaunchConfig(len(players), MasterConfig(str(folder))), run, console)
+    values = {"folder": str(folder), "condition": condition, "ending": ending}
+    made._master.arguments = ["-c", MASTER.format(**values)]
+    for player, code in zip(made._players, players, strict=True):
+        player.arguments = ["-c", code]
+    made._evaluator.arguments = ["-c", WORKER]
+    return made
+
+
+def finish(made: Launcher, folder: Path) -> tuple[int, str]:
+    """Run to the end; the status, and what was said through the master or beside it."""
+    with made.signals():
+        try:
+            status = made.run()
+        finally:
+            made.end_all()
+    made._console.file.close()
+    for one in [*made._workers, made._master]:
+        assert not one.alive
+    return status, (folder / "news").read_text() + (folder / "said").read_text()
+
+
+def logs(*names: str) -> str:
+    """True while these logs are empty: workers write there when they have started."""
+    return " or ".join(f"not (folder / 'logs' / '{name}.log').exists()" for name in names)
+
+
+@pytest.mark.cluster
+@pytest.mark.parametrize(
+    ("ending", "status", "said"),
+    [
+        ("end()", 0, ""),
+        ("sys.exit(2)", 2, ""),
+        ("sys.exit(5)", 5, "the master ended with status 5; resume=auto goes on from its last"),
+        ("os.kill(os.getpid(), 9)", 137, "the master ended with SIGKILL; resume=auto"),
+    ],
+)
+def test_everything_ends_with_the_master(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str, status: int, said: str
+) -> None:
+    monkeypatch.setattr(launch_module, "LEAVE_S", 0.2)
+    started = logs("worker-0", "worker-1", "evaluator")
+    result, told = finish(launcher(tmp_path, ending, started), tmp_path)
+    assert result == status
+    assert told.startswith(said)
+    assert bool(told) == bool(said)
+
+
+@pytest.mark.cluster
+def test_workers_that_the_master_sent_home_may_leave_in_order(tmp_path: Path) -> None:
+    leaving = f"""
+import signal
+from pathlib import Path
+print("plays", flush=True)
+while Path({str(tmp_path / "connection.json")!r}).exists():
+    signal.sigtimedwait([], 0.01)
+signal.sigtimedwait([], 0.2)
+print("left in order", flush=True)
+"""
+    plays = "not (folder / 'logs' / 'worker-0.log').read_text() == 'plays\\n'"
+    made = launcher(tmp_path, condition=f"{logs('worker-0')} or {plays}", players=[leaving])
+    made._evaluator.next_start_s = None
+    assert finish(made, tmp_path) == (0, "")
+    assert made._players[0].tail() == "plays\nleft in order"
+
+
+@pytest.mark.cluster
+def test_workers_start_only_when_the_master_can_be_reached(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = launcher(tmp_path)
+    made._master.arguments = ["-c", f"open({str(tmp_path / 'news')!r}, 'w'); raise SystemExit(2)"]
+    assert finish(made, tmp_path)[0] == 2
+    assert list((tmp_path / "logs").iterdir()) == []
+
+
+@pytest.mark.cluster
+def test_a_worker_that_dies_is_started_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(launch_module, "LEAVE_S", 0.2)
+    mark = tmp_path / "came_back"
+    once = f"""
+from pathlib import Path
+if Path({str(tmp_path / "died")!r}).exists():
+    Path({str(mark)!r}).touch()
+else:
+    Path({str(tmp_path / "died")!r}).touch()
+    import os; os.kill(os.getpid(), 9)
+{WORKER}"""
+    made = launcher(tmp_path, condition=f"not Path({str(mark)!r}).exists()", players=[once])
+    status, told = finish(made, tmp_path)
+    assert status == 0
+    assert told == (
+        f"worker 0 ended with SIGKILL: it is started again (1 of {MAX_RESTARTS}); "
+        f"see {tmp_path}/logs/worker-0.log\n"
+    )
+
+
+@pytest.mark.cluster
+def test_when_no_worker_can_be_kept_the_run_ends_with_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(launch_module, "LEAVE_S", 0.2)
+    monkeypatch.setattr(children_module, "FIRST_DELAY_S", 0.01)
+    players = ["raise SystemExit('wrong tokens')", "print('bad input'); raise SystemExit(2)"]
+    status, told = finish(launcher(tmp_path, players=players), tmp_path)
+    assert status == 1
+    assert told.count("it is started again") == MAX_RESTARTS
+    assert "worker 0 ended with status 1: given up\nwrong tokens\n" in told
+    assert "worker 1 ended with status 2: given up\nbad input\n" in told
+    assert told.endswith("no worker is left: the run ends\n")
+
+
+@pytest.mark.cluster
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_the_master_in_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    monkeypatch.setattr(launch_module, "LEAVE_S", 0.2)
+    before = signal.signal(number, signal.SIG_DFL)  # nohup and scripts may have it ignored
+    made = launcher(tmp_path, condition="True", ending="")
+    start = made._start_due
+
+    def start_and_signal() -> None:
+        start()
+        if made._players[0].alive and made._stop_s is None:
+            signal.raise_signal(number)
+
+    monkeypatch.setattr(made, "_start_due", start_and_signal)
+    status, told = finish(made, tmp_path)
+    signal.signal(number, before)
+    assert status == 0
+    assert told == f"{number.name}: the run ends with a checkpoint, again to end at once\n"
+
+
+@pytest.mark.cluster
+def test_a_second_signal_ends_everything_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = launcher(tmp_path)
+    stubborn = made._master.arguments[1].replace("SIGTERM, told", "SIGTERM, signal.SIG_IGN")
+    made._master.arguments = ["-c", stubborn]
+    start = made._start_due
+
+    def start_and_signal() -> None:
+        start()
+        if (tmp_path / "connection.json").exists():
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(made, "_start_due", start_and_signal)
+    assert finish(made, tmp_path)[0] == 137
+
+
+@pytest.mark.cluster
+def test_a_master_that_does_not_end_is_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(launch_module, "STOP_S", 0.2)
+    made = launcher(tmp_path)
+    stubborn = made._master.arguments[1].replace("SIGTERM, told", "SIGTERM, signal.SIG_IGN")
+    made._master.arguments = ["-c", stubborn]
+    start = made._start_due
+
+    def start_and_stop() -> None:
+        start()
+        if made._stop_s is None and (tmp_path / "connection.json").exists():
+            signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(made, "_start_due", start_and_stop)
+    status, told = finish(made, tmp_path)
+    assert status == 137
+    assert "the master does not end within 0.2 s: it is killed" in told
+
+
+# A process in the middle of its loop, as the master is.
+SIGNALLED = """
+import signal, sys
+from master.signals import SIGNALS, StopSignals
+for number in SIGNALS:
+    signal.signal(number, signal.SIG_DFL)
+with StopSignals() as stop:
+    print("ready", flush=True)
+    while stop.reason is None:
+        signal.sigtimedwait([], 0.01)
+    print(stop.reason, flush=True)
+    if sys.argv[1] == "stuck":
+        while True:
+            signal.sigtimedwait([], 0.01)
+"""
+
+
+@pytest.mark.fast
+def test_a_signal_that_is_ignored_stays_ignored() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        assert heeded() == [number for number in SIGNALS if number != signal.SIGHUP]
+        with StopSignals() as stop:
+            signal.raise_signal(signal.SIGHUP)
+            assert stop.reason is None
+            assert signal.getsignal(signal.SIGTERM) == stop._handle
+        assert signal.getsignal(signal.SIGTERM) != stop._handle
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.cluster
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("kind", ["orderly", "stuck"])
+def test_the_first_signal_asks_and_the_second_ends(number: signal.Signals, kind: str) -> None:
+    command = [sys.executable, "-c", SIGNALLED, kind]
+    environ = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}
+    with subprocess.Popen(command, env=environ, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(number)
+        assert process.stdout.readline() == f"{number.name}\n"
+        if kind == "stuck":
+            process.send_signal(number)
+        assert process.wait(LIMIT_S) == (0 if kind == "orderly" else 128 + number)

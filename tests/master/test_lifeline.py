@@ -1,0 +1,127 @@
+"""A child ends with its parent, even after SIGKILL; shown with real processes."""
+
+import os
+import select
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from tangram_agent import lifeline
+from tangram_agent.lifeline import VARIABLE, Lifeline
+from tangram_sim.errors import ConfigError
+
+pytestmark = pytest.mark.cluster
+
+ROOT = Path(__file__).resolve().parents[2]
+LIMIT_S = 30.0
+
+# Tells when it watches, then waits for ever; `kind` decides how it takes SIGTERM.
+CHILD = """
+    import signal, sys, threading
+    from tangram_agent import lifeline
+    kind = sys.argv[1]
+    if kind == "orderly":
+        signal.signal(signal.SIGTERM, lambda *_: (print("orderly", flush=True), sys.exit(3)))
+    if kind == "stubborn":
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    watched = lifeline.watch(lambda line: print("heard", line, flush=True), grace_s=0.2)
+    print("watches" if watched else "alone", flush=True)
+    if watched:
+        while True:
+            signal.pause()
+"""
+# Starts a child as the launcher does, tells its pid, and waits for ever.
+PARENT = """
+    import signal, subprocess, sys
+    from master.children import Child
+    from pathlib import Path
+    child = Child("child", ["-c", sys.argv[1], "plain"], Path(sys.argv[2]))
+    child.start(lambda _child: None)
+    print(child._process.pid, flush=True)
+    while True:
+        signal.pause()
+"""
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(ROOT)}
+
+
+def start_child(line: Lifeline, kind: str) -> "subprocess.Popen[str]":
+    process = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(CHILD), kind],
+        env=line.environment(environment()),
+        pass_fds=[line.read_end],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    line.started()
+    return process
+
+
+@pytest.mark.parametrize(
+    ("kind", "status", "last"),
+    [("plain", -signal.SIGTERM, ""), ("orderly", 3, "orderly\n"), ("stubborn", 1, "")],
+)
+def test_a_cut_lifeline_ends_the_child(kind: str, status: int, last: str) -> None:
+    line = Lifeline()
+    with start_child(line, kind) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == "watches\n"
+        assert line.tell("one")
+        assert line.tell("two")
+        assert [child.stdout.readline() for _ in range(2)] == ["heard one\n", "heard two\n"]
+        assert child.poll() is None
+        line.cut()
+        assert child.wait(LIMIT_S) == status
+        assert child.stdout.read() == last
+
+
+def test_a_child_ends_when_its_parent_is_killed(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", textwrap.dedent(PARENT)]
+    log = tmp_path / "child.log"
+    with subprocess.Popen(
+        [*command, textwrap.dedent(CHILD), str(log)],
+        env=environment(),
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as parent:
+        assert parent.stdout is not None
+        child = int(parent.stdout.readline())
+        with os.fdopen(os.pidfd_open(child)) as handle:
+            assert select.select([handle], [], [], 0.0)[0] == []
+            parent.kill()
+            assert select.select([handle], [], [], LIMIT_S)[0] == [handle]
+        assert parent.wait(LIMIT_S) == -signal.SIGKILL
+
+
+def test_without_a_parent_nothing_is_watched() -> None:
+    command = [sys.executable, "-c", textwrap.dedent(CHILD), "plain"]
+    alone = {name: value for name, value in environment().items() if name != VARIABLE}
+    done = subprocess.run(command, env=alone, capture_output=True, text=True, check=True)
+    assert done.stdout == "alone\n"
+
+
+@pytest.mark.parametrize("value", ["none", "-1", "987654"])
+def test_a_variable_that_names_no_file_is_refused(
+    monkeypatch: pytest.MonkeyPatch, value: str
+) -> None:
+    monkeypatch.setenv(VARIABLE, value)
+    with pytest.raises(ConfigError, match=f"{VARIABLE} must be the number of an open file"):
+        lifeline.watch()
+    assert VARIABLE not in os.environ
+
+
+def test_telling_a_child_that_does_not_listen_does_not_block() -> None:
+    line = Lifeline()
+    taken = 0
+    while line.tell("x" * 1000):
+        taken += 1
+    assert 10 < taken < 10_000
+    line.started()
+    assert not line.tell("nobody")
+    line.cut()

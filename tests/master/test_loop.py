@@ -1,0 +1,352 @@
+"""The loop around a scripted hub: what is acknowledged, learned, sent, kept, and when it ends."""
+
+import json
+import stat
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from master import loop as loop_module
+from master.loop import Loop
+from master.result import make_result
+from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
+from tangram_sim.errors import RunError
+from tests.master.builders import AGENT, FakeHub, ShownProgress, arrival, loop, scores, small_setup
+
+pytestmark = pytest.mark.fast
+
+MADE = small_setup()
+STARTS, BATCH = AGENT["learning_starts"], 4
+
+
+@pytest.fixture(autouse=True)
+def unhurried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All updates that are due come in one go, however busy the machine is."""
+    monkeypatch.setattr(loop_module, "LEARN_S", 600.0)
+
+
+def batches(count: int, size: int = BATCH) -> list[list[Any]]:
+    """One batch in each poll."""
+    return [[arrival(MADE, sequence, size)] for sequence in range(1, count + 1)]
+
+
+def shown(made: Loop) -> ShownProgress:
+    progress = made._reporter.progress
+    assert isinstance(progress, ShownProgress)
+    return progress
+
+
+def test_a_batch_is_acknowledged_after_its_insert(tmp_path: Path) -> None:
+    hub = FakeHub(MADE, batches(3))
+    made = loop(tmp_path, MADE, hub, max_updates=6)
+    inserted: list[int] = []
+    acknowledge = hub.acknowledge
+
+    def noting(arrived: Any) -> None:
+        inserted.append(made.parts.trainer.episodes)
+        acknowledge(arrived)
+
+    hub.acknowledge = noting  # type: ignore[method-assign]
+    assert made.run() == "max_updates=6"
+    assert hub.values("acknowledge") == [1, 2, 3]
+    assert inserted == [4, 8, 12]
+    twins = len(MADE.agent.hindsight) + 1
+    assert made.parts.trainer.replay.added == 12 * twins
+
+
+def test_batches_wait_unacknowledged_while_the_learner_is_behind(tmp_path: Path) -> None:
+    """4 transitions are worth 2 updates, and 2 updates of lag are allowed."""
+    hub = FakeHub(MADE, [[arrival(MADE, i, BATCH) for i in (1, 2, 3)]])
+    made = loop(tmp_path, MADE, hub, max_updates=6)
+    made.receive(0.0)
+    for _ in range(3):
+        made.insert()
+    assert hub.values("acknowledge") == [1]
+    for expected in (2, 4, 6):
+        made.learn()
+        assert made.parts.trainer.updates == expected
+        made.insert()
+    assert hub.values("acknowledge") == [1, 2, 3]
+
+
+def test_nothing_is_learned_before_enough_was_played(tmp_path: Path) -> None:
+    hub = FakeHub(MADE, batches(1, STARTS - 1))
+    made = loop(tmp_path, MADE, hub, max_episodes=STARTS - 1)
+    assert made.run() == f"max_episodes={STARTS - 1}"
+    assert made.parts.trainer.updates == 0
+
+
+def test_sockets_are_served_between_updates(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hub = FakeHub(MADE, batches(1, 40))
+    made = loop(tmp_path, MADE, hub, {"lag_updates": 64}, max_updates=20)
+    monkeypatch.setattr(loop_module, "LEARN_S", 0.05)
+    clock = iter(np.arange(0.0, 1e5, 0.02))  # every look at the clock takes 20 ms
+    monkeypatch.setattr(loop_module.time, "monotonic", lambda: float(next(clock)))
+    at_polls: list[int] = []
+    hub.on_poll = lambda: at_polls.append(made.parts.trainer.updates)
+    made.run()
+    assert at_polls[-1] == 18
+    assert np.diff(at_polls).max() == 2
+
+
+@pytest.mark.parametrize(
+    ("bounds", "reason", "episodes", "updates"),
+    [
+        ({"max_updates": 3}, "max_updates=3", 8, 3),
+        # The updates that the last episodes are worth are made before the end.
+        ({"max_episodes": 8}, "max_episodes=8", 8, 4),
+        ({"max_episodes": 6}, "max_episodes=6", 8, 4),
+        ({"max_episodes": 8, "max_updates": 1}, "max_updates=1", 4, 1),
+    ],
+)
+def test_the_bounds_end_it(
+    tmp_path: Path, bounds: dict[str, int], reason: str, episodes: int, updates: int
+) -> None:
+    hub = FakeHub(MADE, batches(9))
+    made = loop(tmp_path, MADE, hub, **bounds)
+    assert made.run() == reason
+    assert (made.parts.trainer.episodes, made.parts.trainer.updates) == (episodes, updates)
+
+
+def test_episodes_beyond_the_bound_are_not_taken(tmp_path: Path) -> None:
+    hub = FakeHub(MADE, [[arrival(MADE, i, BATCH) for i in range(1, 6)]])
+    made = loop(tmp_path, MADE, hub, {"lag_updates": 64}, max_episodes=8)
+    made.run()
+    assert hub.values("acknowledge") == [1, 2]
+    assert made.parts.trainer.updates == 4
+
+
+def test_hours_end_it(tmp_path: Path) -> None:
+    made = loop(tmp_path, MADE, FakeHub(MADE), max_hours=1.0)
+    made.parts.record.loop_s = 3599.99
+    assert made.run() == "max_hours=1"
+    assert made.parts.record.loop_s == pytest.approx(3600.0, abs=10.0)
+    assert made.parts.record.train_s == 0.0
+
+
+def test_a_signal_ends_it(tmp_path: Path) -> None:
+    hub = FakeHub(MADE)
+    made = loop(tmp_path, MADE, hub)
+
+    def third() -> None:
+        if hub.polls == 3:
+            made._signals.reason = "SIGTERM"
+
+    hub.on_poll = third
+    assert made.run() == "SIGTERM"
+    assert hub.polls == 3
+
+
+@pytest.mark.parametrize(
+    ("service", "versions"),
+    [
+        ({"publish_seconds": 1000.0}, [0, 4]),
+        ({"publish_seconds": 1000.0, "every_update": True}, [0, 1, 2, 3, 4]),
+    ],
+)
+def test_weights_are_sent_at_a_bounded_rate_or_after_every_update(
+    tmp_path: Path, service: dict[str, Any], versions: list[int]
+) -> None:
+    hub = FakeHub(MADE, batches(2))
+    made = loop(tmp_path, MADE, hub, service, max_updates=4)
+    made.run()
+    made.finish(launched=False)
+    assert hub.values("publish") == versions
+
+
+def test_weights_are_sent_once(tmp_path: Path) -> None:
+    hub = FakeHub(MADE, [[] for _ in range(5)])
+    made = loop(tmp_path, MADE, hub, {"publish_seconds": 0.0})
+    hub.on_poll = lambda: setattr(made._signals, "reason", "SIGINT" if hub.polls > 4 else None)
+    made.run()
+    assert hub.values("publish") == [0]
+
+
+def test_weights_that_are_not_finite_are_neither_sent_nor_kept(tmp_path: Path) -> None:
+    hub = FakeHub(MADE, batches(2))
+    made = loop(tmp_path, MADE, hub, {"publish_seconds": 0.0}, max_updates=4)
+
+    def poison() -> None:
+        if made.parts.trainer.updates == 2:
+            with torch.no_grad():
+                next(made.parts.trainer.learner.acting.parameters()).fill_(float("nan"))
+
+    hub.on_poll = poison
+    with closing(made), pytest.raises(RunError, match=r"not finite after \d updates .*grad_clip"):
+        made.run()
+    assert max(hub.values("publish")) <= 2
+    with pytest.raises(RunError, match="neither sent nor kept"):
+        made.save()
+    assert list_checkpoints(tmp_path / "checkpoints") == []
+    assert hub.values("stop") == ["the master failed"]
+
+
+def test_checkpoints_come_on_their_interval(tmp_path: Path) -> None:
+    hub = FakeHub(MADE, batches(3))
+    service = {"checkpoint_minutes": 1e-3, "keep_checkpoints": 1}
+    made = loop(tmp_path, MADE, hub, service, max_updates=6)
+    made._checkpoint._seconds = made._checkpoint._next_s = 0.0
+    made.run()
+    (path,) = list_checkpoints(tmp_path / "checkpoints")
+    counters = load_checkpoint(path, []).counters
+    assert counters["hub"]["player/0"]["sequence"] == counters["episodes"] // BATCH
+
+
+def test_the_connection_is_there_while_the_loop_runs(tmp_path: Path) -> None:
+    hub = FakeHub(MADE)
+    made = loop(tmp_path, MADE, hub)
+    path, seen = tmp_path / "connection.json", []
+
+    def look() -> None:
+        seen.append((json.loads(path.read_text()), stat.S_IMODE(path.stat().st_mode)))
+        made._signals.reason = "SIGTERM"
+
+    hub.on_poll = look
+    made.run()
+    made.dismiss("the end")
+    content = {
+        "endpoint": hub.endpoint,
+        "weights_endpoint": hub.weights_endpoint,
+        "run_id": made.parts.record.run_id,
+    }
+    assert seen == [(content, 0o600)]
+    assert not path.exists()
+    assert hub.values("stop") == ["the end"]
+
+
+def test_the_final_weights_are_waited_for_and_reported(tmp_path: Path) -> None:
+    hub = FakeHub(MADE, batches(2), roles=["player", "evaluator"])
+    made = loop(tmp_path, MADE, hub, max_updates=4)
+    reason = made.run()
+    # First the score of older weights comes, which is not the one that counts.
+    hub.script.extend([[scores(MADE, 1, reward=0.1)], [], [scores(MADE, 4, reward=0.9)]])
+    made.finish(launched=False)
+    result = make_result(made.parts, reason, wall_s=1.0)
+    assert (result["scored_updates"], result["updates"]) == (4, 4)
+    assert (result["mean_reward"], result["mean_reward_camera"]) == (0.9, None)
+    assert (result["test_episodes"], result["workers"]) == (100.0, 1)
+    with Image.open(tmp_path / "test_episodes.png") as picture:
+        assert picture.width > picture.height
+    assert load_checkpoint(list_checkpoints(tmp_path / "checkpoints")[-1]).updates == 4
+
+
+def test_without_an_evaluator_nothing_is_waited_for(tmp_path: Path) -> None:
+    hub = FakeHub(MADE, batches(2))
+    made = loop(tmp_path, MADE, hub, max_updates=4)
+    reason = made.run()
+    polls = hub.polls
+    made.finish(launched=False)
+    assert hub.polls == polls
+    result = make_result(made.parts, reason, wall_s=1.0)
+    assert result["scored_updates"] is None
+    assert result["mean_reward"] is None
+    assert not (tmp_path / "test_episodes.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("launched", "roles", "reason", "waits"),
+    [
+        (True, [], None, True),
+        (True, [], "SIGTERM", False),
+        (False, ["evaluator"], None, True),
+        (False, ["evaluator"], "SIGTERM", True),
+    ],
+)
+def test_who_is_waited_for(
+    tmp_path: Path, launched: bool, roles: list[str], reason: str | None, waits: bool
+) -> None:
+    hub = FakeHub(MADE, [[], [scores(MADE, 0)]], roles)
+    made = loop(tmp_path, MADE, hub)
+    made._signals.reason = reason
+    made.finish(launched)
+    assert (made.parts.record.scored_version == 0) is waits
+
+
+def test_a_second_wish_to_end_is_not_kept_waiting(tmp_path: Path) -> None:
+    hub = FakeHub(MADE, roles=["evaluator"])
+    made = loop(tmp_path, MADE, hub)
+    hub.on_poll = lambda: setattr(made._signals, "reason", "SIGINT")
+    made.finish(launched=True)
+    assert hub.polls == 1
+
+
+def test_a_lost_evaluator_is_waited_for_only_so_long(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop_module, "SCORES_S", 0.01)
+    made = loop(tmp_path, MADE, FakeHub(MADE, roles=["evaluator"]), {"eval_seconds": 0.0})
+    made.finish(launched=True)
+    assert made.parts.record.scored_version == -1
+
+
+def test_the_learning_rate_follows_the_budget(tmp_path: Path) -> None:
+    made = loop(tmp_path, MADE, FakeHub(MADE, batches(5)), max_updates=10)
+    seen = []
+    update = made.parts.trainer.update
+
+    def noting(share: float) -> dict[str, float]:
+        seen.append(share)
+        return update(share)
+
+    made.parts.trainer.update = noting  # type: ignore[method-assign]
+    made.run()
+    assert seen == pytest.approx([i / 10 for i in range(10)])
+
+
+def test_what_is_told(tmp_path: Path) -> None:
+    hub = FakeHub(MADE, [*batches(2), [scores(MADE, 2)]], ["player", "evaluator"])
+    made = loop(tmp_path, MADE, hub, {"publish_seconds": 0.0}, max_updates=4)
+    made._news.put("worker 0 ended")
+    made.run()
+    made.finish(launched=False) if made.parts.record.scored_version == 4 else made.save()
+    made._reporter.flush(made.parts)
+    made._reporter.metrics.close()
+    assert shown(made).notices == ["worker 0 ended"]
+    last = shown(made).statuses[-1]
+    assert (last.episodes, last.updates, last.share) == (8, 4, 1.0)
+    assert (last.players, last.evaluators, last.activity) == (1, 1, "waiting for episodes")
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    expected = {
+        "train/critic_loss",
+        "train/actor_loss",
+        "train/q",
+        "play/reward",
+        "replay/fill",
+        "rates/transitions_per_s",
+        "rates/updates_per_s",
+        "weights/age_updates",
+        "weights/age_seconds",
+        "run/workers",
+        "pace/lag",
+    }
+    assert expected <= set(events.Tags()["scalars"])
+
+
+@pytest.mark.parametrize(
+    ("transitions", "updates", "players", "words"),
+    [
+        (0, 0, 0, "waiting for workers to join"),
+        (3, 0, 1, "filling the replay, 3 of 4"),
+        (4, 0, 1, "learning, workers wait"),
+        (4, 0, 0, "learning"),
+        (4, 1, 1, "learning"),
+        (4, 2, 1, "waiting for episodes"),
+    ],
+)
+def test_what_is_waited_for(
+    tmp_path: Path, transitions: int, updates: int, players: int, words: str
+) -> None:
+    made = loop(tmp_path, MADE, FakeHub(MADE, roles=["player"] * players))
+    made.parts.trainer.pace.inserted(transitions)
+    made.parts.trainer.pace.updated(updates)
+    made.tell()
+    assert shown(made).statuses[-1].activity == words

@@ -1,0 +1,75 @@
+"""What stands in TensorBoard after a run."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from master.metrics import Means, Metrics, flatten
+
+pytestmark = pytest.mark.fast
+
+
+def read(folder: Path) -> Any:
+    events = EventAccumulator(str(folder))
+    events.Reload()
+    return events
+
+
+def points(events: Any, tag: str) -> list[tuple[int, float]]:
+    return [(event.step, pytest.approx(event.value)) for event in events.Scalars(tag)]
+
+
+def test_points_stand_under_their_names_and_steps(tmp_path: Path) -> None:
+    metrics = Metrics(tmp_path)
+    metrics.scalars({"train/q": 0.5}, 10)
+    metrics.scalars({"train/q": 0.75, "replay/fill": 1.0}, 20)
+    metrics.scores({"mean_reward": 0.9}, updates=20, episodes=300, seconds=12.7)
+    metrics.picture(np.full((4, 6, 3), 255, np.uint8), 20)
+    metrics.settings({"agent": {"noise": 0.1}})
+    metrics.close()
+    events = read(tmp_path)
+    assert points(events, "train/q") == [(10, 0.5), (20, 0.75)]
+    assert points(events, "replay/fill") == [(20, 1.0)]
+    assert points(events, "test/mean_reward") == [(20, 0.9)]
+    assert points(events, "test_by_episodes/mean_reward") == [(300, 0.9)]
+    assert points(events, "test_by_seconds/mean_reward") == [(12, 0.9)]
+    (picture,) = events.Images("test/pictures")
+    assert (picture.step, picture.width, picture.height) == (20, 6, 4)
+    assert "noise: 0.1" in str(events.Tensors("config/text_summary")[0].tensor_proto)
+
+
+def test_hyperparameters_stand_beside_the_final_scores(tmp_path: Path) -> None:
+    metrics = Metrics(tmp_path)
+    metrics.hyperparameters({"agent": {"noise": 0.1}, "seed": 3}, {"mean_reward": 0.9})
+    metrics.close()
+    events = read(tmp_path / "final")
+    assert points(events, "final/mean_reward") == [(0, 0.9)]
+    assert "_hparams_/session_start_info" in events.summary_metadata
+
+
+def test_points_after_a_checkpoint_are_hidden_when_the_run_goes_on_from_it(tmp_path: Path) -> None:
+    for updates, value in ((0, 1.0), (20, 2.0)):
+        metrics = Metrics(tmp_path, updates)
+        for step in (10, 20, 30):
+            if step >= updates:
+                metrics.scalars({"train/q": value}, step)
+        metrics.close()
+    assert points(read(tmp_path), "train/q") == [(10, 1.0), (20, 2.0), (30, 2.0)]
+
+
+def test_means_are_weighted_and_begin_anew() -> None:
+    means = Means()
+    assert means.take() == {}
+    means.add({"reward": 1.0}, count=3)
+    means.add({"reward": 0.0, "age": 2.0}, count=1)
+    assert means.take() == {"reward": 0.75, "age": 2.0}
+    assert means.take() == {}
+
+
+def test_nested_settings_become_dotted_names() -> None:
+    nested = {"a": {"b": {"c": 1}, "d": [1, 2]}, "e": None, "f": True, "g": "x", "h": 0.5}
+    expected = {"a.b.c": 1, "a.d": "[1, 2]", "e": "None", "f": True, "g": "x", "h": 0.5}
+    assert flatten(nested) == expected

@@ -1,0 +1,146 @@
+"""Going on from a checkpoint: bit-equal, past corrupt ones, and never with another task."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from master.checkpoint import restore_run, save_run
+from master.record import Record
+from master.trainer import Trainer, choose_device
+from tangram_agent.checkpoints import list_checkpoints, load_checkpoint, save_checkpoint
+from tangram_sim.errors import ConfigError, RunError
+from tests.agent.builders import PAIR, random_episodes, setup
+from tests.master.builders import AGENT, small_setup, trainer
+
+pytestmark = pytest.mark.fast
+
+MADE = small_setup()
+HUB = {"player/0": {"incarnation": 2, "sequence": 17}}
+
+
+def play_on(made: Trainer, rounds: int, seed: int = 0) -> None:
+    """Insert and learn in turns; hindsight and sampling draw from the trainer's generators."""
+    for i in range(rounds):
+        made.insert(random_episodes(made.setup, 4, seed=1000 * seed + i))
+        while made.pace.may_update():
+            made.update(i / rounds)
+
+
+def everything(made: Trainer) -> dict[str, Any]:
+    arrays, counters = made.state()
+    flat = {f"{stem}/{n}": a.copy() for stem, part in arrays.items() for n, a in part.items()}
+    return flat | {"counters": counters}
+
+
+def assert_same(one: dict[str, Any], other: dict[str, Any]) -> None:
+    assert one.keys() == other.keys()
+    for name, value in one.items():
+        if name == "counters":
+            assert value == other[name]
+        else:
+            np.testing.assert_array_equal(value, other[name], err_msg=name)
+
+
+def test_a_run_goes_on_as_if_it_had_never_stopped(tmp_path: Path) -> None:
+    straight, stopped = trainer(MADE), trainer(MADE)
+    play_on(straight, 5)
+    play_on(stopped, 5)
+    record = Record(loop_s=12.5, scores={"mean_reward": 0.5}, scored_version=4, workers=3)
+    save_run(tmp_path, stopped, record, HUB, keep=1)
+    resumed = trainer(MADE, seed=99)
+    assert restore_run(tmp_path, resumed, pytest.fail) == (record, HUB)
+    assert_same(everything(resumed), everything(straight))
+    for made in (straight, resumed):
+        play_on(made, 5, seed=1)
+    assert_same(everything(resumed), everything(straight))
+    assert resumed.updates == 20
+
+
+def test_another_seed_gives_another_run() -> None:
+    one, other = trainer(MADE, seed=0), trainer(MADE, seed=1)
+    for made in (one, other):
+        play_on(made, 2)
+    goals = [everything(made)["replay/goal"] for made in (one, other)]
+    assert not np.array_equal(*goals)
+
+
+def test_nothing_to_go_on_from(tmp_path: Path) -> None:
+    assert restore_run(tmp_path / "checkpoints", trainer(MADE), pytest.fail) is None
+
+
+@pytest.mark.parametrize("corrupt", [1, 2])
+def test_corrupt_ones_are_set_aside_with_a_warning(tmp_path: Path, corrupt: int) -> None:
+    made = trainer(MADE)
+    for _ in range(2):
+        play_on(made, 1)
+        save_run(tmp_path, made, Record(), HUB, keep=2)
+    paths = list_checkpoints(tmp_path)
+    for path in paths[2 - corrupt :]:
+        data = bytearray((path / "learner.safetensors").read_bytes())
+        data[-1] ^= 1
+        (path / "learner.safetensors").write_bytes(data)
+    warnings: list[str] = []
+    resumed = trainer(MADE)
+    found = restore_run(tmp_path, resumed, warnings.append)
+    assert (found is None) == (corrupt == 2)
+    assert resumed.updates == (2 if corrupt == 1 else 0)
+    assert warnings == [
+        f"warning: checkpoint {path} is corrupt (checksum of learner.safetensors differs): it is "
+        f"{path.name}.corrupt now, and the one before is taken"
+        for path in reversed(paths[2 - corrupt :])
+    ]
+    assert list_checkpoints(tmp_path) == paths[: 2 - corrupt]
+
+
+@pytest.mark.parametrize(
+    ("other", "reason"),
+    [
+        (setup(PAIR, AGENT), "other settings of tokens: resume it with its own"),
+        (setup(agent=AGENT, arena=3.0), "other settings of sim"),
+        (setup(agent=AGENT, net={"kind": "mlp"}), "other settings of net"),
+        (setup(agent=AGENT | {"offsets": False}), "weights of another layout"),
+    ],
+)
+def test_another_task_is_refused(tmp_path: Path, other: Any, reason: str) -> None:
+    save_run(tmp_path, trainer(MADE), Record(), HUB, keep=1)
+    with pytest.raises(RunError, match=f"cannot go on from {tmp_path}/00000000: .*{reason}"):
+        restore_run(tmp_path, trainer(other), pytest.fail)
+
+
+def test_settings_of_the_agent_may_change_on_the_way(tmp_path: Path) -> None:
+    made = trainer(MADE)
+    play_on(made, 3)
+    save_run(tmp_path, made, Record(), HUB, keep=1)
+    resumed = trainer(small_setup(updates_per_transition=1.0, replay_capacity=32))
+    assert restore_run(tmp_path, resumed, pytest.fail) is not None
+    assert (len(resumed.replay), resumed.pace.may_update()) == (32, False)
+    play_on(resumed, 1)
+    assert resumed.updates == 6 + 4
+
+
+@pytest.mark.parametrize("lost", ["fingerprints", "pace", "record", "hub", "generators"])
+def test_a_checkpoint_that_lacks_a_part_is_refused(tmp_path: Path, lost: str) -> None:
+    path = save_run(tmp_path, trainer(MADE), Record(), HUB, keep=1)
+    found = load_checkpoint(path)
+    counters = {name: value for name, value in found.counters.items() if name != lost}
+    save_checkpoint(tmp_path, 1, found.arrays, counters, keep=1)
+    with pytest.raises(RunError, match=f"not that of a run .KeyError: '{lost}'"):
+        restore_run(tmp_path, trainer(MADE), pytest.fail)
+
+
+def test_a_record_that_lacks_a_field_is_refused() -> None:
+    state = Record().state()
+    del state["train_s"]
+    with pytest.raises(RunError, match="record lacks train_s: start a new run"):
+        Record.of(state)
+
+
+def test_a_gpu_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    assert [choose_device(name) for name in ("cpu", "auto")] == ["cpu", "cpu"]
+    with pytest.raises(ConfigError, match=r"service.device=cuda needs a GPU.*service.device=cpu"):
+        choose_device("cuda")
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    assert [choose_device(name) for name in ("cpu", "auto", "cuda")] == ["cpu", "cuda", "cuda"]

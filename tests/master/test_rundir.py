@@ -1,0 +1,84 @@
+"""The run folder: who may use it, and files that are whole at any moment."""
+
+import json
+import os
+import stat
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from master.rundir import RunFolder
+from tangram_agent.checkpoints import save_checkpoint
+from tangram_sim.errors import ConfigError
+
+pytestmark = pytest.mark.fast
+
+
+def finished(folder: RunFolder) -> None:
+    folder.path.mkdir()
+    folder.write_result({})
+
+
+def checkpointed(folder: RunFolder) -> None:
+    save_checkpoint(folder.checkpoints, 1, {"weights": {"a": np.zeros(1)}}, {}, keep=1)
+
+
+def with_curves(folder: RunFolder) -> None:
+    folder.tensorboard.mkdir(parents=True)
+    (folder.tensorboard / "events").touch()
+
+
+@pytest.mark.parametrize("leave", [finished, checkpointed, with_curves])
+def test_a_folder_with_a_run_is_refused_unless_resumed(
+    tmp_path: Path, leave: Callable[[RunFolder], None]
+) -> None:
+    folder = RunFolder(tmp_path / "run")
+    leave(folder)
+    with pytest.raises(ConfigError, match=r"holds a run already: choose another .* resume=auto"):
+        folder.prepare("none")
+    folder.prepare("auto")
+
+
+def test_a_new_folder_is_made_and_one_of_a_launcher_is_used(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path / "deep" / "run")
+    folder.prepare("none")
+    folder.write_config({"seed": 1})
+    folder.logs.mkdir()
+    folder.prepare("none")
+
+
+def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match=r"cannot be made .*: choose another run_dir"):
+        RunFolder(tmp_path / "file" / "run").prepare("none")
+
+
+def test_only_one_master_works_in_a_folder(tmp_path: Path) -> None:
+    with RunFolder(tmp_path).lock(), pytest.raises(ConfigError, match="in use by another master"):
+        RunFolder(tmp_path).lock()
+    RunFolder(tmp_path).lock().close()
+
+
+def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    config = {"sim": {"arena": 2.0}, "tokens": {"shapes": ["square"]}, "seed": 0}
+    folder.write_config(config)
+    assert yaml.safe_load(folder.config.read_text()) == config
+    assert list(yaml.safe_load(folder.config.read_text())) == list(config)
+    folder.write_result({"mean_reward": None})
+    assert json.loads(folder.result.read_text()) == {"mean_reward": None}
+
+
+def test_only_the_user_may_read_the_connection(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    folder.connection.touch(0o644)
+    before = os.umask(0)
+    try:
+        folder.write_connection({"endpoint": "tcp://127.0.0.1:5555"})
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(folder.connection.stat().st_mode) == 0o600
+    assert json.loads(folder.connection.read_text()) == {"endpoint": "tcp://127.0.0.1:5555"}

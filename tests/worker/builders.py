@@ -1,0 +1,46 @@
+"""Policies and finished runs that the tests of the worker share."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from tangram_agent.checkpoints import save_checkpoint
+from tangram_agent.config import ServiceConfig
+from tangram_agent.ddpg import Learner
+from tangram_agent.policy import Policy
+from tangram_agent.setup import Setup, make_setup
+from tangram_agent.types import Weights
+from tests.agent.builders import SMALL, SQUARE
+
+
+def weights(made: Setup, version: int) -> Weights:
+    """Random weights; every version has its own, and all of them move the tokens visibly."""
+    return Learner(made, seed=version).acting_weights(version)
+
+
+def policy(made: Setup, version: int = 1) -> Policy:
+    """A policy with random weights."""
+    acting = Policy(made)
+    acting.load(weights(made, version))
+    return acting
+
+
+def write_run(folder: Path, tokens: dict[str, Any] = SQUARE, **sections: Any) -> Setup:
+    """A run folder with one checkpoint of random weights, on the kinematic backend."""
+    config = {
+        "tokens": tokens,
+        "sim": {"backend": "kinematic"},
+        "reward": {},
+        "agent": {},
+        "net": SMALL,
+        "service": asdict(ServiceConfig()),
+    } | sections
+    made = make_setup(config)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    arrays = {"weights": weights(made, 1).tensors, "learner": {"updates": np.array([7])}}
+    save_checkpoint(folder / "checkpoints", 7, arrays, {}, keep=1)
+    return made

@@ -1,0 +1,238 @@
+"""The player with a real hub on real sockets."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zmq
+
+from master.hub import EpisodesArrived, Hub
+from tangram_agent.config import ServiceConfig
+from tangram_agent.lifeline import Lifeline
+from tangram_agent.setup import Setup
+from tangram_sim.errors import ConfigError, TangramError
+from tangram_sim.sampling import sample_poses
+from tangram_sim.seeding import episode_generator
+from tests.agent.builders import setup
+from tests.worker.builders import policy, weights, write_run
+from tests.worker.masters import LIMIT_S, collect, open_hub, with_master
+from worker.config import WorkerConfig
+from worker.player import run_player
+
+pytestmark = pytest.mark.cluster
+
+SERVICE = ServiceConfig(envs=4, batch_episodes=6, window=2)
+
+
+def config(hub: Hub, service: ServiceConfig = SERVICE, **more: object) -> WorkerConfig:
+    return WorkerConfig(hub.endpoint, service=service, **more)
+
+
+def greedy_setup(**sim: object) -> Setup:
+    """No noise at all: actions follow from corners and weights."""
+    return setup(agent={"noise": 0.0, "uniform_share": 0.0}, **sim)
+
+
+def test_weights_change_between_batches_only_and_batches_tell_which() -> None:
+    made = greedy_setup(actions_per_token=3)
+
+    # 32 groups to a batch, and new weights all the time: most come in the middle of one.
+    service = replace(SERVICE, envs=1, batch_episodes=32)
+    sets = [weights(made, i) for i in range(5)]
+
+    def script(hub: Hub) -> list[EpisodesArrived]:
+        arrived: list[EpisodesArrived] = []
+        version = 0
+        deadline = time.monotonic() + LIMIT_S
+        while len({batch.weights_version for batch in arrived}) < 6:
+            assert time.monotonic() < deadline
+            hub.publish(replace(sets[version % 5], version=version))
+            version += 1
+            for batch in hub.poll(0.002):
+                arrived.append(batch)
+                hub.acknowledge(batch)
+        return arrived
+
+    hub = open_hub(made, window=2)
+    arrived, status = with_master(hub, script, lambda: run_player(config(hub, service), made))
+    assert status == 0
+    versions = [batch.weights_version for batch in arrived]
+    assert versions == sorted(versions)
+    for batch in arrived:
+        acting = policy(made, batch.weights_version % 5)
+        # Copies: what arrives is read-only, and torch warns of that.
+        played = {name: column.copy() for name, column in vars(batch.episodes).items()}
+        for t in range(3):
+            expected = acting.act(played["corners"][:, t], played["placed"][:, t], played["goals"])
+            np.testing.assert_allclose(played["actions"][:, t], expected, atol=1e-4)
+
+
+def test_messages_hold_the_episodes_of_this_worker_in_order() -> None:
+    """Two groups of 4 fill a message of 6; the rest follows at once, with the same weights."""
+    made = greedy_setup()
+
+    def script(hub: Hub) -> list[EpisodesArrived]:
+        hub.publish(weights(made, 1))
+        arrived = []
+        while len(arrived) < 5:
+            batch = collect(hub, bool)
+            arrived += batch
+            for one in batch:
+                hub.acknowledge(one)
+        return arrived
+
+    hub = open_hub(made, seed=3)
+    arrived, _ = with_master(hub, script, lambda: run_player(config(hub, index=7), made))
+    assert [batch.episodes.count for batch in arrived[:5]] == [6, 2, 6, 2, 6]
+    assert {(batch.index, batch.incarnation) for batch in arrived} == {(7, 1)}
+    goals = np.concatenate([batch.episodes.goals for batch in arrived[:5]])
+    for number, goal in enumerate(goals):
+        rng = episode_generator(3, "player", 7, 1, number)
+        expected = made.layout.corners(sample_poses(made.layout, made.sim, rng))
+        np.testing.assert_allclose(goal, expected, atol=1e-6)
+
+
+def test_nothing_is_played_ahead_while_the_window_is_full() -> None:
+    """After a pause play goes on with the weights of now, not with those from before it."""
+    made = greedy_setup()
+    service = replace(SERVICE, batch_episodes=4)
+
+    def script(hub: Hub) -> list[EpisodesArrived]:
+        hub.publish(weights(made, 1))
+        first = collect(hub, lambda batches: len(batches) == 2)
+        hub.publish(weights(made, 2))
+        # The first heartbeat from now on tells the worker of version 2 and makes it ask if it has
+        # none; that answer goes out before the one to the second.
+        heard = hub.counters["heartbeats"]
+        late = collect(hub, lambda _: hub.counters["heartbeats"] >= heard + 2)
+        assert late == []
+        assert hub.peers[0].stats == {"episodes": 8.0}
+        hub.acknowledge(first[0])
+        return collect(hub, bool)
+
+    hub = open_hub(made, window=2)
+    after, _ = with_master(hub, script, lambda: run_player(config(hub, service), made))
+    assert [(batch.sequence, batch.weights_version) for batch in after] == [(3, 2)]
+
+
+def test_a_player_without_weights_waits_and_ends_on_stop() -> None:
+    made = greedy_setup()
+    hub = open_hub(made)
+    arrived, status = with_master(
+        hub,
+        lambda hub: collect(hub, lambda _: hub.counters["welcomed"] > 0),
+        lambda: run_player(config(hub), made),
+    )
+    assert (arrived, status) == ([], 0)
+
+
+@pytest.fixture
+def survivable_signals() -> Iterator[dict[int, object]]:
+    """What the handlers were; without the worker's own a signal does nothing."""
+    numbers = (signal.SIGTERM, signal.SIGINT)
+    before = {number: signal.signal(number, lambda *_: None) for number in numbers}
+    yield {number: signal.getsignal(number) for number in numbers}
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_a_player_with_a_goodbye(
+    number: signal.Signals,
+    survivable_signals: dict[int, object],
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    made = greedy_setup()
+
+    def script(hub: Hub) -> None:
+        hub.publish(weights(made, 1))
+        for batch in collect(hub, bool):
+            hub.acknowledge(batch)
+        os.kill(os.getpid(), number)
+        collect(hub, lambda _: hub.counters["byes"] == 1)
+
+    hub = open_hub(made)
+    _, status = with_master(hub, script, lambda: run_player(config(hub), made))
+    assert status == 0
+    assert {n: signal.getsignal(n) for n in survivable_signals} == survivable_signals
+    lines = [line.partition(" ")[2] for line in capfd.readouterr().err.splitlines()]
+    assert [line for line in lines if "is behind" not in line] == [
+        f"player: joining {hub.endpoint}",
+        "player 0: joined run run",
+        "player 0: waits: no weights yet",
+        f"player 0: ends: {number.name}",
+    ]
+
+
+def test_a_signal_ends_a_player_that_no_master_answers(
+    survivable_signals: dict[int, object],
+) -> None:
+    made = greedy_setup()
+    with (
+        zmq.Context() as context,
+        context.socket(zmq.ROUTER) as mute,
+        ThreadPoolExecutor(1) as pool,
+    ):
+        endpoint = f"tcp://127.0.0.1:{mute.bind_to_random_port('tcp://127.0.0.1')}"
+
+        def wait_for_hello() -> bool:
+            heard = mute.poll(LIMIT_S * 1000)
+            os.kill(os.getpid(), signal.SIGTERM)
+            return bool(heard)
+
+        heard = pool.submit(wait_for_hello)
+        assert run_player(WorkerConfig(endpoint, service=SERVICE), made) == 0
+        assert heard.result(LIMIT_S)
+
+
+@pytest.mark.parametrize("role", ["player", "evaluator"])
+def test_a_process_whose_parent_is_gone_takes_its_leave(tmp_path: Path, role: str) -> None:
+    """`python -m worker`, as tangram-train starts it; the master lives on and asks for nothing."""
+    made = write_run(tmp_path)
+    lifeline = Lifeline()
+    with open_hub(made) as hub:
+        command = [
+            *(sys.executable, "-m", "worker", f"connect={hub.endpoint}", f"role={role}"),
+            *(f"from_config={tmp_path / 'config.yaml'}", "service.envs=2"),
+        ]
+        with subprocess.Popen(
+            command, env=lifeline.environment(os.environ), pass_fds=(lifeline.read_end,)
+        ) as process:
+            try:
+                lifeline.started()
+                hub.publish(weights(made, 1))
+                assert collect(hub, lambda found: found or process.poll() is not None)
+                lifeline.cut()
+                collect(hub, lambda _: hub.counters["byes"] == 1)
+                assert process.wait(LIMIT_S) == 0
+            finally:
+                process.kill()
+
+
+def test_a_player_with_other_settings_is_refused() -> None:
+    made, other = greedy_setup(), setup(agent={"noise": 0.1})
+    hub = open_hub(made)
+
+    def worker() -> int:
+        with pytest.raises(TangramError, match="agent"):
+            run_player(config(hub), other)
+        return 0
+
+    with_master(
+        hub, lambda hub: collect(hub, lambda _: hub.counters["refused_settings"] == 1), worker
+    )
+
+
+def test_messages_that_would_be_too_large_are_refused_at_the_start() -> None:
+    made = setup({"shapes": ["square"] * 16, "scale": 0.1}, actions_per_token=100)
+    service = replace(SERVICE, batch_episodes=4096)
+    with pytest.raises(ConfigError, match="batch_episodes"):
+        run_player(WorkerConfig("tcp://127.0.0.1:9", service=service), made)

@@ -1,0 +1,138 @@
+"""Play: what is recorded equals a naive loop, whatever is played side by side."""
+
+from contextlib import closing
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tangram_agent.policy import Policy
+from tangram_agent.setup import Setup
+from tangram_agent.types import Episodes
+from tangram_sim.batch import BatchedEnv
+from tangram_sim.geometry import overlap_share
+from tangram_sim.sampling import sample_poses
+from tangram_sim.seeding import episode_generator
+from tests.agent.builders import PAIR, SQUARE, setup
+from tests.worker.builders import policy
+from worker.rollout import Rollout, join_episodes, join_played, play, split_episodes
+
+pytestmark = pytest.mark.fast
+
+# Explores a lot, so that a stream of random numbers that is out of step shows.
+CURIOUS = {"noise": 0.3, "uniform_share": 0.3}
+IDENTITY = (5, "player", 2, 3)
+
+
+def naive_episode(made: Setup, acting: Policy, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """One episode without any batch: pose arithmetic straight from the definition."""
+    layout, sim = made.layout, made.sim
+    goal = layout.corners(sample_poses(layout, sim, rng))
+    pose = sample_poses(layout, sim, rng).copy()
+    moves = np.zeros(layout.tokens, int)
+    corners, placed, actions, rewards = [layout.corners(pose)], [moves >= 1], [], []
+    for _ in range(made.horizon):
+        flags = moves >= sim.actions_per_token
+        action = acting.explore(corners[-1][None], flags[None], goal[None], [rng])[0]
+        token = 0
+        if layout.tokens > 1:
+            token = min(int((action[0] + 1.0) / 2.0 * layout.tokens), layout.tokens - 1)
+        if moves[token] < sim.actions_per_token:
+            pose[token] += action[-3:] * np.array([sim.arena, sim.arena, np.pi])
+            moves[token] += 1
+        corners.append(layout.corners(pose))
+        placed.append(moves >= sim.actions_per_token)
+        actions.append(action)
+        rewards.append(2.0 * overlap_share(corners[-1][None], goal[None], layout)[0] - 1.0)
+    return {
+        "corners": np.array(corners),
+        "placed": np.array(placed),
+        "actions": np.array(actions),
+        "rewards": np.array(rewards),
+        "goals": goal,
+    }
+
+
+def rolled_out(made: Setup, envs: int, count: int) -> Episodes:
+    acting = policy(made)
+    with closing(BatchedEnv(made.layout, made.sim, made.reward, envs)) as env:
+        rollout = Rollout(env, *IDENTITY)
+        parts = [rollout.play(acting.explore) for _ in range(count // envs)]
+        assert rollout.episode == count
+    return join_episodes(parts)
+
+
+@pytest.mark.parametrize(("tokens", "actions"), [(SQUARE, 1), (SQUARE, 3), (PAIR, 2)])
+@pytest.mark.parametrize("envs", [1, 4, 32])
+def test_episodes_equal_a_naive_loop_however_they_are_batched(
+    tokens: dict, actions: int, envs: int
+) -> None:
+    made = setup(tokens, CURIOUS, actions_per_token=actions)
+    episodes = rolled_out(made, envs, 32)
+    for number in range(32):
+        expected = naive_episode(made, policy(made), episode_generator(*IDENTITY, number))
+        for name, column in expected.items():
+            # Batches of other sizes round differently in the network's matrix products.
+            np.testing.assert_allclose(
+                vars(episodes)[name][number], column, atol=2e-5, err_msg=f"{name} of {number}"
+            )
+
+
+def test_what_travels_has_the_types_of_the_wire() -> None:
+    episodes = rolled_out(setup(PAIR, CURIOUS), envs=4, count=4)
+    assert {name: column.dtype.name for name, column in vars(episodes).items()} == {
+        "corners": "float32",
+        "placed": "uint8",
+        "actions": "float32",
+        "rewards": "float32",
+        "goals": "float32",
+    }
+    assert (np.abs(episodes.actions) <= 1.0).all()
+
+
+@pytest.mark.parametrize("position", range(4))
+def test_each_part_of_the_identity_gives_other_episodes(position: int) -> None:
+    made = setup()
+    other = list(IDENTITY)
+    other[position] = "evaluator" if position == 1 else IDENTITY[position] + 1
+    with closing(BatchedEnv(made.layout, made.sim, made.reward, 4)) as env:
+        one, two = (Rollout(env, *who).play(policy(made).explore) for who in (IDENTITY, other))
+    assert not np.isclose(one.goals, two.goals).any(axis=(1, 2)).all()
+    assert not np.isclose(one.corners[:, 0], two.corners[:, 0]).any(axis=(1, 2)).all()
+
+
+def test_episodes_do_not_repeat_within_an_incarnation() -> None:
+    goals = rolled_out(setup(), envs=8, count=32).goals
+    assert len(np.unique(goals.reshape(32, -1), axis=0)) == 32
+
+
+def test_physics_plays_what_kinematics_plays() -> None:
+    kinematic = setup(agent=CURIOUS)
+    physics = replace(kinematic, sim=replace(kinematic.sim, backend="physics"))
+    one, two = rolled_out(kinematic, 4, 8), rolled_out(physics, 4, 8)
+    for name, column in vars(one).items():
+        np.testing.assert_allclose(vars(two)[name], column, atol=1e-2, err_msg=name)
+
+
+@pytest.mark.parametrize(("size", "counts"), [(5, [5, 5, 2]), (12, [12]), (40, [12]), (4, [4] * 3)])
+def test_split_and_join_are_inverse(size: int, counts: list[int]) -> None:
+    episodes = rolled_out(setup(), envs=4, count=12)
+    parts = list(split_episodes(episodes, size))
+    assert [part.count for part in parts] == counts
+    for name, column in vars(join_episodes(parts)).items():
+        np.testing.assert_array_equal(column, vars(episodes)[name])
+
+
+@pytest.mark.parametrize("camera", [True, False])
+def test_joined_groups_are_cut_to_the_number_asked_for(camera: bool) -> None:
+    made = setup(camera=camera, pixels=32)
+    with closing(BatchedEnv(made.layout, made.sim, made.reward, 3)) as env:
+        numbers = [range(3), range(3, 6)]
+        acting = policy(made)
+        groups = [
+            play(env, acting.explore, [np.random.default_rng(i) for i in few]) for few in numbers
+        ]
+    whole = join_played(groups, 4)
+    assert len(whole.overlap) == len(whole.starts) == len(whole.goals) == 4
+    np.testing.assert_array_equal(whole.corners[3], groups[1].corners[0])
+    assert (whole.camera is None) == (not camera)

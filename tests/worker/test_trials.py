@@ -1,0 +1,126 @@
+"""The fixed test set, and the two policies to compare with."""
+
+from contextlib import closing
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tangram_sim.seeding import evaluation_generators
+from tests.agent.builders import PAIR, SQUARE, setup
+from tests.worker.builders import policy
+from worker.baselines import position_policy, random_policy
+from worker.rollout import Played
+from worker.trials import Trials, greedy, with_actions
+
+pytestmark = pytest.mark.fast
+
+
+def played(episodes: int, at_once: int, **more: object) -> Played:
+    made = setup(pixels=32)
+    with closing(Trials(made, episodes, at_once, **more)) as trials:
+        return trials.play(greedy(policy(made)))
+
+
+@pytest.mark.parametrize(("episodes", "at_once"), [(7, 3), (7, 7), (7, 50), (1, 1)])
+def test_the_set_does_not_depend_on_how_many_play_at_a_time(episodes: int, at_once: int) -> None:
+    expected, found = played(12, 4), played(episodes, at_once)
+    assert len(found.overlap) == episodes
+    for name in ("corners", "goals", "overlap", "actions"):
+        column = vars(expected)[name][:episodes]
+        np.testing.assert_allclose(vars(found)[name], column, atol=1e-4, err_msg=name)
+
+
+def test_the_default_set_is_that_of_the_simulation() -> None:
+    made = setup(pixels=32)
+    with closing(Trials(made, 3, 3)) as trials:
+        goals = trials.play(greedy(policy(made))).goals
+        trials.env.reset(evaluation_generators(3))
+        np.testing.assert_array_equal(goals, trials.env.goals)
+
+
+@pytest.mark.parametrize("other", [{"seed": 1}, {"role": "play"}])
+def test_another_name_is_another_set(other: dict) -> None:
+    assert not np.isclose(played(4, 4).goals, played(4, 4, **other).goals).any()
+
+
+def test_noise_is_off() -> None:
+    made = setup(agent={"noise": 1.0, "uniform_share": 1.0}, pixels=32)
+    acting = policy(made)
+    with closing(Trials(made, 3, 3)) as trials:
+        found = trials.play(greedy(acting))
+    expected = acting.act(found.starts, found.placed[:, 0], found.goals)
+    np.testing.assert_array_equal(found.actions[:, 0], expected)
+
+
+def test_the_camera_is_on_though_training_has_none() -> None:
+    made = setup(pixels=128)
+    assert not made.sim.camera
+    with closing(Trials(made, 20, 10)) as trials:
+        found = trials.play(position_policy(made.layout, made.sim.arena))
+        scores = trials.scores(found)
+    assert found.camera is not None
+    np.testing.assert_allclose(found.camera, 2.0 * found.overlap - 1.0, atol=0.1)
+    assert scores["mean_reward_camera"] == pytest.approx(scores["mean_reward"], abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("reward", "own"),
+    [
+        ({}, False),
+        ({"name": "dense"}, True),
+        ({"name": "pose"}, True),
+        ({"source": "camera"}, True),
+    ],
+)
+def test_the_trained_reward_is_reported_where_it_is_another(reward: dict, own: bool) -> None:
+    made = setup(camera=True, pixels=32)
+    made = replace(made, reward=replace(made.reward, **reward))
+    with closing(Trials(made, 3, 3)) as trials:
+        found = trials.play(greedy(policy(made)))
+        scores = trials.scores(found)
+    assert scores["mean_reward"] == pytest.approx(float(np.mean(2.0 * found.overlap - 1.0)))
+    assert ("mean_train_reward" in scores) == own
+
+
+@pytest.mark.parametrize(("tokens", "actions"), [(SQUARE, 1), (SQUARE, 3), (PAIR, 1), (PAIR, 2)])
+def test_the_position_policy_solves_position_and_nothing_else(tokens: dict, actions: int) -> None:
+    made = with_actions(setup(tokens, pixels=32), actions)
+    with closing(Trials(made, 10, 10)) as trials:
+        found = trials.play(position_policy(made.layout, made.sim.arena))
+    centres = made.layout.bases(found.ends), made.layout.bases(found.goals)
+    np.testing.assert_allclose(*centres, atol=1e-6)
+    assert found.placed[:, -1].all()
+    angles = made.layout.poses(found.corners)[..., 2]
+    np.testing.assert_allclose(angles[:, -1], angles[:, 0], atol=1e-9)
+
+
+def test_the_position_policy_reaches_the_plateau_of_the_paper() -> None:
+    """A square on its target's centre at a uniform angle: 0.8825 raw, 0.765 scaled."""
+    made = setup(pixels=16)
+    with closing(Trials(made, 2000, 200)) as trials:
+        found = trials.play(position_policy(made.layout, made.sim.arena))
+        assert trials.scores(found)["mean_reward"] == pytest.approx(0.765, abs=0.01)
+
+
+@pytest.mark.parametrize("tokens", [SQUARE, PAIR])
+def test_the_random_policy_fills_the_action_space_from_the_episodes_generators(
+    tokens: dict,
+) -> None:
+    made = setup(tokens)
+    choose = random_policy(made.action_size)
+    nothing = np.zeros((500, 1))
+    one, two = (choose(nothing, nothing, nothing, evaluation_generators(500)) for _ in range(2))
+    np.testing.assert_array_equal(one, two)
+    assert one.shape == (500, made.action_size)
+    np.testing.assert_allclose(one.min(axis=0), -1.0, atol=0.05)
+    np.testing.assert_allclose(one.max(axis=0), 1.0, atol=0.05)
+
+
+def test_the_number_of_actions_can_be_another_than_in_training() -> None:
+    made = setup()
+    assert with_actions(made, None) is made
+    longer = with_actions(made, 5)
+    assert longer.horizon == 5
+    with closing(Trials(replace(longer, sim=replace(longer.sim, pixels=16)), 2, 2)) as trials:
+        assert trials.play(greedy(policy(made))).actions.shape == (2, 5, 3)

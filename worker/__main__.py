@@ -1,0 +1,7 @@
+"""`python -m worker` is tangram-worker."""
+
+import sys
+
+from worker.cli import worker
+
+sys.exit(worker())

@@ -1,0 +1,110 @@
+"""A worker's two sockets for one connection to the master: DEALER, and SUB for weights."""
+
+import math
+import secrets
+from collections.abc import Iterator, Sequence
+
+import zmq
+
+from tangram_agent.frames import MAX_HEADER
+from tangram_agent.payloads import MAX_WEIGHTS_BYTES
+from tangram_sim.errors import RunError
+
+LINGER_MS = 1000
+# More than any window, so that only heartbeats to a master that is away find no room.
+HIGH_WATER = 2048
+# ZMTP pings find connections that died without a word.
+PING_MS = 5000
+RECONNECT_MS = 100
+RECONNECT_MAX_MS = 2000
+
+
+class Channel:
+    """A DEALER with an identity of its own, and one SUB that keeps the newest frame only.
+
+    A fresh channel has a fresh identity: a ROUTER ignores a second connection of an identity that
+    it believes alive.
+    """
+
+    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str) -> None:
+        self._context, self.endpoint = context, endpoint
+        self._sub: zmq.Socket[bytes] | None = None
+        self._weights_endpoint = ""
+        self._poller = zmq.Poller()
+        self._dealer = self._open(zmq.DEALER)
+        # The first byte must not be zero.
+        self._dealer.setsockopt(zmq.IDENTITY, b"w" + secrets.token_bytes(16))
+        self._connect(self._dealer, endpoint)
+
+    def subscribe(self, weights_endpoint: str) -> None:
+        """Listen for weights there, and nowhere else."""
+        if weights_endpoint == self._weights_endpoint:
+            return
+        self._drop_sub()
+        self._sub = self._open(zmq.SUB)
+        self._sub.setsockopt(zmq.CONFLATE, 1)
+        self._sub.setsockopt(zmq.SUBSCRIBE, b"")
+        self._connect(self._sub, weights_endpoint)
+        self._weights_endpoint = weights_endpoint
+
+    def wait(self, timeout_s: float) -> None:
+        """Return when something came, or after this time."""
+        self._poller.poll(math.ceil(max(0.0, timeout_s) * 1000))
+
+    def send(self, frames: Sequence[bytes]) -> bool:
+        """Queue a message; False if there is no room."""
+        try:
+            self._dealer.send_multipart(frames, zmq.NOBLOCK)
+        except zmq.Again:
+            return False
+        return True
+
+    def messages(self) -> Iterator[list[bytes]]:
+        """What the master answered and is there."""
+        while True:
+            try:
+                frames = self._dealer.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            yield frames
+
+    def weights(self) -> bytes | None:
+        """The newest broadcast that has not been returned."""
+        if self._sub is None:
+            return None
+        try:
+            return self._sub.recv(zmq.NOBLOCK)
+        except zmq.Again:
+            return None
+
+    def close(self, linger_ms: int = 0) -> None:
+        """Close both sockets; what is queued gets so long."""
+        self._drop_sub()
+        self._dealer.close(linger_ms)
+
+    def _drop_sub(self) -> None:
+        if self._sub is not None:
+            self._poller.unregister(self._sub)
+            self._sub.close(0)
+            self._sub = None
+
+    def _open(self, kind: int) -> zmq.Socket[bytes]:
+        socket = self._context.socket(kind)
+        socket.setsockopt(zmq.LINGER, LINGER_MS)
+        socket.setsockopt(zmq.SNDHWM, HIGH_WATER)
+        socket.setsockopt(zmq.RCVHWM, HIGH_WATER)
+        socket.setsockopt(zmq.MAXMSGSIZE, MAX_WEIGHTS_BYTES + MAX_HEADER)
+        socket.setsockopt(zmq.HEARTBEAT_IVL, PING_MS)
+        socket.setsockopt(zmq.RECONNECT_IVL, RECONNECT_MS)
+        socket.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MAX_MS)
+        self._poller.register(socket, zmq.POLLIN)
+        return socket
+
+    def _connect(self, socket: zmq.Socket[bytes], endpoint: str) -> None:
+        socket.setsockopt(zmq.IPV6, int("[" in endpoint))
+        try:
+            socket.connect(endpoint)
+        except zmq.ZMQError as error:
+            raise RunError(
+                f"cannot connect to {endpoint} ({error.strerror}): it must be tcp://host:port"
+            ) from None

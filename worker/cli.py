@@ -1,0 +1,74 @@
+"""The commands tangram-worker, tangram-eval and tangram-play.
+
+Everything heavy is imported after the config was composed, so --help and wrong input are instant.
+"""
+
+from pathlib import Path
+
+from conf.cli import entry
+from conf.help import Plain
+
+
+def worker() -> int:
+    """tangram-worker: plays for a master, or scores what it has learned."""
+    return entry("worker", _worker)
+
+
+def evaluate() -> int:
+    """tangram-eval: scores a finished run."""
+    return entry("eval", _evaluate)
+
+
+def play() -> int:
+    """tangram-play: draws a finished run at play."""
+    return entry("play", _play)
+
+
+def _worker(settings: Plain) -> int:
+    from tangram_agent.setup import SECTIONS, from_mapping, make_setup
+    from worker.config import WorkerConfig
+
+    rest = {name: value for name, value in settings.items() if name not in SECTIONS}
+    config = from_mapping(WorkerConfig, rest)
+    setup = make_setup(settings)
+    _ = setup.layout  # refuses an unknown shape before anything is connected
+
+    if config.role == "evaluator":
+        from worker.evaluator import run_evaluator
+
+        return run_evaluator(config, setup)
+    from worker.player import run_player
+
+    return run_player(config, setup)
+
+
+def _evaluate(settings: Plain) -> int:
+    from tangram_agent.setup import from_mapping
+    from worker.config import EvalConfig
+
+    config = from_mapping(EvalConfig, with_absolute_paths(settings))
+
+    from worker.evaluate import evaluate_run
+
+    return evaluate_run(config)
+
+
+def _play(settings: Plain) -> int:
+    from tangram_agent.setup import from_mapping
+    from worker.config import PlayConfig
+
+    config = from_mapping(PlayConfig, with_absolute_paths(settings))
+
+    from worker.play import play_run
+
+    return play_run(config)
+
+
+def with_absolute_paths(settings: Plain) -> Plain:
+    """run_dir and out seen from where the command was started; what is no text is left alone."""
+    result = dict(settings)
+    for name in ("run_dir", "out"):
+        value = result.get(name)
+        if isinstance(value, str) and value.strip():
+            result[name] = str(Path(value).expanduser().absolute())
+    return result

@@ -1,0 +1,105 @@
+"""The process that scores: plays the fixed test set with the newest weights, noise off."""
+
+import logging
+import time
+from contextlib import closing
+
+import numpy as np
+
+from tangram_agent.config import ServiceConfig
+from tangram_agent.policy import Policy
+from tangram_agent.setup import Setup
+from tangram_agent.types import Weights
+from tangram_agent.wire import Scores
+from worker.config import WorkerConfig
+from worker.link import Link
+from worker.rollout import Played
+from worker.session import joined
+from worker.trials import Trials, greedy
+
+PICTURES = 12
+POLL_S = 0.2
+# Weights that no newer ones follow for so long are probably the last: their score is waited for.
+STILL_S = 2.0
+
+_log = logging.getLogger(__name__)
+
+
+class Schedule:
+    """Which weights are scored, and when: at most one evaluation each `interval` seconds.
+
+    A version that nothing newer follows is scored without waiting for the interval's end, and
+    whatever happens the newest version is scored in the end.
+    """
+
+    def __init__(self, interval: float, still: float) -> None:
+        self._interval, self._still = interval, still
+        self._newest: Weights | None = None
+        self._arrived = self._began = -np.inf
+
+    def offer(self, weights: Weights | None, now: float) -> None:
+        """Newer weights arrived; None: none did."""
+        if weights is not None:
+            self._newest, self._arrived = weights, now
+
+    def due(self, now: float) -> Weights | None:
+        """The weights to score now; each is given once."""
+        waited, stood = now - self._began, now - self._arrived
+        if self._newest is None or (waited < self._interval and stood < self._still):
+            return None
+        weights, self._newest, self._began = self._newest, None, now
+        return weights
+
+
+def run_evaluator(config: WorkerConfig, setup: Setup) -> int:
+    """Score the newest weights until the master or a signal ends it.
+
+    Returns:
+        Exit status 0.
+
+    Raises:
+        TangramError: a setting that cannot work, or a master that refuses or is gone for long.
+    """
+    policy, schedule = Policy(setup), _schedule(config.service)
+    trials = Trials(setup, config.service.eval_episodes, config.service.envs)
+    with closing(trials), joined(config, setup, trials.env.bound, policy) as link:
+        while not link.stopped:
+            link.poll(POLL_S)
+            schedule.offer(link.newest_weights(), time.monotonic())
+            weights = schedule.due(time.monotonic())
+            if weights is not None:
+                policy.load(weights)
+                scores = _evaluate(trials, policy, link)
+                if scores is not None:
+                    link.send_scores(scores)
+    return 0
+
+
+def _schedule(service: ServiceConfig) -> Schedule:
+    return Schedule(service.eval_seconds, max(STILL_S, 4.0 * service.publish_seconds))
+
+
+def _evaluate(trials: Trials, policy: Policy, link: Link) -> Scores | None:
+    """Scores of the policy; None if the link was stopped meanwhile."""
+    began = time.monotonic()
+    groups = []
+    for group in trials.groups(greedy(policy)):
+        groups.append(group)
+        link.poll()
+        if link.stopped:
+            return None
+    played = trials.join(groups)
+    scalars = trials.scores(played) | {"seconds": time.monotonic() - began}
+    _log.info(
+        "weights %d: mean reward %.3f, raw overlap %.3f, median angle error %.2f degrees (%.1f s)",
+        policy.version,
+        *(scalars[name] for name in ("mean_reward", "raw_overlap", "angle_error_deg_median")),
+        scalars["seconds"],
+    )
+    return _message(policy.version, scalars, played)
+
+
+def _message(version: int, scalars: dict[str, float], played: Played) -> Scores:
+    shown = (played.starts, played.ends, played.goals)
+    starts, ends, goals = (corners[:PICTURES].astype(np.float32) for corners in shown)
+    return Scores(version, scalars, starts, ends, goals)

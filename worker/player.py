@@ -1,0 +1,75 @@
+"""The process that plays: explores with the newest weights, sends whole episodes."""
+
+import math
+from contextlib import closing
+
+from tangram_agent.policy import Policy
+from tangram_agent.setup import Setup
+from tangram_agent.types import Episodes
+from tangram_sim.batch import BatchedEnv
+from worker.config import WorkerConfig
+from worker.link import Link
+from worker.report import Report
+from worker.rollout import Rollout, join_episodes, split_episodes
+from worker.session import joined
+
+
+def run_player(config: WorkerConfig, setup: Setup) -> int:
+    """Play until the master or a signal ends it.
+
+    Returns:
+        Exit status 0.
+
+    Raises:
+        TangramError: a setting that cannot work, or a master that refuses or is gone for long.
+    """
+    policy, report = Policy(setup), Report()
+    size = config.service.batch_episodes
+    with (
+        closing(BatchedEnv(setup.layout, setup.sim, setup.reward, config.service.envs)) as env,
+        joined(config, setup, env.bound, policy) as link,
+    ):
+        if not _take_first_weights(link, policy, report):
+            return 0
+        me = link.welcome
+        rollout = Rollout(env, me.seed, config.role, me.index, me.incarnation)
+        while _wait_for_room(link, report):
+            # Weights change here and nowhere else: a batch is played with one version.
+            newest = link.newest_weights()
+            if newest is not None:
+                policy.load(newest)
+            episodes = _play(rollout, policy, link, groups=math.ceil(size / env.count))
+            for batch in split_episodes(episodes, size):
+                if not link.send(batch, policy.version):
+                    break
+            link.stats["episodes"] = float(rollout.episode)
+            report.played(episodes.count, policy.version)
+    return 0
+
+
+def _take_first_weights(link: Link, policy: Policy, report: Report) -> bool:
+    """Load the first weights; False if the link was stopped before they came."""
+    with report.waiting("no weights yet"):
+        weights = link.wait_for_weights()
+    if weights is None:
+        return False
+    policy.load(weights)
+    return True
+
+
+def _wait_for_room(link: Link, report: Report) -> bool:
+    """Wait until one more batch may be on its way; False if the link was stopped."""
+    link.poll()
+    if link.window_free > 0:
+        return not link.stopped
+    with report.waiting("the master is behind, nothing more is played before it has caught up"):
+        return link.wait_for_window()
+
+
+def _play(rollout: Rollout, policy: Policy, link: Link, groups: int) -> Episodes:
+    """So many groups of episodes, fewer if the link is stopped."""
+    parts = [rollout.play(policy.explore)]
+    while len(parts) < groups and not link.stopped:
+        link.poll()
+        parts.append(rollout.play(policy.explore))
+    return join_episodes(parts)

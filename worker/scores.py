@@ -1,0 +1,56 @@
+"""What played episodes are worth: overlaps, and errors of position and angle.
+
+Legend: E episodes, K tokens, V corners.
+"""
+
+import numpy as np
+
+from tangram_sim.arrays import Floats
+from tangram_sim.layout import Layout
+from worker.rollout import Played
+
+
+def pose_errors(layout: Layout, ends: Floats, goals: Floats) -> tuple[Floats, Floats]:
+    """How far each token is from its target, both as corners (E, V, 2).
+
+    Token k is measured against target k, also where equal shapes could change places.
+
+    Returns:
+        (E, K) distances of the centres of area, in arena units; (E, K) angles between the
+        orientations modulo the shape's symmetry, in degrees, from 0 to 180 / symmetry.
+    """
+    difference = layout.poses(ends) - layout.poses(goals)
+    position: Floats = np.linalg.norm(difference[..., :2], axis=-1)
+    period = 2.0 * np.pi / np.array([shape.symmetry for shape in layout.shapes])
+    turn = difference[..., 2] - period * np.round(difference[..., 2] / period)
+    return position, np.degrees(np.abs(turn))
+
+
+def summarise(layout: Layout, played: Played, own_reward: bool) -> dict[str, float]:
+    """Scores of E episodes; percentiles look at the bad end of each distribution.
+
+    Args:
+        own_reward: report the mean of the last action's reward, too: training is not on Eq. 14 of
+            exact polygons.
+
+    Returns:
+        mean_reward (Eq. 14 of exact polygons, in [-1, 1], whatever is trained on), raw_overlap
+        and its 10th percentile, medians and 90th percentiles of the errors over all tokens,
+        episodes; mean_reward_camera and mean_train_reward where they exist.
+    """
+    position, angle = pose_errors(layout, played.ends, played.goals)
+    scores = {
+        "mean_reward": float(np.mean(2.0 * played.overlap - 1.0)),
+        "raw_overlap": float(np.mean(played.overlap)),
+        "raw_overlap_p10": float(np.percentile(played.overlap, 10)),
+        "angle_error_deg_median": float(np.median(angle)),
+        "angle_error_deg_p90": float(np.percentile(angle, 90)),
+        "position_error_median": float(np.median(position)),
+        "position_error_p90": float(np.percentile(position, 90)),
+        "episodes": float(len(played.overlap)),
+    }
+    if played.camera is not None:
+        scores["mean_reward_camera"] = float(np.mean(played.camera))
+    if own_reward:
+        scores["mean_train_reward"] = float(np.mean(played.rewards[:, -1]))
+    return scores

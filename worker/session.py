@@ -1,0 +1,95 @@
+"""What player and evaluator share: joining a master, ending on a signal, and log lines."""
+
+import logging
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import TextIO
+
+import torch
+
+from tangram_agent import lifeline
+from tangram_agent.payloads import EpisodeSpec
+from tangram_agent.policy import Policy
+from tangram_agent.setup import Setup
+from worker.config import WorkerConfig
+from worker.link import Link
+
+SIGNALS = (signal.SIGTERM, signal.SIGINT)
+
+_log = logging.getLogger(__name__)
+
+
+@contextmanager
+def joined(config: WorkerConfig, setup: Setup, bound: float, policy: Policy) -> Iterator[Link]:
+    """A link to the master that has joined, or that was stopped while it tried.
+
+    On leaving, the master is told, after the batches that are on their way, and the signal handlers
+    are put back.
+
+    Args:
+        bound: largest |coordinate| of a corner, from the environment.
+        policy: what the master's weights must fit.
+
+    Raises:
+        ConfigError: service.batch_episodes makes messages that are too large.
+        TangramError: the master refuses, or does not answer.
+    """
+    lifeline.watch()
+    # Several workers share one machine: more threads each would only get in each other's way.
+    torch.set_num_threads(1)
+    log_as(config.role)
+    service = config.service
+    spec = EpisodeSpec.of(setup, bound)
+    if config.role == "player":
+        spec.check_batch_size(service.batch_episodes)
+    link = Link(
+        config.connect,
+        config.role,
+        config.index,
+        setup.fingerprints(),
+        spec,
+        policy.shapes,
+        service.window,
+    )
+    with link, stopped_by_signals(link):
+        _log.info("joining %s", config.connect)
+        if link.join():
+            log_as(f"{config.role} {link.welcome.index}")
+            _log.info("joined run %s", link.welcome.run_id)
+        yield link
+        _log.info("ends: %s", link.stop_reason)
+
+
+@contextmanager
+def stopped_by_signals(link: Link) -> Iterator[None]:
+    """SIGTERM and SIGINT stop the link instead of the process, so that it can say BYE."""
+
+    def handle(number: int, _frame: FrameType | None) -> None:
+        link.stop(signal.Signals(number).name)
+
+    before = {number: signal.signal(number, handle) for number in SIGNALS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def log_as(who: str) -> None:
+    """Log lines of this room go to stderr, with the time and who writes them."""
+    logger = logging.getLogger("worker")
+    logger.setLevel(logging.INFO)
+    for handler in [h for h in logger.handlers if isinstance(h, _Lines)]:
+        logger.removeHandler(handler)
+    logger.addHandler(_Lines(who))
+
+
+class _Lines(logging.StreamHandler[TextIO]):
+    """stderr, with a name in each line."""
+
+    def __init__(self, who: str) -> None:
+        super().__init__(sys.stderr)
+        self.setFormatter(logging.Formatter(f"%(asctime)s {who}: %(message)s", "%H:%M:%S"))
