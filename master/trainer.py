@@ -11,7 +11,7 @@ from master.pace import Pace
 from tangram_agent.ddpg import Learner
 from tangram_agent.hindsight import with_twins
 from tangram_agent.replay import ReplayBuffer
-from tangram_agent.runs import ACTING
+from tangram_agent.runs import ACTING, FINGERPRINTS
 from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes, Weights
 from tangram_sim.errors import ConfigError, RunError
@@ -108,7 +108,7 @@ class Trainer:
             "episodes": self.episodes,
             "pace": self.pace.state(),
             "generators": generators,
-            "fingerprints": self.setup.fingerprints(),
+            FINGERPRINTS: self.setup.fingerprints(),
         }
         return arrays, counters
 
@@ -118,7 +118,7 @@ class Trainer:
         Raises:
             RunError: the state belongs to another task or network.
         """
-        self._check_same_task(counters["fingerprints"])
+        self._check_same_task(counters[FINGERPRINTS])
         self.learner.load_state(arrays["learner"])
         self.replay.load_state(arrays["replay"])
         self.pace.load_state(counters["pace"])
@@ -127,9 +127,8 @@ class Trainer:
             generator.bit_generator.state = counters["generators"][name]
 
     def _check_same_task(self, theirs: Mapping[str, str]) -> None:
-        own = self.setup.fingerprints()
         # The agent's rates may change on the way; what shapes its networks shows when they load.
-        odd = [name for name in own if name != "agent" and own[name] != theirs.get(name)]
+        odd = [name for name in self.setup.differences(theirs) if name != "agent"]
         if odd:
             raise RunError(
                 f"the run was made with other settings of {', '.join(odd)}: resume it with its own "

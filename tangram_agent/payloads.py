@@ -223,7 +223,7 @@ def decode_weights(frame: bytes, shapes: WeightShapes | None) -> tuple[str, Weig
     fields.end()
     try:
         tensors = load(data)
-    # KeyError: a dtype that numpy has not; ValueError: an empty tensor.
+    # KeyError: a dtype that numpy has not; ValueError: a shape beyond its limits.
     except (SafetensorError, KeyError, ValueError) as error:
         raise WireError(f"weights: not safetensors: {error}") from None
     _check_tensors(tensors, shapes)

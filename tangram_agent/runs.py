@@ -19,6 +19,8 @@ from tangram_sim.errors import RunError
 CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"
 ACTING = "weights"  # the checkpoint's file of acting weights
+POLICY_SECTIONS = ("tokens", "agent", "net")
+FINGERPRINTS = "fingerprints"  # the checkpoint's counter that tells the setup
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +69,7 @@ def load_run(run_dir: str | Path, checkpoint: str | None = None) -> Run:
     Raises:
         RunError: the folder, its config or the checkpoint is missing or corrupt, or the weights
             do not fit the config.
+        ConfigError: the config is not one that this version can use.
     """
     folder = Path(run_dir)
     if not folder.is_dir():
@@ -76,6 +79,14 @@ def load_run(run_dir: str | Path, checkpoint: str | None = None) -> Run:
     checkpoints = folder / CHECKPOINTS
     path = checkpoints / checkpoint if checkpoint else newest_checkpoint(checkpoints)
     content = load_checkpoint(path, [ACTING])
+    # Where it plays may change: another backend or another reward does not change the policy.
+    trained = content.counters.get(FINGERPRINTS, setup.fingerprints())
+    odd = [name for name in setup.differences(trained) if name in POLICY_SECTIONS]
+    if odd:
+        raise RunError(
+            f"{folder / CONFIG} is not what {path.name} was trained with: its {', '.join(odd)} "
+            "differ; restore the run's own config.yaml"
+        )
     policy = Policy(setup)
     policy.load(Weights(content.updates, content.arrays[ACTING]))
     return Run(folder, config, setup, content.updates, policy)

@@ -58,6 +58,11 @@ class Setup:
             sections[name] = hashlib.sha256(content.encode()).hexdigest()[:16]
         return sections
 
+    def differences(self, fingerprints: Mapping[str, str]) -> list[str]:
+        """The sections in which another setup, known by its fingerprints, is not this one."""
+        own = self.fingerprints()
+        return sorted(n for n in own | dict(fingerprints) if own.get(n) != fingerprints.get(n))
+
 
 def make_setup(config: Mapping[str, Any]) -> Setup:
     """The setup in the sections tokens, sim, reward, agent and net of a resolved config.

@@ -30,7 +30,8 @@ def run_dir(tmp_path: Path) -> Path:
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(CONFIG))
     for updates in (10, 20):
         arrays = {"weights": Learner(MADE, seed=updates).acting_weights(1).tensors}
-        save_checkpoint(tmp_path / "checkpoints", updates, arrays, {}, keep=2)
+        counters = {"fingerprints": MADE.fingerprints()}
+        save_checkpoint(tmp_path / "checkpoints", updates, arrays, counters, keep=2)
     return tmp_path
 
 
@@ -78,8 +79,32 @@ def test_a_missing_folder_is_refused(tmp_path: Path) -> None:
         load_run(tmp_path / "nowhere")
 
 
-def test_weights_of_another_net_are_refused(run_dir: Path) -> None:
-    config = CONFIG | {"net": {**SMALL, "width": 32}}
-    (run_dir / "config.yaml").write_text(yaml.safe_dump(config))
-    with pytest.raises(RunError, match="weights of another layout"):
+@pytest.mark.parametrize(
+    ("section", "content"),
+    [
+        ("tokens", {"shapes": ["parallelogram"], "scale": 1.0}),
+        ("agent", {"egocentric": False}),
+        ("net", {**SMALL, "heads": 1}),
+    ],
+)
+def test_a_config_that_was_changed_after_the_training_is_refused(
+    run_dir: Path, section: str, content: dict[str, object]
+) -> None:
+    """None of these changes the shape of any weight."""
+    (run_dir / "config.yaml").write_text(yaml.safe_dump(CONFIG | {section: content}))
+    with pytest.raises(RunError, match=f"00000020 was trained with: its {section} differ"):
         load_run(run_dir)
+
+
+def test_a_run_may_be_played_in_another_world(run_dir: Path) -> None:
+    config = CONFIG | {"sim": {"backend": "physics"}, "reward": {"name": "dense"}}
+    (run_dir / "config.yaml").write_text(yaml.safe_dump(config))
+    assert load_run(run_dir).setup.sim.backend == "physics"
+
+
+def test_weights_of_another_net_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(CONFIG | {"net": {**SMALL, "width": 32}}))
+    arrays = {"weights": Learner(MADE, seed=0).acting_weights(1).tensors}
+    save_checkpoint(tmp_path / "checkpoints", 10, arrays, {}, keep=2)
+    with pytest.raises(RunError, match="weights of another layout"):
+        load_run(tmp_path)

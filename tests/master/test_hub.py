@@ -432,7 +432,8 @@ def test_whoever_says_something_is_not_silent(monkeypatch: pytest.MonkeyPatch) -
     with staged(silence_s=30.0) as stage:
         dealer = stage.dealer()
         dealer.join()
-        for now in (20.0, 40.0, 60.0):
+        for later in (20.0, 40.0, 60.0):
+            now = later
             dealer.say(Heartbeat({}).encode())
             assert dealer.hear() == Alive(-1)
         now = 90.1

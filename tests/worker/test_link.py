@@ -419,6 +419,23 @@ def test_weights_come_newest_only_and_once() -> None:
             assert seen == sorted(set(seen))
 
 
+def test_who_was_busy_skips_all_broadcasts_but_the_newest() -> None:
+    with standing_in() as master, make_link(master.endpoint) as link:
+        master.welcome(link)
+        frames = [encode_weights("e1", weights(version)) for version in range(500)]
+        master.until(link, lambda: master.broadcast(frames[0]) or link._talk.inbox.version == 0)
+        for frame in frames:
+            master.broadcast(frame)
+        seen: set[int] = set()
+
+        def last() -> bool:
+            seen.add(link._talk.inbox.version)
+            return 499 in seen
+
+        master.until(link, last)
+        assert len(seen) < 250
+
+
 def test_a_missed_broadcast_is_asked_for() -> None:
     with standing_in() as master, make_link(master.endpoint) as link:
         master.welcome(link)
