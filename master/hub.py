@@ -4,7 +4,7 @@ Whatever a peer sends, `poll` does not raise: what is wrong is answered with a r
 name, and forgotten. A peer that does not read its answers loses them and nobody waits for it: the
 worker asks again.
 
-Delivery: see `peers`. A batch is acknowledged only by `acknowledge`, after its insert (a journal
+Delivery: see `ledger`. A batch is acknowledged only by `acknowledge`, after its insert (a journal
 has its place between the two), and the unacknowledged batches of one peer are bounded by `window`.
 """
 
@@ -13,16 +13,16 @@ import secrets
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Self
 
+from master.arrivals import Arrival, EpisodesArrived, ScoresArrived, WelcomeInfo
 from master.ledger import Verdict
-from master.peers import FullError, Peer, Registry, SupersededError, differing
+from master.peers import Peer, RefusedError, Registry
 from master.sockets import Sockets
 from tangram_agent.decoding import BatchError, decode_from_worker
 from tangram_agent.frames import ProtocolError
-from tangram_agent.payloads import EpisodeSpec, encode_weights
-from tangram_agent.types import Episodes, Weights
+from tangram_agent.payloads import encode_weights
+from tangram_agent.types import Weights
 from tangram_agent.wire import (
     Ack,
     Alive,
@@ -49,49 +49,6 @@ log = logging.getLogger(__name__)
 MAX_DRAIN = 256
 
 
-@dataclass(frozen=True)
-class WelcomeInfo:
-    """What the master tells, and asks of, a process that joins.
-
-    Attributes:
-        run_id: of the run.
-        seed: of the run.
-        fingerprints: section of the settings -> digest; a worker's must be equal.
-        spec: the task that arrays are checked against.
-        window: most unacknowledged batches of one peer.
-    """
-
-    run_id: str
-    seed: int
-    fingerprints: Mapping[str, str]
-    spec: EpisodeSpec
-    window: int = 4
-
-
-@dataclass(frozen=True, eq=False)
-class EpisodesArrived:
-    """A new batch that waits for its insert; its arrays are read-only."""
-
-    role: str
-    index: int
-    incarnation: int
-    sequence: int
-    weights_version: int
-    episodes: Episodes
-
-
-@dataclass(frozen=True, eq=False)
-class ScoresArrived:
-    """Results of an evaluator."""
-
-    index: int
-    incarnation: int
-    scores: Scores
-
-
-Arrival = EpisodesArrived | ScoresArrived
-
-
 class Hub:
     """The master's end of all conversations.
 
@@ -106,7 +63,7 @@ class Hub:
         self.counters: Counter[str] = Counter()
         self.epoch = secrets.token_hex(8)
         self._info, self._silence_s = info, silence_s
-        self._registry = Registry(silence_s)
+        self._registry = Registry(info.fingerprints, silence_s)
         self._weights: bytes | None = None
         self._version = -1
         self._stop_reason: str | None = None
@@ -241,23 +198,10 @@ class Hub:
         return ()
 
     def _hello(self, identity: bytes, hello: Hello) -> None:
-        odd = differing(self._info.fingerprints, hello.fingerprints)
-        if odd:
-            counter = "refused_tokens" if "tokens" in odd else "refused_settings"
-            listed = ", ".join(odd)
-            reason = (
-                f"its settings of {listed} differ from the master's: start both with the same "
-                f"overrides of {listed}"
-            )
-            self._refuse(identity, counter, Refused(reason))
-            return
         try:
             peer, older = self._registry.admit(identity, hello, time.monotonic())
-        except SupersededError as error:
-            self._refuse(identity, "superseded", Stop(str(error)))
-            return
-        except FullError as error:
-            self._refuse(identity, "refused_full", Refused(str(error)))
+        except RefusedError as error:
+            self._refuse(identity, error.counter, error.answer)
             return
         if older is not None:
             reason = f"{peer.name} was taken over by a newer process"

@@ -11,10 +11,10 @@ from typing import Any
 
 import torch
 
+from master.arrivals import EpisodesArrived, ScoresArrived
 from master.checkpoint import save_run
 from master.config import MasterConfig
 from master.console import sturdy_console
-from master.hub import EpisodesArrived, ScoresArrived
 from master.metrics import Metrics
 from master.parts import Parts, make_parts
 from master.progress import make_progress, notices_from

@@ -3,17 +3,16 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from master.arrivals import WelcomeInfo
 from master.budget import Budget
 from master.checkpoint import restore_run
 from master.config import MasterConfig
-from master.hub import Hub, WelcomeInfo
+from master.hub import Hub
 from master.record import Record
 from master.rundir import RunFolder
 from master.trainer import Trainer, choose_device
 from tangram_agent.payloads import EpisodeSpec
 from tangram_agent.setup import Setup
-from tangram_sim.batch import BatchedEnv
-from tangram_sim.config import RewardConfig, SimConfig
 
 UNBOUNDED = (
     "warning: max_hours, max_episodes and max_updates are all 0: only Ctrl-C or SIGTERM ends this "
@@ -93,18 +92,10 @@ def make_parts(
         run_id=record.run_id,
         seed=config.seed,
         fingerprints=setup.fingerprints(),
-        spec=EpisodeSpec.of(setup, coordinate_bound(setup)),
+        spec=EpisodeSpec.of(setup),
         window=service.window,
     )
     hub = Hub(service.bind, service.port, info)
     if found:
         hub.load_state(table)
     return Parts(config, setup, folder, trainer, record, budget, hub)
-
-
-def coordinate_bound(setup: Setup) -> float:
-    """The largest |coordinate| that a corner can reach; it is the same without the engine."""
-    sim = SimConfig(
-        "kinematic", arena=setup.sim.arena, actions_per_token=setup.sim.actions_per_token
-    )
-    return BatchedEnv(setup.layout, sim, RewardConfig()).bound

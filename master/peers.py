@@ -9,19 +9,24 @@ from dataclasses import dataclass, field
 
 from master.ledger import Ledger
 from tangram_agent.decoding import MAX_INDEX
-from tangram_agent.wire import ROLES, Hello
+from tangram_agent.wire import ROLES, Hello, Refused, Stop
 from tangram_sim.errors import RunError, TangramError
 
 MAX_PEERS = 4096
 Key = tuple[str, int]
 
 
-class SupersededError(TangramError):
-    """A process whose index was given to a newer one."""
+class RefusedError(TangramError):
+    """A process that may not take part.
 
+    Attributes:
+        counter: that counts such refusals.
+        answer: to the process.
+    """
 
-class FullError(TangramError):
-    """There is no room for another process."""
+    def __init__(self, counter: str, answer: Refused | Stop) -> None:
+        super().__init__(answer.reason)
+        self.counter, self.answer = counter, answer
 
 
 @dataclass(eq=False)
@@ -71,8 +76,15 @@ class Registry:
         lost_batches: numbers that a checkpoint had not seen and a worker has no more.
     """
 
-    def __init__(self, grace_s: float) -> None:
+    def __init__(self, fingerprints: Mapping[str, str], grace_s: float) -> None:
+        """Nobody takes part yet.
+
+        Args:
+            fingerprints: section of the settings -> digest; a process must have the same.
+            grace_s: after a restart, how long indices wait for their workers.
+        """
         self.lost_batches = 0
+        self._fingerprints = fingerprints
         self._grace_s, self._reserved_until = grace_s, 0.0
         self._by_identity: dict[bytes, Peer] = {}
         self._by_key: dict[Key, Peer] = {}
@@ -103,9 +115,10 @@ class Registry:
             The peer, and the older process that it took the index from.
 
         Raises:
-            SupersededError: the index belongs to a newer incarnation.
-            FullError: too many peers.
+            RefusedError: other settings, too many peers, or an index that belongs to a newer
+                incarnation.
         """
+        self._check_settings(hello)
         same = next((p for p in self._by_key.values() if p.process == hello.process), None)
         if same is not None and same.role == hello.role:
             # A HELLO again, because WELCOME was late or the connection is a new one.
@@ -114,7 +127,8 @@ class Registry:
             self._by_identity[identity] = same
             return same, None
         if len(self._by_key) >= MAX_PEERS:
-            raise FullError(f"{MAX_PEERS} processes take part already, the most there can be")
+            reason = f"{MAX_PEERS} processes take part already, the most there can be"
+            raise RefusedError("refused_full", Refused(reason))
         stranger = self._by_identity.get(identity)
         if stranger is not None:
             self.leave(stranger)
@@ -156,12 +170,25 @@ class Registry:
         self._ledgers = {_key(name): _ledger(name, entry) for name, entry in state.items()}
         self._reserved_until = now + self._grace_s
 
+    def _check_settings(self, hello: Hello) -> None:
+        odd = differing(self._fingerprints, hello.fingerprints)
+        if not odd:
+            return
+        listed = ", ".join(odd)
+        reason = (
+            f"its settings of {listed} differ from the master's: start both with the same "
+            f"overrides of {listed}"
+        )
+        counter = "refused_tokens" if "tokens" in odd else "refused_settings"
+        raise RefusedError(counter, Refused(reason))
+
     def _free_index(self, role: str, now: float) -> int:
         reserved = self._ledgers if now < self._reserved_until else {}
         for index in range(MAX_INDEX + 1):
             if (role, index) not in self._by_key and (role, index) not in reserved:
                 return index
-        raise FullError(f"all {MAX_INDEX + 1} indices of role {role} are taken")
+        reason = f"all {MAX_INDEX + 1} indices of role {role} are taken"
+        raise RefusedError("refused_full", Refused(reason))
 
     def _open_ledger(self, key: Key, hello: Hello) -> Ledger:
         last = self._ledgers.get(key)
@@ -171,10 +198,11 @@ class Registry:
         elif hello.incarnation == 0:
             ledger = Ledger(last.incarnation + 1, hello.first - 1)
         elif hello.incarnation < last.incarnation or last.process not in ("", hello.process):
-            raise SupersededError(
+            reason = (
                 f"{key[0]} {key[1]} was taken over by a newer process "
                 f"(incarnation {last.incarnation}, this is {hello.incarnation})"
             )
+            raise RefusedError("superseded", Stop(reason))
         else:
             ledger = last
             # Acknowledged after the checkpoint was written, so the worker has them no more.

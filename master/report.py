@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 from PIL import Image
 
+from master.arrivals import EpisodesArrived
 from master.budget import Rates
-from master.hub import EpisodesArrived
 from master.metrics import Means, Metrics
 from master.parts import Parts
 from master.progress import Progress, Status

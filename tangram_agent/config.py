@@ -191,7 +191,9 @@ class ServiceConfig:
         check_range("service.eval_episodes", self.eval_episodes, 1, 100_000)
         check_range("service.keep_checkpoints", self.keep_checkpoints, 1, 1000)
         check_range("service.threads", self.threads, 1, 1024)
-        for name in ("lag_updates", "publish_seconds", "eval_seconds"):
+        # Without any lag a worker would wait for updates that wait for its episodes.
+        check_range("service.lag_updates", self.lag_updates, 1)
+        for name in ("publish_seconds", "eval_seconds"):
             check_range(f"service.{name}", getattr(self, name), 0)
         for name in ("log_seconds", "checkpoint_minutes"):
             check_range(f"service.{name}", getattr(self, name), 1e-3)

@@ -115,11 +115,11 @@ class EpisodeSpec:
         self.check_batch_size(1)
 
     @staticmethod
-    def of(setup: Setup, bound: float) -> "EpisodeSpec":
+    def of(setup: Setup) -> "EpisodeSpec":
         """The spec of a run's task."""
         layout = setup.layout
         return EpisodeSpec(
-            layout.tokens, layout.corner_count, setup.horizon, setup.action_size, bound
+            layout.tokens, layout.corner_count, setup.horizon, setup.action_size, setup.bound
         )
 
     @property

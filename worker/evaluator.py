@@ -62,7 +62,7 @@ def run_evaluator(config: WorkerConfig, setup: Setup) -> int:
     """
     policy, schedule = Policy(setup), _schedule(config.service)
     trials = Trials(setup, config.service.eval_episodes, config.service.envs)
-    with closing(trials), joined(config, setup, trials.env.bound, policy) as link:
+    with closing(trials), joined(config, setup, policy) as link:
         while not link.stopped:
             link.poll(POLL_S)
             schedule.offer(link.newest_weights(), time.monotonic())

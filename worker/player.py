@@ -27,7 +27,7 @@ def run_player(config: WorkerConfig, setup: Setup) -> int:
     size = config.service.batch_episodes
     with (
         closing(BatchedEnv(setup.layout, setup.sim, setup.reward, config.service.envs)) as env,
-        joined(config, setup, env.bound, policy) as link,
+        joined(config, setup, policy) as link,
     ):
         if not _take_first_weights(link, policy, report):
             return 0

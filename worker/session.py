@@ -23,14 +23,15 @@ _log = logging.getLogger(__name__)
 
 
 @contextmanager
-def joined(config: WorkerConfig, setup: Setup, bound: float, policy: Policy) -> Iterator[Link]:
+def joined(config: WorkerConfig, setup: Setup, policy: Policy) -> Iterator[Link]:
     """A link to the master that has joined, or that was stopped while it tried.
 
     On leaving, the master is told, after the batches that are on their way, and the signal handlers
     are put back.
 
     Args:
-        bound: largest |coordinate| of a corner, from the environment.
+        config: of this worker.
+        setup: the task, which the master must share.
         policy: what the master's weights must fit.
 
     Raises:
@@ -42,7 +43,7 @@ def joined(config: WorkerConfig, setup: Setup, bound: float, policy: Policy) -> 
     torch.set_num_threads(1)
     log_as(config.role)
     service = config.service
-    spec = EpisodeSpec.of(setup, bound)
+    spec = EpisodeSpec.of(setup)
     if config.role == "player":
         spec.check_batch_size(service.batch_episodes)
     link = Link(

@@ -1,6 +1,7 @@
 """A task, messages of it, and the ways to break them."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import msgpack
@@ -13,7 +14,7 @@ from tests.agent.builders import PAIR, random_episodes, setup
 
 BOUND = 4.0
 TASK = setup(PAIR, actions_per_token=2)  # K 2, V 7, T 4, A 4
-SPEC = EpisodeSpec.of(TASK, BOUND)
+SPEC = replace(EpisodeSpec.of(TASK), bound=BOUND)
 SHAPES = {"actor.weight": (3, 2), "actor.bias": (3,), "scale": ()}
 FINGERPRINTS = {"tokens": "aaaa", "sim": "bbbb"}
 

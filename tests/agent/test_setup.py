@@ -4,7 +4,8 @@ from typing import Any
 
 import pytest
 
-from tangram_agent.setup import make_setup
+from tangram_agent.config import ServiceConfig
+from tangram_agent.setup import from_mapping, make_setup
 from tangram_sim.errors import ConfigError
 
 pytestmark = pytest.mark.fast
@@ -93,3 +94,26 @@ def test_sizes_follow_from_tokens_and_actions(
     config = changed("tokens", shapes=shapes) | {"sim": {"actions_per_token": actions}}
     made = make_setup(config)
     assert (made.horizon, made.action_size) == (horizon, action_size)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "reason"),
+    [
+        ("port", 65536, "service.port must be between 0 and 65535, got 65536"),
+        ("envs", 0, "service.envs must be between 1 and 512, got 0"),
+        ("batch_episodes", 0, "service.batch_episodes must be between 1 and 4096"),
+        ("window", 0, "service.window must be between 1 and 1024"),
+        ("lag_updates", 0, "service.lag_updates must be at least 1, got 0"),
+        ("publish_seconds", -1.0, "service.publish_seconds must be at least 0, got -1"),
+        ("eval_seconds", -1.0, "service.eval_seconds must be at least 0, got -1"),
+        ("eval_episodes", 0, "service.eval_episodes must be between 1"),
+        ("log_seconds", 0.0, "service.log_seconds must be at least 0.001"),
+        ("checkpoint_minutes", 0.0, "service.checkpoint_minutes must be at least 0.001"),
+        ("keep_checkpoints", 0, "service.keep_checkpoints must be between 1"),
+        ("device", "tpu", "service.device must be one of auto, cpu, cuda, got 'tpu'"),
+        ("threads", 0, "service.threads must be between 1"),
+    ],
+)
+def test_wrong_service_settings_are_refused(name: str, value: object, reason: str) -> None:
+    with pytest.raises(ConfigError, match=reason):
+        from_mapping(ServiceConfig, {name: value})

@@ -195,8 +195,8 @@ def test_a_task_of_which_no_episode_fits_is_refused() -> None:
 
 def test_the_spec_of_a_setup() -> None:
     made = setup(PAIR, actions_per_token=2)
-    assert EpisodeSpec.of(made, 3.0) == EpisodeSpec(2, 7, 4, 4, 3.0)
-    assert EpisodeSpec.of(setup(), 3.0) == EpisodeSpec(1, 4, 1, 3, 3.0)
+    assert EpisodeSpec.of(made) == EpisodeSpec(2, 7, 4, 4, made.bound)
+    assert EpisodeSpec.of(setup()) == EpisodeSpec(1, 4, 1, 3, setup().bound)
 
 
 @pytest.mark.parametrize("bound", [-1.0, NAN, INF])

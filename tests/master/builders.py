@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from master.arrivals import EpisodesArrived, ScoresArrived
 from master.budget import Budget
 from master.config import MasterConfig
-from master.hub import EpisodesArrived, ScoresArrived
 from master.loop import Loop
 from master.metrics import Metrics
 from master.parts import Parts

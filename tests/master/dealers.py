@@ -7,7 +7,8 @@ from typing import Any
 
 import zmq
 
-from master.hub import Arrival, EpisodesArrived, Hub, WelcomeInfo
+from master.arrivals import Arrival, EpisodesArrived, WelcomeInfo
+from master.hub import Hub
 from tangram_agent.decoding import decode_from_master
 from tangram_agent.wire import ToWorker, Welcome
 from tests.agent.messages import FINGERPRINTS, SPEC, batch, hello

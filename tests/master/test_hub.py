@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from master.hub import Hub, ScoresArrived
+from master.arrivals import ScoresArrived
+from master.hub import Hub
 from tangram_agent.decoding import decode_from_master
 from tangram_agent.frames import PROTOCOL
 from tangram_agent.payloads import decode_weights

@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from master.peers import MAX_PEERS, FullError, Peer, Registry, SupersededError, differing
+from master.peers import MAX_PEERS, Peer, RefusedError, Registry, differing
 from tangram_sim.errors import RunError
-from tests.agent.messages import hello
+from tests.agent.messages import FINGERPRINTS, hello
 
 pytestmark = pytest.mark.fast
 
@@ -21,13 +21,13 @@ def admitted(registry: Registry, name: str, now: float = 0.0, **fields: Any) -> 
 
 def restored(registry: Registry, now: float = 0.0) -> Registry:
     """The registry of a master that was restarted from its checkpoint."""
-    fresh = Registry(GRACE_S)
+    fresh = Registry(FINGERPRINTS, GRACE_S)
     fresh.load_state(json.loads(json.dumps(registry.state())), now)
     return fresh
 
 
 def test_any_index_is_the_lowest_that_is_free_within_the_role() -> None:
-    registry = Registry(GRACE_S)
+    registry = Registry(FINGERPRINTS, GRACE_S)
     asked = [("a", -1), ("b", 2), ("c", -1), ("d", -1)]
     assert [admitted(registry, n, index=i).index for n, i in asked] == [0, 2, 1, 3]
     assert admitted(registry, "e", role="evaluator").index == 0
@@ -44,13 +44,13 @@ def test_any_index_is_the_lowest_that_is_free_within_the_role() -> None:
 
 
 def test_the_newest_process_of_an_index_wins() -> None:
-    registry = Registry(GRACE_S)
+    registry = Registry(FINGERPRINTS, GRACE_S)
     old = admitted(registry, "a", index=3)
     new, taken_from = registry.admit(b"b", hello(index=3, process="b"), 0.0)
     assert taken_from is old
     assert (new.incarnation, registry.peers) == (2, [new])
     assert registry.find(b"a") is None
-    with pytest.raises(SupersededError) as caught:
+    with pytest.raises(RefusedError, match="taken over") as caught:
         admitted(registry, "a", index=3, incarnation=1)
     assert str(caught.value) == (
         "player 3 was taken over by a newer process (incarnation 2, this is 1)"
@@ -59,7 +59,7 @@ def test_the_newest_process_of_an_index_wins() -> None:
 
 
 def test_a_hello_again_changes_nothing_but_the_connection() -> None:
-    registry = Registry(GRACE_S)
+    registry = Registry(FINGERPRINTS, GRACE_S)
     first = admitted(registry, "a")
     first.ledger.take(1)
     again, taken_from = registry.admit(b"other", hello(process="a"), 9.0)
@@ -69,7 +69,7 @@ def test_a_hello_again_changes_nothing_but_the_connection() -> None:
 
 
 def test_a_connection_belongs_to_one_process() -> None:
-    registry = Registry(GRACE_S)
+    registry = Registry(FINGERPRINTS, GRACE_S)
     admitted(registry, "a")
     second, _ = registry.admit(b"a", hello(process="b"), 0.0)
     assert registry.peers == [second]
@@ -77,7 +77,7 @@ def test_a_connection_belongs_to_one_process() -> None:
 
 
 def test_the_silent_are_forgotten_but_not_their_batches() -> None:
-    registry = Registry(GRACE_S)
+    registry = Registry(FINGERPRINTS, GRACE_S)
     peer = admitted(registry, "a", now=0.0)
     peer.ledger.take(1)
     busy = admitted(registry, "b", now=5.0)
@@ -89,7 +89,7 @@ def test_the_silent_are_forgotten_but_not_their_batches() -> None:
 
 
 def test_a_checkpoint_keeps_incarnations_and_inserted_batches() -> None:
-    registry = Registry(GRACE_S)
+    registry = Registry(FINGERPRINTS, GRACE_S)
     peer = admitted(registry, "a", index=4)
     for sequence in (1, 2, 3):
         peer.ledger.take(sequence)
@@ -105,23 +105,23 @@ def test_a_checkpoint_keeps_incarnations_and_inserted_batches() -> None:
 
 
 def test_after_a_restart_a_new_process_does_not_repeat_an_incarnation() -> None:
-    registry = Registry(GRACE_S)
+    registry = Registry(FINGERPRINTS, GRACE_S)
     admitted(registry, "a", index=4)
     assert admitted(restored(registry), "b", index=4).incarnation == 2
 
 
 def test_after_a_restart_an_older_process_is_still_the_older() -> None:
-    registry = Registry(GRACE_S)
+    registry = Registry(FINGERPRINTS, GRACE_S)
     admitted(registry, "a", index=0)
     admitted(registry, "b", index=0)
     after = restored(registry)
-    with pytest.raises(SupersededError):
+    with pytest.raises(RefusedError, match="taken over"):
         admitted(after, "a", index=0, incarnation=1)
     assert admitted(after, "b", index=0, incarnation=2).incarnation == 2
 
 
 def test_after_a_restart_indices_wait_for_their_workers_for_a_while() -> None:
-    registry = Registry(GRACE_S)
+    registry = Registry(FINGERPRINTS, GRACE_S)
     admitted(registry, "a")
     soon, late = restored(registry, now=100.0), restored(registry, now=100.0)
     assert admitted(soon, "new", now=100.0 + GRACE_S - 1).index == 1
@@ -130,7 +130,7 @@ def test_after_a_restart_indices_wait_for_their_workers_for_a_while() -> None:
 
 
 def test_what_a_checkpoint_missed_is_counted_not_waited_for() -> None:
-    registry = Registry(GRACE_S)
+    registry = Registry(FINGERPRINTS, GRACE_S)
     admitted(registry, "a").ledger.take(1)
     registry.peers[0].ledger.held.clear()
     after = restored(registry)
@@ -139,22 +139,22 @@ def test_what_a_checkpoint_missed_is_counted_not_waited_for() -> None:
 
 
 def test_an_incarnation_newer_than_the_checkpoint_goes_on_where_it_is() -> None:
-    registry = Registry(GRACE_S)
+    registry = Registry(FINGERPRINTS, GRACE_S)
     back = admitted(registry, "a", index=2, incarnation=7, first=12)
     assert (back.incarnation, back.ledger.received, registry.lost_batches) == (7, 11, 0)
 
 
 def test_two_processes_never_share_an_incarnation() -> None:
     """Both were given the same by masters that did not know of each other's."""
-    registry = Registry(GRACE_S)
+    registry = Registry(FINGERPRINTS, GRACE_S)
     first = admitted(registry, "a", index=0, incarnation=1)
     registry.leave(first)
-    with pytest.raises(SupersededError):
+    with pytest.raises(RefusedError, match="taken over"):
         admitted(registry, "b", index=0, incarnation=1)
 
 
 def test_batches_of_an_older_incarnation_have_no_ledger() -> None:
-    registry = Registry(GRACE_S)
+    registry = Registry(FINGERPRINTS, GRACE_S)
     old = admitted(registry, "a", index=0)
     assert registry.ledger(old.key, 1) is old.ledger
     admitted(registry, "b", index=0)
@@ -163,11 +163,11 @@ def test_batches_of_an_older_incarnation_have_no_ledger() -> None:
 
 
 def test_there_is_a_limit() -> None:
-    registry = Registry(GRACE_S)
+    registry = Registry(FINGERPRINTS, GRACE_S)
     for number in range(MAX_PEERS):
         peer = Peer("player", number, 1, f"p{number}", b"", 0.0, None)  # type: ignore[arg-type]
         registry._by_key[peer.key] = peer
-    with pytest.raises(FullError, match=f"{MAX_PEERS} processes take part already"):
+    with pytest.raises(RefusedError, match=f"{MAX_PEERS} processes take part already"):
         admitted(registry, "one more")
 
 
@@ -186,7 +186,7 @@ def test_there_is_a_limit() -> None:
 )
 def test_malformed_tables_are_refused(state: Any, reason: str) -> None:
     with pytest.raises(RunError) as caught:
-        Registry(GRACE_S).load_state(state, 0.0)
+        Registry(FINGERPRINTS, GRACE_S).load_state(state, 0.0)
     assert str(caught.value).startswith(reason)
 
 

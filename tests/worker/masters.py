@@ -3,9 +3,11 @@
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import TypeVar
 
-from master.hub import Arrival, Hub, WelcomeInfo
+from master.arrivals import Arrival, WelcomeInfo
+from master.hub import Hub
 from tangram_agent.payloads import EpisodeSpec
 from tangram_agent.setup import Setup
 
@@ -16,7 +18,7 @@ Result = TypeVar("Result")
 
 def open_hub(made: Setup, window: int = 4, seed: int = 11) -> Hub:
     """A master's hub on a free port."""
-    spec = EpisodeSpec.of(made, bound=100.0)
+    spec = replace(EpisodeSpec.of(made), bound=100.0)
     return Hub("127.0.0.1", 0, WelcomeInfo("run", seed, made.fingerprints(), spec, window))
 
 

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from master.hub import Arrival, Hub, ScoresArrived
+from master.arrivals import Arrival, ScoresArrived
+from master.hub import Hub
 from tangram_agent.config import ServiceConfig
 from tangram_sim.errors import TangramError
 from tests.agent.builders import PAIR, setup

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 import pytest
 
-from master.hub import ScoresArrived
+from master.arrivals import ScoresArrived
 from tangram_agent.payloads import encode_weights
 from tangram_agent.types import Episodes
 from tangram_agent.wire import (

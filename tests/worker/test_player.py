@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 import zmq
 
-from master.hub import EpisodesArrived, Hub
+from master.arrivals import EpisodesArrived
+from master.hub import Hub
 from tangram_agent.config import ServiceConfig
 from tangram_agent.lifeline import Lifeline
 from tangram_agent.setup import Setup
