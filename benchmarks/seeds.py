@@ -44,4 +44,5 @@ def _train(seed: int, run_dir: Path, overrides: tuple[str, ...]) -> dict[str, An
     if done.returncode or not result.exists():
         raise RunError(f"seed {seed} did not finish (exit status {done.returncode})")
     content: dict[str, Any] = json.loads(result.read_text())
+    content.pop("host", None)  # says nothing to anybody else
     return content
