@@ -95,22 +95,37 @@ def _run(config_name: str, task: Callable[[Plain], int]) -> int:
     def job(config: DictConfig) -> None:
         try:
             statuses.append(task(_plain(config)))
-        except TangramError as error:
+        except (TangramError, OSError, MemoryError) as error:
             # An exception that hydra sees costs two more lines; an exit passes through it.
-            errors.append(error)
+            errors.append(_as_ours(error))
             raise SystemExit(USAGE_STATUS) from None
 
     # Without it hydra prints errors of the command line itself, over several lines.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
         hydra.main(version_base="1.3", config_path="pkg://conf", config_name=config_name)(job)()
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise ConfigError(_explain(error, config_name)) from error
     except SystemExit:
         if not errors:
             raise
         raise errors[0] from None
     return max(statuses)
+
+
+def _as_ours(error: Exception) -> TangramError:
+    """A full disk, a folder without permission or too little memory, in one line."""
+    if isinstance(error, TangramError):
+        return error
+    if isinstance(error, OSError):
+        return TangramError(
+            f"cannot use {error.filename or 'a file'} ({error.strerror or error}): make room or "
+            "choose a folder that you may write to"
+        )
+    return TangramError(
+        f"not enough memory ({error}): lower agent.replay_capacity, agent.batch_size or "
+        "service.envs"
+    )
 
 
 def _plain(config: Any) -> Plain:
@@ -120,6 +135,7 @@ def _plain(config: Any) -> Plain:
         ConfigError: a setting without a default was not given, or an interpolation fails.
     """
     from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
@@ -130,7 +146,11 @@ def _plain(config: Any) -> Plain:
         raise ConfigError(f"cannot resolve the config: {_first_line(error)}") from None
     if missing:
         raise ConfigError(MISSING_HINTS.get(missing[0], f"set {missing[0]}=..., it has no default"))
-    return with_run_config(_mapping(settings), list(HydraConfig.get().overrides.task))
+    plain = _mapping(settings)
+    if HydraConfig.get().mode == RunMode.MULTIRUN and isinstance(plain.get("run_dir"), str):
+        # The jobs of one sweep start at one time and share their arguments: a folder for each.
+        plain["run_dir"] = f"{plain['run_dir']}/{HydraConfig.get().job.num}"
+    return with_run_config(plain, list(HydraConfig.get().overrides.task))
 
 
 def _mapping(container: object) -> Plain:
@@ -155,6 +175,8 @@ def with_run_config(settings: Plain, overrides: Sequence[str]) -> Plain:
     path = settings.pop("from_config", None)
     if path is None:
         return settings
+    if not isinstance(path, str):
+        raise ConfigError(f"from_config must be the path of a run's config.yaml, got {path!r}")
     sections = [name for name, value in settings.items() if isinstance(value, dict)]
     stored = _read_run_config(Path(path), sections)
     chosen, result = OmegaConf.create(settings), OmegaConf.create({**settings, **stored})

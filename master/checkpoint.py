@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from master.record import Record
-from master.trainer import Trainer
+from master.trainer import Trainer, check_same_task
 from tangram_agent.checkpoints import (
     Checkpoint,
     CorruptError,
@@ -14,7 +14,25 @@ from tangram_agent.checkpoints import (
     save_checkpoint,
     set_aside,
 )
+from tangram_agent.runs import FINGERPRINTS
+from tangram_agent.setup import make_setup
 from tangram_sim.errors import RunError
+
+
+def check_resumable(folder: Path, resolved: Mapping[str, Any]) -> None:
+    """Refuse another task before anything of the run is overwritten.
+
+    Raises:
+        RunError: the newest checkpoint was made with other tokens, sim, reward or net.
+    """
+    found = list_checkpoints(folder)
+    if not found:
+        return
+    try:
+        counters = load_checkpoint(found[-1], stems=[]).counters
+    except CorruptError:
+        return  # the one before decides, when the run is restored
+    check_same_task(make_setup(resolved), counters.get(FINGERPRINTS, {}))
 
 
 def save_run(

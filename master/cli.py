@@ -22,6 +22,7 @@ def master() -> int:
 def _train(settings: Plain) -> int:
     from master.config import LaunchConfig, MasterConfig
     from tangram_agent.setup import SECTIONS, from_mapping, make_setup
+    from tangram_sim.world import check_world
 
     settings["run_dir"] = absolute(settings["run_dir"])
     rest = {name: value for name, value in settings.items() if name not in SECTIONS}
@@ -30,7 +31,8 @@ def _train(settings: Plain) -> int:
         LaunchConfig, {"workers": workers, "master": from_mapping(MasterConfig, rest)}
     )
     # The children check it again; a wrong task is refused before any of them starts.
-    _ = make_setup(settings).layout
+    setup = make_setup(settings)
+    check_world(setup.layout, setup.sim)
 
     from master.launch import run_training
 

@@ -183,8 +183,12 @@ class Hub:
 
     def _talk(self, peer: Peer, message: Any) -> Sequence[Arrival]:
         match message:
+            case EpisodeBatch(sequence) if peer.role != "player":
+                self._not_its_role(peer, sequence, "episodes come from players only")
             case EpisodeBatch():
                 return self._batch(peer, message)
+            case Scores() if peer.role != "evaluator":
+                self._not_its_role(peer, 0, "scores come from evaluators only")
             case Scores():
                 self.counters["scores"] += 1
                 return [ScoresArrived(peer.index, peer.incarnation, message)]
@@ -196,6 +200,10 @@ class Hub:
                 if self._weights is not None and (epoch, version) != (self.epoch, self._version):
                     self._sockets.send(peer.identity, WeightsMessage.wrap(self._weights))
         return ()
+
+    def _not_its_role(self, peer: Peer, sequence: int, rule: str) -> None:
+        answer = Reject(reason=f"{peer.name}: {rule}", sequence=sequence, final=True)
+        self._refuse(peer.identity, "rejected", answer)
 
     def _hello(self, identity: bytes, hello: Hello) -> None:
         try:

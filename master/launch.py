@@ -10,11 +10,12 @@ from typing import Any
 
 from rich.console import Console
 
+from master.checkpoint import check_resumable
 from master.children import MAX_RESTARTS, Child, describe, module, override
 from master.config import LaunchConfig
 from master.console import sturdy_console
 from master.rundir import RunFolder
-from master.signals import heeded
+from master.signals import SAME_WISH_S, heeded
 
 # While the master starts, its connection file is looked for this often.
 LOOK_S = 0.1
@@ -42,6 +43,7 @@ def run_training(config: LaunchConfig, resolved: Mapping[str, Any]) -> int:
     folder = RunFolder(config.master.run_dir)
     folder.prepare(config.master.resume)
     with folder.lock():
+        check_resumable(folder.checkpoints, resolved)
         folder.logs.mkdir(exist_ok=True)
         folder.write_config(resolved)
         # Left by a master that was killed; workers must wait for the new one.
@@ -64,6 +66,7 @@ class Launcher:
         self._players = [_worker(folder, "player", i) for i in range(config.workers)]
         self._evaluator = _worker(folder, "evaluator", -1)
         self._stop_s: float | None = None
+        self._signalled_s: float | None = None
         self._failed, self._sent_home = False, False
 
     @contextmanager
@@ -131,11 +134,14 @@ class Launcher:
             return None
 
     def _signalled(self, number: signal.Signals) -> None:
-        """The first signal ends the run in order; the second kills everything."""
+        """The first signal ends the run in order; a later one kills everything."""
+        now_s = time.monotonic()
+        if self._signalled_s is None:
+            self._signalled_s = now_s
         if self._stop_s is None:
             self._stop(f"{number.name}: the run ends with a checkpoint, again to end at once")
-            return
-        self._kill_all()
+        elif now_s - self._signalled_s >= SAME_WISH_S:
+            self._kill_all()
 
     def _kill_all(self) -> None:
         for child in [self._master, *self._workers]:

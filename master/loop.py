@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from master.arrivals import EpisodesArrived, ScoresArrived
-from master.checkpoint import save_run
+from master.checkpoint import check_resumable, save_run
 from master.config import MasterConfig
 from master.console import sturdy_console
 from master.metrics import Metrics
@@ -35,6 +35,7 @@ GRACE_S = 30.0
 # At the end: for the scores of the final weights, the same after a signal, and for goodbyes.
 SCORES_S = 60.0
 SIGNALLED_SCORES_S = 8.0
+JOIN_S = 30.0  # for an evaluator that has not joined yet, or was given up
 LEAVE_S = 5.0
 MINUTE_S = 60.0
 PICTURE_PIXELS = 240
@@ -62,6 +63,7 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
     folder.prepare(config.resume)
     with folder.lock(), StopSignals() as signals:
         if not launched:  # the launcher wrote it, with settings of its own
+            check_resumable(folder.checkpoints, resolved)
             folder.write_config(resolved)
         with (
             closing(make_progress(console, f"tangram · {folder.path.name}")) as progress,
@@ -232,10 +234,12 @@ class Loop:
         parts, signalled = self.parts, self._signals.reason is not None
         limit_s = SCORES_S + parts.config.service.eval_seconds
         until_s = time.monotonic() + (SIGNALLED_SCORES_S if signalled else limit_s)
+        join_s = time.monotonic() + JOIN_S
         told = False
         while parts.record.scored_version != parts.trainer.updates and time.monotonic() < until_s:
             hurried = self._signals.reason is not None and not signalled
-            hopeless = not parts.count("evaluator") and (signalled or not launched)
+            late = signalled or not launched or time.monotonic() >= join_s
+            hopeless = late and not parts.count("evaluator")
             if hurried or hopeless:
                 return
             if not told:

@@ -50,7 +50,11 @@ class Metrics:
             updates: of the checkpoint that the run goes on from; later points of an earlier
                 process are hidden, since they happen again.
         """
-        self._writer = SummaryWriter(str(folder), purge_step=updates or None, flush_secs=FLUSH_S)
+        purge = updates + 1 if updates else None
+        self._writer = SummaryWriter(str(folder), purge_step=purge, flush_secs=FLUSH_S)
+        # Purging hides points of every tag in a folder by their step, so curves against episodes
+        # and seconds, which nothing repeats, lie in a folder of their own.
+        self._axes = SummaryWriter(str(folder / "axes"), flush_secs=FLUSH_S)
 
     def scalars(self, values: Mapping[str, float], step: int) -> None:
         """Points of many curves at one step."""
@@ -61,9 +65,10 @@ class Metrics:
         self, scores: Mapping[str, float], updates: int, episodes: int, seconds: float
     ) -> None:
         """An evaluation of the weights after so many updates."""
-        axes = (("test", updates), ("test_by_episodes", episodes), ("test_by_seconds", seconds))
-        for group, step in axes:
-            self.scalars({f"{group}/{name}": value for name, value in scores.items()}, int(step))
+        self.scalars({f"test/{name}": value for name, value in scores.items()}, updates)
+        for group, step in (("test_by_episodes", episodes), ("test_by_seconds", seconds)):
+            for name, value in scores.items():
+                self._axes.add_scalar(f"{group}/{name}", value, int(step))
 
     def picture(self, pixels: Pixels, updates: int) -> None:
         """The test episodes (height, width, 3) after so many updates."""
@@ -83,6 +88,7 @@ class Metrics:
     def close(self) -> None:
         """Write what is left."""
         self._writer.close()
+        self._axes.close()
 
 
 def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, float | str | bool]:

@@ -3,10 +3,13 @@
 import os
 import signal
 import sys
+import time
 from types import FrameType, TracebackType
 from typing import Any, Self
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+# One wish to end may arrive twice: a time limit signals a process and then its whole group.
+SAME_WISH_S = 1.0
 SHOW_CURSOR = b"\x1b[?25h\n"
 
 
@@ -24,6 +27,7 @@ class StopSignals:
 
     def __init__(self) -> None:
         self.reason: str | None = None
+        self._first_s = 0.0
         self._before: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Self:
@@ -41,7 +45,8 @@ class StopSignals:
 
     def _handle(self, number: int, _frame: FrameType | None) -> None:
         if self.reason is None:
-            self.reason = signal.Signals(number).name
+            self.reason, self._first_s = signal.Signals(number).name, time.monotonic()
+        if time.monotonic() - self._first_s < SAME_WISH_S:
             return
         # A live panel has hidden the cursor, and nobody else will show it again.
         if sys.stdout.isatty():

@@ -118,7 +118,7 @@ class Trainer:
         Raises:
             RunError: the state belongs to another task or network.
         """
-        self._check_same_task(counters[FINGERPRINTS])
+        check_same_task(self.setup, counters[FINGERPRINTS])
         self.learner.load_state(arrays["learner"])
         self.replay.load_state(arrays["replay"])
         self.pace.load_state(counters["pace"])
@@ -126,14 +126,18 @@ class Trainer:
         for name, generator in self._generators.items():
             generator.bit_generator.state = counters["generators"][name]
 
-    def _check_same_task(self, theirs: Mapping[str, str]) -> None:
-        # The agent's rates may change on the way; what shapes its networks shows when they load.
-        odd = [name for name in self.setup.differences(theirs) if name != "agent"]
-        if odd:
-            raise RunError(
-                f"the run was made with other settings of {', '.join(odd)}: resume it with its own "
-                "(config.yaml in its folder), or choose another run_dir"
-            )
+
+def check_same_task(setup: Setup, fingerprints: Mapping[str, str]) -> None:
+    """Raise RunError unless a run with these fingerprints can go on with this setup.
+
+    The agent's rates may change on the way; what shapes its networks shows when they load.
+    """
+    odd = [name for name in setup.differences(fingerprints) if name != "agent"]
+    if odd:
+        raise RunError(
+            f"the run was made with other settings of {', '.join(odd)}: resume it with its own, "
+            "from_config=RUN_DIR/config.yaml, or choose another run_dir"
+        )
 
 
 def choose_device(wanted: str) -> str:

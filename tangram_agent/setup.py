@@ -3,9 +3,9 @@
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, is_dataclass
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast, get_origin, get_type_hints
 
 import dacite
 
@@ -82,11 +82,24 @@ def from_mapping(kind: type[Settings], mapping: Mapping[str, Any]) -> Settings:
     Raises:
         ConfigError: names the key and what is wrong with it.
     """
+    _check_lists(kind, mapping)
     rules = dacite.Config(strict=True, cast=[tuple], type_hooks={float: _as_float})
     try:
         return dacite.from_dict(kind, mapping, rules)
     except dacite.DaciteError as error:
         raise ConfigError(f"wrong config: {error}") from None
+
+
+def _check_lists(kind: type[Any], mapping: Mapping[str, Any]) -> None:
+    """Refuse what is no list where one is expected: a text would be taken letter by letter."""
+    for name, hint in get_type_hints(kind).items():
+        value = mapping.get(name)
+        if name not in mapping:
+            continue
+        if get_origin(hint) is tuple and not isinstance(value, list | tuple):
+            raise ConfigError(f"{name} must be a list, as in {name}=[...], got {value!r}")
+        if is_dataclass(hint) and isinstance(value, Mapping):
+            _check_lists(cast("type[Any]", hint), value)
 
 
 def _as_float(value: object) -> object:

@@ -8,7 +8,8 @@ from tangram_sim.errors import ConfigError
 BACKENDS = ("physics", "kinematic")
 REWARDS = ("overlap", "dense", "pose")
 SOURCES = ("polygon", "camera")
-# Bullet turns a body by at most pi / 4 in one step, so a half turn needs four.
+# A step of Bullet is exact up to a turn of pi / 4 and turns too little beyond, so a half turn
+# needs four.
 MIN_SUBSTEPS = 4
 
 

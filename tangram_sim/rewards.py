@@ -135,7 +135,7 @@ def _load(name: str) -> UserReward:
     module_name, _, attribute = name.partition(":")
     try:
         module = importlib.import_module(module_name)
-    except ImportError as error:
+    except Exception as error:  # it is the user's code: anything may go wrong
         raise ConfigError(
             f"reward.name={name}: cannot import '{module_name}' ({error}): install it, or put its "
             "folder on PYTHONPATH"
@@ -157,8 +157,8 @@ def _checked(
     """What the user's function returns, if it is one finite number per row."""
     try:
         rewards = np.asarray(function(achieved, desired, layout), dtype=np.float64)
-    except ValueError as error:
-        raise ConfigError(f"reward.name={name} failed: {error}") from error
+    except Exception as error:  # it is the user's code: anything may go wrong
+        raise ConfigError(f"reward.name={name} failed: {type(error).__name__}: {error}") from error
     if rewards.shape != (len(achieved),):
         raise ConfigError(
             f"reward.name={name} must return one number per row, shape ({len(achieved)},), "

@@ -40,7 +40,7 @@ def sample_batch(
         SamplingError: a token does not fit into the arena, or `sim.max_tries` poses for one all
             overlapped those before it.
     """
-    reach = _reach(layout, sim)
+    reach = check_fits(layout, sim)
     poses = np.empty((len(generators), layout.tokens, 3))
     order = sorted(range(layout.tokens), key=lambda token: -layout.shapes[token].area)
     obstacles: list[Floats] = []  # (B, V of one token, 2) each
@@ -104,8 +104,12 @@ def _outlines(shape: Shape, poses: Floats) -> Floats:
     return outlines
 
 
-def _reach(layout: Layout, sim: SimConfig) -> Floats:
-    """(K,) largest coordinate of each token's centre."""
+def check_fits(layout: Layout, sim: SimConfig) -> Floats:
+    """(K,) largest coordinate of each token's centre.
+
+    Raises:
+        SamplingError: a token does not fit into the arena at every angle.
+    """
     radius = np.array([shape.radius for shape in layout.shapes])
     reach: Floats = sim.arena / 2.0 - radius
     if (reach < 0.0).any():

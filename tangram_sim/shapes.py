@@ -14,6 +14,7 @@ from tangram_sim.arrays import Floats
 from tangram_sim.errors import ConfigError
 
 MAX_CORNERS = 16
+MAX_COORDINATE = 1e6
 _TOLERANCE = 1e-9  # radians
 
 
@@ -84,8 +85,11 @@ def _checked_points(name: str, corners: Sequence[Sequence[float]]) -> Floats:
             f"shape '{name}': corners must be a list of 3 to {MAX_CORNERS} pairs [x, y], "
             f"got {corners!r}"
         )
-    if not np.isfinite(points).all():
-        raise ConfigError(f"shape '{name}': corners must be finite, got {corners!r}")
+    if not (np.abs(points) <= MAX_COORDINATE).all():
+        raise ConfigError(
+            f"shape '{name}': corners must be finite and within +-{MAX_COORDINATE:g}, "
+            f"got {corners!r}"
+        )
     return points
 
 

@@ -1,5 +1,6 @@
 """One arena with K tokens, whatever moves them."""
 
+from importlib.util import find_spec
 from typing import Protocol
 
 from tangram_sim.arrays import Floats, Pixels
@@ -7,6 +8,7 @@ from tangram_sim.config import SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.kinematics import KinematicWorld
 from tangram_sim.layout import Layout
+from tangram_sim.sampling import check_fits
 
 
 class World(Protocol):
@@ -37,6 +39,18 @@ class World(Protocol):
         """Free what the world holds; calling it twice does no harm."""
 
 
+def check_world(layout: Layout, sim: SimConfig) -> None:
+    """Refuse a task that no world could play, without making one.
+
+    Raises:
+        SamplingError: a token does not fit into the arena.
+        ConfigError: the engine is asked for and not installed.
+    """
+    check_fits(layout, sim)
+    if sim.backend == "physics" and find_spec("pybullet") is None:
+        raise _no_engine("no module named 'pybullet'")
+
+
 def make_world(layout: Layout, sim: SimConfig) -> World:
     """A world of the configured backend.
 
@@ -49,8 +63,12 @@ def make_world(layout: Layout, sim: SimConfig) -> World:
         # Only here: the master and machines without an engine must never load it.
         from tangram_sim.physics import PhysicsWorld  # noqa: PLC0415
     except ModuleNotFoundError as error:
-        raise ConfigError(
-            f"sim.backend=physics needs PyBullet ({error}): install pybullet, or set "
-            "sim.backend=kinematic"
-        ) from error
+        raise _no_engine(str(error)) from error
     return PhysicsWorld(layout, sim)
+
+
+def _no_engine(why: str) -> ConfigError:
+    return ConfigError(
+        f"sim.backend=physics needs PyBullet ({why}): install pybullet, or set "
+        "sim.backend=kinematic"
+    )

@@ -1,10 +1,16 @@
 """Rules that hold for every test."""
 
+import signal
+
 import pytest
 import torch
 
 # The sizes are small: a second thread costs more than it brings, the more so on a busy machine.
 torch.set_num_threads(1)
+
+# nohup and some runners have it ignored, which the commands under test would inherit and respect.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 TIERS = ("fast", "cluster", "slow")
 

@@ -26,12 +26,13 @@ def play() -> int:
 
 def _worker(settings: Plain) -> int:
     from tangram_agent.setup import SECTIONS, from_mapping, make_setup
+    from tangram_sim.world import check_world
     from worker.config import WorkerConfig
 
     rest = {name: value for name, value in settings.items() if name not in SECTIONS}
     config = from_mapping(WorkerConfig, rest)
     setup = make_setup(settings)
-    _ = setup.layout  # refuses an unknown shape before anything is connected
+    check_world(setup.layout, setup.sim)  # before anything is connected
 
     if config.role == "evaluator":
         from worker.evaluator import run_evaluator

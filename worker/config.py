@@ -21,6 +21,11 @@ def _check_run_dir(value: str) -> None:
         raise ConfigError("run_dir must name the folder of a run, got '': set run_dir=runs/my_run")
 
 
+def _check_out(value: str) -> None:
+    if not Path(value).name:
+        raise ConfigError(f"out must name a file, got '{value}': set out=scores.json")
+
+
 def _check_actions(value: int | None) -> None:
     if value is not None:
         check_range("actions", value, 1, MAX_ACTIONS)
@@ -74,6 +79,8 @@ class EvalConfig:
         check_range("episodes", self.episodes, 1, MAX_EPISODES)
         check_range("seed", self.seed, 0, MAX_SEED)
         _check_actions(self.actions)
+        if self.out is not None:
+            _check_out(self.out)
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,17 @@ def changed(section: str, **values: Any) -> dict[str, dict[str, Any]]:
         (changed("tokens", shapes=[]), "must list 1 to 16 shapes, got 0"),
         (changed("tokens", scale=0), "tokens.scale must be positive, got 0"),
         (changed("tokens", shapes=[{"name": "x"}]), "a mapping with the keys name and corners"),
+        (
+            changed("tokens", shapes="square"),
+            "shapes must be a list, .* got 'square'",
+        ),
+        (changed("tokens", shapes=None), "shapes must be a list"),
+        (changed("net", hidden=3), "hidden must be a list, .* got 3"),
+        (changed("agent", hindsight="final"), "hindsight must be a list"),
+        (
+            changed("tokens", shapes=[{"name": "x", "corners": [[0, 0], [1e200, 0], [0, 1e200]]}]),
+            "corners must be finite and within",
+        ),
         (changed("sim", substeps=2), "sim.substeps must be between 4 and 1000, got 2"),
         (changed("sim", backend="bullet"), "sim.backend must be one of physics, kinematic"),
         (changed("sim", arena="wide"), 'wrong value type for field "sim.arena"'),

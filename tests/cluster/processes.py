@@ -27,6 +27,21 @@ def run(command: str, *arguments: str, cwd: Path, limit_s: float = LIMIT_S) -> s
     return done.stdout
 
 
+def refused(command: str, *arguments: str, cwd: Path) -> str:
+    """Run a command that must refuse; the one line that it says."""
+    done = subprocess.run(
+        [BIN / command, *arguments],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        timeout=LIMIT_S,
+        check=False,
+    )
+    assert done.returncode == 2, done.stdout + done.stderr
+    (line,) = done.stderr.splitlines()
+    return line
+
+
 @contextmanager
 def started(command: str, *arguments: str, cwd: Path) -> Iterator[subprocess.Popen[bytes]]:
     """A running command in a session of its own, killed at the end if it still runs."""

@@ -13,7 +13,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
 from tangram_agent.setup import make_setup
 from tests.cluster.conftest import UPDATES
-from tests.cluster.processes import all_ended, pids_of, run, started, wait_for_file
+from tests.cluster.processes import all_ended, pids_of, refused, run, started, wait_for_file
 
 # The session's training runs inside the first of these tests.
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
@@ -140,6 +140,33 @@ def test_a_finished_run_is_extended(tmp_path: Path) -> None:
     second = json.loads((folder / "result.json").read_text())
     assert (first["updates"], second["updates"]) == (40, 200)
     assert second["episodes"] > first["episodes"]
+
+
+def test_a_refused_resume_leaves_the_run_as_it_was(trained: Path) -> None:
+    before = (trained / "config.yaml").read_bytes()
+    arguments = (f"run_dir={trained}", "resume=auto", "tokens=parallelogram")
+    line = refused("tangram-train", *arguments, cwd=trained.parent)
+    assert "made with other settings of tokens" in line
+    assert (trained / "config.yaml").read_bytes() == before
+
+
+def test_the_same_signal_twice_in_a_moment_is_one_wish(tmp_path: Path) -> None:
+    """As `timeout` sends it: to the process, and to its group."""
+    folder = tmp_path / "run"
+    arguments = (f"run_dir={folder}", *QUICK, "max_updates=100000")
+    with started("tangram-train", *arguments, cwd=tmp_path) as launcher:
+        wait_for_file(folder / "connection.json", launcher)
+        launcher.send_signal(signal.SIGTERM)
+        launcher.send_signal(signal.SIGTERM)
+        assert launcher.wait(60) == 0
+    assert (folder / "result.json").exists()
+
+
+def test_each_job_of_a_multirun_has_a_folder(tmp_path: Path) -> None:
+    arguments = ("--multirun", "seed=0,1", "run_dir=sweep", *QUICK, "max_updates=1")
+    run("tangram-train", *arguments, cwd=tmp_path, limit_s=120)
+    seeds = [json.loads((tmp_path / "sweep" / n / "result.json").read_text())["seed"] for n in "01"]
+    assert seeds == [0, 1]
 
 
 @pytest.mark.parametrize("agent", ["paper", "mlp"])

@@ -427,6 +427,25 @@ def test_scores_and_heartbeats() -> None:
         np.testing.assert_array_equal(arrival.scores.ends, scores().ends)
 
 
+@pytest.mark.parametrize(
+    ("role", "number", "frames", "reason"),
+    [
+        ("player", 0, scores().encode(SPEC), "player 2: scores come from evaluators only"),
+        ("evaluator", 1, batch(1).encode(SPEC), "evaluator 2: episodes come from players only"),
+    ],
+)
+def test_each_role_sends_its_own_kind_only(
+    role: str, number: int, frames: list[bytes], reason: str
+) -> None:
+    with staged() as stage:
+        dealer = stage.dealer()
+        dealer.join(role=role, index=2)
+        dealer.say(frames)
+        assert dealer.hear() == Reject(reason=reason, sequence=number, final=True)
+        assert stage.arrivals == []
+        assert stage.hub.counters["rejected"] == 1
+
+
 def test_whoever_says_something_is_not_silent(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 0.0
     monkeypatch.setattr("master.hub.time", SimpleNamespace(monotonic=lambda: now))

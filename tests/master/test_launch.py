@@ -1,10 +1,12 @@
 """Starting, restarting and ending children, with small real processes in place of the commands."""
 
+import contextlib
 import json
 import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from queue import SimpleQueue
@@ -163,7 +165,11 @@ from tangram_agent import lifeline
 folder = Path({folder!r})
 news = open(folder / "news", "w")
 heard = threading.Event()
-lifeline.watch(lambda line: (print(line, file=news, flush=True), heard.set()))
+def hear(line):
+    print(line, file=news, flush=True)
+    if "the run ends" in line:
+        heard.set()
+lifeline.watch(hear)
 def end():
     (folder / "connection.json").unlink()
     sys.exit(0)
@@ -411,6 +417,10 @@ def test_the_first_signal_asks_and_the_second_ends(number: signal.Signals, kind:
         assert process.stdout.readline() == "ready\n"
         process.send_signal(number)
         assert process.stdout.readline() == f"{number.name}\n"
-        if kind == "stuck":
+        # At once it would count as the same wish, sent twice.
+        deadline = time.monotonic() + LIMIT_S
+        while kind == "stuck" and process.poll() is None and time.monotonic() < deadline:
             process.send_signal(number)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(0.1)
         assert process.wait(LIMIT_S) == (0 if kind == "orderly" else 128 + number)

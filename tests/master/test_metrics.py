@@ -34,8 +34,9 @@ def test_points_stand_under_their_names_and_steps(tmp_path: Path) -> None:
     assert points(events, "train/q") == [(10, 0.5), (20, 0.75)]
     assert points(events, "replay/fill") == [(20, 1.0)]
     assert points(events, "test/mean_reward") == [(20, 0.9)]
-    assert points(events, "test_by_episodes/mean_reward") == [(300, 0.9)]
-    assert points(events, "test_by_seconds/mean_reward") == [(12, 0.9)]
+    axes = read(tmp_path / "axes")
+    assert points(axes, "test_by_episodes/mean_reward") == [(300, 0.9)]
+    assert points(axes, "test_by_seconds/mean_reward") == [(12, 0.9)]
     (picture,) = events.Images("test/pictures")
     assert (picture.step, picture.width, picture.height) == (20, 6, 4)
     assert "noise: 0.1" in str(events.Tensors("config/text_summary")[0].tensor_proto)
@@ -54,10 +55,13 @@ def test_points_after_a_checkpoint_are_hidden_when_the_run_goes_on_from_it(tmp_p
     for updates, value in ((0, 1.0), (20, 2.0)):
         metrics = Metrics(tmp_path, updates)
         for step in (10, 20, 30):
-            if step >= updates:
+            if step > updates:
                 metrics.scalars({"train/q": value}, step)
+                metrics.scores({"mean_reward": value}, step, 10 * step, step / 10)
         metrics.close()
-    assert points(read(tmp_path), "train/q") == [(10, 1.0), (20, 2.0), (30, 2.0)]
+    assert points(read(tmp_path), "train/q") == [(10, 1.0), (20, 1.0), (30, 2.0)]
+    by_episodes = points(read(tmp_path / "axes"), "test_by_episodes/mean_reward")
+    assert by_episodes == [(100, 1.0), (200, 1.0), (300, 1.0), (300, 2.0)]
 
 
 def test_means_are_weighted_and_begin_anew() -> None:

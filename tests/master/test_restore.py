@@ -1,15 +1,17 @@
 """Going on from a checkpoint: bit-equal, past corrupt ones, and never with another task."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from master.checkpoint import restore_run, save_run
+from master.checkpoint import check_resumable, restore_run, save_run
 from master.record import Record
 from master.trainer import Trainer, choose_device
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint, save_checkpoint
+from tangram_agent.setup import SECTIONS
 from tangram_sim.errors import ConfigError, RunError
 from tests.agent.builders import PAIR, random_episodes, setup
 from tests.master.builders import AGENT, small_setup, trainer
@@ -144,3 +146,14 @@ def test_a_gpu_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) -> Non
         choose_device("cuda")
     monkeypatch.setattr("torch.cuda.is_available", lambda: True)
     assert [choose_device(name) for name in ("cpu", "auto", "cuda")] == ["cpu", "cuda", "cuda"]
+
+
+def test_another_task_is_refused_from_the_checkpoint_alone(tmp_path: Path) -> None:
+    mine = {name: asdict(getattr(MADE, name)) for name in SECTIONS}
+    check_resumable(tmp_path, {})  # nothing is there yet
+    save_run(tmp_path, trainer(MADE), Record(), HUB, keep=1)
+    check_resumable(tmp_path, mine)
+    check_resumable(tmp_path, mine | {"agent": mine["agent"] | {"noise": 0.5}})
+    other = mine | {"tokens": {"shapes": ["parallelogram"], "scale": 1.0}}
+    with pytest.raises(RunError, match="made with other settings of tokens: .* from_config="):
+        check_resumable(tmp_path, other)

@@ -233,7 +233,7 @@ def test_a_reward_of_the_users_own() -> None:
     ("function", "reason"),
     [
         ("table", r"one number per row, shape \(5,\), got shape \(5, 1\)"),
-        ("text", "failed: could not convert string"),
+        ("text", "failed: ValueError: could not convert string"),
         ("lost", "must return finite numbers"),
     ],
 )

@@ -6,12 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tangram_sim import world as world_module
 from tangram_sim.arrays import Floats
 from tangram_sim.config import SimConfig
-from tangram_sim.errors import ConfigError
+from tangram_sim.errors import ConfigError, SamplingError
 from tangram_sim.layout import Layout
 from tangram_sim.pictures import BACKGROUND, TOKEN_GRAY, rasterise
-from tangram_sim.world import World, make_world
+from tangram_sim.world import World, check_world, make_world
 from tests.sim.builders import LOPSIDED, TRIO, angle_gap, layout_of, random_poses
 
 pytestmark = pytest.mark.fast
@@ -73,7 +74,7 @@ def test_enough_substeps_turn_fully(substeps: int) -> None:
 
 @pytest.mark.parametrize(("substeps", "missing"), [(1, 60), (2, 20), (3, 5)])
 def test_fewer_substeps_than_the_bound_turn_too_little(substeps: int, missing: float) -> None:
-    """Why `SimConfig` refuses them: Bullet turns a body by at most 45 degrees in a step."""
+    """Why `SimConfig` refuses them: a step of Bullet is exact up to a turn of 45 degrees."""
     sim = SimConfig()
     object.__setattr__(sim, "substeps", substeps)  # past the guard
     world = make_world(layout_of("square"), sim)
@@ -200,3 +201,16 @@ def test_a_missing_engine_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(__import__("sys").modules, "tangram_sim.physics", raising=False)
     with pytest.raises(ConfigError, match=r"set\s+sim\.backend=kinematic"):
         make_world(layout_of("square"), SimConfig())
+
+
+def test_a_token_that_does_not_fit_is_refused_before_a_world_is_made() -> None:
+    check_world(layout_of("square"), SimConfig())
+    with pytest.raises(SamplingError, match="does not fit into an arena of width 2"):
+        check_world(layout_of("square", scale=10.0), SimConfig())
+
+
+def test_a_missing_engine_is_told_before_a_world_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(world_module, "find_spec", lambda name: None)
+    check_world(layout_of("square"), SimConfig(backend="kinematic"))
+    with pytest.raises(ConfigError, match=r"needs PyBullet .*: install pybullet, or set"):
+        check_world(layout_of("square"), SimConfig())

@@ -26,10 +26,11 @@ def make_link(
     timing: Timing = QUICK,
     index: int = -1,
     fingerprints: Mapping[str, str] = FINGERPRINTS,
+    role: str = "player",
     **more: Any,
 ) -> Link:
-    """A player's link."""
-    return Link(connect, "player", index, fingerprints, SPEC, timing=timing, **more)
+    """A worker's link."""
+    return Link(connect, role, index, fingerprints, SPEC, timing=timing, **more)
 
 
 class StandIn:

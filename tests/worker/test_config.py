@@ -47,3 +47,9 @@ def test_wrong_settings_of_the_tools(kind: type, wrong: dict, reason: str) -> No
 def test_a_picture_of_another_kind_is_refused_with_the_choices(out: str) -> None:
     with pytest.raises(ConfigError, match=r"out must end with \.gif or \.png, got"):
         PlayConfig("runs/one", out=out)
+
+
+@pytest.mark.parametrize("out", ["", "/", "."])
+def test_scores_need_a_file_name(out: str) -> None:
+    with pytest.raises(ConfigError, match="out must name a file"):
+        EvalConfig("runs/one", out=out)

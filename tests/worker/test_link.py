@@ -509,7 +509,7 @@ def test_draining_waits_for_what_is_on_its_way_also_after_a_signal() -> None:
 
 
 def test_scores_and_stats_arrive() -> None:
-    with staged() as stage, joined(stage) as link:
+    with staged() as stage, joined(stage, role="evaluator") as link:
         link.stats["episodes"] = 12.0
         link.send_scores(scores())
         stage.counted("scores")
