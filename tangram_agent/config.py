@@ -95,7 +95,7 @@ class AgentConfig:
         batch_size: transitions in one update.
         replay_capacity: transitions kept.
         updates_per_transition: pace: updates for each transition played.
-        learning_starts: transitions in the replay before the first update.
+        learning_starts: transitions played before the first update; twins do not count.
         noise: standard deviation of the Gaussian exploration noise on actions.
         uniform_share: share of actions drawn uniformly.
         hindsight: the twins added for every transition.
