@@ -3,9 +3,10 @@
 SHELL := /bin/bash
 BIN := .venv/bin
 ARGS ?=
+BUDGET ?= laptop
 
 .DEFAULT_GOAL := help
-.PHONY: help train test lint format bench clean
+.PHONY: help train test lint format paper bench clean
 
 help:  ## list these commands
 	@sed -nE 's/^([a-z]+):.*## (.*)/  make \1\t\2/p' Makefile | expand -t 16
@@ -26,6 +27,10 @@ lint: .venv/.installed-dev  ## ruff, mypy and import-linter; changes nothing
 format: .venv/.installed-dev  ## sort and lay out the code
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+paper: .venv/.installed-run  ## all figures and tables of the paper: BUDGET=smoke, laptop or paper
+	@$(BIN)/tangram-experiment budget=$(BUDGET) $(ARGS)
+	@$(BIN)/tangram-report runs=runs/experiments/$(BUDGET) out=runs/experiments/$(BUDGET)/report
 
 bench: .venv/.installed-dev  ## measure speed; options go into ARGS
 	@$(BIN)/python -m benchmarks $(ARGS)

@@ -5,16 +5,17 @@ from pathlib import Path
 from typing import Any
 
 from master.record import Record
-from master.trainer import Trainer, check_same_task
+from master.trainer import LEARNER, Trainer, check_same_task
 from tangram_agent.checkpoints import (
     Checkpoint,
     CorruptError,
     list_checkpoints,
     load_checkpoint,
+    newest_checkpoint,
     save_checkpoint,
     set_aside,
 )
-from tangram_agent.runs import FINGERPRINTS
+from tangram_agent.runs import CHECKPOINTS, FINGERPRINTS
 from tangram_agent.setup import make_setup
 from tangram_sim.errors import RunError
 
@@ -79,6 +80,26 @@ def restore_run(
             f"cannot go on from {found.path}: its content is not that of a run "
             f"({type(error).__name__}: {error}); start a new run with another run_dir"
         ) from error
+
+
+def warm_start(run_dir: Path, trainer: Trainer) -> str:
+    """Give the trainer the networks of another run, with fresh optimisers and an empty replay.
+
+    The other run may have had other tokens, where the networks do not depend on them (net=mha).
+
+    Returns:
+        A line for the user.
+
+    Raises:
+        RunError: there is no whole checkpoint, or its networks have other shapes.
+    """
+    path = newest_checkpoint(run_dir / CHECKPOINTS)
+    try:
+        content = load_checkpoint(path, [LEARNER])
+        trainer.learner.load_networks(content.arrays[LEARNER])
+    except RunError as error:
+        raise RunError(f"warm_start={run_dir}: {error}") from None
+    return f"begins with the networks of {run_dir} after {content.updates:,} updates"
 
 
 def _newest_whole(folder: Path, warn: Callable[[str], None]) -> Checkpoint | None:

@@ -24,7 +24,7 @@ def _train(settings: Plain) -> int:
     from tangram_agent.setup import SECTIONS, from_mapping, make_setup
     from tangram_sim.world import check_world
 
-    settings["run_dir"] = absolute(settings["run_dir"])
+    _make_absolute(settings)
     rest = {name: value for name, value in settings.items() if name not in SECTIONS}
     workers = rest.pop("workers", None)
     config = from_mapping(
@@ -43,7 +43,7 @@ def _master(settings: Plain) -> int:
     from master.config import MasterConfig
     from tangram_agent.setup import SECTIONS, from_mapping, make_setup
 
-    settings["run_dir"] = absolute(settings["run_dir"])
+    _make_absolute(settings)
     rest = {name: value for name, value in settings.items() if name not in SECTIONS}
     config = from_mapping(MasterConfig, rest)
     setup = make_setup(settings)
@@ -54,8 +54,9 @@ def _master(settings: Plain) -> int:
     return run_master(config, setup, settings)
 
 
-def absolute(run_dir: object) -> object:
-    """The run folder seen from where the command was started; what is no text is left alone."""
-    if not isinstance(run_dir, str) or not run_dir.strip():
-        return run_dir
-    return str(Path(run_dir).expanduser().absolute())
+def _make_absolute(settings: Plain) -> None:
+    """Folders as seen from where the command was started; what is no text is left alone."""
+    for name in ("run_dir", "warm_start"):
+        value = settings.get(name)
+        if isinstance(value, str) and value.strip():
+            settings[name] = str(Path(value).expanduser().absolute())

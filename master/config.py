@@ -22,6 +22,7 @@ class MasterConfig:
         max_updates: updates after which it ends, 0 for no bound.
         resume: none (a folder that holds a run is refused) or auto (go on from its newest valid
             checkpoint, start anew where there is none).
+        warm_start: folder of a run whose networks this one begins with, or None.
         service: sockets, rates and intervals.
     """
 
@@ -31,6 +32,7 @@ class MasterConfig:
     max_episodes: int = 0
     max_updates: int = 0
     resume: str = "none"
+    warm_start: str | None = None
     service: ServiceConfig = field(default_factory=ServiceConfig)
 
     def __post_init__(self) -> None:

@@ -224,4 +224,5 @@ def master_arguments(config: LaunchConfig, folder: RunFolder) -> list[str]:
             f"{name}={getattr(master, name)}"
             for name in ("seed", "max_hours", "max_episodes", "max_updates", "resume")
         ),
+        *([override("warm_start", master.warm_start)] if master.warm_start else []),
     ]

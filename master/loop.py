@@ -15,9 +15,10 @@ from master.arrivals import EpisodesArrived, ScoresArrived
 from master.checkpoint import check_resumable, save_run
 from master.config import MasterConfig
 from master.console import sturdy_console
+from master.curve import Curve
 from master.metrics import Metrics
 from master.parts import Parts, make_parts
-from master.progress import make_progress, notices_from
+from master.progress import Progress, make_progress, notices_from
 from master.record import Clock
 from master.report import Every, Reporter, scores_picture
 from master.result import make_result, show_result
@@ -70,9 +71,7 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
             notices_from("master", progress),
             closing(make_parts(config, setup, folder, progress.notice)) as parts,
             closing(Metrics(folder.tensorboard, parts.trainer.updates)) as metrics,
-            closing(
-                Loop(parts, Reporter(progress, metrics, config.service), signals, news)
-            ) as loop,
+            closing(Loop(parts, _reporter(parts, progress, metrics), signals, news)) as loop,
         ):
             metrics.settings(resolved)
             reason = loop.run()
@@ -83,6 +82,11 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
             loop.dismiss(f"the run has ended ({reason})")
     show_result(console, folder, result)
     return 0
+
+
+def _reporter(parts: Parts, progress: Progress, metrics: Metrics) -> Reporter:
+    curve = Curve(parts.folder.curve, parts.trainer.updates)
+    return Reporter(progress, metrics, curve, parts.config.service)
 
 
 class Loop:

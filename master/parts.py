@@ -2,10 +2,11 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 from master.arrivals import WelcomeInfo
 from master.budget import Budget
-from master.checkpoint import restore_run
+from master.checkpoint import restore_run, warm_start
 from master.config import MasterConfig
 from master.hub import Hub
 from master.record import Record
@@ -82,6 +83,8 @@ def make_parts(
     service = config.service
     trainer = Trainer(setup, config.seed, choose_device(service.device), service.lag_updates)
     found = restore_run(folder.checkpoints, trainer, notice) if config.resume == "auto" else None
+    if found is None and config.warm_start is not None:
+        notice(warm_start(Path(config.warm_start), trainer))
     record, table = found or (Record(), {})
     budget = Budget(config)
     if not budget.bounded:

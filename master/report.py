@@ -9,6 +9,7 @@ from PIL import Image
 
 from master.arrivals import EpisodesArrived
 from master.budget import Rates
+from master.curve import Curve
 from master.metrics import Means, Metrics
 from master.parts import Parts
 from master.progress import Progress, Status
@@ -44,8 +45,10 @@ class Every:
 class Reporter:
     """Collects what happens between two reports."""
 
-    def __init__(self, progress: Progress, metrics: Metrics, service: ServiceConfig) -> None:
-        self.progress, self.metrics = progress, metrics
+    def __init__(
+        self, progress: Progress, metrics: Metrics, curve: Curve, service: ServiceConfig
+    ) -> None:
+        self.progress, self.metrics, self._curve = progress, metrics, curve
         self._losses, self._play = Means(), Means()
         self._rates = Rates()
         self._tick = Every(TICK_S, at_once=True)
@@ -79,6 +82,7 @@ class Reporter:
         values = {name: value for name, value in scores.scalars.items() if name != "episodes"}
         updates = scores.weights_version
         self.metrics.scores(values, updates, parts.trainer.episodes, parts.record.loop_s)
+        self._curve.add(values, updates, parts.trainer.episodes, parts.record.train_s)
         # Drawing takes time from learning.
         if len(scores.ends) and self._picture.due():
             picture = scores_picture(scores, parts.setup, CURVE_PIXELS)

@@ -22,6 +22,7 @@ PLAIN = re.compile(r"run_dir=[\w./-]+")
 ROOT = Path(__file__).resolve().parent.parent
 SCORES = (
     "mean_reward",
+    "mean_reward_dense",
     "mean_reward_camera",
     "raw_overlap",
     "raw_overlap_p10",

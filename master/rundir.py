@@ -25,6 +25,7 @@ class RunFolder:
         checkpoints: folder of the checkpoints.
         tensorboard: folder of the curves.
         logs: folder of the output of workers and evaluator.
+        curve: the scores of every evaluation.
         result: the scores of the final weights.
         picture: the test episodes, played with the final weights.
     """
@@ -36,6 +37,7 @@ class RunFolder:
         self.checkpoints = self.path / "checkpoints"
         self.tensorboard = self.path / "tensorboard"
         self.logs = self.path / "logs"
+        self.curve = self.path / "curve.jsonl"
         self.result = self.path / "result.json"
         self.picture = self.path / "test_episodes.png"
 

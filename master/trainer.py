@@ -18,6 +18,7 @@ from tangram_sim.errors import ConfigError, RunError
 from tangram_sim.rewards import make_reward
 
 STREAMS = ("replay", "hindsight")
+LEARNER = "learner"  # the checkpoint's file of networks and optimisers
 
 Arrays = dict[str, dict[str, npt.NDArray[Any]]]
 
@@ -100,7 +101,7 @@ class Trainer:
         """
         arrays = {
             ACTING: dict(self.weights().tensors),
-            "learner": self.learner.state(),
+            LEARNER: self.learner.state(),
             "replay": self.replay.state(),
         }
         generators = {name: g.bit_generator.state for name, g in self._generators.items()}
@@ -119,7 +120,7 @@ class Trainer:
             RunError: the state belongs to another task or network.
         """
         check_same_task(self.setup, counters[FINGERPRINTS])
-        self.learner.load_state(arrays["learner"])
+        self.learner.load_state(arrays[LEARNER])
         self.replay.load_state(arrays["replay"])
         self.pace.load_state(counters["pace"])
         self.episodes = int(counters["episodes"])

@@ -80,6 +80,7 @@ class AgentConfig:
         egocentric: coordinates relative to the moving token, in its own orientation.
         offsets: each corner's displacement from its token's centre as node features.
         orientation: (cos k*theta, sin k*theta) of each target relative to the moving token.
+        edges: of the graph: paper (Sec. IV-A) or complete (every node sees every other).
         afterstate: the critic sees the graph as the action would leave it.
         angle_head: plain (one output) or kfold (two outputs, angle = atan2 / k).
         squash: of the actor's outputs: tanh (the paper) or clamp.
@@ -105,6 +106,7 @@ class AgentConfig:
     egocentric: bool = True
     offsets: bool = True
     orientation: bool = True
+    edges: str = "paper"
     afterstate: bool = True
     angle_head: str = "kfold"
     squash: str = "clamp"
@@ -128,6 +130,7 @@ class AgentConfig:
 
     def __post_init__(self) -> None:
         check_choice("agent.angle_head", self.angle_head, ("plain", "kfold"))
+        check_choice("agent.edges", self.edges, ("paper", "complete"))
         check_choice("agent.squash", self.squash, ("tanh", "clamp"))
         check_choice("agent.lr_decay", self.lr_decay, ("none", "cosine"))
         for name in ("gamma", "polyak", "acting_average", "lr_final", "uniform_share"):

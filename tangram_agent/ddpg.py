@@ -181,8 +181,7 @@ class Learner:
         """
         if _COUNTER not in state:
             raise RunError("learner state: no counter of updates: not a learner's checkpoint")
-        for part in PARTS:
-            load_arrays(getattr(self, part), _under(f"{part}.", state))
+        self.load_networks(state)
         for part, optimiser in self._optimisers().items():
             slots = _under(f"{part}_optimiser.", state)
             content: dict[int, dict[str, Tensor]] = {}
@@ -192,6 +191,15 @@ class Learner:
             groups = optimiser.state_dict()["param_groups"]
             optimiser.load_state_dict({"state": content, "param_groups": groups})
         self.updates = int(state[_COUNTER][0])
+
+    def load_networks(self, state: dict[str, Array]) -> None:
+        """Take over the networks of a state, and nothing else.
+
+        Raises:
+            RunError: tensors are missing or have other shapes.
+        """
+        for part in PARTS:
+            load_arrays(getattr(self, part), _under(f"{part}.", state))
 
     def _optimisers(self) -> dict[str, torch.optim.Adam]:
         return {"actor": self.actor_optimiser, "critic": self.critic_optimiser}

@@ -67,7 +67,7 @@ class TokenGraph(nn.Module):
             "base_weights": torch.as_tensor(layout.base_weights, dtype=torch.float32),
             "body": torch.as_tensor(layout.body, dtype=torch.float32),
             "members": one_hot,
-            "adjacency": torch.as_tensor(layout.adjacency),
+            "adjacency": _adjacency(layout, agent.edges),
             "symmetry": symmetry,
             "radius": torch.tensor([shape.radius for shape in layout.shapes]).float(),
             # The target's piece j is token j's counterpart and counts as piece K + j.
@@ -164,3 +164,10 @@ class TokenGraph(nn.Module):
         moved = turn(corners - centre, by) + centre + shift
         own = self.token_of_corner[None, :] == token[:, None]
         return torch.where(own[..., None], moved, corners)
+
+
+def _adjacency(layout: Layout, edges: str) -> Tensor:
+    """(N, N) flags: the edges of Sec. IV-A, or all but those of a node to itself."""
+    if edges == "complete":
+        return ~torch.eye(layout.nodes, dtype=torch.bool)
+    return torch.as_tensor(layout.adjacency)

@@ -1,10 +1,11 @@
 """Loading a finished run: its config, its setup and the policy that it learned.
 
 `load_run("runs/my-run").policy.act(corners, placed, goals)` gives actions; docs/inference.md shows
-a whole example.
+a whole example. `load_run("pretrained/square")` gives one of the agents that come with the package.
 """
 
 from dataclasses import dataclass
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,11 @@ import yaml
 
 from tangram_agent.checkpoints import load_checkpoint, newest_checkpoint
 from tangram_agent.policy import Policy
+from tangram_agent.pretrained import CONFIG, is_agent, is_name, packaged, read_agent
 from tangram_agent.setup import Setup, make_setup
 from tangram_agent.types import Weights
 from tangram_sim.errors import RunError
 
-CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"
 ACTING = "weights"  # the checkpoint's file of acting weights
 POLICY_SECTIONS = ("tokens", "agent", "net")
@@ -28,11 +29,12 @@ class Run:
     """A run that was read from its folder.
 
     Attributes:
-        folder: the run folder.
-        config: the resolved config that it was trained with.
+        folder: the run folder, as it was named; `pretrained/<name>` for one of the package.
+        config: the resolved config that it was trained with; only what makes the setup for an
+            agent of the package.
         setup: the task and the agent.
-        updates: of the checkpoint that was loaded.
-        policy: acts with the checkpoint's weights; see `Policy.act` for shapes.
+        updates: of the weights that were loaded.
+        policy: acts with these weights; see `Policy.act` for shapes.
     """
 
     folder: Path
@@ -49,21 +51,34 @@ def read_config(path: Path) -> dict[str, Any]:
         RunError: the file is missing or not a YAML mapping.
     """
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise RunError(f"cannot read {path} ({error.strerror}): is this a run folder?") from None
-    except (yaml.YAMLError, UnicodeDecodeError):
-        raise RunError(f"{path} is not valid YAML: mend it or name another run_dir") from None
+    except UnicodeDecodeError:
+        raise _no_yaml(path) from None
+    return _parse_config(text, path)
+
+
+def _parse_config(text: str, path: Path) -> dict[str, Any]:
+    try:
+        content = yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise _no_yaml(path) from None
     if not isinstance(content, dict):
         raise RunError(f"{path} holds no settings: it must be a mapping of sections")
     return content
+
+
+def _no_yaml(path: Path) -> RunError:
+    return RunError(f"{path} is not valid YAML: mend it or name another run_dir")
 
 
 def load_run(run_dir: str | Path, checkpoint: str | None = None) -> Run:
     """A run with the weights of its newest checkpoint, or of the one that is named.
 
     Args:
-        run_dir: the run folder.
+        run_dir: the run folder, or `pretrained/<name>` for an agent that comes with the package;
+            a folder of that name wins.
         checkpoint: name of a folder under `checkpoints`, such as 00004000.
 
     Raises:
@@ -72,8 +87,25 @@ def load_run(run_dir: str | Path, checkpoint: str | None = None) -> Run:
         ConfigError: the config is not one that this version can use.
     """
     folder = Path(run_dir)
+    source: Traversable = folder
     if not folder.is_dir():
-        raise RunError(f"no run folder {folder}: give the folder that tangram-train printed")
+        if not is_name(folder):
+            raise RunError(f"no run folder {folder}: give the folder that tangram-train printed")
+        source = packaged(folder)
+    if is_agent(source):
+        return _agent_run(source, folder, checkpoint)
+    return _trained_run(folder, checkpoint)
+
+
+def _agent_run(source: Traversable, folder: Path, checkpoint: str | None) -> Run:
+    if checkpoint is not None:
+        raise RunError(f"{folder} has no checkpoint {checkpoint}: leave the checkpoint out")
+    agent = read_agent(source, folder)
+    config = _parse_config(agent.config, folder / CONFIG)
+    return _make_run(folder, config, make_setup(config), agent.weights)
+
+
+def _trained_run(folder: Path, checkpoint: str | None) -> Run:
     config = read_config(folder / CONFIG)
     setup = make_setup(config)
     checkpoints = folder / CHECKPOINTS
@@ -87,6 +119,10 @@ def load_run(run_dir: str | Path, checkpoint: str | None = None) -> Run:
             f"{folder / CONFIG} is not what {path.name} was trained with: its {', '.join(odd)} "
             "differ; restore the run's own config.yaml"
         )
+    return _make_run(folder, config, setup, Weights(content.updates, content.arrays[ACTING]))
+
+
+def _make_run(folder: Path, config: dict[str, Any], setup: Setup, weights: Weights) -> Run:
     policy = Policy(setup)
-    policy.load(Weights(content.updates, content.arrays[ACTING]))
-    return Run(folder, config, setup, content.updates, policy)
+    policy.load(weights)
+    return Run(folder, config, setup, weights.version, policy)

@@ -15,6 +15,7 @@ from tangram_sim.geometry import overlap_share
 from tangram_sim.layout import Layout
 from tangram_sim.rewards import make_reward, picture_reward, scaled_overlap
 from tangram_sim.sampling import sample_batch
+from tangram_sim.sensing import noise_bound, see
 from tangram_sim.world import make_world
 
 _ROUNDING = 1.0 + 1e-6
@@ -53,9 +54,10 @@ def corner_bound(sim: SimConfig) -> float:
     """The largest |coordinate| that a corner can reach in an episode, arena units.
 
     A start lies inside the arena, and each action moves a token by at most the arena's width in x
-    and in y; turning keeps a corner within the start's margin for every angle.
+    and in y; turning keeps a corner within the start's margin for every angle. What an agent sees
+    may lie further out by the noise's bound.
     """
-    return sim.arena * (0.5 + sim.actions_per_token) * _ROUNDING
+    return (sim.arena * (0.5 + sim.actions_per_token) + noise_bound(sim)) * _ROUNDING
 
 
 def chosen_tokens(actions: Floats, tokens: int) -> Ints:
@@ -92,6 +94,8 @@ class BatchedEnv:
         corners: (B, V, 2) of the tokens.
         placed: (B, K) which tokens are placed.
         goals: (B, V, 2) corners of the targets.
+        seen: `corners` as an agent sees them, new noise at every step if there is any.
+        seen_goals: `goals` as an agent sees them, with one noise for the whole episode.
     """
 
     def __init__(
@@ -113,6 +117,8 @@ class BatchedEnv:
         self.steps_done = self.horizon  # no episode yet
         self.corners: Floats = np.zeros((count, layout.corner_count, 2))
         self.goals: Floats = np.zeros((count, layout.corner_count, 2))
+        self.seen, self.seen_goals = self.corners, self.goals
+        self._generators: Sequence[np.random.Generator] = ()
 
     @property
     def placed(self) -> Bools:
@@ -137,8 +143,10 @@ class BatchedEnv:
             self._pictures = self._photograph(targets)
         for world, start in zip(self._worlds, starts, strict=True):
             world.place(start)
+        self._generators = generators
         self.goals = self.layout.corners(targets)
-        self.corners = self._read_corners()
+        self.seen_goals = see(self.goals, self.sim, generators)
+        self._look()
         self._moves[:] = 0
         self.steps_done = 0
 
@@ -162,7 +170,7 @@ class BatchedEnv:
             self._worlds[b].move(int(tokens[b]), velocity[b])
             self._moves[b, tokens[b]] += 1
         self.steps_done += 1
-        self.corners = self._read_corners()
+        self._look()
         return self._result(refused)
 
     def close(self) -> None:
@@ -208,5 +216,6 @@ class BatchedEnv:
         pairs = zip(self._pictures, self._worlds, strict=True)
         return np.array([picture_reward(target, world.picture()) for target, world in pairs])
 
-    def _read_corners(self) -> Floats:
-        return self.layout.corners(np.stack([world.poses() for world in self._worlds]))
+    def _look(self) -> None:
+        self.corners = self.layout.corners(np.stack([world.poses() for world in self._worlds]))
+        self.seen = see(self.corners, self.sim, self._generators)

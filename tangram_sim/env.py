@@ -26,7 +26,8 @@ class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
 
     Observations are a dict of float64 vectors: `achieved_goal` and `desired_goal` are the corners
     of the tokens and of the targets, (2V,); `observation` is the tokens' corners and one flag per
-    token that is placed, (2V + K,). Actions are those of `BatchedEnv`. An episode ends after
+    token that is placed, (2V + K,), with the noise of `sim.corner_noise`. Actions are those of
+    `BatchedEnv`. An episode ends after
     K * actions_per_token steps.
 
     `info` has `overlap` (raw, in [0, 1]), `is_success` (overlap of at least `success_overlap`),
@@ -117,7 +118,7 @@ class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
     def state_matrix(self) -> Floats:
         """The paper's state (Sec. IV-A): nodes and adjacency stacked, (N, 4 + N)."""
         batch = self.batch
-        return self.layout.state_matrix(batch.corners[0], batch.placed[0], batch.goals[0])
+        return self.layout.state_matrix(batch.seen[0], batch.placed[0], batch.seen_goals[0])
 
     def render(self) -> Pixels | None:
         """The scene as (size, size, 3), the token that moved last marked; None without a mode."""
@@ -139,11 +140,11 @@ class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         self.batch.close()
 
     def _observation(self) -> Observation:
-        achieved = self.batch.corners[0].ravel()
+        achieved = self.batch.seen[0].ravel()
         return {
             "observation": np.concatenate([achieved, self.batch.placed[0]]),
             "achieved_goal": achieved.copy(),
-            "desired_goal": self.batch.goals[0].flatten(),
+            "desired_goal": self.batch.seen_goals[0].flatten(),
         }
 
     def _info(self, result: StepResult) -> dict[str, Any]:

@@ -45,6 +45,7 @@ class PhysicsWorld:
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=1.0, numSubSteps=sim.substeps, physicsClientId=self._client
         )
+        self._damping = sim.damping
         self._bodies = [self._make_body(s.corners * self._unit) for s in layout.shapes]
         self._view, self._projection = _camera(sim.pixels)
 
@@ -108,9 +109,13 @@ class PhysicsWorld:
             physicsClientId=self._client,
         )
         body: int = pybullet.createMultiBody(1.0, collision, visual, physicsClientId=self._client)
-        # Bullet damps by 0.04 a step unless told otherwise: tokens would stop short.
+        # Bullet damps by 0.04 unless told otherwise: tokens would stop short.
         pybullet.changeDynamics(
-            body, -1, linearDamping=0.0, angularDamping=0.0, physicsClientId=self._client
+            body,
+            -1,
+            linearDamping=self._damping,
+            angularDamping=self._damping,
+            physicsClientId=self._client,
         )
         # Tokens pass through each other for now: no group, no mask.
         pybullet.setCollisionFilterGroupMask(body, -1, 0, 0, physicsClientId=self._client)

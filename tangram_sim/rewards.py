@@ -6,6 +6,7 @@ arrays.py: achieved and desired are (B, V, 2) corners, rewards are (B,).
 
 import importlib
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,8 @@ def make_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> RewardF
     """The configured reward as a function (achieved, desired) -> (B,).
 
     With source=camera it is Eq. 14 on polygons too: a goal that was relabelled has no picture.
-    `BatchedEnv` replaces it by the camera's value while playing.
+    `BatchedEnv` replaces it by the camera's value while playing. With sim.corner_noise the rigid
+    pieces that fit the corners best are rewarded.
 
     Raises:
         ConfigError: the camera is to be the source but is off, or a user's function that cannot
@@ -35,6 +37,9 @@ def make_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> RewardF
         raise ConfigError("reward.source=camera needs the camera: set sim.camera=true")
     # The longest distance of two points of the arena.
     reach = sim.arena * np.sqrt(2.0)
+    if sim.corner_noise > 0.0:
+        exact = make_reward(config, layout, replace(sim, corner_noise=0.0))
+        return lambda achieved, desired: exact(_fitted(achieved, layout), _fitted(desired, layout))
     if config.name == "overlap":
         return lambda achieved, desired: overlap(achieved, desired, layout)
     if config.name == "dense":
@@ -43,6 +48,11 @@ def make_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> RewardF
         return lambda achieved, desired: pose(achieved, desired, layout, reach, config.sharpness)
     function = _load(config.name)
     return lambda achieved, desired: _checked(config.name, function, achieved, desired, layout)
+
+
+def _fitted(corners: Floats, layout: Layout) -> Floats:
+    """The rigid pieces nearest to noisy corners (B, V, 2), which need not be convex."""
+    return layout.corners(layout.poses(corners))
 
 
 def overlap(achieved: Floats, desired: Floats, layout: Layout) -> Floats:

@@ -1,4 +1,4 @@
-"""Two policies to compare with: chance, and the paper's plateau.
+"""Three policies to compare with: chance, the paper's plateau, and a perfect hand.
 
 Legend: B environments, K tokens, V corners, A entries of an action.
 """
@@ -27,13 +27,40 @@ def position_policy(layout: Layout, arena: float) -> Choose:
     """
 
     def choose(corners: Floats, placed: Bools, goals: Floats, _generators: Generators) -> Singles:
-        token = np.argmin(placed, axis=1)
-        row = np.arange(len(corners))
-        shift = (layout.bases(goals) - layout.bases(corners))[row, token] / arena
-        motion = np.column_stack([shift, np.zeros(len(shift))])
-        if layout.tokens == 1:
-            return motion.astype(np.float32)
-        selector = (2.0 * token + 1.0) / layout.tokens - 1.0
-        return np.column_stack([selector, motion]).astype(np.float32)
+        way = _ways(layout, corners, goals)
+        way[..., 2] = 0.0
+        return _actions(way, placed, arena)
 
     return choose
+
+
+def exact_policy(layout: Layout, arena: float) -> Choose:
+    """Token after token exactly onto its own target, by the smallest turn that fits.
+
+    What remains to a perfect score is the world's: float32 actions, and the engine's arithmetic.
+    """
+    period = 2.0 * np.pi / np.array([shape.symmetry for shape in layout.shapes])
+
+    def choose(corners: Floats, placed: Bools, goals: Floats, _generators: Generators) -> Singles:
+        way = _ways(layout, corners, goals)
+        way[..., 2] -= period * np.round(way[..., 2] / period)
+        return _actions(way, placed, arena)
+
+    return choose
+
+
+def _ways(layout: Layout, corners: Floats, goals: Floats) -> Floats:
+    """(B, K, 3) from every token's pose to its target's."""
+    ways: Floats = layout.poses(goals) - layout.poses(corners)
+    return ways
+
+
+def _actions(ways: Floats, placed: Bools, arena: float) -> Singles:
+    """Actions (B, A) that take the first token that is not placed along its way (B, K, 3)."""
+    token = np.argmin(placed, axis=1)
+    motion = ways[np.arange(len(ways)), token] / np.array([arena, arena, np.pi])
+    tokens = ways.shape[1]
+    if tokens == 1:
+        return motion.astype(np.float32)
+    selector = (2.0 * token + 1.0) / tokens - 1.0
+    return np.column_stack([selector, motion]).astype(np.float32)

@@ -56,20 +56,37 @@ def _evaluate(settings: Plain) -> int:
 
 def _play(settings: Plain) -> int:
     from tangram_agent.setup import from_mapping
-    from worker.config import PlayConfig
+    from worker.config import PlayConfig, check_compare
 
+    check_compare(settings.get("compare"))  # before a text is taken for a list of letters
     config = from_mapping(PlayConfig, with_absolute_paths(settings))
 
+    if config.compare is not None:
+        from worker.compare import compare_runs
+
+        return compare_runs(config)
     from worker.play import play_run
 
     return play_run(config)
 
 
 def with_absolute_paths(settings: Plain) -> Plain:
-    """run_dir and out seen from where the command was started; what is no text is left alone."""
+    """Folders and files seen from where the command was started; what is no text is left alone."""
     result = dict(settings)
     for name in ("run_dir", "out"):
-        value = result.get(name)
-        if isinstance(value, str) and value.strip():
-            result[name] = str(Path(value).expanduser().absolute())
-    return result
+        result[name] = _absolute(result.get(name), is_run=name == "run_dir")
+    if isinstance(result.get("compare"), list):
+        result["compare"] = [_absolute(run, is_run=True) for run in result["compare"]]
+    return {name: value for name, value in result.items() if name in settings}
+
+
+def _absolute(value: object, is_run: bool) -> object:
+    """A path made absolute; `pretrained/<name>` stays a name unless a folder here is called so."""
+    from tangram_agent.pretrained import is_name
+
+    if not isinstance(value, str) or not value.strip():
+        return value
+    path = Path(value).expanduser()
+    if is_run and is_name(path) and not path.is_dir():
+        return str(path)
+    return str(path.absolute())

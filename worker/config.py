@@ -7,12 +7,14 @@ from tangram_agent.config import ServiceConfig
 from tangram_agent.decoding import MAX_INDEX
 from tangram_agent.wire import ROLES
 from tangram_sim.checks import check_choice, check_range
+from tangram_sim.config import MAX_CORNER_NOISE
 from tangram_sim.errors import ConfigError
 
 MAX_EPISODES = 1_000_000
 MAX_ACTIONS = 100
 MAX_SHOWN = 100
 PICTURES = (".gif", ".png")
+MIN_COMPARED, MAX_COMPARED = 2, 4
 MAX_SEED = 2**63 - 1
 
 
@@ -64,6 +66,7 @@ class EvalConfig:
         run_dir: folder of the run.
         episodes: how many of the fixed test episodes.
         actions: actions per token; None is what the run was trained with (Table II: 1 to 5).
+        corner_noise: see `SimConfig`; None is what the run was trained with.
         seed: of the test episodes; 0 is the fixed test set that training is scored on.
         out: JSON file for the scores; None prints them only.
     """
@@ -71,6 +74,7 @@ class EvalConfig:
     run_dir: str
     episodes: int = 100
     actions: int | None = None
+    corner_noise: float | None = None
     seed: int = 0
     out: str | None = None
 
@@ -79,30 +83,54 @@ class EvalConfig:
         check_range("episodes", self.episodes, 1, MAX_EPISODES)
         check_range("seed", self.seed, 0, MAX_SEED)
         _check_actions(self.actions)
+        if self.corner_noise is not None:
+            check_range("corner_noise", self.corner_noise, 0.0, MAX_CORNER_NOISE)
         if self.out is not None:
             _check_out(self.out)
 
 
+def check_compare(value: object) -> None:
+    """Refuse what is no list of a few different run folders; None is none.
+
+    Raises:
+        ConfigError: says how to write one.
+    """
+    if value is None:
+        return
+    runs = list(value) if isinstance(value, list | tuple) else []
+    named = all(isinstance(run, str) and run.strip() for run in runs)
+    if not (named and MIN_COMPARED <= len(runs) <= MAX_COMPARED):
+        raise ConfigError(
+            f"compare must list {MIN_COMPARED} to {MAX_COMPARED} folders of runs, got {value!r}: "
+            "set compare=[runs/a,runs/b]"
+        )
+    if len(set(runs)) < len(runs):
+        raise ConfigError(f"compare must list different runs, got {value!r}: name each one once")
+
+
 @dataclass(frozen=True)
 class PlayConfig:
-    """Pictures of a finished run at play (tangram-play).
+    """Pictures of finished runs at play (tangram-play): of one, or of several on the same starts.
 
     Attributes:
-        run_dir: folder of the run.
+        run_dir: folder of the run; None to compare.
         out: file to write: .gif moves, .png shows the ends.
         episodes: shown side by side.
-        actions: actions per token; None is what the run was trained with.
+        actions: actions per token; None is what each run was trained with.
         seed: decides which episodes are shown.
+        compare: folders of 2 to 4 runs of the same tokens and arena; None to show one.
     """
 
-    run_dir: str
+    run_dir: str | None = None
     out: str = "play.gif"
     episodes: int = 12
     actions: int | None = None
     seed: int = 0
+    compare: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
-        _check_run_dir(self.run_dir)
+        check_compare(self.compare)
+        self._check_one_of_both()
         if Path(self.out).suffix not in PICTURES:
             raise ConfigError(
                 f"out must end with {' or '.join(PICTURES)}, got '{self.out}': .gif moves, .png "
@@ -111,3 +139,21 @@ class PlayConfig:
         check_range("episodes", self.episodes, 1, MAX_SHOWN)
         _check_actions(self.actions)
         check_range("seed", self.seed, 0, MAX_SEED)
+
+    @property
+    def run_dirs(self) -> tuple[str, ...]:
+        """The runs to show, one or several."""
+        return self.compare or (self.run_dir or "",)
+
+    def _check_one_of_both(self) -> None:
+        if self.run_dir is None and self.compare is None:
+            raise ConfigError(
+                "say which run: run_dir=runs/..., or which ones: compare=[runs/a,runs/b]"
+            )
+        if self.run_dir is not None and self.compare is not None:
+            raise ConfigError(
+                f"run_dir={self.run_dir} and compare do not go together: give run_dir=... to show "
+                "one run, or compare=[a,b] to show several"
+            )
+        if self.run_dir is not None:
+            _check_run_dir(self.run_dir)

@@ -13,22 +13,22 @@ from rich.table import Table
 from tangram_agent.files import write_whole
 from tangram_agent.runs import Run, load_run
 from tangram_agent.setup import Setup
-from worker.baselines import position_policy, random_policy
+from worker.baselines import exact_policy, position_policy, random_policy
 from worker.config import EvalConfig
 from worker.rollout import Choose
-from worker.trials import Trials, greedy, with_actions
+from worker.trials import Trials, greedy, with_actions, with_corner_noise
 
 AT_ONCE = 32
 RUN = "this run"
 
 # Scores in the order of the table, with their labels and digits; the rest is only in the file.
 _ROWS = {
-    "mean_reward": ("mean reward, exact polygons [-1, 1]", 3),
-    "mean_reward_camera": ("mean reward, camera's pixels [-1, 1]", 3),
-    "mean_train_reward": ("mean reward that it was trained on", 3),
+    "mean_reward": ("mean reward, polygons [-1, 1]", 3),
+    "mean_reward_camera": ("mean reward, camera [-1, 1]", 3),
+    "mean_train_reward": ("mean reward, as trained on", 3),
     "raw_overlap": ("raw overlap [0, 1]", 3),
     "raw_overlap_p10": ("raw overlap, 10th percentile", 3),
-    "position_error_median": ("position error, median (arena units)", 4),
+    "position_error_median": ("position error, median", 4),
     "position_error_p90": ("position error, 90th percentile", 4),
     "angle_error_deg_median": ("angle error, median (degrees)", 2),
     "angle_error_deg_p90": ("angle error, 90th percentile", 2),
@@ -40,8 +40,9 @@ Scores = dict[str, float]
 def evaluate_run(config: EvalConfig) -> int:
     """Score a run, print a table and write the scores.
 
-    Two policies that learned nothing play the same episodes, to compare with: `position only`
-    moves every token exactly onto its target's centre and never turns it, `random` is chance.
+    Three policies that learned nothing play the same episodes, to compare with: `exact` moves
+    every token exactly onto its target, `position only` onto its centre and never turns it,
+    `random` is chance.
 
     Returns:
         Exit status 0.
@@ -52,7 +53,7 @@ def evaluate_run(config: EvalConfig) -> int:
     torch.set_num_threads(1)
     began = time.monotonic()
     run = load_run(config.run_dir)
-    setup = with_actions(run.setup, config.actions)
+    setup = with_corner_noise(with_actions(run.setup, config.actions), config.corner_noise)
     scores = score_policies(setup, greedy(run.policy), config)
     if config.out is not None:
         report = _report(run, setup, config, scores) | {"seconds": time.monotonic() - began}
@@ -65,9 +66,10 @@ def evaluate_run(config: EvalConfig) -> int:
 
 
 def score_policies(setup: Setup, choose: Choose, config: EvalConfig) -> dict[str, Scores]:
-    """Scores of a policy and of the two to compare with, on the same episodes."""
+    """Scores of a policy and of those to compare with, on the same episodes."""
     policies = {
         RUN: choose,
+        "exact": exact_policy(setup.layout, setup.sim.arena),
         "position only": position_policy(setup.layout, setup.sim.arena),
         "random": random_policy(setup.action_size),
     }
@@ -83,6 +85,7 @@ def _report(
         **scores[RUN],
         "episodes": config.episodes,
         "actions": setup.sim.actions_per_token,
+        "corner_noise": setup.sim.corner_noise,
         "test_seed": config.seed,
         "run_dir": str(run.folder),
         "updates": run.updates,
@@ -99,7 +102,7 @@ def _table(run: Run, setup: Setup, config: EvalConfig, scores: dict[str, Scores]
     table = Table(
         title=f"{run.folder.name} after {run.updates:,} updates",
         caption=f"{config.episodes:,} {tests}, {actions} action{'s' * (actions > 1)} a token, "
-        f"noise off, {setup.sim.backend}",
+        f"noise off, {setup.sim.backend}; positions in arena units",
     )
     table.add_column("")
     for name in scores:

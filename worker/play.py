@@ -1,6 +1,7 @@
 """tangram-play: episodes of a finished run as an animation or as one picture."""
 
 import math
+from collections.abc import Sequence
 from contextlib import closing
 from io import BytesIO
 from pathlib import Path
@@ -11,7 +12,7 @@ from PIL import Image
 from rich.console import Console
 
 from tangram_agent.files import write_whole
-from tangram_agent.runs import load_run
+from tangram_agent.runs import Run, load_run
 from tangram_agent.setup import Setup
 from tangram_sim.arrays import Floats
 from tangram_sim.drawing import episode_sheet, save_gif
@@ -40,16 +41,12 @@ def play_run(config: PlayConfig) -> int:
         RunError: a folder or a checkpoint that is missing or corrupt, or `out` is not writable.
     """
     torch.set_num_threads(1)
-    run = load_run(config.run_dir)
-    setup = with_actions(run.setup, config.actions)
-    with closing(Trials(setup, config.episodes, AT_ONCE, role="play", seed=config.seed)) as trials:
-        played = trials.play(greedy(run.policy))
-    picture = BytesIO()
+    (run_dir,) = config.run_dirs
+    setup, played = play_episodes(load_run(run_dir), config)
     if Path(config.out).suffix == ".png":
-        draw_sheet(setup, played, played.ends).save(picture, format="PNG")
+        save_picture(config.out, [draw_sheet(setup, played, played.ends)])
     else:
-        save_gif(draw_motion(setup, played), picture, FRAME_MS)
-    write_whole(Path(config.out), picture.getvalue())
+        save_picture(config.out, draw_motion(setup, played))
     Console(highlight=False).print(
         f"{config.out}: {config.episodes} episodes, raw overlap {played.overlap.mean():.3f}",
         markup=False,
@@ -58,10 +55,37 @@ def play_run(config: PlayConfig) -> int:
     return 0
 
 
-def draw_sheet(setup: Setup, played: Played, corners: Floats) -> Image.Image:
-    """One tile for each of E episodes while its tokens are at corners (E, V, 2)."""
+def play_episodes(run: Run, config: PlayConfig) -> tuple[Setup, Played]:
+    """The episodes that the settings name, played by a run; the task as it was played."""
+    setup = with_actions(run.setup, config.actions)
+    with closing(Trials(setup, config.episodes, AT_ONCE, role="play", seed=config.seed)) as trials:
+        return setup, trials.play(greedy(run.policy))
+
+
+def save_picture(out: str, frames: Sequence[Image.Image]) -> None:
+    """Write one frame as a PNG or all of them as a GIF, whole or not at all.
+
+    Raises:
+        RunError: `out` is not writable.
+    """
+    picture = BytesIO()
+    if Path(out).suffix == ".png":
+        frames[-1].save(picture, format="PNG")
+    else:
+        save_gif(frames, picture, FRAME_MS)
+    write_whole(Path(out), picture.getvalue())
+
+
+def draw_sheet(
+    setup: Setup, played: Played, corners: Floats, width: int = SHEET
+) -> Image.Image:
+    """One tile for each of E episodes while its tokens are at corners (E, V, 2).
+
+    Args:
+        width: of all tiles of a row together, about, in pixels.
+    """
     columns = math.ceil(math.sqrt(len(corners)))
-    size = min(max(SHEET // columns, MIN_TILE), MAX_TILE)
+    size = min(max(width // columns, MIN_TILE), MAX_TILE)
     scenes = (played.starts, corners, played.goals)
     return episode_sheet(setup.layout, setup.sim.arena, *scenes, columns, size)
 
@@ -69,10 +93,16 @@ def draw_sheet(setup: Setup, played: Played, corners: Floats) -> Image.Image:
 def draw_motion(setup: Setup, played: Played) -> list[Image.Image]:
     """The episodes' frames: start, every action as a motion at constant velocity, end."""
     count = frames_per_action(played.actions.shape[1])
-    frames = [
-        draw_sheet(setup, played, corners)
-        for corners in motion(setup.layout, played.corners, count)
-    ]
+    return with_stills(
+        [
+            draw_sheet(setup, played, corners)
+            for corners in motion(setup.layout, played.corners, count)
+        ]
+    )
+
+
+def with_stills(frames: list[Image.Image]) -> list[Image.Image]:
+    """The same film with a rest before and after."""
     return [frames[0]] * STILL_START + frames + [frames[-1]] * STILL_END
 
 

@@ -31,6 +31,8 @@ class Played:
         actions: (B, T, A) in [-1, 1].
         rewards: (B, T) by the reward that the run trains on.
         goals: (B, V, 2) corners of the targets.
+        seen: `corners` as the policy saw them.
+        seen_goals: `goals` as the policy saw them.
         overlap: (B,) raw overlap of exact polygons after the last step.
         camera: (B,) Eq. 14 of the pictures after the last step; None without a camera.
     """
@@ -40,6 +42,8 @@ class Played:
     actions: Singles
     rewards: Floats
     goals: Floats
+    seen: Floats
+    seen_goals: Floats
     overlap: Floats
     camera: Floats | None
 
@@ -54,13 +58,13 @@ class Played:
         return self.corners[:, -1]
 
     def episodes(self) -> Episodes:
-        """What travels of them."""
+        """What travels of them: what the policy saw."""
         return Episodes(
-            corners=self.corners.astype(np.float32),
+            corners=self.seen.astype(np.float32),
             placed=self.placed.astype(np.uint8),
             actions=self.actions,
             rewards=self.rewards.astype(np.float32),
-            goals=self.goals.astype(np.float32),
+            goals=self.seen_goals.astype(np.float32),
         )
 
 
@@ -72,13 +76,14 @@ def play(env: BatchedEnv, choose: Choose, generators: Generators) -> Played:
             `choose` draws, so an episode does not depend on those that are played beside it.
     """
     env.reset(generators)
-    corners, placed = [env.corners], [env.placed]
+    corners, seen, placed = [env.corners], [env.seen], [env.placed]
     actions, rewards = [], []
     for _ in range(env.horizon):
-        actions.append(choose(env.corners, env.placed, env.goals, generators))
+        actions.append(choose(env.seen, env.placed, env.seen_goals, generators))
         result = env.step(actions[-1].astype(np.float64))
         rewards.append(result.rewards)
         corners.append(env.corners)
+        seen.append(env.seen)
         placed.append(env.placed)
     return Played(
         corners=np.stack(corners, axis=1),
@@ -86,6 +91,8 @@ def play(env: BatchedEnv, choose: Choose, generators: Generators) -> Played:
         actions=np.stack(actions, axis=1),
         rewards=np.stack(rewards, axis=1),
         goals=env.goals,
+        seen=np.stack(seen, axis=1),
+        seen_goals=env.seen_goals,
         overlap=result.overlap,
         camera=result.camera_rewards,
     )

@@ -6,7 +6,9 @@ Legend: E episodes, K tokens, V corners.
 import numpy as np
 
 from tangram_sim.arrays import Floats
+from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.layout import Layout
+from tangram_sim.rewards import make_reward
 from worker.rollout import Played
 
 
@@ -26,7 +28,7 @@ def pose_errors(layout: Layout, ends: Floats, goals: Floats) -> tuple[Floats, Fl
     return position, np.degrees(np.abs(turn))
 
 
-def summarise(layout: Layout, played: Played, own_reward: bool) -> dict[str, float]:
+def summarise(layout: Layout, sim: SimConfig, played: Played, own_reward: bool) -> dict[str, float]:
     """Scores of E episodes; percentiles look at the bad end of each distribution.
 
     Args:
@@ -34,13 +36,16 @@ def summarise(layout: Layout, played: Played, own_reward: bool) -> dict[str, flo
             exact polygons.
 
     Returns:
-        mean_reward (Eq. 14 of exact polygons, in [-1, 1], whatever is trained on), raw_overlap
-        and its 10th percentile, medians and 90th percentiles of the errors over all tokens,
-        episodes; mean_reward_camera and mean_train_reward where they exist.
+        mean_reward (Eq. 14 of exact polygons, in [-1, 1], whatever is trained on),
+        mean_reward_dense (Eq. 15 at the default sharpness), raw_overlap and its 10th percentile,
+        medians and 90th percentiles of the errors over all tokens, episodes; mean_reward_camera
+        and mean_train_reward where they exist.
     """
     position, angle = pose_errors(layout, played.ends, played.goals)
+    dense = make_reward(RewardConfig("dense"), layout, sim)
     scores = {
         "mean_reward": float(np.mean(2.0 * played.overlap - 1.0)),
+        "mean_reward_dense": float(np.mean(dense(played.ends, played.goals))),
         "raw_overlap": float(np.mean(played.overlap)),
         "raw_overlap_p10": float(np.percentile(played.overlap, 10)),
         "angle_error_deg_median": float(np.median(angle)),

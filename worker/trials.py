@@ -32,6 +32,13 @@ def with_actions(setup: Setup, actions: int | None) -> Setup:
     return replace(setup, sim=replace(setup.sim, actions_per_token=actions))
 
 
+def with_corner_noise(setup: Setup, noise: float | None) -> Setup:
+    """The setup with other noise on the corners that a policy sees; None leaves it as it is."""
+    if noise is None:
+        return setup
+    return replace(setup, sim=replace(setup.sim, corner_noise=noise))
+
+
 class Trials:
     """Test episodes that are the same whoever plays them.
 
@@ -73,7 +80,7 @@ class Trials:
         """See `worker.scores.summarise`."""
         reward = self.setup.reward
         own_reward = (reward.name, reward.source) != ("overlap", "polygon")
-        return summarise(self.setup.layout, played, own_reward)
+        return summarise(self.setup.layout, self.setup.sim, played, own_reward)
 
     def close(self) -> None:
         """Close the environments."""

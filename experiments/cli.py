@@ -1,0 +1,28 @@
+"""The command tangram-experiment.
+
+Everything heavy is imported after the config was composed, so --help and wrong input are instant.
+"""
+
+from pathlib import Path
+
+from conf.cli import entry
+from conf.help import Plain
+
+
+def experiment() -> int:
+    """tangram-experiment: runs the trainings and tests of experiments."""
+    return entry("experiments", _experiment)
+
+
+def _experiment(settings: Plain) -> int:
+    from experiments.plan import StudyConfig
+    from tangram_agent.setup import from_mapping
+
+    run_dir = settings.get("run_dir")
+    if isinstance(run_dir, str) and run_dir.strip():
+        settings["run_dir"] = str(Path(run_dir).expanduser().absolute())
+    config = from_mapping(StudyConfig, settings)
+
+    from experiments.runner import run_study
+
+    return run_study(config)

@@ -1,0 +1,103 @@
+"""What a study tells while it runs: one bar over everything, one line for each running job."""
+
+import json
+from collections.abc import Mapping, Sequence
+from types import TracebackType
+from typing import Any
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from experiments.jobs import Job
+from master.progress import duration
+
+
+class StudyProgress:
+    """Bars on a terminal; elsewhere a line for each job that is done."""
+
+    def __init__(self, console: Console, total: int, done: int) -> None:
+        """Nothing is shown before it is entered.
+
+        Args:
+            console: where to.
+            total: number of jobs.
+            done: how many of them were done before.
+        """
+        self._console, self._total, self._done = console, total, done
+        self._bars = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=console,
+            disable=not console.is_terminal,
+        )
+        # What was done before took no time now: the estimate is made from the rest.
+        self._all = self._bars.add_task("all jobs", total=total - done)
+        self._tasks: dict[Job, TaskID] = {}
+
+    def __enter__(self) -> "StudyProgress":
+        self._bars.start()
+        self.say(f"{self._done} of {self._total} jobs were done before")
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._bars.stop()
+
+    def say(self, text: str) -> None:
+        """A line for the user."""
+        self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+    def started(self, job: Job) -> None:
+        """A job runs."""
+        self._tasks[job] = self._bars.add_task(f"  {job.name}", total=None)
+
+    def look(self, running: Sequence[Job]) -> None:
+        """Show how far the running trainings are."""
+        if self._bars.disable:
+            return
+        for job in running:
+            if job.overrides is not None:
+                self._bars.update(self._tasks[job], description=f"  {job.name}{_state(job)}")
+
+    def finished(self, job: Job, result: Mapping[str, Any]) -> None:
+        """A job came to its end."""
+        self._done += 1
+        self._bars.advance(self._all)
+        self.say(f"[{self._done}/{self._total}] {job.name}: {_outcome(result)}")
+
+    def ended(self, job: Job) -> None:
+        """A job runs no longer."""
+        self._bars.remove_task(self._tasks.pop(job))
+
+
+def _state(job: Job) -> str:
+    """The last evaluation of a training, if there was one."""
+    try:
+        last = json.loads((job.run_dir / "curve.jsonl").read_text("utf-8").splitlines()[-1])
+        return f": {last['updates']:,} updates, mean reward {last['mean_reward']:.3f}"
+    except (OSError, ValueError, KeyError, IndexError, TypeError):
+        return ""
+
+
+def _outcome(result: Mapping[str, Any]) -> str:
+    reward, angle = result.get("mean_reward"), result.get("angle_error_deg_median")
+    if reward is None or angle is None:
+        return "done, without scores"
+    text = f"mean reward {reward:.3f}, angle error {angle:.2f} deg"
+    seconds = result.get("train_s")
+    return text if seconds is None else f"{text}, {duration(seconds)} of training"

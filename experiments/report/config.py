@@ -1,0 +1,23 @@
+"""Settings of tangram-report."""
+
+from dataclasses import dataclass
+
+from tangram_sim.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class ReportConfig:
+    """A study and where to report on it.
+
+    Attributes:
+        runs: folder of the study, with plan.json.
+        out: folder for README.md, data.json and the figures; files of the same names are replaced.
+    """
+
+    runs: str
+    out: str
+
+    def __post_init__(self) -> None:
+        for name, value in (("runs", self.runs), ("out", self.out)):
+            if not value.strip():
+                raise ConfigError(f"{name} must name a folder, got '': set {name}=...")

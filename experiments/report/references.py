@@ -1,0 +1,94 @@
+"""Policies to compare with, as tests of the same task scored them on the same episodes."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from experiments.report.markdown import Measure
+from experiments.report.records import Row
+from experiments.report.study import Experiment, Study, Training, Trial
+
+# Name in the files of tests -> name in the report.
+NAMES = {"position only": "position only", "exact": "perfect", "random": "random"}
+POSITION = "position only"
+# Settings of the simulation that tests set themselves, or that move no token.
+APART = ("sim.actions_per_token", "sim.corner_noise", "sim.camera", "sim.pixels", "sim.max_tries")
+
+Task = tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A policy that learned nothing, at one task.
+
+    Attributes:
+        name: position only, perfect or random.
+        task: what tells the task from the experiment's others; empty if it has only one.
+        by_test: name of a test -> its scores there.
+    """
+
+    name: str
+    task: str
+    by_test: dict[str, Row]
+
+    @property
+    def label(self) -> str:
+        """For tables and legends."""
+        return f"{self.name} ({self.task})" if self.task else self.name
+
+    def score(self, tests: Sequence[Trial], measure: Measure) -> float | None:
+        """Its score in the first of the tests that has one."""
+        found = [self.by_test[one.name] for one in tests if one.name in self.by_test]
+        values = [row[measure.key] for row in found if row.get(measure.key) is not None]
+        return float(values[0]) if values else None
+
+
+class References:
+    """All that the tests of a study know of such policies.
+
+    Attributes:
+        plain: the tests of the study, those most like training first: without noise, one action.
+    """
+
+    def __init__(self, study: Study) -> None:
+        self.plain = sorted(study.tests, key=lambda t: (bool(t.corner_noise), t.actions or 1))
+        self._scores: dict[tuple[str, Task], dict[str, Row]] = {}
+        for training in study.trainings:
+            for seed in training.finished:
+                for test, row in seed.tests.items():
+                    for key, scores in row.get("baselines", {}).items():
+                        by_test = self._scores.setdefault((key, task_of(training)), {})
+                        by_test.setdefault(test, scores)
+
+    def of(self, experiment: Experiment) -> list[Reference]:
+        """Every known policy at every task of an experiment."""
+        tasks: dict[Task, str] = {}
+        shapes = [one.tokens for one in _one_for_each_task(experiment)]
+        for one in _one_for_each_task(experiment):
+            name = one.tokens if shapes.count(one.tokens) == 1 else one.label
+            tasks[task_of(one)] = name if len(shapes) > 1 else ""
+        return [
+            Reference(name, label, self._scores[key, task])
+            for key, name in NAMES.items()
+            for task, label in tasks.items()
+            if (key, task) in self._scores
+        ]
+
+    def position(self, training: Training, measure: Measure) -> float | None:
+        """What the position-only policy scores at a training's task."""
+        known = self._scores.get((POSITION, task_of(training)), {})
+        return Reference(POSITION, "", known).score(self.plain, measure)
+
+
+def task_of(training: Training) -> Task:
+    """What decides how policies without a network score: shapes, their sizes, the engine."""
+    settings = sorted(
+        text
+        for text in training.overrides
+        if text.startswith(("tokens.", "sim.")) and text.partition("=")[0] not in APART
+    )
+    return (training.tokens, *settings)
+
+
+def _one_for_each_task(experiment: Experiment) -> list[Training]:
+    known = [one for one in experiment.trainings if one.finished]
+    return list({task_of(one): one for one in reversed(known)}.values())[::-1]
