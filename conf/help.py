@@ -6,6 +6,7 @@ Only `yaml` is needed for it: a command's help does not wait for hydra.
 from collections.abc import Iterator, Mapping
 from importlib.resources import files
 from importlib.resources.abc import Traversable
+from textwrap import wrap
 from typing import Any
 
 import yaml
@@ -49,17 +50,18 @@ def choices(group: str) -> list[str]:
     return sorted(e.name.removesuffix(".yaml") for e in entries if e.name.endswith(".yaml"))
 
 
-def group_defaults(config_name: str) -> dict[str, str]:
-    """Config group -> default preset, of a primary config."""
+def group_defaults(config_name: str) -> dict[str, list[str]]:
+    """Config group -> presets that are taken by default, of a primary config."""
     defaults = _primary(config_name)["defaults"]
-    return {k: v for item in defaults if isinstance(item, Mapping) for k, v in item.items()}
+    pairs = [pair for item in defaults if isinstance(item, Mapping) for pair in item.items()]
+    return {group: [name] if isinstance(name, str) else name for group, name in pairs}
 
 
 def setting_names(config_name: str) -> list[str]:
     """Dotted names of all settings and groups of a command, as its defaults compose them."""
     names = [name for name in _primary(config_name) if name not in ("defaults", "hydra")]
-    for group, choice in group_defaults(config_name).items():
-        content = _load(files("conf") / group / f"{choice}.yaml")
+    for group, chosen in group_defaults(config_name).items():
+        content = _load(files("conf") / group / f"{chosen[0]}.yaml")
         names.append(group)
         names.extend(f"{group}.{key}" for key in content if key != "defaults")
     return names
@@ -72,10 +74,13 @@ def _groups_text(config_name: str, command: str) -> Iterator[str]:
     yield ""
     yield "Config groups (* is the default):"
     for group, default in defaults.items():
-        names = [f"{name}*" if name == default else name for name in choices(group)]
-        yield f"  {group:<8} {', '.join(names)}"
-    yield "Their values are settings too, as in agent.noise=0.1 or tokens.shapes=[square,square];"
-    yield f"`{command} --cfg job` shows all of them."
+        names = [f"{name}*" if name in default else name for name in choices(group)]
+        yield from wrap(
+            f"{group:<8} {', '.join(names)}", 96, initial_indent="  ", subsequent_indent=" " * 11
+        )
+    if "agent" in defaults:
+        yield "Their values are settings too, as in agent.noise=0.1, tokens.shapes=[square,square];"
+    yield f"`{command} --cfg job` shows all of their values."
 
 
 def _setting_lines(config_name: str) -> list[str]:

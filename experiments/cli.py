@@ -17,10 +17,13 @@ def experiment() -> int:
 def _experiment(settings: Plain) -> int:
     from experiments.plan import StudyConfig
     from tangram_agent.setup import from_mapping
+    from tangram_sim.errors import ConfigError
 
     run_dir = settings.get("run_dir")
     if isinstance(run_dir, str) and run_dir.strip():
         settings["run_dir"] = str(Path(run_dir).expanduser().absolute())
+    if not isinstance(settings.get("experiments"), dict):
+        raise ConfigError("experiments are chosen by the names of presets: experiment=[fig4,table2]")
     config = from_mapping(StudyConfig, settings)
 
     from experiments.runner import run_study

@@ -11,6 +11,7 @@ from typing import Any
 from experiments.plan import StudyConfig, seed_folder, test_file
 from master.children import override
 from tangram_agent.files import write_whole
+from tangram_agent.runs import CONFIG
 from tangram_sim.errors import ConfigError
 
 RESULT = "result.json"
@@ -68,8 +69,8 @@ class Job:
 
     def check(self) -> None:
         """Raise ConfigError if the folder holds a training with other settings."""
-        path = settings_file(self.run_dir)
-        if self.overrides is None or not path.exists():
+        path, begun = settings_file(self.run_dir), (self.run_dir / CONFIG).exists()
+        if self.overrides is None or not begun:
             return
         stored = read_object(path).get("overrides")
         if stored != list(self.overrides):

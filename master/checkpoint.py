@@ -93,9 +93,8 @@ def warm_start(run_dir: Path, trainer: Trainer) -> str:
     Raises:
         RunError: there is no whole checkpoint, or its networks have other shapes.
     """
-    path = newest_checkpoint(run_dir / CHECKPOINTS)
     try:
-        content = load_checkpoint(path, [LEARNER])
+        content = load_checkpoint(newest_checkpoint(run_dir / CHECKPOINTS), [LEARNER])
         trainer.learner.load_networks(content.arrays[LEARNER])
     except RunError as error:
         raise RunError(f"warm_start={run_dir}: {error}") from None

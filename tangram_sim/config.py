@@ -24,8 +24,7 @@ class SimConfig:
         arena: side of the square arena, in the units of the tokens.
         actions_per_token: actions after which a token counts as placed.
         substeps: simulation steps in one action of one second (physics only).
-        damping: share of its velocity that a token loses in a second (physics only); Bullet's own
-            default is 0.04.
+        damping: Bullet's linear and angular damping (physics only), whose own default is 0.04.
         inexact: allow damping and fewer than 4 substeps, with which tokens fall short of what
             they are told; for experiments on what an agent makes of that.
         corner_noise: standard deviation of the Gaussian noise on the corners that agents see, as a

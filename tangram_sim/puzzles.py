@@ -87,11 +87,16 @@ def parse_puzzle(text: str, name: str) -> Puzzle:
             f"puzzle '{name}': tokens must be a list of mappings with the keys "
             f"{', '.join(sorted(_TOKEN_KEYS))}"
         )
-    arena, scale = (_number(content[key], f"{key} of puzzle '{name}'") for key in ("arena", "scale"))
+    arena, scale = (
+        _number(content[key], f"{key} of puzzle '{name}'") for key in ("arena", "scale")
+    )
     layout = make_layout(TokensConfig(tuple(token["shape"] for token in tokens), scale))
     poses = np.array(
         [
-            [_number(token[key], f"{key} of token {k} of puzzle '{name}'") for key in "x y angle".split()]
+            [
+                _number(token[key], f"{key} of token {k} of puzzle '{name}'")
+                for key in ("x", "y", "angle")
+            ]
             for k, token in enumerate(tokens)
         ]
     )

@@ -12,7 +12,7 @@ import pytest
 pytestmark = pytest.mark.fast
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("conf", "master", "tangram_agent", "tangram_sim", "worker")
+PACKAGES = ("conf", "experiments", "master", "tangram_agent", "tangram_sim", "worker")
 
 
 def run(command: list[str], cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
@@ -45,7 +45,7 @@ def test_import_contracts_catch_every_wrong_arrow(tmp_path: Path) -> None:
     wrong = {
         "tangram_sim/wrong.py": "import torch, pybullet, zmq, omegaconf",
         "tangram_agent/wrong.py": "import worker.config, conf.help",
-        "master/wrong.py": "import tangram_sim.wrong",
+        "master/wrong.py": "import experiments.plan, tangram_sim.wrong",
     }
     for path, code in wrong.items():
         (tmp_path / path).write_text(code)
@@ -65,7 +65,7 @@ def test_master_and_registration_never_load_the_engine() -> None:
 
 def test_command_lines_load_nothing_heavy() -> None:
     loaded = run_python(
-        "import master.cli, worker.cli, sys\n"
+        "import experiments.cli, experiments.report.cli, master.cli, worker.cli, sys\n"
         "print({'torch', 'numpy', 'hydra', 'zmq', 'gymnasium'} & set(sys.modules))"
     )
     assert loaded == "set()"
@@ -74,7 +74,9 @@ def test_command_lines_load_nothing_heavy() -> None:
 # Packaging
 
 
-@pytest.mark.parametrize("command", ["master", "train", "worker", "eval", "play"])
+@pytest.mark.parametrize(
+    "command", ["master", "train", "worker", "eval", "play", "experiment", "report"]
+)
 def test_console_scripts_are_declared(command: str) -> None:
     (script,) = entry_points(group="console_scripts", name=f"tangram-{command}")
     assert callable(script.load())

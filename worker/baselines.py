@@ -35,7 +35,7 @@ def position_policy(layout: Layout, arena: float) -> Choose:
 
 
 def exact_policy(layout: Layout, arena: float) -> Choose:
-    """Token after token exactly onto its own target, by the smallest turn that fits.
+    """Token after token exactly onto its own target as it is seen, by the smallest turn that fits.
 
     What remains to a perfect score is the world's: float32 actions, and the engine's arithmetic.
     """
@@ -60,7 +60,8 @@ def _actions(ways: Floats, placed: Bools, arena: float) -> Singles:
     token = np.argmin(placed, axis=1)
     motion = ways[np.arange(len(ways)), token] / np.array([arena, arena, np.pi])
     tokens = ways.shape[1]
-    if tokens == 1:
-        return motion.astype(np.float32)
-    selector = (2.0 * token + 1.0) / tokens - 1.0
-    return np.column_stack([selector, motion]).astype(np.float32)
+    if tokens > 1:
+        selector = (2.0 * token + 1.0) / tokens - 1.0
+        motion = np.column_stack([selector, motion])
+    actions: Singles = motion.astype(np.float32)
+    return actions

@@ -99,9 +99,7 @@ def distinct_names(folders: Sequence[Path]) -> list[str]:
     return [str(folder) for folder in folders]
 
 
-def _films(
-    config: PlayConfig, shown: Sequence[tuple[Setup, Played]]
-) -> list[list[Image.Image]]:
+def _films(config: PlayConfig, shown: Sequence[tuple[Setup, Played]]) -> list[list[Image.Image]]:
     """For each run its frames, equally many: only the last one for a PNG."""
     if Path(config.out).suffix == ".png":
         scenes = [[played.ends] for _, played in shown]

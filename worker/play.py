@@ -76,9 +76,7 @@ def save_picture(out: str, frames: Sequence[Image.Image]) -> None:
     write_whole(Path(out), picture.getvalue())
 
 
-def draw_sheet(
-    setup: Setup, played: Played, corners: Floats, width: int = SHEET
-) -> Image.Image:
+def draw_sheet(setup: Setup, played: Played, corners: Floats, width: int = SHEET) -> Image.Image:
     """One tile for each of E episodes while its tokens are at corners (E, V, 2).
 
     Args:

@@ -106,3 +106,11 @@ def test_constants_are_no_weights() -> None:
     graph = graph_of(setup())
     assert graph.state_dict() == {}
     assert list(graph.parameters()) == []
+
+
+@pytest.mark.parametrize("tokens", [SQUARE, PAIR])
+def test_edges_are_the_papers_or_all(tokens: dict[str, object]) -> None:
+    paper, complete = (graph_of(setup(tokens, agent={"edges": e})) for e in ("paper", "complete"))
+    layout = setup(tokens).layout
+    np.testing.assert_array_equal(paper.adjacency, layout.adjacency)
+    np.testing.assert_array_equal(complete.adjacency, ~np.eye(layout.nodes, dtype=bool))

@@ -54,6 +54,7 @@ def changed(section: str, **values: Any) -> dict[str, dict[str, Any]]:
         ),
         (changed("agent", squash="relu"), "agent.squash must be one of tanh, clamp, got 'relu'"),
         (changed("agent", angle_head="x"), "agent.angle_head must be one of plain, kfold"),
+        (changed("agent", edges="x"), "agent.edges must be one of paper, complete, got 'x'"),
         (changed("agent", lr_decay="x"), "agent.lr_decay must be one of none, cosine"),
         (changed("agent", hindsight=[{"strategy": "x"}]), "must be one of final, future, near"),
         (

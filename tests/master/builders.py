@@ -13,6 +13,7 @@ import torch
 from master.arrivals import EpisodesArrived, ScoresArrived
 from master.budget import Budget
 from master.config import MasterConfig
+from master.curve import Curve
 from master.loop import Loop
 from master.metrics import Metrics
 from master.parts import Parts
@@ -151,5 +152,6 @@ def loop(
         hub,  # type: ignore[arg-type]
     )
     metrics = Metrics(run_folder.tensorboard)
-    reporter = Reporter(ShownProgress(), metrics, settings.service)
+    curve = Curve(run_folder.curve, parts.trainer.updates)
+    reporter = Reporter(ShownProgress(), metrics, curve, settings.service)
     return Loop(parts, reporter, StopSignals(), SimpleQueue())

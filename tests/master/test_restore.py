@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from master.checkpoint import check_resumable, restore_run, save_run
+from master.checkpoint import check_resumable, restore_run, save_run, warm_start
 from master.record import Record
 from master.trainer import Trainer, choose_device
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint, save_checkpoint
@@ -157,3 +157,47 @@ def test_another_task_is_refused_from_the_checkpoint_alone(tmp_path: Path) -> No
     other = mine | {"tokens": {"shapes": ["parallelogram"], "scale": 1.0}}
     with pytest.raises(RunError, match="made with other settings of tokens: .* from_config="):
         check_resumable(tmp_path, other)
+
+
+# A warm start
+
+
+def saved(folder: Path, made: Trainer) -> Path:
+    """A run folder with one checkpoint."""
+    save_run(folder / "checkpoints", made, Record(), HUB, keep=1)
+    return folder
+
+
+def test_a_warm_start_takes_the_networks_and_nothing_else(tmp_path: Path) -> None:
+    source, fresh = trainer(MADE), trainer(MADE, seed=99)
+    play_on(source, 5)
+    line = warm_start(saved(tmp_path, source), fresh)
+    assert line == f"begins with the networks of {tmp_path} after {source.updates} updates"
+    ours, theirs = fresh.learner.state(), source.learner.state()
+    networks = [name for name in theirs if "optimiser" not in name and name != "updates"]
+    assert len(networks) > 5
+    for name in networks:
+        np.testing.assert_array_equal(ours[name], theirs[name], err_msg=name)
+    assert not any("optimiser" in name for name in ours)
+    assert (fresh.updates, fresh.episodes, len(fresh.replay)) == (0, 0, 0)
+
+
+def test_networks_of_another_shape_can_be_taken_over(tmp_path: Path) -> None:
+    """Attention does not care how many nodes there are."""
+    source = trainer(MADE)
+    play_on(source, 3)
+    other = trainer(setup({"shapes": ["large_triangle"], "scale": 0.8}, agent=AGENT))
+    warm_start(saved(tmp_path, source), other)
+    for ours, theirs in zip(
+        other.learner.actor.parameters(), source.learner.actor.parameters(), strict=True
+    ):
+        np.testing.assert_array_equal(ours.detach(), theirs.detach())
+
+
+def test_a_warm_start_that_cannot_be_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=f"warm_start={tmp_path}: no checkpoint in"):
+        warm_start(tmp_path, trainer(MADE))
+    saved(tmp_path, trainer(MADE))
+    wider = trainer(setup(agent=AGENT, net={"width": 16, "heads": 2, "layers": 1}))
+    with pytest.raises(RunError, match=f"warm_start={tmp_path}: weights of another"):
+        warm_start(tmp_path, wider)

@@ -19,6 +19,10 @@ pytestmark = pytest.mark.fast
         ({"arena": math.nan}, "sim.arena must be between"),
         ({"actions_per_token": 0}, "sim.actions_per_token must be between 1 and 100, got 0"),
         ({"substeps": 3}, "sim.substeps must be between 4 and 1000, got 3"),
+        ({"substeps": 0, "inexact": True}, "sim.substeps must be between 1 and 1000, got 0"),
+        ({"damping": 0.04}, "sim.damping must be 0, got 0.04: .* set sim.inexact=true"),
+        ({"damping": 1.5, "inexact": True}, "sim.damping must be between 0 and 1, got 1.5"),
+        ({"corner_noise": 0.3}, "sim.corner_noise must be between 0 and 0.2, got 0.3"),
         ({"pixels": 15}, "sim.pixels must be between 16 and 1024, got 15"),
         ({"pixels": 1025}, "sim.pixels must be between 16 and 1024, got 1025"),
         ({"max_tries": 0}, "sim.max_tries must be between 1"),
@@ -43,6 +47,11 @@ def test_refused_sim(settings: dict[str, Any], reason: str) -> None:
 def test_refused_reward(settings: dict[str, Any], reason: str) -> None:
     with pytest.raises(ConfigError, match=reason):
         RewardConfig(**settings)
+
+
+def test_an_inexact_world_is_made_on_request() -> None:
+    sim = SimConfig(inexact=True, substeps=1, damping=0.04)
+    assert (sim.substeps, sim.damping) == (1, 0.04)
 
 
 def test_defaults_work() -> None:

@@ -1,8 +1,11 @@
 """Scores of hand-made episodes whose errors are known exactly."""
 
+import math
+
 import numpy as np
 import pytest
 
+from tangram_sim.config import SimConfig
 from tangram_sim.layout import Layout, TokensConfig, make_layout
 from worker.rollout import Played
 from worker.scores import pose_errors, summarise
@@ -80,6 +83,8 @@ def played(layout: Layout, camera: np.ndarray | None) -> Played:
         actions=np.zeros((11, 1, 3), np.float32),
         rewards=steps[:, None] / 100.0,
         goals=goals,
+        seen=np.stack([goals + 1.0, ends], axis=1),
+        seen_goals=goals,
         overlap=steps / 10.0,
         camera=camera,
     )
@@ -87,10 +92,15 @@ def played(layout: Layout, camera: np.ndarray | None) -> Played:
 
 def test_the_scores_of_a_known_set() -> None:
     layout = layout_of("square")
-    scores = summarise(layout, played(layout, np.full(11, 0.25)), own_reward=True)
+    made = played(layout, np.full(11, 0.25))
+    scores = summarise(layout, SimConfig(), made, own_reward=True)
+    # Eq. 15: 1 - 2 log(1 + 100 d / reach) / log(101), reach the diagonal of the arena
+    distances = np.arange(11) * 0.01 / math.sqrt(8.0)
+    dense = np.mean(1.0 - 2.0 * np.log1p(100.0 * distances) / math.log(101.0))
     assert scores == pytest.approx(
         {
             "mean_reward": 0.0,
+            "mean_reward_dense": dense,
             "raw_overlap": 0.5,
             "raw_overlap_p10": 0.1,
             "angle_error_deg_median": 5.0,
@@ -106,6 +116,6 @@ def test_the_scores_of_a_known_set() -> None:
 
 def test_scores_that_do_not_exist_are_left_out() -> None:
     layout = layout_of("square")
-    scores = summarise(layout, played(layout, None), own_reward=False)
+    scores = summarise(layout, SimConfig(), played(layout, None), own_reward=False)
     assert "mean_reward_camera" not in scores
     assert "mean_train_reward" not in scores

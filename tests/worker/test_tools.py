@@ -43,7 +43,7 @@ def test_evaluation_writes_scores_and_prints_them(
     assert report["updates"] == 7
     assert report["tokens"] == ["square"]
     assert report["agent"] == "tangram"
-    assert set(report["baselines"]) == {"position only", "random"}
+    assert set(report["baselines"]) == {"exact", "position only", "random"}
     assert report["baselines"]["position only"]["position_error_median"] < 1e-6
     assert (
         report["baselines"]["random"]["mean_reward"]

@@ -1,0 +1,125 @@
+"""Agents of the package: found by name from any folder, and read with every byte checked."""
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors.numpy
+import yaml
+
+from tangram_agent import pretrained
+from tangram_agent.ddpg import Learner
+from tangram_agent.policy import Policy
+from tangram_agent.pretrained import CARD, CONFIG, WEIGHTS, agent_names, is_name
+from tangram_agent.runs import load_run
+from tangram_sim.errors import RunError, TangramError
+from tests.agent.builders import SMALL, SQUARE, random_transitions, setup
+
+pytestmark = pytest.mark.fast
+
+MADE = setup()
+TENSORS = Learner(MADE, seed=3).acting_weights(1).tensors
+SECTIONS = {
+    "tokens": SQUARE,
+    "sim": {"backend": "kinematic"},
+    "reward": {},
+    "agent": {},
+    "net": SMALL,
+}
+
+
+def write_agent(folder: Path, **card: object) -> Path:
+    folder.mkdir(parents=True)
+    (folder / CONFIG).write_text(yaml.safe_dump(SECTIONS))
+    data = safetensors.numpy.save(TENSORS)
+    (folder / WEIGHTS).write_bytes(data)
+    content = {"format": 1, "updates": 12, "sha256": hashlib.sha256(data).hexdigest()} | card
+    (folder / CARD).write_text(json.dumps(content))
+    return folder
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A package with two agents, seen from an empty folder."""
+    for name in ("square", "other"):
+        write_agent(tmp_path / "package" / name)
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.setattr(pretrained, "PACKAGED", tmp_path / "package")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    return tmp_path / "package"
+
+
+@pytest.mark.parametrize("run_dir", ["pretrained/square", Path("pretrained/square")])
+def test_an_agent_is_found_by_its_name(package: Path, run_dir: str | Path) -> None:
+    run = load_run(run_dir)
+    assert (run.folder, run.updates, run.config) == (Path("pretrained/square"), 12, SECTIONS)
+    expected = Policy(MADE)
+    expected.load(Learner(MADE, seed=3).acting_weights(1))
+    batch = random_transitions(MADE, 4)
+    scene = (batch.state, batch.placed, batch.goal)
+    np.testing.assert_array_equal(run.policy.act(*scene), expected.act(*scene))
+
+
+def test_a_folder_of_that_name_wins(package: Path) -> None:
+    write_agent(Path("pretrained/square"), updates=99)
+    assert load_run("pretrained/square").updates == 99
+
+
+def test_an_agents_folder_is_read_from_anywhere(tmp_path: Path) -> None:
+    folder = write_agent(tmp_path / "mine")
+    assert load_run(folder).folder == folder
+
+
+def test_an_unknown_name_lists_those_that_there_are(package: Path) -> None:
+    with pytest.raises(
+        RunError,
+        match="no pretrained agent 'cat': choose from pretrained/other, pretrained/square",
+    ):
+        load_run("pretrained/cat")
+
+
+@pytest.mark.parametrize("run_dir", ["runs/pretrained/square", "/pretrained/square", "square"])
+def test_only_the_plain_name_means_the_package(package: Path, run_dir: str) -> None:
+    assert not is_name(run_dir)
+    with pytest.raises(RunError, match="no run folder"):
+        load_run(run_dir)
+
+
+def test_an_agent_has_no_checkpoints(package: Path) -> None:
+    with pytest.raises(RunError, match="has no checkpoint 00000010"):
+        load_run("pretrained/square", "00000010")
+
+
+@pytest.mark.parametrize(
+    ("harm", "reason"),
+    [
+        (lambda agent: (agent / WEIGHTS).write_bytes(b"x"), "checksum of weights.safetensors"),
+        (lambda agent: (agent / WEIGHTS).unlink(), "is damaged .*: install tangram-rl again"),
+        (lambda agent: (agent / CONFIG).unlink(), "is damaged"),
+        (lambda agent: (agent / CONFIG).write_text("- 1"), "holds no settings"),
+        (lambda agent: (agent / CONFIG).write_text("a: [1"), "not valid YAML"),
+        (lambda agent: (agent / CARD).write_text("{"), "cannot be read"),
+        (lambda agent: (agent / CARD).write_text("[]"), "not of format 1"),
+        (lambda agent: (agent / CARD).write_text('{"format": 2}'), "not of format 1"),
+        (lambda agent: (agent / CARD).write_text('{"format": 1}'), "does not tell the updates"),
+    ],
+)
+def test_a_damaged_agent_is_refused(package: Path, harm: object, reason: str) -> None:
+    harm(package / "square")
+    with pytest.raises(TangramError, match=reason) as caught:
+        load_run("pretrained/square")
+    assert "\n" not in str(caught.value)
+    assert "pretrained/square" in str(caught.value)
+
+
+@pytest.mark.parametrize("name", agent_names())
+def test_the_packages_own_agents_are_whole_small_and_good(name: str) -> None:
+    folder = pretrained.PACKAGED / name
+    run = load_run(f"pretrained/{name}")
+    card = json.loads((folder / CARD).read_bytes())
+    assert [shape.name for shape in run.setup.layout.shapes] == card["task"]["tokens"]
+    assert card["scores"]["mean_reward"] > 0.9
+    assert len((folder / WEIGHTS).read_bytes()) < 1_000_000
+    assert f"# pretrained/{name}\n" in (folder / "card.md").read_text()
