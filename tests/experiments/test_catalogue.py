@@ -45,7 +45,7 @@ def test_every_training_composes_with_every_budget(budget: str) -> None:
     config = study(budget, choices("experiment"))
     for name, training in config.trainings.items():
         made = setup_of(config, name)
-        assert made.agent.name == {"start": "tangram"}.get(training.family, training.family), name
+        assert made.agent.name == {"start": "tangram", "mlp_large": "mlp"}.get(training.family, training.family), name
 
 
 def test_every_training_and_test_of_the_catalogue_is_used() -> None:
