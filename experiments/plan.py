@@ -210,7 +210,7 @@ def plan_content(config: StudyConfig, source: Mapping[str, Any]) -> dict[str, An
 
 
 def joined_plan(path: Path, content: dict[str, Any]) -> dict[str, Any]:
-    """A plan together with what earlier commands put into the same folder.
+    """A plan together with what earlier commands put into the same folder; seeds may be added.
 
     Raises:
         ConfigError: the folder was made with another budget, or its plan cannot be read.
@@ -219,13 +219,15 @@ def joined_plan(path: Path, content: dict[str, Any]) -> dict[str, Any]:
         return content
     try:
         earlier = json.loads(path.read_text(encoding="utf-8"))
-        known = {name: earlier[name] for name in ("budget", "experiments", "trainings", "tests")}
+        known = {n: dict(earlier[n]) for n in ("budget", "experiments", "trainings", "tests")}
     except (OSError, ValueError, KeyError, TypeError):
         raise ConfigError(f"cannot read {path}: remove it, or choose another run_dir") from None
-    if known["budget"] != content["budget"]:
-        raise ConfigError(
-            f"{path.parent} was made with another budget ({known['budget'].get('name')}): choose "
-            "another run_dir"
-        )
+    for name in ("name", "test_episodes"):
+        earlier, now = known["budget"].get(name), content["budget"][name]
+        if earlier != now:
+            raise ConfigError(
+                f"{path.parent} was made with budget.{name}={earlier}, now it is {now}: choose "
+                "another run_dir"
+            )
     merged = {n: known[n] | content[n] for n in ("experiments", "trainings", "tests")}
     return content | merged

@@ -114,12 +114,29 @@ def test_a_plan_keeps_what_was_there(tmp_path: Path) -> None:
     assert list(joined["tests"]) == ["twice", "noisy"]
 
 
-def test_another_budget_needs_another_folder(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("name", "huge", "was made with budget.name=tiny, now it is huge: choose another run_dir"),
+        ("test_episodes", 6, "was made with budget.test_episodes=5, now it is 6"),
+    ],
+)
+def test_another_budget_needs_another_folder(
+    tmp_path: Path, name: str, value: Any, message: str
+) -> None:
+    path = tmp_path / "plan.json"
+    path.write_text(json.dumps(plan_content(study(tmp_path), {})))
+    budget = content(tmp_path)["budget"] | {name: value}
+    with pytest.raises(ConfigError, match=message):
+        joined_plan(path, plan_content(study(tmp_path, budget=budget), {}))
+
+
+def test_seeds_may_be_added(tmp_path: Path) -> None:
     path = tmp_path / "plan.json"
     path.write_text(json.dumps(plan_content(study(tmp_path), {})))
     budget = content(tmp_path)["budget"] | {"seeds": [0, 1, 2]}
-    with pytest.raises(ConfigError, match=r"another budget \(tiny\): choose another run_dir"):
-        joined_plan(path, plan_content(study(tmp_path, budget=budget), {}))
+    joined = joined_plan(path, plan_content(study(tmp_path, budget=budget), {}))
+    assert joined["budget"]["seeds"] == [0, 1, 2]
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"budget": 1}'])
