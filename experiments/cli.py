@@ -23,7 +23,7 @@ def _experiment(settings: Plain) -> int:
     if isinstance(run_dir, str) and run_dir.strip():
         settings["run_dir"] = str(Path(run_dir).expanduser().absolute())
     if not isinstance(settings.get("experiments"), dict):
-        raise ConfigError("experiments are chosen by the names of presets: experiment=[fig4,table2]")
+        raise ConfigError("experiments are chosen by their presets: experiment=[fig4,table2]")
     config = from_mapping(StudyConfig, settings)
 
     from experiments.runner import run_study

@@ -13,11 +13,12 @@ import yaml
 
 from tangram_agent.checkpoints import load_checkpoint, newest_checkpoint
 from tangram_agent.policy import Policy
-from tangram_agent.pretrained import CONFIG, is_agent, is_name, packaged, read_agent
+from tangram_agent.pretrained import is_agent, is_name, packaged, read_agent
 from tangram_agent.setup import Setup, make_setup
 from tangram_agent.types import Weights
 from tangram_sim.errors import RunError
 
+CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"
 ACTING = "weights"  # the checkpoint's file of acting weights
 POLICY_SECTIONS = ("tokens", "agent", "net")

@@ -99,10 +99,12 @@ def _report(
 def _table(run: Run, setup: Setup, config: EvalConfig, scores: dict[str, Scores]) -> Table:
     tests = "fixed tests" if config.seed == 0 else f"tests of seed {config.seed}"
     actions = setup.sim.actions_per_token
+    noise = setup.sim.corner_noise
+    seen = f"corners with noise {noise:g}" if noise else "exact corners"
     table = Table(
         title=f"{run.folder.name} after {run.updates:,} updates",
         caption=f"{config.episodes:,} {tests}, {actions} action{'s' * (actions > 1)} a token, "
-        f"noise off, {setup.sim.backend}; positions in arena units",
+        f"exploration off, {seen}, {setup.sim.backend}; positions in arena units",
     )
     table.add_column("")
     for name in scores:

@@ -51,7 +51,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         "kind must be one of curves, complexity, tests, rewards, ranking, got 'pie'",
     ),
     ({"families": {"ours": []}}, "training paper: family 'theirs' is not in the catalogue"),
-    ({"trainings": {"square": WARM}, "experiments": {}}, "training square: after 'warm' is not in the catalogue"),
+    ({"trainings": {"square": WARM}, "experiments": {}}, "training square: after 'warm' is not in"),
 ]
 
 

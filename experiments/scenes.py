@@ -1,0 +1,67 @@
+"""Tokens and arenas in matplotlib's panels, for the pictures of the paper, and their files."""
+
+import io
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+
+from experiments.report.style import COLOURS, DPI
+from tangram_agent.files import write_whole
+from tangram_sim.arrays import Floats
+from tangram_sim.layout import Layout
+
+FRAME = "#9CA3AF"
+
+
+def new_picture(width_in: float, height_in: float) -> Figure:
+    """An empty figure of that many inches, without pyplot."""
+    figure = Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save_picture(figure: Figure, stem: Path) -> None:
+    """Write `<stem>.png` and `<stem>.svg`; the same picture gives the same bytes.
+
+    Raises:
+        RunError: the files cannot be written.
+    """
+    # Names of the program and times would change with every machine and run.
+    for kind, left_out in {"png": ("Software",), "svg": ("Date", "Creator")}.items():
+        data = io.BytesIO()
+        figure.savefig(data, format=kind, metadata=dict.fromkeys(left_out))
+        write_whole(stem.with_name(f"{stem.name}.{kind}"), data.getvalue())
+
+
+def bare(panel: Axes) -> None:
+    """No grid, no ticks, no frame, and both axes of one scale."""
+    panel.grid(visible=False)
+    panel.set_xticks([])
+    panel.set_yticks([])
+    panel.set_aspect("equal")
+    for spine in panel.spines.values():
+        spine.set_visible(False)
+
+
+def show_arena(panel: Axes, arena: float) -> None:
+    """The square playground around the origin, with its frame."""
+    bare(panel)
+    half = arena / 2.0
+    panel.set_xlim(-half, half)
+    panel.set_ylim(-half, half)
+    for spine in panel.spines.values():
+        spine.set_visible(True)
+        spine.set_color(FRAME)
+
+
+def draw_tokens(panel: Axes, layout: Layout, corners: Floats, opacity: float = 0.85) -> None:
+    """Tokens with corners (V, 2), each in its own colour."""
+    for k in range(layout.tokens):
+        colour = COLOURS[k % len(COLOURS)]
+        outline = corners[layout.corners_of(k)]
+        panel.add_patch(
+            Polygon(outline, facecolor=(colour, opacity), edgecolor="white", linewidth=1.2)
+        )
