@@ -23,6 +23,7 @@ CFG_KINDS = ("job", "hydra", "all")
 FLAGS = ("--cfg", "--multirun", "-m")
 MISSING_HINTS = {
     "run_dir": "say which run: run_dir=runs/...",
+    "runs": "say which study: runs=runs/experiments/laptop",
     "connect": "say which master: connect=tcp://host:port or connect=runs/.../connection.json",
 }
 

@@ -20,4 +20,4 @@ class ReportConfig:
     def __post_init__(self) -> None:
         for name, value in (("runs", self.runs), ("out", self.out)):
             if not value.strip():
-                raise ConfigError(f"{name} must name a folder, got '': set {name}=...")
+                raise ConfigError(f"{name} must name a folder, got '{value}': set {name}=...")

@@ -35,13 +35,13 @@ def draw_curves(
     experiment: Experiment, looks: Mapping[str, Look], references: References, measure: Measure
 ) -> Figure | None:
     """Three panels: against episodes, updates and minutes; None if nothing has a curve."""
-    known = [one for one in experiment.trainings if _has_curve(one, measure)]
+    known = [one for one in experiment.trainings if _band(one, "updates", measure)]
     if not known:
         return None
     figure, panels = new_figure(3.9, 1, len(AXES), sharey=True)
     for panel, (axis, (label, unit)) in zip(panels, AXES.items(), strict=True):
         for training in known:
-            found = band([seed.curve for seed in training.finished], axis, measure.key)
+            found = _band(training, axis, measure)
             if found is not None:
                 _draw_band(panel, found, unit, looks[training.name], training.label)
         if measure is REWARD:
@@ -56,8 +56,8 @@ def draw_curves(
     return figure
 
 
-def _has_curve(training: Training, measure: Measure) -> bool:
-    return any(len(points(seed.curve, "updates", measure.key)[0]) for seed in training.finished)
+def _band(training: Training, axis: str, measure: Measure) -> Band | None:
+    return band([seed.curve for seed in training.finished], axis, measure.key)
 
 
 def _draw_band(panel: Axes, found: Band, unit: float, look: Look, label: str) -> None:
@@ -76,7 +76,7 @@ def _draw_papers(
     for training in known:
         value = paper.value(experiment, training)
         if value is not None and value.mean_reward is not None:
-            label = f"paper's {training.label}: {value.mean_reward:.2f}"
+            label = f"{training.label}, the paper's: {value.mean_reward:.2f}"
             colour = looks[training.name].colour
             panel.axhline(
                 value.mean_reward, color=colour, linestyle=":", linewidth=1.4, label=label
@@ -101,19 +101,21 @@ def draw_single_seeds(experiment: Experiment, looks: Mapping[str, Look]) -> Figu
 
     The first training, which the others are compared with, stands in grey behind each.
     """
-    known = [one for one in experiment.trainings if _has_curve(one, REWARD)]
+    known = [one for one in experiment.trainings if _band(one, "updates", REWARD)]
     if not known:
         return None
     rows, columns = -(-len(known) // PER_ROW), min(PER_ROW, max(len(known), 3))
-    figure, panels = new_figure(0.55 + 1.75 * rows, rows, columns, sharex=True, sharey=True)
+    figure, panels = new_figure(0.55 + 1.6 * rows, rows, columns, sharex=True, sharey=True)
     for panel, training in zip(panels, known, strict=False):
         if training is not known[0] and known[0] is experiment.trainings[0]:
             _draw_seeds(panel, known[0], PALE, 1.6)
         _draw_seeds(panel, training, looks[training.name].colour, 1.1)
-        panel.set_title(training.label, loc="left")
+        panel.set_title(training.label, loc="left", fontsize=8.5)
         panel.xaxis.set_major_formatter(thousands())
     for panel in panels[len(known) :]:
         panel.set_visible(False)
+    for panel in panels[max(len(known) - columns, 0) : len(known)]:
+        panel.tick_params(labelbottom=True)  # the last one of its column
     figure.supxlabel("updates (gradient steps)", fontsize=9.5, color="#374151")
     figure.supylabel(REWARD.axis, fontsize=9.5, color="#374151")
     return figure

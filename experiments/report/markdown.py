@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from experiments.report.numbers import Spread, spread
+from experiments.report.numbers import spread
 
 NOTHING = "-"
 
@@ -34,14 +34,20 @@ class Measure:
         return text[1:] if text.startswith("-") and not text.strip("-0.°,") else text
 
     def show_spread(self, values: Mapping[int, float]) -> str:
-        """Median (least to most) over the seeds, or the only number."""
+        """Median (least to most) over the seeds; only the median where that is all."""
         known = spread(values.values())
         if known is None:
             return NOTHING
-        return self.show(known.median) + (self._range(known) if len(values) > 1 else "")
+        least, median, most = map(self.show, (known.least, known.median, known.most))
+        return median if least == median == most else f"{median} ({least} to {most})"
 
-    def _range(self, known: Spread) -> str:
-        return f" ({self.show(known.least)} to {self.show(known.most)})"
+    def show_difference(self, ours: Mapping[int, float], theirs: Mapping[int, float]) -> str:
+        """Difference of two medians, with its sign."""
+        one, other = spread(ours.values()), spread(theirs.values())
+        if one is None or other is None:
+            return NOTHING
+        signed = self.pattern.replace("{:", "{:+", 1)
+        return signed.format((one.median - other.median) * self.factor)
 
 
 REWARD = Measure("mean_reward", "mean reward", "mean reward (\N{MINUS SIGN}1 to 1)", "{:.3f}")
@@ -62,9 +68,9 @@ HOURS = Measure("train_s", "training, h", "training time (hours)", "{:,.2f}", 1 
 PARAMETERS = Measure("parameters", "parameters", "parameters", "{:,.0f}")
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """A table; all columns but the first are numbers."""
-    ruler = ["---", *["---:"] * (len(head) - 1)]
+def table(head: Sequence[str], rows: Iterable[Sequence[str]], rest: str = "---:") -> list[str]:
+    """A table; the columns after the first are numbers, unless `rest` is `---`."""
+    ruler = ["---", *[rest] * (len(head) - 1)]
     return [_line(map(_cell, head)), _line(ruler), *(_line(map(_cell, row)) for row in rows), ""]
 
 

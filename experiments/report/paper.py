@@ -39,20 +39,6 @@ VALUES = {
     },
     "Table II": {"paper": Value(by_actions=(0.758, 0.754, 0.754, 0.764, 0.750))},
 }
-CLAIMS = {
-    "Fig. 4": "MHA reaches a plateau of 0.75 after about 1,500 episodes, the MLP one of 0.70 after "
-    "about 19,000.",
-    "Fig. 5": "The mean reward of the triangle is significantly lower than that of the square.",
-    "Fig. 6": "Trained on the sparse reward (overlap), the agent scores higher on both rewards "
-    "than trained on the dense one (distance).",
-    "Table I": "MHA has 504k parameters and trained 72 h, 28k episodes; MLP 14k, 48 h, 100k.",
-    "Table II": "0.758, 0.754, 0.754, 0.764, 0.750 with 1 to 5 actions: more of them do not help.",
-}
-
-
-def claims(experiment: Experiment) -> list[str]:
-    """What the paper says at the places that the experiment names, each with its place."""
-    return [f"{place}: {CLAIMS[place]}" for place in _places(experiment)]
 
 
 def value(experiment: Experiment, training: Training) -> Value | None:
@@ -61,8 +47,7 @@ def value(experiment: Experiment, training: Training) -> Value | None:
     They belong to the training of that very name; where an experiment has none, to its family.
     """
     names = {one.name for one in experiment.trainings}
-    for place in _places(experiment):
-        known = VALUES.get(place, {})
+    for known in (VALUES[place] for place in _places(experiment)):
         if training.name in known:
             return known[training.name]
         if training.family in known and training.family not in names:
@@ -79,4 +64,4 @@ def trial_value(experiment: Experiment, training: Training, trial: Trial) -> flo
 
 
 def _places(experiment: Experiment) -> list[str]:
-    return [p for p in CLAIMS if re.search(rf"{re.escape(p)}(?!\w)", experiment.source)]
+    return [p for p in VALUES if re.search(rf"{re.escape(p)}(?!\w)", experiment.source)]

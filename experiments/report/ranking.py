@@ -1,6 +1,6 @@
 """Figures of rankings: final scores, training by training, a dot for every seed."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -9,9 +9,8 @@ from experiments.report.markdown import ANGLE, REWARD, Measure
 from experiments.report.numbers import spread
 from experiments.report.references import POSITION, References
 from experiments.report.study import Experiment, Training
-from experiments.report.style import GREY, LEVEL, Look, legend_below, new_figure
+from experiments.report.style import GREY, LEVEL, Look, legend_below, new_figure, widen
 
-WIDE = 30.0  # most / least of values that need a logarithmic axis
 MEASURES = (REWARD, ANGLE)
 
 
@@ -24,16 +23,20 @@ def draw_ranking(
         return None
     figure, panels = new_figure(1.2 + 0.3 * len(known), 1, len(MEASURES), sharey=True)
     for panel, measure in zip(panels, MEASURES, strict=True):
-        for row, training in enumerate(known):
+        positions = [references.position(training, measure) for training in known]
+        for row, (training, position) in enumerate(zip(known, positions, strict=True)):
             _draw_row(panel, row, training.values(measure.key), looks[training.name].colour)
-            _mark_position(panel, row, references.position(training, measure))
+            _mark_position(panel, row, position)
         _mark_first(panel, experiment.trainings[0], measure)
         values = [value for one in known for value in one.values(measure.key).values()]
-        _widen(panel.set_xscale, values)
+        if measure is ANGLE:
+            widen(panel, "x", [*values, *(one for one in positions if one is not None)])
         panel.set_xlabel(measure.axis)
         panel.grid(axis="y", visible=False)
     panels[0].set_yticks(range(len(known)), [one.label for one in known])
     panels[0].set_ylim(len(known) - 0.4, -0.6)
+    panels[0].plot([], [], "o", color=GREY, ms=5, mew=0, label="one seed")
+    panels[0].plot([], [], "|", color=GREY, ms=12, mew=2.2, label="median of the seeds")
     legend_below(figure, panels[0])
     return figure
 
@@ -44,10 +47,8 @@ def _draw_row(panel: Axes, row: int, values: Mapping[int, float], colour: str) -
         return
     dots = list(values.values())
     panel.plot([known.least, known.most], [row, row], color=colour, linewidth=1.2, alpha=0.5)
-    panel.plot(
-        dots, [row] * len(dots), "o", color=colour, alpha=0.75, ms=5, mew=0, label="one seed"
-    )
-    panel.plot(known.median, row, "|", color=colour, ms=14, mew=2.2, label="median of the seeds")
+    panel.plot(dots, [row] * len(dots), "o", color=colour, alpha=0.75, ms=5, mew=0)
+    panel.plot(known.median, row, "|", color=colour, ms=14, mew=2.2)
 
 
 def _mark_position(panel: Axes, row: int, score: float | None) -> None:
@@ -62,8 +63,3 @@ def _mark_first(panel: Axes, first: Training, measure: Measure) -> None:
     if known is not None:
         label = f"median of {first.label}"
         panel.axvline(known.median, color=LEVEL, linewidth=1.0, zorder=1, label=label)
-
-
-def _widen(set_scale: Callable[[str], object], values: Sequence[float]) -> None:
-    if values and min(values) > 0.0 and max(values) / min(values) > WIDE:
-        set_scale("log")

@@ -8,8 +8,8 @@ from experiments.report.records import Row
 from experiments.report.study import Experiment, Study, Training, Trial
 
 # Name in the files of tests -> name in the report.
-NAMES = {"position only": "position only", "exact": "perfect", "random": "random"}
-POSITION = "position only"
+POSITION, PERFECT, RANDOM = "position only", "perfect", "random"
+NAMES = {"position only": POSITION, "exact": PERFECT, "random": RANDOM}
 # Settings of the simulation that tests set themselves, or that move no token.
 APART = ("sim.actions_per_token", "sim.corner_noise", "sim.camera", "sim.pixels", "sim.max_tries")
 
@@ -61,16 +61,24 @@ class References:
 
     def of(self, experiment: Experiment) -> list[Reference]:
         """Every known policy at every task of an experiment."""
-        tasks: dict[Task, str] = {}
-        shapes = [one.tokens for one in _one_for_each_task(experiment)]
-        for one in _one_for_each_task(experiment):
-            name = one.tokens if shapes.count(one.tokens) == 1 else one.label
-            tasks[task_of(one)] = name if len(shapes) > 1 else ""
+        return [one for one in self._all(experiment) if one.by_test]
+
+    def lacking(self, experiment: Experiment) -> list[str]:
+        """The policies that no test of the study has, and for which tasks."""
+        tasks: dict[str, list[str]] = {}
+        for one in self._all(experiment):
+            if not one.by_test:
+                tasks.setdefault(one.name, []).append(one.task)
+        names: dict[str, list[str]] = {}
+        for name, group in tasks.items():
+            names.setdefault("; ".join(filter(None, group)), []).append(name)
+        return [", ".join(n) + f" ({group})" * bool(group) for group, n in names.items()]
+
+    def _all(self, experiment: Experiment) -> list[Reference]:
         return [
-            Reference(name, label, self._scores[key, task])
+            Reference(name, label, self._scores.get((key, task), {}))
             for key, name in NAMES.items()
-            for task, label in tasks.items()
-            if (key, task) in self._scores
+            for task, label in _tasks(experiment).items()
         ]
 
     def position(self, training: Training, measure: Measure) -> float | None:
@@ -89,6 +97,15 @@ def task_of(training: Training) -> Task:
     return (training.tokens, *settings)
 
 
-def _one_for_each_task(experiment: Experiment) -> list[Training]:
+def _tasks(experiment: Experiment) -> dict[Task, str]:
+    """Every task of an experiment, and what tells it from the others."""
     known = [one for one in experiment.trainings if one.finished]
-    return list({task_of(one): one for one in reversed(known)}.values())[::-1]
+    firsts = {task_of(one): one for one in reversed(known)}
+    tasks = list(dict.fromkeys(map(task_of, known)))
+    if len(tasks) == 1:
+        return {tasks[0]: ""}
+    shapes = [firsts[task].tokens for task in tasks]
+    return {
+        task: shape if shapes.count(shape) == 1 else firsts[task].label
+        for task, shape in zip(tasks, shapes, strict=True)
+    }

@@ -1,7 +1,7 @@
 """How figures look, and how they are saved; nothing here touches pyplot's global state."""
 
 import io
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,13 +11,14 @@ import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from experiments.report.study import Experiment, Study
 from tangram_agent.files import write_whole
 
 WIDTH_IN = 9.0  # a README shows it a little smaller than that
 DPI = 160
+WIDE = 30.0  # most / least of values that need a logarithmic axis
 # Okabe and Ito's colours for all kinds of colour vision, without black and yellow, and two of
 # Paul Tol's.
 COLOURS = (
@@ -41,12 +42,14 @@ SETTINGS: dict[Any, Any] = {
     "axes.spines.top": False,
     "axes.titlesize": 9.5,
     "axes.unicode_minus": True,
+    "figure.constrained_layout.h_pad": 0.07,
+    "figure.constrained_layout.w_pad": 0.06,
     "figure.facecolor": "white",
     "font.family": "DejaVu Sans",  # comes with matplotlib, so every machine draws the same
     "font.size": 9.0,
     "legend.fontsize": 9.0,
     "legend.frameon": False,
-    "lines.linewidth": 1.8,
+    "lines.linewidth": 1.6,
     "svg.hashsalt": "tangram-report",
     "text.color": "#1F2937",
     "xtick.color": "#4B5563",
@@ -65,21 +68,6 @@ class Look:
     colour: str
     marker: str
     dash: Dash
-
-
-@dataclass(frozen=True)
-class Saved:
-    """A figure's files, as the report names them.
-
-    Attributes:
-        title: what it shows.
-        png: path from the report's folder.
-        svg: the same.
-    """
-
-    title: str
-    png: str
-    svg: str
 
 
 def looks(study: Study) -> dict[str, Look]:
@@ -142,8 +130,8 @@ def new_figure(
 def legend_below(figure: Figure, panel: Axes, columns: int = 4) -> None:
     """One legend for all panels, under them, from the labels of one; each label once."""
     handles, labels = panel.get_legend_handles_labels()
-    once = {label: handle for label, handle in zip(labels[::-1], handles[::-1], strict=True)}
-    names = [label for label in dict.fromkeys(labels)]
+    once = dict(zip(labels[::-1], handles[::-1], strict=True))
+    names = list(dict.fromkeys(labels))
     if names:
         figure.legend(
             [once[name] for name in names],
@@ -155,6 +143,16 @@ def legend_below(figure: Figure, panel: Axes, columns: int = 4) -> None:
         )
 
 
+def widen(panel: Axes, axis: str, values: Sequence[float]) -> None:
+    """A logarithmic axis, x or y, where the values need one; its ticks are plain numbers."""
+    if values and min(values) > 0.0 and max(values) / min(values) > WIDE:
+        panel.set(**{f"{axis}scale": "log"})
+        scaled = panel.xaxis if axis == "x" else panel.yaxis
+        scaled.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+        scaled.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        scaled.set_minor_formatter(NullFormatter())
+
+
 def thousands() -> FuncFormatter:
     """20000 as 20k, 1500 as 1.5k."""
     return FuncFormatter(
@@ -162,23 +160,19 @@ def thousands() -> FuncFormatter:
     )
 
 
-def save(figure: Figure, out: Path, folder: str, name: str, title: str) -> Saved:
+def save(figure: Figure, folder: Path, name: str) -> None:
     """Write a figure as PNG and SVG; the same data gives the same bytes.
 
     Args:
-        out: folder of the report.
-        folder: of the figures, under `out`.
+        folder: of the files.
+        name: of the files, without an ending.
 
     Raises:
         RunError: the files cannot be written.
     """
     # Names of the program and times would change with every machine and run.
-    formats: dict[str, Mapping[str, None]] = {
-        "png": {"Software": None},
-        "svg": {"Date": None, "Creator": None},
-    }
-    for kind, metadata in formats.items():
+    formats = {"png": ("Software",), "svg": ("Date", "Creator")}
+    for kind, left_out in formats.items():
         data = io.BytesIO()
-        figure.savefig(data, format=kind, metadata=dict(metadata))
-        write_whole(out / folder / f"{name}.{kind}", data.getvalue())
-    return Saved(title, f"{folder}/{name}.png", f"{folder}/{name}.svg")
+        figure.savefig(data, format=kind, metadata=dict.fromkeys(left_out))
+        write_whole(folder / f"{name}.{kind}", data.getvalue())

@@ -4,15 +4,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.report import paper
 from experiments.report.markdown import ANGLE, REWARD, Measure
 from experiments.report.numbers import Spread, spread
-from experiments.report.references import POSITION, References
+from experiments.report.references import PERFECT, POSITION, References
 from experiments.report.study import Experiment, Training, Trial
-from experiments.report.style import GREY, LEVEL, Look, legend_below, new_figure
+from experiments.report.style import GREY, LEVEL, Look, legend_below, new_figure, widen
 
 MEASURES = (REWARD, ANGLE)
 NOISE = "noise on the corners, standard deviation (% of the arena)"
@@ -58,18 +59,24 @@ def draw_sweep(
             _draw_line(panel, training, sweep, measure, looks[training.name])
         if measure is REWARD:
             _draw_papers(panel, experiment, sweep, looks)
-            panel.axhline(1.0, color=LEVEL, linewidth=1.0, zorder=1, label="perfect: 1")
-        _draw_position(panel, experiment, references, sweep, measure)
+        _draw_references(panel, experiment, references, sweep, measure)
         panel.set_xlabel(sweep.label)
         panel.set_ylabel(measure.axis)
         places = [at for at, _ in sweep.places]
+        panel.margins(y=0.08)
+        if measure is ANGLE:
+            widen(panel, "y", [y for line in panel.lines for y in np.ravel(line.get_ydata())])
         panel.set_xticks(places, [f"{at:g}" for at in places])
     legend_below(figure, panels[0])
     return figure
 
 
 def _rising(places: Iterable[tuple[float, Trial]]) -> tuple[tuple[float, Trial], ...]:
-    return tuple(sorted(places, key=lambda place: place[0]))
+    """In order; of several tests at one place the first."""
+    firsts: dict[float, Trial] = {}
+    for x, trial in places:
+        firsts.setdefault(x, trial)
+    return tuple(sorted(firsts.items(), key=lambda place: place[0]))
 
 
 def _spreads(training: Training, sweep: Sweep, measure: Measure) -> list[tuple[float, Spread]]:
@@ -92,19 +99,22 @@ def _draw_papers(
 ) -> None:
     for training in experiment.trainings:
         values = [(x, paper.trial_value(experiment, training, t)) for x, t in sweep.places]
-        label = f"paper's {training.label}"
+        label = f"{training.label}, the paper's"
         _draw_points(
             panel, values, "D", mfc="white", ms=7, color=looks[training.name].colour, label=label
         )
 
 
-def _draw_position(
+def _draw_references(
     panel: Axes, experiment: Experiment, references: References, sweep: Sweep, measure: Measure
 ) -> None:
+    """Position only, dashed; perfect, which sees the same noise, in the reward's panel."""
     for reference in references.of(experiment):
+        values = [(x, reference.score([t], measure)) for x, t in sweep.places]
         if reference.name == POSITION:
-            values = [(x, reference.score([t], measure)) for x, t in sweep.places]
             _draw_points(panel, values, "--", linewidth=1.2, color=GREY, label=reference.label)
+        elif reference.name == PERFECT and measure is REWARD:
+            _draw_points(panel, values, "-", linewidth=1.0, color=LEVEL, label=reference.label)
 
 
 def _draw_points(

@@ -44,8 +44,8 @@ def test_the_papers_figures_and_tables_are_the_default() -> None:
 def test_every_training_composes_with_every_budget(budget: str) -> None:
     config = study(budget, choices("experiment"))
     for name, training in config.trainings.items():
-        made = setup_of(config, name)
-        assert made.agent.name == {"start": "tangram", "mlp_large": "mlp"}.get(training.family, training.family), name
+        agent = {"start": "tangram", "mlp_large": "mlp"}.get(training.family, training.family)
+        assert setup_of(config, name).agent.name == agent, name
 
 
 def test_every_training_and_test_of_the_catalogue_is_used() -> None:

@@ -1,0 +1,68 @@
+"""The end of a report: how, where and with what everything was made."""
+
+from collections.abc import Iterable
+
+from experiments.report.markdown import details, plain, shell, table
+from experiments.report.records import Row
+from experiments.report.study import Study, Training
+
+HOUR_S = 3600.0
+
+
+def closing(study: Study) -> list[str]:
+    """Budget, machine, versions, and every training with its settings."""
+    results = [seed.result for one in study.trainings for seed in one.finished]
+    return [
+        "## How it was made",
+        "",
+        f"Budget `{study.budget}`: {plain(study.budget_note)}",
+        "",
+        *table(["", ""], _facts(study, results), "---"),
+        "The last command that ran trainings of it:",
+        "",
+        *shell(study.command),
+        *details("All trainings and their settings", _trainings(study.trainings)),
+    ]
+
+
+def finished_count(trainings: Iterable[Training]) -> str:
+    """How many runs are finished, of how many."""
+    runs = [seed for one in trainings for seed in one.seeds]
+    return f"{sum(seed.finished for seed in runs)} of {len(runs)}"
+
+
+def _facts(study: Study, results: list[Row]) -> list[tuple[str, str]]:
+    commits = [study.commit, *(row["commit"] for row in results)]
+    hours = sum(row["wall_s"] for row in results) / HOUR_S
+    return [
+        ("runs finished", finished_count(study.trainings)),
+        ("seeds", _several(study.planned_seeds)),
+        ("episodes of every test", f"{study.test_episodes:,}"),
+        ("commit", _several(one for one in commits if one is not None)),
+        ("processor", _several(row["processor"] for row in results)),
+        ("cores", _several(row["cores"] for row in results)),
+        ("versions", ", ".join(_versions(results)) or "-"),
+        ("time, all runs added up", f"{hours:,.2f} h"),
+    ]
+
+
+def _versions(results: list[Row]) -> list[str]:
+    names = dict.fromkeys(name for row in results for name in row["versions"])
+    return [
+        f"{name} {_several(row['versions'][name] for row in results if name in row['versions'])}"
+        for name in names
+    ]
+
+
+def _several(values: Iterable[object]) -> str:
+    """Each different value once."""
+    return " / ".join(dict.fromkeys(str(value) for value in values)) or "-"
+
+
+def _trainings(trainings: Iterable[Training]) -> list[str]:
+    lines = []
+    for one in trainings:
+        began = f", begins with the networks of `{one.after}`" if one.after else ""
+        settings = " ".join(f"`{text}`" for text in one.overrides) or "(defaults)"
+        lines.append(f"- **{plain(one.label)}** (`{one.name}`{began}): {settings}")
+    return [*lines, ""]

@@ -1,0 +1,91 @@
+"""tangram-report: a study's figures and tables, as Markdown."""
+
+from pathlib import Path
+
+from experiments.pictures import draw_paper_pictures
+from experiments.report.closing import closing, finished_count
+from experiments.report.data import study_data, to_json
+from experiments.report.markdown import picture, plain, table
+from experiments.report.reading import read_study
+from experiments.report.references import References
+from experiments.report.sections import Page, section
+from experiments.report.study import Study
+from experiments.report.style import drawing, looks
+from tangram_agent.files import write_whole
+from tangram_sim.errors import RunError
+
+FIGURES = "figures"
+HOW_TO_READ = (
+    "Scores are those of the fixed tests, exploration off. The mean reward is Eq. 14 on exact "
+    "polygons: -1 is no overlap, 1 is perfect. Where several seeds were trained, numbers are their "
+    "median, with the least and the most in brackets. Three policies that learned nothing stand "
+    "beside them: *position only* moves every token exactly onto its target's centre and never "
+    "turns it, *perfect* moves it exactly onto its target as it is seen, *random* is chance."
+)
+
+
+def write_report(runs: Path, out: Path) -> list[Path]:
+    """Report on a study; files of an earlier report in the same folder are replaced.
+
+    Args:
+        runs: the study's folder.
+        out: folder for README.md, data.json and figures/.
+
+    Returns:
+        The two files.
+
+    Raises:
+        RunError: a file of the study is not what it should be, or `out` cannot be written.
+    """
+    study = read_study(runs)
+    _make(out / FIGURES)
+    page = Page(study, out, FIGURES, looks(study), References(study))
+    lines = _opening(study)
+    with drawing():
+        lines += _paper_pictures(out)
+        for experiment in study.experiments:
+            lines += section(page, experiment)
+    lines += closing(study)
+    files = {
+        out / "README.md": ("\n".join(lines).rstrip() + "\n").encode(),
+        out / "data.json": to_json(study_data(study)),
+    }
+    for path, data in files.items():
+        write_whole(path, data)
+    return list(files)
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunError(
+            f"cannot make {folder} ({error.strerror}): choose another folder with out=..."
+        ) from None
+
+
+def _opening(study: Study) -> list[str]:
+    rows = [
+        (f"[{plain(one.title)}](#{one.name})", one.source, finished_count(one.trainings))
+        for one in study.experiments
+    ]
+    return [
+        f"# Experiments, budget `{study.budget}`",
+        "",
+        plain(study.budget_note),
+        "",
+        HOW_TO_READ,
+        "",
+        *table(["experiment", "source", "runs finished"], rows, "---"),
+        "`tangram-report` wrote this page; `data.json` beside it holds all of its numbers.",
+        "",
+    ]
+
+
+def _paper_pictures(out: Path) -> list[str]:
+    """The paper's Figs. 1 to 3, which need no training."""
+    lines: list[str] = []
+    for title, file, caption in draw_paper_pictures(out / FIGURES):
+        lines += [f"## {plain(title)}", "", *picture(title, f"{FIGURES}/{file}")]
+        lines += [f"*{plain(caption)}*", ""]
+    return lines
