@@ -22,6 +22,7 @@ def master() -> int:
 def _train(settings: Plain) -> int:
     from master.config import LaunchConfig, MasterConfig
     from tangram_agent.setup import SECTIONS, from_mapping, make_setup
+    from tangram_sim.rewards import check_reward
     from tangram_sim.world import check_world
 
     _make_absolute(settings)
@@ -33,6 +34,7 @@ def _train(settings: Plain) -> int:
     # The children check it again; a wrong task is refused before any of them starts.
     setup = make_setup(settings)
     check_world(setup.layout, setup.sim)
+    check_reward(setup.reward, setup.layout, setup.sim)
 
     from master.launch import run_training
 
@@ -42,12 +44,13 @@ def _train(settings: Plain) -> int:
 def _master(settings: Plain) -> int:
     from master.config import MasterConfig
     from tangram_agent.setup import SECTIONS, from_mapping, make_setup
+    from tangram_sim.rewards import check_reward
 
     _make_absolute(settings)
     rest = {name: value for name, value in settings.items() if name not in SECTIONS}
     config = from_mapping(MasterConfig, rest)
     setup = make_setup(settings)
-    _ = setup.layout
+    check_reward(setup.reward, setup.layout, setup.sim)
 
     from master.loop import run_master
 

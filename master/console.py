@@ -1,19 +1,19 @@
 """A console that outlives its terminal."""
 
 import os
-from typing import IO, Any, cast
+from typing import Any, TextIO, cast
 
 from rich.console import Console
 
 
 class _Sturdy:
-    """A text file that turns into the null device when its reader is gone.
+    """A text file that turns into the null device when its reader is gone, and shows what it can.
 
     A closed terminal or pipe must not end a run that goes on without anybody watching, nor a clean
     end that has still to be written down.
     """
 
-    def __init__(self, file: IO[str]) -> None:
+    def __init__(self, file: TextIO) -> None:
         self._file = file
 
     def __getattr__(self, name: str) -> Any:
@@ -22,6 +22,9 @@ class _Sturdy:
     def write(self, text: str) -> int:
         try:
             return self._file.write(text)
+        except UnicodeEncodeError:  # a terminal that knows fewer characters, such as LC_ALL=C
+            known = text.encode(self._file.encoding, "replace")
+            return self._file.write(known.decode(self._file.encoding))
         except OSError:
             return self._silence(text)
 
@@ -39,6 +42,6 @@ class _Sturdy:
         return len(text)
 
 
-def sturdy_console(file: IO[str]) -> Console:
+def sturdy_console(file: TextIO) -> Console:
     """A console on stdout or stderr that falls silent instead of failing."""
-    return Console(file=cast(IO[str], _Sturdy(file)))
+    return Console(file=cast(TextIO, _Sturdy(file)))

@@ -15,7 +15,7 @@ from master.children import MAX_RESTARTS, Child, describe, module, override
 from master.config import LaunchConfig
 from master.console import sturdy_console
 from master.rundir import RunFolder
-from master.signals import SAME_WISH_S, heeded
+from master.signals import SAME_WISH_S, heeded, show_cursor
 
 # While the master starts, its connection file is looked for this often.
 LOOK_S = 0.1
@@ -146,6 +146,7 @@ class Launcher:
     def _kill_all(self) -> None:
         for child in [self._master, *self._workers]:
             child.signal(signal.SIGKILL)
+        show_cursor()
 
     def _stop(self, why: str) -> None:
         self._say(why)

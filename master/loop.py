@@ -13,6 +13,7 @@ import torch
 
 from master.arrivals import EpisodesArrived, ScoresArrived
 from master.checkpoint import check_resumable, save_run
+from master.children import override
 from master.config import MasterConfig
 from master.console import sturdy_console
 from master.curve import Curve
@@ -74,6 +75,9 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
             closing(Loop(parts, _reporter(parts, progress, metrics), signals, news)) as loop,
         ):
             metrics.settings(resolved)
+            if not launched:
+                where = override("connect", str(folder.path))
+                progress.notice(f"workers join with: tangram-worker {where}")
             reason = loop.run()
             loop.finish(launched)
             result = make_result(parts, reason, loop.clock.wall_s())

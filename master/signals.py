@@ -48,7 +48,11 @@ class StopSignals:
             self.reason, self._first_s = signal.Signals(number).name, time.monotonic()
         if time.monotonic() - self._first_s < SAME_WISH_S:
             return
-        # A live panel has hidden the cursor, and nobody else will show it again.
-        if sys.stdout.isatty():
-            os.write(sys.stdout.fileno(), SHOW_CURSOR)
+        show_cursor()
         os._exit(128 + number)
+
+
+def show_cursor() -> None:
+    """Where a live panel was killed, which had hidden it, nobody else will show it again."""
+    if sys.stdout.isatty():
+        os.write(sys.stdout.fileno(), SHOW_CURSOR)

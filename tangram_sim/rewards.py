@@ -50,6 +50,18 @@ def make_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> RewardF
     return lambda achieved, desired: _checked(config.name, function, achieved, desired, layout)
 
 
+def check_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> None:
+    """Ask the configured reward once, so that a user's function fails before anything starts.
+
+    Raises:
+        ConfigError: see `make_reward`.
+    """
+    apart = np.zeros((2, layout.tokens, 3))
+    apart[1, :, 0] = sim.arena / 4.0
+    corners = layout.corners(apart)
+    make_reward(config, layout, sim)(corners, corners[::-1])
+
+
 def _fitted(corners: Floats, layout: Layout) -> Floats:
     """The rigid pieces nearest to noisy corners (B, V, 2), which need not be convex."""
     return layout.corners(layout.poses(corners))

@@ -3,12 +3,14 @@
 from importlib.util import find_spec
 from typing import Protocol
 
+import numpy as np
+
 from tangram_sim.arrays import Floats, Pixels
 from tangram_sim.config import SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.kinematics import KinematicWorld
 from tangram_sim.layout import Layout
-from tangram_sim.sampling import check_fits
+from tangram_sim.sampling import sample_poses
 
 
 class World(Protocol):
@@ -43,10 +45,10 @@ def check_world(layout: Layout, sim: SimConfig) -> None:
     """Refuse a task that no world could play, without making one.
 
     Raises:
-        SamplingError: a token does not fit into the arena.
+        SamplingError: a token does not fit into the arena, or not all tokens do.
         ConfigError: the engine is asked for and not installed.
     """
-    check_fits(layout, sim)
+    sample_poses(layout, sim, np.random.default_rng(0))
     if sim.backend == "physics" and find_spec("pybullet") is None:
         raise _no_engine("no module named 'pybullet'")
 

@@ -26,6 +26,7 @@ def play() -> int:
 
 def _worker(settings: Plain) -> int:
     from tangram_agent.setup import SECTIONS, from_mapping, make_setup
+    from tangram_sim.rewards import check_reward
     from tangram_sim.world import check_world
     from worker.config import WorkerConfig
 
@@ -33,6 +34,7 @@ def _worker(settings: Plain) -> int:
     config = from_mapping(WorkerConfig, rest)
     setup = make_setup(settings)
     check_world(setup.layout, setup.sim)  # before anything is connected
+    check_reward(setup.reward, setup.layout, setup.sim)
 
     if config.role == "evaluator":
         from worker.evaluator import run_evaluator

@@ -45,3 +45,24 @@ def test_a_reader_that_goes_away_ends_nothing(terminal: bool) -> None:
         os.close(ours)
         _, errors = process.communicate("go on\n", timeout=LIMIT_S)
     assert (process.returncode, errors) == (0, f"{terminal}\n")
+
+
+def test_a_terminal_of_few_characters_shows_what_it_can() -> None:
+    code = (
+        "import sys\nfrom master.console import sturdy_console\n"
+        "sturdy_console(sys.stdout).print('0.04° · done')"
+    )
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(Path(__file__).resolve().parents[2]),
+        "PYTHONIOENCODING": "ascii",
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=LIMIT_S,
+        check=False,
+    )
+    assert (done.stdout, done.returncode) == ("0.04? ? done\n", 0), done.stderr

@@ -12,7 +12,7 @@ from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import Layout
 from tangram_sim.pictures import BACKGROUND, TOKEN_GRAY
-from tangram_sim.rewards import RewardFn, closeness, make_reward, picture_reward
+from tangram_sim.rewards import RewardFn, check_reward, closeness, make_reward, picture_reward
 from tangram_sim.sampling import sample_batch
 from tests.sim.builders import LOPSIDED, SEVEN, TRIO, layout_of, random_poses
 
@@ -257,3 +257,20 @@ def test_what_the_users_own_returns_is_checked(function: str, reason: str) -> No
 def test_an_own_reward_that_cannot_be_loaded(name: str, reason: str) -> None:
     with pytest.raises(ConfigError, match=reason):
         reward_of(name, layout_of("square"))
+
+
+@pytest.mark.usefixtures("own")
+@pytest.mark.parametrize("name", ["overlap", "dense", "pose", "own_rewards_of_a_test:near"])
+def test_a_reward_that_works_passes_the_check(name: str) -> None:
+    check_reward(RewardConfig(name), layout_of("square", "small_triangle"), SimConfig())
+
+
+@pytest.mark.usefixtures("own")
+@pytest.mark.parametrize(
+    ("function", "reason"), [("text", "failed: ValueError"), ("table", "one number per row")]
+)
+def test_a_reward_that_fails_is_told_before_anything_starts(function: str, reason: str) -> None:
+    with pytest.raises(ConfigError, match=reason):
+        check_reward(
+            RewardConfig(f"own_rewards_of_a_test:{function}"), layout_of("square"), SimConfig()
+        )

@@ -216,6 +216,8 @@ def test_a_token_that_does_not_fit_is_refused_before_a_world_is_made() -> None:
     check_world(layout_of("square"), SimConfig())
     with pytest.raises(SamplingError, match="does not fit into an arena of width 2"):
         check_world(layout_of("square", scale=10.0), SimConfig())
+    with pytest.raises(SamplingError, match="no room for token .* beside .* others"):
+        check_world(layout_of(*["square"] * 16, scale=1.8), SimConfig())
 
 
 def test_a_missing_engine_is_told_before_a_world_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
