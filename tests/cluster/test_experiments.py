@@ -1,0 +1,111 @@
+"""A whole study through the commands: trained, tested, stopped, continued, reported."""
+
+import json
+import signal
+from pathlib import Path
+
+import pytest
+
+from tangram_agent.checkpoints import list_checkpoints
+from tests.cluster.processes import all_ended, pids_of, refused, run, started, wait_for_file
+
+pytestmark = pytest.mark.cluster
+
+SMALL = ("experiment=[table2]", "budget=smoke", "experiments.table2.tests=[actions_2]")
+LONG = "budget.overrides.tangram=['max_updates=1000000']"
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of Table II with the smoke budget and one test."""
+    folder = tmp_path_factory.mktemp("experiments") / "study"
+    told = run("tangram-experiment", *SMALL, f"run_dir={folder}", cwd=folder.parent, limit_s=110)
+    assert told.startswith("0 of 4 jobs were done before\n")
+    assert "\n[4/4] " in told
+    return folder
+
+
+def scores(study: Path, training: str) -> tuple[dict[str, float], dict[str, float]]:
+    """Those of a training and of its test."""
+    run_dir = study / "trainings" / training / "seed_0"
+    files = (run_dir / "result.json", run_dir / "tests" / "actions_2.json")
+    result, test = (json.loads(path.read_text()) for path in files)
+    return result, test
+
+
+@pytest.mark.parametrize("training", ["paper", "tangram"])
+def test_every_training_is_done_and_tested(study: Path, training: str) -> None:
+    result, test = scores(study, training)
+    assert (result["updates"], result["agent"], result["seed"]) == (20, training, 0)
+    assert (test["actions"], test["episodes"], test["updates"]) == (2, 16, 20)
+    assert result["mean_reward"] is not None
+    assert result["mean_reward_dense"] is not None
+
+
+def test_what_is_done_is_skipped(study: Path) -> None:
+    def times() -> dict[Path, int]:
+        return {path: path.stat().st_mtime_ns for path in study.rglob("*.json")}
+
+    before = times()
+    told = run("tangram-experiment", *SMALL, f"run_dir={study}", cwd=study.parent)
+    assert told == "4 of 4 jobs were done before\n"
+    assert {path for path, when in times().items() if before[path] != when} == {study / "plan.json"}
+
+
+def test_other_settings_are_refused(study: Path) -> None:
+    line = refused("tangram-experiment", *SMALL, LONG, f"run_dir={study}", cwd=study.parent)
+    assert "tangram/seed_0 was trained with other settings" in line
+    assert "max_updates=1000000" in line
+
+
+def test_a_report_is_drawn(study: Path, tmp_path: Path) -> None:
+    run("tangram-report", f"runs={study}", f"out={tmp_path / 'report'}", cwd=tmp_path)
+    text = (tmp_path / "report" / "README.md").read_text()
+    result, test = scores(study, "tangram")
+    assert f"| MHA (tangram) | 1 of 1 | {test['mean_reward']:.3f} |" in text
+    assert result["host"] not in text
+    for name in ("fig1_puzzle", "fig3_camera"):
+        assert (tmp_path / "report" / "figures" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        assert "<svg" in (tmp_path / "report" / "figures" / f"{name}.svg").read_text()
+
+
+def test_a_signal_stops_a_study_and_the_same_command_goes_on(tmp_path: Path) -> None:
+    study = tmp_path / "study"
+    arguments = (*SMALL, f"run_dir={study}", "experiments.table2.trainings=[tangram]")
+    run_dir = study / "trainings" / "tangram" / "seed_0"
+    with started("tangram-experiment", *arguments, LONG, cwd=tmp_path) as process:
+        wait_for_file(run_dir / "curve.jsonl", process)
+        children = pids_of(study)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 130
+        assert all_ended(children)
+    assert len(children) >= 4
+    assert list_checkpoints(run_dir / "checkpoints")
+    done = json.loads((run_dir / "result.json").read_text())
+    assert done["ended_by"].startswith("SIG")
+
+    listed = run("tangram-experiment", *arguments, LONG, "dry=true", cwd=tmp_path)
+    assert listed.splitlines()[:2] == ["tangram, seed 0", "tangram, seed 0, test actions_2"]
+    bound = f"budget.overrides.tangram=['max_updates={done['updates'] + 5}']"
+    settings = run_dir / "training.json"
+    settings.write_text(settings.read_text().replace("1000000", str(done["updates"] + 5)))
+    run("tangram-experiment", *arguments, bound, cwd=tmp_path)
+    again = json.loads((run_dir / "result.json").read_text())
+    assert again["updates"] == done["updates"] + 5
+    assert again["run_id"] == done["run_id"]
+
+
+def test_a_training_that_fails_is_told_and_the_others_go_on(tmp_path: Path) -> None:
+    arguments = (
+        *SMALL,
+        f"run_dir={tmp_path / 'study'}",
+        "families.paper=['agent=paper','net.width=3']",
+        "budget.overrides.paper=['max_updates=20']",
+        "experiments.table2.tests=[]",
+    )
+    with pytest.raises(AssertionError) as failure:
+        run("tangram-experiment", *arguments, cwd=tmp_path)
+    told = str(failure.value)
+    assert "net.width must be a multiple of net.heads, got 3 and 4" in told
+    assert "[1/2] tangram, seed 0: mean reward" in told
+    assert "paper, seed 0: failed, see" in told
