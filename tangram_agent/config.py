@@ -111,7 +111,7 @@ class AgentConfig:
     angle_head: str = "kfold"
     squash: str = "clamp"
     saturation_penalty: float = 1.0
-    saturation_limit: float = 2.0
+    saturation_limit: float = 1.0
     gamma: float = 0.0
     polyak: float = 0.995
     acting_average: float = 0.99
