@@ -11,7 +11,8 @@ class ReportConfig:
 
     Attributes:
         runs: folder of the study, with plan.json.
-        out: folder for README.md, data.json and the figures; files of the same names are replaced.
+        out: folder for README.md, data.json and the figures, or the page itself, NAME.md, with the
+            others in the folder NAME beside it; files of the same names are replaced.
     """
 
     runs: str

@@ -25,34 +25,34 @@ HOW_TO_READ = (
 
 
 def write_report(runs: Path, out: Path) -> list[Path]:
-    """Report on a study; files of an earlier report in the same folder are replaced.
+    """Report on a study; files of an earlier report in the same place are replaced.
 
     Args:
         runs: the study's folder.
-        out: folder for README.md, data.json and figures/.
+        out: folder for README.md, data.json and figures/, or the page itself, `NAME.md`, with the
+            others in the folder NAME beside it.
 
     Returns:
-        The two files.
+        The page and the data.
 
     Raises:
         RunError: a file of the study is not what it should be, or `out` cannot be written.
     """
     study = read_study(runs)
-    _make(out / FIGURES)
-    page = Page(study, out, FIGURES, looks(study), References(study))
-    lines = _opening(study)
+    path, beside = (out, out.with_suffix("")) if out.suffix == ".md" else (out / "README.md", out)
+    root, figures = path.parent, (beside / FIGURES).relative_to(path.parent).as_posix()
+    _make(root / figures)
+    page = Page(study, root, figures, looks(study), References(study))
+    data = beside / "data.json"
+    lines = _opening(study, data.relative_to(root).as_posix())
     with drawing():
-        lines += _paper_pictures(out)
+        lines += _paper_pictures(root, figures)
         for experiment in study.experiments:
             lines += section(page, experiment)
     lines += closing(study)
-    files = {
-        out / "README.md": ("\n".join(lines).rstrip() + "\n").encode(),
-        out / "data.json": to_json(study_data(study)),
-    }
-    for path, data in files.items():
-        write_whole(path, data)
-    return list(files)
+    write_whole(path, ("\n".join(lines).rstrip() + "\n").encode())
+    write_whole(data, to_json(study_data(study)))
+    return [path, data]
 
 
 def _make(folder: Path) -> None:
@@ -64,7 +64,7 @@ def _make(folder: Path) -> None:
         ) from None
 
 
-def _opening(study: Study) -> list[str]:
+def _opening(study: Study, data: str) -> list[str]:
     rows = [
         (f"[{plain(one.title)}](#{one.name})", one.source, finished_count(one.trainings))
         for one in study.experiments
@@ -77,15 +77,15 @@ def _opening(study: Study) -> list[str]:
         HOW_TO_READ,
         "",
         *table(["experiment", "source", "runs finished"], rows, "---"),
-        "`tangram-report` wrote this page; `data.json` beside it holds all of its numbers.",
+        f"`tangram-report` wrote this page; [{data}]({data}) holds all of its numbers.",
         "",
     ]
 
 
-def _paper_pictures(out: Path) -> list[str]:
+def _paper_pictures(root: Path, figures: str) -> list[str]:
     """The paper's Figs. 1 to 3, which need no training."""
     lines: list[str] = []
-    for title, file, caption in draw_paper_pictures(out / FIGURES):
-        lines += [f"## {plain(title)}", "", *picture(title, f"{FIGURES}/{file}")]
+    for title, file, caption in draw_paper_pictures(root / figures):
+        lines += [f"## {plain(title)}", "", *picture(title, f"{figures}/{file}")]
         lines += [f"*{plain(caption)}*", ""]
     return lines

@@ -1,6 +1,7 @@
 """tangram-report: pages, tables, figures and data from a study folder."""
 
 import json
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -267,3 +268,15 @@ def test_a_report_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("a file")
     with pytest.raises(RunError, match="cannot make .*figures .*: choose another folder with out="):
         write_report(tmp_path, tmp_path / "out")
+
+
+@pytest.mark.usefixtures("made")
+def test_the_page_itself_may_be_named(tmp_path: Path) -> None:
+    write_study(tmp_path)
+    page, data = write_report(tmp_path, tmp_path / "docs" / "results.md")
+    assert page == tmp_path / "docs" / "results.md"
+    assert data == tmp_path / "docs" / "results" / "data.json"
+    links = re.findall(r"\]\((results/[^)]+)\)", page.read_text())
+    assert len(links) > 5
+    missing = [link for link in links if not (page.parent / link).is_file()]
+    assert missing == ["results/figures/p.png"]  # which the fixture only names
