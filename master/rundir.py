@@ -65,10 +65,10 @@ class RunFolder:
         return self.result.exists() or bool(list_checkpoints(self.checkpoints)) or curves
 
     def lock(self) -> IO[bytes]:
-        """Claim the folder for one master; the claim ends with the process or with `close`.
+        """Claim the folder for one process; the claim ends with the process or with `close`.
 
         Raises:
-            ConfigError: another master runs here.
+            ConfigError: another process works here.
         """
         claim = (self.path / ".lock").open("ab")
         try:
@@ -76,7 +76,7 @@ class RunFolder:
         except BlockingIOError:
             claim.close()
             raise ConfigError(
-                f"run_dir {self.path} is in use by another master: choose another run_dir, or stop "
+                f"run_dir {self.path} is in use by another process: choose another run_dir, or stop "
                 "that one first"
             ) from None
         return claim

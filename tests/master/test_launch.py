@@ -151,7 +151,7 @@ def test_a_folder_with_a_run_is_refused_before_anything_starts(tmp_path: Path) -
 def test_a_folder_in_use_is_left_alone(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
     folder.connection.touch()
-    with folder.lock(), pytest.raises(ConfigError, match="in use by another master"):
+    with folder.lock(), pytest.raises(ConfigError, match="in use by another process"):
         run_training(LaunchConfig(1, MasterConfig(str(tmp_path), resume="auto")), {})
     assert folder.connection.exists()
     assert not folder.config.exists()

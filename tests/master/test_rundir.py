@@ -57,7 +57,7 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
 
 
 def test_only_one_master_works_in_a_folder(tmp_path: Path) -> None:
-    with RunFolder(tmp_path).lock(), pytest.raises(ConfigError, match="in use by another master"):
+    with RunFolder(tmp_path).lock(), pytest.raises(ConfigError, match="in use by another process"):
         RunFolder(tmp_path).lock()
     RunFolder(tmp_path).lock().close()
 
