@@ -76,8 +76,8 @@ class RunFolder:
         except BlockingIOError:
             claim.close()
             raise ConfigError(
-                f"run_dir {self.path} is in use by another process: choose another run_dir, or stop "
-                "that one first"
+                f"run_dir {self.path} is in use by another process: choose another run_dir, or "
+                "stop that one first"
             ) from None
         return claim
 
