@@ -103,7 +103,7 @@ def episode_sheet(
         draw_scene(layout, arena, end, goal, size, start=start)
         for start, end, goal in zip(starts, ends, goals, strict=True)
     ]
-    captions = [f"overlap {share:.3f}" for share in overlap_share(ends, goals, layout)]
+    captions = [f"overlap  {share:.3f}" for share in overlap_share(ends, goals, layout)]
     return contact_sheet(scenes, columns, captions)
 
 
