@@ -41,9 +41,13 @@ def test_the_papers_figures_and_tables_are_the_default() -> None:
 
 
 @pytest.mark.parametrize("budget", BUDGETS)
-def test_every_training_composes_with_every_budget(budget: str) -> None:
+def test_every_training_composes(budget: str) -> None:
+    """All of them with one budget; with the others those whose nets the budget changes, too."""
     config = study(budget, choices("experiment"))
     for name, training in config.trainings.items():
+        own_net = any(text.startswith("net") for text in training.overrides)
+        if not (budget == "laptop" or own_net or name == training.family):
+            continue
         agent = {"start": "tangram", "mlp_large": "mlp"}.get(training.family, training.family)
         assert setup_of(config, name).agent.name == agent, name
 
