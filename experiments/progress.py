@@ -8,7 +8,6 @@ from typing import Any
 from rich.console import Console
 from rich.progress import (
     BarColumn,
-    MofNCompleteColumn,
     Progress,
     TaskID,
     TextColumn,
@@ -35,14 +34,14 @@ class StudyProgress:
         self._bars = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
-            MofNCompleteColumn(),
+            TextColumn("{task.fields[count]}"),
             TimeElapsedColumn(),
             TimeRemainingColumn(),
             console=console,
             disable=not console.is_terminal,
         )
         # What was done before took no time now: the estimate is made from the rest.
-        self._all = self._bars.add_task("all jobs", total=total - done)
+        self._all = self._bars.add_task("all jobs", total=total - done, count=f"{done}/{total}")
         self._tasks: dict[Job, TaskID] = {}
 
     def __enter__(self) -> "StudyProgress":
@@ -64,20 +63,25 @@ class StudyProgress:
 
     def started(self, job: Job) -> None:
         """A job runs."""
-        self._tasks[job] = self._bars.add_task(f"  {job.name}", total=None)
+        total = bound(job)[1]
+        self._tasks[job] = self._bars.add_task(f"  {job.name}", total=total, count="")
 
     def look(self, running: Sequence[Job]) -> None:
         """Show how far the running trainings are."""
         if self._bars.disable:
             return
         for job in running:
-            if job.overrides is not None:
-                self._bars.update(self._tasks[job], description=f"  {job.name}{_state(job)}")
+            last = _last_evaluation(job)
+            unit, total = bound(job)
+            if last and total is not None:
+                done = int(last[unit])
+                text = f"{done:,}/{total:,} {unit}, mean reward {last['mean_reward']:.3f}"
+                self._bars.update(self._tasks[job], completed=done, count=text)
 
     def finished(self, job: Job, result: Mapping[str, Any]) -> None:
         """A job came to its end."""
         self._done += 1
-        self._bars.advance(self._all)
+        self._bars.update(self._all, advance=1, count=f"{self._done}/{self._total}")
         self.say(f"[{self._done}/{self._total}] {job.name}: {_outcome(result)}")
 
     def ended(self, job: Job) -> None:
@@ -85,13 +89,24 @@ class StudyProgress:
         self._bars.remove_task(self._tasks.pop(job))
 
 
-def _state(job: Job) -> str:
-    """The last evaluation of a training, if there was one."""
+def bound(job: Job) -> tuple[str, int | None]:
+    """What ends a training, updates or episodes, and after how many; None for a test."""
+    settings = dict(text.split("=", 1) for text in job.overrides or ())
+    for unit in ("updates", "episodes"):
+        limit = settings.get(f"max_{unit}", "0")
+        if limit.isdecimal() and int(limit):
+            return unit, int(limit)
+    return "updates", None
+
+
+def _last_evaluation(job: Job) -> dict[str, Any]:
+    """The last line of a training's curve; empty where there is none."""
     try:
-        last = json.loads((job.run_dir / "curve.jsonl").read_text("utf-8").splitlines()[-1])
-        return f": {last['updates']:,} updates, mean reward {last['mean_reward']:.3f}"
-    except (OSError, ValueError, KeyError, IndexError, TypeError):
-        return ""
+        text = (job.run_dir / "curve.jsonl").read_text(encoding="utf-8")
+        last = json.loads(text.splitlines()[-1])
+        return last if {"updates", "episodes", "mean_reward"} <= set(last) else {}
+    except (OSError, ValueError, IndexError, TypeError):
+        return {}
 
 
 def _outcome(result: Mapping[str, Any]) -> str:

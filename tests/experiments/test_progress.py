@@ -1,0 +1,69 @@
+"""What a study tells while it runs."""
+
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from experiments.jobs import Job
+from experiments.progress import StudyProgress, bound
+
+pytestmark = pytest.mark.fast
+
+
+def job(folder: Path, *overrides: str) -> Job:
+    return Job("square, seed 0", ("x",), folder, (), folder / "result.json", overrides)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "expected"),
+    [
+        (("a=1", "max_updates=20"), ("updates", 20)),
+        (("max_episodes=500", "max_updates=0"), ("episodes", 500)),
+        (("max_updates=1e6",), ("updates", None)),
+        (("agent.hindsight=[{strategy:near,angle:0.5}]",), ("updates", None)),
+    ],
+)
+def test_what_ends_a_training(tmp_path: Path, overrides: tuple[str, ...], expected: object) -> None:
+    assert bound(job(tmp_path, *overrides)) == expected
+
+
+def test_a_test_has_no_bound(tmp_path: Path) -> None:
+    assert bound(replace(job(tmp_path), overrides=None)) == ("updates", None)
+
+
+def shown(folder: Path, curve: str | None, terminal: bool) -> str:
+    """What stands on the screen after one look at a running training."""
+    if curve is not None:
+        (folder / "curve.jsonl").write_text(curve)
+    console = Console(file=io.StringIO(), force_terminal=terminal, width=120)
+    with StudyProgress(console, total=12, done=2) as progress:
+        running = job(folder, "max_updates=2000")
+        progress.started(running)
+        progress.look([running])
+        progress.finished(running, {"mean_reward": 0.5, "angle_error_deg_median": 2.0})
+        progress.ended(running)
+    return console.file.getvalue()  # type: ignore[attr-defined]
+
+
+LINE = '{"updates": 1200, "episodes": 9, "mean_reward": 0.75}\n'
+
+
+def test_a_terminal_shows_how_far_a_training_is(tmp_path: Path) -> None:
+    text = shown(tmp_path, LINE + LINE, terminal=True)
+    assert "3/12" in text
+    assert "[3/12] square, seed 0: mean reward 0.500, angle error 2.00 deg" in text
+
+
+@pytest.mark.parametrize("curve", [None, "", '{"upd', "[]", '{"updates": 3}'])
+def test_a_curve_that_cannot_be_read_does_no_harm(tmp_path: Path, curve: str | None) -> None:
+    assert "[3/12]" in shown(tmp_path, curve, terminal=True)
+
+
+def test_elsewhere_each_job_is_a_line(tmp_path: Path) -> None:
+    assert shown(tmp_path, LINE, terminal=False) == (
+        "2 of 12 jobs were done before\n"
+        "[3/12] square, seed 0: mean reward 0.500, angle error 2.00 deg\n"
+    )
