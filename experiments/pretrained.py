@@ -116,7 +116,7 @@ def _check_one_setup(seeds: Sequence[Candidate]) -> None:
         raise RunError("no runs: name the folder of at least one finished run")
     first = seeds[0]
     for one in seeds[1:]:
-        odd = first.run.setup.differences(one.run.setup.fingerprints())
+        odd = first.run.setup.differences(one.run.setup.contents())
         if odd:
             raise RunError(
                 f"{one.run.folder} differs from {first.run.folder} in {', '.join(odd)}: the seeds "

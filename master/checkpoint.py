@@ -15,7 +15,7 @@ from tangram_agent.checkpoints import (
     save_checkpoint,
     set_aside,
 )
-from tangram_agent.runs import CHECKPOINTS, FINGERPRINTS
+from tangram_agent.runs import CHECKPOINTS, SETUP
 from tangram_agent.setup import make_setup
 from tangram_sim.errors import RunError
 
@@ -33,7 +33,7 @@ def check_resumable(folder: Path, resolved: Mapping[str, Any]) -> None:
         counters = load_checkpoint(found[-1], stems=[]).counters
     except CorruptError:
         return  # the one before decides, when the run is restored
-    check_same_task(make_setup(resolved), counters.get(FINGERPRINTS, {}))
+    check_same_task(make_setup(resolved), counters.get(SETUP, {}))
 
 
 def save_run(

@@ -11,7 +11,7 @@ from master.pace import Pace
 from tangram_agent.ddpg import Learner
 from tangram_agent.hindsight import with_twins
 from tangram_agent.replay import ReplayBuffer
-from tangram_agent.runs import ACTING, FINGERPRINTS
+from tangram_agent.runs import ACTING, SETUP
 from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes, Weights
 from tangram_sim.errors import ConfigError, RunError
@@ -109,7 +109,7 @@ class Trainer:
             "episodes": self.episodes,
             "pace": self.pace.state(),
             "generators": generators,
-            FINGERPRINTS: self.setup.fingerprints(),
+            SETUP: self.setup.contents(),
         }
         return arrays, counters
 
@@ -119,7 +119,7 @@ class Trainer:
         Raises:
             RunError: the state belongs to another task or network.
         """
-        check_same_task(self.setup, counters[FINGERPRINTS])
+        check_same_task(self.setup, counters[SETUP])
         self.learner.load_state(arrays[LEARNER])
         self.replay.load_state(arrays["replay"])
         self.pace.load_state(counters["pace"])
@@ -128,12 +128,12 @@ class Trainer:
             generator.bit_generator.state = counters["generators"][name]
 
 
-def check_same_task(setup: Setup, fingerprints: Mapping[str, str]) -> None:
-    """Raise RunError unless a run with these fingerprints can go on with this setup.
+def check_same_task(setup: Setup, contents: Mapping[str, Any]) -> None:
+    """Raise RunError unless a run of a setup with these contents can go on with this one.
 
     The agent's rates may change on the way; what shapes its networks shows when they load.
     """
-    odd = [name for name in setup.differences(fingerprints) if name != "agent"]
+    odd = [name for name in setup.differences(contents) if name != "agent"]
     if odd:
         raise RunError(
             f"the run was made with other settings of {', '.join(odd)}: resume it with its own, "

@@ -22,7 +22,7 @@ CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"
 ACTING = "weights"  # the checkpoint's file of acting weights
 POLICY_SECTIONS = ("tokens", "agent", "net")
-FINGERPRINTS = "fingerprints"  # the checkpoint's counter that tells the setup
+SETUP = "setup"  # the checkpoint's counter that tells the setup
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,8 +113,8 @@ def _trained_run(folder: Path, checkpoint: str | None) -> Run:
     path = checkpoints / checkpoint if checkpoint else newest_checkpoint(checkpoints)
     content = load_checkpoint(path, [ACTING])
     # Where it plays may change: another backend or another reward does not change the policy.
-    trained = content.counters.get(FINGERPRINTS, setup.fingerprints())
-    odd = [name for name in setup.differences(trained) if name in POLICY_SECTIONS]
+    trained = setup.differences(content.counters.get(SETUP, {}))
+    odd = [name for name in trained if name in POLICY_SECTIONS]
     if odd:
         raise RunError(
             f"{folder / CONFIG} is not what {path.name} was trained with: its {', '.join(odd)} "

@@ -58,10 +58,30 @@ class Setup:
             sections[name] = hashlib.sha256(content.encode()).hexdigest()[:16]
         return sections
 
-    def differences(self, fingerprints: Mapping[str, str]) -> list[str]:
-        """The sections in which another setup, known by its fingerprints, is not this one."""
-        own = self.fingerprints()
-        return sorted(n for n in own | dict(fingerprints) if own.get(n) != fingerprints.get(n))
+    def contents(self) -> dict[str, Any]:
+        """Each section as JSON values, for a checkpoint; tokens by what makes them."""
+        sections: dict[str, Any] = {name: asdict(getattr(self, name)) for name in SECTIONS[1:]}
+        sections["tokens"] = self.layout.fingerprint()
+        plain: dict[str, Any] = json.loads(json.dumps(sections))
+        return plain
+
+    def differences(self, contents: Mapping[str, Any]) -> list[str]:
+        """The sections in which another setup, known by its contents, is not this one.
+
+        Only settings that both know are compared, so that a run outlives a version with more of
+        them: what is new does by default what was done before.
+        """
+        own = self.contents()
+        return sorted(name for name in own if not _agree(own[name], contents.get(name, own[name])))
+
+
+def _agree(one: object, other: object) -> bool:
+    """Whether two JSON values are equal in all that both say."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return all(_agree(one[name], other[name]) for name in one.keys() & other.keys())
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(map(_agree, one, other))
+    return one == other
 
 
 def make_setup(config: Mapping[str, Any]) -> Setup:

@@ -30,7 +30,7 @@ def run_dir(tmp_path: Path) -> Path:
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(CONFIG))
     for updates in (10, 20):
         arrays = {"weights": Learner(MADE, seed=updates).acting_weights(1).tensors}
-        counters = {"fingerprints": MADE.fingerprints()}
+        counters = {"setup": MADE.contents()}
         save_checkpoint(tmp_path / "checkpoints", updates, arrays, counters, keep=2)
     return tmp_path
 

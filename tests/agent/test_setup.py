@@ -85,11 +85,24 @@ def test_wrong_settings_are_refused_in_clear_words(config: dict[str, Any], reaso
         ("net", {"layers": 2}),
     ],
 )
-def test_a_fingerprint_names_the_section_that_differs(section: str, values: dict[str, Any]) -> None:
-    ours = make_setup(BASE).fingerprints()
-    theirs = make_setup(changed(section, **values)).fingerprints()
+def test_the_section_that_differs_is_named(section: str, values: dict[str, Any]) -> None:
+    made, other = make_setup(BASE), make_setup(changed(section, **values))
+    ours, theirs = made.fingerprints(), other.fingerprints()
     assert [name for name in ours if ours[name] != theirs[name]] == [section]
     assert make_setup(BASE).fingerprints() == ours
+    assert made.differences(other.contents()) == other.differences(made.contents()) == [section]
+    assert made.differences(make_setup(BASE).contents()) == []
+
+
+def test_settings_that_only_one_version_knows_do_not_differ() -> None:
+    made = make_setup(BASE)
+    older = made.contents()
+    del older["agent"]["edges"], older["agent"]["hindsight"][0]["angle"], older["reward"]
+    assert made.differences(older | {"newer": {}}) == []
+    older["agent"]["hindsight"][0]["copies"] = 7
+    assert made.differences(older) == ["agent"]
+    older["agent"]["hindsight"] = []
+    assert made.differences(older) == ["agent"]
 
 
 def test_whole_numbers_are_welcome_as_floats() -> None:

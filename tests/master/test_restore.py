@@ -122,7 +122,7 @@ def test_settings_of_the_agent_may_change_on_the_way(tmp_path: Path) -> None:
     assert resumed.updates == 6 + 4
 
 
-@pytest.mark.parametrize("lost", ["fingerprints", "pace", "record", "hub", "generators"])
+@pytest.mark.parametrize("lost", ["setup", "pace", "record", "hub", "generators"])
 def test_a_checkpoint_that_lacks_a_part_is_refused(tmp_path: Path, lost: str) -> None:
     path = save_run(tmp_path, trainer(MADE), Record(), HUB, keep=1)
     found = load_checkpoint(path)
