@@ -16,6 +16,7 @@ from master.config import LaunchConfig
 from master.console import sturdy_console
 from master.rundir import RunFolder
 from master.signals import SAME_WISH_S, heeded, show_cursor
+from tangram_agent import lifeline
 
 # While the master starts, its connection file is looked for this often.
 LOOK_S = 0.1
@@ -50,6 +51,7 @@ def run_training(config: LaunchConfig, resolved: Mapping[str, Any]) -> int:
         folder.connection.unlink(missing_ok=True)
     launcher = Launcher(config, folder, sturdy_console(sys.stderr))
     with launcher.signals():
+        lifeline.watch(grace_s=STOP_S + 2.0 * LEAVE_S)  # of an experiment that started it
         try:
             return launcher.run()
         finally:

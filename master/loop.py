@@ -187,7 +187,7 @@ class Loop:
             weights = self.parts.trainer.weights()
             self.parts.hub.publish(weights)
             self._published = weights.version
-            self._reporter.published(weights.version)
+            self._reporter.published(weights.version, self.parts)
 
     def save(self) -> Path:
         """Write a checkpoint."""

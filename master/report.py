@@ -13,6 +13,7 @@ from master.curve import Curve
 from master.metrics import Means, Metrics
 from master.parts import Parts
 from master.progress import Progress, Status
+from master.record import Record
 from master.trainer import Trainer
 from tangram_agent.config import ServiceConfig
 from tangram_agent.setup import Setup
@@ -24,6 +25,20 @@ PICTURE_COLUMNS = 4
 CURVE_PIXELS = 120
 PICTURE_S = 30.0
 TICK_S = 0.1
+
+
+class Sent:
+    """The state of the run when weights were sent.
+
+    Attributes:
+        at_s: monotonic time.
+        episodes: taken in by then.
+        loop_s, train_s: see `Record`.
+    """
+
+    def __init__(self, at_s: float, episodes: int, record: Record) -> None:
+        self.at_s, self.episodes = at_s, episodes
+        self.loop_s, self.train_s = record.loop_s, record.train_s
 
 
 class Every:
@@ -53,11 +68,12 @@ class Reporter:
         self._rates = Rates()
         self._tick = Every(TICK_S, at_once=True)
         self._log, self._picture = Every(service.log_seconds), Every(PICTURE_S, at_once=True)
-        self._published: OrderedDict[int, float] = OrderedDict()
+        self._published: OrderedDict[int, Sent] = OrderedDict()
 
-    def published(self, version: int) -> None:
-        """Note when weights were sent, to tell the age of those that played a batch."""
-        self._published.setdefault(version, time.monotonic())
+    def published(self, version: int, parts: Parts) -> None:
+        """Note when weights were sent, and which episodes they had learned from."""
+        sent = Sent(time.monotonic(), parts.trainer.episodes, parts.record)
+        self._published.setdefault(version, sent)
         while len(self._published) > REMEMBERED_VERSIONS:
             self._published.popitem(last=False)
 
@@ -72,17 +88,19 @@ class Reporter:
             "play/reward": float(np.mean(episodes.rewards[:, -1])),
             "weights/age_updates": float(updates - arrival.weights_version),
         }
-        sent_s = self._published.get(arrival.weights_version)
-        if sent_s is not None:
-            values["weights/age_seconds"] = time.monotonic() - sent_s
+        sent = self._published.get(arrival.weights_version)
+        if sent is not None:
+            values["weights/age_seconds"] = time.monotonic() - sent.at_s
         self._play.add(values, episodes.count)
 
     def scored(self, scores: Scores, parts: Parts) -> None:
-        """Curves and a picture of an evaluation."""
+        """Curves and a picture of an evaluation of weights that were sent a while ago."""
         values = {name: value for name, value in scores.scalars.items() if name != "episodes"}
         updates = scores.weights_version
-        self.metrics.scores(values, updates, parts.trainer.episodes, parts.record.loop_s)
-        self._curve.add(values, updates, parts.trainer.episodes, parts.record.train_s)
+        now = Sent(time.monotonic(), parts.trainer.episodes, parts.record)
+        sent = self._published.get(updates, now)
+        self.metrics.scores(values, updates, sent.episodes, sent.loop_s)
+        self._curve.add(values, updates, sent.episodes, sent.train_s)
         # Drawing takes time from learning.
         if len(scores.ends) and self._picture.due():
             picture = scores_picture(scores, parts.setup, CURVE_PIXELS)

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from master.curve import Curve
-from tests.master.builders import FakeHub, loop, scores, small_setup
+from tests.master.builders import FakeHub, arrival, loop, scores, small_setup
 
 pytestmark = pytest.mark.fast
 
@@ -50,3 +50,17 @@ def test_the_loop_writes_every_evaluation(tmp_path: Path) -> None:
     moved.receive(0.0)
     (line,) = lines(tmp_path / "curve.jsonl")
     assert (line["updates"], line["mean_reward"]) == (0, 0.25)
+
+
+def test_a_point_stands_where_its_weights_were_sent(tmp_path: Path) -> None:
+    """Not where their scores arrive: episodes and time have gone on since."""
+    made = small_setup()
+    script = [[arrival(made, 1)], [arrival(made, 2), scores(made, version=0, reward=0.25)]]
+    moved = loop(tmp_path, made, FakeHub(made, script))
+    moved.publish()
+    for _ in script:
+        moved.receive(0.0)
+        moved.insert()
+    assert moved.parts.trainer.episodes > 0
+    (line,) = lines(tmp_path / "curve.jsonl")
+    assert (line["updates"], line["episodes"], line["train_s"]) == (0, 0, 0.0)
