@@ -87,10 +87,10 @@ CHANGES = {
     },
     "paper": {
         "paper_literal": {"agent.saturation_penalty"},
-        "paper_clamp": {"agent.squash"},
         "paper_egocentric": {"agent.egocentric"},
         "paper_offsets": {"agent.offsets"},
         "paper_orientation": {"agent.orientation"},
+        "paper_clamp": {"agent.squash"},
         "paper_kfold": {"agent.angle_head"},
         "paper_afterstate": {"agent.afterstate"},
         "paper_near": {"agent.hindsight"},
