@@ -154,6 +154,24 @@ def _plain(config: Any) -> Plain:
     return with_run_config(plain, list(HydraConfig.get().overrides.task))
 
 
+def composed(config_name: str, overrides: Sequence[str]) -> Plain:
+    """The config that another command would make of its arguments; only inside of a task.
+
+    Raises:
+        ConfigError: an argument that it would refuse.
+    """
+    import hydra
+    from hydra.errors import HydraException
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    try:
+        config = hydra.compose(config_name, list(overrides))
+        return _mapping(OmegaConf.to_container(config, resolve=True))
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(_explain(error, config_name)) from error
+
+
 def _mapping(container: object) -> Plain:
     if not isinstance(container, dict):
         raise ConfigError(f"a config must be a mapping, got {type(container).__name__}")

@@ -5,7 +5,7 @@ Everything heavy is imported after the config was composed, so --help and wrong 
 
 from pathlib import Path
 
-from conf.cli import entry
+from conf.cli import composed, entry
 from conf.help import Plain
 
 
@@ -25,7 +25,21 @@ def _experiment(settings: Plain) -> int:
     if not isinstance(settings.get("experiments"), dict):
         raise ConfigError("experiments are chosen by their presets: experiment=[fig4,table2]")
     config = from_mapping(StudyConfig, settings)
+    resolved = {name: _resolved(name, config.command(name)) for name in config.wanted()}
 
     from experiments.runner import run_study
 
-    return run_study(config)
+    return run_study(config, resolved)
+
+
+def _resolved(name: str, overrides: list[str]) -> Plain:
+    """The whole config of a training, so that a wrong one is told before any of them starts."""
+    from tangram_agent.setup import make_setup
+    from tangram_sim.errors import ConfigError
+
+    try:
+        settings = composed("train", ["run_dir=x", *overrides])
+        make_setup(settings)
+    except ConfigError as error:
+        raise ConfigError(f"training {name}: {error}") from None
+    return settings

@@ -1,21 +1,19 @@
 """The work of a study as processes: trainings and tests, and whether each is done."""
 
 import json
-import shlex
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from experiments.plan import StudyConfig, seed_folder, test_file
 from master.children import override
-from tangram_agent.files import write_whole
-from tangram_agent.runs import CONFIG
+from tangram_agent.runs import CONFIG, read_config
+from tangram_agent.setup import SECTIONS
 from tangram_sim.errors import ConfigError
 
 RESULT = "result.json"
-# What it says of a run that used up its budget.
 BOUNDS = ("max_updates", "max_episodes", "max_hours")
 
 
@@ -27,32 +25,41 @@ class Job:
         name: for people.
         command: a console script of this installation, and its arguments.
         run_dir: the run folder that it works on.
-        needs: files that must be there before it can start.
         leaves: its file.
-        overrides: of a training; None for a test.
+        needs: the training that must be done before it can start.
+        settings: of a training: its whole config; of a test: what its file must say.
+        trains: whether it is a training.
     """
 
     name: str
     command: tuple[str, ...]
     run_dir: Path
-    needs: tuple[Path, ...]
     leaves: Path
-    overrides: tuple[str, ...] | None = None
+    needs: "Job | None" = None
+    settings: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    trains: bool = True
 
     @property
     def log(self) -> Path:
         """Where its output goes."""
-        return self.run_dir / ("training.log" if self.overrides is not None else "tests.log")
+        return self.run_dir / ("training.log" if self.trains else "tests.log")
 
     @property
     def ready(self) -> bool:
         """Whether it can start."""
-        return all(finished(path) for path in self.needs)
+        return self.needs is None or self.needs.done
 
     @property
     def done(self) -> bool:
-        """Whether its file is there and says that it came to its end."""
-        return finished(self.leaves)
+        """Whether its file is there and is that of this job, come to its end."""
+        content = read_object(self.leaves)
+        return _trained(content) if self.trains else self._tested(content)
+
+    def _tested(self, content: Mapping[str, Any]) -> bool:
+        """A test of the final weights, with the settings that are asked for."""
+        trained = read_object(self.run_dir / RESULT)
+        wanted = {**self.settings, "updates": trained.get("updates")}
+        return bool(content) and all(content.get(name) == wanted[name] for name in wanted)
 
     @property
     def arguments(self) -> list[str]:
@@ -61,29 +68,43 @@ class Job:
         return [str(Path(sys.executable).with_name(script)), *rest]
 
     def prepare(self) -> None:
-        """Make its folders, and note the settings of a training before it starts."""
+        """Make its folders."""
         self.leaves.parent.mkdir(parents=True, exist_ok=True)
-        if self.overrides is not None:
-            content = json.dumps({"overrides": list(self.overrides)}, indent=1) + "\n"
-            write_whole(settings_file(self.run_dir), content.encode())
 
     def check(self) -> None:
         """Raise ConfigError if the folder holds a training with other settings."""
-        path, begun = settings_file(self.run_dir), (self.run_dir / CONFIG).exists()
-        if self.overrides is None or not begun:
+        if not self.trains or not (self.run_dir / CONFIG).exists():
             return
-        stored = read_object(path).get("overrides")
-        if stored != list(self.overrides):
-            odd = sorted(set(map(str, stored or [])) ^ set(self.overrides))
+        stored = read_config(self.run_dir / CONFIG)
+        names = [*SECTIONS, *BOUNDS]
+        found = [text for n in names for text in _differences(n, stored, self.settings)]
+        if found:
             raise ConfigError(
-                f"{self.run_dir} was trained with other settings ({', '.join(odd)}): remove it, or "
-                "choose another run_dir"
+                f"{self.run_dir} was trained with other settings ({', '.join(found)}): remove it, "
+                "or choose another run_dir"
             )
 
 
-def settings_file(run_dir: Path) -> Path:
-    """The settings that a training was started with."""
-    return run_dir / "training.json"
+def _trained(content: Mapping[str, Any]) -> bool:
+    """Whether a run used up its budget, and its final weights were scored."""
+    ended_by, scored = content.get("ended_by"), content.get("scored_updates")
+    by_budget = isinstance(ended_by, str) and ended_by.startswith(BOUNDS)
+    return by_budget and scored is not None and scored == content.get("updates")
+
+
+def _differences(name: str, one: object, other: object) -> Iterator[str]:
+    """Where two configs disagree below a name; what only one of them knows does not count."""
+    key = name.rpartition(".")[2]
+    if not (isinstance(one, Mapping) and isinstance(other, Mapping)):
+        return
+    if key not in one or key not in other:
+        return
+    here, there = one[key], other[key]
+    if isinstance(here, Mapping) and isinstance(there, Mapping):
+        for inner in sorted(set(here) & set(there)):
+            yield from _differences(f"{name}.{inner}", here, there)
+    elif here != there:
+        yield f"{name}={here}, now {there}"
 
 
 def read_object(path: Path) -> dict[str, Any]:
@@ -95,57 +116,53 @@ def read_object(path: Path) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def finished(path: Path) -> bool:
-    """Whether a result file is there; that of a training must have ended by its budget."""
-    content = read_object(path)
-    ended_by = content.get("ended_by")
-    if path.name != RESULT:
-        return bool(content)
-    return isinstance(ended_by, str) and ended_by.startswith(BOUNDS)
+def make_jobs(config: StudyConfig, resolved: Mapping[str, Mapping[str, Any]]) -> list[Job]:
+    """All trainings seed by seed, each followed by its tests.
 
-
-def make_jobs(config: StudyConfig) -> list[Job]:
-    """All trainings seed by seed, each followed by its tests."""
+    Args:
+        config: the study.
+        resolved: the whole config of each training that is wanted.
+    """
     jobs: list[Job] = []
     for seed in config.budget.seeds:
+        trainings: dict[str, Job] = {}
         for name in config.wanted():
-            training = _training(config, name, seed)
-            jobs += [training, *(_test(config, training, t) for t in config.tests_of(name))]
+            source = config.trainings[name].after
+            needs = None if source is None else trainings[source]
+            trainings[name] = _training(config, name, seed, needs, resolved[name])
+            tests = (_test(config, trainings[name], test) for test in config.tests_of(name))
+            jobs += [trainings[name], *tests]
     return jobs
 
 
-def _training(config: StudyConfig, name: str, seed: int) -> Job:
-    study = Path(config.run_dir)
-    run_dir = seed_folder(study, name, seed)
-    overrides = config.overrides(config.trainings[name])
-    source = config.trainings[name].after
-    begun = [] if source is None else [seed_folder(study, source, seed)]
+def _training(
+    config: StudyConfig, name: str, seed: int, needs: Job | None, settings: Mapping[str, Any]
+) -> Job:
+    run_dir = seed_folder(Path(config.run_dir), name, seed)
     command = (
         "tangram-train",
         override("run_dir", str(run_dir)),
         f"seed={seed}",
         "resume=auto",
-        *overrides,
-        *(override("warm_start", str(folder)) for folder in begun),
+        *config.command(name),
+        *([] if needs is None else [override("warm_start", str(needs.run_dir))]),
     )
-    needs = tuple(folder / RESULT for folder in begun)
-    return Job(f"{name}, seed {seed}", command, run_dir, needs, run_dir / RESULT, tuple(overrides))
+    return Job(f"{name}, seed {seed}", command, run_dir, run_dir / RESULT, needs, settings)
 
 
 def _test(config: StudyConfig, training: Job, name: str) -> Job:
     test, out = config.tests[name], test_file(training.run_dir, name)
-    settings = {"actions": test.actions, "corner_noise": test.corner_noise}
+    asked = {
+        "episodes": config.budget.test_episodes,
+        "actions": test.actions,
+        "corner_noise": test.corner_noise,
+    }
+    settings = {key: value for key, value in asked.items() if value is not None}
     command = (
         "tangram-eval",
         override("run_dir", str(training.run_dir)),
         override("out", str(out)),
-        f"episodes={config.budget.test_episodes}",
-        *(f"{key}={value}" for key, value in settings.items() if value is not None),
+        *(f"{key}={value}" for key, value in settings.items()),
     )
     label = f"{training.name}, test {name}"
-    return Job(label, command, training.run_dir, (training.leaves,), out)
-
-
-def shown(command: Sequence[str]) -> str:
-    """A command as it can be pasted into a shell."""
-    return shlex.join(command)
+    return Job(label, command, training.run_dir, out, training, settings, trains=False)

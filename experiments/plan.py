@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from tangram_sim.checks import check_choice, check_range
+from tangram_sim.config import MAX_CORNER_NOISE
 from tangram_sim.errors import ConfigError
+from worker.config import MAX_ACTIONS
 
 FORMAT = 1
 KINDS = ("curves", "complexity", "tests", "rewards", "ranking")
@@ -45,6 +47,12 @@ class TestConfig:
     actions: int | None = None
     corner_noise: float | None = None
 
+    def __post_init__(self) -> None:
+        if self.actions is not None:
+            check_range("tests.actions", self.actions, 1, MAX_ACTIONS)
+        if self.corner_noise is not None:
+            check_range("tests.corner_noise", self.corner_noise, 0.0, MAX_CORNER_NOISE)
+
 
 @dataclass(frozen=True)
 class ExperimentConfig:
@@ -55,6 +63,7 @@ class ExperimentConfig:
         source: where the paper has it.
         kind: of figure and table: one of KINDS.
         trainings, tests: names in the catalogue; every test is made of every training.
+        labels: of trainings that are called otherwise here than in the catalogue.
     """
 
     title: str
@@ -63,9 +72,12 @@ class ExperimentConfig:
     note: str
     trainings: tuple[str, ...]
     tests: tuple[str, ...] = ()
+    labels: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_choice("kind", self.kind, KINDS)
+        for name in self.labels:
+            check_choice("labels", name, self.trainings)
 
 
 @dataclass(frozen=True)
@@ -90,6 +102,8 @@ class BudgetConfig:
         check_range("budget.test_episodes", self.test_episodes, 1)
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
             raise ConfigError(f"budget.seeds must be different numbers, got {list(self.seeds)}")
+        for seed in self.seeds:
+            check_range("budget.seeds", seed, 0)
 
 
 @dataclass(frozen=True)
@@ -125,8 +139,9 @@ class StudyConfig:
             if training.after is not None:
                 _check_known(f"training {name}: after", (training.after,), self.trainings)
 
-    def overrides(self, training: TrainingConfig) -> list[str]:
+    def command(self, name: str) -> list[str]:
         """Everything that tangram-train is told, each setting once: the last word counts."""
+        training = self.trainings[name]
         budget = self.budget.overrides
         said = (
             *self.families[training.family],
@@ -200,7 +215,7 @@ def plan_content(config: StudyConfig, source: Mapping[str, Any]) -> dict[str, An
             name: {
                 "label": config.trainings[name].label,
                 "family": config.trainings[name].family,
-                "overrides": config.overrides(config.trainings[name]),
+                "overrides": config.command(name),
                 "after": config.trainings[name].after,
             }
             for name in wanted
@@ -210,7 +225,7 @@ def plan_content(config: StudyConfig, source: Mapping[str, Any]) -> dict[str, An
 
 
 def joined_plan(path: Path, content: dict[str, Any]) -> dict[str, Any]:
-    """A plan together with what earlier commands put into the same folder; seeds may be added.
+    """A plan together with what earlier commands put into the same folder, their seeds too.
 
     Raises:
         ConfigError: the folder was made with another budget, or its plan cannot be read.
@@ -230,4 +245,5 @@ def joined_plan(path: Path, content: dict[str, Any]) -> dict[str, Any]:
                 "another run_dir"
             )
     merged = {n: known[n] | content[n] for n in ("experiments", "trainings", "tests")}
-    return content | merged
+    seeds = sorted({*known["budget"].get("seeds", ()), *content["budget"]["seeds"]})
+    return content | merged | {"budget": content["budget"] | {"seeds": seeds}}

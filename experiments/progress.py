@@ -91,11 +91,10 @@ class StudyProgress:
 
 def bound(job: Job) -> tuple[str, int | None]:
     """What ends a training, updates or episodes, and after how many; None for a test."""
-    settings = dict(text.split("=", 1) for text in job.overrides or ())
     for unit in ("updates", "episodes"):
-        limit = settings.get(f"max_{unit}", "0")
-        if limit.isdecimal() and int(limit):
-            return unit, int(limit)
+        limit = job.settings.get(f"max_{unit}", 0) if job.trains else 0
+        if isinstance(limit, int) and limit:
+            return unit, limit
     return "updates", None
 
 

@@ -2,14 +2,16 @@
 
 import json
 import os
+import shlex
 import signal
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from queue import Empty, SimpleQueue
+from typing import Any
 
 from experiments.jobs import Job, make_jobs, read_object
 from experiments.plan import PLAN, StudyConfig, joined_plan, plan_content
@@ -18,6 +20,7 @@ from master.children import Child, describe
 from master.console import sturdy_console
 from master.result import commit, processor, versions
 from master.rundir import RunFolder
+from master.signals import heeded
 from tangram_agent.files import write_whole
 from tangram_sim.errors import ConfigError
 
@@ -28,8 +31,12 @@ FAILED_STATUS = 1
 INTERRUPT_STATUS = 130
 
 
-def run_study(config: StudyConfig) -> int:
+def run_study(config: StudyConfig, resolved: Mapping[str, Mapping[str, Any]]) -> int:
     """Do everything that is missing.
+
+    Args:
+        config: the study.
+        resolved: the whole config of each training that is wanted.
 
     Returns:
         Exit status: 0 when all is done, 1 when a job failed, 130 after a signal.
@@ -37,7 +44,7 @@ def run_study(config: StudyConfig) -> int:
     Raises:
         ConfigError: the folder holds trainings with other settings or budget, or is in use.
     """
-    study, jobs = RunFolder(config.run_dir), make_jobs(config)
+    study, jobs = RunFolder(config.run_dir), make_jobs(config, resolved)
     for job in jobs:
         job.check()
     plan = joined_plan(study.path / PLAN, plan_content(config, _source()))
@@ -67,7 +74,7 @@ def _make(path: Path) -> None:
 def _source() -> dict[str, object]:
     """Where the numbers of a study come from."""
     return {
-        "command": " ".join(["tangram-experiment", *sys.argv[1:]]),
+        "command": shlex.join(["tangram-experiment", *sys.argv[1:]]),
         "commit": commit(),
         "processor": processor(),
         "cores": len(os.sched_getaffinity(0)),
@@ -88,11 +95,10 @@ class Runner:
     def run(self) -> int:
         """Until nothing is left to do; returns the exit status."""
         with self._signals():
-            while self._start_ready() or self._running:
-                self._take(self._next())
-                self._progress.look(list(self._running.values()))
-                if self._stop_s is not None and time.monotonic() >= self._stop_s:
-                    self._signal(signal.SIGKILL)
+            try:
+                self._work()
+            finally:
+                self._signal(signal.SIGTERM)  # nobody is left, unless this failed
         if self._stop_s is not None:
             self._progress.say("stopped: give the same command again to go on")
             return INTERRUPT_STATUS
@@ -101,6 +107,13 @@ class Runner:
         for job in self._failed:
             self._progress.say(f"{job.name}: failed, see {job.log}")
         return FAILED_STATUS if self._failed or self._waiting else 0
+
+    def _work(self) -> None:
+        while self._start_ready() or self._running:
+            self._take(self._next())
+            self._progress.look(list(self._running.values()))
+            if self._stop_s is not None and time.monotonic() >= self._stop_s:
+                self._signal(signal.SIGKILL)
 
     def _start_ready(self) -> bool:
         """Start what there is room for; whether anything was started."""
@@ -147,10 +160,9 @@ class Runner:
 
     @contextmanager
     def _signals(self) -> Iterator[None]:
-        numbers = (signal.SIGINT, signal.SIGTERM)
         before = {
             number: signal.signal(number, lambda n, _frame: self._events.put(signal.Signals(n)))
-            for number in numbers
+            for number in heeded()
         }
         try:
             yield

@@ -72,7 +72,7 @@ def _draw_band(panel: Axes, found: Band, unit: float, look: Look, label: str) ->
 def _draw_papers(
     panel: Axes, experiment: Experiment, known: Sequence[Training], looks: Mapping[str, Look]
 ) -> None:
-    """The plateaus of the paper, each in its training's colour."""
+    """What the paper's agents reach, each in its training's colour."""
     for training in known:
         value = paper.value(experiment, training)
         if value is not None and value.mean_reward is not None:

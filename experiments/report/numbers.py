@@ -12,7 +12,6 @@ from tangram_sim.arrays import Floats
 
 GRID = 200
 KEPT = 60
-NEAR_PLATEAU = 0.02
 
 
 @dataclass(frozen=True)
@@ -75,14 +74,13 @@ def band(curves: Iterable[Sequence[Row]], axis: str, key: str) -> Band | None:
     return Band(grid, values.mean(axis=0), deviation, len(known))
 
 
-def plateau_after(seed: Seed, axis: str = "episodes", key: str = "mean_reward") -> float | None:
-    """Where the curve first comes within 0.02 of the run's final score."""
-    final = seed.result.get(key)
-    if final is None:
-        return None
+def first_at_least(
+    seed: Seed, level: float, axis: str = "episodes", key: str = "mean_reward"
+) -> float | None:
+    """Where the curve first reaches a level; None if it never does."""
     x, y = points(seed.curve, axis, key)
-    near = np.flatnonzero(y >= final - NEAR_PLATEAU)
-    return float(x[near[0]]) if len(near) else None
+    reached = np.flatnonzero(y >= level)
+    return float(x[reached[0]]) if len(reached) else None
 
 
 def thinned(curve: Sequence[Row], count: int = KEPT) -> list[Row]:

@@ -11,8 +11,8 @@ class Value:
     """What the paper reports of one of its agents.
 
     Attributes:
-        mean_reward: of the plateau.
-        plateau_after: episodes until it is reached.
+        mean_reward: that it reliably reaches.
+        after: episodes until then.
         parameters: of the network.
         hours: of training.
         episodes: of training.
@@ -20,7 +20,7 @@ class Value:
     """
 
     mean_reward: float | None = None
-    plateau_after: int | None = None
+    after: int | None = None
     parameters: int | None = None
     hours: float | None = None
     episodes: int | None = None
@@ -30,8 +30,8 @@ class Value:
 # Source -> name of a training or of a family -> what the paper reports.
 VALUES = {
     "Fig. 4": {
-        "paper": Value(mean_reward=0.75, plateau_after=1_500),
-        "mlp": Value(mean_reward=0.70, plateau_after=19_000),
+        "paper": Value(mean_reward=0.75, after=1_500),
+        "mlp": Value(mean_reward=0.70, after=19_000),
     },
     "Table I": {
         "paper": Value(parameters=504_000, hours=72, episodes=28_000),

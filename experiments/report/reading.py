@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -87,13 +88,17 @@ def _experiment(
             f"{record.path}: experiment {name} is of the unknown kind '{kind}'; "
             f"use one of {', '.join(KINDS)}"
         )
+    labels = record.record("labels").content if "labels" in record.content else {}
     return Experiment(
         name=name,
         title=record.text("title"),
         source=record.text("source"),
         kind=kind,
         note=record.text("note"),
-        trainings=_chosen(record, "trainings", trainings),
+        trainings=tuple(
+            replace(one, label=labels.get(one.name, one.label))
+            for one in _chosen(record, "trainings", trainings)
+        ),
         tests=_chosen(record, "tests", tests),
     )
 

@@ -13,6 +13,9 @@ NAMES = {"position only": POSITION, "exact": PERFECT, "random": RANDOM}
 # Settings of the simulation that tests set themselves, or that move no token.
 APART = ("sim.actions_per_token", "sim.corner_noise", "sim.camera", "sim.pixels", "sim.max_tries")
 
+# Where tokens fall short of what they are told, no policy here is an oracle.
+INEXACT = "sim.inexact=true"
+
 Task = tuple[str, ...]
 
 
@@ -79,6 +82,7 @@ class References:
             Reference(name, label, self._scores.get((key, task), {}))
             for key, name in NAMES.items()
             for task, label in _tasks(experiment).items()
+            if INEXACT not in task
         ]
 
     def position(self, training: Training, measure: Measure) -> float | None:

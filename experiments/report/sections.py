@@ -33,9 +33,7 @@ DOTS = (
 )
 SMALL = "Every seed's test scores while it trains; the first training stands in grey behind each."
 SWEEP = "Median over the seeds; the band goes from the least to the most."
-PLATEAU = (
-    "The plateau is reached where a seed's test score first comes within 0.02 of its final one."
-)
+REACHED = "Episodes are those at the first evaluation in which a seed reached the mean reward."
 
 
 @dataclass(frozen=True)
@@ -82,10 +80,18 @@ def command(study: Study, experiment: Experiment) -> str:
         words = shlex.split(study.command)[1:]
     except ValueError:
         words = []
-    kept = [word for word in words if word.partition("=")[0] not in ("experiment", "budget", "dry")]
+    kept = [word for word in words if _concerns(word, experiment)]
     rest = (shlex.quote(word) for word in kept)
     chosen = f"experiment=[{experiment.name}] budget={study.budget}"
     return " ".join(("tangram-experiment", chosen, *rest))
+
+
+def _concerns(word: str, experiment: Experiment) -> bool:
+    """Whether an argument has a meaning where this experiment is run alone."""
+    key = word.partition("=")[0]
+    if key.startswith("experiments."):
+        return key.startswith(f"experiments.{experiment.name}.")
+    return key not in ("experiment", "budget", "dry")
 
 
 # Kinds
@@ -111,7 +117,7 @@ def _rewards(page: Page, experiment: Experiment) -> list[str]:
 
 
 def _effort(experiment: Experiment) -> list[str]:
-    return [*effort_table(experiment), PLATEAU, ""]
+    return [*effort_table(experiment), REACHED, ""]
 
 
 def _complexity(_page: Page, experiment: Experiment) -> list[str]:

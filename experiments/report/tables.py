@@ -16,11 +16,12 @@ from experiments.report.markdown import (
     Measure,
     table,
 )
-from experiments.report.numbers import plateau_after
+from experiments.report.numbers import first_at_least
 from experiments.report.references import References
 from experiments.report.study import Experiment, Study, Training, Trial
 
 SPREAD = "median (least to most)"
+LEVELS = (0.70, 0.75)  # that the paper tells of in Fig. 4
 
 
 def score_table(
@@ -49,25 +50,36 @@ def score_table(
 
 
 def effort_table(experiment: Experiment) -> list[str]:
-    """When the plateau was reached, the errors at the end, and what it took."""
+    """How soon the paper's two rewards were reached, the errors at the end, and what it took."""
     values = {one.name: paper.value(experiment, one) for one in experiment.trainings}
-    papers = {name: value.plateau_after for name, value in values.items() if value is not None}
-    with_paper = any(papers.values())
+    papers = {
+        name: f"{value.mean_reward:.2f} after {value.after:,}"
+        for name, value in values.items()
+        if value is not None and value.mean_reward is not None and value.after is not None
+    }
     shown = (ANGLE, POSITION, EPISODES, UPDATES, MINUTES)
-    head = ["training", *["paper: plateau after, episodes"] * with_paper]
-    head += ["plateau after, episodes", *(measure.label for measure in shown)]
+    head = ["training", *["paper, episodes"] * bool(papers)]
+    head += [f"{level:.2f} after, episodes" for level in LEVELS]
     return table(
-        head,
+        [*head, *(measure.label for measure in shown)],
         (
             [
                 one.label,
-                *[_show(papers.get(one.name), "{:,}")] * with_paper,
-                EPISODES.show_spread(one.each(plateau_after)),
+                *[papers.get(one.name, NOTHING)] * bool(papers),
+                *(_soon(one, level) for level in LEVELS),
                 *(measure.show_spread(one.values(measure.key)) for measure in shown),
             ]
             for one in experiment.trainings
         ),
     )
+
+
+def _soon(training: Training, level: float) -> str:
+    """Episodes until a mean reward was first reached, and by how many seeds if not by all."""
+    reached = training.each(lambda seed: first_at_least(seed, level))
+    text = EPISODES.show_spread(reached)
+    few = 0 < len(reached) < len(training.finished)
+    return f"{text}, {len(reached)} of {len(training.finished)} seeds" if few else text
 
 
 def complexity_table(experiment: Experiment) -> list[str]:

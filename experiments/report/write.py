@@ -19,8 +19,8 @@ HOW_TO_READ = (
     "Scores are those of the fixed tests, exploration off. The mean reward is Eq. 14 on exact "
     "polygons: -1 is no overlap, 1 is perfect. Where several seeds were trained, numbers are their "
     "median, with the least and the most in brackets. Three policies that learned nothing stand "
-    "beside them: *position only* moves every token exactly onto its target's centre and never "
-    "turns it, *perfect* moves it exactly onto its target as it is seen, *random* is chance."
+    "beside them: *position only* asks for the motion to the target's centre and never for a turn, "
+    "*perfect* asks for the exact motion onto the target as it is seen, *random* is chance."
 )
 
 

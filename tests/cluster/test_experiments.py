@@ -55,7 +55,7 @@ def test_what_is_done_is_skipped(study: Path) -> None:
 def test_other_settings_are_refused(study: Path) -> None:
     line = refused("tangram-experiment", *SMALL, LONG, f"run_dir={study}", cwd=study.parent)
     assert "tangram/seed_0 was trained with other settings" in line
-    assert "max_updates=1000000" in line
+    assert "max_updates=20, now 1000000" in line
 
 
 def test_a_report_is_drawn(study: Path, tmp_path: Path) -> None:
@@ -87,7 +87,7 @@ def test_a_signal_stops_a_study_and_the_same_command_goes_on(tmp_path: Path) -> 
     listed = run("tangram-experiment", *arguments, LONG, "dry=true", cwd=tmp_path)
     assert listed.splitlines()[:2] == ["tangram, seed 0", "tangram, seed 0, test actions_2"]
     bound = f"budget.overrides.tangram=['max_updates={done['updates'] + 5}']"
-    settings = run_dir / "training.json"
+    settings = run_dir / "config.yaml"
     settings.write_text(settings.read_text().replace("1000000", str(done["updates"] + 5)))
     run("tangram-experiment", *arguments, bound, cwd=tmp_path)
     again = json.loads((run_dir / "result.json").read_text())
@@ -95,17 +95,39 @@ def test_a_signal_stops_a_study_and_the_same_command_goes_on(tmp_path: Path) -> 
     assert again["run_id"] == done["run_id"]
 
 
+def test_a_study_that_is_killed_leaves_no_training_behind(tmp_path: Path) -> None:
+    study = tmp_path / "study"
+    arguments = (*SMALL, f"run_dir={study}", "experiments.table2.trainings=[tangram]")
+    run_dir = study / "trainings" / "tangram" / "seed_0"
+    with started("tangram-experiment", *arguments, LONG, cwd=tmp_path) as process:
+        wait_for_file(run_dir / "curve.jsonl", process)
+        children = [pid for pid in pids_of(study) if pid != process.pid]
+        assert len(children) >= 3
+        process.kill()
+        assert all_ended(children)
+    assert list_checkpoints(run_dir / "checkpoints")
+
+
+def test_wrong_settings_are_told_before_anything_starts(tmp_path: Path) -> None:
+    arguments = (*SMALL, f"run_dir={tmp_path / 'study'}")
+    wrong = "families.paper=['agent=paper','net.heads=3']"
+    line = refused("tangram-experiment", *arguments, wrong, cwd=tmp_path)
+    assert "training paper: net.width must be a multiple of net.heads, got 16 and 3" in line
+    line = refused("tangram-experiment", *arguments, "families.paper=['agnt=x']", cwd=tmp_path)
+    assert "training paper: unknown setting 'agnt' (did you mean 'agent'?)" in line
+    assert not (tmp_path / "study").exists()
+
+
 def test_a_training_that_fails_is_told_and_the_others_go_on(tmp_path: Path) -> None:
     arguments = (
         *SMALL,
         f"run_dir={tmp_path / 'study'}",
-        "families.paper=['agent=paper','net.width=3']",
-        "budget.overrides.paper=['max_updates=20']",
+        "families.paper=['agent=paper','agent.actor_lr=1000.0']",
         "experiments.table2.tests=[]",
     )
     with pytest.raises(AssertionError) as failure:
         run("tangram-experiment", *arguments, cwd=tmp_path)
     told = str(failure.value)
-    assert "net.width must be a multiple of net.heads, got 3 and 4" in told
-    assert "[1/2] tangram, seed 0: mean reward" in told
+    assert "the weights are not finite" in told
+    assert "/2] tangram, seed 0: mean reward" in told
     assert "paper, seed 0: failed, see" in told

@@ -30,8 +30,7 @@ def study(budget: str, names: list[str]) -> StudyConfig:
 
 
 def setup_of(config: StudyConfig, training: str) -> Setup:
-    overrides = config.overrides(config.trainings[training])
-    return make_setup(compose("train", ["run_dir=x", *overrides]))
+    return make_setup(compose("train", ["run_dir=x", *config.command(training)]))
 
 
 def test_the_papers_figures_and_tables_are_the_default() -> None:
@@ -128,8 +127,8 @@ def changes(one: Setup, other: Setup) -> set[str]:
 
 def test_the_papers_budget_is_the_papers() -> None:
     config = study("paper", PAPERS)
-    assert "max_episodes=28000" in config.overrides(config.trainings["paper"])
-    assert "max_episodes=100000" in config.overrides(config.trainings["mlp"])
+    assert "max_episodes=28000" in config.command("paper")
+    assert "max_episodes=100000" in config.command("mlp")
     net = setup_of(config, "paper").net
     assert (net.width, net.layers, net.heads, net.feed_forward) == (64, 3, 4, 512)
     assert setup_of(config, "mlp_large").net.hidden == (482, 482)
@@ -137,6 +136,6 @@ def test_the_papers_budget_is_the_papers() -> None:
 
 def test_the_papers_trainings_publish_and_reward_as_the_paper_does() -> None:
     config = study("laptop", PAPERS)
-    made = compose("train", ["run_dir=x", *config.overrides(config.trainings["paper"])])
+    made = compose("train", ["run_dir=x", *config.command("paper")])
     assert made["service"]["every_update"]
     assert (made["reward"]["source"], made["sim"]["camera"]) == ("camera", True)

@@ -5,16 +5,25 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
-from experiments.jobs import Job, finished, make_jobs, settings_file
+from experiments.jobs import Job, make_jobs
+from experiments.plan import StudyConfig
 from tangram_sim.errors import ConfigError
 from tests.experiments.studies import study
 
 pytestmark = pytest.mark.fast
 
 
+def resolved(config: StudyConfig, **changes: Any) -> dict[str, dict[str, Any]]:
+    """A config for each training, as far as jobs look at it."""
+    agent = {"gamma": 0.0, "hindsight": [{"strategy": "final"}]}
+    return {name: {"agent": agent, "max_updates": 3} | changes for name in config.wanted()}
+
+
 def jobs_of(folder: Path, **changes: Any) -> dict[str, Job]:
-    return {job.name: job for job in make_jobs(study(folder, **changes))}
+    config = study(folder, **changes)
+    return {job.name: job for job in make_jobs(config, resolved(config))}
 
 
 def test_all_trainings_of_a_seed_come_before_the_next_seed(tmp_path: Path) -> None:
@@ -45,15 +54,16 @@ def test_a_training_is_a_command_that_can_go_on(tmp_path: Path) -> None:
         *("tangram-train", f"run_dir='{run_dir}'", "seed=1", "resume=auto"),
         *("agent=paper", "a=1", "b=3", "c=1"),
     )
-    assert (job.run_dir, job.leaves, job.needs) == (run_dir, run_dir / "result.json", ())
+    assert (job.run_dir, job.leaves, job.needs) == (run_dir, run_dir / "result.json", None)
+    assert job.settings["max_updates"] == 3
     assert job.log == run_dir / "training.log"
 
 
 def test_a_warm_start_waits_for_its_source(tmp_path: Path) -> None:
-    job = jobs_of(tmp_path)["warm, seed 1"]
-    source = tmp_path / "trainings" / "square" / "seed_1"
+    jobs = jobs_of(tmp_path)
+    job, source = jobs["warm, seed 1"], tmp_path / "trainings" / "square" / "seed_1"
     assert job.command[-1] == f"warm_start='{source}'"
-    assert job.needs == (source / "result.json",)
+    assert job.needs is jobs["square, seed 1"]
     assert not job.ready
     end(source / "result.json", "max_updates=3")
     assert job.ready
@@ -63,66 +73,96 @@ def test_a_warm_start_waits_for_its_source(tmp_path: Path) -> None:
     ("test", "setting"), [("twice", "actions=2"), ("noisy", "corner_noise=0.01")]
 )
 def test_a_test_follows_its_training(tmp_path: Path, test: str, setting: str) -> None:
-    job = jobs_of(tmp_path)[f"square, seed 0, test {test}"]
+    jobs = jobs_of(tmp_path)
+    job = jobs[f"square, seed 0, test {test}"]
     run_dir = tmp_path / "trainings" / "square" / "seed_0"
     out = run_dir / "tests" / f"{test}.json"
     assert job.command == (
         *("tangram-eval", f"run_dir='{run_dir}'", f"out='{out}'", "episodes=5"),
         setting,
     )
-    assert (job.needs, job.leaves) == ((run_dir / "result.json",), out)
+    assert job.needs is jobs["square, seed 0"]
+    assert (job.leaves, job.trains) == (out, False)
 
 
-def end(path: Path, ended_by: str) -> None:
+def end(path: Path, ended_by: str = "max_updates=3", updates: int = 3, scored: Any = 3) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({"ended_by": ended_by}))
+    content = {"ended_by": ended_by, "updates": updates, "scored_updates": scored}
+    path.write_text(json.dumps(content))
 
 
 @pytest.mark.parametrize(
-    ("ended_by", "done"),
+    ("ended_by", "scored", "done"),
     [
-        ("max_updates=3", True),
-        ("max_episodes=8", True),
-        ("max_hours=1.0", True),
-        ("SIGTERM", False),
+        ("max_updates=3", 3, True),
+        ("max_episodes=8", 3, True),
+        ("max_hours=1.0", 3, True),
+        ("SIGTERM", 3, False),
+        ("max_updates=3", 2, False),
+        ("max_updates=3", None, False),
+        (3, 3, False),
     ],
 )
-def test_a_training_is_done_when_its_budget_ended_it(
-    tmp_path: Path, ended_by: str, done: bool
+def test_a_training_is_done_when_its_final_weights_are_scored(
+    tmp_path: Path, ended_by: str, scored: int | None, done: bool
 ) -> None:
-    end(tmp_path / "result.json", ended_by)
-    assert finished(tmp_path / "result.json") is done
+    job = jobs_of(tmp_path)["paper, seed 0"]
+    end(job.leaves, ended_by, scored=scored)
+    assert job.done is done
 
 
 @pytest.mark.parametrize("text", [None, "", "[]", '{"ended_by": 3}', '{"ended_by"', "\xff"])
 def test_what_cannot_be_read_is_not_done(tmp_path: Path, text: str | None) -> None:
-    path = tmp_path / "result.json"
-    if text is not None:
-        path.write_text(text, encoding="latin-1")
-    assert not finished(path)
+    for job in list(jobs_of(tmp_path).values())[:2]:
+        job.prepare()
+        if text is not None:
+            job.leaves.write_text(text, encoding="latin-1")
+        assert not job.done
 
 
-def test_a_test_is_done_when_its_scores_are_there(tmp_path: Path) -> None:
-    path = tmp_path / "twice.json"
-    assert not finished(path)
-    path.write_text('{"mean_reward": 0.5}')
-    assert finished(path)
+@pytest.mark.parametrize(
+    ("changes", "done"),
+    [
+        ({}, True),
+        ({"mean_reward": 0.5}, True),
+        ({"actions": 3}, False),
+        ({"episodes": 6}, False),
+        ({"updates": 2}, False),
+    ],
+)
+def test_a_test_is_done_when_it_is_that_of_the_final_weights(
+    tmp_path: Path, changes: dict[str, Any], done: bool
+) -> None:
+    job = jobs_of(tmp_path)["square, seed 0, test twice"]
+    end(job.run_dir / "result.json")
+    job.prepare()
+    assert not job.done
+    job.leaves.write_text(json.dumps({"actions": 2, "episodes": 5, "updates": 3} | changes))
+    assert job.done is done
 
 
-def test_other_settings_in_the_same_folder_are_refused(tmp_path: Path) -> None:
-    job = jobs_of(tmp_path)["paper, seed 0"]
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({}, None),
+        ({"max_updates": 4}, "max_updates=3, now 4"),
+        ({"agent": {"gamma": 0.5}}, "agent.gamma=0.0, now 0.5"),
+        ({"agent": {"hindsight": []}}, r"agent.hindsight=.*, now \[\]"),
+        ({"agent": {"newer": 1}, "service": {"envs": 1}}, None),
+    ],
+)
+def test_other_settings_in_the_same_folder_are_refused(
+    tmp_path: Path, changes: dict[str, Any], message: str | None
+) -> None:
+    config = study(tmp_path)
+    job = make_jobs(config, resolved(config))[0]
     job.check()
     job.prepare()
     job.check()
-    (job.run_dir / "config.yaml").touch()
-    job.check()
-    settings_file(job.run_dir).write_text(json.dumps({"overrides": [*job.command[4:-1], "c=2"]}))
-    with pytest.raises(ConfigError, match=r"trained with other settings \(c=1, c=2\): remove it"):
-        job.check()
-
-
-def test_a_training_that_never_began_may_change(tmp_path: Path) -> None:
-    job = jobs_of(tmp_path)["paper, seed 0"]
-    job.prepare()
-    settings_file(job.run_dir).write_text('{"overrides": ["typo=1"]}')
-    job.check()
+    (job.run_dir / "config.yaml").write_text(yaml.safe_dump(dict(job.settings)))
+    changed = make_jobs(config, resolved(config, **changes))[0]
+    if message is None:
+        changed.check()
+        return
+    with pytest.raises(ConfigError, match=f"was trained with other settings .{message}.: remove"):
+        changed.check()

@@ -24,7 +24,7 @@ def test_the_last_word_on_a_setting_counts(
     tmp_path: Path, training: str, expected: list[str]
 ) -> None:
     config = study(tmp_path)
-    assert config.overrides(config.trainings[training]) == expected
+    assert config.command(training) == expected
 
 
 def test_trainings_are_wanted_once_and_after_those_that_they_begin_with(tmp_path: Path) -> None:
@@ -50,6 +50,15 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         {"experiments": {"x": experiment(["square"], []) | {"kind": "pie"}}},
         "kind must be one of curves, complexity, tests, rewards, ranking, got 'pie'",
     ),
+    (
+        {"experiments": {"x": experiment(["square"], []) | {"labels": {"paper": "x"}}}},
+        "labels must be one of square, got 'paper'",
+    ),
+    ({"tests": {"twice": {"label": "x", "actions": 0}}}, "tests.actions must be between 1 and 100"),
+    (
+        {"tests": {"noisy": {"label": "x", "corner_noise": 0.5}}},
+        "tests.corner_noise must be between 0 and 0.2, got 0.5",
+    ),
     ({"families": {"ours": []}}, "training paper: family 'theirs' is not in the catalogue"),
     ({"trainings": {"square": WARM}, "experiments": {}}, "training square: after 'warm' is not in"),
 ]
@@ -67,6 +76,12 @@ def test_what_does_not_exist_is_refused(
 def test_seeds_are_different(tmp_path: Path, seeds: list[int]) -> None:
     budget = content(tmp_path)["budget"] | {"seeds": seeds}
     with pytest.raises(ConfigError, match="budget.seeds must be different numbers, got"):
+        study(tmp_path, budget=budget)
+
+
+def test_seeds_are_not_negative(tmp_path: Path) -> None:
+    budget = content(tmp_path)["budget"] | {"seeds": [0, -1]}
+    with pytest.raises(ConfigError, match="budget.seeds must be at least 0, got -1"):
         study(tmp_path, budget=budget)
 
 
@@ -131,12 +146,17 @@ def test_another_budget_needs_another_folder(
         joined_plan(path, plan_content(study(tmp_path, budget=budget), {}))
 
 
-def test_seeds_may_be_added(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("seeds", "expected"), [([0, 1, 2], [0, 1, 2]), ([0], [0, 1]), ([5, 3], [0, 1, 3, 5])]
+)
+def test_seeds_may_be_added_and_none_is_forgotten(
+    tmp_path: Path, seeds: list[int], expected: list[int]
+) -> None:
     path = tmp_path / "plan.json"
     path.write_text(json.dumps(plan_content(study(tmp_path), {})))
-    budget = content(tmp_path)["budget"] | {"seeds": [0, 1, 2]}
+    budget = content(tmp_path)["budget"] | {"seeds": seeds}
     joined = joined_plan(path, plan_content(study(tmp_path, budget=budget), {}))
-    assert joined["budget"]["seeds"] == [0, 1, 2]
+    assert joined["budget"]["seeds"] == expected
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"budget": 1}'])

@@ -13,25 +13,25 @@ from experiments.progress import StudyProgress, bound
 pytestmark = pytest.mark.fast
 
 
-def job(folder: Path, *overrides: str) -> Job:
-    return Job("square, seed 0", ("x",), folder, (), folder / "result.json", overrides)
+def job(folder: Path, **settings: object) -> Job:
+    return Job("square, seed 0", ("x",), folder, folder / "result.json", None, settings)
 
 
 @pytest.mark.parametrize(
-    ("overrides", "expected"),
+    ("settings", "expected"),
     [
-        (("a=1", "max_updates=20"), ("updates", 20)),
-        (("max_episodes=500", "max_updates=0"), ("episodes", 500)),
-        (("max_updates=1e6",), ("updates", None)),
-        (("agent.hindsight=[{strategy:near,angle:0.5}]",), ("updates", None)),
+        ({"max_episodes": 0, "max_updates": 20}, ("updates", 20)),
+        ({"max_episodes": 500, "max_updates": 0}, ("episodes", 500)),
+        ({"max_updates": 0}, ("updates", None)),
+        ({}, ("updates", None)),
     ],
 )
-def test_what_ends_a_training(tmp_path: Path, overrides: tuple[str, ...], expected: object) -> None:
-    assert bound(job(tmp_path, *overrides)) == expected
+def test_what_ends_a_training(tmp_path: Path, settings: dict[str, int], expected: object) -> None:
+    assert bound(job(tmp_path, **settings)) == expected
 
 
 def test_a_test_has_no_bound(tmp_path: Path) -> None:
-    assert bound(replace(job(tmp_path), overrides=None)) == ("updates", None)
+    assert bound(replace(job(tmp_path, max_updates=20), trains=False)) == ("updates", None)
 
 
 def shown(folder: Path, curve: str | None, terminal: bool) -> str:
@@ -40,7 +40,7 @@ def shown(folder: Path, curve: str | None, terminal: bool) -> str:
         (folder / "curve.jsonl").write_text(curve)
     console = Console(file=io.StringIO(), force_terminal=terminal, width=120)
     with StudyProgress(console, total=12, done=2) as progress:
-        running = job(folder, "max_updates=2000")
+        running = job(folder, max_updates=2000)
         progress.started(running)
         progress.look([running])
         progress.finished(running, {"mean_reward": 0.5, "angle_error_deg_median": 2.0})

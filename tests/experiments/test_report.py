@@ -93,9 +93,9 @@ def test_scores_of_an_experiment(page: str) -> None:
 def test_effort_of_an_experiment(page: str) -> None:
     text = part(page, "fig4")
     paper, ours = cells(text, "MHA (paper)")[1], cells(text, "ours")[1]
-    assert paper[0] == "1,500"
-    assert paper[2] == "24.20° (23.80° to 25.00°)"
-    assert paper[3:] == ["0.0005", "20,640", "2,000", "1.0 (0.9 to 1.1)"]
+    assert paper[0] == "0.75 after 1,500"
+    assert paper[3] == "24.20° (23.80° to 25.00°)"
+    assert paper[4:] == ["0.0005", "20,640", "2,000", "1.0 (0.9 to 1.1)"]
     assert ours[0] == "-"
 
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments.report.markdown import ANGLE, MINUTES, REWARD
-from experiments.report.numbers import GRID, band, plateau_after, points, spread, thinned
+from experiments.report.numbers import GRID, band, first_at_least, points, spread, thinned
 from experiments.report.study import Seed
 from tests.experiments.builders import learning_curve, result
 
@@ -77,15 +77,13 @@ def test_points_without_a_value_are_left_out() -> None:
 
 
 @pytest.mark.parametrize(
-    ("final", "expected"), [(0.75, 300), (0.761, 400), (0.9, None), (None, None)]
+    ("level", "expected"), [(0.1, 100), (0.735, 300), (0.75, 400), (0.8, None)]
 )
-def test_plateau_is_within_two_hundredths_of_the_final_score(
-    final: float | None, expected: float | None
-) -> None:
+def test_where_a_curve_first_reaches_a_level(level: float, expected: float | None) -> None:
     pairs = [(100, 0.2), (200, 0.6), (300, 0.735), (400, 0.75), (500, 0.74)]
     rows = tuple({"episodes": x, "mean_reward": y} for x, y in pairs)
-    seed = Seed(0, "finished", result(0, final), rows, {})
-    assert plateau_after(seed) == expected
+    seed = Seed(0, "finished", result(0, 0.75), rows, {})
+    assert first_at_least(seed, level) == expected
 
 
 @given(st.integers(0, 300), st.integers(2, 80))

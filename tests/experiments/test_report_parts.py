@@ -149,6 +149,14 @@ def test_sweeps_over_noise_and_actions(tmp_path: Path) -> None:
             "tangram-experiment experiment=[all] run_dir='my runs' jobs=2",
             "tangram-experiment experiment=[fig4] budget=laptop 'run_dir=my runs' jobs=2",
         ),
+        (
+            "tangram-experiment experiments.fig4.tests=[a] experiments.fig5.tests=[]",
+            "tangram-experiment experiment=[fig4] budget=laptop 'experiments.fig4.tests=[a]'",
+        ),
+        (
+            "tangram-experiment 'budget.overrides.all=[a=1,b=2]'",
+            "tangram-experiment experiment=[fig4] budget=laptop 'budget.overrides.all=[a=1,b=2]'",
+        ),
         ("tangram-experiment dry=true", "tangram-experiment experiment=[fig4] budget=laptop"),
         ("it's broken", "tangram-experiment experiment=[fig4] budget=laptop"),
     ],
