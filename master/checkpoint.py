@@ -21,19 +21,28 @@ from tangram_sim.errors import RunError
 
 
 def check_resumable(folder: Path, resolved: Mapping[str, Any]) -> None:
-    """Refuse another task before anything of the run is overwritten.
+    """Refuse another task, or a warm start from nowhere, before anything is overwritten.
 
     Raises:
-        RunError: the newest checkpoint was made with other tokens, sim, reward or net.
+        RunError: the newest checkpoint was made with other tokens, sim, reward or net, or there is
+            none, and none in the run that this one is to begin with.
     """
     found = list_checkpoints(folder)
     if not found:
+        _check_warm_start(resolved.get("warm_start"))
         return
     try:
         counters = load_checkpoint(found[-1], stems=[]).counters
     except CorruptError:
         return  # the one before decides, when the run is restored
     check_same_task(make_setup(resolved), counters.get(SETUP, {}))
+
+
+def _check_warm_start(run_dir: str | None) -> None:
+    if run_dir is not None and not list_checkpoints(Path(run_dir) / CHECKPOINTS):
+        raise RunError(
+            f"warm_start={run_dir} has no checkpoint: name the folder of a run that was trained"
+        )
 
 
 def save_run(

@@ -9,7 +9,18 @@ import pytest
 
 pytestmark = pytest.mark.cluster
 
-COMMANDS = ("tangram-train", "tangram-master", "tangram-worker", "tangram-eval", "tangram-play")
+COMMANDS = (
+    *("tangram-train", "tangram-master", "tangram-worker", "tangram-eval", "tangram-play"),
+    *("tangram-experiment", "tangram-report"),
+)
+    "tangram-train",
+    "tangram-master",
+    "tangram-worker",
+    "tangram-eval",
+    "tangram-play",
+    "tangram-experiment",
+    "tangram-report",
+)
 WITH_GROUPS = COMMANDS[:3]
 LIMIT_S = 60
 
@@ -65,6 +76,10 @@ WRONG = [
     ("tangram-train run_dir=", "run_dir must name a folder"),
     ("tangram-master +sim.colour=1", 'can not match "colour"'),
     ("tangram-master from_config=nowhere.yaml", "from_config=nowhere.yaml: No such file"),
+    ("tangram-train reward.name=os:getcwd", "reward.name=os:getcwd failed: TypeError"),
+    ("tangram-master reward.name=os:getcwd", "reward.name=os:getcwd failed: TypeError"),
+    ("tangram-worker connect=tcp://127.0.0.1:1 reward.name=os:getcwd", "failed: TypeError"),
+    ("tangram-train tokens.shapes=[square,square,square] tokens.scale=2.2", "no room for token"),
     ("tangram-worker", "say which master: connect=tcp://host:port"),
     ("tangram-worker connect=tcp://127.0.0.1:1 role=judge", "role must be one of player, evalu"),
     ("tangram-eval", "say which run: run_dir=runs/..."),

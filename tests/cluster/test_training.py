@@ -177,3 +177,20 @@ def test_every_agent_trains_through_the_same_path(tmp_path: Path, agent: str) ->
     result = json.loads((folder / "result.json").read_text())
     assert (result["agent"], result["updates"]) == (agent, 20)
     assert result["parameters"] == {"paper": 504_324, "mlp": 13_508}[agent]
+
+
+def test_a_warm_start_begins_with_another_runs_networks_once(trained: Path) -> None:
+    """The folder is named as seen from where the command is given, and shapes may differ."""
+    folder = trained.parent / "warm"
+    arguments = (f"run_dir={folder}", *QUICK, "tokens=large_triangle", f"warm_start={trained.name}")
+    told = run("tangram-train", *arguments, "max_updates=5", cwd=trained.parent)
+    updates = json.loads((trained / "result.json").read_text())["updates"]
+    assert f"begins with the networks of {trained} after {updates} updates" in told
+    again = run("tangram-train", *arguments, "max_updates=9", "resume=auto", cwd=trained.parent)
+    assert "begins with the networks" not in again
+    assert "goes on after 5 updates" in again
+
+
+def test_a_warm_start_from_nowhere_is_refused(tmp_path: Path) -> None:
+    line = refused("tangram-train", "run_dir=x", *QUICK, "warm_start=nowhere", cwd=tmp_path)
+    assert line.startswith(f"tangram-train: warm_start={tmp_path / 'nowhere'} has no checkpoint")

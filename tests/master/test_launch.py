@@ -23,6 +23,7 @@ from master.config import LaunchConfig, MasterConfig
 from master.launch import Launcher, master_arguments, run_training
 from master.rundir import RunFolder
 from master.signals import SIGNALS, StopSignals, heeded
+from tangram_agent.setup import from_mapping
 from tangram_sim.errors import ConfigError
 
 LIMIT_S = 30.0
@@ -57,7 +58,8 @@ def test_any_path_is_read_back_from_an_override(value: str) -> None:
 
 @pytest.mark.fast
 def test_the_master_gets_its_settings(tmp_path: Path) -> None:
-    master = MasterConfig(str(tmp_path), seed=3, max_hours=0.5, max_updates=7, resume="auto")
+    bounds = {"max_hours": 0.5, "max_updates": 7, "resume": "auto", "warm_start": "a b"}
+    master = from_mapping(MasterConfig, {"run_dir": str(tmp_path), "seed": 3, **bounds})
     arguments = master_arguments(LaunchConfig(2, master), RunFolder(tmp_path))
     assert arguments == [
         "-P",
@@ -70,6 +72,7 @@ def test_the_master_gets_its_settings(tmp_path: Path) -> None:
         "max_episodes=0",
         "max_updates=7",
         "resume=auto",
+        "warm_start='a b'",
     ]
 
 

@@ -2,6 +2,7 @@
 
 from contextlib import closing
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from tangram_sim.sampling import sample_poses
 from tangram_sim.seeding import episode_generator
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.worker.builders import policy
+from worker.baselines import position_policy
 from worker.rollout import Rollout, join_episodes, join_played, play, split_episodes
 
 pytestmark = pytest.mark.fast
@@ -136,3 +138,32 @@ def test_joined_groups_are_cut_to_the_number_asked_for(camera: bool) -> None:
     assert len(whole.overlap) == len(whole.starts) == len(whole.goals) == 4
     np.testing.assert_array_equal(whole.corners[3], groups[1].corners[0])
     assert (whole.camera is None) == (not camera)
+
+
+def test_the_policy_sees_noise_and_that_is_what_travels() -> None:
+    made = setup(corner_noise=0.02)
+    seen: list[np.ndarray] = []
+
+    def choose(corners: np.ndarray, _placed: object, goals: np.ndarray, _generators: object) -> Any:
+        seen.extend([corners.copy(), goals.copy()])
+        return np.zeros((4, 3), np.float32)
+
+    with closing(BatchedEnv(made.layout, made.sim, made.reward, 4)) as env:
+        played = play(env, choose, [np.random.default_rng(i) for i in range(4)])
+    episodes = played.episodes()
+    np.testing.assert_array_equal(episodes.corners[:, 0], seen[0].astype(np.float32))
+    np.testing.assert_array_equal(episodes.goals, seen[1].astype(np.float32))
+    for noisy, exact in ((episodes.corners, played.corners), (episodes.goals, played.goals)):
+        assert 0.02 < np.abs(noisy - exact).max() <= 4 * 0.02 * made.sim.arena + 1e-6
+
+
+def test_noise_does_not_change_starts_and_targets() -> None:
+    played = []
+    for noise in (0.0, 0.05):
+        made = setup(corner_noise=noise)
+        with closing(BatchedEnv(made.layout, made.sim, made.reward, 4)) as env:
+            generators = [np.random.default_rng(i) for i in range(4)]
+            played.append(play(env, position_policy(made.layout, made.sim.arena), generators))
+    np.testing.assert_array_equal(played[0].starts, played[1].starts)
+    np.testing.assert_array_equal(played[0].goals, played[1].goals)
+    assert played[1].overlap.mean() < played[0].overlap.mean()

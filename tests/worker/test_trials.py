@@ -11,7 +11,7 @@ from tests.agent.builders import PAIR, SQUARE, setup
 from tests.worker.builders import policy
 from worker.baselines import position_policy, random_policy
 from worker.rollout import Played
-from worker.trials import Trials, greedy, with_actions
+from worker.trials import Trials, greedy, with_actions, with_corner_noise
 
 pytestmark = pytest.mark.fast
 
@@ -124,3 +124,18 @@ def test_the_number_of_actions_can_be_another_than_in_training() -> None:
     assert longer.horizon == 5
     with closing(Trials(replace(longer, sim=replace(longer.sim, pixels=16)), 2, 2)) as trials:
         assert trials.play(greedy(policy(made))).actions.shape == (2, 5, 3)
+
+
+def test_the_noise_can_be_another_than_in_training() -> None:
+    made = setup(pixels=16)
+    assert with_corner_noise(made, None) is made
+    noisy = with_corner_noise(made, 0.05)
+    assert noisy.sim.corner_noise == 0.05
+    scores = []
+    for tested in (made, noisy, with_corner_noise(noisy, 0.0)):
+        with closing(Trials(tested, 50, 50)) as trials:
+            found = trials.play(position_policy(made.layout, made.sim.arena))
+            scores.append(trials.scores(found)["position_error_median"])
+    assert scores[0] == scores[2] == pytest.approx(0.0, abs=1e-6)
+    # the mean of four corners, of token and target each: 0.1 * sqrt(2 / 4), in the plane
+    assert scores[1] == pytest.approx(0.1 * np.sqrt(0.5) * np.sqrt(2 * np.log(2)), rel=0.3)
