@@ -212,7 +212,7 @@ def test_wrong_run_config_is_refused(tmp_path: Path, content: bytes | None, mess
 def test_examples_of_the_help_compose(primary: str) -> None:
     text = help_text(primary)
     examples = [line.split() for line in text.partition("Examples:")[2].strip().splitlines()]
-    assert len(examples) >= 2
+    assert len(examples) == 3
     for command, *overrides in examples:
         assert command == text.split()[0]
         compose(primary, *overrides)
