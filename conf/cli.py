@@ -14,7 +14,7 @@ from typing import Any
 
 import yaml
 
-from conf.help import Plain, command_name, help_text, setting_names
+from conf.help import Plain, choices, command_name, help_text, setting_names
 from tangram_sim.errors import ConfigError, TangramError
 
 USAGE_STATUS = 2
@@ -235,9 +235,10 @@ def _explain(error: Exception, config_name: str) -> str:
     """What is wrong with the command line and what to write instead."""
     from hydra.errors import MissingConfigException, OverrideParseException
 
-    if isinstance(error, MissingConfigException) and error.options:
+    if isinstance(error, MissingConfigException):
         group, _, name = str(error.missing_cfg_file).rpartition("/")
-        return f"unknown {group} '{name}': choose from {', '.join(error.options)}"
+        known = error.options or choices(group)
+        return f"unknown {group} '{name}': choose from {', '.join(known)}"
     if isinstance(error, OverrideParseException):
         return f"cannot read '{error.override}': write name=value, and quote texts with '...'"
     if "Ambiguous value" in str(error):

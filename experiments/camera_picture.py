@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from experiments.report.style import COLOURS, WIDTH_IN
-from experiments.scenes import FRAME, bare, new_picture
+from experiments.report.style import COLOURS, WIDTH_IN, empty_figure
+from experiments.scenes import FRAME, bare
 from tangram_sim.arrays import Floats, Pixels
 from tangram_sim.batch import velocities
 from tangram_sim.config import SimConfig
@@ -46,7 +46,7 @@ class Shots:
 def draw_camera() -> tuple[Figure, str]:
     """The four panels of Fig. 3, and what they show."""
     shots = take_shots()
-    figure = new_picture(WIDTH_IN, WIDTH_IN * 0.28)
+    figure = empty_figure(WIDTH_IN, WIDTH_IN * 0.28)
     panels = figure.subplots(1, 4)
     pictures = (shots.target, shots.start, shots.end)
     labels = ("(a) target", "(b) initial position", "(c) after action a")

@@ -12,8 +12,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Rectangle
 
-from experiments.report.style import COLOURS, GREY, WIDTH_IN
-from experiments.scenes import bare, new_picture
+from experiments.report.style import COLOURS, GREY, WIDTH_IN, empty_figure
+from experiments.scenes import bare
 from tangram_agent.attention import GraphEncoder
 from tangram_agent.config import NetConfig
 from tangram_agent.networks import initialise
@@ -34,7 +34,7 @@ def draw_graph() -> tuple[Figure, str]:
     layout = make_layout(TOKENS)
     corners, goal = (layout.corners(np.array([pose])) for pose in (TOKEN_POSE, TARGET_POSE))
     features = layout.node_features(corners, np.zeros(1, np.bool_), goal)
-    figure = new_picture(WIDTH_IN, WIDTH_IN * 0.5)
+    figure = empty_figure(WIDTH_IN, WIDTH_IN * 0.5)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.0, 1.45), height_ratios=(0.8, 1.2))
     _draw_scene(figure.add_subplot(grid[:, 0]), layout, features)
     _draw_stages(figure.add_subplot(grid[0, 1]), layout, features)

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 
 from experiments.camera_picture import draw_camera
 from experiments.graph_picture import draw_graph
-from experiments.report.style import WIDTH_IN, drawing
-from experiments.scenes import draw_tokens, new_picture, save_picture, show_arena
+from experiments.report.style import WIDTH_IN, drawing, empty_figure, save
+from experiments.scenes import draw_tokens, show_arena
 from tangram_sim.config import SimConfig
 from tangram_sim.puzzles import Puzzle, load_puzzle
 from tangram_sim.sampling import sample_poses
@@ -38,7 +38,7 @@ def draw_paper_pictures(out: Path) -> list[tuple[str, str, str]]:
             ("fig2_graph", "Fig. 2: the graph of a single token", draw_graph()),
             ("fig3_camera", "Fig. 3: what the camera sees", draw_camera()),
         ):
-            save_picture(figure, out / name)
+            save(figure, out, name)
             shown.append((title, f"{name}.png", caption))
     return shown
 
@@ -47,7 +47,7 @@ def draw_puzzle(puzzle: Puzzle) -> tuple[Figure, str]:
     """A puzzle and a random start of its tokens, side by side; and what they are."""
     sim = SimConfig(backend="kinematic", arena=puzzle.arena)
     start = sample_poses(puzzle.layout, sim, np.random.default_rng(START_SEED))
-    figure = new_picture(WIDTH_IN * 0.8, WIDTH_IN * 0.42)
+    figure = empty_figure(WIDTH_IN * 0.8, WIDTH_IN * 0.42)
     panels = figure.subplots(1, 2)
     for panel, poses, label in zip(
         panels, (puzzle.poses, start), ("(a) target", "(b) random start"), strict=True

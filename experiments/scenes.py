@@ -1,39 +1,13 @@
 """Tokens and arenas in matplotlib's panels, for the pictures of the paper, and their files."""
 
-import io
-from pathlib import Path
-
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
-from experiments.report.style import COLOURS, DPI
-from tangram_agent.files import write_whole
+from experiments.report.style import COLOURS
 from tangram_sim.arrays import Floats
 from tangram_sim.layout import Layout
 
 FRAME = "#9CA3AF"
-
-
-def new_picture(width_in: float, height_in: float) -> Figure:
-    """An empty figure of that many inches, without pyplot."""
-    figure = Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def save_picture(figure: Figure, stem: Path) -> None:
-    """Write `<stem>.png` and `<stem>.svg`; the same picture gives the same bytes.
-
-    Raises:
-        RunError: the files cannot be written.
-    """
-    # Names of the program and times would change with every machine and run.
-    for kind, left_out in {"png": ("Software",), "svg": ("Date", "Creator")}.items():
-        data = io.BytesIO()
-        figure.savefig(data, format=kind, metadata=dict.fromkeys(left_out))
-        write_whole(stem.with_name(f"{stem.name}.{kind}"), data.getvalue())
 
 
 def bare(panel: Axes) -> None:

@@ -107,6 +107,13 @@ def drawing() -> Iterator[None]:
         yield
 
 
+def empty_figure(width_in: float, height_in: float) -> Figure:
+    """A figure without panels of that many inches, and without pyplot's global state."""
+    figure = Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
 def new_figure(
     height_in: float, rows: int, columns: int, sharex: bool = False, sharey: bool = False
 ) -> tuple[Figure, list[Axes]]:
@@ -117,8 +124,7 @@ def new_figure(
         sharex: all panels have one range of x.
         sharey: all panels have one range of y.
     """
-    figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = empty_figure(WIDTH_IN, height_in)
     panels = figure.subplots(rows, columns, sharex=sharex, sharey=sharey, squeeze=False)
     for panel in panels.flat:
         panel.grid(axis="both", color="#E5E7EB", linewidth=0.7)
