@@ -1,4 +1,4 @@
-"""Every preset of conf/: each training composes with each budget, and is what its name says."""
+"""Every preset of conf/: each experiment is what its name says."""
 
 from dataclasses import asdict
 from typing import Any
@@ -13,7 +13,6 @@ from tangram_agent.setup import Setup, from_mapping, make_setup
 
 pytestmark = pytest.mark.fast
 
-BUDGETS = choices("budget")
 PAPERS = ["fig4", "table1", "table2", "fig5", "fig6"]
 
 
@@ -38,18 +37,6 @@ def test_the_papers_figures_and_tables_are_the_default() -> None:
     assert list(config.experiments) == PAPERS
     assert config.budget.name == "laptop"
     assert config.budget.seeds == (0, 1, 2)
-
-
-@pytest.mark.parametrize("budget", BUDGETS)
-def test_every_training_composes(budget: str) -> None:
-    """All of them with one budget; with the others those whose nets the budget changes, too."""
-    config = study(budget, choices("experiment"))
-    for name, training in config.trainings.items():
-        own_net = any(text.startswith("net") for text in training.overrides)
-        if not (budget == "laptop" or own_net or name == training.family):
-            continue
-        agent = {"start": "tangram", "mlp_large": "mlp"}.get(training.family, training.family)
-        assert setup_of(config, name).agent.name == agent, name
 
 
 def test_every_training_and_test_of_the_catalogue_is_used() -> None:

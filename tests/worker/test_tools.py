@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import worker.play as play_module
 from tangram_sim.errors import ConfigError, RunError
 from tests.agent.builders import PAIR, setup
 from tests.worker.builders import write_run
@@ -78,8 +79,13 @@ def test_the_number_of_actions_is_written_down(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("episodes", "actions"), [(4, None), (1, 2)])
 def test_an_animation_has_frames_that_move(
-    tmp_path: Path, episodes: int, actions: int | None, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    episodes: int,
+    actions: int | None,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    monkeypatch.setattr(play_module, "FRAMES_PER_ACTION", 6)  # drawing takes its time
     write_run(tmp_path / "run", PAIR)
     out = tmp_path / "film.gif"
     config = PlayConfig(str(tmp_path / "run"), str(out), episodes=episodes, actions=actions)
