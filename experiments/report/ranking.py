@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from experiments.report.markdown import ANGLE, REWARD, Measure
 from experiments.report.numbers import spread
@@ -11,6 +12,7 @@ from experiments.report.references import POSITION, References
 from experiments.report.study import Experiment, Training
 from experiments.report.style import GREY, LEVEL, Look, legend_below, new_figure, widen
 
+TICKS = 5
 MEASURES = (REWARD, ANGLE)
 
 
@@ -32,6 +34,8 @@ def draw_ranking(
         if measure is ANGLE:
             widen(panel, "x", [*values, *(one for one in positions if one is not None)])
         panel.set_xlabel(measure.axis)
+        if panel.get_xscale() == "linear":
+            panel.xaxis.set_major_locator(MaxNLocator(TICKS))  # more run into each other
         panel.grid(axis="y", visible=False)
     panels[0].set_yticks(range(len(known)), [one.label for one in known])
     panels[0].set_ylim(len(known) - 0.4, -0.6)
