@@ -22,7 +22,6 @@ from master.result import commit, processor, versions
 from master.rundir import RunFolder
 from master.signals import heeded
 from tangram_agent.files import write_whole
-from tangram_sim.errors import ConfigError
 
 LOOK_S = 0.5
 # A training that is asked to end writes its checkpoint first.
@@ -55,20 +54,11 @@ def run_study(config: StudyConfig, resolved: Mapping[str, Mapping[str, Any]]) ->
             console.print(job.name, highlight=False)
         console.print(f"{len(missing)} of {len(jobs)} jobs to do in {study.path}", highlight=False)
         return 0
-    _make(study.path)
+    study.prepare("auto")
     with study.lock():
         write_whole(study.path / PLAN, _json(plan))
         with StudyProgress(console, len(jobs), len(jobs) - len(missing)) as progress:
             return Runner(missing, config.jobs, progress).run()
-
-
-def _make(path: Path) -> None:
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(
-            f"run_dir {path} cannot be made ({error.strerror}): choose another run_dir"
-        ) from None
 
 
 def _source() -> dict[str, object]:
