@@ -15,7 +15,23 @@ LIMIT_S = 60.0
 
 def run(command: str, *arguments: str, cwd: Path, limit_s: float = LIMIT_S) -> str:
     """Run a command to its end and return what it printed; a failure shows that."""
-    done = subprocess.run(
+    done = _ended(command, *arguments, cwd=cwd, limit_s=limit_s)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def refused(command: str, *arguments: str, cwd: Path) -> str:
+    """Run a command that must refuse; the one line that it says."""
+    done = _ended(command, *arguments, cwd=cwd, limit_s=LIMIT_S)
+    assert done.returncode == 2, done.stdout + done.stderr
+    (line,) = done.stderr.splitlines()
+    return line
+
+
+def _ended(
+    command: str, *arguments: str, cwd: Path, limit_s: float
+) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
         [BIN / command, *arguments],
         cwd=cwd,
         capture_output=True,
@@ -23,23 +39,6 @@ def run(command: str, *arguments: str, cwd: Path, limit_s: float = LIMIT_S) -> s
         timeout=limit_s,
         check=False,
     )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
-
-
-def refused(command: str, *arguments: str, cwd: Path) -> str:
-    """Run a command that must refuse; the one line that it says."""
-    done = subprocess.run(
-        [BIN / command, *arguments],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        timeout=LIMIT_S,
-        check=False,
-    )
-    assert done.returncode == 2, done.stdout + done.stderr
-    (line,) = done.stderr.splitlines()
-    return line
 
 
 @contextmanager
