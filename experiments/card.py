@@ -1,5 +1,6 @@
 """The card of an agent that comes with the package: what it is, what made it, what it can do."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -9,6 +10,9 @@ from tangram_agent.setup import Setup
 from worker.evaluate import RUN
 
 Scores = Mapping[str, float]
+
+# What result.json says of a run's effort, for the card.
+_BUDGET = ("updates", "train_s", "wall_s", "cores", "processor", "device", "workers")
 
 # Scores of the card's tables: name -> label, digits.
 _ROWS = {
@@ -43,29 +47,15 @@ def make_card(
         "format": FORMAT,
         "name": name,
         "licence": "MIT",
-        "task": {
-            "tokens": [shape.name for shape in setup.layout.shapes],
-            "token_areas": [round(shape.area, 9) for shape in setup.layout.shapes],
-            "scale": setup.tokens.scale,
-            "arena": setup.sim.arena,
-            "actions_per_token": setup.sim.actions_per_token,
-            "backend": setup.sim.backend,
-        },
+        "task": _task(setup),
         "agent": setup.agent.name,
         "net": setup.net.kind,
-        "parameters": {
-            "acting": _numbers(setup),
-            "trained": result["parameters"],
-        },
+        "parameters": {"acting": _numbers(setup), "trained": result["parameters"]},
         "data": {
             "source": f"simulated by this project ({setup.sim.backend}), random starts and targets",
-            "episodes": result["episodes"],
-            "transitions": result["transitions"],
+            **{key: result[key] for key in ("episodes", "transitions")},
         },
-        "budget": {
-            key: result[key]
-            for key in ("updates", "train_s", "wall_s", "cores", "processor", "device", "workers")
-        },
+        "budget": {key: result[key] for key in _BUDGET},
         "updates": result["updates"],
         "seed": result["seed"],
         "selection": "median of the seeds by final mean_reward (the lower one of two)",
@@ -80,15 +70,20 @@ def make_card(
     }
 
 
+def _task(setup: Setup) -> dict[str, Any]:
+    return {
+        "tokens": [shape.name for shape in setup.layout.shapes],
+        "token_areas": [round(shape.area, 9) for shape in setup.layout.shapes],
+        "scale": setup.tokens.scale,
+        "arena": setup.sim.arena,
+        "actions_per_token": setup.sim.actions_per_token,
+        "backend": setup.sim.backend,
+    }
+
+
 def _numbers(setup: Setup) -> int:
     """Trainable numbers of the acting actor."""
-    total = 0
-    for shape in Policy(setup).shapes.values():
-        size = 1
-        for length in shape:
-            size *= length
-        total += size
-    return total
+    return sum(math.prod(shape) for shape in Policy(setup).shapes.values())
 
 
 def _limits(setup: Setup, scores: Scores) -> list[str]:
@@ -110,42 +105,52 @@ def _limits(setup: Setup, scores: Scores) -> list[str]:
 
 def card_text(card: Mapping[str, Any]) -> str:
     """card.md: the same for people."""
-    task, name = card["task"], f"{PREFIX}/{card['name']}"
-    tokens = ", ".join(task["tokens"])
+    lines = [
+        f"# {PREFIX}/{card['name']}",
+        "",
+        _about(card),
+        "",
+        *_usage(card["name"]),
+        *_training(card),
+        *_evaluation(card),
+        "## Limits",
+        "",
+        *(f"- {limit}" for limit in card["limits"]),
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _about(card: Mapping[str, Any]) -> str:
+    task = card["task"]
     areas = ", ".join(f"{area:g}" for area in task["token_areas"])
     actions = task["actions_per_token"]
-    return "\n".join(
-        [
-            f"# {name}",
-            "",
-            f"An agent that moves a tangram token ({tokens}; area {areas}) from anywhere in a "
-            f"square arena of width {task['arena']:g} onto its target, position and angle, in "
-            f"{actions} action{'s' * (actions > 1)}. Agent `{card['agent']}`, network "
-            f"`{card['net']}` with {card['parameters']['acting']:,} parameters. "
-            f"Licence: {card['licence']}.",
-            "",
-            "## How to use it",
-            "",
-            "```bash",
-            f"tangram-eval run_dir={name} episodes=400 seed=1",
-            f"tangram-play run_dir={name} out={card['name']}.gif",
-            "```",
-            "",
-            "```python",
-            "from tangram_agent.runs import load_run",
-            "",
-            f'run = load_run("{name}")',
-            "actions = run.policy.act(corners, placed, goals)  # see docs/inference.md",
-            "```",
-            "",
-            *_training(card),
-            *_evaluation(card),
-            "## Limits",
-            "",
-            *(f"- {limit}" for limit in card["limits"]),
-            "",
-        ]
+    return (
+        f"An agent that moves a tangram token ({', '.join(task['tokens'])}; area {areas}) from "
+        f"anywhere in a square arena of width {task['arena']:g} onto its target, position and "
+        f"angle, in {actions} action{'s' * (actions > 1)}. Agent `{card['agent']}`, network "
+        f"`{card['net']}` with {card['parameters']['acting']:,} parameters. "
+        f"Licence: {card['licence']}."
     )
+
+
+def _usage(name: str) -> list[str]:
+    return [
+        "## How to use it",
+        "",
+        "```bash",
+        f"tangram-eval run_dir={PREFIX}/{name} episodes=400 seed=1",
+        f"tangram-play run_dir={PREFIX}/{name} out={name}.gif",
+        "```",
+        "",
+        "```python",
+        "from tangram_agent.runs import load_run",
+        "",
+        f'run = load_run("{PREFIX}/{name}")',
+        "actions = run.policy.act(corners, placed, goals)  # see docs/inference.md",
+        "```",
+        "",
+    ]
 
 
 def _training(card: Mapping[str, Any]) -> list[str]:

@@ -109,19 +109,17 @@ def _draw_stages(panel: Axes, layout: Layout, features: Floats) -> None:
     _arrow(panel, 1.12, 1.7, "Eq. 8")
     _arrow(panel, 2.92, 3.5, f"${NET.layers} \\times$\nEqs. 9-13")
     _arrow(panel, 4.72, 5.15, "base")
-    panel.add_patch(
-        FancyBboxPatch(
-            (5.28, 0.16),
-            0.72,
-            0.68,
-            "round,pad=0.04",
-            facecolor="#ECFDF5",
-            edgecolor=CLASS_COLOURS[1],
-        )
-    )
+    _draw_action(panel)
+    panel.set_title("message passing", loc="left", weight="bold")
+
+
+def _draw_action(panel: Axes) -> None:
+    """A box with the three velocities."""
+    box = FancyBboxPatch((5.28, 0.16), 0.72, 0.68, "round,pad=0.04", facecolor="#ECFDF5")
+    box.set_edgecolor(CLASS_COLOURS[1])
+    panel.add_patch(box)
     panel.text(5.64, 0.5, "$v_x$\n$v_y$\n$\\omega$", ha="center", va="center", fontsize=8.5)
     panel.text(5.64, -0.22, "action\n3", ha="center", va="top", fontsize=8)
-    panel.set_title("message passing", loc="left", weight="bold")
 
 
 def _in_unit_square(positions: Floats) -> Floats:

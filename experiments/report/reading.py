@@ -52,7 +52,6 @@ def _study(folder: Path, plan: Record) -> Study:
         for name, record in plan.records("trainings").items()
     }
     return Study(
-        folder=folder,
         plan=plan.content,
         command=plan.text("command"),
         commit=plan.maybe_text("commit"),

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from pathlib import Path
 
 from experiments.report.records import Row
 
@@ -120,7 +119,6 @@ class Study:
     """A folder of tangram-experiment that was read.
 
     Attributes:
-        folder: where it lies.
         plan: content of plan.json.
         command: that made it.
         commit: of the source tree that planned it, or None.
@@ -132,7 +130,6 @@ class Study:
         tests: in the plan's order.
     """
 
-    folder: Path
     plan: Row
     command: str
     commit: str | None

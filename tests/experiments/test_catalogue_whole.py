@@ -8,6 +8,8 @@ from tests.experiments.test_catalogue import setup_of, study
 pytestmark = pytest.mark.slow
 
 BUDGETS = choices("budget")
+# The agent of each family that is not called like its agent.
+AGENTS = {"start": "tangram", "matched": "tangram", "mlp_large": "mlp"}
 
 
 @pytest.mark.parametrize("budget", BUDGETS)
@@ -18,5 +20,5 @@ def test_every_training_composes(budget: str) -> None:
         own_net = any(text.startswith("net") for text in training.overrides)
         if not (budget == "laptop" or own_net or name == training.family):
             continue
-        agent = {"start": "tangram", "mlp_large": "mlp"}.get(training.family, training.family)
+        agent = AGENTS.get(training.family, training.family)
         assert setup_of(config, name).agent.name == agent, name
