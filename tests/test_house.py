@@ -54,15 +54,6 @@ def test_import_contracts_catch_every_wrong_arrow(tmp_path: Path) -> None:
     assert f"0 kept, {len(contracts['contracts'])} broken" in result.stdout, result.stdout
 
 
-def test_master_and_registration_never_load_the_engine() -> None:
-    loaded = run_python(
-        "import gymnasium, master.cli, master.launch, master.loop, tangram_sim.register, sys\n"
-        "assert 'Tangram-v0' in gymnasium.registry\n"
-        "print([name for name in sys.modules if name.startswith('pybullet')])"
-    )
-    assert loaded == "[]"
-
-
 def test_command_lines_load_nothing_heavy() -> None:
     loaded = run_python(
         "import experiments.cli, experiments.report.cli, master.cli, worker.cli, sys\n"
@@ -98,19 +89,3 @@ def test_every_file_of_conf_is_package_data() -> None:
     ]["conf"]
     packed = {path for pattern in patterns for path in (ROOT / "conf").glob(pattern)}
     assert packed == set((ROOT / "conf").rglob("*.yaml"))
-
-
-# Tiers
-
-
-@pytest.mark.parametrize(
-    ("marks", "status"),
-    [("", 4), ("@pytest.mark.fast", 0), ("@pytest.mark.fast\n@pytest.mark.slow", 4)],
-)
-def test_each_test_carries_one_tier(tmp_path: Path, marks: str, status: int) -> None:
-    (tmp_path / "test_it.py").write_text(f"import pytest\n\n{marks}\ndef test_it(): pass\n")
-    options = ["-p", "tests.conftest", "-p", "no:cacheprovider", "-c", "pyproject.toml"]
-    result = run([sys.executable, "-m", "pytest", *options, f"--rootdir={tmp_path}", str(tmp_path)])
-    assert result.returncode == status, result.stdout + result.stderr
-    if status:
-        assert "test_it.py::test_it must carry exactly one of the markers" in result.stderr

@@ -1,6 +1,5 @@
 """Every preset of conf/: each experiment is what its name says."""
 
-from dataclasses import asdict
 from typing import Any
 
 import hydra
@@ -50,66 +49,6 @@ def test_every_training_and_test_of_the_catalogue_is_used() -> None:
 def test_each_experiment_can_be_chosen_alone(name: str) -> None:
     (only,) = study("smoke", [name]).experiments
     assert only == name
-
-
-# What each row of an ablation changes, seen from the first row of its table.
-CHANGES = {
-    "tangram": {
-        "tangram_no_penalty": {"agent.saturation_penalty"},
-        "tangram_late_penalty": {"agent.saturation_limit"},
-        "tangram_arena_frame": {"agent.egocentric"},
-        "tangram_no_offsets": {"agent.offsets"},
-        "tangram_no_orientation": {"agent.orientation"},
-        "tangram_plain_head": {"agent.angle_head"},
-        "tangram_no_afterstate": {"agent.afterstate"},
-        "tangram_no_near": {"agent.hindsight"},
-        "tangram_no_hindsight": {"agent.hindsight"},
-        "tangram_no_decay": {"agent.lr_decay"},
-        "tangram_no_average": {"agent.acting_average"},
-        "tangram_tanh": {"agent.squash", "agent.saturation_limit"},
-        "tangram_all_edges": {"agent.edges"},
-        "tangram_mlp": {"net.kind"},
-        "tangram_mlp_large": {"net.kind", "net.hidden"},
-    },
-    "paper": {
-        "paper_literal": {"agent.saturation_penalty"},
-        "paper_egocentric": {"agent.egocentric"},
-        "paper_offsets": {"agent.offsets"},
-        "paper_orientation": {"agent.orientation"},
-        "paper_clamp": {"agent.squash"},
-        "paper_kfold": {"agent.angle_head"},
-        "paper_afterstate": {"agent.afterstate"},
-        "paper_near": {"agent.hindsight"},
-        "paper_no_hindsight": {"agent.hindsight"},
-        "paper_decay": {"agent.lr_decay", "agent.lr_final"},
-        "paper_all_edges": {"agent.edges"},
-        "paper_mlp": {"net.kind"},
-    },
-}
-MHA_ONLY = {"net.width", "net.layers", "net.feed_forward", "net.scale"}  # an MLP has none of them
-
-
-@pytest.mark.parametrize("reference", ["tangram", "paper"])
-def test_an_ablation_changes_what_its_label_says(reference: str) -> None:
-    config = study("laptop", [f"ablation_{reference}"])
-    (experiment,) = config.experiments.values()
-    assert experiment.trainings == (reference, *CHANGES[reference])
-    first = setup_of(config, reference)
-    for name, expected in CHANGES[reference].items():
-        found = changes(first, setup_of(config, name))
-        assert (found - MHA_ONLY if "net.kind" in found else found) == expected, name
-        assert config.trainings[name].family == reference
-
-
-def changes(one: Setup, other: Setup) -> set[str]:
-    """The settings in which two setups differ."""
-    ours, theirs = asdict(one), asdict(other)
-    return {
-        f"{section}.{key}"
-        for section, values in ours.items()
-        for key in values
-        if values[key] != theirs[section][key]
-    }
 
 
 def test_the_papers_budget_is_the_papers() -> None:

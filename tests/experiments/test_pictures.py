@@ -13,7 +13,7 @@ from experiments.pictures import draw_paper_pictures
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import make_layout
 
-pytestmark = pytest.mark.fast
+pytestmark = pytest.mark.slow
 
 
 def test_three_pictures_with_titles_and_captions_twice_the_same(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ from tests.experiments.builders import (
     write_study,
 )
 
-pytestmark = pytest.mark.fast
+pytestmark = pytest.mark.slow
 
 FIGURES = {
     "fig4": (1440, 624),

@@ -215,27 +215,3 @@ def test_an_impossible_layout_is_told_at_reset() -> None:
     env = kinematic(arena=0.4)
     with pytest.raises(SamplingError, match=r"raise sim\.arena"):
         env.reset(seed=0)
-
-
-def test_stable_baselines3_runs_unchanged(made: list[Any]) -> None:
-    pytest.importorskip("torch").set_num_threads(1)
-    sb3 = pytest.importorskip("stable_baselines3", reason="pip install '.[sb3]'")
-    env = gymnasium.make(ENV_ID, shapes=["square", "small_triangle"], actions_per_token=2)
-    made.append(env)
-    model = sb3.DDPG(
-        "MultiInputPolicy",
-        env,
-        replay_buffer_class=sb3.HerReplayBuffer,
-        replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "future"},
-        learning_starts=40,
-        batch_size=32,
-        policy_kwargs={"net_arch": [32]},
-        seed=0,
-        device="cpu",
-    )
-    model.learn(240)
-    assert model.num_timesteps >= 240
-    assert model._n_updates > 100
-    observation, _ = env.reset(seed=0)
-    action, _ = model.predict(observation, deterministic=True)
-    assert env.action_space.contains(action)

@@ -26,29 +26,6 @@ def compared(folder: Path, *names: str, **more: object) -> PlayConfig:
     return PlayConfig(compare=runs, **settings)
 
 
-def test_two_agents_move_side_by_side(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_run(tmp_path / "first")
-    write_run(tmp_path / "second", agent=PLAIN_AGENT)
-    assert compare_runs(compared(tmp_path, "first", "second", episodes=1)) == 0
-    printed = capsys.readouterr().out
-    assert f"{tmp_path / 'both.gif'}: 1 episodes; first: mean raw overlap 0." in printed
-    assert "; second: mean raw overlap 0." in printed
-    with Image.open(tmp_path / "both.gif") as film:
-        assert film.n_frames > 10
-        assert film.width > film.height
-        left, right = halves(film)
-        film.seek(film.n_frames - 1)
-        last = halves(film)
-        assert (last[0] != left).any()
-        assert (last[1] != right).any()
-
-
-def halves(film: Image.Image) -> tuple[np.ndarray, np.ndarray]:
-    pixels = np.asarray(film.convert("RGB"))
-    middle = pixels.shape[1] // 2
-    return pixels[:, : middle - 12], pixels[:, middle + 12 :]
-
-
 @pytest.mark.parametrize("count", [2, 3, 4])
 def test_every_run_has_a_column(tmp_path: Path, count: int) -> None:
     names = [f"run_{number}" for number in range(count)]

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import worker.play as play_module
 from tangram_sim.errors import ConfigError, RunError
 from tests.agent.builders import PAIR, setup
 from tests.worker.builders import write_run
@@ -75,29 +74,6 @@ def test_the_number_of_actions_is_written_down(tmp_path: Path) -> None:
     out = tmp_path / "scores.json"
     evaluate_run(EvalConfig(str(tmp_path / "run"), episodes=2, actions=4, out=str(out)))
     assert json.loads(out.read_text())["actions"] == 4
-
-
-@pytest.mark.parametrize(("episodes", "actions"), [(4, None), (1, 2)])
-def test_an_animation_has_frames_that_move(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    episodes: int,
-    actions: int | None,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.setattr(play_module, "FRAMES_PER_ACTION", 6)  # drawing takes its time
-    write_run(tmp_path / "run", PAIR)
-    out = tmp_path / "film.gif"
-    config = PlayConfig(str(tmp_path / "run"), str(out), episodes=episodes, actions=actions)
-    assert play_run(config) == 0
-    with Image.open(out) as film:
-        assert film.format == "GIF"
-        assert film.n_frames > 10
-        first = np.asarray(film.convert("RGB"))
-        film.seek(film.n_frames - 1)
-        assert (np.asarray(film.convert("RGB")) != first).any()
-    assert f"{out}: {episodes} episodes, raw overlap 0." in capsys.readouterr().out
-    assert list(tmp_path.glob(".film*")) == []
 
 
 def test_a_picture_shows_all_episodes(tmp_path: Path) -> None:

@@ -1,0 +1,32 @@
+"""Rules of the house that start other processes to be seen: tiers of tests, no engine."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.test_house import run, run_python
+
+pytestmark = pytest.mark.slow
+
+
+def test_master_and_registration_never_load_the_engine() -> None:
+    loaded = run_python(
+        "import gymnasium, master.cli, master.launch, master.loop, tangram_sim.register, sys\n"
+        "assert 'Tangram-v0' in gymnasium.registry\n"
+        "print([name for name in sys.modules if name.startswith('pybullet')])"
+    )
+    assert loaded == "[]"
+
+
+@pytest.mark.parametrize(
+    ("marks", "status"),
+    [("", 4), ("@pytest.mark.fast", 0), ("@pytest.mark.fast\n@pytest.mark.slow", 4)],
+)
+def test_each_test_carries_one_tier(tmp_path: Path, marks: str, status: int) -> None:
+    (tmp_path / "test_it.py").write_text(f"import pytest\n\n{marks}\ndef test_it(): pass\n")
+    options = ["-p", "tests.conftest", "-p", "no:cacheprovider", "-c", "pyproject.toml"]
+    result = run([sys.executable, "-m", "pytest", *options, f"--rootdir={tmp_path}", str(tmp_path)])
+    assert result.returncode == status, result.stdout + result.stderr
+    if status:
+        assert "test_it.py::test_it must carry exactly one of the markers" in result.stderr
