@@ -1,6 +1,7 @@
 """Checkpoints of a whole run: what is in one, and going on from the newest that is whole."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,13 @@ from tangram_agent.checkpoints import (
     newest_checkpoint,
     save_checkpoint,
     set_aside,
+    was_set_aside,
 )
 from tangram_agent.runs import CHECKPOINTS, SETUP
 from tangram_agent.setup import make_setup
 from tangram_sim.errors import RunError
+
+SEGMENT = "journal"
 
 
 def check_resumable(folder: Path, resolved: Mapping[str, Any]) -> None:
@@ -45,43 +49,70 @@ def _check_warm_start(run_dir: str | None) -> None:
         )
 
 
-def save_run(
-    folder: Path, trainer: Trainer, record: Record, hub: Mapping[str, Any], keep: int
-) -> Path:
+@dataclass(frozen=True)
+class Restored:
+    """What a checkpoint holds besides the trainer's state.
+
+    Attributes:
+        record: what the run had been through.
+        hub: the hub's table of what was inserted, so that nothing is inserted twice.
+        segment: of the journal, the first one that the checkpoint does not cover.
+    """
+
+    record: Record
+    hub: Mapping[str, Any]
+    segment: int = 1
+
+    @staticmethod
+    def of(counters: Mapping[str, Any]) -> "Restored":
+        """From the counters of a checkpoint; RunError if its record is not whole."""
+        record = Record.of(counters["record"])
+        return Restored(record, dict(counters["hub"]), int(counters.get(SEGMENT, 1)))
+
+
+def save_run(folder: Path, trainer: Trainer, rest: Restored, keep: int) -> Path:
     """Write a checkpoint from which `restore_run` goes on.
 
     Args:
         folder: of all checkpoints.
         trainer: networks, replay, counters and generators.
-        record: what the run has been through.
-        hub: the hub's table of what was inserted, so that nothing is inserted twice.
+        rest: everything else.
         keep: newest checkpoints that stay.
 
     Raises:
         RunError: the weights are not finite, or the folder cannot be written.
     """
     arrays, counters = trainer.state()
-    counters |= {"record": record.state(), "hub": dict(hub)}
+    counters |= {"record": rest.record.state(), "hub": dict(rest.hub), SEGMENT: rest.segment}
     return save_checkpoint(folder, trainer.updates, arrays, counters, keep)
 
 
-def restore_run(
-    folder: Path, trainer: Trainer, warn: Callable[[str], None]
-) -> tuple[Record, dict[str, Any]] | None:
+def first_needed(folder: Path) -> int:
+    """The first segment of the journal that one of the checkpoints may be continued with."""
+    needed = []
+    for path in list_checkpoints(folder):
+        try:
+            needed.append(int(load_checkpoint(path, stems=[]).counters.get(SEGMENT, 1)))
+        except (RunError, TypeError, ValueError):
+            continue  # it cannot be gone on from
+    return min(needed, default=1)
+
+
+def restore_run(folder: Path, trainer: Trainer, warn: Callable[[str], None]) -> Restored | None:
     """Take over the newest checkpoint that is whole; corrupt ones are renamed, with a warning.
 
     Returns:
-        The record and the hub's state, or None where there is nothing to go on from.
+        What it holds besides the trainer's state, None where there was never a checkpoint.
 
     Raises:
-        RunError: the checkpoint is of another format, task or network.
+        RunError: the checkpoint is of another format, task or network, or none is whole.
     """
     found = _newest_whole(folder, warn)
     if found is None:
         return None
     try:
         trainer.load_state(found.arrays, found.counters)
-        return Record.of(found.counters["record"]), dict(found.counters["hub"])
+        return Restored.of(found.counters)
     except RunError as error:
         raise RunError(f"cannot go on from {found.path}: {error}") from None
     except (KeyError, TypeError, ValueError) as error:
@@ -120,4 +151,9 @@ def _newest_whole(folder: Path, warn: Callable[[str], None]) -> Checkpoint | Non
                 f"warning: checkpoint {path} is corrupt ({error.why}): it is {aside.name} now, and "
                 "the one before is taken"
             )
+    if was_set_aside(folder):
+        raise RunError(
+            f"no checkpoint in {folder} is whole: put one from a backup there, or start a new run "
+            "with another run_dir"
+        )
     return None

@@ -146,6 +146,11 @@ class Hub:
         """
         self._registry.load_state(state, time.monotonic())
 
+    def recover(self, arrival: EpisodesArrived) -> bool:
+        """Note a batch of the journal, before the first poll; False if it was inserted before."""
+        key = (arrival.role, arrival.index)
+        return self._registry.recover(key, arrival.incarnation, arrival.sequence, time.monotonic())
+
     def close(self) -> None:
         """Close the sockets; answers that are on their way get a second."""
         self._sockets.close()

@@ -5,23 +5,24 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from contextlib import closing
-from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
 import torch
 
 from master.arrivals import EpisodesArrived, ScoresArrived
-from master.checkpoint import check_resumable, save_run
+from master.checkpoint import check_resumable
 from master.children import override
 from master.config import MasterConfig
 from master.console import sturdy_console
 from master.curve import Curve
+from master.every import Every
+from master.keeper import Keeper
 from master.metrics import Metrics
 from master.parts import Parts, make_parts
 from master.progress import Progress, make_progress, notices_from
 from master.record import Clock
-from master.report import Every, Reporter, scores_picture
+from master.report import Reporter, scores_picture
 from master.result import make_result, show_result
 from master.rundir import RunFolder
 from master.signals import StopSignals
@@ -39,7 +40,6 @@ SCORES_S = 60.0
 SIGNALLED_SCORES_S = 8.0
 JOIN_S = 30.0  # for an evaluator that has not joined yet, or was given up
 LEAVE_S = 5.0
-MINUTE_S = 60.0
 PICTURE_PIXELS = 240
 
 
@@ -111,7 +111,7 @@ class Loop:
         self._latest: Scores | None = None
         self._published, self._dismissed = -1, False
         self._publish = Every(service.publish_seconds)
-        self._checkpoint = Every(service.checkpoint_minutes * MINUTE_S)
+        self._keeper = Keeper(parts, self.clock, reporter.progress.notice)
 
     def run(self) -> str:
         """Learn until a bound or a signal ends it; returns which."""
@@ -124,8 +124,7 @@ class Loop:
             self.learn()
             if self._publish.due():
                 self.publish()
-            if self._checkpoint.due():
-                self.save()
+            self._keeper.tick()
             self.tell()
         return reason
 
@@ -160,6 +159,8 @@ class Loop:
         while (
             self._arrived and trainer.pace.may_insert() and budget.takes_episodes(trainer.episodes)
         ):
+            if not self._keeper.keep(self._arrived[0]):
+                return
             arrival = self._arrived.popleft()
             trainer.insert(arrival.episodes)
             # Only now: a worker forgets what is acknowledged.
@@ -189,14 +190,6 @@ class Loop:
             self._published = weights.version
             self._reporter.published(weights.version, self.parts)
 
-    def save(self) -> Path:
-        """Write a checkpoint."""
-        parts = self.parts
-        parts.record.wall_s = self.clock.wall_s()
-        keep = parts.config.service.keep_checkpoints
-        state = parts.hub.state()
-        return save_run(parts.folder.checkpoints, parts.trainer, parts.record, state, keep)
-
     def tell(self) -> None:
         """Show where the run stands."""
         while not self._news.empty():
@@ -214,7 +207,7 @@ class Loop:
         """
         self.publish()
         # Before anything that takes time: what was learned is safe from here on.
-        self.save()
+        self._keeper.save()
         self._wait_for_scores(launched)
         self.tell()
         self._reporter.flush(self.parts)

@@ -6,10 +6,12 @@ from pathlib import Path
 
 from master.arrivals import WelcomeInfo
 from master.budget import Budget
-from master.checkpoint import restore_run, warm_start
+from master.checkpoint import Restored, restore_run, warm_start
 from master.config import MasterConfig
 from master.hub import Hub
+from master.journal import Journal
 from master.record import Record
+from master.recovery import journal_run_id, read_journal
 from master.rundir import RunFolder
 from master.trainer import Trainer, choose_device
 from tangram_agent.payloads import EpisodeSpec
@@ -33,6 +35,7 @@ class Parts:
         record: what the run has been through.
         budget: its bounds.
         hub: the sockets, open.
+        journal: keeps what was not in the last checkpoint.
     """
 
     config: MasterConfig
@@ -42,6 +45,7 @@ class Parts:
     record: Record
     budget: Budget
     hub: Hub
+    journal: Journal
 
     @property
     def share(self) -> float:
@@ -62,8 +66,9 @@ class Parts:
         }
 
     def close(self) -> None:
-        """Close the sockets."""
+        """Close the sockets and the journal."""
         self.hub.close()
+        self.journal.close()
 
 
 def make_parts(
@@ -80,25 +85,54 @@ def make_parts(
     Raises:
         TangramError: the port or a checkpoint cannot be used, or there is no such device.
     """
-    service = config.service
+    service, resumes = config.service, config.resume == "auto"
     trainer = Trainer(setup, config.seed, choose_device(service.device), service.lag_updates)
-    found = restore_run(folder.checkpoints, trainer, notice) if config.resume == "auto" else None
+    found = restore_run(folder.checkpoints, trainer, notice) if resumes else None
     if found is None and config.warm_start is not None:
         notice(warm_start(Path(config.warm_start), trainer))
-    record, table = found or (Record(), {})
+    rest = found or Restored(_new_record(folder.journal), {})
     budget = Budget(config)
     if not budget.bounded:
         notice(UNBOUNDED)
-    if config.resume == "auto":
-        notice(f"goes on after {trainer.updates:,} updates" if found else "a new run begins")
-    info = WelcomeInfo(
-        run_id=record.run_id,
-        seed=config.seed,
-        fingerprints=setup.fingerprints(),
-        spec=EpisodeSpec.of(setup),
-        window=service.window,
+    spec, run_id = EpisodeSpec.of(setup), rest.record.run_id
+    journal = Journal(
+        folder.journal, run_id, setup.task_digest(), spec, service.journal_sync_seconds
     )
+    info = WelcomeInfo(run_id, config.seed, setup.fingerprints(), spec, service.window)
     hub = Hub(service.bind, service.port, info)
-    if found:
-        hub.load_state(table)
-    return Parts(config, setup, folder, trainer, record, budget, hub)
+    parts = Parts(config, setup, folder, trainer, rest.record, budget, hub, journal)
+    try:
+        if found:
+            hub.load_state(rest.hub)
+        _insert_again(parts, rest.segment, notice)
+    except BaseException:
+        parts.close()
+        raise
+    if resumes:
+        began = found or trainer.episodes
+        notice(f"goes on after {trainer.updates:,} updates" if began else "a new run begins")
+    return parts
+
+
+def _new_record(journal: Path) -> Record:
+    """Of the run whose journal it is, which was killed before its first checkpoint, or of none."""
+    run_id = journal_run_id(journal)
+    return Record() if run_id is None else Record(run_id)
+
+
+def _insert_again(parts: Parts, segment: int, notice: Callable[[str], None]) -> None:
+    """Take in what was acknowledged after the checkpoint."""
+    found = read_journal(
+        parts.folder.journal,
+        segment,
+        parts.record.run_id,
+        parts.setup.task_digest(),
+        EpisodeSpec.of(parts.setup),
+        notice,
+    )
+    before = parts.trainer.episodes
+    for arrival in found:
+        if parts.hub.recover(arrival):
+            parts.trainer.insert(arrival.episodes)
+    if parts.trainer.episodes > before:
+        notice(f"{parts.trainer.episodes - before:,} episodes come back from the journal")

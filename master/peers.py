@@ -170,6 +170,17 @@ class Registry:
         self._ledgers = {_key(name): _ledger(name, entry) for name, entry in state.items()}
         self._reserved_until = now + self._grace_s
 
+    def recover(self, key: Key, incarnation: int, sequence: int, now: float) -> bool:
+        """Note a batch of the journal as inserted; False if the table has it already."""
+        ledger = self._ledgers.get(key)
+        if ledger is None or incarnation > ledger.incarnation:
+            ledger = self._ledgers[key] = Ledger(incarnation)
+        if incarnation < ledger.incarnation or sequence <= ledger.received:
+            return False
+        ledger.consume(sequence)
+        self._reserved_until = now + self._grace_s
+        return True
+
     def _check_settings(self, hello: Hello) -> None:
         odd = differing(self._fingerprints, hello.fingerprints)
         if not odd:

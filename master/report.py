@@ -10,6 +10,7 @@ from PIL import Image
 from master.arrivals import EpisodesArrived
 from master.budget import Rates
 from master.curve import Curve
+from master.every import Every
 from master.metrics import Means, Metrics
 from master.parts import Parts
 from master.progress import Progress, Status
@@ -39,22 +40,6 @@ class Sent:
     def __init__(self, at_s: float, episodes: int, record: Record) -> None:
         self.at_s, self.episodes = at_s, episodes
         self.loop_s, self.train_s = record.loop_s, record.train_s
-
-
-class Every:
-    """True at most once in an interval."""
-
-    def __init__(self, seconds: float, at_once: bool = False) -> None:
-        self._seconds = seconds
-        self._next_s = 0.0 if at_once else time.monotonic() + seconds
-
-    def due(self) -> bool:
-        """Whether the interval has passed; starts the next one if so."""
-        now_s = time.monotonic()
-        if now_s < self._next_s:
-            return False
-        self._next_s = now_s + self._seconds
-        return True
 
 
 class Reporter:

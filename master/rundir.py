@@ -8,6 +8,7 @@ from typing import IO, Any
 
 import yaml
 
+from master.journal import segments
 from tangram_agent.checkpoints import list_checkpoints
 from tangram_agent.files import write_whole
 from tangram_sim.errors import ConfigError
@@ -23,6 +24,7 @@ class RunFolder:
         config: the resolved config.
         connection: where the master can be reached; there while it runs.
         checkpoints: folder of the checkpoints.
+        journal: folder of what came since.
         tensorboard: folder of the curves.
         logs: folder of the output of workers and evaluator.
         curve: the scores of every evaluation.
@@ -35,6 +37,7 @@ class RunFolder:
         self.config = self.path / "config.yaml"
         self.connection = self.path / "connection.json"
         self.checkpoints = self.path / "checkpoints"
+        self.journal = self.path / "journal"
         self.tensorboard = self.path / "tensorboard"
         self.logs = self.path / "logs"
         self.curve = self.path / "curve.jsonl"
@@ -62,7 +65,8 @@ class RunFolder:
     def holds_run(self) -> bool:
         """Whether a run has left something here that a new one would mix with."""
         curves = self.tensorboard.is_dir() and any(self.tensorboard.iterdir())
-        return self.result.exists() or bool(list_checkpoints(self.checkpoints)) or curves
+        kept = bool(list_checkpoints(self.checkpoints)) or bool(segments(self.journal))
+        return self.result.exists() or kept or curves
 
     def lock(self) -> IO[bytes]:
         """Claim the folder for one process; the claim ends with the process or with `close`.

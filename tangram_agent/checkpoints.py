@@ -33,6 +33,10 @@ _SET_ASIDE = ".corrupt"
 Tensors = dict[str, npt.NDArray[Any]]
 
 
+class DiskError(RunError):
+    """The disk does not take a checkpoint."""
+
+
 class CorruptError(RunError):
     """A checkpoint that is not as it was written.
 
@@ -78,12 +82,12 @@ def save_checkpoint(
         counters: JSON values.
 
     Raises:
-        RunError: the folder cannot be written.
+        DiskError: the folder cannot be written; what was there before is as it was.
     """
+    aside = folder / f"{_TEMPORARY}{updates:08d}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         _drop_temporary(folder)
-        aside = folder / f"{_TEMPORARY}{updates:08d}"
         aside.mkdir()
         _write_content(aside, updates, arrays, counters)
         final = _free_name(folder, updates)
@@ -93,7 +97,8 @@ def save_checkpoint(
         for old in list_checkpoints(folder)[:-keep]:
             shutil.rmtree(old)
     except OSError as error:
-        raise RunError(
+        shutil.rmtree(aside, ignore_errors=True)  # others may need the room
+        raise DiskError(
             f"cannot write a checkpoint to {folder} ({error}): make room there or choose another "
             "run_dir"
         ) from None
@@ -141,6 +146,11 @@ def set_aside(path: Path) -> Path:
     return path.rename(target)
 
 
+def was_set_aside(folder: Path) -> bool:
+    """Whether a corrupt checkpoint lies here."""
+    return any(folder.glob(f"*{_SET_ASIDE}"))
+
+
 def _order(path: Path) -> tuple[int, int]:
     match = _NAME.fullmatch(path.name)
     if match is None:
@@ -149,12 +159,10 @@ def _order(path: Path) -> tuple[int, int]:
 
 
 def _free_name(folder: Path, updates: int) -> Path:
-    """A folder cannot be renamed onto a full one, and deleting that first would risk both."""
-    name, again = f"{updates:08d}", 0
-    while (folder / name).exists():
-        again += 1
-        name = f"{updates:08d}-{again}"
-    return folder / name
+    """One behind all others of that number; a folder cannot be renamed onto a full one."""
+    orders = map(_order, list_checkpoints(folder))
+    again = max((number for found, number in orders if found == updates), default=-1) + 1
+    return folder / (f"{updates:08d}-{again}" if again else f"{updates:08d}")
 
 
 def _drop_temporary(folder: Path) -> None:

@@ -166,6 +166,7 @@ class ServiceConfig:
         log_seconds: time between two lines of progress and TensorBoard scalars.
         checkpoint_minutes: time between two checkpoints.
         keep_checkpoints: newest checkpoints kept.
+        journal_sync_seconds: time between two syncs of the journal, 0 for every batch.
         device: auto, cpu or cuda.
         threads: torch threads of the master.
     """
@@ -183,6 +184,7 @@ class ServiceConfig:
     log_seconds: float = 2.0
     checkpoint_minutes: float = 5.0
     keep_checkpoints: int = 2
+    journal_sync_seconds: float = 1.0
     device: str = "auto"
     threads: int = 1
 
@@ -196,7 +198,7 @@ class ServiceConfig:
         check_range("service.threads", self.threads, 1, 1024)
         # Without any lag a worker would wait for updates that wait for its episodes.
         check_range("service.lag_updates", self.lag_updates, 1)
-        for name in ("publish_seconds", "eval_seconds"):
+        for name in ("publish_seconds", "eval_seconds", "journal_sync_seconds"):
             check_range(f"service.{name}", getattr(self, name), 0)
         for name in ("log_seconds", "checkpoint_minutes"):
             check_range(f"service.{name}", getattr(self, name), 1e-3)

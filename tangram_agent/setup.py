@@ -58,6 +58,11 @@ class Setup:
             sections[name] = hashlib.sha256(content.encode()).hexdigest()[:16]
         return sections
 
+    def task_digest(self) -> str:
+        """A digest of all sections but the agent's, which may change in the middle of a run."""
+        digests = [value for name, value in sorted(self.fingerprints().items()) if name != "agent"]
+        return hashlib.sha256("".join(digests).encode()).hexdigest()[:16]
+
     def contents(self) -> dict[str, Any]:
         """Each section as JSON values, for a checkpoint; tokens by what makes them."""
         sections: dict[str, Any] = {name: asdict(getattr(self, name)) for name in SECTIONS[1:]}

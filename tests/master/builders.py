@@ -14,6 +14,7 @@ from master.arrivals import EpisodesArrived, ScoresArrived
 from master.budget import Budget
 from master.config import MasterConfig
 from master.curve import Curve
+from master.journal import Journal
 from master.loop import Loop
 from master.metrics import Metrics
 from master.parts import Parts
@@ -24,6 +25,7 @@ from master.rundir import RunFolder
 from master.signals import StopSignals
 from master.trainer import Trainer
 from tangram_agent.config import ServiceConfig
+from tangram_agent.payloads import EpisodeSpec
 from tangram_agent.setup import Setup
 from tangram_agent.types import Weights
 from tangram_agent.wire import Scores
@@ -55,6 +57,22 @@ def scores(made: Setup, version: int, reward: float = 0.5) -> ScoresArrived:
     corners = random_episodes(made, 2).goals
     scalars = {"mean_reward": reward, "raw_overlap": 0.75, "episodes": 100.0}
     return ScoresArrived(0, 1, Scores(version, scalars, corners, corners, corners))
+
+
+_journals: list[Journal] = []
+
+
+def journal(folder: Path, made: Setup, sync_s: float = 1.0) -> Journal:
+    """A journal of the run `run`."""
+    opened = Journal(folder, "run", made.task_digest(), EpisodeSpec.of(made), sync_s)
+    _journals.append(opened)
+    return opened
+
+
+def close_journals() -> None:
+    """All that were made here."""
+    while _journals:
+        _journals.pop().close()
 
 
 class FakeHub:
@@ -150,6 +168,7 @@ def loop(
         Record(),
         Budget(settings),
         hub,  # type: ignore[arg-type]
+        journal(run_folder.journal, made),
     )
     metrics = Metrics(run_folder.tensorboard)
     curve = Curve(run_folder.curve, parts.trainer.updates)

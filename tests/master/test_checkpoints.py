@@ -89,6 +89,13 @@ def test_the_same_number_again_replaces_nothing_before_it_is_whole(tmp_path: Pat
     assert (first.name, second.name, names(tmp_path)) == ("00000005", "00000005-1", ["00000005-1"])
 
 
+def test_the_newest_of_one_number_is_the_last_written(tmp_path: Path) -> None:
+    """A run that waits for workers writes many without an update between."""
+    written = [save(tmp_path, keep=2).name for _ in range(5)]
+    assert written == ["00000005", *(f"00000005-{i}" for i in range(1, 5))]
+    assert names(tmp_path) == written[-2:]
+
+
 def test_a_crash_before_the_rename_leaves_the_old_one_valid(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -202,3 +202,27 @@ def test_malformed_tables_are_refused(state: Any, reason: str) -> None:
 )
 def test_sections_that_differ_are_named(theirs: dict[str, str], names: list[str]) -> None:
     assert differing({"tokens": "a", "sim": "b"}, theirs) == names
+
+
+def test_batches_of_the_journal_are_new_once() -> None:
+    registry = Registry(FINGERPRINTS, GRACE_S)
+    registry.load_state({"player/0": {"incarnation": 2, "sequence": 5}}, 0.0)
+    known, new = ("player", 0), ("player", 1)
+    found = [
+        registry.recover(known, 1, 9, 0.0),  # of a process that was taken over before
+        registry.recover(known, 2, 5, 0.0),  # in the checkpoint
+        registry.recover(known, 2, 6, 0.0),
+        registry.recover(known, 2, 6, 0.0),
+        registry.recover(known, 2, 8, 0.0),  # 7 was refused for good, so the journal has it not
+        registry.recover(known, 3, 1, 0.0),
+        registry.recover(new, 1, 1, 0.0),
+    ]
+    assert found == [False, False, True, False, True, True, True]
+    assert registry.state() == {
+        "player/0": {"incarnation": 3, "sequence": 1},
+        "player/1": {"incarnation": 1, "sequence": 1},
+    }
+    # They wait for their workers like those of a checkpoint.
+    assert admitted(registry, "a", now=1.0).index == 2
+    again = admitted(registry, "b", now=1.0, index=1, incarnation=1, first=2)
+    assert (again.incarnation, again.ledger.inserted) == (1, 1)

@@ -2,6 +2,7 @@
 
 import json
 import stat
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -13,11 +14,21 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from master import loop as loop_module
+from master.every import Every
 from master.loop import Loop
 from master.result import make_result
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
 from tangram_sim.errors import RunError
-from tests.master.builders import AGENT, FakeHub, ShownProgress, arrival, loop, scores, small_setup
+from tests.master.builders import (
+    AGENT,
+    FakeHub,
+    ShownProgress,
+    arrival,
+    close_journals,
+    loop,
+    scores,
+    small_setup,
+)
 
 pytestmark = pytest.mark.fast
 
@@ -29,6 +40,12 @@ STARTS, BATCH = AGENT["learning_starts"], 4
 def unhurried(monkeypatch: pytest.MonkeyPatch) -> None:
     """All updates that are due come in one go, however busy the machine is."""
     monkeypatch.setattr(loop_module, "LEARN_S", 600.0)
+
+
+@pytest.fixture(autouse=True)
+def closed() -> Iterator[None]:
+    yield
+    close_journals()
 
 
 def batches(count: int, size: int = BATCH) -> list[list[Any]]:
@@ -184,7 +201,7 @@ def test_weights_that_are_not_finite_are_neither_sent_nor_kept(tmp_path: Path) -
         made.run()
     assert max(hub.values("publish")) <= 2
     with pytest.raises(RunError, match="neither sent nor kept"):
-        made.save()
+        made._keeper.save()
     assert list_checkpoints(tmp_path / "checkpoints") == []
     assert hub.values("stop") == ["the master failed"]
 
@@ -193,7 +210,7 @@ def test_checkpoints_come_on_their_interval(tmp_path: Path) -> None:
     hub = FakeHub(MADE, batches(3))
     service = {"checkpoint_minutes": 1e-3, "keep_checkpoints": 1}
     made = loop(tmp_path, MADE, hub, service, max_updates=6)
-    made._checkpoint._seconds = made._checkpoint._next_s = 0.0
+    made._keeper._checkpoint = Every(0.0)
     made.run()
     (path,) = list_checkpoints(tmp_path / "checkpoints")
     counters = load_checkpoint(path, []).counters
@@ -306,7 +323,7 @@ def test_what_is_told(tmp_path: Path) -> None:
     made = loop(tmp_path, MADE, hub, {"publish_seconds": 0.0}, max_updates=4)
     made._news.put("worker 0 ended")
     made.run()
-    made.finish(launched=False) if made.parts.record.scored_version == 4 else made.save()
+    made.finish(launched=False) if made.parts.record.scored_version == 4 else made._keeper.save()
     made._reporter.flush(made.parts)
     made._reporter.metrics.close()
     assert shown(made).notices == ["worker 0 ended"]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from master.checkpoint import check_resumable, restore_run, save_run, warm_start
+from master.checkpoint import Restored, check_resumable, restore_run, save_run, warm_start
 from master.record import Record
 from master.trainer import Trainer, choose_device
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint, save_checkpoint
@@ -20,6 +20,7 @@ pytestmark = pytest.mark.fast
 
 MADE = small_setup()
 HUB = {"player/0": {"incarnation": 2, "sequence": 17}}
+REST = Restored(Record(), HUB)
 
 
 def play_on(made: Trainer, rounds: int, seed: int = 0) -> None:
@@ -50,9 +51,10 @@ def test_a_run_goes_on_as_if_it_had_never_stopped(tmp_path: Path) -> None:
     play_on(straight, 5)
     play_on(stopped, 5)
     record = Record(loop_s=12.5, scores={"mean_reward": 0.5}, scored_version=4, workers=3)
-    save_run(tmp_path, stopped, record, HUB, keep=1)
+    rest = Restored(record, HUB, segment=7)
+    save_run(tmp_path, stopped, rest, keep=1)
     resumed = trainer(MADE, seed=99)
-    assert restore_run(tmp_path, resumed, pytest.fail) == (record, HUB)
+    assert restore_run(tmp_path, resumed, pytest.fail) == rest
     assert_same(everything(resumed), everything(straight))
     for made in (straight, resumed):
         play_on(made, 5, seed=1)
@@ -72,28 +74,42 @@ def test_nothing_to_go_on_from(tmp_path: Path) -> None:
     assert restore_run(tmp_path / "checkpoints", trainer(MADE), pytest.fail) is None
 
 
-@pytest.mark.parametrize("corrupt", [1, 2])
-def test_corrupt_ones_are_set_aside_with_a_warning(tmp_path: Path, corrupt: int) -> None:
+def test_a_corrupt_one_is_set_aside_and_the_one_before_is_taken(tmp_path: Path) -> None:
+    first, second = saved_twice(tmp_path)
+    damage(second)
+    warnings: list[str] = []
+    resumed = trainer(MADE)
+    assert restore_run(tmp_path, resumed, warnings.append) is not None
+    assert resumed.updates == 2
+    assert warnings == [
+        f"warning: checkpoint {second} is corrupt (checksum of learner.safetensors differs): it is "
+        f"{second.name}.corrupt now, and the one before is taken"
+    ]
+    assert list_checkpoints(tmp_path) == [first]
+
+
+def test_a_run_is_not_begun_anew_because_all_are_corrupt(tmp_path: Path) -> None:
+    for path in saved_twice(tmp_path):
+        damage(path)
+    for warnings in (2, 0):  # the second time they are out of the way, and still no new run begins
+        told: list[str] = []
+        with pytest.raises(RunError, match=r"no checkpoint in .* is whole: put one from a backup"):
+            restore_run(tmp_path, trainer(MADE), told.append)
+        assert len(told) == warnings
+
+
+def saved_twice(folder: Path) -> list[Path]:
     made = trainer(MADE)
     for _ in range(2):
         play_on(made, 1)
-        save_run(tmp_path, made, Record(), HUB, keep=2)
-    paths = list_checkpoints(tmp_path)
-    for path in paths[2 - corrupt :]:
-        data = bytearray((path / "learner.safetensors").read_bytes())
-        data[-1] ^= 1
-        (path / "learner.safetensors").write_bytes(data)
-    warnings: list[str] = []
-    resumed = trainer(MADE)
-    found = restore_run(tmp_path, resumed, warnings.append)
-    assert (found is None) == (corrupt == 2)
-    assert resumed.updates == (2 if corrupt == 1 else 0)
-    assert warnings == [
-        f"warning: checkpoint {path} is corrupt (checksum of learner.safetensors differs): it is "
-        f"{path.name}.corrupt now, and the one before is taken"
-        for path in reversed(paths[2 - corrupt :])
-    ]
-    assert list_checkpoints(tmp_path) == paths[: 2 - corrupt]
+        save_run(folder, made, REST, keep=2)
+    return list_checkpoints(folder)
+
+
+def damage(path: Path) -> None:
+    data = bytearray((path / "learner.safetensors").read_bytes())
+    data[-1] ^= 1
+    (path / "learner.safetensors").write_bytes(data)
 
 
 @pytest.mark.parametrize(
@@ -106,7 +122,7 @@ def test_corrupt_ones_are_set_aside_with_a_warning(tmp_path: Path, corrupt: int)
     ],
 )
 def test_another_task_is_refused(tmp_path: Path, other: Any, reason: str) -> None:
-    save_run(tmp_path, trainer(MADE), Record(), HUB, keep=1)
+    save_run(tmp_path, trainer(MADE), REST, keep=1)
     with pytest.raises(RunError, match=f"cannot go on from {tmp_path}/00000000: .*{reason}"):
         restore_run(tmp_path, trainer(other), pytest.fail)
 
@@ -114,7 +130,7 @@ def test_another_task_is_refused(tmp_path: Path, other: Any, reason: str) -> Non
 def test_settings_of_the_agent_may_change_on_the_way(tmp_path: Path) -> None:
     made = trainer(MADE)
     play_on(made, 3)
-    save_run(tmp_path, made, Record(), HUB, keep=1)
+    save_run(tmp_path, made, REST, keep=1)
     resumed = trainer(small_setup(updates_per_transition=1.0, replay_capacity=32))
     assert restore_run(tmp_path, resumed, pytest.fail) is not None
     assert (len(resumed.replay), resumed.pace.may_update()) == (32, False)
@@ -124,7 +140,7 @@ def test_settings_of_the_agent_may_change_on_the_way(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("lost", ["setup", "pace", "record", "hub", "generators"])
 def test_a_checkpoint_that_lacks_a_part_is_refused(tmp_path: Path, lost: str) -> None:
-    path = save_run(tmp_path, trainer(MADE), Record(), HUB, keep=1)
+    path = save_run(tmp_path, trainer(MADE), REST, keep=1)
     found = load_checkpoint(path)
     counters = {name: value for name, value in found.counters.items() if name != lost}
     save_checkpoint(tmp_path, 1, found.arrays, counters, keep=1)
@@ -151,7 +167,7 @@ def test_a_gpu_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_another_task_is_refused_from_the_checkpoint_alone(tmp_path: Path) -> None:
     mine = {name: asdict(getattr(MADE, name)) for name in SECTIONS}
     check_resumable(tmp_path, {})  # nothing is there yet
-    save_run(tmp_path, trainer(MADE), Record(), HUB, keep=1)
+    save_run(tmp_path, trainer(MADE), REST, keep=1)
     check_resumable(tmp_path, mine)
     check_resumable(tmp_path, mine | {"agent": mine["agent"] | {"noise": 0.5}})
     other = mine | {"tokens": {"shapes": ["parallelogram"], "scale": 1.0}}
@@ -164,7 +180,7 @@ def test_another_task_is_refused_from_the_checkpoint_alone(tmp_path: Path) -> No
 
 def saved(folder: Path, made: Trainer) -> Path:
     """A run folder with one checkpoint."""
-    save_run(folder / "checkpoints", made, Record(), HUB, keep=1)
+    save_run(folder / "checkpoints", made, REST, keep=1)
     return folder
 
 

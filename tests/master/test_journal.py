@@ -1,0 +1,262 @@
+"""The journal: what was appended comes back, in order, however the master ended."""
+
+import errno
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from master import journal as journal_module
+from master.arrivals import EpisodesArrived
+from master.journal import HEAD, JournalError, segments
+from master.recovery import journal_run_id, read_journal
+from tangram_agent.payloads import EpisodeSpec
+from tangram_agent.setup import Setup
+from tangram_sim.errors import RunError
+from tests.agent.builders import PAIR, setup
+from tests.master.builders import arrival, close_journals, journal, small_setup
+
+pytestmark = pytest.mark.fast
+
+MADE = small_setup()
+
+
+@pytest.fixture(autouse=True)
+def closed() -> Iterator[None]:
+    yield
+    close_journals()
+
+
+def read(
+    folder: Path,
+    warnings: list[str] | None = None,
+    first: int = 1,
+    run_id: str = "run",
+    made: Setup = MADE,
+) -> list[EpisodesArrived]:
+    warn = pytest.fail if warnings is None else warnings.append
+    spec = EpisodeSpec.of(made)
+    return list(read_journal(folder, first, run_id, made.task_digest(), spec, warn))
+
+
+def sequences(folder: Path, **more: Any) -> list[int]:
+    return [found.sequence for found in read(folder, **more)]
+
+
+def assert_same(one: EpisodesArrived, other: EpisodesArrived) -> None:
+    for name in ("role", "index", "incarnation", "sequence", "weights_version"):
+        assert getattr(one, name) == getattr(other, name), name
+    for name in ("corners", "placed", "actions", "rewards", "goals"):
+        ours, theirs = getattr(one.episodes, name), getattr(other.episodes, name)
+        assert ours.dtype == theirs.dtype, name
+        np.testing.assert_array_equal(ours, theirs, err_msg=name)
+
+
+@pytest.mark.parametrize("made", [MADE, setup(PAIR)], ids=["square", "pair"])
+def test_batches_come_back_as_they_were_appended(tmp_path: Path, made: Setup) -> None:
+    written = [arrival(made, number, count=number, version=number - 2) for number in (1, 2, 3)]
+    kept = journal(tmp_path, made)
+    for one in written:
+        kept.append(one)  # not closed: as a kill leaves it
+    for one, other in zip(written, read(tmp_path, made=made), strict=True):
+        assert_same(one, other)
+    assert journal_run_id(tmp_path) == "run"
+
+
+def test_nothing_is_written_before_the_first_batch(tmp_path: Path) -> None:
+    journal(tmp_path / "journal", MADE).close()
+    assert not (tmp_path / "journal").exists()
+    assert read(tmp_path / "journal") == []
+    assert journal_run_id(tmp_path / "journal") is None
+
+
+def test_a_batch_is_with_the_operating_system_when_append_returns(tmp_path: Path) -> None:
+    kept = journal(tmp_path, MADE, sync_s=1000.0)
+    sizes = []
+    for number in (1, 2):
+        kept.append(arrival(MADE, number))
+        sizes.append(segments(tmp_path)[1].stat().st_size)
+    assert 0 < sizes[0] < sizes[1]
+
+
+@pytest.mark.parametrize(("sync_s", "syncs"), [(0.0, 3), (1000.0, 0)])
+def test_syncs_come_on_their_interval(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sync_s: float, syncs: int
+) -> None:
+    done: list[int] = []
+    monkeypatch.setattr(journal_module.os, "fsync", done.append)
+    kept = journal(tmp_path, MADE, sync_s)
+    for number in (1, 2, 3):
+        kept.append(arrival(MADE, number))
+    assert len(done) == syncs
+    kept.close()
+    assert len(done) == max(syncs, 1)
+
+
+def test_every_life_and_every_checkpoint_begins_a_segment(tmp_path: Path) -> None:
+    first = journal(tmp_path, MADE)
+    first.append(arrival(MADE, 1))
+    second = journal(tmp_path, MADE)
+    second.append(arrival(MADE, 2))
+    assert second.rotate() == 3
+    assert second.rotate() == 3  # nothing came since
+    second.append(arrival(MADE, 3))
+    assert list(segments(tmp_path)) == [1, 2, 3]
+    assert sequences(tmp_path) == [1, 2, 3]
+    assert sequences(tmp_path, first=3) == [3]
+    assert sequences(tmp_path, first=4) == []
+
+
+def test_covered_segments_are_dropped_and_never_the_current_one(tmp_path: Path) -> None:
+    kept = journal(tmp_path, MADE)
+    for number in (1, 2, 3):
+        kept.append(arrival(MADE, number))
+        if number < 3:
+            kept.rotate()
+    kept.drop_before(2)
+    assert list(segments(tmp_path)) == [2, 3]
+    kept.drop_before(99)
+    assert list(segments(tmp_path)) == [3]
+    kept.append(arrival(MADE, 4))
+    assert sequences(tmp_path, first=3) == [3, 4]
+
+
+@given(st.data())
+def test_wherever_a_kill_cuts_whole_batches_come_back(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    folder = tmp_path_factory.mktemp("journal")
+    kept = journal(folder, MADE)
+    ends = []
+    for number in (1, 2, 3):
+        kept.append(arrival(MADE, number, count=1))
+        ends.append(segments(folder)[1].stat().st_size)
+    close_journals()
+    cut = data.draw(st.integers(0, ends[-1]))
+    os.truncate(segments(folder)[1], cut)
+    warnings: list[str] = []
+    whole = [number for number, end in zip((1, 2, 3), ends, strict=True) if end <= cut]
+    assert sequences(folder, warnings=warnings) == whole
+    title = ends[0] - (ends[1] - ends[0])
+    torn = cut not in (0, title, *ends)
+    assert len(warnings) == torn
+    assert all("cut short" in line and "it was not acknowledged" in line for line in warnings)
+
+
+def test_damage_in_the_middle_is_told_as_a_loss(tmp_path: Path) -> None:
+    kept = journal(tmp_path, MADE)
+    kept.append(arrival(MADE, 1))
+    start = segments(tmp_path)[1].stat().st_size
+    for number in (2, 3):
+        kept.append(arrival(MADE, number))
+    data = bytearray(segments(tmp_path)[1].read_bytes())
+    data[start + HEAD.size + 40] ^= 1
+    segments(tmp_path)[1].write_bytes(data)
+    warnings: list[str] = []
+    assert sequences(tmp_path, warnings=warnings) == [1]
+    assert len(warnings) == 1
+    assert f"is damaged at byte {start:,}: the {len(data) - start:,} bytes" in warnings[0]
+
+
+def test_a_missing_segment_is_told_and_the_others_are_read(tmp_path: Path) -> None:
+    kept = journal(tmp_path, MADE)
+    for number in (1, 2, 3):
+        kept.append(arrival(MADE, number))
+        kept.rotate()
+    segments(tmp_path)[2].unlink()
+    warnings: list[str] = []
+    assert sequences(tmp_path, warnings=warnings) == [1, 3]
+    assert warnings == [
+        f"warning: {tmp_path / '00000002.log'} is missing: the batches that it held are lost"
+    ]
+
+
+def test_another_run_or_task_is_refused(tmp_path: Path) -> None:
+    journal(tmp_path, MADE).append(arrival(MADE, 1))
+    with pytest.raises(RunError, match="of another run, task or version"):
+        read(tmp_path, run_id="other")
+    with pytest.raises(RunError, match="of another run, task or version"):
+        read(tmp_path, made=setup(PAIR))
+
+
+def test_what_is_no_journal_is_refused(tmp_path: Path) -> None:
+    kept = journal(tmp_path, MADE)
+    kept.append(arrival(MADE, 1))
+    content = segments(tmp_path)[1].read_bytes()
+    (length, _) = HEAD.unpack_from(content)
+    segments(tmp_path)[1].write_bytes(content[HEAD.size + length :])  # without its title
+    with pytest.raises(RunError, match=r"is no segment of format 1: choose another run_dir"):
+        read(tmp_path)
+
+
+class Disk:
+    """Writes as long as there is room; stands in for os-level writes of a file."""
+
+    def __init__(self, room: int) -> None:
+        self.room = room
+
+    def write(self, file: Any, data: memoryview) -> int:
+        if not self.room:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        size = min(len(data), self.room)
+        self.room -= size
+        return int(os.write(file.fileno(), data[:size]))
+
+
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
+    """A disk with room for less than one batch."""
+    made = Disk(room=300)
+    opened = journal_module.FileIO
+
+    class Full(opened):  # type: ignore[misc, valid-type]
+        def write(self, data: Any) -> int:
+            return made.write(self, data)
+
+    monkeypatch.setattr(journal_module, "FileIO", Full)
+    return made
+
+
+@pytest.mark.parametrize("room", [0, 30, 300])
+def test_a_full_disk_is_told_and_leaves_whole_records(
+    tmp_path: Path, disk: Disk, room: int
+) -> None:
+    """No room for the title, for a part of it, and for a part of the batch."""
+    kept = journal(tmp_path, MADE)
+    disk.room = room
+    for _ in range(2):
+        with pytest.raises(JournalError, match=r"cannot be written \(No space left on device\)"):
+            kept.append(arrival(MADE, 1))
+        assert read(tmp_path) == []
+    disk.room = 10**9
+    kept.append(arrival(MADE, 1))
+    kept.append(arrival(MADE, 2))
+    assert sequences(tmp_path) == [1, 2]
+
+
+def test_a_sync_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = journal(tmp_path, MADE, sync_s=1000.0)
+    kept.append(arrival(MADE, 1))
+
+    def fail(_: int) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(journal_module.os, "fsync", fail)
+        with pytest.raises(JournalError, match="Input/output error"):
+            kept.sync()
+    kept.sync()
+
+
+def test_a_journal_takes_what_the_wire_takes(tmp_path: Path) -> None:
+    """The largest batch of a message fits a record."""
+    spec = EpisodeSpec.of(MADE)
+    kept = journal(tmp_path, MADE)
+    kept.append(arrival(MADE, 1, count=spec.max_count))
+    (found,) = read(tmp_path)
+    assert found.episodes.count == spec.max_count

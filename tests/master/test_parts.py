@@ -1,0 +1,94 @@
+"""A run's parts: what a master that was killed left behind, and what it comes to."""
+
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from master.checkpoint import Restored, save_run
+from master.config import MasterConfig
+from master.journal import segments
+from master.parts import Parts, make_parts
+from master.record import Record
+from master.rundir import RunFolder
+from tangram_sim.errors import ConfigError, RunError
+from tests.master.builders import arrival, close_journals, journal, small_setup, trainer
+
+pytestmark = pytest.mark.cluster
+
+MADE = small_setup()
+BATCH = 4
+
+
+@pytest.fixture(autouse=True)
+def closed() -> Iterator[None]:
+    yield
+    close_journals()
+
+
+def parts(folder: Path, told: list[str], resume: str = "auto") -> Parts:
+    run_folder = RunFolder(folder)
+    run_folder.prepare(resume)
+    return make_parts(MasterConfig(str(folder), resume=resume), MADE, run_folder, told.append)
+
+
+def test_a_run_that_was_killed_before_its_first_checkpoint_goes_on(tmp_path: Path) -> None:
+    kept = journal(tmp_path / "journal", MADE)
+    for number in (1, 2, 2, 3):  # one was written twice
+        kept.append(arrival(MADE, number))
+    told: list[str] = []
+    with closing(parts(tmp_path, told)) as made:
+        assert made.record.run_id == "run"
+        assert made.trainer.episodes == 3 * BATCH
+        assert made.hub.state() == {"player/0": {"incarnation": 1, "sequence": 3}}
+        assert made.journal.segment == 2
+    assert "12 episodes come back from the journal" in told
+    assert "goes on after 0 updates" in told
+
+
+def test_what_the_checkpoint_covers_is_not_read(tmp_path: Path) -> None:
+    kept, learner = journal(tmp_path / "journal", MADE), trainer(MADE)
+    for number in (1, 2):
+        kept.append(arrival(MADE, number))
+        learner.insert(arrival(MADE, number).episodes)
+    table = {"player/0": {"incarnation": 1, "sequence": 2}}
+    rest = Restored(Record("run"), table, kept.rotate())
+    save_run(tmp_path / "checkpoints", learner, rest, keep=2)
+    kept.append(arrival(MADE, 3))
+    segments(tmp_path / "journal")[1].write_bytes(b"nobody reads this")
+    told: list[str] = []
+    with closing(parts(tmp_path, told)) as made:
+        assert made.trainer.episodes == 3 * BATCH
+        assert made.hub.state() == {"player/0": {"incarnation": 1, "sequence": 3}}
+    assert told[-2:] == ["4 episodes come back from the journal", "goes on after 0 updates"]
+
+
+def test_the_one_before_a_corrupt_checkpoint_has_a_longer_journal(tmp_path: Path) -> None:
+    kept, learner = journal(tmp_path / "journal", MADE), trainer(MADE)
+    for number in (1, 2, 3):
+        kept.append(arrival(MADE, number))
+        learner.insert(arrival(MADE, number).episodes)
+        table = {"player/0": {"incarnation": 1, "sequence": number}}
+        rest = Restored(Record("run"), table, kept.rotate())
+        path = save_run(tmp_path / "checkpoints", learner, rest, keep=2)
+    (path / "replay.safetensors").unlink()
+    told: list[str] = []
+    with closing(parts(tmp_path, told)) as made:
+        assert made.trainer.episodes == 3 * BATCH
+        assert made.hub.state() == {"player/0": {"incarnation": 1, "sequence": 3}}
+    assert "4 episodes come back from the journal" in told
+
+
+def test_a_journal_of_another_run_is_refused_and_the_port_is_free_again(tmp_path: Path) -> None:
+    kept, learner = journal(tmp_path / "journal", MADE), trainer(MADE)
+    kept.append(arrival(MADE, 1))
+    save_run(tmp_path / "checkpoints", learner, Restored(Record("another"), {}), keep=2)
+    with pytest.raises(RunError, match="is of another run, task or version"):
+        parts(tmp_path, [])
+
+
+def test_a_folder_with_a_journal_is_no_place_for_a_new_run(tmp_path: Path) -> None:
+    journal(tmp_path / "journal", MADE).append(arrival(MADE, 1))
+    with pytest.raises(ConfigError, match="holds a run already"):
+        parts(tmp_path, [], resume="none")
