@@ -54,10 +54,11 @@ class Keeper:
         """Write a checkpoint, and drop the segments of the journal that nobody needs any more.
 
         Raises:
-            RunError: the weights are not finite.
+            RunError: the weights are not finite, one time too many.
             DiskError: the disk does not take it; what was there before is as it was.
         """
         parts = self._parts
+        parts.guard.check()
         parts.record.wall_s = self._clock.wall_s()
         rest = Restored(parts.record, parts.hub.state(), parts.journal.rotate())
         folder, keep = parts.folder.checkpoints, parts.config.service.keep_checkpoints

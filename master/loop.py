@@ -174,7 +174,7 @@ class Loop:
         while trainer.pace.may_update() and time.monotonic() < until_s:
             if parts.budget.spent(parts.record.loop_s, trainer.updates):
                 return
-            self._reporter.updated(trainer.update(parts.share))
+            self._reporter.updated(parts.guard.update(parts.share))
             if parts.config.service.every_update:
                 self.publish()
 
@@ -182,10 +182,14 @@ class Loop:
         """Send the acting weights, unless these were sent before.
 
         Raises:
-            RunError: they are not finite; nothing was sent.
+            RunError: they are not finite, one time too many; nothing was sent.
         """
-        if self.parts.trainer.updates > self._published:
-            weights = self.parts.trainer.weights()
+        if self.parts.trainer.updates <= self._published:
+            return
+        weights = self.parts.guard.weights()
+        if (
+            weights.version > self._published
+        ):  # else these were bad, and the last good ones are known
             self.parts.hub.publish(weights)
             self._published = weights.version
             self._reporter.published(weights.version, self.parts)
@@ -203,8 +207,9 @@ class Loop:
             launched: an evaluator is known to come, even if it has not joined yet.
 
         Raises:
-            RunError: the final weights are not finite, or the disk is full.
+            RunError: the disk is full.
         """
+        self.parts.guard.check()
         self.publish()
         # Before anything that takes time: what was learned is safe from here on.
         self._keeper.save()

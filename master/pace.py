@@ -73,7 +73,7 @@ class Pace:
         self.transitions += transitions
 
     def updated(self, count: int = 1) -> None:
-        """Count updates that were done."""
+        """Count updates that were done; a negative count takes back such that were undone."""
         self.updates += count
 
     def state(self) -> dict[str, float]:

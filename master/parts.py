@@ -8,6 +8,7 @@ from master.arrivals import WelcomeInfo
 from master.budget import Budget
 from master.checkpoint import Restored, restore_run, warm_start
 from master.config import MasterConfig
+from master.guard import Guard
 from master.hub import Hub
 from master.journal import Journal
 from master.record import Record
@@ -35,6 +36,7 @@ class Parts:
         record: what the run has been through.
         budget: its bounds.
         hub: the sockets, open.
+        guard: updates the trainer, and undoes what is not finite.
         journal: keeps what was not in the last checkpoint.
     """
 
@@ -45,6 +47,7 @@ class Parts:
     record: Record
     budget: Budget
     hub: Hub
+    guard: Guard
     journal: Journal
 
     @property
@@ -100,7 +103,8 @@ def make_parts(
     )
     info = WelcomeInfo(run_id, config.seed, setup.fingerprints(), spec, service.window)
     hub = Hub(service.bind, service.port, info)
-    parts = Parts(config, setup, folder, trainer, rest.record, budget, hub, journal)
+    guard = Guard(trainer, service.max_bad_updates, folder.bad_batch)
+    parts = Parts(config, setup, folder, trainer, rest.record, budget, hub, guard, journal)
     try:
         if found:
             hub.load_state(rest.hub)

@@ -117,6 +117,7 @@ class Reporter:
             "rates/transitions_per_s": rates.transitions_per_s(),
             "rates/updates_per_s": rates.updates_per_s(),
             "pace/lag": trainer.pace.lag,
+            "train/undone_updates": parts.guard.undone,
         }
         values |= {f"hub/{name}": value for name, value in parts.hub.counters.items()}
         self.metrics.scalars(values, trainer.updates)

@@ -29,6 +29,7 @@ class RunFolder:
         logs: folder of the output of workers and evaluator.
         curve: the scores of every evaluation.
         result: the scores of the final weights.
+        bad_batch: what the learner could not learn from, where that ended the run.
         picture: the test episodes, played with the final weights.
     """
 
@@ -42,6 +43,7 @@ class RunFolder:
         self.logs = self.path / "logs"
         self.curve = self.path / "curve.jsonl"
         self.result = self.path / "result.json"
+        self.bad_batch = self.path / "bad_batch.safetensors"
         self.picture = self.path / "test_episodes.png"
 
     def prepare(self, resume: str) -> None:

@@ -13,7 +13,7 @@ from tangram_agent.hindsight import with_twins
 from tangram_agent.replay import ReplayBuffer
 from tangram_agent.runs import ACTING, SETUP
 from tangram_agent.setup import Setup
-from tangram_agent.types import Episodes, Weights
+from tangram_agent.types import Episodes, Transitions, Weights
 from tangram_sim.errors import ConfigError, RunError
 from tangram_sim.rewards import make_reward
 
@@ -32,7 +32,7 @@ class Trainer:
         replay: transitions played and their hindsight twins.
         pace: decides whether to learn or to take in episodes.
         episodes: taken in since the run began.
-        last: losses of the last update.
+        batch: of the last update.
     """
 
     def __init__(self, setup: Setup, seed: int, device: str, lag_updates: int) -> None:
@@ -45,7 +45,7 @@ class Trainer:
         )
         self.pace = Pace(agent.updates_per_transition, agent.learning_starts, lag_updates)
         self.episodes = 0
-        self.last: dict[str, float] = {}
+        self.batch: Transitions | None = None
         self._generators = {
             name: np.random.default_rng([seed, stream]) for stream, name in enumerate(STREAMS)
         }
@@ -70,34 +70,26 @@ class Trainer:
 
     def update(self, share: float) -> dict[str, float]:
         """One update, at the used share of the budget; returns its losses."""
-        batch = self.replay.sample(self.setup.agent.batch_size, self._generators["replay"])
-        self.last = self.learner.update(batch, share)
+        self.batch = self.replay.sample(self.setup.agent.batch_size, self._generators["replay"])
+        losses = self.learner.update(self.batch, share)
         self.pace.updated()
-        return self.last
+        return losses
+
+    def go_back(self, state: dict[str, npt.NDArray[Any]]) -> int:
+        """Take the learner back to a state of its own; returns how many updates that undoes."""
+        before = self.updates
+        self.learner.load_state(state)
+        self.pace.updated(self.updates - before)
+        return before - self.updates
 
     def weights(self) -> Weights:
-        """The acting weights; their version is the number of updates.
-
-        Raises:
-            RunError: they are not finite, so nobody may play with them or keep them.
-        """
-        weights = self.learner.acting_weights(self.updates)
-        for name, tensor in weights.tensors.items():
-            if not np.isfinite(tensor).all():
-                losses = ", ".join(f"{key}={value:g}" for key, value in self.last.items())
-                raise RunError(
-                    f"the weights are not finite after {self.updates} updates ('{name}'; "
-                    f"{losses}); they were neither sent nor kept: lower agent.actor_lr and "
-                    "agent.critic_lr or set agent.grad_clip=1, and start again or go on from the "
-                    "last checkpoint with resume=auto"
-                )
-        return weights
+        """The acting weights; their version is the number of updates."""
+        return self.learner.acting_weights(self.updates)
 
     def state(self) -> tuple[Arrays, dict[str, Any]]:
         """Arrays by file, and JSON values, for a checkpoint.
 
-        Raises:
-            RunError: the weights are not finite.
+        The caller sees to it that they are finite, see `guard`.
         """
         arrays = {
             ACTING: dict(self.weights().tensors),

@@ -167,6 +167,7 @@ class ServiceConfig:
         checkpoint_minutes: time between two checkpoints.
         keep_checkpoints: newest checkpoints kept.
         journal_sync_seconds: time between two syncs of the journal, 0 for every batch.
+        max_bad_updates: updates in a row that may be undone because they are not finite.
         device: auto, cpu or cuda.
         threads: torch threads of the master.
     """
@@ -185,6 +186,7 @@ class ServiceConfig:
     checkpoint_minutes: float = 5.0
     keep_checkpoints: int = 2
     journal_sync_seconds: float = 1.0
+    max_bad_updates: int = 10
     device: str = "auto"
     threads: int = 1
 
@@ -195,6 +197,7 @@ class ServiceConfig:
         check_range("service.window", self.window, 1, 1024)
         check_range("service.eval_episodes", self.eval_episodes, 1, 100_000)
         check_range("service.keep_checkpoints", self.keep_checkpoints, 1, 1000)
+        check_range("service.max_bad_updates", self.max_bad_updates, 1)
         check_range("service.threads", self.threads, 1, 1024)
         # Without any lag a worker would wait for updates that wait for its episodes.
         check_range("service.lag_updates", self.lag_updates, 1)

@@ -58,6 +58,10 @@ def polyak_update(target: nn.Module, source: nn.Module, rho: float) -> None:
         torch._foreach_lerp_(targets, sources, 1.0 - rho)
 
 
+class NotFiniteError(RunError):
+    """Numbers of an update, or weights, that are not finite."""
+
+
 class Learner:
     """Actor, critic, their targets and optimisers.
 
@@ -93,19 +97,25 @@ class Learner:
             progress: used share of the run's budget, in [0, 1]; decides the learning rate.
 
         Returns:
-            critic_loss, actor_loss, q (mean value of the batch's actions), saturation.
+            critic_loss, actor_loss, q (mean value of the batch's actions), saturation, and the
+            norms of the gradients, critic_gradient and actor_gradient.
+
+        Raises:
+            NotFiniteError: one of these is not finite. The update does not count, and the networks
+                may be spoilt: load a state from before.
         """
         tensors = {name: self._tensor(column) for name, column in vars(batch).items()}
         self._set_learning_rate(progress)
-        critic_loss, q = self._critic_step(tensors)
-        actor_loss, penalty = self._actor_step(tensors)
+        values = self._critic_step(tensors) | self._actor_step(tensors)
         if self.config.gamma > 0.0:
             polyak_update(self.target_critic, self.critic, self.config.polyak)
             polyak_update(self.target_actor, self.actor, self.config.polyak)
         polyak_update(self.acting, self.actor, self.config.acting_average)
+        # One wait for the device, after everything has been asked of it.
+        numbers = dict(zip(values, torch.stack(list(values.values())).tolist(), strict=True))
+        _check_finite(self.updates + 1, numbers)
         self.updates += 1
-        values = torch.stack([critic_loss, actor_loss, q, penalty]).tolist()
-        return dict(zip(("critic_loss", "actor_loss", "q", "saturation"), values, strict=True))
+        return numbers
 
     def critic_loss(self, t: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Mean squared Bellman error of Eq. 3, and the values (B,)."""
@@ -132,18 +142,22 @@ class Learner:
             t["reward"], t["done"], self.target_critic(*after, velocity), self.config.gamma
         )
 
-    def _critic_step(self, t: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def _critic_step(self, t: dict[str, Tensor]) -> dict[str, Tensor]:
         loss, q = self.critic_loss(t)
-        _step(self.critic, self.critic_optimiser, loss, self.config.grad_clip)
-        return loss.detach(), q.detach().mean()
+        norm = _step(self.critic, self.critic_optimiser, loss, self.config.grad_clip)
+        return {"critic_loss": loss.detach(), "q": q.detach().mean(), "critic_gradient": norm}
 
-    def _actor_step(self, t: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def _actor_step(self, t: dict[str, Tensor]) -> dict[str, Tensor]:
         self.critic.requires_grad_(False)
         value_loss, penalty = self.actor_loss(t)
         loss = value_loss + self.config.saturation_penalty * penalty
-        _step(self.actor, self.actor_optimiser, loss, self.config.grad_clip)
+        norm = _step(self.actor, self.actor_optimiser, loss, self.config.grad_clip)
         self.critic.requires_grad_(True)
-        return value_loss.detach(), penalty.detach()
+        return {
+            "actor_loss": value_loss.detach(),
+            "saturation": penalty.detach(),
+            "actor_gradient": norm,
+        }
 
     def _set_learning_rate(self, progress: float) -> None:
         factor = 1.0
@@ -243,9 +257,17 @@ def _adam(module: nn.Module, rate: float) -> torch.optim.Adam:
     return torch.optim.Adam(module.parameters(), lr=rate, fused=True)
 
 
-def _step(module: nn.Module, optimiser: torch.optim.Adam, loss: Tensor, clip: float) -> None:
+def _step(module: nn.Module, optimiser: torch.optim.Adam, loss: Tensor, clip: float) -> Tensor:
+    """One step; returns the norm of the whole gradient."""
     optimiser.zero_grad(set_to_none=True)
     loss.backward()  # type: ignore[no-untyped-call]
-    if clip > 0.0:
-        nn.utils.clip_grad_norm_(module.parameters(), clip)
+    limit = clip if clip > 0.0 else math.inf
+    norm = nn.utils.clip_grad_norm_(module.parameters(), limit)
     optimiser.step()
+    return norm
+
+
+def _check_finite(updates: int, numbers: dict[str, float]) -> None:
+    if not all(map(math.isfinite, numbers.values())):
+        listed = ", ".join(f"{name}={value:g}" for name, value in numbers.items())
+        raise NotFiniteError(f"update {updates} is not finite ({listed})")

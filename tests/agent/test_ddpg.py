@@ -1,7 +1,6 @@
 """Eqs. 3-6: hand-made targets, goldens, and what must have no effect."""
 
 import json
-import math
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import torch
 
 from tangram_agent.ddpg import (
     Learner,
+    NotFiniteError,
     critic_target,
     next_token,
     polyak_update,
@@ -141,7 +141,9 @@ def test_target_networks_matter_where_an_episode_goes_on() -> None:
     made = setup(agent={"gamma": 0.99})
     spoilt = Learner(made, seed=0)
     spoil_targets(spoilt)
-    assert math.isnan(spoilt.update(random_transitions(made, 16, done=None))["critic_loss"])
+    with pytest.raises(NotFiniteError, match="update 1 is not finite .critic_loss=nan"):
+        spoilt.update(random_transitions(made, 16, done=None))
+    assert spoilt.updates == 0
 
 
 def test_an_update_moves_each_network_and_drags_the_averages() -> None:

@@ -14,6 +14,7 @@ from master.arrivals import EpisodesArrived, ScoresArrived
 from master.budget import Budget
 from master.config import MasterConfig
 from master.curve import Curve
+from master.guard import Guard
 from master.journal import Journal
 from master.loop import Loop
 from master.metrics import Metrics
@@ -160,14 +161,16 @@ def loop(
     settings = MasterConfig(str(folder), service=ServiceConfig(**lag | (service or {})), **config)
     run_folder = RunFolder(folder)
     run_folder.prepare("auto")
+    learner = trainer(made, lag_updates=settings.service.lag_updates)
     parts = Parts(
         settings,
         made,
         run_folder,
-        trainer(made, lag_updates=settings.service.lag_updates),
+        learner,
         Record(),
         Budget(settings),
         hub,  # type: ignore[arg-type]
+        Guard(learner, settings.service.max_bad_updates, run_folder.bad_batch),
         journal(run_folder.journal, made),
     )
     metrics = Metrics(run_folder.tensorboard)

@@ -1,0 +1,114 @@
+"""Numbers that are not finite: the update is undone, counted, and ends the run if it goes on."""
+
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import safetensors.numpy
+
+from master.every import Every
+from master.trainer import Trainer
+from tangram_agent.ddpg import NotFiniteError
+from tangram_agent.files import write_whole
+from tangram_agent.types import Weights
+from tangram_sim.errors import RunError
+
+log = logging.getLogger(__name__)
+
+# Going back further costs updates, keeping more often costs time.
+KEEP_S = 0.5
+
+
+class Guard:
+    """Updates a trainer, and takes it back to its last good state when one goes wrong.
+
+    Attributes:
+        undone: updates that were not finite.
+    """
+
+    def __init__(self, trainer: Trainer, limit: int, evidence: Path) -> None:
+        """Keep the present state as the first good one.
+
+        Args:
+            trainer: as made or restored.
+            limit: failures in a row, without good weights between them, that end the run.
+            evidence: where the batch of the last failure is then written to.
+
+        Raises:
+            NotFiniteError: the state is not finite already.
+        """
+        self.undone = 0
+        self._trainer, self._limit, self._evidence = trainer, limit, evidence
+        self._in_a_row, self._keep = 0, Every(KEEP_S)
+        self._good = trainer.learner.state()
+        _check_finite(self._good, trainer.updates)
+
+    def update(self, share: float) -> dict[str, float]:
+        """One update; its losses, none if it was undone.
+
+        Raises:
+            RunError: it was one failure too many.
+        """
+        try:
+            losses = self._trainer.update(share)
+        except NotFiniteError as error:
+            self._undo(error)
+            return {}
+        if self._keep.due():
+            self.check()
+        return losses
+
+    def weights(self) -> Weights:
+        """The acting weights, which are finite.
+
+        Raises:
+            RunError: they were not, one time too many.
+        """
+        weights = self._trainer.weights()
+        try:
+            _check_finite(weights.tensors, weights.version)
+        except NotFiniteError as error:
+            self._undo(error)
+            return self._trainer.weights()
+        return weights
+
+    def check(self) -> None:
+        """Keep the present state if it is finite, else go back to the one kept before.
+
+        Raises:
+            RunError: it was one failure too many.
+        """
+        state = self._trainer.learner.state()
+        try:
+            _check_finite(state, self._trainer.updates)
+        except NotFiniteError as error:
+            self._undo(error)
+        else:
+            self._good, self._in_a_row = state, 0
+
+    def _undo(self, error: NotFiniteError) -> None:
+        self.undone += 1
+        self._in_a_row += 1
+        if self._in_a_row >= self._limit:
+            raise RunError(
+                f"{error}; {self._in_a_row} times in a row, so the run ends. The last batch is in "
+                f"{self._write_batch()}: lower agent.actor_lr and agent.critic_lr or set "
+                "agent.grad_clip=1, and go on from the last checkpoint with resume=auto"
+            )
+        lost = self._trainer.go_back(self._good)
+        if self._in_a_row & (self._in_a_row - 1) == 0:  # the 1st, 2nd, 4th, ...
+            log.warning("%s: undone, with %d updates before it", error, lost)
+
+    def _write_batch(self) -> Path:
+        batch = {} if self._trainer.batch is None else vars(self._trainer.batch)
+        write_whole(self._evidence, safetensors.numpy.save(batch))
+        return self._evidence
+
+
+def _check_finite(arrays: Mapping[str, npt.NDArray[Any]], updates: int) -> None:
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise NotFiniteError(f"the weights are not finite after {updates} updates ('{name}')")
