@@ -16,6 +16,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 from master.arrivals import Arrival, EpisodesArrived, ScoresArrived, WelcomeInfo
+from master.keys import Keys
 from master.ledger import Verdict
 from master.peers import Peer, RefusedError, Registry
 from master.sockets import Sockets
@@ -59,7 +60,23 @@ class Hub:
         counters: traffic and refusals by name.
     """
 
-    def __init__(self, bind: str, port: int, info: WelcomeInfo, silence_s: float = 30.0) -> None:
+    def __init__(
+        self,
+        bind: str,
+        port: int,
+        info: WelcomeInfo,
+        silence_s: float = 30.0,
+        keys: Keys | None = None,
+    ) -> None:
+        """Open the sockets.
+
+        Args:
+            bind: address to listen on.
+            port: of the ROUTER, 0 for any.
+            info: what joiners are told, and must agree with.
+            silence_s: after which a peer is forgotten.
+            keys: for encrypted sockets, None for plain ones.
+        """
         self.counters: Counter[str] = Counter()
         self.epoch = secrets.token_hex(8)
         self._info, self._silence_s = info, silence_s
@@ -67,7 +84,7 @@ class Hub:
         self._weights: bytes | None = None
         self._version = -1
         self._stop_reason: str | None = None
-        self._sockets = Sockets(bind, port, self.counters)
+        self._sockets = Sockets(bind, port, self.counters, keys)
         self.endpoint = self._sockets.endpoint
         self.weights_endpoint = self._sockets.weights_endpoint
 

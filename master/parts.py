@@ -11,16 +11,22 @@ from master.config import MasterConfig
 from master.guard import Guard
 from master.hub import Hub
 from master.journal import Journal
+from master.keys import Keys, is_loopback, needs_keys, run_keys
 from master.record import Record
 from master.recovery import journal_run_id, read_journal
 from master.rundir import RunFolder
 from master.trainer import Trainer, choose_device
+from tangram_agent.config import ServiceConfig
 from tangram_agent.payloads import EpisodeSpec
 from tangram_agent.setup import Setup
 
 UNBOUNDED = (
     "warning: max_hours, max_episodes and max_updates are all 0: only Ctrl-C or SIGTERM ends this "
     "run, and learning rates do not decay"
+)
+PLAIN = (
+    "warning: service.security=plain: whoever reaches this address can read what is sent, and send "
+    "what he likes"
 )
 
 
@@ -38,6 +44,7 @@ class Parts:
         hub: the sockets, open.
         guard: updates the trainer, and undoes what is not finite.
         journal: keeps what was not in the last checkpoint.
+        keys: of the sockets, None where they are plain.
     """
 
     config: MasterConfig
@@ -49,6 +56,7 @@ class Parts:
     hub: Hub
     guard: Guard
     journal: Journal
+    keys: Keys | None = None
 
     @property
     def share(self) -> float:
@@ -61,11 +69,18 @@ class Parts:
         return sum(peer.role == role for peer in self.hub.peers)
 
     def connection(self) -> dict[str, str]:
-        """What a worker needs to find this master."""
-        return {
+        """What a worker needs to find this master, and to be let in."""
+        where = {
             "endpoint": self.hub.endpoint,
             "weights_endpoint": self.hub.weights_endpoint,
             "run_id": self.record.run_id,
+        }
+        if self.keys is None:
+            return where
+        return where | {
+            "server_key": self.keys.server_public,
+            "public_key": self.keys.worker_public,
+            "secret_key": self.keys.worker_secret,
         }
 
     def close(self) -> None:
@@ -102,9 +117,10 @@ def make_parts(
         folder.journal, run_id, setup.task_digest(), spec, service.journal_sync_seconds
     )
     info = WelcomeInfo(run_id, config.seed, setup.fingerprints(), spec, service.window)
-    hub = Hub(service.bind, service.port, info)
+    keys = _keys(service, folder, notice)
+    hub = Hub(service.bind, service.port, info, keys=keys)
     guard = Guard(trainer, service.max_bad_updates, folder.bad_batch)
-    parts = Parts(config, setup, folder, trainer, rest.record, budget, hub, guard, journal)
+    parts = Parts(config, setup, folder, trainer, rest.record, budget, hub, guard, journal, keys)
     try:
         if found:
             hub.load_state(rest.hub)
@@ -116,6 +132,15 @@ def make_parts(
         began = found or trainer.episodes
         notice(f"goes on after {trainer.updates:,} updates" if began else "a new run begins")
     return parts
+
+
+def _keys(service: ServiceConfig, folder: RunFolder, notice: Callable[[str], None]) -> Keys | None:
+    """Keys where the sockets must be encrypted."""
+    if needs_keys(service.bind, service.security):
+        return run_keys(folder.keys)
+    if not is_loopback(service.bind):
+        notice(PLAIN)
+    return None
 
 
 def _new_record(journal: Path) -> Record:

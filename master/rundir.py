@@ -23,6 +23,7 @@ class RunFolder:
         path: the folder.
         config: the resolved config.
         connection: where the master can be reached; there while it runs.
+        keys: of encrypted sockets.
         checkpoints: folder of the checkpoints.
         journal: folder of what came since.
         tensorboard: folder of the curves.
@@ -37,6 +38,7 @@ class RunFolder:
         self.path = Path(path).expanduser()
         self.config = self.path / "config.yaml"
         self.connection = self.path / "connection.json"
+        self.keys = self.path / "keys.json"
         self.checkpoints = self.path / "checkpoints"
         self.journal = self.path / "journal"
         self.tensorboard = self.path / "tensorboard"

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 import zmq
 
+from master.doorkeeper import Doorkeeper
+from master.keys import Keys
 from tangram_agent.payloads import MAX_BATCH_BYTES
 from tangram_sim.errors import ConfigError
 
@@ -24,14 +26,17 @@ class Sockets:
         weights_endpoint: of the PUB.
     """
 
-    def __init__(self, bind: str, port: int, counters: Counter[str]) -> None:
+    def __init__(
+        self, bind: str, port: int, counters: Counter[str], keys: Keys | None = None
+    ) -> None:
         self._counters = counters
         self._context = zmq.Context()
+        self._doorkeeper = Doorkeeper(self._context, keys, counters) if keys else None
         try:
             self._router = self._open(zmq.ROUTER, bind, port)
             self._pub = self._open(zmq.PUB, bind, 0)
         except ConfigError:
-            self._context.destroy(linger=0)
+            self._close(0)
             raise
         self.endpoint = self._router.getsockopt_string(zmq.LAST_ENDPOINT)
         self.weights_endpoint = self._pub.getsockopt_string(zmq.LAST_ENDPOINT)
@@ -65,7 +70,12 @@ class Sockets:
 
     def close(self) -> None:
         """Close; what is on its way gets a second."""
-        self._context.destroy(linger=LINGER_MS)
+        self._close(LINGER_MS)
+
+    def _close(self, linger_ms: int) -> None:
+        if self._doorkeeper is not None:
+            self._doorkeeper.close()
+        self._context.destroy(linger=linger_ms)
 
     def _open(self, kind: int, bind: str, port: int) -> zmq.Socket[bytes]:
         socket = self._context.socket(kind)
@@ -78,6 +88,8 @@ class Sockets:
         if kind == zmq.ROUTER:
             # Else answers to those who are gone vanish without a word.
             socket.setsockopt(zmq.ROUTER_MANDATORY, 1)
+        if self._doorkeeper is not None:
+            self._doorkeeper.guard(socket)
         host = f"[{bind}]" if ":" in bind else bind
         try:
             socket.bind(f"tcp://{host}:{port or '*'}")

@@ -155,6 +155,8 @@ class ServiceConfig:
     Attributes:
         bind: address that the master listens on.
         port: of the master's ROUTER socket, 0 for any free one; PUB takes any free one.
+        security: curve (encrypted, and only for who has the run's connection file), plain, or
+            auto: curve on every address but loopback.
         publish_seconds: least time between two broadcasts of weights.
         every_update: broadcast after every update instead, as the paper does.
         envs: environments that one worker plays at a time.
@@ -174,6 +176,7 @@ class ServiceConfig:
 
     bind: str = "127.0.0.1"
     port: int = 0
+    security: str = "auto"
     publish_seconds: float = 0.5
     every_update: bool = False
     envs: int = 16
@@ -205,4 +208,5 @@ class ServiceConfig:
             check_range(f"service.{name}", getattr(self, name), 0)
         for name in ("log_seconds", "checkpoint_minutes"):
             check_range(f"service.{name}", getattr(self, name), 1e-3)
+        check_choice("service.security", self.security, ("auto", "curve", "plain"))
         check_choice("service.device", self.device, ("auto", "cpu", "cuda"))

@@ -5,10 +5,12 @@ import secrets
 from collections.abc import Iterator, Sequence
 
 import zmq
+from zmq.utils.monitor import recv_monitor_message
 
 from tangram_agent.frames import MAX_HEADER
 from tangram_agent.payloads import MAX_WEIGHTS_BYTES
 from tangram_sim.errors import RunError
+from worker.connection import Connection
 
 LINGER_MS = 1000
 # More than any window, so that only heartbeats to a master that is away find no room.
@@ -17,6 +19,11 @@ HIGH_WATER = 2048
 PING_MS = 5000
 RECONNECT_MS = 100
 RECONNECT_MAX_MS = 2000
+HANDSHAKES = (
+    zmq.EVENT_HANDSHAKE_FAILED_AUTH
+    | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+    | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+)
 
 
 class Channel:
@@ -26,15 +33,16 @@ class Channel:
     it believes alive.
     """
 
-    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str) -> None:
-        self._context, self.endpoint = context, endpoint
+    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], found: Connection) -> None:
+        self._context, self._found = context, found
         self._sub: zmq.Socket[bytes] | None = None
         self._weights_endpoint = ""
         self._poller = zmq.Poller()
         self._dealer = self._open(zmq.DEALER)
         # The first byte must not be zero.
         self._dealer.setsockopt(zmq.IDENTITY, b"w" + secrets.token_bytes(16))
-        self._connect(self._dealer, endpoint)
+        self._monitor = self._dealer.get_monitor_socket(HANDSHAKES)
+        self._connect(self._dealer, found.endpoint)
 
     def subscribe(self, weights_endpoint: str) -> None:
         """Listen for weights there, and nowhere else."""
@@ -77,9 +85,19 @@ class Channel:
         except zmq.Again:
             return None
 
+    def handshake_failed(self) -> bool:
+        """Whether the other side and this one did not agree on encryption and keys since then."""
+        failed = False
+        while self._monitor.poll(0):
+            recv_monitor_message(self._monitor)
+            failed = True
+        return failed
+
     def close(self, linger_ms: int = 0) -> None:
         """Close both sockets; what is queued gets so long."""
         self._drop_sub()
+        self._dealer.disable_monitor()
+        self._monitor.close(0)
         self._dealer.close(linger_ms)
 
     def _drop_sub(self) -> None:
@@ -97,6 +115,10 @@ class Channel:
         socket.setsockopt(zmq.HEARTBEAT_IVL, PING_MS)
         socket.setsockopt(zmq.RECONNECT_IVL, RECONNECT_MS)
         socket.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MAX_MS)
+        if self._found.server_key:
+            socket.setsockopt(zmq.CURVE_SERVERKEY, self._found.server_key.encode())
+            socket.setsockopt(zmq.CURVE_PUBLICKEY, self._found.public_key.encode())
+            socket.setsockopt(zmq.CURVE_SECRETKEY, self._found.secret_key.encode())
         self._poller.register(socket, zmq.POLLIN)
         return socket
 

@@ -1,13 +1,16 @@
 """Where the master is: an address, or the connection file that it writes into its run folder."""
 
 import json
-from dataclasses import dataclass
+import re
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from tangram_sim.errors import RunError
 
 FILE_NAME = "connection.json"
 SCHEME = "tcp://"
+KEYS = ("server_key", "public_key", "secret_key")
+KEY = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
 WILDCARDS = ("0.0.0.0", "*", "[::]")  # noqa: S104  # replaced, never bound
 
 
@@ -18,10 +21,20 @@ class Connection:
     Attributes:
         endpoint: of its ROUTER socket.
         run_id: that it must have, empty where any will do.
+        server_key: the master's public CURVE key, empty where nothing is encrypted.
+        public_key, secret_key: the pair of the run's workers.
     """
 
     endpoint: str
     run_id: str = ""
+    server_key: str = ""
+    public_key: str = ""
+    secret_key: str = field(default="", repr=False)
+
+    def __post_init__(self) -> None:
+        keys = (self.server_key, self.public_key, self.secret_key)
+        if any(keys) and not all(KEY.fullmatch(key) for key in keys):
+            raise ValueError("server_key, public_key and secret_key must be 40 characters of Z85")
 
 
 def find_connection(connect: str) -> Connection | None:
@@ -40,7 +53,9 @@ def find_connection(connect: str) -> Connection | None:
         path /= FILE_NAME
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        return Connection(_checked(str(content["endpoint"]), str(path)), str(content["run_id"]))
+        endpoint = _checked(str(content["endpoint"]), str(path))
+        keys = {name: str(content.get(name, "")) for name in KEYS}
+        return Connection(endpoint, str(content["run_id"]), **keys)
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError) as error:

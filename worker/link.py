@@ -110,9 +110,12 @@ class Link:
         """
         joined = self._wait(lambda: self._talk.joined, self._timing.join_s)
         if not joined and not self.stopped:
-            lacking = "master answers" if self._talk.found else "connection file is"
+            line = self._talk.line
+            if line.stranger:
+                raise TangramError(line.estranged)
+            lacking = "master answers" if line.found else "connection file is"
             raise TangramError(
-                f"no {lacking} at {self._talk.place} after {self._timing.join_s:g} s: "
+                f"no {lacking} at {line.place} after {self._timing.join_s:g} s: "
                 "is tangram-master running there?"
             )
         return joined

@@ -10,8 +10,6 @@ import secrets
 import time
 from collections import Counter
 
-import zmq
-
 from tangram_agent.decoding import decode_from_master
 from tangram_agent.frames import ProtocolError
 from tangram_agent.payloads import WeightShapes
@@ -32,9 +30,10 @@ from tangram_agent.wire import (
     Welcome,
 )
 from tangram_sim.errors import TangramError, WireError
-from worker.channel import LINGER_MS, Channel
-from worker.connection import Connection, find_connection, reachable
+from worker.channel import Channel
+from worker.connection import reachable
 from worker.inbox import Inbox
+from worker.line import Line
 from worker.spool import Spool
 from worker.terms import Introduction, Timing
 
@@ -51,6 +50,7 @@ class Talk:
         counters: what was sent again, refused, lost or not understood.
         welcome: the master's last one.
         joined: the present connection is known to the master.
+        line: the connection.
         dismissed: the master wants this process to end.
         reason: that it gave.
     """
@@ -61,28 +61,13 @@ class Talk:
         self.spool, self.inbox = Spool(window), Inbox(shapes)
         self.stats: dict[str, float] = {}
         self.counters: Counter[str] = Counter()
+        self.line = Line(who.connect, timing, self.counters)
         self.welcome: Welcome | None = None
         self.joined = self.dismissed = False
         self.reason = ""
         self._who, self._window, self._shapes, self._timing = who, window, shapes, timing
         self._process = secrets.token_hex(16)
-        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._channel: Channel | None = None
-        self._found: Connection | None = None
         self._hello_at = self._heartbeat_at = self._resend_at = 0.0
-        # Since when an answer is due on this connection, and on all since the last answer.
-        self._asked_at: float | None = None
-        self._lost_at: float | None = None
-
-    @property
-    def place(self) -> str:
-        """Where the master is, as far as known."""
-        return self._found.endpoint if self._found else self._who.connect
-
-    @property
-    def found(self) -> bool:
-        """Whether the master's address is known."""
-        return self._found is not None
 
     def step(self, timeout_s: float) -> None:
         """Wait at most so long for something to come, then answer and do what is due.
@@ -90,24 +75,21 @@ class Talk:
         Raises:
             TangramError: refused, another run, or without an answer for `lost_s`.
         """
-        channel = self._channel or self._open()
+        channel = self.line.channel or self._open()
         if channel is None:  # nothing to wait for but the file
             time.sleep(timeout_s)
         else:
             channel.wait(timeout_s)
+            self.line.look(time.monotonic())
             self._receive_weights(channel)
             for frames in channel.messages():
                 self._receive(frames)
             self._do_what_is_due(channel, time.monotonic())
-        if self._lost_at is not None and time.monotonic() - self._lost_at > self._timing.lost_s:
-            raise TangramError(
-                f"the master at {self.place} has not answered for {self._timing.lost_s:g} s: "
-                "is it still running?"
-            )
+        self.line.check_lost(time.monotonic())
 
     def post(self, frames: list[bytes]) -> bool:
         """Send to a master that knows this connection; False if that was not possible."""
-        return self.joined and self._channel is not None and self._channel.send(frames)
+        return self.joined and self.line.channel is not None and self.line.channel.send(frames)
 
     def post_next(self, frames: list[bytes]) -> None:
         """Keep the spool's next message and send it."""
@@ -118,34 +100,21 @@ class Talk:
 
     def close(self, reason: str) -> None:
         """Say BYE and close; bounded, also when nobody listens."""
-        if self._channel is not None:
-            self._channel.send(Bye(reason).encode())
-            self._channel.close(LINGER_MS)
-            self._channel = None
-        self._context.destroy(linger=LINGER_MS)
+        if self.line.channel is not None:
+            self.line.channel.send(Bye(reason).encode())
+        self.line.close()
 
     def _open(self) -> Channel | None:
-        self._found = find_connection(self._who.connect)
-        if self._found is not None:
-            self._channel = Channel(self._context, self._found.endpoint)
-            self._say_hello(self._channel, time.monotonic())
-        return self._channel
-
-    def _reopen(self, channel: Channel) -> None:
-        """Drop a connection that does not answer; its file may name another address by now."""
-        self.counters["reconnects"] += 1
-        if self._lost_at is None:
-            self._lost_at = self._asked_at
-        self._asked_at = None
-        self.joined = False
-        channel.close()
-        self._channel = None
-        self._open()
+        if self.line.open() and self.line.channel is not None:
+            self._say_hello(self.line.channel, time.monotonic())
+        return self.line.channel
 
     def _do_what_is_due(self, channel: Channel, now: float) -> None:
         timing = self._timing
-        if self._asked_at is not None and now - self._asked_at > timing.silence_s:
-            self._reopen(channel)
+        if self.line.is_dead(now):
+            self.joined = False
+            self.line.drop()
+            self._open()
         elif not self.joined:
             if now >= self._hello_at:
                 self._say_hello(channel, now)
@@ -170,8 +139,7 @@ class Talk:
         self._ask(channel, hello, now)
 
     def _ask(self, channel: Channel, question: Plain, now: float) -> None:
-        if self._asked_at is None:
-            self._asked_at = now
+        self.line.asked(now)
         channel.send(question.encode())
 
     def _resend(self, now: float) -> None:
@@ -187,9 +155,9 @@ class Talk:
             raise
         except WireError as error:
             self.counters["malformed"] += 1
-            log.warning("the master at %s sent what is not understood: %s", self.place, error)
+            log.warning("the master at %s sent what is not understood: %s", self.line.place, error)
             return
-        self._asked_at = self._lost_at = None
+        self.line.answered()
         self._handle(message, time.monotonic())
 
     def _receive_weights(self, channel: Channel) -> None:
@@ -200,7 +168,7 @@ class Talk:
             self.inbox.offer_frame(frame)
         except WireError as error:
             self.counters["malformed"] += 1
-            log.warning("weights from %s are refused: %s", self.place, error)
+            log.warning("weights from %s are refused: %s", self.line.place, error)
 
     def _handle(self, message: ToWorker, now: float) -> None:
         match message:
@@ -229,22 +197,23 @@ class Talk:
                 self.dismissed, self.reason = True, reason
             case Refused(reason):
                 raise TangramError(
-                    f"the master at {self.place} refused this {self._who.role}: {reason}"
+                    f"the master at {self.line.place} refused this {self._who.role}: {reason}"
                 )
 
     def _join(self, welcome: Welcome, now: float) -> None:
-        if self.joined or self._channel is None or self._found is None:
+        channel, found = self.line.channel, self.line.found
+        if self.joined or channel is None or found is None:
             return
-        wanted = self._found.run_id if self.welcome is None else self.welcome.run_id
+        wanted = found.run_id if self.welcome is None else self.welcome.run_id
         if wanted and wanted != welcome.run_id:
             raise TangramError(
-                f"the master at {self.place} runs '{welcome.run_id}', not '{wanted}': the "
+                f"the master at {self.line.place} runs '{welcome.run_id}', not '{wanted}': the "
                 "connection file is stale, take the one of a master that is running"
             )
-        self.welcome, self.joined = welcome, True
+        self.welcome, self.joined, self.line.stranger = welcome, True, False
         self.spool.window = min(self._window, welcome.window)
         self.inbox.begin(welcome.epoch)
-        self._channel.subscribe(reachable(welcome.weights_endpoint, self._found.endpoint))
+        channel.subscribe(reachable(welcome.weights_endpoint, found.endpoint))
         self._want_weights()
         self._heartbeat_at = now + self._timing.heartbeat_s
         self._resend(now)
@@ -254,7 +223,7 @@ class Talk:
 
     def _take_back(self, reject: Reject, now: float) -> None:
         self.counters["rejected" if reject.final else "out_of_turn"] += 1
-        log.warning("the master at %s refused a message: %s", self.place, reject.reason)
+        log.warning("the master at %s refused a message: %s", self.line.place, reject.reason)
         if reject.final:
             self.spool.remove(reject.sequence)
         else:

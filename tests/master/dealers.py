@@ -47,7 +47,11 @@ class Stage:
 
     def until(self, done: Callable[[], Any]) -> None:
         """Serve the hub until something holds, within a limit."""
-        deadline = time.monotonic() + LIMIT_S
+        self.until_within(LIMIT_S, done)
+
+    def until_within(self, limit_s: float, done: Callable[[], Any]) -> None:
+        """Serve the hub until something holds; TimeoutError when the time is over before."""
+        deadline = time.monotonic() + limit_s
         while not done():
             if time.monotonic() > deadline:
                 raise TimeoutError(f"{dict(self.hub.counters)}")

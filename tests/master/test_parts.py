@@ -9,9 +9,10 @@ import pytest
 from master.checkpoint import Restored, save_run
 from master.config import MasterConfig
 from master.journal import segments
-from master.parts import Parts, make_parts
+from master.parts import PLAIN, UNBOUNDED, Parts, make_parts
 from master.record import Record
 from master.rundir import RunFolder
+from tangram_agent.config import ServiceConfig
 from tangram_sim.errors import ConfigError, RunError
 from tests.master.builders import arrival, close_journals, journal, small_setup, trainer
 
@@ -27,10 +28,14 @@ def closed() -> Iterator[None]:
     close_journals()
 
 
-def parts(folder: Path, told: list[str], resume: str = "auto") -> Parts:
+EVERYWHERE = "0.0.0.0"  # noqa: S104
+
+
+def parts(folder: Path, told: list[str], resume: str = "auto", **service: str) -> Parts:
     run_folder = RunFolder(folder)
     run_folder.prepare(resume)
-    return make_parts(MasterConfig(str(folder), resume=resume), MADE, run_folder, told.append)
+    config = MasterConfig(str(folder), resume=resume, service=ServiceConfig(**service))
+    return make_parts(config, MADE, run_folder, told.append)
 
 
 def test_a_run_that_was_killed_before_its_first_checkpoint_goes_on(tmp_path: Path) -> None:
@@ -92,3 +97,27 @@ def test_a_folder_with_a_journal_is_no_place_for_a_new_run(tmp_path: Path) -> No
     journal(tmp_path / "journal", MADE).append(arrival(MADE, 1))
     with pytest.raises(ConfigError, match="holds a run already"):
         parts(tmp_path, [], resume="none")
+
+
+def test_outside_of_loopback_the_connection_carries_keys(tmp_path: Path) -> None:
+    told: list[str] = []
+    with closing(parts(tmp_path, told, bind=EVERYWHERE)) as made:
+        connection = made.connection()
+    names = ("server_key", "public_key", "secret_key")
+    assert all(len(connection[name]) == 40 for name in names)
+    with closing(parts(tmp_path, told, bind=EVERYWHERE)) as again:
+        assert {name: again.connection()[name] for name in names} == {
+            name: connection[name] for name in names
+        }
+    assert told == 2 * [UNBOUNDED, "a new run begins"]
+
+
+@pytest.mark.parametrize(("bind", "warned"), [(EVERYWHERE, True), ("127.0.0.1", False)])
+def test_plain_transport_is_warned_of_where_others_reach_it(
+    tmp_path: Path, bind: str, warned: bool
+) -> None:
+    told: list[str] = []
+    with closing(parts(tmp_path, told, bind=bind, security="plain")) as made:
+        assert set(made.connection()) == {"endpoint", "weights_endpoint", "run_id"}
+    assert (PLAIN in told) is warned
+    assert not (tmp_path / "keys.json").exists()

@@ -1,0 +1,146 @@
+"""Encrypted sockets: who has the run's connection file is let in, and nobody else."""
+
+import json
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import zmq
+
+from master.hub import Hub
+from master.keys import Keys, make_keys
+from tangram_agent.types import Weights
+from tangram_sim.errors import TangramError
+from tests.agent.messages import episodes, hello, weights
+from tests.master.dealers import INFO, Stage, staged
+from tests.worker.standin import QUICK, make_link
+from worker.link import Link
+
+pytestmark = pytest.mark.cluster
+
+SHORT = replace(QUICK, join_s=1.5, retry_s=0.1)
+
+
+def write_file(folder: Path, hub: Hub, keys: Keys | None, run_id: str = "run") -> Path:
+    """What a master with these keys would write."""
+    content = {"endpoint": hub.endpoint, "run_id": run_id}
+    if keys is not None:
+        content |= {
+            "server_key": keys.server_public,
+            "public_key": keys.worker_public,
+            "secret_key": keys.worker_secret,
+        }
+    path = folder / "connection.json"
+    path.write_text(json.dumps(content))
+    return path
+
+
+@contextmanager
+def joining(stage: Stage, path: Path | str, timing: object = SHORT) -> Iterator[Link]:
+    """A link that tries to join, while the hub is served."""
+    with make_link(str(path), timing=timing) as link, ThreadPoolExecutor(1) as pool:
+        future = pool.submit(link.join)
+        stage.until(future.done)
+        future.result()
+        yield link
+
+
+def test_the_file_lets_a_worker_in_and_everything_works(tmp_path: Path) -> None:
+    keys = make_keys()
+    with staged(keys=keys) as stage:
+        path = write_file(tmp_path, stage.hub, keys)
+        with joining(stage, path) as link:
+            link.send(episodes(), 0)
+            stage.until(stage.batches)
+            stage.hub.acknowledge(stage.batches()[0])
+            # Broadcasts are encrypted with the same keys.
+            got: list[Weights | None] = []
+
+            def served() -> bool:
+                stage.hub.publish(weights(version=len(got) + 1))
+                link.poll()
+                got.append(link.newest_weights())
+                return got[-1] is not None and link._talk.spool.first == 2
+
+            stage.until(served)
+    assert stage.hub.counters["refused_keys"] == 0
+
+
+@pytest.mark.parametrize("wrong", ["server", "worker", "both", "none"])
+def test_other_keys_are_turned_away_and_the_worker_names_its_file(
+    tmp_path: Path, wrong: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    keys, other = make_keys(), make_keys()
+    given: dict[str, Keys | None] = {
+        "server": replace(keys, server_public=other.server_public),
+        "worker": replace(
+            keys, worker_public=other.worker_public, worker_secret=other.worker_secret
+        ),
+        "both": other,
+        "none": None,
+    }
+    with staged(keys=keys) as stage:
+        path = write_file(tmp_path, stage.hub, given[wrong])
+        with pytest.raises(TangramError) as caught, joining(stage, path):
+            pass
+        assert str(caught.value) == (
+            f"wrong or stale connection file: what answers at {stage.hub.endpoint} does not take "
+            f"the keys of {path}; take the file of a master that is running"
+        )
+        assert stage.hub.counters["refused_keys"] >= (wrong == "worker")
+        assert stage.hub.peers == []
+    # It was told at once, too, not only when the patience was over.
+    assert [r.message for r in caplog.records if r.name == "worker.line"] == [str(caught.value)]
+
+
+def test_a_file_with_keys_does_not_fit_a_plain_master(tmp_path: Path) -> None:
+    with staged() as stage:
+        path = write_file(tmp_path, stage.hub, make_keys())
+        with pytest.raises(TangramError, match="wrong or stale"), joining(stage, path):
+            pass
+
+
+def test_an_address_alone_is_not_enough() -> None:
+    with (
+        staged(keys=make_keys()) as stage,
+        pytest.raises(TangramError, match=r"wants keys, or is none: name its connection file"),
+        joining(stage, stage.hub.endpoint),
+    ):
+        pass
+
+
+def test_a_file_that_becomes_right_is_read_again(tmp_path: Path) -> None:
+    """A worker may be there before its master, whose file of another life still lies there."""
+    keys = make_keys()
+    with staged(keys=keys) as stage:
+        path = write_file(tmp_path, stage.hub, make_keys())
+        patient = replace(SHORT, join_s=20.0)
+        with make_link(str(path), timing=patient) as link, ThreadPoolExecutor(1) as pool:
+            future = pool.submit(link.join)
+            stage.until(lambda: link.counters["handshakes_failed"])
+            write_file(tmp_path, stage.hub, keys)
+            stage.until(future.done)
+            assert future.result()
+
+
+def test_a_stranger_without_keys_is_not_heard_at_all() -> None:
+    """No reason is given to those who are not authenticated, whatever they say."""
+    with staged(keys=make_keys()) as stage, zmq.Context() as context:
+        socket = context.socket(zmq.DEALER)
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.connect(stage.hub.endpoint)
+        for _ in range(3):
+            socket.send_multipart(hello().encode())
+        with pytest.raises(TimeoutError):
+            stage.until_within(0.5, lambda: socket.poll(0) or stage.hub.counters)
+        socket.close()
+
+
+def test_the_port_of_an_encrypted_hub_is_free_after_it_is_closed() -> None:
+    first = Hub("127.0.0.1", 0, INFO, keys=make_keys())
+    port = int(first.endpoint.rpartition(":")[2])
+    first.close()
+    Hub("127.0.0.1", port, INFO, keys=make_keys()).close()
