@@ -52,6 +52,11 @@ class Line:
             f"of {self._connect}; take the file of a master that is running"
         )
 
+    @property
+    def is_waiting(self) -> bool:
+        """Whether no answer has come since the connection before this one was given up."""
+        return self._lost_at is not None
+
     def open(self) -> bool:
         """Connect to where the master is now; False while that is not known."""
         self.found = find_connection(self._connect)
@@ -65,6 +70,13 @@ class Line:
         self._counters["reconnects"] += 1
         if self._lost_at is None:
             self._lost_at = self._asked_at
+            if not self.stranger:
+                log.warning(
+                    "the master at %s has not answered for %g s: tries again for %g s",
+                    self.place,
+                    self._timing.silence_s,
+                    self._timing.lost_s,
+                )
         self._asked_at, self._reopen_at = None, math.inf
         if self.channel is not None:
             self.channel.close()
@@ -77,6 +89,8 @@ class Line:
 
     def answered(self) -> None:
         """Anything came."""
+        if self._lost_at is not None:
+            log.info("the master at %s answers again", self.place)
         self._asked_at = self._lost_at = None
 
     def look(self, now: float) -> None:

@@ -4,6 +4,7 @@ Nothing here waits without looking at `stopped` every STEP_S, so a signal handle
 ends each wait.
 """
 
+import logging
 import math
 import time
 from collections import Counter
@@ -18,6 +19,10 @@ from worker.talk import Talk
 from worker.terms import Introduction, Timing
 
 STEP_S = 0.1
+# Between two log lines of what is waited for.
+TELL_S = 60.0
+
+log = logging.getLogger(__name__)
 
 
 class Link:
@@ -108,7 +113,7 @@ class Link:
         Raises:
             TangramError: no master in time, or it refused; the reason is the master's.
         """
-        joined = self._wait(lambda: self._talk.joined, self._timing.join_s)
+        joined = self._wait(lambda: self._talk.joined, "the master", self._timing.join_s)
         if not joined and not self.stopped:
             line = self._talk.line
             if line.stranger:
@@ -143,7 +148,7 @@ class Link:
 
     def wait_for_window(self) -> bool:
         """Wait until a batch may be sent; False if stopped."""
-        return self._wait(lambda: self._talk.spool.free > 0)
+        return self._wait(lambda: self._talk.spool.free > 0, "the master to take what was played")
 
     def send_scores(self, scores: Scores) -> None:
         """Send the results of an evaluation, once; they are lost if no master is there.
@@ -167,7 +172,7 @@ class Link:
             found.extend([] if weights is None else [weights])
             return bool(found)
 
-        self._wait(take)
+        self._wait(take, "newer weights")
         return found[0] if found else None
 
     def drain(self, timeout_s: float) -> bool:
@@ -181,13 +186,16 @@ class Link:
         """Say BYE and close; takes a second at most."""
         self._talk.close(reason or self.stop_reason or "done")
 
-    def _wait(self, done: Callable[[], bool], timeout_s: float = math.inf) -> bool:
-        deadline = time.monotonic() + timeout_s
+    def _wait(self, done: Callable[[], bool], what: str, timeout_s: float = math.inf) -> bool:
+        begun = told = time.monotonic()
         while not self.stopped:
             if done():
                 return True
-            left = deadline - time.monotonic()
-            if left <= 0:
+            now = time.monotonic()
+            if now - begun >= timeout_s:
                 return False
-            self.poll(min(STEP_S, left))
+            if now - told >= TELL_S:
+                told = now
+                log.info("waits for %s since %.0f s", self._talk.lacks or what, now - begun)
+            self.poll(min(STEP_S, timeout_s))
         return False

@@ -69,6 +69,15 @@ class Talk:
         self._process = secrets.token_hex(16)
         self._hello_at = self._heartbeat_at = self._resend_at = 0.0
 
+    @property
+    def lacks(self) -> str:
+        """What nothing goes on without, empty while the master answers."""
+        if not self.line.found:
+            return f"the connection file {self._who.connect}"
+        if not self.joined or self.line.is_waiting:
+            return f"an answer of the master at {self.line.place}"
+        return ""
+
     def step(self, timeout_s: float) -> None:
         """Wait at most so long for something to come, then answer and do what is due.
 

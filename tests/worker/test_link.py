@@ -35,6 +35,7 @@ from tangram_sim.errors import RunError, TangramError, WireError
 from tests.agent.messages import FINGERPRINTS, SHAPES, episodes, scores, weights, with_header
 from tests.master.dealers import Stage, staged
 from tests.worker.standin import LIMIT_S, QUICK, make_link, standing_in
+from worker import link as link_module
 from worker.link import Link
 
 pytestmark = pytest.mark.cluster
@@ -542,3 +543,54 @@ def test_an_address_that_zeromq_does_not_take() -> None:
     with make_link("tcp://bad host:5555") as link, pytest.raises(RunError) as caught:
         link.join()
     assert str(caught.value).startswith("cannot connect to tcp://bad host:5555 (")
+
+
+def test_a_waiting_link_says_what_it_waits_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """First the file is missing, then the master does not answer, then it does not acknowledge."""
+    monkeypatch.setattr(link_module, "TELL_S", 0.2)
+    caplog.set_level("INFO")
+
+    def said(text: str) -> bool:
+        return any(text in record.message for record in caplog.records)
+
+    def wait_until_said(link: Link, call: Callable[[], Any], text: str) -> None:
+        with ThreadPoolExecutor(1) as pool:
+            future = pool.submit(call)
+            deadline = time.monotonic() + LIMIT_S
+            while not said(text):
+                assert time.monotonic() < deadline, [r.message for r in caplog.records]
+                time.sleep(0.01)
+            link.stop("enough")
+            future.result()
+
+    with make_link(str(tmp_path)) as link:
+        wait_until_said(link, link.join, f"waits for the connection file {tmp_path} since 0 s")
+    write_connection(tmp_path, f"tcp://127.0.0.1:{free_port()}")
+    with make_link(str(tmp_path)) as link:
+        wait_until_said(link, link.join, "waits for an answer of the master at tcp://127.0.0.1:")
+    with staged() as stage, joined(stage, window=1) as link:
+        link.send(episodes(), 0)
+        with ThreadPoolExecutor(1) as pool:
+            future = pool.submit(link.wait_for_window)
+            stage.until(lambda: said("waits for the master to take what was played since"))
+            link.stop("enough")
+            stage.until(future.done)
+
+
+def test_a_silent_master_is_told_and_its_return_too(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    timing = replace(QUICK, silence_s=0.3)
+    port = free_port()
+    with staged(port=port) as stage, joined(stage, timing=timing) as link:
+        endpoint = stage.hub.endpoint
+
+        def told(text: str) -> bool:
+            link.poll(0.01)
+            return any(text in record.message for record in caplog.records)
+
+        deadline = time.monotonic() + LIMIT_S
+        while not told(f"the master at {endpoint} has not answered for 0.3 s: tries again"):
+            assert time.monotonic() < deadline
+        stage.until(lambda: told(f"the master at {endpoint} answers again"))
