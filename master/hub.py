@@ -4,35 +4,32 @@ Whatever a peer sends, `poll` does not raise: what is wrong is answered with a r
 name, and forgotten. A peer that does not read its answers loses them and nobody waits for it: the
 worker asks again.
 
-Delivery: see `ledger`. A batch is acknowledged only by `acknowledge`, after its insert (a journal
-has its place between the two), and the unacknowledged batches of one peer are bounded by `window`.
+Delivery: see `ledger`. A batch is acknowledged only by `acknowledge`, after it was
+journalled and inserted, and the unacknowledged batches of one peer are bounded by `window`.
 """
 
-import logging
 import secrets
 import time
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 from master.arrivals import Arrival, EpisodesArrived, ScoresArrived, WelcomeInfo
+from master.intake import Intake
 from master.keys import Keys
-from master.ledger import Verdict
 from master.peers import Peer, RefusedError, Registry
-from master.sockets import Sockets
+from master.post import Post
 from tangram_agent.decoding import BatchError, decode_from_worker
 from tangram_agent.frames import ProtocolError
 from tangram_agent.payloads import encode_weights
+from tangram_agent.standing import AskStatus, RunStatus
 from tangram_agent.types import Weights
 from tangram_agent.wire import (
-    Ack,
     Alive,
     Bye,
     EpisodeBatch,
     Greet,
     Heartbeat,
     Hello,
-    Plain,
     Refused,
     Reject,
     Scores,
@@ -43,8 +40,6 @@ from tangram_agent.wire import (
     Welcome,
 )
 from tangram_sim.errors import WireError
-
-log = logging.getLogger(__name__)
 
 # Most messages taken in one poll, so that the loop gets its turn under any load.
 MAX_DRAIN = 256
@@ -77,14 +72,16 @@ class Hub:
             silence_s: after which a peer is forgotten.
             keys: for encrypted sockets, None for plain ones.
         """
-        self.counters: Counter[str] = Counter()
         self.epoch = secrets.token_hex(8)
         self._info, self._silence_s = info, silence_s
         self._registry = Registry(info.fingerprints, silence_s)
         self._weights: bytes | None = None
         self._version = -1
         self._stop_reason: str | None = None
-        self._sockets = Sockets(bind, port, self.counters, keys)
+        self._status: list[bytes] | None = None
+        self._post = Post(bind, port, keys)
+        self._sockets, self.counters = self._post.sockets, self._post.counters
+        self._intake = Intake(self._post, self._registry, info.window)
         self.endpoint = self._sockets.endpoint
         self.weights_endpoint = self._sockets.weights_endpoint
 
@@ -115,22 +112,12 @@ class Hub:
             else:  # more is waiting, perhaps from those who seem silent
                 return arrivals
         for peer in self._registry.drop_silent(time.monotonic(), self._silence_s):
-            self._count("lost_peers", f"{peer.name} was silent for {self._silence_s:g} s")
+            self._post.count("lost_peers", f"{peer.name} was silent for {self._silence_s:g} s")
         return arrivals
 
     def acknowledge(self, arrival: EpisodesArrived) -> None:
         """Tell the worker that its batch is safe; once for each arrival, after its insert."""
-        key = (arrival.role, arrival.index)
-        ledger = self._registry.ledger(key, arrival.incarnation)
-        if ledger is None or arrival.sequence not in ledger.held:
-            return  # a newer process has the index, so nobody waits for this answer
-        ledger.held.discard(arrival.sequence)
-        peer = self._registry.at(key)
-        if peer is not None:
-            peer.batches += 1
-            peer.episodes += arrival.episodes.count
-            peer.transitions += arrival.episodes.transitions
-            self._send(peer.identity, Ack(arrival.sequence, duplicate=False))
+        self._intake.acknowledge(arrival)
 
     def publish(self, weights: Weights) -> None:
         """Broadcast weights, and keep them for those who join later.
@@ -142,6 +129,10 @@ class Hub:
         self._sockets.publish(self._weights)
         self.counters["published"] += 1
 
+    def tell(self, status: RunStatus) -> None:
+        """Answer with this whoever asks how the run stands."""
+        self._status = status.encode()
+
     def stop(self, reason: str) -> None:
         """Tell all peers to end, and from now on whoever says anything.
 
@@ -149,7 +140,7 @@ class Hub:
         """
         self._stop_reason = reason
         for peer in self.peers:
-            self._send(peer.identity, Stop(reason))
+            self._post.send(peer.identity, Stop(reason))
 
     def state(self) -> dict[str, dict[str, int]]:
         """The table of duplicates, for a checkpoint."""
@@ -176,28 +167,31 @@ class Hub:
         try:
             message = decode_from_worker(frames, self._info.spec)
         except ProtocolError as error:
-            self._refuse(identity, "refused_protocol", Refused(str(error)))
+            self._post.refuse(identity, "refused_protocol", Refused(str(error)))
         except BatchError as error:
-            self._broken_batch(identity, error)
+            self._intake.broken(identity, error)
         except WireError as error:
             reject = Reject(reason=str(error), sequence=0, final=True)
-            self._refuse(identity, "malformed", reject)
+            self._post.refuse(identity, "malformed", reject)
         else:
             return self._dispatch(identity, message)
         return ()
 
-    def _dispatch(self, identity: bytes, message: ToMaster) -> Sequence[Arrival]:
+    def _dispatch(self, identity: bytes, message: ToMaster | AskStatus) -> Sequence[Arrival]:
         peer = self._registry.find(identity)
-        if isinstance(message, Bye):
+        if isinstance(message, AskStatus):
+            if self._status is not None:
+                self._sockets.send(identity, self._status)
+        elif isinstance(message, Bye):
             self.counters["byes"] += 1
             if peer is not None:
                 self._registry.leave(peer)
         elif self._stop_reason is not None:
-            self._send(identity, Stop(self._stop_reason))
+            self._post.send(identity, Stop(self._stop_reason))
         elif isinstance(message, Hello):
             self._hello(identity, message)
         elif peer is None:
-            self._refuse(identity, "strangers", Greet())
+            self._post.refuse(identity, "strangers", Greet())
         else:
             peer.last_seen = time.monotonic()
             return self._talk(peer, message)
@@ -208,7 +202,7 @@ class Hub:
             case EpisodeBatch(sequence) if peer.role != "player":
                 self._not_its_role(peer, sequence, "episodes come from players only")
             case EpisodeBatch():
-                return self._batch(peer, message)
+                return self._intake.batch(peer, message)
             case Scores() if peer.role != "evaluator":
                 self._not_its_role(peer, 0, "scores come from evaluators only")
             case Scores():
@@ -217,7 +211,7 @@ class Hub:
             case Heartbeat(stats):
                 self.counters["heartbeats"] += 1
                 peer.stats = dict(stats)
-                self._send(peer.identity, Alive(self._version))
+                self._post.send(peer.identity, Alive(self._version))
             case WantWeights(epoch, version):
                 if self._weights is not None and (epoch, version) != (self.epoch, self._version):
                     self._sockets.send(peer.identity, WeightsMessage.wrap(self._weights))
@@ -225,20 +219,20 @@ class Hub:
 
     def _not_its_role(self, peer: Peer, sequence: int, rule: str) -> None:
         answer = Reject(reason=f"{peer.name}: {rule}", sequence=sequence, final=True)
-        self._refuse(peer.identity, "rejected", answer)
+        self._post.refuse(peer.identity, "rejected", answer)
 
     def _hello(self, identity: bytes, hello: Hello) -> None:
         try:
             peer, older = self._registry.admit(identity, hello, time.monotonic())
         except RefusedError as error:
-            self._refuse(identity, error.counter, error.answer)
+            self._post.refuse(identity, error.counter, error.answer)
             return
         if older is not None:
             reason = f"{peer.name} was taken over by a newer process"
-            self._refuse(older.identity, "superseded", Stop(reason))
+            self._post.refuse(older.identity, "superseded", Stop(reason))
         self.counters["welcomed"] += 1
         self.counters["lost_batches"] = self._registry.lost_batches
-        self._send(identity, self._welcome(peer))
+        self._post.send(identity, self._welcome(peer))
 
     def _welcome(self, peer: Peer) -> Welcome:
         return Welcome(
@@ -250,43 +244,3 @@ class Hub:
             weights_endpoint=self.weights_endpoint,
             window=self._info.window,
         )
-
-    def _batch(self, peer: Peer, batch: EpisodeBatch) -> Sequence[Arrival]:
-        verdict = peer.ledger.judge(batch.sequence, self._info.window)
-        if verdict is not Verdict.NEW:
-            self.counters[verdict.value] += 1
-            answer = peer.ledger.answer(verdict, batch.sequence)
-            if answer is not None:
-                self._send(peer.identity, answer)
-            return ()
-        peer.ledger.take(batch.sequence)
-        peer.weights_version = batch.weights_version
-        self.counters["batches"] += 1
-        self.counters["episodes"] += batch.episodes.count
-        key = (peer.role, peer.index, peer.incarnation)
-        return [EpisodesArrived(*key, batch.sequence, batch.weights_version, batch.episodes)]
-
-    def _broken_batch(self, identity: bytes, error: BatchError) -> None:
-        peer = self._registry.find(identity)
-        if peer is None:
-            self._refuse(identity, "strangers", Greet())
-            return
-        final = peer.ledger.judge(error.sequence, self._info.window) is Verdict.NEW
-        if final:  # it must not come again, and those after it need not wait for it
-            peer.ledger.consume(error.sequence)
-        reason = f"{peer.name}: batch {error.sequence}: {error}"
-        answer = Reject(reason=reason, sequence=error.sequence, final=final)
-        self._refuse(identity, "rejected", answer)
-
-    def _refuse(self, identity: bytes, counter: str, answer: Plain) -> None:
-        self._count(counter, getattr(answer, "reason", "a connection without HELLO"))
-        self._send(identity, answer)
-
-    def _count(self, counter: str, reason: str) -> None:
-        self.counters[counter] += 1
-        count = self.counters[counter]
-        if count & (count - 1) == 0:  # the 1st, 2nd, 4th, ...: a flood must not fill the log
-            log.warning("%s (number %d): %s", counter, count, reason)
-
-    def _send(self, identity: bytes, answer: Plain) -> None:
-        self._sockets.send(identity, answer.encode())

@@ -4,6 +4,7 @@ A disk that takes nothing more ends no run: nothing is acknowledged until there 
 the workers keep what they played, and wait.
 """
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -27,7 +28,13 @@ class Keeper:
         self._parts, self._clock, self._notice = parts, clock, notice
         self._checkpoint = Every(parts.config.service.checkpoint_minutes * MINUTE_S)
         self._failing = False
+        self._saved_s: float | None = None
         self._retry, self._tell = Every(RETRY_S), Every(MINUTE_S, at_once=True)
+
+    def numbers(self) -> dict[str, float]:
+        """How old the last checkpoint of this process is, and whether the disk takes nothing."""
+        age_s = -1.0 if self._saved_s is None else time.monotonic() - self._saved_s
+        return {"checkpoint_age_s": age_s, "disk_failing": float(self._failing)}
 
     def keep(self, arrival: EpisodesArrived) -> bool:
         """Journal a batch; False while the disk does not take it."""
@@ -64,6 +71,7 @@ class Keeper:
         folder, keep = parts.folder.checkpoints, parts.config.service.keep_checkpoints
         path = save_run(folder, parts.trainer, rest, keep)
         parts.journal.drop_before(first_needed(folder))
+        self._saved_s = time.monotonic()
         return path
 
     def _failed(self, text: str) -> None:

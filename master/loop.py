@@ -198,7 +198,8 @@ class Loop:
         """Show where the run stands."""
         while not self._news.empty():
             self._reporter.progress.notice(self._news.get())
-        self._reporter.tick(self.parts)
+        more = {"queue": len(self._arrived), **self._keeper.numbers()}
+        self._reporter.tick(self.parts, more)
 
     def finish(self, launched: bool) -> None:
         """Send and keep the final weights, have them scored, draw the test episodes.

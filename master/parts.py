@@ -1,6 +1,7 @@
 """The parts of a run, made or restored, before anything moves."""
 
 from collections.abc import Callable
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from master.budget import Budget
 from master.checkpoint import Restored, restore_run, warm_start
 from master.config import MasterConfig
 from master.guard import Guard
+from master.health import OFF, Health
 from master.hub import Hub
 from master.journal import Journal
 from master.keys import Keys, is_loopback, needs_keys, run_keys
@@ -44,6 +46,7 @@ class Parts:
         hub: the sockets, open.
         guard: updates the trainer, and undoes what is not finite.
         journal: keeps what was not in the last checkpoint.
+        health: HTTP for machines, None where it is off.
         keys: of the sockets, None where they are plain.
     """
 
@@ -56,6 +59,7 @@ class Parts:
     hub: Hub
     guard: Guard
     journal: Journal
+    health: Health | None = None
     keys: Keys | None = None
 
     @property
@@ -75,6 +79,8 @@ class Parts:
             "weights_endpoint": self.hub.weights_endpoint,
             "run_id": self.record.run_id,
         }
+        if self.health is not None:
+            where["http"] = self.health.url
         if self.keys is None:
             return where
         return where | {
@@ -85,6 +91,8 @@ class Parts:
 
     def close(self) -> None:
         """Close the sockets and the journal."""
+        if self.health is not None:
+            self.health.close()
         self.hub.close()
         self.journal.close()
 
@@ -118,16 +126,19 @@ def make_parts(
     )
     info = WelcomeInfo(run_id, config.seed, setup.fingerprints(), spec, service.window)
     keys = _keys(service, folder, notice)
-    hub = Hub(service.bind, service.port, info, keys=keys)
     guard = Guard(trainer, service.max_bad_updates, folder.bad_batch)
-    parts = Parts(config, setup, folder, trainer, rest.record, budget, hub, guard, journal, keys)
-    try:
+    with ExitStack() as opened:  # closed again if what follows fails
+        hub = opened.enter_context(Hub(service.bind, service.port, info, keys=keys))
         if found:
             hub.load_state(rest.hub)
+        health = None
+        if service.http_port != OFF:
+            health = opened.enter_context(closing(Health(service.http_bind, service.http_port)))
+        parts = Parts(
+            config, setup, folder, trainer, rest.record, budget, hub, guard, journal, health, keys
+        )
         _insert_again(parts, rest.segment, notice)
-    except BaseException:
-        parts.close()
-        raise
+        opened.pop_all()
     if resumes:
         began = found or trainer.episodes
         notice(f"goes on after {trainer.updates:,} updates" if began else "a new run begins")

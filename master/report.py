@@ -15,6 +15,7 @@ from master.metrics import Means, Metrics
 from master.parts import Parts
 from master.progress import Progress, Status
 from master.record import Record
+from master.standing import run_status
 from master.trainer import Trainer
 from tangram_agent.config import ServiceConfig
 from tangram_agent.setup import Setup
@@ -26,6 +27,7 @@ PICTURE_COLUMNS = 4
 CURVE_PIXELS = 120
 PICTURE_S = 30.0
 TICK_S = 0.1
+STAND_S = 1.0
 
 
 class Sent:
@@ -51,7 +53,7 @@ class Reporter:
         self.progress, self.metrics, self._curve = progress, metrics, curve
         self._losses, self._play = Means(), Means()
         self._rates = Rates()
-        self._tick = Every(TICK_S, at_once=True)
+        self._tick, self._stand = Every(TICK_S, at_once=True), Every(STAND_S, at_once=True)
         self._log, self._picture = Every(service.log_seconds), Every(PICTURE_S, at_once=True)
         self._published: OrderedDict[int, Sent] = OrderedDict()
 
@@ -91,12 +93,22 @@ class Reporter:
             picture = scores_picture(scores, parts.setup, CURVE_PIXELS)
             self.metrics.picture(np.asarray(picture), updates)
 
-    def tick(self, parts: Parts) -> None:
-        """Show the state of the run, and write the curves when it is time."""
+    def tick(self, parts: Parts, more: Mapping[str, float]) -> None:
+        """Show the state of the run, and write the curves when it is time.
+
+        Args:
+            parts: of the run.
+            more: numbers that only the loop knows, for `standing`.
+        """
         if not self._tick.due():
             return
         trainer = parts.trainer
         self._rates.mark(time.monotonic(), trainer.transitions, trainer.updates, parts.share)
+        if self._stand.due():
+            standing = run_status(self._status(parts), parts, more)
+            parts.hub.tell(standing)
+            if parts.health is not None:
+                parts.health.update(standing)
         if self._log.due():
             self.flush(parts)
         else:

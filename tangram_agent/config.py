@@ -157,6 +157,8 @@ class ServiceConfig:
         port: of the master's ROUTER socket, 0 for any free one; PUB takes any free one.
         security: curve (encrypted, and only for who has the run's connection file), plain, or
             auto: curve on every address but loopback.
+        http_bind: address of the master's /metrics and /healthz.
+        http_port: their port, 0 for any free one, -1 for none.
         publish_seconds: least time between two broadcasts of weights.
         every_update: broadcast after every update instead, as the paper does.
         envs: environments that one worker plays at a time.
@@ -177,6 +179,8 @@ class ServiceConfig:
     bind: str = "127.0.0.1"
     port: int = 0
     security: str = "auto"
+    http_bind: str = "127.0.0.1"
+    http_port: int = 0
     publish_seconds: float = 0.5
     every_update: bool = False
     envs: int = 16
@@ -195,6 +199,7 @@ class ServiceConfig:
 
     def __post_init__(self) -> None:
         check_range("service.port", self.port, 0, 65535)
+        check_range("service.http_port", self.http_port, -1, 65535)
         check_range("service.envs", self.envs, 1, 512)
         check_range("service.batch_episodes", self.batch_episodes, 1, 4096)
         check_range("service.window", self.window, 1, 1024)

@@ -11,6 +11,7 @@ from tangram_agent.payloads import (
     decode_episodes,
     decode_weights,
 )
+from tangram_agent.standing import AskStatus, RunStatus, read_status
 from tangram_agent.wire import (
     MAX_PICTURES,
     ROLES,
@@ -53,7 +54,7 @@ class BatchError(WireError):
         self.sequence = sequence
 
 
-def decode_from_worker(frames: Sequence[bytes], spec: EpisodeSpec) -> ToMaster:
+def decode_from_worker(frames: Sequence[bytes], spec: EpisodeSpec) -> ToMaster | AskStatus:
     """A worker's message.
 
     Args:
@@ -73,7 +74,9 @@ def decode_from_worker(frames: Sequence[bytes], spec: EpisodeSpec) -> ToMaster:
     return _plain(fields, frames, _FROM_WORKER)
 
 
-def decode_from_master(frames: Sequence[bytes], shapes: WeightShapes | None) -> ToWorker:
+def decode_from_master(
+    frames: Sequence[bytes], shapes: WeightShapes | None
+) -> ToWorker | RunStatus:
     """The master's message.
 
     Args:
@@ -90,6 +93,8 @@ def decode_from_master(frames: Sequence[bytes], shapes: WeightShapes | None) -> 
         if len(frames) != 2:
             raise WireError(f"weights: there must be 2 frames, got {len(frames)}")
         return WeightsMessage(*decode_weights(frames[1], shapes))
+    if fields.kind == RunStatus.kind:
+        return read_status(fields, frames[1:])
     return _plain(fields, frames, _FROM_MASTER)
 
 
@@ -164,11 +169,12 @@ def _reject(fields: Fields) -> Reject:
     )
 
 
-_FROM_WORKER: Mapping[str, Callable[[Fields], ToMaster]] = {
+_FROM_WORKER: Mapping[str, Callable[[Fields], ToMaster | AskStatus]] = {
     Hello.kind: _hello,
     WantWeights.kind: lambda f: WantWeights(f.text("epoch", MAX_ID), f.integer("version", -1)),
     Heartbeat.kind: lambda f: Heartbeat(f.numbers("stats")),
     Bye.kind: lambda f: Bye(f.text("reason")),
+    AskStatus.kind: lambda _: AskStatus(),
 }
 _FROM_MASTER: Mapping[str, Callable[[Fields], ToWorker]] = {
     Welcome.kind: _welcome,

@@ -20,7 +20,7 @@ from tangram_agent.setup import SECTIONS, Setup, from_mapping, make_setup
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.errors import ConfigError, TangramError
 from tangram_sim.layout import TokensConfig
-from worker.config import EvalConfig, PlayConfig, WorkerConfig
+from worker.config import EvalConfig, PlayConfig, StatusConfig, WorkerConfig
 
 pytestmark = pytest.mark.fast
 
@@ -32,7 +32,7 @@ GROUPS = {
     "agent": AgentConfig,
     "service": ServiceConfig,
 }
-PRIMARIES = ("train", "master", "worker", "eval", "play", "experiments", "report")
+PRIMARIES = ("train", "master", "worker", "status", "eval", "play", "experiments", "report")
 WITH_GROUPS = ("train", "master", "worker")
 PRESETS = [(group, name) for group in GROUPS for name in choices(group)]
 
@@ -71,6 +71,7 @@ def test_first_twin_of_a_preset_writes_out_every_field(name: str) -> None:
         ("train", (LaunchConfig, MasterConfig), {"master"}),
         ("master", (MasterConfig,), set()),
         ("worker", (WorkerConfig,), set()),
+        ("status", (StatusConfig,), set()),
         ("eval", (EvalConfig,), set()),
         ("play", (PlayConfig,), set()),
     ],

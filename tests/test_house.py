@@ -66,7 +66,7 @@ def test_command_lines_load_nothing_heavy() -> None:
 
 
 @pytest.mark.parametrize(
-    "command", ["master", "train", "worker", "eval", "play", "experiment", "report"]
+    "command", ["master", "train", "worker", "status", "eval", "play", "experiment", "report"]
 )
 def test_console_scripts_are_declared(command: str) -> None:
     (script,) = entry_points(group="console_scripts", name=f"tangram-{command}")

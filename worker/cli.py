@@ -1,4 +1,4 @@
-"""The commands tangram-worker, tangram-eval and tangram-play.
+"""The commands tangram-worker, tangram-status, tangram-eval and tangram-play.
 
 Everything heavy is imported after the config was composed, so --help and wrong input are instant.
 """
@@ -12,6 +12,11 @@ from conf.help import Plain
 def worker() -> int:
     """tangram-worker: plays for a master, or scores what it has learned."""
     return entry("worker", _worker)
+
+
+def status() -> int:
+    """tangram-status: how a run stands."""
+    return entry("status", _status)
 
 
 def evaluate() -> int:
@@ -43,6 +48,17 @@ def _worker(settings: Plain) -> int:
     from worker.player import run_player
 
     return run_player(config, setup)
+
+
+def _status(settings: Plain) -> int:
+    from tangram_agent.setup import from_mapping
+    from worker.config import StatusConfig
+
+    config = from_mapping(StatusConfig, settings)
+
+    from worker.status import show_status
+
+    return show_status(config)
 
 
 def _evaluate(settings: Plain) -> int:

@@ -15,12 +15,20 @@ MAX_ACTIONS = 100
 MAX_SHOWN = 100
 PICTURES = (".gif", ".png")
 MIN_COMPARED, MAX_COMPARED = 2, 4
+MAX_SECONDS = 86_400.0
 MAX_SEED = 2**63 - 1
 
 
 def _check_run_dir(value: str) -> None:
     if not value.strip():
         raise ConfigError("run_dir must name the folder of a run, got '': set run_dir=runs/my_run")
+
+
+def _check_connect(value: str) -> None:
+    if not value.strip():
+        raise ConfigError(
+            "connect must name the master's endpoint, got '': set connect=tcp://HOST:PORT"
+        )
 
 
 def _check_out(value: str) -> None:
@@ -50,12 +58,28 @@ class WorkerConfig:
     service: ServiceConfig = field(default_factory=ServiceConfig)
 
     def __post_init__(self) -> None:
-        if not self.connect.strip():
-            raise ConfigError(
-                "connect must name the master's endpoint, got '': set connect=tcp://HOST:PORT"
-            )
+        _check_connect(self.connect)
         check_choice("role", self.role, ROLES)
         check_range("index", self.index, -1, MAX_INDEX)
+
+
+@dataclass(frozen=True)
+class StatusConfig:
+    """How a run stands (tangram-status).
+
+    Attributes:
+        connect: where its master listens: tcp://host:port, a connection file or a run folder.
+        every_seconds: ask again after so long; 0 asks once.
+        json: print a JSON object instead of a table.
+    """
+
+    connect: str
+    every_seconds: float = 0.0
+    json: bool = False
+
+    def __post_init__(self) -> None:
+        _check_connect(self.connect)
+        check_range("every_seconds", self.every_seconds, 0.0, MAX_SECONDS)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from collections import Counter
 from tangram_agent.decoding import decode_from_master
 from tangram_agent.frames import ProtocolError
 from tangram_agent.payloads import WeightShapes
+from tangram_agent.standing import RunStatus
 from tangram_agent.wire import (
     Ack,
     Alive,
@@ -167,7 +168,8 @@ class Talk:
             log.warning("the master at %s sent what is not understood: %s", self.line.place, error)
             return
         self.line.answered()
-        self._handle(message, time.monotonic())
+        if not isinstance(message, RunStatus):  # nobody asked for one here
+            self._handle(message, time.monotonic())
 
     def _receive_weights(self, channel: Channel) -> None:
         frame = channel.weights()

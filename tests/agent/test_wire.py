@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from tangram_agent.decoding import BatchError, decode_from_master, decode_from_worker
 from tangram_agent.frames import MAX_HEADER, MAX_INTEGER, MAX_TEXT, PROTOCOL, ProtocolError
 from tangram_agent.payloads import encode_weights
+from tangram_agent.standing import AskStatus
 from tangram_agent.types import Episodes
 from tangram_agent.wire import (
     MAX_PICTURES,
@@ -79,6 +80,7 @@ to_master = st.one_of(
     st.builds(WantWeights, epoch=ids, version=versions),
     st.builds(Heartbeat, stats=numbers),
     st.builds(Bye, reason=reasons),
+    st.builds(AskStatus),
 )
 to_worker = st.one_of(
     welcomes,
@@ -310,7 +312,8 @@ def test_the_size_of_a_header_is_checked_before_it_is_unpacked() -> None:
 
 def test_all_kinds_are_in_the_round_trips() -> None:
     """A new message must be added above."""
-    drawn = {Hello, WantWeights, Heartbeat, Bye, Welcome, Refused, Greet, Ack, Reject, Alive, Stop}
+    drawn = {Hello, WantWeights, Heartbeat, Bye, AskStatus}
+    drawn |= {Welcome, Refused, Greet, Ack, Reject, Alive, Stop}
     kinds = {
         kind for parent in (Plain, *Plain.__subclasses__()) for kind in parent.__subclasses__()
     }

@@ -1,10 +1,10 @@
 """Small runs that the tests of the master share: everything real but the sockets."""
 
+import time
 from collections import Counter, deque
 from collections.abc import Iterable
 from pathlib import Path
 from queue import SimpleQueue
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,9 +16,11 @@ from master.config import MasterConfig
 from master.curve import Curve
 from master.guard import Guard
 from master.journal import Journal
+from master.ledger import Ledger
 from master.loop import Loop
 from master.metrics import Metrics
 from master.parts import Parts
+from master.peers import Peer
 from master.progress import Status
 from master.record import Record
 from master.report import Reporter
@@ -28,6 +30,7 @@ from master.trainer import Trainer
 from tangram_agent.config import ServiceConfig
 from tangram_agent.payloads import EpisodeSpec
 from tangram_agent.setup import Setup
+from tangram_agent.standing import RunStatus
 from tangram_agent.types import Weights
 from tangram_agent.wire import Scores
 from tests.agent.builders import random_episodes, setup
@@ -92,7 +95,8 @@ class FakeHub:
     ) -> None:
         self.made = made
         self.script = deque(script)
-        self.peers = [SimpleNamespace(role=role) for role in roles]
+        now = time.monotonic()
+        self.peers = [Peer(r, i, 1, f"p{i}", b"", now, Ledger(1)) for i, r in enumerate(roles)]
         self.counters: Counter[str] = Counter()
         self.log: list[tuple[str, Any]] = []
         self.polls = 0
@@ -110,6 +114,9 @@ class FakeHub:
     def publish(self, weights: Weights) -> None:
         assert all(np.isfinite(tensor).all() for tensor in weights.tensors.values())
         self.log.append(("publish", weights.version))
+
+    def tell(self, status: RunStatus) -> None:
+        self.log.append(("tell", status))
 
     def stop(self, reason: str) -> None:
         self.log.append(("stop", reason))

@@ -118,6 +118,6 @@ def test_plain_transport_is_warned_of_where_others_reach_it(
 ) -> None:
     told: list[str] = []
     with closing(parts(tmp_path, told, bind=bind, security="plain")) as made:
-        assert set(made.connection()) == {"endpoint", "weights_endpoint", "run_id"}
+        assert set(made.connection()) == {"endpoint", "weights_endpoint", "run_id", "http"}
     assert (PLAIN in told) is warned
     assert not (tmp_path / "keys.json").exists()

@@ -1,0 +1,85 @@
+"""HTTP for machines: what Prometheus and a health check see."""
+
+import json
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import closing
+
+import numpy as np
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from master import health as health_module
+from master.health import Health
+from tangram_agent.standing import WORKER_COLUMNS, RunStatus
+from tangram_sim.errors import ConfigError
+
+pytestmark = pytest.mark.cluster
+
+STATUS = RunStatus(
+    {"updates": 7.0, "share": -1.0, "test/mean_reward": 0.5, "hub/batches": 2.0},
+    {"run": "r", "activity": "learning"},
+    np.array([[0, 3, 1, 0.5, 8, 10, 320, 320, 2], [1, 0, 2, 1.5, -1, 0, 0, 0, 0]], np.float64),
+)
+
+
+@pytest.fixture
+def health() -> Iterator[Health]:
+    with closing(Health("127.0.0.1", 0)) as made:
+        yield made
+
+
+def fetch(url: str) -> tuple[int, str]:
+    try:
+        with urllib.request.urlopen(url, timeout=10) as answer:  # noqa: S310
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        return error.code, error.read().decode()
+
+
+def samples(text: str) -> dict[tuple[str, ...], float]:
+    return {
+        (sample.name, *map(sample.labels.get, sorted(sample.labels, reverse=True))): sample.value
+        for family in text_string_to_metric_families(text)
+        for sample in family.samples
+    }
+
+
+def test_metrics_are_those_of_the_last_status(health: Health) -> None:
+    assert fetch(f"{health.url}/metrics") == (200, "")
+    health.update(STATUS)
+    code, text = fetch(f"{health.url}/metrics")
+    found = samples(text)
+    assert code == 200
+    assert found[("tangram_updates",)] == 7.0
+    assert found[("tangram_share",)] == -1.0
+    assert found[("tangram_test_mean_reward",)] == 0.5
+    assert found[("tangram_hub_events_total", "batches")] == 2.0
+    assert found[("tangram_worker_behind", "player", "3")] == 8.0
+    assert found[("tangram_worker_silent_s", "evaluator", "0")] == 1.5
+    per_worker = [name for name in found if name[0].startswith("tangram_worker_")]
+    assert len(per_worker) == 2 * (len(WORKER_COLUMNS) - 3)
+
+
+def test_health_is_lost_when_the_loop_hangs(
+    health: Health, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    health.update(STATUS)
+    code, text = fetch(f"{health.url}/healthz")
+    assert (code, json.loads(text)["status"]) == (200, "ok")
+    assert json.loads(text)["activity"] == "learning"
+    monkeypatch.setattr(health_module, "STALLED_S", 0.0)
+    code, text = fetch(f"{health.url}/healthz")
+    assert code == 503
+    assert json.loads(text)["status"].startswith("the loop has hung for 0 s")
+
+
+def test_other_pages_are_not_there(health: Health) -> None:
+    assert fetch(f"{health.url}/etc/passwd")[0] == 404
+
+
+def test_a_port_that_is_taken_is_told(health: Health) -> None:
+    port = int(health.url.rpartition(":")[2])
+    with pytest.raises(ConfigError, match=rf"port {port} \(.*service\.http_port=-1 for none"):
+        Health("127.0.0.1", port)

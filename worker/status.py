@@ -1,0 +1,159 @@
+"""tangram-status: how a run stands, asked of its master from anywhere that its workers may be."""
+
+import json
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import zmq
+from rich.console import Console
+from rich.table import Table
+
+from tangram_agent.decoding import decode_from_master
+from tangram_agent.standing import WORKER_COLUMNS, AskStatus, RunStatus
+from tangram_sim.errors import TangramError, WireError
+from worker.channel import Channel
+from worker.config import StatusConfig
+from worker.connection import find_connection
+
+PATIENCE_S = 10.0
+ASK_AGAIN_S = 1.0
+MINUTE_S = 60.0
+UNKNOWN = -1.0
+
+
+def show_status(config: StatusConfig) -> int:
+    """Print the status once, or again and again.
+
+    Returns:
+        Exit status 0.
+
+    Raises:
+        TangramError: no connection file, keys that do not fit, or a master that does not answer.
+    """
+    console = Console()
+    with zmq.Context() as context:
+        while True:
+            status = ask_status(config.connect, context)
+            if config.json:
+                console.print(json.dumps(_plain(status)), soft_wrap=True, highlight=False)
+            else:
+                _print(console, status)
+            if not config.every_seconds:
+                return 0
+            time.sleep(config.every_seconds)
+
+
+def ask_status(
+    connect: str, context: "zmq.Context[zmq.Socket[bytes]]", patience_s: float = PATIENCE_S
+) -> RunStatus:
+    """The present status of a run.
+
+    Args:
+        connect: tcp://host:port, a connection file, or a run folder that holds one.
+        context: of the sockets.
+        patience_s: to wait for the answer.
+
+    Raises:
+        TangramError: see `show_status`.
+    """
+    found = find_connection(connect)
+    if found is None:
+        raise TangramError(f"no connection file at {connect}: no master runs there")
+    channel = Channel(context, found)
+    try:
+        until_s, ask_s = time.monotonic() + patience_s, 0.0
+        while time.monotonic() < until_s:
+            if time.monotonic() >= ask_s:
+                channel.send(AskStatus().encode())
+                ask_s = time.monotonic() + ASK_AGAIN_S
+            channel.wait(0.1)
+            if channel.handshake_failed():
+                raise TangramError(
+                    f"wrong or stale connection file: what answers at {found.endpoint} does not "
+                    f"take the keys of {connect}"
+                )
+            for frames in channel.messages():
+                status = _read(frames)
+                if status is not None:
+                    return status
+    finally:
+        channel.close()
+    raise TangramError(
+        f"the master at {found.endpoint} has not answered for {patience_s:g} s: is it still "
+        "running?"
+    )
+
+
+def _read(frames: list[bytes]) -> RunStatus | None:
+    try:
+        message = decode_from_master(frames, None)
+    except WireError as error:
+        raise TangramError(f"the master's answer is not understood: {error}") from None
+    return message if isinstance(message, RunStatus) else None
+
+
+def _plain(status: RunStatus) -> dict[str, Any]:
+    rows = [dict(zip(WORKER_COLUMNS, row, strict=True)) for row in status.workers.tolist()]
+    return {**status.texts, **status.numbers, "workers": rows}
+
+
+def _print(console: Console, status: RunStatus) -> None:
+    texts = status.texts
+    console.print(f"run {texts.get('run', '?')} ({texts.get('run_id', '?')})", highlight=False)
+    grid = Table.grid(padding=(0, 3))
+    for name, text in _lines(defaultdict(lambda: UNKNOWN, status.numbers), texts):
+        grid.add_row(name, text)
+    console.print(grid, highlight=False)
+    if len(status.workers):
+        console.print(_table(status))
+
+
+def _lines(n: Mapping[str, float], texts: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    """What a person wants to know first."""
+    yield "does", texts.get("activity", "?")
+    yield "episodes", f"{n['episodes']:,.0f}, {n['transitions_per_s']:,.1f} transitions/s"
+    due = f"{n['lag_updates']:,.0f} due"
+    yield "updates", f"{n['updates']:,.0f}, {n['updates_per_s']:,.1f}/s, {due}"
+    yield "time", _time(n["elapsed_s"], n["left_s"], n["share"])
+    share = n["replay"] / max(n["replay_capacity"], 1.0)
+    yield "replay", f"{n['replay']:,.0f} transitions, {share:.0%} of its capacity"
+    yield "waiting batches", f"{n['queue']:,.0f}"
+    yield "last checkpoint", _age(n["checkpoint_age_s"])
+    if "test/mean_reward" in n:
+        angle = f"angle error {n['test/angle_error_deg_median']:.2f} deg"
+        yield "last test", f"mean reward {n['test/mean_reward']:.3f}, {angle}"
+    if n["disk_failing"] > 0:
+        yield "disk", "full or broken: nothing is acknowledged"
+    if n["undone_updates"] > 0:
+        yield "undone updates", f"{n['undone_updates']:,.0f} were not finite"
+
+
+def _time(elapsed_s: float, left_s: float, share: float) -> str:
+    text = f"{elapsed_s / MINUTE_S:,.1f} min"
+    if share >= 0:
+        text += f", {share:.0%} of the budget"
+    return text + (f", {left_s / MINUTE_S:,.1f} min left" if left_s >= 0 else "")
+
+
+def _age(seconds: float) -> str:
+    return "none by this process" if seconds < 0 else f"{seconds / MINUTE_S:,.1f} min ago"
+
+
+def _table(status: RunStatus) -> Table:
+    table = Table(box=None, padding=(0, 2))
+    for name in ("process", "heard of", "weights", "batches", "episodes", "waiting"):
+        table.add_column(name, justify="left" if name == "process" else "right")
+    for row in status.workers.tolist():
+        one = dict(zip(WORKER_COLUMNS, row, strict=True))
+        behind = "-" if one["behind"] < 0 else f"{one['behind']:,.0f} behind"
+        table.add_row(
+            f"{'evaluator' if one['evaluator'] else 'worker'} {one['index']:.0f}",
+            f"{one['silent_s']:.1f} s ago",
+            behind,
+            f"{one['batches']:,.0f}",
+            f"{one['episodes']:,.0f}",
+            f"{one['waiting']:,.0f}",
+        )
+    return table
