@@ -52,7 +52,7 @@ def _master(settings: Plain) -> int:
     setup = make_setup(settings)
     check_reward(setup.reward, setup.layout, setup.sim)
 
-    from master.loop import run_master
+    from master.run import run_master
 
     return run_master(config, setup, settings)
 

@@ -1,96 +1,28 @@
 """The master: one process, one loop, from what workers played to the weights they play with."""
 
-import sys
 import time
 from collections import deque
-from collections.abc import Mapping
-from contextlib import closing
 from queue import SimpleQueue
-from typing import Any
-
-import torch
 
 from master.arrivals import EpisodesArrived, ScoresArrived
-from master.checkpoint import check_resumable
-from master.children import override
-from master.config import MasterConfig
-from master.console import sturdy_console
-from master.curve import Curve
 from master.every import Every
 from master.keeper import Keeper
-from master.metrics import Metrics
-from master.parts import Parts, make_parts
-from master.progress import Progress, make_progress, notices_from
+from master.parts import Parts
 from master.record import Clock
 from master.report import Reporter, scores_picture
-from master.result import make_result, show_result
-from master.rundir import RunFolder
 from master.signals import StopSignals
-from tangram_agent import lifeline
-from tangram_agent.setup import Setup
+from tangram_agent.watchdog import Watchdog
 from tangram_agent.wire import Scores
 
 # Between two looks at the sockets: learning goes on for so long, or idleness lasts.
 LEARN_S = 0.05
 IDLE_S = 0.05
-# A clean end after the parent's death; a large replay takes seconds to write.
-GRACE_S = 30.0
 # At the end: for the scores of the final weights, the same after a signal, and for goodbyes.
 SCORES_S = 60.0
 SIGNALLED_SCORES_S = 8.0
 JOIN_S = 30.0  # for an evaluator that has not joined yet, or was given up
 LEAVE_S = 5.0
 PICTURE_PIXELS = 240
-
-
-def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) -> int:
-    """Learn until a bound is reached or a signal comes, and leave a finished run folder.
-
-    Args:
-        config: the master's settings.
-        setup: the task and the agent.
-        resolved: the whole config as plain values, for config.yaml.
-
-    Returns:
-        Exit status 0, also after SIGINT and SIGTERM.
-
-    Raises:
-        TangramError: the folder, the port or a checkpoint cannot be used, or the weights are no
-            longer finite.
-    """
-    news: SimpleQueue[str] = SimpleQueue()
-    launched = lifeline.watch(news.put, GRACE_S)
-    torch.set_num_threads(config.service.threads)
-    folder, console = RunFolder(config.run_dir), sturdy_console(sys.stdout)
-    folder.prepare(config.resume)
-    with folder.lock(), StopSignals() as signals:
-        if not launched:  # the launcher wrote it, with settings of its own
-            check_resumable(folder.checkpoints, resolved)
-            folder.write_config(resolved)
-        with (
-            closing(make_progress(console, f"tangram · {folder.path.name}")) as progress,
-            notices_from("master", progress),
-            closing(make_parts(config, setup, folder, progress.notice)) as parts,
-            closing(Metrics(folder.tensorboard, parts.trainer.updates)) as metrics,
-            closing(Loop(parts, _reporter(parts, progress, metrics), signals, news)) as loop,
-        ):
-            metrics.settings(resolved)
-            if not launched:
-                where = override("connect", str(folder.path))
-                progress.notice(f"workers join with: tangram-worker {where}")
-            reason = loop.run()
-            loop.finish(launched)
-            result = make_result(parts, reason, loop.clock.wall_s())
-            folder.write_result(result)
-            metrics.hyperparameters(resolved, parts.record.scores)
-            loop.dismiss(f"the run has ended ({reason})")
-    show_result(console, folder, result)
-    return 0
-
-
-def _reporter(parts: Parts, progress: Progress, metrics: Metrics) -> Reporter:
-    curve = Curve(parts.folder.curve, parts.trainer.updates)
-    return Reporter(progress, metrics, curve, parts.config.service)
 
 
 class Loop:
@@ -102,11 +34,17 @@ class Loop:
     """
 
     def __init__(
-        self, parts: Parts, reporter: Reporter, signals: StopSignals, news: "SimpleQueue[str]"
+        self,
+        parts: Parts,
+        reporter: Reporter,
+        signals: StopSignals,
+        news: "SimpleQueue[str]",
+        watchdog: Watchdog,
     ) -> None:
         service = parts.config.service
         self.parts, self.clock = parts, Clock(parts.record)
         self._reporter, self._signals, self._news = reporter, signals, news
+        self._watchdog = watchdog
         self._arrived: deque[EpisodesArrived] = deque()
         self._latest: Scores | None = None
         self._published, self._dismissed = -1, False
@@ -143,6 +81,7 @@ class Loop:
 
     def receive(self, patience_s: float) -> None:
         """Take what has arrived, and answer the peers."""
+        self._watchdog.progress()
         parts = self.parts
         for arrival in parts.hub.poll(patience_s):
             if isinstance(arrival, ScoresArrived):

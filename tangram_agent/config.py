@@ -172,6 +172,7 @@ class ServiceConfig:
         keep_checkpoints: newest checkpoints kept.
         journal_sync_seconds: time between two syncs of the journal, 0 for every batch.
         max_bad_updates: updates in a row that may be undone because they are not finite.
+        watchdog_seconds: a process that makes no progress for so long ends, 0: never.
         device: auto, cpu or cuda.
         threads: torch threads of the master.
     """
@@ -194,6 +195,7 @@ class ServiceConfig:
     keep_checkpoints: int = 2
     journal_sync_seconds: float = 1.0
     max_bad_updates: int = 10
+    watchdog_seconds: float = 300.0
     device: str = "auto"
     threads: int = 1
 
@@ -209,7 +211,7 @@ class ServiceConfig:
         check_range("service.threads", self.threads, 1, 1024)
         # Without any lag a worker would wait for updates that wait for its episodes.
         check_range("service.lag_updates", self.lag_updates, 1)
-        for name in ("publish_seconds", "eval_seconds", "journal_sync_seconds"):
+        for name in ("publish_seconds", "eval_seconds", "journal_sync_seconds", "watchdog_seconds"):
             check_range(f"service.{name}", getattr(self, name), 0)
         for name in ("log_seconds", "checkpoint_minutes"):
             check_range(f"service.{name}", getattr(self, name), 1e-3)

@@ -12,7 +12,7 @@ pytestmark = pytest.mark.slow
 
 def test_master_and_registration_never_load_the_engine() -> None:
     loaded = run_python(
-        "import gymnasium, master.cli, master.launch, master.loop, tangram_sim.register, sys\n"
+        "import gymnasium, master.cli, master.launch, master.run, tangram_sim.register, sys\n"
         "assert 'Tangram-v0' in gymnasium.registry\n"
         "print([name for name in sys.modules if name.startswith('pybullet')])"
     )

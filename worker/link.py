@@ -37,6 +37,9 @@ class Link:
         shapes: of the tensors that weights must have; None takes any.
         window: most batches kept unacknowledged; the master's own bound holds as well.
         timing: patience.
+
+    Attributes:
+        on_progress: called whenever the link is at work.
     """
 
     def __init__(
@@ -51,7 +54,7 @@ class Link:
         timing: Timing | None = None,
     ) -> None:
         self._spec, self._timing = spec, timing or Timing()
-        self._connect = connect
+        self.on_progress: Callable[[], None] = lambda: None
         who = Introduction(connect, role, index, fingerprints)
         self._talk = Talk(who, window, shapes, self._timing)
         self._stop_reason = ""
@@ -131,6 +134,7 @@ class Link:
         Raises:
             TangramError: the master refuses this process, or did not answer for `lost_s`.
         """
+        self.on_progress()
         self._talk.step(timeout_s)
 
     def send(self, episodes: Episodes, weights_version: int) -> bool:

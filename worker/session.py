@@ -14,6 +14,7 @@ from tangram_agent import lifeline
 from tangram_agent.payloads import EpisodeSpec
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
+from tangram_agent.watchdog import Watchdog
 from worker.config import WorkerConfig
 from worker.link import Link
 
@@ -46,6 +47,7 @@ def joined(config: WorkerConfig, setup: Setup, policy: Policy) -> Iterator[Link]
     spec = EpisodeSpec.of(setup)
     if config.role == "player":
         spec.check_batch_size(service.batch_episodes)
+    watchdog = Watchdog(service.watchdog_seconds)
     link = Link(
         config.connect,
         config.role,
@@ -55,7 +57,8 @@ def joined(config: WorkerConfig, setup: Setup, policy: Policy) -> Iterator[Link]
         policy.shapes,
         service.window,
     )
-    with link, stopped_by_signals(link):
+    link.on_progress = watchdog.progress
+    with link, stopped_by_signals(link), watchdog:
         _log.info("joining %s", config.connect)
         if link.join():
             log_as(f"{config.role} {link.welcome.index}")

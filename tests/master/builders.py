@@ -32,6 +32,7 @@ from tangram_agent.payloads import EpisodeSpec
 from tangram_agent.setup import Setup
 from tangram_agent.standing import RunStatus
 from tangram_agent.types import Weights
+from tangram_agent.watchdog import Watchdog
 from tangram_agent.wire import Scores
 from tests.agent.builders import random_episodes, setup
 
@@ -183,4 +184,4 @@ def loop(
     metrics = Metrics(run_folder.tensorboard)
     curve = Curve(run_folder.curve, parts.trainer.updates)
     reporter = Reporter(ShownProgress(), metrics, curve, settings.service)
-    return Loop(parts, reporter, StopSignals(), SimpleQueue())
+    return Loop(parts, reporter, StopSignals(), SimpleQueue(), Watchdog(0.0))

@@ -1,0 +1,82 @@
+"""One run of the master, from its folder to its result."""
+
+import sys
+from collections.abc import Mapping
+from contextlib import closing
+from queue import SimpleQueue
+from typing import Any
+
+import torch
+
+from master.checkpoint import check_resumable
+from master.children import override
+from master.config import MasterConfig
+from master.console import sturdy_console
+from master.curve import Curve
+from master.loop import Loop
+from master.metrics import Metrics
+from master.parts import Parts, make_parts
+from master.progress import Progress, make_progress, notices_from
+from master.report import Reporter
+from master.result import make_result, show_result
+from master.rundir import RunFolder
+from master.signals import StopSignals
+from tangram_agent import lifeline
+from tangram_agent.setup import Setup
+from tangram_agent.watchdog import Watchdog
+
+# A clean end after the parent's death; a large replay takes seconds to write.
+GRACE_S = 30.0
+
+
+def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) -> int:
+    """Learn until a bound is reached or a signal comes, and leave a finished run folder.
+
+    Args:
+        config: the master's settings.
+        setup: the task and the agent.
+        resolved: the whole config as plain values, for config.yaml.
+
+    Returns:
+        Exit status 0, also after SIGINT and SIGTERM.
+
+    Raises:
+        TangramError: the folder, the port or a checkpoint cannot be used, or the weights are no
+            longer finite.
+    """
+    news: SimpleQueue[str] = SimpleQueue()
+    launched = lifeline.watch(news.put, GRACE_S)
+    torch.set_num_threads(config.service.threads)
+    folder, console = RunFolder(config.run_dir), sturdy_console(sys.stdout)
+    folder.prepare(config.resume)
+    watchdog = Watchdog(config.service.watchdog_seconds)
+    with folder.lock(), StopSignals() as signals, watchdog:
+        if not launched:  # the launcher wrote it, with settings of its own
+            check_resumable(folder.checkpoints, resolved)
+            folder.write_config(resolved)
+        with (
+            closing(make_progress(console, f"tangram · {folder.path.name}")) as progress,
+            notices_from("master", progress),
+            closing(make_parts(config, setup, folder, progress.notice)) as parts,
+            closing(Metrics(folder.tensorboard, parts.trainer.updates)) as metrics,
+            closing(
+                Loop(parts, _reporter(parts, progress, metrics), signals, news, watchdog)
+            ) as loop,
+        ):
+            metrics.settings(resolved)
+            if not launched:
+                where = override("connect", str(folder.path))
+                progress.notice(f"workers join with: tangram-worker {where}")
+            reason = loop.run()
+            loop.finish(launched)
+            result = make_result(parts, reason, loop.clock.wall_s())
+            folder.write_result(result)
+            metrics.hyperparameters(resolved, parts.record.scores)
+            loop.dismiss(f"the run has ended ({reason})")
+    show_result(console, folder, result)
+    return 0
+
+
+def _reporter(parts: Parts, progress: Progress, metrics: Metrics) -> Reporter:
+    curve = Curve(parts.folder.curve, parts.trainer.updates)
+    return Reporter(progress, metrics, curve, parts.config.service)
