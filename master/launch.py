@@ -11,20 +11,21 @@ from typing import Any
 from rich.console import Console
 
 from master.checkpoint import check_resumable
-from master.children import MAX_RESTARTS, Child, describe, module, override
+from master.children import MAX_RESTARTS, Child, describe
+from master.commands import master_arguments, worker_child
 from master.config import LaunchConfig
 from master.console import sturdy_console
 from master.rundir import RunFolder
 from master.signals import SAME_WISH_S, heeded, show_cursor
 from tangram_agent import lifeline
+from tangram_agent.config import RECYCLED_STATUS
 
 # While the master starts, its connection file is looked for this often.
 LOOK_S = 0.1
+IDLE_S = 1.0
 # The master writes its checkpoint and its result meanwhile.
 STOP_S = 120.0
 LEAVE_S = 8.0
-PLAYER_NICE = 5
-EVALUATOR_NICE = 10
 FAILED_STATUS = 1
 
 
@@ -65,11 +66,12 @@ class Launcher:
         self._folder, self._console = folder, console
         self._events: SimpleQueue[Child | signal.Signals] = SimpleQueue()
         self._master = Child("master", master_arguments(config, folder))
-        self._players = [_worker(folder, "player", i) for i in range(config.workers)]
-        self._evaluator = _worker(folder, "evaluator", -1)
+        self._players = [worker_child(folder, "player", i) for i in range(config.workers)]
+        self._evaluator = worker_child(folder, "evaluator", -1)
         self._stop_s: float | None = None
         self._signalled_s: float | None = None
         self._failed, self._sent_home = False, False
+        self._reached = False  # this life of the master can be reached, or could
 
     @contextmanager
     def signals(self) -> Iterator[None]:
@@ -94,7 +96,9 @@ class Launcher:
             if isinstance(event, signal.Signals):
                 self._signalled(event)
             elif event is self._master:
-                return self._master_ended()
+                status = self._master.clear()
+                if not self._master_comes_back(status):
+                    return self._master_ended(status)
             elif event is not None:
                 self._worker_ended(event)
             elif self._stop_s is not None and time.monotonic() >= self._stop_s:
@@ -119,17 +123,20 @@ class Launcher:
         return [*self._players, self._evaluator]
 
     def _start_due(self) -> None:
-        """Start the workers once the master can be reached, and again those whose delay is over."""
-        if self._stop_s is not None or not self._folder.connection.exists():
+        """Start the workers once the master can be reached, and again whose delay is over."""
+        if self._stop_s is not None:
             return
-        for child in self._workers:
+        reachable = self._folder.connection.exists()
+        self._reached = self._reached or reachable
+        for child in [self._master, *(self._workers if reachable else ())]:
             if child.next_start_s is not None and time.monotonic() >= child.next_start_s:
                 child.start(self._events.put)
 
     def _next_event(self) -> Child | signal.Signals | None:
-        planned = [c.next_start_s for c in self._workers if c.next_start_s is not None]
+        children = [self._master, *self._workers]
+        planned = [c.next_start_s for c in children if c.next_start_s is not None]
         limits = [self._stop_s] if self._stop_s is not None else planned
-        timeout = max(min(limits) - time.monotonic(), LOOK_S) if limits else None
+        timeout = max(min(limits) - time.monotonic(), LOOK_S) if limits else IDLE_S
         try:
             return self._events.get(timeout=timeout)
         except Empty:
@@ -155,8 +162,23 @@ class Launcher:
         self._stop_s = time.monotonic() + STOP_S
         self._master.signal(signal.SIGTERM)
 
-    def _master_ended(self) -> int:
-        status = self._master.clear()
+    def _master_comes_back(self, status: int) -> bool:
+        """Plan to go on from what a master left that was killed, or hung; workers wait for it."""
+        if status == 0 or self._stop_s is not None or not self._master.plan_restart(status):
+            return False
+        # A worker that is started meanwhile must not look for the one that is gone.
+        self._folder.connection.unlink(missing_ok=True)
+        self._reached = False
+        self._master.arguments = [
+            "resume=auto" if text.startswith("resume=") else text for text in self._master.arguments
+        ]
+        self._print(
+            f"the master ended with {describe(status)}: it goes on from what it left "
+            f"({self._master.restarts} of {MAX_RESTARTS})"
+        )
+        return True
+
+    def _master_ended(self, status: int) -> int:
         # A master that ends in order has told its workers.
         self._sent_home = status == 0
         if status not in (0, 2):  # 2: it has told what is wrong
@@ -170,8 +192,12 @@ class Launcher:
 
     def _worker_ended(self, child: Child) -> None:
         status = child.clear()
-        if self._stop_s is not None or not self._folder.connection.exists():
-            return  # the run ends, and so do its workers
+        ends = self._reached and self._master.alive and not self._folder.connection.exists()
+        if self._stop_s is not None or ends:
+            return  # the master takes leave, and so do its workers
+        if status == RECYCLED_STATUS:
+            child.next_start_s = 0.0
+            return
         if child.plan_restart(status):
             self._say(
                 f"{child.name} ended with {describe(status)}: it is started again "
@@ -201,31 +227,3 @@ class Launcher:
                 return
             if isinstance(event, signal.Signals):
                 return
-
-
-def _worker(folder: RunFolder, role: str, index: int) -> Child:
-    name = role if role == "evaluator" else f"worker {index}"
-    arguments = [
-        *module("worker"),
-        override("connect", str(folder.connection)),
-        f"index={index}",
-        f"role={role}",
-        override("from_config", str(folder.config)),
-    ]
-    nice = EVALUATOR_NICE if role == "evaluator" else PLAYER_NICE
-    return Child(name, arguments, folder.logs / f"{name.replace(' ', '-')}.log", nice)
-
-
-def master_arguments(config: LaunchConfig, folder: RunFolder) -> list[str]:
-    """How the master is started, as arguments of this Python."""
-    master = config.master
-    return [
-        *module("master"),
-        override("from_config", str(folder.config)),
-        override("run_dir", str(folder.path)),
-        *(
-            f"{name}={getattr(master, name)}"
-            for name in ("seed", "max_hours", "max_episodes", "max_updates", "resume")
-        ),
-        *([override("warm_start", master.warm_start)] if master.warm_start else []),
-    ]

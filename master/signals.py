@@ -1,4 +1,4 @@
-"""SIGINT, SIGTERM and SIGHUP: the first asks for a clean end, the second ends at once."""
+"""SIGINT, SIGTERM, SIGHUP, SIGUSR1: the first asks for a clean end, the second ends at once."""
 
 import os
 import signal
@@ -7,7 +7,7 @@ import time
 from types import FrameType, TracebackType
 from typing import Any, Self
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 # One wish to end may arrive twice: a time limit signals a process and then its whole group.
 SAME_WISH_S = 1.0
 SHOW_CURSOR = b"\x1b[?25h\n"

@@ -45,6 +45,7 @@ class NetConfig:
             check_range("net.hidden", size, 1, 65536)
 
 
+RECYCLED_STATUS = 75  # exit status of a worker that wants to be started anew
 STRATEGIES = ("final", "future", "near", "none")
 
 
@@ -173,6 +174,9 @@ class ServiceConfig:
         journal_sync_seconds: time between two syncs of the journal, 0 for every batch.
         max_bad_updates: updates in a row that may be undone because they are not finite.
         watchdog_seconds: a process that makes no progress for so long ends, 0: never.
+        recycle_episodes: a worker that was started by tangram-train is started anew after so many
+            episodes, 0: never.
+        recycle_gib: the same when it holds so much memory.
         device: auto, cpu or cuda.
         threads: torch threads of the master.
     """
@@ -196,6 +200,8 @@ class ServiceConfig:
     journal_sync_seconds: float = 1.0
     max_bad_updates: int = 10
     watchdog_seconds: float = 300.0
+    recycle_episodes: int = 0
+    recycle_gib: float = 0.0
     device: str = "auto"
     threads: int = 1
 
@@ -211,7 +217,14 @@ class ServiceConfig:
         check_range("service.threads", self.threads, 1, 1024)
         # Without any lag a worker would wait for updates that wait for its episodes.
         check_range("service.lag_updates", self.lag_updates, 1)
-        for name in ("publish_seconds", "eval_seconds", "journal_sync_seconds", "watchdog_seconds"):
+        for name in (
+            "publish_seconds",
+            "eval_seconds",
+            "journal_sync_seconds",
+            "watchdog_seconds",
+            "recycle_episodes",
+            "recycle_gib",
+        ):
             check_range(f"service.{name}", getattr(self, name), 0)
         for name in ("log_seconds", "checkpoint_minutes"):
             check_range(f"service.{name}", getattr(self, name), 1e-3)

@@ -6,7 +6,7 @@ from collections import Counter
 
 import zmq
 
-from tangram_sim.errors import TangramError
+from tangram_sim.errors import RunError, TangramError
 from worker.channel import LINGER_MS, Channel
 from worker.connection import Connection, find_connection
 from worker.terms import Timing
@@ -32,7 +32,7 @@ class Line:
         # Since when an answer is due on this connection, and on all since the last answer.
         self._asked_at: float | None = None
         self._lost_at: float | None = None
-        self._reopen_at = math.inf
+        self._reopen_at, self._follow_at = math.inf, 0.0
 
     @property
     def place(self) -> str:
@@ -70,13 +70,6 @@ class Line:
         self._counters["reconnects"] += 1
         if self._lost_at is None:
             self._lost_at = self._asked_at
-            if not self.stranger:
-                log.warning(
-                    "the master at %s has not answered for %g s: tries again for %g s",
-                    self.place,
-                    self._timing.silence_s,
-                    self._timing.lost_s,
-                )
         self._asked_at, self._reopen_at = None, math.inf
         if self.channel is not None:
             self.channel.close()
@@ -94,7 +87,8 @@ class Line:
         self._asked_at = self._lost_at = None
 
     def look(self, now: float) -> None:
-        """Note a handshake that failed: by the next try the file may be another one."""
+        """Note a master that moved, and a handshake that failed: its file may change, too."""
+        self._follow(now)
         if self.channel is None or not self.channel.handshake_failed():
             return
         self._counters["handshakes_failed"] += 1
@@ -105,7 +99,27 @@ class Line:
     def is_dead(self, now: float) -> bool:
         """Whether to try another connection."""
         silent = self._asked_at is not None and now - self._asked_at > self._timing.silence_s
+        if silent and self._lost_at is None and not self.stranger:
+            log.warning(
+                "the master at %s has not answered for %g s: tries again for %g s",
+                self.place,
+                self._timing.silence_s,
+                self._timing.lost_s,
+            )
         return silent or now >= self._reopen_at
+
+    def _follow(self, now: float) -> None:
+        """A master that was started again writes its new address into the same file."""
+        if now < self._follow_at:
+            return
+        self._follow_at = now + self._timing.retry_s
+        try:
+            found = find_connection(self._connect)
+        except RunError:
+            return  # by the next look it may be whole
+        if found is not None and found != self.found:
+            log.info("the master is at %s now", found.endpoint)
+            self._reopen_at = now
 
     def check_lost(self, now: float) -> None:
         """Raise TangramError if no connection brought an answer for too long."""

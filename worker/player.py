@@ -1,8 +1,11 @@
 """The process that plays: explores with the newest weights, sends whole episodes."""
 
 import math
+import os
 from contextlib import closing
+from pathlib import Path
 
+from tangram_agent.config import RECYCLED_STATUS, ServiceConfig
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes
@@ -13,12 +16,15 @@ from worker.report import Report
 from worker.rollout import Rollout, join_episodes, split_episodes
 from worker.session import joined
 
+DRAIN_S = 60.0
+GIB = 2**30
+
 
 def run_player(config: WorkerConfig, setup: Setup) -> int:
     """Play until the master or a signal ends it.
 
     Returns:
-        Exit status 0.
+        Exit status 0, or RECYCLED_STATUS to be started anew.
 
     Raises:
         TangramError: a setting that cannot work, or a master that refuses or is gone for long.
@@ -44,7 +50,23 @@ def run_player(config: WorkerConfig, setup: Setup) -> int:
                     break
             link.stats["episodes"] = float(rollout.episode)
             report.played(episodes.count, policy.version)
+            if is_worn_out(config.service, rollout.episode) and link.drain(DRAIN_S):
+                link.stop("recycled")
+                return RECYCLED_STATUS
     return 0
+
+
+def is_worn_out(service: ServiceConfig, episodes: int) -> bool:
+    """Whether a fresh process should go on in the place of this one."""
+    limit = service.recycle_gib * GIB
+    tired = 0 < service.recycle_episodes <= episodes
+    return tired or 0.0 < limit <= memory_bytes()
+
+
+def memory_bytes() -> int:
+    """What this process holds in memory."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 def _take_first_weights(link: Link, policy: Policy, report: Report) -> bool:

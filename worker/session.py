@@ -18,7 +18,7 @@ from tangram_agent.watchdog import Watchdog
 from worker.config import WorkerConfig
 from worker.link import Link
 
-SIGNALS = (signal.SIGTERM, signal.SIGINT)
+SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
 
 _log = logging.getLogger(__name__)
 
@@ -69,7 +69,7 @@ def joined(config: WorkerConfig, setup: Setup, policy: Policy) -> Iterator[Link]
 
 @contextmanager
 def stopped_by_signals(link: Link) -> Iterator[None]:
-    """SIGTERM and SIGINT stop the link instead of the process, so that it can say BYE."""
+    """SIGTERM, SIGINT and SIGUSR1 stop the link instead of the process, so that it can say BYE."""
 
     def handle(number: int, _frame: FrameType | None) -> None:
         link.stop(signal.Signals(number).name)

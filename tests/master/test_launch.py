@@ -19,10 +19,12 @@ from hypothesis import strategies as st
 from master import children as children_module
 from master import launch as launch_module
 from master.children import MAX_RESTARTS, Child, describe, environment, override
+from master.commands import master_arguments
 from master.config import LaunchConfig, MasterConfig
-from master.launch import Launcher, master_arguments, run_training
+from master.launch import Launcher, run_training
 from master.rundir import RunFolder
 from master.signals import SIGNALS, StopSignals, heeded
+from tangram_agent.config import RECYCLED_STATUS
 from tangram_agent.setup import from_mapping
 from tangram_sim.errors import ConfigError
 
@@ -236,19 +238,51 @@ def logs(*names: str) -> str:
     [
         ("end()", 0, ""),
         ("sys.exit(2)", 2, ""),
-        ("sys.exit(5)", 5, "the master ended with status 5; resume=auto goes on from its last"),
-        ("os.kill(os.getpid(), 9)", 137, "the master ended with SIGKILL; resume=auto"),
+        ("sys.exit(5)", 5, "status 5"),
+        ("os.kill(os.getpid(), 9)", 137, "SIGKILL"),
     ],
 )
 def test_everything_ends_with_the_master(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str, status: int, said: str
 ) -> None:
     monkeypatch.setattr(launch_module, "LEAVE_S", 0.2)
+    monkeypatch.setattr(children_module, "FIRST_DELAY_S", 0.01)
     started = logs("worker-0", "worker-1", "evaluator")
     result, told = finish(launcher(tmp_path, ending, started), tmp_path)
     assert result == status
-    assert told.startswith(said)
-    assert bool(told) == bool(said)
+    tries = [f"({i} of {MAX_RESTARTS})" for i in range(1, MAX_RESTARTS + 1)]
+    expected = [f"the master ended with {said}: it goes on from what it left {t}" for t in tries]
+    expected.append(f"the master ended with {said}; resume=auto goes on from its last checkpoint")
+    assert told.splitlines() == (expected if said else [])
+
+
+@pytest.mark.cluster
+def test_a_master_that_is_killed_goes_on_and_its_workers_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(children_module, "FIRST_DELAY_S", 0.01)
+    ending = """
+if "resume=auto" in sys.argv:
+    end()
+os.kill(os.getpid(), 9)
+"""
+    made = launcher(tmp_path, ending, logs("worker-0", "worker-1", "evaluator"))
+    made._master.arguments = [*made._master.arguments, "resume=none"]
+    pids = []
+    forget = Child.clear
+
+    def noting(one: Child) -> int:
+        pids.append([c._process.pid for c in made._workers if c._process is not None])
+        return forget(one)
+
+    monkeypatch.setattr(Child, "clear", noting)
+    status, told = finish(made, tmp_path)
+    assert status == 0
+    assert told == (
+        f"the master ended with SIGKILL: it goes on from what it left (1 of {MAX_RESTARTS})\n"
+    )
+    assert len(pids[0]) == 3
+    assert pids[0] == pids[1]
 
 
 @pytest.mark.cluster
@@ -427,3 +461,23 @@ def test_the_first_signal_asks_and_the_second_ends(number: signal.Signals, kind:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(0.1)
         assert process.wait(LIMIT_S) == (0 if kind == "orderly" else 128 + number)
+
+
+@pytest.mark.cluster
+def test_a_recycled_worker_is_started_again_without_a_word(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More often than a failing one would be."""
+    monkeypatch.setattr(launch_module, "LEAVE_S", 0.2)
+    count = tmp_path / "count"
+    tired = f"""
+from pathlib import Path
+count = Path({str(count)!r})
+lives = len(count.read_text()) if count.exists() else 0
+count.write_text("x" * (lives + 1))
+if lives <= {MAX_RESTARTS}:
+    raise SystemExit({RECYCLED_STATUS})
+{WORKER}"""
+    lives = f"len(Path({str(count)!r}).read_text()) if Path({str(count)!r}).exists() else 0"
+    made = launcher(tmp_path, condition=f"({lives}) < {MAX_RESTARTS + 2}", players=[tired])
+    assert finish(made, tmp_path) == (0, "")

@@ -594,3 +594,22 @@ def test_a_silent_master_is_told_and_its_return_too(caplog: pytest.LogCaptureFix
         while not told(f"the master at {endpoint} has not answered for 0.3 s: tries again"):
             assert time.monotonic() < deadline
         stage.until(lambda: told(f"the master at {endpoint} answers again"))
+
+
+def test_a_master_that_moved_is_followed_at_once(tmp_path: Path) -> None:
+    """Its new address stands in the file; nobody waits for the old one to be silent."""
+    patient = replace(QUICK, silence_s=3600.0)
+    with staged() as first:
+        write_connection(tmp_path, first.hub.endpoint)
+        with make_link(str(tmp_path), timing=patient) as link:
+            assert served(first, link.join)
+            link.send(episodes(), 0)
+            with staged() as second:
+                write_connection(tmp_path, second.hub.endpoint)
+                both(second, link, second.batches)
+                (again,) = second.batches()
+                assert (again.incarnation, again.sequence) == (1, 1)
+                # A file that is being replaced in a clumsy way changes nothing.
+                (tmp_path / "connection.json").write_text("{")
+                heartbeats = second.hub.counters["heartbeats"]
+                both(second, link, lambda: second.hub.counters["heartbeats"] > heartbeats + 5)
