@@ -18,6 +18,7 @@ class WelcomeInfo:
         fingerprints: section of the settings -> digest; a worker's must be equal.
         spec: the task that arrays are checked against.
         window: most unacknowledged batches of one peer.
+        lockstep: players wait for orders.
     """
 
     run_id: str
@@ -25,6 +26,7 @@ class WelcomeInfo:
     fingerprints: Mapping[str, str]
     spec: EpisodeSpec
     window: int = 4
+    lockstep: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,6 +25,7 @@ def worker_child(folder: RunFolder, role: str, index: int) -> Child:
 def master_arguments(config: LaunchConfig, folder: RunFolder) -> list[str]:
     """How the master is started, as arguments of this Python."""
     master = config.master
+    in_step = master.service.mode == "lockstep"
     return [
         *module("master"),
         override("from_config", str(folder.config)),
@@ -33,5 +34,6 @@ def master_arguments(config: LaunchConfig, folder: RunFolder) -> list[str]:
             f"{name}={getattr(master, name)}"
             for name in ("seed", "max_hours", "max_episodes", "max_updates", "resume")
         ),
+        *([f"service.lockstep_workers={config.workers}"] if in_step else []),
         *([override("warm_start", master.warm_start)] if master.warm_start else []),
     ]

@@ -16,6 +16,7 @@ from typing import Any, Self
 from master.arrivals import Arrival, EpisodesArrived, ScoresArrived, WelcomeInfo
 from master.intake import Intake
 from master.keys import Keys
+from master.orders import Orders
 from master.peers import Peer, RefusedError, Registry
 from master.post import Post
 from tangram_agent.decoding import BatchError, decode_from_worker
@@ -27,6 +28,7 @@ from tangram_agent.wire import (
     Alive,
     Bye,
     EpisodeBatch,
+    Go,
     Greet,
     Heartbeat,
     Hello,
@@ -81,6 +83,7 @@ class Hub:
         self._status: list[bytes] | None = None
         self._post = Post(bind, port, keys)
         self._sockets, self.counters = self._post.sockets, self._post.counters
+        self._orders = Orders(self._post)
         self._intake = Intake(self._post, self._registry, info.window)
         self.endpoint = self._sockets.endpoint
         self.weights_endpoint = self._sockets.weights_endpoint
@@ -128,6 +131,10 @@ class Hub:
         self._weights, self._version = encode_weights(self.epoch, weights), weights.version
         self._sockets.publish(self._weights)
         self.counters["published"] += 1
+
+    def order(self, orders: Mapping[int, Go]) -> None:
+        """In lockstep: tell players what to play next, by index."""
+        self._orders.give(orders, self.peers)
 
     def tell(self, status: RunStatus) -> None:
         """Answer with this whoever asks how the run stands."""
@@ -202,6 +209,7 @@ class Hub:
             case EpisodeBatch(sequence) if peer.role != "player":
                 self._not_its_role(peer, sequence, "episodes come from players only")
             case EpisodeBatch():
+                self._orders.done(peer)
                 return self._intake.batch(peer, message)
             case Scores() if peer.role != "evaluator":
                 self._not_its_role(peer, 0, "scores come from evaluators only")
@@ -212,6 +220,7 @@ class Hub:
                 self.counters["heartbeats"] += 1
                 peer.stats = dict(stats)
                 self._post.send(peer.identity, Alive(self._version))
+                self._orders.remind(peer)
             case WantWeights(epoch, version):
                 if self._weights is not None and (epoch, version) != (self.epoch, self._version):
                     self._sockets.send(peer.identity, WeightsMessage.wrap(self._weights))
@@ -233,6 +242,7 @@ class Hub:
         self.counters["welcomed"] += 1
         self.counters["lost_batches"] = self._registry.lost_batches
         self._post.send(identity, self._welcome(peer))
+        self._orders.remind(peer)
 
     def _welcome(self, peer: Peer) -> Welcome:
         return Welcome(
@@ -243,4 +253,5 @@ class Hub:
             incarnation=peer.incarnation,
             weights_endpoint=self.weights_endpoint,
             window=self._info.window,
+            lockstep=self._info.lockstep,
         )

@@ -7,6 +7,7 @@ from queue import SimpleQueue
 from master.arrivals import EpisodesArrived, ScoresArrived
 from master.every import Every
 from master.keeper import Keeper
+from master.lockstep import Lockstep
 from master.parts import Parts
 from master.record import Clock
 from master.report import Reporter, scores_picture
@@ -53,14 +54,18 @@ class Loop:
 
     def run(self) -> str:
         """Learn until a bound or a signal ends it; returns which."""
+        parts = self.parts
         self.publish()
-        self.parts.folder.write_connection(self.parts.connection())
+        parts.folder.write_connection(parts.connection())
         while (reason := self.over()) is None:
             self.receive(0.0 if self.parts.trainer.pace.may_update() else IDLE_S)
             self.clock.advance(training=self.parts.trainer.episodes > 0)
-            self.insert()
+            if parts.lockstep is None:
+                self.insert()
+            else:
+                self.insert_round(parts.lockstep)
             self.learn()
-            if self._publish.due():
+            if parts.lockstep is None and self._publish.due():
                 self.publish()
             self._keeper.tick()
             self.tell()
@@ -100,11 +105,31 @@ class Loop:
         ):
             if not self._keeper.keep(self._arrived[0]):
                 return
-            arrival = self._arrived.popleft()
-            trainer.insert(arrival.episodes)
-            # Only now: a worker forgets what is acknowledged.
-            self.parts.hub.acknowledge(arrival)
-            self._reporter.inserted(arrival, trainer.updates)
+            self._insert(self._arrived.popleft())
+
+    def insert_round(self, lockstep: Lockstep) -> None:
+        """In lockstep: insert a round when it is whole, order the next when it is learned."""
+        trainer = self.parts.trainer
+        while self._arrived:
+            lockstep.take(self._arrived.popleft())
+        if lockstep.begins_round(trainer.episodes) and trainer.pace.may_update():
+            return
+        if not lockstep.ordered:
+            self.publish()
+            self.parts.hub.order(lockstep.orders(self._published, trainer.episodes))
+            lockstep.ordered = True
+        while (arrival := lockstep.next(trainer.episodes)) is not None:
+            if not self._keeper.keep(arrival):
+                return
+            self._insert(arrival)
+            lockstep.inserted(arrival)
+
+    def _insert(self, arrival: EpisodesArrived) -> None:
+        trainer = self.parts.trainer
+        trainer.insert(arrival.episodes)
+        # Only now: a worker forgets what is acknowledged.
+        self.parts.hub.acknowledge(arrival)
+        self._reporter.inserted(arrival, trainer.updates)
 
     def learn(self) -> None:
         """Updates that are due, for a short while, so that the sockets are served in between."""

@@ -14,6 +14,7 @@ from master.health import OFF, Health
 from master.hub import Hub
 from master.journal import Journal
 from master.keys import Keys, is_loopback, needs_keys, run_keys
+from master.lockstep import Lockstep
 from master.record import Record
 from master.recovery import journal_run_id, read_journal
 from master.rundir import RunFolder
@@ -46,6 +47,7 @@ class Parts:
         hub: the sockets, open.
         guard: updates the trainer, and undoes what is not finite.
         journal: keeps what was not in the last checkpoint.
+        lockstep: its rounds, None where nobody waits for anybody.
         health: HTTP for machines, None where it is off.
         keys: of the sockets, None where they are plain.
     """
@@ -59,6 +61,7 @@ class Parts:
     hub: Hub
     guard: Guard
     journal: Journal
+    lockstep: Lockstep | None = None
     health: Health | None = None
     keys: Keys | None = None
 
@@ -124,7 +127,10 @@ def make_parts(
     journal = Journal(
         folder.journal, run_id, setup.task_digest(), spec, service.journal_sync_seconds
     )
-    info = WelcomeInfo(run_id, config.seed, setup.fingerprints(), spec, service.window)
+    lockstep = Lockstep.of(service)
+    info = WelcomeInfo(
+        run_id, config.seed, setup.fingerprints(), spec, service.window, lockstep is not None
+    )
     keys = _keys(service, folder, notice)
     guard = Guard(trainer, service.max_bad_updates, folder.bad_batch)
     with ExitStack() as opened:  # closed again if what follows fails
@@ -135,7 +141,18 @@ def make_parts(
         if service.http_port != OFF:
             health = opened.enter_context(closing(Health(service.http_bind, service.http_port)))
         parts = Parts(
-            config, setup, folder, trainer, rest.record, budget, hub, guard, journal, health, keys
+            config,
+            setup,
+            folder,
+            trainer,
+            rest.record,
+            budget,
+            hub,
+            guard,
+            journal,
+            lockstep,
+            health,
+            keys,
         )
         _insert_again(parts, rest.segment, notice)
         opened.pop_all()
@@ -173,6 +190,16 @@ def _insert_again(parts: Parts, segment: int, notice: Callable[[str], None]) -> 
     before = parts.trainer.episodes
     for arrival in found:
         if parts.hub.recover(arrival):
+            _learn_first(parts)
             parts.trainer.insert(arrival.episodes)
     if parts.trainer.episodes > before:
         notice(f"{parts.trainer.episodes - before:,} episodes come back from the journal")
+
+
+def _learn_first(parts: Parts) -> None:
+    """In lockstep a round begins when the updates of those before it are made."""
+    trainer, lockstep = parts.trainer, parts.lockstep
+    if lockstep is None or not lockstep.begins_round(trainer.episodes):
+        return
+    while trainer.pace.may_update() and not parts.budget.spent(0.0, trainer.updates):
+        parts.guard.update(parts.share)

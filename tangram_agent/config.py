@@ -156,6 +156,8 @@ class ServiceConfig:
     Attributes:
         bind: address that the master listens on.
         port: of the master's ROUTER socket, 0 for any free one; PUB takes any free one.
+        mode: async (nobody waits for anybody), or lockstep (the same seed gives the same weights).
+        lockstep_workers: players that lockstep waits for; tangram-train knows it.
         security: curve (encrypted, and only for who has the run's connection file), plain, or
             auto: curve on every address but loopback.
         http_bind: address of the master's /metrics and /healthz.
@@ -183,6 +185,8 @@ class ServiceConfig:
 
     bind: str = "127.0.0.1"
     port: int = 0
+    mode: str = "async"
+    lockstep_workers: int = 0
     security: str = "auto"
     http_bind: str = "127.0.0.1"
     http_port: int = 0
@@ -228,5 +232,7 @@ class ServiceConfig:
             check_range(f"service.{name}", getattr(self, name), 0)
         for name in ("log_seconds", "checkpoint_minutes"):
             check_range(f"service.{name}", getattr(self, name), 1e-3)
+        check_choice("service.mode", self.mode, ("async", "lockstep"))
+        check_range("service.lockstep_workers", self.lockstep_workers, 0, 4096)
         check_choice("service.security", self.security, ("auto", "curve", "plain"))
         check_choice("service.device", self.device, ("auto", "cpu", "cuda"))

@@ -5,6 +5,7 @@ from typing import TypeVar
 
 from tangram_agent.frames import MAX_ID, Fields, unpack_header
 from tangram_agent.payloads import (
+    MAX_EPISODES,
     EpisodeSpec,
     WeightShapes,
     decode_columns,
@@ -19,6 +20,7 @@ from tangram_agent.wire import (
     Alive,
     Bye,
     EpisodeBatch,
+    Go,
     Greet,
     Heartbeat,
     Hello,
@@ -158,6 +160,16 @@ def _welcome(fields: Fields) -> Welcome:
         incarnation=fields.integer("incarnation", 1),
         weights_endpoint=fields.text("weights_endpoint", MAX_ADDRESS),
         window=fields.integer("window", 1, MAX_WINDOW),
+        lockstep=fields.boolean("lockstep"),
+    )
+
+
+def _go(fields: Fields) -> Go:
+    return Go(
+        number=fields.integer("number", 0),
+        version=fields.integer("version", -1),
+        first_episode=fields.integer("first_episode", 0),
+        episodes=fields.integer("episodes", 1, MAX_EPISODES),
     )
 
 
@@ -178,6 +190,7 @@ _FROM_WORKER: Mapping[str, Callable[[Fields], ToMaster | AskStatus]] = {
 }
 _FROM_MASTER: Mapping[str, Callable[[Fields], ToWorker]] = {
     Welcome.kind: _welcome,
+    Go.kind: _go,
     Refused.kind: lambda f: Refused(f.text("reason")),
     Greet.kind: lambda _: Greet(),
     Ack.kind: lambda f: Ack(f.integer("sequence", 1), f.boolean("duplicate")),

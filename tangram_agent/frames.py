@@ -13,7 +13,7 @@ import msgpack
 
 from tangram_sim.errors import WireError
 
-PROTOCOL = 1
+PROTOCOL = 2
 MAX_HEADER = 16 * 1024
 MAX_TEXT = 1024
 MAX_ID = 64

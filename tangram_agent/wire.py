@@ -4,7 +4,7 @@ The first frame is a msgpack header (`frames`), raw arrays follow (`payloads`). 
 frozen dataclass with `encode`; `decoding` has one decoder for each direction.
 
 Worker -> master: Hello, EpisodeBatch, Scores, WantWeights, Heartbeat, Bye.
-Master -> worker: Welcome, Refused, Greet, Ack, Reject, Alive, WeightsMessage, Stop.
+Master -> worker: Welcome, Go, Refused, Greet, Ack, Reject, Alive, WeightsMessage, Stop.
 
 Delivery: batches are numbered from 1 within an incarnation and sent in order, at least once. The
 master acknowledges a batch after its insert, takes them in order, and drops what it had before.
@@ -163,6 +163,7 @@ class Welcome(Plain):
         incarnation: of the process within its index, from 1.
         weights_endpoint: of the PUB socket.
         window: most batches that the master accepts unacknowledged.
+        lockstep: play only what Go says.
     """
 
     kind: ClassVar[str] = "welcome"
@@ -173,6 +174,25 @@ class Welcome(Plain):
     incarnation: int
     weights_endpoint: str
     window: int
+    lockstep: bool
+
+
+@dataclass(frozen=True)
+class Go(Plain):
+    """In lockstep, what a player plays next; it may come more than once.
+
+    Attributes:
+        number: of the round.
+        version: of the weights to play with.
+        first_episode: number of the first episode, from which its generator follows.
+        episodes: how many, in one batch.
+    """
+
+    kind: ClassVar[str] = "go"
+    number: int
+    version: int
+    first_episode: int
+    episodes: int
 
 
 @dataclass(frozen=True)
@@ -250,4 +270,4 @@ class WeightsMessage:
 
 
 ToMaster = Hello | EpisodeBatch | Scores | WantWeights | Heartbeat | Bye
-ToWorker = Welcome | Refused | Greet | Ack | Reject | Alive | Stop | WeightsMessage
+ToWorker = Welcome | Go | Refused | Greet | Ack | Reject | Alive | Stop | WeightsMessage

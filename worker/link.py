@@ -13,7 +13,7 @@ from typing import Self
 
 from tangram_agent.payloads import EpisodeSpec, WeightShapes
 from tangram_agent.types import Episodes, Weights
-from tangram_agent.wire import EpisodeBatch, Scores, Welcome
+from tangram_agent.wire import EpisodeBatch, Go, Scores, Welcome
 from tangram_sim.errors import TangramError
 from worker.talk import Talk
 from worker.terms import Introduction, Timing
@@ -178,6 +178,15 @@ class Link:
 
         self._wait(take, "newer weights")
         return found[0] if found else None
+
+    def wait_for_order(self, done: Go | None) -> Go | None:
+        """In lockstep: wait for what to play after an order that was done; None if stopped."""
+
+        def is_new() -> bool:
+            order = self._talk.order
+            return order is not None and (done is None or order.number != done.number)
+
+        return self._talk.order if self._wait(is_new, "its turn") else None
 
     def drain(self, timeout_s: float) -> bool:
         """Wait until all batches are acknowledged, also after `stop`; False if that failed."""

@@ -9,6 +9,7 @@ from tangram_agent.config import RECYCLED_STATUS, ServiceConfig
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes
+from tangram_agent.wire import Go
 from tangram_sim.batch import BatchedEnv
 from worker.config import WorkerConfig
 from worker.link import Link
@@ -38,6 +39,10 @@ def run_player(config: WorkerConfig, setup: Setup) -> int:
         if not _take_first_weights(link, policy, report):
             return 0
         me = link.welcome
+        if me.lockstep:
+            # Nothing may depend on how often a process was started.
+            _play_in_step(link, policy, Rollout(env, me.seed, config.role, me.index, 0), report)
+            return 0
         rollout = Rollout(env, me.seed, config.role, me.index, me.incarnation)
         while _wait_for_room(link, report):
             # Weights change here and nowhere else: a batch is played with one version.
@@ -54,6 +59,24 @@ def run_player(config: WorkerConfig, setup: Setup) -> int:
                 link.stop("recycled")
                 return RECYCLED_STATUS
     return 0
+
+
+def _play_in_step(link: Link, policy: Policy, rollout: Rollout, report: Report) -> None:
+    """Play what is ordered, with the weights that are ordered, until the link is stopped."""
+    done: Go | None = None
+    while (order := link.wait_for_order(done)) is not None:
+        while policy.version != order.version:
+            with report.waiting("the weights of this round"):
+                newest = link.wait_for_weights()
+            if newest is None:
+                return
+            policy.load(newest)
+        rollout.episode = order.first_episode
+        episodes = _play(rollout, policy, link, groups=order.episodes // rollout.envs)
+        if episodes.count < order.episodes or not link.send(episodes, policy.version):
+            return
+        report.played(episodes.count, policy.version)
+        done = order
 
 
 def is_worn_out(service: ServiceConfig, episodes: int) -> bool:

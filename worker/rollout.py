@@ -117,6 +117,11 @@ class Rollout:
         self._identity = (run_seed, role, index, incarnation)
         self.episode = 0
 
+    @property
+    def envs(self) -> int:
+        """Episodes that are played at a time."""
+        return self._env.count
+
     def play(self, choose: Choose) -> Episodes:
         """The next `env.count` episodes."""
         numbers = range(self.episode, self.episode + self._env.count)

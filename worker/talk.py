@@ -18,6 +18,7 @@ from tangram_agent.wire import (
     Ack,
     Alive,
     Bye,
+    Go,
     Greet,
     Heartbeat,
     Hello,
@@ -50,6 +51,7 @@ class Talk:
         stats: numbers for the next heartbeats.
         counters: what was sent again, refused, lost or not understood.
         welcome: the master's last one.
+        order: in lockstep, the last one.
         joined: the present connection is known to the master.
         line: the connection.
         dismissed: the master wants this process to end.
@@ -64,6 +66,7 @@ class Talk:
         self.counters: Counter[str] = Counter()
         self.line = Line(who.connect, timing, self.counters)
         self.welcome: Welcome | None = None
+        self.order: Go | None = None
         self.joined = self.dismissed = False
         self.reason = ""
         self._who, self._window, self._shapes, self._timing = who, window, shapes, timing
@@ -188,6 +191,8 @@ class Talk:
                     self._resend_at = now + self._timing.resend_s
             case Reject():
                 self._take_back(message, now)
+            case Go():
+                self.order = message
             case Alive(version):
                 if self.inbox.version < version:  # the broadcast was missed, or is on its way
                     self._want_weights()

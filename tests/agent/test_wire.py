@@ -22,6 +22,7 @@ from tangram_agent.wire import (
     Alive,
     Bye,
     EpisodeBatch,
+    Go,
     Greet,
     Heartbeat,
     Hello,
@@ -74,6 +75,7 @@ welcomes = st.builds(
     incarnation=counts,
     weights_endpoint=ids,
     window=st.integers(1, 1024),
+    lockstep=st.booleans(),
 )
 to_master = st.one_of(
     hellos,
@@ -84,6 +86,13 @@ to_master = st.one_of(
 )
 to_worker = st.one_of(
     welcomes,
+    st.builds(
+        Go,
+        number=st.integers(0, MAX_INTEGER),
+        version=versions,
+        first_episode=st.integers(0, MAX_INTEGER),
+        episodes=st.integers(1, 4096),
+    ),
     st.builds(Refused, reason=reasons),
     st.builds(Greet),
     st.builds(Ack, sequence=counts, duplicate=st.booleans()),
@@ -182,7 +191,8 @@ def test_wrong_fields_from_workers_are_named(
     assert str(caught.value).startswith(reason)
 
 
-WELCOME = Welcome("e", "run", 1, 0, 1, "tcp://h:1", 4)
+WELCOME = Welcome("e", "run", 1, 0, 1, "tcp://h:1", 4, False)
+GO = Go(number=3, version=7, first_episode=96, episodes=32)
 REJECT = Reject(reason="x", sequence=1, final=True)
 
 FROM_MASTER: list[tuple[Plain, dict[str, Any], str]] = [
@@ -194,6 +204,11 @@ FROM_MASTER: list[tuple[Plain, dict[str, Any], str]] = [
     (WELCOME, {"weights_endpoint": 5}, "welcome: weights_endpoint must be a text of at most 256"),
     (WELCOME, {"window": 0}, f"welcome: window {INTEGER} 1 and 1024, got 0"),
     (WELCOME, {"window": 1025}, f"welcome: window {INTEGER} 1 and 1024, got 1025"),
+    (WELCOME, {"lockstep": 0}, "welcome: lockstep must be true or false, got 0"),
+    (GO, {"number": -1}, f"go: number {INTEGER} 0 and {MAX_INTEGER}, got -1"),
+    (GO, {"version": -2}, f"go: version {INTEGER} -1 and {MAX_INTEGER}, got -2"),
+    (GO, {"first_episode": -1}, f"go: first_episode {INTEGER} 0 and {MAX_INTEGER}, got -1"),
+    (GO, {"episodes": 4097}, f"go: episodes {INTEGER} 1 and 4096, got 4097"),
     (Ack(1, duplicate=False), {"sequence": 0}, f"ack: sequence {INTEGER} 1 and {MAX_INTEGER}"),
     (Ack(1, duplicate=False), {"duplicate": 0}, "ack: duplicate must be true or false, got 0"),
     (REJECT, {"sequence": -1}, f"reject: sequence {INTEGER} 0 and {MAX_INTEGER}, got -1"),
@@ -313,7 +328,7 @@ def test_the_size_of_a_header_is_checked_before_it_is_unpacked() -> None:
 def test_all_kinds_are_in_the_round_trips() -> None:
     """A new message must be added above."""
     drawn = {Hello, WantWeights, Heartbeat, Bye, AskStatus}
-    drawn |= {Welcome, Refused, Greet, Ack, Reject, Alive, Stop}
+    drawn |= {Welcome, Go, Refused, Greet, Ack, Reject, Alive, Stop}
     kinds = {
         kind for parent in (Plain, *Plain.__subclasses__()) for kind in parent.__subclasses__()
     }

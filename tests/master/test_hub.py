@@ -48,7 +48,7 @@ def test_hello_is_answered_with_all_that_a_worker_needs() -> None:
     with staged() as stage:
         welcome = stage.dealer().join(index=4)
         hub = stage.hub
-        assert welcome == Welcome(hub.epoch, "run", 7, 4, 1, hub.weights_endpoint, WINDOW)
+        assert welcome == Welcome(hub.epoch, "run", 7, 4, 1, hub.weights_endpoint, WINDOW, False)
         [peer] = hub.peers
         assert (peer.role, peer.index, peer.incarnation) == ("player", 4, 1)
         assert hub.counters["welcomed"] == 1

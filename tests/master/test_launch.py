@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from queue import SimpleQueue
 
@@ -24,7 +25,7 @@ from master.config import LaunchConfig, MasterConfig
 from master.launch import Launcher, run_training
 from master.rundir import RunFolder
 from master.signals import SIGNALS, StopSignals, heeded
-from tangram_agent.config import RECYCLED_STATUS
+from tangram_agent.config import RECYCLED_STATUS, ServiceConfig
 from tangram_agent.setup import from_mapping
 from tangram_sim.errors import ConfigError
 
@@ -76,6 +77,9 @@ def test_the_master_gets_its_settings(tmp_path: Path) -> None:
         "resume=auto",
         "warm_start='a b'",
     ]
+    in_step = replace(master, service=ServiceConfig(mode="lockstep"), warm_start=None)
+    arguments = master_arguments(LaunchConfig(2, in_step), RunFolder(tmp_path))
+    assert arguments[-1] == "service.lockstep_workers=2"
 
 
 @pytest.mark.fast

@@ -112,6 +112,7 @@ class StandIn:
             "incarnation": 2,
             "weights_endpoint": self._pub.getsockopt_string(zmq.LAST_ENDPOINT),
             "window": 4,
+            "lockstep": False,
         }
         return Welcome(**(fields | changes))
 

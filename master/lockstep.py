@@ -1,0 +1,81 @@
+"""Lockstep: everybody waits for everybody, so that the same seed gives the same weights.
+
+A run is a row of rounds. In a round each of N players plays one batch with the same weights, and
+episodes whose generators follow from (run, role, index, number) alone; the master inserts the
+batches by index, makes all updates that are due, and sends the weights that the next round is
+played with. Nothing depends on who is fast or when a process was started again, and what was
+inserted says which round it is, so a run that was stopped goes on where it was.
+"""
+
+from master.arrivals import EpisodesArrived
+from tangram_agent.config import ServiceConfig
+from tangram_agent.wire import Go
+from tangram_sim.errors import ConfigError
+
+
+class Lockstep:
+    """The rounds of a run.
+
+    Attributes:
+        ordered: the players of this round know what to play.
+    """
+
+    def __init__(self, players: int, batch_episodes: int) -> None:
+        """Begin with the first round.
+
+        Args:
+            players: N, with the indices 0 to N - 1.
+            batch_episodes: episodes that each plays in a round.
+        """
+        self._players, self._size = players, batch_episodes
+        self._arrived: dict[int, EpisodesArrived] = {}
+        self.ordered = False
+
+    @staticmethod
+    def of(service: ServiceConfig) -> "Lockstep | None":
+        """What the settings ask for, None where workers play as they like.
+
+        Raises:
+            ConfigError: the number of players is not known, or batches are no whole groups.
+        """
+        if service.mode != "lockstep":
+            return None
+        if service.lockstep_workers < 1:
+            raise ConfigError(
+                "service.mode=lockstep waits for a known number of workers: set "
+                "service.lockstep_workers=..., or use tangram-train workers=..."
+            )
+        if service.batch_episodes % service.envs:
+            raise ConfigError(
+                f"service.batch_episodes={service.batch_episodes} must be a multiple of "
+                f"service.envs={service.envs} in lockstep: set one of them"
+            )
+        return Lockstep(service.lockstep_workers, service.batch_episodes)
+
+    def begins_round(self, episodes: int) -> bool:
+        """Whether, with so many episodes inserted, the next one is the first of a round."""
+        return episodes % (self._players * self._size) == 0
+
+    def orders(self, version: int, episodes: int) -> dict[int, Go]:
+        """Index -> what to play with the weights of a version, when so many were inserted."""
+        number, done = divmod(episodes, self._players * self._size)
+        first = number * self._size
+        missing = range(done // self._size, self._players)
+        return {i: Go(number, version, first, self._size) for i in missing}
+
+    def take(self, arrival: EpisodesArrived) -> None:
+        """A batch has come, in any order."""
+        self._arrived.setdefault(arrival.index, arrival)
+
+    def next(self, episodes: int) -> EpisodesArrived | None:
+        """The batch to insert after so many episodes, once all of its round have come."""
+        index = episodes % (self._players * self._size) // self._size
+        if not all(i in self._arrived for i in range(index, self._players)):
+            return None
+        return self._arrived[index]
+
+    def inserted(self, arrival: EpisodesArrived) -> None:
+        """It was inserted: with the last of a round the next one begins."""
+        del self._arrived[arrival.index]
+        if not self._arrived:
+            self.ordered = False

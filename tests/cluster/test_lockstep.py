@@ -1,0 +1,120 @@
+"""Lockstep: the same seed gives the same weights, through stops and kills as well."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zmq
+
+from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
+from tangram_sim.errors import TangramError
+from tests.cluster.processes import pids_of, refused, run, started
+from worker.status import ask_status
+
+pytestmark = [pytest.mark.cluster, pytest.mark.timeout(130)]
+
+UPDATES = 400
+STEP = (
+    "service.mode=lockstep",
+    "workers=2",
+    f"max_updates={UPDATES}",
+    "sim=kinematic",
+    "net=mlp",
+    "agent.learning_starts=64",
+    "service.eval_seconds=1000",
+    "service.eval_episodes=4",
+)
+LIMIT_S = 60.0
+
+
+@pytest.fixture(scope="module")
+def straight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run that nothing disturbed."""
+    folder = tmp_path_factory.mktemp("lockstep") / "straight"
+    run("tangram-train", f"run_dir={folder}", *STEP, cwd=folder.parent)
+    return folder
+
+
+def until_updates(folder: Path, updates: int) -> None:
+    """Wait until a run that goes on has made so many updates."""
+    end, done = time.monotonic() + LIMIT_S, -1.0
+    with zmq.Context() as context:
+        while done < updates:
+            assert time.monotonic() < end, f"{done} updates after {LIMIT_S} s"
+            try:
+                done = ask_status(str(folder), context, 5.0).numbers["updates"]
+            except TangramError:
+                time.sleep(0.05)  # it is not there yet
+    assert done < UPDATES, "it was over before it could be disturbed"
+
+
+def assert_same(one: Path, other: Path) -> None:
+    """Every number of the final checkpoints, the replay and the generators included."""
+    ours, theirs = (load_checkpoint(list_checkpoints(p / "checkpoints")[-1]) for p in (one, other))
+    assert ours.updates == theirs.updates == UPDATES
+    for stem, tensors in ours.arrays.items():
+        assert tensors.keys() == theirs.arrays[stem].keys()
+        for name, tensor in tensors.items():
+            np.testing.assert_array_equal(tensor, theirs.arrays[stem][name], err_msg=name)
+    for name in ("episodes", "generators"):
+        assert ours.counters[name] == theirs.counters[name], name
+    assert ours.counters["pace"] == pytest.approx(theirs.counters["pace"])
+
+
+def test_the_same_numbers_come_twice(straight: Path, tmp_path: Path) -> None:
+    run("tangram-train", f"run_dir={tmp_path / 'again'}", *STEP, cwd=tmp_path)
+    assert_same(tmp_path / "again", straight)
+
+
+def test_another_seed_gives_other_numbers(straight: Path, tmp_path: Path) -> None:
+    run("tangram-train", f"run_dir={tmp_path / 'other'}", "seed=1", *STEP, cwd=tmp_path)
+    with pytest.raises(AssertionError):
+        assert_same(tmp_path / "other", straight)
+
+
+def test_a_stop_in_the_middle_changes_nothing(straight: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "stopped"
+    with started("tangram-train", f"run_dir={folder}", *STEP, cwd=tmp_path) as process:
+        until_updates(folder, 50)
+        process.terminate()
+        assert process.wait(LIMIT_S) == 0
+    assert load_checkpoint(list_checkpoints(folder / "checkpoints")[-1], []).updates < UPDATES
+    run("tangram-train", f"run_dir={folder}", "resume=auto", *STEP, cwd=tmp_path)
+    assert_same(folder, straight)
+
+
+@pytest.mark.parametrize("victim", ["-m master", "-m worker"])
+def test_a_kill_in_the_middle_changes_nothing(straight: Path, tmp_path: Path, victim: str) -> None:
+    """tangram-train starts it again; a master learns again what its checkpoint had not seen."""
+    folder = tmp_path / "killed"
+    settings = (f"run_dir={folder}", *STEP, "service.checkpoint_minutes=0.01")
+    with started("tangram-train", *settings, cwd=tmp_path) as process:
+        until_updates(folder, 50)
+        found = [pid for pid in pids_of(folder) if victim in _line(pid)]
+        os.kill(min(found), signal.SIGKILL)
+        assert process.wait(LIMIT_S) == 0
+    assert_same(folder, straight)
+
+
+def _line(pid: int) -> str:
+    return (Path("/proc") / str(pid) / "cmdline").read_bytes().replace(b"\0", b" ").decode()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ((), "service.mode=lockstep waits for a known number of workers: set"),
+        (
+            ("service.lockstep_workers=2", "service.envs=5"),
+            "service.batch_episodes=32 must be a multiple of service.envs=5 in lockstep",
+        ),
+    ],
+)
+def test_what_lockstep_needs_is_asked_for(
+    tmp_path: Path, settings: tuple[str, ...], message: str
+) -> None:
+    arguments = (f"run_dir={tmp_path / 'run'}", "service.mode=lockstep", *settings)
+    assert message in refused("tangram-master", *arguments, cwd=tmp_path)

@@ -1,0 +1,72 @@
+"""The rounds of lockstep, without sockets."""
+
+import pytest
+
+from master.arrivals import EpisodesArrived
+from master.lockstep import Lockstep
+from tangram_agent.config import ServiceConfig
+from tangram_agent.wire import Go
+from tangram_sim.errors import ConfigError
+from tests.agent.builders import random_episodes
+from tests.master.builders import small_setup
+
+pytestmark = pytest.mark.fast
+
+MADE = small_setup()
+SIZE = 4
+
+
+def batch(index: int, sequence: int = 1) -> EpisodesArrived:
+    return EpisodesArrived("player", index, 1, sequence, 0, random_episodes(MADE, SIZE, index))
+
+
+def test_a_round_is_inserted_by_index_when_it_is_whole() -> None:
+    lockstep, episodes = Lockstep(3, SIZE), 0
+    inserted = []
+    for came in (2, 0, 1):
+        assert lockstep.next(episodes) is None
+        lockstep.take(batch(came))
+    lockstep.ordered = True
+    while (found := lockstep.next(episodes)) is not None:
+        lockstep.inserted(found)
+        inserted.append(found.index)
+        episodes += SIZE
+    assert (inserted, episodes, lockstep.ordered) == ([0, 1, 2], 12, False)
+    assert lockstep.begins_round(episodes)
+
+
+def test_orders_follow_from_what_was_inserted() -> None:
+    lockstep = Lockstep(3, SIZE)
+    assert lockstep.orders(0, 0) == {i: Go(0, 0, 0, SIZE) for i in range(3)}
+    assert lockstep.orders(9, 24) == {i: Go(2, 9, 8, SIZE) for i in range(3)}
+
+
+def test_a_round_that_was_cut_goes_on_with_those_who_are_missing() -> None:
+    """A kill between two inserts of a round: the journal has the first of three."""
+    lockstep = Lockstep(3, SIZE)
+    assert not lockstep.begins_round(28)
+    assert lockstep.orders(9, 28) == {i: Go(2, 9, 8, SIZE) for i in (1, 2)}
+    lockstep.take(batch(2))
+    assert lockstep.next(28) is None
+    lockstep.take(batch(1))
+    first = lockstep.next(28)
+    assert first is not None
+    assert first.index == 1
+
+
+def test_the_first_of_two_batches_of_an_index_counts() -> None:
+    lockstep = Lockstep(1, SIZE)
+    first = batch(0, sequence=1)
+    lockstep.take(first)
+    lockstep.take(batch(0, sequence=2))
+    assert lockstep.next(0) is first
+
+
+def test_the_settings_must_fit() -> None:
+    assert Lockstep.of(ServiceConfig()) is None
+    step = {"mode": "lockstep", "envs": 4, "batch_episodes": 8}
+    assert Lockstep.of(ServiceConfig(lockstep_workers=2, **step)) is not None
+    with pytest.raises(ConfigError, match=r"set service\.lockstep_workers=\.\.\."):
+        Lockstep.of(ServiceConfig(**step))
+    with pytest.raises(ConfigError, match=r"must be a multiple of service\.envs=3 in lockstep"):
+        Lockstep.of(ServiceConfig(lockstep_workers=2, **(step | {"envs": 3})))
