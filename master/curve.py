@@ -1,11 +1,14 @@
 """curve.jsonl: every evaluation of a run, one JSON object a line, for plots without TensorBoard."""
 
 import json
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from tangram_agent.files import write_whole
+
+log = logging.getLogger(__name__)
 
 
 class Curve:
@@ -25,10 +28,16 @@ class Curve:
             write_whole(path, "".join(map(_text, kept)).encode())
 
     def add(self, scores: Mapping[str, float], updates: int, episodes: int, seconds: float) -> None:
-        """Note the scores of weights after so many updates, episodes, seconds of training."""
+        """Note the scores of weights after so many updates, episodes, seconds of training.
+
+        What the disk does not take is left out, and told.
+        """
         line = {"updates": updates, "episodes": episodes, "train_s": round(seconds, 3), **scores}
-        with self._path.open("a", encoding="utf-8") as file:
-            file.write(_text(line))
+        try:
+            with self._path.open("a", encoding="utf-8") as file:
+                file.write(_text(line))
+        except OSError as error:
+            log.warning("%s cannot be written (%s): a score is missing", self._path, error.strerror)
 
 
 def _text(line: Mapping[str, Any]) -> str:

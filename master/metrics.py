@@ -4,8 +4,10 @@ Curves are drawn against updates. Scores of the evaluator stand there three time
 (`test`), against episodes (`test_by_episodes`) and against seconds of training (`test_by_seconds`).
 """
 
+import logging
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +15,13 @@ import numpy as np
 import yaml
 from torch.utils.tensorboard import SummaryWriter
 
+from master.every import Every
 from tangram_sim.arrays import Pixels
 
 FLUSH_S = 30
+RETRY_S = 60.0
+
+log = logging.getLogger(__name__)
 
 
 class Means:
@@ -50,45 +56,79 @@ class Metrics:
             updates: of the checkpoint that the run goes on from; later points of an earlier
                 process are hidden, since they happen again.
         """
-        purge = updates + 1 if updates else None
-        self._writer = SummaryWriter(str(folder), purge_step=purge, flush_secs=FLUSH_S)
-        # Purging hides points of every tag in a folder by their step, so curves against episodes
-        # and seconds, which nothing repeats, lie in a folder of their own.
-        self._axes = SummaryWriter(str(folder / "axes"), flush_secs=FLUSH_S)
+        self._folder = folder
+        self._broken = False
+        self._again = Every(RETRY_S)
+        self._open(updates + 1 if updates else None)
 
     def scalars(self, values: Mapping[str, float], step: int) -> None:
         """Points of many curves at one step."""
-        for name, value in values.items():
-            self._writer.add_scalar(name, value, step)
+
+        def write() -> None:
+            for name, value in values.items():
+                self._writer.add_scalar(name, value, step)
+
+        self._try(write)
 
     def scores(
         self, scores: Mapping[str, float], updates: int, episodes: int, seconds: float
     ) -> None:
         """An evaluation of the weights after so many updates."""
+
+        def write() -> None:
+            for group, step in (("test_by_episodes", episodes), ("test_by_seconds", seconds)):
+                for name, value in scores.items():
+                    self._axes.add_scalar(f"{group}/{name}", value, int(step))
+
         self.scalars({f"test/{name}": value for name, value in scores.items()}, updates)
-        for group, step in (("test_by_episodes", episodes), ("test_by_seconds", seconds)):
-            for name, value in scores.items():
-                self._axes.add_scalar(f"{group}/{name}", value, int(step))
+        self._try(write)
 
     def picture(self, pixels: Pixels, updates: int) -> None:
         """The test episodes (height, width, 3) after so many updates."""
-        self._writer.add_image("test/pictures", np.asarray(pixels), updates, dataformats="HWC")
+        content = np.asarray(pixels)
+        self._try(
+            lambda: self._writer.add_image("test/pictures", content, updates, dataformats="HWC")
+        )
 
     def settings(self, resolved: Mapping[str, Any]) -> None:
         """The whole config as text."""
         text = yaml.safe_dump(dict(resolved), sort_keys=False)
         indented = "".join(f"    {line}\n" for line in text.splitlines())
-        self._writer.add_text("config", indented)
+        self._try(lambda: self._writer.add_text("config", indented))
 
     def hyperparameters(self, resolved: Mapping[str, Any], scores: Mapping[str, float]) -> None:
         """What runs are compared by in the HPARAMS tab, with the final scores."""
         metrics = {f"final/{name}": value for name, value in scores.items()}
-        self._writer.add_hparams(flatten(resolved), metrics, run_name="final")
+        plain = flatten(resolved)
+        self._try(lambda: self._writer.add_hparams(plain, metrics, run_name="final"))
 
     def close(self) -> None:
         """Write what is left."""
-        self._writer.close()
-        self._axes.close()
+        for writer in (self._writer, self._axes):
+            self._try(writer.close)
+
+    def _open(self, purge: int | None) -> None:
+        self._writer = SummaryWriter(str(self._folder), purge_step=purge, flush_secs=FLUSH_S)
+        # Purging hides points of every tag in a folder by their step, so curves against episodes
+        # and seconds, which nothing repeats, lie in a folder of their own.
+        self._axes = SummaryWriter(str(self._folder / "axes"), flush_secs=FLUSH_S)
+
+    def _try(self, write: Callable[[], object]) -> None:
+        """Curves are not worth a run: what the disk does not take is left out, and told."""
+        if self._broken and not self._again.due():
+            return
+        try:
+            if self._broken:
+                self._open(None)
+                self._broken = False
+            write()
+        except OSError as error:
+            if not self._broken:
+                log.warning("curves cannot be written (%s): a gap is left in them", error.strerror)
+                for writer in (self._writer, self._axes):
+                    with suppress(OSError):
+                        writer.close()
+            self._broken, self._again = True, Every(RETRY_S)
 
 
 def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, float | str | bool]:

@@ -1,12 +1,15 @@
 """What stands in TensorBoard after a run."""
 
+import errno
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torch.utils.tensorboard import SummaryWriter
 
+from master import metrics as metrics_module
 from master.metrics import Means, Metrics, flatten
 
 pytestmark = pytest.mark.fast
@@ -77,3 +80,30 @@ def test_nested_settings_become_dotted_names() -> None:
     nested = {"a": {"b": {"c": 1}, "d": [1, 2]}, "e": None, "f": True, "g": "x", "h": 0.5}
     expected = {"a.b.c": 1, "a.d": "[1, 2]", "e": "None", "f": True, "g": "x", "h": 0.5}
     assert flatten(nested) == expected
+
+
+def test_a_disk_that_takes_no_curves_leaves_a_gap_and_ends_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(metrics_module, "RETRY_S", 0.0)
+    metrics = Metrics(tmp_path)
+    metrics.scalars({"a": 1.0}, 1)
+    full = OSError(errno.ENOSPC, "No space left on device")
+
+    def fail(*_: object) -> None:
+        raise full
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SummaryWriter, "add_scalar", fail)
+        for step in (2, 3):
+            metrics.scalars({"a": 1.0}, step)
+        metrics.scores({"b": 1.0}, 3, 30, 3.0)
+    metrics.scalars({"a": 1.0}, 4)
+    metrics.close()
+    told = "curves cannot be written (No space left on device): a gap is left in them"
+    assert told in {record.message for record in caplog.records}
+    files = [read(path) for path in tmp_path.glob("events.*")]
+    found = [
+        point for file in files if "a" in file.Tags()["scalars"] for point in points(file, "a")
+    ]
+    assert sorted(step for step, _ in found) == [1, 4]

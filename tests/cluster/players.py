@@ -1,0 +1,112 @@
+"""Workers of a real master that know what they sent, and what must be in its replay."""
+
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
+from tangram_agent.payloads import EpisodeSpec
+from tangram_agent.setup import Setup, make_setup
+from tests.agent.builders import random_episodes
+from tests.cluster.processes import started, wait_for_file
+from worker.link import Link
+from worker.terms import Timing
+
+LIMIT_S = 60.0
+EPISODES = 3  # in each batch
+FIRST_TAG = 2.0  # rewards of hindsight twins are at most 1
+QUICK = Timing(retry_s=0.2, heartbeat_s=0.2, resend_s=1.0, silence_s=1.5)
+MASTER = (
+    "resume=auto",
+    "sim=kinematic",
+    "net=mlp",
+    "agent.updates_per_transition=0.02",
+    "agent.learning_starts=30",
+    "agent.batch_size=16",
+)
+
+
+@contextmanager
+def master(folder: Path, *more: str) -> Iterator["subprocess.Popen[bytes]"]:
+    """A real master that can be reached."""
+    (folder / "connection.json").unlink(missing_ok=True)
+    with started("tangram-master", f"run_dir={folder}", *MASTER, *more, cwd=folder) as process:
+        wait_for_file(folder / "connection.json", process)
+        yield process
+
+
+class Player:
+    """A worker whose batches can be told apart in the replay, by their rewards."""
+
+    def __init__(self, connect: str | Path, index: int, setup: Setup) -> None:
+        self._setup, self.index = setup, index
+        spec = EpisodeSpec.of(setup)
+        self.link = Link(str(connect), "player", index, setup.fingerprints(), spec, None, 4, QUICK)
+        self.sent = 0
+
+    @property
+    def acknowledged(self) -> int:
+        return self.link._talk.spool.first - 1
+
+    def tag(self, sequence: int) -> float:
+        return FIRST_TAG + 100_000.0 * self.index + sequence
+
+    def step(self) -> None:
+        """Send what the window takes, and take what came."""
+        while self.link._talk.joined and self.link.window_free and not self.link.stopped:
+            self.sent += 1
+            episodes = random_episodes(self._setup, EPISODES, seed=self.sent)
+            tags = np.full_like(episodes.rewards, self.tag(self.sent))
+            assert self.link.send(replace(episodes, rewards=tags), -1)
+        self.link.poll(0.002)
+
+
+def until(players: list[Player], done: Callable[[], Any]) -> None:
+    """Play until something holds."""
+    end = time.monotonic() + LIMIT_S
+    while not done():
+        assert time.monotonic() < end, [player.acknowledged for player in players]
+        for player in players:
+            player.step()
+
+
+def finish(players: list[Player], process: "subprocess.Popen[bytes]") -> None:
+    """End the master in order, with the players at work."""
+    process.terminate()
+    until(players, lambda: process.poll() is not None)
+    assert process.returncode == 0
+
+
+def more_acknowledged(players: list[Player], batches: int) -> None:
+    """Play until each has so many more acknowledgements."""
+    wanted = [player.acknowledged + batches for player in players]
+    until(players, lambda: all(p.acknowledged >= w for p, w in zip(players, wanted, strict=True)))
+
+
+def setup_of(folder: Path) -> Setup:
+    return make_setup(yaml.safe_load((folder / "config.yaml").read_text()))
+
+
+def assert_exactly_once(folder: Path, players: list[Player]) -> None:
+    """The last checkpoint against what the players know."""
+    content = load_checkpoint(list_checkpoints(folder / "checkpoints")[-1])
+    tags, counts = np.unique(content.arrays["replay"]["reward"], return_counts=True)
+    found = dict(zip(tags.tolist(), counts.tolist(), strict=True))
+    played = {tag: count for tag, count in found.items() if tag >= FIRST_TAG}
+    acknowledged = {p.tag(n): EPISODES for p in players for n in range(1, p.acknowledged + 1)}
+    sent = {p.tag(n): EPISODES for p in players for n in range(1, p.sent + 1)}
+    assert acknowledged.items() <= played.items() <= sent.items()
+    assert content.counters["episodes"] == sum(played.values())
+    table = content.counters["hub"]
+    for player in players:
+        entry = table[f"player/{player.index}"]
+        assert player.acknowledged <= entry["sequence"] <= player.sent
+        tags = {tag for tag in played if int(tag - FIRST_TAG) // 100_000 == player.index}
+        assert len(tags) == entry["sequence"]

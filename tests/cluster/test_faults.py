@@ -1,0 +1,209 @@
+"""Faults of the machine and the network, against real masters and workers."""
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+
+import pytest
+import zmq
+
+from tangram_agent.setup import Setup
+from tangram_sim.errors import TangramError
+from tests.cluster.players import (
+    LIMIT_S,
+    MASTER,
+    Player,
+    assert_exactly_once,
+    finish,
+    master,
+    more_acknowledged,
+    setup_of,
+    until,
+)
+from tests.cluster.processes import BIN, all_ended, pids_of, started, wait_for_file
+from tests.cluster.proxy import DOWN, UP, Proxy
+from worker.status import ask_status
+
+pytestmark = [pytest.mark.cluster, pytest.mark.timeout(130)]
+
+
+@contextmanager
+def players(setup: Setup, *connects: str | Path) -> Iterator[list[Player]]:
+    """Players that have joined."""
+    with ExitStack() as stack:
+        made = [Player(connect, i, setup) for i, connect in enumerate(connects)]
+        for player in made:
+            stack.enter_context(player.link)
+            assert player.link.join()
+        yield made
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    path = tmp_path / "run"
+    path.mkdir()
+    return path
+
+
+def port_of(folder: Path) -> int:
+    content = json.loads((folder / "connection.json").read_text())
+    return int(content["endpoint"].rpartition(":")[2])
+
+
+@pytest.mark.parametrize("directions", [(UP, DOWN), (UP,), (DOWN,)], ids="-".join)
+def test_a_network_that_swallows_everything_for_a_while(
+    folder: Path, directions: tuple[str, ...]
+) -> None:
+    """One player behind the proxy, one beside it, who must not notice."""
+    with (
+        master(folder) as process,
+        Proxy(port_of(folder)) as proxy,
+        players(setup_of(folder), f"tcp://127.0.0.1:{proxy.port}", folder) as made,
+    ):
+        more_acknowledged(made, 5)
+        proxy.cut(*directions)
+        behind, beside = made
+        goal = beside.acknowledged + 20
+        until(made, lambda: behind.link.counters["reconnects"] and beside.acknowledged >= goal)
+        stuck = behind.acknowledged
+        proxy.cut()
+        until(made, lambda: behind.acknowledged >= stuck + 5)
+        assert beside.link.counters["reconnects"] == 0
+        finish(made, process)
+    assert_exactly_once(folder, made)
+
+
+def test_a_frozen_master_comes_back(folder: Path) -> None:
+    with master(folder) as process, players(setup_of(folder), folder, folder) as made:
+        more_acknowledged(made, 3)
+        process.send_signal(signal.SIGSTOP)
+        until(made, lambda: all(player.link.counters["reconnects"] for player in made))
+        process.send_signal(signal.SIGCONT)
+        more_acknowledged(made, 5)
+        finish(made, process)
+    assert_exactly_once(folder, made)
+
+
+def test_a_frozen_worker_harms_nobody_and_comes_back(folder: Path) -> None:
+    """It does nothing for longer than the master's patience, while the other goes on."""
+    with master(folder) as process, players(setup_of(folder), folder, folder) as made:
+        frozen, other = made
+        more_acknowledged(made, 3)
+        with zmq.Context() as context:
+
+            def count() -> float:
+                return ask_status(str(folder), context).numbers["players"]
+
+            until(made, lambda: count() == 2.0)
+            until([other], lambda: count() == 1.0)
+        more_acknowledged([other], 5)
+        more_acknowledged(made, 5)
+        assert frozen.link.counters["reconnects"] == 0  # it was greeted anew on its connection
+        finish(made, process)
+    assert_exactly_once(folder, made)
+
+
+def test_two_runs_on_one_machine_do_not_meet(tmp_path: Path) -> None:
+    folders = [tmp_path / name for name in ("one", "two")]
+    for path in folders:
+        path.mkdir()
+    with ExitStack() as stack:
+        processes = [stack.enter_context(master(path)) for path in folders]
+        made = [stack.enter_context(players(setup_of(p), p)) for p in folders]
+        for group in made:
+            more_acknowledged(group, 5)
+        # A file of the other run with this run's address is a stale one.
+        content = json.loads((folders[0] / "connection.json").read_text())
+        other = json.loads((folders[1] / "connection.json").read_text())
+        stale = tmp_path / "stale.json"
+        stale.write_text(json.dumps(content | {"endpoint": other["endpoint"]}))
+        wrong = Player(stale, 7, setup_of(folders[0]))
+        with wrong.link, pytest.raises(TangramError, match="the connection file is stale"):
+            wrong.link.join()
+        for group, process in zip(made, processes, strict=True):
+            finish(group, process)
+    for path, group in zip(folders, made, strict=True):
+        assert_exactly_once(path, group)
+
+
+def can_mount() -> bool:
+    """Whether this user may have a file system of his own."""
+    if shutil.which("unshare") is None:
+        return False
+    command = ["unshare", "-Urm", "sh", "-c", "mount -t tmpfs -o size=1m none /mnt"]
+    return subprocess.run(command, capture_output=True, check=False).returncode == 0
+
+
+@pytest.mark.skipif(not can_mount(), reason="this machine lets nobody mount a small disk")
+def test_a_full_disk_stops_the_acknowledgements_and_nothing_is_lost(tmp_path: Path) -> None:
+    """The run lies on a disk of 40 MB, in a namespace of its own, that something else fills up."""
+    disk, log, kept = tmp_path / "disk", tmp_path / "log", tmp_path / "kept"
+    disk.mkdir()
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    settings = [*MASTER, f"service.port={port}", "service.checkpoint_minutes=0.05"]
+    words = " ".join(f"'{text}'" for text in [f"run_dir={disk / 'run'}", *settings])
+    script = (
+        f"mount -t tmpfs -o size=40m none {disk} && {{\n"
+        f"{BIN / 'tangram-master'} {words} > {log} 2>&1 & echo $! > {tmp_path / 'pid'}\n"
+        f"wait $!; status=$?; cp -r {disk / 'run'} {kept}; exit $status; }}"
+    )
+    process = subprocess.Popen(["unshare", "-Urm", "sh", "-c", script], start_new_session=True)
+    try:
+        inside = Path(f"/proc/{process.pid}/root{disk}")  # the disk as the master sees it
+        wait_for_file(inside / "run" / "connection.json", process)
+        setup = setup_of(inside / "run")
+        with players(setup, f"tcp://127.0.0.1:{port}") as made:
+            more_acknowledged(made, 5)
+            fill(inside / "ballast")
+            until(made, lambda: "nothing is acknowledged" in log.read_text())
+            (player,) = made
+            stuck = player.acknowledged
+            for _ in range(200):  # the window is full: it waits, with what it played
+                player.step()
+            assert player.acknowledged == stuck
+            assert player.link.window_free == 0
+            assert process.poll() is None
+            (inside / "ballast").unlink()
+            more_acknowledged(made, 5)
+            assert "batches are taken in" in log.read_text()
+            os.kill(int((tmp_path / "pid").read_text()), signal.SIGTERM)
+            until(made, lambda: process.poll() is not None)
+            assert process.returncode == 0, log.read_text()
+        assert_exactly_once(kept, made)
+    finally:
+        with suppress(ProcessLookupError):  # it has ended
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+def fill(path: Path) -> None:
+    """Write until the disk is full to the last byte."""
+    with path.open("wb", buffering=0) as file:
+        for size in (2**20, 2**12, 1):
+            try:
+                while file.write(b"\0" * size):
+                    pass
+            except OSError:
+                continue
+
+
+def test_no_process_is_left_of_a_training_whose_launcher_was_killed(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    quick = ("sim=kinematic", "net=mlp", "workers=2")
+    with started("tangram-train", f"run_dir={folder}", *quick, cwd=tmp_path) as process:
+        wait_for_file(folder / "connection.json", process)
+        end = time.monotonic() + LIMIT_S
+        while len(pids_of(folder)) < 5 and time.monotonic() < end:
+            time.sleep(0.05)
+        children = [pid for pid in pids_of(folder) if pid != process.pid]
+        os.kill(process.pid, signal.SIGKILL)
+        assert len(children) == 4
+        assert all_ended(children)
