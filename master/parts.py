@@ -120,46 +120,60 @@ def make_parts(
     if found is None and config.warm_start is not None:
         notice(warm_start(Path(config.warm_start), trainer))
     rest = found or Restored(_new_record(folder.journal), {})
-    budget = Budget(config)
-    if not budget.bounded:
+    if not Budget(config).bounded:
         notice(UNBOUNDED)
-    spec, run_id = EpisodeSpec.of(setup), rest.record.run_id
-    journal = Journal(
-        folder.journal, run_id, setup.task_digest(), spec, service.journal_sync_seconds
-    )
-    lockstep = Lockstep.of(service)
-    info = WelcomeInfo(
-        run_id, config.seed, setup.fingerprints(), spec, service.window, lockstep is not None
-    )
-    keys = _keys(service, folder, notice)
-    guard = Guard(trainer, service.max_bad_updates, folder.bad_batch)
     with ExitStack() as opened:  # closed again if what follows fails
-        hub = opened.enter_context(Hub(service.bind, service.port, info, keys=keys))
+        parts = _open(config, setup, folder, trainer, rest.record, opened, notice)
         if found:
-            hub.load_state(rest.hub)
-        health = None
-        if service.http_port != OFF:
-            health = opened.enter_context(closing(Health(service.http_bind, service.http_port)))
-        parts = Parts(
-            config,
-            setup,
-            folder,
-            trainer,
-            rest.record,
-            budget,
-            hub,
-            guard,
-            journal,
-            lockstep,
-            health,
-            keys,
-        )
+            parts.hub.load_state(rest.hub)
         _insert_again(parts, rest.segment, notice)
         opened.pop_all()
     if resumes:
         began = found or trainer.episodes
         notice(f"goes on after {trainer.updates:,} updates" if began else "a new run begins")
     return parts
+
+
+def _open(
+    config: MasterConfig,
+    setup: Setup,
+    folder: RunFolder,
+    trainer: Trainer,
+    record: Record,
+    opened: ExitStack,
+    notice: Callable[[str], None],
+) -> Parts:
+    """The parts around a trainer, with their sockets open."""
+    service, spec, lockstep = config.service, EpisodeSpec.of(setup), Lockstep.of(config.service)
+    keys = _keys(service, folder, notice)
+    info = WelcomeInfo(
+        run_id=record.run_id,
+        seed=config.seed,
+        fingerprints=setup.fingerprints(),
+        spec=spec,
+        window=service.window,
+        lockstep=lockstep is not None,
+    )
+    hub = opened.enter_context(Hub(service.bind, service.port, info, keys=keys))
+    health = None
+    if service.http_port != OFF:
+        health = opened.enter_context(closing(Health(service.http_bind, service.http_port)))
+    return Parts(
+        config=config,
+        setup=setup,
+        folder=folder,
+        trainer=trainer,
+        record=record,
+        budget=Budget(config),
+        hub=hub,
+        guard=Guard(trainer, service.max_bad_updates, folder.bad_batch),
+        journal=Journal(
+            folder.journal, record.run_id, setup.task_digest(), spec, service.journal_sync_seconds
+        ),
+        lockstep=lockstep,
+        health=health,
+        keys=keys,
+    )
 
 
 def _keys(service: ServiceConfig, folder: RunFolder, notice: Callable[[str], None]) -> Keys | None:
