@@ -87,6 +87,11 @@ class Link:
         return self._talk.counters
 
     @property
+    def acknowledged(self) -> int:
+        """Number of the last batch up to which all were acknowledged."""
+        return self._talk.spool.first - 1
+
+    @property
     def stopped(self) -> bool:
         """Whether this process must end."""
         return bool(self._stop_reason) or self._talk.dismissed

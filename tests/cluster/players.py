@@ -53,7 +53,7 @@ class Player:
 
     @property
     def acknowledged(self) -> int:
-        return self.link._talk.spool.first - 1
+        return self.link.acknowledged
 
     def tag(self, sequence: int) -> float:
         return FIRST_TAG + 100_000.0 * self.index + sequence

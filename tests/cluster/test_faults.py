@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 import zmq
 
+from benchmarks.proxy import DOWN, UP, Proxy
 from tangram_agent.setup import Setup
 from tangram_sim.errors import TangramError
 from tests.cluster.players import (
@@ -28,7 +29,6 @@ from tests.cluster.players import (
     until,
 )
 from tests.cluster.processes import BIN, all_ended, pids_of, started, wait_for_file
-from tests.cluster.proxy import DOWN, UP, Proxy
 from worker.status import ask_status
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(130)]

@@ -1,0 +1,247 @@
+"""Random faults over a real training: what recovers, how fast, and whether anything is lost."""
+
+import os
+import random
+import signal
+import socket
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+import zmq
+
+from benchmarks.proxy import DOWN, UP, Proxy
+from benchmarks.report import show, write
+from benchmarks.witness import Witness, compare
+from tangram_agent.setup import make_setup
+from tangram_sim.errors import TangramError
+from worker.status import ask_status
+
+WORKERS = 2
+# One update for each transition: slow enough that the replay holds the whole run.
+SETTINGS = (
+    f"workers={WORKERS}",
+    "agent.updates_per_transition=1.0",
+    "agent.replay_capacity=2000000",
+    "net.width=32",
+    "net.feed_forward=64",
+    "service.eval_seconds=20",
+    "service.checkpoint_minutes=0.5",
+)
+PAUSE_S = (3.0, 12.0)  # between the recovery from one fault and the next
+FROZEN_S = (3.0, 15.0)
+CUT_S = (5.0, 20.0)
+PATIENCE_S = 120.0
+LOOK_S = 0.3
+GARBAGE = 200
+
+
+@dataclass
+class Trial:
+    """A training under fire.
+
+    Attributes:
+        folder: of the run.
+        launcher: tangram-train.
+        proxy: between the witness and the master.
+        port: of the master.
+        dice: decides everything.
+        faults: kind -> seconds until the run was whole again; infinite where it never was.
+    """
+
+    folder: Path
+    launcher: "subprocess.Popen[bytes]"
+    proxy: Proxy
+    port: int
+    dice: random.Random
+    context: "zmq.Context[zmq.Socket[bytes]]" = field(default_factory=zmq.Context)
+    faults: dict[str, list[float]] = field(default_factory=dict)
+
+    def status(self) -> Mapping[str, float]:
+        """Numbers of the run; empty while the master does not answer."""
+        try:
+            return ask_status(str(self.folder), self.context, 3.0).numbers
+        except TangramError:
+            return {}
+
+    def pids(self, words: str) -> list[int]:
+        """Processes of the run whose command line holds these words."""
+        found = []
+        for entry in Path("/proc").iterdir():
+            if entry.name.isdigit() and int(entry.name) != os.getpid():
+                try:
+                    line = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode()
+                except OSError:
+                    continue  # it ended meanwhile
+                if str(self.folder) in line and words in line:
+                    found.append(int(entry.name))
+        return found
+
+    def strike(self, kind: str) -> None:
+        """One fault, and the time until all take part again and learning has gone on."""
+        before = self.status().get("updates", 0.0)
+        KINDS[kind](self)
+        begun = time.monotonic()
+        while time.monotonic() - begun < PATIENCE_S:
+            now = self.status()
+            # A master that was killed may begin a few updates earlier.
+            whole = now.get("players", 0.0) >= WORKERS + 1 and now.get("updates", 0.0) > before
+            if whole or self.launcher.poll() is not None:
+                break
+            time.sleep(LOOK_S)
+        took = time.monotonic() - begun
+        self.faults.setdefault(kind, []).append(took if took < PATIENCE_S else float("inf"))
+
+
+def _signal(words: str, number: signal.Signals) -> Callable[[Trial], None]:
+    def strike(trial: Trial) -> None:
+        for pid in trial.dice.sample(trial.pids(words), k=1) if trial.pids(words) else []:
+            os.kill(pid, number)
+
+    return strike
+
+
+def _freeze(words: str) -> Callable[[Trial], None]:
+    def strike(trial: Trial) -> None:
+        found = trial.pids(words)
+        if not found:
+            return
+        pid = trial.dice.choice(found)
+        os.kill(pid, signal.SIGSTOP)
+        time.sleep(trial.dice.uniform(*FROZEN_S))
+        os.kill(pid, signal.SIGCONT)
+
+    return strike
+
+
+def _cut(*directions: str) -> Callable[[Trial], None]:
+    def strike(trial: Trial) -> None:
+        trial.proxy.cut(*directions)
+        time.sleep(trial.dice.uniform(*CUT_S))
+        trial.proxy.cut()
+
+    return strike
+
+
+def _garbage(trial: Trial) -> None:
+    """Random frames from a stranger, and random bytes that are not even a handshake."""
+    with trial.context.socket(zmq.DEALER) as stranger:
+        stranger.setsockopt(zmq.LINGER, 0)
+        stranger.connect(f"tcp://127.0.0.1:{trial.port}")
+        for _ in range(GARBAGE):
+            frames = [trial.dice.randbytes(trial.dice.randrange(300)) for _ in range(3)]
+            stranger.send_multipart(frames)
+    with socket.create_connection(("127.0.0.1", trial.port)) as raw:
+        raw.sendall(trial.dice.randbytes(4096))
+
+
+EVALUATOR, MASTER = "role=evaluator", "-m master"
+KINDS: dict[str, Callable[[Trial], None]] = {
+    "worker killed": _signal("role=player", signal.SIGKILL),
+    "worker asked to end": _signal("role=player", signal.SIGTERM),
+    "worker frozen": _freeze("role=player"),
+    "evaluator killed": _signal(EVALUATOR, signal.SIGKILL),
+    "master killed": _signal(MASTER, signal.SIGKILL),
+    "master frozen": _freeze(MASTER),
+    "network cut": _cut(UP, DOWN),
+    "network cut to the master": _cut(UP),
+    "network cut from the master": _cut(DOWN),
+    "garbage": _garbage,
+}
+
+
+def run_chaos(minutes: float, seed: int, out: Path | None, folder: Path) -> None:
+    """Train under faults, compare with an undisturbed training, and report.
+
+    Args:
+        minutes: of faults.
+        seed: of the dice, and of both trainings.
+        out: JSON file.
+        folder: for the two runs; must not hold any.
+    """
+    disturbed, straight = folder / "disturbed", folder / "straight"
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = int(probe.getsockname()[1])
+    bounds = (f"seed={seed}", f"service.port={port}", *SETTINGS)
+    launcher = start_training(disturbed, *bounds)
+    wait_for(disturbed / "connection.json", launcher)
+    setup = make_setup(yaml.safe_load((disturbed / "config.yaml").read_text()))
+    with Proxy(port) as proxy:
+        witness = Witness(f"tcp://127.0.0.1:{proxy.port}", setup)
+        witness.start()
+        trial = Trial(disturbed, launcher, proxy, port, random.Random(seed))
+        _rage(trial, minutes * 60.0)
+        witness.stop()
+        witness.join(PATIENCE_S)
+        launcher.terminate()
+        status = launcher.wait(PATIENCE_S)
+    left = len(trial.pids(""))
+    delivery = compare(disturbed, witness)
+    result = _result(disturbed)
+    start_training(straight, f"seed={seed}", f"max_updates={result['updates']}", *SETTINGS).wait()
+    rows = [_row(kind, times) for kind, times in sorted(trial.faults.items())]
+    show("faults, and seconds until the run was whole again", rows)
+    outcome = {
+        "faults": sum(map(len, trial.faults.values())),
+        **delivery,
+        "witness_error": str(witness.error or ""),
+        "launcher_status": status,
+        "processes_left": left,
+        "updates": result["updates"],
+        "reward": result["mean_reward"],
+        "reward_undisturbed": _result(straight)["mean_reward"],
+    }
+    show("outcome", [{"what": name, "value": value} for name, value in outcome.items()])
+    write(out, {"kinds": rows, "outcome": outcome, "minutes": minutes, "seed": seed})
+
+
+def _rage(trial: Trial, seconds: float) -> None:
+    """Faults until the time is over; each kind comes as often as the others, in random order."""
+    until, bag = time.monotonic() + seconds, list[str]()
+    while time.monotonic() < until and trial.launcher.poll() is None:
+        if not bag:
+            bag = trial.dice.sample(list(KINDS), k=len(KINDS))
+        kind = bag.pop()
+        trial.strike(kind)
+        left = until - time.monotonic()
+        print(f"{left:5.0f} s left: {kind}, whole after {trial.faults[kind][-1]:.1f} s", flush=True)
+        time.sleep(trial.dice.uniform(*PAUSE_S))
+
+
+def _row(kind: str, times: list[float]) -> dict[str, Any]:
+    known = [t for t in times if t < float("inf")]
+    return {
+        "kind": kind,
+        "times": len(times),
+        "recovered": len(known),
+        "median": statistics.median(known) if known else float("nan"),
+        "most": max(known, default=float("nan")),
+    }
+
+
+def start_training(folder: Path, *settings: str) -> "subprocess.Popen[bytes]":
+    """tangram-train in the background; what it says goes to `told` in its folder."""
+    folder.mkdir(parents=True)
+    command = [Path(sys.executable).with_name("tangram-train"), f"run_dir={folder}", *settings]
+    with (folder / "told").open("wb") as told:
+        return subprocess.Popen(command, stdout=told, stderr=told, start_new_session=True)
+
+
+def wait_for(path: Path, process: "subprocess.Popen[bytes]") -> None:
+    """Wait for a file of a training that runs; TangramError if that ends before."""
+    while not path.exists():
+        if process.poll() is not None:
+            raise TangramError(f"the training ended before {path} was there")
+        time.sleep(LOOK_S)
+
+
+def _result(folder: Path) -> dict[str, Any]:
+    content = yaml.safe_load((folder / "result.json").read_text())
+    assert isinstance(content, dict)
+    return content
