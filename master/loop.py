@@ -58,7 +58,7 @@ class Loop:
         self.publish()
         parts.folder.write_connection(parts.connection())
         while (reason := self.over()) is None:
-            self.receive(0.0 if self.parts.trainer.pace.may_update() else IDLE_S)
+            self.receive(0.0 if self.may_learn() else IDLE_S)
             self.clock.advance(training=self.parts.trainer.episodes > 0)
             if parts.lockstep is None:
                 self.insert()
@@ -112,7 +112,7 @@ class Loop:
         trainer = self.parts.trainer
         while self._arrived:
             lockstep.take(self._arrived.popleft())
-        if lockstep.begins_round(trainer.episodes) and trainer.pace.may_update():
+        if self.may_learn():
             return
         if not lockstep.ordered:
             self.publish()
@@ -131,11 +131,17 @@ class Loop:
         self.parts.hub.acknowledge(arrival)
         self._reporter.inserted(arrival, trainer.updates)
 
+    def may_learn(self) -> bool:
+        """Whether an update is due, and in lockstep whether the round is whole."""
+        lockstep, trainer = self.parts.lockstep, self.parts.trainer
+        whole = lockstep is None or lockstep.begins_round(trainer.episodes)
+        return whole and trainer.pace.may_update()
+
     def learn(self) -> None:
         """Updates that are due, for a short while, so that the sockets are served in between."""
         parts, trainer = self.parts, self.parts.trainer
         until_s = time.monotonic() + LEARN_S
-        while trainer.pace.may_update() and time.monotonic() < until_s:
+        while self.may_learn() and time.monotonic() < until_s:
             if parts.budget.spent(parts.record.loop_s, trainer.updates):
                 return
             self._reporter.updated(parts.guard.update(parts.share))

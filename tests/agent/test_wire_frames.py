@@ -35,7 +35,9 @@ def header(**fields: Any) -> bytes:
 
 def nested(depth: int) -> bytes:
     """A map in a map in a map, of valid msgpack."""
-    return b"\x83\xa1v\x01\xa4kind\xa4test\xa1a" + b"\x81\xa1a" * depth + b"\x01"
+    return (
+        b"\x83\xa1v" + bytes([PROTOCOL]) + b"\xa4kind\xa4test\xa1a" + b"\x81\xa1a" * depth + b"\x01"
+    )
 
 
 @pytest.mark.parametrize(

@@ -30,6 +30,7 @@ MASTER = (
     "agent.updates_per_transition=0.02",
     "agent.learning_starts=30",
     "agent.batch_size=16",
+    "agent.replay_capacity=2000000",  # nothing makes room for anything
 )
 
 

@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter, deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
@@ -17,6 +17,7 @@ from master.curve import Curve
 from master.guard import Guard
 from master.journal import Journal
 from master.ledger import Ledger
+from master.lockstep import Lockstep
 from master.loop import Loop
 from master.metrics import Metrics
 from master.parts import Parts
@@ -33,7 +34,7 @@ from tangram_agent.setup import Setup
 from tangram_agent.standing import RunStatus
 from tangram_agent.types import Weights
 from tangram_agent.watchdog import Watchdog
-from tangram_agent.wire import Scores
+from tangram_agent.wire import Go, Scores
 from tests.agent.builders import random_episodes, setup
 
 # Small tensors on several threads wait for cores that others use, a hundred times longer.
@@ -116,6 +117,9 @@ class FakeHub:
         assert all(np.isfinite(tensor).all() for tensor in weights.tensors.values())
         self.log.append(("publish", weights.version))
 
+    def order(self, orders: Mapping[int, Go]) -> None:
+        self.log.append(("order", dict(orders)))
+
     def tell(self, status: RunStatus) -> None:
         self.log.append(("tell", status))
 
@@ -180,6 +184,7 @@ def loop(
         hub,  # type: ignore[arg-type]
         Guard(learner, settings.service.max_bad_updates, run_folder.bad_batch),
         journal(run_folder.journal, made),
+        Lockstep.of(settings.service),
     )
     metrics = Metrics(run_folder.tensorboard)
     curve = Curve(run_folder.curve, parts.trainer.updates)

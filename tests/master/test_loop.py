@@ -4,6 +4,7 @@ import json
 import stat
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,12 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from master import loop as loop_module
+from master.arrivals import EpisodesArrived
 from master.every import Every
 from master.loop import Loop
 from master.result import make_result
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
+from tangram_agent.wire import Go
 from tangram_sim.errors import RunError
 from tests.master.builders import (
     AGENT,
@@ -375,3 +378,48 @@ def test_what_is_waited_for(
     made.parts.trainer.pace.updated(updates)
     made.tell()
     assert shown(made).statuses[-1].activity == words
+
+
+IN_STEP = {"mode": "lockstep", "lockstep_workers": 2, "envs": BATCH, "batch_episodes": BATCH}
+
+
+def played(index: int, sequence: int) -> EpisodesArrived:
+    return replace(arrival(MADE, 10 * index + sequence), index=index, sequence=sequence)
+
+
+def test_in_lockstep_rounds_are_inserted_by_index_and_learned_before_the_next(
+    tmp_path: Path,
+) -> None:
+    """The second player is quicker; 8 transitions are worth 4 updates."""
+    hub = FakeHub(MADE, [[played(1, 1)], [], [played(0, 1)], [], [played(0, 2), played(1, 2)]])
+    made = loop(tmp_path, MADE, hub, IN_STEP, max_updates=8)
+    assert made.run() == "max_updates=8"
+    done = [(kind, value) for kind, value in hub.log if kind != "tell"]
+    first = {i: Go(0, 0, 0, BATCH) for i in range(2)}
+    second = {i: Go(1, 4, BATCH, BATCH) for i in range(2)}
+    assert done == [
+        ("publish", 0),
+        ("order", first),
+        ("acknowledge", 1),
+        ("acknowledge", 1),
+        ("publish", 4),
+        ("order", second),
+        ("acknowledge", 2),
+        ("acknowledge", 2),
+    ]
+    goals = made.parts.trainer.replay.state()["goal"]
+    own = len(MADE.agent.hindsight) + 1
+    np.testing.assert_array_equal(goals[0], played(0, 1).episodes.goals[0])
+    np.testing.assert_array_equal(goals[BATCH * own], played(1, 1).episodes.goals[0])
+
+
+def test_in_lockstep_nothing_is_learned_from_half_a_round(tmp_path: Path) -> None:
+    """A kill between two inserts left the first player's batch; the other one's must come first."""
+    hub = FakeHub(MADE, [[], [], [], [played(1, 1)]])
+    made = loop(tmp_path, MADE, hub, IN_STEP, max_updates=4)
+    made.parts.trainer.insert(played(0, 1).episodes)
+    updates: list[int] = []
+    hub.on_poll = lambda: updates.append(made.parts.trainer.updates)
+    assert made.run() == "max_updates=4"
+    assert updates[:4] == [0, 0, 0, 0]
+    assert hub.values("order") == [{1: Go(0, 0, 0, BATCH)}]
