@@ -9,6 +9,7 @@ from pathlib import Path
 from benchmarks.chaos import run_chaos
 from benchmarks.fuzz_wire import run_fuzz
 from benchmarks.rates import measure_rates
+from benchmarks.soak import run_soak
 from tangram_sim.errors import TangramError
 
 
@@ -26,9 +27,11 @@ def _parser() -> argparse.ArgumentParser:
     fuzz = kinds.add_parser("fuzz", help="mutated messages against decoder and master")
     fuzz.add_argument("--messages", type=int, default=1_000_000, help="for the decoder (1,000,000)")
     fuzz.add_argument("--live", type=int, default=100_000, help="for a live master (100,000)")
-    for one in (chaos, fuzz):
+    soak = kinds.add_parser("soak", help="memory and open files of a long training, drawn")
+    soak.add_argument("--minutes", type=float, default=60.0, help="of training (60)")
+    for one in (chaos, fuzz, soak):
         one.add_argument("--seed", type=int, default=0, help="of everything random (0)")
-    for one in (rates, chaos, fuzz):
+    for one in (rates, chaos, fuzz, soak):
         one.add_argument("--out", type=Path, help="JSON file of the results")
     return parser
 
@@ -57,6 +60,8 @@ def _run(arguments: argparse.Namespace) -> int:
         if arguments.kind == "chaos":
             run_chaos(arguments.minutes, arguments.seed, arguments.out, Path(folder))
             return 0
+        if arguments.kind == "soak":
+            return run_soak(arguments.minutes, arguments.seed, arguments.out, Path(folder) / "run")
         numbers = (arguments.messages, arguments.live, arguments.seed)
         return run_fuzz(*numbers, arguments.out, Path(folder) / "run")
 

@@ -72,16 +72,7 @@ class Trial:
 
     def pids(self, words: str) -> list[int]:
         """Processes of the run whose command line holds these words."""
-        found = []
-        for entry in Path("/proc").iterdir():
-            if entry.name.isdigit() and int(entry.name) != os.getpid():
-                try:
-                    line = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode()
-                except OSError:
-                    continue  # it ended meanwhile
-                if str(self.folder) in line and words in line:
-                    found.append(int(entry.name))
-        return found
+        return [pid for pid, line in processes_of(self.folder).items() if words in line]
 
     def strike(self, kind: str) -> None:
         """One fault, and the time until all take part again and learning has gone on."""
@@ -97,6 +88,20 @@ class Trial:
             time.sleep(LOOK_S)
         took = time.monotonic() - begun
         self.faults.setdefault(kind, []).append(took if took < PATIENCE_S else float("inf"))
+
+
+def processes_of(folder: Path) -> dict[int, str]:
+    """Process -> command line, of those that name a run folder."""
+    found = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit() and int(entry.name) != os.getpid():
+            try:
+                line = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode()
+            except OSError:
+                continue  # it ended meanwhile
+            if str(folder) in line:
+                found[int(entry.name)] = line
+    return found
 
 
 def _signal(words: str, number: signal.Signals) -> Callable[[Trial], None]:
