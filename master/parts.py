@@ -154,7 +154,7 @@ def _open(
         window=service.window,
         lockstep=lockstep is not None,
     )
-    hub = opened.enter_context(Hub(service.bind, service.port, info, keys=keys))
+    hub = opened.enter_context(Hub(service.bind, service.port, info, service.silence_seconds, keys))
     health = None
     if service.http_port != OFF:
         health = opened.enter_context(closing(Health(service.http_bind, service.http_port)))

@@ -175,6 +175,7 @@ class ServiceConfig:
         keep_checkpoints: newest checkpoints kept.
         journal_sync_seconds: time between two syncs of the journal, 0 for every batch.
         max_bad_updates: updates in a row that may be undone because they are not finite.
+        silence_seconds: after which the master forgets a worker that says nothing.
         watchdog_seconds: a process that makes no progress for so long ends, 0: never.
         recycle_episodes: a worker that was started by tangram-train is started anew after so many
             episodes, 0: never.
@@ -203,6 +204,7 @@ class ServiceConfig:
     keep_checkpoints: int = 2
     journal_sync_seconds: float = 1.0
     max_bad_updates: int = 10
+    silence_seconds: float = 30.0
     watchdog_seconds: float = 300.0
     recycle_episodes: int = 0
     recycle_gib: float = 0.0
@@ -211,6 +213,8 @@ class ServiceConfig:
 
     def __post_init__(self) -> None:
         check_range("service.port", self.port, 0, 65535)
+        # Heartbeats come every two seconds.
+        check_range("service.silence_seconds", self.silence_seconds, 3.0)
         check_range("service.http_port", self.http_port, -1, 65535)
         check_range("service.envs", self.envs, 1, 512)
         check_range("service.batch_episodes", self.batch_episodes, 1, 4096)

@@ -93,7 +93,10 @@ def test_a_frozen_master_comes_back(folder: Path) -> None:
 
 def test_a_frozen_worker_harms_nobody_and_comes_back(folder: Path) -> None:
     """It does nothing for longer than the master's patience, while the other goes on."""
-    with master(folder) as process, players(setup_of(folder), folder, folder) as made:
+    with (
+        master(folder, "service.silence_seconds=3") as process,
+        players(setup_of(folder), folder, folder) as made,
+    ):
         frozen, other = made
         more_acknowledged(made, 3)
         with zmq.Context() as context:
