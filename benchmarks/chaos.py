@@ -173,7 +173,7 @@ def run_chaos(minutes: float, seed: int, out: Path | None, folder: Path) -> None
     disturbed, straight = folder / "disturbed", folder / "straight"
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = int(probe.getsockname()[1])
-    bounds = (f"seed={seed}", f"service.port={port}", *SETTINGS)
+    bounds = (f"seed={seed}", f"service.port={port}", "max_updates=0", *SETTINGS)
     launcher = start_training(disturbed, *bounds)
     wait_for(disturbed / "connection.json", launcher)
     setup = make_setup(yaml.safe_load((disturbed / "config.yaml").read_text()))

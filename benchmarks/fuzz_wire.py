@@ -22,7 +22,7 @@ from tangram_agent.wire import Bye, EpisodeBatch, Heartbeat, Hello, Scores, Want
 from tangram_sim.errors import WireError
 from worker.status import ask_status
 
-SETTINGS = ("workers=1", "sim=kinematic", "net=mlp", "service.eval_seconds=5", "max_hours=1")
+SETTINGS = ("workers=1", "sim=kinematic", "net=mlp", "service.eval_seconds=5", "max_updates=0")
 KEPT = 20  # examples of what should not have happened
 PAUSE_EVERY = 100
 UPDATES = 100  # that the master must make before and after

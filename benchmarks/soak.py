@@ -29,7 +29,7 @@ def run_soak(minutes: float, seed: int, out: Path | None, folder: Path) -> int:
     Returns:
         1 if a process was replaced meanwhile or the training failed, else 0.
     """
-    launcher = start_training(folder, f"seed={seed}", f"max_hours={minutes / 60 + 1}", *SETTINGS)
+    launcher = start_training(folder, f"seed={seed}", "max_updates=0", *SETTINGS)
     wait_for(folder / "connection.json", launcher)
     samples: Samples = {}
     began = time.monotonic()
