@@ -8,7 +8,7 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from benchmarks.proxy import DOWN, UP, Proxy
 from benchmarks.report import show, write
 from benchmarks.witness import Witness, compare
 from tangram_agent.setup import make_setup
+from tangram_agent.standing import WORKER_COLUMNS, RunStatus
 from tangram_sim.errors import TangramError
 from worker.status import ask_status
 
@@ -39,6 +40,9 @@ FROZEN_S = (3.0, 15.0)
 CUT_S = (5.0, 20.0)
 PATIENCE_S = 120.0
 LOOK_S = 0.3
+# Players are heard of every two seconds, and the status is a second old.
+FRESH_S, SETTLE_S = 3.5, 4.0
+EVALUATES, SILENT = WORKER_COLUMNS.index("evaluator"), WORKER_COLUMNS.index("silent_s")
 GARBAGE = 200
 
 
@@ -63,12 +67,20 @@ class Trial:
     context: "zmq.Context[zmq.Socket[bytes]]" = field(default_factory=zmq.Context)
     faults: dict[str, list[float]] = field(default_factory=dict)
 
-    def status(self) -> Mapping[str, float]:
-        """Numbers of the run; empty while the master does not answer."""
+    def status(self) -> RunStatus | None:
+        """How the run stands; None while the master does not answer."""
         try:
-            return ask_status(str(self.folder), self.context, 3.0).numbers
+            return ask_status(str(self.folder), self.context, 3.0)
         except TangramError:
-            return {}
+            return None
+
+    def is_whole(self, updates: float) -> bool:
+        """Whether all players were heard of just now, and there are more updates than before."""
+        now = self.status()
+        if now is None:
+            return False
+        silence = now.workers[now.workers[:, EVALUATES] == 0, SILENT]
+        return bool((silence < FRESH_S).sum() > WORKERS) and now.numbers["updates"] > updates
 
     def pids(self, words: str) -> list[int]:
         """Processes of the run whose command line holds these words."""
@@ -76,14 +88,13 @@ class Trial:
 
     def strike(self, kind: str) -> None:
         """One fault, and the time until all take part again and learning has gone on."""
-        before = self.status().get("updates", 0.0)
+        status = self.status()
+        before = 0.0 if status is None else status.numbers["updates"]
         KINDS[kind](self)
         begun = time.monotonic()
-        while time.monotonic() - begun < PATIENCE_S:
-            now = self.status()
-            # A master that was killed may begin a few updates earlier.
-            whole = now.get("players", 0.0) >= WORKERS + 1 and now.get("updates", 0.0) > before
-            if whole or self.launcher.poll() is not None:
+        time.sleep(SETTLE_S)
+        while time.monotonic() - begun < PATIENCE_S and self.launcher.poll() is None:
+            if self.is_whole(before):
                 break
             time.sleep(LOOK_S)
         took = time.monotonic() - begun

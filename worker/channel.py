@@ -19,6 +19,7 @@ HIGH_WATER = 2048
 PING_MS = 5000
 RECONNECT_MS = 100
 RECONNECT_MAX_MS = 2000
+SURE = 3  # handshakes in a row that failed without a reason
 HANDSHAKES = (
     zmq.EVENT_HANDSHAKE_FAILED_AUTH
     | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
@@ -37,6 +38,7 @@ class Channel:
         self._context, self._found = context, found
         self._sub: zmq.Socket[bytes] | None = None
         self._weights_endpoint = ""
+        self._doubts = 0
         self._poller = zmq.Poller()
         self._dealer = self._open(zmq.DEALER)
         # The first byte must not be zero.
@@ -86,11 +88,16 @@ class Channel:
             return None
 
     def handshake_failed(self) -> bool:
-        """Whether the other side and this one did not agree on encryption and keys since then."""
-        failed = False
+        """Whether the two sides do not agree on encryption and keys.
+
+        A wrong key of the master looks like a connection that was lost in the handshake: only
+        several of these count.
+        """
         while self._monitor.poll(0):
-            recv_monitor_message(self._monitor)
-            failed = True
+            event = recv_monitor_message(self._monitor)["event"]
+            self._doubts += 1 if event == zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL else SURE
+        failed = self._doubts >= SURE
+        self._doubts = 0 if failed else self._doubts
         return failed
 
     def close(self, linger_ms: int = 0) -> None:

@@ -1,6 +1,7 @@
 """Encrypted sockets: who has the run's connection file is let in, and nobody else."""
 
 import json
+import socket
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -144,3 +145,29 @@ def test_the_port_of_an_encrypted_hub_is_free_after_it_is_closed() -> None:
     port = int(first.endpoint.rpartition(":")[2])
     first.close()
     Hub("127.0.0.1", port, INFO, keys=make_keys()).close()
+
+
+def test_a_connection_that_is_lost_in_the_handshake_is_no_wrong_key(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A network that fails at the wrong moment, twice, before it works."""
+    keys = make_keys()
+    with staged(keys=keys) as stage, socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+        path = write_file(tmp_path, stage.hub, keys)
+        content = json.loads(path.read_text())
+        path.write_text(json.dumps(content | {"endpoint": f"tcp://127.0.0.1:{port}"}))
+        with (
+            make_link(str(path), timing=replace(SHORT, join_s=20.0)) as link,
+            ThreadPoolExecutor(1) as pool,
+        ):
+            future = pool.submit(link.join)
+            for _ in range(2):
+                near, _ = listener.accept()
+                near.recv(10)
+                near.close()
+            write_file(tmp_path, stage.hub, keys)
+            stage.until(future.done)
+            assert future.result()
+            assert link.counters["handshakes_failed"] == 0
+    assert "wrong or stale" not in caplog.text
