@@ -3,7 +3,6 @@
 import selectors
 import socket
 from threading import Event, Thread
-from types import TracebackType
 from typing import Self
 
 CHUNK = 65536
@@ -30,12 +29,7 @@ class Proxy:
         self._thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._ends.set()
         self._thread.join()
         for key in list(self._selector.get_map().values()):

@@ -7,8 +7,7 @@ import signal
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -19,7 +18,7 @@ from master.children import Child, describe
 from master.console import sturdy_console
 from master.result import commit, processor, versions
 from master.rundir import RunFolder
-from master.signals import heeded
+from master.signals import handling
 from tangram_agent.files import write_whole
 
 LOOK_S = 0.5
@@ -83,7 +82,7 @@ class Runner:
 
     def run(self) -> int:
         """Until nothing is left to do; returns the exit status."""
-        with self._signals():
+        with handling(self._events.put):
             try:
                 self._work()
             finally:
@@ -146,18 +145,6 @@ class Runner:
     def _signal(self, number: signal.Signals) -> None:
         for child in self._running:
             child.signal(number)
-
-    @contextmanager
-    def _signals(self) -> Iterator[None]:
-        before = {
-            number: signal.signal(number, lambda n, _frame: self._events.put(signal.Signals(n)))
-            for number in heeded()
-        }
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
 
 
 def _json(content: dict[str, object]) -> bytes:

@@ -1,23 +1,19 @@
 """Who may connect at all: with CURVE, whoever has the key of the run's workers."""
 
-import logging
-from collections import Counter
-
 import zmq
 from zmq.auth.thread import ThreadAuthenticator
 
 from master.keys import Keys
+from master.tally import Tally
 
 DOMAIN = "tangram"
-
-log = logging.getLogger(__name__)
 
 
 class Doorkeeper:
     """Encrypts sockets of a context, and turns away those with another key; see ZeroMQ's ZAP."""
 
     def __init__(
-        self, context: zmq.Context[zmq.Socket[bytes]], keys: Keys, counters: Counter[str]
+        self, context: zmq.Context[zmq.Socket[bytes]], keys: Keys, counters: Tally
     ) -> None:
         self._keys, self._counters = keys, counters
         self._thread = ThreadAuthenticator(context)
@@ -34,10 +30,7 @@ class Doorkeeper:
         """Whether a key (Z85) may connect; called by the thread."""
         allowed = key == self._keys.worker_public.encode()
         if not allowed:
-            self._counters["refused_keys"] += 1
-            count = self._counters["refused_keys"]
-            if count & (count - 1) == 0:
-                log.warning("refused_keys (number %d): a worker with the key of another run", count)
+            self._counters.note("refused_keys", "a worker with the key of another run")
         return allowed
 
     def close(self) -> None:

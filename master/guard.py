@@ -1,6 +1,5 @@
 """Numbers that are not finite: the update is undone, counted, and ends the run if it goes on."""
 
-import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,24 +9,20 @@ import numpy.typing as npt
 import safetensors.numpy
 
 from master.every import Every
+from master.tally import Tally
 from master.trainer import Trainer
 from tangram_agent.ddpg import NotFiniteError
 from tangram_agent.files import write_whole
 from tangram_agent.types import Weights
 from tangram_sim.errors import RunError
 
-log = logging.getLogger(__name__)
-
 # Going back further costs updates, keeping more often costs time.
 KEEP_S = 0.5
+UNDONE = "undone updates"
 
 
 class Guard:
-    """Updates a trainer, and takes it back to its last good state when one goes wrong.
-
-    Attributes:
-        undone: updates that were not finite.
-    """
+    """Updates a trainer, and takes it back to its last good state when one goes wrong."""
 
     def __init__(self, trainer: Trainer, limit: int, evidence: Path) -> None:
         """Keep the present state as the first good one.
@@ -40,11 +35,16 @@ class Guard:
         Raises:
             NotFiniteError: the state is not finite already.
         """
-        self.undone = 0
+        self._tally = Tally()
         self._trainer, self._limit, self._evidence = trainer, limit, evidence
         self._in_a_row, self._keep = 0, Every(KEEP_S)
         self._good = trainer.learner.state()
         _check_finite(self._good, trainer.updates)
+
+    @property
+    def undone(self) -> int:
+        """How often something was not finite and the learner went back."""
+        return self._tally[UNDONE]
 
     def update(self, share: float) -> dict[str, float]:
         """One update; its losses, none if it was undone.
@@ -90,7 +90,7 @@ class Guard:
             self._good, self._in_a_row = state, 0
 
     def _undo(self, error: NotFiniteError) -> None:
-        self.undone += 1
+        self._tally.note(UNDONE, str(error))
         self._in_a_row += 1
         if self._in_a_row >= self._limit:
             raise RunError(
@@ -98,9 +98,7 @@ class Guard:
                 f"{self._write_batch()}: lower agent.actor_lr and agent.critic_lr or set "
                 "agent.grad_clip=1, and go on from the last checkpoint with resume=auto"
             )
-        lost = self._trainer.go_back(self._good)
-        if self._in_a_row & (self._in_a_row - 1) == 0:  # the 1st, 2nd, 4th, ...
-            log.warning("%s: undone, with %d updates before it", error, lost)
+        self._trainer.go_back(self._good)
 
     def _write_batch(self) -> Path:
         batch = {} if self._trainer.batch is None else vars(self._trainer.batch)

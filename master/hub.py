@@ -115,7 +115,7 @@ class Hub:
             else:  # more is waiting, perhaps from those who seem silent
                 return arrivals
         for peer in self._registry.drop_silent(time.monotonic(), self._silence_s):
-            self._post.count("lost_peers", f"{peer.name} was silent for {self._silence_s:g} s")
+            self.counters.note("lost_peers", f"{peer.name} was silent for {self._silence_s:g} s")
         return arrivals
 
     def acknowledge(self, arrival: EpisodesArrived) -> None:

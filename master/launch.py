@@ -3,8 +3,8 @@
 import signal
 import sys
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -16,7 +16,7 @@ from master.commands import master_arguments, worker_child
 from master.config import LaunchConfig
 from master.console import sturdy_console
 from master.rundir import RunFolder
-from master.signals import SAME_WISH_S, heeded, show_cursor
+from master.signals import SAME_WISH_S, handling, show_cursor
 from tangram_agent import lifeline
 from tangram_agent.config import RECYCLED_STATUS
 
@@ -73,19 +73,9 @@ class Launcher:
         self._failed, self._sent_home = False, False
         self._reached = False  # this life of the master can be reached, or could
 
-    @contextmanager
-    def signals(self) -> Iterator[None]:
+    def signals(self) -> AbstractContextManager[None]:
         """Turn signals into events."""
-        handler = self._events.put
-        before = {
-            number: signal.signal(number, lambda n, _frame: handler(signal.Signals(n)))
-            for number in heeded()
-        }
-        try:
-            yield
-        finally:
-            for number, old in before.items():
-                signal.signal(number, old)
+        return handling(self._events.put)
 
     def run(self) -> int:
         """Until the master has ended; returns the exit status for the user."""
@@ -195,14 +185,12 @@ class Launcher:
         ends = self._reached and self._master.alive and not self._folder.connection.exists()
         if self._stop_s is not None or ends:
             return  # the master takes leave, and so do its workers
-        if status == RECYCLED_STATUS:
-            child.next_start_s = 0.0
-            return
         if child.plan_restart(status):
-            self._say(
-                f"{child.name} ended with {describe(status)}: it is started again "
-                f"({child.restarts} of {MAX_RESTARTS}); see {child.log}"
-            )
+            if status != RECYCLED_STATUS:
+                self._say(
+                    f"{child.name} ended with {describe(status)}: it is started again "
+                    f"({child.restarts} of {MAX_RESTARTS}); see {child.log}"
+                )
             return
         self._say(f"{child.name} ended with {describe(status)}: given up\n{child.tail()}")
         if not any(c.alive or c.next_start_s is not None for c in self._players):

@@ -4,7 +4,8 @@ import os
 import signal
 import sys
 import time
-from types import FrameType, TracebackType
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, Self
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
@@ -18,6 +19,20 @@ def heeded() -> list[signal.Signals]:
     return [number for number in SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
 
 
+@contextmanager
+def handling(handle: Callable[[signal.Signals], None]) -> Iterator[None]:
+    """These signals call a function, until what was there before is put back."""
+    before = {
+        number: signal.signal(number, lambda n, _frame: handle(signal.Signals(n)))
+        for number in heeded()
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 class StopSignals:
     """Catches the signals while it is entered.
 
@@ -28,24 +43,18 @@ class StopSignals:
     def __init__(self) -> None:
         self.reason: str | None = None
         self._first_s = 0.0
-        self._before: dict[signal.Signals, Any] = {}
+        self._handling = handling(self._handle)
 
     def __enter__(self) -> Self:
-        self._before = {number: signal.signal(number, self._handle) for number in heeded()}
+        self._handling.__enter__()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
+    def __exit__(self, *error: Any) -> None:
+        self._handling.__exit__(*error)
 
-    def _handle(self, number: int, _frame: FrameType | None) -> None:
+    def _handle(self, number: signal.Signals) -> None:
         if self.reason is None:
-            self.reason, self._first_s = signal.Signals(number).name, time.monotonic()
+            self.reason, self._first_s = number.name, time.monotonic()
         if time.monotonic() - self._first_s < SAME_WISH_S:
             return
         show_cursor()

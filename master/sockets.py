@@ -1,13 +1,13 @@
 """The master's two sockets: bounded queues, bounded lingering, and sends that never wait."""
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 
 import zmq
 
 from master.doorkeeper import Doorkeeper
 from master.keys import Keys
+from master.tally import Tally
 from tangram_agent.payloads import MAX_BATCH_BYTES
 from tangram_sim.errors import ConfigError
 
@@ -26,9 +26,7 @@ class Sockets:
         weights_endpoint: of the PUB.
     """
 
-    def __init__(
-        self, bind: str, port: int, counters: Counter[str], keys: Keys | None = None
-    ) -> None:
+    def __init__(self, bind: str, port: int, counters: Tally, keys: Keys | None = None) -> None:
         self._counters = counters
         self._context = zmq.Context()
         self._doorkeeper = Doorkeeper(self._context, keys, counters) if keys else None

@@ -75,12 +75,11 @@ class Trainer:
         self.pace.updated()
         return losses
 
-    def go_back(self, state: dict[str, npt.NDArray[Any]]) -> int:
-        """Take the learner back to a state of its own; returns how many updates that undoes."""
+    def go_back(self, state: dict[str, npt.NDArray[Any]]) -> None:
+        """Take the learner back to a state of its own; the updates since are due again."""
         before = self.updates
         self.learner.load_state(state)
         self.pace.updated(self.updates - before)
-        return before - self.updates
 
     def weights(self) -> Weights:
         """The acting weights; their version is the number of updates."""

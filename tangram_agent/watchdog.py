@@ -6,7 +6,6 @@ an extension. Whoever started the process sees it end, and starts it again.
 
 import faulthandler
 import time
-from types import TracebackType
 from typing import Self
 
 # Winding the clock up takes a thread each time.
@@ -29,12 +28,7 @@ class Watchdog:
         self._wind()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._seconds:
             faulthandler.cancel_dump_traceback_later()
 

@@ -65,6 +65,19 @@ def find_connection(connect: str) -> Connection | None:
         ) from None
 
 
+def estranged(connect: str, endpoint: str) -> str:
+    """Why a handshake fails, for the user, with what `connect` names."""
+    if "://" in connect:
+        return (
+            f"the master at {endpoint} wants keys, or is none: name its connection file instead, "
+            f"connect=RUN_DIR/{FILE_NAME}"
+        )
+    return (
+        f"wrong or stale connection file: what answers at {endpoint} does not take the keys of "
+        f"{connect}; take the file of a master that is running"
+    )
+
+
 def reachable(endpoint: str, via: str) -> str:
     """An endpoint as seen from here: a wildcard host becomes the host of the endpoint `via`."""
     host, _, port = endpoint.removeprefix(SCHEME).rpartition(":")

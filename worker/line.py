@@ -8,7 +8,7 @@ import zmq
 
 from tangram_sim.errors import RunError, TangramError
 from worker.channel import LINGER_MS, Channel
-from worker.connection import Connection, find_connection
+from worker.connection import Connection, estranged, find_connection
 from worker.terms import Timing
 
 log = logging.getLogger(__name__)
@@ -42,15 +42,7 @@ class Line:
     @property
     def estranged(self) -> str:
         """Why a handshake fails."""
-        if "://" in self._connect:
-            return (
-                f"the master at {self.place} wants keys, or is none: name its connection file "
-                "instead, connect=RUN_DIR/connection.json"
-            )
-        return (
-            f"wrong or stale connection file: what answers at {self.place} does not take the keys "
-            f"of {self._connect}; take the file of a master that is running"
-        )
+        return estranged(self._connect, self.place)
 
     @property
     def is_waiting(self) -> bool:

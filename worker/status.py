@@ -15,7 +15,7 @@ from tangram_agent.standing import WORKER_COLUMNS, AskStatus, RunStatus
 from tangram_sim.errors import TangramError, WireError
 from worker.channel import Channel
 from worker.config import StatusConfig
-from worker.connection import find_connection
+from worker.connection import estranged, find_connection
 
 PATIENCE_S = 10.0
 ASK_AGAIN_S = 1.0
@@ -70,10 +70,7 @@ def ask_status(
                 ask_s = time.monotonic() + ASK_AGAIN_S
             channel.wait(0.1)
             if channel.handshake_failed():
-                raise TangramError(
-                    f"wrong or stale connection file: what answers at {found.endpoint} does not "
-                    f"take the keys of {connect}"
-                )
+                raise TangramError(estranged(connect, found.endpoint))
             for frames in channel.messages():
                 status = _read(frames)
                 if status is not None:

@@ -356,7 +356,7 @@ def test_when_no_worker_can_be_kept_the_run_ends_with_the_reason(
 
 
 @pytest.mark.cluster
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", SIGNALS)
 def test_a_signal_ends_the_master_in_order(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
@@ -436,19 +436,21 @@ with StopSignals() as stop:
 @pytest.mark.fast
 def test_a_signal_that_is_ignored_stays_ignored() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    earlier = signal.getsignal(signal.SIGTERM)
     try:
         assert heeded() == [number for number in SIGNALS if number != signal.SIGHUP]
         with StopSignals() as stop:
             signal.raise_signal(signal.SIGHUP)
             assert stop.reason is None
-            assert signal.getsignal(signal.SIGTERM) == stop._handle
-        assert signal.getsignal(signal.SIGTERM) != stop._handle
+            signal.raise_signal(signal.SIGTERM)
+            assert stop.reason == "SIGTERM"
+        assert signal.getsignal(signal.SIGTERM) == earlier
     finally:
         signal.signal(signal.SIGHUP, before)
 
 
 @pytest.mark.cluster
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", SIGNALS)
 @pytest.mark.parametrize("kind", ["orderly", "stuck"])
 def test_the_first_signal_asks_and_the_second_ends(number: signal.Signals, kind: str) -> None:
     command = [sys.executable, "-c", SIGNALLED, kind]
@@ -471,8 +473,10 @@ def test_the_first_signal_asks_and_the_second_ends(number: signal.Signals, kind:
 def test_a_recycled_worker_is_started_again_without_a_word(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """More often than a failing one would be."""
+    """More often than a failing one would be, if each has lived for a while."""
     monkeypatch.setattr(launch_module, "LEAVE_S", 0.2)
+    monkeypatch.setattr(children_module, "STEADY_S", 0.0)
+    monkeypatch.setattr(children_module, "FIRST_DELAY_S", 0.01)
     count = tmp_path / "count"
     tired = f"""
 from pathlib import Path
@@ -485,3 +489,17 @@ if lives <= {MAX_RESTARTS}:
     lives = f"len(Path({str(count)!r}).read_text()) if Path({str(count)!r}).exists() else 0"
     made = launcher(tmp_path, condition=f"({lives}) < {MAX_RESTARTS + 2}", players=[tired])
     assert finish(made, tmp_path) == (0, "")
+
+
+@pytest.mark.cluster
+def test_a_worker_that_is_worn_out_at_once_is_given_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """service.recycle_gib below what a worker needs would go on for ever."""
+    monkeypatch.setattr(launch_module, "LEAVE_S", 0.2)
+    monkeypatch.setattr(children_module, "FIRST_DELAY_S", 0.01)
+    tired = f"print('ends: recycled'); raise SystemExit({RECYCLED_STATUS})"
+    status, told = finish(launcher(tmp_path, players=[tired]), tmp_path)
+    assert status == 1
+    assert told.startswith(f"worker 0 ended with status {RECYCLED_STATUS}: given up\n")
+    assert "ends: recycled\n" in told
