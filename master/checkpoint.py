@@ -5,7 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from master.journal import segments
 from master.record import Record
+from master.recovery import check_journal
+from master.rundir import RunFolder
 from master.trainer import LEARNER, Trainer, check_same_task
 from tangram_agent.checkpoints import (
     Checkpoint,
@@ -24,15 +27,17 @@ from tangram_sim.errors import RunError
 SEGMENT = "journal"
 
 
-def check_resumable(folder: Path, resolved: Mapping[str, Any]) -> None:
+def check_resumable(folder: RunFolder, resolved: Mapping[str, Any]) -> None:
     """Refuse another task, or a warm start from nowhere, before anything is overwritten.
 
     Raises:
         RunError: the newest checkpoint was made with other tokens, sim, reward or net, or there is
-            none, and none in the run that this one is to begin with.
+            none, and the journal was, or the run that this one is to begin with has none.
     """
-    found = list_checkpoints(folder)
+    found = list_checkpoints(folder.checkpoints)
     if not found:
+        if segments(folder.journal):  # it was killed before its first checkpoint
+            check_journal(folder.journal, make_setup(resolved).task_digest())
         _check_warm_start(resolved.get("warm_start"))
         return
     try:
@@ -80,7 +85,7 @@ def save_run(folder: Path, trainer: Trainer, rest: Restored, keep: int) -> Path:
         keep: newest checkpoints that stay.
 
     Raises:
-        RunError: the weights are not finite, or the folder cannot be written.
+        DiskError: the folder cannot be written; what was there before is as it was.
     """
     arrays, counters = trainer.state()
     counters |= {"record": rest.record.state(), "hub": dict(rest.hub), SEGMENT: rest.segment}

@@ -209,8 +209,10 @@ class Hub:
             case EpisodeBatch(sequence) if peer.role != "player":
                 self._not_its_role(peer, sequence, "episodes come from players only")
             case EpisodeBatch():
-                self._orders.done(peer)
-                return self._intake.batch(peer, message)
+                arrived = self._intake.batch(peer, message)
+                if arrived:  # and not one that was sent again
+                    self._orders.done(peer)
+                return arrived
             case Scores() if peer.role != "evaluator":
                 self._not_its_role(peer, 0, "scores come from evaluators only")
             case Scores():

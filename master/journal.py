@@ -15,6 +15,7 @@ disk at an interval, so a machine that loses power may lose what came since.
 import os
 import struct
 import zlib
+from contextlib import suppress
 from io import FileIO
 from pathlib import Path
 
@@ -134,13 +135,24 @@ class Journal:
         self._good += len(record)
 
     def _take_back(self) -> None:
-        """Cut off a record that was written in part."""
-        if self._file is not None:
+        """Cut off a record that was written in part; where that fails, too, go on in a new file."""
+        if self._file is None:
+            return
+        try:
             os.ftruncate(self._file.fileno(), self._good)
             self._file.seek(self._good)
+        except OSError:
+            self._drop()
+            self.segment += 1  # a record that is cut short ends the one before
+        else:
             if not self._good:
+                self._drop()
+
+    def _drop(self) -> None:
+        if self._file is not None:
+            with suppress(OSError):
                 self._file.close()
-                self._file = None
+            self._file = None
 
     def _broken(self, error: OSError) -> JournalError:
         return JournalError(f"the journal in {self._folder} cannot be written ({error.strerror})")

@@ -45,7 +45,7 @@ def run_training(config: LaunchConfig, resolved: Mapping[str, Any]) -> int:
     folder = RunFolder(config.master.run_dir)
     folder.prepare(config.master.resume)
     with folder.lock():
-        check_resumable(folder.checkpoints, resolved)
+        check_resumable(folder, resolved)
         folder.logs.mkdir(exist_ok=True)
         folder.write_config(resolved)
         # Left by a master that was killed; workers must wait for the new one.

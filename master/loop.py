@@ -157,12 +157,11 @@ class Loop:
         if self.parts.trainer.updates <= self._published:
             return
         weights = self.parts.guard.weights()
-        if (
-            weights.version > self._published
-        ):  # else these were bad, and the last good ones are known
-            self.parts.hub.publish(weights)
-            self._published = weights.version
-            self._reporter.published(weights.version, self.parts)
+        if weights.version <= self._published:
+            return  # the present ones were bad, and the last good ones are known
+        self.parts.hub.publish(weights)
+        self._published = weights.version
+        self._reporter.published(weights.version, self.parts)
 
     def tell(self) -> None:
         """Show where the run stands."""

@@ -101,7 +101,11 @@ class Parts:
 
 
 def make_parts(
-    config: MasterConfig, setup: Setup, folder: RunFolder, notice: Callable[[str], None]
+    config: MasterConfig,
+    setup: Setup,
+    folder: RunFolder,
+    notice: Callable[[str], None],
+    progress: Callable[[], None] = lambda: None,
 ) -> Parts:
     """Make everything, from the newest checkpoint where the run is to be resumed.
 
@@ -110,6 +114,7 @@ def make_parts(
         setup: the task and the agent.
         folder: prepared and locked.
         notice: takes lines for the user.
+        progress: called while the journal is read, which may take long.
 
     Raises:
         TangramError: the port or a checkpoint cannot be used, or there is no such device.
@@ -126,7 +131,7 @@ def make_parts(
         parts = _open(config, setup, folder, trainer, rest.record, opened, notice)
         if found:
             parts.hub.load_state(rest.hub)
-        _insert_again(parts, rest.segment, notice)
+        _insert_again(parts, rest.segment, notice, progress)
         opened.pop_all()
     if resumes:
         began = found or trainer.episodes
@@ -191,7 +196,9 @@ def _new_record(journal: Path) -> Record:
     return Record() if run_id is None else Record(run_id)
 
 
-def _insert_again(parts: Parts, segment: int, notice: Callable[[str], None]) -> None:
+def _insert_again(
+    parts: Parts, segment: int, notice: Callable[[str], None], progress: Callable[[], None]
+) -> None:
     """Take in what was acknowledged after the checkpoint."""
     found = read_journal(
         parts.folder.journal,
@@ -203,17 +210,19 @@ def _insert_again(parts: Parts, segment: int, notice: Callable[[str], None]) -> 
     )
     before = parts.trainer.episodes
     for arrival in found:
+        progress()
         if parts.hub.recover(arrival):
-            _learn_first(parts)
+            _learn_first(parts, progress)
             parts.trainer.insert(arrival.episodes)
     if parts.trainer.episodes > before:
         notice(f"{parts.trainer.episodes - before:,} episodes come back from the journal")
 
 
-def _learn_first(parts: Parts) -> None:
+def _learn_first(parts: Parts, progress: Callable[[], None]) -> None:
     """In lockstep a round begins when the updates of those before it are made."""
     trainer, lockstep = parts.trainer, parts.lockstep
     if lockstep is None or not lockstep.begins_round(trainer.episodes):
         return
     while trainer.pace.may_update() and not parts.budget.spent(0.0, trainer.updates):
+        progress()
         parts.guard.update(parts.share)

@@ -29,6 +29,19 @@ def journal_run_id(folder: Path) -> str | None:
     return None
 
 
+def check_journal(folder: Path, task: str) -> None:
+    """Raise RunError if there is a journal of another task or format."""
+    for path in segments(folder).values():
+        for header, _ in _records(path, lambda _: None):
+            if _title(path, header)[1] != task:
+                raise _of_another(path)
+            break
+
+
+def _of_another(path: Path) -> RunError:
+    return RunError(f"{path} is of another run, task or version of tangram-rl: {ANOTHER}")
+
+
 def read_journal(
     folder: Path,
     first: int,
@@ -65,7 +78,7 @@ def _segment(
     records = _records(path, warn)
     for header, _ in records:
         if _title(path, header) != (run_id, task):
-            raise RunError(f"{path} is of another run, task or version of tangram-rl: {ANOTHER}")
+            raise _of_another(path)
         break
     for header, arrays in records:
         try:

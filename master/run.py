@@ -52,12 +52,12 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
     watchdog = Watchdog(config.service.watchdog_seconds)
     with folder.lock(), StopSignals() as signals, watchdog:
         if not launched:  # the launcher wrote it, with settings of its own
-            check_resumable(folder.checkpoints, resolved)
+            check_resumable(folder, resolved)
             folder.write_config(resolved)
         with (
             closing(make_progress(console, f"tangram · {folder.path.name}")) as progress,
             notices_from("master", progress),
-            closing(make_parts(config, setup, folder, progress.notice)) as parts,
+            closing(make_parts(config, setup, folder, progress.notice, watchdog.progress)) as parts,
             closing(Metrics(folder.tensorboard, parts.trainer.updates)) as metrics,
             closing(
                 Loop(parts, _reporter(parts, progress, metrics), signals, news, watchdog)

@@ -178,7 +178,7 @@ class ServiceConfig:
         silence_seconds: after which the master forgets a worker that says nothing.
         watchdog_seconds: a process that makes no progress for so long ends, 0: never.
         recycle_episodes: a worker that was started by tangram-train is started anew after so many
-            episodes, 0: never.
+            episodes, 0: never; not in lockstep.
         recycle_gib: the same when it holds so much memory.
         device: auto, cpu or cuda.
         threads: torch threads of the master.

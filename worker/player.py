@@ -11,6 +11,7 @@ from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes
 from tangram_agent.wire import Go
 from tangram_sim.batch import BatchedEnv
+from tangram_sim.errors import TangramError
 from worker.config import WorkerConfig
 from worker.link import Link
 from worker.report import Report
@@ -65,6 +66,11 @@ def _play_in_step(link: Link, policy: Policy, rollout: Rollout, report: Report) 
     """Play what is ordered, with the weights that are ordered, until the link is stopped."""
     done: Go | None = None
     while (order := link.wait_for_order(done)) is not None:
+        if order.episodes % rollout.envs:
+            raise TangramError(
+                f"the master's lockstep asks for {order.episodes} episodes, no multiple of "
+                f"service.envs={rollout.envs}: start this worker with the master's service settings"
+            )
         while policy.version != order.version:
             with report.waiting("the weights of this round"):
                 newest = link.wait_for_weights()

@@ -19,11 +19,13 @@ from tangram_agent.wire import (
     Ack,
     Alive,
     Bye,
+    Go,
     Greet,
     Heartbeat,
     Refused,
     Reject,
     Stop,
+    ToWorker,
     WantWeights,
     WeightsMessage,
     Welcome,
@@ -114,6 +116,44 @@ def test_a_batch_arrives_as_it_was_sent_and_is_acknowledged_after_its_insert_onl
         assert dealer.hear() == Ack(1, duplicate=False)
         [peer] = stage.hub.peers
         assert (peer.batches, peer.episodes, peer.transitions) == (1, 3, 12)
+
+
+def test_an_order_is_told_again_until_its_batch_has_come() -> None:
+    with staged() as stage:
+        one, other, evaluator = stage.dealer(), stage.dealer(), stage.dealer()
+        one.join(index=0)
+        evaluator.join(role="evaluator")
+        first, second = Go(0, 0, 0, 3), Go(1, 5, 3, 3)
+        stage.hub.order({0: first, 1: second})
+        assert one.hear() == first
+        other.say(hello(process="other", index=1).encode())  # joins after the order was given
+        assert isinstance(other.hear(), Welcome)
+        assert other.hear() == second
+        assert heartbeat(one) == [Alive(-1), first]
+        assert heartbeat(other) == [Alive(-1), second]
+        one.send(1)
+        stage.counted("batches")
+        assert heartbeat(one) == [Alive(-1)]
+        stage.hub.acknowledge(stage.batches()[0])
+        assert one.hear() == Ack(1, duplicate=False)
+
+        # Sent again, since the acknowledgement did not come in time; the next order stays.
+        stage.hub.order({0: second})
+        assert one.hear() == second
+        one.send(1)
+        assert one.hear() == Ack(1, duplicate=True)
+        assert heartbeat(one) == [Alive(-1), second]
+        assert heartbeat(evaluator) == [Alive(-1)]
+
+
+def heartbeat(dealer: Dealer) -> list[ToWorker]:
+    """All the answers to a heartbeat: those before the answer to what follows it."""
+    dealer.say(Heartbeat({}).encode())
+    dealer.say([b"no message"])
+    answers: list[ToWorker] = []
+    while not isinstance(answer := dealer.hear(), Reject):
+        answers.append(answer)
+    return answers
 
 
 def test_a_duplicate_is_not_delivered_again() -> None:

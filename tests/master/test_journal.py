@@ -239,6 +239,31 @@ def test_a_full_disk_is_told_and_leaves_whole_records(
     assert sequences(tmp_path) == [1, 2]
 
 
+def test_a_record_that_cannot_be_taken_back_ends_its_segment(
+    tmp_path: Path, disk: Disk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A disk that fails altogether: neither written on nor cut back."""
+    disk.room = 10**9
+    kept = journal(tmp_path, MADE)
+    kept.append(arrival(MADE, 1))
+
+    def fail(*_: int) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(journal_module.os, "ftruncate", fail)
+        disk.room = 30
+        with pytest.raises(JournalError, match="No space left on device"):
+            kept.append(arrival(MADE, 2))
+    disk.room = 10**9
+    for number in (2, 3):
+        kept.append(arrival(MADE, number))
+    warnings: list[str] = []
+    assert sequences(tmp_path, warnings=warnings) == [1, 2, 3]
+    assert len(warnings) == 1
+    assert "00000001.log is cut short" in warnings[0]
+
+
 def test_a_sync_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     kept = journal(tmp_path, MADE, sync_s=1000.0)
     kept.append(arrival(MADE, 1))

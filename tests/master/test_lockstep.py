@@ -62,6 +62,18 @@ def test_the_first_of_two_batches_of_an_index_counts() -> None:
     assert lockstep.next(0) is first
 
 
+def test_a_player_too_many_holds_nothing_up() -> None:
+    lockstep = Lockstep(2, SIZE)
+    for index in (2, 7, 0, 1):
+        lockstep.take(batch(index))
+    for episodes, index in ((0, 0), (SIZE, 1)):
+        found = lockstep.next(episodes)
+        assert found is not None
+        assert found.index == index
+        lockstep.inserted(found)
+    assert lockstep.next(2 * SIZE) is None
+
+
 def test_the_settings_must_fit() -> None:
     assert Lockstep.of(ServiceConfig()) is None
     step = {"mode": "lockstep", "envs": 4, "batch_episodes": 8}

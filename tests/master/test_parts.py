@@ -2,7 +2,10 @@
 
 from collections.abc import Iterator
 from contextlib import closing
+from functools import partial
+from itertools import count
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -20,6 +23,12 @@ pytestmark = pytest.mark.cluster
 
 MADE = small_setup()
 BATCH = 4
+STEP: dict[str, Any] = {
+    "mode": "lockstep",
+    "lockstep_workers": 1,
+    "envs": BATCH,
+    "batch_episodes": BATCH,
+}
 
 
 @pytest.fixture(autouse=True)
@@ -31,7 +40,7 @@ def closed() -> Iterator[None]:
 EVERYWHERE = "0.0.0.0"  # noqa: S104
 
 
-def parts(folder: Path, told: list[str], resume: str = "auto", **service: str) -> Parts:
+def parts(folder: Path, told: list[str], resume: str = "auto", **service: Any) -> Parts:
     run_folder = RunFolder(folder)
     run_folder.prepare(resume)
     config = MasterConfig(str(folder), resume=resume, service=ServiceConfig(**service))
@@ -50,6 +59,29 @@ def test_a_run_that_was_killed_before_its_first_checkpoint_goes_on(tmp_path: Pat
         assert made.journal.segment == 2
     assert "12 episodes come back from the journal" in told
     assert "goes on after 0 updates" in told
+
+
+def test_a_long_journal_is_no_standstill(tmp_path: Path) -> None:
+    """The watchdog hears of every batch, in lockstep also of every update."""
+    folder = RunFolder(tmp_path)
+    kept = journal(folder.journal, MADE)
+    for number in (1, 2, 3):
+        kept.append(arrival(MADE, number))
+    folder.prepare("auto")
+    for service, updates in ({}, 0), (STEP, 4):  # those that the batches after the first wait for
+        config = MasterConfig(str(tmp_path), resume="auto", service=ServiceConfig(**service))
+        beats = count()
+        with closing(
+            make_parts(config, MADE, folder, lambda _: None, partial(next, beats))
+        ) as made:
+            assert (made.trainer.episodes, made.trainer.updates) == (12, updates)
+        assert next(beats) == 3 + updates
+
+
+def test_without_a_port_nothing_is_served(tmp_path: Path) -> None:
+    with closing(parts(tmp_path, [], http_port=-1)) as made:
+        assert made.health is None
+        assert "http" not in made.connection()
 
 
 def test_what_the_checkpoint_covers_is_not_read(tmp_path: Path) -> None:

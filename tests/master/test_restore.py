@@ -8,19 +8,23 @@ import numpy as np
 import pytest
 
 from master.checkpoint import Restored, check_resumable, restore_run, save_run, warm_start
+from master.journal import segments
 from master.record import Record
+from master.rundir import RunFolder
 from master.trainer import Trainer, choose_device
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint, save_checkpoint
 from tangram_agent.setup import SECTIONS
 from tangram_sim.errors import ConfigError, RunError
 from tests.agent.builders import PAIR, random_episodes, setup
-from tests.master.builders import AGENT, small_setup, trainer
+from tests.master.builders import AGENT, arrival, close_journals, journal, small_setup, trainer
 
 pytestmark = pytest.mark.fast
 
 MADE = small_setup()
 HUB = {"player/0": {"incarnation": 2, "sequence": 17}}
 REST = Restored(Record(), HUB)
+MINE: dict[str, Any] = {name: asdict(getattr(MADE, name)) for name in SECTIONS}
+OTHER = MINE | {"tokens": {"shapes": ["parallelogram"], "scale": 1.0}}
 
 
 def play_on(made: Trainer, rounds: int, seed: int = 0) -> None:
@@ -165,14 +169,28 @@ def test_a_gpu_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_another_task_is_refused_from_the_checkpoint_alone(tmp_path: Path) -> None:
-    mine = {name: asdict(getattr(MADE, name)) for name in SECTIONS}
-    check_resumable(tmp_path, {})  # nothing is there yet
-    save_run(tmp_path, trainer(MADE), REST, keep=1)
-    check_resumable(tmp_path, mine)
-    check_resumable(tmp_path, mine | {"agent": mine["agent"] | {"noise": 0.5}})
-    other = mine | {"tokens": {"shapes": ["parallelogram"], "scale": 1.0}}
+    folder = RunFolder(tmp_path)
+    check_resumable(folder, {})  # nothing is there yet
+    save_run(folder.checkpoints, trainer(MADE), REST, keep=1)
+    check_resumable(folder, MINE)
+    check_resumable(folder, MINE | {"agent": MINE["agent"] | {"noise": 0.5}})
     with pytest.raises(RunError, match="made with other settings of tokens: .* from_config="):
-        check_resumable(tmp_path, other)
+        check_resumable(folder, OTHER)
+
+
+def test_another_task_is_refused_from_the_journal_of_a_run_without_checkpoint(
+    tmp_path: Path,
+) -> None:
+    folder = RunFolder(tmp_path)
+    kept = journal(folder.journal, MADE)
+    kept.append(arrival(MADE, 1))
+    close_journals()
+    check_resumable(folder, MINE)
+    with pytest.raises(RunError, match="00000001.log is of another run, task or version"):
+        check_resumable(folder, OTHER)
+    save_run(folder.checkpoints, trainer(MADE), REST, keep=1)
+    segments(folder.journal)[1].write_bytes(b"nobody reads this where there is a checkpoint")
+    check_resumable(folder, MINE)
 
 
 # A warm start

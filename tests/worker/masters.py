@@ -16,10 +16,11 @@ LIMIT_S = 60.0
 Result = TypeVar("Result")
 
 
-def open_hub(made: Setup, window: int = 4, seed: int = 11) -> Hub:
+def open_hub(made: Setup, window: int = 4, seed: int = 11, lockstep: bool = False) -> Hub:
     """A master's hub on a free port."""
     spec = replace(EpisodeSpec.of(made), bound=100.0)
-    return Hub("127.0.0.1", 0, WelcomeInfo("run", seed, made.fingerprints(), spec, window))
+    info = WelcomeInfo("run", seed, made.fingerprints(), spec, window, lockstep)
+    return Hub("127.0.0.1", 0, info)
 
 
 def collect(hub: Hub, enough: Callable[[list[Arrival]], bool]) -> list[Arrival]:

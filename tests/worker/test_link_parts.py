@@ -59,6 +59,10 @@ def test_a_file_and_its_folder_are_found(tmp_path: Path) -> None:
         ("{}", "KeyError('endpoint')"),
         ('{"endpoint": "tcp://h:1"}', "KeyError('run_id')"),
         ("\x00", "JSONDecodeError"),
+        (
+            '{"endpoint": "tcp://h:1", "run_id": "r", "server_key": "short"}',
+            "ValueError('server_key,",
+        ),
     ],
 )
 def test_a_file_that_is_no_connection_file(tmp_path: Path, content: str, reason: str) -> None:

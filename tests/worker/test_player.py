@@ -19,6 +19,7 @@ from master.hub import Hub
 from tangram_agent.config import RECYCLED_STATUS, ServiceConfig
 from tangram_agent.lifeline import Lifeline
 from tangram_agent.setup import Setup
+from tangram_agent.wire import Go
 from tangram_sim.errors import ConfigError, TangramError
 from tangram_sim.sampling import sample_poses
 from tangram_sim.seeding import episode_generator
@@ -133,6 +134,49 @@ def test_a_player_without_weights_waits_and_ends_on_stop() -> None:
         lambda: run_player(config(hub), made),
     )
     assert (arrived, status) == ([], 0)
+
+
+def test_in_lockstep_what_is_ordered_is_played_and_nothing_else() -> None:
+    made = greedy_setup()
+
+    def script(hub: Hub) -> list[EpisodesArrived]:
+        arrived = []
+        for number in range(3):
+            hub.publish(weights(made, number))
+            hub.order({0: Go(number, number, 8 * number, 8)})
+            arrived += collect(hub, bool)
+            hub.acknowledge(arrived[-1])
+        return arrived
+
+    hub = open_hub(made, seed=3, lockstep=True)
+    arrived, status = with_master(hub, script, lambda: run_player(config(hub), made))
+    assert status == 0
+    told = [(batch.sequence, batch.weights_version, batch.episodes.count) for batch in arrived]
+    assert told == [(1, 0, 8), (2, 1, 8), (3, 2, 8)]
+    goals = np.concatenate([batch.episodes.goals for batch in arrived])
+    for number, goal in enumerate(goals):
+        rng = episode_generator(3, "player", 0, 0, number)  # incarnation 0 whichever this is
+        expected = made.layout.corners(sample_poses(made.layout, made.sim, rng))
+        np.testing.assert_allclose(goal, expected, atol=1e-6)
+
+
+def test_in_lockstep_a_player_with_other_environments_says_so() -> None:
+    made = greedy_setup()
+
+    def worker() -> int:
+        with pytest.raises(
+            TangramError, match=r"asks for 6 episodes, no multiple of service\.envs=4"
+        ):
+            run_player(config(hub), made)
+        return 0
+
+    def script(hub: Hub) -> None:
+        hub.publish(weights(made, 0))
+        hub.order({0: Go(0, 0, 0, 6)})
+        collect(hub, lambda _: hub.counters["byes"] == 1)
+
+    hub = open_hub(made, lockstep=True)
+    with_master(hub, script, worker)
 
 
 @pytest.fixture
