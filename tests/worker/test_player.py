@@ -143,7 +143,7 @@ def test_in_lockstep_what_is_ordered_is_played_and_nothing_else() -> None:
         arrived = []
         for number in range(3):
             hub.publish(weights(made, number))
-            hub.order({0: Go(number, number, 8 * number, 8)})
+            hub.order({0: Go(number, number, 16 * number, 8)})  # every other eight
             arrived += collect(hub, bool)
             hub.acknowledge(arrived[-1])
         return arrived
@@ -154,7 +154,8 @@ def test_in_lockstep_what_is_ordered_is_played_and_nothing_else() -> None:
     told = [(batch.sequence, batch.weights_version, batch.episodes.count) for batch in arrived]
     assert told == [(1, 0, 8), (2, 1, 8), (3, 2, 8)]
     goals = np.concatenate([batch.episodes.goals for batch in arrived])
-    for number, goal in enumerate(goals):
+    numbers = [16 * batch + i for batch in range(3) for i in range(8)]
+    for number, goal in zip(numbers, goals, strict=True):
         rng = episode_generator(3, "player", 0, 0, number)  # incarnation 0 whichever this is
         expected = made.layout.corners(sample_poses(made.layout, made.sim, rng))
         np.testing.assert_allclose(goal, expected, atol=1e-6)
