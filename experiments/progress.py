@@ -15,7 +15,7 @@ from rich.progress import (
 )
 
 from experiments.jobs import Job
-from master.progress import duration
+from master.status import duration
 
 
 class StudyProgress:

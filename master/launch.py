@@ -8,13 +8,12 @@ from contextlib import AbstractContextManager
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from rich.console import Console
-
 from master.checkpoint import check_resumable
 from master.children import MAX_RESTARTS, Child, describe
 from master.commands import master_arguments, worker_child
 from master.config import LaunchConfig
 from master.console import sturdy_console
+from master.progress import Progress, make_lines
 from master.rundir import RunFolder
 from master.signals import SAME_WISH_S, handling, show_cursor
 from tangram_agent import lifeline
@@ -50,7 +49,8 @@ def run_training(config: LaunchConfig, resolved: Mapping[str, Any]) -> int:
         folder.write_config(resolved)
         # Left by a master that was killed; workers must wait for the new one.
         folder.connection.unlink(missing_ok=True)
-    launcher = Launcher(config, folder, sturdy_console(sys.stderr))
+    lines = make_lines(sturdy_console(sys.stderr), config.master.service.log_format)
+    launcher = Launcher(config, folder, lines)
     with launcher.signals():
         lifeline.watch(grace_s=STOP_S + 2.0 * LEAVE_S)  # of an experiment that started it
         try:
@@ -62,8 +62,8 @@ def run_training(config: LaunchConfig, resolved: Mapping[str, Any]) -> int:
 class Launcher:
     """Starts the children, restarts those that fail, and ends them in order."""
 
-    def __init__(self, config: LaunchConfig, folder: RunFolder, console: Console) -> None:
-        self._folder, self._console = folder, console
+    def __init__(self, config: LaunchConfig, folder: RunFolder, lines: Progress) -> None:
+        self._folder, self._lines = folder, lines
         self._events: SimpleQueue[Child | signal.Signals] = SimpleQueue()
         self._master = Child("master", master_arguments(config, folder))
         self._players = [worker_child(folder, "player", i) for i in range(config.workers)]
@@ -93,7 +93,7 @@ class Launcher:
                 self._worker_ended(event)
             elif self._stop_s is not None and time.monotonic() >= self._stop_s:
                 self._kill_all()
-                self._print(f"the master does not end within {STOP_S:g} s: it is killed")
+                self._lines.notice(f"the master does not end within {STOP_S:g} s: it is killed")
 
     def end_all(self) -> None:
         """Wait for the children to leave, then ask them to, then make them; a signal hurries it."""
@@ -162,7 +162,7 @@ class Launcher:
         self._master.arguments = [
             "resume=auto" if text.startswith("resume=") else text for text in self._master.arguments
         ]
-        self._print(
+        self._lines.notice(
             f"the master ended with {describe(status)}: it goes on from what it left "
             f"({self._master.restarts} of {MAX_RESTARTS})"
         )
@@ -201,10 +201,7 @@ class Launcher:
         """Through the master, which owns the terminal while it runs."""
         for line in text.splitlines():
             if not (self._master.alive and self._master.tell(line)):
-                self._print(line)
-
-    def _print(self, line: str) -> None:
-        self._console.print(line, soft_wrap=True, markup=False, highlight=False)
+                self._lines.notice(line)
 
     def _wait_for(self, children: list[Child]) -> None:
         until_s = time.monotonic() + LEAVE_S

@@ -166,7 +166,7 @@ class Loop:
     def tell(self) -> None:
         """Show where the run stands."""
         while not self._news.empty():
-            self._reporter.progress.notice(self._news.get())
+            self._reporter.progress.notice(self._news.get(), event="launcher")
         more = {"queue": len(self._arrived), **self._keeper.numbers()}
         self._reporter.tick(self.parts, more)
 

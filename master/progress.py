@@ -4,8 +4,8 @@ import logging
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import asdict
+from typing import Any, Protocol
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -14,38 +14,12 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from master.status import Status, duration, left_text, plural, status_line
+from tangram_agent.logs import formatter
+
 PANEL_S = 0.5
 LINE_S = 10.0
 PANEL_WIDTH = 76
-
-
-@dataclass(frozen=True)
-class Status:
-    """A run at one moment.
-
-    Attributes:
-        episodes, transitions, updates: since the run began.
-        elapsed_s: seconds of training since the run began.
-        share: used share of the budget, or None where nothing is bounded.
-        left_s: seconds left, or None when unknown.
-        transitions_per_s, updates_per_s: over the last seconds.
-        players, evaluators: connected now.
-        activity: what happens, or what is waited for.
-        scores: of the last evaluation, by name; empty before the first.
-    """
-
-    episodes: int
-    transitions: int
-    updates: int
-    elapsed_s: float
-    share: float | None
-    left_s: float | None
-    transitions_per_s: float
-    updates_per_s: float
-    players: int
-    evaluators: int
-    activity: str
-    scores: Mapping[str, float]
 
 
 class Progress(Protocol):
@@ -54,16 +28,23 @@ class Progress(Protocol):
     def show(self, status: Status) -> None:
         """Show a status; cheap, and may be called as often as one likes."""
 
-    def notice(self, line: str) -> None:
-        """Show one line at once, and keep it."""
+    def notice(self, line: str, level: str = "info", **fields: Any) -> None:
+        """Show one line at once, and keep it; the fields are for programs."""
 
     def close(self) -> None:
         """Leave the terminal as it was found."""
 
 
-def make_progress(console: Console, title: str) -> Progress:
-    """A live panel where the console is a terminal, plain lines where it is not."""
+def make_progress(console: Console, title: str, log_format: str = "text") -> Progress:
+    """A live panel where the console is a terminal, lines where it is not, or JSON."""
+    if log_format == "json":
+        return JsonLines(console, "master")
     return LivePanel(console, title) if console.is_terminal else PlainLines(console)
+
+
+def make_lines(console: Console, log_format: str = "text") -> Progress:
+    """Lines of the process that starts the others, beside whose progress there can be no panel."""
+    return JsonLines(console, "launcher") if log_format == "json" else PlainLines(console)
 
 
 class _Notices(logging.Handler):
@@ -72,7 +53,9 @@ class _Notices(logging.Handler):
         self._progress = progress
 
     def emit(self, record: logging.LogRecord) -> None:
-        self._progress.notice(f"{record.levelname.lower()}: {record.getMessage()}")
+        known = vars(logging.makeLogRecord({}))
+        fields = {name: value for name, value in vars(record).items() if name not in known}
+        self._progress.notice(record.getMessage(), record.levelname.lower(), **fields)
 
 
 @contextmanager
@@ -84,6 +67,15 @@ def notices_from(logger_name: str, progress: Progress) -> Iterator[None]:
         yield
     finally:
         logger.removeHandler(handler)
+
+
+def print_line(console: Console, line: str) -> None:
+    """One line as it is, however long."""
+    console.print(line, soft_wrap=True, markup=False, highlight=False)
+
+
+def _with_level(line: str, level: str) -> str:
+    return line if level == "info" else f"{level}: {line}"
 
 
 class PlainLines:
@@ -101,9 +93,33 @@ class PlainLines:
             self._next_s = now_s + self._interval_s
             self.notice(status_line(status))
 
-    def notice(self, line: str) -> None:
+    def notice(self, line: str, level: str = "info", **_: Any) -> None:
         """Print one line."""
-        self._console.print(line, soft_wrap=True, markup=False, highlight=False)
+        print_line(self._console, _with_level(line, level))
+
+    def close(self) -> None:
+        """Nothing is left to do."""
+
+
+class JsonLines:
+    """One JSON object a line: for programs that collect logs."""
+
+    def __init__(self, console: Console, who: str, interval_s: float = LINE_S) -> None:
+        self._console, self._formatter = console, formatter("json", who)
+        self._interval_s = interval_s
+        self._next_s = 0.0
+
+    def show(self, status: Status) -> None:
+        """Write the status if the last one is old enough."""
+        now_s = time.monotonic()
+        if now_s >= self._next_s:
+            self._next_s = now_s + self._interval_s
+            self.notice(status.activity, event="status", **asdict(status))
+
+    def notice(self, line: str, level: str = "info", **fields: Any) -> None:
+        """Write one line."""
+        record = logging.makeLogRecord({"levelname": level.upper(), "msg": line} | fields)
+        print_line(self._console, self._formatter.format(record))
 
     def close(self) -> None:
         """Nothing is left to do."""
@@ -128,9 +144,9 @@ class LivePanel:
             self._next_s = now_s + self._interval_s
             self._draw(status)
 
-    def notice(self, line: str) -> None:
+    def notice(self, line: str, level: str = "info", **_: Any) -> None:
         """Print one line above the panel."""
-        self._console.print(line, soft_wrap=True, markup=False, highlight=False)
+        print_line(self._console, _with_level(line, level))
 
     def close(self) -> None:
         """Leave the last status and go below it."""
@@ -140,45 +156,6 @@ class LivePanel:
 
     def _draw(self, status: Status) -> None:
         self._live.update(status_panel(status, self._title), refresh=True)
-
-
-def duration(seconds: float) -> str:
-    """0:07, 12:34 or 1:02:03."""
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
-
-
-def plural(count: int, noun: str) -> str:
-    """1 worker, 2 workers."""
-    return f"{count:,} {noun}" if count == 1 else f"{count:,} {noun}s"
-
-
-def status_line(status: Status) -> str:
-    """One line for people and for grep."""
-    parts = [duration(status.elapsed_s)]
-    if status.share is not None:
-        parts.append(f"{status.share:.0%}{_left(status)}")
-    parts += [
-        plural(status.episodes, "episode"),
-        plural(status.updates, "update"),
-        f"{status.transitions_per_s:,.0f} transitions/s",
-        f"{status.updates_per_s:,.1f} updates/s",
-        score_text(status.scores),
-        plural(status.players, "worker"),
-        status.activity,
-    ]
-    return " | ".join(part for part in parts if part)
-
-
-def score_text(scores: Mapping[str, float]) -> str:
-    """The scores that matter most, or nothing before the first evaluation."""
-    known = (
-        ("mean_reward", "reward {:.3f}"),
-        ("angle_error_deg_median", "angle {:.2f}°"),
-        ("position_error_median", "position {:.4f}"),
-    )
-    return ", ".join(text.format(scores[name]) for name, text in known if name in scores)
 
 
 def status_panel(status: Status, title: str) -> Panel:
@@ -221,12 +198,8 @@ def _bar(status: Status) -> Table:
         row.add_row(Text("no bound: Ctrl-C ends the run", style="dim"), duration(status.elapsed_s))
         return row
     bar = ProgressBar(total=1.0, completed=status.share, complete_style="cyan")
-    row.add_row(bar, f"{status.share:4.0%}  {duration(status.elapsed_s)}{_left(status)}")
+    row.add_row(bar, f"{status.share:4.0%}  {duration(status.elapsed_s)}{left_text(status)}")
     return row
-
-
-def _left(status: Status) -> str:
-    return f", {duration(status.left_s)} left" if status.left_s else ""
 
 
 def _score(scores: Mapping[str, float], name: str, pattern: str) -> str:

@@ -13,9 +13,10 @@ from master.curve import Curve
 from master.every import Every
 from master.metrics import Means, Metrics
 from master.parts import Parts
-from master.progress import Progress, Status
+from master.progress import Progress
 from master.record import Record
 from master.standing import run_status
+from master.status import Status
 from master.trainer import Trainer
 from tangram_agent.config import ServiceConfig
 from tangram_agent.setup import Setup

@@ -15,8 +15,8 @@ from rich.table import Table
 
 from master.children import override
 from master.parts import Parts
-from master.progress import duration
 from master.rundir import RunFolder
+from master.status import duration
 
 PLAIN = re.compile(r"run_dir=[\w./-]+")
 ROOT = Path(__file__).resolve().parent.parent

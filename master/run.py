@@ -49,13 +49,14 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
     torch.set_num_threads(config.service.threads)
     folder, console = RunFolder(config.run_dir), sturdy_console(sys.stdout)
     folder.prepare(config.resume)
+    form = config.service.log_format
     watchdog = Watchdog(config.service.watchdog_seconds)
     with folder.lock(), StopSignals() as signals, watchdog:
         if not launched:  # the launcher wrote it, with settings of its own
             check_resumable(folder, resolved)
             folder.write_config(resolved)
         with (
-            closing(make_progress(console, f"tangram · {folder.path.name}")) as progress,
+            closing(make_progress(console, f"tangram · {folder.path.name}", form)) as progress,
             notices_from("master", progress),
             closing(make_parts(config, setup, folder, progress.notice, watchdog.progress)) as parts,
             closing(Metrics(folder.tensorboard, parts.trainer.updates)) as metrics,
@@ -73,7 +74,10 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
             folder.write_result(result)
             metrics.hyperparameters(resolved, parts.record.scores)
             loop.dismiss(f"the run has ended ({reason})")
-    show_result(console, folder, result)
+            if form == "json":
+                progress.notice(f"the run has ended ({reason})", event="result", **result)
+    if form != "json":
+        show_result(console, folder, result)
     return 0
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from master.parts import Parts
 from master.peers import Peer
-from master.progress import Status
+from master.status import Status
 from tangram_agent.standing import WORKER_COLUMNS, RunStatus
 from tangram_sim.arrays import Floats
 

@@ -14,4 +14,5 @@ class Tally(Counter[str]):
         self[name] += 1
         count = self[name]
         if count & (count - 1) == 0:  # the 1st, 2nd, 4th, ...: a flood must not fill the log
-            log.warning("%s (number %d): %s", name, count, reason)
+            fields = {"event": name, "count": count}
+            log.warning("%s (number %d): %s", name, count, reason, extra=fields)

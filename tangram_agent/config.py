@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from tangram_agent.logs import FORMATS
 from tangram_sim.checks import check_choice, check_range
 from tangram_sim.errors import ConfigError
 
@@ -170,6 +171,7 @@ class ServiceConfig:
         lag_updates: updates that the learner may lag behind before workers must wait.
         eval_seconds: least time between two evaluations.
         eval_episodes: fixed test episodes of one evaluation.
+        log_format: of the lines that processes write: text for people, json for programs.
         log_seconds: time between two lines of progress and TensorBoard scalars.
         checkpoint_minutes: time between two checkpoints.
         keep_checkpoints: newest checkpoints kept.
@@ -199,6 +201,7 @@ class ServiceConfig:
     lag_updates: int = 64
     eval_seconds: float = 10.0
     eval_episodes: int = 100
+    log_format: str = "text"
     log_seconds: float = 2.0
     checkpoint_minutes: float = 5.0
     keep_checkpoints: int = 2
@@ -239,4 +242,5 @@ class ServiceConfig:
         check_choice("service.mode", self.mode, ("async", "lockstep"))
         check_range("service.lockstep_workers", self.lockstep_workers, 0, 4096)
         check_choice("service.security", self.security, ("auto", "curve", "plain"))
+        check_choice("service.log_format", self.log_format, FORMATS)
         check_choice("service.device", self.device, ("auto", "cpu", "cuda"))

@@ -95,6 +95,7 @@ def _evaluate(trials: Trials, policy: Policy, link: Link) -> Scores | None:
         policy.version,
         *(scalars[name] for name in ("mean_reward", "raw_overlap", "angle_error_deg_median")),
         scalars["seconds"],
+        extra={"event": "scored", "weights_version": policy.version} | scalars,
     )
     return _message(policy.version, scalars, played)
 

@@ -75,7 +75,7 @@ class Line:
     def answered(self) -> None:
         """Anything came."""
         if self._lost_at is not None:
-            log.info("the master at %s answers again", self.place)
+            log.info("the master at %s answers again", self.place, extra={"event": "found_again"})
         self._asked_at = self._lost_at = None
 
     def look(self, now: float) -> None:
@@ -85,7 +85,7 @@ class Line:
             return
         self._counters["handshakes_failed"] += 1
         if not self.stranger:
-            log.warning("%s", self.estranged)
+            log.warning("%s", self.estranged, extra={"event": "estranged"})
         self.stranger, self._reopen_at = True, now + self._timing.retry_s
 
     def is_dead(self, now: float) -> bool:
@@ -97,6 +97,7 @@ class Line:
                 self.place,
                 self._timing.silence_s,
                 self._timing.lost_s,
+                extra={"event": "silent"},
             )
         return silent or now >= self._reopen_at
 
@@ -110,7 +111,7 @@ class Line:
         except RunError:
             return  # by the next look it may be whole
         if found is not None and found != self.found:
-            log.info("the master is at %s now", found.endpoint)
+            log.info("the master is at %s now", found.endpoint, extra={"event": "moved"})
             self._reopen_at = now
 
     def check_lost(self, now: float) -> None:

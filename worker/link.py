@@ -214,6 +214,7 @@ class Link:
                 return False
             if now - told >= TELL_S:
                 told = now
-                log.info("waits for %s since %.0f s", self._talk.lacks or what, now - begun)
+                lacks = self._talk.lacks or what
+                log.info("waits for %s since %.0f s", lacks, now - begun, extra={"event": "waits"})
             self.poll(min(STEP_S, timeout_s))
         return False

@@ -27,7 +27,7 @@ class Report:
     def waiting(self, why: str) -> Iterator[None]:
         """Time that passes inside is no play; each reason is said once between two reports."""
         if why not in self._told:
-            _log.info("waits: %s", why)
+            _log.info("waits: %s", why, extra={"event": "waits"})
             self._told.add(why)
         start = self._clock()
         try:
@@ -41,12 +41,16 @@ class Report:
         passed = self._clock() - self._since
         if passed < REPORT_S:
             return
+        values = {
+            "episodes": self._episodes,
+            "seconds": passed,
+            "episodes_per_s": self._episodes / passed,
+            "percent_waiting": 100.0 * self._waited / passed,
+            "weights_version": version,
+        }
         _log.info(
             "%d episodes in %.0f s (%.1f/s), %.0f %% of the time waiting, weights %d",
-            self._episodes,
-            passed,
-            self._episodes / passed,
-            100.0 * self._waited / passed,
-            version,
+            *values.values(),
+            extra={"event": "played", **values},
         )
         self._begin()

@@ -11,6 +11,7 @@ from typing import TextIO
 import torch
 
 from tangram_agent import lifeline
+from tangram_agent.logs import formatter
 from tangram_agent.payloads import EpisodeSpec
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
@@ -42,8 +43,8 @@ def joined(config: WorkerConfig, setup: Setup, policy: Policy) -> Iterator[Link]
     lifeline.watch()
     # Several workers share one machine: more threads each would only get in each other's way.
     torch.set_num_threads(1)
-    log_as(config.role)
     service = config.service
+    log_as(config.role, service.log_format)
     spec = EpisodeSpec.of(setup)
     if config.role == "player":
         spec.check_batch_size(service.batch_episodes)
@@ -59,12 +60,14 @@ def joined(config: WorkerConfig, setup: Setup, policy: Policy) -> Iterator[Link]
     )
     link.on_progress = watchdog.progress
     with link, stopped_by_signals(link), watchdog:
-        _log.info("joining %s", config.connect)
+        _log.info("joining %s", config.connect, extra={"event": "joining"})
         if link.join():
-            log_as(f"{config.role} {link.welcome.index}")
-            _log.info("joined run %s", link.welcome.run_id)
+            me = link.welcome
+            log_as(f"{config.role} {me.index}", service.log_format)
+            fields = {"event": "joined", "run_id": me.run_id, "incarnation": me.incarnation}
+            _log.info("joined run %s", me.run_id, extra=fields)
         yield link
-        _log.info("ends: %s", link.stop_reason)
+        _log.info("ends: %s", link.stop_reason, extra={"event": "ended"})
 
 
 @contextmanager
@@ -82,18 +85,16 @@ def stopped_by_signals(link: Link) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def log_as(who: str) -> None:
+def log_as(who: str, log_format: str) -> None:
     """Log lines of this room go to stderr, with the time and who writes them."""
     logger = logging.getLogger("worker")
     logger.setLevel(logging.INFO)
-    for handler in [h for h in logger.handlers if isinstance(h, _Lines)]:
-        logger.removeHandler(handler)
-    logger.addHandler(_Lines(who))
+    for former in [h for h in logger.handlers if isinstance(h, _Lines)]:
+        logger.removeHandler(former)
+    handler = _Lines(sys.stderr)
+    handler.setFormatter(formatter(log_format, who))
+    logger.addHandler(handler)
 
 
 class _Lines(logging.StreamHandler[TextIO]):
-    """stderr, with a name in each line."""
-
-    def __init__(self, who: str) -> None:
-        super().__init__(sys.stderr)
-        self.setFormatter(logging.Formatter(f"%(asctime)s {who}: %(message)s", "%H:%M:%S"))
+    """The handler that `log_as` replaces."""

@@ -168,7 +168,7 @@ class Talk:
             raise
         except WireError as error:
             self.counters["malformed"] += 1
-            log.warning("the master at %s sent what is not understood: %s", self.line.place, error)
+            self._warn("malformed", "the master at %s sent what is not understood: %s", error)
             return
         self.line.answered()
         if not isinstance(message, RunStatus):  # nobody asked for one here
@@ -182,7 +182,7 @@ class Talk:
             self.inbox.offer_frame(frame)
         except WireError as error:
             self.counters["malformed"] += 1
-            log.warning("weights from %s are refused: %s", self.line.place, error)
+            self._warn("bad_weights", "weights from %s are refused: %s", error)
 
     def _handle(self, message: ToWorker, now: float) -> None:
         match message:
@@ -239,8 +239,11 @@ class Talk:
 
     def _take_back(self, reject: Reject, now: float) -> None:
         self.counters["rejected" if reject.final else "out_of_turn"] += 1
-        log.warning("the master at %s refused a message: %s", self.line.place, reject.reason)
+        self._warn("rejected", "the master at %s refused a message: %s", reject.reason)
         if reject.final:
             self.spool.remove(reject.sequence)
         else:
             self._resend_at = min(self._resend_at, now + self._timing.retry_s)
+
+    def _warn(self, event: str, text: str, reason: object) -> None:
+        log.warning(text, self.line.place, reason, extra={"event": event})

@@ -136,9 +136,12 @@ def test_a_finished_run_is_extended(tmp_path: Path) -> None:
     first = json.loads((folder / "result.json").read_text())
     # Up to service.lag_updates of them are owed already; the rest needs new episodes.
     arguments = (f"run_dir={folder}", *QUICK, "max_updates=200", "resume=auto")
-    run("tangram-train", *arguments, cwd=tmp_path)
+    printed = run("tangram-train", *arguments, "service.log_format=json", cwd=tmp_path)
     second = json.loads((folder / "result.json").read_text())
     assert (first["updates"], second["updates"]) == (40, 200)
+    told = [json.loads(line) for line in printed.splitlines()]
+    assert {"note", "status", "result"} <= {line["event"] for line in told}
+    assert told[-1].items() >= second.items()
     assert second["episodes"] > first["episodes"]
 
 

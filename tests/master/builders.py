@@ -22,11 +22,11 @@ from master.loop import Loop
 from master.metrics import Metrics
 from master.parts import Parts
 from master.peers import Peer
-from master.progress import Status
 from master.record import Record
 from master.report import Reporter
 from master.rundir import RunFolder
 from master.signals import StopSignals
+from master.status import Status
 from master.trainer import Trainer
 from tangram_agent.config import ServiceConfig
 from tangram_agent.payloads import EpisodeSpec
@@ -148,8 +148,8 @@ class ShownProgress:
     def show(self, status: Status) -> None:
         self.statuses.append(status)
 
-    def notice(self, line: str) -> None:
-        self.notices.append(line)
+    def notice(self, line: str, level: str = "info", **fields: Any) -> None:
+        self.notices.append(line if level == "info" else f"{level}: {line}")
 
     def close(self) -> None:
         pass

@@ -16,6 +16,7 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hypothesis import given
 from hypothesis import strategies as st
+from rich.console import Console
 
 from master import children as children_module
 from master import launch as launch_module
@@ -23,6 +24,7 @@ from master.children import MAX_RESTARTS, Child, describe, environment, override
 from master.commands import master_arguments
 from master.config import LaunchConfig, MasterConfig
 from master.launch import Launcher, run_training
+from master.progress import PlainLines
 from master.rundir import RunFolder
 from master.signals import SIGNALS, StopSignals, heeded
 from tangram_agent.config import RECYCLED_STATUS, ServiceConfig
@@ -208,8 +210,8 @@ def launcher(
     """A launcher whose children run the given code."""
     run = RunFolder(folder)
     run.logs.mkdir()
-    console = launch_module.Console(file=(folder / "said").open("w"), width=100)
-    made = Launcher(LaunchConfig(len(players), MasterConfig(str(folder))), run, console)
+    lines = PlainLines(Console(file=(folder / "said").open("w"), width=100))
+    made = Launcher(LaunchConfig(len(players), MasterConfig(str(folder))), run, lines)
     values = {"folder": str(folder), "condition": condition, "ending": ending}
     made._master.arguments = ["-c", MASTER.format(**values)]
     for player, code in zip(made._players, players, strict=True):
@@ -225,7 +227,7 @@ def finish(made: Launcher, folder: Path) -> tuple[int, str]:
             status = made.run()
         finally:
             made.end_all()
-    made._console.file.close()
+    made._lines._console.file.close()
     for one in [*made._workers, made._master]:
         assert not one.alive
     return status, (folder / "news").read_text() + (folder / "said").read_text()

@@ -1,9 +1,11 @@
 """What the user sees: lines, the panel, and the final table."""
 
 import io
+import json
 import logging
 import shlex
-from dataclasses import replace
+from dataclasses import asdict, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +16,15 @@ from rich.console import Console
 from master.progress import (
     LivePanel,
     PlainLines,
-    Status,
-    duration,
+    make_lines,
     make_progress,
     notices_from,
-    status_line,
     status_panel,
 )
 from master.result import SCORES, show_result
 from master.rundir import RunFolder
+from master.status import Status, duration, status_line
+from master.tally import Tally
 from tests.master.builders import ShownProgress
 
 pytestmark = pytest.mark.fast
@@ -134,6 +136,37 @@ def test_terminals_get_a_panel_and_pipes_get_lines(terminal: bool, kind: type) -
     made = make_progress(console(force_terminal=terminal), "run")
     made.close()
     assert isinstance(made, kind)
+
+
+def json_lines(shown: Console) -> list[dict[str, Any]]:
+    lines = [json.loads(line) for line in text(shown).splitlines()]
+    for line in lines:
+        assert datetime.fromisoformat(line.pop("time")).tzinfo is not None
+    return lines
+
+
+def test_programs_read_json() -> None:
+    shown = console()
+    lines = make_progress(shown, "run", "json")
+    for _ in range(2):  # within one interval
+        lines.show(STATUS)
+    lines.notice("goes [on] " + "x" * 200)
+    with notices_from("master", lines):
+        Tally().note("malformed", "no header")
+    make_lines(shown, "json").notice("the master ended")
+    common = {"level": "INFO", "process": "master"}
+    assert json_lines(shown) == [
+        common | {"event": "status", "message": "learning"} | asdict(STATUS),
+        common | {"event": "note", "message": "goes [on] " + "x" * 200},
+        {
+            "level": "WARNING",
+            "process": "master",
+            "event": "malformed",
+            "message": "malformed (number 1): no header",
+            "count": 1,
+        },
+        common | {"process": "launcher", "event": "note", "message": "the master ended"},
+    ]
 
 
 def test_warnings_of_the_hub_become_notices() -> None:

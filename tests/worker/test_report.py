@@ -1,10 +1,13 @@
 """The lines that a player logs about itself."""
 
+import json
 import logging
+from datetime import datetime
 
 import pytest
 
 from worker.report import Report
+from worker.session import log_as
 
 pytestmark = pytest.mark.fast
 
@@ -36,6 +39,31 @@ def test_a_line_every_half_minute_with_rate_and_waiting(caplog: pytest.LogCaptur
     report.played(30, 4)
     assert caplog.messages[2:] == [
         "30 episodes in 30 s (1.0/s), 0 % of the time waiting, weights 4"
+    ]
+
+
+def test_as_json_every_number_has_a_name(capsys: pytest.CaptureFixture[str]) -> None:
+    log_as("player 3", "json")
+    clock = Clock()
+    report = Report(clock)
+    with report.waiting("the master is behind"):
+        clock.now += 30.0
+    report.played(60, 3)
+    lines = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+    assert all(datetime.fromisoformat(line.pop("time")).tzinfo is not None for line in lines)
+    common = {"level": "INFO", "process": "player 3"}
+    assert lines == [
+        common | {"event": "waits", "message": "waits: the master is behind"},
+        common
+        | {
+            "event": "played",
+            "message": "60 episodes in 30 s (2.0/s), 100 % of the time waiting, weights 3",
+            "episodes": 60,
+            "seconds": 30.0,
+            "episodes_per_s": 2.0,
+            "percent_waiting": 100.0,
+            "weights_version": 3,
+        },
     ]
 
 
