@@ -1,6 +1,9 @@
 """An hour of training: memory and open files of every process, drawn."""
 
+import json
+import statistics
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +15,9 @@ SETTINGS = ("workers=2", "agent.replay_capacity=20000", "service.checkpoint_minu
 EVERY_S = 10.0
 # What fills up at first (the replay, caches) is no leak.
 WARM_SHARE = 0.25
+# Per hour; about half a gigabyte in three days.
+FLAT_MIB, FLAT_FILES = 8.0, 1.0
+PROCESSES = 5
 MIB = 2**20
 
 Samples = dict[str, list[tuple[float, float, int]]]  # name -> (minute, MiB, open files)
@@ -27,7 +33,7 @@ def run_soak(minutes: float, seed: int, out: Path | None, folder: Path) -> int:
         folder: of the run; must not hold any.
 
     Returns:
-        1 if a process was replaced meanwhile or the training failed, else 0.
+        0 if the training went well, no process was replaced and all of them stayed flat, else 1.
     """
     launcher = start_training(folder, f"seed={seed}", "max_updates=0", *SETTINGS)
     wait_for(folder / "connection.json", launcher)
@@ -40,10 +46,24 @@ def run_soak(minutes: float, seed: int, out: Path | None, folder: Path) -> int:
     status = launcher.wait(120)
     rows = [_row(name, points, minutes) for name, points in sorted(samples.items())]
     show("memory and open files after the first quarter", rows)
-    write(out, {"minutes": minutes, "status": status, "processes": rows, "samples": samples})
+    result = json.loads((folder / "result.json").read_text())
+    print(f"{result['episodes']:,} episodes, {result['updates']:,} updates, ended with {status}")
+    write(
+        out,
+        {
+            "minutes": minutes,
+            "settings": SETTINGS,
+            "status": status,
+            "episodes": result["episodes"],
+            "updates": result["updates"],
+            "processes": rows,
+            "samples": samples,
+        },
+    )
     if out is not None:
         _draw(samples, out.with_suffix(".png"))
-    return int(status != 0 or len(samples) != 5)
+    flat = len(rows) == PROCESSES and all(row["flat"] == "yes" for row in rows)
+    return int(status != 0 or not flat)
 
 
 def _sample(samples: Samples, minute: float, folder: Path) -> None:
@@ -66,15 +86,21 @@ def _name(line: str) -> str:
 
 def _row(name: str, points: list[tuple[float, float, int]], minutes: float) -> dict[str, Any]:
     warm = [point for point in points if point[0] >= WARM_SHARE * minutes] or points
-    first, last = warm[0], warm[-1]
-    hours = max(last[0] - first[0], 1e-9) / 60.0
+    hours = [minute / 60.0 for minute, _, _ in warm]
+    memory, files = _growth(hours, [m for _, m, _ in warm]), _growth(hours, [f for _, _, f in warm])
     return {
         "process": name,
-        "MiB": round(last[1], 1),
-        "MiB per hour": round((last[1] - first[1]) / hours, 2),
-        "open files": last[2],
-        "more open files": last[2] - first[2],
+        "MiB": round(warm[-1][1], 1),
+        "MiB per hour": round(memory, 2),
+        "open files": warm[-1][2],
+        "open files per hour": round(files, 2),
+        "flat": "yes" if memory <= FLAT_MIB and files <= FLAT_FILES else "no",
     }
+
+
+def _growth(hours: list[float], values: Sequence[float]) -> float:
+    """Per hour, by the line that fits best."""
+    return statistics.linear_regression(hours, values).slope if len(hours) > 1 else 0.0
 
 
 def _draw(samples: Samples, path: Path) -> None:
