@@ -2,8 +2,8 @@
 
 import subprocess
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -46,8 +46,11 @@ def master(folder: Path, *more: str) -> Iterator["subprocess.Popen[bytes]"]:
 class Player:
     """A worker whose batches can be told apart in the replay, by their rewards."""
 
-    def __init__(self, connect: str | Path, index: int, setup: Setup) -> None:
+    def __init__(
+        self, connect: str | Path, index: int, setup: Setup, tag_index: int | None = None
+    ) -> None:
         self._setup, self.index = setup, index
+        self._first_tag = FIRST_TAG + 100_000.0 * (index if tag_index is None else tag_index)
         spec = EpisodeSpec.of(setup)
         self.link = Link(str(connect), "player", index, setup.fingerprints(), spec, None, 4, QUICK)
         self.sent = 0
@@ -57,7 +60,22 @@ class Player:
         return self.link.acknowledged
 
     def tag(self, sequence: int) -> float:
-        return FIRST_TAG + 100_000.0 * self.index + sequence
+        return self._first_tag + sequence
+
+    def assert_exactly_once(self, found: Mapping[float, int]) -> int:
+        """All that was acknowledged was found, once, and nothing that was not sent.
+
+        Args:
+            found: tag -> episodes.
+
+        Returns:
+            Batches that were found.
+        """
+        own = {tag: n for tag, n in found.items() if 0 < tag - self._first_tag < 100_000}
+        acknowledged = {self.tag(n): EPISODES for n in range(1, self.acknowledged + 1)}
+        sent = {self.tag(n): EPISODES for n in range(1, self.sent + 1)}
+        assert acknowledged.items() <= own.items() <= sent.items()
+        return len(own)
 
     def step(self) -> None:
         """Send what the window takes, and take what came."""
@@ -95,19 +113,32 @@ def setup_of(folder: Path) -> Setup:
     return make_setup(yaml.safe_load((folder / "config.yaml").read_text()))
 
 
-def assert_exactly_once(folder: Path, players: list[Player]) -> None:
-    """The last checkpoint against what the players know."""
+@contextmanager
+def players(setup: Setup, *connects: str | Path) -> Iterator[list[Player]]:
+    """Players that have joined."""
+    with ExitStack() as stack:
+        made = [Player(connect, i, setup) for i, connect in enumerate(connects)]
+        for player in made:
+            stack.enter_context(player.link)
+            assert player.link.join()
+        yield made
+
+
+def tags_in_replay(folder: Path) -> dict[float, int]:
+    """Tag -> episodes in the replay of the last checkpoint."""
     content = load_checkpoint(list_checkpoints(folder / "checkpoints")[-1])
     tags, counts = np.unique(content.arrays["replay"]["reward"], return_counts=True)
     found = dict(zip(tags.tolist(), counts.tolist(), strict=True))
     played = {tag: count for tag, count in found.items() if tag >= FIRST_TAG}
-    acknowledged = {p.tag(n): EPISODES for p in players for n in range(1, p.acknowledged + 1)}
-    sent = {p.tag(n): EPISODES for p in players for n in range(1, p.sent + 1)}
-    assert acknowledged.items() <= played.items() <= sent.items()
     assert content.counters["episodes"] == sum(played.values())
-    table = content.counters["hub"]
-    for player in players:
-        entry = table[f"player/{player.index}"]
-        assert player.acknowledged <= entry["sequence"] <= player.sent
-        tags = {tag for tag in played if int(tag - FIRST_TAG) // 100_000 == player.index}
-        assert len(tags) == entry["sequence"]
+    return played
+
+
+def assert_exactly_once(folder: Path, players: list[Player]) -> None:
+    """The last checkpoint against what the players know."""
+    found = tags_in_replay(folder)
+    batches = [player.assert_exactly_once(found) for player in players]
+    assert sum(batches) == len(found)
+    table = load_checkpoint(list_checkpoints(folder / "checkpoints")[-1]).counters["hub"]
+    for player, count in zip(players, batches, strict=True):
+        assert table[f"player/{player.index}"]["sequence"] == count

@@ -42,15 +42,20 @@ def _ended(
 
 
 @contextmanager
-def started(command: str, *arguments: str, cwd: Path) -> Iterator[subprocess.Popen[bytes]]:
+def started(
+    command: str, *arguments: str, cwd: Path, err: Path | None = None
+) -> Iterator[subprocess.Popen[bytes]]:
     """A running command in a session of its own, killed at the end if it still runs."""
-    with subprocess.Popen(
-        [BIN / command, *arguments],
-        cwd=cwd,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    ) as process:
+    with (
+        (err or Path(os.devnull)).open("wb") as said,
+        subprocess.Popen(
+            [BIN / command, *arguments],
+            cwd=cwd,
+            stdout=subprocess.DEVNULL,
+            stderr=said,
+            start_new_session=True,
+        ) as process,
+    ):
         try:
             yield process
         finally:

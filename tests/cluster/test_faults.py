@@ -7,15 +7,13 @@ import signal
 import socket
 import subprocess
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
 import zmq
 
 from benchmarks.proxy import DOWN, UP, Proxy
-from tangram_agent.setup import Setup
 from tangram_sim.errors import TangramError
 from tests.cluster.players import (
     LIMIT_S,
@@ -25,6 +23,7 @@ from tests.cluster.players import (
     finish,
     master,
     more_acknowledged,
+    players,
     setup_of,
     until,
 )
@@ -32,17 +31,6 @@ from tests.cluster.processes import BIN, all_ended, pids_of, started, wait_for_f
 from worker.status import ask_status
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(130)]
-
-
-@contextmanager
-def players(setup: Setup, *connects: str | Path) -> Iterator[list[Player]]:
-    """Players that have joined."""
-    with ExitStack() as stack:
-        made = [Player(connect, i, setup) for i, connect in enumerate(connects)]
-        for player in made:
-            stack.enter_context(player.link)
-            assert player.link.join()
-        yield made
 
 
 @pytest.fixture

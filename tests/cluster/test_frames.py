@@ -1,0 +1,140 @@
+"""What must not come over a wire, between real masters and workers that must not mind."""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zmq
+
+from tangram_agent.decoding import decode_from_master
+from tangram_agent.wire import Alive, Heartbeat, Hello, Welcome
+from tangram_sim.errors import TangramError
+from tests.cluster.mangler import KINDS, Mangler
+from tests.cluster.players import (
+    Player,
+    assert_exactly_once,
+    finish,
+    master,
+    more_acknowledged,
+    players,
+    setup_of,
+    tags_in_replay,
+    until,
+)
+from tests.cluster.processes import started
+from worker.status import ask_status
+
+pytestmark = [pytest.mark.cluster, pytest.mark.timeout(130)]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    path = tmp_path / "run"
+    path.mkdir()
+    return path
+
+
+def endpoint_of(folder: Path) -> str:
+    return str(json.loads((folder / "connection.json").read_text())["endpoint"])
+
+
+def numbers(folder: Path) -> dict[str, float]:
+    with zmq.Context() as context:
+        return ask_status(str(folder), context).numbers
+
+
+def test_repeated_swapped_and_damaged_messages_change_nothing(folder: Path) -> None:
+    """One player behind the relay, one beside it, who must not notice."""
+    with (
+        master(folder) as process,
+        Mangler(endpoint_of(folder), seed=1) as mangler,
+        players(setup_of(folder), f"tcp://127.0.0.1:{mangler.port}", folder) as made,
+    ):
+        wanted = {(kind, way) for kind in KINDS for way in ("up", "down")}
+        until(made, lambda: wanted <= mangler.done.keys())
+        more_acknowledged(made, 10)
+        told = {"hub/malformed", "hub/rejected", "hub/duplicates"}
+        until(made, lambda: told <= numbers(folder).keys())
+        _, beside = made
+        assert beside.link.counters.keys().isdisjoint({"reconnects", "malformed", "rejected"})
+        finish(made, process)
+    assert_exactly_once(folder, made)
+
+
+def test_the_newest_of_two_processes_with_one_index_goes_on(folder: Path) -> None:
+    with master(folder) as process:
+        setup = setup_of(folder)
+        with players(setup, folder) as (older,):
+            more_acknowledged([older], 5)
+            newer = Player(folder, older.index, setup, tag_index=1)
+            with newer.link:
+                assert newer.link.join()
+                until([older, newer], lambda: older.link.stopped)
+                assert older.link.stop_reason == "player 0 was taken over by a newer process"
+                more_acknowledged([newer], 5)
+                finish([newer], process)
+    found = tags_in_replay(folder)
+    for player in (older, newer):
+        player.assert_exactly_once(found)
+    assert len(found) >= older.acknowledged + newer.acknowledged
+
+
+def test_a_connection_that_takes_anothers_name_is_not_heard(folder: Path) -> None:
+    """ZeroMQ lets peers choose the name of their connection: the first one keeps it."""
+    with master(folder) as process, zmq.Context() as context:
+        with named(context, folder) as first:
+            hello = Hello("player", 0, 0, "one", 1, setup_of(folder).fingerprints())
+            first.send_multipart(hello.encode())
+            assert isinstance(heard(first), Welcome)
+            with named(context, folder) as second:
+                second.send_multipart(Heartbeat({}).encode())
+                first.send_multipart(Heartbeat({}).encode())
+                assert isinstance(heard(first), Alive)
+                assert second.poll(500) == 0
+        finish([], process)
+
+
+@contextmanager
+def named(context: "zmq.Context[zmq.Socket[bytes]]", folder: Path) -> Iterator[Any]:
+    with context.socket(zmq.DEALER) as end:
+        end.setsockopt(zmq.LINGER, 0)
+        end.setsockopt(zmq.IDENTITY, b"the same")
+        end.connect(endpoint_of(folder))
+        yield end
+
+
+def heard(end: Any) -> object:
+    assert end.poll(20_000)
+    return decode_from_master(end.recv_multipart(), None)
+
+
+def test_strangers_with_stale_or_foreign_keys_are_turned_away(tmp_path: Path) -> None:
+    """Two encrypted runs; a file with the address of the one and the keys of the other."""
+    one, other = tmp_path / "one", tmp_path / "other"
+    for path in (one, other):
+        path.mkdir()
+    with master(one, "service.security=curve") as process:
+        with master(other, "service.security=curve") as second:
+            keys = json.loads((other / "connection.json").read_text())
+            finish([], second)
+        mine = json.loads((one / "connection.json").read_text())
+        stale = tmp_path / "stale.json"
+        stale.write_text(json.dumps(mine | {n: keys[n] for n in ("public_key", "secret_key")}))
+        with players(setup_of(one), one) as made:
+            more_acknowledged(made, 3)
+            line = f"wrong or stale connection file: what answers at {mine['endpoint']} does not"
+            arguments = (f"connect={stale}", f"from_config={one / 'config.yaml'}")
+            with started("tangram-worker", *arguments, cwd=tmp_path, err=tmp_path / "said") as who:
+                until(made, lambda: line in (tmp_path / "said").read_text())
+                assert who.poll() is None  # it waits for the file to become right
+                stale.write_text(json.dumps(mine))
+                until(made, lambda: "joined run" in (tmp_path / "said").read_text())
+            with zmq.Context() as context, pytest.raises(TangramError, match="wants keys"):
+                ask_status(mine["endpoint"], context)
+            more_acknowledged(made, 3)
+            assert numbers(one)["hub/refused_keys"] > 0
+            finish(made, process)
+        assert sum(tags_in_replay(one).values()) >= 3 * made[0].acknowledged
