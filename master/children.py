@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Thread
 
+from tangram_agent.config import RECYCLED_STATUS
 from tangram_agent.lifeline import Lifeline
 
 # A process that lived for so long starts with a clean record.
@@ -19,6 +20,7 @@ FIRST_DELAY_S = 0.5
 MAX_DELAY_S = 30.0
 USAGE_STATUS = 2
 TAIL_LINES = 12
+STOPPED = "T"
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -32,6 +34,7 @@ class Child:
         arguments: of this Python.
         log: file that its output is appended to, None for the terminal.
         nice: added to its niceness.
+        patience_s: without progress before its watchdog ends it, 0 for none.
         restarts: in a row, without a steady time between.
         next_start_s: monotonic time of the next start, None while nothing is planned.
     """
@@ -40,11 +43,13 @@ class Child:
     arguments: Sequence[str]
     log: Path | None = None
     nice: int = 0
+    patience_s: float = 0.0
     restarts: int = 0
     next_start_s: float | None = 0.0
     _process: "subprocess.Popen[bytes] | None" = field(default=None, init=False)
     _lifeline: Lifeline | None = field(default=None, init=False)
     _started_s: float = field(default=0.0, init=False)
+    _frozen_s: float = field(default=0.0, init=False)
 
     @property
     def alive(self) -> bool:
@@ -53,7 +58,7 @@ class Child:
 
     def start(self, ended: Callable[["Child"], None]) -> None:
         """Start a process; `ended` is called with this, in another thread, when it ends."""
-        self.next_start_s, self._started_s = None, time.monotonic()
+        self.next_start_s, self._started_s, self._frozen_s = None, time.monotonic(), 0.0
         self._lifeline = Lifeline()
         output = None if self.log is None else self.log.open("ab")
         try:
@@ -88,7 +93,9 @@ class Child:
         Status 2 is wrong input, which does not mend itself.
         """
         now_s = time.monotonic()
-        if now_s - self._started_s >= STEADY_S:
+        # One that only hung from its beginning did not live longer than its watchdog let it.
+        hung_s = 0.0 if status == RECYCLED_STATUS else self.patience_s
+        if now_s - self._started_s >= STEADY_S + hung_s:
             self.restarts = 0
         if status == USAGE_STATUS or self.restarts >= MAX_RESTARTS:
             return False
@@ -100,6 +107,23 @@ class Child:
     def tell(self, line: str) -> bool:
         """Send a line to the process; False where it cannot take it."""
         return self._lifeline is not None and self._lifeline.tell(line)
+
+    def kill_frozen(self, passed_s: float) -> bool:
+        """Kill a process that has been stopped (SIGSTOP) for too long: so has its watchdog.
+
+        Args:
+            passed_s: since this was called last; time in which the caller was stopped, as with a
+                whole job, does not count.
+
+        Returns:
+            Whether it was killed.
+        """
+        frozen = self._process is not None and _state(self._process.pid) == STOPPED
+        self._frozen_s = self._frozen_s + passed_s if frozen else 0.0
+        if not 0.0 < self.patience_s <= self._frozen_s:
+            return False
+        self.signal(signal.SIGKILL)
+        return True
 
     def signal(self, number: signal.Signals) -> None:
         """Send a signal, if the process still runs."""
@@ -124,6 +148,14 @@ class Child:
                 os.setpriority(os.PRIO_PROCESS, self._process.pid, current + self.nice)
             except ProcessLookupError:
                 return  # ended already; the waiting thread tells
+
+
+def _state(pid: int) -> str:
+    """The kernel's letter for what a process does, empty where there is none."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2][:1]
+    except OSError:
+        return ""
 
 
 def describe(status: int) -> str:

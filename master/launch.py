@@ -13,6 +13,7 @@ from master.children import MAX_RESTARTS, Child, describe
 from master.commands import master_arguments, worker_child
 from master.config import LaunchConfig
 from master.console import sturdy_console
+from master.every import Every
 from master.progress import Progress, make_lines
 from master.rundir import RunFolder
 from master.signals import SAME_WISH_S, handling, show_cursor
@@ -68,6 +69,9 @@ class Launcher:
         self._master = Child("master", master_arguments(config, folder))
         self._players = [worker_child(folder, "player", i) for i in range(config.workers)]
         self._evaluator = worker_child(folder, "evaluator", -1)
+        for child in (self._master, *self._workers):
+            child.patience_s = config.master.service.watchdog_seconds
+        self._look = Every(IDLE_S)
         self._stop_s: float | None = None
         self._signalled_s: float | None = None
         self._failed, self._sent_home = False, False
@@ -82,6 +86,7 @@ class Launcher:
         self._master.start(self._events.put)
         while True:
             self._start_due()
+            self._kill_frozen()
             event = self._next_event()
             if isinstance(event, signal.Signals):
                 self._signalled(event)
@@ -121,6 +126,14 @@ class Launcher:
         for child in [self._master, *(self._workers if reachable else ())]:
             if child.next_start_s is not None and time.monotonic() >= child.next_start_s:
                 child.start(self._events.put)
+
+    def _kill_frozen(self) -> None:
+        if not self._look.due():
+            return
+        for child in (self._master, *self._workers):
+            if child.kill_frozen(IDLE_S):
+                tell = self._lines.notice if child is self._master else self._say
+                tell(f"{child.name} has been stopped for {child.patience_s:g} s: it is killed")
 
     def _next_event(self) -> Child | signal.Signals | None:
         children = [self._master, *self._workers]

@@ -343,6 +343,66 @@ else:
 
 
 @pytest.mark.cluster
+def test_a_process_that_stays_stopped_is_killed_and_started_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(launch_module, "LEAVE_S", 0.2)
+    monkeypatch.setattr(launch_module, "IDLE_S", 0.1)
+    mark = tmp_path / "came_back"
+    once = f"""
+import os, signal
+from pathlib import Path
+if Path({str(tmp_path / "stopped")!r}).exists():
+    Path({str(mark)!r}).touch()
+else:
+    Path({str(tmp_path / "stopped")!r}).touch()
+    os.kill(os.getpid(), signal.SIGSTOP)
+{WORKER}"""
+    made = launcher(tmp_path, condition=f"not Path({str(mark)!r}).exists()", players=[once])
+    made._players[0].patience_s = 0.3
+    status, told = finish(made, tmp_path)
+    assert status == 0
+    assert told.splitlines() == [
+        "worker 0 has been stopped for 0.3 s: it is killed",
+        f"worker 0 ended with SIGKILL: it is started again (1 of {MAX_RESTARTS}); "
+        f"see {tmp_path}/logs/worker-0.log",
+    ]
+
+
+@pytest.mark.cluster
+def test_a_process_that_is_stopped_for_a_while_is_left_alone() -> None:
+    made = Child("worker", ["-c", "import signal; signal.pause()"], patience_s=10.0)
+    made.start(lambda _: None)
+    pid = made._process.pid
+    try:
+        made.signal(signal.SIGSTOP)
+        os.waitid(os.P_PID, pid, os.WSTOPPED)
+        assert not made.kill_frozen(9.0)
+        made.signal(signal.SIGCONT)
+        os.waitid(os.P_PID, pid, os.WCONTINUED)
+        assert not made.kill_frozen(9.0)  # it counts from the beginning the next time
+        made.signal(signal.SIGSTOP)
+        os.waitid(os.P_PID, pid, os.WSTOPPED)
+        assert not made.kill_frozen(9.0)
+        made.patience_s = 0.0  # no watchdog
+        assert not made.kill_frozen(1e9)
+        made.patience_s = 10.0
+        assert made.kill_frozen(1.0)
+    finally:
+        made.signal(signal.SIGKILL)
+        assert made.clear() == -signal.SIGKILL
+
+
+@pytest.mark.fast
+def test_a_process_that_only_hung_has_no_steady_life() -> None:
+    made = Child("worker", [], patience_s=300.0)
+    for lived_s, restarts in ((300.0, 1), (359.0, 2), (360.0, 1)):
+        made._started_s = time.monotonic() - lived_s
+        assert made.plan_restart(1)
+        assert made.restarts == restarts
+
+
+@pytest.mark.cluster
 def test_when_no_worker_can_be_kept_the_run_ends_with_the_reason(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
