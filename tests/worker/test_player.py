@@ -183,14 +183,14 @@ def test_in_lockstep_a_player_with_other_environments_says_so() -> None:
 @pytest.fixture
 def survivable_signals() -> Iterator[dict[int, object]]:
     """What the handlers were; without the worker's own a signal does nothing."""
-    numbers = (signal.SIGTERM, signal.SIGINT)
+    numbers = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
     before = {number: signal.signal(number, lambda *_: None) for number in numbers}
     yield {number: signal.getsignal(number) for number in numbers}
     for number, handler in before.items():
         signal.signal(number, handler)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGUSR1])
 def test_a_signal_ends_a_player_with_a_goodbye(
     number: signal.Signals,
     survivable_signals: dict[int, object],
