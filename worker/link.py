@@ -97,11 +97,6 @@ class Link:
         return bool(self._stop_reason) or self._talk.dismissed
 
     @property
-    def stopped_by_master(self) -> bool:
-        """Whether the master asked for the end: it acknowledges nothing more."""
-        return self._talk.dismissed
-
-    @property
     def stop_reason(self) -> str:
         """Why it must end, empty while it need not."""
         return self._stop_reason or self._talk.reason

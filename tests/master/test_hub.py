@@ -1,8 +1,5 @@
 """The hub with peers that keep the rules and peers that do not, on real sockets."""
 
-import os
-import socket
-from dataclasses import fields
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,27 +7,23 @@ import numpy as np
 import pytest
 
 from master.arrivals import ScoresArrived
-from master.hub import Hub
 from tangram_agent.decoding import decode_from_master
 from tangram_agent.frames import PROTOCOL
 from tangram_agent.payloads import decode_weights
-from tangram_agent.types import Episodes
 from tangram_agent.wire import (
     Ack,
     Alive,
     Bye,
-    Go,
     Greet,
     Heartbeat,
     Refused,
     Reject,
     Stop,
-    ToWorker,
     WantWeights,
     WeightsMessage,
     Welcome,
 )
-from tangram_sim.errors import ConfigError, RunError, WireError
+from tangram_sim.errors import WireError
 from tests.agent.messages import (
     FINGERPRINTS,
     SHAPES,
@@ -41,7 +34,7 @@ from tests.agent.messages import (
     weights,
     with_header,
 )
-from tests.master.dealers import INFO, WINDOW, Dealer, staged
+from tests.master.dealers import WINDOW, Dealer, staged
 
 pytestmark = pytest.mark.cluster
 
@@ -97,128 +90,6 @@ def test_a_full_house_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
         assert stage.hub.counters["refused_full"] == 1
 
 
-def test_a_batch_arrives_as_it_was_sent_and_is_acknowledged_after_its_insert_only() -> None:
-    with staged() as stage:
-        dealer = stage.dealer()
-        dealer.join()
-        dealer.send(1)
-        stage.counted("batches")
-        # An answer to something sent later comes first: there was no acknowledgement before it.
-        dealer.say(Heartbeat({}).encode())
-        assert dealer.hear() == Alive(-1)
-        [arrival] = stage.batches()
-        assert (arrival.index, arrival.incarnation, arrival.sequence) == (0, 1, 1)
-        assert arrival.weights_version == 7
-        for field in fields(Episodes):
-            sent, got = getattr(batch().episodes, field.name), getattr(arrival.episodes, field.name)
-            np.testing.assert_array_equal(sent, got)
-        stage.hub.acknowledge(arrival)
-        assert dealer.hear() == Ack(1, duplicate=False)
-        [peer] = stage.hub.peers
-        assert (peer.batches, peer.episodes, peer.transitions) == (1, 3, 12)
-
-
-def test_an_order_is_told_again_until_its_batch_has_come() -> None:
-    with staged() as stage:
-        one, other, evaluator = stage.dealer(), stage.dealer(), stage.dealer()
-        one.join(index=0)
-        evaluator.join(role="evaluator")
-        first, second = Go(0, 0, 0, 3), Go(1, 5, 3, 3)
-        stage.hub.order({0: first, 1: second})
-        assert one.hear() == first
-        other.say(hello(process="other", index=1).encode())  # joins after the order was given
-        assert isinstance(other.hear(), Welcome)
-        assert other.hear() == second
-        assert heartbeat(one) == [Alive(-1), first]
-        assert heartbeat(other) == [Alive(-1), second]
-        one.send(1)
-        stage.counted("batches")
-        assert heartbeat(one) == [Alive(-1)]
-        stage.hub.acknowledge(stage.batches()[0])
-        assert one.hear() == Ack(1, duplicate=False)
-
-        # Sent again, since the acknowledgement did not come in time; the next order stays.
-        stage.hub.order({0: second})
-        assert one.hear() == second
-        one.send(1)
-        assert one.hear() == Ack(1, duplicate=True)
-        assert heartbeat(one) == [Alive(-1), second]
-        assert heartbeat(evaluator) == [Alive(-1)]
-
-
-def heartbeat(dealer: Dealer) -> list[ToWorker]:
-    """All the answers to a heartbeat: those before the answer to what follows it."""
-    dealer.say(Heartbeat({}).encode())
-    dealer.say([b"no message"])
-    answers: list[ToWorker] = []
-    while not isinstance(answer := dealer.hear(), Reject):
-        answers.append(answer)
-    return answers
-
-
-def test_a_duplicate_is_not_delivered_again() -> None:
-    with staged() as stage:
-        dealer = stage.dealer()
-        dealer.join()
-        dealer.send(1, 1, 2)
-        stage.counted("batches", 2)
-        # Held by the master and not inserted: counted, answered after the insert.
-        assert [a.sequence for a in stage.batches()] == [1, 2]
-        assert stage.hub.counters["held_duplicates"] == 1
-        stage.hub.acknowledge(stage.batches()[0])
-        assert dealer.hear() == Ack(1, duplicate=False)
-        # Inserted, and the acknowledgement was lost: acknowledged again.
-        dealer.send(1)
-        assert dealer.hear() == Ack(1, duplicate=True)
-        assert stage.hub.counters["duplicates"] == 1
-        assert len(stage.batches()) == 2
-
-
-def test_acknowledging_twice_counts_once() -> None:
-    with staged() as stage:
-        dealer = stage.dealer()
-        dealer.join()
-        dealer.send(1)
-        stage.counted("batches")
-        for _ in range(2):
-            stage.hub.acknowledge(stage.batches()[0])
-        assert dealer.hear() == Ack(1, duplicate=False)
-        assert stage.hub.peers[0].batches == 1
-        dealer.say(Heartbeat({}).encode())
-        assert dealer.hear() == Alive(-1)
-
-
-def test_a_gap_is_refused_until_it_is_filled() -> None:
-    with staged() as stage:
-        dealer = stage.dealer()
-        dealer.join()
-        dealer.send(2)
-        assert dealer.hear() == Reject(
-            reason="batch 2: batch 1 must come first", sequence=2, final=False
-        )
-        dealer.send(1, 2)
-        stage.counted("batches", 2)
-        assert [a.sequence for a in stage.batches()] == [1, 2]
-        assert stage.hub.counters["gaps"] == 1
-
-
-def test_no_more_than_a_window_is_taken_unacknowledged() -> None:
-    with staged() as stage:
-        dealer = stage.dealer()
-        dealer.join()
-        dealer.send(*range(1, WINDOW + 2))
-        assert dealer.hear() == Reject(
-            reason="batch 4: 3 batches are unacknowledged, the most there may be",
-            sequence=4,
-            final=False,
-        )
-        assert stage.hub.counters["over_window"] == 1
-        assert len(stage.batches()) == WINDOW
-        stage.hub.acknowledge(stage.batches()[0])
-        dealer.send(WINDOW + 1)
-        stage.counted("batches", WINDOW + 1)
-
-
 def test_the_newest_process_of_an_index_wins() -> None:
     with staged() as stage:
         old, new = stage.dealer(), stage.dealer()
@@ -266,130 +137,6 @@ def test_who_said_no_hello_is_greeted() -> None:
             assert dealer.hear() == Greet()
         assert stage.hub.counters["strangers"] == 3
         assert stage.arrivals == []
-
-
-def test_a_wrong_batch_is_refused_for_good_and_those_after_it_are_taken() -> None:
-    with staged() as stage:
-        dealer = stage.dealer()
-        dealer.join(index=5)
-        frames = batch(1).encode(SPEC)
-        rewards = np.frombuffer(frames[4], "<f4").copy()
-        rewards[0] = np.nan
-        dealer.say([*frames[:4], rewards.tobytes(), frames[5]])
-        assert dealer.hear() == Reject(
-            reason="player 5: batch 1: rewards holds nan at [0, 0], must be finite and between "
-            "-1e+06 and 1e+06",
-            sequence=1,
-            final=True,
-        )
-        dealer.send(2)
-        stage.counted("batches")
-        assert stage.batches()[0].sequence == 2
-        assert stage.hub.counters["rejected"] == 1
-        # Out of turn it may be a mutation of one that will come again.
-        dealer.say(with_header(batch(9).encode(SPEC), count=0))
-        answer = dealer.hear()
-        assert isinstance(answer, Reject)
-        assert (answer.sequence, answer.final) == (9, False)
-        dealer.send(3)
-        stage.counted("batches", 2)
-
-
-GARBAGE = [
-    [b""],
-    [b"", b""],
-    [os.urandom(100)],
-    [b"\xc1"] * 3,
-    [b"\x81\xa1a" * 3000],
-    [bytes(1_000_000)],
-    with_header(hello().encode(), role="spy"),
-    with_header(hello().encode(), more=1),
-    with_header(hello().encode(), kind="welcome"),
-    with_header(batch().encode(SPEC), sequence=-1),
-    with_header(scores().encode(SPEC), scalars={"a": float("nan")}),
-]
-
-
-def test_garbage_is_refused_with_a_reason_and_the_hub_lives_on() -> None:
-    with staged() as stage:
-        good, bad, unknown = stage.dealer(), stage.dealer(), stage.dealer()
-        good.join(process="good")
-        bad.join(process="bad")
-        for frames in GARBAGE:
-            for dealer in (bad, unknown):
-                dealer.say(frames)
-                answer = dealer.hear()
-                assert isinstance(answer, Reject)
-                assert (answer.sequence, answer.final) == (0, True)
-                assert answer.reason
-        assert stage.hub.counters["malformed"] == 2 * len(GARBAGE)
-        good.send(1)
-        bad.send(1)
-        stage.counted("batches", 2)
-
-
-def test_bytes_that_are_not_even_zeromq_hurt_nobody() -> None:
-    with staged() as stage:
-        dealer = stage.dealer()
-        dealer.join()
-        host, port = stage.hub.endpoint.removeprefix("tcp://").split(":")
-        with socket.create_connection((host, int(port)), timeout=5) as raw:
-            raw.sendall(os.urandom(4096))
-            dealer.send(1)
-            stage.counted("batches")
-
-
-def test_a_frame_over_the_limit_never_arrives(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("master.sockets.MAX_BATCH_BYTES", 10_000)
-    with staged() as stage:
-        large, small = stage.dealer(), stage.dealer()
-        large.say([bytes(10_001)])
-        large.say(Heartbeat({}).encode())
-        small.say([bytes(10_000)])
-        assert isinstance(small.hear(), Reject)
-        # The connection of the large one was cut; it comes again, without its message.
-        large.say(Heartbeat({}).encode())
-        assert large.hear() == Greet()
-        assert stage.hub.counters["malformed"] == 1
-
-
-def test_who_vanished_is_unreachable_and_nobody_waits() -> None:
-    with staged() as stage:
-        gone, here = stage.dealer(), stage.dealer()
-        gone.join(process="gone")
-        here.join(process="here")
-        gone.send(*range(1, WINDOW + 1))
-        stage.counted("batches", WINDOW)
-        [identity] = [p.identity for p in stage.hub.peers if p.process == "gone"]
-        gone.socket.close(0)
-
-        def unreachable() -> int:
-            # The ROUTER learns of it some time; until then it accepts answers.
-            stage.hub._post.send(identity, Greet())
-            return stage.hub.counters["unreachable"]
-
-        stage.until(unreachable)
-        for arrival in stage.batches():
-            stage.hub.acknowledge(arrival)
-        here.send(1)
-        stage.counted("batches", WINDOW + 1)
-
-
-def test_who_does_not_read_loses_answers_and_nobody_waits(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("master.sockets.HIGH_WATER", 2)
-    with staged() as stage:
-        deaf = stage.dealer()
-        deaf.join()
-        big = weights()
-        big.tensors["actor.weight"] = np.zeros(2**20, np.float32)
-        stage.hub.publish(big)
-        wanted = 0
-        while not stage.hub.counters["congested"] and wanted < 200:
-            deaf.say(WantWeights("", -1).encode())
-            deaf.say(Heartbeat({}).encode())
-            wanted += 1
-            stage.counted("heartbeats", wanted)
-        assert stage.hub.counters["congested"] > 0
 
 
 def test_a_joiner_gets_the_current_weights() -> None:
@@ -531,68 +278,6 @@ def test_stop_reaches_those_who_are_there_and_those_who_come_later() -> None:
         peer.say(Bye("stopped").encode())
         stage.until(lambda: not stage.hub.peers)
         assert len(stage.batches()) == 1
-
-
-def test_after_a_restart_duplicates_are_known_and_the_rest_is_taken() -> None:
-    with staged() as stage:
-        dealer = stage.dealer()
-        dealer.join(index=0, process="p")
-        dealer.send(1, 2)
-        stage.counted("batches", 2)
-        stage.hub.acknowledge(stage.batches()[0])
-        state, epoch = stage.hub.state(), stage.hub.epoch
-    with staged() as stage:
-        stage.hub.load_state(state)
-        assert stage.hub.epoch != epoch
-        dealer = stage.dealer()
-        assert dealer.join(index=0, process="p", incarnation=1, first=1).incarnation == 1
-        dealer.send(1, 2)
-        assert dealer.hear() == Ack(1, duplicate=True)
-        stage.counted("batches")
-        assert stage.batches()[0].sequence == 2
-        with pytest.raises(RunError, match="unknown key"):
-            stage.hub.load_state({"x": {}})
-
-
-def test_one_poll_takes_a_bounded_number_of_messages(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("master.hub.MAX_DRAIN", 2)
-    with staged() as stage:
-        dealer = stage.dealer()
-        dealer.join()
-        dealer.send(1, 2, 3)
-        sizes: list[int] = []
-        stage.until(lambda: sizes.append(len(stage.arrivals)) or len(stage.arrivals) == 3)
-        assert max(np.diff(sizes)) <= 2
-
-
-def test_a_port_in_use_says_what_to_do() -> None:
-    with staged() as stage:
-        port = int(stage.hub.endpoint.rpartition(":")[2])
-        with pytest.raises(ConfigError) as caught:
-            Hub("127.0.0.1", port, INFO)
-        assert str(caught.value) == (
-            f"port {port} of 127.0.0.1 is in use: choose another with service.port=..., "
-            "or 0 for any free one"
-        )
-
-
-@pytest.mark.parametrize("bind", ["nowhere", "203.0.113.7", "1.2.3", "::zz"])
-def test_a_wrong_address_says_what_to_do(bind: str) -> None:
-    with pytest.raises(ConfigError) as caught:
-        Hub(bind, 0, INFO)
-    assert str(caught.value).startswith(f"cannot listen on {bind}, port 0 (")
-    assert str(caught.value).endswith(
-        "set service.bind to an address of this machine, such as 127.0.0.1, and service.port to "
-        "one you may use"
-    )
-
-
-def test_all_addresses_and_a_given_port() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        port = probe.getsockname()[1]
-    with staged("0.0.0.0", port) as stage:  # noqa: S104
-        assert stage.hub.endpoint == f"tcp://0.0.0.0:{port}"
-        assert isinstance(stage.dealer().join(), Welcome)
 
 
 def test_answers_are_read_by_the_decoder_of_workers() -> None:

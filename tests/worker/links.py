@@ -1,0 +1,59 @@
+"""Links that the tests drive against a staged hub."""
+
+import json
+import socket
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+from tangram_agent.wire import (
+    EpisodeBatch,
+    ToMaster,
+)
+from tests.master.dealers import Stage
+from tests.worker.standin import make_link
+from worker.link import Link
+
+Result = TypeVar("Result")
+
+
+def served(stage: Stage, call: Callable[[], Result]) -> Result:
+    """What a call that waits returns, while the hub is served."""
+    with ThreadPoolExecutor(1) as pool:
+        future = pool.submit(call)
+        stage.until(future.done)
+        return future.result()
+
+
+@contextmanager
+def joined(stage: Stage, **more: Any) -> Iterator[Link]:
+    with make_link(stage.hub.endpoint, **more) as link:
+        assert served(stage, link.join)
+        yield link
+
+
+def both(stage: Stage, link: Link, done: Callable[[], Any]) -> None:
+    """Serve the hub and let the link work until something holds."""
+
+    def step() -> Any:
+        link.poll()
+        return done()
+
+    stage.until(step)
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return int(probe.getsockname()[1])
+
+
+def write_connection(folder: Path, endpoint: str, run_id: str = "run") -> None:
+    aside = folder / "aside"
+    aside.write_text(json.dumps({"endpoint": endpoint, "run_id": run_id}))
+    aside.replace(folder / "connection.json")
+
+
+def numbers(heard: list[ToMaster]) -> list[int]:
+    return [message.sequence for message in heard if isinstance(message, EpisodeBatch)]
