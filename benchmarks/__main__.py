@@ -58,8 +58,7 @@ def _run(arguments: argparse.Namespace) -> int:
         return 0
     with tempfile.TemporaryDirectory(prefix="tangram-") as folder:
         if arguments.kind == "chaos":
-            run_chaos(arguments.minutes, arguments.seed, arguments.out, Path(folder))
-            return 0
+            return run_chaos(arguments.minutes, arguments.seed, arguments.out, Path(folder))
         if arguments.kind == "soak":
             return run_soak(arguments.minutes, arguments.seed, arguments.out, Path(folder) / "run")
         numbers = (arguments.messages, arguments.live, arguments.seed)

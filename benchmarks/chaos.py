@@ -6,7 +6,6 @@ import signal
 import socket
 import statistics
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -18,6 +17,7 @@ import zmq
 
 from benchmarks.proxy import DOWN, UP, Proxy
 from benchmarks.report import show, write
+from benchmarks.trainings import LOOK_S, processes_of, result_of, start_training, wait_for
 from benchmarks.witness import Witness, compare
 from tangram_agent.setup import make_setup
 from tangram_agent.standing import WORKER_COLUMNS, RunStatus
@@ -39,7 +39,6 @@ PAUSE_S = (3.0, 12.0)  # between the recovery from one fault and the next
 FROZEN_S = (3.0, 15.0)
 CUT_S = (5.0, 20.0)
 PATIENCE_S = 120.0
-LOOK_S = 0.3
 # Players are heard of every two seconds, and the status is a second old.
 FRESH_S, SETTLE_S = 3.5, 4.0
 EVALUATES, SILENT = WORKER_COLUMNS.index("evaluator"), WORKER_COLUMNS.index("silent_s")
@@ -101,20 +100,6 @@ class Trial:
         self.faults.setdefault(kind, []).append(took if took < PATIENCE_S else float("inf"))
 
 
-def processes_of(folder: Path) -> dict[int, str]:
-    """Process -> command line, of those that name a run folder."""
-    found = {}
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit() and int(entry.name) != os.getpid():
-            try:
-                line = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode()
-            except OSError:
-                continue  # it ended meanwhile
-            if str(folder) in line:
-                found[int(entry.name)] = line
-    return found
-
-
 def _signal(words: str, number: signal.Signals) -> Callable[[Trial], None]:
     def strike(trial: Trial) -> None:
         for pid in trial.dice.sample(trial.pids(words), k=1) if trial.pids(words) else []:
@@ -172,7 +157,7 @@ KINDS: dict[str, Callable[[Trial], None]] = {
 }
 
 
-def run_chaos(minutes: float, seed: int, out: Path | None, folder: Path) -> None:
+def run_chaos(minutes: float, seed: int, out: Path | None, folder: Path) -> int:
     """Train under faults, compare with an undisturbed training, and report.
 
     Args:
@@ -180,6 +165,9 @@ def run_chaos(minutes: float, seed: int, out: Path | None, folder: Path) -> None
         seed: of the dice, and of both trainings.
         out: JSON file.
         folder: for the two runs; must not hold any.
+
+    Returns:
+        0 if the run recovered from every fault and nothing was lost, doubled or left, else 1.
     """
     disturbed, straight = folder / "disturbed", folder / "straight"
     with socket.create_server(("127.0.0.1", 0)) as probe:
@@ -199,22 +187,26 @@ def run_chaos(minutes: float, seed: int, out: Path | None, folder: Path) -> None
         status = launcher.wait(PATIENCE_S)
     left = len(trial.pids(""))
     delivery = compare(disturbed, witness)
-    result = _result(disturbed)
+    result = result_of(disturbed)
     start_training(straight, f"seed={seed}", f"max_updates={result['updates']}", *SETTINGS).wait()
+    unhealed = sum(took == float("inf") for times in trial.faults.values() for took in times)
     rows = [_row(kind, times) for kind, times in sorted(trial.faults.items())]
     show("faults, and seconds until the run was whole again", rows)
     outcome = {
         "faults": sum(map(len, trial.faults.values())),
+        "not_recovered_from": unhealed,
         **delivery,
         "witness_error": str(witness.error or ""),
         "launcher_status": status,
         "processes_left": left,
         "updates": result["updates"],
         "reward": result["mean_reward"],
-        "reward_undisturbed": _result(straight)["mean_reward"],
+        "reward_undisturbed": result_of(straight)["mean_reward"],
     }
     show("outcome", [{"what": name, "value": value} for name, value in outcome.items()])
     write(out, {"kinds": rows, "outcome": outcome, "minutes": minutes, "seed": seed})
+    bad = ("not_recovered_from", "lost", "doubled", "witness_error", "launcher_status")
+    return int(any(outcome[name] for name in (*bad, "processes_left")))
 
 
 def _rage(trial: Trial, seconds: float) -> None:
@@ -239,25 +231,3 @@ def _row(kind: str, times: list[float]) -> dict[str, Any]:
         "median": statistics.median(known) if known else float("nan"),
         "most": max(known, default=float("nan")),
     }
-
-
-def start_training(folder: Path, *settings: str) -> "subprocess.Popen[bytes]":
-    """tangram-train in the background; what it says goes to `told` in its folder."""
-    folder.mkdir(parents=True)
-    command = [Path(sys.executable).with_name("tangram-train"), f"run_dir={folder}", *settings]
-    with (folder / "told").open("wb") as told:
-        return subprocess.Popen(command, stdout=told, stderr=told, start_new_session=True)
-
-
-def wait_for(path: Path, process: "subprocess.Popen[bytes]") -> None:
-    """Wait for a file of a training that runs; TangramError if that ends before."""
-    while not path.exists():
-        if process.poll() is not None:
-            raise TangramError(f"the training ended before {path} was there")
-        time.sleep(LOOK_S)
-
-
-def _result(folder: Path) -> dict[str, Any]:
-    content = yaml.safe_load((folder / "result.json").read_text())
-    assert isinstance(content, dict)
-    return content

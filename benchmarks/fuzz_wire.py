@@ -11,8 +11,8 @@ import numpy as np
 import yaml
 import zmq
 
-from benchmarks.chaos import start_training, wait_for
 from benchmarks.report import show, write
+from benchmarks.trainings import start_training, wait_for
 from tangram_agent.decoding import decode_from_worker
 from tangram_agent.payloads import EpisodeSpec
 from tangram_agent.setup import Setup, make_setup

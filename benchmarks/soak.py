@@ -1,14 +1,13 @@
 """An hour of training: memory and open files of every process, drawn."""
 
-import json
 import statistics
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.chaos import processes_of, start_training, wait_for
 from benchmarks.report import show, write
+from benchmarks.trainings import processes_of, result_of, start_training, wait_for
 from experiments.report.style import COLOURS, WIDTH_IN, drawing, empty_figure, save
 
 SETTINGS = ("workers=2", "agent.replay_capacity=20000", "service.checkpoint_minutes=1")
@@ -46,7 +45,7 @@ def run_soak(minutes: float, seed: int, out: Path | None, folder: Path) -> int:
     status = launcher.wait(120)
     rows = [_row(name, points, minutes) for name, points in sorted(samples.items())]
     show("memory and open files after the first quarter", rows)
-    result = json.loads((folder / "result.json").read_text())
+    result = result_of(folder)
     print(f"{result['episodes']:,} episodes, {result['updates']:,} updates, ended with {status}")
     write(
         out,

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Thread
 
-from tangram_agent.config import RECYCLED_STATUS
 from tangram_agent.lifeline import Lifeline
 
 # A process that lived for so long starts with a clean record.
@@ -18,6 +17,7 @@ STEADY_S = 60.0
 MAX_RESTARTS = 5
 FIRST_DELAY_S = 0.5
 MAX_DELAY_S = 30.0
+HUNG_STATUS = 1  # of a watchdog, though others use it, too
 USAGE_STATUS = 2
 TAIL_LINES = 12
 STOPPED = "T"
@@ -93,9 +93,9 @@ class Child:
         Status 2 is wrong input, which does not mend itself.
         """
         now_s = time.monotonic()
-        # One that only hung from its beginning did not live longer than its watchdog let it.
-        hung_s = 0.0 if status == RECYCLED_STATUS else self.patience_s
-        if now_s - self._started_s >= STEADY_S + hung_s:
+        # One that hung from its beginning lived for as long as its watchdog let it.
+        hung = status == HUNG_STATUS or self._frozen_s > 0.0
+        if now_s - self._started_s >= STEADY_S + (self.patience_s if hung else 0.0):
             self.restarts = 0
         if status == USAGE_STATUS or self.restarts >= MAX_RESTARTS:
             return False

@@ -138,7 +138,12 @@ def test_a_process_that_is_stopped_for_a_while_is_left_alone() -> None:
 @pytest.mark.fast
 def test_a_process_that_only_hung_has_no_steady_life() -> None:
     made = Child("worker", [], patience_s=300.0)
-    for lived_s, restarts in ((300.0, 1), (359.0, 2), (360.0, 1)):
+    lives = [(300.0, 1, 1), (359.0, 1, 2), (360.0, 1, 1), (59.0, -9, 2), (60.0, -9, 1)]
+    for lived_s, status, restarts in lives:
         made._started_s = time.monotonic() - lived_s
-        assert made.plan_restart(1)
+        assert made.plan_restart(status)
         assert made.restarts == restarts
+    made._frozen_s = 300.0  # and was killed for that
+    made._started_s = time.monotonic() - 300.0
+    assert made.plan_restart(-9)
+    assert made.restarts == 2
