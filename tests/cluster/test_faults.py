@@ -14,6 +14,8 @@ import pytest
 import zmq
 
 from benchmarks.proxy import DOWN, UP, Proxy
+from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
+from tangram_agent.standing import WORKER_COLUMNS
 from tangram_sim.errors import TangramError
 from tests.cluster.players import (
     LIMIT_S,
@@ -29,6 +31,10 @@ from tests.cluster.players import (
 )
 from tests.cluster.processes import BIN, all_ended, pids_of, started, wait_for_file
 from worker.status import ask_status
+
+EVALUATOR, INDEX, INCARNATION, EPISODES = map(
+    WORKER_COLUMNS.index, ("evaluator", "index", "incarnation", "episodes")
+)
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(130)]
 
@@ -184,6 +190,42 @@ def fill(path: Path) -> None:
                     pass
             except OSError:
                 continue
+
+
+def test_a_worker_that_is_killed_while_it_plays_comes_back(tmp_path: Path) -> None:
+    """Real workers with the engine; episodes of theirs that never arrived are all that is lost."""
+    folder = tmp_path / "run"
+    settings = (
+        *("workers=2", "agent.learning_starts=100", "agent.replay_capacity=100000"),
+        *("agent.updates_per_transition=0.02", "max_updates=100000"),
+    )
+    with (
+        zmq.Context() as context,
+        started("tangram-train", f"run_dir={folder}", *settings, cwd=tmp_path) as process,
+    ):
+        wait_for_file(folder / "connection.json", process)
+
+        def plays(incarnation: int) -> bool:
+            rows = ask_status(str(folder), context, 5.0).workers
+            players = {int(r[INDEX]): r for r in rows if not r[EVALUATOR] and r[EPISODES]}
+            return len(players) == 2 and players[1][INCARNATION] == incarnation
+
+        for incarnation in (1, 2):
+            until([], lambda life=incarnation: plays(life))
+            if incarnation == 1:
+                (pid,) = (p for p in pids_of(folder) if b"index=1" in command_line(p))
+                os.kill(pid, signal.SIGKILL)
+        process.terminate()
+        assert process.wait(LIMIT_S) == 0
+    content = load_checkpoint(list_checkpoints(folder / "checkpoints")[-1])
+    copies = 1 + sum(twin.copies for twin in setup_of(folder).agent.hindsight)
+    assert content.counters["episodes"] * copies == len(content.arrays["replay"]["reward"])
+    assert content.counters["hub"]["player/1"]["incarnation"] == 2
+    assert pids_of(folder) == []
+
+
+def command_line(pid: int) -> bytes:
+    return Path(f"/proc/{pid}/cmdline").read_bytes()
 
 
 def test_no_process_is_left_of_a_training_whose_launcher_was_killed(tmp_path: Path) -> None:
