@@ -64,6 +64,7 @@ class Hub:
         info: WelcomeInfo,
         silence_s: float = 30.0,
         keys: Keys | None = None,
+        weights_port: int = 0,
     ) -> None:
         """Open the sockets.
 
@@ -73,6 +74,7 @@ class Hub:
             info: what joiners are told, and must agree with.
             silence_s: after which a peer is forgotten.
             keys: for encrypted sockets, None for plain ones.
+            weights_port: of the PUB, 0 for any.
         """
         self.epoch = secrets.token_hex(8)
         self._info, self._silence_s = info, silence_s
@@ -81,7 +83,7 @@ class Hub:
         self._version = -1
         self._stop_reason: str | None = None
         self._status: list[bytes] | None = None
-        self._post = Post(bind, port, keys)
+        self._post = Post(bind, port, keys, weights_port)
         self._sockets, self.counters = self._post.sockets, self._post.counters
         self._orders = Orders(self._post)
         self._intake = Intake(self._post, self._registry, info.window)

@@ -1,5 +1,6 @@
 """The parts of a run, made or restored, before anything moves."""
 
+import socket
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from master.record import Record
 from master.recovery import journal_run_id, read_journal
 from master.rundir import RunFolder
 from master.trainer import Trainer, choose_device
+from tangram_agent.addresses import reachable, with_host
 from tangram_agent.config import ServiceConfig
 from tangram_agent.payloads import EpisodeSpec
 from tangram_agent.setup import Setup
@@ -78,12 +80,12 @@ class Parts:
     def connection(self) -> dict[str, str]:
         """What a worker needs to find this master, and to be let in."""
         where = {
-            "endpoint": self.hub.endpoint,
-            "weights_endpoint": self.hub.weights_endpoint,
+            "endpoint": self._announced(self.hub.endpoint),
+            "weights_endpoint": self._announced(self.hub.weights_endpoint),
             "run_id": self.record.run_id,
         }
         if self.health is not None:
-            where["http"] = self.health.url
+            where["http"] = reachable(self.health.url, self._host)
         if self.keys is None:
             return where
         return where | {
@@ -91,6 +93,14 @@ class Parts:
             "public_key": self.keys.worker_public,
             "secret_key": self.keys.worker_secret,
         }
+
+    @property
+    def _host(self) -> str:
+        return self.config.service.host or socket.gethostname()
+
+    def _announced(self, endpoint: str) -> str:
+        named = bool(self.config.service.host)
+        return with_host(endpoint, self._host) if named else reachable(endpoint, self._host)
 
     def close(self) -> None:
         """Close the sockets and the journal."""
@@ -159,7 +169,8 @@ def _open(
         window=service.window,
         lockstep=lockstep is not None,
     )
-    hub = opened.enter_context(Hub(service.bind, service.port, info, service.silence_seconds, keys))
+    place, patience_s = (service.bind, service.port), service.silence_seconds
+    hub = opened.enter_context(Hub(*place, info, patience_s, keys, service.weights_port))
     health = None
     if service.http_port != OFF:
         health = opened.enter_context(closing(Health(service.http_bind, service.http_port)))

@@ -14,9 +14,9 @@ class Post:
         counters: traffic and refusals by name.
     """
 
-    def __init__(self, bind: str, port: int, keys: Keys | None) -> None:
+    def __init__(self, bind: str, port: int, keys: Keys | None, weights_port: int) -> None:
         self.counters = Tally()
-        self.sockets = Sockets(bind, port, self.counters, keys)
+        self.sockets = Sockets(bind, port, self.counters, keys, weights_port)
 
     def send(self, identity: bytes, answer: Plain) -> None:
         """Send to a peer, unless it is gone or does not read."""

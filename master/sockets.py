@@ -26,13 +26,20 @@ class Sockets:
         weights_endpoint: of the PUB.
     """
 
-    def __init__(self, bind: str, port: int, counters: Tally, keys: Keys | None = None) -> None:
+    def __init__(
+        self,
+        bind: str,
+        port: int,
+        counters: Tally,
+        keys: Keys | None = None,
+        weights_port: int = 0,
+    ) -> None:
         self._counters = counters
         self._context = zmq.Context()
         self._doorkeeper = Doorkeeper(self._context, keys, counters) if keys else None
         try:
-            self._router = self._open(zmq.ROUTER, bind, port)
-            self._pub = self._open(zmq.PUB, bind, 0)
+            self._router = self._open(zmq.ROUTER, bind, port, "service.port")
+            self._pub = self._open(zmq.PUB, bind, weights_port, "service.weights_port")
         except ConfigError:
             self._close(0)
             raise
@@ -75,7 +82,7 @@ class Sockets:
             self._doorkeeper.close()
         self._context.destroy(linger=linger_ms)
 
-    def _open(self, kind: int, bind: str, port: int) -> zmq.Socket[bytes]:
+    def _open(self, kind: int, bind: str, port: int, setting: str) -> zmq.Socket[bytes]:
         socket = self._context.socket(kind)
         socket.setsockopt(zmq.LINGER, LINGER_MS)
         socket.setsockopt(zmq.SNDHWM, HIGH_WATER)
@@ -94,11 +101,11 @@ class Sockets:
         except zmq.ZMQError as error:
             if error.errno == zmq.EADDRINUSE:
                 raise ConfigError(
-                    f"port {port} of {bind} is in use: choose another with service.port=..., "
+                    f"port {port} of {bind} is in use: choose another with {setting}=..., "
                     "or 0 for any free one"
                 ) from None
             raise ConfigError(
                 f"cannot listen on {bind}, port {port} ({error.strerror}): set service.bind to an "
-                "address of this machine, such as 127.0.0.1, and service.port to one you may use"
+                f"address of this machine, such as 127.0.0.1, and {setting} to one you may use"
             ) from None
         return socket

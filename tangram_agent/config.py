@@ -156,7 +156,10 @@ class ServiceConfig:
 
     Attributes:
         bind: address that the master listens on.
-        port: of the master's ROUTER socket, 0 for any free one; PUB takes any free one.
+        port: of the master's ROUTER socket, 0 for any free one.
+        weights_port: of its PUB socket, 0 for any free one.
+        host: name or address that workers find the master under; empty: `bind`, or the name of the
+            master's machine where `bind` stands for all of its addresses.
         mode: async (nobody waits for anybody), or lockstep (the same seed gives the same weights).
         lockstep_workers: players that lockstep waits for; tangram-train knows it.
         security: curve (encrypted, and only for who has the run's connection file), plain, or
@@ -188,6 +191,8 @@ class ServiceConfig:
 
     bind: str = "127.0.0.1"
     port: int = 0
+    weights_port: int = 0
+    host: str = ""
     mode: str = "async"
     lockstep_workers: int = 0
     security: str = "auto"
@@ -216,6 +221,7 @@ class ServiceConfig:
 
     def __post_init__(self) -> None:
         check_range("service.port", self.port, 0, 65535)
+        check_range("service.weights_port", self.weights_port, 0, 65535)
         # Heartbeats come every two seconds.
         check_range("service.silence_seconds", self.silence_seconds, 3.0)
         check_range("service.http_port", self.http_port, -1, 65535)

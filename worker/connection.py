@@ -11,7 +11,6 @@ FILE_NAME = "connection.json"
 SCHEME = "tcp://"
 KEYS = ("server_key", "public_key", "secret_key")
 KEY = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
-WILDCARDS = ("0.0.0.0", "*", "[::]")  # noqa: S104  # replaced, never bound
 
 
 @dataclass(frozen=True)
@@ -76,15 +75,6 @@ def estranged(connect: str, endpoint: str) -> str:
         f"wrong or stale connection file: what answers at {endpoint} does not take the keys of "
         f"{connect}; take the file of a master that is running"
     )
-
-
-def reachable(endpoint: str, via: str) -> str:
-    """An endpoint as seen from here: a wildcard host becomes the host of the endpoint `via`."""
-    host, _, port = endpoint.removeprefix(SCHEME).rpartition(":")
-    if host not in WILDCARDS:
-        return endpoint
-    own_host = via.removeprefix(SCHEME).rpartition(":")[0]
-    return f"{SCHEME}{own_host}:{port}"
 
 
 def _checked(endpoint: str, source: str) -> str:

@@ -10,6 +10,7 @@ import secrets
 import time
 from collections import Counter
 
+from tangram_agent.addresses import host_of, reachable
 from tangram_agent.decoding import decode_from_master
 from tangram_agent.frames import ProtocolError
 from tangram_agent.payloads import WeightShapes
@@ -33,7 +34,6 @@ from tangram_agent.wire import (
 )
 from tangram_sim.errors import TangramError, WireError
 from worker.channel import Channel
-from worker.connection import reachable
 from worker.inbox import Inbox
 from worker.line import Line
 from worker.spool import Spool
@@ -229,7 +229,7 @@ class Talk:
         self.welcome, self.joined, self.line.stranger = welcome, True, False
         self.spool.window = min(self._window, welcome.window)
         self.inbox.begin(welcome.epoch)
-        channel.subscribe(reachable(welcome.weights_endpoint, found.endpoint))
+        channel.subscribe(reachable(welcome.weights_endpoint, host_of(found.endpoint)))
         self._want_weights()
         self._heartbeat_at = now + self._timing.heartbeat_s
         self._resend(now)

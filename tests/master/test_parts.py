@@ -1,5 +1,6 @@
 """A run's parts: what a master that was killed left behind, and what it comes to."""
 
+import socket
 from collections.abc import Iterator
 from contextlib import closing
 from functools import partial
@@ -142,6 +143,42 @@ def test_outside_of_loopback_the_connection_carries_keys(tmp_path: Path) -> None
             name: connection[name] for name in names
         }
     assert told == 2 * [UNBOUNDED, "a new run begins"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "host"),
+    [
+        ({"bind": EVERYWHERE}, socket.gethostname()),
+        ({"bind": EVERYWHERE, "host": "learner.lan"}, "learner.lan"),
+        ({"bind": "127.0.0.1"}, "127.0.0.1"),
+        ({"bind": "127.0.0.1", "host": "::1"}, "[::1]"),
+    ],
+)
+def test_the_connection_names_a_host_that_others_reach(
+    tmp_path: Path, settings: dict[str, str], host: str
+) -> None:
+    with closing(parts(tmp_path, [], http_bind=settings["bind"], **settings)) as made:
+        connection = made.connection()
+        ports = [int(made.hub.endpoint.rpartition(":")[2])]
+        ports.append(int(made.hub.weights_endpoint.rpartition(":")[2]))
+    assert connection["endpoint"] == f"tcp://{host}:{ports[0]}"
+    assert connection["weights_endpoint"] == f"tcp://{host}:{ports[1]}"
+    http_host = host if settings["bind"] == EVERYWHERE else "127.0.0.1"
+    assert connection["http"].startswith(f"http://{http_host}:")
+
+
+def test_both_ports_can_be_fixed_and_the_wrong_one_is_named(tmp_path: Path) -> None:
+    with (
+        socket.create_server(("127.0.0.1", 0)) as one,
+        socket.create_server(("127.0.0.1", 0)) as two,
+    ):
+        ports = {"port": one.getsockname()[1], "weights_port": two.getsockname()[1]}
+    with closing(parts(tmp_path / "a", [], **ports)) as made:
+        found = (made.hub.endpoint, made.hub.weights_endpoint)
+        assert [int(endpoint.rpartition(":")[2]) for endpoint in found] == list(ports.values())
+        for name, port in ports.items():
+            with pytest.raises(ConfigError, match=rf"in use: choose another with service\.{name}="):
+                parts(tmp_path / name, [], **{name: port})
 
 
 @pytest.mark.parametrize(("bind", "warned"), [(EVERYWHERE, True), ("127.0.0.1", False)])

@@ -11,7 +11,7 @@ from tangram_agent.payloads import encode_weights
 from tangram_agent.types import Weights
 from tangram_sim.errors import RunError, WireError
 from tests.agent.messages import SHAPES, weights
-from worker.connection import Connection, find_connection, reachable
+from worker.connection import Connection, find_connection
 from worker.inbox import Inbox
 from worker.spool import Spool
 
@@ -79,19 +79,6 @@ def test_an_address_in_a_file_is_checked(tmp_path: Path) -> None:
     path.write_text('{"endpoint": "ipc://x", "run_id": "r"}')
     with pytest.raises(RunError, match=r"'ipc://x' \(from .*c.json\) is no address"):
         find_connection(str(path))
-
-
-@pytest.mark.parametrize(
-    ("endpoint", "via", "seen"),
-    [
-        ("tcp://10.0.0.1:5", "tcp://learner:1", "tcp://10.0.0.1:5"),
-        ("tcp://0.0.0.0:5", "tcp://learner:1", "tcp://learner:5"),
-        ("tcp://*:5", "tcp://learner:1", "tcp://learner:5"),
-        ("tcp://[::]:5", "tcp://[fe80::1]:1", "tcp://[fe80::1]:5"),
-    ],
-)
-def test_a_wildcard_is_the_host_that_was_reached(endpoint: str, via: str, seen: str) -> None:
-    assert reachable(endpoint, via) == seen
 
 
 @given(st.lists(st.one_of(st.none(), st.integers(1, 12)), max_size=40))

@@ -1,0 +1,26 @@
+"""Addresses of sockets, as those on other machines see them."""
+
+WILDCARDS = ("0.0.0.0", "*", "[::]")  # noqa: S104  # replaced, never bound
+
+
+def host_of(address: str) -> str:
+    """The host of scheme://host:port; IPv6 in brackets."""
+    return _split(address)[1]
+
+
+def reachable(address: str, host: str) -> str:
+    """The address, whose host becomes this one if it stands for all of a machine's addresses."""
+    return with_host(address, host) if host_of(address) in WILDCARDS else address
+
+
+def with_host(address: str, host: str) -> str:
+    """The address with another host; a plain IPv6 address gets its brackets."""
+    scheme, _, port = _split(address)
+    bracketed = f"[{host}]" if ":" in host and not host.startswith("[") else host
+    return f"{scheme}://{bracketed}:{port}"
+
+
+def _split(address: str) -> tuple[str, str, str]:
+    scheme, _, rest = address.partition("://")
+    host, _, port = rest.rpartition(":")
+    return scheme, host, port

@@ -1,0 +1,36 @@
+"""Addresses as others see them."""
+
+import pytest
+
+from tangram_agent.addresses import host_of, reachable, with_host
+
+pytestmark = pytest.mark.fast
+
+
+@pytest.mark.parametrize(
+    ("address", "host", "seen"),
+    [
+        ("tcp://10.0.0.1:5", "learner", "tcp://10.0.0.1:5"),
+        ("tcp://0.0.0.0:5", "learner", "tcp://learner:5"),
+        ("http://0.0.0.0:5", "learner", "http://learner:5"),
+        ("tcp://*:5", "learner", "tcp://learner:5"),
+        ("tcp://[::]:5", "[fe80::1]", "tcp://[fe80::1]:5"),
+        ("tcp://[::]:5", "fe80::1", "tcp://[fe80::1]:5"),
+    ],
+)
+def test_a_wildcard_becomes_a_host(address: str, host: str, seen: str) -> None:
+    assert reachable(address, host) == seen
+
+
+@pytest.mark.parametrize(
+    ("address", "host"),
+    [
+        ("tcp://10.0.0.1:5", "10.0.0.1"),
+        ("tcp://[fe80::1]:5", "[fe80::1]"),
+        ("http://a.b:80", "a.b"),
+    ],
+)
+def test_hosts(address: str, host: str) -> None:
+    assert host_of(address) == host
+    assert with_host(address, "x").count("x") == 1
+    assert with_host(address, host) == address
