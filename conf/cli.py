@@ -17,6 +17,9 @@ import yaml
 from conf.help import Plain, choices, command_name, help_text, setting_names
 from tangram_sim.errors import ConfigError, TangramError
 
+# From the settings of a command: where the groups of a run are named, and these; None for nowhere.
+Stored = Callable[[Plain], tuple[str, Plain] | None]
+
 USAGE_STATUS = 2
 INTERRUPT_STATUS = 130
 CFG_KINDS = ("job", "hydra", "all")
@@ -28,12 +31,13 @@ MISSING_HINTS = {
 }
 
 
-def entry(config_name: str, task: Callable[[Plain], int]) -> int:
+def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None = None) -> int:
     """Run a command and return its exit status.
 
     Args:
         config_name: primary config in this package, without .yaml.
         task: takes the resolved config as plain containers and returns the exit status.
+        stored: the groups of a run that the settings name otherwise than by `from_config`.
 
     Returns:
         The task's status; 2 after a TangramError or a wrong command line, which are told in one
@@ -49,7 +53,7 @@ def entry(config_name: str, task: Callable[[Plain], int]) -> int:
         return 0
     try:
         sys.argv[1:] = _options_first(arguments)
-        return _run(config_name, task)
+        return _run(config_name, task, stored)
     except TangramError as error:
         print(f"{command}: {error}", file=sys.stderr)
         return USAGE_STATUS
@@ -83,7 +87,7 @@ def _options_first(arguments: Sequence[str]) -> list[str]:
     return [*options, *overrides]
 
 
-def _run(config_name: str, task: Callable[[Plain], int]) -> int:
+def _run(config_name: str, task: Callable[[Plain], int], stored: Stored | None) -> int:
     """Hand over to hydra, so that its --multirun and --cfg work as everywhere."""
     import hydra
     from hydra.errors import HydraException
@@ -95,7 +99,7 @@ def _run(config_name: str, task: Callable[[Plain], int]) -> int:
 
     def job(config: DictConfig) -> None:
         try:
-            statuses.append(task(_plain(config)))
+            statuses.append(task(_plain(config, stored)))
         except (TangramError, OSError, MemoryError) as error:
             # An exception that hydra sees costs two more lines; an exit passes through it.
             errors.append(_as_ours(error))
@@ -129,7 +133,7 @@ def _as_ours(error: Exception) -> TangramError:
     )
 
 
-def _plain(config: Any) -> Plain:
+def _plain(config: Any, stored: Stored | None) -> Plain:
     """Hydra's config as plain containers, with nothing missing and everything resolved.
 
     Raises:
@@ -151,7 +155,7 @@ def _plain(config: Any) -> Plain:
     if HydraConfig.get().mode == RunMode.MULTIRUN and isinstance(plain.get("run_dir"), str):
         # The jobs of one sweep start at one time and share their arguments: a folder for each.
         plain["run_dir"] = f"{plain['run_dir']}/{HydraConfig.get().job.num}"
-    return with_run_config(plain, list(HydraConfig.get().overrides.task))
+    return with_run_config(plain, list(HydraConfig.get().overrides.task), stored)
 
 
 def composed(config_name: str, overrides: Sequence[str]) -> Plain:
@@ -181,51 +185,61 @@ def _mapping(container: object) -> Plain:
 # A run's config in place of the groups
 
 
-def with_run_config(settings: Plain, overrides: Sequence[str]) -> Plain:
+def with_run_config(
+    settings: Plain, overrides: Sequence[str], stored: Stored | None = None
+) -> Plain:
     """Replace the groups by those of the run that `from_config` names; the key itself goes.
 
     Single values that were set on the command line still win.
+
+    Args:
+        settings: of the command.
+        overrides: as they were given.
+        stored: asked for the groups where `from_config` is not set.
 
     Raises:
         ConfigError: no such file, not a run's config, or an override chooses a whole group.
     """
     from omegaconf import OmegaConf
 
-    path = settings.pop("from_config", None)
-    if path is None:
+    found = _from_config(settings) or (None if stored is None else stored(settings))
+    if found is None:
         return settings
-    if not isinstance(path, str):
-        raise ConfigError(f"from_config must be the path of a run's config.yaml, got {path!r}")
+    source, content = found
     sections = [name for name, value in settings.items() if isinstance(value, dict)]
-    stored = _read_run_config(Path(path), sections)
-    chosen, result = OmegaConf.create(settings), OmegaConf.create({**settings, **stored})
+    lacking = [name for name in sections if name not in content]
+    if lacking:
+        raise ConfigError(f"{source} lacks {', '.join(lacking)}: it must come from a run")
+    content = {name: content[name] for name in sections}
+    chosen, result = OmegaConf.create(settings), OmegaConf.create({**settings, **content})
     for override in overrides:
         key = override.lstrip("+~").partition("=")[0]
         section = key.partition(".")[0]
-        if section not in stored:
+        if section not in content:
             continue
         if key == section or override.startswith("~"):
             raise ConfigError(
-                f"from_config chooses {section} already: leave out {override}, "
+                f"{source} chooses {section} already: leave out {override}, "
                 f"or set single values as in {section}.name=value"
             )
         OmegaConf.update(result, key, OmegaConf.select(chosen, key))
     return _mapping(OmegaConf.to_container(result))
 
 
-def _read_run_config(path: Path, sections: Sequence[str]) -> Plain:
+def _from_config(settings: Plain) -> tuple[str, Plain] | None:
+    path = settings.pop("from_config", None)
+    if path is None:
+        return None
+    if not isinstance(path, str):
+        raise ConfigError(f"from_config must be the path of a run's config.yaml, got {path!r}")
+    source = f"from_config={path}"
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
-        raise ConfigError(f"from_config={path}: {error.strerror or error}") from None
+        raise ConfigError(f"{source}: {error.strerror or error}") from None
     except (yaml.YAMLError, UnicodeDecodeError):
-        raise ConfigError(f"from_config={path} is not a YAML file") from None
-    lacking = [n for n in sections if not isinstance(content, dict) or n not in content]
-    if lacking:
-        raise ConfigError(
-            f"from_config={path} lacks {', '.join(lacking)}: name the config.yaml of a run"
-        )
-    return {name: content[name] for name in sections}
+        raise ConfigError(f"{source} is not a YAML file") from None
+    return source, content if isinstance(content, dict) else {}
 
 
 # Errors of the command line in one line

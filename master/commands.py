@@ -16,7 +16,6 @@ def worker_child(folder: RunFolder, role: str, index: int) -> Child:
         override("connect", str(folder.connection)),
         f"index={index}",
         f"role={role}",
-        override("from_config", str(folder.config)),
     ]
     nice = EVALUATOR_NICE if role == "evaluator" else PLAYER_NICE
     return Child(name, arguments, folder.logs / f"{name.replace(' ', '-')}.log", nice)

@@ -11,9 +11,12 @@ import yaml
 from master.journal import segments
 from tangram_agent.checkpoints import list_checkpoints
 from tangram_agent.files import write_whole
+from tangram_agent.setup import SECTIONS
 from tangram_sim.errors import ConfigError
 
 PRIVATE = 0o600
+# What a worker must know of the config.
+SHARED = (*SECTIONS, "service")
 
 
 class RunFolder:
@@ -94,8 +97,15 @@ class RunFolder:
         write_whole(self.config, yaml.safe_dump(dict(resolved), sort_keys=False).encode())
 
     def write_connection(self, connection: Mapping[str, str]) -> None:
-        """Write what a worker needs to find this master; only the user may read it."""
-        write_whole(self.connection, json.dumps(dict(connection), indent=1).encode(), PRIVATE)
+        """Write what a worker needs to take part; only the user may read it.
+
+        Args:
+            connection: where the master is; the settings of the run are added to it.
+        """
+        config = yaml.safe_load(self.config.read_text(encoding="utf-8"))
+        settings = {name: config[name] for name in SHARED if name in config}
+        content = {**connection, "settings": settings}
+        write_whole(self.connection, json.dumps(content, indent=1).encode(), PRIVATE)
 
     def write_result(self, result: Mapping[str, Any]) -> None:
         """Write the scores of the run."""

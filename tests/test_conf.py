@@ -182,6 +182,22 @@ def test_single_values_still_override_a_run_config(stored: Path) -> None:
     assert settings["agent"]["name"] == "mlp"
 
 
+def test_a_command_may_know_other_places_of_a_run_config(stored: Path) -> None:
+    content = yaml.safe_load(stored.read_text())
+    settings = compose("worker", "connect=runs/shared", "service.envs=7")
+
+    def apply_stored(overrides: list[str], content: dict[str, Any] = content) -> dict[str, Any]:
+        return with_run_config(dict(settings), overrides, lambda given: (given["connect"], content))
+
+    made = apply_stored(["service.envs=7"])
+    assert (made["agent"]["name"], made["service"]["envs"], "seed" in made) == ("mlp", 7, False)
+    with pytest.raises(ConfigError, match="runs/shared chooses tokens already: leave out tokens=x"):
+        apply_stored(["tokens=x"])
+    with pytest.raises(ConfigError, match="runs/shared lacks net: it must come from a run"):
+        apply_stored([], {name: value for name, value in content.items() if name != "net"})
+    assert with_run_config(dict(settings), [], lambda _: None)["agent"]["name"] == "tangram"
+
+
 @pytest.mark.parametrize("override", ["agent=paper", "~agent.noise", "tokens=square"])
 def test_choosing_a_group_beside_a_run_config_is_refused(stored: Path, override: str) -> None:
     with pytest.raises(ConfigError, match="from_config chooses"):

@@ -3,6 +3,8 @@
 Everything heavy is imported after the config was composed, so --help and wrong input are instant.
 """
 
+import sys
+from functools import partial
 from pathlib import Path
 
 from conf.cli import entry
@@ -11,7 +13,7 @@ from conf.help import Plain
 
 def worker() -> int:
     """tangram-worker: plays for a master, or scores what it has learned."""
-    return entry("worker", _worker)
+    return entry("worker", _worker, _of_the_run)
 
 
 def status() -> int:
@@ -27,6 +29,19 @@ def evaluate() -> int:
 def play() -> int:
     """tangram-play: draws a finished run at play."""
     return entry("play", _play)
+
+
+def _of_the_run(settings: Plain) -> tuple[str, Plain] | None:
+    """What the connection file says of the run; nothing where only an address is given."""
+    from tangram_agent import lifeline
+    from worker.connection import await_connection
+
+    lifeline.watch()  # already here: a parent may end while the file is waited for
+    connect = settings.get("connect")
+    if not isinstance(connect, str) or not connect.strip() or "://" in connect:
+        return None
+    found = await_connection(connect, partial(print, file=sys.stderr, flush=True)).settings
+    return None if found is None else (f"connect={connect}", dict(found))
 
 
 def _worker(settings: Plain) -> int:

@@ -2,12 +2,18 @@
 
 import json
 import re
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from tangram_sim.errors import RunError
 
 FILE_NAME = "connection.json"
+# A master may still be starting, or wait in a queue.
+PATIENCE_S = 60.0
+LOOK_S = 0.2
 SCHEME = "tcp://"
 KEYS = ("server_key", "public_key", "secret_key")
 KEY = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
@@ -22,6 +28,7 @@ class Connection:
         run_id: that it must have, empty where any will do.
         server_key: the master's public CURVE key, empty where nothing is encrypted.
         public_key, secret_key: the pair of the run's workers.
+        settings: section -> those of the run; None where only an address is known.
     """
 
     endpoint: str
@@ -29,11 +36,14 @@ class Connection:
     server_key: str = ""
     public_key: str = ""
     secret_key: str = field(default="", repr=False)
+    settings: Mapping[str, Any] | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         keys = (self.server_key, self.public_key, self.secret_key)
         if any(keys) and not all(KEY.fullmatch(key) for key in keys):
             raise ValueError("server_key, public_key and secret_key must be 40 characters of Z85")
+        if not isinstance(self.settings, Mapping | None):
+            raise TypeError("settings must be a map")
 
 
 def find_connection(connect: str) -> Connection | None:
@@ -54,7 +64,8 @@ def find_connection(connect: str) -> Connection | None:
         content = json.loads(path.read_text(encoding="utf-8"))
         endpoint = _checked(str(content["endpoint"]), str(path))
         keys = {name: str(content.get(name, "")) for name in KEYS}
-        return Connection(endpoint, str(content["run_id"]), **keys)
+        settings = content.get("settings")
+        return Connection(endpoint, str(content["run_id"]), **keys, settings=settings)
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -62,6 +73,39 @@ def find_connection(connect: str) -> Connection | None:
             f"{path} is no connection file ({error!r}): connect=... takes tcp://host:port, a run "
             f"folder, or the {FILE_NAME} that tangram-master writes into it"
         ) from None
+
+
+def await_connection(
+    connect: str, tell: Callable[[str], None], patience_s: float = PATIENCE_S
+) -> Connection:
+    """The master's address, also when its file is written later.
+
+    Args:
+        connect: see `find_connection`.
+        tell: takes a line for the user.
+        patience_s: most to wait.
+
+    Raises:
+        RunError: neither an address nor a readable connection file, or none in time.
+    """
+    until_s = time.monotonic() + patience_s
+    told = False
+    while (found := find_connection(connect)) is None:
+        if time.monotonic() >= until_s:
+            raise RunError(missing(connect, patience_s))
+        if not told:
+            tell(f"waits for the connection file {connect}")
+            told = True
+        time.sleep(LOOK_S)
+    return found
+
+
+def missing(connect: str, patience_s: float) -> str:
+    """That there is no file, for the user."""
+    return (
+        f"no connection file is at {connect} after {patience_s:g} s: is tangram-master running "
+        "there?"
+    )
 
 
 def estranged(connect: str, endpoint: str) -> str:

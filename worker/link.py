@@ -15,6 +15,7 @@ from tangram_agent.payloads import EpisodeSpec, WeightShapes
 from tangram_agent.types import Episodes, Weights
 from tangram_agent.wire import EpisodeBatch, Go, Scores, Welcome
 from tangram_sim.errors import TangramError
+from worker.connection import missing
 from worker.talk import Talk
 from worker.terms import Introduction, Timing
 
@@ -121,9 +122,10 @@ class Link:
             line = self._talk.line
             if line.stranger:
                 raise TangramError(line.estranged)
-            lacking = "master answers" if line.found else "connection file is"
+            if not line.found:
+                raise TangramError(missing(line.place, self._timing.join_s))
             raise TangramError(
-                f"no {lacking} at {line.place} after {self._timing.join_s:g} s: "
+                f"no master answers at {line.place} after {self._timing.join_s:g} s: "
                 "is tangram-master running there?"
             )
         return joined

@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from worker.connection import PATIENCE_S
+
 
 @dataclass(frozen=True)
 class Timing:
@@ -17,7 +19,7 @@ class Timing:
         lost_s: without an answer, over all connections, before giving up.
     """
 
-    join_s: float = 60.0
+    join_s: float = PATIENCE_S
     retry_s: float = 1.0
     heartbeat_s: float = 2.0
     resend_s: float = 10.0

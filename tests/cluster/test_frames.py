@@ -126,12 +126,12 @@ def test_strangers_with_stale_or_foreign_keys_are_turned_away(tmp_path: Path) ->
         with players(setup_of(one), one) as made:
             more_acknowledged(made, 3)
             line = f"wrong or stale connection file: what answers at {mine['endpoint']} does not"
-            arguments = (f"connect={stale}", f"from_config={one / 'config.yaml'}")
-            with started("tangram-worker", *arguments, cwd=tmp_path, err=tmp_path / "said") as who:
-                until(made, lambda: line in (tmp_path / "said").read_text())
+            said = tmp_path / "said"
+            with started("tangram-worker", f"connect={stale}", cwd=tmp_path, err=said) as who:
+                until(made, lambda: line in said.read_text())
                 assert who.poll() is None  # it waits for the file to become right
                 stale.write_text(json.dumps(mine))
-                until(made, lambda: "joined run" in (tmp_path / "said").read_text())
+                until(made, lambda: "joined run" in said.read_text())
             with zmq.Context() as context, pytest.raises(TangramError, match="wants keys"):
                 ask_status(mine["endpoint"], context)
             more_acknowledged(made, 3)

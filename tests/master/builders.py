@@ -173,6 +173,7 @@ def loop(
     settings = MasterConfig(str(folder), service=ServiceConfig(**lag | (service or {})), **config)
     run_folder = RunFolder(folder)
     run_folder.prepare("auto")
+    run_folder.write_config({})
     learner = trainer(made, lag_updates=settings.service.lag_updates)
     parts = Parts(
         settings,

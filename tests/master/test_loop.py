@@ -244,6 +244,7 @@ def test_the_connection_is_there_while_the_loop_runs(tmp_path: Path) -> None:
         "endpoint": hub.endpoint,
         "weights_endpoint": hub.weights_endpoint,
         "run_id": made.parts.record.run_id,
+        "settings": {},
     }
     assert seen == [(content, 0o600)]
     assert not path.exists()

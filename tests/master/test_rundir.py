@@ -74,6 +74,8 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
 
 def test_only_the_user_may_read_the_connection(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
+    config = {"tokens": {"shapes": ["square"]}, "service": {"envs": 4}, "seed": 0}
+    folder.write_config(config)
     folder.connection.touch(0o644)
     before = os.umask(0)
     try:
@@ -81,4 +83,6 @@ def test_only_the_user_may_read_the_connection(tmp_path: Path) -> None:
     finally:
         os.umask(before)
     assert stat.S_IMODE(folder.connection.stat().st_mode) == 0o600
-    assert json.loads(folder.connection.read_text()) == {"endpoint": "tcp://127.0.0.1:5555"}
+    settings = {name: config[name] for name in ("tokens", "service")}
+    content = {"endpoint": "tcp://127.0.0.1:5555", "settings": settings}
+    assert json.loads(folder.connection.read_text()) == content

@@ -11,7 +11,7 @@ from tangram_agent.payloads import encode_weights
 from tangram_agent.types import Weights
 from tangram_sim.errors import RunError, WireError
 from tests.agent.messages import SHAPES, weights
-from worker.connection import Connection, find_connection
+from worker.connection import Connection, await_connection, find_connection
 from worker.inbox import Inbox
 from worker.spool import Spool
 
@@ -72,6 +72,33 @@ def test_a_file_that_is_no_connection_file(tmp_path: Path, content: str, reason:
         find_connection(str(path))
     assert str(caught.value).startswith(f"{path} is no connection file ({reason}")
     assert str(caught.value).endswith(REMEDY)
+
+
+def test_the_settings_of_the_run_stand_in_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "c.json"
+    content = {"endpoint": "tcp://h:1", "run_id": "r", "settings": {"net": {"width": 3}}}
+    path.write_text(json.dumps(content))
+    found = await_connection(str(path), pytest.fail)
+    assert found.settings == {"net": {"width": 3}}
+    assert found == Connection("tcp://h:1", "r")  # a master that moved is one with another address
+    path.write_text(json.dumps(content | {"settings": 3}))
+    with pytest.raises(RunError, match=r"settings must be a map"):
+        find_connection(str(path))
+
+
+def test_a_file_that_comes_late_is_waited_for(tmp_path: Path) -> None:
+    path = tmp_path / "c.json"
+    told: list[str] = []
+
+    def tell(line: str) -> None:
+        told.append(line)
+        path.write_text(json.dumps({"endpoint": "tcp://h:1", "run_id": "r"}))
+
+    assert await_connection(str(path), tell, 60.0) == Connection("tcp://h:1", "r")
+    assert told == [f"waits for the connection file {path}"]
+    path.unlink()
+    with pytest.raises(RunError, match=r"no connection file is at .*c.json after 0.1 s"):
+        await_connection(str(path), lambda _: None, 0.1)
 
 
 def test_an_address_in_a_file_is_checked(tmp_path: Path) -> None:
