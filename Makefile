@@ -4,6 +4,7 @@ SHELL := /bin/bash
 BIN := .venv/bin
 ARGS ?=
 BUDGET ?= laptop
+SCRIPTS := .ci/install .ci/run $(shell find docker slurm -name "*.sh" -o -name "*.sbatch" 2>/dev/null)
 
 .DEFAULT_GOAL := help
 .PHONY: help train test lint format paper bench clean
@@ -18,11 +19,13 @@ train: .venv/.installed-run  ## train an agent on this machine; settings go into
 test: lint  ## lint, then all tests, a short training through real processes included
 	@$(BIN)/python -m pytest $(ARGS)
 
-lint: .venv/.installed-dev  ## ruff, mypy and import-linter; changes nothing
+lint: .venv/.installed-dev  ## ruff, mypy, import-linter, hadolint and shellcheck; changes nothing
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
+	$(BIN)/hadolint docker/Dockerfile
+	$(BIN)/shellcheck $(SCRIPTS)
 
 format: .venv/.installed-dev  ## sort and lay out the code
 	$(BIN)/ruff check --fix .

@@ -1,0 +1,40 @@
+"""Health of a container: the master answers, or the worker's master can be reached.
+
+    health.py master|worker [CONNECTION_FILE]
+
+A worker that makes no progress ends itself, so all that remains to ask is whether its master is
+there. Only the standard library is loaded: this runs every few seconds.
+"""
+
+import json
+import socket
+import sys
+import urllib.request
+from pathlib import Path
+from urllib.parse import urlsplit
+
+RUNS = Path("/runs")
+TIMEOUT_S = 4.0
+
+
+def main() -> str | None:
+    """What is wrong, or nothing."""
+    role = sys.argv[1]
+    files = [Path(name) for name in sys.argv[2:]] or list(RUNS.glob("*/connection.json"))
+    if not files:
+        return "no connection file: no master runs"
+    content = json.loads(max(files, key=lambda path: path.stat().st_mtime).read_text())
+    try:
+        if role == "master":
+            port = urlsplit(content["http"]).port
+            urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", None, TIMEOUT_S).close()
+        else:
+            place = urlsplit(content["endpoint"])
+            socket.create_connection((place.hostname, place.port), TIMEOUT_S).close()
+    except OSError as error:  # of urllib, too: 503 is one
+        return str(error)
+    return None
+
+
+if __name__ == "__main__":
+    sys.exit(main())  # a text goes to stderr, with status 1

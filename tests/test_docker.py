@@ -1,0 +1,106 @@
+"""The images and the compose file, as far as they can be judged without a docker daemon."""
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from hydra import compose, initialize_config_module
+
+pytestmark = pytest.mark.fast
+
+ROOT = Path(__file__).parents[1]
+DOCKER = ROOT / "docker"
+COMPOSE: dict[str, Any] = yaml.safe_load((DOCKER / "docker-compose.yml").read_text())
+# Neither plays nor learns: the gymnasium environment, and the figures of reports.
+LEFT_OUT = {"gymnasium", "matplotlib"}
+
+
+def requirements(name: str) -> set[str]:
+    """Names in a list of an image, those that it refers to included."""
+    found: set[str] = set()
+    for line in (DOCKER / name).read_text().splitlines():
+        if line.startswith("-r "):
+            found |= requirements(line.removeprefix("-r "))
+        elif line and not line.startswith("#"):
+            found.add(line)
+    return found
+
+
+def defaults() -> dict[str, str]:
+    lines = (DOCKER / ".env").read_text().splitlines()
+    return dict(line.split("=", 1) for line in lines if line and not line.startswith("#"))
+
+
+def filled(text: str) -> str:
+    """A command with the defaults of docker/.env."""
+    return re.sub(r"\$\{(\w+)(?::-[^}]*)?\}", lambda match: defaults()[match[1]], text)
+
+
+def stages() -> dict[str, str]:
+    """Stage -> what it is made from."""
+    text = (DOCKER / "Dockerfile").read_text()
+    return {name: base for base, name in re.findall(r"^FROM (\S+) AS (\S+)", text, re.MULTILINE)}
+
+
+def test_images_have_all_that_the_project_needs_and_nothing_else() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    wanted = {re.match(r"[\w-]+", text)[0] for text in project["dependencies"]}  # type: ignore[index]
+    assert requirements("worker.txt") | requirements("master.txt") == wanted - LEFT_OUT
+    assert "tensorboard" not in requirements("worker.txt")
+    assert "pybullet" not in requirements("master.txt")
+
+
+def test_the_targets_are_there() -> None:
+    assert {"worker", "master-cpu", "master-gpu", "test"} <= stages().keys()
+    assert list(stages())[-1] == "master-gpu"  # a builder that makes all stages stops before it
+    built = {s["build"]["target"] for s in COMPOSE["services"].values()}
+    assert built == {"worker", "master-cpu", "master-gpu"}
+
+
+def test_nothing_runs_as_root() -> None:
+    text = (DOCKER / "Dockerfile").read_text()
+    finals = re.split(r"^FROM ", text, flags=re.MULTILINE)
+    for stage in finals:
+        if re.match(r"\S+ AS (worker|master-cpu|test)\n", stage):
+            assert "\nUSER 10001\n" in stage
+
+
+@pytest.mark.parametrize("service", ["master", "master-gpu", "worker", "evaluator"])
+def test_commands_of_the_compose_file_are_settings_that_exist(service: str) -> None:
+    primary = "master" if service.startswith("master") else "worker"
+    overrides = filled(COMPOSE["services"][service]["command"]).split()
+    with initialize_config_module("conf", version_base="1.3"):
+        compose(primary, overrides)
+
+
+def test_the_command_of_the_master_image_exists() -> None:
+    text = (DOCKER / "Dockerfile").read_text().replace("\\\n", "")
+    commands = [
+        re.findall(r'"([^"]+)"', line) for line in re.findall(r"^CMD (.*)$", text, re.MULTILINE)
+    ]
+    with initialize_config_module("conf", version_base="1.3"):
+        compose("worker", commands[0])
+        compose("master", commands[1])
+
+
+def test_every_variable_has_a_default_that_the_file_shows() -> None:
+    text = (DOCKER / "docker-compose.yml").read_text()
+    used = dict(re.findall(r"\$\{(\w+):-([^}]*)\}", text))
+    shown = defaults()
+    assert {name: shown[name] for name in used} == used
+    assert shown.keys() - used.keys() == {"COMPOSE_PROFILES"}
+    assert len(re.findall(r"\$\{", text)) == len(re.findall(r"\$\{\w+:-", text))
+
+
+def test_ports_reach_this_machine_only() -> None:
+    for service in COMPOSE["services"].values():
+        for port in service.get("ports", ()):
+            assert port.startswith("127.0.0.1:")
+
+
+def test_a_master_has_time_for_its_checkpoint() -> None:
+    assert COMPOSE["services"]["master"]["stop_grace_period"] == "120s"
+    assert all(service["restart"] == "on-failure" for service in COMPOSE["services"].values())
