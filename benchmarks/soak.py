@@ -114,5 +114,6 @@ def _draw(samples: Samples, path: Path) -> None:
             panel.set_xlabel("minutes")
             panel.set_ylabel(label)
             panel.set_ylim(bottom=0)
-        panels[0].legend()
+        handles, names = panels[0].get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside lower center", ncols=len(names))
         save(figure, path.parent, path.stem)
