@@ -1,6 +1,7 @@
 """What stands in TensorBoard after a run."""
 
 import errno
+import time
 from pathlib import Path
 from typing import Any
 
@@ -54,8 +55,13 @@ def test_hyperparameters_stand_beside_the_final_scores(tmp_path: Path) -> None:
     assert "_hparams_/session_start_info" in events.summary_metadata
 
 
-def test_points_after_a_checkpoint_are_hidden_when_the_run_goes_on_from_it(tmp_path: Path) -> None:
+def test_points_after_a_checkpoint_are_hidden_when_the_run_goes_on_from_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun = time.time()
     for updates, value in ((0, 1.0), (20, 2.0)):
+        # Files are read in the order of the seconds in their names: two lives are never so close.
+        monkeypatch.setattr(time, "time", lambda later=updates: begun + later)
         metrics = Metrics(tmp_path, updates)
         for step in (10, 20, 30):
             if step > updates:
