@@ -35,7 +35,7 @@ SETTINGS = (
     "service.eval_seconds=20",
     "service.checkpoint_minutes=0.5",
 )
-PAUSE_S = (3.0, 12.0)  # between the recovery from one fault and the next
+PAUSE_S = (1.0, 5.0)  # between the recovery from one fault and the next
 FROZEN_S = (3.0, 15.0)
 CUT_S = (5.0, 20.0)
 PATIENCE_S = 120.0
