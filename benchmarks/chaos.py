@@ -74,12 +74,14 @@ class Trial:
             return None
 
     def is_whole(self, updates: float) -> bool:
-        """Whether all players were heard of just now, and there are more updates than before."""
+        """Whether all workers were heard of just now, and there are more updates than before."""
         now = self.status()
         if now is None:
             return False
-        silence = now.workers[now.workers[:, EVALUATES] == 0, SILENT]
-        return bool((silence < FRESH_S).sum() > WORKERS) and now.numbers["updates"] > updates
+        evaluates = now.workers[now.workers[:, SILENT] < FRESH_S, EVALUATES]
+        players, evaluators = len(evaluates) - evaluates.sum(), evaluates.sum()
+        here = players > WORKERS and evaluators > 0  # the witness is a player, too
+        return bool(here) and now.numbers["updates"] > updates
 
     def pids(self, words: str) -> list[int]:
         """Processes of the run whose command line holds these words."""
