@@ -77,12 +77,27 @@ apart() { # RUN_DIR OTHER: workers of each joined one run, and not the same
     [[ $(joined "$1" | wc -l) == 1 && $(joined "$2" | wc -l) == 1 && $(joined "$1") != $(joined "$2") ]]
 }
 
-# Two runs on one node; one loses a worker.
+# Stands for an image: tells of the commands that it is put in front of.
+make_front() {
+    cat >"$work/front" <<END
+#!/bin/sh
+echo "\$1" >>"$work/front.log"
+exec "\$@"
+END
+    chmod +x "$work/front"
+}
+
+front_saw() { # the commands in order, each once
+    [[ $(sort -u "$work/front.log" | paste -sd ' ') == "$*" ]]
+}
+
+# Two runs on one node; one loses a worker, the other has something in front of its commands.
 try_node() {
     local a=$work/a b=$work/b first second step
+    make_front
     first=$(submit "$a" --nodelist=try1 --ntasks=4 slurm/train.sbatch max_updates=600 "${TINY[@]}")
-    second=$(submit "$b" --nodelist=try1 --ntasks=3 slurm/train.sbatch max_updates=600 seed=1 \
-        sim=kinematic "${TINY[@]}")
+    second=$(RUN_WITH=$work/front submit "$b" --nodelist=try1 --ntasks=3 slurm/train.sbatch \
+        max_updates=600 seed=1 sim=kinematic "${TINY[@]}")
     until_true "$PATIENCE_S" evaluations "$a" 2 || true
     step=$(step_of "$first" worker-1)
     scancel "$step" || true
@@ -94,6 +109,8 @@ try_node() {
     held "train.sbatch, kinematic: a second run on the same node reached its bound, too" \
         result_is "$b" max_updates=600
     held "train.sbatch, kinematic: the reward rose" reward_rose "$b" 0.3
+    held "train.sbatch: RUN_WITH stood in front of each command" \
+        front_saw tangram-master tangram-worker
     held "two runs on one node: no worker joined the other's" apart "$a" "$b"
     held "a run that reached its bound was not queued again" \
         test "$(job_field "$first" Restarts)$(job_field "$second" Restarts)" = 00
@@ -110,7 +127,7 @@ try_limit() {
         "${settings[@]}")
     read -r master workers <<<"$(
         RUN_DIR=$e WORKERS=2 MASTER_OPTIONS="${short[*]} --output=$work/%x-%j.log" \
-            WORKER_OPTIONS="--output=$work/%x-%A_%a.log" slurm/elastic/submit.sh "${settings[@]}" |
+            WORKER_OPTIONS="--time=5 --signal=B:USR1@60 --output=$work/%x-%A_%a.log" slurm/elastic/submit.sh "${settings[@]}" |
             sed -nE 's/^master: job ([0-9]+),.* workers: job ([0-9]+),.*/\1 \2/p'
     )"
     until_true "$PATIENCE_S" evaluations "$e" 2 || true
@@ -133,6 +150,8 @@ try_limit() {
         test "$(nodes_of "$het")" = 'try1 try2'
     held "between nodes everything was encrypted" \
         test -s "$a/keys.json" -a -s "$h/keys.json" -a -s "$e/keys.json"
+    held "elastic: at its own time limit a worker left and was queued again" \
+        was_requeued "${workers}_1"
     held "elastic: a worker came back to the master's next life" came_back "$e"
     held "elastic: evaluator and workers left when the run was complete" \
         until_true 120 none_queued "$workers"
@@ -165,28 +184,36 @@ went_on() { # RUN_DIR
     [[ -n $at && $at -gt 0 && $at == "$before" ]] && is_beyond "$1" "$at"
 }
 
-came_back() { # RUN_DIR
-    (($(grep -c 'joined run' "$1"/logs/task-1.*.log) >= 2))
+came_back() { # RUN_DIR: it saw a master end, and joined again
+    sed -n '/waits for the next one/,$p' "$1"/logs/task-[01].*.log | grep -q 'joined run'
 }
 
 none_queued() { # JOB
     [[ -z $(squeue --noheader --jobs="$1" 2>/dev/null) ]]
 }
 
+# submitit asks the accounting, which this SLURM has not, and goes by the files of its jobs then.
+sweep() { # RUN_DIR
+    .venv/bin/tangram-train --multirun hydra/launcher=submitit_slurm \
+        hydra.sweep.dir="$work/submitit" hydra.launcher.cpus_per_task=2 \
+        hydra.launcher.timeout_min=30 hydra.launcher.array_parallelism=2 \
+        run_dir="$1" seed=0,1,2 agent=paper,tangram sim=kinematic max_updates=40 \
+        agent.learning_starts=64 agent.updates_per_transition=0.1 "${TINY[@]}" \
+        >"$work/sweep.log" 2>&1 || { tail "$work/sweep.log"; return 1; }
+}
+
+report() { # RUN_DIR
+    .venv/bin/tangram-report runs="$1" out="$work/report" >/dev/null
+}
+
 # Seeds and agents as jobs of one sweep, and one table of them.
 try_sweep() {
     local out=$work/sweep
-    held "tangram-train --multirun: every job of the sweep ended well" \
-        .venv/bin/tangram-train --multirun hydra/launcher=submitit_slurm \
-        hydra.sweep.dir="$work/submitit" hydra.launcher.cpus_per_task=2 \
-        hydra.launcher.timeout_min=30 hydra.launcher.array_parallelism=2 \
-        run_dir="$out" seed=0,1,2 agent=paper,tangram sim=kinematic max_updates=40 \
-        agent.learning_starts=64 agent.updates_per_transition=0.1 "${TINY[@]}"
+    held "tangram-train --multirun: every job of the sweep ended well" sweep "$out"
     held "a sweep of 3 seeds and 2 agents left six complete runs" \
         test "$(grep -l '"ended_by": "max_updates=40"' "$out"/*/result.json | wc -l)" = 6
-    held "tangram-report made one table of them" \
-        .venv/bin/tangram-report runs="$out" out="$work/report"
-    grep -E '^\| .*(3 of 3|seeds)' "$work/report/README.md" | sed 's/^/  /' || true
+    held "tangram-report made one table of them" report "$out"
+    grep -E '^\| (training|.* 3 of 3) ' "$work/report/README.md" | sed 's/^/  /' || true
     held "each agent stands there with three seeds" \
         test "$(grep -cE '^\| .*\| 3 of 3 \|' "$work/report/README.md")" = 2
 }

@@ -53,7 +53,8 @@ def _test_episodes(study: Study, results: list[Row]) -> str:
     """As planned; without a plan those of the evaluations while it trained."""
     if study.plan:
         return f"{study.test_episodes:,}"
-    return _several(row.get("test_episodes", "-") for row in results)
+    counts = [row.get("test_episodes") for row in results]
+    return _several(f"{count:,.0f}" for count in counts if isinstance(count, int | float))
 
 
 def _versions(results: list[Row]) -> list[str]:
