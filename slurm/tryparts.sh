@@ -185,7 +185,7 @@ went_on() { # RUN_DIR
 }
 
 came_back() { # RUN_DIR: it saw a master end, and joined again
-    sed -n '/waits for the next one/,$p' "$1"/logs/task-[01].*.log | grep -q 'joined run'
+    grep -c 'joined run' <(sed -n '/waits for the next one/,$p' "$1"/logs/task-[01].*.log) >/dev/null
 }
 
 none_queued() { # JOB
