@@ -48,7 +48,9 @@ clean_up() {
 }
 
 nothing_left() {
-    [[ -z $(left_processes) && ! -e $work ]]
+    local left
+    left=$(left_processes)
+    [[ -z $left && ! -e $work ]] || { echo "  left: $left $(ls -d "$work" 2>/dev/null)"; return 1; }
 }
 
 [[ $EUID -eq 0 ]] || refuse "must run as root: it installs packages and starts daemons"

@@ -101,6 +101,7 @@ stop_cluster() {
     ((${#daemons[@]})) || return 0
     scancel --user=root >/dev/null 2>&1 || true
     until_true 90 queue_is_empty || true
+    until_true 60 steps_are_gone || true
     local i
     for ((i = ${#daemons[@]} - 1; i >= 1; i--)); do
         kill "${daemons[i]}" 2>/dev/null || true
@@ -109,17 +110,34 @@ stop_cluster() {
     kill "${daemons[0]}" 2>/dev/null || true
     wait "${daemons[0]}" 2>/dev/null || true
     daemons=()
+    # Whatever is still there hangs.
+    local process
+    for process in $(left_processes); do
+        kill -KILL "${process#/proc/}" 2>/dev/null || true
+    done
+}
+
+# The daemons that keep the last steps' word must outlive them.
+steps_are_gone() {
+    local process
+    for process in $(left_processes); do
+        case $(cat "$process/comm" 2>/dev/null) in
+            munged | slurmctld | slurmscriptd | slurmd | '') ;;
+            *) return 1 ;;
+        esac
+    done
 }
 
 queue_is_empty() {
     [[ -z $(squeue --noheader 2>/dev/null) ]]
 }
 
-# Processes of the cluster and of its jobs: all of them inherit where its configuration is.
-left_processes() {
-    env -u SLURM_CONF grep -lzs "^SLURM_CONF=$work/slurm.conf" /proc/[0-9]*/environ |
-        sed 's:/environ$::' || true
-}
+# Processes of the cluster and of its jobs: all of them inherit where its configuration is. What is
+# started here to look for them must not.
+left_processes() (
+    unset SLURM_CONF
+    grep -lzs "^SLURM_CONF=$work/slurm.conf" /proc/[0-9]*/environ | sed 's:/environ$::' || true
+)
 
 # Wait for a command to succeed: until_true SECONDS COMMAND...
 until_true() {
