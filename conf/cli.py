@@ -15,6 +15,7 @@ from typing import Any
 import yaml
 
 from conf.help import Plain, choices, command_name, help_text, setting_names
+from conf.sweep import LAUNCHER, SWEEP, check_launcher, refuse_lost_job
 from tangram_sim.errors import ConfigError, TangramError
 
 # From the settings of a command: where the groups of a run are named, and these; None for nowhere.
@@ -23,7 +24,7 @@ Stored = Callable[[Plain], tuple[str, Plain] | None]
 USAGE_STATUS = 2
 INTERRUPT_STATUS = 130
 CFG_KINDS = ("job", "hydra", "all")
-FLAGS = ("--cfg", "--multirun", "-m")
+FLAGS = ("--cfg", *SWEEP)
 MISSING_HINTS = {
     "run_dir": "say which run: run_dir=runs/...",
     "runs": "say which study: runs=runs/experiments/laptop",
@@ -53,6 +54,7 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
         return 0
     try:
         sys.argv[1:] = _options_first(arguments)
+        check_launcher(sys.argv[1:])
         return _run(config_name, task, stored)
     except TangramError as error:
         print(f"{command}: {error}", file=sys.stderr)
@@ -82,7 +84,7 @@ def _options_first(arguments: Sequence[str]) -> list[str]:
             overrides.append(argument)
     if options[-1:] == ["--cfg"]:
         options.append("job")
-    if len({"--cfg", "--multirun", "-m"} & set(options)) > 1:
+    if len(set(FLAGS) & set(options)) > 1:
         raise ConfigError("--cfg and --multirun do not go together: leave one out")
     return [*options, *overrides]
 
@@ -99,8 +101,10 @@ def _run(config_name: str, task: Callable[[Plain], int], stored: Stored | None) 
 
     def job(config: DictConfig) -> None:
         try:
-            statuses.append(task(_plain(config, stored)))
+            statuses.append(_in_sweep(task(_plain(config, stored))))
         except (TangramError, OSError, MemoryError) as error:
+            if _is_elsewhere():
+                raise _as_ours(error) from None  # hydra brings it home
             # An exception that hydra sees costs two more lines; an exit passes through it.
             errors.append(_as_ours(error))
             raise SystemExit(USAGE_STATUS) from None
@@ -109,13 +113,32 @@ def _run(config_name: str, task: Callable[[Plain], int], stored: Stored | None) 
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
         hydra.main(version_base="1.3", config_path="pkg://conf", config_name=config_name)(job)()
+    except TangramError:
+        raise
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise ConfigError(_explain(error, config_name)) from error
     except SystemExit:
         if not errors:
             raise
         raise errors[0] from None
+    except Exception as error:
+        refuse_lost_job(error)
+        raise
     return max(statuses)
+
+
+def _is_elsewhere() -> bool:
+    """Whether this is a job of a sweep in a process of its own, perhaps on another machine."""
+    from hydra.core.hydra_config import HydraConfig
+
+    return str(HydraConfig.get().runtime.choices.get(LAUNCHER, "basic")) != "basic"
+
+
+def _in_sweep(status: int) -> int:
+    """An exit status as it is, unless nobody at home would hear of it."""
+    if status and _is_elsewhere():
+        raise TangramError(f"a job of the sweep ended with status {status}: see its log")
+    return status
 
 
 def _as_ours(error: Exception) -> TangramError:

@@ -217,11 +217,15 @@ class Launcher:
                 self._lines.notice(line)
 
     def _wait_for(self, children: list[Child]) -> None:
-        until_s = time.monotonic() + LEAVE_S
+        began_s = time.monotonic()
+        until_s = began_s + LEAVE_S
         while any(child.alive for child in children):
             try:
                 event = self._events.get(timeout=max(until_s - time.monotonic(), 0.0))
             except Empty:
                 return
-            if isinstance(event, signal.Signals):
+            # The signal that ended the run may come again at once, as from SLURM when it queues a
+            # job again: children that were just asked to leave need their time.
+            hurried = time.monotonic() - began_s >= SAME_WISH_S
+            if isinstance(event, signal.Signals) and hurried:
                 return

@@ -1,30 +1,35 @@
-"""SIGINT, SIGTERM, SIGHUP, SIGUSR1: the first asks for a clean end, the second ends at once."""
+"""SIGINT, SIGTERM, SIGHUP, SIGUSR1, SIGUSR2: the first asks for a clean end, the second ends."""
 
 import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, Self
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
+# submitit's, near a time limit: all processes of a job get it, and tangram-train leaves it to
+# submitit, which queues the job again; the others must end in order meanwhile.
+SUBMITIT = signal.SIGUSR2
 # One wish to end may arrive twice: a time limit signals a process and then its whole group.
 SAME_WISH_S = 1.0
 SHOW_CURSOR = b"\x1b[?25h\n"
 
 
-def heeded() -> list[signal.Signals]:
+def heeded(numbers: Iterable[signal.Signals] = SIGNALS) -> list[signal.Signals]:
     """Those that are not ignored: nohup and scripts hide some from what they start."""
-    return [number for number in SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
+    return [number for number in numbers if signal.getsignal(number) != signal.SIG_IGN]
 
 
 @contextmanager
-def handling(handle: Callable[[signal.Signals], None]) -> Iterator[None]:
+def handling(
+    handle: Callable[[signal.Signals], None], numbers: Iterable[signal.Signals] = SIGNALS
+) -> Iterator[None]:
     """These signals call a function, until what was there before is put back."""
     before = {
         number: signal.signal(number, lambda n, _frame: handle(signal.Signals(n)))
-        for number in heeded()
+        for number in heeded(numbers)
     }
     try:
         yield
@@ -43,7 +48,7 @@ class StopSignals:
     def __init__(self) -> None:
         self.reason: str | None = None
         self._first_s = 0.0
-        self._handling = handling(self._handle)
+        self._handling = handling(self._handle, (*SIGNALS, SUBMITIT))
 
     def __enter__(self) -> Self:
         self._handling.__enter__()

@@ -12,7 +12,7 @@ torch.set_num_threads(1)
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-TIERS = ("fast", "cluster", "slow")
+TIERS = ("fast", "cluster", "slow", "slurm")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -1,6 +1,7 @@
 """Config groups, presets, overrides and help."""
 
 import dataclasses
+import re
 import sys
 from collections.abc import Callable
 from importlib.resources import files
@@ -14,6 +15,7 @@ from omegaconf import OmegaConf
 
 from conf.cli import entry, with_run_config
 from conf.help import Plain, choices, group_defaults, help_text, setting_names
+from conf.sweep import check_launcher, refuse_lost_job
 from master.config import LaunchConfig, MasterConfig
 from tangram_agent.config import AgentConfig, NetConfig, ServiceConfig, TwinConfig
 from tangram_agent.setup import SECTIONS, Setup, from_mapping, make_setup
@@ -303,3 +305,39 @@ def test_entry_turns_errors_into_a_line_and_a_status(
 def test_entry_does_not_hide_a_fault_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ZeroDivisionError):
         start(monkeypatch, lambda settings: 1 // 0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["hydra/launcher=submitit_slurm"], "is for the jobs of a sweep: add --multirun"),
+        (["-m", "hydra/launcher=submitit_slurm"], "needs a plugin: pip install 'tangram-rl.slurm"),
+    ],
+)
+def test_a_launcher_that_cannot_work_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    message: str,
+) -> None:
+    monkeypatch.setattr("conf.sweep.find_spec", lambda name: None)
+    assert start(monkeypatch, lambda settings: 0, *arguments) == 2
+    assert re.search(message, capsys.readouterr().err)
+
+
+def test_slurm_is_asked_for_only_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("conf.sweep.find_spec", lambda name: name)
+    check_launcher(["-m", "hydra/launcher=basic"])
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    check_launcher(["-m", "hydra/launcher=submitit_local"])
+    with pytest.raises(ConfigError, match="needs SLURM, and there is no srun"):
+        check_launcher(["-m", "hydra/launcher=submitit_slurm"])
+    monkeypatch.setattr("shutil.which", lambda name: "/usr/bin/srun")
+    check_launcher(["-m", "hydra/launcher=submitit_slurm"])
+
+
+def test_a_lost_job_of_a_sweep_is_told_in_one_line() -> None:
+    lost = type("UncompletedJobError", (Exception,), {"__module__": "submitit.core.utils"})
+    with pytest.raises(TangramError, match="was lost .Job 3 has no output.; the same command"):
+        refuse_lost_job(lost("Job 3\nhas no output\n----\nmany lines"))
+    refuse_lost_job(ZeroDivisionError())

@@ -19,7 +19,7 @@ from tangram_agent.watchdog import Watchdog
 from worker.config import WorkerConfig
 from worker.link import Link
 
-SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
+SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1, signal.SIGUSR2)
 
 _log = logging.getLogger(__name__)
 
@@ -72,7 +72,7 @@ def joined(config: WorkerConfig, setup: Setup, policy: Policy) -> Iterator[Link]
 
 @contextmanager
 def stopped_by_signals(link: Link) -> Iterator[None]:
-    """SIGTERM, SIGINT and SIGUSR1 stop the link instead of the process, so that it can say BYE."""
+    """The signals stop the link instead of the process, so that it can say BYE."""
 
     def handle(number: int, _frame: FrameType | None) -> None:
         link.stop(signal.Signals(number).name)

@@ -15,12 +15,9 @@ def closing(study: Study) -> list[str]:
     return [
         "## How it was made",
         "",
-        f"Budget `{study.budget}`: {plain(study.budget_note)}",
-        "",
+        *([f"Budget `{study.budget}`: {plain(study.budget_note)}", ""] if study.plan else []),
         *table(["", ""], _facts(study, results), "---"),
-        "The last command that ran trainings of it:",
-        "",
-        *shell(study.command),
+        *_command(study),
         *details("All trainings and their settings", _trainings(study.trainings)),
     ]
 
@@ -37,13 +34,27 @@ def _facts(study: Study, results: list[Row]) -> list[tuple[str, str]]:
     return [
         ("runs finished", finished_count(study.trainings)),
         ("seeds", _several(study.planned_seeds)),
-        ("episodes of every test", f"{study.test_episodes:,}"),
+        ("episodes of every test", _test_episodes(study, results)),
         ("commit", _several(one for one in commits if one is not None)),
         ("processor", _several(row["processor"] for row in results)),
         ("cores", _several(row["cores"] for row in results)),
         ("versions", ", ".join(_versions(results)) or "-"),
         ("time, all runs added up", f"{hours:,.2f} h"),
     ]
+
+
+def _command(study: Study) -> list[str]:
+    if not study.plan:
+        return []
+    return ["The last command that ran trainings of it:", "", *shell(study.command)]
+
+
+def _test_episodes(study: Study, results: list[Row]) -> str:
+    """As planned; without a plan those of the evaluations while it trained."""
+    if study.plan:
+        return f"{study.test_episodes:,}"
+    counts = [row.get("test_episodes") for row in results]
+    return _several(f"{count:,.0f}" for count in counts if isinstance(count, int | float))
 
 
 def _versions(results: list[Row]) -> list[str]:

@@ -10,7 +10,7 @@ class ReportConfig:
     """A study and where to report on it.
 
     Attributes:
-        runs: folder of the study, with plan.json.
+        runs: folder of the study, with plan.json, or one whose folders are runs.
         out: folder for README.md, data.json and the figures, or the page itself, NAME.md, with the
             others in the folder NAME beside it; files of the same names are replaced.
     """

@@ -32,7 +32,8 @@ def read_study(folder: Path) -> Study:
     """
     if not (folder / PLAN).is_file():
         raise RunError(
-            f"{folder / PLAN} is missing: name a folder that tangram-experiment made, runs=..."
+            f"{folder / PLAN} is missing: name a folder that tangram-experiment made, or one "
+            "whose folders are runs, runs=..."
         )
     plan = read_record(folder / PLAN, REMAKE)
     if plan.content.get("format") != FORMAT:

@@ -66,11 +66,14 @@ class Page:
 def section(page: Page, experiment: Experiment) -> list[str]:
     """All lines of an experiment; its figures are written on the way."""
     lines = [f'<a id="{experiment.name}"></a>', "", f"## {plain(experiment.title)}", ""]
-    lines += [f"Source: {plain(experiment.source)}. {plain(experiment.note)}", ""]
+    if page.study.plan:
+        lines += [f"Source: {plain(experiment.source)}. {plain(experiment.note)}", ""]
     if any(one.finished for one in experiment.trainings):
         lines += KINDS[experiment.kind](page, experiment)
         lines += _lacking(page, experiment)
     lines += _gaps(experiment)
+    if not page.study.plan:
+        return lines
     return [*lines, "Make it again:", "", *shell(command(page.study, experiment))]
 
 

@@ -119,7 +119,7 @@ class Study:
     """A folder of tangram-experiment that was read.
 
     Attributes:
-        plan: content of plan.json.
+        plan: content of plan.json; empty for runs that nobody planned.
         command: that made it.
         commit: of the source tree that planned it, or None.
         budget: name of the budget.

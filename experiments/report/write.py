@@ -5,8 +5,8 @@ from pathlib import Path
 from experiments.pictures import draw_paper_pictures
 from experiments.report.closing import closing, finished_count
 from experiments.report.data import study_data, to_json
+from experiments.report.loose import read_runs
 from experiments.report.markdown import picture, plain, table
-from experiments.report.reading import read_study
 from experiments.report.references import References
 from experiments.report.sections import Page, section
 from experiments.report.study import Study
@@ -28,7 +28,7 @@ def write_report(runs: Path, out: Path) -> list[Path]:
     """Report on a study; files of an earlier report in the same place are replaced.
 
     Args:
-        runs: the study's folder.
+        runs: the study's folder, or one whose folders are runs.
         out: folder for README.md, data.json and figures/, or the page itself, `NAME.md`, with the
             others in the folder NAME beside it.
 
@@ -38,7 +38,7 @@ def write_report(runs: Path, out: Path) -> list[Path]:
     Raises:
         RunError: a file of the study is not what it should be, or `out` cannot be written.
     """
-    study = read_study(runs)
+    study = read_runs(runs)
     path, beside = (out, out.with_suffix("")) if out.suffix == ".md" else (out / "README.md", out)
     root, figures = path.parent, (beside / FIGURES).relative_to(path.parent).as_posix()
     _make(root / figures)
@@ -46,7 +46,7 @@ def write_report(runs: Path, out: Path) -> list[Path]:
     data = beside / "data.json"
     lines = _opening(study, data.relative_to(root).as_posix())
     with drawing():
-        lines += _paper_pictures(root, figures)
+        lines += _paper_pictures(root, figures) if study.plan else []
         for experiment in study.experiments:
             lines += section(page, experiment)
     lines += closing(study)
@@ -70,7 +70,7 @@ def _opening(study: Study, data: str) -> list[str]:
         for one in study.experiments
     ]
     return [
-        f"# Experiments, budget `{study.budget}`",
+        f"# Experiments, budget `{study.budget}`" if study.plan else "# Runs",
         "",
         plain(study.budget_note),
         "",

@@ -1,6 +1,7 @@
 """Starting, restarting and ending children, with small real processes in place of the commands."""
 
 import signal
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -319,6 +320,34 @@ def test_a_second_signal_ends_everything_at_once(
 
     monkeypatch.setattr(made, "_start_due", start_and_signal)
     assert finish(made, tmp_path)[0] == 137
+
+
+@pytest.mark.cluster
+def test_a_signal_that_comes_again_at_once_cuts_nobody_short(tmp_path: Path) -> None:
+    leaving = """
+import signal, sys, time
+from tangram_agent import lifeline
+lifeline.watch()
+def leave(*_):
+    time.sleep(0.3)
+    print("left in order", flush=True)
+    sys.exit(0)
+signal.signal(signal.SIGTERM, leave)
+print("plays", flush=True)
+while True:
+    signal.sigtimedwait([], 1.0)
+"""
+    made = launcher(tmp_path, players=[leaving])
+    (player,) = made._players
+    player.start(made._events.put)
+    until_s = time.monotonic() + LIMIT_S
+    while player.tail() != "plays":
+        assert time.monotonic() < until_s
+        time.sleep(0.02)
+    made._events.put(signal.SIGTERM)
+    made.end_all()
+    made._lines._console.file.close()
+    assert player.tail() == "plays\nleft in order"
 
 
 @pytest.mark.cluster

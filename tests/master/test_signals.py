@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from master.signals import StopSignals, heeded
+from master.signals import SUBMITIT, StopSignals, heeded
 
 LIMIT_S = 30.0
 
@@ -22,7 +22,7 @@ ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 SIGNALLED = """
 import signal, sys
 from master.signals import StopSignals
-for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1):
+for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2):
     signal.signal(number, signal.SIG_DFL)
 with StopSignals() as stop:
     print("ready", flush=True)
@@ -52,7 +52,7 @@ def test_a_signal_that_is_ignored_stays_ignored() -> None:
 
 
 @pytest.mark.cluster
-@pytest.mark.parametrize("number", ENDING)
+@pytest.mark.parametrize("number", [*ENDING, SUBMITIT])
 @pytest.mark.parametrize("kind", ["orderly", "stuck"])
 def test_the_first_signal_asks_and_the_second_ends(number: signal.Signals, kind: str) -> None:
     command = [sys.executable, "-c", SIGNALLED, kind]

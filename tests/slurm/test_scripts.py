@@ -1,0 +1,123 @@
+"""The job scripts as texts: what can be seen without SLURM."""
+
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.test_conf import compose
+
+pytestmark = pytest.mark.fast
+
+FOLDER = Path(__file__).parents[2] / "slurm"
+JOBS = sorted(FOLDER.rglob("*.sbatch"))
+SCRIPTS = [*JOBS, *sorted(FOLDER.rglob("*.sh"))]
+SHARED = "".join((FOLDER / f"{name}.sh").read_text() for name in ("lib", "master", "worker"))
+# After these words stand settings.
+TAKERS = re.compile(
+    r"tangram-\w+ |start_master |start_worker |\.sbatch |submit\.sh |settings\+?=\("
+)
+SETTING = re.compile(r"(?<![\w.$/-])([a-z_]+(?:\.[a-z_]+)*)=([^\s\"()]+)")
+PARAMETER = re.compile(r"^([A-Z_]+)=\$\{\1:[-?]", re.MULTILINE)
+OF_WORKERS = ("role", "connect")
+PATHS = {"run_dir": "runs/x", "connect": "runs/x"}
+
+
+def identity(path: Path) -> str:
+    return path.relative_to(FOLDER).as_posix()
+
+
+def settings(path: Path) -> Iterator[tuple[str, str]]:
+    """Every setting that a script or an example in it gives: the command's config, and the word."""
+    text = path.read_text().replace("\\\n", " ")
+    for line in text.splitlines():
+        taker = TAKERS.search(line)
+        if taker is None:
+            continue
+        for name, value in SETTING.findall(line[taker.end() :]):
+            if name.startswith("hydra."):
+                continue
+            primary = "worker" if name in OF_WORKERS else "master"
+            known = PATHS.get(name, "1") if "$" in value else value
+            for one in known.split(","):
+                yield primary, f"{name}={one}"
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=identity)
+def test_bash_can_read_it(path: Path) -> None:
+    done = subprocess.run(
+        ["bash", "-n", str(path)], capture_output=True, text=True, check=False, timeout=20
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=identity)
+def test_shellcheck_finds_nothing(path: Path) -> None:
+    tool = shutil.which("shellcheck")
+    if tool is None:
+        pytest.skip("shellcheck is not installed: apt-get install shellcheck")
+    done = subprocess.run(
+        [tool, "--external-sources", str(path)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=identity)
+def test_scripts_stop_at_the_first_error(path: Path) -> None:
+    text = path.read_text()
+    sourced = text.startswith("# ")  # the script that sources it says so
+    assert sourced or "\nset -euo pipefail\n" in text
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=identity)
+def test_every_setting_is_one_of_the_config(path: Path) -> None:
+    for primary, override in settings(path):
+        given = ["connect=runs/x"] if primary == "worker" else []
+        compose(primary, *given, override)
+
+
+def test_settings_are_found() -> None:
+    found = {path.name: [word for _, word in settings(path)] for path in SCRIPTS}
+    assert {"run_dir=runs/x", "resume=auto", "service.threads=1"} == set(found["master.sh"])
+    assert {"seed=1", "tokens=parallelogram", "role=evaluator", "service.bind=0.0.0.0"} <= set(
+        found["train.sbatch"]
+    )
+    assert {"max_updates=0", "agent=paper", "sim=kinematic"} <= set(found["tryparts.sh"])
+
+
+@pytest.mark.parametrize("path", JOBS, ids=identity)
+def test_parameters_are_explained_and_used(path: Path) -> None:
+    text = path.read_text()
+    names = PARAMETER.findall(text)
+    assert {"PROJECT", "RUN_DIR", "RUN_WITH"} <= set(names)
+    lines = text.splitlines()
+    for name in names:
+        (number,) = [i for i, line in enumerate(lines) if line.startswith(f"{name}=")]
+        assert lines[number - 1].startswith("# "), f"{name} is not explained"
+        rest = "\n".join(lines[number + 1 :]) + SHARED
+        assert re.search(rf"\b{name}\b", rest), f"{name} is not used"
+
+
+@pytest.mark.parametrize("path", JOBS, ids=identity)
+def test_every_job_can_be_queued_again(path: Path) -> None:
+    text = path.read_text()
+    for option in ("--open-mode=append", "--requeue", "--signal=B:USR1@", "--time=", "--output="):
+        assert f"\n#SBATCH {option}" in text, option
+    assert "\nfollow_master\n" in text or "\nend_job\n" in text
+
+
+def test_the_image_takes_every_package_along() -> None:
+    text = (FOLDER.parent / "docker" / "apptainer.def").read_text()
+    files = re.search(r"^%files\n((?: .*\n)+)", text, re.MULTILINE)
+    assert files is not None
+    sources = [line.split()[0] for line in files.group(1).splitlines()]
+    packages = ("conf", "experiments", "master", "tangram_agent", "tangram_sim", "worker")
+    assert set(packages) <= set(sources)
+    assert all((FOLDER.parent / source).exists() for source in sources)
