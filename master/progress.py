@@ -1,7 +1,6 @@
 """What the user sees while a run goes on: a live panel on a terminal, plain lines elsewhere."""
 
 import logging
-import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -14,6 +13,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from master.every import Every
 from master.status import Status, duration, left_text, plural, status_line
 from tangram_agent.logs import formatter
 
@@ -83,14 +83,11 @@ class PlainLines:
 
     def __init__(self, console: Console, interval_s: float = LINE_S) -> None:
         self._console = console
-        self._interval_s = interval_s
-        self._next_s = 0.0
+        self._due = Every(interval_s, at_once=True)
 
     def show(self, status: Status) -> None:
         """Print the status if the last line is old enough."""
-        now_s = time.monotonic()
-        if now_s >= self._next_s:
-            self._next_s = now_s + self._interval_s
+        if self._due.due():
             self.notice(status_line(status))
 
     def notice(self, line: str, level: str = "info", **_: Any) -> None:
@@ -106,14 +103,11 @@ class JsonLines:
 
     def __init__(self, console: Console, who: str, interval_s: float = LINE_S) -> None:
         self._console, self._formatter = console, formatter("json", who)
-        self._interval_s = interval_s
-        self._next_s = 0.0
+        self._due = Every(interval_s, at_once=True)
 
     def show(self, status: Status) -> None:
         """Write the status if the last one is old enough."""
-        now_s = time.monotonic()
-        if now_s >= self._next_s:
-            self._next_s = now_s + self._interval_s
+        if self._due.due():
             self.notice(status.activity, event="status", **asdict(status))
 
     def notice(self, line: str, level: str = "info", **fields: Any) -> None:
@@ -130,8 +124,7 @@ class LivePanel:
 
     def __init__(self, console: Console, title: str, interval_s: float = PANEL_S) -> None:
         self._console, self._title = console, title
-        self._interval_s = interval_s
-        self._next_s = 0.0
+        self._due = Every(interval_s, at_once=True)
         self._last: Status | None = None
         self._live = Live(console=console, auto_refresh=False, transient=False)
         self._live.start()
@@ -139,9 +132,7 @@ class LivePanel:
     def show(self, status: Status) -> None:
         """Draw the panel if the last drawing is old enough."""
         self._last = status
-        now_s = time.monotonic()
-        if now_s >= self._next_s:
-            self._next_s = now_s + self._interval_s
+        if self._due.due():
             self._draw(status)
 
     def notice(self, line: str, level: str = "info", **_: Any) -> None:

@@ -22,3 +22,11 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
         limit_s=300,
     )
     return folder
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Of a run that a test starts."""
+    path = tmp_path / "run"
+    path.mkdir()
+    return path

@@ -39,13 +39,6 @@ EVALUATOR, INDEX, INCARNATION, EPISODES = map(
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(130)]
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    path = tmp_path / "run"
-    path.mkdir()
-    return path
-
-
 def port_of(folder: Path) -> int:
     content = json.loads((folder / "connection.json").read_text())
     return int(content["endpoint"].rpartition(":")[2])

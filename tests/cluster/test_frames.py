@@ -30,13 +30,6 @@ from worker.status import ask_status
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(130)]
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    path = tmp_path / "run"
-    path.mkdir()
-    return path
-
-
 def endpoint_of(folder: Path) -> str:
     return str(json.loads((folder / "connection.json").read_text())["endpoint"])
 
