@@ -5,8 +5,8 @@
 #
 # Installs docker.io and docker-compose, starts a docker daemon of its own where none runs, makes a
 # base image with debootstrap where no registry is reached, and prints line by line what held. Ends
-# with status 1 if anything did not. Containers, images, volumes and the daemon are gone afterwards;
-# Debian's packages stay.
+# with status 1 if anything did not. Containers, images, volumes, the daemon and what it did to the
+# network are gone afterwards; Debian's packages stay.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")"
 
@@ -14,16 +14,17 @@ WAIT_S=240
 STARTED_S=$SECONDS
 NOT_HELD=0
 WORK=$(mktemp -d)
+SAID=$WORK/said
 DAEMON=
 
 held() {  # held TEXT COMMAND...: whether the command succeeds, in a line
     local text=$1
     shift
-    if "$@" >"$WORK/said" 2>&1; then
+    if "$@" >"$SAID" 2>&1; then
         printf '%4d s  held      %s\n' $((SECONDS - STARTED_S)) "$text"
     else
         printf '%4d s  NOT HELD  %s\n' $((SECONDS - STARTED_S)) "$text"
-        tail -n 5 "$WORK/said" | sed 's/^/                  /'
+        tail -n 5 "$SAID" | sed 's/^/                  /'
         NOT_HELD=$((NOT_HELD + 1))
     fi
 }
@@ -49,8 +50,36 @@ clean_up() {
     if [[ -n $DAEMON ]]; then
         kill "$DAEMON"
         wait "$DAEMON"
+        restore_network
     fi
     rm -rf --one-file-system "$WORK"
+}
+
+# A daemon leaves its bridge, its firewall rules and forwarding behind when it ends.
+restore_network() {
+    [[ $(links) == *docker0* && $LINKS != *docker0* ]] && ip link delete docker0
+    local table
+    for table in filter nat; do
+        iptables --table "$table" --flush
+        iptables --table "$table" --delete-chain
+    done
+    iptables --policy FORWARD ACCEPT
+    iptables-restore <<<"$FIREWALL"
+    echo "$FORWARDING" >/proc/sys/net/ipv4/ip_forward
+}
+
+links() { ip -oneline link | cut -d: -f2; }
+rules() { grep '^-A' || true; }
+
+nothing_left() {
+    [[ ! -e $WORK && ! -e wheels/${OWN_WHEEL:-none} ]] || return 1
+    if [[ -n $DAEMON ]]; then
+        ! kill -0 "$DAEMON" && [[ $(links) == "$LINKS" ]] &&
+            [[ $(iptables-save | rules) == $(rules <<<"$FIREWALL") ]]
+    else
+        [[ -z $(docker images --quiet "$BASE") ]] &&
+            [[ -z $(docker volume ls --quiet --filter name=tangram-try) ]]
+    fi
 }
 
 compose() { docker-compose "$@"; }
@@ -58,7 +87,7 @@ compose() { docker-compose "$@"; }
 # ---- what is needed ------------------------------------------------------------------------------
 [[ $EUID -eq 0 ]] || fail "must be root, to install packages and to start a docker daemon"
 command -v apt-get >/dev/null || fail "needs Debian: apt-get is not here"
-packages=(docker.io docker-compose debootstrap curl)
+packages=(docker.io docker-compose debootstrap curl iproute2 iptables)
 dpkg --status "${packages[@]}" >/dev/null 2>&1 ||
     { apt-get update -qq && apt-get install -y -qq --no-install-recommends "${packages[@]}" >/dev/null; } ||
     fail "cannot install ${packages[*]}"
@@ -70,6 +99,7 @@ export BASE=python:3.11-slim-bookworm
 trap clean_up EXIT
 
 if ! docker info >/dev/null 2>&1; then
+    LINKS=$(links) FIREWALL=$(iptables-save) FORWARDING=$(</proc/sys/net/ipv4/ip_forward)
     export DOCKER_HOST=unix://$WORK/docker.sock
     dockerd --data-root "$WORK/data" --exec-root "$WORK/exec" --pidfile "$WORK/pid" \
         --host "$DOCKER_HOST" >"$WORK/dockerd.log" 2>&1 &
@@ -171,13 +201,18 @@ held "goes on from that checkpoint" eventually above updates "$updates"
 held "down again" compose down --timeout 120
 
 echo
-echo "versions: $(docker --version); $(docker-compose --version | head -n 1); $(sed -n 's/^PRETTY_NAME=//p' /etc/os-release)"
+echo "versions: docker $(docker version --format '{{.Server.Version}}'); $(docker-compose --version | head -n 1); $(sed -n 's/^PRETTY_NAME=//p' /etc/os-release)"
 docker images --format '{{.Repository}}: {{.Size}}' | grep -E '^tangram-(worker|master-cpu|test|try-base)' || true
 for image in tangram-worker tangram-master-cpu; do
-    echo "largest parts of $image:"
-    docker run --rm --entrypoint sh "$image" -c 'du --summarize --megabytes /opt/tangram/lib/python3*/site-packages/* | sort --numeric --reverse | head -n 6' |
+    echo "largest parts of $image, MiB:"
+    docker run --rm --entrypoint sh "$image" -c 'du --summarize --block-size=1M /opt/tangram/lib/python3*/site-packages/* | sort --numeric --reverse | head -n 6' |
         sed -E 's|/opt/.*site-packages/||; s/^/    /'
 done
+echo
+trap - EXIT
+clean_up
+SAID=/dev/null
+held "nothing is left behind" nothing_left
 echo
 if ((NOT_HELD)); then
     echo "$NOT_HELD did not hold"
