@@ -25,6 +25,7 @@ USAGE_STATUS = 2
 INTERRUPT_STATUS = 130
 CFG_KINDS = ("job", "hydra", "all")
 FLAGS = ("--cfg", *SWEEP)
+MAKE_RUNS = ("train", "master")  # the commands whose run_dir is made, not read
 MISSING_HINTS = {
     "run_dir": "say which run: run_dir=runs/...",
     "runs": "say which study: runs=runs/experiments/laptop",
@@ -101,7 +102,7 @@ def _run(config_name: str, task: Callable[[Plain], int], stored: Stored | None) 
 
     def job(config: DictConfig) -> None:
         try:
-            statuses.append(_in_sweep(task(_plain(config, stored))))
+            statuses.append(_in_sweep(task(_plain(config, stored, config_name))))
         except (TangramError, OSError, MemoryError) as error:
             if _is_elsewhere():
                 raise _as_ours(error) from None  # hydra brings it home
@@ -156,7 +157,7 @@ def _as_ours(error: Exception) -> TangramError:
     )
 
 
-def _plain(config: Any, stored: Stored | None) -> Plain:
+def _plain(config: Any, stored: Stored | None, config_name: str) -> Plain:
     """Hydra's config as plain containers, with nothing missing and everything resolved.
 
     Raises:
@@ -175,7 +176,8 @@ def _plain(config: Any, stored: Stored | None) -> Plain:
     if missing:
         raise ConfigError(MISSING_HINTS.get(missing[0], f"set {missing[0]}=..., it has no default"))
     plain = _mapping(settings)
-    if HydraConfig.get().mode == RunMode.MULTIRUN and isinstance(plain.get("run_dir"), str):
+    in_sweep = HydraConfig.get().mode == RunMode.MULTIRUN and config_name in MAKE_RUNS
+    if in_sweep and isinstance(plain.get("run_dir"), str):
         # The jobs of one sweep start at one time and share their arguments: a folder for each.
         plain["run_dir"] = f"{plain['run_dir']}/{HydraConfig.get().job.num}"
     return with_run_config(plain, list(HydraConfig.get().overrides.task), stored)

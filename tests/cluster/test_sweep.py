@@ -36,3 +36,12 @@ def test_a_job_that_is_refused_is_heard_of_at_home(tmp_path: Path) -> None:
     job, said = done.stderr.splitlines()  # hydra says which job it was
     assert (done.returncode, "seed=3" in job) == (2, True)
     assert said == "tangram-train: agent.batch_size must be at least 1, got 0"
+
+
+def test_a_sweep_reads_the_run_that_it_is_told(tmp_path: Path) -> None:
+    """run_dir of tangram-eval is a run that is there, in every job the same."""
+    sweep = ("--multirun", "episodes=4,5", "run_dir=pretrained/square")
+    out = "out=scores_${episodes}.json"
+    run("tangram-eval", *sweep, out, cwd=tmp_path, limit_s=120.0)
+    found = [json.loads((tmp_path / f"scores_{n}.json").read_text())["episodes"] for n in (4, 5)]
+    assert found == [4, 5]
