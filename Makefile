@@ -48,5 +48,5 @@ clean:  ## remove caches and build products; .venv and runs/ stay
 	@touch $@
 
 .venv/.installed-dev: pyproject.toml constraints.txt
-	@.ci/install .venv dev,sb3,slurm
+	@.ci/install .venv dev,peers,slurm
 	@touch .venv/.installed-run $@

@@ -18,7 +18,7 @@ def show(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     """Print rows with equal keys as a table."""
     table = Table(title=title, title_justify="left")
     for name in rows[0]:
-        table.add_column(name, justify="left" if name in {"stage", "unit"} else "right")
+        table.add_column(name, justify="left" if isinstance(rows[0][name], str) else "right")
     for row in rows:
         table.add_row(*(_text(value) for value in row.values()))
     # Wide enough for all columns also where the output goes into a file.
@@ -30,7 +30,7 @@ def write(path: Path | None, content: Mapping[str, Any]) -> None:
     if path is None:
         return
     source = {
-        "command": " ".join(["python -m benchmarks", *sys.argv[1:]]),
+        "command": " ".join(["tangram-bench", *sys.argv[1:]]),
         "commit": commit(),
         "processor": processor(),
         "cores": len(os.sched_getaffinity(0)),

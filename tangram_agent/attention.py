@@ -11,6 +11,12 @@ from torch import Tensor, nn
 from tangram_agent.config import NetConfig
 
 
+# Added to the score of two nodes without an edge: its exponential is exactly zero, and finite.
+NO_EDGE = -1e30
+# Up to so many nodes torch's own softmax is slower than its definition.
+SHORT_ROW = 16
+
+
 class GraphAttention(nn.Module):
     """One MHA layer: Eqs. 9-12.
 
@@ -27,21 +33,29 @@ class GraphAttention(nn.Module):
         self.combine = nn.Linear(width, width, bias=False)
 
     def forward(self, nodes: Tensor, edges: Tensor) -> Tensor:
-        """Messages (B, N, W) from nodes (B, N, W) along edges (N, N) or (B, N, N).
+        """Messages (B, N, W) from nodes (B, N, W) along edges (N, N).
 
         A node without any edge gets a message of zeros.
         """
         size, count, width = nodes.shape
         joint = self.query_key_value(nodes).view(size, count, 3, self.heads, self.key_width)
-        query, key, value = joint.permute(2, 0, 3, 1, 4)
-        scores = (query @ key.transpose(-1, -2)) * self.scale
-        allowed = edges if edges.dim() == 2 else edges[:, None]
-        # A large negative number instead of -inf: a row without edges stays finite.
-        scores = scores.masked_fill(~allowed, torch.finfo(scores.dtype).min)
-        weights = torch.softmax(scores, dim=-1) * allowed
-        messages = (weights @ value).transpose(1, 2).reshape(size, count, width)
-        combined: Tensor = self.combine(messages)
+        # All heads of the whole batch as one batch: (3, B * M, N, D).
+        stacked = joint.permute(2, 0, 3, 1, 4).reshape(3, -1, count, self.key_width)
+        query, key, value = stacked.unbind()
+        apart = torch.where(edges, 0.0, NO_EDGE).expand(len(query), -1, -1)
+        scores = torch.baddbmm(apart, query, key.transpose(1, 2), alpha=self.scale)
+        messages = softmax_mean(scores, value) * edges.any(dim=-1, keepdim=True)
+        heads = messages.view(size, self.heads, count, self.key_width)
+        combined: Tensor = self.combine(heads.transpose(1, 2).reshape(size, count, width))
         return combined
+
+
+def softmax_mean(scores: Tensor, value: Tensor) -> Tensor:
+    """softmax(scores) @ value: (B, N, N), (B, N, D) -> (B, N, D)."""
+    if scores.shape[-1] > SHORT_ROW:
+        return torch.softmax(scores, dim=-1) @ value
+    exponential = (scores - scores.detach().amax(dim=-1, keepdim=True)).exp()
+    return (exponential @ value) / exponential.sum(dim=-1, keepdim=True)
 
 
 class EncoderLayer(nn.Module):
@@ -83,22 +97,12 @@ class GraphEncoder(nn.Module):
         self.embed = nn.Linear(features, config.width, bias=False)
         self.layers = nn.ModuleList([EncoderLayer(config) for _ in range(config.layers)])
 
-    def forward(
-        self, features: Tensor, edges: Tensor, present: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Node embeddings (B, N, W) and their mean over the graph (B, W).
+    def forward(self, features: Tensor, edges: Tensor) -> tuple[Tensor, Tensor]:
+        """Node embeddings (B, N, W) of features (B, N, F), and their mean over the graph (B, W).
 
-        Args:
-            features: (B, N, F).
-            edges: (N, N).
-            present: (B, N), False for nodes that are only padding; they influence nothing.
+        Edges are (N, N).
         """
-        if present is not None:
-            edges = edges & present[:, :, None] & present[:, None, :]
         nodes = self.embed(features)
         for layer in self.layers:
             nodes = layer(nodes, edges)
-        if present is None:
-            return nodes, nodes.mean(dim=1)
-        weight = present[..., None].to(nodes.dtype)
-        return nodes, (nodes * weight).sum(dim=1) / weight.sum(dim=1)
+        return nodes, nodes.mean(dim=1)

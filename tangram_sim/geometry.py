@@ -7,103 +7,128 @@ piece for two that only touch.
 
 import numpy as np
 
-from tangram_sim.arrays import Bools, Floats
+from tangram_sim.arrays import AnyArray, Bools, Complex, Floats
 from tangram_sim.layout import Layout
 
 
 def area(polygons: Floats) -> Floats:
     """Signed areas (B,) of polygons (B, M, 2); repeated corners do no harm."""
-    ahead = np.roll(polygons, -1, axis=1)
-    cross = polygons[..., 0] * ahead[..., 1] - ahead[..., 0] * polygons[..., 1]
-    total: Floats = cross.sum(axis=1) / 2.0
+    corners = _complex(polygons)
+    total: Floats = (corners.conj() * _ahead(corners)).imag.sum(axis=1) / 2.0
     return total
 
 
 def clip(polygons: Floats, clipper: Floats) -> Floats:
     """Intersection of convex polygons (B, M, 2) with convex counter-clockwise ones (B, C, 2).
 
+    Repeated corners, by which polygons of fewer corners are padded, do no harm in either.
+
     Returns:
         (B, M', 2): corners of the intersection, padded by repeating its first corner to the
         longest of the batch; all corners are zero where the intersection is empty.
     """
-    result = polygons
-    for c in range(clipper.shape[1]):
-        start = clipper[:, c]
-        result = _clip_half_plane(result, start, clipper[:, (c + 1) % clipper.shape[1]] - start)
-    return result
+    result, corners = _complex(polygons), _complex(clipper)
+    for c in range(corners.shape[1]):
+        start = corners[:, c, None]
+        result = _clip_half_plane(result, start, corners[:, c - corners.shape[1] + 1, None] - start)
+    return np.stack([result.real, result.imag], axis=-1)
 
 
-def _clip_half_plane(polygons: Floats, point: Floats, direction: Floats) -> Floats:
-    """Keep what lies left of a line: (B, M, 2) -> (B, M', 2)."""
-    offset: Floats = polygons - point[:, None]
-    side: Floats = direction[:, None, 0] * offset[..., 1] - direction[:, None, 1] * offset[..., 0]
-    next_side = np.roll(side, -1, axis=1)
+def _complex(points: Floats) -> Complex:
+    """Points (..., 2) as x + iy (...): a rotation or a cross product is then one call."""
+    numbers: Complex = points[..., 0] + 1j * points[..., 1]
+    return numbers
+
+
+def _ahead(row: AnyArray) -> AnyArray:
+    """Each row's next element, (B, M)."""
+    return np.concatenate([row[:, 1:], row[:, :1]], axis=1)
+
+
+def _clip_half_plane(polygons: Complex, point: Complex, direction: Complex) -> Complex:
+    """Keep what lies left of lines (B, 1): (B, M) -> (B, M')."""
+    side: Floats = (direction.conj() * (polygons - point)).imag
+    next_side = _ahead(side)
     inside = side >= 0.0
     crosses = inside != (next_side >= 0.0)
-    span = np.where(crosses, side - next_side, 1.0)
-    ahead = np.roll(polygons, -1, axis=1)
-    crossing = polygons + (side / span)[..., None] * (ahead - polygons)
+    if inside.all():
+        return polygons
+    share = side / np.where(crosses, side - next_side, 1.0)
+    crossing = polygons + share * (_ahead(polygons) - polygons)
     return _compact(polygons, inside, crossing, crosses)
 
 
-def _compact(polygons: Floats, inside: Bools, crossing: Floats, crosses: Bools) -> Floats:
+def _compact(polygons: Complex, inside: Bools, crossing: Complex, crosses: Bools) -> Complex:
     """Interleave kept corners and crossings, drop the rest, pad with the first one left."""
-    size, m = inside.shape
-    points = np.stack([polygons, crossing], axis=2).reshape(size, 2 * m, 2)
-    keep: Bools = np.stack([inside, crosses], axis=2).reshape(size, 2 * m)
-    slot = np.cumsum(keep, axis=1) - 1
-    first = points[np.arange(size), np.argmax(keep, axis=1)] * keep.any(axis=1, keepdims=True)
+    points, keep = _interleaved(polygons, crossing), _interleaved(inside, crosses)
+    count = keep.sum(axis=1)
     # Mostly at most m + 1; corners on the line may alternate sides by rounding, then more.
-    width = max(int(slot[:, -1].max(initial=0)) + 1, 1)
-    packed = np.repeat(first[:, None], width, axis=1)
-    row, column = np.nonzero(keep)
-    packed[row, slot[row, column]] = points[row, column]
+    width = max(int(count.max(initial=0)), 1)
+    order = np.argsort(~keep, axis=1, kind="stable")[:, :width]
+    order = np.where(np.arange(width) < count[:, None], order, order[:, :1])
+    packed: Complex = points[np.arange(len(points))[:, None], order] * (count > 0)[:, None]
     return packed
+
+
+def _interleaved(first: AnyArray, second: AnyArray) -> AnyArray:
+    """Columns of both in turns: (B, M), (B, M) -> (B, 2M)."""
+    joined = np.empty((len(first), 2 * first.shape[1]), first.dtype)
+    joined[:, ::2], joined[:, 1::2] = first, second
+    return joined
 
 
 def overlap_area(tokens: Floats, targets: Floats, layout: Layout) -> Floats:
     """Area (B,) of (union of tokens) intersected with (union of targets).
+
+    Inclusion and exclusion, one round for each number of tokens that cover the same place: what
+    single tokens cover of the target's pieces, less what two of them do, and so on. Each round
+    clips all pieces of the whole batch at once, and only where both can meet.
 
     Args:
         tokens: (B, V, 2) corners of the tokens; tokens may overlap each other.
         targets: (B, V, 2) corners of the targets, which do not overlap each other.
         layout: which corners belong to which token.
     """
-    total = np.zeros(len(tokens))
-    for j in range(layout.tokens):
-        target = targets[:, layout.corners_of(j)]
-        total += _covered(target, tokens, layout)
-    return total
-
-
-def _covered(piece: Floats, tokens: Floats, layout: Layout, first: int = 0) -> Floats:
-    """Area (B,) of each convex piece that at least one token k >= first covers.
-
-    Inclusion-exclusion as a recursion: |P n (T_k u rest)| = |P n T_k| + |P n rest| minus what of
-    P n T_k the rest covers. Only the rows of the batch where both can meet are followed.
-    """
-    total = np.zeros(len(piece))
-    for k in range(first, layout.tokens):
-        token = tokens[:, layout.corners_of(k)]
-        rows = np.flatnonzero(_boxes_meet(piece, token))
-        if not len(rows):
-            continue
-        common = clip(piece[rows], token[rows])
+    own, count = outlines(tokens, layout), layout.tokens
+    total, sign = np.zeros(len(tokens)), 1.0
+    rows = np.repeat(np.arange(len(tokens)), count)
+    pieces = outlines(targets, layout).reshape(len(rows), -1, 2)
+    last = np.full(len(rows), -1)
+    for _ in range(count):
+        # Every piece with every token behind the last one that it was cut with.
+        piece, token = np.nonzero(np.arange(count) > last[:, None])
+        meet = _boxes_meet(pieces[piece], own[rows[piece], token])
+        piece, token = piece[meet], token[meet]
+        if not len(piece):
+            break
+        common = clip(pieces[piece], own[rows[piece], token])
         size = area(common)
-        total[rows] += size
+        total += sign * np.bincount(rows[piece], size, minlength=len(tokens))
         hit = size > 0.0
-        if k + 1 < layout.tokens and hit.any():
-            deeper = rows[hit]
-            total[deeper] -= _covered(common[hit], tokens[deeper], layout, k + 1)
+        rows, pieces, last = rows[piece[hit]], common[hit], token[hit]
+        sign = -sign
     return total
+
+
+def outlines(corners: Floats, layout: Layout) -> Floats:
+    """Corners (B, V, 2) token by token, (B, K, C, 2), padded by repeating a token's last one."""
+    padded: Floats = corners[:, layout.padded_corners]
+    return padded
 
 
 def _boxes_meet(first: Floats, second: Floats) -> Bools:
     """(B,), whether the bounding boxes of polygons (B, M, 2) and (B, C, 2) overlap."""
-    below = first.min(axis=1) < second.max(axis=1)
-    above = second.min(axis=1) < first.max(axis=1)
-    meet: Bools = (below & above).all(axis=-1)
-    return meet
+    low, high = _box(first)
+    other_low, other_high = _box(second)
+    apart = (low >= other_high) | (other_low >= high)
+    return ~(apart[:, 0] | apart[:, 1])
+
+
+def _box(polygons: Floats) -> tuple[Floats, Floats]:
+    """Lowest and highest coordinates (B, 2) of polygons (B, M, 2)."""
+    # Corner by corner: numpy is several times slower along a short axis in the middle.
+    corners = np.ascontiguousarray(polygons.swapaxes(0, 1))
+    return corners.min(axis=0), corners.max(axis=0)
 
 
 def overlap_share(tokens: Floats, targets: Floats, layout: Layout) -> Floats:
@@ -125,9 +150,7 @@ def pairs_overlap(first: Floats, second: Floats, tolerance: float = 1e-9) -> Boo
 
 def any_overlap(corners: Floats, layout: Layout, tolerance: float = 1e-9) -> Bools:
     """Whether any two tokens of a layout overlap by more than `tolerance` in area: (B,)."""
-    found = np.zeros(len(corners), dtype=np.bool_)
-    for i in range(layout.tokens):
-        for j in range(i + 1, layout.tokens):
-            first, second = corners[:, layout.corners_of(i)], corners[:, layout.corners_of(j)]
-            found |= pairs_overlap(first, second, tolerance)
-    return found
+    own, pairs = outlines(corners, layout), np.triu_indices(layout.tokens, 1)
+    first, second = (own[:, side].reshape(-1, *own.shape[2:]) for side in pairs)
+    overlaps = pairs_overlap(first, second, tolerance).reshape(len(corners), -1)
+    return np.asarray(overlaps.any(axis=1))

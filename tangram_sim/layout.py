@@ -69,6 +69,8 @@ class Layout:
         body: (V, 2) corners of all tokens in their body frames.
         starts: (K + 1,) token k owns the corners starts[k]:starts[k + 1].
         token_of_corner: (V,) index of the owning token.
+        padded_corners: (K, C) the corners of each token, filled up to the C of the largest by
+            repeating the last.
         base_weights: (K, V) centre of token k as an affine combination of the corners.
         adjacency: (N, N) edges of the graph, E(i, i) = 0.
     """
@@ -79,6 +81,8 @@ class Layout:
         self.starts: Ints = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
         self.body: Floats = np.concatenate([shape.corners for shape in self.shapes])
         self.token_of_corner: Ints = np.repeat(np.arange(len(sizes)), sizes)
+        steps = np.minimum(np.arange(max(sizes)), np.array(sizes)[:, None] - 1)
+        self.padded_corners: Ints = self.starts[:-1, None] + steps
         self.base_weights: Floats = self._base_weights()
         self.adjacency: Bools = self._adjacency()
 

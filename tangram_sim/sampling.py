@@ -43,32 +43,35 @@ def sample_batch(
     reach = check_fits(layout, sim)
     poses = np.empty((len(generators), layout.tokens, 3))
     order = sorted(range(layout.tokens), key=lambda token: -layout.shapes[token].area)
-    obstacles: list[Floats] = []  # (B, V of one token, 2) each
+    corners = layout.padded_corners.shape[1]
+    obstacles: Floats = np.empty((len(generators), 0, corners, 2))
     for token in order:
         shape = layout.shapes[token]
         poses[:, token] = _place(shape, reach[token], obstacles, sim, generators)
-        obstacles.append(_outlines(shape, poses[:, token]))
+        placed = _outlines(shape, poses[:, token], corners)
+        obstacles = np.concatenate([obstacles, placed[:, None]], axis=1)
     return poses
 
 
 def _place(
     shape: Shape,
     reach: float,
-    obstacles: Sequence[Floats],
+    obstacles: Floats,
     sim: SimConfig,
     generators: Sequence[np.random.Generator],
 ) -> Floats:
-    """(B, 3) a pose of one token in every environment, clear of all obstacles."""
+    """(B, 3) a pose of one token in every environment, clear of all obstacles (B, k, C, 2)."""
     poses = np.empty((len(generators), 3))
-    chunk = _CHUNK if obstacles else 1
+    before = obstacles.shape[1]
+    chunk = _CHUNK if before else 1
     open_rows = np.arange(len(generators))
     tries = 0
     while len(open_rows):
         size = min(chunk, sim.max_tries - tries)
         if size == 0:
-            raise _exhausted(shape, len(obstacles), sim)
+            raise _exhausted(shape, before, sim)
         drawn = np.stack([_draw(generators[b], size, reach) for b in open_rows.tolist()])
-        blocked = _blocked(shape, drawn, [obstacle[open_rows] for obstacle in obstacles])
+        blocked = _blocked(shape, drawn, obstacles[open_rows])
         first = np.argmin(blocked, axis=1)
         free = ~blocked[np.arange(len(open_rows)), first]
         poses[open_rows[free]] = drawn[free, first[free]]
@@ -84,21 +87,20 @@ def _draw(rng: np.random.Generator, size: int, reach: float) -> Floats:
     return poses
 
 
-def _blocked(shape: Shape, drawn: Floats, obstacles: Sequence[Floats]) -> Bools:
-    """(B, size), which of the poses (B, size, 3) overlap an obstacle (B, V, 2)."""
-    rows, size = drawn.shape[:2]
-    blocked = np.zeros(rows * size, dtype=np.bool_)
-    if obstacles:
-        outlines = _outlines(shape, drawn.reshape(-1, 3))
-        for obstacle in obstacles:
-            blocked |= pairs_overlap(outlines, np.repeat(obstacle, size, axis=0))
-    return blocked.reshape(rows, size)
+def _blocked(shape: Shape, drawn: Floats, obstacles: Floats) -> Bools:
+    """(B, size), which of the poses (B, size, 3) overlap an obstacle (B, k, C, 2)."""
+    rows, size, before = *drawn.shape[:2], obstacles.shape[1]
+    if not before:
+        return np.zeros((rows, size), dtype=np.bool_)
+    own = np.repeat(_outlines(shape, drawn.reshape(-1, 3)), before, axis=0)
+    others = np.repeat(obstacles, size, axis=0).reshape(len(own), -1, 2)
+    return np.asarray(pairs_overlap(own, others).reshape(rows, size, before).any(axis=2))
 
 
-def _outlines(shape: Shape, poses: Floats) -> Floats:
-    """Corners (M, V, 2) of one shape in poses (M, 3)."""
+def _outlines(shape: Shape, poses: Floats, count: int = 0) -> Floats:
+    """Corners (M, V, 2) of one shape in poses (M, 3); its last corner repeated up to `count`."""
     cos, sin = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
-    x, y = shape.corners.T
+    x, y = np.pad(shape.corners, ((0, max(0, count - len(shape.corners))), (0, 0)), mode="edge").T
     turned = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
     outlines: Floats = turned + poses[:, None, :2]
     return outlines

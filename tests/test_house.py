@@ -76,7 +76,7 @@ def test_console_scripts_are_declared(command: str) -> None:
 def test_constraints_pin_every_requirement() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    wanted = [*project["dependencies"], *extras["dev"], *extras["sb3"], *extras["slurm"]]
+    wanted = [*project["dependencies"], *extras["dev"], *extras["peers"], *extras["slurm"]]
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pinned = {line.partition("==")[0].lower().replace("_", "-") for line in lines if "==" in line}
     names = {text.partition(";")[0].partition(">=")[0].strip().lower() for text in wanted}

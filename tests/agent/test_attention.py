@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tangram_agent.attention import GraphAttention, GraphEncoder
+from tangram_agent.attention import NO_EDGE, SHORT_ROW, GraphAttention, GraphEncoder, softmax_mean
 from tangram_agent.config import NetConfig
 from tangram_agent.networks import initialise
 from tests.agent.builders import setup
@@ -105,18 +105,13 @@ def test_without_an_edge_there_is_no_influence() -> None:
         assert moved.tolist() == expected.tolist()
 
 
-def test_padding_nodes_influence_nothing() -> None:
-    encoder = GraphEncoder(4, NetConfig(width=WIDTH, heads=HEADS, layers=2, feed_forward=8))
-    initialise(encoder, torch.Generator().manual_seed(1))
-    generator = torch.Generator().manual_seed(2)
-    features = torch.randn(2, NODES + 3, 4, generator=generator)
-    edges = torch.ones(NODES + 3, NODES + 3, dtype=torch.bool).fill_diagonal_(fill_value=False)
-    present = torch.zeros(2, NODES + 3, dtype=torch.bool)
-    present[:, :NODES] = True
-    nodes, mean = encoder(features, edges, present)
-    alone, alone_mean = encoder(features[:, :NODES], edges[:NODES, :NODES])
-    torch.testing.assert_close(nodes[:, :NODES], alone, atol=1e-6, rtol=1e-5)
-    torch.testing.assert_close(mean, alone_mean, atol=1e-6, rtol=1e-5)
-    changed = features.clone()
-    changed[:, NODES:] = 1e3
-    torch.testing.assert_close(encoder(changed, edges, present)[1], mean)
+@pytest.mark.parametrize("count", [1, 3, SHORT_ROW, SHORT_ROW + 1, 53])
+def test_the_mean_is_that_of_torchs_softmax(count: int) -> None:
+    """Also with scores whose exponentials overflow, and where edges are missing."""
+    generator = torch.Generator().manual_seed(count)
+    scores = 200.0 * torch.randn(4, count, count, generator=generator, dtype=torch.float32)
+    scores[:, :, 0].mul_(torch.tensor([1.0, 1.0, 0.0, 0.0])[:, None])
+    scores[2, :, 1:] = NO_EDGE
+    value = torch.randn(4, count, 5, generator=generator)
+    expected = torch.softmax(scores, dim=-1) @ value
+    torch.testing.assert_close(softmax_mean(scores, value), expected)

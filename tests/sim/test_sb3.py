@@ -10,7 +10,7 @@ pytestmark = pytest.mark.slow
 
 def test_stable_baselines3_runs_unchanged() -> None:
     pytest.importorskip("torch").set_num_threads(1)
-    sb3 = pytest.importorskip("stable_baselines3", reason="pip install '.[sb3]'")
+    sb3 = pytest.importorskip("stable_baselines3", reason="pip install '.[peers]'")
     env = gymnasium.make(ENV_ID, shapes=["square", "small_triangle"], actions_per_token=2)
     model = sb3.DDPG(
         "MultiInputPolicy",
