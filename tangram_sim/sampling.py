@@ -9,6 +9,7 @@ the batch, which are only checked together for speed.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,7 +18,6 @@ from tangram_sim.config import SimConfig
 from tangram_sim.errors import SamplingError
 from tangram_sim.geometry import pairs_overlap
 from tangram_sim.layout import Layout
-from tangram_sim.shapes import Shape
 
 _CHUNK = 4  # poses drawn at once when some may overlap: fewer, larger checks
 
@@ -43,19 +43,35 @@ def sample_batch(
     reach = check_fits(layout, sim)
     poses = np.empty((len(generators), layout.tokens, 3))
     order = sorted(range(layout.tokens), key=lambda token: -layout.shapes[token].area)
-    corners = layout.padded_corners.shape[1]
-    obstacles: Floats = np.empty((len(generators), 0, corners, 2))
+    bodies = layout.body[layout.padded_corners]
+    obstacles: Floats = np.empty((len(generators), 0, *bodies.shape[1:]))
     for token in order:
-        shape = layout.shapes[token]
-        poses[:, token] = _place(shape, reach[token], obstacles, sim, generators)
-        placed = _outlines(shape, poses[:, token], corners)
+        piece = _Piece(layout.shapes[token].name, bodies[token], reach[token])
+        poses[:, token] = _place(piece, obstacles, sim, generators)
+        placed = piece.outlines(poses[:, token])
         obstacles = np.concatenate([obstacles, placed[:, None]], axis=1)
     return poses
 
 
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """A token that is to be placed: its name, corners (C, 2) and how far out its centre may be."""
+
+    name: str
+    body: Floats
+    reach: float
+
+    def outlines(self, poses: Floats) -> Floats:
+        """Corners (M, C, 2) in poses (M, 3)."""
+        cos, sin = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
+        x, y = self.body.T
+        turned = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+        moved: Floats = turned + poses[:, None, :2]
+        return moved
+
+
 def _place(
-    shape: Shape,
-    reach: float,
+    piece: _Piece,
     obstacles: Floats,
     sim: SimConfig,
     generators: Sequence[np.random.Generator],
@@ -69,9 +85,9 @@ def _place(
     while len(open_rows):
         size = min(chunk, sim.max_tries - tries)
         if size == 0:
-            raise _exhausted(shape, before, sim)
-        drawn = np.stack([_draw(generators[b], size, reach) for b in open_rows.tolist()])
-        blocked = _blocked(shape, drawn, obstacles[open_rows])
+            raise _exhausted(piece.name, before, sim)
+        drawn = np.stack([_draw(generators[b], size, piece.reach) for b in open_rows.tolist()])
+        blocked = _blocked(piece, drawn, obstacles[open_rows])
         first = np.argmin(blocked, axis=1)
         free = ~blocked[np.arange(len(open_rows)), first]
         poses[open_rows[free]] = drawn[free, first[free]]
@@ -87,23 +103,14 @@ def _draw(rng: np.random.Generator, size: int, reach: float) -> Floats:
     return poses
 
 
-def _blocked(shape: Shape, drawn: Floats, obstacles: Floats) -> Bools:
+def _blocked(piece: _Piece, drawn: Floats, obstacles: Floats) -> Bools:
     """(B, size), which of the poses (B, size, 3) overlap an obstacle (B, k, C, 2)."""
     rows, size, before = *drawn.shape[:2], obstacles.shape[1]
     if not before:
         return np.zeros((rows, size), dtype=np.bool_)
-    own = np.repeat(_outlines(shape, drawn.reshape(-1, 3)), before, axis=0)
+    own = np.repeat(piece.outlines(drawn.reshape(-1, 3)), before, axis=0)
     others = np.repeat(obstacles, size, axis=0).reshape(len(own), -1, 2)
     return np.asarray(pairs_overlap(own, others).reshape(rows, size, before).any(axis=2))
-
-
-def _outlines(shape: Shape, poses: Floats, count: int = 0) -> Floats:
-    """Corners (M, V, 2) of one shape in poses (M, 3); its last corner repeated up to `count`."""
-    cos, sin = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
-    x, y = np.pad(shape.corners, ((0, max(0, count - len(shape.corners))), (0, 0)), mode="edge").T
-    turned = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
-    outlines: Floats = turned + poses[:, None, :2]
-    return outlines
 
 
 def check_fits(layout: Layout, sim: SimConfig) -> Floats:
@@ -124,8 +131,8 @@ def check_fits(layout: Layout, sim: SimConfig) -> Floats:
     return reach
 
 
-def _exhausted(shape: Shape, before: int, sim: SimConfig) -> SamplingError:
+def _exhausted(name: str, before: int, sim: SimConfig) -> SamplingError:
     return SamplingError(
-        f"no room for token '{shape.name}' beside {before} others in {sim.max_tries} tries in an "
+        f"no room for token '{name}' beside {before} others in {sim.max_tries} tries in an "
         f"arena of width {sim.arena:g}: raise sim.arena or sim.max_tries, or lower tokens.scale"
     )
