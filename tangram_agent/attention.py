@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from tangram_agent.config import NetConfig
 
-
 # Added to the score of two nodes without an edge: its exponential is exactly zero, and finite.
 NO_EDGE = -1e30
 # Up to so many nodes torch's own softmax is slower than its definition.

@@ -50,12 +50,18 @@ def saturation(raw: Tensor, limit: float) -> Tensor:
     return torch.relu(raw.abs() - limit).square().mean()
 
 
-def polyak_update(target: nn.Module, source: nn.Module, rho: float) -> None:
-    """Eq. 4: target <- rho * target + (1 - rho) * source."""
+def polyak_update(targets: list[Tensor], sources: list[Tensor], rho: float) -> None:
+    """Eq. 4: target <- rho * target + (1 - rho) * source, parameter by parameter."""
     with torch.no_grad():
-        targets: list[Tensor] = list(target.parameters())
-        sources: list[Tensor] = list(source.parameters())
         torch._foreach_lerp_(targets, sources, 1.0 - rho)
+
+
+def average_so_far(rho: float, updates: int) -> float:
+    """Rho of a running average after so many updates: less at first, while it is mostly its start.
+
+    A constant 0.99 holds the random weights of the start for hundreds of updates.
+    """
+    return min(rho, updates / (updates + 9.0))
 
 
 class NotFiniteError(RunError):
@@ -86,8 +92,12 @@ class Learner:
             module.to(self.device)
         self.target_actor, self.target_critic = _frozen(self.actor), _frozen(self.critic)
         self.acting = _frozen(self.actor)
-        self.actor_optimiser = _adam(self.actor, self.config.actor_lr)
-        self.critic_optimiser = _adam(self.critic, self.config.critic_lr)
+        # Kept as lists: walking the modules takes a fifth of a small network's update.
+        self._lists: dict[str, list[Tensor]] = {
+            part: list(getattr(self, part).parameters()) for part in PARTS
+        }
+        self.actor_optimiser = _adam(self._lists["actor"], self.config.actor_lr)
+        self.critic_optimiser = _adam(self._lists["critic"], self.config.critic_lr)
 
     def update(self, batch: Transitions, progress: float = 0.0) -> dict[str, float]:
         """One step of both networks on a batch.
@@ -106,30 +116,45 @@ class Learner:
         """
         tensors = {name: self._tensor(column) for name, column in vars(batch).items()}
         self._set_learning_rate(progress)
+        self._look(tensors)
         values = self._critic_step(tensors) | self._actor_step(tensors)
-        if self.config.gamma > 0.0:
-            polyak_update(self.target_critic, self.critic, self.config.polyak)
-            polyak_update(self.target_actor, self.actor, self.config.polyak)
-        polyak_update(self.acting, self.actor, self.config.acting_average)
+        self._follow()
         # One wait for the device, after everything has been asked of it.
         numbers = dict(zip(values, torch.stack(list(values.values())).tolist(), strict=True))
         _check_finite(self.updates + 1, numbers)
         self.updates += 1
         return numbers
 
+    def _look(self, t: dict[str, Tensor]) -> None:
+        """Make the features once where critic and actor see the same: one token, as it stands."""
+        if self.tokens == 1 and not self.config.afterstate:
+            token = next_token(t["placed"])
+            t["features"] = self.graph.node_features(t["state"], t["placed"], t["goal"], token)
+
+    def _follow(self) -> None:
+        """Targets and the acting average, a little of the way to the networks."""
+        lists, config = self._lists, self.config
+        if config.gamma > 0.0:
+            polyak_update(lists["target_critic"], lists["critic"], config.polyak)
+            polyak_update(lists["target_actor"], lists["actor"], config.polyak)
+        rho = average_so_far(config.acting_average, self.updates)
+        polyak_update(lists["acting"], lists["actor"], rho)
+
     def critic_loss(self, t: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Mean squared Bellman error of Eq. 3, and the values (B,)."""
         with torch.no_grad():
             y = self._target(t)
         token, velocity = split_action(t["action"], self.tokens)
-        q = self.critic(t["state"], t["placed"], t["goal"], token, velocity)
+        state = (t["state"], t["placed"], t["goal"], token)
+        q = self.critic(*state, velocity, t.get("features"))
         return (q - y).square().mean(), q
 
     def actor_loss(self, t: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Minus the value of the actor's own actions (Eq. 6), and the saturation penalty."""
         token = next_token(t["placed"])
-        velocity, raw = self.actor(t["state"], t["placed"], t["goal"], token)
-        q = self.critic(t["state"], t["placed"], t["goal"], token, velocity)
+        state = (t["state"], t["placed"], t["goal"], token)
+        velocity, raw = self.actor(*state, t.get("features"))
+        q = self.critic(*state, velocity, t.get("features"))
         return -q.mean(), saturation(raw, self.config.saturation_limit)
 
     def _target(self, t: dict[str, Tensor]) -> Tensor:
@@ -144,20 +169,30 @@ class Learner:
 
     def _critic_step(self, t: dict[str, Tensor]) -> dict[str, Tensor]:
         loss, q = self.critic_loss(t)
-        norm = _step(self.critic, self.critic_optimiser, loss, self.config.grad_clip)
+        norm = self._step("critic", loss)
         return {"critic_loss": loss.detach(), "q": q.detach().mean(), "critic_gradient": norm}
 
     def _actor_step(self, t: dict[str, Tensor]) -> dict[str, Tensor]:
-        self.critic.requires_grad_(False)
         value_loss, penalty = self.actor_loss(t)
         loss = value_loss + self.config.saturation_penalty * penalty
-        norm = _step(self.actor, self.actor_optimiser, loss, self.config.grad_clip)
-        self.critic.requires_grad_(True)
+        norm = self._step("actor", loss)
         return {
             "actor_loss": value_loss.detach(),
             "saturation": penalty.detach(),
             "actor_gradient": norm,
         }
+
+    def _step(self, part: str, loss: Tensor) -> Tensor:
+        """One step of one network, whatever else the loss depends on; its gradient's norm."""
+        parameters = self._lists[part]
+        gradients = torch.autograd.grad(loss, parameters)
+        norm = nn.utils.get_total_norm(gradients)
+        for parameter, gradient in zip(parameters, gradients, strict=True):
+            parameter.grad = gradient
+        if self.config.grad_clip > 0.0:
+            nn.utils.clip_grads_with_norm_(parameters, self.config.grad_clip, norm)
+        self._optimisers()[part].step()
+        return norm
 
     def _set_learning_rate(self, progress: float) -> None:
         factor = 1.0
@@ -253,18 +288,8 @@ def _frozen(module: nn.Module) -> nn.Module:
     return copy.deepcopy(module).requires_grad_(False)
 
 
-def _adam(module: nn.Module, rate: float) -> torch.optim.Adam:
-    return torch.optim.Adam(module.parameters(), lr=rate, fused=True)
-
-
-def _step(module: nn.Module, optimiser: torch.optim.Adam, loss: Tensor, clip: float) -> Tensor:
-    """One step; returns the norm of the whole gradient."""
-    optimiser.zero_grad(set_to_none=True)
-    loss.backward()  # type: ignore[no-untyped-call]
-    limit = clip if clip > 0.0 else math.inf
-    norm = nn.utils.clip_grad_norm_(module.parameters(), limit)
-    optimiser.step()
-    return norm
+def _adam(parameters: list[Tensor], rate: float) -> torch.optim.Adam:
+    return torch.optim.Adam(parameters, lr=rate, fused=True)
 
 
 def _check_finite(updates: int, numbers: dict[str, float]) -> None:

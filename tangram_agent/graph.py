@@ -60,7 +60,7 @@ class TokenGraph(nn.Module):
         owner = torch.as_tensor(layout.token_of_corner)
         one_hot = torch.nn.functional.one_hot(owner, layout.tokens).T.float()
         symmetry = torch.tensor([float(shape.symmetry) for shape in layout.shapes])
-        target_flag = torch.zeros(layout.nodes, 1)
+        target_flag = torch.zeros(layout.nodes)
         target_flag[layout.corner_count + layout.tokens :] = 1.0
         constants = {
             "token_of_corner": owner,
@@ -87,16 +87,15 @@ class TokenGraph(nn.Module):
         """Node index (B,) of the base of token (B,)."""
         return self.corner_count + token
 
-    def pieces(self, corners: Tensor) -> tuple[Tensor, Tensor]:
-        """Centres (B, K, 2) and orientations (B, K, 2) of pieces with corners (B, V, 2).
+    def centres(self, corners: Tensor) -> Tensor:
+        """Centres of area (B, K, 2) of pieces with corners (B, V, 2)."""
+        return self.base_weights @ corners
 
-        The orientation is the least-squares rotation from the body frame.
-        """
-        centre = self.base_weights @ corners
+    def headings(self, corners: Tensor, centre: Tensor) -> Tensor:
+        """Orientations (B, K, 2): the least-squares rotations from the body frame."""
         offset = corners - centre[:, self.token_of_corner]
         relative = turn_back(offset, self.body.expand_as(offset))
-        heading = self.members @ relative
-        return centre, nn.functional.normalize(heading, dim=-1)
+        return nn.functional.normalize(self.members @ relative, dim=-1)
 
     def node_features(self, corners: Tensor, placed: Tensor, goal: Tensor, token: Tensor) -> Tensor:
         """Features (B, N, F).
@@ -108,29 +107,40 @@ class TokenGraph(nn.Module):
             token: (B,) the token that the agent is to move or has just moved.
         """
         rows = torch.arange(len(corners), device=corners.device)
-        centre, heading = self.pieces(corners)
-        goal_centre, goal_heading = self.pieces(goal)
+        centre, goal_centre = self.centres(corners), self.centres(goal)
         positions = torch.cat([corners, centre, goal], dim=1)
-        centres = torch.cat([centre[:, self.token_of_corner], centre], dim=1)
-        offset = torch.cat([positions[:, : centres.shape[1]] - centres, goal], dim=1)
-        offset[:, centres.shape[1] :] -= goal_centre[:, self.token_of_corner]
+        offset = self._offset(corners, centre, goal, goal_centre) if self.offsets else None
+        if self.egocentric or self.orientation:
+            heading = self.headings(corners, centre)
+            reference = heading[rows, token][:, None]
         if self.egocentric:
-            frame = heading[rows, token][:, None]
-            positions = turn_back(positions - centre[rows, token][:, None], frame)
-            offset = turn_back(offset, frame)
-        flags = torch.cat([placed[:, self.token_of_corner], placed], dim=1)
-        flags = nn.functional.pad(flags, (0, self.corner_count), value=1.0)[..., None]
-        parts = [positions, self.target_flag.expand(len(corners), -1, -1), flags]
-        if self.offsets:
-            parts.append(offset / self.radius[self.token_of_node][:, None])
+            positions = turn_back(positions - centre[rows, token][:, None], reference)
+            offset = None if offset is None else turn_back(offset, reference)
+        parts = [positions, self._flags(placed)]
+        if offset is not None:
+            parts.append(offset)
         if self.orientation:
-            parts.append(self._orientation(heading, goal_heading, heading[rows, token]))
+            goal_heading = self.headings(goal, goal_centre)
+            parts.append(self._orientation(heading, goal_heading, reference))
         return torch.cat(parts, dim=-1)
+
+    def _flags(self, placed: Tensor) -> Tensor:
+        """Whether a node is the target's, and whether it is placed: (B, N, 2)."""
+        flags = torch.cat([placed[:, self.token_of_corner], placed], dim=1)
+        flags = nn.functional.pad(flags, (0, self.corner_count), value=1.0)
+        return torch.stack([self.target_flag.expand_as(flags), flags], dim=-1)
+
+    def _offset(self, corners: Tensor, centre: Tensor, goal: Tensor, goal_centre: Tensor) -> Tensor:
+        """Each node's displacement from its own piece's centre, in radii: (B, N, 2)."""
+        own = corners - centre[:, self.token_of_corner]
+        target = goal - goal_centre[:, self.token_of_corner]
+        offset = torch.cat([own, torch.zeros_like(centre), target], dim=1)
+        return offset / self.radius[self.token_of_node][:, None]
 
     def _orientation(self, heading: Tensor, goal_heading: Tensor, reference: Tensor) -> Tensor:
         """(cos k*theta, sin k*theta) of each node's piece relative to the token: (B, N, 2)."""
         headings = torch.cat([heading, goal_heading], dim=1)
-        cos, sin = turn_back(headings, reference[:, None]).unbind(-1)
+        cos, sin = turn_back(headings, reference).unbind(-1)
         angle = torch.atan2(sin, cos) * self.symmetry.repeat(2)
         per_piece = torch.stack([torch.cos(angle), torch.sin(angle)], dim=-1)
         return per_piece[:, self.piece_of_node]
@@ -149,7 +159,7 @@ class TokenGraph(nn.Module):
 
     def _heading(self, corners: Tensor, token: Tensor) -> Tensor:
         rows = torch.arange(len(corners), device=corners.device)
-        return self.pieces(corners)[1][rows, token]
+        return self.headings(corners, self.centres(corners))[rows, token]
 
     def move(self, corners: Tensor, token: Tensor, velocity: Tensor) -> Tensor:
         """Corners (B, V, 2) after the exact rigid motion of a normalised velocity (B, 3).
@@ -157,7 +167,7 @@ class TokenGraph(nn.Module):
         The same motion as the simulation's: x and y times the arena's width, the angle times pi.
         """
         rows = torch.arange(len(corners), device=corners.device)
-        centre = (self.base_weights @ corners)[rows, token][:, None]
+        centre = self.centres(corners)[rows, token][:, None]
         angle = velocity[:, 2] * math.pi
         by = torch.stack([torch.cos(angle), torch.sin(angle)], dim=-1)[:, None]
         shift = (velocity[:, :2] * self.arena)[:, None]

@@ -50,9 +50,12 @@ class PerceptronReadout(nn.Module):
 
     def forward(self, features: Tensor, token: Tensor) -> Tensor:
         """(B, N, F), (B,) -> (B, outputs) of the token."""
-        groups = self.layers(features.flatten(1)).unflatten(1, (self.tokens, -1))
-        outputs: Tensor = groups[torch.arange(len(groups), device=groups.device), token]
-        return outputs
+        outputs: Tensor = self.layers(features.flatten(1))
+        if self.tokens == 1:
+            return outputs
+        groups = outputs.view(len(outputs), self.tokens, -1)
+        chosen: Tensor = groups[torch.arange(len(groups), device=groups.device), token]
+        return chosen
 
 
 class AttentionValue(nn.Module):
@@ -108,10 +111,19 @@ class Actor(nn.Module):
         self.head = kind(graph, net, outputs)
 
     def forward(
-        self, corners: Tensor, placed: Tensor, goal: Tensor, token: Tensor
+        self,
+        corners: Tensor,
+        placed: Tensor,
+        goal: Tensor,
+        token: Tensor,
+        features: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Velocity (B, 3) in [-1, 1] in the world's frame, and pre-activations (B, outputs)."""
-        features = self.graph.node_features(corners, placed, goal, token)
+        """Velocity (B, 3) in [-1, 1] in the world's frame, and pre-activations (B, outputs).
+
+        Features (B, N, F) of just this state may be handed in where they were made before.
+        """
+        if features is None:
+            features = self.graph.node_features(corners, placed, goal, token)
         raw = self.head(features, token)
         shift = self.graph.to_world(corners, token, self._squash(raw[:, :2]))
         velocity = torch.cat([shift, self._angle(raw[:, 2:], token)], dim=-1)
@@ -142,12 +154,18 @@ class Critic(nn.Module):
         self.head = kind(graph, net, 0 if agent.afterstate else VELOCITY)
 
     def forward(
-        self, corners: Tensor, placed: Tensor, goal: Tensor, token: Tensor, velocity: Tensor
+        self,
+        corners: Tensor,
+        placed: Tensor,
+        goal: Tensor,
+        token: Tensor,
+        velocity: Tensor,
+        features: Tensor | None = None,
     ) -> Tensor:
         """Values (B,).
 
         An afterstate critic sees the graph as the velocity would leave it, a known rigid motion,
-        instead of the velocity itself.
+        instead of the velocity itself. Features are as for the actor; it makes its own.
         """
         if self.afterstate:
             moved = self.graph.move(corners, token, velocity)
@@ -155,7 +173,8 @@ class Critic(nn.Module):
                 self.graph.node_features(moved, placed, goal, token), token, None
             )
             return value
-        features = self.graph.node_features(corners, placed, goal, token)
+        if features is None:
+            features = self.graph.node_features(corners, placed, goal, token)
         shift = self.graph.to_token(corners, token, velocity[:, :2])
         action = torch.cat([shift, velocity[:, 2:]], dim=-1)
         valued: Tensor = self.head(features, token, action)

@@ -11,6 +11,7 @@ import torch
 from tangram_agent.ddpg import (
     Learner,
     NotFiniteError,
+    average_so_far,
     critic_target,
     next_token,
     polyak_update,
@@ -58,9 +59,24 @@ def test_polyak_averaging_of_eq_4() -> None:
     with torch.no_grad():
         target.weight.fill_(1.0)
         source.weight.fill_(3.0)
-    polyak_update(target, source, 0.75)
+    polyak_update(list(target.parameters()), list(source.parameters()), 0.75)
     assert target.weight.item() == pytest.approx(1.5)
     assert source.weight.item() == 3.0
+
+
+@pytest.mark.parametrize(
+    ("rho", "updates", "expected"),
+    [(0.99, 0, 0.0), (0.99, 1, 0.1), (0.99, 9, 0.5), (0.99, 891, 0.99), (0.5, 50, 0.5), (0, 9, 0)],
+)
+def test_a_young_average_forgets_its_start(rho: float, updates: int, expected: float) -> None:
+    assert average_so_far(rho, updates) == pytest.approx(expected)
+
+
+def test_after_the_first_update_the_actor_itself_plays() -> None:
+    learner = Learner(setup(agent={"acting_average": 0.99}), seed=0)
+    learner.update(random_transitions(setup(), 16, done=None))
+    pairs = zip(learner.acting.parameters(), learner.actor.parameters(), strict=True)
+    assert all(torch.equal(average, own) for average, own in pairs)
 
 
 def test_saturation_counts_what_lies_beyond_the_limit() -> None:
@@ -149,6 +165,7 @@ def test_target_networks_matter_where_an_episode_goes_on() -> None:
 def test_an_update_moves_each_network_and_drags_the_averages() -> None:
     made = setup(agent={"gamma": 0.9, "polyak": 0.9, "acting_average": 0.5})
     learner = Learner(made, seed=0)
+    learner.updates = 1000  # the acting average is no longer young
     before = weights(learner)
     learner.update(random_transitions(made, 16, done=None))
     after = weights(learner)
@@ -158,7 +175,7 @@ def test_an_update_moves_each_network_and_drags_the_averages() -> None:
         assert largest_change(before, after, f"target_{part}") == pytest.approx(0.1 * moved, 1e-3)
     acting = largest_change(before, after, "acting")
     assert acting == pytest.approx(0.5 * largest_change(before, after, "actor"), 1e-3)
-    assert learner.updates == after["updates"][0] == 1
+    assert learner.updates == after["updates"][0] == 1001
 
 
 def test_the_actor_step_leaves_the_critic_alone() -> None:
