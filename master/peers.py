@@ -149,7 +149,7 @@ class Registry:
 
     def drop_silent(self, now: float, silence_s: float) -> list[Peer]:
         """Forget the peers that were not heard of for so long, and return them."""
-        silent = [p for p in self.peers if now - p.last_seen > silence_s]
+        silent = [p for p in self._by_key.values() if now - p.last_seen > silence_s]
         for peer in silent:
             self.leave(peer)
         return silent

@@ -40,10 +40,12 @@ class Channel:
         self._weights_endpoint = ""
         self._doubts = 0
         self._poller = zmq.Poller()
+        self._ready: set[zmq.Socket[bytes]] = set()
         self._dealer = self._open(zmq.DEALER)
         # The first byte must not be zero.
         self._dealer.setsockopt(zmq.IDENTITY, b"w" + secrets.token_bytes(16))
         self._monitor = self._dealer.get_monitor_socket(HANDSHAKES)
+        self._poller.register(self._monitor, zmq.POLLIN)
         self._connect(self._dealer, found.endpoint)
 
     def subscribe(self, weights_endpoint: str) -> None:
@@ -58,8 +60,9 @@ class Channel:
         self._weights_endpoint = weights_endpoint
 
     def wait(self, timeout_s: float) -> None:
-        """Return when something came, or after this time."""
-        self._poller.poll(math.ceil(max(0.0, timeout_s) * 1000))
+        """Return when something came, or after this time; what came is looked at after this."""
+        events = self._poller.poll(math.ceil(max(0.0, timeout_s) * 1000))
+        self._ready = {socket for socket, _ in events}
 
     def send(self, frames: Sequence[bytes]) -> bool:
         """Queue a message; False if there is no room."""
@@ -70,7 +73,9 @@ class Channel:
         return True
 
     def messages(self) -> Iterator[list[bytes]]:
-        """What the master answered and is there."""
+        """What the master had answered by the last `wait`, and what comes meanwhile."""
+        if self._dealer not in self._ready:
+            return
         while True:
             try:
                 frames = self._dealer.recv_multipart(zmq.NOBLOCK)
@@ -79,8 +84,8 @@ class Channel:
             yield frames
 
     def weights(self) -> bytes | None:
-        """The newest broadcast that has not been returned."""
-        if self._sub is None:
+        """The newest broadcast that was there at the last `wait`."""
+        if self._sub is None or self._sub not in self._ready:
             return None
         try:
             return self._sub.recv(zmq.NOBLOCK)
@@ -93,6 +98,8 @@ class Channel:
         A wrong key of the master looks like a connection that was lost in the handshake: only
         several of these count.
         """
+        if self._monitor not in self._ready:
+            return False
         while self._monitor.poll(0):
             event = recv_monitor_message(self._monitor)["event"]
             self._doubts += 1 if event == zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL else SURE
