@@ -35,8 +35,8 @@ paper: .venv/.installed-run  ## all figures and tables of the paper: BUDGET=smok
 	@$(BIN)/tangram-experiment budget=$(BUDGET) $(ARGS)
 	@$(BIN)/tangram-report runs=runs/experiments/$(BUDGET) out=runs/experiments/$(BUDGET)/report
 
-bench: .venv/.installed-dev  ## measure speed; options go into ARGS
-	@$(BIN)/python -m benchmarks $(ARGS)
+bench: .venv/.installed-dev  ## measure speed against what else one could do; options go into ARGS="runs=9"
+	@$(BIN)/tangram-bench all out=docs/results/bench.json $(ARGS)
 
 clean:  ## remove caches and build products; .venv and runs/ stay
 	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -4,21 +4,32 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from tangram_sim.errors import TangramError
 
 LOOK_S = 0.3
+PATIENCE_S = 60.0
 
 
-def start_training(folder: Path, *settings: str) -> "subprocess.Popen[bytes]":
-    """tangram-train in the background; what it says goes to `told` in its folder."""
+def start_training(
+    folder: Path, *settings: str, command: str = "tangram-train"
+) -> "subprocess.Popen[bytes]":
+    """A training in the background, or a master; what it says goes to `told` in its folder."""
     folder.mkdir(parents=True)
-    command = [Path(sys.executable).with_name("tangram-train"), f"run_dir={folder}", *settings]
+    program = str(Path(sys.executable).with_name(command))
     with (folder / "told").open("wb") as told:
-        return subprocess.Popen(command, stdout=told, stderr=told, start_new_session=True)
+        return subprocess.Popen(
+            [program, f"run_dir={folder}", *settings],
+            stdout=told,
+            stderr=told,
+            start_new_session=True,
+        )
 
 
 def wait_for(path: Path, process: "subprocess.Popen[bytes]") -> None:
@@ -27,6 +38,20 @@ def wait_for(path: Path, process: "subprocess.Popen[bytes]") -> None:
         if process.poll() is not None:
             raise TangramError(f"the training ended before {path} was there")
         time.sleep(LOOK_S)
+
+
+@contextmanager
+def running(*settings: str) -> Iterator[Path]:
+    """Our service at work; the folder of its run, which is gone afterwards."""
+    with tempfile.TemporaryDirectory(prefix="tangram-") as name:
+        folder = Path(name) / "run"
+        launcher = start_training(folder, *settings)
+        try:
+            wait_for(folder / "connection.json", launcher)
+            yield folder
+        finally:
+            launcher.terminate()
+            launcher.wait(PATIENCE_S)
 
 
 def processes_of(folder: Path) -> dict[int, str]:

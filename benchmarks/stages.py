@@ -1,0 +1,68 @@
+"""Which stages there are, and what a run of them prints and writes."""
+
+import argparse
+from collections.abc import Callable, Sequence
+
+import torch
+
+from benchmarks.acting import measure_acting
+from benchmarks.growth import draw_growth, measure_growth
+from benchmarks.learner import measure_learner
+from benchmarks.measure import Row
+from benchmarks.peers import measure_peers
+from benchmarks.profile import show_profile
+from benchmarks.replay import measure_replay
+from benchmarks.report import show, write
+from benchmarks.scaling import measure_scaling
+from benchmarks.sim import measure_sim
+from benchmarks.train import measure_train
+from benchmarks.wire import measure_wire
+
+STAGES: dict[str, Callable[[argparse.Namespace], Sequence[Row]]] = {
+    "sim": lambda given: measure_sim(given.runs),
+    "acting": lambda given: measure_acting(given.runs),
+    "wire": lambda given: measure_wire(given.runs),
+    "replay": lambda given: measure_replay(given.runs),
+    "learner": lambda given: measure_learner(given.runs),
+    "peers": lambda given: measure_peers(given.runs),
+    "scaling": lambda given: measure_scaling(given.runs),
+    "growth": lambda given: measure_growth(given.runs),
+    "train": lambda given: measure_train(given.seeds, given.minutes),
+}
+
+
+def run_stages(given: argparse.Namespace) -> int:
+    """Measure one stage or all; the exit status is 0 whatever was found."""
+    torch.set_num_threads(1)
+    if given.kind == "profile":
+        show_profile(given.out)
+        return 0
+    names = list(STAGES) if given.kind == "all" else [given.kind]
+    rows = [row for name in names for row in STAGES[name](given)]
+    show(f"{given.kind}: medians, one thread each", [_cells(row) for row in rows])
+    missed = [f"{row.stage}: {row.case}" for row in rows if row.held is False]
+    if missed:
+        print("short of the target:", *missed, sep="\n  ")
+    grown = [row for row in rows if row.stage == "growth"]
+    if grown and given.out is not None:
+        draw_growth(grown, given.out.with_name("growth.png"))
+    settings = {name: value for name, value in vars(given).items() if name != "out"}
+    write(given.out, {"settings": settings, "rows": [row.plain() for row in rows]})
+    return 0
+
+
+def _cells(row: Row) -> dict[str, object]:
+    spread = "" if row.least is None else f"{row.least:,.3g} - {row.most:,.3g}"
+    held = {None: "", True: "yes", False: "NO"}[row.held]
+    return {
+        "stage": row.stage,
+        "case": row.case,
+        "unit": row.unit,
+        "ours": row.ours,
+        "against": row.against,
+        "theirs": "" if row.theirs is None else row.theirs,
+        "ratio": "" if row.ratio is None else row.ratio,
+        "least - most": spread,
+        "target": row.target,
+        "held": held,
+    }

@@ -1,0 +1,72 @@
+"""Ratios, bounds and the command line of the measurements."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks.measure import Bound, compared, rates, single
+
+LABELS = ("stage", "case", "unit")
+
+
+@pytest.mark.fast
+def test_the_ratio_is_the_median_of_the_turns() -> None:
+    row = compared(LABELS, [10.0, 30.0, 20.0], "other", [10.0, 10.0, 40.0], Bound(least=0.9))
+    assert (row.ratio, row.least, row.most, row.ours, row.theirs) == (1.0, 0.5, 3.0, 20.0, 10.0)
+    assert (row.target, row.held) == (">= 0.9", True)
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize(
+    ("bound", "value", "held", "text"),
+    [
+        (Bound(least=2.0), 2.0, True, ">= 2"),
+        (Bound(least=2.0), 1.9, False, ">= 2"),
+        (Bound(most=0.2), 0.2, True, "<= 0.2"),
+        (Bound(most=0.2), 0.3, False, "<= 0.2"),
+        (Bound(1.0, 2.0), 3.0, False, ">= 1, <= 2"),
+    ],
+)
+def test_bounds(bound: Bound, value: float, held: bool, text: str) -> None:
+    row = single(LABELS, [value], bound)
+    assert (row.held, row.target) == (held, text)
+
+
+@pytest.mark.fast
+def test_without_a_bound_nothing_is_held() -> None:
+    assert single(LABELS, [1.0, 3.0, 2.0]).held is None
+
+
+@pytest.mark.fast
+def test_ways_are_measured_in_turns() -> None:
+    order: list[str] = []
+    works = {name: lambda name=name: order.append(name) or 1.0 for name in "ab"}
+    found = rates(works, runs=3, span_s=0.0)
+    assert {name: len(values) for name, values in found.items()} == {"a": 3, "b": 3}
+    assert order[:2] == ["a", "b"]
+
+
+def bench(*arguments: str) -> "subprocess.CompletedProcess[str]":
+    command = [Path(sys.executable).with_name("tangram-bench"), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=110, check=False)
+
+
+@pytest.mark.cluster
+def test_a_stage_prints_a_table_and_writes_where_its_numbers_come_from(tmp_path: Path) -> None:
+    done = bench("replay", "runs=1", f"out={tmp_path / 'replay.json'}")
+    assert done.returncode == 0, done.stderr
+    assert "numpy fancy indexing" in done.stdout
+    content = json.loads((tmp_path / "replay.json").read_text())
+    assert {"command", "commit", "processor", "cores", "versions", "rows"} <= content.keys()
+    assert {row["stage"] for row in content["rows"]} == {"replay"}
+
+
+@pytest.mark.cluster
+def test_wrong_arguments_are_answered_in_one_line() -> None:
+    done = bench("nothing")
+    assert done.returncode == 2
+    assert "invalid choice: 'nothing'" in done.stderr
+    assert "Traceback" not in done.stderr
