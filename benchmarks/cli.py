@@ -2,6 +2,7 @@
 
 import argparse
 import re
+import signal
 import sys
 import tempfile
 from pathlib import Path
@@ -66,6 +67,8 @@ def _parser() -> argparse.ArgumentParser:
 
 def main() -> int:
     """The command."""
+    # As after Ctrl-C, so that no process that was started is left.
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     arguments = _parser().parse_args([_dashed(argument) for argument in sys.argv[1:]])
     try:
         return _run(arguments)

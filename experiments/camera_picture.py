@@ -15,7 +15,7 @@ from tangram_sim.config import SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import TokensConfig, make_layout
 from tangram_sim.pictures import token_pixels
-from tangram_sim.rewards import picture_reward
+from tangram_sim.rewards import TargetPictures
 from tangram_sim.sampling import sample_poses
 from tangram_sim.world import check_world, make_world
 from worker.baselines import position_policy
@@ -84,7 +84,7 @@ def take_shots(backend: str = "physics") -> Shots:
         end_picture = world.picture()
     finally:
         world.close()
-    reward = picture_reward(target_picture, end_picture)
+    reward = TargetPictures(target_picture[None]).rewards(end_picture[None])[0]
     return Shots(sim.backend, target_picture, start_picture, end_picture, reward)
 
 

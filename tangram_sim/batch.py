@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tangram_sim.arrays import Bools, Floats, Ints, Pixels
+from tangram_sim.arrays import Bools, Floats, Ints
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.geometry import overlap_share
 from tangram_sim.layout import Layout
-from tangram_sim.rewards import make_reward, picture_reward, scaled_overlap
+from tangram_sim.rewards import TargetPictures, make_reward, scaled_overlap
 from tangram_sim.sampling import sample_batch
 from tangram_sim.sensing import noise_bound, see
 from tangram_sim.world import make_world
@@ -112,7 +112,7 @@ class BatchedEnv:
         self.action_size = action_size(layout.tokens)
         self.bound = corner_bound(sim)
         self._worlds = [make_world(layout, sim) for _ in range(count)]
-        self._pictures: list[Pixels] = []
+        self._targets: TargetPictures | None = None
         self._moves: Ints = np.zeros((count, layout.tokens), dtype=np.int64)
         self.steps_done = self.horizon  # no episode yet
         self.corners: Floats = np.zeros((count, layout.corner_count, 2))
@@ -139,14 +139,11 @@ class BatchedEnv:
             raise ValueError(f"need {self.count} generators, got {len(generators)}")
         targets = sample_batch(self.layout, self.sim, generators)
         starts = sample_batch(self.layout, self.sim, generators)
-        if self.sim.camera:
-            self._pictures = self._photograph(targets)
-        for world, start in zip(self._worlds, starts, strict=True):
-            world.place(start)
+        self._begin(targets, starts)
         self._generators = generators
         self.goals = self.layout.corners(targets)
         self.seen_goals = see(self.goals, self.sim, generators)
-        self._look()
+        self._look(np.stack([world.poses() for world in self._worlds]))
         self._moves[:] = 0
         self.steps_done = 0
 
@@ -165,21 +162,41 @@ class BatchedEnv:
         actions = self._checked(actions)
         tokens = chosen_tokens(actions, self.layout.tokens)
         refused = self.placed[np.arange(self.count), tokens]
-        velocity = velocities(actions, self.sim)
-        for b in np.flatnonzero(~refused):
-            self._worlds[b].move(int(tokens[b]), velocity[b])
-            self._moves[b, tokens[b]] += 1
+        self._moves[np.flatnonzero(~refused), tokens[~refused]] += 1
+        camera = self._move(tokens, velocities(actions, self.sim), refused)
         self.steps_done += 1
-        self._look()
-        return self._result(refused)
+        return self._result(refused, camera)
 
     def close(self) -> None:
         """Close all worlds; calling it twice does no harm."""
         for world in self._worlds:
             world.close()
 
-    def _result(self, refused: Bools) -> StepResult:
-        camera = self._camera_rewards() if self.sim.camera else None
+    def _begin(self, targets: Floats, starts: Floats) -> None:
+        """Photograph the targets and put the tokens at their starts."""
+        # World after world, here and in `_move`: the engine's memory of each fills the cache.
+        pictures = []
+        for world, target, start in zip(self._worlds, targets, starts, strict=True):
+            if self.sim.camera:
+                world.place(target)
+                pictures.append(world.picture())
+            world.place(start)
+        if self.sim.camera:
+            self._targets = TargetPictures(np.stack(pictures))
+
+    def _move(self, tokens: Ints, velocity: Floats, refused: Bools) -> Floats | None:
+        """Move in every world and look at it; (B,) Eq. 14 of the pictures with the camera on."""
+        poses, pictures = [], []
+        for b, world in enumerate(self._worlds):
+            if not refused[b]:
+                world.move(int(tokens[b]), velocity[b])
+            poses.append(world.poses())
+            if self.sim.camera:
+                pictures.append(world.picture())
+        self._look(np.stack(poses))
+        return None if self._targets is None else self._targets.rewards(np.stack(pictures))
+
+    def _result(self, refused: Bools, camera: Floats | None) -> StepResult:
         share = overlap_share(self.corners, self.goals, self.layout)
         if camera is not None and self._reward.source == "camera":
             rewards = camera
@@ -205,17 +222,6 @@ class BatchedEnv:
             raise ValueError("actions must be finite")
         return np.clip(actions, -1.0, 1.0)
 
-    def _photograph(self, poses: Floats) -> list[Pixels]:
-        pictures = []
-        for world, pose in zip(self._worlds, poses, strict=True):
-            world.place(pose)
-            pictures.append(world.picture())
-        return pictures
-
-    def _camera_rewards(self) -> Floats:
-        pairs = zip(self._pictures, self._worlds, strict=True)
-        return np.array([picture_reward(target, world.picture()) for target, world in pairs])
-
-    def _look(self) -> None:
-        self.corners = self.layout.corners(np.stack([world.poses() for world in self._worlds]))
+    def _look(self, poses: Floats) -> None:
+        self.corners = self.layout.corners(poses)
         self.seen = see(self.corners, self.sim, self._generators)

@@ -77,20 +77,28 @@ def scaled_overlap(share: Floats) -> Floats:
     return 2.0 * share - 1.0
 
 
-def picture_reward(target: Pixels, state: Pixels) -> float:
-    """Eq. 14 on two pictures (P, P) of the camera, from [0, 1] to [-1, 1].
+class TargetPictures:
+    """Pictures (B, P, P) of the targets, as Eq. 14 compares others with them.
 
     Raises:
-        ConfigError: the target covers no pixel.
+        ConfigError: a target covers no pixel.
     """
-    wanted = token_pixels(target)
-    total = int(np.count_nonzero(wanted))
-    if total == 0:
-        raise ConfigError(
-            f"the target covers no pixel of a picture of {len(target)} x {len(target)}: raise "
-            "sim.pixels or tokens.scale, or lower sim.arena"
-        )
-    return 2.0 * float(np.count_nonzero(wanted & token_pixels(state))) / total - 1.0
+
+    def __init__(self, targets: Pixels) -> None:
+        self._wanted = token_pixels(targets)
+        self._total = np.count_nonzero(self._wanted, axis=(1, 2))
+        if not self._total.all():
+            size = targets.shape[-1]
+            raise ConfigError(
+                f"the target covers no pixel of a picture of {size} x {size}: raise "
+                "sim.pixels or tokens.scale, or lower sim.arena"
+            )
+
+    def rewards(self, states: Pixels) -> Floats:
+        """Eq. 14 (B,) of other pictures (B, P, P), from [0, 1] to [-1, 1]."""
+        covered = np.count_nonzero(self._wanted & token_pixels(states), axis=(1, 2))
+        rewards: Floats = 2.0 * covered / self._total - 1.0
+        return rewards
 
 
 def dense(

@@ -8,7 +8,7 @@ from tangram_sim.config import SimConfig
 from tangram_sim.geometry import area, clip, overlap_share
 from tangram_sim.layout import Layout
 from tangram_sim.pictures import BACKGROUND, TOKEN_GRAY, token_pixels
-from tangram_sim.rewards import picture_reward
+from tangram_sim.rewards import TargetPictures
 from tangram_sim.sampling import sample_batch
 from tangram_sim.world import make_world
 from tests.sim.builders import SQUARE_SCALE, TRIO, layout_of, perimeter, total_area
@@ -67,7 +67,7 @@ def test_camera_and_polygons_agree(
         world.place(targets[i])
         wanted = world.picture()
         world.place(states[i])
-        camera[i] = (picture_reward(wanted, world.picture()) + 1.0) / 2.0
+        camera[i] = (TargetPictures(wanted[None]).rewards(world.picture()[None])[0] + 1.0) / 2.0
     world.close()
     tokens, goals = layout.corners(states), layout.corners(targets)
     error = camera - overlap_share(tokens, goals, layout)
@@ -90,7 +90,9 @@ def test_finer_pictures_are_closer() -> None:
             world.place(target)
             wanted = world.picture()
             world.place(state)
-            pairs.append((picture_reward(wanted, world.picture()) + 1.0) / 2.0)
+            pairs.append(
+                (TargetPictures(wanted[None]).rewards(world.picture()[None])[0] + 1.0) / 2.0
+            )
         world.close()
         exact = overlap_share(layout.corners(states), layout.corners(targets), layout)
         mean_errors.append(np.abs(np.array(pairs) - exact).mean())

@@ -12,7 +12,7 @@ from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import Layout
 from tangram_sim.pictures import BACKGROUND, TOKEN_GRAY
-from tangram_sim.rewards import RewardFn, check_reward, closeness, make_reward, picture_reward
+from tangram_sim.rewards import RewardFn, TargetPictures, check_reward, closeness, make_reward
 from tangram_sim.sampling import sample_batch
 from tests.sim.builders import LOPSIDED, SEVEN, TRIO, layout_of, random_poses
 
@@ -174,17 +174,17 @@ def test_picture_reward() -> None:
     target = np.full((4, 4), BACKGROUND, dtype=np.uint8)
     state = target.copy()
     target[0, :] = TOKEN_GRAY
-    assert picture_reward(target, state) == -1.0
+    assert TargetPictures(target[None]).rewards(state[None])[0] == -1.0
     state[:, 0] = TOKEN_GRAY
-    assert picture_reward(target, state) == -0.5
+    assert TargetPictures(target[None]).rewards(state[None])[0] == -0.5
     state[0, :] = 0  # any gray but the background's
-    assert picture_reward(target, state) == 1.0
+    assert TargetPictures(target[None]).rewards(state[None])[0] == 1.0
 
 
 def test_a_target_without_pixels_is_refused() -> None:
     empty = np.full((16, 16), BACKGROUND, dtype=np.uint8)
     with pytest.raises(ConfigError, match=r"no pixel of a picture of 16 x 16: raise sim\.pixels"):
-        picture_reward(empty, empty)
+        TargetPictures(empty[None]).rewards(empty[None])[0]
 
 
 def test_camera_as_source_needs_the_camera() -> None:
