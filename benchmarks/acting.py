@@ -29,9 +29,13 @@ def measure_acting(runs: int) -> list[Row]:
     for pixels in (128, 64, 0):
         sim = {"camera": pixels > 0, "pixels": pixels or 64}
         pictures = f"pictures of {pixels} px" if pixels else "no pictures"
+        shares, speeds = zip(
+            *(_worker(with_sim(preset(), **sim)) for _ in range(runs)), strict=True
+        )
         labels = ("acting", f"share of a worker's time, {pictures}", "share")
-        shares = [_share(with_sim(preset(), **sim)) for _ in range(runs)]
         rows.append(single(labels, shares, Bound(most=0.2)))
+        labels = ("acting", f"a worker's play, {pictures}", "episodes/s")
+        rows.append(single(labels, speeds))
     return rows
 
 
@@ -56,13 +60,15 @@ class _Clocked:
         return actions
 
 
-def _share(setup: Setup) -> float:
+def _worker(setup: Setup) -> tuple[float, float]:
+    """The share of acting in a worker's time, and its episodes in a second."""
     choose = _Clocked(setup)
     env = BatchedEnv(setup.layout, setup.sim, setup.reward, ServiceConfig().envs)
     with closing(env):
         rollout = Rollout(env, 0, "player", 0, 1)
         rollout.play(choose)
-        choose.spent_s, begin = 0.0, time.perf_counter()
+        first, choose.spent_s, begin = rollout.episode, 0.0, time.perf_counter()
         while rollout.episode < EPISODES:
             rollout.play(choose)
-        return choose.spent_s / (time.perf_counter() - begin)
+        passed = time.perf_counter() - begin
+        return choose.spent_s / passed, (rollout.episode - first) / passed

@@ -48,12 +48,12 @@ class Curve:
 
 
 def measure_growth(runs: int) -> list[Row]:
-    """Milliseconds of CPU by size; `theirs` is the expected law through the first point."""
+    """Milliseconds of CPU by size; `theirs` is the expected law through the last point."""
     return [row for curve in _curves() for row in _measured(curve, runs)]
 
 
 def _curves() -> list[Curve]:
-    products = "multiplications of the network"
+    products = "multiplications"
     constant = "the same for all"
 
     def by_tokens(count: int) -> AbstractContextManager[Work]:
@@ -71,29 +71,37 @@ def _curves() -> list[Curve]:
     ]
 
 
-def _measured(curve: Curve, runs: int) -> Iterator[Row]:
-    scale = 0.0
-    for size in curve.sizes:
-        with curve.work(size) as work:
-            for _ in range(WARM):
-                work()
-            spent = [1e3 / rate(work, SPAN_S, time.thread_time) for _ in range(runs)]
-        found = statistics.median(spent)
-        scale = scale or found / curve.cost(size)
-        expected = scale * curve.cost(size)
-        yield told(
-            Row(
-                "growth",
-                f"{curve.name}: {size:,}",
-                "ms of CPU",
-                ours=found,
-                against=curve.law,
-                theirs=expected,
-                ratio=found / expected,
-                least=min(spent) / expected,
-                most=max(spent) / expected,
-            )
+def _measured(curve: Curve, runs: int) -> list[Row]:
+    """The law goes through the largest size, where it should hold; above it are fixed costs."""
+    spent = {size: _spent(curve, size, runs) for size in curve.sizes}
+    last = curve.sizes[-1]
+    scale = statistics.median(spent[last]) / curve.cost(last)
+    return [_row(curve, size, spent[size], scale * curve.cost(size)) for size in curve.sizes]
+
+
+def _spent(curve: Curve, size: int, runs: int) -> list[float]:
+    """Milliseconds of CPU, `runs` times."""
+    with curve.work(size) as work:
+        for _ in range(WARM):
+            work()
+        return [1e3 / rate(work, SPAN_S, time.thread_time) for _ in range(runs)]
+
+
+def _row(curve: Curve, size: int, spent: list[float], expected: float) -> Row:
+    found = statistics.median(spent)
+    return told(
+        Row(
+            "growth",
+            f"{curve.name}: {size:,}",
+            "ms of CPU",
+            ours=found,
+            against=curve.law,
+            theirs=expected,
+            ratio=found / expected,
+            least=min(spent) / expected,
+            most=max(spent) / expected,
         )
+    )
 
 
 def _products(setup: Setup) -> float:

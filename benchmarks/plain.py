@@ -20,9 +20,10 @@ class HeadByHead(nn.Module):
         super().__init__()
         key_width = width // heads
         self.scale = scale
-        for name in ("query", "key", "value"):
-            parts = [nn.Linear(width, key_width, bias=False) for _ in range(heads)]
-            setattr(self, name, nn.ModuleList(parts))
+        self.query, self.key, self.value = (
+            nn.ModuleList(nn.Linear(width, key_width, bias=False) for _ in range(heads))
+            for _ in range(3)
+        )
         self.combine = nn.ModuleList(nn.Linear(key_width, width, bias=False) for _ in range(heads))
 
     def forward(self, nodes: Tensor, edges: Tensor) -> Tensor:
@@ -65,7 +66,7 @@ class PlainLearner(Learner):
     def _step(self, part: str, loss: Tensor) -> Tensor:
         optimiser = self._optimisers()[part]
         optimiser.zero_grad()
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]
         norm = nn.utils.clip_grad_norm_(getattr(self, part).parameters(), math.inf)
         optimiser.step()
         return norm
@@ -80,4 +81,5 @@ class PlainLearner(Learner):
 def _take_apart(layer: EncoderLayer) -> None:
     joint = layer.attention
     width = joint.combine.in_features
-    layer.attention = HeadByHead(width, joint.heads, joint.scale)
+    apart: Any = HeadByHead(width, joint.heads, joint.scale)
+    layer.attention = apart

@@ -25,6 +25,13 @@ def show(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     Console(width=None if sys.stdout.isatty() else 220).print(table)
 
 
+def page(title: str, rows: Sequence[Mapping[str, Any]]) -> str:
+    """The same table in Markdown."""
+    lines = [f"# {title}", "", "| " + " | ".join(rows[0]) + " |", "|---" * len(rows[0]) + "|"]
+    lines += ["| " + " | ".join(_text(value) for value in row.values()) + " |" for row in rows]
+    return "\n".join(lines) + "\n"
+
+
 def write(path: Path | None, content: Mapping[str, Any]) -> None:
     """Write results with the command, the commit, the machine and the versions; None: nothing."""
     if path is None:

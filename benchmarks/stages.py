@@ -12,7 +12,7 @@ from benchmarks.measure import Row
 from benchmarks.peers import measure_peers
 from benchmarks.profile import show_profile
 from benchmarks.replay import measure_replay
-from benchmarks.report import show, write
+from benchmarks.report import page, show, write
 from benchmarks.scaling import measure_scaling
 from benchmarks.sim import measure_sim
 from benchmarks.train import measure_train
@@ -32,26 +32,33 @@ STAGES: dict[str, Callable[[argparse.Namespace], Sequence[Row]]] = {
 
 
 def run_stages(given: argparse.Namespace) -> int:
-    """Measure one stage or all; the exit status is 0 whatever was found."""
+    """Measure one stage or all; the exit status is 0 whatever was found.
+
+    With `out` the table goes into a Markdown file beside the JSON, and growth is drawn there.
+    """
     torch.set_num_threads(1)
     if given.kind == "profile":
         show_profile(given.out)
         return 0
     names = list(STAGES) if given.kind == "all" else [given.kind]
     rows = [row for name in names for row in STAGES[name](given)]
-    show(f"{given.kind}: medians, one thread each", [_cells(row) for row in rows])
+    title, cells = f"{given.kind}: medians, one thread each", [cells_of(row) for row in rows]
+    show(title, cells)
     missed = [f"{row.stage}: {row.case}" for row in rows if row.held is False]
     if missed:
         print("short of the target:", *missed, sep="\n  ")
     grown = [row for row in rows if row.stage == "growth"]
-    if grown and given.out is not None:
-        draw_growth(grown, given.out.with_name("growth.png"))
+    if given.out is not None:
+        given.out.parent.mkdir(parents=True, exist_ok=True)
+        given.out.with_suffix(".md").write_text(page(title, cells))
+        if grown:
+            draw_growth(grown, given.out.with_name("growth.png"))
     settings = {name: value for name, value in vars(given).items() if name != "out"}
     write(given.out, {"settings": settings, "rows": [row.plain() for row in rows]})
     return 0
 
 
-def _cells(row: Row) -> dict[str, object]:
+def cells_of(row: Row) -> dict[str, object]:
     spread = "" if row.least is None else f"{row.least:,.3g} - {row.most:,.3g}"
     held = {None: "", True: "yes", False: "NO"}[row.held]
     return {
