@@ -90,7 +90,8 @@ class AgentConfig:
         saturation_limit: pre-activation beyond which the penalty starts.
         gamma: discount, Eq. 5.
         polyak: rho of the target networks, Eq. 4.
-        acting_average: Polyak average of the actor that plays and is scored; 0 is the actor.
+        acting_average: Polyak average of the actor that plays and is scored, less in the first
+            updates (see `ddpg.average_so_far`); 0 is the actor.
         actor_lr, critic_lr: Adam's learning rates at the start.
         lr_decay: none or cosine over the run's budget.
         lr_final: share of the learning rate that cosine decay ends at.
