@@ -10,6 +10,9 @@ import numpy as np
 from tangram_sim.arrays import AnyArray, Bools, Complex, Floats
 from tangram_sim.layout import Layout
 
+# Pairs of pieces that are looked at together: more no longer fit into a core's cache.
+_MAX_PAIRS = 8192
+
 
 def area(polygons: Floats) -> Floats:
     """Signed areas (B,) of polygons (B, M, 2); repeated corners do no harm."""
@@ -89,6 +92,13 @@ def overlap_area(tokens: Floats, targets: Floats, layout: Layout) -> Floats:
         targets: (B, V, 2) corners of the targets, which do not overlap each other.
         layout: which corners belong to which token.
     """
+    rows = max(1, _MAX_PAIRS // layout.tokens**2)
+    parts = range(0, len(tokens), rows)
+    areas = [_overlap_area(tokens[i : i + rows], targets[i : i + rows], layout) for i in parts]
+    return np.concatenate([np.zeros(0), *areas])
+
+
+def _overlap_area(tokens: Floats, targets: Floats, layout: Layout) -> Floats:
     own, count = outlines(tokens, layout), layout.tokens
     total, sign = np.zeros(len(tokens)), 1.0
     rows = np.repeat(np.arange(len(tokens)), count)
