@@ -17,6 +17,7 @@ from tangram_sim.puzzles import Puzzle, load_puzzle
 from tangram_sim.sampling import sample_poses
 
 START_SEED = 3  # of Fig. 1 (b)
+CAT_SCALE = 0.8
 
 
 def draw_paper_pictures(out: Path) -> list[tuple[str, str, str]]:
@@ -32,9 +33,14 @@ def draw_paper_pictures(out: Path) -> list[tuple[str, str, str]]:
         RunError: the files cannot be written.
     """
     shown = []
+    cat = load_puzzle("cat_of_six", CAT_SCALE)
     with drawing():
         for name, title, (figure, caption) in (
-            ("fig1_puzzle", "Fig. 1: the puzzle", draw_puzzle(load_puzzle("cat"))),
+            (
+                "fig1_puzzle",
+                "Fig. 1: the puzzle",
+                draw_puzzle(cat),
+            ),
             ("fig2_graph", "Fig. 2: the graph of a single token", draw_graph()),
             ("fig3_camera", "Fig. 3: what the camera sees", draw_camera()),
         ):
@@ -44,19 +50,19 @@ def draw_paper_pictures(out: Path) -> list[tuple[str, str, str]]:
 
 
 def draw_puzzle(puzzle: Puzzle) -> tuple[Figure, str]:
-    """A puzzle and a random start of its tokens, side by side; and what they are."""
-    sim = SimConfig(backend="kinematic", arena=puzzle.arena)
+    """The cat and a random start of its tokens, side by side; and what they are."""
+    sim = SimConfig(backend="kinematic")
     start = sample_poses(puzzle.layout, sim, np.random.default_rng(START_SEED))
     figure = empty_figure(WIDTH_IN * 0.8, WIDTH_IN * 0.42)
     panels = figure.subplots(1, 2)
     for panel, poses, label in zip(
         panels, (puzzle.poses, start), ("(a) target", "(b) random start"), strict=True
     ):
-        show_arena(panel, puzzle.arena)
+        show_arena(panel, sim.arena)
         draw_tokens(panel, puzzle.layout, puzzle.layout.corners(poses))
         panel.set_xlabel(label)
     caption = (
-        f"Fig. 1: (a) {puzzle.title} as the target, (b) the same tokens at a random start "
-        "without overlap."
+        "Fig. 1: (a) a sitting cat of six tokens as the target, (b) the same tokens at a random "
+        "start without overlap."
     )
     return figure, caption

@@ -1,123 +1,131 @@
-"""Puzzles that people know: tokens and the poses that make a figure of them, as JSON.
+"""Puzzles that people know: figures of the seven tans, from files and from the package's library.
 
-A file of `puzzles/` holds name, title, arena (its width), scale (see `TokensConfig`) and a list of
-tokens: shape, x, y (arena units, origin in the middle) and angle (radians).
+A file is JSON (see `sketches`) or SVG (see `svg`) and drawn by hand to about a hundredth of a unit.
+Each piece becomes the exact tan that fits best. Pieces that overlap a little are pushed apart; gaps
+stay as they are drawn.
 """
 
-import json
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
+from pathlib import Path
 
-import numpy as np
-
-from tangram_sim.arrays import Floats
+from tangram_sim.assembly import Puzzle, PuzzleRules, build_puzzle
 from tangram_sim.errors import ConfigError
-from tangram_sim.geometry import any_overlap
-from tangram_sim.layout import Layout, TokensConfig, make_layout
+from tangram_sim.sketches import FaultError, Sketch, parse_sketches, read_text
+from tangram_sim.svg import parse_svg
 
 PACKAGED: Traversable = files("tangram_sim") / "puzzles"
-_KEYS = {"name", "title", "arena", "scale", "tokens"}
-_TOKEN_KEYS = {"shape", "x", "y", "angle"}
+SPLITS = ("train", "test", "paper")
+_MAX_TOLD = 20  # faults in one message
 
 
 @dataclass(frozen=True, eq=False)
-class Puzzle:
-    """A figure of K tokens.
+class PuzzleFile:
+    """What a file held.
 
     Attributes:
-        name: of its file.
-        title: what it shows.
-        arena: width of the square arena that it lies in.
-        layout: its tokens.
-        poses: (K, 3) x, y (arena units) and angle (radians) of the tokens in the figure.
+        puzzles: in the file's order.
+        faults: of the puzzles that were left out.
     """
 
-    name: str
-    title: str
-    arena: float
-    layout: Layout
-    poses: Floats
-
-    @property
-    def corners(self) -> Floats:
-        """(V, 2) of the tokens in the figure."""
-        return self.layout.corners(self.poses)
+    puzzles: tuple[Puzzle, ...]
+    faults: tuple[str, ...]
 
 
-def puzzle_names() -> list[str]:
-    """The puzzles that come with the package."""
-    names = [entry.name for entry in PACKAGED.iterdir()]
-    return sorted(name.removesuffix(".json") for name in names if name.endswith(".json"))
+def read_puzzles(
+    path: Path, rules: PuzzleRules | None = None, skip_invalid: bool = False
+) -> PuzzleFile:
+    """The puzzles of a file: one if its name ends in .svg, JSON otherwise.
 
-
-def load_puzzle(name: str) -> Puzzle:
-    """A puzzle of the package.
+    Args:
+        path: of the file.
+        rules: the full set of tans by default.
+        skip_invalid: leave faulty puzzles out instead of raising.
 
     Raises:
-        ConfigError: no such puzzle, or a file that is none.
+        ConfigError: the file cannot be used, or has faults; all of them are named.
     """
-    if name not in puzzle_names():
-        raise ConfigError(f"unknown puzzle '{name}': choose from {', '.join(puzzle_names())}")
-    return parse_puzzle((PACKAGED / f"{name}.json").read_text(encoding="utf-8"), name)
+    text = read_text(path)
+    if path.suffix.lower() == ".svg":
+        return parse_svg_puzzle(text, path.stem, rules, skip_invalid)
+    return parse_puzzles(text, f"puzzle file {path.name}", rules, skip_invalid)
 
 
-def parse_puzzle(text: str, name: str) -> Puzzle:
-    """A puzzle from the text of its file.
+def parse_puzzles(
+    text: str, source: str, rules: PuzzleRules | None = None, skip_invalid: bool = False
+) -> PuzzleFile:
+    """The puzzles of a JSON text; see `read_puzzles`.
 
     Args:
         text: JSON.
-        name: what errors call it.
+        source: what errors call the file.
+    """
+    sketches, faults = parse_sketches(text, source)
+    return _built(sketches, faults, rules or PuzzleRules(), skip_invalid)
+
+
+def parse_svg_puzzle(
+    text: str, name: str, rules: PuzzleRules | None = None, skip_invalid: bool = False
+) -> PuzzleFile:
+    """The one puzzle of an SVG text; see `read_puzzles`."""
+    try:
+        sketches, faults = [parse_svg(text, name)], list[str]()
+    except FaultError as fault:
+        sketches, faults = [], [str(fault)]
+    return _built(sketches, faults, rules or PuzzleRules(), skip_invalid)
+
+
+def _built(
+    sketches: Sequence[Sketch], faults: list[str], rules: PuzzleRules, skip_invalid: bool
+) -> PuzzleFile:
+    puzzles = []
+    for sketch in sketches:
+        puzzle, wrong = build_puzzle(sketch, rules)
+        faults += wrong
+        if puzzle is not None:
+            puzzles.append(puzzle)
+    if faults and not skip_invalid:
+        told = "; ".join(faults[:_MAX_TOLD])
+        more = len(faults) - _MAX_TOLD
+        raise ConfigError(told + (f"; and {more} more" if more > 0 else ""))
+    return PuzzleFile(tuple(puzzles), tuple(faults))
+
+
+def puzzle_names(split: str | None = None) -> list[str]:
+    """The puzzles that come with the package, those of one of `SPLITS` or all."""
+    return [puzzle.name for puzzle in library(split)]
+
+
+def load_puzzle(name: str, scale: float = 0.6) -> Puzzle:
+    """A puzzle of the package.
 
     Raises:
-        ConfigError: a key is missing or unknown, a number is none, tokens overlap, or one lies
-            outside the arena.
+        ConfigError: no such puzzle.
     """
-    try:
-        content = json.loads(text)
-    except ValueError:
-        raise ConfigError(f"puzzle '{name}' is not JSON") from None
-    if not isinstance(content, dict) or set(content) != _KEYS:
-        raise ConfigError(f"puzzle '{name}' must have the keys {', '.join(sorted(_KEYS))}")
-    tokens = content["tokens"]
-    if not isinstance(tokens, list) or any(
-        not isinstance(token, dict) or set(token) != _TOKEN_KEYS for token in tokens
-    ):
-        raise ConfigError(
-            f"puzzle '{name}': tokens must be a list of mappings with the keys "
-            f"{', '.join(sorted(_TOKEN_KEYS))}"
-        )
-    arena, scale = (
-        _number(content[key], f"{key} of puzzle '{name}'") for key in ("arena", "scale")
-    )
-    layout = make_layout(TokensConfig(tuple(token["shape"] for token in tokens), scale))
-    poses = np.array(
-        [
-            [
-                _number(token[key], f"{key} of token {k} of puzzle '{name}'")
-                for key in ("x", "y", "angle")
-            ]
-            for k, token in enumerate(tokens)
-        ]
-    )
-    puzzle = Puzzle(str(content["name"]), str(content["title"]), arena, layout, poses)
-    _check_figure(puzzle)
-    return puzzle
+    found = {puzzle.name: puzzle for puzzle in library(None, scale)}
+    if name not in found:
+        raise ConfigError(f"unknown puzzle '{name}': choose from {', '.join(found)}")
+    return found[name]
 
 
-def _number(value: object, what: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        raise ConfigError(f"{what} must be a finite number, got {value!r}")
-    return float(value)
+@lru_cache(maxsize=16)
+def library(split: str | None = None, scale: float = 0.6) -> tuple[Puzzle, ...]:
+    """The package's puzzles: train and test have all seven tans, paper has the paper's own.
 
+    Args:
+        split: one of `SPLITS`, or all of them.
+        scale: side of the full square, in arena units.
 
-def _check_figure(puzzle: Puzzle) -> None:
-    corners = puzzle.corners
-    if any_overlap(corners[None], puzzle.layout)[0]:
-        raise ConfigError(f"tokens of puzzle '{puzzle.name}' overlap: move them apart")
-    reach = float(np.abs(corners).max())
-    if reach > puzzle.arena / 2.0:
-        raise ConfigError(
-            f"puzzle '{puzzle.name}' reaches {reach:.3g} from the middle, further than half of its "
-            f"arena of width {puzzle.arena:g}: raise arena or lower scale"
-        )
+    Raises:
+        ConfigError: an unknown split.
+    """
+    if split is None:
+        return tuple(puzzle for one in SPLITS for puzzle in library(one, scale))
+    if split not in SPLITS:
+        raise ConfigError(f"unknown split '{split}': choose from {', '.join(SPLITS)}")
+    text = (PACKAGED / f"{split}.json").read_text(encoding="utf-8")
+    rules = PuzzleRules(scale, subset=split == "paper")
+    return parse_puzzles(text, f"{split}.json", rules).puzzles

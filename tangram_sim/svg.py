@@ -1,0 +1,112 @@
+"""One puzzle as an SVG drawing of seven polygons, read without trust.
+
+Counted are <polygon> and <path> elements, the latter of straight lines (M, L, H, V, Z); their own
+transforms and those of the groups around them apply. What is defined but not drawn is left out.
+"""
+
+import re
+from collections.abc import Iterator
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from tangram_sim.arrays import Floats
+from tangram_sim.errors import ConfigError
+from tangram_sim.fitting import VARIANTS, fit_piece
+from tangram_sim.shapes import MAX_COORDINATE, polygon_area, tan
+from tangram_sim.sketches import MAX_BYTES, MAX_PIECES, FaultError, Sketch, checked_name
+from tangram_sim.svg_attributes import path_points, polygon_points, transform_matrix
+
+MAX_DEPTH = 50
+_NOT_DRAWN = {"defs", "symbol", "clipPath", "mask", "marker", "pattern", "metadata"}
+
+
+def parse_svg(text: str, name: str) -> Sketch:
+    """The figure of an SVG file; its seven areas together are one squared unit.
+
+    Args:
+        text: SVG.
+        name: of the puzzle.
+
+    Raises:
+        ConfigError: not an SVG that can be read.
+        FaultError: its polygons are not the seven tans; the fit is not checked here.
+    """
+    outlines = [
+        _outline(element, motion, f"SVG '{name}', polygon {i + 1}")
+        for i, (element, motion) in enumerate(_polygons(_root(text, name), name))
+    ]
+    where = f"puzzle '{checked_name(name, 'SVG file')}'"
+    if len(outlines) != 7:
+        raise FaultError(f"{where}: must draw 7 polygons or paths, got {len(outlines)}")
+    for i, outline in enumerate(outlines):
+        if len(outline) not in (3, 4):
+            raise FaultError(
+                f"{where}, piece {i + 1}: must have 3 or 4 corners, got {len(outline)}"
+            )
+    areas = [abs(polygon_area(outline)) for outline in outlines]
+    if not sum(areas) > 0.0:
+        raise FaultError(f"{where}: its polygons have no area")
+    unit = float(np.sqrt(sum(areas)))
+    # The y axis of SVG points down.
+    units = [outline / (unit, -unit) for outline in outlines]
+    return Sketch(name, tuple((_kind(outline), outline) for outline in units))
+
+
+def _kind(outline: Floats) -> str:
+    """The tan of the same number of corners whose size, then shape, is closest to an outline."""
+    kinds = [kind for kind in VARIANTS if len(tan(kind).corners) == len(outline)]
+    if len(outline) == 4:
+        return min(kinds, key=lambda kind: fit_piece(kind, outline).residual)
+    size = abs(polygon_area(outline))
+    return min(kinds, key=lambda kind: abs(np.sqrt(size) - np.sqrt(tan(kind).area)))
+
+
+def _root(text: str, name: str) -> ET.Element:
+    if len(text) > MAX_BYTES:
+        raise ConfigError(f"SVG '{name}' is longer than {MAX_BYTES} characters: simplify it")
+    if re.search(r"<!\s*(doctype|entity)", text, re.IGNORECASE):
+        raise ConfigError(f"SVG '{name}' must have no DOCTYPE and no ENTITY: delete them")
+    try:
+        # Entities are the danger of XML, and none can be defined without a DOCTYPE.
+        root = ET.fromstring(text)  # noqa: S314
+    except (ET.ParseError, ValueError) as error:
+        raise ConfigError(f"SVG '{name}' is not XML: {error}") from None
+    if _tag(root) != "svg":
+        raise ConfigError(f"SVG '{name}' must be an <svg> element, got <{_tag(root)}>")
+    return root
+
+
+def _tag(element: ET.Element) -> str:
+    return str(element.tag).rpartition("}")[2]
+
+
+def _polygons(root: ET.Element, name: str) -> Iterator[tuple[ET.Element, Floats]]:
+    """Drawn polygons in the file's order, each with its motion (3, 3)."""
+    waiting, found = [(root, np.eye(3), 0)], 0
+    while waiting:
+        element, motion, depth = waiting.pop()
+        if depth > MAX_DEPTH:
+            raise ConfigError(f"SVG '{name}' nests deeper than {MAX_DEPTH} groups: ungroup it")
+        if _tag(element) in _NOT_DRAWN:
+            continue
+        motion = motion @ transform_matrix(element.get("transform", ""), f"SVG '{name}'")
+        if _tag(element) in ("polygon", "path"):
+            found += 1
+            if found > MAX_PIECES:
+                raise ConfigError(f"SVG '{name}' draws more than {MAX_PIECES} polygons: draw 7")
+            yield element, motion
+        waiting += [(child, motion, depth + 1) for child in reversed(element)]
+
+
+def _outline(element: ET.Element, motion: Floats, where: str) -> Floats:
+    """Corners (V, 2) after all transforms, without repetitions."""
+    if _tag(element) == "polygon":
+        points = polygon_points(element.get("points", ""), where)
+    else:
+        points = path_points(element.get("d", ""), where)
+    points = points @ motion[:2, :2].T + motion[:2, 2]
+    if not (np.abs(points) <= MAX_COORDINATE).all():
+        raise ConfigError(f"{where} must lie within +-{MAX_COORDINATE:g}: scale it down")
+    apart = np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1)
+    return points[apart > 1e-6 * max(np.ptp(points), 1e-300)] if len(points) > 1 else points
