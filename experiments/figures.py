@@ -14,15 +14,17 @@ from PIL import Image
 from experiments.designs import PAPER, TEST, TRAIN
 from experiments.tiling import TANS, Polygon, as_array, atoms, tilings
 from tangram_sim.arrays import Floats
+from tangram_sim.assembly import Puzzle, PuzzleRules
 from tangram_sim.drawing import contact_sheet, draw_scene
 from tangram_sim.errors import ConfigError
-from tangram_sim.puzzles import Puzzle, PuzzleRules, parse_puzzles
+from tangram_sim.fitting import TOUCHING, fit_piece, overlap_depths
+from tangram_sim.puzzles import parse_puzzles
 from tangram_sim.sketches import FORMAT, VERSION
 
 ROOT = Path(__file__).parents[1]
 ARENA = 2.0
-GRID = np.sqrt(2.0) / 4.0  # units of the full square in one grid unit
-_NUMBERS = {"": 1.0, "r": np.sqrt(2.0), "h": np.sqrt(0.5)}
+GRID = 2.0**0.5 / 4.0  # units of the full square in one grid unit
+_NUMBERS = {"": 1.0, "r": 2.0**0.5, "h": 0.5**0.5}
 _DIGITS = 12  # of a coordinate in the files
 
 
@@ -49,6 +51,7 @@ def file_text(designs: Mapping[str, str]) -> str:
 def _puzzle_text(name: str, design: str) -> str:
     try:
         pieces = figure_pieces(design)
+        _check_exact(pieces)
     except ConfigError as error:
         raise ConfigError(f"figure '{name}': {error}") from None
     lines = [
@@ -56,6 +59,18 @@ def _puzzle_text(name: str, design: str) -> str:
         for kind, corners in pieces
     ]
     return f'{{"name": {json.dumps(name)}, "pieces": [\n  ' + ",\n  ".join(lines) + "\n]}"
+
+
+def _check_exact(pieces: list[tuple[str, Floats]]) -> None:
+    """Raise ConfigError for a piece that is not its tan or lies in another."""
+    residual = max(fit_piece(kind, corners).residual for kind, corners in pieces)
+    padded = np.array([corners[[0, 1, 2, -1]] for _, corners in pieces])
+    depth = overlap_depths(padded)[0].max()
+    if max(residual, depth) > TOUCHING:
+        raise ConfigError(
+            f"pieces must fit to {TOUCHING:g} units, are {residual:.3g} off their shapes and lie "
+            f"{depth:.3g} deep in each other"
+        )
 
 
 def figure_pieces(design: str) -> list[tuple[str, Floats]]:
@@ -98,7 +113,7 @@ def _number(text: str) -> float:
     """A sum of multiples of 1, r (the root of 2) and h (its half): "2-1.5r"."""
     terms = re.findall(r"([-+]?)(\d*\.?\d*)([rh]?)", text)
     return sum(
-        (-1.0 if sign == "-" else 1.0) * float(factor or 1.0) * _NUMBERS[letter]
+        float(f"{sign}{factor or 1}") * _NUMBERS[letter]
         for sign, factor, letter in terms
         if factor or letter
     )

@@ -12,8 +12,9 @@ from experiments.camera_picture import draw_camera
 from experiments.graph_picture import draw_graph
 from experiments.report.style import WIDTH_IN, drawing, empty_figure, save
 from experiments.scenes import draw_tokens, show_arena
+from tangram_sim.assembly import Puzzle
 from tangram_sim.config import SimConfig
-from tangram_sim.puzzles import Puzzle, load_puzzle
+from tangram_sim.puzzles import load_puzzle
 from tangram_sim.sampling import sample_poses
 
 START_SEED = 3  # of Fig. 1 (b)

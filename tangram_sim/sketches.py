@@ -97,7 +97,11 @@ def _loaded(text: str, source: str) -> Any:
     except FaultError as fault:
         raise ConfigError(f"{source}: {fault}") from None
     except (ValueError, RecursionError) as error:
-        place = f"line {error.lineno}" if isinstance(error, json.JSONDecodeError) else "numbers"
+        place = (
+            f"line {error.lineno}"
+            if isinstance(error, json.JSONDecodeError)
+            else "its nesting and numbers"
+        )
         raise ConfigError(f"{source} is not JSON that can be read: check {place}") from None
 
 
