@@ -24,7 +24,7 @@ from tangram_sim.sketches import FORMAT, VERSION
 ROOT = Path(__file__).parents[1]
 ARENA = 2.0
 GRID = 2.0**0.5 / 4.0  # units of the full square in one grid unit
-_NUMBERS = {"": 1.0, "r": 2.0**0.5, "h": 0.5**0.5}
+_NUMBERS: dict[str, float] = {"": 1.0, "r": 2.0**0.5, "h": 0.5**0.5}
 _DIGITS = 12  # of a coordinate in the files
 
 

@@ -25,11 +25,12 @@ COUNTS = {
     "square": 1,
     "parallelogram": 1,
 }
-# Units. A drawing to a hundredth moves a corner by up to 0.014, and two neighbours by twice that.
+# Units. Coordinates to a hundredth move a corner by up to 0.014 and a fit leaves less.
 MAX_RESIDUAL = 0.03
-# How deep and not how large: an overlap along a whole edge has a larger area than one at a corner,
-# but the same error of the drawing. 0.01 along the longest edge is 8 % of a small triangle.
-MAX_DEPTH = 0.03
+# Two neighbours move by twice that, and turn. How deep and not how large: an overlap along a whole
+# edge has a larger area than one at a corner, but comes from the same error of the drawing: 0.014
+# along its longest edge is 11 % of a small triangle.
+MAX_DEPTH = 0.04
 MAX_PUSH = 0.1  # that a piece may be pushed in all
 
 

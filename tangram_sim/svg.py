@@ -21,6 +21,7 @@ MAX_DEPTH = 50
 _NOT_DRAWN = {"defs", "symbol", "clipPath", "mask", "marker", "pattern", "metadata"}
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what overflows is out of bounds later
 def parse_svg(text: str, name: str) -> Sketch:
     """The figure of an SVG file; its seven areas together are one squared unit.
 
@@ -46,7 +47,7 @@ def parse_svg(text: str, name: str) -> Sketch:
             )
     areas = [abs(polygon_area(outline)) for outline in outlines]
     if not sum(areas) > 0.0:
-        raise FaultError(f"{where}: its polygons have no area")
+        raise FaultError(f"{where}: its polygons have no area: draw them larger")
     unit = float(np.sqrt(sum(areas)))
     # The y axis of SVG points down.
     units = [outline / (unit, -unit) for outline in outlines]

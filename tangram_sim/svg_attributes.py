@@ -12,6 +12,7 @@ from tangram_sim.errors import ConfigError
 from tangram_sim.sketches import shown
 
 MAX_NUMBERS = 64  # of one attribute
+MAX_TEXT = 4096  # characters of one attribute
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _TRANSFORM = r"(\w+)\s*\(([^()]*)\)"
 _COUNTS = {"matrix": (6,), "translate": (1, 2), "scale": (1, 2), "rotate": (1, 3)}
@@ -20,6 +21,7 @@ _COUNTS = {"matrix": (6,), "translate": (1, 2), "scale": (1, 2), "rotate": (1, 3
 def transform_matrix(text: str, where: str) -> Floats:
     """The matrix (3, 3) of matrix, translate, scale and rotate, applied from right to left."""
     motion = np.eye(3)
+    _check_length(text, where)
     if re.sub(_TRANSFORM, "", text).strip(", \t\r\n"):
         raise ConfigError(f"{where}: transform {shown(text)} cannot be read: check its brackets")
     for kind, inside in re.findall(_TRANSFORM, text):
@@ -51,6 +53,7 @@ def _matrix(kind: str, values: list[float]) -> Floats:
 
 def polygon_points(text: str, where: str) -> Floats:
     """Corners (V, 2) of the attribute `points`."""
+    _check_length(text, where)
     values = _numbers(text, where)
     if len(values) % 2:
         raise ConfigError(f"{where}: points must be pairs, got {len(values)} numbers: add one")
@@ -59,6 +62,7 @@ def polygon_points(text: str, where: str) -> Floats:
 
 def path_points(text: str, where: str) -> Floats:
     """Corners (V, 2) of the attribute `d`, one outline of M, L, H, V and Z in either case."""
+    _check_length(text, where)
     steps = re.findall(r"([a-zA-Z])([^a-dA-Df-zF-Z]*)", text)
     if not steps or steps[0][0] not in "Mm" or not text.lstrip().startswith(steps[0][0]):
         raise ConfigError(f"{where}: a path must start with M, got {shown(text)}")
@@ -97,13 +101,23 @@ def _moved(command: str, x: float, y: float, values: list[float]) -> tuple[float
     return start_x + values[0], start_y + values[1]
 
 
+def _check_length(text: str, where: str) -> None:
+    if len(text) > MAX_TEXT:
+        raise ConfigError(
+            f"{where}: an attribute must have at most {MAX_TEXT} characters, got {len(text)}: "
+            "draw straight lines with fewer digits"
+        )
+
+
 def _numbers(text: str, where: str) -> list[float]:
     """Finite numbers apart by blanks, commas or their signs."""
     if re.sub(_NUMBER, "", text).strip(", \t\r\n"):
         raise ConfigError(f"{where}: numbers cannot be read from {shown(text)}")
     values = [float(number) for number in re.findall(_NUMBER, text)]
     if len(values) > MAX_NUMBERS:
-        raise ConfigError(f"{where}: at most {MAX_NUMBERS} numbers, got {len(values)}")
+        raise ConfigError(
+            f"{where}: at most {MAX_NUMBERS} numbers, got {len(values)}: draw straight lines"
+        )
     if not np.isfinite(values).all():
         raise ConfigError(f"{where}: numbers must be finite, got {shown(text)}")
     return values

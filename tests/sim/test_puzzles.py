@@ -186,9 +186,9 @@ def test_pieces_that_overlap_are_named_with_their_depth() -> None:
     small["corners"] = (np.array(small["corners"]) - (0.1, 0.0)).tolist()
     assert refused(file_of(wrong)) == (
         "puzzle 'square', piece 1 (large_triangle): lies 0.0707 units deep in piece 3 "
-        "(small_triangle), at most 0.03 allowed: move them apart; "
+        "(small_triangle), at most 0.04 allowed: move them apart; "
         "puzzle 'square', piece 3 (small_triangle): lies 0.0707 units deep in piece 4 (square), "
-        "at most 0.03 allowed: move them apart"
+        "at most 0.04 allowed: move them apart"
     )
 
 
