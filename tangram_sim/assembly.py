@@ -120,6 +120,7 @@ def _ordered(name: str, layout: Layout, poses: Floats, scale: float) -> Puzzle:
     names = [shape.name for shape in layout.shapes]
     order = sorted(range(len(names)), key=lambda k: SHAPE_NAMES.index(names[k]))
     poses = poses[order] * (scale, scale, 1.0)
+    poses.setflags(write=False)  # the library's are shared
     return Puzzle(name, tuple(names[k] for k in order), poses, scale)
 
 

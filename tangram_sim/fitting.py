@@ -21,7 +21,7 @@ VARIANTS = {
 }
 TOUCHING = 1e-9  # units; less is rounding
 CLEARANCE = 1e-5  # units that pieces are left apart which were pushed
-MAX_ROUNDS = 2000
+MAX_ROUNDS = 500  # a drawing to a hundredth takes up to 80
 
 
 @dataclass(frozen=True, eq=False)

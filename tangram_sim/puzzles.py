@@ -63,30 +63,31 @@ def parse_puzzles(
         text: JSON.
         source: what errors call the file.
     """
-    sketches, faults = parse_sketches(text, source)
-    return _built(sketches, faults, rules or PuzzleRules(), skip_invalid)
+    return _built(parse_sketches(text, source), rules or PuzzleRules(), skip_invalid)
 
 
 def parse_svg_puzzle(
     text: str, name: str, rules: PuzzleRules | None = None, skip_invalid: bool = False
 ) -> PuzzleFile:
     """The one puzzle of an SVG text; see `read_puzzles`."""
+    sketch: Sketch | list[str]
     try:
-        sketches, faults = [parse_svg(text, name)], list[str]()
+        sketch = parse_svg(text, name)
     except FaultError as fault:
-        sketches, faults = [], [str(fault)]
-    return _built(sketches, faults, rules or PuzzleRules(), skip_invalid)
+        sketch = [str(fault)]
+    return _built([sketch], rules or PuzzleRules(), skip_invalid)
 
 
 def _built(
-    sketches: Sequence[Sketch], faults: list[str], rules: PuzzleRules, skip_invalid: bool
+    sketches: Sequence[Sketch | list[str]], rules: PuzzleRules, skip_invalid: bool
 ) -> PuzzleFile:
-    puzzles = []
+    puzzles, faults = list[Puzzle](), list[str]()
     for sketch in sketches:
-        puzzle, wrong = build_puzzle(sketch, rules)
+        puzzle, wrong = (
+            build_puzzle(sketch, rules) if isinstance(sketch, Sketch) else (None, sketch)
+        )
         faults += wrong
-        if puzzle is not None:
-            puzzles.append(puzzle)
+        puzzles += [puzzle] if puzzle else []
     if faults and not skip_invalid:
         told = "; ".join(faults[:_MAX_TOLD])
         more = len(faults) - _MAX_TOLD

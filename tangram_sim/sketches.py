@@ -63,8 +63,8 @@ def read_text(path: Path) -> str:
         raise ConfigError(f"puzzle file {path} is not UTF-8: save it as UTF-8") from None
 
 
-def parse_sketches(text: str, source: str) -> tuple[list[Sketch], list[str]]:
-    """The puzzles of a file, and the faults of those that are none.
+def parse_sketches(text: str, source: str) -> list[Sketch | list[str]]:
+    """The puzzles of a file in its order; instead of one that is none, its faults.
 
     Args:
         text: JSON.
@@ -121,9 +121,8 @@ def _entries(puzzles: Any, source: str) -> list[Any]:
     return puzzles
 
 
-def _sketches(entries: list[Any]) -> tuple[list[Sketch], list[str]]:
-    sketches: list[Sketch] = []
-    faults: list[str] = []
+def _sketches(entries: list[Any]) -> list[Sketch | list[str]]:
+    sketches: list[Sketch | list[str]] = []
     names: set[str] = set()
     for i, entry in enumerate(entries):
         try:
@@ -134,12 +133,10 @@ def _sketches(entries: list[Any]) -> tuple[list[Sketch], list[str]]:
                 )
             names.add(name)
             pieces, wrong = _pieces(entry["pieces"], f"puzzle '{name}'")
+            sketches.append(wrong or Sketch(name, pieces))
         except FaultError as fault:
-            wrong = [str(fault)]
-        faults += wrong
-        if not wrong:
-            sketches.append(Sketch(name, pieces))
-    return sketches, faults
+            sketches.append([str(fault)])
+    return sketches
 
 
 def _name_of(entry: Any, where: str) -> str:

@@ -188,8 +188,8 @@ def test_all_faults_of_a_file_are_told_at_once() -> None:
     assert starts == [
         "puzzle 'cat', piece 2:",
         "puzzle 'cat', piece 5:",
-        "puzzle number 4 must h",
         "puzzle 'duck': has 1 s",
+        "puzzle number 4 must h",
     ]
     assert message_of(text) == "; ".join(loaded.faults)
 
