@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from tangram_sim.errors import ConfigError
 from tangram_sim.puzzles import parse_puzzles, read_puzzles
@@ -198,3 +200,23 @@ def test_a_message_is_bounded() -> None:
     told = message_of(json.dumps(file_of(*["x" * 1000] * 500)))
     assert told.endswith("; and 480 more")
     assert len(told) < 5000
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner),
+    max_leaves=8,
+)
+PLACES = st.sampled_from(
+    ["name", "pieces", "pieces.0", "pieces.3.shape", "pieces.3.corners", "pieces.3.corners.0"]
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(PLACES, VALUES)
+def test_whatever_stands_in_a_file_is_a_puzzle_or_a_fault(place: str, value: Any) -> None:
+    cat = figure("cat")
+    at(place, value)(cat)
+    loaded = parse_puzzles(json.dumps(file_of(cat)), "my.json", skip_invalid=True)
+    assert bool(loaded.puzzles) != bool(loaded.faults)
+    assert all("\n" not in fault for fault in loaded.faults)

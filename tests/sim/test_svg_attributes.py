@@ -1,9 +1,12 @@
 """Transforms, points and paths as SVG writes them, and text that is none."""
 
 from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from tangram_sim.arrays import Floats
 from tangram_sim.errors import ConfigError
@@ -102,3 +105,12 @@ def test_other_transforms_are_refused(text: str, message: str) -> None:
     with pytest.raises(ConfigError) as caught:
         transform_matrix(text, "it")
     assert str(caught.value).startswith(message)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.text("MLHVZmlhvzC0123.,-+e ()translcomix", max_size=30))
+def test_whatever_stands_in_an_attribute_is_read_or_refused(text: str) -> None:
+    for read, size in ((path_points, 2), (polygon_points, 2), (transform_matrix, 3)):
+        for attribute in (text, f"M1 2{text}", f"scale({text})"):
+            with suppress(ConfigError):
+                assert read(attribute, "it").shape[1] == size
