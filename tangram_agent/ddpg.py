@@ -17,6 +17,7 @@ from tangram_agent.graph import TokenGraph
 from tangram_agent.networks import Actor, Critic, initialise, parameter_count
 from tangram_agent.setup import Setup
 from tangram_agent.types import Transitions, Weights
+from tangram_agent.weights import load_arrays, to_arrays, under
 from tangram_sim.errors import RunError
 
 Array = npt.NDArray[Any]
@@ -208,13 +209,13 @@ class Learner:
 
     def acting_weights(self, version: int) -> Weights:
         """A copy of the weights that workers play with."""
-        return Weights(version, _arrays(self.acting))
+        return Weights(version, to_arrays(self.acting))
 
     def state(self) -> dict[str, Array]:
         """Everything that the next update depends on, as arrays for a checkpoint."""
         state: dict[str, Array] = {_COUNTER: np.array([self.updates], np.int64)}
         for part in PARTS:
-            for name, value in _arrays(getattr(self, part)).items():
+            for name, value in to_arrays(getattr(self, part)).items():
                 state[f"{part}.{name}"] = value
         for part, optimiser in self._optimisers().items():
             for i, slots in optimiser.state_dict()["state"].items():
@@ -232,7 +233,7 @@ class Learner:
             raise RunError("learner state: no counter of updates: not a learner's checkpoint")
         self.load_networks(state)
         for part, optimiser in self._optimisers().items():
-            slots = _under(f"{part}_optimiser.", state)
+            slots = under(f"{part}_optimiser.", state)
             content: dict[int, dict[str, Tensor]] = {}
             for key, value in slots.items():
                 i, name = key.split(".", 1)
@@ -248,40 +249,10 @@ class Learner:
             RunError: tensors are missing or have other shapes.
         """
         for part in PARTS:
-            load_arrays(getattr(self, part), _under(f"{part}.", state))
+            load_arrays(getattr(self, part), under(f"{part}.", state))
 
     def _optimisers(self) -> dict[str, torch.optim.Adam]:
         return {"actor": self.actor_optimiser, "critic": self.critic_optimiser}
-
-
-def load_arrays(module: nn.Module, arrays: dict[str, Array]) -> None:
-    """Copy named arrays into a module's parameters.
-
-    Raises:
-        RunError: names or shapes differ; says which first.
-    """
-    own = dict(module.named_parameters())
-    if set(own) != set(arrays):
-        odd = min(set(own) ^ set(arrays))
-        raise RunError(f"weights of another network: '{odd}' is on one side only")
-    with torch.no_grad():
-        for name, parameter in own.items():
-            if tuple(parameter.shape) != arrays[name].shape:
-                raise RunError(
-                    f"weights of another layout: '{name}' is {arrays[name].shape}, "
-                    f"this setup needs {tuple(parameter.shape)}: start with the run's own tokens, "
-                    "agent and net"
-                )
-            parameter.copy_(torch.from_numpy(np.array(arrays[name])))
-
-
-def _arrays(module: nn.Module) -> dict[str, Array]:
-    named = module.named_parameters()
-    return {name: p.detach().cpu().numpy().copy() for name, p in named}
-
-
-def _under(prefix: str, state: dict[str, Array]) -> dict[str, Array]:
-    return {name.removeprefix(prefix): v for name, v in state.items() if name.startswith(prefix)}
 
 
 def _frozen(module: nn.Module) -> nn.Module:

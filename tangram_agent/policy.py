@@ -9,11 +9,12 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from tangram_agent.ddpg import load_arrays, next_token
+from tangram_agent.ddpg import next_token
 from tangram_agent.graph import TokenGraph
 from tangram_agent.networks import Actor
 from tangram_agent.setup import Setup
 from tangram_agent.types import Weights
+from tangram_agent.weights import load_arrays
 from tangram_sim.arrays import Floats, Singles
 
 Flags = npt.NDArray[np.bool_] | npt.NDArray[np.uint8]

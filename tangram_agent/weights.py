@@ -1,0 +1,44 @@
+"""A network's parameters as named arrays, and back."""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import nn
+
+from tangram_sim.errors import RunError
+
+Array = npt.NDArray[Any]
+
+
+def load_arrays(module: nn.Module, arrays: dict[str, Array]) -> None:
+    """Copy named arrays into a module's parameters.
+
+    Raises:
+        RunError: names or shapes differ; says which first.
+    """
+    own = dict(module.named_parameters())
+    if set(own) != set(arrays):
+        odd = min(set(own) ^ set(arrays))
+        raise RunError(f"weights of another network: '{odd}' is on one side only")
+    with torch.no_grad():
+        for name, parameter in own.items():
+            if tuple(parameter.shape) != arrays[name].shape:
+                raise RunError(
+                    f"weights of another layout: '{name}' is {arrays[name].shape}, "
+                    f"this setup needs {tuple(parameter.shape)}: start with the run's own tokens, "
+                    "agent and net"
+                )
+            parameter.copy_(torch.from_numpy(np.array(arrays[name])))
+
+
+def to_arrays(module: nn.Module) -> dict[str, Array]:
+    """Copies of a module's parameters by name."""
+    named = module.named_parameters()
+    return {name: p.detach().cpu().numpy().copy() for name, p in named}
+
+
+def under(prefix: str, state: dict[str, Array]) -> dict[str, Array]:
+    """The arrays whose names begin so, by the rest of their names."""
+    return {name.removeprefix(prefix): v for name, v in state.items() if name.startswith(prefix)}
