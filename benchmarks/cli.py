@@ -15,7 +15,7 @@ Options may be written as elsewhere in this project: runs=9 for --runs 9.
 examples:
   tangram-bench learner                     a table of the learner alone
   tangram-bench wire runs=9 out=wire.json   more runs, and a file with machine, versions, commit
-  tangram-bench all out=bench.json          everything, half an hour on two cores (make bench)
+  tangram-bench all out=bench.json          everything, most of an hour on two cores (make bench)
   tangram-bench chaos minutes=20 seed=1     random faults over a real training
 """
 RATES = {

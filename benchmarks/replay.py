@@ -36,12 +36,10 @@ def filled(setup: Setup, capacity: int) -> ReplayBuffer:
     """A full buffer of random numbers."""
     layout = setup.layout
     replay = ReplayBuffer(capacity, layout.corner_count, layout.tokens, setup.action_size)
-    replay.add(random_transitions(setup, CHUNK))
-    first = replay.state()
-    for name, column in columns(replay).items():
-        part = first[name]
-        column[:] = np.resize(part, (len(column), *part.shape[1:]))
+    chunk = vars(random_transitions(setup, CHUNK))
     replay.added = capacity
+    for name, column in columns(replay).items():
+        column[:] = np.resize(chunk[name], column.shape)
     return replay
 
 
@@ -63,8 +61,8 @@ def random_transitions(setup: Setup, count: int) -> Transitions:
 
 
 def columns(replay: ReplayBuffer) -> dict[str, np.ndarray]:
-    """The arrays of a buffer, as they lie in memory."""
-    return replay._columns
+    """The arrays of a full buffer, as they lie in memory."""
+    return {name: column for name, column in replay.state().items() if name != "counters"}
 
 
 def _bytes(replay: ReplayBuffer) -> int:

@@ -8,6 +8,7 @@ import yaml
 
 import conf
 from tangram_agent.setup import SECTIONS, Setup, make_setup
+from tangram_sim.assembly import COUNTS
 from tangram_sim.layout import TokensConfig
 
 
@@ -30,15 +31,7 @@ def preset(agent: str = "tangram", tokens: str = "square") -> Setup:
     return make_setup({name: group(name, choice) for name, choice in choices.items()})
 
 
-SEVEN = (
-    "large_triangle",
-    "large_triangle",
-    "medium_triangle",
-    "small_triangle",
-    "small_triangle",
-    "square",
-    "parallelogram",
-)
+SEVEN = tuple(name for name, count in COUNTS.items() for _ in range(count))
 
 
 def several(count: int, agent: str = "tangram") -> Setup:
