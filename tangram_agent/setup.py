@@ -43,12 +43,12 @@ class Setup:
     @property
     def action_size(self) -> int:
         """A: x, y and angular velocity, with more than one token its number before them."""
-        return action_size(self.layout.tokens)
+        return action_size(self.layout.tokens, self.sim)
 
     @property
     def bound(self) -> float:
         """The largest |coordinate| that a corner can reach."""
-        return corner_bound(self.sim)
+        return corner_bound(self.layout.tokens, self.sim)
 
     def fingerprints(self) -> dict[str, str]:
         """A digest of each section: two processes with the same ones play the same task."""

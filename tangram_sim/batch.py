@@ -6,16 +6,17 @@ whole batch, and a batch of episodes travels as a few raw frames.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from tangram_sim.arrays import Bools, Floats, Ints
 from tangram_sim.config import RewardConfig, SimConfig
-from tangram_sim.geometry import overlap_share
+from tangram_sim.geometry import outlines, overlap_share, shared_area
 from tangram_sim.layout import Layout
 from tangram_sim.rewards import TargetPictures, make_reward, scaled_overlap
-from tangram_sim.sampling import sample_batch
 from tangram_sim.sensing import noise_bound, see
+from tangram_sim.targets import Sides, sample_starts, sample_targets
 from tangram_sim.world import make_world
 
 _ROUNDING = 1.0 + 1e-6
@@ -30,6 +31,7 @@ class StepResult:
         overlap: (B,) raw overlap in [0, 1] on exact polygons.
         camera_rewards: (B,) Eq. 14 from the pictures, or None with the camera off.
         refused: (B,) where the action named a placed token: nothing moved.
+        blocked: (B,) where a lifted token could not be set down on others: nothing moved.
         done: whether the episodes are over, all at once.
     """
 
@@ -37,12 +39,13 @@ class StepResult:
     overlap: Floats
     camera_rewards: Floats | None
     refused: Bools
+    blocked: Bools
     done: bool
 
 
-def action_size(tokens: int) -> int:
-    """A: 3 velocities, and before them which token to move if there are several."""
-    return 3 if tokens == 1 else 4
+def action_size(tokens: int, sim: SimConfig) -> int:
+    """A: 3 velocities, before them which token if there are several, and whether it is flipped."""
+    return 3 + (tokens > 1) + sim.allow_flip
 
 
 def horizon(tokens: int, sim: SimConfig) -> int:
@@ -50,14 +53,16 @@ def horizon(tokens: int, sim: SimConfig) -> int:
     return tokens * sim.actions_per_token
 
 
-def corner_bound(sim: SimConfig) -> float:
+def corner_bound(tokens: int, sim: SimConfig) -> float:
     """The largest |coordinate| that a corner can reach in an episode, arena units.
 
     A start lies inside the arena, and each action moves a token by at most the arena's width in x
-    and in y; turning keeps a corner within the start's margin for every angle. What an agent sees
-    may lie further out by the noise's bound.
+    and in y; turning keeps a corner within the start's margin for every angle. A token that slides
+    may push another as far as it goes itself, in each action of the episode; one that settles moves
+    others by less than an arena. What an agent sees may lie further out by the noise's bound.
     """
-    return (sim.arena * (0.5 + sim.actions_per_token) + noise_bound(sim)) * _ROUNDING
+    pushes = 0 if tokens == 1 else horizon(tokens, sim) if sim.motion == "slide" else 1
+    return (sim.arena * (0.5 + sim.actions_per_token + pushes) + noise_bound(sim)) * _ROUNDING
 
 
 def chosen_tokens(actions: Floats, tokens: int) -> Ints:
@@ -78,16 +83,27 @@ def velocities(actions: Floats, sim: SimConfig) -> Floats:
     return scaled
 
 
+def flips(actions: Floats, sim: SimConfig) -> Bools:
+    """(B,) which actions (B, A) turn their token over: the entry before the velocities says so."""
+    if not sim.allow_flip:
+        return np.zeros(len(actions), dtype=np.bool_)
+    return np.asarray(actions)[:, -4] > 0.0
+
+
 class BatchedEnv:
     """`count` environments in one process.
 
     An action is (x, y, angular velocity) in [-1, 1], with one entry before them that names the
-    token if there are several. A token that had its `actions_per_token` actions is placed. An
-    action that names a placed token is refused: it moves nothing, but uses up its step.
+    token if there are several, and with `sim.allow_flip` one more between, above 0 where the token
+    is to be turned over. A token that had its `actions_per_token` actions is placed. An action that
+    names a placed token is refused: it moves nothing, but uses up its step. One that would set a
+    lifted token down on others by more than `sim.max_overlap` of its area moves nothing either,
+    and is one of the token's actions.
 
     Attributes:
         count: B.
         horizon: steps of an episode, K * actions_per_token.
+        task: what is played from the next `reset` on.
         action_size: A.
         bound: largest |coordinate| that a corner can reach, arena units.
         steps_done: steps taken in this episode.
@@ -109,8 +125,9 @@ class BatchedEnv:
         self.reward_fn = make_reward(reward, layout, sim)
         self.count = count
         self.horizon = horizon(layout.tokens, sim)
-        self.action_size = action_size(layout.tokens)
-        self.bound = corner_bound(sim)
+        self.action_size = action_size(layout.tokens, sim)
+        self.bound = corner_bound(layout.tokens, sim)
+        self.task = sim.task
         self._worlds = [make_world(layout, sim) for _ in range(count)]
         self._targets: TargetPictures | None = None
         self._moves: Ints = np.zeros((count, layout.tokens), dtype=np.int64)
@@ -137,15 +154,47 @@ class BatchedEnv:
         """
         if len(generators) != self.count:
             raise ValueError(f"need {self.count} generators, got {len(generators)}")
-        targets = sample_batch(self.layout, self.sim, generators)
-        starts = sample_batch(self.layout, self.sim, generators)
+        targets = sample_targets(self.layout, self.sim, self.task, generators)
+        self._start(targets, generators)
+
+    def reset_to(
+        self, poses: Floats, flipped: Bools, generators: Sequence[np.random.Generator]
+    ) -> None:
+        """Begin an episode with given targets in every environment; starts are drawn.
+
+        Args:
+            poses: (B, K, 3) of the targets.
+            flipped: (B, K) target pieces on their other side.
+            generators: as for `reset`.
+
+        Raises:
+            SamplingError: no start without overlap was found.
+        """
+        if len(generators) != self.count:
+            raise ValueError(f"need {self.count} generators, got {len(generators)}")
+        self._start((poses, flipped), generators)
+
+    def _start(self, targets: Sides, generators: Sequence[np.random.Generator]) -> None:
+        self.goals = self.layout.corners(*targets)
+        starts = sample_starts(self.layout, self.sim, self.goals, targets[1], generators)
+        self._moves[:] = 0
+        self._lay_out(targets, starts, generators)
         self._begin(targets, starts)
         self._generators = generators
-        self.goals = self.layout.corners(targets)
         self.seen_goals = see(self.goals, self.sim, generators)
-        self._look(np.stack([world.poses() for world in self._worlds]))
-        self._moves[:] = 0
+        self._look()
         self.steps_done = 0
+
+    def _lay_out(self, targets: Sides, starts: Sides, generators: Any) -> None:
+        """In a stage with fewer tokens to move, put the others on their targets already."""
+        moved = self.task.tokens
+        if not 0 < moved < self.layout.tokens:
+            return
+        for b, generator in enumerate(generators):
+            done = generator.permutation(self.layout.tokens)[moved:]
+            for start, target in zip(starts, targets, strict=True):
+                start[b, done] = target[b, done]
+            self._moves[b, done] = self.sim.actions_per_token
 
     def step(self, actions: Floats) -> StepResult:
         """Play one action in every environment.
@@ -163,40 +212,58 @@ class BatchedEnv:
         tokens = chosen_tokens(actions, self.layout.tokens)
         refused = self.placed[np.arange(self.count), tokens]
         self._moves[np.flatnonzero(~refused), tokens[~refused]] += 1
-        camera = self._move(tokens, velocities(actions, self.sim), refused)
+        velocity, flip = velocities(actions, self.sim), flips(actions, self.sim)
+        blocked = self._blocked(tokens, velocity, flip) & ~refused
+        camera = self._move(tokens, velocity, flip, refused | blocked)
         self.steps_done += 1
-        return self._result(refused, camera)
+        return self._result(refused, blocked, camera)
 
     def close(self) -> None:
         """Close all worlds; calling it twice does no harm."""
         for world in self._worlds:
             world.close()
 
-    def _begin(self, targets: Floats, starts: Floats) -> None:
+    def _blocked(self, tokens: Ints, velocity: Floats, flip: Bools) -> Bools:
+        """(B,) where a lifted token would be set down on others by more than is allowed."""
+        layout, rows = self.layout, np.arange(self.count)
+        if layout.tokens == 1 or self.sim.motion != "lift":
+            return np.zeros(self.count, dtype=np.bool_)
+        poses, sides = self._poses.copy(), self._flipped.copy()
+        poses[rows, tokens] += velocity
+        sides[rows, tokens] ^= flip
+        pieces = outlines(layout.corners(poses, sides), layout)
+        own = np.repeat(pieces[rows, tokens], layout.tokens, axis=0)
+        others = pieces.reshape(len(own), *own.shape[1:])
+        common = shared_area(own, others).reshape(self.count, -1)
+        common[rows, tokens] = 0.0
+        areas = np.array([shape.area for shape in layout.shapes])
+        blocked: Bools = common.sum(axis=1) > self.sim.max_overlap * areas[tokens]
+        return blocked
+
+    def _begin(self, targets: Sides, starts: Sides) -> None:
         """Photograph the targets and put the tokens at their starts."""
         # World after world, here and in `_move`: the engine's memory of each fills the cache.
         pictures = []
-        for world, target, start in zip(self._worlds, targets, starts, strict=True):
+        for b, world in enumerate(self._worlds):
             if self.sim.camera:
-                world.place(target)
+                world.place(targets[0][b], targets[1][b])
                 pictures.append(world.picture())
-            world.place(start)
+            world.place(starts[0][b], starts[1][b])
         if self.sim.camera:
             self._targets = TargetPictures(np.stack(pictures))
 
-    def _move(self, tokens: Ints, velocity: Floats, refused: Bools) -> Floats | None:
+    def _move(self, tokens: Ints, velocity: Floats, flip: Bools, idle: Bools) -> Floats | None:
         """Move in every world and look at it; (B,) Eq. 14 of the pictures with the camera on."""
-        poses, pictures = [], []
+        pictures = []
         for b, world in enumerate(self._worlds):
-            if not refused[b]:
-                world.move(int(tokens[b]), velocity[b])
-            poses.append(world.poses())
+            if not idle[b]:
+                world.move(int(tokens[b]), velocity[b], bool(flip[b]))
             if self.sim.camera:
                 pictures.append(world.picture())
-        self._look(np.stack(poses))
+        self._look()
         return None if self._targets is None else self._targets.rewards(np.stack(pictures))
 
-    def _result(self, refused: Bools, camera: Floats | None) -> StepResult:
+    def _result(self, refused: Bools, blocked: Bools, camera: Floats | None) -> StepResult:
         share = overlap_share(self.corners, self.goals, self.layout)
         if camera is not None and self._reward.source == "camera":
             rewards = camera
@@ -209,6 +276,7 @@ class BatchedEnv:
             overlap=share,
             camera_rewards=camera,
             refused=refused,
+            blocked=blocked,
             done=self.steps_done == self.horizon,
         )
 
@@ -222,6 +290,8 @@ class BatchedEnv:
             raise ValueError("actions must be finite")
         return np.clip(actions, -1.0, 1.0)
 
-    def _look(self, poses: Floats) -> None:
-        self.corners = self.layout.corners(poses)
+    def _look(self) -> None:
+        self._poses = np.stack([world.poses() for world in self._worlds])
+        self._flipped = np.stack([world.flipped() for world in self._worlds])
+        self.corners = self.layout.corners(self._poses, self._flipped)
         self.seen = see(self.corners, self.sim, self._generators)

@@ -13,6 +13,32 @@ SOURCES = ("polygon", "camera")
 MIN_SUBSTEPS = 4
 # A fifth of the arena is a whole token: nothing is left to see beyond.
 MAX_CORNER_NOISE = 0.2
+MOTIONS = ("lift", "slide")
+STARTS = ("anywhere", "outside")
+TARGETS = ("uniform", "gaussian", "connected", "figures", "mixed")
+
+
+@dataclass(frozen=True)
+class StageConfig:
+    """What is played from some update on: a step of a curriculum.
+
+    Attributes:
+        updates: the stage begins with the weights of so many updates.
+        tokens: how many are to be moved, the others lie on their targets from the start; 0: all.
+        targets: see `SimConfig`.
+        spread: see `SimConfig`.
+    """
+
+    updates: int = 0
+    tokens: int = 0
+    targets: str = "uniform"
+    spread: float = 0.2
+
+    def __post_init__(self) -> None:
+        check_range("sim.stages.updates", self.updates, 0)
+        check_range("sim.stages.tokens", self.tokens, 0, 100)
+        check_choice("sim.stages.targets", self.targets, TARGETS)
+        check_range("sim.stages.spread", self.spread, 1e-3, 1.0)
 
 
 @dataclass(frozen=True)
@@ -29,6 +55,20 @@ class SimConfig:
             they are told; for experiments on what an agent makes of that.
         corner_noise: standard deviation of the Gaussian noise on the corners that agents see, as a
             share of the arena; rewards and scores are those of the exact corners.
+        motion: lift (carried above the others, set down and settled) or slide (pushed along the
+            table, and the others with it; physics only).
+        max_overlap: lift: share of a token that may come to lie on others; a placement beyond it
+            is refused and costs the action.
+        targets: uniform (apart from each other, Sec. V), gaussian (their centres, Sec. VIII),
+            connected (edge to edge), figures (of the package's train split, all seven tans), or
+            mixed (uniform and connected in turns of chance).
+        spread: gaussian: standard deviation of the centres, as a share of the arena.
+        starts: anywhere in the arena, or outside of the target where there is room.
+        mirrored: share of episodes whose chiral tokens lie on their other side, in start and
+            target alike.
+        allow_flip: the start's side is drawn, whatever the target's, and an action has one entry
+            more, by which it turns its token over. Needs lift.
+        stages: a curriculum, by the number of updates; tests are always the whole task.
         camera: take the pictures and report Eq. 14 from them at every step.
         pixels: side of the camera's square picture.
         max_tries: random poses tried for a token before sampling gives up.
@@ -41,9 +81,30 @@ class SimConfig:
     damping: float = 0.0
     inexact: bool = False
     corner_noise: float = 0.0
+    motion: str = "lift"
+    max_overlap: float = 0.2
+    targets: str = "uniform"
+    spread: float = 0.2
+    starts: str = "anywhere"
+    mirrored: float = 0.0
+    allow_flip: bool = False
+    stages: tuple[StageConfig, ...] = ()
     camera: bool = False
     pixels: int = 64
     max_tries: int = 1000
+
+    @property
+    def task(self) -> StageConfig:
+        """What is played without a curriculum, and after it, and what tests are."""
+        return StageConfig(targets=self.targets, spread=self.spread)
+
+    def stage(self, updates: int) -> int:
+        """The number of the stage that weights of so many updates play, 0 before the first."""
+        return sum(stage.updates <= updates for stage in self.stages)
+
+    def stage_task(self, stage: int) -> StageConfig:
+        """What is played in a stage."""
+        return self.stages[stage - 1] if stage else self.task
 
     def __post_init__(self) -> None:
         check_choice("sim.backend", self.backend, BACKENDS)
@@ -51,10 +112,35 @@ class SimConfig:
         check_range("sim.actions_per_token", self.actions_per_token, 1, 100)
         check_range("sim.corner_noise", self.corner_noise, 0.0, MAX_CORNER_NOISE)
         self._check_motion()
+        self._check_task()
         check_range("sim.pixels", self.pixels, 16, 1024)
         check_range("sim.max_tries", self.max_tries, 1, 1_000_000)
 
+    def _check_task(self) -> None:
+        check_choice("sim.targets", self.targets, TARGETS)
+        check_choice("sim.starts", self.starts, STARTS)
+        check_range("sim.spread", self.spread, 1e-3, 1.0)
+        check_range("sim.mirrored", self.mirrored, 0.0, 1.0)
+        begins = [stage.updates for stage in self.stages]
+        if begins != sorted(set(begins)):
+            raise ConfigError(
+                f"sim.stages must begin one after the other, got updates {begins}: sort them, and "
+                "name each number once"
+            )
+
     def _check_motion(self) -> None:
+        check_choice("sim.motion", self.motion, MOTIONS)
+        check_range("sim.max_overlap", self.max_overlap, 0.0, 1.0)
+        if self.motion == "slide" and self.backend == "kinematic":
+            raise ConfigError(
+                "sim.motion=slide needs the engine's contacts, got sim.backend=kinematic: set "
+                "sim.backend=physics, or sim.motion=lift"
+            )
+        if self.motion == "slide" and self.allow_flip:
+            raise ConfigError(
+                "sim.allow_flip=true needs sim.motion=lift, got slide: a token that stays on the "
+                "table cannot be turned over"
+            )
         check_range("sim.damping", self.damping, 0.0, 1.0)
         check_range("sim.substeps", self.substeps, 1 if self.inexact else MIN_SUBSTEPS, 1000)
         if self.damping > 0.0 and not self.inexact:

@@ -121,8 +121,14 @@ def _overlap_area(tokens: Floats, targets: Floats, layout: Layout) -> Floats:
 
 
 def outlines(corners: Floats, layout: Layout) -> Floats:
-    """Corners (B, V, 2) token by token, (B, K, C, 2), padded by repeating a token's last one."""
+    """Corners (B, V, 2) token by token, (B, K, C, 2), padded by repeating a token's last one.
+
+    Counter-clockwise, whichever side a token lies on.
+    """
     padded: Floats = corners[:, layout.padded_corners]
+    if layout.any_chiral:
+        flipped = layout.flipped(corners)[..., None, None]
+        padded = np.where(flipped, padded[:, :, ::-1], padded)
     return padded
 
 
@@ -150,12 +156,17 @@ def overlap_share(tokens: Floats, targets: Floats, layout: Layout) -> Floats:
 
 def pairs_overlap(first: Floats, second: Floats, tolerance: float = 1e-9) -> Bools:
     """(B,), whether polygons (B, M, 2) and (B, C, 2) overlap by more than `tolerance` in area."""
-    found: Bools = _boxes_meet(first, second)
+    return np.asarray(shared_area(first, second) > tolerance)
+
+
+def shared_area(first: Floats, second: Floats) -> Floats:
+    """(B,) area that convex counter-clockwise polygons (B, M, 2) and (B, C, 2) share."""
+    shared = np.zeros(len(first))
     # Most pairs are too far apart to meet: only the rest is worth clipping.
-    rows = np.flatnonzero(found)
+    rows = np.flatnonzero(_boxes_meet(first, second))
     if len(rows):
-        found[rows] = area(clip(first[rows], second[rows])) > tolerance
-    return found
+        shared[rows] = area(clip(first[rows], second[rows]))
+    return shared
 
 
 def any_overlap(corners: Floats, layout: Layout, tolerance: float = 1e-9) -> Bools:

@@ -2,27 +2,33 @@
 
 import numpy as np
 
-from tangram_sim.arrays import Floats, Pixels
+from tangram_sim.arrays import Bools, Floats, Pixels
 from tangram_sim.config import SimConfig
 from tangram_sim.layout import Layout
 from tangram_sim.pictures import rasterise
 
 
 class KinematicWorld:
-    """Tokens that go exactly where their velocity takes them. See `World`."""
+    """Tokens that go exactly where their velocity takes them, lifted, without contacts.
+
+    See `World`.
+    """
 
     def __init__(self, layout: Layout, sim: SimConfig) -> None:
         self._layout = layout
         self._sim = sim
         self._poses: Floats = np.zeros((layout.tokens, 3))
+        self._flipped: Bools = np.zeros(layout.tokens, dtype=np.bool_)
 
-    def place(self, poses: Floats) -> None:
+    def place(self, poses: Floats, flipped: Bools | None = None) -> None:
         """See `World.place`."""
         self._poses[:] = poses
         self._poses[:, 2] = wrap(self._poses[:, 2])
+        self._flipped[:] = False if flipped is None else flipped
 
-    def move(self, token: int, velocity: Floats) -> None:
+    def move(self, token: int, velocity: Floats, flip: bool = False) -> None:
         """See `World.move`."""
+        self._flipped[token] ^= flip
         self._poses[token] += velocity
         self._poses[token, 2] = wrap(self._poses[token, 2])
 
@@ -30,9 +36,13 @@ class KinematicWorld:
         """See `World.poses`."""
         return self._poses.copy()
 
+    def flipped(self) -> Bools:
+        """See `World.flipped`."""
+        return self._flipped.copy()
+
     def picture(self) -> Pixels:
         """See `World.picture`."""
-        corners = self._layout.corners(self._poses)
+        corners = self._layout.corners(self._poses, self._flipped)
         return rasterise(corners, self._layout, self._sim.arena, self._sim.pixels)
 
     def close(self) -> None:

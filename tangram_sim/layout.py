@@ -71,6 +71,7 @@ class Layout:
         token_of_corner: (V,) index of the owning token.
         padded_corners: (K, C) the corners of each token, filled up to the C of the largest by
             repeating the last.
+        chiral: (K,) tokens whose mirror image no turn gives: they can lie on either side.
         base_weights: (K, V) centre of token k as an affine combination of the corners.
         adjacency: (N, N) edges of the graph, E(i, i) = 0.
     """
@@ -83,6 +84,8 @@ class Layout:
         self.token_of_corner: Ints = np.repeat(np.arange(len(sizes)), sizes)
         steps = np.minimum(np.arange(max(sizes)), np.array(sizes)[:, None] - 1)
         self.padded_corners: Ints = self.starts[:-1, None] + steps
+        self.chiral: Bools = np.array([shape.mirror is None for shape in self.shapes])
+        self.any_chiral = bool(self.chiral.any())
         self.base_weights: Floats = self._base_weights()
         self.adjacency: Bools = self._adjacency()
 
@@ -105,11 +108,19 @@ class Layout:
         """The corners of one token, as a slice of V."""
         return slice(int(self.starts[token]), int(self.starts[token + 1]))
 
-    def corners(self, poses: Floats) -> Floats:
-        """Corners (..., V, 2) of poses (..., K, 3), each x, y and angle in radians."""
+    def corners(self, poses: Floats, flipped: Bools | None = None) -> Floats:
+        """Corners (..., V, 2) of poses (..., K, 3), each x, y and angle in radians.
+
+        Args:
+            poses: of the tokens.
+            flipped: (..., K) which lie on their other side: turned over about their body's x axis
+                before the rest; their corners then run clockwise. None: none does.
+        """
         pose = np.asarray(poses)[..., self.token_of_corner, :]
         cos, sin = np.cos(pose[..., 2]), np.sin(pose[..., 2])
         x, y = self.body.T
+        if flipped is not None:
+            y = np.where(np.asarray(flipped)[..., self.token_of_corner], -y, y)
         return np.stack(
             [pose[..., 0] + cos * x - sin * y, pose[..., 1] + sin * x + cos * y], axis=-1
         )
@@ -119,17 +130,46 @@ class Layout:
         centres: Floats = self.base_weights @ corners
         return centres
 
+    def flipped(self, corners: Floats) -> Bools:
+        """(..., K) which tokens with corners (..., V, 2) lie on their other side.
+
+        Only a chiral token can: what any other shows is the same after a turn.
+        """
+        if not self.any_chiral:
+            return np.zeros((*corners.shape[:-2], self.tokens), dtype=np.bool_)
+        first = self.starts[:-1]
+        one = corners[..., first + 1, :] - corners[..., first, :]
+        two = corners[..., first + 2, :] - corners[..., first, :]
+        clockwise = one[..., 0] * two[..., 1] < one[..., 1] * two[..., 0]
+        return np.asarray(clockwise & self.chiral)
+
     def poses(self, corners: Floats) -> Floats:
-        """Poses (..., K, 3) of corners (..., V, 2): least-squares rotation, angle in (-pi, pi]."""
+        """Poses (..., K, 3) of corners (..., V, 2): least-squares rotation, angle in (-pi, pi].
+
+        Which side a token lies on is told by `flipped`.
+        """
         centres = self.bases(corners)
         offset = corners - centres[..., self.token_of_corner, :]
-        dot = np.sum(self.body * offset, axis=-1)
-        cross = self.body[:, 0] * offset[..., 1] - self.body[:, 1] * offset[..., 0]
+        x, y = self.body.T
+        if self.any_chiral:
+            y = np.where(self.flipped(corners)[..., self.token_of_corner], -y, y)
+        dot = x * offset[..., 0] + y * offset[..., 1]
+        cross = x * offset[..., 1] - y * offset[..., 0]
         angle = np.arctan2(
             np.add.reduceat(cross, self.starts[:-1], axis=-1),
             np.add.reduceat(dot, self.starts[:-1], axis=-1),
         )
         return np.concatenate([centres, angle[..., None]], axis=-1)
+
+    def mirrored(self, poses: Floats, flipped: Bools) -> tuple[Floats, Bools]:
+        """The mirror image (x, -y) of poses (..., K, 3) and sides (..., K).
+
+        A chiral token changes its side, any other is the same after a turn.
+        """
+        turns = np.array([shape.mirror or 0.0 for shape in self.shapes])
+        image = np.asarray(poses) * (1.0, -1.0, -1.0)
+        image[..., 2] += turns
+        return image, np.asarray(flipped) ^ self.chiral
 
     def node_features(self, corners: Floats, placed: Bools, goal: Floats) -> Floats:
         """The 4 features per node of Sec. IV-A: x, y, part of the target, placed.

@@ -24,8 +24,11 @@ def rasterise(corners: Floats, layout: Layout, arena: float, pixels: int) -> Pix
     centres = (np.arange(pixels) + 0.5) * (arena / pixels) - arena / 2.0
     x, y = centres[None, :], -centres[:, None]
     picture = np.full((pixels, pixels), BACKGROUND, dtype=np.uint8)
+    flipped = layout.flipped(corners)
     for token in range(layout.tokens):
         outline = corners[layout.corners_of(token)]
+        if flipped[token]:
+            outline = outline[::-1]
         inside = np.ones((pixels, pixels), dtype=np.bool_)
         for start, end in zip(outline, np.roll(outline, -1, axis=0), strict=True):
             edge = end - start

@@ -1,8 +1,8 @@
-"""Targets and starts: uniform positions and orientations without overlap (Sec. V).
+"""Layouts without overlap, token after token: uniform or around one place.
 
-Tokens are placed one after the other, the largest first, each uniform over the poses that those
-before it leave free. Drawing whole layouts and rejecting those with an overlap would be uniform
-over layouts, but hardly ever succeeds for seven tokens that fill a sixth of the arena.
+Tokens are placed one after the other, the largest first, each over the poses that those before it
+leave free. Drawing whole layouts and rejecting those with an overlap would be uniform over
+layouts, but hardly ever succeeds for seven tokens that fill a tenth of the arena.
 
 Each environment draws from its own generator only: what it gets does not depend on the others of
 the batch, which are only checked together for speed.
@@ -13,13 +13,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tangram_sim.arrays import Bools, Floats
+from tangram_sim.arrays import Bools, Floats, Ints
 from tangram_sim.config import SimConfig
 from tangram_sim.errors import SamplingError
 from tangram_sim.geometry import pairs_overlap
 from tangram_sim.layout import Layout
 
 _CHUNK = 4  # poses drawn at once when some may overlap: fewer, larger checks
+_CLEAR_TRIES = 64  # outside of what is only to be avoided; then anywhere
+_WIDENING = 1.02  # of a Gaussian with every pose that was blocked: there is room in the end
 
 
 def sample_poses(layout: Layout, sim: SimConfig, rng: np.random.Generator) -> Floats:
@@ -29,12 +31,25 @@ def sample_poses(layout: Layout, sim: SimConfig, rng: np.random.Generator) -> Fl
 
 
 def sample_batch(
-    layout: Layout, sim: SimConfig, generators: Sequence[np.random.Generator]
+    layout: Layout,
+    sim: SimConfig,
+    generators: Sequence[np.random.Generator],
+    flipped: Bools | None = None,
+    avoid: Floats | None = None,
+    spread: float | None = None,
 ) -> Floats:
     """One layout per generator: (B, K, 3) of x, y (arena units) and angle in (-pi, pi].
 
-    Centres are uniform in the square that keeps the token inside the arena at every angle, angles
-    are uniform, and no two tokens of a layout overlap.
+    Centres lie in the square that keeps the token inside the arena at every angle, angles are
+    uniform, and no two tokens of a layout overlap.
+
+    Args:
+        layout: the tokens.
+        sim: the arena, and how long to try.
+        generators: one for each of B environments.
+        flipped: (B, K) tokens that lie on their other side; None: none does.
+        avoid: (B, M, C, 2) outlines that tokens keep clear of where there is room.
+        spread: deviation of Gaussian centres (Sec. VIII), as a share of the arena; None: uniform.
 
     Raises:
         SamplingError: a token does not fit into the arena, or `sim.max_tries` poses for one all
@@ -42,73 +57,108 @@ def sample_batch(
     """
     reach = check_fits(layout, sim)
     poses = np.empty((len(generators), layout.tokens, 3))
+    sides = np.zeros(poses.shape[:2], np.bool_) if flipped is None else flipped
     order = sorted(range(layout.tokens), key=lambda token: -layout.shapes[token].area)
     bodies = layout.body[layout.padded_corners]
-    obstacles: Floats = np.empty((len(generators), 0, *bodies.shape[1:]))
+    placed: Floats = np.empty((len(generators), 0, *bodies.shape[1:]))
+    draw = _Draw(sim, generators, spread)
     for token in order:
-        piece = _Piece(layout.shapes[token].name, bodies[token], reach[token])
-        poses[:, token] = _place(piece, obstacles, sim, generators)
-        placed = piece.outlines(poses[:, token])
-        obstacles = np.concatenate([obstacles, placed[:, None]], axis=1)
+        piece = _Piece(layout.shapes[token].name, bodies[token], reach[token], sides[:, token])
+        poses[:, token] = _place(piece, placed, avoid, draw)
+        outline = piece.outlines(poses[:, token], sides[:, token])
+        placed = np.concatenate([placed, outline[:, None]], axis=1)
     return poses
 
 
 @dataclass(frozen=True, eq=False)
 class _Piece:
-    """A token that is to be placed: its name, corners (C, 2) and how far out its centre may be."""
+    """A token that is to be placed.
+
+    Attributes:
+        name: of its shape.
+        body: (C, 2) corners.
+        reach: how far out its centre may be.
+        flipped: (B,) on its other side.
+    """
 
     name: str
     body: Floats
     reach: float
+    flipped: Bools
 
-    def outlines(self, poses: Floats) -> Floats:
-        """Corners (M, C, 2) in poses (M, 3)."""
+    def outlines(self, poses: Floats, flipped: Bools) -> Floats:
+        """Counter-clockwise corners (M, C, 2) in poses (M, 3)."""
         cos, sin = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
         x, y = self.body.T
+        if flipped.any():
+            turned_over = flipped[:, None]
+            x = np.where(turned_over, x[::-1], x)
+            y = np.where(turned_over, -y[::-1], y)
         turned = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
         moved: Floats = turned + poses[:, None, :2]
         return moved
 
 
-def _place(
-    piece: _Piece,
-    obstacles: Floats,
-    sim: SimConfig,
-    generators: Sequence[np.random.Generator],
-) -> Floats:
-    """(B, 3) a pose of one token in every environment, clear of all obstacles (B, k, C, 2)."""
-    poses = np.empty((len(generators), 3))
-    before = obstacles.shape[1]
-    chunk = _CHUNK if before else 1
-    open_rows = np.arange(len(generators))
+@dataclass(frozen=True, eq=False)
+class _Draw:
+    """Draws poses, overlapping or not."""
+
+    sim: SimConfig
+    generators: Sequence[np.random.Generator]
+    spread: float | None
+
+    def __call__(self, row: int, size: int, tries: int, reach: float) -> Floats:
+        """(size, 3) poses of one environment, after so many that were blocked."""
+        rng = self.generators[row]
+        unit: Floats = 1.0 - 2.0 * rng.random((size, 3))  # in (-1, 1]
+        poses: Floats = unit * np.array([reach, reach, np.pi])
+        if self.spread is not None:
+            deviation = self.spread * self.sim.arena * _WIDENING**tries
+            centres = rng.standard_normal((size, 2)) * deviation
+            # What falls outside is drawn uniformly: a bound on the Gaussian, and always an end.
+            inside = (np.abs(centres) <= reach).all(axis=1)
+            poses[inside, :2] = centres[inside]
+        return poses
+
+
+def _place(piece: _Piece, placed: Floats, avoid: Floats | None, draw: _Draw) -> Floats:
+    """(B, 3) a pose of one token in every environment, clear of those placed (B, k, C, 2)."""
+    poses = np.empty((len(draw.generators), 3))
+    open_rows = np.arange(len(poses))
+    if avoid is not None:
+        both = np.concatenate([placed, avoid], axis=1)
+        open_rows = _try(piece, both, draw, poses, open_rows, _CLEAR_TRIES)
+    open_rows = _try(piece, placed, draw, poses, open_rows, draw.sim.max_tries)
+    if len(open_rows):
+        raise _exhausted(piece.name, placed.shape[1], draw.sim)
+    return poses
+
+
+def _try(
+    piece: _Piece, obstacles: Floats, draw: _Draw, poses: Floats, open_rows: Ints, limit: int
+) -> Ints:
+    """Fill the open rows of poses (B, 3) where one of `limit` poses is free; the rows left open."""
+    chunk = _CHUNK if obstacles.shape[1] else 1
     tries = 0
-    while len(open_rows):
-        size = min(chunk, sim.max_tries - tries)
-        if size == 0:
-            raise _exhausted(piece.name, before, sim)
-        drawn = np.stack([_draw(generators[b], size, piece.reach) for b in open_rows.tolist()])
-        blocked = _blocked(piece, drawn, obstacles[open_rows])
+    while len(open_rows) and tries < limit:
+        size = min(chunk, limit - tries)
+        drawn = np.stack([draw(b, size, tries, piece.reach) for b in open_rows.tolist()])
+        blocked = _blocked(piece, drawn, obstacles[open_rows], piece.flipped[open_rows])
         first = np.argmin(blocked, axis=1)
         free = ~blocked[np.arange(len(open_rows)), first]
         poses[open_rows[free]] = drawn[free, first[free]]
         open_rows = open_rows[~free]
         tries += size
-    return poses
+    return open_rows
 
 
-def _draw(rng: np.random.Generator, size: int, reach: float) -> Floats:
-    """(size, 3) poses, overlapping or not."""
-    unit: Floats = 1.0 - 2.0 * rng.random((size, 3))  # in (-1, 1]
-    poses: Floats = unit * np.array([reach, reach, np.pi])
-    return poses
-
-
-def _blocked(piece: _Piece, drawn: Floats, obstacles: Floats) -> Bools:
+def _blocked(piece: _Piece, drawn: Floats, obstacles: Floats, flipped: Bools) -> Bools:
     """(B, size), which of the poses (B, size, 3) overlap an obstacle (B, k, C, 2)."""
     rows, size, before = *drawn.shape[:2], obstacles.shape[1]
     if not before:
         return np.zeros((rows, size), dtype=np.bool_)
-    own = np.repeat(piece.outlines(drawn.reshape(-1, 3)), before, axis=0)
+    outlines = piece.outlines(drawn.reshape(-1, 3), np.repeat(flipped, size))
+    own = np.repeat(outlines, before, axis=0)
     others = np.repeat(obstacles, size, axis=0).reshape(len(own), -1, 2)
     return np.asarray(pairs_overlap(own, others).reshape(rows, size, before).any(axis=2))
 

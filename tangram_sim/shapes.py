@@ -42,6 +42,14 @@ class Shape:
         """Distance of the farthest corner from the centre."""
         return float(np.linalg.norm(self.corners, axis=1).max())
 
+    @cached_property
+    def mirror(self) -> float | None:
+        """The angle by which the mirror image (x, -y) is the shape itself turned; None if none.
+
+        A shape without one is chiral: no turn in the plane gives its mirror image.
+        """
+        return turn_onto(self.corners, mirror_image(self.corners))
+
     def scaled(self, scale: float) -> "Shape":
         """The same shape, `scale` times as large."""
         return Shape(self.name, self.corners * scale, self.symmetry)
@@ -59,6 +67,28 @@ def polygon_centroid(corners: Floats) -> Floats:
     cross = corners[:, 0] * ahead[:, 1] - ahead[:, 0] * corners[:, 1]
     centroid: Floats = ((corners + ahead) * cross[:, None]).sum(axis=0) / (3.0 * cross.sum())
     return centroid
+
+
+def mirror_image(corners: Floats) -> Floats:
+    """Counter-clockwise corners (V, 2) of the mirror image (x, -y) of such corners."""
+    image: Floats = corners[::-1] * (1.0, -1.0)
+    return image
+
+
+def turn_onto(corners: Floats, image: Floats) -> float | None:
+    """The angle by which corners (V, 2) must be turned to be the image (V, 2); None if none does.
+
+    Both are counter-clockwise around the origin, and may begin with different corners.
+    """
+    if len(corners) != len(image):
+        return None
+    body, wanted = corners @ (1.0, 1j), image @ (1.0, 1j)
+    for shift in range(len(body)):
+        rolled = np.roll(wanted, shift)
+        turn = rolled[0] / body[0]
+        if np.allclose(rolled, turn * body, rtol=0.0, atol=1e-6 * np.abs(body).max()):
+            return float(np.angle(turn))
+    return None
 
 
 def polygon(name: str, corners: Sequence[Sequence[float]]) -> Shape:

@@ -5,34 +5,46 @@ from typing import Protocol
 
 import numpy as np
 
-from tangram_sim.arrays import Floats, Pixels
+from tangram_sim.arrays import Bools, Floats, Pixels
 from tangram_sim.config import SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.kinematics import KinematicWorld
 from tangram_sim.layout import Layout
 from tangram_sim.sampling import sample_poses
+from tangram_sim.targets import check_targets
 
 
 class World(Protocol):
     """K tokens on the plane, in a square arena around the origin.
 
-    Both backends keep this contract; one test module holds them to it. Tokens do not collide yet:
-    they pass through each other. Nothing stops one at the arena's edge.
+    Both backends keep this contract; one test module holds them to it. A lifted token is carried
+    above the others and set down; with the engine, tokens that are set down in one place then push
+    each other apart. A sliding one pushes what is in its way. Nothing stops one at the arena's
+    edge.
     """
 
-    def place(self, poses: Floats) -> None:
-        """Put every token at rest at its pose: (K, 3) of x, y (arena units) and angle (rad)."""
+    def place(self, poses: Floats, flipped: Bools | None = None) -> None:
+        """Put every token at rest at its pose: (K, 3) of x, y (arena units) and angle (rad).
 
-    def move(self, token: int, velocity: Floats) -> None:
-        """Move one token for one second and stop it.
+        Args:
+            poses: of the tokens.
+            flipped: (K,) which lie on their other side, see `Layout.corners`; None: none does.
+        """
+
+    def move(self, token: int, velocity: Floats, flip: bool = False) -> None:
+        """Move one token for one second, as `sim.motion` says, and stop it.
 
         Args:
             token: its index.
             velocity: (3,) x, y in arena units a second; angular velocity about z in rad/s.
+            flip: turn it over in the air, about its body's x axis, before it moves.
         """
 
     def poses(self) -> Floats:
         """(K, 3) x, y and angle in (-pi, pi]."""
+
+    def flipped(self) -> Bools:
+        """(K,) which tokens lie on their other side."""
 
     def picture(self) -> Pixels:
         """(P, P) grayscale picture of the tokens as they lie; see pictures.py."""
@@ -46,8 +58,9 @@ def check_world(layout: Layout, sim: SimConfig) -> None:
 
     Raises:
         SamplingError: a token does not fit into the arena, or not all tokens do.
-        ConfigError: the engine is asked for and not installed.
+        ConfigError: the engine is asked for and not installed, or figures of other tokens.
     """
+    check_targets(layout, sim)
     sample_poses(layout, sim, np.random.default_rng(0))
     if sim.backend == "physics" and find_spec("pybullet") is None:
         raise _no_engine("no module named 'pybullet'")

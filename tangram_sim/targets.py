@@ -1,0 +1,167 @@
+"""What is to be assembled in an episode: targets by the kinds of `SimConfig.targets`, and starts.
+
+Legend: B environments, K tokens. A layout is poses (B, K, 3) and sides (B, K): which tokens lie on
+their other side.
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+
+from tangram_sim.arrays import Bools, Floats
+from tangram_sim.assembly import COUNTS, Puzzle
+from tangram_sim.config import SimConfig, StageConfig
+from tangram_sim.connected import sample_connected
+from tangram_sim.errors import ConfigError
+from tangram_sim.geometry import outlines
+from tangram_sim.layout import Layout
+from tangram_sim.puzzles import library
+from tangram_sim.sampling import sample_batch
+from tangram_sim.shapes import Shape, mirror_image, tan, turn_onto
+
+Generators = Sequence[np.random.Generator]
+Sides = tuple[Floats, Bools]
+
+_MIRRORED = "parallelogram_mirrored"
+
+
+def sample_targets(
+    layout: Layout, sim: SimConfig, task: StageConfig, generators: Generators
+) -> Sides:
+    """One target per generator.
+
+    Raises:
+        SamplingError: no room.
+        ConfigError: figures, and the tokens are not all seven tans.
+    """
+    kinds = [_kind(task, rng) for rng in generators]
+    flipped = _sides(layout, sim, generators)
+    poses = np.empty((len(generators), layout.tokens, 3))
+    apart = [b for b, kind in enumerate(kinds) if kind in ("uniform", "gaussian")]
+    if apart:
+        spread = task.spread if task.targets == "gaussian" else None
+        rngs = [generators[b] for b in apart]
+        poses[apart] = sample_batch(layout, sim, rngs, flipped[apart], spread=spread)
+    for b, kind in enumerate(kinds):
+        if kind == "connected":
+            one = sample_connected(layout, sim, generators[b])
+            sides = np.zeros(layout.tokens, dtype=np.bool_)
+            poses[b], flipped[b] = layout.mirrored(one, sides) if flipped[b].any() else (one, sides)
+        elif kind == "figures":
+            poses[b], flipped[b] = _figure(layout, bool(flipped[b].any()), generators[b])
+    return poses, flipped
+
+
+def sample_starts(
+    layout: Layout, sim: SimConfig, targets: Floats, flipped: Bools, generators: Generators
+) -> Sides:
+    """One start per generator: on the target's sides, or on any with `allow_flip`.
+
+    Args:
+        layout: the tokens.
+        sim: says whether starts keep clear of the target.
+        targets: (B, V, 2) corners.
+        flipped: (B, K) sides of the targets.
+        generators: one for each environment.
+    """
+    if sim.allow_flip:
+        drawn = [rng.random(layout.tokens) < 0.5 for rng in generators]
+        flipped = np.stack(drawn) & layout.chiral
+    avoid = outlines(targets, layout) if sim.starts == "outside" else None
+    return sample_batch(layout, sim, generators, flipped, avoid), flipped
+
+
+def check_targets(layout: Layout, sim: SimConfig) -> None:
+    """Raise ConfigError where figures are wanted of tokens that are not all seven tans."""
+    for task in (sim.task, *sim.stages):
+        if task.targets == "figures":
+            _check_full_set(layout)
+
+
+def placement(puzzle: Puzzle, layout: Layout) -> Sides:
+    """Poses (K, 3) and sides (K,) of a puzzle's pieces as tokens of a layout.
+
+    Equal pieces are taken in order. A mirrored parallelogram is one that lies on its other side.
+
+    Raises:
+        ConfigError: the layout's tokens are not the puzzle's pieces, or of another size.
+    """
+    left = list(range(len(puzzle.pieces)))
+    poses, flipped = np.empty((layout.tokens, 3)), np.zeros(layout.tokens, dtype=np.bool_)
+    for token, shape in enumerate(layout.shapes):
+        piece = next((k for k in left if _is_piece(puzzle, k, shape)), None)
+        if piece is None:
+            raise ConfigError(
+                f"puzzle '{puzzle.name}' has the pieces {', '.join(puzzle.pieces)} of scale "
+                f"{puzzle.scale:g}: it cannot be assembled from the tokens "
+                f"{', '.join(s.name for s in layout.shapes)}; set tokens=tangram7"
+            )
+        left.remove(piece)
+        own = puzzle.layout.shapes[piece]
+        turn = turn_onto(shape.corners, own.corners)
+        flipped[token] = turn is None
+        if turn is None:
+            turn = turn_onto(mirror_image(shape.corners), own.corners)
+        poses[token] = puzzle.poses[piece]
+        poses[token, 2] += turn or 0.0
+    if left:
+        raise ConfigError(
+            f"puzzle '{puzzle.name}' has {len(puzzle.pieces)} pieces, and there are "
+            f"{layout.tokens} tokens: set tokens=tangram7"
+        )
+    return poses, flipped
+
+
+def _is_piece(puzzle: Puzzle, piece: int, shape: Shape) -> bool:
+    own = puzzle.layout.shapes[piece].corners
+    return any(
+        turn_onto(corners, own) is not None
+        for corners in (shape.corners, mirror_image(shape.corners))
+    )
+
+
+def _kind(task: StageConfig, rng: np.random.Generator) -> str:
+    if task.targets != "mixed":
+        return task.targets
+    return ("uniform", "connected")[int(rng.random() < 0.5)]
+
+
+def _sides(layout: Layout, sim: SimConfig, generators: Generators) -> Bools:
+    """(B, K): all chiral tokens on their other side in a share of the episodes."""
+    flipped = np.zeros((len(generators), layout.tokens), dtype=np.bool_)
+    if sim.mirrored > 0.0 and layout.any_chiral:
+        flipped[:] = np.array([rng.random() < sim.mirrored for rng in generators])[:, None]
+    return np.asarray(flipped & layout.chiral)
+
+
+def _figure(layout: Layout, mirrored: bool, rng: np.random.Generator) -> Sides:
+    """A figure of the train split at any angle, in the middle of the arena."""
+    figures = _figures(layout)
+    poses, flipped = figures[int(rng.integers(len(figures)))]
+    if mirrored:
+        poses, flipped = layout.mirrored(poses, flipped)
+    return turned(poses, rng.uniform(-np.pi, np.pi)), flipped
+
+
+def turned(poses: Floats, angle: float) -> Floats:
+    """Poses (K, 3) turned about the origin."""
+    centres = (poses[:, :2] @ (1.0, 1j)) * np.exp(1j * angle)
+    return np.column_stack([centres.real, centres.imag, poses[:, 2] + angle])
+
+
+@lru_cache(maxsize=4)
+def _figures(layout: Layout) -> list[Sides]:
+    shape = layout.shapes[0]
+    scale = float(np.sqrt(shape.area / tan(shape.name).area))
+    return [placement(puzzle, layout) for puzzle in library("train", round(scale, 9))]
+
+
+def _check_full_set(layout: Layout) -> None:
+    names = sorted("parallelogram" if s.name == _MIRRORED else s.name for s in layout.shapes)
+    wanted = sorted(name for name, count in COUNTS.items() for _ in range(count))
+    if names != wanted:
+        raise ConfigError(
+            f"sim.targets=figures needs all seven tans, got tokens {', '.join(names)}: set "
+            "tokens=tangram7, or another kind of targets"
+        )
