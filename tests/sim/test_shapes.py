@@ -8,7 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tangram_sim.errors import ConfigError
-from tangram_sim.shapes import SHAPE_NAMES, Shape, polygon, polygon_area, polygon_centroid, tan
+from tangram_sim.shapes import (
+    SHAPE_NAMES,
+    Shape,
+    polygon,
+    polygon_area,
+    polygon_centroid,
+    tan,
+    turn_onto,
+)
 from tests.sim.builders import SEVEN
 
 pytestmark = pytest.mark.fast
@@ -136,3 +144,9 @@ def test_a_turned_polygon_is_the_same_shape(angle: float, name: str) -> None:
     turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     turned = polygon("own", (shape.corners @ turn.T).tolist())
     assert (turned.symmetry, turned.area) == (shape.symmetry, pytest.approx(shape.area))
+
+
+@pytest.mark.parametrize(("scale", "turn"), [(1.0, 0.0), (2.0, None), (0.5, None)])
+def test_a_larger_one_of_the_same_form_is_another_shape(scale: float, turn: float | None) -> None:
+    square = tan("square")
+    assert turn_onto(square.corners, square.scaled(scale).corners) == turn
