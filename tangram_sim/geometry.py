@@ -7,7 +7,7 @@ piece for two that only touch.
 
 import numpy as np
 
-from tangram_sim.arrays import AnyArray, Bools, Complex, Floats
+from tangram_sim.arrays import AnyArray, Bools, Complex, Floats, Ints
 from tangram_sim.layout import Layout
 
 # Pairs of pieces that are looked at together: more no longer fit into a core's cache.
@@ -99,11 +99,32 @@ def overlap_area(tokens: Floats, targets: Floats, layout: Layout) -> Floats:
 
 
 def _overlap_area(tokens: Floats, targets: Floats, layout: Layout) -> Floats:
-    own, count = outlines(tokens, layout), layout.tokens
-    total, sign = np.zeros(len(tokens)), 1.0
-    rows = np.repeat(np.arange(len(tokens)), count)
+    rows = np.repeat(np.arange(len(tokens)), layout.tokens)
     pieces = outlines(targets, layout).reshape(len(rows), -1, 2)
-    last = np.full(len(rows), -1)
+    return _covered(outlines(tokens, layout), rows, pieces, np.full(len(rows), -1))
+
+
+def union_area(tokens: Floats, layout: Layout) -> Floats:
+    """Area (B,) of the union of tokens with corners (B, V, 2), which may overlap each other."""
+    count = layout.tokens
+    rows = np.repeat(np.arange(len(tokens)), count)
+    own = outlines(tokens, layout)
+    # Each token counts without what those behind it cover of it.
+    last = np.tile(np.arange(count), len(tokens))
+    whole = sum(shape.area for shape in layout.shapes)
+    return np.asarray(whole - _covered(own, rows, own.reshape(len(rows), -1, 2), last))
+
+
+def _covered(own: Floats, rows: Ints, pieces: Floats, last: Ints) -> Floats:
+    """(B,) summed area of the parts of pieces (P, M, 2) that tokens (B, K, C, 2) cover.
+
+    Args:
+        own: outlines of the tokens.
+        rows: (P,) whose piece it is.
+        pieces: outlines.
+        last: (P,) only tokens behind this one count.
+    """
+    total, sign, count = np.zeros(len(own)), 1.0, own.shape[1]
     for _ in range(count):
         # Every piece with every token behind the last one that it was cut with.
         piece, token = np.nonzero(np.arange(count) > last[:, None])
@@ -113,7 +134,7 @@ def _overlap_area(tokens: Floats, targets: Floats, layout: Layout) -> Floats:
             break
         common = clip(pieces[piece], own[rows[piece], token])
         size = area(common)
-        total += sign * np.bincount(rows[piece], size, minlength=len(tokens))
+        total += sign * np.bincount(rows[piece], size, minlength=len(own))
         hit = size > 0.0
         rows, pieces, last = rows[piece[hit]], common[hit], token[hit]
         sign = -sign

@@ -8,7 +8,14 @@ from hypothesis import strategies as st
 
 from tangram_sim.arrays import Floats
 from tangram_sim.config import SimConfig
-from tangram_sim.geometry import any_overlap, area, clip, overlap_area, overlap_share
+from tangram_sim.geometry import (
+    any_overlap,
+    area,
+    clip,
+    overlap_area,
+    overlap_share,
+    union_area,
+)
 from tangram_sim.layout import Layout
 from tangram_sim.sampling import sample_batch
 from tangram_sim.shapes import SHAPE_NAMES, polygon, tan
@@ -50,6 +57,14 @@ def test_overlap_area_equals_shapely(shapes: tuple[str, ...], scale: float, size
     expected = [oracle_overlap(layout, t, g) for t, g in zip(tokens, targets, strict=True)]
     np.testing.assert_allclose(got, expected, atol=1e-7)
     assert np.count_nonzero(got > 0.01) > size / 4
+
+
+@pytest.mark.parametrize("shapes", [("square",), TRIO, SEVEN])
+def test_union_area_equals_shapely(shapes: tuple[str, ...]) -> None:
+    layout = layout_of(*shapes, scale=1.0)
+    tokens = layout.corners(random_poses(np.random.default_rng(2), 40, layout.tokens, 0.4))
+    unions = [shapely.union_all(pieces(layout, one), grid_size=1e-9).area for one in tokens]
+    np.testing.assert_allclose(union_area(tokens, layout), unions, atol=1e-7)
 
 
 def test_any_overlap_equals_shapely() -> None:
