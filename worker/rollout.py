@@ -4,6 +4,7 @@ Legend: E episodes, B environments, T steps of an episode, K tokens, V corners, 
 action.
 """
 
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +16,7 @@ from tangram_agent.types import Episodes
 from tangram_sim.arrays import Bools, Floats, Singles
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.seeding import episode_generator
+from tangram_sim.targets import Sides
 
 Generators = Sequence[np.random.Generator]
 # (corners (B, V, 2), placed (B, K), goals (B, V, 2), one generator each) -> actions (B, A)
@@ -34,6 +36,10 @@ class Played:
         seen: `corners` as the policy saw them.
         seen_goals: `goals` as the policy saw them.
         overlap: (B,) raw overlap of exact polygons after the last step.
+        refused: (B, T) where the action named a placed token.
+        blocked: (B, T) where a token could not be set down on others.
+        seconds: (B,) wall time of choosing and moving, an equal share for each of those that were
+            played together.
         camera: (B,) Eq. 14 of the pictures after the last step; None without a camera.
     """
 
@@ -45,6 +51,9 @@ class Played:
     seen: Floats
     seen_goals: Floats
     overlap: Floats
+    refused: Bools
+    blocked: Bools
+    seconds: Floats
     camera: Floats | None
 
     @property
@@ -68,33 +77,45 @@ class Played:
         )
 
 
-def play(env: BatchedEnv, choose: Choose, generators: Generators) -> Played:
+def play(
+    env: BatchedEnv, choose: Choose, generators: Generators, targets: Sides | None = None
+) -> Played:
     """One episode in every environment.
 
     Args:
+        env: where.
+        choose: gives the actions.
         generators: one per environment: it makes the target, then the start, then whatever
             `choose` draws, so an episode does not depend on those that are played beside it.
+        targets: poses (B, K, 3) and sides (B, K) to assemble instead of targets that are drawn.
     """
-    env.reset(generators)
+    if targets is None:
+        env.reset(generators)
+    else:
+        env.reset_to(*targets, generators)
     corners, seen, placed = [env.corners], [env.seen], [env.placed]
-    actions, rewards = [], []
+    actions, results = [], []
+    began = time.perf_counter()
     for _ in range(env.horizon):
         actions.append(choose(env.seen, env.placed, env.seen_goals, generators))
-        result = env.step(actions[-1].astype(np.float64))
-        rewards.append(result.rewards)
+        results.append(env.step(actions[-1].astype(np.float64)))
         corners.append(env.corners)
         seen.append(env.seen)
         placed.append(env.placed)
+    seconds = (time.perf_counter() - began) / env.count
     return Played(
         corners=np.stack(corners, axis=1),
         placed=np.stack(placed, axis=1),
         actions=np.stack(actions, axis=1),
-        rewards=np.stack(rewards, axis=1),
+        rewards=np.stack([result.rewards for result in results], axis=1),
         goals=env.goals,
         seen=np.stack(seen, axis=1),
         seen_goals=env.seen_goals,
-        overlap=result.overlap,
-        camera=result.camera_rewards,
+        overlap=results[-1].overlap,
+        refused=np.stack([result.refused for result in results], axis=1),
+        blocked=np.stack([result.blocked for result in results], axis=1),
+        seconds=np.full(env.count, seconds),
+        camera=results[-1].camera_rewards,
     )
 
 

@@ -9,23 +9,26 @@ from tangram_sim.arrays import Floats
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.layout import Layout
 from tangram_sim.rewards import make_reward
+from worker.assembly import assembled
+from worker.pairing import paired
 from worker.rollout import Played
 
 
 def pose_errors(layout: Layout, ends: Floats, goals: Floats) -> tuple[Floats, Floats]:
-    """How far each token is from its target, both as corners (E, V, 2).
+    """How far each token is from its place in the target, both as corners (E, V, 2).
 
-    Token k is measured against target k, also where equal shapes could change places.
+    Equal tokens may change places: they are measured against the pieces that they are paired with.
 
     Returns:
         (E, K) distances of the centres of area, in arena units; (E, K) angles between the
-        orientations modulo the shape's symmetry, in degrees, from 0 to 180 / symmetry.
+        orientations modulo the shape's symmetry, in degrees, from 0 to 180 / symmetry, which is
+        also the error of a token that lies on the wrong side.
     """
-    difference = layout.poses(ends) - layout.poses(goals)
-    position: Floats = np.linalg.norm(difference[..., :2], axis=-1)
-    period = 2.0 * np.pi / np.array([shape.symmetry for shape in layout.shapes])
-    turn = difference[..., 2] - period * np.round(difference[..., 2] / period)
-    return position, np.degrees(np.abs(turn))
+    pairing = paired(layout, ends, goals)
+    position: Floats = np.linalg.norm(pairing.way[..., :2], axis=-1)
+    largest = 180.0 / np.array([shape.symmetry for shape in layout.shapes])
+    turn = np.degrees(np.abs(pairing.way[..., 2]))
+    return position, np.where(pairing.other_side, largest, turn)
 
 
 def summarise(layout: Layout, sim: SimConfig, played: Played, own_reward: bool) -> dict[str, float]:
@@ -39,7 +42,7 @@ def summarise(layout: Layout, sim: SimConfig, played: Played, own_reward: bool) 
         mean_reward (Eq. 14 of exact polygons, in [-1, 1], whatever is trained on),
         mean_reward_dense (Eq. 15 at the default sharpness), raw_overlap and its 10th percentile,
         medians and 90th percentiles of the errors over all tokens, episodes; mean_reward_camera
-        and mean_train_reward where they exist.
+        and mean_train_reward where they exist; with several tokens the means of `Assembled`.
     """
     position, angle = pose_errors(layout, played.ends, played.goals)
     dense = make_reward(RewardConfig("dense"), layout, sim)
@@ -58,4 +61,6 @@ def summarise(layout: Layout, sim: SimConfig, played: Played, own_reward: bool) 
         scores["mean_reward_camera"] = float(np.mean(played.camera))
     if own_reward:
         scores["mean_train_reward"] = float(np.mean(played.rewards[:, -1]))
+    if layout.tokens > 1:
+        scores |= assembled(layout, played).means()
     return scores

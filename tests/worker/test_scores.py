@@ -86,6 +86,9 @@ def played(layout: Layout, camera: np.ndarray | None) -> Played:
         seen=np.stack([goals + 1.0, ends], axis=1),
         seen_goals=goals,
         overlap=steps / 10.0,
+        refused=np.zeros((11, 1), dtype=np.bool_),
+        blocked=np.zeros((11, 1), dtype=np.bool_),
+        seconds=np.zeros(11),
         camera=camera,
     )
 

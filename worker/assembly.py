@@ -1,0 +1,106 @@
+"""How well several tokens make up their target: what is covered, by what, and in how many actions.
+
+Legend: E episodes, T steps, K tokens, V corners.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tangram_sim.arrays import Bools, Floats, Ints
+from tangram_sim.geometry import outlines, overlap_share, shared_area, union_area
+from tangram_sim.layout import Layout
+from worker.pairing import alike
+from worker.rollout import Played
+
+SOLVED = 0.95  # of the target covered
+# Share of a piece that a token must cover to count: less is a neighbour that reaches over.
+TOUCHED = 0.05
+USED = 0.25
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Assembled:
+    """Scores of E episodes.
+
+    Attributes:
+        coverage: (E,) share of the target that the tokens cover, in [0, 1].
+        iou: (E,) area that tokens and target share over the area of both together, in [0, 1].
+        wrong: (E,) pieces of the target that a token of another shape covers most, and by more
+            than `TOUCHED`; on its other side a chiral token has another shape.
+        doubly_used: (E,) pieces that two or more tokens cover by more than `USED` each.
+        refused: (E,) actions that named a placed token.
+        blocked: (E,) tokens that could not be set down because of others.
+        actions_used: (E,) actions that were not refused.
+    """
+
+    coverage: Floats
+    iou: Floats
+    wrong: Ints
+    doubly_used: Ints
+    refused: Ints
+    blocked: Ints
+    actions_used: Ints
+
+    @property
+    def solved(self) -> Bools:
+        """(E,) where at least `SOLVED` of the target is covered."""
+        solved: Bools = self.coverage >= SOLVED
+        return solved
+
+    def means(self) -> dict[str, float]:
+        """Each score's mean over the episodes; `solved` as `share_solved`."""
+        means = {name: float(np.mean(column)) for name, column in vars(self).items()}
+        return means | {"share_solved": float(np.mean(self.solved))}
+
+
+def assembled(layout: Layout, played: Played) -> Assembled:
+    """Scores of episodes as they ended."""
+    coverage = overlap_share(played.ends, played.goals, layout)
+    covered = covered_shares(layout, played.ends, played.goals)
+    refused = played.refused.sum(axis=1)
+    return Assembled(
+        coverage=coverage,
+        iou=_iou(layout, played.ends, coverage),
+        wrong=_wrong(layout, played, covered),
+        doubly_used=((covered > USED + _ROUNDING).sum(axis=2) > 1).sum(axis=1),
+        refused=refused,
+        blocked=played.blocked.sum(axis=1),
+        actions_used=played.refused.shape[1] - refused,
+    )
+
+
+def covered_shares(layout: Layout, ends: Floats, goals: Floats) -> Floats:
+    """(E, K, K) the share of each piece of the target that each token covers.
+
+    Args:
+        layout: the tokens.
+        ends: (E, V, 2) corners of the tokens.
+        goals: (E, V, 2) corners of the target.
+    """
+    tokens, pieces = outlines(ends, layout), outlines(goals, layout)
+    count, shape = layout.tokens, tokens.shape[2:]
+    first = np.repeat(pieces.reshape(-1, *shape), count, axis=0)
+    second = np.repeat(tokens, count, axis=0).reshape(-1, *shape)
+    areas = np.array([piece.area for piece in layout.shapes])
+    shares: Floats = shared_area(first, second).reshape(-1, count, count) / areas[:, None]
+    return shares
+
+
+def _iou(layout: Layout, ends: Floats, coverage: Floats) -> Floats:
+    whole = sum(shape.area for shape in layout.shapes)
+    common = coverage * whole
+    share: Floats = common / (whole + union_area(ends, layout) - common)
+    return share
+
+
+def _wrong(layout: Layout, played: Played, covered: Floats) -> Ints:
+    """(E,), see `Assembled`."""
+    sides = layout.flipped(played.goals)[:, :, None] == layout.flipped(played.ends)[:, None]
+    same = alike(layout) & sides
+    # A piece that two cover alike is right if one of them is.
+    right = np.where(same, covered, 0.0).max(axis=2)
+    other = np.where(same, 0.0, covered).max(axis=2)
+    wrong: Ints = ((other > right + _ROUNDING) & (other > TOUCHED)).sum(axis=1)
+    return wrong

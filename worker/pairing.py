@@ -1,0 +1,130 @@
+"""Which token goes onto which piece of the target: equal ones may change places.
+
+Legend: E episodes, K tokens, V corners.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tangram_sim.arrays import Bools, Floats, Ints
+from tangram_sim.layout import Layout
+from tangram_sim.shapes import turn_onto
+
+
+@dataclass(frozen=True, eq=False)
+class Pairing:
+    """The target piece of each token, and the way to it.
+
+    Attributes:
+        target: (E, K) number of the piece.
+        way: (E, K, 3) x, y (arena units) and the smallest turn (radians) from the token to it.
+        other_side: (E, K) the piece lies on the other side than the token.
+    """
+
+    target: Ints
+    way: Floats
+    other_side: Bools
+
+
+def paired(layout: Layout, corners: Floats, goals: Floats) -> Pairing:
+    """Pair the tokens with pieces of their shape so that they have the least way in all.
+
+    A way is the distance of the centres and the arc of the farthest corner; a token whose side is
+    not the piece's takes it only where no other can.
+
+    Args:
+        layout: the tokens.
+        corners: (E, V, 2) of the tokens.
+        goals: (E, V, 2) of the target.
+    """
+    turns = _turns(layout)
+    ways = _all_ways(layout, corners, goals, turns)
+    sides = layout.flipped(corners)[:, :, None] != layout.flipped(goals)[:, None, :]
+    radius = np.array([shape.radius for shape in layout.shapes])
+    cost = np.linalg.norm(ways[..., :2], axis=-1) + radius[:, None] * np.abs(ways[..., 2])
+    cost += sides * (cost.sum(axis=(1, 2), keepdims=True) + 1.0)
+    target = np.tile(np.arange(layout.tokens), (len(corners), 1))
+    for group in _groups(turns):
+        for e in range(len(corners)):
+            target[e, group] = group[cheapest(cost[e][np.ix_(group, group)])]
+    rows, tokens = np.arange(len(corners))[:, None], np.arange(layout.tokens)
+    return Pairing(target, ways[rows, tokens, target], sides[rows, tokens, target])
+
+
+def alike(layout: Layout) -> Bools:
+    """(K, K) which tokens have one shape and size, and are on one side the same when turned."""
+    same: Bools = np.isfinite(_turns(layout))
+    return same
+
+
+def _turns(layout: Layout) -> Floats:
+    """(K, K) the turn of a token's body that gives another's, NaN where none does."""
+    turns = np.full((layout.tokens, layout.tokens), np.nan)
+    for k, own in enumerate(layout.shapes):
+        for j, other in enumerate(layout.shapes):
+            turn = 0.0 if k == j else turn_onto(own.corners, other.corners)
+            turns[k, j] = np.nan if turn is None else turn
+    return turns
+
+
+def _groups(turns: Floats) -> list[Ints]:
+    """The tokens of each shape that several have."""
+    groups = [np.flatnonzero(row) for k, row in enumerate(np.isfinite(turns)) if row.argmax() == k]
+    return [group for group in groups if len(group) > 1]
+
+
+def _all_ways(layout: Layout, corners: Floats, goals: Floats, turns: Floats) -> Floats:
+    """(E, K, K, 3) from every token to every piece, the turn modulo the symmetry."""
+    ways: Floats = layout.poses(goals)[:, None] - layout.poses(corners)[:, :, None]
+    # A body on its other side is turned the other way.
+    turn = np.where(layout.flipped(goals)[:, None], -1.0, 1.0) * np.nan_to_num(turns)
+    period = 2.0 * np.pi / np.array([shape.symmetry for shape in layout.shapes])
+    ways[..., 2] += turn
+    ways[..., 2] -= period * np.round(ways[..., 2] / period)
+    return ways
+
+
+def cheapest(cost: Floats) -> Ints:
+    """(N,) the column of each row of costs (N, N) that together cost least, each column once.
+
+    The Hungarian method: row after row takes the shortest path to a free column, O(N^3).
+    """
+    count = len(cost)
+    row_of = np.full(count + 1, -1)  # the last column is where a new row begins
+    row_price, price = np.zeros(count), np.zeros(count + 1)
+    for row in range(count):
+        row_of[count] = row
+        before = _shortest_path(cost, row_of, row_price, price)
+        column = before[count]
+        while column != count:
+            row_of[column], column = row_of[before[column]], before[column]
+    columns = np.empty(count, dtype=np.int64)
+    columns[row_of[:count]] = np.arange(count)
+    return columns
+
+
+def _shortest_path(cost: Floats, row_of: Ints, row_price: Floats, price: Floats) -> Ints:
+    """Adjust the prices until a free column is reached.
+
+    Returns:
+        (N + 1,) for each column the one before it on the path; for the last, the free one.
+    """
+    count = len(cost)
+    seen, slack = np.zeros(count + 1, np.bool_), np.full(count, np.inf)
+    before = np.full(count + 1, count)
+    column = count
+    while row_of[column] >= 0:
+        seen[column] = True
+        row = row_of[column]
+        reduced = cost[row] - row_price[row] - price[:count]
+        closer = ~seen[:count] & (reduced < slack)
+        slack[closer], before[:count][closer] = reduced[closer], column
+        nearest = int(np.argmin(np.where(seen[:count], np.inf, slack)))
+        step = slack[nearest]
+        row_price[row_of[seen]] += step
+        price[seen] -= step
+        slack[~seen[:count]] -= step
+        column = nearest
+    before[count] = column
+    return before
