@@ -8,8 +8,8 @@ import numpy.typing as npt
 import torch
 
 from master.pace import Pace
-from tangram_agent.ddpg import Learner
 from tangram_agent.hindsight import with_twins
+from tangram_agent.pair_learner import make_learner
 from tangram_agent.replay import ReplayBuffer
 from tangram_agent.runs import ACTING, SETUP
 from tangram_agent.setup import Setup
@@ -39,7 +39,7 @@ class Trainer:
         agent, layout = setup.agent, setup.layout
         self.setup = setup
         self.reward = make_reward(setup.reward, layout, setup.sim)
-        self.learner = Learner(setup, seed, device)
+        self.learner = make_learner(setup, seed, device)
         self.replay = ReplayBuffer(
             agent.replay_capacity, layout.corner_count, layout.tokens, setup.action_size
         )
@@ -62,7 +62,8 @@ class Trainer:
 
     def insert(self, episodes: Episodes) -> None:
         """Take in episodes as they were played, with their hindsight twins."""
-        twins = self.setup.agent.hindsight
+        # On pairs twins are made anew for every update.
+        twins = () if self.setup.pairs else self.setup.agent.hindsight
         generator = self._generators["hindsight"]
         self.replay.add(with_twins(episodes, twins, self.setup.layout, self.reward, generator))
         self.pace.inserted(episodes.transitions)
@@ -71,7 +72,8 @@ class Trainer:
     def update(self, share: float) -> dict[str, float]:
         """One update, at the used share of the budget; returns its losses."""
         self.batch = self.replay.sample(self.setup.agent.batch_size, self._generators["replay"])
-        losses = self.learner.update(self.batch, share)
+        prepared = self.learner.prepared(self.batch, self._generators["hindsight"])
+        losses = self.learner.update(prepared, share)
         self.pace.updated()
         return losses
 

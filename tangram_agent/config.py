@@ -47,6 +47,7 @@ class NetConfig:
 
 
 RECYCLED_STATUS = 75  # exit status of a worker that wants to be started anew
+ORDERS = ("learned", "listed", "size", "random")
 STRATEGIES = ("final", "future", "near", "none")
 
 
@@ -88,6 +89,17 @@ class AgentConfig:
         squash: of the actor's outputs: tanh (the paper) or clamp.
         saturation_penalty: weight of mean(relu(|z| - saturation_limit)^2) in the actor's loss.
         saturation_limit: pre-activation beyond which the penalty starts.
+        readout: token (one velocity of a given token, the next one in the set's order), pair (a
+            pose for every pair of a token and a piece of the target, and its value), or auto: pair
+            for several tokens.
+        order: pair: which token is next: learned (the one with the best value), listed (as in the
+            set), size (the largest first) or random.
+        reapply: pair: how often the actor is applied again to its own proposals before one is
+            chosen; 0 is not.
+        refine_steps: pair: gradient steps on the critic that the chosen pose makes before it is
+            played, exploration off.
+        refine_rate: pair: length of the first of these steps, in arena units and radians.
+        pairs_per_transition: pair: pairs that a transition gives in one update.
         gamma: discount, Eq. 5.
         polyak: rho of the target networks, Eq. 4.
         acting_average: Polyak average of the actor that plays and is scored, less in the first
@@ -115,6 +127,12 @@ class AgentConfig:
     squash: str = "clamp"
     saturation_penalty: float = 1.0
     saturation_limit: float = 1.0
+    readout: str = "auto"
+    order: str = "learned"
+    reapply: int = 0
+    refine_steps: int = 0
+    refine_rate: float = 0.004
+    pairs_per_transition: int = 8
     gamma: float = 0.0
     polyak: float = 0.995
     acting_average: float = 0.99
@@ -136,6 +154,7 @@ class AgentConfig:
         check_choice("agent.edges", self.edges, ("paper", "complete"))
         check_choice("agent.squash", self.squash, ("tanh", "clamp"))
         check_choice("agent.lr_decay", self.lr_decay, ("none", "cosine"))
+        self._check_pairs()
         for name in ("gamma", "polyak", "acting_average", "lr_final", "uniform_share"):
             check_range(f"agent.{name}", getattr(self, name), 0.0, 1.0)
         for name in ("saturation_penalty", "saturation_limit", "grad_clip", "noise"):
@@ -144,6 +163,17 @@ class AgentConfig:
             check_range(f"agent.{name}", getattr(self, name), 1e-9, 1e3)
         for name in ("batch_size", "replay_capacity", "learning_starts"):
             check_range(f"agent.{name}", getattr(self, name), 1)
+        self._check_capacity()
+
+    def _check_pairs(self) -> None:
+        check_choice("agent.readout", self.readout, ("auto", "token", "pair"))
+        check_choice("agent.order", self.order, ORDERS)
+        check_range("agent.reapply", self.reapply, 0, 100)
+        check_range("agent.refine_steps", self.refine_steps, 0, 10_000)
+        check_range("agent.refine_rate", self.refine_rate, 1e-9, 1.0)
+        check_range("agent.pairs_per_transition", self.pairs_per_transition, 1, 1024)
+
+    def _check_capacity(self) -> None:
         if self.batch_size > self.replay_capacity:
             raise ConfigError(
                 f"agent.batch_size ({self.batch_size}) must not exceed "

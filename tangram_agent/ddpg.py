@@ -15,12 +15,14 @@ from torch import Tensor, nn
 from tangram_agent.config import AgentConfig
 from tangram_agent.graph import TokenGraph
 from tangram_agent.networks import Actor, Critic, initialise, parameter_count
+from tangram_agent.pair_batch import PairBatch
 from tangram_agent.setup import Setup
 from tangram_agent.types import Transitions, Weights
 from tangram_agent.weights import load_arrays, to_arrays, under
 from tangram_sim.errors import RunError
 
 Array = npt.NDArray[Any]
+Batch = Transitions | PairBatch
 PARTS = ("actor", "critic", "target_actor", "target_critic", "acting")
 _COUNTER = "updates"
 
@@ -82,9 +84,7 @@ class Learner:
         self.device = torch.device(device)
         self.tokens = setup.layout.tokens
         self.updates = 0
-        self.graph = TokenGraph(setup.layout, setup.sim.arena, setup.agent)
-        self.actor = Actor(self.graph, setup.agent, setup.net)
-        self.critic = Critic(self.graph, setup.agent, setup.net)
+        self.actor, self.critic = self.make_networks(setup)
         generator = torch.Generator().manual_seed(seed)
         initialise(self.actor, generator)
         initialise(self.critic, generator)
@@ -92,19 +92,30 @@ class Learner:
         for module in (self.actor, self.critic):
             module.to(self.device)
         self.target_actor, self.target_critic = _frozen(self.actor), _frozen(self.critic)
-        self.acting = _frozen(self.actor)
+        self.acting = _frozen(self.playing())
         # Kept as lists: walking the modules takes a fifth of a small network's update.
         self._lists: dict[str, list[Tensor]] = {
             part: list(getattr(self, part).parameters()) for part in PARTS
         }
+        self._played: list[Tensor] = list(self.playing().parameters())
         self.actor_optimiser = _adam(self._lists["actor"], self.config.actor_lr)
         self.critic_optimiser = _adam(self._lists["critic"], self.config.critic_lr)
 
-    def update(self, batch: Transitions, progress: float = 0.0) -> dict[str, float]:
+    def make_networks(self, setup: Setup) -> tuple[nn.Module, nn.Module]:
+        """Actor and critic."""
+        self.graph = TokenGraph(setup.layout, setup.sim.arena, setup.agent)
+        actor = Actor(self.graph, setup.agent, setup.net)
+        return actor, Critic(self.graph, setup.agent, setup.net)
+
+    def playing(self) -> nn.Module:
+        """What plays: its running average is what workers get."""
+        return self.actor
+
+    def update(self, batch: Batch, progress: float = 0.0) -> dict[str, float]:
         """One step of both networks on a batch.
 
         Args:
-            batch: B transitions.
+            batch: B transitions; see `prepared`.
             progress: used share of the run's budget, in [0, 1]; decides the learning rate.
 
         Returns:
@@ -117,7 +128,7 @@ class Learner:
         """
         tensors = {name: self._tensor(column) for name, column in vars(batch).items()}
         self._set_learning_rate(progress)
-        self._look(tensors)
+        self.look(tensors)
         values = self._critic_step(tensors) | self._actor_step(tensors)
         self._follow()
         # One wait for the device, after everything has been asked of it.
@@ -126,7 +137,12 @@ class Learner:
         self.updates += 1
         return numbers
 
-    def _look(self, t: dict[str, Tensor]) -> None:
+    def prepared(self, batch: Transitions, generator: np.random.Generator) -> Batch:
+        """What `update` takes, from a batch of transitions: the same here."""
+        del generator
+        return batch
+
+    def look(self, t: dict[str, Tensor]) -> None:
         """Make the features once where critic and actor see the same: one token, as it stands."""
         if self.tokens == 1 and not self.config.afterstate:
             token = next_token(t["placed"])
@@ -139,7 +155,7 @@ class Learner:
             polyak_update(lists["target_critic"], lists["critic"], config.polyak)
             polyak_update(lists["target_actor"], lists["actor"], config.polyak)
         rho = average_so_far(config.acting_average, self.updates)
-        polyak_update(lists["acting"], lists["actor"], rho)
+        polyak_update(lists["acting"], self._played, rho)
 
     def critic_loss(self, t: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Mean squared Bellman error of Eq. 3, and the values (B,)."""

@@ -1,4 +1,4 @@
-"""Acting: a copy of the actor on the CPU, batched, with or without exploration noise.
+"""Acting: a copy of the networks on the CPU, batched, with or without exploration noise.
 
 Legend: B environments, K tokens, V corners, A entries of an action.
 """
@@ -12,6 +12,9 @@ import torch
 from tangram_agent.ddpg import next_token
 from tangram_agent.graph import TokenGraph
 from tangram_agent.networks import Actor
+from tangram_agent.pair_networks import PairNetworks
+from tangram_agent.pair_policy import PairChooser
+from tangram_agent.pairs import PairGraph
 from tangram_agent.setup import Setup
 from tangram_agent.types import Weights
 from tangram_agent.weights import load_arrays
@@ -21,22 +24,31 @@ Flags = npt.NDArray[np.bool_] | npt.NDArray[np.uint8]
 
 
 class Policy:
-    """The actor as workers use it.
+    """The networks as workers use them.
 
     Attributes:
         version: of the weights that are loaded; -1 before the first.
     """
 
     def __init__(self, setup: Setup) -> None:
-        self.tokens, self.config = setup.layout.tokens, setup.agent
+        self.layout, self.config, self.sim = setup.layout, setup.agent, setup.sim
+        self.tokens = setup.layout.tokens
         self.version = -1
-        graph = TokenGraph(setup.layout, setup.sim.arena, setup.agent)
-        self._actor = Actor(graph, setup.agent, setup.net).requires_grad_(False)
+        self._chooser: PairChooser | None = None
+        if setup.pairs:
+            networks = PairNetworks(PairGraph(setup.layout, setup.sim.arena), setup.net)
+            flips = setup.sim.allow_flip
+            self._chooser = PairChooser(networks, setup.layout, setup.agent, flips)
+            self._network: torch.nn.Module = networks
+        else:
+            graph = TokenGraph(setup.layout, setup.sim.arena, setup.agent)
+            self._network = Actor(graph, setup.agent, setup.net)
+        self._network.requires_grad_(False)
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Names and shapes of the tensors that `load` accepts."""
-        return {name: tuple(p.shape) for name, p in self._actor.named_parameters()}
+        return {name: tuple(p.shape) for name, p in self._network.named_parameters()}
 
     def load(self, weights: Weights) -> None:
         """Take over broadcast weights.
@@ -44,26 +56,69 @@ class Policy:
         Raises:
             RunError: they belong to another layout or network.
         """
-        load_arrays(self._actor, weights.tensors)
+        load_arrays(self._network, weights.tensors)
         self.version = weights.version
 
-    def act(self, corners: Floats | Singles, placed: Flags, goals: Floats | Singles) -> Singles:
+    def act(
+        self,
+        corners: Floats | Singles,
+        placed: Flags,
+        goals: Floats | Singles,
+        refine: bool = True,
+    ) -> Singles:
         """Actions (B, A) in [-1, 1], noise off.
 
         Args:
             corners: (B, V, 2) of the tokens.
             placed: (B, K) which tokens are placed.
             goals: (B, V, 2) corners of the targets.
+            refine: take the steps of `agent.refine_steps`, where the agent has such.
         """
+        if self._chooser is None:
+            token, velocity = self._velocity(corners, placed, goals)
+            flip = np.zeros(len(token), dtype=np.bool_)
+        else:
+            exact = np.asarray(corners, np.float64)
+            wanted = np.asarray(goals, np.float64)
+            choice = self._chooser.choose(exact, np.asarray(placed, np.bool_), wanted, refine)
+            token, flip = choice.token, choice.flip
+            pose = self.layout.poses(exact)[np.arange(len(token)), token]
+            velocity = self._way(pose, choice.pose)
+        return self._joined(token, flip, velocity)
+
+    def _velocity(
+        self, corners: Floats | Singles, placed: Flags, goals: Floats | Singles
+    ) -> tuple[npt.NDArray[np.int64], Singles]:
+        """The next token (B,) in the set's order, and its velocity (B, 3)."""
         flags = _tensor(placed)
         token = next_token(flags)
         with torch.inference_mode():
-            velocity, _ = self._actor(_tensor(corners), flags, _tensor(goals), token)
-        action: Singles = velocity.numpy()
-        if self.tokens == 1:
-            return action
-        selector = (2.0 * token.numpy() + 1.0) / self.tokens - 1.0
-        return np.concatenate([selector[:, None].astype(np.float32), action], axis=1)
+            velocity, _ = self._network(_tensor(corners), flags, _tensor(goals), token)
+        return token.numpy(), velocity.numpy()
+
+    def _way(self, pose: Floats, wanted: Floats) -> Singles:
+        """Velocities (B, 3) in [-1, 1] from one pose to another, by the shorter turn."""
+        way = wanted - pose
+        way[:, 2] = np.pi - np.mod(np.pi - way[:, 2], 2.0 * np.pi)
+        velocity: Singles = (way / (self.sim.arena, self.sim.arena, np.pi)).astype(np.float32)
+        return np.clip(velocity, -1.0, 1.0)
+
+    def _joined(
+        self, token: npt.NDArray[np.int64], flip: npt.NDArray[np.bool_], velocity: Singles
+    ) -> Singles:
+        """Actions (B, A) of tokens (B,), flips (B,) and velocities (B, 3)."""
+        parts = []
+        if self.tokens > 1:
+            parts.append(self._selector(token)[:, None])
+        if self.sim.allow_flip:
+            parts.append(np.where(flip, 1.0, -1.0)[:, None])
+        joined: Singles = np.concatenate([*parts, velocity], axis=1).astype(np.float32)
+        return joined
+
+    def _selector(self, token: npt.NDArray[np.int64]) -> Floats:
+        """The entry that names a token: the middle of its part of [-1, 1]."""
+        middle: Floats = (2.0 * token + 1.0) / self.tokens - 1.0
+        return middle
 
     def explore(
         self,
@@ -76,14 +131,32 @@ class Policy:
 
         Each environment has its own generator, so the noise does not depend on the batching.
         """
-        actions = self.act(corners, placed, goals)
-        for action, generator in zip(actions, generators, strict=True):
+        actions = self.act(corners, placed, goals, refine=False)
+        for i, (action, generator) in enumerate(zip(actions, generators, strict=True)):
             velocity = action[-3:]
             if generator.random() < self.config.uniform_share:
-                velocity[:] = generator.uniform(-1.0, 1.0, 3)
+                if self._chooser is None:
+                    velocity[:] = generator.uniform(-1.0, 1.0, 3)
+                else:
+                    here = self.layout.poses(np.asarray(corners[i], np.float64))
+                    self._anything(action, here, np.asarray(placed)[i], generator)
             else:
                 velocity += self.config.noise * generator.standard_normal(3)
         return np.clip(actions, -1.0, 1.0)
+
+    def _anything(
+        self, action: Singles, here: Floats, placed: Flags, generator: np.random.Generator
+    ) -> None:
+        """Let an action take any token that is left to any pose in the arena, on any side."""
+        left = np.flatnonzero(np.asarray(placed) == 0)
+        token = int(generator.choice(left)) if len(left) else 0
+        reach = (self.sim.arena / 2.0, self.sim.arena / 2.0, np.pi)
+        wanted = generator.uniform(-1.0, 1.0, 3) * reach
+        action[-3:] = self._way(here[None, token], wanted[None])[0]
+        if self.tokens > 1:
+            action[0] = (2.0 * token + 1.0) / self.tokens - 1.0
+        if self.sim.allow_flip:
+            action[-4] = generator.choice((-1.0, 1.0))
 
 
 def _tensor(array: Floats | Singles | Flags) -> torch.Tensor:

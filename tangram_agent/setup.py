@@ -41,6 +41,13 @@ class Setup:
         return horizon(self.layout.tokens, self.sim)
 
     @property
+    def pairs(self) -> bool:
+        """Whether the agent acts on pairs of a token and a piece of the target."""
+        if self.agent.readout == "auto":
+            return self.layout.tokens > 1
+        return self.agent.readout == "pair"
+
+    @property
     def action_size(self) -> int:
         """A: x, y and angular velocity, with more than one token its number before them."""
         return action_size(self.layout.tokens, self.sim)

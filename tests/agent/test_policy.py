@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from tangram_agent.ddpg import Learner
+from tangram_agent.pair_learner import make_learner
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
 from tangram_agent.types import Weights
@@ -16,7 +17,7 @@ pytestmark = pytest.mark.fast
 
 def policy_of(made: Setup) -> Policy:
     policy = Policy(made)
-    policy.load(Learner(made, seed=0).acting_weights(7))
+    policy.load(make_learner(made, seed=0).acting_weights(7))
     return policy
 
 
@@ -59,7 +60,7 @@ def test_acting_is_the_acting_network_of_the_learner() -> None:
 
 
 def test_with_several_tokens_the_next_one_is_named() -> None:
-    made = setup(PAIR)
+    made = setup(PAIR, agent={"readout": "token"})
     batch = random_transitions(made, 2)
     actions = policy_of(made).act(batch.state, np.array([[0, 0], [1, 0]]), batch.goal)
     assert actions.shape == (2, 4)
@@ -89,7 +90,7 @@ def test_a_share_of_actions_is_uniform() -> None:
 
 
 def test_exploring_stays_in_range_and_keeps_the_choice_of_token() -> None:
-    plain, noisy = explore(setup(PAIR, agent={"noise": 2.0, "uniform_share": 0.5}))
+    plain, noisy = explore(setup(PAIR, agent={"readout": "token", "noise": 2.0, "uniform_share": 0.5}))
     assert np.abs(noisy).max() <= 1.0
     np.testing.assert_array_equal(noisy[:, 0], plain[:, 0])
 
