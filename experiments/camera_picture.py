@@ -70,7 +70,7 @@ def take_shots(backend: str = "physics") -> Shots:
         return take_shots("kinematic")
     generator = np.random.default_rng(SEED)
     target, start = (sample_poses(layout, sim, generator) for _ in range(2))
-    policy = position_policy(layout, sim.arena)
+    policy = position_policy(layout, sim)
     placed = np.zeros((1, 1), dtype=np.bool_)
     corners, goals = layout.corners(start)[None], layout.corners(target)[None]
     action = policy(corners, placed, goals, [generator])

@@ -5,63 +5,103 @@ Legend: B environments, K tokens, V corners, A entries of an action.
 
 import numpy as np
 
-from tangram_sim.arrays import Bools, Floats, Singles
+from tangram_sim.arrays import Bools, Floats, Ints, Singles
+from tangram_sim.batch import action_size
+from tangram_sim.config import SimConfig
+from tangram_sim.geometry import outlines, shared_area
+from tangram_sim.kinematics import wrap
 from tangram_sim.layout import Layout
+from worker.pairing import Pairing, paired
 from worker.rollout import Choose, Generators
 
 
-def random_policy(action_size: int) -> Choose:
-    """Every entry uniform in [-1, 1]; with several tokens most of its choices are refused."""
+def random_policy(layout: Layout, sim: SimConfig) -> Choose:
+    """Chance: of one token every entry uniform in [-1, 1].
 
-    def choose(_corners: Floats, _placed: Bools, _goals: Floats, generators: Generators) -> Singles:
-        drawn = [generator.uniform(-1.0, 1.0, action_size) for generator in generators]
-        return np.array(drawn, np.float32)
+    Of several, any that is left goes to any pose with its centre in the arena: uniform entries
+    would mostly name a placed token, or throw it out of the arena.
+    """
+    size = action_size(layout.tokens, sim)
+
+    def choose(corners: Floats, placed: Bools, _goals: Floats, generators: Generators) -> Singles:
+        drawn = np.array([generator.uniform(-1.0, 1.0, size) for generator in generators])
+        if layout.tokens == 1:
+            return drawn.astype(np.float32)
+        token = np.array([_any_left(row, rng) for row, rng in zip(placed, generators, strict=True)])
+        pose = drawn[:, -3:] * (sim.arena / 2.0, sim.arena / 2.0, np.pi)
+        way = pose - layout.poses(corners)[np.arange(len(token)), token]
+        flip = (drawn[:, -4] > 0.0) & layout.chiral[token]  # read with sim.allow_flip only
+        return _actions(sim, layout, token, way, flip)
 
     return choose
 
 
-def position_policy(layout: Layout, arena: float) -> Choose:
+def position_policy(layout: Layout, sim: SimConfig) -> Choose:
     """Token after token exactly onto the centre of its own target, and never turned.
 
     A square moved so overlaps by 0.8825 on average: that is the plateau of the paper's Table II.
     """
 
     def choose(corners: Floats, placed: Bools, goals: Floats, _generators: Generators) -> Singles:
-        way = _ways(layout, corners, goals)
-        way[..., 2] = 0.0
-        return _actions(way, placed, arena)
+        token = np.argmin(placed, axis=1)
+        way = (layout.poses(goals) - layout.poses(corners))[np.arange(len(token)), token]
+        way[:, 2] = 0.0
+        return _actions(sim, layout, token, way, np.zeros(len(token), dtype=np.bool_))
 
     return choose
 
 
-def exact_policy(layout: Layout, arena: float) -> Choose:
-    """Token after token exactly onto its own target as it is seen, by the smallest turn that fits.
+def exact_policy(layout: Layout, sim: SimConfig) -> Choose:
+    """Each token exactly onto a piece of its shape as it is seen, by the smallest turn that fits.
 
-    What remains to a perfect score is the world's: float32 actions, and the engine's arithmetic.
+    Equal tokens share the pieces by the least way in all. Next is the one whose place is covered
+    least by others. What remains to a perfect score is the world's: places that cover each other in
+    a circle, float32 actions, and the engine's arithmetic.
     """
-    period = 2.0 * np.pi / np.array([shape.symmetry for shape in layout.shapes])
 
     def choose(corners: Floats, placed: Bools, goals: Floats, _generators: Generators) -> Singles:
-        way = _ways(layout, corners, goals)
-        way[..., 2] -= period * np.round(way[..., 2] / period)
-        return _actions(way, placed, arena)
+        pairing = paired(layout, corners, goals)
+        token = _freest(layout, corners, placed, goals, pairing)
+        rows = np.arange(len(token))
+        way, flip = pairing.way[rows, token], pairing.other_side[rows, token]
+        return _actions(sim, layout, token, way, flip)
 
     return choose
 
 
-def _ways(layout: Layout, corners: Floats, goals: Floats) -> Floats:
-    """(B, K, 3) from every token's pose to its target's."""
-    ways: Floats = layout.poses(goals) - layout.poses(corners)
-    return ways
+def _any_left(placed: Bools, generator: np.random.Generator) -> int:
+    """One of the tokens that are not placed (K,), or any if all are."""
+    left = np.flatnonzero(~np.asarray(placed, dtype=np.bool_))
+    return int(generator.choice(left if len(left) else len(placed)))
 
 
-def _actions(ways: Floats, placed: Bools, arena: float) -> Singles:
-    """Actions (B, A) that take the first token that is not placed along its way (B, K, 3)."""
-    token = np.argmin(placed, axis=1)
-    motion = ways[np.arange(len(ways)), token] / np.array([arena, arena, np.pi])
-    tokens = ways.shape[1]
-    if tokens > 1:
-        selector = (2.0 * token + 1.0) / tokens - 1.0
-        motion = np.column_stack([selector, motion])
-    actions: Singles = motion.astype(np.float32)
+def _freest(
+    layout: Layout, corners: Floats, placed: Bools, goals: Floats, pairing: Pairing
+) -> Ints:
+    """(B,) the token left whose place the others cover least; the first of several."""
+    rows, count = np.arange(len(corners))[:, None], layout.tokens
+    own, places = outlines(corners, layout), outlines(goals, layout)[rows, pairing.target]
+    flat = (len(corners) * count * count, *own.shape[2:])
+    first, second = (
+        np.broadcast_to(part, (len(corners), count, *own.shape[1:])).reshape(flat)
+        for part in (places[:, :, None], own[:, None])
+    )
+    shared = shared_area(first, second).reshape(-1, count, count)
+    shared[:, np.arange(count), np.arange(count)] = 0.0
+    covered = shared.sum(axis=2) / np.array([shape.area for shape in layout.shapes])
+    # Rounding must not decide between places that are free.
+    blocked = np.where(placed, np.inf, np.round(covered, 6))
+    freest: Ints = np.argmin(blocked, axis=1)
+    return freest
+
+
+def _actions(sim: SimConfig, layout: Layout, token: Ints, way: Floats, flip: Bools) -> Singles:
+    """Actions (B, A) that take tokens (B,) along ways (B, 3), turned over where flip (B,) says."""
+    turn = wrap(way[:, 2])
+    parts = [way[:, :2] / sim.arena, turn[:, None] / np.pi]
+    if sim.allow_flip:
+        parts.insert(0, np.where(flip, 1.0, -1.0)[:, None])
+    if layout.tokens > 1:
+        parts.insert(0, ((2.0 * token + 1.0) / layout.tokens - 1.0)[:, None])
+    actions: Singles = np.concatenate(parts, axis=1).astype(np.float32)
     return actions

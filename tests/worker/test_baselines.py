@@ -1,4 +1,7 @@
-"""The perfect hand: exact in every world, at the smallest turn, with one action or several."""
+"""The perfect hand: exact in every world, at the smallest turn, with one action or several.
+
+And chance, which plays by the rules.
+"""
 
 from contextlib import closing
 
@@ -7,11 +10,13 @@ import pytest
 
 from tangram_sim.kinematics import wrap
 from tests.agent.builders import PAIR, SQUARE, setup
-from worker.baselines import exact_policy
+from tests.sim.builders import SEVEN
+from worker.baselines import exact_policy, random_policy
 from worker.trials import Trials
 
 pytestmark = pytest.mark.fast
 
+GAME = {"shapes": list(SEVEN), "scale": 0.6}
 SHAPES = ("square", "small_triangle", "parallelogram")
 
 
@@ -21,7 +26,7 @@ SHAPES = ("square", "small_triangle", "parallelogram")
 def test_the_exact_policy_scores_one(backend: str, tokens: dict, actions: int) -> None:
     made = setup(tokens, backend=backend, actions_per_token=actions)
     with closing(Trials(made, 5, 5)) as trials:
-        scores = trials.scores(trials.play(exact_policy(made.layout, made.sim.arena)))
+        scores = trials.scores(trials.play(exact_policy(made.layout, made.sim)))
     assert scores["raw_overlap_p10"] > 0.9999
     assert scores["position_error_p90"] < 1e-4
     assert scores["angle_error_deg_p90"] < 1e-2
@@ -33,10 +38,58 @@ def test_it_turns_no_further_than_the_symmetry_asks_for(shape: str) -> None:
     layout, rng = made.layout, np.random.default_rng(0)
     starts, goals = rng.uniform(-3.1, 3.1, (2, 200, 1, 3)) * [0.1, 0.1, 1.0]
     placed = np.zeros((200, 1), bool)
-    policy = exact_policy(layout, made.sim.arena)
+    policy = exact_policy(layout, made.sim)
     actions = policy(layout.corners(starts), placed, layout.corners(goals), [])
     assert actions.dtype == np.float32
     symmetry = layout.shapes[0].symmetry
     assert (np.abs(actions[:, 2]) <= 1.0 / symmetry + 1e-6).all()
     rest = wrap((starts[:, 0, 2] + np.pi * actions[:, 2] - goals[:, 0, 2]) * symmetry)
     np.testing.assert_allclose(rest, 0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("backend", ["kinematic", "physics"])
+@pytest.mark.parametrize("targets", ["figures", "uniform"])
+@pytest.mark.parametrize("allow_flip", [False, True])
+def test_the_exact_policy_solves_the_game(backend: str, targets: str, allow_flip: bool) -> None:
+    sim = {"targets": targets, "starts": "outside", "mirrored": 0.5, "allow_flip": allow_flip}
+    made = setup(GAME, backend=backend, pixels=16, **sim)
+    with closing(Trials(made, 8, 8)) as trials:
+        played = trials.play(exact_policy(made.layout, made.sim))
+        scores = trials.scores(played)
+    assert scores["raw_overlap_p10"] > 0.999
+    assert (scores["share_solved"], scores["wrong"], scores["refused"]) == (1.0, 0.0, 0.0)
+    assert scores["angle_error_deg_p90"] < 0.1
+
+
+def test_it_makes_room_before_it_sets_down() -> None:
+    """The first token's place is under the second: the second goes first."""
+    made = setup({"shapes": ["square", "large_triangle"], "scale": 0.8})
+    starts = np.array([[[-0.6, 0.0, 0.0], [0.6, 0.0, 0.0]]])
+    goals = np.array([[[0.6, 0.0, 0.0], [0.0, 0.6, 0.0]]])
+    policy, placed = exact_policy(made.layout, made.sim), np.zeros((1, 2), bool)
+    corners, wanted = made.layout.corners(starts), made.layout.corners(goals)
+    assert policy(corners, placed, wanted, [])[0, 0] > 0.0
+    assert policy(corners, np.array([[False, True]]), wanted, [])[0, 0] < 0.0
+    free = made.layout.corners(starts - [0.0, 0.6, 0.0])
+    assert policy(free, placed, wanted, [])[0, 0] < 0.0
+
+
+def test_equal_tokens_take_the_nearer_places() -> None:
+    made = setup({"shapes": ["square", "square"], "scale": 0.6})
+    starts = made.layout.corners(np.array([[[-0.6, 0.0, 0.0], [0.6, 0.0, 0.0]]]))
+    goals = made.layout.corners(np.array([[[0.5, 0.1, 0.0], [-0.5, 0.1, 0.0]]]))
+    action = exact_policy(made.layout, made.sim)(starts, np.zeros((1, 2), bool), goals, [])
+    np.testing.assert_allclose(action[0, 1:], [0.05, 0.05, 0.0], atol=1e-6)
+
+
+@pytest.mark.parametrize("allow_flip", [False, True])
+def test_chance_names_tokens_that_are_left_and_stays_in_the_arena(allow_flip: bool) -> None:
+    made = setup(GAME, allow_flip=allow_flip, max_overlap=1.0, pixels=16)
+    with closing(Trials(made, 20, 20)) as trials:
+        played = trials.play(random_policy(made.layout, made.sim))
+    assert not played.refused.any()
+    assert played.placed[:, -1].all()
+    centres = made.layout.poses(played.ends)[..., :2]
+    assert 0.9 < np.abs(centres).max() <= 1.0 + 1e-6
+    turned = made.layout.flipped(played.ends) != made.layout.flipped(played.starts)
+    assert turned.any() == allow_flip

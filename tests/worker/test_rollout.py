@@ -164,7 +164,7 @@ def test_noise_does_not_change_starts_and_targets() -> None:
         made = setup(corner_noise=noise)
         with closing(BatchedEnv(made.layout, made.sim, made.reward, 4)) as env:
             generators = [np.random.default_rng(i) for i in range(4)]
-            played.append(play(env, position_policy(made.layout, made.sim.arena), generators))
+            played.append(play(env, position_policy(made.layout, made.sim), generators))
     np.testing.assert_array_equal(played[0].starts, played[1].starts)
     np.testing.assert_array_equal(played[0].goals, played[1].goals)
     assert played[1].overlap.mean() < played[0].overlap.mean()

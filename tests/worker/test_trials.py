@@ -57,7 +57,7 @@ def test_the_camera_is_on_though_training_has_none() -> None:
     made = setup(pixels=128)
     assert not made.sim.camera
     with closing(Trials(made, 20, 10)) as trials:
-        found = trials.play(position_policy(made.layout, made.sim.arena))
+        found = trials.play(position_policy(made.layout, made.sim))
         scores = trials.scores(found)
     assert found.camera is not None
     np.testing.assert_allclose(found.camera, 2.0 * found.overlap - 1.0, atol=0.1)
@@ -85,9 +85,9 @@ def test_the_trained_reward_is_reported_where_it_is_another(reward: dict, own: b
 
 @pytest.mark.parametrize(("tokens", "actions"), [(SQUARE, 1), (SQUARE, 3), (PAIR, 1), (PAIR, 2)])
 def test_the_position_policy_solves_position_and_nothing_else(tokens: dict, actions: int) -> None:
-    made = with_actions(setup(tokens, pixels=32), actions)
+    made = with_actions(setup(tokens, pixels=32, max_overlap=1.0), actions)
     with closing(Trials(made, 10, 10)) as trials:
-        found = trials.play(position_policy(made.layout, made.sim.arena))
+        found = trials.play(position_policy(made.layout, made.sim))
     centres = made.layout.bases(found.ends), made.layout.bases(found.goals)
     np.testing.assert_allclose(*centres, atol=1e-6)
     assert found.placed[:, -1].all()
@@ -99,16 +99,14 @@ def test_the_position_policy_reaches_the_plateau_of_the_paper() -> None:
     """A square on its target's centre at a uniform angle: 0.8825 raw, 0.765 scaled."""
     made = setup(pixels=16)
     with closing(Trials(made, 2000, 200)) as trials:
-        found = trials.play(position_policy(made.layout, made.sim.arena))
+        found = trials.play(position_policy(made.layout, made.sim))
         assert trials.scores(found)["mean_reward"] == pytest.approx(0.765, abs=0.01)
 
 
-@pytest.mark.parametrize("tokens", [SQUARE, PAIR])
-def test_the_random_policy_fills_the_action_space_from_the_episodes_generators(
-    tokens: dict,
-) -> None:
-    made = setup(tokens)
-    choose = random_policy(made.action_size)
+@pytest.mark.parametrize("flip", [False, True])
+def test_the_random_policy_fills_the_action_space_from_the_episodes_generators(flip: bool) -> None:
+    made = setup(allow_flip=flip)
+    choose = random_policy(made.layout, made.sim)
     nothing = np.zeros((500, 1))
     one, two = (choose(nothing, nothing, nothing, evaluation_generators(500)) for _ in range(2))
     np.testing.assert_array_equal(one, two)
@@ -134,7 +132,7 @@ def test_the_noise_can_be_another_than_in_training() -> None:
     scores = []
     for tested in (made, noisy, with_corner_noise(noisy, 0.0)):
         with closing(Trials(tested, 50, 50)) as trials:
-            found = trials.play(position_policy(made.layout, made.sim.arena))
+            found = trials.play(position_policy(made.layout, made.sim))
             scores.append(trials.scores(found)["position_error_median"])
     assert scores[0] == scores[2] == pytest.approx(0.0, abs=1e-6)
     # the mean of four corners, of token and target each: 0.1 * sqrt(2 / 4), in the plane
