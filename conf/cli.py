@@ -27,7 +27,6 @@ CFG_KINDS = ("job", "hydra", "all")
 FLAGS = ("--cfg", *SWEEP)
 MAKE_RUNS = ("train", "master")  # the commands whose run_dir is made, not read
 MISSING_HINTS = {
-    "run_dir": "say which run: run_dir=runs/...",
     "runs": "say which study: runs=runs/experiments/laptop",
     "connect": "say which master: connect=tcp://host:port or connect=runs/.../connection.json",
 }

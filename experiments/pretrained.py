@@ -25,8 +25,7 @@ from tangram_agent.pretrained import CARD, CARD_TEXT, CONFIG, WEIGHTS
 from tangram_agent.runs import ACTING, CHECKPOINTS, Run, load_run
 from tangram_sim.errors import ConfigError, RunError, TangramError
 from worker.config import EvalConfig
-from worker.evaluate import score_policies
-from worker.trials import greedy
+from worker.evaluate import policies, score_policies
 
 PACKAGE = Path(__file__).resolve().parent.parent / "tangram_agent" / "pretrained"
 RESULT = "result.json"
@@ -75,7 +74,8 @@ def publish(
     chosen = median(seeds)
     weights = _weights(chosen.run)
     config = EvalConfig(str(chosen.run.folder), episodes=tests, seed=TEST_SEED)
-    scores = score_policies(chosen.run.setup, greedy(chosen.run.policy), config)
+    setup = chosen.run.setup
+    scores = score_policies(setup, policies(chosen.run, setup), config)
     card = make_card(name, chosen.run.setup, chosen.result, [one.result for one in seeds], scores)
     card |= {"tests": {"episodes": tests, "seed": TEST_SEED, "scores": scores}}
     card |= {"sha256": hashlib.sha256(weights).hexdigest()}

@@ -271,8 +271,9 @@ def test_entry_hands_over_plain_settings(monkeypatch: pytest.MonkeyPatch) -> Non
     seen: list[Plain] = []
     assert start(monkeypatch, lambda settings: seen.append(settings) or 5, "seed=3") == 5
     assert seen == [
-        {"run_dir": "x", "episodes": 100, "seed": 3, "out": None}
-        | {"actions": None, "corner_noise": None}
+        {"run_dir": "x", "episodes": 100, "seed": 3, "turns": 1, "skip_invalid": False}
+        | dict.fromkeys(("out", "actions", "corner_noise", "puzzles", "sheet"))
+        | dict.fromkeys(("order", "reapply", "refine_steps"))
     ]
     assert type(seen[0]) is dict
 

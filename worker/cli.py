@@ -104,10 +104,17 @@ def _play(settings: Plain) -> int:
 
 
 def with_absolute_paths(settings: Plain) -> Plain:
-    """Folders and files seen from where the command was started; what is no text is left alone."""
+    """Folders and files seen from where the command was started; what is no text is left alone.
+
+    A split of the library stays a name.
+    """
+    from tangram_sim.puzzles import SPLITS
+
     result = dict(settings)
-    for name in ("run_dir", "out"):
+    for name in ("run_dir", "out", "sheet"):
         result[name] = _absolute(result.get(name), is_run=name == "run_dir")
+    if result.get("puzzles") not in SPLITS:
+        result["puzzles"] = _absolute(result.get("puzzles"), is_run=False)
     if isinstance(result.get("compare"), list):
         result["compare"] = [_absolute(run, is_run=True) for run in result["compare"]]
     return {name: value for name, value in result.items() if name in settings}

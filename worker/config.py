@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from tangram_agent.config import ServiceConfig
+from tangram_agent.config import ORDERS, ServiceConfig
 from tangram_agent.decoding import MAX_INDEX
+from tangram_agent.pretrained import PREFIX, agent_names
 from tangram_agent.wire import ROLES
 from tangram_sim.checks import check_choice, check_range
 from tangram_sim.config import MAX_CORNER_NOISE
@@ -13,6 +15,8 @@ from tangram_sim.errors import ConfigError
 MAX_EPISODES = 1_000_000
 MAX_ACTIONS = 100
 MAX_SHOWN = 100
+MAX_TURNS = 360
+GAME = "tangram7"  # the agent that plays puzzles unless another is named
 PICTURES = (".gif", ".png")
 MIN_COMPARED, MAX_COMPARED = 2, 4
 MAX_SECONDS = 86_400.0
@@ -22,6 +26,19 @@ MAX_SEED = 2**63 - 1
 def _check_run_dir(value: str) -> None:
     if not value.strip():
         raise ConfigError("run_dir must name the folder of a run, got '': set run_dir=runs/my_run")
+
+
+def game_run() -> str:
+    """The run that plays puzzles unless another is named."""
+    return f"{PREFIX}/{GAME}"
+
+
+def _check_run(run_dir: str | None, puzzles: bool) -> None:
+    """Refuse no run where none can be meant."""
+    if run_dir is not None:
+        _check_run_dir(run_dir)
+    elif not (puzzles and GAME in agent_names()):
+        raise ConfigError("say which run: run_dir=runs/...")
 
 
 def _check_connect(value: str) -> None:
@@ -84,26 +101,38 @@ class StatusConfig:
 
 @dataclass(frozen=True)
 class EvalConfig:
-    """Scores of a finished run on the fixed test set (tangram-eval).
+    """Scores of a finished run on the fixed test set, or on puzzles (tangram-eval).
 
     Attributes:
-        run_dir: folder of the run.
-        episodes: how many of the fixed test episodes.
+        run_dir: folder of the run; None with puzzles: the agent of the game.
+        episodes: how many of the fixed test episodes; of no account with puzzles.
         actions: actions per token; None is what the run was trained with (Table II: 1 to 5).
         corner_noise: see `SimConfig`; None is what the run was trained with.
         seed: of the test episodes; 0 is the fixed test set that training is scored on.
         out: JSON file for the scores; None prints them only.
+        puzzles: a file, or a split of the library, to assemble instead of random targets.
+        turns: angles that each puzzle is played at, evenly spread from how it is drawn.
+        skip_invalid: leave out puzzles that cannot be played.
+        sheet: PNG file for a picture of every puzzle's end.
+        order, reapply, refine_steps: see `AgentConfig`; None is what the run was trained with.
     """
 
-    run_dir: str
+    run_dir: str | None = None
     episodes: int = 100
     actions: int | None = None
     corner_noise: float | None = None
     seed: int = 0
     out: str | None = None
+    puzzles: str | None = None
+    turns: int = 1
+    skip_invalid: bool = False
+    sheet: str | None = None
+    order: str | None = None
+    reapply: int | None = None
+    refine_steps: int | None = None
 
     def __post_init__(self) -> None:
-        _check_run_dir(self.run_dir)
+        _check_run(self.run_dir, self.puzzles is not None)
         check_range("episodes", self.episodes, 1, MAX_EPISODES)
         check_range("seed", self.seed, 0, MAX_SEED)
         _check_actions(self.actions)
@@ -111,6 +140,29 @@ class EvalConfig:
             check_range("corner_noise", self.corner_noise, 0.0, MAX_CORNER_NOISE)
         if self.out is not None:
             _check_out(self.out)
+        if self.order is not None:
+            check_choice("order", self.order, ORDERS)
+        self._check_puzzles()
+
+    @property
+    def run(self) -> str:
+        """The run to score."""
+        return self.run_dir or game_run()
+
+    @property
+    def agent_changes(self) -> dict[str, Any]:
+        """What is set of the agent's play."""
+        named = {name: getattr(self, name) for name in ("order", "reapply", "refine_steps")}
+        return {name: value for name, value in named.items() if value is not None}
+
+    def _check_puzzles(self) -> None:
+        check_range("turns", self.turns, 1, MAX_TURNS)
+        needs = {"turns": self.turns > 1, "sheet": self.sheet, "skip_invalid": self.skip_invalid}
+        for name, given in needs.items():
+            if given and self.puzzles is None:
+                raise ConfigError(f"{name} is for puzzles: set puzzles=test, or leave {name} out")
+        if self.sheet is not None and Path(self.sheet).suffix != ".png":
+            raise ConfigError(f"sheet must end with .png, got '{self.sheet}'")
 
 
 def check_compare(value: object) -> None:

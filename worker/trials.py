@@ -1,12 +1,15 @@
 """A fixed set of test episodes, played with noise off and the camera on."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from typing import Any
 
 from tangram_agent.policy import Policy
+from tangram_agent.runs import Run
 from tangram_agent.setup import Setup
 from tangram_sim.arrays import Bools, Floats, Singles
 from tangram_sim.batch import BatchedEnv
+from tangram_sim.errors import ConfigError
 from tangram_sim.seeding import episode_generator
 from worker.rollout import Choose, Generators, Played, join_played, play
 from worker.scores import summarise
@@ -37,6 +40,23 @@ def with_corner_noise(setup: Setup, noise: float | None) -> Setup:
     if noise is None:
         return setup
     return replace(setup, sim=replace(setup.sim, corner_noise=noise))
+
+
+def adapted(run: Run, changes: Mapping[str, Any]) -> Run:
+    """The run with other settings of its agent's play, the same weights; none leaves it as it is.
+
+    Raises:
+        ConfigError: the agent has no such choice, or a value is out of its range.
+    """
+    if not changes:
+        return run
+    if not run.setup.pairs:
+        raise ConfigError(
+            f"{', '.join(changes)}: the agent of {run.folder} moves each token once it is its turn "
+            "and chooses nothing else; leave it out, or name a run of several tokens with "
+            "agent.readout=pair"
+        )
+    return run.with_agent(**changes)
 
 
 class Trials:

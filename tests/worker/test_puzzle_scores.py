@@ -1,0 +1,165 @@
+"""tangram-eval on puzzles and on several tokens: what is written, printed and drawn."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+
+from tangram_sim.errors import ConfigError
+from tests.worker.builders import write_run
+from tests.worker.puzzle_files import GAME, SIM, drawn, write_puzzles
+from worker.config import EvalConfig
+from worker.evaluate import evaluate_run
+from worker.tables import MAX_LINES
+
+pytestmark = pytest.mark.fast
+
+MEANS = {
+    "coverage",
+    "iou",
+    "share_solved",
+    "wrong",
+    "doubly_used",
+    "refused",
+    "blocked",
+    "actions_used",
+    "seconds_per_puzzle",
+    "position_error_median",
+    "angle_error_deg_median",
+}
+ORDERS = {"order=listed", "order=size", "order=random"}
+
+
+def evaluated(folder: Path, **settings: Any) -> dict[str, Any]:
+    """The report of a run of random weights."""
+    if not (folder / "run").exists():
+        write_run(folder / "run", GAME, sim=SIM)
+    out = folder / "scores.json"
+    assert evaluate_run(EvalConfig(str(folder / "run"), out=str(out), **settings)) == 0
+    report: dict[str, Any] = json.loads(out.read_text())
+    return report
+
+
+def test_puzzles_of_a_file_are_scored_together_and_one_by_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_puzzles(tmp_path / "mine.json", drawn("cat"), drawn("fish"))
+    report = evaluated(tmp_path, puzzles=str(path), turns=2)
+    assert set(report) >= MEANS | {"backend", "motion", "order", "refine_steps", "reapply"}
+    assert set(report["baselines"]) == ORDERS | {"exact", "random"}
+    assert [(one["name"], one["degrees"]) for one in report["puzzles"]] == [
+        (name, degrees) for name in ("my_cat", "my_fish") for degrees in (0.0, 180.0)
+    ]
+    for name in ("coverage", "iou", "wrong", "blocked", "actions_used"):
+        values = [one[name] for one in report["puzzles"]]
+        assert report[name] == pytest.approx(sum(values) / 4)
+    assert all(len(one["position_errors"]) == 7 for one in report["puzzles"])
+    exact, chance = report["baselines"]["exact"], report["baselines"]["random"]
+    assert (exact["share_solved"], exact["coverage"]) == (1.0, pytest.approx(1.0))
+    assert chance["coverage"] < 0.5
+    printed = capsys.readouterr().out
+    assert "4 puzzles of mine.json, 1 action a token" in printed
+    assert "my_fish 180°" in printed
+
+
+def test_settings_of_the_agents_play_are_played_and_written_down(tmp_path: Path) -> None:
+    trained = evaluated(tmp_path, puzzles="test")
+    listed = evaluated(tmp_path, puzzles="test", order="listed", reapply=1, refine_steps=2)
+    assert (trained["order"], trained["reapply"], trained["refine_steps"]) == ("learned", 0, 0)
+    assert (listed["order"], listed["reapply"], listed["refine_steps"]) == ("listed", 1, 2)
+    assert set(listed["baselines"]) == {"order=size", "order=random", "exact", "random"}
+    plain = evaluated(tmp_path, puzzles="test", order="listed")
+    assert plain["coverage"] == trained["baselines"]["order=listed"]["coverage"]
+    assert [one["coverage"] for one in plain["puzzles"]] != [
+        one["coverage"] for one in listed["puzzles"]
+    ]
+
+
+def test_the_same_seed_gives_the_same_scores(tmp_path: Path) -> None:
+    one, two, other = (evaluated(tmp_path, puzzles="test", seed=seed) for seed in (3, 3, 4))
+    timed = {"seconds", "seconds_per_puzzle", "puzzles", "baselines"}
+    assert {k: v for k, v in one.items() if k not in timed} == {
+        k: v for k, v in two.items() if k not in timed
+    }
+    assert one["coverage"] != other["coverage"]
+
+
+def test_random_targets_of_several_tokens_get_the_same_scores(tmp_path: Path) -> None:
+    report = evaluated(tmp_path, episodes=3)
+    assert set(report) >= MEANS | {"mean_reward", "mean_reward_camera", "episodes"}
+    assert report["coverage"] == pytest.approx(report["raw_overlap"])
+    assert set(report["baselines"]) == ORDERS | {"exact", "random"}
+    assert "puzzles" not in report
+
+
+def test_a_long_list_is_cut_on_the_screen_only(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = evaluated(tmp_path, puzzles="test", turns=3)
+    assert len(report["puzzles"]) == 42
+    printed = capsys.readouterr().out
+    assert printed.count("│ camel") == 3
+    assert f"and {42 - MAX_LINES} more: all are in" in " ".join(printed.split())
+
+
+def test_puzzles_that_were_left_out_are_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_puzzles(tmp_path / "mine.json", drawn("cat"), drawn("fish", [0, 1]))
+    report = evaluated(tmp_path, puzzles=str(path), skip_invalid=True)
+    assert len(report["puzzles"]) == len(report["skipped"]) == 1
+    assert "left out: puzzle 'my_fish' has the pieces" in capsys.readouterr().out
+
+
+def test_the_sheet_shows_every_puzzle(tmp_path: Path) -> None:
+    sheet = tmp_path / "ends.png"
+    evaluated(tmp_path, puzzles="test", sheet=str(sheet))
+    with Image.open(sheet) as picture:
+        assert picture.format == "PNG"
+        assert 1000 < picture.width < 1400
+        assert 600 < picture.height < picture.width
+
+
+def test_an_agent_without_a_choice_of_order(tmp_path: Path) -> None:
+    write_run(tmp_path / "run", GAME, sim=SIM, agent={"readout": "token"})
+    assert set(evaluated(tmp_path, puzzles="test")["baselines"]) == {"exact", "random"}
+    with pytest.raises(ConfigError, match="order, reapply: the agent of .* leave it out"):
+        evaluated(tmp_path, puzzles="test", order="size", reapply=1)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"turns": 0}, "turns must be between 1 and 360, got 0"),
+        ({"turns": 361}, "turns must be between 1 and 360, got 361"),
+        ({"sheet": "ends.gif"}, "sheet must end with .png, got 'ends.gif'"),
+        ({"order": "best"}, "order must be one of learned, listed, size, random, got 'best'"),
+    ],
+)
+def test_wrong_settings_of_puzzles(settings: dict, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        EvalConfig("runs/one", **({"puzzles": "test"} | settings))
+
+
+@pytest.mark.parametrize("settings", [{"turns": 2}, {"sheet": "a.png"}, {"skip_invalid": True}])
+def test_settings_of_puzzles_need_puzzles(settings: dict) -> None:
+    (name,) = settings
+    with pytest.raises(ConfigError, match=f"{name} is for puzzles: set puzzles=test, or leave"):
+        EvalConfig("runs/one", **settings)
+
+
+@pytest.mark.parametrize("names", [["square"], ["square", "tangram7"]])
+def test_puzzles_are_played_by_the_agent_of_the_game_if_there_is_one(
+    monkeypatch: pytest.MonkeyPatch, names: list[str]
+) -> None:
+    monkeypatch.setattr("worker.config.agent_names", lambda: names)
+    with pytest.raises(ConfigError, match="say which run: run_dir=runs/..."):
+        EvalConfig()
+    if "tangram7" in names:
+        assert EvalConfig(puzzles="test").run == "pretrained/tangram7"
+        assert EvalConfig("runs/one", puzzles="test").run == "runs/one"
+    else:
+        with pytest.raises(ConfigError, match="say which run: run_dir=runs/..."):
+            EvalConfig(puzzles="test")

@@ -1,0 +1,130 @@
+"""Puzzles as targets of a run: found, named, turned, refused, played from fixed starts."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tangram_agent.setup import Setup
+from tangram_sim.arrays import Floats
+from tangram_sim.errors import ConfigError
+from tangram_sim.geometry import overlap_share
+from tangram_sim.puzzles import load_puzzle, puzzle_names
+from tests.agent.builders import PAIR, setup
+from tests.worker.puzzle_files import GAME, SIM, drawn, write_puzzles
+from worker.baselines import exact_policy, random_policy
+from worker.puzzles import find_figures, play_figures
+
+pytestmark = pytest.mark.fast
+
+
+def game(**sim: object) -> Setup:
+    return setup(GAME, **(SIM | sim))
+
+
+@pytest.mark.parametrize("split", ["train", "test"])
+def test_a_split_of_the_library_is_found_by_its_name(split: str) -> None:
+    assert [one.name for one in find_figures(split, game()).figures] == puzzle_names(split)
+
+
+def test_without_a_file_the_whole_library_is_meant() -> None:
+    found = find_figures(None, game(), ["cat", "heart"])
+    assert [(one.name, one.degrees) for one in found.figures] == [("cat", 0.0), ("heart", 0.0)]
+
+
+def test_puzzles_are_turned_evenly_from_how_they_are_drawn(tmp_path: Path) -> None:
+    made = game()
+    found = find_figures("test", made, ["heart"], turns=8).figures
+    assert [one.degrees for one in found] == [45.0 * i for i in range(8)]
+    assert [one.title for one in found[:2]] == ["heart", "heart 45°"]
+    drawn_as = load_puzzle("heart").corners @ (1.0, 1j)
+    for one in found:
+        corners = made.layout.corners(one.poses, one.flipped) @ (1.0, 1j)
+        turned = drawn_as * np.exp(1j * np.radians(one.degrees))
+        np.testing.assert_allclose(np.sort_complex(corners.round(6)), _sorted(turned), atol=2e-6)
+
+
+def _sorted(points: np.ndarray) -> np.ndarray:
+    return np.sort_complex(points.round(6))
+
+
+@pytest.mark.parametrize("scale", [0.6, 0.3])
+def test_pieces_are_as_large_as_the_tokens(tmp_path: Path, scale: float) -> None:
+    made = setup(GAME | {"scale": scale}, **SIM)
+    path = write_puzzles(tmp_path / "mine.json", drawn("cat"))
+    (figure,) = find_figures(str(path), made).figures
+    corners = made.layout.corners(figure.poses, figure.flipped)[None]
+    own = load_puzzle("cat", scale).corners[None]
+    assert overlap_share(corners, own, made.layout)[0] > 0.99
+
+
+@pytest.mark.parametrize(
+    ("puzzles", "names", "message"),
+    [
+        ([drawn("cat")], ["dog"], "no puzzle 'dog' in .*mine.json: choose from my_cat"),
+        ([drawn("cat", [0, 1, 5])], None, "puzzle 'my_cat' has the pieces large_triangle, large"),
+        ([drawn("cat", [0, 1, 5])], None, "the run moves .* name a run of the puzzle's pieces"),
+        ([drawn("cat", stretch=1.3)], None, "puzzle 'my_cat', piece 1"),
+    ],
+)
+def test_what_cannot_be_played_is_refused_by_name(
+    tmp_path: Path, puzzles: list, names: list[str] | None, message: str
+) -> None:
+    path = write_puzzles(tmp_path / "mine.json", *puzzles)
+    with pytest.raises(ConfigError, match=message):
+        find_figures(str(path), game(), names)
+
+
+def test_a_run_of_other_tokens_is_named() -> None:
+    with pytest.raises(
+        ConfigError, match="puzzle 'square' .* the run moves square, large_triangle"
+    ):
+        find_figures("train", setup(PAIR))
+
+
+def test_a_figure_that_does_not_fit_into_the_arena_is_refused() -> None:
+    find_figures("train", game())
+    with pytest.raises(
+        ConfigError, match="reaches 0.* from its middle, and the run's arena only 0"
+    ):
+        find_figures("train", game(arena=1.4))
+
+
+def test_invalid_ones_are_left_out_if_asked_for(tmp_path: Path) -> None:
+    puzzles = [drawn("cat"), drawn("fish", [0, 1]), drawn("dog", stretch=1.3)]
+    path = write_puzzles(tmp_path / "mine.json", *puzzles)
+    found = find_figures(str(path), game(), skip_invalid=True)
+    assert [one.name for one in found.figures] == ["my_cat"]
+    assert len({fault.split("'")[1] for fault in found.faults}) == 2
+    none = write_puzzles(tmp_path / "none.json", puzzles[1])
+    with pytest.raises(ConfigError, match="has no puzzle to play: puzzle 'my_fish' has the pieces"):
+        find_figures(str(none), game(), skip_invalid=True)
+
+
+def starts(names: list[str], seed: int = 0, turns: int = 1) -> dict[tuple[str, float], Floats]:
+    made = game()
+    figures = find_figures("test", made, names, turns).figures
+    played = play_figures(made, figures, random_policy(made.layout, made.sim), seed)
+    assert len(played.starts) == len(figures)
+    keys = [(one.name, one.degrees) for one in figures]
+    return dict(zip(keys, played.starts, strict=True))
+
+
+def test_starts_depend_on_seed_and_figure_and_nothing_else() -> None:
+    alone, among = starts(["heart"]), starts(["swan", "heart", "camel"])
+    np.testing.assert_array_equal(alone["heart", 0.0], among["heart", 0.0])
+    assert (among["swan", 0.0] != among["camel", 0.0]).all()
+    assert (starts(["heart"], seed=1)["heart", 0.0] != alone["heart", 0.0]).all()
+    turned = starts(["heart"], turns=2)
+    assert (turned["heart", 0.0] != turned["heart", 180.0]).all()
+    np.testing.assert_array_equal(turned["heart", 0.0], alone["heart", 0.0])
+
+
+def test_more_puzzles_than_are_played_at_a_time() -> None:
+    made = game()
+    figures = find_figures("train", made).figures
+    played = play_figures(made, figures, exact_policy(made.layout, made.sim), 0)
+    assert len(played.overlap) == len(figures) == 35
+    goals = [made.layout.corners(one.poses, one.flipped) for one in figures]
+    np.testing.assert_allclose(played.goals, np.stack(goals))
+    np.testing.assert_allclose(played.overlap, 1.0, atol=1e-5)

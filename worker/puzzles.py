@@ -1,0 +1,174 @@
+"""Puzzles as what a run is to assemble: found, checked against its tokens, turned and played.
+
+Legend: E episodes, K tokens.
+"""
+
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from tangram_agent.setup import Setup
+from tangram_sim.arrays import Bools, Floats
+from tangram_sim.assembly import Puzzle, PuzzleRules
+from tangram_sim.batch import BatchedEnv
+from tangram_sim.config import RewardConfig
+from tangram_sim.errors import ConfigError
+from tangram_sim.puzzles import SPLITS, PuzzleFile, library, read_puzzles
+from tangram_sim.seeding import episode_generator
+from tangram_sim.targets import placement, turned
+from worker.rollout import Choose, Played, join_played, play
+
+AT_ONCE = 32
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Figure:
+    """A puzzle at one angle, as the target of a run's tokens.
+
+    Attributes:
+        name: of the puzzle.
+        degrees: by which it is turned from how it was drawn.
+        poses: (K, 3) of the tokens in it.
+        flipped: (K,) tokens that lie on their other side in it.
+    """
+
+    name: str
+    degrees: float
+    poses: Floats
+    flipped: Bools
+
+    @property
+    def title(self) -> str:
+        """The name for a picture, and by how much it is turned."""
+        name = self.name.replace("_", " ")
+        return f"{name} {self.degrees:g}°" if self.degrees else name
+
+
+@dataclass(frozen=True, eq=False)
+class Figures:
+    """What is to be played.
+
+    Attributes:
+        figures: at least one, puzzle after puzzle, each at all its angles.
+        faults: why others of the file were left out.
+    """
+
+    figures: tuple[Figure, ...]
+    faults: tuple[str, ...] = ()
+
+    @property
+    def titles(self) -> list[str]:
+        """What the figures are called."""
+        return [figure.title for figure in self.figures]
+
+
+def find_figures(
+    source: str | None,
+    setup: Setup,
+    names: Sequence[str] | None = None,
+    turns: int = 1,
+    skip_invalid: bool = False,
+) -> Figures:
+    """The puzzles of a file or of the library as targets of a run.
+
+    Args:
+        source: a file, or a split of the library; None is all of the library.
+        setup: whose tokens are to be moved.
+        names: of the puzzles wanted; None is all that there are.
+        turns: at so many angles each, evenly spread from the one that it is drawn at.
+        skip_invalid: leave out what is faulty or does not fit the tokens instead of raising.
+
+    Raises:
+        ConfigError: a file that cannot be used, an unknown name, or pieces that are not the tokens.
+    """
+    found = _read(source, setup.tokens.scale, skip_invalid)
+    figures, faults = list[Figure](), list(found.faults)
+    for puzzle in _named(found.puzzles, names, source):
+        try:
+            figures += _turns(puzzle, setup, turns)
+        except ConfigError as error:
+            if not skip_invalid:
+                raise
+            faults.append(str(error))
+    if not figures:
+        why = f": {faults[0]}" if faults else ""
+        raise ConfigError(f"{source or 'the library'} has no puzzle to play{why}")
+    return Figures(tuple(figures), tuple(faults))
+
+
+def play_figures(setup: Setup, figures: Sequence[Figure], choose: Choose, seed: int) -> Played:
+    """Assemble E figures, one episode each; where the tokens start is decided by seed and figure.
+
+    Raises:
+        SamplingError: the tokens find no room to start.
+    """
+    count = min(AT_ONCE, len(figures))
+    sim = replace(setup.sim, camera=False)
+    groups = []
+    with closing(BatchedEnv(setup.layout, sim, RewardConfig(), count)) as env:
+        for first in range(0, len(figures), count):
+            some = [figures[i % len(figures)] for i in range(first, first + count)]
+            targets = (np.stack([f.poses for f in some]), np.stack([f.flipped for f in some]))
+            generators = [_generator(figure, seed) for figure in some]
+            groups.append(play(env, choose, generators, targets))
+    return join_played(groups, len(figures))
+
+
+def _generator(figure: Figure, seed: int) -> np.random.Generator:
+    """A figure's own, whatever else is in its file."""
+    return episode_generator(seed, f"puzzle {figure.name}", 0, 0, round(figure.degrees * 1000))
+
+
+def _read(source: str | None, scale: float, skip_invalid: bool) -> PuzzleFile:
+    if source is None or source in SPLITS:
+        return PuzzleFile(library(source, scale), ())
+    return read_puzzles(Path(source), PuzzleRules(scale, subset=True), skip_invalid)
+
+
+def _named(
+    puzzles: Sequence[Puzzle], names: Sequence[str] | None, source: str | None
+) -> list[Puzzle]:
+    if names is None:
+        return list(puzzles)
+    found = {puzzle.name: puzzle for puzzle in puzzles}
+    for name in names:
+        if name not in found:
+            raise ConfigError(
+                f"no puzzle '{name}' in {source or 'the library'}: choose from "
+                f"{', '.join(found) or 'none'}"
+            )
+    return [found[name] for name in names]
+
+
+def _turns(puzzle: Puzzle, setup: Setup, turns: int) -> list[Figure]:
+    poses, flipped = _placed(puzzle, setup)
+    figures = []
+    for degrees in (360.0 * i / turns for i in range(turns)):
+        there = turned(poses, np.radians(degrees))
+        _check_inside(puzzle, setup, setup.layout.corners(there, flipped))
+        figures.append(Figure(puzzle.name, degrees, there, flipped))
+    return figures
+
+
+def _placed(puzzle: Puzzle, setup: Setup) -> tuple[Floats, Bools]:
+    try:
+        return placement(puzzle, setup.layout)
+    except ConfigError:
+        tokens = ", ".join(shape.name for shape in setup.layout.shapes)
+        raise ConfigError(
+            f"puzzle '{puzzle.name}' has the pieces {', '.join(puzzle.pieces)}, and the run moves "
+            f"{tokens} of scale {setup.tokens.scale:g}: name a run of the puzzle's pieces"
+        ) from None
+
+
+def _check_inside(puzzle: Puzzle, setup: Setup, corners: Floats) -> None:
+    reach = float(np.abs(corners).max())
+    if reach > setup.sim.arena / 2.0 + _ROUNDING:
+        raise ConfigError(
+            f"puzzle '{puzzle.name}' reaches {reach:.3g} from its middle, and the run's arena only "
+            f"{setup.sim.arena / 2.0:.3g}: name a run of a larger arena or of smaller tokens"
+        )
