@@ -48,6 +48,11 @@ class Setup:
         return self.agent.readout == "pair"
 
     @property
+    def contacts(self) -> bool:
+        """Whether tokens push each other out of their places."""
+        return self.layout.tokens > 1 and self.sim.motion == "slide"
+
+    @property
     def action_size(self) -> int:
         """A: x, y and angular velocity, with more than one token its number before them."""
         return action_size(self.layout.tokens, self.sim)

@@ -90,7 +90,9 @@ def test_a_share_of_actions_is_uniform() -> None:
 
 
 def test_exploring_stays_in_range_and_keeps_the_choice_of_token() -> None:
-    plain, noisy = explore(setup(PAIR, agent={"readout": "token", "noise": 2.0, "uniform_share": 0.5}))
+    plain, noisy = explore(
+        setup(PAIR, agent={"readout": "token", "noise": 2.0, "uniform_share": 0.5})
+    )
     assert np.abs(noisy).max() <= 1.0
     np.testing.assert_array_equal(noisy[:, 0], plain[:, 0])
 
