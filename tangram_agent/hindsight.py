@@ -67,7 +67,7 @@ def _goals(
     poses = layout.poses(final.astype(np.float64))
     spread = np.array([twin.position, twin.position, twin.angle])
     poses += generator.standard_normal(poses.shape) * spread
-    return layout.corners(poses).astype(np.float32)
+    return layout.corners(poses, layout.flipped(final)).astype(np.float32)
 
 
 def _transitions(episodes: Episodes, goals: Singles, rewards: Singles) -> Transitions:
