@@ -95,7 +95,7 @@ class SimConfig:
 
     @property
     def task(self) -> StageConfig:
-        """What is played without a curriculum, and after it, and what tests are."""
+        """What is played without a curriculum and before its first stage, and what tests are."""
         return StageConfig(targets=self.targets, spread=self.spread)
 
     def stage(self, updates: int) -> int:
