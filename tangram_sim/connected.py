@@ -70,7 +70,7 @@ class _Outlines:
 
 
 def _bodies(layout: Layout) -> _Outlines:
-    corners: Complex = layout.body @ (1.0, 1j)
+    corners: Complex = layout.body[:, 0] + 1j * layout.body[:, 1]
     ahead = np.concatenate(
         [np.roll(corners[layout.corners_of(k)], -1) for k in range(layout.tokens)]
     )
