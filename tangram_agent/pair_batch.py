@@ -14,8 +14,8 @@ import numpy.typing as npt
 
 from tangram_agent.config import AgentConfig
 from tangram_agent.types import Transitions
+from tangram_sim.actions import chosen_tokens
 from tangram_sim.arrays import Bools, Floats, Ints
-from tangram_sim.batch import chosen_tokens
 from tangram_sim.geometry import outlines, shared_area
 from tangram_sim.layout import Layout
 
