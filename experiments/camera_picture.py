@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 
 from experiments.report.style import COLOURS, WIDTH_IN, empty_figure
 from experiments.scenes import FRAME, bare
+from tangram_sim.actions import velocities
 from tangram_sim.arrays import Floats, Pixels
-from tangram_sim.batch import velocities
 from tangram_sim.config import SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import TokensConfig, make_layout

@@ -49,6 +49,7 @@ class Loop:
         self._arrived: deque[EpisodesArrived] = deque()
         self._latest: Scores | None = None
         self._published, self._dismissed = -1, False
+        self._stage = -1
         self._publish = Every(service.publish_seconds)
         self._keeper = Keeper(parts, self.clock, reporter.progress.notice)
 
@@ -160,8 +161,17 @@ class Loop:
         if weights.version <= self._published:
             return  # the present ones were bad, and the last good ones are known
         self.parts.hub.publish(weights)
+        self._tell_stage(weights.version)
         self._published = weights.version
         self._reporter.published(weights.version, self.parts)
+
+    def _tell_stage(self, updates: int) -> None:
+        """Say when the curriculum goes on: workers play by the weights that they get."""
+        sim = self.parts.setup.sim
+        stage = sim.stage(updates)
+        if sim.stages and stage != self._stage:
+            self._reporter.progress.notice(f"{sim.told(stage)}, from update {updates:,} on")
+        self._stage = stage
 
     def tell(self) -> None:
         """Show where the run stands."""

@@ -64,10 +64,11 @@ def _goals(
     final = np.repeat(episodes.corners[:, -1], steps, axis=0)
     if twin.strategy == "final":
         return final
-    poses = layout.poses(final.astype(np.float64))
+    exact = final.astype(np.float64)
+    poses = layout.poses(exact)
     spread = np.array([twin.position, twin.position, twin.angle])
     poses += generator.standard_normal(poses.shape) * spread
-    return layout.corners(poses).astype(np.float32)
+    return layout.corners(poses, layout.flipped(exact)).astype(np.float32)
 
 
 def _transitions(episodes: Episodes, goals: Singles, rewards: Singles) -> Transitions:

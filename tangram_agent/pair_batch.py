@@ -14,8 +14,8 @@ import numpy.typing as npt
 
 from tangram_agent.config import AgentConfig
 from tangram_agent.types import Transitions
+from tangram_sim.actions import chosen_tokens
 from tangram_sim.arrays import Bools, Floats, Ints
-from tangram_sim.batch import chosen_tokens
 from tangram_sim.geometry import outlines, shared_area
 from tangram_sim.layout import Layout
 
@@ -51,6 +51,23 @@ class PairBatch:
     value: Floats
 
 
+@dataclass(frozen=True, eq=False)
+class ContactBatch(PairBatch):
+    """Pairs of tokens that slide, with another token of the same scene for each.
+
+    Attributes:
+        other: (M,) its index.
+        other_pose: (M, 3) where it lay before the action.
+        other_flipped: (M,) on which side.
+        pushed: (M,) share of its area that the action pushed away from there.
+    """
+
+    other: Ints
+    other_pose: Floats
+    other_flipped: Bools
+    pushed: Floats
+
+
 def make_pairs(
     batch: Transitions, agent: AgentConfig, layout: Layout, generator: np.random.Generator
 ) -> PairBatch:
@@ -84,6 +101,23 @@ def make_pairs(
     value = newly_covered(after, after_side, token, goal, goal_side, piece, covered, layout)
     return PairBatch(
         before, after, before_side, after_side, token, goal, goal_side, piece, covered, value
+    )
+
+
+def with_contacts(
+    pairs: PairBatch, batch: Transitions, layout: Layout, generator: np.random.Generator
+) -> ContactBatch:
+    """The same pairs, with what their action did to another token, drawn uniformly."""
+    rows = np.repeat(np.arange(batch.count), len(pairs.token) // batch.count)
+    other = (pairs.token + generator.integers(1, layout.tokens, len(rows))) % layout.tokens
+    pose, side = _pose_of(batch.state, layout, rows, other)
+    later, later_side = _pose_of(batch.next_state, layout, rows, other)
+    before = _outlines_at(pose, side, other, layout)
+    areas = np.array([shape.area for shape in layout.shapes])[other]
+    kept = shared_area(before, _outlines_at(later, later_side, other, layout)) / areas
+    pushed = np.clip(1.0 - kept, 0.0, 1.0)
+    return ContactBatch(
+        **vars(pairs), other=other, other_pose=pose, other_flipped=side, pushed=pushed
     )
 
 
@@ -146,6 +180,26 @@ def covered_share(
     areas = np.array([shape.area for shape in layout.shapes])
     share: Floats = np.minimum(shared / areas[piece], 1.0)
     return share
+
+
+def worths(corners: Floats, placed: Bools, goals: Floats, layout: Layout) -> Floats:
+    """(B, K) what placed tokens cover of all pieces, as the sum of their values; open ones 0.
+
+    Args:
+        corners: (B, V, 2) of the tokens.
+        placed: (B, K).
+        goals: (B, V, 2) of the targets.
+        layout: of both.
+    """
+    rows, tokens = np.nonzero(placed)
+    count = layout.tokens
+    own = np.repeat(outlines(corners, layout)[rows, tokens], count, axis=0)
+    wanted = outlines(goals, layout)[rows].reshape(own.shape)
+    areas = np.array([shape.area for shape in layout.shapes])
+    shared = shared_area(wanted, own).reshape(-1, count)
+    worth = np.zeros(np.shape(placed))
+    worth[rows, tokens] = (shared / np.maximum(areas[tokens, None], areas)).sum(axis=1)
+    return worth
 
 
 def newly_covered(

@@ -7,20 +7,18 @@ Legend: B environments, K tokens, V corners, M candidates (pairs of all environm
 """
 
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tangram_agent.config import AgentConfig
-from tangram_agent.pair_batch import covered_share
+from tangram_agent.pair_batch import covered_share, worths
 from tangram_agent.pair_networks import PairNetworks
 from tangram_agent.pairs import Pairs
+from tangram_agent.setup import Setup
 from tangram_sim.arrays import Bools, Floats, Ints, Singles
 from tangram_sim.layout import Layout
-
-_Candidates = tuple[Tensor, Tensor, Tensor, Tensor]  # row, token, flip and piece, each (M,)
 
 _SHORT_LIST = 8  # proposals of an environment that are valued for all pieces
 
@@ -43,37 +41,73 @@ class Choice:
 
 
 @dataclass(frozen=True, eq=False)
+class _Candidates:
+    """M actions that may be played, row after row: each takes a token to a piece of the target.
+
+    Attributes:
+        row: (M,) environment.
+        token: (M,) which token.
+        flip: (M,) 1 where it is turned over.
+        piece: (M,) which piece it is meant for.
+    """
+
+    row: Tensor
+    token: Tensor
+    flip: Tensor
+    piece: Tensor
+
+    def at(self, index: Tensor) -> "_Candidates":
+        """Some of them."""
+        return _Candidates(*(part[index] for part in vars(self).values()))
+
+
+@dataclass(frozen=True, eq=False)
 class _Scene:
-    """B environments as tensors: poses (B, K, 3), sides (B, K), covered shares (B, K)."""
+    """B environments as tensors.
+
+    Poses and goals are (B, K, 3), sides, covered shares and worths (B, K). A placed token's worth
+    is the sum of the values of what it covers, an open one's is 0.
+    """
 
     pose: Tensor
     flipped: Tensor
     goal: Tensor
     goal_flipped: Tensor
     covered: Tensor
+    worth: Tensor
 
-    def pairs(self, row: Tensor, token: Tensor, flip: Tensor, piece: Tensor) -> Pairs:
-        """The pairs (M,) of these rows, tokens and pieces; a flipped token has changed its side."""
-        side = self.flipped[row, token]
+    def between(self, movers: _Candidates, where: Tensor, other: Tensor) -> Pairs:
+        """Pairs (M,) of tokens that move and others (M,) that lie at poses (M, 3)."""
         return Pairs(
-            pose=self.pose[row, token],
-            flipped=(side - flip).abs(),
-            token=token,
-            goal=self.goal[row, piece],
-            goal_flipped=self.goal_flipped[row, piece],
-            piece=piece,
-            covered=self.covered[row, piece],
+            pose=self.pose[movers.row, movers.token],
+            flipped=(self.flipped[movers.row, movers.token] - movers.flip).abs(),
+            token=movers.token,
+            goal=where,
+            goal_flipped=self.flipped[movers.row, other],
+            piece=other,
+            covered=torch.zeros(len(other)),
+        )
+
+    def pairs(self, c: _Candidates) -> Pairs:
+        """The pairs (M,) of candidates; a token that is turned over has changed its side."""
+        return Pairs(
+            pose=self.pose[c.row, c.token],
+            flipped=(self.flipped[c.row, c.token] - c.flip).abs(),
+            token=c.token,
+            goal=self.goal[c.row, c.piece],
+            goal_flipped=self.goal_flipped[c.row, c.piece],
+            piece=c.piece,
+            covered=self.covered[c.row, c.piece],
         )
 
 
 class PairChooser:
     """Chooses token, side and pose."""
 
-    def __init__(
-        self, networks: PairNetworks, layout: Layout, agent: AgentConfig, allow_flip: bool
-    ) -> None:
-        self._networks, self._layout, self._agent = networks, layout, agent
-        self._turns_over = layout.chiral & allow_flip
+    def __init__(self, networks: PairNetworks, setup: Setup) -> None:
+        self._networks, self._layout, self._agent = networks, setup.layout, setup.agent
+        self._contacts = setup.contacts
+        self._turns_over = setup.layout.chiral & setup.sim.allow_flip
 
     def choose(self, corners: Floats, placed: Bools, goals: Floats, refine: bool = True) -> Choice:
         """What to play, where every environment still has a token to place.
@@ -86,15 +120,17 @@ class PairChooser:
         """
         scene = self._scene(corners, placed, goals)
         with torch.no_grad():
-            candidates = self._candidates(self._open(placed, goals))
-            proposed = self._propose(scene, candidates)
-            best, value = self._best(scene, candidates, proposed)
-        row, token, flip = candidates[0][best], candidates[1][best], candidates[2][best]
-        pose = proposed[best]
+            candidates = self._candidates(scene, self._open(placed, goals))
+            pose = self._proposed(scene, candidates)
+            best, value = self._best(scene, candidates, pose)
+        chosen, pose = candidates.at(best), pose[best]
         if refine and self._agent.refine_steps:
-            pose, value = self._refined(scene, row, token, flip, pose)
+            pose, value = self._refined(scene, chosen, pose)
         return Choice(
-            token.numpy(), flip.numpy() > 0.5, pose.numpy().astype(np.float64), value.numpy()
+            chosen.token.numpy(),
+            chosen.flip.numpy() > 0.5,
+            pose.numpy().astype(np.float64),
+            value.numpy(),
         )
 
     def _scene(self, corners: Floats, placed: Bools, goals: Floats) -> _Scene:
@@ -107,7 +143,14 @@ class PairChooser:
             _tensor(layout.poses(goals)),
             _tensor(layout.flipped(goals)),
             _tensor(covered.reshape(-1, count)),
+            _tensor(self._worths(corners, placed, goals)),
         )
+
+    def _worths(self, corners: Floats, placed: Bools, goals: Floats) -> Floats:
+        """(B, K), zeros where nothing can push a placed token away."""
+        if not self._contacts:
+            return np.zeros(placed.shape)
+        return worths(corners, placed, goals, self._layout)
 
     def _open(self, placed: Bools, goals: Floats) -> Bools:
         """(B, K) tokens that may be next, at least one in each row."""
@@ -119,73 +162,119 @@ class PairChooser:
         rank = np.where(is_open, _ranks(self._agent.order, self._layout, goals), np.inf)
         return np.asarray(np.arange(rank.shape[1]) == rank.argmin(axis=1)[:, None])
 
-    def _candidates(self, is_open: Bools) -> _Candidates:
-        """Row, token, flip and piece (M,) of every pair that may be played, row after row."""
+    def _candidates(self, scene: _Scene, is_open: Bools) -> _Candidates:
+        """The best few of all pairs that may be played, by their own piece's value."""
         sides = np.stack([is_open, is_open & self._turns_over], axis=-1)
         every = np.broadcast_to(sides[..., None], (*sides.shape, self._layout.tokens))
         row, token, flip, piece = map(torch.from_numpy, np.nonzero(every))
-        return row, token, flip.float(), piece
+        candidates = _Candidates(row, token, flip.float(), piece)
+        pairs = scene.pairs(candidates)
+        value = self._networks.critic(pairs.at(self._networks.actor(pairs)[0]))
+        return candidates.at(_best_of_each(row, value, len(is_open)))
 
-    def _propose(self, scene: _Scene, candidates: _Candidates) -> Tensor:
-        """Poses (M, 3)."""
-        pairs = scene.pairs(*candidates)
+    def _proposed(self, scene: _Scene, candidates: _Candidates) -> Tensor:
+        """Poses (M, 3), the actor applied again to its own as often as it is configured."""
+        pairs = scene.pairs(candidates)
         pose: Tensor = self._networks.actor(pairs)[0]
         for _ in range(self._agent.reapply):
             pose = self._networks.actor(pairs.at(pose))[0]
         return pose
 
-    def _best(
-        self, scene: _Scene, candidates: _Candidates, proposed: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def _best(self, scene: _Scene, candidates: _Candidates, pose: Tensor) -> tuple[Tensor, Tensor]:
         """Index (B,) of the best candidate of each row, and its value (B,)."""
-        row, token, flip, _ = candidates
-        own = self._networks.critic(scene.pairs(*candidates).at(proposed))
-        listed = _best_of_each(row, own, len(scene.pose))
-        chosen = listed.reshape(-1)
-        known = chosen >= 0
-        total = torch.full((len(chosen),), -torch.inf)
-        at = chosen[known]
-        total[known] = self._total(scene, row[at], token[at], flip[at], proposed[at])
-        value, place = total.view(listed.shape).max(dim=1)
-        return listed.gather(1, place[:, None])[:, 0], value
+        total = self._total(scene, candidates, pose)
+        if self._contacts:
+            total = total - self._damage(scene, candidates, pose, total)
+        table, first = _by_row(candidates.row, total, len(scene.pose))
+        value, place = table.max(dim=1)
+        return place + first, value
 
-    def _total(
-        self, scene: _Scene, row: Tensor, token: Tensor, flip: Tensor, pose: Tensor
-    ) -> Tensor:
+    def _total(self, scene: _Scene, candidates: _Candidates, pose: Tensor) -> Tensor:
         """(M,) values of poses (M, 3) over all pieces of the target."""
         count = self._layout.tokens
-        rows, tokens, flips = (part.repeat_interleave(count) for part in (row, token, flip))
-        pairs = scene.pairs(rows, tokens, flips, torch.arange(count).repeat(len(row)))
+        pieces = torch.arange(count).repeat(len(pose))
+        every = candidates.at(torch.arange(len(pose)).repeat_interleave(count))
+        pairs = scene.pairs(replace(every, piece=pieces))
         values: Tensor = self._networks.critic(pairs.at(pose.repeat_interleave(count, dim=0)))
         return values.view(-1, count).sum(dim=1)
 
-    def _refined(
-        self, scene: _Scene, row: Tensor, token: Tensor, flip: Tensor, pose: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def _damage(
+        self, scene: _Scene, candidates: _Candidates, pose: Tensor, value: Tensor
+    ) -> Tensor:
+        """(M,) what sliding there pushes off the target, and what later pushes will cost it.
+
+        Now: each placed token's worth, times the share that it is pushed away. Later, with the
+        weight gamma: the candidate's own value, times the share that every token which is still to
+        come pushes it away on the way to the best pose known for it. So what lies in the way of
+        others is placed after them.
+        """
+        now = self._pushed(scene, candidates, pose, scene.worth)
+        if self._agent.gamma == 0.0:
+            return now
+        return now + self._agent.gamma * value * self._pushed_later(scene, candidates, pose, value)
+
+    def _pushed(
+        self, scene: _Scene, candidates: _Candidates, pose: Tensor, worth: Tensor
+    ) -> Tensor:
+        """(M,) sum over tokens of the share that each is pushed away times its worth (B, K)."""
+        index, other = torch.nonzero(worth[candidates.row] > 0.0, as_tuple=True)
+        keep = candidates.token[index] != other
+        index, other = index[keep], other[keep]
+        movers = candidates.at(index)
+        pairs = scene.between(movers, scene.pose[movers.row, other], other)
+        share = self._networks.critic.pushed(pairs, pose[index]).clamp(0.0, 1.0)
+        cost = share * worth[movers.row, other]
+        return torch.zeros(len(pose)).index_add(0, index, cost)
+
+    def _pushed_later(
+        self, scene: _Scene, candidates: _Candidates, pose: Tensor, value: Tensor
+    ) -> Tensor:
+        """(M,) sum over the tokens to come of the share that each pushes a candidate away."""
+        count = len(pose)
+        same = candidates.row[:, None] == candidates.row[None, :]
+        leader = _leaders(candidates, value)
+        later = same & leader[None, :] & (candidates.token[:, None] != candidates.token[None, :])
+        index, mover = torch.nonzero(later, as_tuple=True)
+        movers, lying = candidates.at(mover), candidates.at(index)
+        pairs = scene.between(movers, pose[index], lying.token)
+        share = self._networks.critic.pushed(pairs, pose[mover]).clamp(0.0, 1.0)
+        return torch.zeros(count).index_add(0, index, share)
+
+    def _refined(self, scene: _Scene, chosen: _Candidates, pose: Tensor) -> tuple[Tensor, Tensor]:
         """Poses (B, 3) after gradient steps uphill on the critic, and their values (B,)."""
         with torch.enable_grad():
             moved = pose.clone().requires_grad_(True)
             optimiser = torch.optim.Adam([moved], lr=self._agent.refine_rate)
             for _ in range(self._agent.refine_steps):
-                loss = -self._total(scene, row, token, flip, moved).sum()
+                loss = -self._total(scene, chosen, moved).sum()
                 (moved.grad,) = torch.autograd.grad(loss, [moved])
                 optimiser.step()
         with torch.no_grad():
-            value = self._total(scene, row, token, flip, moved)
+            value = self._total(scene, chosen, moved)
         return moved.detach(), value
 
 
-def _best_of_each(row: Tensor, own: Tensor, rows: int) -> Tensor:
-    """(B, L) indices of the best few candidates of each row, filled up with -1.
+def _leaders(candidates: _Candidates, value: Tensor) -> Tensor:
+    """(M,) which candidate is the best one of its token in its row."""
+    key = candidates.row * (int(candidates.token.max()) + 1) + candidates.token
+    best = torch.full((int(key.max()) + 1,), -torch.inf).scatter_reduce(0, key, value, "amax")
+    return value >= best[key]
 
-    Candidates come row after row.
-    """
+
+def _by_row(row: Tensor, value: Tensor, rows: int) -> tuple[Tensor, Tensor]:
+    """Values (M,) that come row after row as a table (B, L), and where each row begins (B,)."""
     counts = torch.bincount(row, minlength=rows)
     first = counts.cumsum(0) - counts
     table = torch.full((rows, int(counts.max())), -torch.inf)
-    table[row, torch.arange(len(row)) - first[row]] = own
+    table[row, torch.arange(len(row)) - first[row]] = value
+    return table, first
+
+
+def _best_of_each(row: Tensor, value: Tensor, rows: int) -> Tensor:
+    """Indices (M',) of the best few candidates of each row, row after row."""
+    table, first = _by_row(row, value, rows)
     best = table.topk(min(_SHORT_LIST, table.shape[1]), dim=1)
-    return torch.where(best.values > -torch.inf, best.indices + first[:, None], -1)
+    return (best.indices + first[:, None])[best.values > -torch.inf]
 
 
 def _ranks(order: str, layout: Layout, goals: Floats) -> Floats:

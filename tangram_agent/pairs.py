@@ -112,6 +112,15 @@ class PairGraph(nn.Module):
         other_side = chiral * (pairs.flipped - pairs.goal_flipped).abs()
         return place, angle, other_side
 
+    def motion(self, pairs: Pairs, to: Tensor) -> Tensor:
+        """The way to poses (M, 3) as tokens see it: (M, 4), shift, cosine and sine of the turn."""
+        heading = torch.stack([torch.cos(pairs.pose[:, 2]), torch.sin(pairs.pose[:, 2])], dim=-1)
+        shift = turn_back(to[:, :2] - pairs.pose[:, :2], heading)
+        sign = 1.0 - 2.0 * pairs.flipped
+        angle = sign * (to[:, 2] - pairs.pose[:, 2])
+        parts = [shift[:, 0], sign * shift[:, 1], torch.cos(angle), torch.sin(angle)]
+        return torch.stack(parts, dim=-1)
+
     def moved(self, pairs: Pairs, shift: Tensor, angle: Tensor) -> Tensor:
         """Poses (M, 3) after a shift (M, 2) and a turn (M,) as the token sees them."""
         heading = torch.stack([torch.cos(pairs.pose[:, 2]), torch.sin(pairs.pose[:, 2])], dim=-1)

@@ -17,7 +17,7 @@ from tangram_agent.pair_policy import PairChooser
 from tangram_agent.pairs import PairGraph
 from tangram_agent.setup import Setup
 from tangram_agent.types import Weights
-from tangram_agent.weights import load_arrays
+from tangram_agent.weights import load_arrays, to_arrays
 from tangram_sim.arrays import Floats, Singles
 
 Flags = npt.NDArray[np.bool_] | npt.NDArray[np.uint8]
@@ -36,9 +36,9 @@ class Policy:
         self.version = -1
         self._chooser: PairChooser | None = None
         if setup.pairs:
-            networks = PairNetworks(PairGraph(setup.layout, setup.sim.arena), setup.net)
-            flips = setup.sim.allow_flip
-            self._chooser = PairChooser(networks, setup.layout, setup.agent, flips)
+            pair_graph = PairGraph(setup.layout, setup.sim.arena)
+            networks = PairNetworks(pair_graph, setup.net, setup.contacts)
+            self._chooser = PairChooser(networks, setup)
             self._network: torch.nn.Module = networks
         else:
             graph = TokenGraph(setup.layout, setup.sim.arena, setup.agent)
@@ -58,6 +58,10 @@ class Policy:
         """
         load_arrays(self._network, weights.tensors)
         self.version = weights.version
+
+    def weights(self) -> Weights:
+        """A copy of the weights that are loaded."""
+        return Weights(self.version, to_arrays(self._network))
 
     def act(
         self,

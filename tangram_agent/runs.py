@@ -4,7 +4,7 @@
 a whole example. `load_run("pretrained/square")` gives one of the agents that come with the package.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
@@ -43,6 +43,18 @@ class Run:
     setup: Setup
     updates: int
     policy: Policy
+
+    def with_agent(self, **changes: Any) -> "Run":
+        """The same weights with other settings of the agent, such as refine_steps=20.
+
+        Raises:
+            ConfigError: a value that cannot be used.
+            RunError: the settings ask for other networks.
+        """
+        setup = replace(self.setup, agent=replace(self.setup.agent, **changes))
+        policy = Policy(setup)
+        policy.load(self.policy.weights())
+        return replace(self, setup=setup, policy=policy)
 
 
 def read_config(path: Path) -> dict[str, Any]:

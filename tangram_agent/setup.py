@@ -10,7 +10,7 @@ from typing import Any, TypeVar, cast, get_origin, get_type_hints
 import dacite
 
 from tangram_agent.config import AgentConfig, NetConfig
-from tangram_sim.batch import action_size, corner_bound, horizon
+from tangram_sim.actions import action_size, corner_bound, horizon
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import Layout, TokensConfig, make_layout
@@ -46,6 +46,11 @@ class Setup:
         if self.agent.readout == "auto":
             return self.layout.tokens > 1
         return self.agent.readout == "pair"
+
+    @property
+    def contacts(self) -> bool:
+        """Whether tokens push each other out of their places."""
+        return self.layout.tokens > 1 and self.sim.motion == "slide"
 
     @property
     def action_size(self) -> int:

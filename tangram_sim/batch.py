@@ -6,20 +6,25 @@ whole batch, and a batch of episodes travels as a few raw frames.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from tangram_sim.actions import (
+    action_size,
+    chosen_tokens,
+    corner_bound,
+    flips,
+    horizon,
+    velocities,
+)
 from tangram_sim.arrays import Bools, Floats, Ints
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.geometry import outlines, overlap_share, shared_area
 from tangram_sim.layout import Layout
 from tangram_sim.rewards import TargetPictures, make_reward, scaled_overlap
-from tangram_sim.sensing import noise_bound, see
+from tangram_sim.sensing import see
 from tangram_sim.targets import Sides, sample_starts, sample_targets
 from tangram_sim.world import make_world
-
-_ROUNDING = 1.0 + 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +37,8 @@ class StepResult:
         camera_rewards: (B,) Eq. 14 from the pictures, or None with the camera off.
         refused: (B,) where the action named a placed token: nothing moved.
         blocked: (B,) where a lifted token could not be set down on others: nothing moved.
+        covered: (B,) share of its area by which a lifted token was, or would have been, set down on
+            others; 0 for one that slides.
         done: whether the episodes are over, all at once.
     """
 
@@ -40,54 +47,8 @@ class StepResult:
     camera_rewards: Floats | None
     refused: Bools
     blocked: Bools
+    covered: Floats
     done: bool
-
-
-def action_size(tokens: int, sim: SimConfig) -> int:
-    """A: 3 velocities, before them which token if there are several, and whether it is flipped."""
-    return 3 + (tokens > 1) + sim.allow_flip
-
-
-def horizon(tokens: int, sim: SimConfig) -> int:
-    """T: the actions of an episode, which is over when every token has had its own."""
-    return tokens * sim.actions_per_token
-
-
-def corner_bound(tokens: int, sim: SimConfig) -> float:
-    """The largest |coordinate| that a corner can reach in an episode, arena units.
-
-    A start lies inside the arena, and each action moves a token by at most the arena's width in x
-    and in y; turning keeps a corner within the start's margin for every angle. A token that slides
-    may push another as far as it goes itself, in each action of the episode; one that settles moves
-    others by less than an arena. What an agent sees may lie further out by the noise's bound.
-    """
-    pushes = 0 if tokens == 1 else horizon(tokens, sim) if sim.motion == "slide" else 1
-    return (sim.arena * (0.5 + sim.actions_per_token + pushes) + noise_bound(sim)) * _ROUNDING
-
-
-def chosen_tokens(actions: Floats, tokens: int) -> Ints:
-    """(B,) the token that each action (B, A) moves: the first entry cuts [-1, 1] into K parts."""
-    if tokens == 1:
-        return np.zeros(len(actions), dtype=np.int64)
-    share = (np.asarray(actions)[:, 0] + 1.0) / 2.0
-    return np.clip(np.floor(share * tokens), 0, tokens - 1).astype(np.int64)
-
-
-def velocities(actions: Floats, sim: SimConfig) -> Floats:
-    """(B, 3) of actions (B, A): full scale crosses the arena and makes half a turn in a second.
-
-    So one action can reach every pose of the arena from every other.
-    """
-    scale = np.array([sim.arena, sim.arena, np.pi])
-    scaled: Floats = np.asarray(actions, dtype=np.float64)[:, -3:] * scale
-    return scaled
-
-
-def flips(actions: Floats, sim: SimConfig) -> Bools:
-    """(B,) which actions (B, A) turn their token over: the entry before the velocities says so."""
-    if not sim.allow_flip:
-        return np.zeros(len(actions), dtype=np.bool_)
-    return np.asarray(actions)[:, -4] > 0.0
 
 
 class BatchedEnv:
@@ -95,10 +56,10 @@ class BatchedEnv:
 
     An action is (x, y, angular velocity) in [-1, 1], with one entry before them that names the
     token if there are several, and with `sim.allow_flip` one more between, above 0 where the token
-    is to be turned over. A token that had its `actions_per_token` actions is placed. An action that
-    names a placed token is refused: it moves nothing, but uses up its step. One that would set a
-    lifted token down on others by more than `sim.max_overlap` of its area moves nothing either,
-    and is one of the token's actions.
+    is to be turned over before it moves (see `actions.flips`). A token that had its
+    `actions_per_token` actions is placed. An action that names a placed token is refused: it moves
+    nothing, but uses up its step. One that would set a lifted token down on others by more than
+    `sim.max_overlap` of its area moves nothing either, and is one of the token's actions.
 
     Attributes:
         count: B.
@@ -176,25 +137,22 @@ class BatchedEnv:
 
     def _start(self, targets: Sides, generators: Sequence[np.random.Generator]) -> None:
         self.goals = self.layout.corners(*targets)
-        starts = sample_starts(self.layout, self.sim, self.goals, targets[1], generators)
-        self._moves[:] = 0
-        self._lay_out(targets, starts, generators)
+        done = self._done(generators)
+        starts = sample_starts(self.layout, self.sim, targets, done, generators)
+        self._moves[:] = self.sim.actions_per_token * done
         self._begin(targets, starts)
         self._generators = generators
         self.seen_goals = see(self.goals, self.sim, generators)
         self._look()
         self.steps_done = 0
 
-    def _lay_out(self, targets: Sides, starts: Sides, generators: Any) -> None:
-        """In a stage with fewer tokens to move, put the others on their targets already."""
-        moved = self.task.tokens
-        if not 0 < moved < self.layout.tokens:
-            return
-        for b, generator in enumerate(generators):
-            done = generator.permutation(self.layout.tokens)[moved:]
-            for start, target in zip(starts, targets, strict=True):
-                start[b, done] = target[b, done]
-            self._moves[b, done] = self.sim.actions_per_token
+    def _done(self, generators: Sequence[np.random.Generator]) -> Bools:
+        """(B, K) tokens that lie on their targets already: in a stage with fewer to move."""
+        done = np.zeros((self.count, self.layout.tokens), dtype=np.bool_)
+        if 0 < self.task.tokens < self.layout.tokens:
+            for row, generator in zip(done, generators, strict=True):
+                row[generator.permutation(len(row))[self.task.tokens :]] = True
+        return done
 
     def step(self, actions: Floats) -> StepResult:
         """Play one action in every environment.
@@ -212,33 +170,33 @@ class BatchedEnv:
         tokens = chosen_tokens(actions, self.layout.tokens)
         refused = self.placed[np.arange(self.count), tokens]
         self._moves[np.flatnonzero(~refused), tokens[~refused]] += 1
-        velocity, flip = velocities(actions, self.sim), flips(actions, self.sim)
-        blocked = self._blocked(tokens, velocity, flip) & ~refused
+        velocity, flip = velocities(actions, self.sim), flips(actions, self.layout, self.sim)
+        covered = self._covered(tokens, velocity, flip)
+        blocked = (covered > self.sim.max_overlap) & ~refused
         camera = self._move(tokens, velocity, flip, refused | blocked)
         self.steps_done += 1
-        return self._result(refused, blocked, camera)
+        return self._result(refused, blocked, covered, camera)
 
     def close(self) -> None:
         """Close all worlds; calling it twice does no harm."""
         for world in self._worlds:
             world.close()
 
-    def _blocked(self, tokens: Ints, velocity: Floats, flip: Bools) -> Bools:
-        """(B,) where a lifted token would be set down on others by more than is allowed."""
+    def _covered(self, tokens: Ints, velocity: Floats, flip: Bools) -> Floats:
+        """(B,) share of its area by which each lifted token would be set down on others."""
         layout, rows = self.layout, np.arange(self.count)
         if layout.tokens == 1 or self.sim.motion != "lift":
-            return np.zeros(self.count, dtype=np.bool_)
+            return np.zeros(self.count)
         poses, sides = self._poses.copy(), self._flipped.copy()
         poses[rows, tokens] += velocity
         sides[rows, tokens] ^= flip
         pieces = outlines(layout.corners(poses, sides), layout)
         own = np.repeat(pieces[rows, tokens], layout.tokens, axis=0)
-        others = pieces.reshape(len(own), *own.shape[1:])
-        common = shared_area(own, others).reshape(self.count, -1)
+        common = shared_area(own, pieces.reshape(own.shape)).reshape(self.count, -1)
         common[rows, tokens] = 0.0
         areas = np.array([shape.area for shape in layout.shapes])
-        blocked: Bools = common.sum(axis=1) > self.sim.max_overlap * areas[tokens]
-        return blocked
+        covered: Floats = common.sum(axis=1) / areas[tokens]
+        return covered
 
     def _begin(self, targets: Sides, starts: Sides) -> None:
         """Photograph the targets and put the tokens at their starts."""
@@ -263,7 +221,9 @@ class BatchedEnv:
         self._look()
         return None if self._targets is None else self._targets.rewards(np.stack(pictures))
 
-    def _result(self, refused: Bools, blocked: Bools, camera: Floats | None) -> StepResult:
+    def _result(
+        self, refused: Bools, blocked: Bools, covered: Floats, camera: Floats | None
+    ) -> StepResult:
         share = overlap_share(self.corners, self.goals, self.layout)
         if camera is not None and self._reward.source == "camera":
             rewards = camera
@@ -277,6 +237,7 @@ class BatchedEnv:
             camera_rewards=camera,
             refused=refused,
             blocked=blocked,
+            covered=covered,
             done=self.steps_done == self.horizon,
         )
 

@@ -95,12 +95,20 @@ class SimConfig:
 
     @property
     def task(self) -> StageConfig:
-        """What is played without a curriculum, and after it, and what tests are."""
+        """What is played without a curriculum and before its first stage, and what tests are."""
         return StageConfig(targets=self.targets, spread=self.spread)
 
     def stage(self, updates: int) -> int:
         """The number of the stage that weights of so many updates play, 0 before the first."""
         return sum(stage.updates <= updates for stage in self.stages)
+
+    def told(self, stage: int) -> str:
+        """A stage in words, for logs."""
+        task = self.stage_task(stage)
+        moved = f"{task.tokens} tokens to move" if task.tokens else "all tokens to move"
+        return f"stage {stage} of {len(self.stages)}: {moved}, targets {task.targets}" + (
+            f" with spread {task.spread:g}" if task.targets == "gaussian" else ""
+        )
 
     def stage_task(self, stage: int) -> StageConfig:
         """What is played in a stage."""

@@ -1,16 +1,22 @@
-"""Targets that hang together: each piece shares a part of an edge with one before it."""
+"""Targets that hang together: each piece shares a part of an edge with one before it.
+
+Points and directions are complex numbers here. Legend: n candidates, k pieces laid before, C
+corners of a piece, filled up to those of the largest by repeating the last one, and edges alike.
+"""
+
+from dataclasses import dataclass
 
 import numpy as np
 
-from tangram_sim.arrays import Complex, Floats
+from tangram_sim.arrays import Bools, Complex, Floats, Ints
 from tangram_sim.config import SimConfig
 from tangram_sim.errors import SamplingError
-from tangram_sim.geometry import pairs_overlap
 from tangram_sim.layout import Layout
+from tangram_sim.sampling import check_fits
 
-_CHUNK = 8  # candidates that are checked together
+_CHUNK = 16  # candidates that are checked together
 _ALIGNED = 0.7  # share of pieces that meet another corner to corner
-_TOUCHING = 1e-7  # of overlap in squared units of the arena: rounding
+_TOUCHING = 1e-9  # depth of an overlap, as a share of the arena: rounding
 
 
 def sample_connected(layout: Layout, sim: SimConfig, rng: np.random.Generator) -> Floats:
@@ -20,59 +26,115 @@ def sample_connected(layout: Layout, sim: SimConfig, rng: np.random.Generator) -
     random one before it, mostly corner to corner. The whole is turned and moved by chance.
 
     Raises:
-        SamplingError: no such layout was found in `sim.max_tries` tries for one piece.
+        SamplingError: a token does not fit into the arena, or no place was found for one in
+            `sim.max_tries` tries.
     """
-    bodies = [layout.body[layout.corners_of(k)] @ (1.0, 1j) for k in range(layout.tokens)]
-    order = rng.permutation(layout.tokens).tolist()
-    poses = np.zeros((layout.tokens, 3))
-    outlines: list[Complex] = []
-    for token in order:
-        angle, shift = (0.0, 0.0j)
-        if outlines:
-            angle, shift = _attached(bodies[token], outlines, sim, rng)
-        poses[token] = shift.real, shift.imag, angle
-        outlines.append(bodies[token] * np.exp(1j * angle) + shift)
+    check_fits(layout, sim)
+    bodies = _bodies(layout)
+    order = rng.permutation(layout.tokens)
+    turns, shifts = np.ones(layout.tokens, np.complex128), np.zeros(layout.tokens, np.complex128)
+    for number, token in enumerate(order[1:], 1):
+        before = order[:number]
+        laid = bodies.of(before).moved(turns[before, None], shifts[before, None])
+        turns[token], shifts[token] = _attached(bodies.of(token), laid, sim, rng)
+    poses = np.column_stack([shifts.real, shifts.imag, np.angle(turns)])
     return _laid_out(layout, poses, sim, rng)
 
 
+@dataclass(frozen=True, eq=False)
+class _Outlines:
+    """Pieces.
+
+    Attributes:
+        corners: (..., C), counter-clockwise.
+        edges: (..., C) unit vectors along the edge behind each corner.
+        lengths: (..., C) of the edges.
+        count: (...,) how many corners there really are.
+    """
+
+    corners: Complex
+    edges: Complex
+    lengths: Floats
+    count: Ints
+
+    def of(self, which: Ints) -> "_Outlines":
+        """Those of some tokens."""
+        return _Outlines(
+            self.corners[which], self.edges[which], self.lengths[which], self.count[which]
+        )
+
+    def moved(self, turn: Complex, shift: Complex) -> "_Outlines":
+        """Turned by a unit number, then shifted."""
+        corners = self.corners * turn + shift
+        return _Outlines(corners, self.edges * turn, self.lengths, self.count)
+
+
+def _bodies(layout: Layout) -> _Outlines:
+    corners: Complex = layout.body[:, 0] + 1j * layout.body[:, 1]
+    ahead = np.concatenate(
+        [np.roll(corners[layout.corners_of(k)], -1) for k in range(layout.tokens)]
+    )
+    edges, own = (ahead - corners)[layout.padded_corners], corners[layout.padded_corners]
+    lengths: Floats = np.abs(edges)
+    units = (edges / lengths).astype(np.complex128)
+    return _Outlines(own, units, lengths, np.diff(layout.starts))
+
+
 def _attached(
-    body: Complex, outlines: list[Complex], sim: SimConfig, rng: np.random.Generator
-) -> tuple[float, complex]:
-    """Angle and shift of a piece that touches one of the others and overlaps none."""
-    others = np.stack([_padded(outline, max(map(len, outlines))) for outline in outlines])
+    piece: _Outlines, laid: _Outlines, sim: SimConfig, rng: np.random.Generator
+) -> tuple[complex, complex]:
+    """Turn and shift of a piece that touches one of the others and overlaps none."""
     for _ in range(-(-sim.max_tries // _CHUNK)):
-        drawn = [_candidate(body, outlines, rng) for _ in range(_CHUNK)]
-        angle, shift = np.array([d[0] for d in drawn]), np.array([d[1] for d in drawn])
-        moved = body * np.exp(1j * angle)[:, None] + shift[:, None]
-        own, rest = np.repeat(moved, len(others), axis=0), np.tile(others, (_CHUNK, 1))
-        blocked = pairs_overlap(_points(own), _points(rest), _TOUCHING * sim.arena**2)
-        free = ~blocked.reshape(_CHUNK, -1).any(axis=1) & (_extent(moved, others) < sim.arena)
+        turn, shift = _candidates(piece, laid, rng)
+        moved = piece.moved(turn[:, None], shift[:, None])
+        free = _apart(moved, laid, _TOUCHING * sim.arena) & (_extent(moved, laid) < sim.arena)
         if free.any():
             first = int(np.argmax(free))
-            return float(angle[first]), complex(shift[first])
+            return complex(turn[first]), complex(shift[first])
     raise SamplingError(
         f"no connected target within an arena of width {sim.arena:g} in {sim.max_tries} tries: "
         "raise sim.arena or sim.max_tries, or lower tokens.scale"
     )
 
 
-def _candidate(
-    body: Complex, outlines: list[Complex], rng: np.random.Generator
-) -> tuple[float, complex]:
-    """A random edge of the piece along a random edge of the others, in the other direction."""
-    other = outlines[rng.integers(len(outlines))]
-    i, j = int(rng.integers(len(other))), int(rng.integers(len(body)))
-    start, edge = other[i], other[(i + 1) % len(other)] - other[i]
-    own = body[(j + 1) % len(body)] - body[j]
-    turn = -(edge / abs(edge)) * (abs(own) / own)
-    along = edge / abs(edge)
-    # The piece's edge ends at `start + along * slide`, and lies from there on beside the other's.
-    slack = abs(edge) - abs(own)
-    slide = (0.0, slack)[int(rng.integers(2))]
-    if rng.random() >= _ALIGNED:
-        slide = rng.uniform(-0.8 * abs(own), abs(edge) - 0.2 * abs(own))
-    shift = start + along * slide - body[(j + 1) % len(body)] * turn
-    return float(np.angle(turn)), complex(shift)
+def _candidates(
+    piece: _Outlines, laid: _Outlines, rng: np.random.Generator
+) -> tuple[Complex, Complex]:
+    """Turns and shifts (n,): a random edge along a random edge of the others, back to back."""
+    drawn = rng.random((_CHUNK, 4))
+    other = (drawn[:, 0] * len(laid.corners)).astype(np.int64)
+    i = (drawn[:, 1] * laid.count[other]).astype(np.int64)
+    j = (drawn[:, 2] * piece.count).astype(np.int64)
+    along, length, own = laid.edges[other, i], laid.lengths[other, i], piece.lengths[j]
+    # The piece's edge ends so far from the other's start, and lies from there on beside it.
+    free = (drawn[:, 3] - _ALIGNED) / (1.0 - _ALIGNED)
+    anywhere = -0.8 * own + free * (length + 0.6 * own)
+    aligned = np.where(drawn[:, 3] < _ALIGNED / 2.0, 0.0, length - own)
+    ends = laid.corners[other, i] + along * np.where(free < 0.0, aligned, anywhere)
+    turn: Complex = -along / piece.edges[j]
+    return turn, ends - (piece.corners[j] + own * piece.edges[j]) * turn
+
+
+def _apart(pieces: _Outlines, laid: _Outlines, depth: float) -> Bools:
+    """(n,) whether a piece overlaps none of the others by more than a depth.
+
+    Two convex pieces lie apart where one has an edge that all of the other lies outside of.
+    """
+    outside = _outside(pieces, laid, depth) | _outside(laid, pieces, depth).T
+    return np.asarray(outside.all(axis=1))
+
+
+def _outside(pieces: _Outlines, others: _Outlines, depth: float) -> Bools:
+    """(n, k) whether a piece has an edge that all of the other lies outside of."""
+    gap = others.corners[None, :, None] - pieces.corners[:, None, :, None]
+    inwards = (pieces.edges.conj()[:, None, :, None] * gap).imag
+    return np.asarray((inwards <= depth).all(axis=-1).any(axis=-1))
+
+
+def _extent(pieces: _Outlines, laid: _Outlines) -> Floats:
+    """(n,) the largest distance between corners of each piece and of the others."""
+    gaps: Floats = np.abs(pieces.corners[:, :, None] - laid.corners.ravel()).max(axis=(1, 2))
+    return gaps
 
 
 def _laid_out(layout: Layout, poses: Floats, sim: SimConfig, rng: np.random.Generator) -> Floats:
@@ -86,17 +148,3 @@ def _laid_out(layout: Layout, poses: Floats, sim: SimConfig, rng: np.random.Gene
     turned[:, :2] += room * rng.random(2) - sim.arena / 2.0 - low
     turned[:, 2] = np.pi - np.mod(np.pi - turned[:, 2], 2.0 * np.pi)
     return turned
-
-
-def _extent(moved: Complex, others: Complex) -> Floats:
-    """(M,) the largest distance between corners of each outline (M, C) and of the others."""
-    gaps: Floats = np.abs(moved[:, :, None] - others.ravel()).max(axis=(1, 2))
-    return gaps
-
-
-def _padded(outline: Complex, size: int) -> Complex:
-    return np.concatenate([outline, np.repeat(outline[-1:], size - len(outline))])
-
-
-def _points(outlines: Complex) -> Floats:
-    return np.stack([outlines.real, outlines.imag], axis=-1)

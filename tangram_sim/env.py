@@ -8,8 +8,9 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 
+from tangram_sim.actions import chosen_tokens
 from tangram_sim.arrays import Floats, Pixels
-from tangram_sim.batch import BatchedEnv, StepResult, chosen_tokens
+from tangram_sim.batch import BatchedEnv, StepResult
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.drawing import draw_scene
 from tangram_sim.errors import ConfigError
@@ -26,13 +27,16 @@ class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
 
     Observations are a dict of float64 vectors: `achieved_goal` and `desired_goal` are the corners
     of the tokens and of the targets, (2V,); `observation` is the tokens' corners and one flag per
-    token that is placed, (2V + K,), with the noise of `sim.corner_noise`. Actions are those of
-    `BatchedEnv`. An episode ends after
+    token that is placed, (2V + K,), with the noise of `sim.corner_noise`. An episode ends after
     K * actions_per_token steps.
 
+    Actions are those of `BatchedEnv`, entries in [-1, 1]: which token (with several), flip (with
+    `allow_flip`: above 0 turns a token over that is not its own mirror image), then x, y and
+    angular velocity. The corners of a token that lies on its other side run clockwise.
+
     `info` has `overlap` (raw, in [0, 1]), `is_success` (overlap of at least `success_overlap`),
-    `refused` with the reason when the action was refused, and `reward_camera` (Eq. 14 from the
-    pictures) with the camera on.
+    `refused` with the reason when the action was refused, `blocked` with the reason when its token
+    could not be set down, and `reward_camera` (Eq. 14 from the pictures) with the camera on.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012 - as gymnasium has it
@@ -156,6 +160,12 @@ class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
             info["refused"] = (
                 f"token {self._active} is placed already: it had its "
                 f"{self.sim.actions_per_token} actions"
+            )
+        if result.blocked[0]:
+            info["blocked"] = (
+                f"token {self._active} would lie on others by {result.covered[0]:.3%} of its area, "
+                f"at most {self.sim.max_overlap:.3%} allowed: set it down where there is room, or "
+                "raise max_overlap"
             )
         return info
 

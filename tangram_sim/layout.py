@@ -86,6 +86,9 @@ class Layout:
         self.padded_corners: Ints = self.starts[:-1, None] + steps
         self.chiral: Bools = np.array([shape.mirror is None for shape in self.shapes])
         self.any_chiral = bool(self.chiral.any())
+        self._centred = np.concatenate(
+            [(shape.corners - shape.corners.mean(axis=0)) @ (1.0, 1j) for shape in self.shapes]
+        )
         self.base_weights: Floats = self._base_weights()
         self.adjacency: Bools = self._adjacency()
 
@@ -137,11 +140,11 @@ class Layout:
         """
         if not self.any_chiral:
             return np.zeros((*corners.shape[:-2], self.tokens), dtype=np.bool_)
-        first = self.starts[:-1]
-        one = corners[..., first + 1, :] - corners[..., first, :]
-        two = corners[..., first + 2, :] - corners[..., first, :]
-        clockwise = one[..., 0] * two[..., 1] < one[..., 1] * two[..., 0]
-        return np.asarray(clockwise & self.chiral)
+        # The side that fits all corners better, whatever their noise.
+        placed = corners @ (1.0, 1j)
+        own = np.add.reduceat(self._centred.conj() * placed, self.starts[:-1], axis=-1)
+        other = np.add.reduceat(self._centred * placed, self.starts[:-1], axis=-1)
+        return np.asarray((np.abs(other) > np.abs(own)) & self.chiral)
 
     def poses(self, corners: Floats) -> Floats:
         """Poses (..., K, 3) of corners (..., V, 2): least-squares rotation, angle in (-pi, pi].

@@ -16,6 +16,7 @@ from tangram_sim.config import SimConfig
 from tangram_sim.errors import TangramError
 from tangram_sim.layout import Layout
 from tangram_sim.pictures import BACKGROUND, TOKEN_GRAY
+from tangram_sim.prisms import inset, prism, thickness
 from tangram_sim.shapes import Shape
 
 _ENGINE_ARENA = 2.0
@@ -24,13 +25,17 @@ _HALF_HEIGHT = 0.01  # of a token as it is drawn
 # is always sideways. Carried tokens pass above that.
 _WALL = 0.25
 _LIFTED = 3.0 * _WALL
+# Without a margin the engine misses one overlap in four and pushes upwards. What collides is
+# smaller by it on every side, so that pieces that only touch leave each other alone.
+_MARGIN = 1e-4
 _UPRIGHT = 1e4  # inertia about x and y, far more than a token's: none tips over
 _FRICTION = 0.2  # between the edges of tokens
 _GRIP = 1e3  # mass of the token that is pushed along the table, as a multiple of its own
-_STRIDE = 0.02  # longest way of any of its points in one step, a fifth of the smallest token
+_STRIDE = 0.02  # longest way of any of its points in one step
+_THIN = 0.25  # the same as a share of the thinnest token, which is not to be jumped over
 _RECOVERY = 0.5  # share of an overlap that one step removes while tokens settle
 _SETTLED = 1e-5  # deepest overlap that stays
-_SETTLE_STEPS, _SETTLE_S = 100, 1.0 / 240.0
+_SETTLE_STEPS, _SETTLE_S = 200, 1.0 / 240.0
 # TinyRenderer draws nothing with an orthographic projection. From this far above, the picture of
 # the arena differs from one by less than a tenth of a pixel at 1024 pixels.
 _CAMERA_HEIGHT = 100.0
@@ -59,6 +64,8 @@ class PhysicsWorld:
         self._substeps, self._damping = sim.substeps, sim.damping
         self._slides, self._alone = sim.motion == "slide", layout.tokens == 1
         self._radius = [shape.radius * self._unit for shape in layout.shapes]
+        thin = min(thickness(shape.corners) for shape in layout.shapes) * self._unit
+        self._stride = min(_STRIDE, _THIN * thin)
         self._flipped: Bools = np.zeros(layout.tokens, dtype=np.bool_)
         self._bodies = [self._make_body(shape) for shape in layout.shapes]
         self._masses = [self._mass(body) for body in self._bodies]
@@ -70,6 +77,7 @@ class PhysicsWorld:
     def place(self, poses: Floats, flipped: Bools | None = None) -> None:
         """See `World.place`."""
         self._flipped[:] = False if flipped is None else flipped
+        self._forget_contacts()
         for token, (x, y, angle) in enumerate(np.asarray(poses).tolist()):
             self._put(token, x * self._unit, y * self._unit, angle)
 
@@ -119,15 +127,18 @@ class PhysicsWorld:
 
     def _lift(self, token: int, command: _Command, flip: bool) -> None:
         """Carry a token above the others and set it down; what it comes to lie in gives way."""
+        poses = [self._pose(other) for other in range(len(self._bodies))]
         if flip or not self._alone:
-            pose = self._pose(token)
             self._flipped[token] ^= flip
-            self._put(token, *pose, height=0.0 if self._alone else _LIFTED)
+            self._put(token, *poses[token], height=0.0 if self._alone else _LIFTED)
         self._set_velocity(token, *command)
         pybullet.stepSimulation(physicsClientId=self._client)
-        self._set_velocity(token, 0.0, 0.0, 0.0)
+        self._stop_all()
         if not self._alone:
-            self._put(token, *self._pose(token))
+            # While one is carried the rest of a settled overlap would make others creep.
+            poses[token] = self._pose(token)
+            for other, pose in enumerate(poses):
+                self._put(other, *pose)
             self._settle()
 
     def _slide(self, token: int, command: _Command) -> None:
@@ -135,20 +146,23 @@ class PhysicsWorld:
 
         The table's friction stops the others as soon as nothing pushes them.
         """
-        x, y, angular = command
-        way = math.hypot(x, y) + abs(angular) * self._radius[token]
-        steps = max(self._substeps, math.ceil(way / _STRIDE))
+        start, way = np.array(self._pose(token)), np.array(command)
+        longest = math.hypot(*command[:2]) + abs(command[2]) * self._radius[token]
+        steps = max(self._substeps, math.ceil(longest / self._stride))
         self._weigh(token, _GRIP)
         self._play_steps_of(1.0 / steps)
-        for _ in range(steps):
-            self._set_velocity(token, x, y, angular)
+        for step in range(1, steps + 1):
+            self._set_velocity(token, *command)
             pybullet.stepSimulation(physicsClientId=self._client)
             self._stop_all()
-        self._settle()
+            # However heavy, it lost a little to what it pushes.
+            self._put(token, *(start + way * (step / steps)).tolist())
+        self._settle(pinned=token)
         self._weigh(token, 1.0)
 
-    def _settle(self) -> None:
-        """Push tokens that lie in each other apart, both of them, without momentum."""
+    def _settle(self, pinned: int | None = None) -> None:
+        """Push tokens that lie in each other apart, all but a pinned one, without momentum."""
+        pose = (0.0, 0.0, 0.0) if pinned is None else self._pose(pinned)
         pybullet.performCollisionDetection(physicsClientId=self._client)
         self._play_steps_of(_SETTLE_S)
         for _ in range(_SETTLE_STEPS):
@@ -156,7 +170,18 @@ class PhysicsWorld:
                 break
             pybullet.stepSimulation(physicsClientId=self._client)
             self._stop_all()
+            if pinned is not None:
+                self._put(pinned, *pose)
         self._play_at_once()
+
+    def _forget_contacts(self) -> None:
+        """Part all tokens by height: the engine keeps the contacts of pairs that only move away.
+
+        Those of the last episode would throw tokens of the next through the arena.
+        """
+        for token in range(len(self._bodies)):
+            self._put(token, 0.0, 0.0, 0.0, height=(token + 1) * _LIFTED)
+        pybullet.performCollisionDetection(physicsClientId=self._client)
 
     def _depth(self) -> float:
         """How deep the two tokens lie in each other that do so most."""
@@ -173,6 +198,8 @@ class PhysicsWorld:
             fixedTimeStep=1.0,
             numSubSteps=self._substeps,
             contactERP=_RECOVERY,
+            contactSlop=0.0,
+            deterministicOverlappingPairs=1,
             physicsClientId=self._client,
         )
 
@@ -184,10 +211,13 @@ class PhysicsWorld:
 
     def _make_body(self, shape: Shape) -> int:
         corners = shape.corners * self._unit
+        margin = min(_MARGIN, 0.1 * thickness(corners))
         collision = pybullet.createCollisionShape(
-            pybullet.GEOM_MESH, vertices=_prism(corners, _WALL)[0], physicsClientId=self._client
+            pybullet.GEOM_MESH,
+            vertices=prism(inset(corners, margin), _WALL)[0],
+            physicsClientId=self._client,
         )
-        vertices, triangles = _prism(corners, _HALF_HEIGHT)
+        vertices, triangles = prism(corners, _HALF_HEIGHT)
         gray = TOKEN_GRAY / BACKGROUND
         visual = pybullet.createVisualShape(
             pybullet.GEOM_MESH,
@@ -204,8 +234,7 @@ class PhysicsWorld:
             -1,
             linearDamping=self._damping,
             angularDamping=self._damping,
-            # Without a margin pieces that only touch leave each other alone.
-            collisionMargin=0.0,
+            collisionMargin=margin,
             lateralFriction=_FRICTION,
             physicsClientId=self._client,
         )
@@ -253,20 +282,6 @@ class PhysicsWorld:
         # q and -q are one rotation: with cosine >= 0 the angle lies in (-pi, pi].
         half = math.atan2(sine, cosine) if cosine >= 0.0 else math.atan2(-sine, -cosine)
         return x, y, 2.0 * half
-
-
-def _prism(corners: Floats, half_height: float) -> tuple[list[list[float]], list[int]]:
-    """Vertices and triangles of the prism over a convex polygon (V, 2)."""
-    count = len(corners)
-    heights = (-half_height, half_height)
-    vertices = [[float(x), float(y), z] for z in heights for x, y in corners]
-    triangles: list[int] = []
-    for i in range(1, count - 1):
-        triangles += [count, count + i, count + i + 1, 0, i + 1, i]
-    for i in range(count):
-        j = (i + 1) % count
-        triangles += [i, j, count + j, i, count + j, count + i]
-    return vertices, triangles
 
 
 def _camera(pixels: int) -> tuple[Sequence[float], Sequence[float]]:

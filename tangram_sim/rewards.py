@@ -64,7 +64,7 @@ def check_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> None:
 
 def _fitted(corners: Floats, layout: Layout) -> Floats:
     """The rigid pieces nearest to noisy corners (B, V, 2), which need not be convex."""
-    return layout.corners(layout.poses(corners))
+    return layout.corners(layout.poses(corners), layout.flipped(corners))
 
 
 def overlap(achieved: Floats, desired: Floats, layout: Layout) -> Floats:

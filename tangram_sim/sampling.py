@@ -16,7 +16,7 @@ import numpy as np
 from tangram_sim.arrays import Bools, Floats, Ints
 from tangram_sim.config import SimConfig
 from tangram_sim.errors import SamplingError
-from tangram_sim.geometry import pairs_overlap
+from tangram_sim.geometry import outlines, pairs_overlap
 from tangram_sim.layout import Layout
 
 _CHUNK = 4  # poses drawn at once when some may overlap: fewer, larger checks
@@ -37,6 +37,7 @@ def sample_batch(
     flipped: Bools | None = None,
     avoid: Floats | None = None,
     spread: float | None = None,
+    laid: tuple[Bools, Floats] | None = None,
 ) -> Floats:
     """One layout per generator: (B, K, 3) of x, y (arena units) and angle in (-pi, pi].
 
@@ -49,6 +50,7 @@ def sample_batch(
         generators: one for each of B environments.
         flipped: (B, K) tokens that lie on their other side; None: none does.
         avoid: (B, M, C, 2) outlines that tokens keep clear of where there is room.
+        laid: (B, K) tokens that lie already, and poses (B, K, 3) of which theirs are taken.
         spread: deviation of Gaussian centres (Sec. VIII), as a share of the arena; None: uniform.
 
     Raises:
@@ -58,13 +60,19 @@ def sample_batch(
     reach = check_fits(layout, sim)
     poses = np.empty((len(generators), layout.tokens, 3))
     sides = np.zeros(poses.shape[:2], np.bool_) if flipped is None else flipped
+    lies = np.zeros(poses.shape[:2], np.bool_)
     order = sorted(range(layout.tokens), key=lambda token: -layout.shapes[token].area)
     bodies = layout.body[layout.padded_corners]
     placed: Floats = np.empty((len(generators), 0, *bodies.shape[1:]))
+    if laid is not None:
+        lies, poses = laid[0], laid[1].copy()
+        # Outlines without an area are in nobody's way.
+        known = outlines(layout.corners(poses, sides), layout)
+        placed = known * lies[..., None, None]
     draw = _Draw(sim, generators, spread)
     for token in order:
         piece = _Piece(layout.shapes[token].name, bodies[token], reach[token], sides[:, token])
-        poses[:, token] = _place(piece, placed, avoid, draw)
+        _place(piece, placed, avoid, draw, poses[:, token], np.flatnonzero(~lies[:, token]))
         outline = piece.outlines(poses[:, token], sides[:, token])
         placed = np.concatenate([placed, outline[:, None]], axis=1)
     return poses
@@ -121,17 +129,21 @@ class _Draw:
         return poses
 
 
-def _place(piece: _Piece, placed: Floats, avoid: Floats | None, draw: _Draw) -> Floats:
-    """(B, 3) a pose of one token in every environment, clear of those placed (B, k, C, 2)."""
-    poses = np.empty((len(draw.generators), 3))
-    open_rows = np.arange(len(poses))
+def _place(
+    piece: _Piece,
+    placed: Floats,
+    avoid: Floats | None,
+    draw: _Draw,
+    poses: Floats,
+    open_rows: Ints,
+) -> None:
+    """Fill the open rows of poses (B, 3) of one token, clear of those placed (B, k, C, 2)."""
     if avoid is not None:
         both = np.concatenate([placed, avoid], axis=1)
         open_rows = _try(piece, both, draw, poses, open_rows, _CLEAR_TRIES)
     open_rows = _try(piece, placed, draw, poses, open_rows, draw.sim.max_tries)
     if len(open_rows):
         raise _exhausted(piece.name, placed.shape[1], draw.sim)
-    return poses
 
 
 def _try(

@@ -10,7 +10,7 @@ from functools import lru_cache
 import numpy as np
 
 from tangram_sim.arrays import Bools, Floats
-from tangram_sim.assembly import COUNTS, Puzzle
+from tangram_sim.assembly import COUNTS, Puzzle, PuzzleRules
 from tangram_sim.config import SimConfig, StageConfig
 from tangram_sim.connected import sample_connected
 from tangram_sim.errors import ConfigError
@@ -54,29 +54,51 @@ def sample_targets(
 
 
 def sample_starts(
-    layout: Layout, sim: SimConfig, targets: Floats, flipped: Bools, generators: Generators
+    layout: Layout, sim: SimConfig, targets: Sides, done: Bools, generators: Generators
 ) -> Sides:
     """One start per generator: on the target's sides, or on any with `allow_flip`.
 
     Args:
         layout: the tokens.
         sim: says whether starts keep clear of the target.
-        targets: (B, V, 2) corners.
-        flipped: (B, K) sides of the targets.
+        targets: see `sample_targets`.
+        done: (B, K) tokens that lie on their targets already; the others keep clear of them.
         generators: one for each environment.
+
+    Raises:
+        SamplingError: no room.
     """
+    poses, flipped = targets
     if sim.allow_flip:
         drawn = [rng.random(layout.tokens) < 0.5 for rng in generators]
-        flipped = np.stack(drawn) & layout.chiral
-    avoid = outlines(targets, layout) if sim.starts == "outside" else None
-    return sample_batch(layout, sim, generators, flipped, avoid), flipped
+        flipped = np.where(done, flipped, np.stack(drawn) & layout.chiral)
+    goals = layout.corners(*targets)
+    avoid = outlines(goals, layout) if sim.starts == "outside" else None
+    laid = (done, poses) if done.any() else None
+    return sample_batch(layout, sim, generators, flipped, avoid, laid=laid), flipped
 
 
 def check_targets(layout: Layout, sim: SimConfig) -> None:
-    """Raise ConfigError where figures are wanted of tokens that are not all seven tans."""
-    for task in (sim.task, *sim.stages):
-        if task.targets == "figures":
-            _check_full_set(layout)
+    """Refuse what these tokens cannot play.
+
+    Raises:
+        ConfigError: figures of tokens that are not all seven tans or too large for the arena, flips
+            of tokens that look the same on both sides, or a stage that moves more than there are.
+    """
+    if sim.allow_flip and not layout.any_chiral:
+        raise ConfigError(
+            "sim.allow_flip=true needs a token that is not its own mirror image, got tokens "
+            f"{', '.join(shape.name for shape in layout.shapes)}: set sim.allow_flip=false"
+        )
+    for stage in sim.stages:
+        if stage.tokens > layout.tokens:
+            raise ConfigError(
+                f"sim.stages: tokens must be at most the {layout.tokens} that there are, got "
+                f"{stage.tokens} (in the stage from update {stage.updates}); 0 moves all"
+            )
+    if any(task.targets == "figures" for task in (sim.task, *sim.stages)):
+        _check_full_set(layout)
+        _check_figures_fit(layout, sim)
 
 
 def placement(puzzle: Puzzle, layout: Layout) -> Sides:
@@ -95,7 +117,8 @@ def placement(puzzle: Puzzle, layout: Layout) -> Sides:
             raise ConfigError(
                 f"puzzle '{puzzle.name}' has the pieces {', '.join(puzzle.pieces)} of scale "
                 f"{puzzle.scale:g}: it cannot be assembled from the tokens "
-                f"{', '.join(s.name for s in layout.shapes)}; set tokens=tangram7"
+                f"{', '.join(s.name for s in layout.shapes)}; set tokens=tangram7 "
+                f"tokens.scale={puzzle.scale:g}"
             )
         left.remove(piece)
         own = puzzle.layout.shapes[piece]
@@ -141,20 +164,39 @@ def _figure(layout: Layout, mirrored: bool, rng: np.random.Generator) -> Sides:
     poses, flipped = figures[int(rng.integers(len(figures)))]
     if mirrored:
         poses, flipped = layout.mirrored(poses, flipped)
-    return turned(poses, rng.uniform(-np.pi, np.pi)), flipped
+    poses = _turned(poses, rng.uniform(-np.pi, np.pi))
+    corners = layout.corners(poses, flipped)
+    poses[:, :2] -= (corners.min(axis=0) + corners.max(axis=0)) / 2.0
+    return poses, flipped
 
 
-def turned(poses: Floats, angle: float) -> Floats:
-    """Poses (K, 3) turned about the origin."""
+def _turned(poses: Floats, angle: float) -> Floats:
+    """Poses (K, 3) turned about the origin, angles in (-pi, pi]."""
     centres = (poses[:, :2] @ (1.0, 1j)) * np.exp(1j * angle)
-    return np.column_stack([centres.real, centres.imag, poses[:, 2] + angle])
+    angles = np.pi - np.mod(np.pi - poses[:, 2] - angle, 2.0 * np.pi)
+    return np.column_stack([centres.real, centres.imag, angles])
 
 
 @lru_cache(maxsize=4)
 def _figures(layout: Layout) -> list[Sides]:
+    scale = round(_scale(layout), 9)
+    return [placement(puzzle, layout) for puzzle in library("train", scale)]
+
+
+def _scale(layout: Layout) -> float:
+    """Side of the full square that tans are cut from."""
     shape = layout.shapes[0]
-    scale = float(np.sqrt(shape.area / tan(shape.name).area))
-    return [placement(puzzle, layout) for puzzle in library("train", round(scale, 9))]
+    return float(np.sqrt(shape.area / tan(shape.name).area))
+
+
+def _check_figures_fit(layout: Layout, sim: SimConfig) -> None:
+    """Turned by any angle, a figure is as wide as its extent at most."""
+    extent = PuzzleRules().max_extent * _scale(layout)
+    if extent > sim.arena:
+        raise ConfigError(
+            f"sim.targets=figures needs an arena of width {extent:g} for tokens.scale="
+            f"{_scale(layout):g}, got {sim.arena:g}: raise sim.arena, or lower tokens.scale"
+        )
 
 
 def _check_full_set(layout: Layout) -> None:

@@ -119,6 +119,7 @@ def _wait_for_room(link: Link, report: Report) -> bool:
 
 def _play(rollout: Rollout, policy: Policy, link: Link, groups: int) -> Episodes:
     """So many groups of episodes, fewer if the link is stopped."""
+    rollout.follow(policy.version)
     parts = [rollout.play(policy.explore)]
     while len(parts) < groups and not link.stopped:
         link.poll()

@@ -143,6 +143,11 @@ class Rollout:
         """Episodes that are played at a time."""
         return self._env.count
 
+    def follow(self, updates: int) -> None:
+        """Play what the curriculum has for weights of so many updates, from the next episode on."""
+        sim = self._env.sim
+        self._env.task = sim.stage_task(sim.stage(updates))
+
     def play(self, choose: Choose) -> Episodes:
         """The next `env.count` episodes."""
         numbers = range(self.episode, self.episode + self._env.count)

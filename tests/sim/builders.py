@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+import shapely
 
 from tangram_sim.arrays import Floats
 from tangram_sim.layout import Layout, TokensConfig, make_layout
@@ -38,6 +39,18 @@ def perimeter(polygons: Floats) -> Floats:
     edges = np.roll(polygons, -1, axis=1) - polygons
     total: Floats = np.linalg.norm(edges, axis=-1).sum(axis=1)
     return total
+
+
+def pieces(layout: Layout, poses: Floats, flipped: Any = None) -> list[shapely.Polygon]:
+    """The tokens of one layout (K, 3) as polygons."""
+    corners = layout.corners(poses, flipped)
+    return [shapely.Polygon(corners[layout.corners_of(k)]) for k in range(layout.tokens)]
+
+
+def largest_overlap(layout: Layout, poses: Floats, flipped: Any = None) -> float:
+    """The largest area that two tokens of one layout (K, 3) share."""
+    own = pieces(layout, poses, flipped)
+    return max((a.intersection(b).area for i, a in enumerate(own) for b in own[:i]), default=0.0)
 
 
 def angle_gap(first: Floats, second: Floats) -> Floats:

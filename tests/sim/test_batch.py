@@ -5,8 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tangram_sim.actions import chosen_tokens, velocities
 from tangram_sim.arrays import Floats
-from tangram_sim.batch import BatchedEnv, chosen_tokens, velocities
+from tangram_sim.batch import BatchedEnv
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.geometry import overlap_share

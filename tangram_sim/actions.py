@@ -1,0 +1,64 @@
+"""What the numbers of an action mean, and how many of them an episode has.
+
+Legend: B actions of A entries each, K tokens.
+"""
+
+import numpy as np
+
+from tangram_sim.arrays import Bools, Floats, Ints
+from tangram_sim.config import SimConfig
+from tangram_sim.layout import Layout
+from tangram_sim.sensing import noise_bound
+
+_ROUNDING = 1.0 + 1e-6
+
+
+def action_size(tokens: int, sim: SimConfig) -> int:
+    """A: 3 velocities, before them which token if there are several, and whether it is flipped."""
+    return 3 + (tokens > 1) + sim.allow_flip
+
+
+def horizon(tokens: int, sim: SimConfig) -> int:
+    """T: the actions of an episode, which is over when every token has had its own."""
+    return tokens * sim.actions_per_token
+
+
+def corner_bound(tokens: int, sim: SimConfig) -> float:
+    """The largest |coordinate| that a corner can reach in an episode, arena units.
+
+    A start lies inside the arena, and each action moves a token by at most the arena's width in x
+    and in y; turning keeps a corner within the start's margin for every angle. A token that slides
+    may push another as far as it goes itself, in each action of the episode; one that settles moves
+    others by less than an arena. What an agent sees may lie further out by the noise's bound.
+    """
+    pushes = 0 if tokens == 1 else horizon(tokens, sim) if sim.motion == "slide" else 1
+    return (sim.arena * (0.5 + sim.actions_per_token + pushes) + noise_bound(sim)) * _ROUNDING
+
+
+def chosen_tokens(actions: Floats, tokens: int) -> Ints:
+    """(B,) the token that each action (B, A) moves: the first entry cuts [-1, 1] into K parts."""
+    if tokens == 1:
+        return np.zeros(len(actions), dtype=np.int64)
+    share = (np.asarray(actions)[:, 0] + 1.0) / 2.0
+    return np.clip(np.floor(share * tokens), 0, tokens - 1).astype(np.int64)
+
+
+def velocities(actions: Floats, sim: SimConfig) -> Floats:
+    """(B, 3) of actions (B, A): full scale crosses the arena and makes half a turn in a second.
+
+    So one action can reach every pose of the arena from every other.
+    """
+    scale = np.array([sim.arena, sim.arena, np.pi])
+    scaled: Floats = np.asarray(actions, dtype=np.float64)[:, -3:] * scale
+    return scaled
+
+
+def flips(actions: Floats, layout: Layout, sim: SimConfig) -> Bools:
+    """(B,) which actions (B, A) turn their token over: the entry before the velocities says so.
+
+    A token that is its own mirror image, turned, has one side only: it never does.
+    """
+    if not sim.allow_flip:
+        return np.zeros(len(actions), dtype=np.bool_)
+    chiral = layout.chiral[chosen_tokens(actions, layout.tokens)]
+    return np.asarray((np.asarray(actions)[:, -4] > 0.0) & chiral)
