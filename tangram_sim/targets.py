@@ -164,17 +164,21 @@ def _figure(layout: Layout, mirrored: bool, rng: np.random.Generator) -> Sides:
     poses, flipped = figures[int(rng.integers(len(figures)))]
     if mirrored:
         poses, flipped = layout.mirrored(poses, flipped)
-    poses = _turned(poses, rng.uniform(-np.pi, np.pi))
-    corners = layout.corners(poses, flipped)
-    poses[:, :2] -= (corners.min(axis=0) + corners.max(axis=0)) / 2.0
-    return poses, flipped
+    return turned_figure(layout, (poses, flipped), rng.uniform(-np.pi, np.pi)), flipped
 
 
-def _turned(poses: Floats, angle: float) -> Floats:
-    """Poses (K, 3) turned about the origin, angles in (-pi, pi]."""
+def turned_figure(layout: Layout, figure: Sides, angle: float) -> Floats:
+    """Poses (K, 3) of a figure turned by an angle, in the middle of the arena.
+
+    Angles are in (-pi, pi].
+    """
+    poses, flipped = figure
     centres = (poses[:, :2] @ (1.0, 1j)) * np.exp(1j * angle)
     angles = np.pi - np.mod(np.pi - poses[:, 2] - angle, 2.0 * np.pi)
-    return np.column_stack([centres.real, centres.imag, angles])
+    turned = np.column_stack([centres.real, centres.imag, angles])
+    corners = layout.corners(turned, flipped)
+    turned[:, :2] -= (corners.min(axis=0) + corners.max(axis=0)) / 2.0
+    return turned
 
 
 @lru_cache(maxsize=4)

@@ -5,8 +5,8 @@ Legend: B environments, K tokens, V corners, A entries of an action.
 
 import numpy as np
 
+from tangram_sim.actions import action_size
 from tangram_sim.arrays import Bools, Floats, Ints, Singles
-from tangram_sim.batch import action_size
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry import outlines, shared_area
 from tangram_sim.kinematics import wrap

@@ -18,7 +18,7 @@ from tangram_sim.config import RewardConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.puzzles import SPLITS, PuzzleFile, library, read_puzzles
 from tangram_sim.seeding import episode_generator
-from tangram_sim.targets import placement, turned
+from tangram_sim.targets import placement, turned_figure
 from worker.rollout import Choose, Played, join_played, play
 
 AT_ONCE = 32
@@ -148,7 +148,7 @@ def _turns(puzzle: Puzzle, setup: Setup, turns: int) -> list[Figure]:
     poses, flipped = _placed(puzzle, setup)
     figures = []
     for degrees in (360.0 * i / turns for i in range(turns)):
-        there = turned(poses, np.radians(degrees))
+        there = turned_figure(setup.layout, (poses, flipped), np.radians(degrees))
         _check_inside(puzzle, setup, setup.layout.corners(there, flipped))
         figures.append(Figure(puzzle.name, degrees, there, flipped))
     return figures
