@@ -15,6 +15,7 @@ from typing import Any
 import yaml
 
 from conf.help import Plain, choices, command_name, help_text, setting_names
+from conf.names import hidden, revealed
 from conf.sweep import LAUNCHER, SWEEP, check_launcher, refuse_lost_job
 from tangram_sim.errors import ConfigError, TangramError
 
@@ -53,7 +54,7 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
         print(f"{command} {version('tangram-rl')}")
         return 0
     try:
-        sys.argv[1:] = _options_first(arguments)
+        sys.argv[1:] = hidden(_options_first(arguments), config_name)
         check_launcher(sys.argv[1:])
         return _run(config_name, task, stored)
     except TangramError as error:
@@ -174,7 +175,7 @@ def _plain(config: Any, stored: Stored | None, config_name: str) -> Plain:
         raise ConfigError(f"cannot resolve the config: {_first_line(error)}") from None
     if missing:
         raise ConfigError(MISSING_HINTS.get(missing[0], f"set {missing[0]}=..., it has no default"))
-    plain = _mapping(settings)
+    plain = revealed(_mapping(settings), config_name)
     in_sweep = HydraConfig.get().mode == RunMode.MULTIRUN and config_name in MAKE_RUNS
     if in_sweep and isinstance(plain.get("run_dir"), str):
         # The jobs of one sweep start at one time and share their arguments: a folder for each.

@@ -31,6 +31,7 @@ from tangram_sim.strokes import (
 )
 
 _OPACITY = 0.8  # of a token, so that the target shows through
+_PALETTE_FRAMES = 40  # that a film's colours are taken from
 _GHOST = 0.18  # opacity of a token where it started
 
 
@@ -138,8 +139,9 @@ def save_gif(
     """
     if not images:
         raise ValueError("an animation needs at least one picture")
-    # One palette for all frames, from all frames: colours must not flicker.
-    strip = contact_sheet(images, columns=len(images))
+    # One palette for all frames, from frames all over the film: colours must not flicker.
+    some = images[:: -(-len(images) // _PALETTE_FRAMES)]
+    strip = contact_sheet(some, columns=len(some))
     palette = strip.quantize(128, dither=Image.Dither.NONE)
     frames = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     frames[0].save(

@@ -13,6 +13,7 @@ from tangram_sim.geometry import overlap_share
 from tangram_sim.layout import Layout
 from tangram_sim.strokes import (
     SAMPLES,
+    SILHOUETTE,
     Point,
     colour_of,
     darker,
@@ -24,7 +25,6 @@ from tangram_sim.strokes import (
     to_points,
 )
 
-_SILHOUETTE = (232, 226, 214)
 _EDGE = (168, 158, 138)
 _OPACITY = 0.9
 _INK = (31, 41, 55)
@@ -34,7 +34,7 @@ _SHADOW = 0.35  # its opacity
 _SHADOW_WAY = (0.03, -0.05)  # of the arena, to the right and down
 _SHADOW_BLUR = 0.012  # of the picture's side
 _SHEET = 1200  # pixels across, about
-_MIN_TILE, _MAX_TILE = 120, 320
+_MIN_TILE, _MAX_TILE = 120, 480
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,13 +43,11 @@ class Held:
 
     Attributes:
         token: its number.
-        corners: (C, 2) as it lies or hangs, in arena units.
         height: 0 on the table to 1 in the air: drawn larger, with a shadow.
         stopped: it cannot be set down: drawn with a red outline.
     """
 
     token: int
-    corners: Floats
     height: float = 0.0
     stopped: bool = False
 
@@ -79,7 +77,8 @@ def draw_game(
             fill(canvas, piece, colour_of(k), _OPACITY)
             draw_outline(canvas, piece, darker(colour_of(k)), 1.0)
     if held is not None:
-        _draw_held(canvas, arena, held)
+        own = np.asarray(corners[layout.corners_of(held.token)], dtype=np.float64)
+        _draw_held(canvas, arena, held, own)
     return shown(canvas)
 
 
@@ -118,12 +117,12 @@ def _draw_silhouette(canvas: Image.Image, targets: Sequence[Sequence[Point]]) ->
     for target in targets:
         draw_outline(canvas, target, _EDGE, 2.0)
     for target in targets:
-        fill(canvas, target, _SILHOUETTE, 1.0)
+        fill(canvas, target, SILHOUETTE, 1.0)
 
 
-def _draw_held(canvas: Image.Image, arena: float, held: Held) -> None:
-    middle = held.corners.mean(axis=0)
-    nearer = middle + (held.corners - middle) * (1.0 + _NEARER * held.height)
+def _draw_held(canvas: Image.Image, arena: float, held: Held, corners: Floats) -> None:
+    middle = corners.mean(axis=0)
+    nearer = middle + (corners - middle) * (1.0 + _NEARER * held.height)
     if held.height > 0.0:
         way = np.array(_SHADOW_WAY) * arena * held.height
         _draw_shadow(canvas, to_points(arena, nearer + way, canvas.width), held.height)

@@ -18,6 +18,7 @@ from tangram_sim.layout import Layout
 from tangram_sim.pictures import BACKGROUND, TOKEN_GRAY
 from tangram_sim.prisms import inset, prism, thickness
 from tangram_sim.shapes import Shape
+from tangram_sim.window import Window
 
 _ENGINE_ARENA = 2.0
 _HALF_HEIGHT = 0.01  # of a token as it is drawn
@@ -298,3 +299,12 @@ def _camera(pixels: int) -> tuple[Sequence[float], Sequence[float]]:
         _CAMERA_HEIGHT + _DEPTH,
     )
     return view, projection
+
+
+def open_window(layout: Layout, arena: float, colours: Sequence[Sequence[float]]) -> Window:
+    """A window of the engine; see `Window`.
+
+    Raises:
+        TangramError: no display.
+    """
+    return Window(pybullet, layout, arena, colours)

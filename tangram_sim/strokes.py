@@ -17,6 +17,7 @@ TABLE = (255, 255, 255)
 FRAME = (214, 214, 208)
 TARGET = (253, 236, 206)
 TARGET_LINE = (146, 110, 40)
+SILHOUETTE = (232, 226, 214)
 TEXT = (55, 65, 81)
 _TOKENS = (
     (59, 130, 196),
@@ -45,8 +46,7 @@ def empty_table(side: int) -> Image.Image:
 
 def shown(canvas: Image.Image) -> Image.Image:
     """The picture that a canvas is drawn for."""
-    size = (canvas.width // SAMPLES, canvas.height // SAMPLES)
-    return canvas.resize(size, Image.Resampling.LANCZOS)
+    return canvas.reduce(SAMPLES)
 
 
 def to_points(arena: float, corners: Floats, side: int) -> list[Point]:

@@ -15,6 +15,7 @@ from omegaconf import OmegaConf
 
 from conf.cli import entry, with_run_config
 from conf.help import Plain, choices, group_defaults, help_text, setting_names
+from conf.names import hidden, revealed
 from conf.sweep import check_launcher, refuse_lost_job
 from master.config import LaunchConfig, MasterConfig
 from tangram_agent.config import AgentConfig, NetConfig, ServiceConfig, TwinConfig
@@ -41,10 +42,10 @@ PRESETS = [(group, name) for group in GROUPS for name in choices(group)]
 
 def compose(primary: str, *overrides: str) -> dict[str, Any]:
     with hydra.initialize_config_module("conf", version_base="1.3"):
-        config = hydra.compose(primary, list(overrides))
+        config = hydra.compose(primary, hidden(overrides, primary))
     plain = OmegaConf.to_container(config)
     assert isinstance(plain, dict)
-    return {str(name): value for name, value in plain.items()}
+    return revealed({str(name): value for name, value in plain.items()}, primary)
 
 
 def field_names(kind: Any) -> set[str]:
@@ -79,7 +80,8 @@ def test_first_twin_of_a_preset_writes_out_every_field(name: str) -> None:
     ],
 )
 def test_primary_has_every_field(primary: str, kinds: tuple[Any, ...], extra: set[str]) -> None:
-    names = set(compose(primary)) - set(SECTIONS) - {"from_config"}
+    groups = SECTIONS if primary in WITH_GROUPS else ()
+    names = set(compose(primary)) - set(groups) - {"from_config"}
     assert names == set().union(*map(field_names, kinds)) - extra
 
 
@@ -227,6 +229,19 @@ def test_wrong_run_config_is_refused(tmp_path: Path, content: bytes | None, mess
         path.write_bytes(content)
     with pytest.raises(ConfigError, match=message):
         apply(path)
+
+
+# A setting that is called like a group
+
+
+@pytest.mark.parametrize(
+    ("given", "name"), [("tangram7", "tangram7"), ("no_preset", "no_preset"), ("null", None)]
+)
+def test_tokens_of_a_command_without_groups_are_a_name(given: str, name: str | None) -> None:
+    settings = compose("play", f"tokens={given}", "out=a.gif")
+    assert (settings["tokens"], settings["out"]) == (name, "a.gif")
+    assert compose("play")["tokens"] is None
+    assert hidden(["tokens=square", "seed=1"], "train") == ["tokens=square", "seed=1"]
 
 
 # Help

@@ -7,7 +7,7 @@ import sys
 from functools import partial
 from pathlib import Path
 
-from conf.cli import entry
+from conf.cli import composed, entry
 from conf.help import Plain
 
 
@@ -89,10 +89,13 @@ def _evaluate(settings: Plain) -> int:
 
 def _play(settings: Plain) -> int:
     from tangram_agent.setup import from_mapping
-    from worker.config import PlayConfig, check_compare
+    from worker.config import PlayConfig, check_compare, check_puzzle
 
     check_compare(settings.get("compare"))  # before a text is taken for a list of letters
-    config = from_mapping(PlayConfig, with_absolute_paths(settings))
+    settings = with_absolute_paths(settings) | {"puzzle": check_puzzle(settings.get("puzzle"))}
+    config = from_mapping(PlayConfig, settings)
+    if config.tokens is not None and config.run_dir is not None:
+        _check_tokens(config.tokens, config.run_dir)
 
     if config.compare is not None:
         from worker.compare import compare_runs
@@ -101,6 +104,25 @@ def _play(settings: Plain) -> int:
     from worker.play import play_run
 
     return play_run(config)
+
+
+def _check_tokens(name: str, run_dir: str) -> None:
+    """Refuse a run that moves other tokens than those of a preset."""
+    from tangram_agent.runs import load_run
+    from tangram_agent.setup import from_mapping
+    from tangram_sim.errors import ConfigError
+    from tangram_sim.layout import TokensConfig, make_layout
+
+    preset = make_layout(
+        from_mapping(TokensConfig, composed("worker", [f"tokens={name}"])["tokens"])
+    )
+    moved = load_run(run_dir).setup.layout
+    if moved.fingerprint() != preset.fingerprint():
+        shapes = ", ".join(shape.name for shape in moved.shapes)
+        raise ConfigError(
+            f"tokens={name} and run_dir={run_dir} do not agree: the run moves {shapes}; leave one "
+            "of both out"
+        )
 
 
 def with_absolute_paths(settings: Plain) -> Plain:

@@ -12,9 +12,9 @@ from tangram_agent.setup import Setup
 from tangram_sim.arrays import Floats
 from tangram_sim.errors import RunError
 from worker.config import PlayConfig
+from worker.film import frames_per_action
 from worker.play import (
     draw_sheet,
-    frames_per_action,
     motion,
     play_episodes,
     save_picture,

@@ -184,17 +184,38 @@ def check_compare(value: object) -> None:
         raise ConfigError(f"compare must list different runs, got {value!r}: name each one once")
 
 
+def check_puzzle(value: object) -> tuple[str, ...] | None:
+    """The names of puzzles: one or a list of some; None is none.
+
+    Raises:
+        ConfigError: says how to write them.
+    """
+    if value is None:
+        return None
+    names = list(value) if isinstance(value, list | tuple) else [value]
+    # A puzzle may be called 8.
+    if not names or not all(isinstance(one, str | int | float) and str(one) for one in names):
+        raise ConfigError(
+            f"puzzle must name puzzles, got {value!r}: set puzzle=cat or puzzle=[cat,dog]"
+        )
+    return tuple(str(name) for name in names)
+
+
 @dataclass(frozen=True)
 class PlayConfig:
     """Pictures of finished runs at play (tangram-play): of one, or of several on the same starts.
 
     Attributes:
-        run_dir: folder of the run; None to compare.
+        run_dir: folder of the run; None to compare, or with tokens or puzzles.
         out: file to write: .gif moves, .png shows the ends.
-        episodes: shown side by side.
+        episodes: shown side by side; of no account with puzzles.
         actions: actions per token; None is what each run was trained with.
-        seed: decides which episodes are shown.
+        seed: decides which episodes are shown, and where pieces of puzzles start.
         compare: folders of 2 to 4 runs of the same tokens and arena; None to show one.
+        tokens: the agent of these tokens that comes with the package; with `run_dir` both agree.
+        puzzle: names of puzzles to assemble instead of random targets; None with `puzzles`: all.
+        puzzles: a file, or a split of the library, that they are in; None is all of the library.
+        live: play in a window instead of writing a file.
     """
 
     run_dir: str | None = None
@@ -203,6 +224,10 @@ class PlayConfig:
     actions: int | None = None
     seed: int = 0
     compare: tuple[str, ...] | None = None
+    tokens: str | None = None
+    puzzle: tuple[str, ...] | None = None
+    puzzles: str | None = None
+    live: bool = False
 
     def __post_init__(self) -> None:
         check_compare(self.compare)
@@ -217,19 +242,32 @@ class PlayConfig:
         check_range("seed", self.seed, 0, MAX_SEED)
 
     @property
+    def plays_puzzles(self) -> bool:
+        """Whether puzzles are to be assembled."""
+        return self.puzzle is not None or self.puzzles is not None
+
+    @property
     def run_dirs(self) -> tuple[str, ...]:
         """The runs to show, one or several."""
-        return self.compare or (self.run_dir or "",)
+        named = f"{PREFIX}/{self.tokens}" if self.tokens is not None else game_run()
+        return self.compare or (self.run_dir or named,)
 
     def _check_one_of_both(self) -> None:
-        if self.run_dir is None and self.compare is None:
+        if self.compare is not None:
+            self._check_compared_alone()
+        elif self.run_dir is not None:
+            _check_run_dir(self.run_dir)
+        elif self.tokens is None and not (self.plays_puzzles and GAME in agent_names()):
             raise ConfigError(
                 "say which run: run_dir=runs/..., or which ones: compare=[runs/a,runs/b]"
             )
-        if self.run_dir is not None and self.compare is not None:
-            raise ConfigError(
-                f"run_dir={self.run_dir} and compare do not go together: give run_dir=... to show "
-                "one run, or compare=[a,b] to show several"
-            )
-        if self.run_dir is not None:
-            _check_run_dir(self.run_dir)
+
+    def _check_compared_alone(self) -> None:
+        names = ("run_dir", "tokens", "puzzle", "puzzles", "live")
+        others: dict[str, Any] = {name: getattr(self, name) for name in names}
+        for name, value in others.items():
+            if value not in (None, False):
+                raise ConfigError(
+                    f"{name}={value} and compare do not go together: give run_dir=... to show one "
+                    "run, or compare=[a,b] to show several on random targets"
+                )

@@ -19,40 +19,51 @@ from tangram_sim.drawing import episode_sheet, save_gif
 from tangram_sim.kinematics import wrap
 from tangram_sim.layout import Layout
 from worker.config import PlayConfig
+from worker.film import frames_per_action
 from worker.rollout import Played
+from worker.show import Show, end_picture, film_pictures, puzzle_show, show_live
 from worker.trials import Trials, greedy, with_actions
 
 AT_ONCE = 32
 FRAME_MS = 50
-FRAMES_PER_ACTION = 20
-MAX_FRAMES = 100  # of motion; more actions get fewer each
 STILL_START, STILL_END = 10, 30  # frames
 SHEET = 720  # pixels across, about
 MIN_TILE, MAX_TILE = 64, 240
 
 
 def play_run(config: PlayConfig) -> int:
-    """Play episodes of a run, noise off, and draw them side by side over their targets.
+    """Play puzzles or random episodes of a run, noise off, and draw them side by side.
 
     Returns:
         Exit status 0.
 
     Raises:
         RunError: a folder or a checkpoint that is missing or corrupt, or `out` is not writable.
+        ConfigError: puzzles that the run cannot play.
+        TangramError: `live` without a display.
     """
     torch.set_num_threads(1)
     (run_dir,) = config.run_dirs
-    setup, played = play_episodes(load_run(run_dir), config)
-    if Path(config.out).suffix == ".png":
-        save_picture(config.out, [draw_sheet(setup, played, played.ends)])
-    else:
-        save_picture(config.out, draw_motion(setup, played))
-    Console(highlight=False).print(
-        f"{config.out}: {config.episodes} episodes, raw overlap {played.overlap.mean():.3f}",
-        markup=False,
-        soft_wrap=True,
-    )
+    show = make_show(load_run(run_dir), config)
+    if config.live:
+        show_live(show)
+        return 0
+    save_picture(config.out, _frames(show, config.out))
+    Console(highlight=False).print(f"{config.out}: {show.told()}", markup=False, soft_wrap=True)
     return 0
+
+
+def make_show(run: Run, config: PlayConfig) -> Show:
+    """What the settings name, played by a run.
+
+    Raises:
+        ConfigError: puzzles that the run cannot play.
+    """
+    if config.plays_puzzles:
+        return puzzle_show(run, config)
+    setup, played = play_episodes(run, config)
+    titles = [f"target {i + 1}" for i in range(config.episodes)]
+    return Show(setup, played, titles, "episodes")
 
 
 def play_episodes(run: Run, config: PlayConfig) -> tuple[Setup, Played]:
@@ -60,6 +71,15 @@ def play_episodes(run: Run, config: PlayConfig) -> tuple[Setup, Played]:
     setup = with_actions(run.setup, config.actions)
     with closing(Trials(setup, config.episodes, AT_ONCE, role="play", seed=config.seed)) as trials:
         return setup, trials.play(greedy(run.policy))
+
+
+def _frames(show: Show, out: str) -> list[Image.Image]:
+    """One picture of the ends, or the film."""
+    setup, played = show.setup, show.played
+    still = Path(out).suffix == ".png"
+    if setup.layout.tokens > 1:
+        return [end_picture(show)] if still else with_stills(film_pictures(show))
+    return [draw_sheet(setup, played, played.ends)] if still else draw_motion(setup, played)
 
 
 def save_picture(out: str, frames: Sequence[Image.Image]) -> None:
@@ -104,11 +124,6 @@ def with_stills(frames: list[Image.Image]) -> list[Image.Image]:
     return [frames[0]] * STILL_START + frames + [frames[-1]] * STILL_END
 
 
-def frames_per_action(horizon: int) -> int:
-    """Fewer in long episodes: all frames of a film are in memory at a time."""
-    return max(min(FRAMES_PER_ACTION, MAX_FRAMES // horizon), 1)
-
-
 def motion(layout: Layout, corners: Floats, count: int) -> list[Floats]:
     """Corners (E, V, 2) at the start and at `count` equal parts of each action.
 
@@ -118,12 +133,12 @@ def motion(layout: Layout, corners: Floats, count: int) -> list[Floats]:
     Args:
         corners: (E, T + 1, V, 2) before each action and after the last.
     """
-    poses = layout.poses(corners)
+    poses, flipped = layout.poses(corners), layout.flipped(corners)
     way = np.diff(poses, axis=1)
     way[..., 2] = wrap(way[..., 2])
     shares = np.arange(1, count + 1) / count
     between = [
-        layout.corners(poses[:, t] + share * way[:, t])
+        layout.corners(poses[:, t] + share * way[:, t], flipped[:, t + 1])
         for t in range(way.shape[1])
         for share in shares
     ]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import worker.play as play_module
+import worker.film as film_module
 from tests.agent.builders import PAIR
 from tests.worker.builders import write_run
 from tests.worker.test_compare import PLAIN_AGENT, compared
@@ -25,7 +25,7 @@ def test_an_animation_has_frames_that_move(
     actions: int | None,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(play_module, "FRAMES_PER_ACTION", 6)  # drawing takes its time
+    monkeypatch.setattr(film_module, "FRAMES_PER_ACTION", 6)  # drawing takes its time
     write_run(tmp_path / "run", PAIR)
     out = tmp_path / "film.gif"
     config = PlayConfig(str(tmp_path / "run"), str(out), episodes=episodes, actions=actions)

@@ -13,7 +13,8 @@ from tests.agent.builders import PAIR, setup
 from tests.worker.builders import write_run
 from worker.config import EvalConfig, PlayConfig
 from worker.evaluate import evaluate_run
-from worker.play import frames_per_action, motion, play_run
+from worker.film import frames_per_action
+from worker.play import motion, play_run
 
 pytestmark = pytest.mark.fast
 

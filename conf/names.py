@@ -1,0 +1,32 @@
+"""Settings that are called like a config group, such as tokens of tangram-play.
+
+Hydra takes `tokens=square` for the choice of a preset wherever there are presets of tokens, but not
+a mapping: so such values travel as `tokens={name:square}`.
+"""
+
+from collections.abc import Sequence
+from importlib.resources import files
+
+from conf.help import Plain, group_defaults, setting_names
+
+
+def plain_names(config_name: str) -> list[str]:
+    """The settings of a command that are called like a group that it has not."""
+    own = group_defaults(config_name)
+    return [n for n in setting_names(config_name) if n not in own and (files("conf") / n).is_dir()]
+
+
+def hidden(arguments: Sequence[str], config_name: str) -> list[str]:
+    """The arguments as hydra must see them."""
+    names = plain_names(config_name)
+    split = [argument.partition("=") for argument in arguments]
+    return [
+        f"{key}={{name:{value or 'null'}}}" if sign and key in names else key + sign + value
+        for key, sign, value in split
+    ]
+
+
+def revealed(settings: Plain, config_name: str) -> Plain:
+    """The settings as they were meant."""
+    own = {name: settings[name] for name in plain_names(config_name)}
+    return settings | {n: v["name"] for n, v in own.items() if isinstance(v, dict) and "name" in v}
