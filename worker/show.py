@@ -121,6 +121,8 @@ def show_live(show: Show) -> None:
     colours.append(_unit(SILHOUETTE))
     with closing(open_window(layout, show.setup.sim.arena, colours)) as window:
         for e in range(len(played.ends)):
+            if not window.is_open:
+                return
             window.show_target(layout.poses(played.goals[e]), layout.flipped(played.goals[e]))
             _play_scene(window, frames, e)
 
