@@ -56,6 +56,7 @@ def test_one_parallelogram_turned_over_is_the_other() -> None:
     assert turn_onto(tan("parallelogram_mirrored").corners, image) is not None
     assert turn_onto(tan("parallelogram").corners, image) is None
     assert turn_onto(tan("square").corners, tan("small_triangle").corners) is None
+    assert turn_onto(tan("small_triangle").corners, tan("large_triangle").corners) is None
 
 
 def test_a_layout_knows_its_chiral_tokens() -> None:
