@@ -118,7 +118,7 @@ class PairChooser:
             goals: (B, V, 2) of the target.
             refine: take the gradient steps that the agent is configured for.
         """
-        scene = self._scene(corners, placed, goals)
+        scene = self._scene(corners, goals)
         with torch.no_grad():
             candidates = self._candidates(scene, self._open(placed, goals))
             pose = self._proposed(scene, candidates)
@@ -133,7 +133,7 @@ class PairChooser:
             value.numpy(),
         )
 
-    def _scene(self, corners: Floats, placed: Bools, goals: Floats) -> _Scene:
+    def _scene(self, corners: Floats, goals: Floats) -> _Scene:
         layout = self._layout
         areas = np.array([shape.area for shape in layout.shapes])
         area = covers(corners, goals, layout)

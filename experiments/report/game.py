@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from experiments.report.markdown import ANGLE, MINUTES, NOTHING, POSITION, Measure, plain, table
+from experiments.report.records import Row
 from experiments.report.study import Experiment, Training, Trial
 
 COVERAGE = Measure("coverage", "coverage", "covered share of the target", "{:.4f}")
@@ -100,9 +101,8 @@ def paired(values: Sequence[float] | np.ndarray) -> str:
 def _baseline(training: Training, test: Trial, name: str, measure: Measure) -> str:
     """A score of a policy that learned nothing, the same for every seed."""
     for seed in training.finished:
-        found: Mapping[str, float] = (
-            seed.tests.get(test.name, {}).get("baselines", {}).get(name, {})
-        )
+        baselines: Mapping[str, Row] = seed.tests.get(test.name, {}).get("baselines", {})
+        found = baselines.get(name, {})
         if measure.key in found:
             return measure.show(found[measure.key])
     return NOTHING
