@@ -152,12 +152,9 @@ def _training(
 
 def _test(config: StudyConfig, training: Job, name: str) -> Job:
     test, out = config.tests[name], test_file(training.run_dir, name)
-    asked = {
-        "episodes": config.budget.test_episodes,
-        "actions": test.actions,
-        "corner_noise": test.corner_noise,
-    }
-    settings = {key: value for key, value in asked.items() if value is not None}
+    settings = test.asked
+    if test.puzzles is None:
+        settings = {"episodes": config.budget.test_episodes, **settings}
     command = (
         "tangram-eval",
         override("run_dir", str(training.run_dir)),

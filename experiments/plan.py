@@ -16,7 +16,7 @@ from tangram_sim.errors import ConfigError
 from worker.config import MAX_ACTIONS
 
 FORMAT = 1
-KINDS = ("curves", "complexity", "tests", "rewards", "ranking")
+KINDS = ("curves", "complexity", "tests", "rewards", "ranking", "game")
 PLAN = "plan.json"
 
 
@@ -46,6 +46,18 @@ class TestConfig:
     label: str
     actions: int | None = None
     corner_noise: float | None = None
+    puzzles: str | None = None
+    turns: int | None = None
+    order: str | None = None
+    reapply: int | None = None
+    refine_steps: int | None = None
+    gamma: float | None = None
+
+    @property
+    def asked(self) -> dict[str, Any]:
+        """The settings that are not as trained, by their names in tangram-eval and in its file."""
+        values = {name: value for name, value in asdict(self).items() if name != "label"}
+        return {name: value for name, value in values.items() if value is not None}
 
     def __post_init__(self) -> None:
         if self.actions is not None:

@@ -85,9 +85,10 @@ def make_pairs(
     goal, goal_side = _pose_of(batch.goal, layout, rows, piece)
     covered = np.zeros(len(rows))
     played = strategy == 0
+    others = np.arange(layout.tokens) != token[played][:, None]
     covered[played] = covered_share(
         batch.state[rows[played]],
-        batch.placed[rows[played]],
+        others,
         batch.goal[rows[played]],
         piece[played],
         layout,
@@ -182,24 +183,19 @@ def covered_share(
     return share
 
 
-def worths(corners: Floats, placed: Bools, goals: Floats, layout: Layout) -> Floats:
-    """(B, K) what placed tokens cover of all pieces, as the sum of their values; open ones 0.
+def covers(corners: Floats, goals: Floats, layout: Layout) -> Floats:
+    """(B, K, K) area that each token covers of each piece of the target.
 
     Args:
         corners: (B, V, 2) of the tokens.
-        placed: (B, K).
         goals: (B, V, 2) of the targets.
         layout: of both.
     """
-    rows, tokens = np.nonzero(placed)
     count = layout.tokens
-    own = np.repeat(outlines(corners, layout)[rows, tokens], count, axis=0)
-    wanted = outlines(goals, layout)[rows].reshape(own.shape)
-    areas = np.array([shape.area for shape in layout.shapes])
-    shared = shared_area(wanted, own).reshape(-1, count)
-    worth = np.zeros(np.shape(placed))
-    worth[rows, tokens] = (shared / np.maximum(areas[tokens, None], areas)).sum(axis=1)
-    return worth
+    own = np.repeat(outlines(corners, layout), count, axis=1)
+    wanted = np.tile(outlines(goals, layout), (1, count, 1, 1))
+    shape = (-1, *own.shape[2:])
+    return shared_area(wanted.reshape(shape), own.reshape(shape)).reshape(-1, count, count)
 
 
 def newly_covered(

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tangram_agent.pair_batch import covered_share, worths
+from tangram_agent.pair_batch import covers
 from tangram_agent.pair_networks import PairNetworks
 from tangram_agent.pairs import Pairs
 from tangram_agent.setup import Setup
@@ -97,7 +97,7 @@ class _Scene:
             goal=self.goal[c.row, c.piece],
             goal_flipped=self.goal_flipped[c.row, c.piece],
             piece=c.piece,
-            covered=self.covered[c.row, c.piece],
+            covered=self.covered[c.row, c.token, c.piece],
         )
 
 
@@ -118,7 +118,7 @@ class PairChooser:
             goals: (B, V, 2) of the target.
             refine: take the gradient steps that the agent is configured for.
         """
-        scene = self._scene(corners, placed, goals)
+        scene = self._scene(corners, goals)
         with torch.no_grad():
             candidates = self._candidates(scene, self._open(placed, goals))
             pose = self._proposed(scene, candidates)
@@ -133,24 +133,20 @@ class PairChooser:
             value.numpy(),
         )
 
-    def _scene(self, corners: Floats, placed: Bools, goals: Floats) -> _Scene:
-        layout, count = self._layout, self._layout.tokens
-        rows, pieces = np.divmod(np.arange(len(corners) * count), count)
-        covered = covered_share(corners[rows], placed[rows], goals[rows], pieces, layout)
+    def _scene(self, corners: Floats, goals: Floats) -> _Scene:
+        layout = self._layout
+        areas = np.array([shape.area for shape in layout.shapes])
+        area = covers(corners, goals, layout)
+        others = area.sum(axis=1, keepdims=True) - area
+        worth = (area / np.maximum(areas[:, None], areas)).sum(axis=2)
         return _Scene(
             _tensor(layout.poses(corners)),
             _tensor(layout.flipped(corners)),
             _tensor(layout.poses(goals)),
             _tensor(layout.flipped(goals)),
-            _tensor(covered.reshape(-1, count)),
-            _tensor(self._worths(corners, placed, goals)),
+            _tensor(np.minimum(others / areas, 1.0)),
+            _tensor(worth),
         )
-
-    def _worths(self, corners: Floats, placed: Bools, goals: Floats) -> Floats:
-        """(B, K), zeros where nothing can push a placed token away."""
-        if not self._contacts:
-            return np.zeros(placed.shape)
-        return worths(corners, placed, goals, self._layout)
 
     def _open(self, placed: Bools, goals: Floats) -> Bools:
         """(B, K) tokens that may be next, at least one in each row."""
@@ -183,6 +179,7 @@ class PairChooser:
     def _best(self, scene: _Scene, candidates: _Candidates, pose: Tensor) -> tuple[Tensor, Tensor]:
         """Index (B,) of the best candidate of each row, and its value (B,)."""
         total = self._total(scene, candidates, pose)
+        total = total - scene.worth[candidates.row, candidates.token]
         if self._contacts:
             total = total - self._damage(scene, candidates, pose, total)
         table, first = _by_row(candidates.row, total, len(scene.pose))

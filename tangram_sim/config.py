@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from tangram_sim.checks import check_choice, check_range
 from tangram_sim.errors import ConfigError
+from tangram_sim.layout import MAX_TOKENS
 
 BACKENDS = ("physics", "kinematic")
 REWARDS = ("overlap", "dense", "pose")
@@ -36,7 +37,7 @@ class StageConfig:
 
     def __post_init__(self) -> None:
         check_range("sim.stages.updates", self.updates, 0)
-        check_range("sim.stages.tokens", self.tokens, 0, 100)
+        check_range("sim.stages.tokens", self.tokens, 0, MAX_TOKENS)
         check_choice("sim.stages.targets", self.targets, TARGETS)
         check_range("sim.stages.spread", self.spread, 1e-3, 1.0)
 
@@ -129,6 +130,10 @@ class SimConfig:
         check_choice("sim.starts", self.starts, STARTS)
         check_range("sim.spread", self.spread, 1e-3, 1.0)
         check_range("sim.mirrored", self.mirrored, 0.0, 1.0)
+        entries: tuple[object, ...] = tuple(self.stages)
+        wrong = [entry for entry in entries if not isinstance(entry, StageConfig)]
+        if wrong:
+            raise ConfigError(f"sim.stages must list stages, got {wrong[0]!r}")
         begins = [stage.updates for stage in self.stages]
         if begins != sorted(set(begins)):
             raise ConfigError(

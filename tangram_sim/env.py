@@ -15,6 +15,7 @@ from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.drawing import draw_scene
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import TokensConfig, make_layout
+from tangram_sim.targets import check_targets
 
 Observation = dict[str, Any]  # of float64 vectors
 
@@ -70,6 +71,7 @@ class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         self.render_mode = render_mode
         self.layout = make_layout(TokensConfig(tuple(shapes), scale))
         self.sim = _sim_config(sim)
+        check_targets(self.layout, self.sim)
         config = reward if isinstance(reward, RewardConfig) else RewardConfig(name=reward)
         self.batch = BatchedEnv(self.layout, self.sim, config)
         self._success_overlap = success_overlap

@@ -1,4 +1,4 @@
-"""Tokens as rigid bodies in PyBullet: the only module that imports the engine.
+"""Tokens as rigid bodies in PyBullet: the only module, with camera.py, that imports the engine.
 
 The engine always sees an arena of width 2, whatever the arena's unit: its tolerances, its limit of
 100 units a second and the camera are made for bodies of about that size.
@@ -6,12 +6,12 @@ The engine always sees an arena of width 2, whatever the arena's unit: its toler
 
 import math
 import weakref
-from collections.abc import Sequence
 
 import numpy as np
 import pybullet
 
 from tangram_sim.arrays import Bools, Floats, Pixels
+from tangram_sim.camera import Camera
 from tangram_sim.config import SimConfig
 from tangram_sim.errors import TangramError
 from tangram_sim.layout import Layout
@@ -33,14 +33,10 @@ _UPRIGHT = 1e4  # inertia about x and y, far more than a token's: none tips over
 _FRICTION = 0.2  # between the edges of tokens
 _GRIP = 1e3  # mass of the token that is pushed along the table, as a multiple of its own
 _STRIDE = 0.02  # longest way of any of its points in one step
-_THIN = 0.25  # the same as a share of the thinnest token, which is not to be jumped over
+_THIN = 0.5  # the same as a share of the thinnest token's thickness, which is not to be jumped over
 _RECOVERY = 0.5  # share of an overlap that one step removes while tokens settle
 _SETTLED = 1e-5  # deepest overlap that stays
 _SETTLE_STEPS, _SETTLE_S = 200, 1.0 / 240.0
-# TinyRenderer draws nothing with an orthographic projection. From this far above, the picture of
-# the arena differs from one by less than a tenth of a pixel at 1024 pixels.
-_CAMERA_HEIGHT = 100.0
-_DEPTH = 10.0
 _DISTANCE = 8  # of two bodies, in what the engine tells of a contact
 
 _Command = tuple[float, float, float]
@@ -53,7 +49,6 @@ class PhysicsWorld:
     """
 
     def __init__(self, layout: Layout, sim: SimConfig) -> None:
-        self._pixels = sim.pixels
         self._unit = _ENGINE_ARENA / sim.arena
         self._client = pybullet.connect(pybullet.DIRECT)
         if self._client < 0:
@@ -73,7 +68,7 @@ class PhysicsWorld:
         for token in range(layout.tokens):
             self._weigh(token, 1.0)
         self._play_at_once()
-        self._view, self._projection = _camera(sim.pixels)
+        self._camera = Camera(self._client, sim.pixels, _ENGINE_ARENA, _HALF_HEIGHT)
 
     def place(self, poses: Floats, flipped: Bools | None = None) -> None:
         """See `World.place`."""
@@ -104,23 +99,7 @@ class PhysicsWorld:
 
     def picture(self) -> Pixels:
         """See `World.picture`."""
-        image = pybullet.getCameraImage(
-            self._pixels,
-            self._pixels,
-            self._view,
-            self._projection,
-            shadow=0,
-            # Even light from everywhere: a token has one gray, as in the kinematic world.
-            lightAmbientCoeff=1.0,
-            lightDiffuseCoeff=0.0,
-            lightSpecularCoeff=0.0,
-            renderer=pybullet.ER_TINY_RENDERER,
-            flags=pybullet.ER_NO_SEGMENTATION_MASK,
-            physicsClientId=self._client,
-        )
-        colours = np.asarray(image[2], dtype=np.uint8).reshape(self._pixels, self._pixels, 4)
-        # Tokens and background are gray, so one channel is the grayscale picture.
-        return colours[..., 0].copy()
+        return self._camera.picture()
 
     def close(self) -> None:
         """See `World.close`."""
@@ -212,7 +191,7 @@ class PhysicsWorld:
 
     def _make_body(self, shape: Shape) -> int:
         corners = shape.corners * self._unit
-        margin = min(_MARGIN, 0.1 * thickness(corners))
+        margin = min(_MARGIN, 0.2 * thickness(corners))
         collision = pybullet.createCollisionShape(
             pybullet.GEOM_MESH,
             vertices=prism(inset(corners, margin), _WALL)[0],
@@ -283,22 +262,6 @@ class PhysicsWorld:
         # q and -q are one rotation: with cosine >= 0 the angle lies in (-pi, pi].
         half = math.atan2(sine, cosine) if cosine >= 0.0 else math.atan2(-sine, -cosine)
         return x, y, 2.0 * half
-
-
-def _camera(pixels: int) -> tuple[Sequence[float], Sequence[float]]:
-    """View and projection matrices of a camera that sees exactly the arena from above."""
-    # TinyRenderer samples a pixel at its lower left corner, so the camera stands half a pixel to
-    # the right and up: then a pixel shows its centre.
-    shift = _ENGINE_ARENA / pixels / 2.0
-    eye = (shift, shift, _CAMERA_HEIGHT + _HALF_HEIGHT)
-    view = pybullet.computeViewMatrix(eye, (shift, shift, 0.0), (0.0, 1.0, 0.0))
-    projection = pybullet.computeProjectionMatrixFOV(
-        math.degrees(2.0 * math.atan(_ENGINE_ARENA / 2.0 / _CAMERA_HEIGHT)),
-        1.0,
-        _CAMERA_HEIGHT - _DEPTH,
-        _CAMERA_HEIGHT + _DEPTH,
-    )
-    return view, projection
 
 
 def open_window(layout: Layout, arena: float, colours: Sequence[Sequence[float]]) -> Window:

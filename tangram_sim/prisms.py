@@ -23,8 +23,7 @@ def prism(corners: Floats, half_height: float) -> tuple[list[list[float]], list[
 def inset(corners: Floats, depth: float) -> Floats:
     """A convex counter-clockwise polygon (V, 2) with every edge moved inwards by `depth`.
 
-    Right for depths that leave every edge some length, as less than half the thickness does of
-    shapes that are no needles.
+    Right for depths that leave every edge some length, such as a small part of the thickness.
     """
     edge = np.roll(corners, -1, axis=0) - corners
     inwards = np.stack([-edge[:, 1], edge[:, 0]], axis=1)
@@ -36,6 +35,10 @@ def inset(corners: Floats, depth: float) -> Floats:
 
 
 def thickness(corners: Floats) -> float:
-    """Four times area by perimeter: at most the diameter of the largest circle inside (V, 2)."""
+    """Twice area by perimeter of a convex polygon (V, 2).
+
+    The radius of the largest circle inside where that touches every edge, as in all triangles and
+    squares, and less than its diameter in every polygon.
+    """
     edge = np.roll(corners, -1, axis=0) - corners
-    return float(4.0 * polygon_area(corners) / np.linalg.norm(edge, axis=1).sum())
+    return float(2.0 * polygon_area(corners) / np.linalg.norm(edge, axis=1).sum())

@@ -86,7 +86,7 @@ def turn_onto(corners: Floats, image: Floats) -> float | None:
     for shift in range(len(body)):
         rolled = np.roll(wanted, shift)
         turn = rolled[0] / body[0]
-        turn /= abs(turn)  # a larger one of the same form is another shape
+        turn /= abs(turn)  # a turn only: a similar shape of another size is not it
         if np.allclose(rolled, turn * body, rtol=0.0, atol=1e-6 * np.abs(body).max()):
             return float(np.angle(turn))
     return None

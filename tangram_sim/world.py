@@ -10,8 +10,7 @@ from tangram_sim.config import SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.kinematics import KinematicWorld
 from tangram_sim.layout import Layout
-from tangram_sim.sampling import sample_poses
-from tangram_sim.targets import check_targets
+from tangram_sim.targets import check_targets, sample_starts, sample_targets
 
 
 class World(Protocol):
@@ -28,7 +27,8 @@ class World(Protocol):
 
         Args:
             poses: of the tokens.
-            flipped: (K,) which lie on their other side, see `Layout.corners`; None: none does.
+            flipped: (K,) which lie on their other side, see `Layout.corners`, chiral ones only;
+                None: none does.
         """
 
     def move(self, token: int, velocity: Floats, flip: bool = False) -> None:
@@ -37,7 +37,7 @@ class World(Protocol):
         Args:
             token: its index.
             velocity: (3,) x, y in arena units a second; angular velocity about z in rad/s.
-            flip: turn it over in the air, about its body's x axis, before it moves.
+            flip: turn it over in the air, about its body's x axis, before it moves; a chiral one.
         """
 
     def poses(self) -> Floats:
@@ -58,10 +58,14 @@ def check_world(layout: Layout, sim: SimConfig) -> None:
 
     Raises:
         SamplingError: a token does not fit into the arena, or not all tokens do.
-        ConfigError: the engine is asked for and not installed, or figures of other tokens.
+        ConfigError: the engine is asked for and not installed, or see `check_targets`.
     """
     check_targets(layout, sim)
-    sample_poses(layout, sim, np.random.default_rng(0))
+    done = np.zeros((1, layout.tokens), dtype=np.bool_)
+    for task in (sim.task, *sim.stages):
+        generators = [np.random.default_rng(0)]
+        targets = sample_targets(layout, sim, task, generators)
+        sample_starts(layout, sim, targets, done, generators)
     if sim.backend == "physics" and find_spec("pybullet") is None:
         raise _no_engine("no module named 'pybullet'")
 

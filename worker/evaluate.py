@@ -8,7 +8,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from rich.console import Console
 
@@ -18,7 +17,7 @@ from tangram_agent.runs import Run, load_run
 from tangram_agent.setup import Setup
 from worker.baselines import exact_policy, position_policy, random_policy
 from worker.config import EvalConfig
-from worker.puzzle_scores import score_puzzles, write_sheet
+from worker.puzzle_scores import of_several, score_puzzles, write_sheet
 from worker.puzzles import find_figures
 from worker.rollout import Choose
 from worker.tables import RUN, Scores, print_faults, puzzles_table, scores_table
@@ -76,10 +75,8 @@ def score_policies(
 
 def _scored(trials: Trials, choose: Choose) -> Scores:
     played = trials.play(choose)
-    scores = trials.scores(played)
-    if trials.setup.layout.tokens > 1:
-        scores["seconds_per_puzzle"] = float(np.mean(played.seconds))
-    return scores
+    scores: Scores = dict(trials.scores(played))
+    return scores | (of_several(played) if trials.setup.layout.tokens > 1 else {})
 
 
 def _episodes(run: Run, setup: Setup, config: EvalConfig) -> dict[str, Any]:

@@ -32,9 +32,17 @@ def score_puzzles(
     scores, played = dict[str, Scores](), dict[str, Played]()
     for name, choose in players.items():
         played[name] = play_figures(setup, figures, choose, seed)
-        scores[name] = summarise(setup.layout, setup.sim, played[name], own_reward=False)
-        scores[name]["seconds_per_puzzle"] = float(np.mean(played[name].seconds))
+        means = summarise(setup.layout, setup.sim, played[name], own_reward=False)
+        scores[name] = means | of_several(played[name])
     return scores, _one_by_one(setup, figures, played[RUN]), played[RUN]
+
+
+def of_several(played: Played) -> Scores:
+    """What only the files of evaluations tell: time, and coverage for tests on pairs of episodes."""
+    return {
+        "seconds_per_puzzle": float(np.mean(played.seconds)),
+        "coverage_each": np.round(played.overlap, 6).tolist(),
+    }
 
 
 def write_sheet(path: str, setup: Setup, found: Figures, played: Played) -> None:

@@ -9,7 +9,7 @@ from rich.table import Table
 RUN = "this run"
 MAX_LINES = 40  # of puzzles and of faults on the screen
 
-Scores = dict[str, float]
+Scores = dict[str, Any]  # numbers, and `coverage_each` of the episodes of several tokens
 
 # Scores in the order of the table, with their labels and digits; the rest is only in the file.
 _REWARDS = {

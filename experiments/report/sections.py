@@ -8,6 +8,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from experiments.report.curves import draw_curves, draw_single_seeds
+from experiments.report.game import assembly_table, order_table
 from experiments.report.markdown import ANGLE, DENSE, REWARD, details, picture, plain, shell
 from experiments.report.ranking import draw_ranking
 from experiments.report.references import References
@@ -149,19 +150,26 @@ def _ranking(page: Page, experiment: Experiment) -> list[str]:
     ]
 
 
+def _game(_page: Page, experiment: Experiment) -> list[str]:
+    return [*assembly_table(experiment), *order_table(experiment)]
+
+
 KINDS: dict[str, Callable[[Page, Experiment], list[str]]] = {
     "curves": _curves,
     "rewards": _rewards,
     "complexity": _complexity,
     "tests": _tests,
     "ranking": _ranking,
+    "game": _game,
 }
 
 # What is not there
 
 
 def _lacking(page: Page, experiment: Experiment) -> list[str]:
-    lacking = [] if experiment.kind == "complexity" else page.references.lacking(experiment)
+    lacking = (
+        [] if experiment.kind in ("complexity", "game") else page.references.lacking(experiment)
+    )
     return [f"Left out, since no test has their scores: {plain('; '.join(lacking))}.", ""] * bool(
         lacking
     )

@@ -125,3 +125,14 @@ def test_rewards_are_those_of_the_given_function() -> None:
         np.random.default_rng(0),
     )
     np.testing.assert_allclose(zero.reward, [-0.9, -0.8, -0.7, 0.5, 0.5, 0.5])
+
+
+def test_near_twins_lie_on_the_side_that_was_reached() -> None:
+    made = setup({"shapes": ["parallelogram"], "scale": 1.0}, actions_per_token=STEPS)
+    layout = made.layout
+    path = np.array([[[0.1 * t, 0.0, 0.0]] for t in range(4)])
+    corners = layout.corners(path, np.ones((4, 1), dtype=bool)).astype(np.float32)
+    episode = Episodes(corners[None], EPISODE.placed, A[None], EPISODE.rewards, corners[None, 0])
+    kind = TwinConfig("near", copies=20, position=0.01, angle=0.1)
+    batch = with_twins(episode, [kind], layout, same, np.random.default_rng(0))
+    assert layout.flipped(batch.goal.astype(np.float64)).all()

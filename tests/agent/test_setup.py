@@ -6,6 +6,7 @@ import pytest
 
 from tangram_agent.config import ServiceConfig
 from tangram_agent.setup import from_mapping, make_setup
+from tangram_sim.config import StageConfig
 from tangram_sim.errors import ConfigError
 
 pytestmark = pytest.mark.fast
@@ -45,6 +46,13 @@ def changed(section: str, **values: Any) -> dict[str, dict[str, Any]]:
         (changed("sim", backend="bullet"), "sim.backend must be one of physics, kinematic"),
         (changed("sim", arena="wide"), 'wrong value type for field "sim.arena"'),
         (changed("sim", speed=1), '"speed"'),
+        (changed("sim", stages={"updates": 0}), "stages must be a list, as in stages=.* got"),
+        (changed("sim", stages=[{"update": 0}]), '"update"'),
+        (changed("sim", stages=[3]), 'wrong value type for field "sim.stages"'),
+        (changed("sim", stages=[{"tokens": 1.5}]), 'wrong value .* "sim.stages.tokens"'),
+        (changed("sim", stages=[{"targets": "x"}]), "sim.stages.targets must be one of uniform"),
+        (changed("sim", stages=[{}, {}]), "sim.stages must begin one after the other"),
+        (changed("sim", motion="slide", allow_flip=True), "allow_flip=true needs sim.motion=lift"),
         (changed("reward", source="camera", name="dense"), "source=camera measures Eq. 14 only"),
         (changed("agent", gamma=1.5), "agent.gamma must be between 0 and 1, got 1.5"),
         (changed("agent", batch_size=0), "agent.batch_size must be at least 1, got 0"),
@@ -142,3 +150,15 @@ def test_sizes_follow_from_tokens_and_actions(
 def test_wrong_service_settings_are_refused(name: str, value: object, reason: str) -> None:
     with pytest.raises(ConfigError, match=reason):
         from_mapping(ServiceConfig, {name: value})
+
+
+def test_stages_are_read_from_mappings() -> None:
+    stages = [{"updates": 0, "tokens": 2, "spread": 1}, {"updates": 10, "targets": "connected"}]
+    read = make_setup(changed("sim", stages=stages)).sim
+    assert read.stages == (
+        StageConfig(tokens=2, spread=1.0),
+        StageConfig(updates=10, targets="connected"),
+    )
+    assert read.stage(9) == 1
+    one, other = (make_setup(changed("sim", stages=s)).fingerprints() for s in (stages, []))
+    assert one["sim"] != other["sim"]

@@ -12,7 +12,13 @@ pytestmark = pytest.mark.slow
 
 BUDGETS = choices("budget")
 # The agent of each family that is not called like its agent.
-AGENTS = {"start": "tangram", "matched": "tangram", "mlp_large": "mlp"}
+AGENTS = {
+    "start": "tangram",
+    "matched": "tangram",
+    "mlp_large": "mlp",
+    "game": "tangram",
+    "game_paper": "paper",
+}
 
 
 @pytest.mark.parametrize("budget", BUDGETS)

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from tangram_sim.config import RewardConfig, SimConfig
+from tangram_sim.config import RewardConfig, SimConfig, StageConfig
 from tangram_sim.errors import ConfigError
 
 pytestmark = pytest.mark.fast
@@ -26,11 +26,40 @@ pytestmark = pytest.mark.fast
         ({"pixels": 15}, "sim.pixels must be between 16 and 1024, got 15"),
         ({"pixels": 1025}, "sim.pixels must be between 16 and 1024, got 1025"),
         ({"max_tries": 0}, "sim.max_tries must be between 1"),
+        ({"motion": "fly"}, "sim.motion must be one of lift, slide, got 'fly'"),
+        ({"max_overlap": 1.1}, "sim.max_overlap must be between 0 and 1, got 1.1"),
+        ({"max_overlap": -0.1}, "sim.max_overlap must be between 0 and 1, got -0.1"),
+        ({"targets": "chaos"}, "sim.targets must be one of uniform, .* mixed, got 'chaos'"),
+        ({"spread": 0.0}, "sim.spread must be between 0.001 and 1, got 0"),
+        ({"starts": "here"}, "sim.starts must be one of anywhere, outside, got 'here'"),
+        ({"mirrored": 2.0}, "sim.mirrored must be between 0 and 1, got 2"),
+        ({"mirrored": math.nan}, "sim.mirrored must be between 0 and 1, got nan"),
+        (
+            {"stages": (StageConfig(updates=5), StageConfig(updates=5))},
+            "sim.stages must begin one after the other, got updates .5, 5.: sort them",
+        ),
+        ({"stages": (StageConfig(updates=5), StageConfig(updates=1))}, "got updates .5, 1."),
+        ({"stages": ({"updates": 0},)}, "sim.stages must list stages, got {'updates': 0}"),
     ],
 )
 def test_refused_sim(settings: dict[str, Any], reason: str) -> None:
     with pytest.raises(ConfigError, match=reason):
         SimConfig(**settings)
+
+
+@pytest.mark.parametrize(
+    ("settings", "reason"),
+    [
+        ({"updates": -1}, "sim.stages.updates must be at least 0, got -1"),
+        ({"tokens": -1}, "sim.stages.tokens must be between 0 and 16, got -1"),
+        ({"tokens": 17}, "sim.stages.tokens must be between 0 and 16, got 17"),
+        ({"targets": "chaos"}, "sim.stages.targets must be one of uniform"),
+        ({"spread": 1.5}, "sim.stages.spread must be between 0.001 and 1, got 1.5"),
+    ],
+)
+def test_refused_stage(settings: dict[str, Any], reason: str) -> None:
+    with pytest.raises(ConfigError, match=reason):
+        StageConfig(**settings)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from tangram_sim.config import SimConfig
 from tangram_sim.layout import Layout
 from tangram_sim.physics import PhysicsWorld
 from tangram_sim.sampling import sample_poses
-from tests.sim.builders import SEVEN, angle_gap, largest_overlap, layout_of
+from tests.sim.builders import SEVEN, SQUARE_SCALE, angle_gap, largest_overlap, layout_of
 
 pytestmark = pytest.mark.fast
 
@@ -172,4 +172,30 @@ def test_settled_tokens_do_not_creep(worlds: list[PhysicsWorld]) -> None:
     before = world.poses()
     for sign in (1.0, -1.0) * 10:
         world.move(2, np.array([0.1 * sign, 0.0, 0.0]))
-    np.testing.assert_allclose(world.poses(), before, atol=1e-5)
+    np.testing.assert_allclose(world.poses(), before, atol=1e-9)
+
+
+def test_settling_ends_soon(worlds: list[PhysicsWorld], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each step removes half of an overlap: to a hundred-thousandth in less than thirty."""
+    steps, play = list[int](), pybullet.stepSimulation
+
+    def counted(**settings: Any) -> None:
+        steps.append(1)
+        play(**settings)
+
+    monkeypatch.setattr(pybullet, "stepSimulation", counted)
+    set_down(make(worlds, PAIR), PAIR, (-0.175, 0.0, 0.0), (0.175, 0.02, 0.3))
+    assert 2 < len(steps) < 30
+
+
+@pytest.mark.parametrize("motion", ["lift", "slide"])
+def test_contacts_of_an_episode_end_with_it(worlds: list[PhysicsWorld], motion: str) -> None:
+    """The same two side by side again, but the other way round: what touched is now far apart."""
+    layout = layout_of("square", "square", "small_triangle", scale=SQUARE_SCALE)
+    world = make(worlds, layout, motion=motion)
+    world.place(np.array([[-0.3, 0, 0], [0.2, 0, 0], [0, 0.8, 0]]))
+    world.move(0, np.array([0.15, 0.0, 0.0]))
+    after = np.array([[0.205, 0, 0], [-0.205, 0, 0], [0, 0.8, 0]])
+    world.place(after)
+    world.move(2, np.array([0.1, 0.0, 0.0]))
+    np.testing.assert_allclose(world.poses()[:2], after[:2], atol=1e-9)

@@ -15,7 +15,7 @@ from tangram_sim.config import RewardConfig
 from tangram_sim.env import TangramEnv
 from tangram_sim.errors import ConfigError, SamplingError
 from tangram_sim.register import ENV_ID, register
-from tests.sim.builders import TRIO
+from tests.sim.builders import SEVEN, TRIO
 
 pytestmark = pytest.mark.fast
 
@@ -37,7 +37,12 @@ def kinematic(**settings: Any) -> TangramEnv:
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(
     "settings",
-    [{}, {"shapes": TRIO, "scale": 0.8, "camera": True, "actions_per_token": 2, "reward": "pose"}],
+    [
+        {},
+        {"shapes": TRIO, "scale": 0.8, "camera": True, "actions_per_token": 2, "reward": "pose"},
+        {"shapes": SEVEN, "scale": 0.6, "allow_flip": True, "starts": "outside"},
+        {"shapes": SEVEN, "scale": 0.6, "targets": "figures", "mirrored": 0.5},
+    ],
 )
 def test_gymnasium_checks_it_without_a_warning(
     backend: str, settings: dict[str, Any], made: list[Any]
@@ -47,6 +52,14 @@ def test_gymnasium_checks_it_without_a_warning(
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(env.unwrapped)
+
+
+def test_a_sliding_game_is_checked_too(made: list[Any]) -> None:
+    env = gymnasium.make(ENV_ID, shapes=SEVEN, scale=0.6, motion="slide", targets="connected")
+    made.append(env)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped, skip_render_check=True)
 
 
 def test_registration_loads_no_engine() -> None:
@@ -204,6 +217,10 @@ def test_render() -> None:
         ({"render_mode": "human"}, "render_mode must be None or rgb_array, got 'human'"),
         ({"gravity": 9.81}, "unknown setting 'gravity' of the environment: .* backend, arena"),
         ({"arena": -1.0}, "sim.arena must be"),
+        ({"motion": "slide"}, "sim.motion=slide needs the engine's contacts"),
+        ({"allow_flip": True}, "sim.allow_flip=true needs a token that is not its own mirror"),
+        ({"targets": "figures"}, "sim.targets=figures needs all seven tans, got tokens square"),
+        ({"stages": [{"updates": 0}]}, "sim.stages must list stages, got"),
     ],
 )
 def test_refused_settings(settings: dict[str, Any], reason: str) -> None:

@@ -9,7 +9,14 @@ from tangram_sim.errors import SamplingError
 from tangram_sim.layout import Layout
 from tangram_sim.sampling import sample_batch, sample_poses
 from tangram_sim.seeding import evaluation_generators
-from tests.sim.builders import LOPSIDED, SEVEN, SQUARE_SCALE, TRIO, layout_of
+from tests.sim.builders import (
+    LOPSIDED,
+    SEVEN,
+    SQUARE_SCALE,
+    TRIO,
+    largest_overlap,
+    layout_of,
+)
 
 pytestmark = pytest.mark.fast
 
@@ -83,3 +90,44 @@ def test_tries_are_bounded_exactly() -> None:
         sample_poses(layout, sim, rng)
     twin.random((1 + 5, 3))
     assert rng.random() == twin.random()
+
+
+def test_what_is_to_be_avoided_is_avoided_where_there_is_room() -> None:
+    layout, sim = layout_of(*TRIO, scale=0.6), SimConfig()
+    wall = np.array([[[-1.0, -1.0], [0.3, -1.0], [0.3, 1.0], [-1.0, 1.0]]])
+    poses = sample_batch(layout, sim, evaluation_generators(30), avoid=np.tile(wall, (30, 1, 1, 1)))
+    assert layout.corners(poses)[..., 0].min() > 0.3 - 1e-6
+    everywhere = np.tile(wall * 9.0, (30, 1, 1, 1))
+    poses = sample_batch(layout, sim, evaluation_generators(30), avoid=everywhere)
+    assert layout.corners(poses)[..., 0].min() < -0.5
+
+
+def test_avoiding_gives_up_after_its_own_tries() -> None:
+    """64 of them, in chunks of 4, then as if there were nothing to avoid."""
+    layout, sim = layout_of("square"), SimConfig()
+    everywhere = np.array([[[[-9.0, -9.0], [9.0, -9.0], [9.0, 9.0], [-9.0, 9.0]]]])
+    rng, twin = np.random.default_rng(0), np.random.default_rng(0)
+    poses = sample_batch(layout, sim, [rng], avoid=everywhere)
+    twin.random((64, 3))
+    np.testing.assert_array_equal(poses[0], sample_poses(layout, sim, twin))
+
+
+def test_tokens_that_lie_already_stay_and_are_kept_clear_of() -> None:
+    layout, sim = layout_of(*SEVEN, scale=0.8), SimConfig()
+    known = sample_batch(layout, sim, evaluation_generators(20))
+    lies = np.random.default_rng(0).random((20, 7)) < 0.5
+    generators = [np.random.default_rng(b) for b in range(20)]
+    poses = sample_batch(layout, sim, generators, laid=(lies, known))
+    np.testing.assert_array_equal(poses[lies], known[lies])
+    assert (np.abs(poses - known).max(axis=2) > 1e-3)[~lies].all()
+    assert max(largest_overlap(layout, one) for one in poses) < 1e-8
+
+
+def test_tokens_on_their_other_side_lie_apart_too() -> None:
+    layout, sim = layout_of("parallelogram", LOPSIDED, "square", scale=0.25), SimConfig(arena=1.4)
+    sides = np.random.default_rng(0).random((60, 3)) < 0.5
+    sides[:, 2] = False
+    poses = sample_batch(layout, sim, evaluation_generators(60), sides)
+    apart = [largest_overlap(layout, *pair) for pair in zip(poses, sides, strict=True)]
+    unaware = [largest_overlap(layout, one) for one in poses]
+    assert max(apart) < 1e-8 < max(unaware)

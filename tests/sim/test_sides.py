@@ -56,6 +56,7 @@ def test_one_parallelogram_turned_over_is_the_other() -> None:
     assert turn_onto(tan("parallelogram_mirrored").corners, image) is not None
     assert turn_onto(tan("parallelogram").corners, image) is None
     assert turn_onto(tan("square").corners, tan("small_triangle").corners) is None
+    assert turn_onto(tan("small_triangle").corners, tan("large_triangle").corners) is None
 
 
 def test_a_layout_knows_its_chiral_tokens() -> None:
@@ -129,4 +130,6 @@ def test_sides_are_told_of_noisy_corners_and_rewarded_as_rigid_pieces() -> None:
     noisy = corners + np.random.default_rng(2).normal(0.0, 0.04, corners.shape)
     np.testing.assert_array_equal(layout.flipped(noisy), sides)
     reward = make_reward(RewardConfig(), layout, SimConfig(corner_noise=0.02))
-    np.testing.assert_allclose(reward(corners, corners), 1.0, atol=1e-9)
+    shifted = corners + 0.1
+    expected = 2.0 * overlap_share(shifted, corners, layout) - 1.0
+    np.testing.assert_allclose(reward(shifted, corners), expected, atol=1e-9)

@@ -92,9 +92,12 @@ def test_nothing_is_jumped_over_at_full_speed(
 ) -> None:
     """A small token in the way of a large one, across the whole arena in one second."""
     layout = layout_of("large_triangle", "small_triangle", scale=scale)
-    poses = pushed(make(worlds, layout), [[-1, -1, angle], [0, 0, 0]], [2.0, 2.0, 0.0])
-    np.testing.assert_allclose(poses[0], [1, 1, angle], atol=1e-9)
-    assert np.linalg.norm(poses[1, :2]) > 0.3 * layout.shapes[0].radius
+    world, size = make(worlds, layout), layout.shapes[0].radius
+    for late in np.linspace(0.0, 0.02, 7):
+        start = [[-1 - late, -1 - late, angle], [0, 0, 0]]
+        poses = pushed(world, start, [2.0, 2.0, 0.0])
+        np.testing.assert_allclose(poses[0], [1 - late, 1 - late, angle], atol=1e-9)
+        assert np.linalg.norm(poses[1, :2]) > 0.3 * size
 
 
 @pytest.mark.parametrize("scale", [0.6, 0.15])

@@ -8,7 +8,7 @@ import pytest
 
 from tangram_sim import world as world_module
 from tangram_sim.arrays import Floats
-from tangram_sim.config import SimConfig
+from tangram_sim.config import SimConfig, StageConfig
 from tangram_sim.errors import ConfigError, SamplingError
 from tangram_sim.layout import Layout
 from tangram_sim.pictures import BACKGROUND, TOKEN_GRAY, rasterise
@@ -217,6 +217,17 @@ def test_a_token_that_does_not_fit_is_refused_before_a_world_is_made() -> None:
         check_world(layout_of("square", scale=10.0), SimConfig())
     with pytest.raises(SamplingError, match="no room for token .* beside .* others"):
         check_world(layout_of(*["square"] * 16, scale=1.8), SimConfig())
+
+
+def test_every_stage_is_tried_before_a_world_is_made() -> None:
+    layout, stage = layout_of("square", "square", scale=2.0**0.5), StageConfig(targets="connected")
+    check_world(layout, SimConfig(arena=1.5, stages=(stage,)))
+    with pytest.raises(SamplingError, match="no connected target within an arena of width 0.75"):
+        check_world(layout, SimConfig(arena=0.75, targets="connected"))
+    with pytest.raises(SamplingError, match="no room for token"):
+        check_world(layout, SimConfig(arena=0.75, stages=(stage,)))
+    with pytest.raises(ConfigError, match="sim.targets=figures needs all seven tans"):
+        check_world(layout, SimConfig(stages=(StageConfig(targets="figures"),)))
 
 
 def test_a_missing_engine_is_told_before_a_world_is_made(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -26,6 +27,7 @@ MEANS = {
     "blocked",
     "actions_used",
     "seconds_per_puzzle",
+    "coverage_each",
     "position_error_median",
     "angle_error_deg_median",
 }
@@ -92,6 +94,9 @@ def test_random_targets_of_several_tokens_get_the_same_scores(tmp_path: Path) ->
     assert report["coverage"] == pytest.approx(report["raw_overlap"])
     assert set(report["baselines"]) == ORDERS | {"exact", "random"}
     assert "puzzles" not in report
+    for scores in (report, *report["baselines"].values()):
+        assert len(scores["coverage_each"]) == 3
+        assert np.mean(scores["coverage_each"]) == pytest.approx(scores["coverage"], abs=1e-6)
 
 
 def test_a_long_list_is_cut_on_the_screen_only(
