@@ -6,6 +6,7 @@ The engine always sees an arena of width 2, whatever the arena's unit: its toler
 
 import math
 import weakref
+from collections.abc import Sequence
 
 import numpy as np
 import pybullet

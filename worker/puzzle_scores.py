@@ -38,7 +38,7 @@ def score_puzzles(
 
 
 def of_several(played: Played) -> Scores:
-    """What only the files of evaluations tell: time, and coverage for tests on pairs of episodes."""
+    """What only evaluations tell: time, and every coverage, for tests on pairs of episodes."""
     return {
         "seconds_per_puzzle": float(np.mean(played.seconds)),
         "coverage_each": np.round(played.overlap, 6).tolist(),

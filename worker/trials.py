@@ -52,9 +52,8 @@ def adapted(run: Run, changes: Mapping[str, Any]) -> Run:
         return run
     if not run.setup.pairs:
         raise ConfigError(
-            f"{', '.join(changes)}: the agent of {run.folder} moves each token once it is its turn "
-            "and chooses nothing else; leave it out, or name a run of several tokens with "
-            "agent.readout=pair"
+            f"{', '.join(changes)}: the agent of {run.folder} has no such choice; leave it out, or "
+            "name a run of several tokens with agent.readout=pair"
         )
     return run.with_agent(**changes)
 
