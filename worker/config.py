@@ -12,6 +12,7 @@ from tangram_sim.checks import check_choice, check_range
 from tangram_sim.config import MAX_CORNER_NOISE
 from tangram_sim.errors import ConfigError
 
+CHANGES = ("order", "reapply", "refine_steps", "gamma")  # of how an agent plays
 MAX_EPISODES = 1_000_000
 MAX_ACTIONS = 100
 MAX_SHOWN = 100
@@ -114,7 +115,7 @@ class EvalConfig:
         turns: angles that each puzzle is played at, evenly spread from how it is drawn.
         skip_invalid: leave out puzzles that cannot be played.
         sheet: PNG file for a picture of every puzzle's end.
-        order, reapply, refine_steps: see `AgentConfig`; None is what the run was trained with.
+        order, reapply, refine_steps, gamma: see `AgentConfig`; None: as the run was trained.
     """
 
     run_dir: str | None = None
@@ -130,6 +131,7 @@ class EvalConfig:
     order: str | None = None
     reapply: int | None = None
     refine_steps: int | None = None
+    gamma: float | None = None
 
     def __post_init__(self) -> None:
         _check_run(self.run_dir, self.puzzles is not None)
@@ -152,7 +154,7 @@ class EvalConfig:
     @property
     def agent_changes(self) -> dict[str, Any]:
         """What is set of the agent's play."""
-        named = {name: getattr(self, name) for name in ("order", "reapply", "refine_steps")}
+        named = {name: getattr(self, name) for name in CHANGES}
         return {name: value for name, value in named.items() if value is not None}
 
     def _check_puzzles(self) -> None:

@@ -16,7 +16,7 @@ from tangram_agent.files import write_whole
 from tangram_agent.runs import Run, load_run
 from tangram_agent.setup import Setup
 from worker.baselines import exact_policy, position_policy, random_policy
-from worker.config import EvalConfig
+from worker.config import CHANGES, EvalConfig
 from worker.puzzle_scores import of_several, score_puzzles, write_sheet
 from worker.puzzles import find_figures
 from worker.rollout import Choose
@@ -124,7 +124,7 @@ def _report(
         "updates": run.updates,
         "tokens": [shape.name for shape in setup.layout.shapes],
         "agent": agent["name"],
-        **{name: agent[name] for name in ("order", "reapply", "refine_steps")},
+        **{name: agent[name] for name in CHANGES},
         "backend": setup.sim.backend,
         "motion": setup.sim.motion,
         "baselines": {name: values for name, values in scores.items() if name != RUN},
