@@ -17,6 +17,8 @@ from tangram_sim.layout import Layout
 # Every tan has a number of its own, whatever set it is in; other shapes share the last one.
 KINDS = ("large_triangle", "medium_triangle", "small_triangle", "square", "parallelogram")
 _MIRROR_NAMES = {"parallelogram_mirrored": "parallelogram"}
+# Corners in radii are larger than the rest; then a perceptron's inputs are of about one size.
+_CORNER_SCALE = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,10 +62,11 @@ class PairGraph(nn.Module):
     mirror: Tensor
     chiral: Tensor
     adjacency: Tensor
+    target_flag: Tensor
 
     def __init__(self, layout: Layout, arena: float) -> None:
         super().__init__()
-        self.arena, self.tokens = arena, layout.tokens
+        self.arena = arena
         self.corners = int(layout.padded_corners.shape[1])
         self.nodes = 2 * self.corners + 1
         constants = {
@@ -75,6 +78,7 @@ class PairGraph(nn.Module):
             "mirror": torch.tensor([shape.mirror or 0.0 for shape in layout.shapes]).float(),
             "chiral": torch.as_tensor(layout.chiral).float(),
             "adjacency": _edges(self.corners),
+            "target_flag": (torch.arange(self.nodes) > self.corners).float()[:, None],
         }
         for name, value in constants.items():
             self.register_buffer(name, value, persistent=False)
@@ -89,10 +93,6 @@ class PairGraph(nn.Module):
         """Numbers that describe a pair without nodes: what a perceptron sees."""
         return 2 + 4 + 4 * self.corners + 2 * (len(KINDS) + 1) + 4
 
-    def base_node(self, token: Tensor) -> Tensor:
-        """Node index (M,) of the token's base."""
-        return torch.full_like(token, self.corners)
-
     def relation(self, pairs: Pairs) -> tuple[Tensor, Tensor, Tensor]:
         """The piece as its token sees it.
 
@@ -100,103 +100,103 @@ class PairGraph(nn.Module):
             (M, 2) where its centre is, (M,) its angle, and (M,) 1 where it lies on the other side
             than the token.
         """
-        heading = torch.stack([torch.cos(pairs.pose[:, 2]), torch.sin(pairs.pose[:, 2])], dim=-1)
-        place = turn_back(pairs.goal[:, :2] - pairs.pose[:, :2], heading)
-        angle = pairs.goal[:, 2] - pairs.pose[:, 2]
-        # Through the mirror y and angles change their sign; a shape that is its own mirror image
-        # is then turned by a known angle.
-        sign = 1.0 - 2.0 * pairs.flipped
+        place, angle = self._seen(pairs, pairs.goal)
+        # A shape that is its own mirror image is, through the mirror, turned by a known angle.
         chiral = self.chiral[pairs.piece]
-        angle = sign * angle + pairs.flipped * (1.0 - chiral) * self.mirror[pairs.piece]
-        place = torch.stack([place[:, 0], sign * place[:, 1]], dim=-1)
-        other_side = chiral * (pairs.flipped - pairs.goal_flipped).abs()
-        return place, angle, other_side
+        angle = angle + pairs.flipped * (1.0 - chiral) * self.mirror[pairs.piece]
+        return place, angle, chiral * (pairs.flipped - pairs.goal_flipped).abs()
 
     def motion(self, pairs: Pairs, to: Tensor) -> Tensor:
         """The way to poses (M, 3) as tokens see it: (M, 4), shift, cosine and sine of the turn."""
-        heading = torch.stack([torch.cos(pairs.pose[:, 2]), torch.sin(pairs.pose[:, 2])], dim=-1)
-        shift = turn_back(to[:, :2] - pairs.pose[:, :2], heading)
-        sign = 1.0 - 2.0 * pairs.flipped
-        angle = sign * (to[:, 2] - pairs.pose[:, 2])
-        parts = [shift[:, 0], sign * shift[:, 1], torch.cos(angle), torch.sin(angle)]
-        return torch.stack(parts, dim=-1)
+        shift, angle = self._seen(pairs, to)
+        return torch.cat([shift, _unit(angle)], dim=-1)
 
     def moved(self, pairs: Pairs, shift: Tensor, angle: Tensor) -> Tensor:
         """Poses (M, 3) after a shift (M, 2) and a turn (M,) as the token sees them."""
-        heading = torch.stack([torch.cos(pairs.pose[:, 2]), torch.sin(pairs.pose[:, 2])], dim=-1)
-        sign = 1.0 - 2.0 * pairs.flipped
-        own = torch.stack([shift[:, 0], sign * shift[:, 1]], dim=-1)
+        sign = _signs(pairs.flipped)
+        world = turn(_mirrored(shift, sign), _unit(pairs.pose[:, 2]))
         # No action reaches further than the arena's width in x and in y.
-        world = turn(own, heading).clamp(-self.arena, self.arena)
+        centre = pairs.pose[:, :2] + world.clamp(-self.arena, self.arena)
         turned = pairs.pose[:, 2] + sign * angle
-        return torch.cat([pairs.pose[:, :2] + world, turned[:, None]], dim=-1)
+        return torch.cat([centre, turned[:, None]], dim=-1)
 
-    def _goal_corners(self, pairs: Pairs, angle: Tensor, other_side: Tensor) -> Tensor:
-        """Displacements (M, C, 2) of the piece's corners from its centre."""
-        body = self.body[pairs.piece]
-        sides = (1.0 - 2.0 * other_side)[:, None]
-        flat = torch.stack([body[..., 0], sides * body[..., 1]], dim=-1)
-        return turn(flat, torch.stack([torch.cos(angle), torch.sin(angle)], dim=-1)[:, None])
+    def _seen(self, pairs: Pairs, to: Tensor) -> tuple[Tensor, Tensor]:
+        """The shift (M, 2) and the turn (M,) to poses (M, 3) as tokens see them.
+
+        Through the mirror y and angles change their sign.
+        """
+        sign = _signs(pairs.flipped)
+        shift = turn_back(to[:, :2] - pairs.pose[:, :2], _unit(pairs.pose[:, 2]))
+        return _mirrored(shift, sign), sign * (to[:, 2] - pairs.pose[:, 2])
 
     def vectors(self, pairs: Pairs) -> Tensor:
         """(M, inputs)."""
         place, angle, other_side = self.relation(pairs)
-        radius = self.radius[pairs.token][:, None]
+        radius = self.radius[pairs.token][:, None, None]
         corners = self._goal_corners(pairs, angle, other_side) + place[:, None]
-        near = torch.exp(-(place / radius).norm(dim=-1))
-        ratio = (self.area[pairs.piece] / self.area[pairs.token]).log()
-        return torch.cat(
-            [
-                place,
-                self._angles(pairs, angle),
-                (corners / radius[:, None] * _CORNER_SCALE).flatten(1),
-                (self.body[pairs.token] / radius[:, None]).flatten(1),
-                self.kind[pairs.token],
-                self.kind[pairs.piece],
-                torch.stack([other_side, pairs.covered, ratio, near], dim=-1),
-            ],
-            dim=-1,
-        )
+        ratio, near = self._sizes(pairs, place)
+        parts = [
+            place,
+            self._angles(pairs, angle),
+            (corners / radius * _CORNER_SCALE).flatten(1),
+            (self.body[pairs.token] / radius).flatten(1),
+            self.kind[pairs.token],
+            self.kind[pairs.piece],
+            torch.stack([other_side, pairs.covered, ratio, near], dim=-1),
+        ]
+        return torch.cat(parts, dim=-1)
 
     def node_features(self, pairs: Pairs) -> Tensor:
-        """(M, N, F), corners of the token, its base, corners of the piece."""
+        """(M, N, F): corners of the token, its base, corners of the piece."""
         place, angle, other_side = self.relation(pairs)
-        radius = self.radius[pairs.token][:, None, None]
-        own, count = self.body[pairs.token], self.corners
-        offset = self._goal_corners(pairs, angle, other_side)
+        own, offset = self.body[pairs.token], self._goal_corners(pairs, angle, other_side)
         base = torch.zeros_like(own[:, :1])
         positions = torch.cat([own, base, offset + place[:, None]], dim=1)
+        radius = self.radius[pairs.token][:, None, None]
         offsets = torch.cat([own, base, offset], dim=1) / radius
-        ratio = (self.area[pairs.piece] / self.area[pairs.token]).log()
-        near = torch.exp(-(place / radius[:, 0]).norm(dim=-1))
-        of_pair = [ratio, near, pairs.covered, other_side]
-        shared = torch.cat(
-            [
-                self._angles(pairs, angle),
-                self.kind[pairs.token],
-                self.kind[pairs.piece],
-                torch.stack(of_pair, dim=-1),
-            ],
-            dim=-1,
-        )
-        target = torch.zeros_like(positions[..., :1])
-        target[:, count + 1 :] = 1.0
-        everywhere = shared[:, None].expand(-1, self.nodes, -1)
+        ratio, near = self._sizes(pairs, place)
+        of_pair = [
+            self._angles(pairs, angle),
+            self.kind[pairs.token],
+            self.kind[pairs.piece],
+            torch.stack([ratio, near, pairs.covered, other_side], dim=-1),
+        ]
+        everywhere = torch.cat(of_pair, dim=-1)[:, None].expand(-1, self.nodes, -1)
+        target = self.target_flag.expand(len(own), -1, -1)
         return torch.cat([positions, offsets, target, everywhere], dim=-1)
+
+    def _goal_corners(self, pairs: Pairs, angle: Tensor, other_side: Tensor) -> Tensor:
+        """Displacements (M, C, 2) of the piece's corners from its centre."""
+        body = _mirrored(self.body[pairs.piece], _signs(other_side)[:, None])
+        return turn(body, _unit(angle)[:, None])
+
+    def _sizes(self, pairs: Pairs, place: Tensor) -> tuple[Tensor, Tensor]:
+        """(M,) how much larger the piece is, and (M,) how near, 1 where both centres are one."""
+        ratio = self.area[pairs.piece] / self.area[pairs.token]
+        return ratio.log(), torch.exp(-place.norm(dim=-1) / self.radius[pairs.token])
 
     def _angles(self, pairs: Pairs, angle: Tensor) -> Tensor:
         """(M, 4) cosine and sine of the angle, and of it times the piece's symmetry."""
-        folded = angle * self.symmetry[pairs.piece]
-        parts = [torch.cos(folded), torch.sin(folded), torch.cos(angle), torch.sin(angle)]
-        return torch.stack(parts, dim=-1)
+        return torch.cat([_unit(angle * self.symmetry[pairs.piece]), _unit(angle)], dim=-1)
 
     def turn_of(self, raw: Tensor, token: Tensor) -> Tensor:
         """Turns (M,) of pre-activations (M, 2): no more than a token's symmetry needs."""
         return torch.atan2(raw[:, 1], raw[:, 0]) / self.symmetry[token]
 
 
-# Corners in radii are larger than the rest; then features are of about one size.
-_CORNER_SCALE = 0.3
+def _unit(angle: Tensor) -> Tensor:
+    """Cosine and sine (M, 2) of angles (M,)."""
+    return torch.stack([torch.cos(angle), torch.sin(angle)], dim=-1)
+
+
+def _signs(flipped: Tensor) -> Tensor:
+    """-1 where flipped is 1, and 1 where it is 0."""
+    return 1.0 - 2.0 * flipped
+
+
+def _mirrored(vectors: Tensor, sign: Tensor) -> Tensor:
+    """Vectors (..., 2), their y times a sign (...)."""
+    return torch.stack([vectors[..., 0], sign * vectors[..., 1]], dim=-1)
 
 
 def _kinds(layout: Layout) -> Tensor:
