@@ -10,13 +10,19 @@ Legend: B transitions, P pairs of each, M = B * P, K tokens.
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from tangram_agent.config import AgentConfig
+from tangram_agent.pair_values import (
+    Lying,
+    covered_share,
+    covering,
+    lying,
+    newly_covered,
+    pushed_share,
+)
 from tangram_agent.types import Transitions
 from tangram_sim.actions import chosen_tokens
 from tangram_sim.arrays import Bools, Floats, Ints
-from tangram_sim.geometry import outlines, shared_area
 from tangram_sim.layout import Layout
 
 _OTHER_SHAPE = 0.15  # share of hindsight pieces that have any shape, not the token's
@@ -78,30 +84,22 @@ def make_pairs(
     """
     rows = np.repeat(np.arange(batch.count), agent.pairs_per_transition)
     token = chosen_tokens(batch.action.astype(np.float64), layout.tokens)[rows]
-    before, before_side = _pose_of(batch.state, layout, rows, token)
-    after, after_side = _pose_of(batch.next_state, layout, rows, token)
+    before = lying(batch.state, layout, rows, token)
+    after = lying(batch.next_state, layout, rows, token)
     strategy = _strategies(agent, len(rows), generator)
-    piece = generator.integers(layout.tokens, size=len(rows))
-    goal, goal_side = _pose_of(batch.goal, layout, rows, piece)
-    covered = np.zeros(len(rows))
-    played = strategy == 0
-    others = np.arange(layout.tokens) != token[played][:, None]
-    covered[played] = covered_share(
-        batch.state[rows[played]],
-        others,
-        batch.goal[rows[played]],
-        piece[played],
-        layout,
-    )
-    told = _Relabelled(agent, layout, generator)
-    hind = np.flatnonzero(~played)
-    piece[hind] = told.pieces(token[hind], piece[hind])
-    goal[hind] = told.goals(after[hind], piece[hind], strategy[hind])
-    goal_side[hind] = told.sides(after_side[hind], piece[hind])
-    covered[hind] = told.covered(len(hind))
-    value = newly_covered(after, after_side, token, goal, goal_side, piece, covered, layout)
+    piece, covered = _played(batch, layout, rows, generator)
+    _Relabelled(agent, layout, generator).replace(piece, covered, after, strategy)
     return PairBatch(
-        before, after, before_side, after_side, token, goal, goal_side, piece, covered, value
+        before=before.pose,
+        after=after.pose,
+        before_flipped=before.flipped,
+        after_flipped=after.flipped,
+        token=token,
+        goal=piece.pose,
+        goal_flipped=piece.flipped,
+        piece=piece.index,
+        covered=covered,
+        value=newly_covered(after, piece, covered, layout),
     )
 
 
@@ -111,15 +109,31 @@ def with_contacts(
     """The same pairs, with what their action did to another token, drawn uniformly."""
     rows = np.repeat(np.arange(batch.count), len(pairs.token) // batch.count)
     other = (pairs.token + generator.integers(1, layout.tokens, len(rows))) % layout.tokens
-    pose, side = _pose_of(batch.state, layout, rows, other)
-    later, later_side = _pose_of(batch.next_state, layout, rows, other)
-    before = _outlines_at(pose, side, other, layout)
-    areas = np.array([shape.area for shape in layout.shapes])[other]
-    kept = shared_area(before, _outlines_at(later, later_side, other, layout)) / areas
-    pushed = np.clip(1.0 - kept, 0.0, 1.0)
+    before = lying(batch.state, layout, rows, other)
+    after = lying(batch.next_state, layout, rows, other)
     return ContactBatch(
-        **vars(pairs), other=other, other_pose=pose, other_flipped=side, pushed=pushed
+        **vars(pairs),
+        other=other,
+        other_pose=before.pose,
+        other_flipped=before.flipped,
+        pushed=pushed_share(before, after, layout),
     )
+
+
+def _strategies(agent: AgentConfig, count: int, generator: np.random.Generator) -> Ints:
+    """(M,) 0 for the goal that was played, i for the i-th twin."""
+    copies = [twin.copies if twin.strategy != "none" else 0 for twin in agent.hindsight]
+    parts = np.array([1, *copies])
+    return generator.choice(len(parts), size=count, p=parts / parts.sum())
+
+
+def _played(
+    batch: Transitions, layout: Layout, rows: Ints, generator: np.random.Generator
+) -> tuple[Lying, Floats]:
+    """Any piece (M,) of the goals that were played, and the share of it covered before (M,)."""
+    piece = generator.integers(layout.tokens, size=len(rows))
+    table = covering(batch.state, batch.placed, batch.goal, layout)
+    return lying(batch.goal, layout, rows, piece), covered_share(table, layout)[rows, piece]
 
 
 class _Relabelled:
@@ -132,14 +146,23 @@ class _Relabelled:
         spreads = [(twin.position, twin.position, twin.angle) for twin in agent.hindsight]
         near = [twin.strategy == "near" for twin in agent.hindsight]
         self._spread = np.array([(0.0, 0.0, 0.0), *spreads]) * np.array([0.0, *near])[:, None]
-        self._alike = _same_shapes(layout)
 
-    def pieces(self, token: Ints, other: Ints) -> Ints:
+    def replace(self, piece: Lying, covered: Floats, after: Lying, strategy: Ints) -> None:
+        """Put hindsight in the place of the pieces (M,) whose strategy is not to keep them."""
+        hind = np.flatnonzero(strategy)
+        index = self._pieces(after.index[hind], piece.index[hind])
+        piece.index[hind] = index
+        piece.pose[hind] = self._goals(after.pose[hind], index, strategy[hind])
+        piece.flipped[hind] = self._sides(after.flipped[hind], index)
+        covered[hind] = self._covered(len(hind))
+
+    def _pieces(self, token: Ints, other: Ints) -> Ints:
         """(M,) mostly a piece of the token's own shape, else the other one."""
-        own = np.array([self._generator.choice(self._alike[k]) for k in token], dtype=np.int64)
+        alike, counts = _same_shapes(self._layout)
+        own = alike[token, self._generator.integers(counts[token])]
         return np.where(self._generator.random(len(token)) < _OTHER_SHAPE, other, own)
 
-    def goals(self, after: Floats, piece: Ints, strategy: Ints) -> Floats:
+    def _goals(self, after: Floats, piece: Ints, strategy: Ints) -> Floats:
         """(M, 3) at the achieved pose or near it, at any of the turns that look alike."""
         draw = self._generator.standard_normal(after.shape) * self._spread[strategy]
         goal: Floats = after + draw
@@ -147,109 +170,19 @@ class _Relabelled:
         goal[:, 2] += 2.0 * np.pi / order * self._generator.integers(order)
         return goal
 
-    def sides(self, after: Bools, piece: Ints) -> Bools:
+    def _sides(self, after: Bools, piece: Ints) -> Bools:
         """(M,) mostly the token's own side, where the piece has two."""
         other = self._generator.random(len(piece)) < _OTHER_SIDE
         return np.asarray((after ^ other) & self._layout.chiral[piece])
 
-    def covered(self, count: int) -> Floats:
+    def _covered(self, count: int) -> Floats:
         """(M,) mostly nothing, else any share."""
         share = self._generator.random(count)
         return np.where(self._generator.random(count) < _COVERED, share, 0.0)
 
 
-def covered_share(
-    corners: npt.NDArray[np.floating],
-    placed: npt.NDArray[np.generic],
-    goals: npt.NDArray[np.floating],
-    piece: Ints,
-    layout: Layout,
-) -> Floats:
-    """(M,) share of one piece of each target that placed tokens cover, one by one.
-
-    Args:
-        corners: (M, V, 2) of the tokens.
-        placed: (M, K).
-        goals: (M, V, 2) of the targets.
-        piece: (M,) which piece.
-        layout: of both.
-    """
-    rows, tokens = np.nonzero(placed)
-    own = outlines(np.asarray(corners, np.float64), layout)[rows, tokens]
-    wanted = outlines(np.asarray(goals, np.float64), layout)[rows, piece[rows]]
-    shared = np.bincount(rows, shared_area(wanted, own), minlength=len(corners))
-    areas = np.array([shape.area for shape in layout.shapes])
-    share: Floats = np.minimum(shared / areas[piece], 1.0)
-    return share
-
-
-def covers(corners: Floats, goals: Floats, layout: Layout) -> Floats:
-    """(B, K, K) area that each token covers of each piece of the target.
-
-    Args:
-        corners: (B, V, 2) of the tokens.
-        goals: (B, V, 2) of the targets.
-        layout: of both.
-    """
-    count = layout.tokens
-    own = np.repeat(outlines(corners, layout), count, axis=1)
-    wanted = np.tile(outlines(goals, layout), (1, count, 1, 1))
-    shape = (-1, *own.shape[2:])
-    return shared_area(wanted.reshape(shape), own.reshape(shape)).reshape(-1, count, count)
-
-
-def newly_covered(
-    pose: Floats,
-    flipped: Bools,
-    token: Ints,
-    goal: Floats,
-    goal_flipped: Bools,
-    piece: Ints,
-    covered: Floats,
-    layout: Layout,
-) -> Floats:
-    """(M,) the area of a piece that a token covers and nothing covered before, as a value.
-
-    Over the larger of both areas: over the token's own a small one inside of a large piece would
-    be worth as much as the right one. Where a piece is covered in part, what the token covers is
-    taken to be what is left first.
-    """
-    areas = np.array([shape.area for shape in layout.shapes])
-    shared = shared_area(
-        _outlines_at(goal, goal_flipped, piece, layout), _outlines_at(pose, flipped, token, layout)
-    )
-    new = np.minimum(shared, (1.0 - covered) * areas[piece])
-    value: Floats = new / np.maximum(areas[piece], areas[token])
-    return value
-
-
-def _outlines_at(pose: Floats, flipped: Bools, token: Ints, layout: Layout) -> Floats:
-    """Counter-clockwise corners (M, C, 2) of single tokens."""
-    body = layout.body[layout.padded_corners][token]
-    body = np.where(flipped[:, None, None], body[:, ::-1] * (1.0, -1.0), body)
-    cos, sin = np.cos(pose[:, 2:]), np.sin(pose[:, 2:])
-    x, y = body[..., 0], body[..., 1]
-    turned = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
-    moved: Floats = turned + pose[:, None, :2]
-    return moved
-
-
-def _pose_of(
-    corners: npt.NDArray[np.floating], layout: Layout, rows: Ints, token: Ints
-) -> tuple[Floats, Bools]:
-    """Pose (M, 3) and side (M,) of one token of each row."""
-    exact = np.asarray(corners, np.float64)
-    return layout.poses(exact)[rows, token], layout.flipped(exact)[rows, token]
-
-
-def _strategies(agent: AgentConfig, count: int, generator: np.random.Generator) -> Ints:
-    """(M,) 0 for the goal that was played, i for the i-th twin."""
-    copies = [twin.copies if twin.strategy != "none" else 0 for twin in agent.hindsight]
-    parts = np.array([1, *copies])
-    return generator.choice(len(parts), size=count, p=parts / parts.sum())
-
-
-def _same_shapes(layout: Layout) -> list[Ints]:
-    """For each token the pieces of its own shape."""
+def _same_shapes(layout: Layout) -> tuple[Ints, Ints]:
+    """For each token the pieces of its own shape, first in a row (K, K), and their number (K,)."""
     names = np.array([shape.name for shape in layout.shapes])
-    return [np.flatnonzero(names == name) for name in names]
+    alike = names[:, None] == names
+    return np.argsort(~alike, axis=1, kind="stable"), alike.sum(axis=1)

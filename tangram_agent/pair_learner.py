@@ -4,7 +4,7 @@ What an action is worth falls apart into what it covers of each piece, and hinds
 geometry: so the critic learns a value for each pair, and the value of an action is their sum. What
 lifted tokens cover stays covered, so all of it is earned at once. Tokens that slide push others out
 of their places: the critic learns that for each pair of tokens, and whoever acts subtracts it, for
-later actions with the weight gamma (see `pair_policy`). Nothing is bootstrapped.
+later actions with the weight gamma (see `pair_damage`). Nothing is bootstrapped.
 
 Legend: M pairs.
 """
@@ -45,11 +45,6 @@ class PairLearner(Learner):
             return with_contacts(pairs, batch, self._layout, generator)
         return pairs
 
-    def _pushed(self, t: dict[str, Tensor]) -> Tensor:
-        """Mean squared error of what tokens that slide push away."""
-        share = self._networks.critic.pushed(_others(t), t["after"])
-        return (share - t["pushed"]).square().mean()
-
     def look(self, t: dict[str, Tensor]) -> None:
         """Indices are whole numbers."""
         for name in {"token", "piece", "other"} & t.keys():
@@ -62,6 +57,11 @@ class PairLearner(Learner):
         if self._contacts:
             loss = loss + self._pushed(t)
         return loss, q
+
+    def _pushed(self, t: dict[str, Tensor]) -> Tensor:
+        """Mean squared error of what tokens that slide push away."""
+        share = self._networks.critic.pushed(_others(t), t["after"])
+        return (share - t["pushed"]).square().mean()
 
     def actor_loss(self, t: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Minus the value of the actor's own poses, and the saturation penalty."""

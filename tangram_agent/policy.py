@@ -86,8 +86,7 @@ class Policy:
             wanted = np.asarray(goals, np.float64)
             choice = self._chooser.choose(exact, np.asarray(placed, np.bool_), wanted, refine)
             token, flip = choice.token, choice.flip
-            pose = self.layout.poses(exact)[np.arange(len(token)), token]
-            velocity = self._way(pose, choice.pose)
+            velocity = self._way(choice.start, choice.pose)
         return self._joined(token, flip, velocity)
 
     def _velocity(
