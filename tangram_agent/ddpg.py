@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from tangram_agent.config import AgentConfig
 from tangram_agent.graph import TokenGraph
-from tangram_agent.networks import Actor, Critic, initialise, parameter_count
+from tangram_agent.networks import VELOCITY, Actor, Critic, initialise, parameter_count
 from tangram_agent.pair_batch import PairBatch
 from tangram_agent.setup import Setup
 from tangram_agent.types import Transitions, Weights
@@ -33,11 +33,12 @@ def next_token(placed: Tensor) -> Tensor:
 
 
 def split_action(action: Tensor, tokens: int) -> tuple[Tensor, Tensor]:
-    """Token (B,) and velocity (B, 3) of an action (B, A) of the environment."""
+    """Token (B,) and velocity (B, 3) of an action (B, A) of the environment, see `actions`."""
+    velocity = action[:, -VELOCITY:]
     if tokens == 1:
-        return torch.zeros(len(action), dtype=torch.long, device=action.device), action
+        return torch.zeros(len(action), dtype=torch.long, device=action.device), velocity
     token = ((action[:, 0] + 1.0) / 2.0 * tokens).long().clamp(0, tokens - 1)
-    return token, action[:, 1:]
+    return token, velocity
 
 
 def critic_target(reward: Tensor, done: Tensor, next_value: Tensor, gamma: float) -> Tensor:

@@ -46,6 +46,7 @@ class TokenGraph(nn.Module):
     token_of_node: Tensor
     piece_of_node: Tensor
     target_flag: Tensor
+    chiral: Tensor
 
     def __init__(self, layout: Layout, arena: float, agent: AgentConfig) -> None:
         super().__init__()
@@ -54,7 +55,7 @@ class TokenGraph(nn.Module):
             layout.corner_count,
             layout.nodes,
         )
-        self.arena = arena
+        self.arena, self.any_chiral = arena, layout.any_chiral
         self.egocentric, self.offsets = agent.egocentric, agent.offsets
         self.orientation = agent.orientation
         owner = torch.as_tensor(layout.token_of_corner)
@@ -74,6 +75,7 @@ class TokenGraph(nn.Module):
             "token_of_node": torch.cat([owner, torch.arange(layout.tokens), owner]),
             "piece_of_node": torch.cat([owner, torch.arange(layout.tokens), layout.tokens + owner]),
             "target_flag": target_flag,
+            "chiral": torch.as_tensor(layout.chiral),
         }
         for name, value in constants.items():
             self.register_buffer(name, value, persistent=False)
@@ -92,10 +94,18 @@ class TokenGraph(nn.Module):
         return self.base_weights @ corners
 
     def headings(self, corners: Tensor, centre: Tensor) -> Tensor:
-        """Orientations (B, K, 2): the least-squares rotations from the body frame."""
+        """Orientations (B, K, 2): the least-squares rotations from the body frame.
+
+        From its mirror image where a token lies on its other side: the one that fits better.
+        """
         offset = corners - centre[:, self.token_of_corner]
-        relative = turn_back(offset, self.body.expand_as(offset))
-        return nn.functional.normalize(self.members @ relative, dim=-1)
+        body = self.body.expand_as(offset)
+        heading: Tensor = self.members @ turn_back(offset, body)
+        if self.any_chiral:
+            mirrored = self.members @ turn(offset, body)
+            turned_over = self.chiral & (mirrored.norm(dim=-1) > heading.norm(dim=-1))
+            heading = torch.where(turned_over[..., None], mirrored, heading)
+        return nn.functional.normalize(heading, dim=-1)
 
     def node_features(self, corners: Tensor, placed: Tensor, goal: Tensor, token: Tensor) -> Tensor:
         """Features (B, N, F).
