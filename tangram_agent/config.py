@@ -56,7 +56,8 @@ class TwinConfig:
     """One kind of hindsight twin that is added for every transition played.
 
     Attributes:
-        strategy: final, future, near (the final pose moved by Gaussian noise), or none.
+        strategy: final, future, near (the final pose moved by Gaussian noise), or none. On pairs
+            final and future are one: where the token came to lie by its action.
         copies: twins of this kind for each transition.
         position: near: standard deviation of the goal's shift, in arena units.
         angle: near: standard deviation of the goal's turn, in radians.
@@ -89,18 +90,20 @@ class AgentConfig:
         squash: of the actor's outputs: tanh (the paper) or clamp.
         saturation_penalty: weight of mean(relu(|z| - saturation_limit)^2) in the actor's loss.
         saturation_limit: pre-activation beyond which the penalty starts.
-        readout: token (one velocity of a given token, the next one in the set's order), pair (a
-            pose for every pair of a token and a piece of the target, and its value), or auto: pair
-            for several tokens.
+        readout: token (one velocity of a given token, the next one in the set's order, which is
+            never turned over), pair (a pose for every pair of a token and a piece of the target,
+            and its value), or auto: pair for several tokens. On pairs the settings from egocentric
+            to squash are not used: their graph has all of it, see `pairs`.
         order: pair: which token is next: learned (the one with the best value), listed (as in the
             set), size (the largest first) or random.
         reapply: pair: how often the actor is applied again to its own proposals before one is
             chosen; 0 is not.
-        refine_steps: pair: gradient steps on the critic that the chosen pose makes before it is
-            played, exploration off.
+        refine_steps: pair: gradient steps that the chosen pose makes uphill on what it covers by
+            the critic before it is played, exploration off.
         refine_rate: pair: length of the first of these steps, in arena units and radians.
         pairs_per_transition: pair: pairs that a transition gives in one update.
-        gamma: discount, Eq. 5.
+        gamma: discount, Eq. 5. On pairs the weight of what later tokens push away again, see
+            `pair_damage`: it has no effect where tokens are lifted.
         polyak: rho of the target networks, Eq. 4.
         acting_average: Polyak average of the actor that plays and is scored, less in the first
             updates (see `ddpg.average_so_far`); 0 is the actor.
