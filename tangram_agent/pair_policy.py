@@ -147,7 +147,9 @@ def _ranks(order: str, layout: Layout, goals: Floats) -> Floats:
     """(B, K) which token comes first, by a rule that was not learned."""
     count = layout.tokens
     if order == "size":
-        rank = np.argsort(np.argsort(-areas(layout), kind="stable"))
+        # Equal areas stay in the set's order, whatever their rounding.
+        size = np.round(areas(layout) / areas(layout).max(), 9)
+        rank = np.argsort(np.argsort(-size, kind="stable"))
         return np.broadcast_to(rank, (len(goals), count))
     if order == "random":
         # By the target, which stays for the whole episode: a policy has no memory.
