@@ -87,7 +87,7 @@ def make_pairs(
     before = lying(batch.state, layout, rows, token)
     after = lying(batch.next_state, layout, rows, token)
     strategy = _strategies(agent, len(rows), generator)
-    piece, covered = _played(batch, layout, rows, generator)
+    piece, covered = _played(batch, layout, rows, token, generator)
     _Relabelled(agent, layout, generator).replace(piece, covered, after, strategy)
     return PairBatch(
         before=before.pose,
@@ -128,12 +128,12 @@ def _strategies(agent: AgentConfig, count: int, generator: np.random.Generator) 
 
 
 def _played(
-    batch: Transitions, layout: Layout, rows: Ints, generator: np.random.Generator
+    batch: Transitions, layout: Layout, rows: Ints, token: Ints, generator: np.random.Generator
 ) -> tuple[Lying, Floats]:
-    """Any piece (M,) of the goals that were played, and the share of it covered before (M,)."""
+    """Any piece (M,) of the goals that were played, and what others covered of it before (M,)."""
     piece = generator.integers(layout.tokens, size=len(rows))
-    table = covering(batch.state, batch.placed, batch.goal, layout)
-    return lying(batch.goal, layout, rows, piece), covered_share(table, layout)[rows, piece]
+    table = covering(batch.state, batch.goal, layout)
+    return lying(batch.goal, layout, rows, piece), covered_share(table, layout)[rows, token, piece]
 
 
 class _Relabelled:

@@ -22,7 +22,7 @@ def damage(
 ) -> Tensor:
     """(M,) what sliding to poses (M, 3) costs.
 
-    Now: each placed token's worth, times the share that it is pushed away. Later, with the weight
+    Now: each other token's worth, times the share that it is pushed away. Later, with the weight
     gamma: the candidate's own value (M,), times the share that every token which is still to come
     pushes it away on the way to the best pose known for it. So what lies in the way of others is
     placed after them. A token without a candidate is not counted.
@@ -34,7 +34,7 @@ def damage(
 
 
 def _pushed_now(critic: PairCritic, scene: Scene, candidates: Candidates, pose: Tensor) -> Tensor:
-    """(M,) sum over placed tokens of the share that each is pushed away times its worth."""
+    """(M,) sum over other tokens of the share that each is pushed away times its worth."""
     index, token = torch.nonzero(scene.worth[candidates.row] > 0.0, as_tuple=True)
     apart = candidates.token[index] != token
     index, token = index[apart], token[apart]

@@ -59,7 +59,7 @@ class PairChooser:
             refine: take the gradient steps that the agent is configured for.
         """
         start = self._layout.poses(corners)
-        scene = self._scene(corners, start, placed, goals)
+        scene = self._scene(corners, start, goals)
         with torch.no_grad():
             candidates, pose = self._short_list(scene, self._open(placed, goals))
             best = self._best(scene, candidates, pose)
@@ -74,17 +74,16 @@ class PairChooser:
             pose=pose.numpy().astype(np.float64),
         )
 
-    def _scene(self, corners: Floats, start: Floats, placed: Bools, goals: Floats) -> Scene:
+    def _scene(self, corners: Floats, start: Floats, goals: Floats) -> Scene:
         layout = self._layout
-        covered = covering(corners, placed, goals, layout)
-        worth = worths(covered, layout) if self._contacts else np.zeros(placed.shape)
+        covered = covering(corners, goals, layout)
         return Scene(
             pose=_tensor(start),
             flipped=_tensor(layout.flipped(corners)),
             goal=_tensor(layout.poses(goals)),
             goal_flipped=_tensor(layout.flipped(goals)),
             covered=_tensor(covered_share(covered, layout)),
-            worth=_tensor(worth),
+            worth=_tensor(worths(covered, layout)),
         )
 
     def _open(self, placed: Bools, goals: Floats) -> Bools:
@@ -117,7 +116,8 @@ class PairChooser:
 
     def _best(self, scene: Scene, candidates: Candidates, pose: Tensor) -> Tensor:
         """Index (B,) of the best candidate of each row."""
-        total = self._total(scene, candidates, pose)
+        # What a token covers already it gives up.
+        total = self._total(scene, candidates, pose) - scene.worth[candidates.row, candidates.token]
         if self._contacts:
             critic, gamma = self._networks.critic, self._agent.gamma
             total = total - damage(critic, gamma, scene, candidates, pose, total)

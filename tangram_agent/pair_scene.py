@@ -55,9 +55,8 @@ class Scene:
         flipped: (B, K) their sides.
         goal: (B, K, 3) of the target's pieces.
         goal_flipped: (B, K) their sides.
-        covered: (B, K) share of each piece that placed tokens cover.
-        worth: (B, K) sum of the values of what each placed token covers; 0 of others, and where
-            nothing can push it away.
+        covered: (B, K, K) share of the second, a piece, that tokens other than the first cover.
+        worth: (B, K) sum of the values of what each token covers.
     """
 
     pose: Tensor
@@ -76,7 +75,7 @@ class Scene:
             goal=self.goal[c.row, c.piece],
             goal_flipped=self.goal_flipped[c.row, c.piece],
             piece=c.piece,
-            covered=self.covered[c.row, c.piece],
+            covered=self.covered[c.row, c.token, c.piece],
         )
 
     def meetings(self, movers: Candidates, other: Candidates, where: Tensor) -> Pairs:

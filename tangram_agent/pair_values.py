@@ -46,29 +46,29 @@ def lying(corners: Corners, layout: Layout, rows: Ints, index: Ints) -> Lying:
     return Lying(index, layout.poses(exact)[rows, index], layout.flipped(exact)[rows, index])
 
 
-def covering(
-    corners: Corners, placed: npt.NDArray[np.generic], goals: Corners, layout: Layout
-) -> Floats:
-    """(B, K, K) area of piece j that token i covers if it is placed; rows of others are 0.
+def covering(corners: Corners, goals: Corners, layout: Layout) -> Floats:
+    """(B, K, K) area of piece j that token i covers where it lies, placed or not.
 
     Args:
         corners: (B, V, 2) of the tokens; with noise, of the pieces that fit them best.
-        placed: (B, K).
         goals: (B, V, 2) of the targets.
         layout: of both.
     """
     count = layout.tokens
-    rows, tokens = np.nonzero(placed)
-    own = np.repeat(_fitted(corners, layout)[rows, tokens], count, axis=0)
-    wanted = _fitted(goals, layout)[rows].reshape(own.shape)
-    covered = np.zeros((*np.shape(placed), count))
-    covered[rows, tokens] = shared_area(wanted, own).reshape(-1, count)
-    return covered
+    own = np.repeat(_fitted(corners, layout), count, axis=1)
+    wanted = np.tile(_fitted(goals, layout), (1, count, 1, 1))
+    shape = (-1, *own.shape[2:])
+    shared = shared_area(wanted.reshape(shape), own.reshape(shape))
+    return shared.reshape(-1, count, count)
 
 
 def covered_share(covered: Floats, layout: Layout) -> Floats:
-    """(B, K) share of each piece that is covered, token by token, by what `covering` gave."""
-    share: Floats = np.minimum(covered.sum(axis=1) / areas(layout), 1.0)
+    """(B, K, K) share of piece j that tokens other than i cover, by what `covering` gave.
+
+    So a token that is to move is seen as if it were gone.
+    """
+    others = covered.sum(axis=1, keepdims=True) - covered
+    share: Floats = np.clip(others / areas(layout), 0.0, 1.0)
     return share
 
 

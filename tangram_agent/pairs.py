@@ -32,7 +32,7 @@ class Pairs:
         goal: (M, 3) pose of the target's piece.
         goal_flipped: (M,) 1 where that lies on its other side.
         piece: (M,) its index.
-        covered: (M,) share of the piece that placed tokens cover already.
+        covered: (M,) share of the piece that other tokens cover already.
     """
 
     pose: Tensor

@@ -76,8 +76,8 @@ def test_played_pairs_have_any_piece_and_its_exact_covered_share() -> None:
     np.testing.assert_allclose(counts, 1 / 7, atol=0.05)
     sides = LAYOUT.flipped(BATCH.goal.astype(np.float64))[ROWS, pairs.piece]
     np.testing.assert_array_equal(pairs.goal_flipped, sides)
-    table = covering(BATCH.state, BATCH.placed, BATCH.goal, LAYOUT)
-    expected = covered_share(table, LAYOUT)[ROWS, pairs.piece]
+    table = covering(BATCH.state, BATCH.goal, LAYOUT)
+    expected = covered_share(table, LAYOUT)[ROWS, pairs.token, pairs.piece]
     np.testing.assert_allclose(pairs.covered, expected)
     assert 0.05 < (expected > 0.1).mean() < 0.95
 

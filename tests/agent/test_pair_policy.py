@@ -12,7 +12,7 @@ from tangram_agent import pair_policy
 from tangram_agent.networks import initialise
 from tangram_agent.pair_networks import PairNetworks
 from tangram_agent.pair_policy import PairChooser
-from tangram_agent.pair_values import covered_share, covering
+from tangram_agent.pair_values import covered_share, covering, worths
 from tangram_agent.pairs import PairGraph, Pairs
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
@@ -71,8 +71,9 @@ def total(
 ) -> tuple[float, np.ndarray]:
     """Value over all pieces of one token's pose, by default the actor's own for one piece."""
     layout = made.layout
-    corners, placed, goals = (part[None] for part in scene)
-    share = covered_share(covering(corners, placed, goals, layout), layout)[0]
+    corners, _, goals = (part[None] for part in scene)
+    covered = covering(corners, goals, layout)
+    share = covered_share(covered, layout)[0, token]
     here, side = layout.poses(corners)[0, token], layout.flipped(corners)[0, token] ^ flip
     wanted, sides = layout.poses(goals)[0], layout.flipped(goals)[0]
 
@@ -92,7 +93,7 @@ def total(
         for _ in range(made.agent.reapply):
             pose = networks.actor(pair(pose, piece))[0][0].numpy()
     values = [networks.critic(pair(pose, index)).item() for index in range(layout.tokens)]
-    return sum(values), pose
+    return sum(values) - worths(covered, layout)[0, token], pose
 
 
 @pytest.mark.parametrize("net", [SMALL, PERCEPTRON])

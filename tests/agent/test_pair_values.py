@@ -62,21 +62,21 @@ def test_what_lies_is_found_in_corners(seed: int) -> None:
 def test_covering_shares_and_worths_against_shapely(seed: int) -> None:
     rng = np.random.default_rng(seed)
     (poses, sides), (goals, goal_sides) = (random_scene(LAYOUT, rng, 2) for _ in range(2))
-    placed = rng.random((2, 7)) < 0.6
     corners, wanted = LAYOUT.corners(poses, sides), LAYOUT.corners(goals, goal_sides)
     expected = np.zeros((2, 7, 7))
     for b in range(2):
         own, pieces = polygons(corners[b]), polygons(wanted[b])
         for i, j in np.ndindex(7, 7):
-            if placed[b, i]:
-                expected[b, i, j] = own[i].intersection(pieces[j]).area
-    found = covering(corners, placed, wanted, LAYOUT)
+            expected[b, i, j] = own[i].intersection(pieces[j]).area
+    found = covering(corners, wanted, LAYOUT)
     assert expected.max() > 0.01
     np.testing.assert_allclose(found, expected, atol=1e-9)
     larger = np.maximum(AREAS[:, None], AREAS)
     np.testing.assert_allclose(worths(found, LAYOUT), (expected / larger).sum(axis=2), atol=1e-7)
-    share = np.minimum(expected.sum(axis=1) / AREAS, 1.0)
-    np.testing.assert_allclose(covered_share(found, LAYOUT), share, atol=1e-7)
+    share = covered_share(found, LAYOUT)
+    for b, mover, j in np.ndindex(2, 7, 7):
+        others = sum(expected[b, i, j] for i in range(7) if i != mover)
+        assert share[b, mover, j] == pytest.approx(min(others / AREAS[j], 1.0), abs=1e-7)
 
 
 def test_the_share_of_tokens_that_do_not_overlap_is_that_of_their_union() -> None:
@@ -88,26 +88,23 @@ def test_the_share_of_tokens_that_do_not_overlap_is_that_of_their_union() -> Non
     corners, wanted = LAYOUT.corners(poses, sides), LAYOUT.corners(goals, goal_sides)
     union = unary_union(polygons(corners))
     expected = [piece.intersection(union).area / piece.area for piece in polygons(wanted)]
-    found = covering(corners[None], np.ones((1, 7)), wanted[None], LAYOUT)
+    found = covering(corners[None], wanted[None], LAYOUT)
     assert max(expected) > 0.3
-    np.testing.assert_allclose(covered_share(found, LAYOUT)[0], expected, atol=1e-9)
+    own = found[0] / AREAS
+    np.testing.assert_allclose(covered_share(found, LAYOUT)[0] + own, [expected] * 7, atol=1e-9)
 
 
 def test_tokens_on_top_of_each_other_cover_no_more_than_the_piece() -> None:
     poses = np.tile([0.1, 0.2, 0.3], (7, 1))
     corners = LAYOUT.corners(poses)[None]
-    share = covered_share(covering(corners, np.ones((1, 7)), corners, LAYOUT), LAYOUT)
+    share = covered_share(covering(corners, corners, LAYOUT), LAYOUT)
     assert share.max() == 1.0
 
 
-def test_tokens_that_are_not_placed_cover_nothing() -> None:
-    corners = LAYOUT.corners(np.zeros((7, 3)))[None]
-    placed = np.array([[0, 0, 1, 0, 0, 0, 0]], np.uint8)
-    found = covering(corners, placed, corners, LAYOUT)
-    assert (found[0, MEDIUM] > 0.0).all()
-    found[0, MEDIUM] = 0.0
-    assert not found.any()
-    assert not worths(found, LAYOUT).any()
+def test_a_token_that_is_to_move_covers_nothing_for_itself() -> None:
+    corners = LAYOUT.corners(np.column_stack([np.arange(7) - 3.0, np.zeros((7, 2))]))[None]
+    share = covered_share(covering(corners, corners, LAYOUT), LAYOUT)[0]
+    np.testing.assert_allclose(share, 1.0 - np.eye(7), atol=1e-9)
 
 
 @pytest.mark.parametrize("noise", [0.01, 0.1, 0.4])
@@ -117,9 +114,9 @@ def test_of_noisy_corners_the_pieces_that_fit_are_covered(noise: float) -> None:
     corners = LAYOUT.corners(*random_scene(LAYOUT, rng, 50))
     corners = corners + noise * rng.standard_normal(corners.shape)
     goals = LAYOUT.corners(*random_scene(LAYOUT, rng, 50))
-    found = covering(corners, np.ones((50, 7)), goals, LAYOUT)
+    found = covering(corners, goals, LAYOUT)
     fitted = LAYOUT.corners(LAYOUT.poses(corners), LAYOUT.flipped(corners))
-    np.testing.assert_allclose(found, covering(fitted, np.ones((50, 7)), goals, LAYOUT), atol=1e-9)
+    np.testing.assert_allclose(found, covering(fitted, goals, LAYOUT), atol=1e-9)
     assert found.min() >= 0.0
     assert (found <= np.minimum(AREAS[:, None], AREAS) + 1e-9).all()
 
