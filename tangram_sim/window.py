@@ -17,6 +17,7 @@ from tangram_sim.prisms import prism
 _ENGINE_ARENA = 2.0
 # Tokens thick enough to be seen from the side, over a flat target.
 _SHOWN_HALF_HEIGHT, _FLAT_HALF_HEIGHT = 0.03, 0.001
+_OUT_OF_SIGHT = (0.0, 0.0, -1e4)  # until it is told where to lie
 _PAPER = " ".join(
     f"--background_color_{name}={value}"
     for name, value in (("red", 0.98), ("green", 0.98), ("blue", 0.97))
@@ -55,7 +56,6 @@ class Window:
             for corners, colour in zip(shapes, colours, strict=False)
         ]
         self._target = [self._body(corners, _FLAT_HALF_HEIGHT, colours[-1]) for corners in shapes]
-        self._drawn = False
 
     @property
     def is_open(self) -> bool:
@@ -73,9 +73,6 @@ class Window:
         for body, pose, roll, height in zip(self._tokens, poses, rolls, heights, strict=True):
             # So that they lie on the table, and not half in it.
             self._put(body, pose, float(roll), _SHOWN_HALF_HEIGHT + float(height))
-        if not self._drawn:
-            self._draw(True)
-            self._drawn = True
 
     def show_target(self, poses: Floats, flipped: Bools) -> None:
         """Lay the target below the tokens: poses (K, 3) and sides (K,)."""
@@ -86,10 +83,6 @@ class Window:
         """Close it; calling it twice does no harm."""
         if self.is_open:
             self._engine.disconnect(self._client)
-
-    def _draw(self, on: bool) -> None:
-        flag = self._engine.COV_ENABLE_RENDERING
-        self._engine.configureDebugVisualizer(flag, int(on), physicsClientId=self._client)
 
     def _body(self, corners: Floats, half_height: float, colour: Sequence[float]) -> int:
         vertices, triangles = prism(corners, half_height)
@@ -106,7 +99,9 @@ class Window:
             specularColor=(0.0, 0.0, 0.0),
             physicsClientId=self._client,
         )
-        body: int = self._engine.createMultiBody(0.0, -1, visual, physicsClientId=self._client)
+        body: int = self._engine.createMultiBody(
+            0.0, -1, visual, basePosition=_OUT_OF_SIGHT, physicsClientId=self._client
+        )
         return body
 
     def _put(self, body: int, pose: Floats, roll: float, height: float) -> None:
