@@ -101,6 +101,14 @@ def test_the_first_entry_of_an_action_names_the_token(selector: float, token: in
     assert velocity.tolist() == action[:, 1:].tolist()
 
 
+def test_the_entry_that_turns_a_token_over_is_no_velocity() -> None:
+    """Tokens turned over: an entry between the token's and the velocity."""
+    found, velocity = split_action(torch.tensor([[0.9, 1.0, 0.1, 0.2, 0.3]]), 2)
+    assert found.tolist() == [1]
+    assert velocity[0].tolist() == pytest.approx([0.1, 0.2, 0.3])
+    assert split_action(torch.tensor([[1.0, 0.1, 0.2, 0.3]]), 1)[1].shape == (1, 3)
+
+
 def test_the_critic_loss_is_the_mean_squared_bellman_error() -> None:
     """Against the value by hand: y from the target networks, one transition at a time."""
     made = setup(agent={**PAPER, "gamma": 0.9}, actions_per_token=2)

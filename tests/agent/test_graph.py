@@ -114,3 +114,16 @@ def test_edges_are_the_papers_or_all(tokens: dict[str, object]) -> None:
     layout = setup(tokens).layout
     np.testing.assert_array_equal(paper.adjacency, layout.adjacency)
     np.testing.assert_array_equal(complete.adjacency, ~np.eye(layout.nodes, dtype=bool))
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.7, -2.9])
+@pytest.mark.parametrize("flipped", [False, True])
+def test_the_heading_of_a_token_on_either_side_is_its_turn(angle: float, flipped: bool) -> None:
+    made = setup({"shapes": ["square", "parallelogram"], "scale": 1}, agent={"readout": "token"})
+    poses = np.array([[0.3, 0.1, -0.4], [-0.2, 0.5, angle]])
+    scene = made.layout.corners(poses, np.array([False, flipped]))
+    points = torch.from_numpy(scene[None]).float()
+    graph = graph_of(made)
+    found = graph.headings(points, graph.centres(points))[0]
+    expected = [[math.cos(a), math.sin(a)] for a in (-0.4, angle)]
+    np.testing.assert_allclose(found, expected, atol=1e-6)

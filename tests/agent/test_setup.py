@@ -64,6 +64,12 @@ def changed(section: str, **values: Any) -> dict[str, dict[str, Any]]:
         (changed("agent", angle_head="x"), "agent.angle_head must be one of plain, kfold"),
         (changed("agent", edges="x"), "agent.edges must be one of paper, complete, got 'x'"),
         (changed("agent", lr_decay="x"), "agent.lr_decay must be one of none, cosine"),
+        (changed("agent", readout="x"), "agent.readout must be one of auto, token, pair, got 'x'"),
+        (changed("agent", order="x"), "agent.order must be one of learned, listed, size, random"),
+        (changed("agent", reapply=-1), "agent.reapply must be between 0 and 100, got -1"),
+        (changed("agent", refine_steps=-1), "agent.refine_steps must be between 0 and 10000"),
+        (changed("agent", refine_rate=0), "agent.refine_rate must be between 1e-09 and 1, got 0"),
+        (changed("agent", pairs_per_transition=0), "pairs_per_transition must be between 1 and"),
         (changed("agent", hindsight=[{"strategy": "x"}]), "must be one of final, future, near"),
         (
             changed("agent", hindsight=[{"strategy": "near", "copies": 0}]),
@@ -127,6 +133,37 @@ def test_sizes_follow_from_tokens_and_actions(
     config = changed("tokens", shapes=shapes) | {"sim": {"actions_per_token": actions}}
     made = make_setup(config)
     assert (made.horizon, made.action_size) == (horizon, action_size)
+
+
+@pytest.mark.parametrize(
+    ("shapes", "readout", "pairs"),
+    [
+        (["square"], "auto", False),
+        (["square"], "pair", True),
+        (["square", "square"], "auto", True),
+        (["square", "square"], "token", False),
+    ],
+)
+def test_several_tokens_are_pairs_unless_told_otherwise(
+    shapes: list[str], readout: str, pairs: bool
+) -> None:
+    config = changed("tokens", shapes=shapes) | {"agent": {"readout": readout}}
+    assert make_setup(config).pairs == pairs
+
+
+@pytest.mark.parametrize(
+    ("shapes", "motion", "contacts"),
+    [
+        (["square"], "slide", False),
+        (["square"] * 2, "lift", False),
+        (["square"] * 2, "slide", True),
+    ],
+)
+def test_tokens_push_each_other_where_several_slide(
+    shapes: list[str], motion: str, contacts: bool
+) -> None:
+    config = changed("tokens", shapes=shapes) | {"sim": {"motion": motion}}
+    assert make_setup(config).contacts == contacts
 
 
 @pytest.mark.parametrize(
