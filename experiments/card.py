@@ -20,6 +20,10 @@ _ROWS = {
     "mean_reward_camera": ("mean reward, camera's pixels, -1 to 1", 4),
     "raw_overlap": ("raw overlap, 0 to 1", 4),
     "raw_overlap_p10": ("raw overlap, 10th percentile", 4),
+    "share_solved": ("share of targets covered by 0.95 or more", 3),
+    "iou": ("intersection over union", 4),
+    "wrong": ("pieces under a token of another shape", 2),
+    "blocked": ("placements refused because of other tokens", 2),
     "angle_error_deg_median": ("angle error, median, degrees", 2),
     "angle_error_deg_p90": ("angle error, 90th percentile", 2),
     "position_error_median": ("position error, median, arena units", 4),
@@ -98,8 +102,21 @@ def _limits(setup: Setup, scores: Scores) -> list[str]:
         f"{pieces}, in an arena of this width: another task needs another training.",
         noise,
         "Each corner must be known by its number: the target's corners come in the token's order.",
-        "Tokens pass through each other in the simulation, and nothing stops one at the edge.",
+        *_motion_limits(setup),
         f"One of ten tests ends below a raw overlap of {scores['raw_overlap_p10']:.3f}.",
+    ]
+
+
+def _motion_limits(setup: Setup) -> list[str]:
+    if setup.layout.tokens == 1:
+        return ["Nothing stops a token at the arena's edge."]
+    told = {
+        "lift": "Tokens are lifted and set down: it knows nothing of pushes along the table.",
+        "slide": "Tokens slide, and push others by the simulation's friction.",
+    }
+    return [
+        told[setup.sim.motion],
+        "The target's pieces must be known, each by its corners: a silhouette is not enough.",
     ]
 
 
@@ -125,6 +142,14 @@ def _about(card: Mapping[str, Any]) -> str:
     task = card["task"]
     areas = ", ".join(f"{area:g}" for area in task["token_areas"])
     actions = task["actions_per_token"]
+    if len(task["tokens"]) > 1:
+        return (
+            f"An agent that assembles {len(task['tokens'])} tangram tokens "
+            f"({', '.join(task['tokens'])}; full square of side {task['scale']:g}) in an order of "
+            f"its own, each with {actions} action{'s' * (actions > 1)}, in a square arena of width "
+            f"{task['arena']:g}. Agent `{card['agent']}`, network `{card['net']}` with "
+            f"{card['parameters']['acting']:,} parameters. Licence: {card['licence']}."
+        )
     return (
         f"An agent that moves a tangram token ({', '.join(task['tokens'])}; area {areas}) from "
         f"anywhere in a square arena of width {task['arena']:g} onto its target, position and "
@@ -187,6 +212,23 @@ def _evaluation(card: Mapping[str, Any]) -> list[str]:
         "",
         *_table(compared),
         "",
+        *_puzzles(card),
+    ]
+
+
+def _puzzles(card: Mapping[str, Any]) -> list[str]:
+    """Scores on the figures of the library, where the tokens are all seven tans."""
+    found = card.get("puzzles", {})
+    if not found:
+        return []
+    splits = {f"{name} split": one["scores"] for name, one in found.items()}
+    turns = next(iter(found.values()))["turns"]
+    return [
+        f"On the figures of tangram_sim/puzzles, each at {turns} angles; it trained on random "
+        "targets only, so that neither split was seen:",
+        "",
+        *_table(splits),
+        "",
     ]
 
 
@@ -195,6 +237,8 @@ def _table(columns: Mapping[str, Mapping[str, Any]]) -> list[str]:
     lines = ["| | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
     for key, (label, digits) in _ROWS.items():
         values = [scores.get(key) for scores in columns.values()]
+        if all(value is None for value in values):
+            continue
         shown = ["-" if value is None else f"{value:.{digits}f}" for value in values]
         lines.append(f"| {label} | " + " | ".join(shown) + " |")
     return lines

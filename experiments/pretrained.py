@@ -24,12 +24,18 @@ from tangram_agent.files import write_whole
 from tangram_agent.pretrained import CARD, CARD_TEXT, CONFIG, WEIGHTS
 from tangram_agent.runs import ACTING, CHECKPOINTS, Run, load_run
 from tangram_sim.errors import ConfigError, RunError, TangramError
+from tangram_sim.targets import has_all_tans
 from worker.config import EvalConfig
 from worker.evaluate import policies, score_policies
+from worker.puzzle_scores import score_puzzles
+from worker.puzzles import find_figures
+from worker.tables import RUN
+from worker.trials import greedy
 
 PACKAGE = Path(__file__).resolve().parent.parent / "tangram_agent" / "pretrained"
 RESULT = "result.json"
 MAX_BYTES = 1_000_000  # of the weights: they travel with every installation
+FIGURES, TURNS = ("test", "train"), 4  # splits of the library, and angles of each figure
 TESTS, TEST_SEED = 400, 1  # tests that no choice was made on: training is scored on seed 0
 
 
@@ -78,6 +84,8 @@ def publish(
     scores = score_policies(setup, policies(chosen.run, setup), config)
     card = make_card(name, chosen.run.setup, chosen.result, [one.result for one in seeds], scores)
     card |= {"tests": {"episodes": tests, "seed": TEST_SEED, "scores": scores}}
+    if has_all_tans(setup.layout):
+        card |= {"puzzles": {split: _on_figures(chosen.run, split) for split in FIGURES}}
     card |= {"sha256": hashlib.sha256(weights).hexdigest()}
     folder = target / name
     write_whole(folder / CONFIG, _config(chosen.run).encode())
@@ -85,6 +93,14 @@ def publish(
     write_whole(folder / CARD_TEXT, card_text(card).encode())
     write_whole(folder / CARD, (json.dumps(card, indent=1) + "\n").encode())
     return folder
+
+
+def _on_figures(run: Run, split: str) -> dict[str, Any]:
+    """Scores of a run on the figures of a split."""
+    found = find_figures(split, run.setup, None, TURNS, False)
+    players = {RUN: greedy(run.policy)}
+    scores, _, _ = score_puzzles(run.setup, found.figures, players, TEST_SEED)
+    return {"turns": TURNS, "scores": scores[RUN]}
 
 
 def median(seeds: Sequence[Candidate]) -> Candidate:

@@ -203,11 +203,19 @@ def _check_figures_fit(layout: Layout, sim: SimConfig) -> None:
         )
 
 
+def has_all_tans(layout: Layout) -> bool:
+    """Whether the tokens are the seven tans, which every figure has."""
+    return _tans(layout) == sorted(name for name, count in COUNTS.items() for _ in range(count))
+
+
 def _check_full_set(layout: Layout) -> None:
-    names = sorted("parallelogram" if s.name == _MIRRORED else s.name for s in layout.shapes)
-    wanted = sorted(name for name, count in COUNTS.items() for _ in range(count))
-    if names != wanted:
+    if not has_all_tans(layout):
         raise ConfigError(
-            f"sim.targets=figures needs all seven tans, got tokens {', '.join(names)}: set "
+            f"sim.targets=figures needs all seven tans, got tokens {', '.join(_tans(layout))}: set "
             "tokens=tangram7, or another kind of targets"
         )
+
+
+def _tans(layout: Layout) -> list[str]:
+    """Names of the tokens, sorted; on which side one lies does not matter."""
+    return sorted("parallelogram" if s.name == _MIRRORED else s.name for s in layout.shapes)

@@ -17,6 +17,7 @@ AGENTS = {
     "matched": "tangram",
     "mlp_large": "mlp",
     "game": "tangram",
+    "game_few": "tangram",
     "game_paper": "paper",
 }
 
