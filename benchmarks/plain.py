@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from tangram_agent.attention import EncoderLayer
-from tangram_agent.ddpg import PARTS, Learner, critic_target, next_token
+from tangram_agent.ddpg import Learner, critic_target, next_token
 from tangram_agent.setup import Setup
 
 GAMMA = 0.99
@@ -46,7 +46,7 @@ class PlainLearner(Learner):
             for layer in part.modules():
                 if isinstance(layer, EncoderLayer):
                     _take_apart(layer)
-        self._lists = {part: list(getattr(self, part).parameters()) for part in PARTS}
+        self._lists = self.parameter_lists()
         rates = (self.config.actor_lr, self.config.critic_lr)
         self.actor_optimiser, self.critic_optimiser = (
             torch.optim.Adam(part.parameters(), lr=rate, foreach=False)

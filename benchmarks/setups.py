@@ -35,8 +35,11 @@ SEVEN = tuple(name for name, count in COUNTS.items() for _ in range(count))
 
 
 def several(count: int, agent: str = "tangram") -> Setup:
-    """The first tans of the game, one action each, in an arena that is wide enough for all."""
-    setup = preset(agent)
+    """The first tans of the game, one action each, in an arena that is wide enough for all.
+
+    One velocity for the next token: the rivals that these are measured against know no pairs.
+    """
+    setup = with_agent(preset(agent), readout="token")
     sim = replace(setup.sim, arena=3.0)
     return replace(setup, tokens=TokensConfig(SEVEN[:count], 0.6), sim=sim)
 

@@ -95,10 +95,7 @@ class Learner:
         self.target_actor, self.target_critic = _frozen(self.actor), _frozen(self.critic)
         self.acting = _frozen(self.playing())
         # Kept as lists: walking the modules takes a fifth of a small network's update.
-        self._lists: dict[str, list[Tensor]] = {
-            part: list(getattr(self, part).parameters()) for part in PARTS
-        }
-        self._played: list[Tensor] = list(self.playing().parameters())
+        self._lists = self.parameter_lists()
         self.actor_optimiser = _adam(self._lists["actor"], self.config.actor_lr)
         self.critic_optimiser = _adam(self._lists["critic"], self.config.critic_lr)
 
@@ -111,6 +108,11 @@ class Learner:
     def playing(self) -> nn.Module:
         """What plays: its running average is what workers get."""
         return self.actor
+
+    def parameter_lists(self) -> dict[str, list[Tensor]]:
+        """Parameters by the names of PARTS, and those of `playing`."""
+        parts = {part: getattr(self, part) for part in PARTS} | {"playing": self.playing()}
+        return {name: list(part.parameters()) for name, part in parts.items()}
 
     def update(self, batch: Batch, progress: float = 0.0) -> dict[str, float]:
         """One step of both networks on a batch.
@@ -156,7 +158,7 @@ class Learner:
             polyak_update(lists["target_critic"], lists["critic"], config.polyak)
             polyak_update(lists["target_actor"], lists["actor"], config.polyak)
         rho = average_so_far(config.acting_average, self.updates)
-        polyak_update(lists["acting"], self._played, rho)
+        polyak_update(lists["acting"], lists["playing"], rho)
 
     def critic_loss(self, t: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Mean squared Bellman error of Eq. 3, and the values (B,)."""
