@@ -127,3 +127,17 @@ def test_the_heading_of_a_token_on_either_side_is_its_turn(angle: float, flipped
     found = graph.headings(points, graph.centres(points))[0]
     expected = [[math.cos(a), math.sin(a)] for a in (-0.4, angle)]
     np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_noise_turns_no_token_over_that_has_one_side() -> None:
+    kite = {"name": "kite", "corners": [[-4, 0], [0, -0.2], [5, 0], [0, 0.2]]}
+    made = setup({"shapes": [kite, "parallelogram"], "scale": 0.1}, agent={"readout": "token"})
+    rng = np.random.default_rng(0)
+    scene = made.layout.corners(rng.uniform(-1.0, 1.0, (200, 2, 3)))
+    scene += 0.02 * rng.standard_normal(scene.shape)
+    points = torch.from_numpy(scene).float()
+    graph = graph_of(made)
+    found = graph.headings(points, graph.centres(points))[:, 0]
+    angle = made.layout.poses(scene)[:, 0, 2]
+    expected = np.column_stack([np.cos(angle), np.sin(angle)])
+    np.testing.assert_allclose(found, expected, atol=1e-4)

@@ -287,9 +287,10 @@ def at(made: Setup, *centres: tuple[float, float]) -> np.ndarray:
     return made.layout.corners(poses)[None]
 
 
-def test_a_token_that_would_push_a_placed_one_off_the_target_is_not_played() -> None:
+@pytest.mark.parametrize("gamma", [0.0, 1.0])
+def test_a_token_that_would_push_a_placed_one_off_the_target_is_not_played(gamma: float) -> None:
     """Token 0 is placed well. Token 1, the better one but for that, would push it away."""
-    made = squares()
+    made = squares(gamma=gamma)
     goals = at(made, (0, 0), (0.5, 0), (0.6, 0.6))
     corners = at(made, (0, 0), (-0.5, 0), (0.8, 0.8))
     placed = np.array([[True, False, False]])
@@ -319,6 +320,8 @@ def test_where_tokens_are_lifted_nothing_is_pushed() -> None:
     made = setup({"shapes": ["square"] * 3, "scale": 0.8}, {"gamma": 1.0}, PERCEPTRON)
     goals = at(made, (0, 0), (0.5, 0), (0.6, 0.6))
     corners = at(made, (0, 0), (-0.5, 0), (0.8, 0.8))
-    everything = perfect(made, np.ones((3, 3)), LIKES)
+    pushes = np.zeros((3, 3))
+    pushes[1, 0] = pushes[2, 1] = 1.0  # what would speak against token 1, now and later
+    everything = perfect(made, pushes, LIKES)
     placed = np.array([[True, False, False]])
     assert everything.choose(corners, placed, goals).token[0] == 1

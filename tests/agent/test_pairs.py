@@ -194,15 +194,16 @@ def test_the_numbers_of_a_pair_without_nodes() -> None:
 
 
 def test_what_all_nodes_of_a_pair_are_told() -> None:
-    """A small triangle and a square of twice its area, on the spot, nine tenths covered."""
-    pairs = one_pair(3, SQUARE, (0.1, 0.1, 0.0), (0.1, 0.1, 0.1))
+    """A small triangle and, a fifth away, a square of twice its area; nine tenths are covered."""
+    pairs = one_pair(3, SQUARE, (0.1, 0.1, 0.0), (0.3, 0.1, 0.1))
+    near = math.exp(-0.2 / LAYOUT.shapes[3].radius)
     pairs.covered[:] = 0.9
     told = GRAPH.node_features(pairs)[0, :, 5:].numpy()
     expected = [
         *(math.cos(0.4), math.sin(0.4), math.cos(0.1), math.sin(0.1)),
         *(0.0, 0.0, 1.0, 0.0, 0.0, 0.0),
         *(0.0, 0.0, 0.0, 1.0, 0.0, 0.0),
-        *(math.log(2.0), 1.0, 0.9, 0.0),
+        *(math.log(2.0), near, 0.9, 0.0),
     ]
     np.testing.assert_allclose(told, np.broadcast_to(expected, told.shape), atol=1e-6)
 
