@@ -292,7 +292,7 @@ def test_a_token_that_would_push_a_placed_one_off_the_target_is_not_played(gamma
     """Token 0 is placed well. Token 1, the better one but for that, would push it away."""
     made = squares(gamma=gamma)
     goals = at(made, (0, 0), (0.5, 0), (0.6, 0.6))
-    corners = at(made, (0, 0), (-0.5, 0), (0.8, 0.8))
+    corners = at(made, (0, 0), (-0.5, 0), (-0.8, -0.8))
     placed = np.array([[True, False, False]])
     harmless, harmful = np.zeros((3, 3)), np.zeros((3, 3))
     harmful[1, 0] = 0.9
@@ -300,8 +300,11 @@ def test_a_token_that_would_push_a_placed_one_off_the_target_is_not_played(gamma
     assert perfect(made, harmless, LIKES).choose(corners, placed, goals).token[0] == 1
     assert perfect(made, harmful, LIKES).choose(corners, placed, goals).token[0] == 2
     # One that lies beside the target may be pushed.
-    elsewhere = at(made, (-0.8, 0.8), (-0.5, 0), (0.8, 0.8))
+    elsewhere = at(made, (-0.8, 0.8), (-0.5, 0), (-0.8, -0.8))
     assert perfect(made, harmful, LIKES).choose(elsewhere, placed, goals).token[0] == 1
+    # And one that covers a tenth of its piece costs a tenth of what it would.
+    hardly = at(made, (-0.9 * 0.8 * 2**0.5 / 4, 0), (-0.5, 0), (-0.8, -0.8))
+    assert perfect(made, harmful, LIKES).choose(hardly, placed, goals).token[0] == 1
 
 
 @pytest.mark.parametrize(("gamma", "expected"), [(0.0, 1), (1.0, 2)])
@@ -309,7 +312,7 @@ def test_what_lies_in_the_way_of_others_comes_after_them(gamma: float, expected:
     """Token 2 would push token 1 away, wherever that is placed; not the other way round."""
     made = squares(gamma=gamma)
     goals = at(made, (0, 0), (0.5, 0), (0.6, 0.6))
-    corners = at(made, (0, 0), (-0.5, 0), (0.8, 0.8))
+    corners = at(made, (0, 0), (-0.5, 0), (-0.8, -0.8))
     pushes = np.zeros((3, 3))
     pushes[2, 1] = 0.8
     found = perfect(made, pushes, LIKES).choose(corners, np.array([[True, False, False]]), goals)
@@ -319,7 +322,7 @@ def test_what_lies_in_the_way_of_others_comes_after_them(gamma: float, expected:
 def test_where_tokens_are_lifted_nothing_is_pushed() -> None:
     made = setup({"shapes": ["square"] * 3, "scale": 0.8}, {"gamma": 1.0}, PERCEPTRON)
     goals = at(made, (0, 0), (0.5, 0), (0.6, 0.6))
-    corners = at(made, (0, 0), (-0.5, 0), (0.8, 0.8))
+    corners = at(made, (0, 0), (-0.5, 0), (-0.8, -0.8))
     pushes = np.zeros((3, 3))
     pushes[1, 0] = pushes[2, 1] = 1.0  # what would speak against token 1, now and later
     everything = perfect(made, pushes, LIKES)
