@@ -14,6 +14,7 @@ from tangram_agent.setup import SECTIONS
 from tangram_sim.errors import ConfigError
 
 RESULT = "result.json"
+IN_FILES = {"puzzles": "source"}  # settings of a test that its file calls otherwise
 BOUNDS = ("max_updates", "max_episodes", "max_hours")
 
 
@@ -58,7 +59,8 @@ class Job:
     def _tested(self, content: Mapping[str, Any]) -> bool:
         """A test of the final weights, with the settings that are asked for."""
         trained = read_object(self.run_dir / RESULT)
-        wanted = {**self.settings, "updates": trained.get("updates")}
+        told = {IN_FILES.get(name, name): value for name, value in self.settings.items()}
+        wanted = {**told, "updates": trained.get("updates")}
         return bool(content) and all(content.get(name) == wanted[name] for name in wanted)
 
     @property

@@ -10,7 +10,7 @@ import yaml
 from experiments.jobs import Job, make_jobs
 from experiments.plan import StudyConfig
 from tangram_sim.errors import ConfigError
-from tests.experiments.studies import study
+from tests.experiments.studies import experiment, study
 
 pytestmark = pytest.mark.fast
 
@@ -166,3 +166,21 @@ def test_other_settings_in_the_same_folder_are_refused(
         return
     with pytest.raises(ConfigError, match=f"was trained with other settings .{message}.: remove"):
         changed.check()
+
+
+@pytest.mark.parametrize(
+    ("changes", "done"), [({}, True), ({"source": "train"}, False), ({"turns": 1}, False)]
+)
+def test_a_test_of_puzzles_is_known_by_their_source(
+    tmp_path: Path, changes: dict[str, Any], done: bool
+) -> None:
+    """Under `puzzles` its file has the scores of each."""
+    tests = {"figures": {"label": "figures", "puzzles": "test", "turns": 8}}
+    one = {"one": experiment(["square"], ["figures"])}
+    job = jobs_of(tmp_path, tests=tests, experiments=one)["square, seed 0, test figures"]
+    assert job.command[-2:] == ("puzzles=test", "turns=8")
+    end(job.run_dir / "result.json")
+    job.prepare()
+    told = {"source": "test", "turns": 8, "updates": 3, "puzzles": [{"name": "cat"}]}
+    job.leaves.write_text(json.dumps(told | changes))
+    assert job.done is done
