@@ -25,6 +25,7 @@ from tangram_sim.actions import chosen_tokens
 from tangram_sim.arrays import Bools, Floats, Ints
 from tangram_sim.layout import Layout
 
+_CORRECTED = 0.25  # share of pairs that begin where the action ended
 _OTHER_SHAPE = 0.15  # share of hindsight pieces that have any shape, not the token's
 _OTHER_SIDE = 0.1  # share of hindsight pieces on the other side than the token
 _COVERED = 0.3  # share of hindsight pieces that are covered in part already
@@ -36,7 +37,8 @@ class PairBatch:
 
     Attributes:
         before, after: (M, 3) poses of the token.
-        before_flipped, after_flipped: (M,) whether it lay on its other side.
+        start: (M, 3) where the actor is asked from: mostly before, else after.
+        before_flipped, after_flipped, start_flipped: (M,) whether it lay on its other side.
         token: (M,) which moved.
         goal: (M, 3) pose of the target's piece.
         goal_flipped: (M,) its side.
@@ -47,8 +49,10 @@ class PairBatch:
 
     before: Floats
     after: Floats
+    start: Floats
     before_flipped: Bools
     after_flipped: Bools
+    start_flipped: Bools
     token: Ints
     goal: Floats
     goal_flipped: Bools
@@ -89,11 +93,14 @@ def make_pairs(
     strategy = _strategies(agent, len(rows), generator)
     piece, covered = _played(batch, layout, rows, token, generator)
     _Relabelled(agent, layout, generator).replace(piece, covered, after, strategy)
+    start = _again(before, after, generator)
     return PairBatch(
         before=before.pose,
         after=after.pose,
+        start=start.pose,
         before_flipped=before.flipped,
         after_flipped=after.flipped,
+        start_flipped=start.flipped,
         token=token,
         goal=piece.pose,
         goal_flipped=piece.flipped,
@@ -117,6 +124,19 @@ def with_contacts(
         other_pose=before.pose,
         other_flipped=before.flipped,
         pushed=pushed_share(before, after, layout),
+    )
+
+
+def _again(before: Lying, after: Lying, generator: np.random.Generator) -> Lying:
+    """Where tokens (M,) are for the actor: mostly before the action, else after it.
+
+    From there it corrects what it proposed itself, which nobody plays: starts are far from targets.
+    """
+    again = generator.random(len(before.index)) < _CORRECTED
+    return Lying(
+        before.index,
+        np.where(again[:, None], after.pose, before.pose),
+        np.where(again, after.flipped, before.flipped),
     )
 
 

@@ -65,7 +65,7 @@ class PairLearner(Learner):
 
     def actor_loss(self, t: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Minus the value of the actor's own poses, and the saturation penalty."""
-        pairs = _pairs(t, "before")
+        pairs = _pairs(t, "start")
         pose, raw = self.actor(pairs)
         return -self.critic(pairs.at(pose)).mean(), saturation(raw, self.config.saturation_limit)
 

@@ -181,3 +181,13 @@ def test_contacts_name_another_token_and_what_it_lost() -> None:
     assert not found.other_flipped.any()
     for name, column in vars(pairs).items():
         assert vars(found)[name] is column
+
+
+def test_a_quarter_of_the_pairs_is_asked_from_where_the_action_ended() -> None:
+    pairs = made_pairs([FINAL, NEAR])
+    again = (pairs.start == pairs.after).all(axis=1) & (pairs.start != pairs.before).any(axis=1)
+    assert again.mean() == pytest.approx(0.25, abs=0.05)
+    np.testing.assert_array_equal(pairs.start[~again], pairs.before[~again])
+    np.testing.assert_array_equal(
+        pairs.start_flipped, np.where(again, pairs.after_flipped, pairs.before_flipped)
+    )

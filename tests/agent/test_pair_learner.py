@@ -97,7 +97,7 @@ def test_the_losses_by_hand(case: str) -> None:
     loss, q = learner.critic_loss(t)
     assert loss.item() == pytest.approx(expected.item(), rel=1e-6)
     np.testing.assert_allclose(q.detach(), value, atol=1e-6)
-    before = pairs_of(t, "before")
+    before = pairs_of(t, "start")
     pose, raw = own.actor(before)
     gain, penalty = learner.actor_loss(t)
     assert gain.item() == pytest.approx(-own.critic(before.at(pose)).mean().item(), rel=1e-5)

@@ -17,7 +17,6 @@ AGENTS = {
     "matched": "tangram",
     "mlp_large": "mlp",
     "game": "tangram",
-    "game_few": "tangram",
     "game_paper": "paper",
 }
 
