@@ -106,7 +106,8 @@ class SimConfig:
     def told(self, stage: int) -> str:
         """A stage in words, for logs."""
         task = self.stage_task(stage)
-        moved = f"{task.tokens} tokens to move" if task.tokens else "all tokens to move"
+        count = f"{task.tokens} token{'s' * (task.tokens > 1)}" if task.tokens else "all tokens"
+        moved = f"{count} to move"
         return f"stage {stage} of {len(self.stages)}: {moved}, targets {task.targets}" + (
             f" with spread {task.spread:g}" if task.targets == "gaussian" else ""
         )
