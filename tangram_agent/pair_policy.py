@@ -16,7 +16,7 @@ from torch import Tensor
 from tangram_agent.pair_damage import damage
 from tangram_agent.pair_networks import PairNetworks
 from tangram_agent.pair_scene import Candidates, Scene
-from tangram_agent.pair_values import areas, covered_share, covering, worths
+from tangram_agent.pair_values import covered_share, covering, worths
 from tangram_agent.setup import Setup
 from tangram_sim.arrays import Bools, Floats, Ints
 from tangram_sim.layout import Layout
@@ -148,7 +148,7 @@ def _ranks(order: str, layout: Layout, goals: Floats) -> Floats:
     count = layout.tokens
     if order == "size":
         # Equal areas stay in the set's order, whatever their rounding.
-        size = np.round(areas(layout) / areas(layout).max(), 9)
+        size = np.round(layout.areas / layout.areas.max(), 9)
         rank = np.argsort(np.argsort(-size, kind="stable"))
         return np.broadcast_to(rank, (len(goals), count))
     if order == "random":

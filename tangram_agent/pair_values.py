@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tangram_sim.arrays import Bools, Floats, Ints
-from tangram_sim.geometry import outlines, shared_area
+from tangram_sim.geometry import outlines, outlines_at, shared_area, shared_areas
 from tangram_sim.layout import Layout
 
 Corners = npt.NDArray[np.floating]
@@ -32,12 +32,7 @@ class Lying:
     def outlines(self, layout: Layout) -> Floats:
         """Counter-clockwise corners (M, C, 2)."""
         body = layout.body[layout.padded_corners][self.index]
-        body = np.where(self.flipped[:, None, None], body[:, ::-1] * (1.0, -1.0), body)
-        cos, sin = np.cos(self.pose[:, 2:]), np.sin(self.pose[:, 2:])
-        x, y = body[..., 0], body[..., 1]
-        turned = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
-        moved: Floats = turned + self.pose[:, None, :2]
-        return moved
+        return outlines_at(body, self.pose, self.flipped)
 
 
 def lying(corners: Corners, layout: Layout, rows: Ints, index: Ints) -> Lying:
@@ -54,12 +49,7 @@ def covering(corners: Corners, goals: Corners, layout: Layout) -> Floats:
         goals: (B, V, 2) of the targets.
         layout: of both.
     """
-    count = layout.tokens
-    own = np.repeat(_fitted(corners, layout), count, axis=1)
-    wanted = np.tile(_fitted(goals, layout), (1, count, 1, 1))
-    shape = (-1, *own.shape[2:])
-    shared = shared_area(wanted.reshape(shape), own.reshape(shape))
-    return shared.reshape(-1, count, count)
+    return shared_areas(_fitted(corners, layout), _fitted(goals, layout))
 
 
 def covered_share(covered: Floats, layout: Layout) -> Floats:
@@ -68,13 +58,13 @@ def covered_share(covered: Floats, layout: Layout) -> Floats:
     So a token that is to move is seen as if it were gone.
     """
     others = covered.sum(axis=1, keepdims=True) - covered
-    share: Floats = np.clip(others / areas(layout), 0.0, 1.0)
+    share: Floats = np.clip(others / layout.areas, 0.0, 1.0)
     return share
 
 
 def worths(covered: Floats, layout: Layout) -> Floats:
     """(B, K) sum over all pieces of each token's values, by what `covering` gave."""
-    own = areas(layout)
+    own = layout.areas
     worth: Floats = (covered / np.maximum(own[:, None], own)).sum(axis=2)
     return worth
 
@@ -92,7 +82,7 @@ def newly_covered(token: Lying, piece: Lying, covered: Floats, layout: Layout) -
         covered: (M,) share of it that is covered already, in [0, 1].
         layout: of both.
     """
-    own, wanted = areas(layout)[token.index], areas(layout)[piece.index]
+    own, wanted = layout.areas[token.index], layout.areas[piece.index]
     shared = shared_area(piece.outlines(layout), token.outlines(layout))
     value: Floats = np.minimum(shared, (1.0 - covered) * wanted) / np.maximum(own, wanted)
     return value
@@ -101,13 +91,8 @@ def newly_covered(token: Lying, piece: Lying, covered: Floats, layout: Layout) -
 def pushed_share(before: Lying, after: Lying, layout: Layout) -> Floats:
     """(M,) share of tokens' areas that does not lie where it lay before."""
     kept = shared_area(before.outlines(layout), after.outlines(layout))
-    share: Floats = np.clip(1.0 - kept / areas(layout)[before.index], 0.0, 1.0)
+    share: Floats = np.clip(1.0 - kept / layout.areas[before.index], 0.0, 1.0)
     return share
-
-
-def areas(layout: Layout) -> Floats:
-    """(K,) areas of the tokens."""
-    return np.array([shape.area for shape in layout.shapes])
 
 
 def _fitted(corners: Corners, layout: Layout) -> Floats:

@@ -12,11 +12,11 @@ import torch
 from torch import Tensor, nn
 
 from tangram_agent.graph import turn, turn_back
+from tangram_sim.fitting import KINDS, kind_of
 from tangram_sim.layout import Layout
 
 # Every tan has a number of its own, whatever set it is in; other shapes share the last one.
-KINDS = ("large_triangle", "medium_triangle", "small_triangle", "square", "parallelogram")
-_MIRROR_NAMES = {"parallelogram_mirrored": "parallelogram"}
+_KINDS = len(KINDS) + 1
 # Corners in radii are larger than the rest; then a perceptron's inputs are of about one size.
 _CORNER_SCALE = 0.3
 
@@ -73,7 +73,7 @@ class PairGraph(nn.Module):
             "body": torch.as_tensor(layout.body[layout.padded_corners], dtype=torch.float32),
             "symmetry": torch.tensor([float(shape.symmetry) for shape in layout.shapes]),
             "radius": torch.tensor([shape.radius for shape in layout.shapes]).float(),
-            "area": torch.tensor([shape.area for shape in layout.shapes]).float(),
+            "area": torch.as_tensor(layout.areas).float(),
             "kind": _kinds(layout),
             "mirror": torch.tensor([shape.mirror or 0.0 for shape in layout.shapes]).float(),
             "chiral": torch.as_tensor(layout.chiral).float(),
@@ -86,12 +86,12 @@ class PairGraph(nn.Module):
     @property
     def features(self) -> int:
         """F of a node."""
-        return 5 + 4 + 2 * (len(KINDS) + 1) + 4
+        return 5 + 4 + 2 * _KINDS + 4
 
     @property
     def inputs(self) -> int:
         """Numbers that describe a pair without nodes: what a perceptron sees."""
-        return 2 + 4 + 4 * self.corners + 2 * (len(KINDS) + 1) + 4
+        return 2 + 4 + 4 * self.corners + 2 * _KINDS + 4
 
     def relation(self, pairs: Pairs) -> tuple[Tensor, Tensor, Tensor]:
         """The piece as its token sees it.
@@ -200,9 +200,9 @@ def _mirrored(vectors: Tensor, sign: Tensor) -> Tensor:
 
 
 def _kinds(layout: Layout) -> Tensor:
-    names = [_MIRROR_NAMES.get(shape.name, shape.name) for shape in layout.shapes]
+    names = [kind_of(shape.name) for shape in layout.shapes]
     numbers = [KINDS.index(name) if name in KINDS else len(KINDS) for name in names]
-    return nn.functional.one_hot(torch.tensor(numbers), len(KINDS) + 1).float()
+    return nn.functional.one_hot(torch.tensor(numbers), _KINDS).float()
 
 
 def _edges(corners: int) -> Tensor:

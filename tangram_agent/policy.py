@@ -18,6 +18,7 @@ from tangram_agent.pairs import PairGraph
 from tangram_agent.setup import Setup
 from tangram_agent.types import Weights
 from tangram_agent.weights import load_arrays, to_arrays
+from tangram_sim.actions import make_actions, velocities_of
 from tangram_sim.arrays import Floats, Singles
 
 Flags = npt.NDArray[np.bool_] | npt.NDArray[np.uint8]
@@ -86,8 +87,8 @@ class Policy:
             wanted = np.asarray(goals, np.float64)
             choice = self._chooser.choose(exact, np.asarray(placed, np.bool_), wanted, refine)
             token, flip = choice.token, choice.flip
-            velocity = self._way(choice.start, choice.pose)
-        return self._joined(token, flip, velocity)
+            velocity = self._velocity_to(choice.start, choice.pose)
+        return make_actions(token, velocity, flip, self.tokens, self.sim)
 
     def _velocity(
         self, corners: Floats | Singles, placed: Flags, goals: Floats | Singles
@@ -99,29 +100,10 @@ class Policy:
             velocity, _ = self._network(_tensor(corners), flags, _tensor(goals), token)
         return token.numpy(), velocity.numpy()
 
-    def _way(self, pose: Floats, wanted: Floats) -> Singles:
-        """Velocities (B, 3) in [-1, 1] from one pose to another, by the shorter turn."""
-        way = wanted - pose
-        way[:, 2] = np.pi - np.mod(np.pi - way[:, 2], 2.0 * np.pi)
-        velocity: Singles = (way / (self.sim.arena, self.sim.arena, np.pi)).astype(np.float32)
+    def _velocity_to(self, pose: Floats, wanted: Floats) -> Singles:
+        """Velocities (B, 3) in [-1, 1] from poses (B, 3) to others, as far as one reaches."""
+        velocity: Singles = velocities_of(wanted - pose, self.sim).astype(np.float32)
         return np.clip(velocity, -1.0, 1.0)
-
-    def _joined(
-        self, token: npt.NDArray[np.int64], flip: npt.NDArray[np.bool_], velocity: Singles
-    ) -> Singles:
-        """Actions (B, A) of tokens (B,), flips (B,) and velocities (B, 3)."""
-        parts = []
-        if self.tokens > 1:
-            parts.append(self._selector(token)[:, None])
-        if self.sim.allow_flip:
-            parts.append(np.where(flip, 1.0, -1.0)[:, None])
-        joined: Singles = np.concatenate([*parts, velocity], axis=1).astype(np.float32)
-        return joined
-
-    def _selector(self, token: npt.NDArray[np.int64]) -> Floats:
-        """The entry that names a token: the middle of its part of [-1, 1]."""
-        middle: Floats = (2.0 * token + 1.0) / self.tokens - 1.0
-        return middle
 
     def explore(
         self,
@@ -142,24 +124,28 @@ class Policy:
                     velocity[:] = generator.uniform(-1.0, 1.0, 3)
                 else:
                     here = self.layout.poses(np.asarray(corners[i], np.float64))
-                    self._anything(action, here, np.asarray(placed)[i], generator)
+                    action[:] = self._anything(here, np.asarray(placed)[i], generator)
             else:
                 velocity += self.config.noise * generator.standard_normal(3)
         return np.clip(actions, -1.0, 1.0)
 
-    def _anything(
-        self, action: Singles, here: Floats, placed: Flags, generator: np.random.Generator
-    ) -> None:
-        """Let an action take any token that is left to any pose in the arena, on any side."""
+    def _anything(self, here: Floats, placed: Flags, generator: np.random.Generator) -> Singles:
+        """An action (A,): any token that is left goes to any pose in the arena, on any side.
+
+        Args:
+            here: (K, 3) poses of the tokens.
+            placed: (K,) which are placed; where all are, the first one is named.
+            generator: draws it.
+        """
         left = np.flatnonzero(np.asarray(placed) == 0)
         token = int(generator.choice(left)) if len(left) else 0
         reach = (self.sim.arena / 2.0, self.sim.arena / 2.0, np.pi)
         wanted = generator.uniform(-1.0, 1.0, 3) * reach
-        action[-3:] = self._way(here[None, token], wanted[None])[0]
-        if self.tokens > 1:
-            action[0] = (2.0 * token + 1.0) / self.tokens - 1.0
-        if self.sim.allow_flip:
-            action[-4] = generator.choice((-1.0, 1.0))
+        flip = self.sim.allow_flip and generator.choice((-1.0, 1.0)) > 0.0
+        velocity = self._velocity_to(here[None, token], wanted[None])
+        named, turned = np.array([token]), np.array([flip])
+        action: Singles = make_actions(named, velocity, turned, self.tokens, self.sim)[0]
+        return action
 
 
 def _tensor(array: Floats | Singles | Flags) -> torch.Tensor:

@@ -5,8 +5,9 @@ Legend: B actions of A entries each, K tokens.
 
 import numpy as np
 
-from tangram_sim.arrays import Bools, Floats, Ints
+from tangram_sim.arrays import Bools, Floats, Ints, Singles
 from tangram_sim.config import SimConfig
+from tangram_sim.kinematics import wrap
 from tangram_sim.layout import Layout
 from tangram_sim.sensing import noise_bound
 
@@ -62,3 +63,35 @@ def flips(actions: Floats, layout: Layout, sim: SimConfig) -> Bools:
         return np.zeros(len(actions), dtype=np.bool_)
     chiral = layout.chiral[chosen_tokens(actions, layout.tokens)]
     return np.asarray((np.asarray(actions)[:, -4] > 0.0) & chiral)
+
+
+def velocities_of(ways: Floats, sim: SimConfig) -> Floats:
+    """(B, 3) of ways (B, 3) in arena units and radians, by the shorter turn.
+
+    What `velocities` scales; a way of more than the arena's width gives entries beyond [-1, 1].
+    """
+    shortest = np.column_stack([ways[:, :2], wrap(ways[:, 2])])
+    velocity: Floats = shortest / (sim.arena, sim.arena, np.pi)
+    return velocity
+
+
+def make_actions(
+    token: Ints, velocity: Floats | Singles, flip: Bools, tokens: int, sim: SimConfig
+) -> Singles:
+    """Actions (B, A) as `chosen_tokens`, `velocities` and `flips` read them.
+
+    Args:
+        token: (B,) which one moves; of account where there are several.
+        velocity: (B, 3) in [-1, 1].
+        flip: (B,) whether it is turned over; of account with `sim.allow_flip`.
+        tokens: K.
+        sim: says whether tokens can be turned over.
+    """
+    parts: list[Floats | Singles] = []
+    if tokens > 1:
+        # The middle of the token's part of [-1, 1].
+        parts.append(((2.0 * token + 1.0) / tokens - 1.0)[:, None])
+    if sim.allow_flip:
+        parts.append(np.where(flip, 1.0, -1.0)[:, None])
+    actions: Singles = np.concatenate([*parts, velocity], axis=1).astype(np.float32)
+    return actions

@@ -104,38 +104,22 @@ class BatchedEnv:
         placed: Bools = self._moves >= self.sim.actions_per_token
         return placed
 
-    def reset(self, generators: Sequence[np.random.Generator]) -> None:
+    def reset(
+        self, generators: Sequence[np.random.Generator], targets: Sides | None = None
+    ) -> None:
         """Begin an episode in every environment: a new target and a new start.
 
         Args:
             generators: one per environment; all of the episode's randomness comes from it.
+            targets: poses (B, K, 3) and sides (B, K) to assemble; None: they are drawn.
 
         Raises:
             SamplingError: no layout without overlap was found.
         """
         if len(generators) != self.count:
             raise ValueError(f"need {self.count} generators, got {len(generators)}")
-        targets = sample_targets(self.layout, self.sim, self.task, generators)
-        self._start(targets, generators)
-
-    def reset_to(
-        self, poses: Floats, flipped: Bools, generators: Sequence[np.random.Generator]
-    ) -> None:
-        """Begin an episode with given targets in every environment; starts are drawn.
-
-        Args:
-            poses: (B, K, 3) of the targets.
-            flipped: (B, K) target pieces on their other side.
-            generators: as for `reset`.
-
-        Raises:
-            SamplingError: no start without overlap was found.
-        """
-        if len(generators) != self.count:
-            raise ValueError(f"need {self.count} generators, got {len(generators)}")
-        self._start((poses, flipped), generators)
-
-    def _start(self, targets: Sides, generators: Sequence[np.random.Generator]) -> None:
+        if targets is None:
+            targets = sample_targets(self.layout, self.sim, self.task, generators)
         self.goals = self.layout.corners(*targets)
         done = self._done(generators)
         starts = sample_starts(self.layout, self.sim, targets, done, generators)
@@ -194,8 +178,7 @@ class BatchedEnv:
         own = np.repeat(pieces[rows, tokens], layout.tokens, axis=0)
         common = shared_area(own, pieces.reshape(own.shape)).reshape(self.count, -1)
         common[rows, tokens] = 0.0
-        areas = np.array([shape.area for shape in layout.shapes])
-        covered: Floats = common.sum(axis=1) / areas[tokens]
+        covered: Floats = common.sum(axis=1) / layout.areas[tokens]
         return covered
 
     def _begin(self, targets: Sides, starts: Sides) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from tangram_sim.arrays import Bools, Complex, Floats, Ints
 from tangram_sim.config import SimConfig
 from tangram_sim.errors import SamplingError
+from tangram_sim.kinematics import wrap
 from tangram_sim.layout import Layout
 from tangram_sim.sampling import check_fits
 
@@ -146,5 +147,5 @@ def _laid_out(layout: Layout, poses: Floats, sim: SimConfig, rng: np.random.Gene
     low, high = corners.min(axis=0), corners.max(axis=0)
     room = sim.arena - (high - low)
     turned[:, :2] += room * rng.random(2) - sim.arena / 2.0 - low
-    turned[:, 2] = np.pi - np.mod(np.pi - turned[:, 2], 2.0 * np.pi)
+    turned[:, 2] = wrap(turned[:, 2])
     return turned

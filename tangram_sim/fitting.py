@@ -19,6 +19,7 @@ VARIANTS = {
     "square": ("square",),
     "parallelogram": ("parallelogram", "parallelogram_mirrored"),
 }
+KINDS = tuple(VARIANTS)
 TOUCHING = 1e-9  # units; less is rounding
 CLEARANCE = 1e-5  # units that pieces are left apart which were pushed
 MAX_ROUNDS = 500  # a drawing to a hundredth takes up to 80
@@ -37,6 +38,11 @@ class Fit:
     shape: str
     pose: Floats
     residual: float
+
+
+def kind_of(name: str) -> str:
+    """The tan that a shape is, on whichever side; the name itself if it is none."""
+    return next((kind for kind, names in VARIANTS.items() if name in names), name)
 
 
 def fit_piece(kind: str, corners: Floats) -> Fit:

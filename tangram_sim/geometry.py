@@ -111,7 +111,7 @@ def union_area(tokens: Floats, layout: Layout) -> Floats:
     own = outlines(tokens, layout)
     # Each token counts without what those behind it cover of it.
     last = np.tile(np.arange(count), len(tokens))
-    whole = sum(shape.area for shape in layout.shapes)
+    whole = layout.areas.sum()
     return np.asarray(whole - _covered(own, rows, own.reshape(len(rows), -1, 2), last))
 
 
@@ -170,7 +170,7 @@ def _box(polygons: Floats) -> tuple[Floats, Floats]:
 
 def overlap_share(tokens: Floats, targets: Floats, layout: Layout) -> Floats:
     """Raw overlap in [0, 1], (B,): the covered share of the target's area."""
-    whole = sum(shape.area for shape in layout.shapes)
+    whole = layout.areas.sum()
     share: Floats = np.clip(overlap_area(tokens, targets, layout) / whole, 0.0, 1.0)
     return share
 
@@ -188,6 +188,35 @@ def shared_area(first: Floats, second: Floats) -> Floats:
     if len(rows):
         shared[rows] = area(clip(first[rows], second[rows]))
     return shared
+
+
+def shared_areas(first: Floats, second: Floats) -> Floats:
+    """(B, K, L) area that each of polygons (B, K, C, 2) shares with each of others (B, L, C, 2).
+
+    All are convex and counter-clockwise, as `outlines` gives them.
+    """
+    size = (len(first), first.shape[1], second.shape[1], *first.shape[2:])
+    one, other = np.broadcast_to(first[:, :, None], size), np.broadcast_to(second[:, None], size)
+    flat = (-1, *first.shape[2:])
+    return shared_area(one.reshape(flat), other.reshape(flat)).reshape(size[:3])
+
+
+def outlines_at(body: Floats, poses: Floats, flipped: Bools) -> Floats:
+    """Counter-clockwise corners (M, C, 2) of single tokens in poses (M, 3).
+
+    Args:
+        body: (C, 2) corners of the one token, or (M, C, 2) of each.
+        poses: x, y and angle of each.
+        flipped: (M,) which lie on their other side, see `Layout.corners`.
+    """
+    cos, sin = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
+    x, y = body[..., 0], body[..., 1]
+    if flipped.any():
+        other_side = flipped[:, None]
+        x, y = np.where(other_side, x[..., ::-1], x), np.where(other_side, -y[..., ::-1], y)
+    turned = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+    moved: Floats = turned + poses[:, None, :2]
+    return moved
 
 
 def any_overlap(corners: Floats, layout: Layout, tolerance: float = 1e-9) -> Bools:

@@ -71,6 +71,7 @@ class Layout:
         token_of_corner: (V,) index of the owning token.
         padded_corners: (K, C) the corners of each token, filled up to the C of the largest by
             repeating the last.
+        areas: (K,) of the tokens, squared arena units.
         chiral: (K,) tokens whose mirror image no turn gives: they can lie on either side.
         base_weights: (K, V) centre of token k as an affine combination of the corners.
         adjacency: (N, N) edges of the graph, E(i, i) = 0.
@@ -84,6 +85,7 @@ class Layout:
         self.token_of_corner: Ints = np.repeat(np.arange(len(sizes)), sizes)
         steps = np.minimum(np.arange(max(sizes)), np.array(sizes)[:, None] - 1)
         self.padded_corners: Ints = self.starts[:-1, None] + steps
+        self.areas: Floats = np.array([shape.area for shape in self.shapes])
         self.chiral: Bools = np.array([shape.mirror is None for shape in self.shapes])
         self.any_chiral = bool(self.chiral.any())
         self._centred = np.concatenate(

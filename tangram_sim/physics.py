@@ -17,11 +17,10 @@ from tangram_sim.config import SimConfig
 from tangram_sim.errors import TangramError
 from tangram_sim.layout import Layout
 from tangram_sim.pictures import BACKGROUND, TOKEN_GRAY
-from tangram_sim.prisms import inset, prism, thickness
+from tangram_sim.prisms import ENGINE_ARENA, inset, prism, thickness
 from tangram_sim.shapes import Shape
 from tangram_sim.window import Window
 
-_ENGINE_ARENA = 2.0
 _HALF_HEIGHT = 0.01  # of a token as it is drawn
 # Of a token as it collides, where there are others: so tall that the shortest way out of another
 # is always sideways. Carried tokens pass above that.
@@ -50,7 +49,7 @@ class PhysicsWorld:
     """
 
     def __init__(self, layout: Layout, sim: SimConfig) -> None:
-        self._unit = _ENGINE_ARENA / sim.arena
+        self._unit = ENGINE_ARENA / sim.arena
         self._client = pybullet.connect(pybullet.DIRECT)
         if self._client < 0:
             raise TangramError(
@@ -69,12 +68,13 @@ class PhysicsWorld:
         for token in range(layout.tokens):
             self._weigh(token, 1.0)
         self._play_at_once()
-        self._camera = Camera(self._client, sim.pixels, _ENGINE_ARENA, _HALF_HEIGHT)
+        self._camera = Camera(self._client, sim.pixels, ENGINE_ARENA, _HALF_HEIGHT)
 
     def place(self, poses: Floats, flipped: Bools | None = None) -> None:
         """See `World.place`."""
         self._flipped[:] = False if flipped is None else flipped
-        self._forget_contacts()
+        if not self._alone:
+            self._forget_contacts()
         for token, (x, y, angle) in enumerate(np.asarray(poses).tolist()):
             self._put(token, x * self._unit, y * self._unit, angle)
 
@@ -108,19 +108,26 @@ class PhysicsWorld:
 
     def _lift(self, token: int, command: _Command, flip: bool) -> None:
         """Carry a token above the others and set it down; what it comes to lie in gives way."""
+        if self._alone:
+            self._carry(token, command, flip, 0.0)
+            return
         poses = [self._pose(other) for other in range(len(self._bodies))]
-        if flip or not self._alone:
+        self._carry(token, command, flip, _LIFTED)
+        # While one is carried the rest of a settled overlap would make others creep.
+        poses[token] = self._pose(token)
+        for other, pose in enumerate(poses):
+            self._put(other, *pose)
+        self._settle()
+
+    def _carry(self, token: int, command: _Command, flip: bool, height: float) -> None:
+        """Move a token at a height for a second; all rest after it."""
+        if flip or height:
+            pose = self._pose(token)
             self._flipped[token] ^= flip
-            self._put(token, *poses[token], height=0.0 if self._alone else _LIFTED)
+            self._put(token, *pose, height=height)
         self._set_velocity(token, *command)
         pybullet.stepSimulation(physicsClientId=self._client)
         self._stop_all()
-        if not self._alone:
-            # While one is carried the rest of a settled overlap would make others creep.
-            poses[token] = self._pose(token)
-            for other, pose in enumerate(poses):
-                self._put(other, *pose)
-            self._settle()
 
     def _slide(self, token: int, command: _Command) -> None:
         """Push a token along the table, at its velocity whatever is in its way.

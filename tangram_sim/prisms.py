@@ -5,6 +5,8 @@ import numpy as np
 from tangram_sim.arrays import Floats
 from tangram_sim.shapes import polygon_area
 
+ENGINE_ARENA = 2.0  # width of the arena as the engine sees it, whatever its unit
+
 
 def prism(corners: Floats, half_height: float) -> tuple[list[list[float]], list[int]]:
     """Vertices and triangles of the prism over a convex counter-clockwise polygon (V, 2)."""

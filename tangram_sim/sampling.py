@@ -16,7 +16,7 @@ import numpy as np
 from tangram_sim.arrays import Bools, Floats, Ints
 from tangram_sim.config import SimConfig
 from tangram_sim.errors import SamplingError
-from tangram_sim.geometry import outlines, pairs_overlap
+from tangram_sim.geometry import outlines, outlines_at, pairs_overlap
 from tangram_sim.layout import Layout
 
 _CHUNK = 4  # poses drawn at once when some may overlap: fewer, larger checks
@@ -73,7 +73,7 @@ def sample_batch(
     for token in order:
         piece = _Piece(layout.shapes[token].name, bodies[token], reach[token], sides[:, token])
         _place(piece, placed, avoid, draw, poses[:, token], np.flatnonzero(~lies[:, token]))
-        outline = piece.outlines(poses[:, token], sides[:, token])
+        outline = outlines_at(piece.body, poses[:, token], sides[:, token])
         placed = np.concatenate([placed, outline[:, None]], axis=1)
     return poses
 
@@ -93,18 +93,6 @@ class _Piece:
     body: Floats
     reach: float
     flipped: Bools
-
-    def outlines(self, poses: Floats, flipped: Bools) -> Floats:
-        """Counter-clockwise corners (M, C, 2) in poses (M, 3)."""
-        cos, sin = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
-        x, y = self.body.T
-        if flipped.any():
-            turned_over = flipped[:, None]
-            x = np.where(turned_over, x[::-1], x)
-            y = np.where(turned_over, -y[::-1], y)
-        turned = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
-        moved: Floats = turned + poses[:, None, :2]
-        return moved
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,8 +157,8 @@ def _blocked(piece: _Piece, drawn: Floats, obstacles: Floats, flipped: Bools) ->
     rows, size, before = *drawn.shape[:2], obstacles.shape[1]
     if not before:
         return np.zeros((rows, size), dtype=np.bool_)
-    outlines = piece.outlines(drawn.reshape(-1, 3), np.repeat(flipped, size))
-    own = np.repeat(outlines, before, axis=0)
+    drawn_outlines = outlines_at(piece.body, drawn.reshape(-1, 3), np.repeat(flipped, size))
+    own = np.repeat(drawn_outlines, before, axis=0)
     others = np.repeat(obstacles, size, axis=0).reshape(len(own), -1, 2)
     return np.asarray(pairs_overlap(own, others).reshape(rows, size, before).any(axis=2))
 

@@ -14,7 +14,9 @@ from tangram_sim.assembly import COUNTS, Puzzle, PuzzleRules
 from tangram_sim.config import SimConfig, StageConfig
 from tangram_sim.connected import sample_connected
 from tangram_sim.errors import ConfigError
+from tangram_sim.fitting import kind_of
 from tangram_sim.geometry import outlines
+from tangram_sim.kinematics import wrap
 from tangram_sim.layout import Layout
 from tangram_sim.puzzles import library
 from tangram_sim.sampling import sample_batch
@@ -22,8 +24,6 @@ from tangram_sim.shapes import Shape, mirror_image, tan, turn_onto
 
 Generators = Sequence[np.random.Generator]
 Sides = tuple[Floats, Bools]
-
-_MIRRORED = "parallelogram_mirrored"
 
 
 def sample_targets(
@@ -174,8 +174,7 @@ def turned_figure(layout: Layout, figure: Sides, angle: float) -> Floats:
     """
     poses, flipped = figure
     centres = (poses[:, :2] @ (1.0, 1j)) * np.exp(1j * angle)
-    angles = np.pi - np.mod(np.pi - poses[:, 2] - angle, 2.0 * np.pi)
-    turned = np.column_stack([centres.real, centres.imag, angles])
+    turned = np.column_stack([centres.real, centres.imag, wrap(poses[:, 2] + angle)])
     corners = layout.corners(turned, flipped)
     turned[:, :2] -= (corners.min(axis=0) + corners.max(axis=0)) / 2.0
     return turned
@@ -218,4 +217,4 @@ def _check_full_set(layout: Layout) -> None:
 
 def _tans(layout: Layout) -> list[str]:
     """Names of the tokens, sorted; on which side one lies does not matter."""
-    return sorted("parallelogram" if s.name == _MIRRORED else s.name for s in layout.shapes)
+    return sorted(kind_of(shape.name) for shape in layout.shapes)

@@ -12,9 +12,8 @@ import numpy as np
 from tangram_sim.arrays import Bools, Floats
 from tangram_sim.errors import TangramError
 from tangram_sim.layout import Layout
-from tangram_sim.prisms import prism
+from tangram_sim.prisms import ENGINE_ARENA, prism
 
-_ENGINE_ARENA = 2.0
 # Tokens thick enough to be seen from the side, over a flat target.
 _SHOWN_HALF_HEIGHT, _FLAT_HALF_HEIGHT = 0.03, 0.001
 _OUT_OF_SIGHT = (0.0, 0.0, -1e4)  # until it is told where to lie
@@ -43,7 +42,7 @@ class Window:
         """
         _check_display()
         self._engine = engine
-        self._unit = _ENGINE_ARENA / arena
+        self._unit = ENGINE_ARENA / arena
         self._client = self._engine.connect(self._engine.GUI, options=_PAPER)
         for flag in (self._engine.COV_ENABLE_GUI, self._engine.COV_ENABLE_MOUSE_PICKING):
             self._engine.configureDebugVisualizer(flag, 0, physicsClientId=self._client)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tangram_sim.arrays import Bools, Floats, Ints
-from tangram_sim.geometry import outlines, overlap_share, shared_area, union_area
+from tangram_sim.geometry import outlines, overlap_share, shared_areas, union_area
 from tangram_sim.layout import Layout
 from worker.pairing import alike
 from worker.rollout import Played
@@ -79,17 +79,13 @@ def covered_shares(layout: Layout, ends: Floats, goals: Floats) -> Floats:
         ends: (E, V, 2) corners of the tokens.
         goals: (E, V, 2) corners of the target.
     """
-    tokens, pieces = outlines(ends, layout), outlines(goals, layout)
-    count, shape = layout.tokens, tokens.shape[2:]
-    first = np.repeat(pieces.reshape(-1, *shape), count, axis=0)
-    second = np.repeat(tokens, count, axis=0).reshape(-1, *shape)
-    areas = np.array([piece.area for piece in layout.shapes])
-    shares: Floats = shared_area(first, second).reshape(-1, count, count) / areas[:, None]
+    shared = shared_areas(outlines(goals, layout), outlines(ends, layout))
+    shares: Floats = shared / layout.areas[:, None]
     return shares
 
 
 def _iou(layout: Layout, ends: Floats, coverage: Floats) -> Floats:
-    whole = sum(shape.area for shape in layout.shapes)
+    whole = layout.areas.sum()
     common = coverage * whole
     share: Floats = common / (whole + union_area(ends, layout) - common)
     return share

@@ -5,11 +5,10 @@ Legend: B environments, K tokens, V corners, A entries of an action.
 
 import numpy as np
 
-from tangram_sim.actions import action_size
+from tangram_sim.actions import action_size, make_actions, velocities_of
 from tangram_sim.arrays import Bools, Floats, Ints, Singles
 from tangram_sim.config import SimConfig
-from tangram_sim.geometry import outlines, shared_area
-from tangram_sim.kinematics import wrap
+from tangram_sim.geometry import outlines, shared_areas
 from tangram_sim.layout import Layout
 from worker.pairing import Pairing, paired
 from worker.rollout import Choose, Generators
@@ -79,16 +78,11 @@ def _freest(
     layout: Layout, corners: Floats, placed: Bools, goals: Floats, pairing: Pairing
 ) -> Ints:
     """(B,) the token left whose place the others cover least; the first of several."""
-    rows, count = np.arange(len(corners))[:, None], layout.tokens
-    own, places = outlines(corners, layout), outlines(goals, layout)[rows, pairing.target]
-    flat = (len(corners) * count * count, *own.shape[2:])
-    first, second = (
-        np.broadcast_to(part, (len(corners), count, *own.shape[1:])).reshape(flat)
-        for part in (places[:, :, None], own[:, None])
-    )
-    shared = shared_area(first, second).reshape(-1, count, count)
-    shared[:, np.arange(count), np.arange(count)] = 0.0
-    covered = shared.sum(axis=2) / np.array([shape.area for shape in layout.shapes])
+    rows, every = np.arange(len(corners))[:, None], np.arange(layout.tokens)
+    places = outlines(goals, layout)[rows, pairing.target]
+    shared = shared_areas(places, outlines(corners, layout))
+    shared[:, every, every] = 0.0
+    covered = shared.sum(axis=2) / layout.areas
     # Rounding must not decide between places that are free.
     blocked = np.where(placed, np.inf, np.round(covered, 6))
     freest: Ints = np.argmin(blocked, axis=1)
@@ -97,11 +91,4 @@ def _freest(
 
 def _actions(sim: SimConfig, layout: Layout, token: Ints, way: Floats, flip: Bools) -> Singles:
     """Actions (B, A) that take tokens (B,) along ways (B, 3), turned over where flip (B,) says."""
-    turn = wrap(way[:, 2])
-    parts = [way[:, :2] / sim.arena, turn[:, None] / np.pi]
-    if sim.allow_flip:
-        parts.insert(0, np.where(flip, 1.0, -1.0)[:, None])
-    if layout.tokens > 1:
-        parts.insert(0, ((2.0 * token + 1.0) / layout.tokens - 1.0)[:, None])
-    actions: Singles = np.concatenate(parts, axis=1).astype(np.float32)
-    return actions
+    return make_actions(token, velocities_of(way, sim), flip, layout.tokens, sim)

@@ -4,6 +4,7 @@ Legend: E episodes, K tokens, V corners.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -58,6 +59,7 @@ def alike(layout: Layout) -> Bools:
     return same
 
 
+@lru_cache(maxsize=16)
 def _turns(layout: Layout) -> Floats:
     """(K, K) the turn of a token's body that gives another's, NaN where none does."""
     turns = np.full((layout.tokens, layout.tokens), np.nan)

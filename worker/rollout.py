@@ -89,10 +89,7 @@ def play(
             `choose` draws, so an episode does not depend on those that are played beside it.
         targets: poses (B, K, 3) and sides (B, K) to assemble instead of targets that are drawn.
     """
-    if targets is None:
-        env.reset(generators)
-    else:
-        env.reset_to(*targets, generators)
+    env.reset(generators, targets)
     corners, seen, placed = [env.corners], [env.seen], [env.placed]
     actions, results = [], []
     began = time.perf_counter()

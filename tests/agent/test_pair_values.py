@@ -9,7 +9,6 @@ from shapely.ops import unary_union
 
 from tangram_agent.pair_values import (
     Lying,
-    areas,
     covered_share,
     covering,
     lying,
@@ -36,7 +35,7 @@ def at(index: int, pose: Any, flipped: bool = False) -> Lying:
 
 
 def test_areas_are_those_of_the_game() -> None:
-    np.testing.assert_allclose(areas(LAYOUT), AREAS)
+    np.testing.assert_allclose(LAYOUT.areas, AREAS)
 
 
 @pytest.mark.parametrize("seed", range(4))

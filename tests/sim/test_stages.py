@@ -111,8 +111,8 @@ def test_an_episode_in_a_stage_depends_on_its_own_generator_only() -> None:
 def test_given_targets_are_played() -> None:
     env, other = begun(StageConfig()), begun(StageConfig(targets="figures"), mirrored=0.5)
     poses, sides = GAME.poses(other.goals), GAME.flipped(other.goals)
-    env.reset_to(poses, sides, evaluation_generators(12))
+    env.reset(evaluation_generators(12), (poses, sides))
     np.testing.assert_allclose(env.goals, other.goals, atol=1e-9)
     assert env.steps_done == 0
     with pytest.raises(ValueError, match="need 12 generators, got 3"):
-        env.reset_to(poses, sides, evaluation_generators(3))
+        env.reset(evaluation_generators(3), (poses, sides))
