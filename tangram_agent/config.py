@@ -46,7 +46,6 @@ class NetConfig:
             check_range("net.hidden", size, 1, 65536)
 
 
-RECYCLED_STATUS = 75  # exit status of a worker that wants to be started anew
 ORDERS = ("learned", "listed", "size", "random")
 STRATEGIES = ("final", "future", "near", "none")
 
@@ -216,9 +215,6 @@ class ServiceConfig:
         max_bad_updates: updates in a row that may be undone because they are not finite.
         silence_seconds: after which the master forgets a worker that says nothing.
         watchdog_seconds: a process that makes no progress for so long ends, 0: never.
-        recycle_episodes: a worker that was started by tangram-train is started anew after so many
-            episodes, 0: never; not in lockstep.
-        recycle_gib: the same when it holds so much memory.
         device: auto, cpu or cuda.
         threads: torch threads of the master.
     """
@@ -248,8 +244,6 @@ class ServiceConfig:
     max_bad_updates: int = 10
     silence_seconds: float = 30.0
     watchdog_seconds: float = 300.0
-    recycle_episodes: int = 0
-    recycle_gib: float = 0.0
     device: str = "auto"
     threads: int = 1
 
@@ -273,8 +267,6 @@ class ServiceConfig:
             "eval_seconds",
             "journal_sync_seconds",
             "watchdog_seconds",
-            "recycle_episodes",
-            "recycle_gib",
         ):
             check_range(f"service.{name}", getattr(self, name), 0)
         for name in ("log_seconds", "checkpoint_minutes"):
