@@ -98,7 +98,7 @@ def _play(settings: Plain) -> int:
         _check_tokens(config.tokens, config.run_dir)
 
     if config.compare is not None:
-        from worker.compare import compare_runs
+        from worker.play import compare_runs
 
         return compare_runs(config)
     from worker.play import play_run
