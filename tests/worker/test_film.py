@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from tests.worker.test_metrics import ended
 
 from tangram_agent.setup import Setup
 from tests.agent.builders import setup
 from tests.sim.builders import layout_of
+from tests.worker.test_metrics import ended
 from worker.film import film, frames_per_action
 from worker.rollout import Played
 
