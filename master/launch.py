@@ -18,7 +18,6 @@ from master.progress import Progress, make_lines
 from master.rundir import RunFolder
 from master.signals import SAME_WISH_S, handling, show_cursor
 from tangram_agent import lifeline
-from tangram_agent.config import RECYCLED_STATUS
 
 # While the master starts, its connection file is looked for this often.
 LOOK_S = 0.1
@@ -199,11 +198,10 @@ class Launcher:
         if self._stop_s is not None or ends:
             return  # the master takes leave, and so do its workers
         if child.plan_restart(status):
-            if status != RECYCLED_STATUS:
-                self._say(
-                    f"{child.name} ended with {describe(status)}: it is started again "
-                    f"({child.restarts} of {MAX_RESTARTS}); see {child.log}"
-                )
+            self._say(
+                f"{child.name} ended with {describe(status)}: it is started again "
+                f"({child.restarts} of {MAX_RESTARTS}); see {child.log}"
+            )
             return
         self._say(f"{child.name} ended with {describe(status)}: given up\n{child.tail()}")
         if not any(c.alive or c.next_start_s is not None for c in self._players):

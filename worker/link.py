@@ -190,13 +190,6 @@ class Link:
 
         return self._talk.order if self._wait(is_new, "its turn") else None
 
-    def drain(self, timeout_s: float) -> bool:
-        """Wait until all batches are acknowledged, also after `stop`; False if that failed."""
-        deadline = time.monotonic() + timeout_s
-        while self._talk.spool and not self._talk.dismissed and time.monotonic() < deadline:
-            self.poll(min(STEP_S, timeout_s))
-        return not self._talk.spool
-
     def close(self, reason: str = "") -> None:
         """Say BYE and close; takes a second at most."""
         self._talk.close(reason or self.stop_reason or "done")

@@ -1,11 +1,8 @@
 """The process that plays: explores with the newest weights, sends whole episodes."""
 
 import math
-import os
 from contextlib import closing
-from pathlib import Path
 
-from tangram_agent.config import RECYCLED_STATUS, ServiceConfig
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes
@@ -18,15 +15,12 @@ from worker.report import Report
 from worker.rollout import Rollout, join_episodes, split_episodes
 from worker.session import joined
 
-DRAIN_S = 60.0
-GIB = 2**30
-
 
 def run_player(config: WorkerConfig, setup: Setup) -> int:
     """Play until the master or a signal ends it.
 
     Returns:
-        Exit status 0, or RECYCLED_STATUS to be started anew.
+        Exit status 0.
 
     Raises:
         TangramError: a setting that cannot work, or a master that refuses or is gone for long.
@@ -56,9 +50,6 @@ def run_player(config: WorkerConfig, setup: Setup) -> int:
                     break
             link.stats["episodes"] = float(rollout.episode)
             report.played(episodes.count, policy.version)
-            if is_worn_out(config.service, rollout.episode) and link.drain(DRAIN_S):
-                link.stop("recycled")
-                return RECYCLED_STATUS
     return 0
 
 
@@ -83,19 +74,6 @@ def _play_in_step(link: Link, policy: Policy, rollout: Rollout, report: Report) 
             return
         report.played(episodes.count, policy.version)
         done = order
-
-
-def is_worn_out(service: ServiceConfig, episodes: int) -> bool:
-    """Whether a fresh process should go on in the place of this one."""
-    limit = service.recycle_gib * GIB
-    tired = 0 < service.recycle_episodes <= episodes
-    return tired or 0.0 < limit <= memory_bytes()
-
-
-def memory_bytes() -> int:
-    """What this process holds in memory."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 def _take_first_weights(link: Link, policy: Policy, report: Report) -> bool:

@@ -17,7 +17,7 @@ from master.config import LaunchConfig, MasterConfig
 from master.launch import Launcher, run_training
 from master.progress import PlainLines
 from master.rundir import RunFolder
-from tangram_agent.config import RECYCLED_STATUS, ServiceConfig
+from tangram_agent.config import ServiceConfig
 from tangram_agent.setup import from_mapping
 from tangram_sim.errors import ConfigError
 
@@ -33,6 +33,7 @@ def test_the_master_gets_its_settings(tmp_path: Path) -> None:
     assert arguments == [
         "-P",
         "-m",
+        "tangram_cli",
         "master",
         f"from_config='{tmp_path}/config.yaml'",
         f"run_dir='{tmp_path}'",
@@ -369,39 +370,3 @@ def test_a_master_that_does_not_end_is_killed(
     status, told = finish(made, tmp_path)
     assert status == 137
     assert "the master does not end within 0.2 s: it is killed" in told
-
-
-@pytest.mark.cluster
-def test_a_recycled_worker_is_started_again_without_a_word(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """More often than a failing one would be, if each has lived for a while."""
-    monkeypatch.setattr(launch_module, "LEAVE_S", 0.2)
-    monkeypatch.setattr(children_module, "STEADY_S", 0.0)
-    monkeypatch.setattr(children_module, "FIRST_DELAY_S", 0.01)
-    count = tmp_path / "count"
-    tired = f"""
-from pathlib import Path
-count = Path({str(count)!r})
-lives = len(count.read_text()) if count.exists() else 0
-count.write_text("x" * (lives + 1))
-if lives <= {MAX_RESTARTS}:
-    raise SystemExit({RECYCLED_STATUS})
-{WORKER}"""
-    lives = f"len(Path({str(count)!r}).read_text()) if Path({str(count)!r}).exists() else 0"
-    made = launcher(tmp_path, condition=f"({lives}) < {MAX_RESTARTS + 2}", players=[tired])
-    assert finish(made, tmp_path) == (0, "")
-
-
-@pytest.mark.cluster
-def test_a_worker_that_is_worn_out_at_once_is_given_up(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """service.recycle_gib below what a worker needs would go on for ever."""
-    monkeypatch.setattr(launch_module, "LEAVE_S", 0.2)
-    monkeypatch.setattr(children_module, "FIRST_DELAY_S", 0.01)
-    tired = f"print('ends: recycled'); raise SystemExit({RECYCLED_STATUS})"
-    status, told = finish(launcher(tmp_path, players=[tired]), tmp_path)
-    assert status == 1
-    assert told.startswith(f"worker 0 ended with status {RECYCLED_STATUS}: given up\n")
-    assert "ends: recycled\n" in told
