@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from tangram_agent.logs import FORMATS
+from tangram_agent.process import FORMATS
 from tangram_sim.checks import check_choice, check_range
 from tangram_sim.errors import ConfigError
 
