@@ -9,7 +9,7 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from master.checkpointer import check_resumable
-from master.children import MAX_RESTARTS, Child, describe, module, override
+from master.children import MAX_RESTARTS, Child, describe, override
 from master.config import LaunchConfig
 from master.console import Progress, make_lines, sturdy_console
 from master.rundir import RunFolder
@@ -232,7 +232,7 @@ def worker_child(folder: RunFolder, role: str, index: int) -> Child:
     """A worker that joins by the run's connection file, with a log of its own."""
     name = role if role == "evaluator" else f"worker {index}"
     arguments = [
-        *module("worker"),
+        *command("worker"),
         override("connect", str(folder.connection)),
         f"index={index}",
         f"role={role}",
@@ -246,7 +246,7 @@ def master_arguments(config: LaunchConfig, folder: RunFolder) -> list[str]:
     master = config.master
     in_step = master.service.mode == "lockstep"
     return [
-        *module("master"),
+        *command("master"),
         override("from_config", str(folder.config)),
         override("run_dir", str(folder.path)),
         *(
