@@ -9,7 +9,7 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from master.checkpointer import check_resumable
-from master.children import MAX_RESTARTS, Child, describe, override
+from master.children import MAX_RESTARTS, Child, command, describe, override
 from master.config import LaunchConfig
 from master.console import Progress, make_lines, sturdy_console
 from master.rundir import RunFolder
