@@ -10,9 +10,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tangram_sim.checks import check_choice, check_range
 from tangram_sim.config import MAX_CORNER_NOISE
 from tangram_sim.errors import ConfigError
+from tangram_sim.settings import check_choice, check_range
 from worker.config import MAX_ACTIONS
 
 FORMAT = 1
