@@ -44,13 +44,13 @@ class NetConfig(Settings, section="net"):
     )
 
     def __post_init__(self) -> None:
+        if not self.hidden:
+            raise ConfigError("net.hidden must name at least one layer, got []")
         super().__post_init__()
         if self.width % self.heads:
             raise ConfigError(
                 f"net.width must be a multiple of net.heads, got {self.width} and {self.heads}"
             )
-        if not self.hidden:
-            raise ConfigError("net.hidden must name at least one layer, got []")
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,7 @@ def test_settings_come_from_a_plain_mapping() -> None:
 
 
 def budget(**bounds: Any) -> Budget:
-    return Budget(MasterConfig("runs/x", **bounds))
+    return Budget(MasterConfig("runs/x", **{"max_updates": 0} | bounds))
 
 
 SHARES = [
