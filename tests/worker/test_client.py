@@ -31,7 +31,7 @@ from tests.worker.standin import QUICK, make_client, standing_in
 pytestmark = pytest.mark.cluster
 
 
-def test_a_link_joins_and_is_told_what_it_needs() -> None:
+def test_a_client_joins_and_is_told_what_it_needs() -> None:
     with staged() as stage, joined(stage, index=5) as client:
         welcome = client.welcome
         assert (welcome.run_id, welcome.seed, welcome.index) == ("run", 7, 5)
@@ -40,7 +40,7 @@ def test_a_link_joins_and_is_told_what_it_needs() -> None:
         assert not client.stopped
 
 
-def test_a_link_waits_for_the_connection_file(tmp_path: Path) -> None:
+def test_a_client_waits_for_the_connection_file(tmp_path: Path) -> None:
     with staged() as stage, make_client(str(tmp_path)) as client, ThreadPoolExecutor(1) as pool:
         future = pool.submit(client.join)
         write_connection(tmp_path, stage.hub.endpoint)
@@ -325,7 +325,7 @@ def test_the_newest_process_of_an_index_wins() -> None:
         assert (new.welcome.incarnation, new.stopped) == (2, False)
 
 
-def test_stop_ends_a_link_and_it_says_bye() -> None:
+def test_stop_ends_a_client_and_it_says_bye() -> None:
     with staged() as stage:
         with joined(stage) as client:
             assert client.send(episodes(), 1)

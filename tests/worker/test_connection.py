@@ -140,7 +140,7 @@ def test_closing_is_bounded_when_nobody_listens(tmp_path: Path) -> None:
         client.close()
 
 
-def test_a_waiting_link_says_what_it_waits_for(
+def test_a_waiting_client_says_what_it_waits_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """First the file is missing, then the master does not answer, then it does not acknowledge."""
