@@ -19,8 +19,8 @@ from benchmarks.proxy import DOWN, UP, Proxy
 from benchmarks.report import show, write
 from benchmarks.trainings import LOOK_S, processes_of, result_of, start_training, wait_for
 from benchmarks.witness import Witness, compare
+from tangram_agent.messages import WORKER_COLUMNS, RunStatus
 from tangram_agent.setup import make_setup
-from tangram_agent.standing import WORKER_COLUMNS, RunStatus
 from tangram_sim.errors import TangramError
 from worker.status import ask_status
 

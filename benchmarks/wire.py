@@ -23,10 +23,10 @@ from benchmarks.setups import several
 from master.arrivals import EpisodesArrived, WelcomeInfo
 from master.hub import Hub
 from master.keys import Keys, make_keys
-from tangram_agent.payloads import EpisodeSpec
+from tangram_agent.arrays import EpisodeSpec
+from tangram_agent.messages import Ack, EpisodeBatch
 from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes
-from tangram_agent.wire import Ack, EpisodeBatch
 from tangram_sim.errors import TangramError
 from worker.link import Link
 from worker.terms import Timing

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from master.journal import segments
+from master.journal import check_journal, segments
 from master.record import Record
-from master.recovery import check_journal
 from master.rundir import RunFolder
 from master.trainer import LEARNER, Trainer, check_same_task
 from tangram_agent.checkpoints import (

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from tangram_agent.frames import MAX_HEADER
-from tangram_agent.payloads import MAX_WEIGHTS_BYTES
+from tangram_agent.arrays import MAX_WEIGHTS_BYTES
+from tangram_agent.schema import MAX_HEADER
 from tangram_sim.errors import RunError
 from worker.connection import Connection
 

@@ -1,6 +1,7 @@
 """The newest weights, whichever way they came."""
 
-from tangram_agent.payloads import WeightShapes, decode_weights
+from tangram_agent.arrays import WeightShapes
+from tangram_agent.messages import decode_weights
 from tangram_agent.types import Weights
 
 

@@ -11,9 +11,9 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Self
 
-from tangram_agent.payloads import EpisodeSpec, WeightShapes
+from tangram_agent.arrays import EpisodeSpec, WeightShapes
+from tangram_agent.messages import EpisodeBatch, Go, Scores, Welcome
 from tangram_agent.types import Episodes, Weights
-from tangram_agent.wire import EpisodeBatch, Go, Scores, Welcome
 from tangram_sim.errors import TangramError
 from worker.connection import missing
 from worker.talk import Talk

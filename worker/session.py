@@ -11,8 +11,8 @@ from typing import TextIO
 import torch
 
 from tangram_agent import lifeline
+from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.logs import formatter
-from tangram_agent.payloads import EpisodeSpec
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
 from tangram_agent.watchdog import Watchdog

@@ -11,11 +11,8 @@ import time
 from collections import Counter
 
 from tangram_agent.addresses import host_of, reachable
-from tangram_agent.decoding import decode_from_master
-from tangram_agent.frames import ProtocolError
-from tangram_agent.payloads import WeightShapes
-from tangram_agent.standing import RunStatus
-from tangram_agent.wire import (
+from tangram_agent.arrays import WeightShapes
+from tangram_agent.messages import (
     Ack,
     Alive,
     Bye,
@@ -23,15 +20,17 @@ from tangram_agent.wire import (
     Greet,
     Heartbeat,
     Hello,
-    Plain,
     Refused,
     Reject,
+    RunStatus,
     Stop,
     ToWorker,
     WantWeights,
     WeightsMessage,
     Welcome,
+    decode_from_master,
 )
+from tangram_agent.schema import Plain, ProtocolError
 from tangram_sim.errors import TangramError, WireError
 from worker.channel import Channel
 from worker.inbox import Inbox

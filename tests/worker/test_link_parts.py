@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tangram_agent.payloads import encode_weights
+from tangram_agent.messages import encode_weights
 from tangram_agent.types import Weights
 from tangram_sim.errors import RunError, WireError
 from tests.agent.messages import SHAPES, weights
