@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Thread
 
-from tangram_agent.lifeline import Lifeline
+from tangram_agent.process import Lifeline
 
 # A process that lived for so long starts with a clean record.
 STEADY_S = 60.0
@@ -168,9 +168,9 @@ def describe(status: int) -> str:
         return f"signal {-status}"
 
 
-def module(name: str) -> list[str]:
-    """Run a module of this installation, not one of that name in the current folder."""
-    return ["-P", "-m", name]
+def command(name: str) -> list[str]:
+    """Run tangram-NAME of this installation, whatever lies in the current folder."""
+    return ["-P", "-m", "tangram_cli", name]
 
 
 def override(name: str, value: str) -> str:

@@ -25,17 +25,9 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from master.arrivals import EpisodesArrived
-from master.every import Every
 from tangram_agent.arrays import MAX_BATCH_BYTES, MAX_FRAMES, EpisodeSpec, join_frames, split_frames
-from tangram_agent.messages import (
-    Count,
-    EpisodeBatch,
-    Id,
-    Index,
-    Number,
-    Role,
-    decode_from_worker,
-)
+from tangram_agent.messages import Count, EpisodeBatch, Id, Index, Number, Role, decode_from_worker
+from tangram_agent.process import Every
 from tangram_agent.schema import MAX_HEADER, Plain, ProtocolError, opened, read
 from tangram_sim.errors import RunError, WireError
 

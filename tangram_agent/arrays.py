@@ -19,8 +19,8 @@ from safetensors.numpy import load, save
 
 from tangram_agent.setup import Setup
 from tangram_sim.arrays import Singles
-from tangram_sim.checks import check_range
 from tangram_sim.errors import ConfigError, WireError
+from tangram_sim.settings import check_range
 
 WeightShapes = Mapping[str, tuple[int, ...]]
 

@@ -10,6 +10,7 @@ acknowledgement would lose a batch just as a damaged batch would. It stands in t
 key stays the version, so that another version of the protocol is told from damage.
 """
 
+import math
 import re
 import zlib
 from collections.abc import Collection, Mapping, Sequence
@@ -136,8 +137,13 @@ class Numbers(Bound):
         """All as floats, in a lenient map those that fit."""
         if not self.lenient:
             return {key: float(number) for key, number in value.items()}
-        known = [(k, v) for k, v in value.items() if _is_name(k) and isinstance(v, Real) and v == v]
-        return {k: float(min(max(v, -MAX_NUMBER), MAX_NUMBER)) for k, v in known[:MAX_ENTRIES]}
+        known: dict[str, Any] = {
+            k: v for k, v in value.items() if _is_name(k) and isinstance(v, Real)
+        }
+        # An integer may be too large for a float; NaN stays what it is between any two bounds.
+        near = {k: float(min(max(v, -MAX_NUMBER), MAX_NUMBER)) for k, v in known.items()}
+        fitted = [(k, v) for k, v in near.items() if not math.isnan(v)]
+        return dict(fitted[:MAX_ENTRIES])
 
 
 @dataclass(frozen=True)

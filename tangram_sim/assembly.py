@@ -11,10 +11,10 @@ from functools import cached_property
 import numpy as np
 
 from tangram_sim.arrays import Floats
-from tangram_sim.checks import check_range
 from tangram_sim.fitting import Fit, fit_piece, overlap_depths, separate
 from tangram_sim.geometry import outlines
 from tangram_sim.layout import Layout, TokensConfig, make_layout
+from tangram_sim.settings import check_range
 from tangram_sim.shapes import SHAPE_NAMES, tan
 from tangram_sim.sketches import Sketch
 
@@ -146,7 +146,7 @@ def _fit_faults(sketch: Sketch, fits: Sequence[Fit], where: str) -> list[str]:
 
 
 def _size(kind: str, corners: Floats) -> float:
-    """How far the corners lie from their middle, next to the exact shape's."""
+    """Summed distance of the corners from their mean, divided by that of the exact tan."""
     spread = np.linalg.norm(corners - corners.mean(axis=0), axis=1).sum()
     return float(spread / np.linalg.norm(tan(kind).corners, axis=1).sum())
 

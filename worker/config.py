@@ -7,9 +7,9 @@ from typing import Any
 from tangram_agent.config import ORDERS, ServiceConfig
 from tangram_agent.messages import MAX_INDEX, ROLES
 from tangram_agent.pretrained import PREFIX, agent_names
-from tangram_sim.checks import check_choice, check_range
 from tangram_sim.config import MAX_CORNER_NOISE
 from tangram_sim.errors import ConfigError
+from tangram_sim.settings import check_choice, check_range
 
 CHANGES = ("order", "reapply", "refine_steps", "gamma")  # of how an agent plays
 MAX_EPISODES = 1_000_000

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from tangram_sim.arrays import Bools, Floats, Ints
 from tangram_sim.layout import Layout
@@ -48,7 +49,7 @@ def paired(layout: Layout, corners: Floats, goals: Floats) -> Pairing:
     target = np.tile(np.arange(layout.tokens), (len(corners), 1))
     for group in _groups(turns):
         for e in range(len(corners)):
-            target[e, group] = group[cheapest(cost[e][np.ix_(group, group)])]
+            target[e, group] = group[linear_sum_assignment(cost[e][np.ix_(group, group)])[1]]
     rows, tokens = np.arange(len(corners))[:, None], np.arange(layout.tokens)
     return Pairing(target, ways[rows, tokens, target], sides[rows, tokens, target])
 
@@ -85,48 +86,3 @@ def _all_ways(layout: Layout, corners: Floats, goals: Floats, turns: Floats) -> 
     ways[..., 2] += turn
     ways[..., 2] -= period * np.round(ways[..., 2] / period)
     return ways
-
-
-def cheapest(cost: Floats) -> Ints:
-    """(N,) the column of each row of costs (N, N) that together cost least, each column once.
-
-    The Hungarian method: row after row takes the shortest path to a free column, O(N^3).
-    """
-    count = len(cost)
-    row_of = np.full(count + 1, -1)  # the last column is where a new row begins
-    row_price, price = np.zeros(count), np.zeros(count + 1)
-    for row in range(count):
-        row_of[count] = row
-        before = _shortest_path(cost, row_of, row_price, price)
-        column = before[count]
-        while column != count:
-            row_of[column], column = row_of[before[column]], before[column]
-    columns = np.empty(count, dtype=np.int64)
-    columns[row_of[:count]] = np.arange(count)
-    return columns
-
-
-def _shortest_path(cost: Floats, row_of: Ints, row_price: Floats, price: Floats) -> Ints:
-    """Adjust the prices until a free column is reached.
-
-    Returns:
-        (N + 1,) for each column the one before it on the path; for the last, the free one.
-    """
-    count = len(cost)
-    seen, slack = np.zeros(count + 1, np.bool_), np.full(count, np.inf)
-    before = np.full(count + 1, count)
-    column = count
-    while row_of[column] >= 0:
-        seen[column] = True
-        row = row_of[column]
-        reduced = cost[row] - row_price[row] - price[:count]
-        closer = ~seen[:count] & (reduced < slack)
-        slack[closer], before[:count][closer] = reduced[closer], column
-        nearest = int(np.argmin(np.where(seen[:count], np.inf, slack)))
-        step = slack[nearest]
-        row_price[row_of[seen]] += step
-        price[seen] -= step
-        slack[~seen[:count]] -= step
-        column = nearest
-    before[count] = column
-    return before

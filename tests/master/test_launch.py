@@ -12,12 +12,11 @@ from rich.console import Console
 from master import children as children_module
 from master import launch as launch_module
 from master.children import MAX_RESTARTS, Child
-from master.commands import master_arguments
 from master.config import LaunchConfig, MasterConfig
-from master.launch import Launcher, run_training
-from master.progress import PlainLines
+from master.console import PlainLines
+from master.launch import Launcher, master_arguments, run_training
 from master.rundir import RunFolder
-from tangram_agent.config import RECYCLED_STATUS, ServiceConfig
+from tangram_agent.config import ServiceConfig
 from tangram_agent.setup import from_mapping
 from tangram_sim.errors import ConfigError
 
@@ -33,6 +32,7 @@ def test_the_master_gets_its_settings(tmp_path: Path) -> None:
     assert arguments == [
         "-P",
         "-m",
+        "tangram_cli",
         "master",
         f"from_config='{tmp_path}/config.yaml'",
         f"run_dir='{tmp_path}'",
@@ -70,7 +70,7 @@ def test_a_folder_in_use_is_left_alone(tmp_path: Path) -> None:
 MASTER = """
 import os, signal, sys, threading
 from pathlib import Path
-from tangram_agent import lifeline
+from tangram_agent.process import watch_parent
 folder = Path({folder!r})
 news = open(folder / "news", "w")
 heard = threading.Event()
@@ -78,7 +78,7 @@ def hear(line):
     print(line, file=news, flush=True)
     if "the run ends" in line:
         heard.set()
-lifeline.watch(hear)
+watch_parent(hear)
 def end():
     (folder / "connection.json").unlink()
     sys.exit(0)
@@ -93,8 +93,8 @@ while {condition}:
 """
 WORKER = """
 import signal
-from tangram_agent import lifeline
-lifeline.watch()
+from tangram_agent.process import watch_parent
+watch_parent()
 signal.pause()
 """
 
@@ -326,8 +326,8 @@ def test_a_second_signal_ends_everything_at_once(
 def test_a_signal_that_comes_again_at_once_cuts_nobody_short(tmp_path: Path) -> None:
     leaving = """
 import signal, sys, time
-from tangram_agent import lifeline
-lifeline.watch()
+from tangram_agent.process import watch_parent
+watch_parent()
 def leave(*_):
     time.sleep(0.3)
     print("left in order", flush=True)
@@ -369,39 +369,3 @@ def test_a_master_that_does_not_end_is_killed(
     status, told = finish(made, tmp_path)
     assert status == 137
     assert "the master does not end within 0.2 s: it is killed" in told
-
-
-@pytest.mark.cluster
-def test_a_recycled_worker_is_started_again_without_a_word(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """More often than a failing one would be, if each has lived for a while."""
-    monkeypatch.setattr(launch_module, "LEAVE_S", 0.2)
-    monkeypatch.setattr(children_module, "STEADY_S", 0.0)
-    monkeypatch.setattr(children_module, "FIRST_DELAY_S", 0.01)
-    count = tmp_path / "count"
-    tired = f"""
-from pathlib import Path
-count = Path({str(count)!r})
-lives = len(count.read_text()) if count.exists() else 0
-count.write_text("x" * (lives + 1))
-if lives <= {MAX_RESTARTS}:
-    raise SystemExit({RECYCLED_STATUS})
-{WORKER}"""
-    lives = f"len(Path({str(count)!r}).read_text()) if Path({str(count)!r}).exists() else 0"
-    made = launcher(tmp_path, condition=f"({lives}) < {MAX_RESTARTS + 2}", players=[tired])
-    assert finish(made, tmp_path) == (0, "")
-
-
-@pytest.mark.cluster
-def test_a_worker_that_is_worn_out_at_once_is_given_up(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """service.recycle_gib below what a worker needs would go on for ever."""
-    monkeypatch.setattr(launch_module, "LEAVE_S", 0.2)
-    monkeypatch.setattr(children_module, "FIRST_DELAY_S", 0.01)
-    tired = f"print('ends: recycled'); raise SystemExit({RECYCLED_STATUS})"
-    status, told = finish(launcher(tmp_path, players=[tired]), tmp_path)
-    assert status == 1
-    assert told.startswith(f"worker 0 ended with status {RECYCLED_STATUS}: given up\n")
-    assert "ends: recycled\n" in told

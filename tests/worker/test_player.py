@@ -16,9 +16,9 @@ import zmq
 
 from master.arrivals import EpisodesArrived
 from master.hub import Hub
-from tangram_agent.config import RECYCLED_STATUS, ServiceConfig
-from tangram_agent.lifeline import Lifeline
+from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import Go
+from tangram_agent.process import Lifeline
 from tangram_agent.setup import Setup
 from tangram_sim.errors import ConfigError, TangramError
 from tangram_sim.sampling import sample_poses
@@ -27,7 +27,7 @@ from tests.agent.builders import setup
 from tests.worker.builders import policy, weights, write_run
 from tests.worker.masters import LIMIT_S, collect, open_hub, with_master
 from worker.config import WorkerConfig
-from worker.player import is_worn_out, run_player
+from worker.player import run_player
 
 pytestmark = pytest.mark.cluster
 
@@ -241,12 +241,19 @@ def test_a_signal_ends_a_player_that_no_master_answers(
 
 @pytest.mark.parametrize("role", ["player", "evaluator"])
 def test_a_process_whose_parent_is_gone_takes_its_leave(tmp_path: Path, role: str) -> None:
-    """`python -m worker`, as tangram-train starts it; the master lives on and asks for nothing."""
+    """As tangram-train starts a worker; the master lives on and asks for nothing."""
     made = write_run(tmp_path)
     lifeline = Lifeline()
     with open_hub(made) as hub:
         command = [
-            *(sys.executable, "-m", "worker", f"connect={hub.endpoint}", f"role={role}"),
+            *(
+                sys.executable,
+                "-m",
+                "tangram_cli",
+                "worker",
+                f"connect={hub.endpoint}",
+                f"role={role}",
+            ),
             *(f"from_config={tmp_path / 'config.yaml'}", "service.envs=2"),
         ]
         with subprocess.Popen(
@@ -282,40 +289,3 @@ def test_messages_that_would_be_too_large_are_refused_at_the_start() -> None:
     service = replace(SERVICE, batch_episodes=4096)
     with pytest.raises(ConfigError, match="batch_episodes"):
         run_player(WorkerConfig("tcp://127.0.0.1:9", service=service), made)
-
-
-@pytest.mark.parametrize(
-    "limit", [{"recycle_episodes": 12}, {"recycle_gib": 1e-3}], ids=["episodes", "memory"]
-)
-def test_a_worn_out_worker_leaves_when_all_it_played_is_safe(limit: dict[str, float]) -> None:
-    made = setup()
-    hub = open_hub(made, window=2)
-
-    def script(hub: Hub) -> list[EpisodesArrived]:
-        hub.publish(weights(made, 0))
-        arrived = collect(hub, lambda batches: len(batches) >= 1)
-        pending = list(arrived)
-        while hub.peers:
-            # Acknowledged late: the worker must wait for it before it goes.
-            if not (new := hub.poll(0.05)) and pending:
-                hub.acknowledge(pending.pop(0))
-            arrived += new
-            pending += new
-        assert pending == []
-        return arrived
-
-    service = replace(SERVICE, **limit)
-    arrived, status = with_master(hub, script, lambda: run_player(config(hub, service), made))
-    assert status == RECYCLED_STATUS
-    played = sum(batch.episodes.count for batch in arrived)
-    assert played >= limit.get("recycle_episodes", 1)
-    assert hub.counters["byes"] == 1
-    assert hub.counters["batches"] == len(arrived)
-
-
-def test_limits_of_zero_recycle_nothing() -> None:
-    assert not is_worn_out(ServiceConfig(), 10**9)
-    assert is_worn_out(ServiceConfig(recycle_episodes=5), 5)
-    assert not is_worn_out(ServiceConfig(recycle_episodes=5), 4)
-    assert is_worn_out(ServiceConfig(recycle_gib=1e-6), 0)
-    assert not is_worn_out(ServiceConfig(recycle_gib=1e6), 0)

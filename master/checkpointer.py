@@ -1,0 +1,262 @@
+"""The checkpointer: batches are on disk before they are acknowledged, the whole run at times.
+
+A run goes on from its newest checkpoint that is whole, and from what the journal holds since.
+
+A disk that takes nothing more ends no run: nothing is acknowledged until there is room again, so
+the workers keep what they played, and wait.
+"""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from master.arrivals import EpisodesArrived
+from master.divergence import DivergenceGuard
+from master.hub import Hub
+from master.journal import Journal, JournalError, check_journal, segments
+from master.rundir import Clock, Record, RunFolder
+from master.trainer import LEARNER, Trainer, check_same_task
+from tangram_agent.checkpoints import (
+    Checkpoint,
+    CorruptError,
+    DiskError,
+    list_checkpoints,
+    load_checkpoint,
+    newest_checkpoint,
+    save_checkpoint,
+    set_aside,
+    was_set_aside,
+)
+from tangram_agent.config import ServiceConfig
+from tangram_agent.process import Every
+from tangram_agent.runs import CHECKPOINTS, SETUP
+from tangram_agent.setup import make_setup
+from tangram_sim.errors import RunError
+
+MINUTE_S = 60.0
+RETRY_S = 1.0
+MAKE_ROOM = "make room there; until then nothing is acknowledged, and workers keep what they played"
+SEGMENT = "journal"
+
+
+class Checkpointer:
+    """Journals batches, and writes checkpoints when they are due."""
+
+    def __init__(
+        self,
+        service: ServiceConfig,
+        folder: RunFolder,
+        guard: DivergenceGuard,
+        hub: Hub,
+        journal: Journal,
+        clock: Clock,
+        notice: Callable[[str], None],
+    ) -> None:
+        """Write nothing yet.
+
+        Args:
+            service: how often, and how many checkpoints are kept.
+            folder: of the run.
+            guard: of the trainer; only what is finite is saved.
+            hub: its table of duplicates is saved with the rest.
+            journal: open.
+            clock: of the run's record.
+            notice: takes lines for the user.
+        """
+        self._folder, self._guard, self._hub, self._journal = folder, guard, hub, journal
+        self._clock, self._notice = clock, notice
+        self._keep_checkpoints = service.keep_checkpoints
+        self._checkpoint = Every(service.checkpoint_minutes * MINUTE_S)
+        self._failing = False
+        self._saved_s: float | None = None
+        self._retry, self._tell = Every(RETRY_S), Every(MINUTE_S, at_once=True)
+
+    def numbers(self) -> dict[str, float]:
+        """How old the last checkpoint of this process is, and whether the disk takes nothing."""
+        age_s = -1.0 if self._saved_s is None else time.monotonic() - self._saved_s
+        return {"checkpoint_age_s": age_s, "disk_failing": float(self._failing)}
+
+    def keep(self, arrival: EpisodesArrived) -> bool:
+        """Journal a batch; False while the disk does not take it."""
+        if self._failing and not self._retry.due():
+            return False
+        try:
+            self._journal.append(arrival)
+        except JournalError as error:
+            self._failed(f"{error}: {MAKE_ROOM}")
+            return False
+        self._worked()
+        return True
+
+    def tick(self) -> None:
+        """Sync the journal and write a checkpoint when it is time; a full disk is told."""
+        try:
+            self._journal.tick()
+            if self._checkpoint.due():
+                self.save()
+        except (JournalError, DiskError) as error:
+            self._failed(f"warning: {error}")
+
+    def save(self) -> Path:
+        """Write a checkpoint, and drop the segments of the journal that nobody needs any more.
+
+        Raises:
+            RunError: the weights are not finite, one time too many.
+            DiskError: the disk does not take it; what was there before is as it was.
+        """
+        self._guard.check()
+        rest = Restored(self._clock.stopped(), self._hub.state(), self._journal.rotate())
+        folder = self._folder.checkpoints
+        path = save_run(folder, self._guard.trainer, rest, self._keep_checkpoints)
+        self._journal.drop_before(first_needed(folder))
+        self._saved_s = time.monotonic()
+        return path
+
+    def _failed(self, text: str) -> None:
+        self._failing = True
+        if self._tell.due():
+            self._notice(text)
+
+    def _worked(self) -> None:
+        if self._failing:
+            self._failing, self._tell = False, Every(MINUTE_S, at_once=True)
+            self._notice("the journal can be written again: batches are taken in")
+
+
+def check_resumable(folder: RunFolder, resolved: Mapping[str, Any]) -> None:
+    """Refuse another task, or a warm start from nowhere, before anything is overwritten.
+
+    Raises:
+        RunError: the newest checkpoint was made with other tokens, sim, reward or net, or there is
+            none, and the journal was, or the run that this one is to begin with has none.
+    """
+    found = list_checkpoints(folder.checkpoints)
+    if not found:
+        if segments(folder.journal):  # it was killed before its first checkpoint
+            check_journal(folder.journal, make_setup(resolved).task_digest())
+        _check_warm_start(resolved.get("warm_start"))
+        return
+    try:
+        counters = load_checkpoint(found[-1], stems=[]).counters
+    except CorruptError:
+        return  # the one before decides, when the run is restored
+    check_same_task(make_setup(resolved), counters.get(SETUP, {}))
+
+
+def _check_warm_start(run_dir: str | None) -> None:
+    if run_dir is not None and not list_checkpoints(Path(run_dir) / CHECKPOINTS):
+        raise RunError(
+            f"warm_start={run_dir} has no checkpoint: name the folder of a run that was trained"
+        )
+
+
+@dataclass(frozen=True)
+class Restored:
+    """What a checkpoint holds besides the trainer's state.
+
+    Attributes:
+        record: what the run had been through.
+        hub: the hub's table of what was inserted, so that nothing is inserted twice.
+        segment: of the journal, the first one that the checkpoint does not cover.
+    """
+
+    record: Record
+    hub: Mapping[str, Any]
+    segment: int = 1
+
+    @staticmethod
+    def of(counters: Mapping[str, Any]) -> "Restored":
+        """From the counters of a checkpoint; RunError if its record is not whole."""
+        record = Record.of(counters["record"])
+        return Restored(record, dict(counters["hub"]), int(counters.get(SEGMENT, 1)))
+
+
+def save_run(folder: Path, trainer: Trainer, rest: Restored, keep: int) -> Path:
+    """Write a checkpoint from which `restore_run` goes on.
+
+    Args:
+        folder: of all checkpoints.
+        trainer: networks, replay, counters and generators.
+        rest: everything else.
+        keep: newest checkpoints that stay.
+
+    Raises:
+        DiskError: the folder cannot be written; what was there before is as it was.
+    """
+    arrays, counters = trainer.state()
+    counters |= {"record": rest.record.state(), "hub": dict(rest.hub), SEGMENT: rest.segment}
+    return save_checkpoint(folder, trainer.updates, arrays, counters, keep)
+
+
+def first_needed(folder: Path) -> int:
+    """The first segment of the journal that one of the checkpoints may be continued with."""
+    needed = []
+    for path in list_checkpoints(folder):
+        try:
+            needed.append(int(load_checkpoint(path, stems=[]).counters.get(SEGMENT, 1)))
+        except (RunError, TypeError, ValueError):
+            continue  # it cannot be gone on from
+    return min(needed, default=1)
+
+
+def restore_run(folder: Path, trainer: Trainer, warn: Callable[[str], None]) -> Restored | None:
+    """Take over the newest checkpoint that is whole; corrupt ones are renamed, with a warning.
+
+    Returns:
+        What it holds besides the trainer's state, None where there was never a checkpoint.
+
+    Raises:
+        RunError: the checkpoint is of another format, task or network, or none is whole.
+    """
+    found = _newest_whole(folder, warn)
+    if found is None:
+        return None
+    try:
+        trainer.load_state(found.arrays, found.counters)
+        return Restored.of(found.counters)
+    except RunError as error:
+        raise RunError(f"cannot go on from {found.path}: {error}") from None
+    except (KeyError, TypeError, ValueError) as error:
+        raise RunError(
+            f"cannot go on from {found.path}: its content is not that of a run "
+            f"({type(error).__name__}: {error}); start a new run with another run_dir"
+        ) from error
+
+
+def warm_start(run_dir: Path, trainer: Trainer) -> str:
+    """Give the trainer the networks of another run, with fresh optimisers and an empty replay.
+
+    The other run may have had other tokens, where the networks do not depend on them (net=mha).
+
+    Returns:
+        A line for the user.
+
+    Raises:
+        RunError: there is no whole checkpoint, or its networks have other shapes.
+    """
+    try:
+        content = load_checkpoint(newest_checkpoint(run_dir / CHECKPOINTS), [LEARNER])
+        trainer.learner.load_networks(content.arrays[LEARNER])
+    except RunError as error:
+        raise RunError(f"warm_start={run_dir}: {error}") from None
+    return f"begins with the networks of {run_dir} after {content.updates:,} updates"
+
+
+def _newest_whole(folder: Path, warn: Callable[[str], None]) -> Checkpoint | None:
+    for path in reversed(list_checkpoints(folder)):
+        try:
+            return load_checkpoint(path)
+        except CorruptError as error:
+            aside = set_aside(path)
+            warn(
+                f"warning: checkpoint {path} is corrupt ({error.why}): it is {aside.name} now, and "
+                "the one before is taken"
+            )
+    if was_set_aside(folder):
+        raise RunError(
+            f"no checkpoint in {folder} is whole: put one from a backup there, or start a new run "
+            "with another run_dir"
+        )
+    return None

@@ -1,0 +1,137 @@
+"""Updates that are not finite are undone, and end the run when they go on."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import safetensors.numpy
+import torch
+from torch import nn
+
+from master import divergence as divergence_module
+from master.divergence import DivergenceGuard
+from master.trainer import Trainer
+from tangram_agent.ddpg import NotFiniteError
+from tangram_sim.errors import RunError
+from tests.agent.builders import random_episodes
+from tests.master.builders import small_setup, trainer
+
+pytestmark = pytest.mark.fast
+
+MADE = small_setup()
+
+
+@pytest.fixture
+def learning() -> Trainer:
+    """A trainer with all of its updates due."""
+    made = trainer(MADE)
+    made.insert(random_episodes(MADE, 60))
+    return made
+
+
+@pytest.fixture(autouse=True)
+def kept_each_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every good state is kept, however fast the machine is."""
+    monkeypatch.setattr(divergence_module, "KEEP_S", 0.0)
+
+
+def fail(made: Trainer, times: int, part: str = "critic_loss") -> None:
+    """The next updates have a loss that is not a number."""
+    loss = getattr(made.learner, part)
+    left = [times]
+
+    def failing(t: dict[str, Any]) -> Any:
+        first, second = loss(t)
+        left[0] -= 1
+        return (first * float("nan") if left[0] >= 0 else first), second
+
+    setattr(made.learner, part, failing)
+
+
+def poison(module: nn.Module) -> None:
+    with torch.no_grad():
+        next(module.parameters()).view(-1)[0] = float("inf")
+
+
+def same(one: dict[str, Any], other: dict[str, Any]) -> bool:
+    return one.keys() == other.keys() and all(np.array_equal(one[n], other[n]) for n in one)
+
+
+@pytest.mark.parametrize("part", ["critic_loss", "actor_loss"])
+def test_a_bad_update_is_undone_and_the_next_one_counts(
+    learning: Trainer, tmp_path: Path, part: str
+) -> None:
+    guard = DivergenceGuard(learning, 3, tmp_path / "bad")
+    for _ in range(2):
+        assert guard.update(0.0)
+    good, lag = learning.learner.state(), learning.rate_limiter.lag
+    fail(learning, 1, part)
+    assert guard.update(0.0) == {}
+    assert same(learning.learner.state(), good)
+    assert (learning.updates, learning.rate_limiter.lag, guard.undone) == (2, lag, 1)
+    assert np.isfinite(list(guard.update(0.0).values())).all()
+    assert (learning.updates, learning.rate_limiter.lag, guard.undone) == (3, lag - 1, 1)
+    assert not (tmp_path / "bad").exists()
+
+
+def test_updates_since_the_last_good_state_are_made_again(
+    learning: Trainer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(divergence_module, "KEEP_S", 1000.0)
+    guard, lag = DivergenceGuard(learning, 3, tmp_path / "bad"), learning.rate_limiter.lag
+    first = learning.learner.state()
+    for _ in range(4):
+        guard.update(0.0)
+    fail(learning, 1)
+    guard.update(0.0)
+    assert same(learning.learner.state(), first)
+    assert (learning.updates, learning.rate_limiter.lag) == (0, lag)
+
+
+def test_too_many_in_a_row_end_the_run_and_the_batch_is_kept(
+    learning: Trainer, tmp_path: Path
+) -> None:
+    guard = DivergenceGuard(learning, 3, tmp_path / "bad")
+    fail(learning, 2)
+    assert [bool(guard.update(0.0)) for _ in range(3)] == [False, False, True]
+    fail(learning, 99)
+    assert [guard.update(0.0) for _ in range(2)] == [{}, {}]
+    with pytest.raises(RunError, match=r"critic_loss=nan.*3 times in a row.*agent\.grad_clip=1"):
+        guard.update(0.0)
+    assert guard.undone == 5
+    batch = safetensors.numpy.load_file(tmp_path / "bad")
+    assert learning.batch is not None
+    assert same(batch, vars(learning.batch))
+
+
+def test_weights_that_went_bad_without_a_loss_are_never_given_out(
+    learning: Trainer, tmp_path: Path
+) -> None:
+    guard = DivergenceGuard(learning, 2, tmp_path / "bad")
+    guard.update(0.0)
+    poison(learning.learner.acting)
+    weights = guard.weights()
+    assert all(np.isfinite(tensor).all() for tensor in weights.tensors.values())
+    assert guard.undone == 1
+    poison(learning.learner.acting)
+    with pytest.raises(RunError, match="the weights are not finite after 1 updates"):
+        guard.weights()
+
+
+@pytest.mark.parametrize("part", ["critic", "actor", "target_actor"])
+def test_a_check_finds_what_no_worker_would_see(
+    learning: Trainer, tmp_path: Path, part: str
+) -> None:
+    guard = DivergenceGuard(learning, 2, tmp_path / "bad")
+    guard.update(0.0)
+    good = learning.learner.state()
+    poison(getattr(learning.learner, part))
+    guard.check()
+    assert (guard.undone, same(learning.learner.state(), good)) == (1, True)
+
+
+def test_a_state_that_is_spoilt_already_is_refused(learning: Trainer, tmp_path: Path) -> None:
+    poison(learning.learner.critic)
+    with pytest.raises(NotFiniteError, match="the weights are not finite after 0 updates"):
+        DivergenceGuard(learning, 2, tmp_path / "bad")
