@@ -8,7 +8,7 @@ import numpy as np
 from master.parts import Parts
 from master.peers import Peer
 from master.status import Status
-from tangram_agent.standing import WORKER_COLUMNS, RunStatus
+from tangram_agent.messages import WORKER_COLUMNS, RunStatus
 from tangram_sim.arrays import Floats
 
 UNKNOWN = -1.0
@@ -34,7 +34,7 @@ def run_status(status: Status, parts: Parts, more: Mapping[str, float]) -> RunSt
         "updates_per_s": status.updates_per_s,
         "players": status.players,
         "evaluators": status.evaluators,
-        "lag_updates": trainer.pace.lag,
+        "lag_updates": trainer.rate_limiter.lag,
         "replay": len(trainer.replay),
         "replay_capacity": trainer.replay.capacity,
         "undone_updates": parts.guard.undone,
