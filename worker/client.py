@@ -17,12 +17,8 @@ from collections.abc import Callable, Mapping
 from typing import Self
 
 from tangram_agent.addresses import host_of, reachable
-from tangram_agent.decoding import decode_from_master
-from tangram_agent.frames import ProtocolError
-from tangram_agent.payloads import EpisodeSpec, WeightShapes
-from tangram_agent.standing import RunStatus
-from tangram_agent.types import Episodes, Weights
-from tangram_agent.wire import (
+from tangram_agent.arrays import EpisodeSpec, WeightShapes
+from tangram_agent.messages import (
     Ack,
     Alive,
     Bye,
@@ -31,16 +27,19 @@ from tangram_agent.wire import (
     Greet,
     Heartbeat,
     Hello,
-    Plain,
     Refused,
     Reject,
+    RunStatus,
     Scores,
     Stop,
     ToWorker,
     WantWeights,
     WeightsMessage,
     Welcome,
+    decode_from_master,
 )
+from tangram_agent.schema import Plain, ProtocolError
+from tangram_agent.types import Episodes, Weights
 from tangram_sim.errors import TangramError, WireError
 from worker.connection import Connection, Sockets, Timing
 from worker.outbox import NewestWeights, Outbox
@@ -221,17 +220,10 @@ class Client:
 
         return self._order if self._wait(is_new, "its turn") else None
 
-    def drain(self, timeout_s: float) -> bool:
-        """Wait until all batches are acknowledged, also after `stop`; False if that failed."""
-        deadline = time.monotonic() + timeout_s
-        while self.outbox and not self._dismissed and time.monotonic() < deadline:
-            self.poll(min(STEP_S, timeout_s))
-        return not self.outbox
-
-    def close(self, reason: str = "") -> None:
+    def close(self) -> None:
         """Say BYE and close; takes a second at most, also when nobody listens."""
         if self._connection.sockets is not None:
-            self._connection.sockets.send(Bye(reason or self.stop_reason or "done").encode())
+            self._connection.sockets.send(Bye(self.stop_reason or "done").encode())
         self._connection.close()
 
     def _wait(self, done: Callable[[], bool], what: str, timeout_s: float = math.inf) -> bool:

@@ -7,10 +7,10 @@ from contextlib import closing
 import numpy as np
 
 from tangram_agent.config import ServiceConfig
+from tangram_agent.messages import Scores
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
 from tangram_agent.types import Weights
-from tangram_agent.wire import Scores
 from worker.client import Client
 from worker.config import WorkerConfig
 from worker.rollout import Played

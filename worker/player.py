@@ -3,10 +3,10 @@
 import math
 from contextlib import closing
 
+from tangram_agent.messages import Go
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes
-from tangram_agent.wire import Go
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.errors import TangramError
 from worker.client import Client

@@ -17,15 +17,15 @@ import zmq
 from master.arrivals import EpisodesArrived
 from master.hub import Hub
 from tangram_agent.config import ServiceConfig
+from tangram_agent.messages import Go
 from tangram_agent.process import Lifeline
 from tangram_agent.setup import Setup
-from tangram_agent.wire import Go
 from tangram_sim.errors import ConfigError, TangramError
 from tangram_sim.sampling import sample_poses
 from tangram_sim.seeding import episode_generator
 from tests.agent.builders import setup
 from tests.worker.builders import policy, weights, write_run
-from tests.worker.masters import LIMIT_S, collect, open_hub, with_master
+from tests.worker.conversation import LIMIT_S, collect, open_hub, with_master
 from worker.config import WorkerConfig
 from worker.player import run_player
 
