@@ -54,7 +54,7 @@ def make_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> RewardF
 
 
 def check_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> None:
-    """Ask the configured reward once, so that a user's function fails before anything starts.
+    """Call the configured reward once, so that a user's function fails before anything starts.
 
     Raises:
         ConfigError: see `make_reward`.

@@ -33,10 +33,10 @@ def play() -> int:
 
 def _of_the_run(settings: Plain) -> tuple[str, Plain] | None:
     """What the connection file says of the run; nothing where only an address is given."""
-    from tangram_agent import lifeline
+    from tangram_agent.process import watch_parent
     from worker.discovery import await_master
 
-    lifeline.watch()  # already here: a parent may end while the file is waited for
+    watch_parent()  # already here: a parent may end while the file is waited for
     connect = settings.get("connect")
     if not isinstance(connect, str) or not connect.strip() or "://" in connect:
         return None

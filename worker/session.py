@@ -11,12 +11,10 @@ from typing import TextIO
 
 import torch
 
-from tangram_agent import lifeline
-from tangram_agent.logs import formatter
 from tangram_agent.payloads import EpisodeSpec
 from tangram_agent.policy import Policy
+from tangram_agent.process import Watchdog, formatter, watch_parent
 from tangram_agent.setup import Setup
-from tangram_agent.watchdog import Watchdog
 from worker.client import Client
 from worker.config import WorkerConfig
 
@@ -42,7 +40,7 @@ def joined(config: WorkerConfig, setup: Setup, policy: Policy) -> Iterator[Clien
         ConfigError: service.batch_episodes makes messages that are too large.
         TangramError: the master refuses, or does not answer.
     """
-    lifeline.watch()
+    watch_parent()
     # Several workers share one machine: more threads each would only get in each other's way.
     torch.set_num_threads(1)
     service = config.service

@@ -178,7 +178,7 @@ def test_a_missing_file_is_found(tmp_path: Path, file: str) -> None:
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"format_version": 2}, "has format 2, this version reads 1: use the version"),
+        ({"format_version": 1}, "has format 1, this version reads 2: use the version"),
         ({"format_version": None}, "manifest.json has no format_version"),
         ({"updates": 6}, "checksum of manifest.json differs"),
         ({"counters": {}}, "checksum of manifest.json differs"),
