@@ -85,13 +85,13 @@ def summary(guards: list[Guard], found: list[str]) -> int:
     console.print(f"{held} of {len(guards)} guards are held by a test")
     for guard, result in zip(guards, found, strict=True):
         if result != "red":
-            console.print(f"not held: {guard.name} ({guard.where}): {result}", markup=False)
+            console.print(f"not held: {guard.name} ({guard.file}): {result}", markup=False)
     return int(held < len(guards))
 
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m tests.guards", description=__doc__)
-    parser.add_argument("only", nargs="*", help="words that a guard's room, place or name holds")
+    parser.add_argument("only", nargs="*", help="words that a guard's room, file or name holds")
     parser.add_argument("--jobs", type=int, default=1, help="guards removed at once, each its copy")
     parser.add_argument("--list", action="store_true", help="name the guards and remove none")
     return parser.parse_args()
@@ -104,13 +104,13 @@ def main() -> int:
         guard
         for guard in declared()
         if not chosen.only
-        or any(word in f"{guard.room} {guard.where} {guard.name}" for word in chosen.only)
+        or any(word in f"{guard.room} {guard.file} {guard.name}" for word in chosen.only)
     ]
     for line in (wrong := faults(guards)):
         console.print(line, markup=False)
     if chosen.list:
         for guard in guards:
-            console.print(f"{guard.room}: {guard.name} ({guard.where})", markup=False)
+            console.print(f"{guard.room}: {guard.name} ({guard.file})", markup=False)
     if wrong or chosen.list or not guards:
         return int(bool(wrong) or not guards)
     with benches(max(1, chosen.jobs)) as free:

@@ -20,7 +20,7 @@ class Guard:
 
     room: str  # the role or promise it belongs to
     name: str  # what is lost when it goes, as a short sentence
-    where: str  # a file, or a folder so that it may move among the files below it
+    file: str  # a file, or a folder so that it may move among the files below it
     old: str  # as it stands there, once
     new: str  # what stands there instead when the guard is removed
     tests: tuple[str, ...]  # files or ids of pytest, of which one must turn red
@@ -31,12 +31,12 @@ class Guard:
         Raises:
             GuardError: there is no such place, or it does not hold ``old`` exactly once.
         """
-        place = root / self.where
+        place = root / self.file
         paths = sorted(place.rglob("*.py")) if place.is_dir() else [place]
         texts = {path: path.read_text() for path in paths if path.is_file()}
         if (times := sum(text.count(self.old) for text in texts.values())) != 1:
             raise GuardError(
-                f"{self.name}: {self.where} holds {self.old!r} {times} times, 1 is needed; "
+                f"{self.name}: {self.file} holds {self.old!r} {times} times, 1 is needed; "
                 "write what stands there now"
             )
         [(path, text)] = [item for item in texts.items() if self.old in item[1]]
