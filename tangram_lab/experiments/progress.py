@@ -14,7 +14,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from master.status import duration
+from master.console import duration
 from tangram_lab.experiments.jobs import Job
 
 
