@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import psutil
 import zmq
 
 from tangram_lab.benchmarks.costs import measure_costs
@@ -83,11 +84,8 @@ class Run:
 
     def cpu_s(self) -> float:
         """CPU time of the processes that name the folder."""
-        ticks = 0
-        for pid in processes_of(self.folder):
-            entries = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-            ticks += int(entries[11]) + int(entries[12])  # user and system
-        return ticks / os.sysconf("SC_CLK_TCK")
+        times = [psutil.Process(pid).cpu_times() for pid in processes_of(self.folder)]
+        return sum(one.user + one.system for one in times)
 
     def rates(self, *names: str) -> dict[str, float]:
         """By how much some numbers grow in a second, and CPU seconds as "cpu"."""

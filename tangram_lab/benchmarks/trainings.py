@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from tangram_sim.errors import TangramError
 
 LOOK_S = 0.3
@@ -56,16 +58,8 @@ def running(*settings: str) -> Iterator[Path]:
 
 def processes_of(folder: Path) -> dict[int, str]:
     """Process -> command line, of those that name a run folder."""
-    found = {}
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit() and int(entry.name) != os.getpid():
-            try:
-                line = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode()
-            except OSError:
-                continue  # it ended meanwhile
-            if str(folder) in line:
-                found[int(entry.name)] = line
-    return found
+    lines = {p.pid: " ".join(p.info["cmdline"] or ()) for p in psutil.process_iter(["cmdline"])}
+    return {pid: line for pid, line in lines.items() if str(folder) in line and pid != os.getpid()}
 
 
 def result_of(folder: Path) -> dict[str, Any]:
