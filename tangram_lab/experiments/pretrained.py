@@ -234,7 +234,7 @@ def make_card(
 def _task(setup: Setup) -> dict[str, Any]:
     return {
         "tokens": [shape.name for shape in setup.layout.shapes],
-        "token_areas": [round(shape.area, 9) for shape in setup.layout.shapes],
+        "token_areas": setup.layout.areas.round(9).tolist(),
         "scale": setup.tokens.scale,
         "arena": setup.sim.arena,
         "actions_per_token": setup.sim.actions_per_token,
