@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import psutil
 import zmq
 
 from tangram_lab.benchmarks.costs import measure_costs
@@ -65,7 +64,8 @@ class Run:
 
     def signal(self, number: signal.Signals) -> None:
         """To all processes of the run."""
-        for pid in (*processes_of(self.folder), *self.more):
+        pids = (process.pid for process in processes_of(self.folder))
+        for pid in (*pids, *self.more):
             os.kill(pid, number)
 
     @contextmanager
@@ -84,8 +84,8 @@ class Run:
 
     def cpu_s(self) -> float:
         """CPU time of the processes that name the folder."""
-        times = [psutil.Process(pid).cpu_times() for pid in processes_of(self.folder)]
-        return sum(one.user + one.system for one in times)
+        spent = (process.cpu_times() for process in processes_of(self.folder))
+        return float(sum(one.user + one.system for one in spent))
 
     def rates(self, *names: str) -> dict[str, float]:
         """By how much some numbers grow in a second, and CPU seconds as "cpu"."""
@@ -162,15 +162,13 @@ def _ages(run: Run) -> Sequence[float]:
 
 
 @contextmanager
-def _training(
-    folder: Path, count: int, *settings: str, command: str = "tangram-train"
-) -> Iterator[Run]:
+def _training(folder: Path, count: int, *settings: str, name: str = "train") -> Iterator[Run]:
     """A training or a master with so many players, stopped once all of them have played."""
-    process = start_training(folder, *settings, command=command)
+    process = start_training(folder, *settings, name=name)
     run = Run(folder)
     try:
         wait_for(folder / "connection.json", process)
-        if command == "tangram-train":
+        if name == "train":
             _settle(run, count)
         yield run
     finally:
@@ -191,7 +189,7 @@ def _fed(folder: Path, count: int) -> Iterator[Run]:
     settings = (*ENDLESS, f"service.publish_seconds={PUBLISH_S}")
     connect, ages = folder / "connection.json", folder / "ages"
     with (
-        _training(folder, count, *settings, command="tangram-master") as run,
+        _training(folder, count, *settings, name="master") as run,
         players(connect, setup, played(setup, BATCH), count, ages) as pid,
     ):
         run.more.append(pid)

@@ -68,14 +68,13 @@ def run_soak(minutes: float, seed: int, out: Path | None, folder: Path) -> int:
 
 
 def _sample(samples: Samples, minute: float, folder: Path) -> None:
-    for pid, line in processes_of(folder).items():
+    for process, line in processes_of(folder).items():
         try:
-            process = psutil.Process(pid)
-            used, files = process.memory_info().rss, process.num_fds()
-        except psutil.Error:
+            memory, files = process.memory_info().rss / MIB, process.num_fds()
+        except psutil.NoSuchProcess:
             continue  # it ended meanwhile
-        points = samples.setdefault(f"{_name(line)} ({pid})", [])
-        points.append((minute, used / MIB, files))
+        points = samples.setdefault(f"{_name(line)} ({process.pid})", [])
+        points.append((minute, memory, files))
 
 
 def _name(line: str) -> str:

@@ -13,21 +13,19 @@ from typing import Any
 
 import psutil
 
+from master.children import command
 from tangram_sim.errors import TangramError
 
 LOOK_S = 0.3
 PATIENCE_S = 60.0
 
 
-def start_training(
-    folder: Path, *settings: str, command: str = "tangram-train"
-) -> "subprocess.Popen[bytes]":
-    """A training in the background, or a master; what it says goes to `told` in its folder."""
+def start_training(folder: Path, *settings: str, name: str = "train") -> "subprocess.Popen[bytes]":
+    """A training in the background, or a `master`; what it says goes to `told` in its folder."""
     folder.mkdir(parents=True)
-    program = str(Path(sys.executable).with_name(command))
     with (folder / "told").open("wb") as told:
         return subprocess.Popen(
-            [program, f"run_dir={folder}", *settings],
+            [sys.executable, *command(name), f"run_dir={folder}", *settings],
             stdout=told,
             stderr=told,
             start_new_session=True,
@@ -56,10 +54,14 @@ def running(*settings: str) -> Iterator[Path]:
             launcher.wait(PATIENCE_S)
 
 
-def processes_of(folder: Path) -> dict[int, str]:
+def processes_of(folder: Path) -> dict[psutil.Process, str]:
     """Process -> command line, of those that name a run folder."""
-    lines = {p.pid: " ".join(p.info["cmdline"] or ()) for p in psutil.process_iter(["cmdline"])}
-    return {pid: line for pid, line in lines.items() if str(folder) in line and pid != os.getpid()}
+    found = {}
+    for process in psutil.process_iter(["cmdline"]):
+        line = " ".join(process.info["cmdline"] or ())  # none of a process that ended meanwhile
+        if str(folder) in line and process.pid != os.getpid():
+            found[process] = line
+    return found
 
 
 def result_of(folder: Path) -> dict[str, Any]:
