@@ -193,6 +193,16 @@ def test_what_is_no_journal_is_refused(tmp_path: Path) -> None:
         read(tmp_path)
 
 
+def test_a_journal_of_another_format_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(journal_module, "FORMAT", 1)
+        journal(tmp_path, MADE).append(arrival(MADE, 1))
+    with pytest.raises(RunError, match=r"is no segment of format 2: choose another run_dir"):
+        read(tmp_path)
+
+
 class Disk:
     """Writes as long as there is room; stands in for os-level writes of a file."""
 
