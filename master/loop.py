@@ -4,8 +4,8 @@ import time
 from collections import deque
 from queue import SimpleQueue
 
-from master.arrivals import EpisodesArrived, ScoresArrived
 from master.checkpointer import Checkpointer
+from master.delivery import EpisodesArrived, ScoresArrived
 from master.lockstep import Lockstep
 from master.parts import Parts
 from master.report import Reporter, scores_picture

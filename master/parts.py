@@ -6,17 +6,16 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from master.arrivals import WelcomeInfo
 from master.budget import Budget
 from master.checkpointer import Restored, restore_run, warm_start
 from master.config import MasterConfig
 from master.divergence import DivergenceGuard
 from master.health import OFF, Health
-from master.hub import Hub
+from master.hub import Hub, WelcomeInfo
 from master.journal import Journal, journal_run_id, read_journal
-from master.keys import Keys, is_loopback, needs_keys, run_keys
 from master.lockstep import Lockstep
 from master.rundir import Record, RunFolder
+from master.security import Keys, is_loopback, needs_keys, run_keys
 from master.trainer import Trainer, choose_device
 from tangram_agent.addresses import reachable, with_host
 from tangram_agent.arrays import EpisodeSpec

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 from PIL import Image
 
-from master.arrivals import EpisodesArrived
 from master.budget import Rates
 from master.console import Progress
+from master.delivery import EpisodesArrived
 from master.metrics import Curve, Means, Metrics
 from master.parts import Parts
 from master.rundir import Record

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from master.parts import Parts
-from master.peers import Peer
+from master.registry import Peer
 from master.status import Status
 from tangram_agent.messages import WORKER_COLUMNS, RunStatus
 from tangram_sim.arrays import Floats

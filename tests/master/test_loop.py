@@ -15,7 +15,7 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from master import loop as loop_module
-from master.arrivals import EpisodesArrived
+from master.delivery import EpisodesArrived
 from master.loop import Loop
 from master.result import make_result
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint

@@ -21,10 +21,10 @@ from master.console import (
     notices_from,
     status_panel,
 )
+from master.counters import Counters
 from master.result import SCORES, show_result
 from master.rundir import RunFolder
 from master.status import Status, duration, status_line
-from master.tally import Tally
 from tests.master.builders import ShownProgress
 
 pytestmark = pytest.mark.fast
@@ -152,7 +152,7 @@ def test_programs_read_json() -> None:
         lines.show(STATUS)
     lines.notice("goes [on] " + "x" * 200)
     with notices_from("master", lines):
-        Tally().note("malformed", "no header")
+        Counters().note("malformed", "no header")
     make_lines(shown, "json").notice("the master ended")
     common = {"level": "INFO", "process": "master"}
     assert json_lines(shown) == [

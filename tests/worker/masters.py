@@ -6,8 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TypeVar
 
-from master.arrivals import Arrival, WelcomeInfo
-from master.hub import Hub
+from master.delivery import Arrival
+from master.hub import Hub, WelcomeInfo
 from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.setup import Setup
 

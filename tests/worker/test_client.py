@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from master.arrivals import ScoresArrived
+from master.delivery import ScoresArrived
 from tangram_agent.messages import (
     Ack,
     Alive,
