@@ -72,6 +72,8 @@ class Layout:
         padded_corners: (K, C) the corners of each token, filled up to the C of the largest by
             repeating the last.
         areas: (K,) of the tokens, squared arena units.
+        radii: (K,) largest distance of a corner from the token's centre, arena units.
+        symmetries: (K,) turns by a whole part of a circle that map a token onto itself.
         chiral: (K,) tokens whose mirror image no turn gives: they can lie on either side.
         base_weights: (K, V) centre of token k as an affine combination of the corners.
         adjacency: (N, N) edges of the graph, E(i, i) = 0.
@@ -86,6 +88,8 @@ class Layout:
         steps = np.minimum(np.arange(max(sizes)), np.array(sizes)[:, None] - 1)
         self.padded_corners: Ints = self.starts[:-1, None] + steps
         self.areas: Floats = np.array([shape.area for shape in self.shapes])
+        self.radii: Floats = np.array([shape.radius for shape in self.shapes])
+        self.symmetries: Ints = np.array([shape.symmetry for shape in self.shapes])
         self.chiral: Bools = np.array([shape.mirror is None for shape in self.shapes])
         self.any_chiral = bool(self.chiral.any())
         self._centred = np.concatenate(

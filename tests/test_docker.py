@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 DOCKER = ROOT / "docker"
 COMPOSE: dict[str, Any] = yaml.safe_load((DOCKER / "docker-compose.yml").read_text())
 # Neither plays nor learns: the gymnasium environment, and the figures of reports.
-LEFT_OUT = {"gymnasium", "matplotlib"}
+LEFT_OUT = {"gymnasium", "matplotlib", "msgspec"}
 
 
 def requirements(name: str) -> set[str]:

@@ -7,13 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
 from master import children as children_module
 from master import launch as launch_module
 from master.children import MAX_RESTARTS, Child
 from master.config import LaunchConfig, MasterConfig
-from master.console import PlainLines
+from master.console import logging_to, sturdy_console
 from master.launch import Launcher, master_arguments, run_training
 from master.rundir import RunFolder
 from tangram_agent.config import ServiceConfig
@@ -108,8 +107,7 @@ def launcher(
     """A launcher whose children run the given code."""
     run = RunFolder(folder)
     run.logs.mkdir()
-    lines = PlainLines(Console(file=(folder / "said").open("w"), width=100))
-    made = Launcher(LaunchConfig(len(players), MasterConfig(str(folder))), run, lines)
+    made = Launcher(LaunchConfig(len(players), MasterConfig(str(folder))), run)
     values = {"folder": str(folder), "condition": condition, "ending": ending}
     made._master.arguments = ["-c", MASTER.format(**values)]
     for player, code in zip(made._players, players, strict=True):
@@ -120,12 +118,11 @@ def launcher(
 
 def finish(made: Launcher, folder: Path) -> tuple[int, str]:
     """Run to the end; the status, and what was said through the master or beside it."""
-    with made.signals():
+    with (folder / "said").open("w") as said, logging_to(sturdy_console(said)), made.signals():
         try:
             status = made.run()
         finally:
             made.end_all()
-    made._lines._console.file.close()
     for one in [*made._workers, made._master]:
         assert not one.alive
     return status, (folder / "news").read_text() + (folder / "said").read_text()
@@ -346,7 +343,6 @@ while True:
         time.sleep(0.02)
     made._events.put(signal.SIGTERM)
     made.end_all()
-    made._lines._console.file.close()
     assert player.tail() == "plays\nleft in order"
 
 
