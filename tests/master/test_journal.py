@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from master import journal as journal_module
-from master.arrivals import EpisodesArrived
+from master.delivery import EpisodesArrived
 from master.journal import HEAD, JournalError, journal_run_id, read_journal, segments
 from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.setup import Setup
