@@ -51,7 +51,7 @@ STRATEGIES = ("final", "future", "near", "none")
 
 
 @dataclass(frozen=True)
-class TwinConfig:
+class RelabelConfig:
     """One kind of hindsight twin that is added for every transition played.
 
     Attributes:
@@ -149,7 +149,7 @@ class AgentConfig:
     learning_starts: int = 512
     noise: float = 0.05
     uniform_share: float = 0.2
-    hindsight: tuple[TwinConfig, ...] = (TwinConfig("final"),)
+    hindsight: tuple[RelabelConfig, ...] = (RelabelConfig("final"),)
 
     def __post_init__(self) -> None:
         check_choice("agent.angle_head", self.angle_head, ("plain", "kfold"))

@@ -43,9 +43,20 @@ class Setup:
     @property
     def pairs(self) -> bool:
         """Whether the agent acts on pairs of a token and a piece of the target."""
-        if self.agent.readout == "auto":
-            return self.layout.tokens > 1
         return self.agent.readout == "pair"
+
+    @property
+    def credits_pieces(self) -> bool:
+        """Whether the critic learns what a token covers of each piece of the target.
+
+        Else it learns the environment's reward.
+        """
+        return self.pairs and self.layout.tokens > 1
+
+    @property
+    def bootstraps(self) -> bool:
+        """Whether the critic's target counts what follows an action (Eq. 5)."""
+        return self.agent.gamma > 0.0 and self.horizon > 1
 
     @property
     def contacts(self) -> bool:
