@@ -168,9 +168,9 @@ def describe(status: int) -> str:
         return f"signal {-status}"
 
 
-def module(name: str) -> list[str]:
-    """Run a module of this installation, not one of that name in the current folder."""
-    return ["-P", "-m", name]
+def command(name: str) -> list[str]:
+    """Run tangram-NAME of this installation, whatever lies in the current folder."""
+    return ["-P", "-m", "tangram_cli", name]
 
 
 def override(name: str, value: str) -> str:

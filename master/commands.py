@@ -1,6 +1,6 @@
 """The command lines of tangram-train's children."""
 
-from master.children import Child, module, override
+from master.children import Child, command, override
 from master.config import LaunchConfig
 from master.rundir import RunFolder
 
@@ -12,7 +12,7 @@ def worker_child(folder: RunFolder, role: str, index: int) -> Child:
     """A worker that joins by the run's connection file, with a log of its own."""
     name = role if role == "evaluator" else f"worker {index}"
     arguments = [
-        *module("worker"),
+        *command("worker"),
         override("connect", str(folder.connection)),
         f"index={index}",
         f"role={role}",
@@ -26,7 +26,7 @@ def master_arguments(config: LaunchConfig, folder: RunFolder) -> list[str]:
     master = config.master
     in_step = master.service.mode == "lockstep"
     return [
-        *module("master"),
+        *command("master"),
         override("from_config", str(folder.config)),
         override("run_dir", str(folder.path)),
         *(

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 
 from tangram_agent.config import ServiceConfig
-from tangram_sim.checks import check_choice, check_range
 from tangram_sim.errors import ConfigError
+from tangram_sim.settings import check_choice, check_range
 
 RESUME = ("none", "auto")
 MAX_WORKERS = 1024

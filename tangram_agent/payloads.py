@@ -19,8 +19,8 @@ from safetensors.numpy import load, save
 from tangram_agent.frames import MAX_HEADER, MAX_ID, pack_map, unpack_map
 from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes, Weights
-from tangram_sim.checks import check_range
 from tangram_sim.errors import ConfigError, WireError
+from tangram_sim.settings import check_range
 
 WeightShapes = Mapping[str, tuple[int, ...]]
 

@@ -1,8 +1,8 @@
 """Agents that come with the package: `pretrained/<name>` wherever a run folder is expected.
 
 An agent's folder holds `config.yaml` (the sections that make a setup), `weights.safetensors` (the
-acting actor alone), `card.json` and `card.md`. `experiments.pretrained` makes such folders; one
-that lies anywhere else is read in the same way.
+acting actor alone), `card.json` and `card.md`. `tangram_lab.experiments.pretrained` makes such
+folders; one that lies anywhere else is read in the same way.
 """
 
 import hashlib

@@ -11,10 +11,10 @@ from functools import cached_property
 import numpy as np
 
 from tangram_sim.arrays import Floats
-from tangram_sim.checks import check_range
 from tangram_sim.fitting import Fit, fit_piece, overlap_depths, separate
 from tangram_sim.geometry import outlines
 from tangram_sim.layout import Layout, TokensConfig, make_layout
+from tangram_sim.settings import check_range
 from tangram_sim.shapes import SHAPE_NAMES, tan
 from tangram_sim.sketches import Sketch
 

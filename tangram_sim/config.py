@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-from tangram_sim.checks import check_choice, check_range
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import MAX_TOKENS
+from tangram_sim.settings import check_choice, check_range
 
 BACKENDS = ("physics", "kinematic")
 REWARDS = ("overlap", "dense", "pose")

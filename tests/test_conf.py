@@ -62,6 +62,14 @@ def test_preset_writes_out_every_field(group: str, name: str) -> None:
     from_mapping(GROUPS[group], section)
 
 
+def test_what_is_not_given_is_as_the_tangram_agent_has_it() -> None:
+    setup = make_setup(compose("train", "agent=tangram"))
+    assert setup.agent == AgentConfig()
+    assert (setup.sim, setup.reward) == (SimConfig(), RewardConfig())
+    assert from_mapping(ServiceConfig, compose("train")["service"]) == ServiceConfig()
+    assert make_setup(compose("train", "agent=paper")).net == NetConfig()
+
+
 @pytest.mark.parametrize("name", choices("agent"))
 def test_first_twin_of_a_preset_writes_out_every_field(name: str) -> None:
     twins = compose("train", f"agent={name}")["agent"]["hindsight"]

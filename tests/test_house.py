@@ -4,15 +4,18 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 
+from tangram_cli.commands import COMMANDS
+
 pytestmark = pytest.mark.fast
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("conf", "experiments", "master", "tangram_agent", "tangram_sim", "worker")
+OURS = ("tangram_agent", "tangram_cli", "tangram_lab", "tangram_sim")
+PACKAGES = ("conf", "master", "worker", *OURS)
 
 
 def run(command: list[str], cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
@@ -45,7 +48,7 @@ def test_import_contracts_catch_every_wrong_arrow(tmp_path: Path) -> None:
     wrong = {
         "tangram_sim/wrong.py": "import torch, pybullet, zmq, omegaconf",
         "tangram_agent/wrong.py": "import worker.config, conf.help",
-        "master/wrong.py": "import experiments.plan, tangram_sim.wrong",
+        "master/wrong.py": "import tangram_lab.experiments.plan, tangram_sim.wrong",
     }
     for path, code in wrong.items():
         (tmp_path / path).write_text(code)
@@ -56,7 +59,8 @@ def test_import_contracts_catch_every_wrong_arrow(tmp_path: Path) -> None:
 
 def test_command_lines_load_nothing_heavy() -> None:
     loaded = run_python(
-        "import experiments.cli, experiments.report.cli, master.cli, worker.cli, sys\n"
+        "import tangram_lab.experiments.cli, tangram_lab.experiments.report.cli\n"
+        "import master.cli, tangram_cli.commands, tangram_lab.benchmarks.cli, worker.cli, sys\n"
         "print({'torch', 'numpy', 'hydra', 'zmq', 'gymnasium'} & set(sys.modules))"
     )
     assert loaded == "set()"
@@ -66,11 +70,21 @@ def test_command_lines_load_nothing_heavy() -> None:
 
 
 @pytest.mark.parametrize(
-    "command", ["master", "train", "worker", "status", "eval", "play", "experiment", "report"]
+    "command",
+    ["master", "train", "worker", "status", "eval", "play", "experiment", "report", "bench"],
 )
-def test_console_scripts_are_declared(command: str) -> None:
-    (script,) = entry_points(group="console_scripts", name=f"tangram-{command}")
-    assert callable(script.load())
+def test_console_scripts_come_through_the_door(command: str) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    script = EntryPoint(command, project["scripts"][f"tangram-{command}"], "console_scripts")
+    assert script.module == "tangram_cli.commands"
+    assert script.load() is COMMANDS[command]
+
+
+def test_every_package_is_installed() -> None:
+    tools = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]
+    roots = [path for name in PACKAGES for path in (ROOT / name).rglob("__init__.py")]
+    found = {".".join(path.parent.relative_to(ROOT).parts) for path in roots}
+    assert found == set(tools["setuptools"]["packages"])
 
 
 def test_constraints_pin_every_requirement() -> None:

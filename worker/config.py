@@ -8,9 +8,9 @@ from tangram_agent.config import ORDERS, ServiceConfig
 from tangram_agent.decoding import MAX_INDEX
 from tangram_agent.pretrained import PREFIX, agent_names
 from tangram_agent.wire import ROLES
-from tangram_sim.checks import check_choice, check_range
 from tangram_sim.config import MAX_CORNER_NOISE
 from tangram_sim.errors import ConfigError
+from tangram_sim.settings import check_choice, check_range
 
 CHANGES = ("order", "reapply", "refine_steps", "gamma")  # of how an agent plays
 MAX_EPISODES = 1_000_000

@@ -22,6 +22,8 @@ PAPER = {
     "acting_average": 0.0,
     "lr_decay": "none",
 }
+# One proposal and one twin: what most tests need.
+PLAIN: dict[str, Any] = {"reapply": 0, "hindsight": [{"strategy": "final"}]}
 SMALL = {"width": 16, "layers": 2, "heads": 2, "feed_forward": 32}
 
 
@@ -37,7 +39,7 @@ def setup(
             "tokens": tokens,
             "sim": {"backend": "kinematic", **sim},
             "reward": {},
-            "agent": agent or {},
+            "agent": PLAIN | (agent or {}),
             "net": net,
         }
     )

@@ -11,7 +11,7 @@ from tangram_agent.ddpg import Learner
 from tangram_agent.policy import Policy
 from tangram_agent.runs import load_run
 from tangram_sim.errors import RunError, TangramError
-from tests.agent.builders import SMALL, SQUARE, random_transitions, setup
+from tests.agent.builders import PLAIN, SMALL, SQUARE, random_transitions, setup
 
 pytestmark = pytest.mark.fast
 
@@ -20,7 +20,7 @@ CONFIG = {
     "tokens": SQUARE,
     "sim": {"backend": "kinematic"},
     "reward": {},
-    "agent": {},
+    "agent": PLAIN,
     "net": SMALL,
 }
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.measure import Bound, compared, rates, single
+from tangram_lab.benchmarks.measure import Bound, compared, rates, single
 
 LABELS = ("stage", "case", "unit")
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.bullet import BareLoop
-from benchmarks.plain import HeadByHead, PlainLearner
-from benchmarks.replay import filled, random_transitions
-from benchmarks.setups import preset, several, with_agent, with_sim
 from tangram_agent.attention import GraphAttention
 from tangram_agent.ddpg import Learner
+from tangram_lab.benchmarks.bullet import BareLoop
+from tangram_lab.benchmarks.plain import HeadByHead, PlainLearner
+from tangram_lab.benchmarks.replay import filled, random_transitions
+from tangram_lab.benchmarks.setups import preset, several, with_agent, with_sim
 from tangram_sim.physics import PhysicsWorld
 
 pytestmark = pytest.mark.fast

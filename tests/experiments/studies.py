@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-from experiments.plan import StudyConfig
 from tangram_agent.setup import from_mapping
+from tangram_lab.experiments.plan import StudyConfig
 
 
 def content(run_dir: Path, **changes: Any) -> dict[str, Any]:

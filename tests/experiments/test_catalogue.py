@@ -7,8 +7,8 @@ import pytest
 from omegaconf import OmegaConf
 
 from conf.help import choices
-from experiments.plan import StudyConfig
 from tangram_agent.setup import Setup, from_mapping, make_setup
+from tangram_lab.experiments.plan import StudyConfig
 
 pytestmark = pytest.mark.fast
 

@@ -5,9 +5,9 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from experiments.designs import PAPER, TEST, TRAIN
-from experiments.figures import GRID, figure_pieces, file_text, sheet
-from experiments.tiling import atoms, tilings
+from tangram_lab.experiments.designs import PAPER, TEST, TRAIN
+from tangram_lab.experiments.figures import GRID, figure_pieces, file_text, sheet
+from tangram_lab.experiments.tiling import atoms, tilings
 from tangram_sim.errors import ConfigError
 from tangram_sim.puzzles import PACKAGED, library
 

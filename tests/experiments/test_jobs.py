@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 import yaml
 
-from experiments.jobs import Job, make_jobs
-from experiments.plan import StudyConfig
+from tangram_lab.experiments.jobs import Job, make_jobs
+from tangram_lab.experiments.plan import StudyConfig
 from tangram_sim.errors import ConfigError
 from tests.experiments.studies import experiment, study
 
@@ -51,7 +51,7 @@ def test_a_training_is_a_command_that_can_go_on(tmp_path: Path) -> None:
     job = jobs_of(tmp_path)["paper, seed 1"]
     run_dir = tmp_path / "trainings" / "paper" / "seed_1"
     assert job.command == (
-        *("tangram-train", f"run_dir='{run_dir}'", "seed=1", "resume=auto"),
+        *("train", f"run_dir='{run_dir}'", "seed=1", "resume=auto"),
         *("agent=paper", "a=1", "b=3", "c=1"),
     )
     assert (job.run_dir, job.leaves, job.needs) == (run_dir, run_dir / "result.json", None)
@@ -78,7 +78,7 @@ def test_a_test_follows_its_training(tmp_path: Path, test: str, setting: str) ->
     run_dir = tmp_path / "trainings" / "square" / "seed_0"
     out = run_dir / "tests" / f"{test}.json"
     assert job.command == (
-        *("tangram-eval", f"run_dir='{run_dir}'", f"out='{out}'", "episodes=5"),
+        *("eval", f"run_dir='{run_dir}'", f"out='{out}'", "episodes=5"),
         setting,
     )
     assert job.needs is jobs["square, seed 0"]

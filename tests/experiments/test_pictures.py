@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments import camera_picture
-from experiments.camera_picture import take_shots
-from experiments.graph_picture import TOKENS, embeddings, node_classes
-from experiments.pictures import draw_paper_pictures
+from tangram_lab.experiments import camera_picture
+from tangram_lab.experiments.camera_picture import take_shots
+from tangram_lab.experiments.graph_picture import TOKENS, embeddings, node_classes
+from tangram_lab.experiments.pictures import draw_paper_pictures
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import make_layout
 

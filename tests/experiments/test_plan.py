@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from experiments.plan import joined_plan, plan_content
+from tangram_lab.experiments.plan import joined_plan, plan_content
 from tangram_sim.errors import ConfigError
 from tests.experiments.studies import content, experiment, study
 

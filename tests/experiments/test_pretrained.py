@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import yaml
 
-from experiments.pretrained import main, publish
 from tangram_agent.runs import load_run
+from tangram_lab.experiments.pretrained import main, publish
 from tangram_sim.errors import ConfigError, RunError
 from tests.agent.builders import random_transitions, setup
 from tests.worker.builders import write_run

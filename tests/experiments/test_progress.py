@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from experiments.jobs import Job
-from experiments.progress import StudyProgress, bound
+from tangram_lab.experiments.jobs import Job
+from tangram_lab.experiments.progress import StudyProgress, bound
 
 pytestmark = pytest.mark.fast
 

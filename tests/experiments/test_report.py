@@ -10,10 +10,10 @@ from xml.etree import ElementTree as ET
 import pytest
 from PIL import Image
 
-from experiments.report import write
-from experiments.report.cli import report, with_absolute_paths
-from experiments.report.config import ReportConfig
-from experiments.report.write import write_report
+from tangram_lab.experiments.report import write
+from tangram_lab.experiments.report.cli import report, with_absolute_paths
+from tangram_lab.experiments.report.config import ReportConfig
+from tangram_lab.experiments.report.write import write_report
 from tangram_sim.errors import ConfigError, RunError
 from tests.experiments.builders import (
     cells,

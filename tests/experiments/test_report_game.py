@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments.report.game import assembly_table, differences, order_table, paired
-from experiments.report.reading import read_study
-from experiments.report.study import Experiment
+from tangram_lab.experiments.report.game import assembly_table, differences, order_table, paired
+from tangram_lab.experiments.report.reading import read_study
+from tangram_lab.experiments.report.study import Experiment
 from tests.experiments.builders import (
     experiment,
     plan,

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 import yaml
 
-from experiments.report.loose import read_runs
-from experiments.report.write import write_report
+from tangram_lab.experiments.report.loose import read_runs
+from tangram_lab.experiments.report.write import write_report
 from tangram_sim.errors import RunError
 from tests.experiments.builders import cells, learning_curve, result, write_study
 

@@ -9,9 +9,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from experiments.report.markdown import ANGLE, MINUTES, REWARD
-from experiments.report.numbers import GRID, band, first_at_least, points, spread, thinned
-from experiments.report.study import Seed
+from tangram_lab.experiments.report.markdown import ANGLE, MINUTES, REWARD
+from tangram_lab.experiments.report.numbers import (
+    GRID,
+    band,
+    first_at_least,
+    points,
+    spread,
+    thinned,
+)
+from tangram_lab.experiments.report.study import Seed
 from tests.experiments.builders import learning_curve, result
 
 pytestmark = pytest.mark.fast

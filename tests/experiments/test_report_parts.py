@@ -6,18 +6,18 @@ from typing import Any
 
 import pytest
 
-from experiments.report import write
-from experiments.report.closing import closing
-from experiments.report.markdown import picture, plain, table
-from experiments.report.paper import value
-from experiments.report.reading import read_study
-from experiments.report.references import References
-from experiments.report.sections import Page, command, section
-from experiments.report.study import Study
-from experiments.report.style import COLOURS, looks
-from experiments.report.sweeps import sweeps
-from experiments.report.tables import ranking_table
-from experiments.report.write import write_report
+from tangram_lab.experiments.report import write
+from tangram_lab.experiments.report.closing import closing
+from tangram_lab.experiments.report.markdown import picture, plain, table
+from tangram_lab.experiments.report.paper import value
+from tangram_lab.experiments.report.reading import read_study
+from tangram_lab.experiments.report.references import References
+from tangram_lab.experiments.report.sections import Page, command, section
+from tangram_lab.experiments.report.study import Study
+from tangram_lab.experiments.report.style import COLOURS, looks
+from tangram_lab.experiments.report.sweeps import sweeps
+from tangram_lab.experiments.report.tables import ranking_table
+from tangram_lab.experiments.report.write import write_report
 from tests.experiments.builders import (
     EXPERIMENTS,
     TESTS,

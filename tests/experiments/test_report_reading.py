@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from experiments.report.reading import read_study
-from experiments.report.records import Record, read_records
-from experiments.report.study import Study
+from tangram_lab.experiments.report.reading import read_study
+from tangram_lab.experiments.report.records import Record, read_records
+from tangram_lab.experiments.report.study import Study
 from tangram_sim.errors import RunError
 from tests.experiments.builders import (
     learning_curve,

@@ -11,10 +11,10 @@ from threading import Thread
 import pytest
 from rich.console import Console
 
-from experiments import runner
-from experiments.jobs import Job
-from experiments.progress import StudyProgress
-from experiments.runner import FAILED_STATUS, INTERRUPT_STATUS, Runner
+from tangram_lab.experiments import runner
+from tangram_lab.experiments.jobs import Job
+from tangram_lab.experiments.progress import StudyProgress
+from tangram_lab.experiments.runner import FAILED_STATUS, INTERRUPT_STATUS, Runner
 
 pytestmark = pytest.mark.cluster
 

@@ -33,6 +33,7 @@ def test_the_master_gets_its_settings(tmp_path: Path) -> None:
     assert arguments == [
         "-P",
         "-m",
+        "tangram_cli",
         "master",
         f"from_config='{tmp_path}/config.yaml'",
         f"run_dir='{tmp_path}'",

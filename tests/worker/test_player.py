@@ -241,12 +241,19 @@ def test_a_signal_ends_a_player_that_no_master_answers(
 
 @pytest.mark.parametrize("role", ["player", "evaluator"])
 def test_a_process_whose_parent_is_gone_takes_its_leave(tmp_path: Path, role: str) -> None:
-    """`python -m worker`, as tangram-train starts it; the master lives on and asks for nothing."""
+    """As tangram-train starts a worker; the master lives on and asks for nothing."""
     made = write_run(tmp_path)
     lifeline = Lifeline()
     with open_hub(made) as hub:
         command = [
-            *(sys.executable, "-m", "worker", f"connect={hub.endpoint}", f"role={role}"),
+            *(
+                sys.executable,
+                "-m",
+                "tangram_cli",
+                "worker",
+                f"connect={hub.endpoint}",
+                f"role={role}",
+            ),
             *(f"from_config={tmp_path / 'config.yaml'}", "service.envs=2"),
         ]
         with subprocess.Popen(

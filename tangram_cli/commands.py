@@ -1,0 +1,61 @@
+"""The door of every command: our packages are found before other modules of their names.
+
+`conf`, `master` and `worker` are names that files of a user may have, too. A `master.py` in the
+current folder or on PYTHONPATH would be imported in place of ours, so whoever comes through this
+door finds these three beside this package, wherever else they may lie.
+"""
+
+import sys
+from collections.abc import Callable, Sequence
+from functools import partial
+from importlib import import_module
+from importlib.machinery import ModuleSpec, PathFinder
+from pathlib import Path
+from types import ModuleType
+
+HOME = Path(__file__).resolve().parents[1]
+COMMON_NAMES = frozenset({"conf", "master", "worker"})
+
+
+class OwnPackages:
+    """Finds the packages with common names beside this one, before sys.path is asked."""
+
+    @staticmethod
+    def find_spec(
+        fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """As `importlib.abc.MetaPathFinder`."""
+        if path is not None or fullname not in COMMON_NAMES:
+            return None
+        return PathFinder.find_spec(fullname, [str(HOME)], target)
+
+
+def run(module: str, function: str) -> int:
+    """Run a command out of our packages and return its exit status."""
+    sys.meta_path.insert(0, OwnPackages)
+    # Late: what a command needs may only be imported once our packages come first.
+    command: Callable[[], int] = getattr(import_module(module), function)
+    return command()
+
+
+master = partial(run, "master.cli", "master")
+train = partial(run, "master.cli", "train")
+worker = partial(run, "worker.cli", "worker")
+status = partial(run, "worker.cli", "status")
+evaluate = partial(run, "worker.cli", "evaluate")
+play = partial(run, "worker.cli", "play")
+experiment = partial(run, "tangram_lab.experiments.cli", "experiment")
+report = partial(run, "tangram_lab.experiments.report.cli", "report")
+bench = partial(run, "tangram_lab.benchmarks.cli", "main")
+
+COMMANDS: dict[str, Callable[[], int]] = {
+    "master": master,
+    "train": train,
+    "worker": worker,
+    "status": status,
+    "eval": evaluate,
+    "play": play,
+    "experiment": experiment,
+    "report": report,
+    "bench": bench,
+}

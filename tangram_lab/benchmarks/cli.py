@@ -1,0 +1,100 @@
+"""`tangram-bench`: how fast it is against what else one could do, and long trials of endurance."""
+
+import argparse
+import re
+import signal
+import sys
+import tempfile
+from pathlib import Path
+
+from tangram_sim.errors import TangramError
+
+EPILOG = """\
+Options may be written as elsewhere in this project: runs=9 for --runs 9.
+
+examples:
+  tangram-bench learner                     a table of the learner alone
+  tangram-bench wire runs=9 out=wire.json   more runs, and a file with machine, versions, commit
+  tangram-bench all out=bench.json          everything, most of an hour on two cores (make bench)
+  tangram-bench chaos minutes=20 seed=1     random faults over a real training
+"""
+RATES = {
+    "sim": "the simulation, against a bare PyBullet loop",
+    "acting": "the policy in batches, against one at a time",
+    "wire": "worker to master, against bare ROUTER-DEALER sockets",
+    "replay": "the replay buffer, against numpy alone",
+    "learner": "updates, against a plain per-head attention and Stable-Baselines3",
+    "train": "a whole training, against Stable-Baselines3 (minutes=)",
+    "peers": "piece by piece, against Stable-Baselines3",
+    "scaling": "more workers, and 64 synthetic ones",
+    "growth": "what grows with tokens, replay and width, and how",
+    "profile": "where an update's and an episode's time goes",
+}
+TRIALS = {
+    "chaos": ("random faults over a real training", 20.0),
+    "fuzz": ("mutated messages against decoder and master", None),
+    "soak": ("memory and open files of a long training, drawn", 60.0),
+}
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="tangram-bench",
+        description=__doc__,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    kinds = parser.add_subparsers(dest="kind", required=True)
+    for name, text in {"all": "everything below down to growth", **RATES}.items():
+        one = kinds.add_parser(name, help=text, description=text)
+        one.add_argument("--runs", type=int, default=5, help="measurements of each rate (5)")
+        one.add_argument("--out", type=Path, help="JSON file of the results")
+        if name in ("all", "train"):
+            limit = "that a rival's training may last (5)"
+            one.add_argument("--minutes", type=float, default=5.0, help=limit)
+            one.add_argument("--seeds", type=int, default=3, help="trainings of each (3)")
+    for name, (text, minutes) in TRIALS.items():
+        one = kinds.add_parser(name, help=text, description=text)
+        if minutes is not None:
+            one.add_argument("--minutes", type=float, default=minutes, help=f"({minutes:g})")
+        else:
+            one.add_argument("--messages", type=int, default=1_000_000, help="for the decoder")
+            one.add_argument("--live", type=int, default=100_000, help="for a live master")
+        one.add_argument("--seed", type=int, default=0, help="of everything random (0)")
+        one.add_argument("--out", type=Path, help="JSON file of the results")
+    return parser
+
+
+def main() -> int:
+    """The command."""
+    # As after Ctrl-C, so that no process that was started is left.
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    arguments = _parser().parse_args([_dashed(argument) for argument in sys.argv[1:]])
+    try:
+        return _run(arguments)
+    except (TangramError, ModuleNotFoundError) as error:
+        print(f"tangram-bench: {error}", file=sys.stderr)
+        return 2
+
+
+def _dashed(argument: str) -> str:
+    return f"--{argument}" if re.fullmatch(r"[a-z]+=.*", argument) else argument
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    # Late imports: --help and wrong input are answered at once.
+    if arguments.kind not in TRIALS:
+        from tangram_lab.benchmarks.stages import run_stages
+
+        return run_stages(arguments)
+    from tangram_lab.benchmarks.chaos import run_chaos
+    from tangram_lab.benchmarks.fuzz_wire import run_fuzz
+    from tangram_lab.benchmarks.soak import run_soak
+
+    with tempfile.TemporaryDirectory(prefix="tangram-") as folder:
+        if arguments.kind == "chaos":
+            return run_chaos(arguments.minutes, arguments.seed, arguments.out, Path(folder))
+        if arguments.kind == "soak":
+            return run_soak(arguments.minutes, arguments.seed, arguments.out, Path(folder) / "run")
+        numbers = (arguments.messages, arguments.live, arguments.seed)
+        return run_fuzz(*numbers, arguments.out, Path(folder) / "run")

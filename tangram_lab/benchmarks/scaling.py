@@ -1,0 +1,205 @@
+"""More workers: real ones in miniature trainings, and 64 synthetic ones of one master.
+
+Two runs that are compared are alive at one time; while one is measured, the processes of the other
+are stopped. So what else the machine does meets both.
+"""
+
+import os
+import signal
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import zmq
+
+from tangram_lab.benchmarks.costs import measure_costs
+from tangram_lab.benchmarks.episodes import played
+from tangram_lab.benchmarks.measure import Bound, Row, compared, single
+from tangram_lab.benchmarks.players import players, read_ages
+from tangram_lab.benchmarks.setups import preset
+from tangram_lab.benchmarks.trainings import processes_of, start_training, wait_for
+from tangram_sim.errors import TangramError
+from worker.status import ask_status
+
+STAGE = "scaling"
+CORES = 8  # below which two workers share cores with the rest
+LINEAR = Bound(least=0.9)
+SAME = Bound(least=0.9)
+FRESH = Bound(most=2.0)
+PERCENTILE = 99.0
+SYNTHETIC = 64
+BATCH = 32
+PUBLISH_S = 0.5
+SETTLE_S = 2.0  # several broadcasts
+SPAN_S = 4.0
+PATIENCE_S = 60.0
+ENDLESS = ("max_updates=0", "service.checkpoint_minutes=60", "service.http_port=-1")
+# Play is slow, learning is next to nothing, and the evaluator rests.
+PLAYING = (
+    *ENDLESS,
+    "sim.camera=true",
+    "agent.updates_per_transition=0.001",
+    "service.eval_seconds=3600",
+    "service.eval_episodes=1",
+)
+
+
+@dataclass
+class Run:
+    """A run that is stopped unless it is measured.
+
+    Attributes:
+        folder: of the run.
+        more: processes beside those that name the folder.
+        windows: monotonic begin and end of what was measured.
+    """
+
+    folder: Path
+    more: list[int] = field(default_factory=list)
+    windows: list[tuple[float, float]] = field(default_factory=list)
+
+    def signal(self, number: signal.Signals) -> None:
+        """To all processes of the run."""
+        for pid in (*processes_of(self.folder), *self.more):
+            os.kill(pid, number)
+
+    @contextmanager
+    def awake(self) -> Iterator[None]:
+        """Let it go on for a while."""
+        self.signal(signal.SIGCONT)
+        try:
+            yield
+        finally:
+            self.signal(signal.SIGSTOP)
+
+    def numbers(self) -> dict[str, float]:
+        """The status of the master; it is a second old at most."""
+        with zmq.Context() as context:
+            return dict(ask_status(str(self.folder), context, PATIENCE_S).numbers)
+
+    def cpu_s(self) -> float:
+        """CPU time of the processes that name the folder."""
+        ticks = 0
+        for pid in processes_of(self.folder):
+            entries = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+            ticks += int(entries[11]) + int(entries[12])  # user and system
+        return ticks / os.sysconf("SC_CLK_TCK")
+
+    def rates(self, *names: str) -> dict[str, float]:
+        """By how much some numbers grow in a second, and CPU seconds as "cpu"."""
+        with self.awake():
+            time.sleep(SETTLE_S)
+            begin, spent, before = time.monotonic(), self.cpu_s(), self.numbers()
+            time.sleep(SPAN_S)
+            after = self.numbers()
+            end, spent = time.monotonic(), self.cpu_s() - spent
+        self.windows.append((begin, end))
+        passed = after["elapsed_s"] - before["elapsed_s"]
+        grown = {name: (after[name] - before[name]) / passed for name in names}
+        return {**grown, "cpu": spent / (end - begin)}
+
+    def wait(self, ready: Callable[[dict[str, float]], bool]) -> None:
+        """Wait until its numbers say so."""
+        until = time.monotonic() + PATIENCE_S
+        while not ready(self.numbers()):
+            if time.monotonic() > until:
+                raise TangramError(f"the run in {self.folder} does not get under way")
+            time.sleep(0.5)
+
+
+def measure_scaling(runs: int) -> list[Row]:
+    """Real workers, synthetic ones, and what a message costs the master."""
+    with tempfile.TemporaryDirectory(prefix="tangram-") as folder:
+        real = list(_real(runs, Path(folder)))
+        return [*real, *_synthetic(runs, Path(folder)), *measure_costs(runs)]
+
+
+def _real(runs: int, folder: Path) -> Iterator[Row]:
+    """Episodes/s of two workers against one."""
+    with ExitStack() as stack:
+        alone, both = (
+            stack.enter_context(_training(folder / f"workers_{n}", n, f"workers={n}", *PLAYING))
+            for n in (1, 2)
+        )
+        found = [[run.rates("episodes")["episodes"] for run in (both, alone)] for _ in range(runs)]
+    two, one = zip(*found, strict=True)
+    yield compared((STAGE, "2 workers, camera", "episodes/s"), two, "1 worker", one)
+    shares = [ours / theirs / 2.0 for ours, theirs in found]
+    bound = LINEAR if len(os.sched_getaffinity(0)) >= CORES else None
+    yield single((STAGE, "2 workers, efficiency", "of twice 1 worker"), shares, bound)
+
+
+def _synthetic(runs: int, folder: Path) -> Iterator[Row]:
+    """A master that learns, with many players and with one."""
+    names = ("updates", "hub/batches")
+    with ExitStack() as stack:
+        one, many = (stack.enter_context(_fed(folder / f"players_{n}", n)) for n in (1, SYNTHETIC))
+        found = [(many.rates(*names), one.rates(*names)) for _ in range(runs)]
+        ages = _ages(many)
+    case, against = f"{SYNTHETIC} synthetic workers", "1 synthetic worker"
+    for name, unit, bound in (
+        ("updates", "updates/s", SAME),
+        ("hub/batches", "messages/s", None),
+    ):
+        ours, theirs = [m[name] for m, _ in found], [o[name] for _, o in found]
+        yield compared((STAGE, case, unit), ours, against, theirs, bound)
+    # What the rest of a busy machine takes from one run more than from the other is left out.
+    ours, theirs = (
+        [run["updates"] / run["cpu"] for run in both] for both in zip(*found, strict=True)
+    )
+    yield compared((STAGE, case, "updates per CPU second"), ours, against, theirs)
+    text = f"{case}, age of the weights, {PERCENTILE:g}th percentile"
+    yield single((STAGE, text, "broadcast periods"), ages, FRESH)
+
+
+def _ages(run: Run) -> Sequence[float]:
+    """The high percentile of each window, in broadcast periods."""
+    path = run.folder / "ages"
+    windows = [read_ages(path, *window) for window in run.windows]
+    return [float(np.percentile(ages, PERCENTILE)) / PUBLISH_S for ages in windows]
+
+
+@contextmanager
+def _training(
+    folder: Path, count: int, *settings: str, command: str = "tangram-train"
+) -> Iterator[Run]:
+    """A training or a master with so many players, stopped once all of them have played."""
+    process = start_training(folder, *settings, command=command)
+    run = Run(folder)
+    try:
+        wait_for(folder / "connection.json", process)
+        if command == "tangram-train":
+            _settle(run, count)
+        yield run
+    finally:
+        run.signal(signal.SIGCONT)
+        process.terminate()
+        process.wait()
+
+
+def _settle(run: Run, count: int) -> None:
+    run.wait(lambda now: now["players"] == count and now["updates"] > 0)
+    run.signal(signal.SIGSTOP)
+
+
+@contextmanager
+def _fed(folder: Path, count: int) -> Iterator[Run]:
+    """A master of its own with so many synthetic players."""
+    setup = preset()
+    settings = (*ENDLESS, f"service.publish_seconds={PUBLISH_S}")
+    connect, ages = folder / "connection.json", folder / "ages"
+    with (
+        _training(folder, count, *settings, command="tangram-master") as run,
+        players(connect, setup, played(setup, BATCH), count, ages) as pid,
+    ):
+        run.more.append(pid)
+        _settle(run, count)
+        try:
+            yield run
+        finally:
+            run.signal(signal.SIGCONT)
+            run.more.clear()

@@ -1,0 +1,75 @@
+"""Which stages there are, and what a run of them prints and writes."""
+
+import argparse
+from collections.abc import Callable, Sequence
+
+import torch
+
+from tangram_lab.benchmarks.acting import measure_acting
+from tangram_lab.benchmarks.growth import draw_growth, measure_growth
+from tangram_lab.benchmarks.learner import measure_learner
+from tangram_lab.benchmarks.measure import Row
+from tangram_lab.benchmarks.peers import measure_peers
+from tangram_lab.benchmarks.profile import show_profile
+from tangram_lab.benchmarks.replay import measure_replay
+from tangram_lab.benchmarks.report import page, show, write
+from tangram_lab.benchmarks.scaling import measure_scaling
+from tangram_lab.benchmarks.sim import measure_sim
+from tangram_lab.benchmarks.train import measure_train
+from tangram_lab.benchmarks.wire import measure_wire
+
+STAGES: dict[str, Callable[[argparse.Namespace], Sequence[Row]]] = {
+    "sim": lambda given: measure_sim(given.runs),
+    "acting": lambda given: measure_acting(given.runs),
+    "wire": lambda given: measure_wire(given.runs),
+    "replay": lambda given: measure_replay(given.runs),
+    "learner": lambda given: measure_learner(given.runs),
+    "peers": lambda given: measure_peers(given.runs),
+    "scaling": lambda given: measure_scaling(given.runs),
+    "growth": lambda given: measure_growth(given.runs),
+    "train": lambda given: measure_train(given.seeds, given.minutes),
+}
+
+
+def run_stages(given: argparse.Namespace) -> int:
+    """Measure one stage or all; the exit status is 0 whatever was found.
+
+    With `out` the table goes into a Markdown file beside the JSON, and growth is drawn there.
+    """
+    torch.set_num_threads(1)
+    if given.kind == "profile":
+        show_profile(given.out)
+        return 0
+    names = list(STAGES) if given.kind == "all" else [given.kind]
+    rows = [row for name in names for row in STAGES[name](given)]
+    title, cells = f"{given.kind}: medians, one thread each", [cells_of(row) for row in rows]
+    show(title, cells)
+    missed = [f"{row.stage}: {row.case}" for row in rows if row.held is False]
+    if missed:
+        print("short of the target:", *missed, sep="\n  ")
+    grown = [row for row in rows if row.stage == "growth"]
+    if given.out is not None:
+        given.out.parent.mkdir(parents=True, exist_ok=True)
+        given.out.with_suffix(".md").write_text(page(title, cells))
+        if grown:
+            draw_growth(grown, given.out.with_name("growth.png"))
+    settings = {name: value for name, value in vars(given).items() if name != "out"}
+    write(given.out, {"settings": settings, "rows": [row.plain() for row in rows]})
+    return 0
+
+
+def cells_of(row: Row) -> dict[str, object]:
+    spread = "" if row.least is None else f"{row.least:,.3g} - {row.most:,.3g}"
+    held = {None: "", True: "yes", False: "NO"}[row.held]
+    return {
+        "stage": row.stage,
+        "case": row.case,
+        "unit": row.unit,
+        "ours": row.ours,
+        "against": row.against,
+        "theirs": "" if row.theirs is None else row.theirs,
+        "ratio": "" if row.ratio is None else row.ratio,
+        "least - most": spread,
+        "target": row.target,
+        "held": held,
+    }

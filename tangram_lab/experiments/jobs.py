@@ -1,0 +1,166 @@
+"""The work of a study as processes: trainings and tests, and whether each is done."""
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from master.children import command, override
+from tangram_agent.runs import CONFIG, read_config
+from tangram_agent.setup import SECTIONS
+from tangram_lab.experiments.plan import StudyConfig, seed_folder, test_file
+from tangram_sim.errors import ConfigError
+
+RESULT = "result.json"
+IN_FILES = {"puzzles": "source"}  # settings of a test that its file calls otherwise
+BOUNDS = ("max_updates", "max_episodes", "max_hours")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One process that leaves one file.
+
+    Attributes:
+        name: for people.
+        command: the name of one of our commands, and its arguments.
+        run_dir: the run folder that it works on.
+        leaves: its file.
+        needs: the training that must be done before it can start.
+        settings: of a training: its whole config; of a test: what its file must say.
+        trains: whether it is a training.
+    """
+
+    name: str
+    command: tuple[str, ...]
+    run_dir: Path
+    leaves: Path
+    needs: "Job | None" = None
+    settings: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    trains: bool = True
+
+    @property
+    def log(self) -> Path:
+        """Where its output goes."""
+        return self.run_dir / ("training.log" if self.trains else "tests.log")
+
+    @property
+    def ready(self) -> bool:
+        """Whether it can start."""
+        return self.needs is None or self.needs.done
+
+    @property
+    def done(self) -> bool:
+        """Whether its file is there and is that of this job, come to its end."""
+        content = read_object(self.leaves)
+        return _trained(content) if self.trains else self._tested(content)
+
+    def _tested(self, content: Mapping[str, Any]) -> bool:
+        """A test of the final weights, with the settings that are asked for."""
+        trained = read_object(self.run_dir / RESULT)
+        told = {IN_FILES.get(name, name): value for name, value in self.settings.items()}
+        wanted = {**told, "updates": trained.get("updates")}
+        return bool(content) and all(content.get(name) == wanted[name] for name in wanted)
+
+    @property
+    def arguments(self) -> list[str]:
+        """Of this Python."""
+        name, *rest = self.command
+        return [*command(name), *rest]
+
+    def prepare(self) -> None:
+        """Make its folders."""
+        self.leaves.parent.mkdir(parents=True, exist_ok=True)
+
+    def check(self) -> None:
+        """Raise ConfigError if the folder holds a training with other settings."""
+        if not self.trains or not (self.run_dir / CONFIG).exists():
+            return
+        stored = read_config(self.run_dir / CONFIG)
+        names = [*SECTIONS, *BOUNDS]
+        found = [text for n in names for text in _differences(n, stored, self.settings)]
+        if found:
+            raise ConfigError(
+                f"{self.run_dir} was trained with other settings ({', '.join(found)}): remove it, "
+                "or choose another run_dir"
+            )
+
+
+def _trained(content: Mapping[str, Any]) -> bool:
+    """Whether a run used up its budget, and its final weights were scored."""
+    ended_by, scored = content.get("ended_by"), content.get("scored_updates")
+    by_budget = isinstance(ended_by, str) and ended_by.startswith(BOUNDS)
+    return by_budget and scored is not None and scored == content.get("updates")
+
+
+def _differences(name: str, one: object, other: object) -> Iterator[str]:
+    """Where two configs disagree below a name; what only one of them knows does not count."""
+    key = name.rpartition(".")[2]
+    if not (isinstance(one, Mapping) and isinstance(other, Mapping)):
+        return
+    if key not in one or key not in other:
+        return
+    here, there = one[key], other[key]
+    if isinstance(here, Mapping) and isinstance(there, Mapping):
+        for inner in sorted(set(here) & set(there)):
+            yield from _differences(f"{name}.{inner}", here, there)
+    elif here != there:
+        yield f"{name}={here}, now {there}"
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """A JSON object; empty where the file is missing or cannot be read."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def make_jobs(config: StudyConfig, resolved: Mapping[str, Mapping[str, Any]]) -> list[Job]:
+    """All trainings seed by seed, each followed by its tests.
+
+    Args:
+        config: the study.
+        resolved: the whole config of each training that is wanted.
+    """
+    jobs: list[Job] = []
+    for seed in config.budget.seeds:
+        trainings: dict[str, Job] = {}
+        for name in config.wanted():
+            source = config.trainings[name].after
+            needs = None if source is None else trainings[source]
+            trainings[name] = _training(config, name, seed, needs, resolved[name])
+            tests = (_test(config, trainings[name], test) for test in config.tests_of(name))
+            jobs += [trainings[name], *tests]
+    return jobs
+
+
+def _training(
+    config: StudyConfig, name: str, seed: int, needs: Job | None, settings: Mapping[str, Any]
+) -> Job:
+    run_dir = seed_folder(Path(config.run_dir), name, seed)
+    told = (
+        "train",
+        override("run_dir", str(run_dir)),
+        f"seed={seed}",
+        "resume=auto",
+        *config.command(name),
+        *([] if needs is None else [override("warm_start", str(needs.run_dir))]),
+    )
+    return Job(f"{name}, seed {seed}", told, run_dir, run_dir / RESULT, needs, settings)
+
+
+def _test(config: StudyConfig, training: Job, name: str) -> Job:
+    test, out = config.tests[name], test_file(training.run_dir, name)
+    settings = test.asked
+    if test.puzzles is None:
+        settings = {"episodes": config.budget.test_episodes, **settings}
+    told = (
+        "eval",
+        override("run_dir", str(training.run_dir)),
+        override("out", str(out)),
+        *(f"{key}={value}" for key, value in settings.items()),
+    )
+    label = f"{training.name}, test {name}"
+    return Job(label, told, training.run_dir, out, training, settings, trains=False)

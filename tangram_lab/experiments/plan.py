@@ -1,0 +1,261 @@
+"""What experiments consist of: trainings over seeds and tests of them, each done once.
+
+A study folder holds all of them: `plan.json`, a run folder for every training and seed, and in it
+a file for every test.
+"""
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from tangram_sim.config import MAX_CORNER_NOISE
+from tangram_sim.errors import ConfigError
+from tangram_sim.settings import check_choice, check_range
+from worker.config import MAX_ACTIONS
+
+FORMAT = 1
+KINDS = ("curves", "complexity", "tests", "rewards", "ranking", "game")
+PLAN = "plan.json"
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """One setting, trained once for every seed.
+
+    Attributes:
+        label: for figures and tables.
+        family: what it has in common with others; budgets are given by family.
+        overrides: of tangram-train, after those of family and budget.
+        after: a training whose networks this one begins with, seed by seed.
+    """
+
+    label: str
+    family: str
+    overrides: tuple[str, ...] = ()
+    after: str | None = None
+
+
+@dataclass(frozen=True)
+class TestConfig:
+    """Settings of tangram-eval for a trained agent; None is what it was trained with."""
+
+    __test__ = False  # pytest collects classes of this name
+
+    label: str
+    actions: int | None = None
+    corner_noise: float | None = None
+    puzzles: str | None = None
+    turns: int | None = None
+    order: str | None = None
+    reapply: int | None = None
+    refine_steps: int | None = None
+    gamma: float | None = None
+
+    @property
+    def asked(self) -> dict[str, Any]:
+        """The settings that are not as trained, by their names in tangram-eval and in its file."""
+        values = {name: value for name, value in asdict(self).items() if name != "label"}
+        return {name: value for name, value in values.items() if value is not None}
+
+    def __post_init__(self) -> None:
+        if self.actions is not None:
+            check_range("tests.actions", self.actions, 1, MAX_ACTIONS)
+        if self.corner_noise is not None:
+            check_range("tests.corner_noise", self.corner_noise, 0.0, MAX_CORNER_NOISE)
+
+
+@dataclass(frozen=True)
+class ExperimentConfig:
+    """One figure or table.
+
+    Attributes:
+        title, note: for the report.
+        source: where the paper has it.
+        kind: of figure and table: one of KINDS.
+        trainings, tests: names in the catalogue; every test is made of every training.
+        labels: of trainings that are called otherwise here than in the catalogue.
+    """
+
+    title: str
+    source: str
+    kind: str
+    note: str
+    trainings: tuple[str, ...]
+    tests: tuple[str, ...] = ()
+    labels: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_choice("kind", self.kind, KINDS)
+        for name in self.labels:
+            check_choice("labels", name, self.trainings)
+
+
+@dataclass(frozen=True)
+class BudgetConfig:
+    """How long everything is trained.
+
+    Attributes:
+        name: of the preset.
+        note: for the report: what is smaller than in the paper.
+        seeds: of every training.
+        test_episodes: of every test.
+        overrides: of tangram-train, by family; `all` holds for every family.
+    """
+
+    name: str
+    note: str
+    seeds: tuple[int, ...]
+    test_episodes: int
+    overrides: dict[str, tuple[str, ...]]
+
+    def __post_init__(self) -> None:
+        check_range("budget.test_episodes", self.test_episodes, 1)
+        if not self.seeds or len(set(self.seeds)) < len(self.seeds):
+            raise ConfigError(f"budget.seeds must be different numbers, got {list(self.seeds)}")
+        for seed in self.seeds:
+            check_range("budget.seeds", seed, 0)
+
+
+@dataclass(frozen=True)
+class StudyConfig:
+    """Experiments, and where and how they are run.
+
+    Attributes:
+        run_dir: the study folder.
+        budget: of every training.
+        families: overrides that the trainings of a family share.
+        trainings, tests: the catalogue.
+        experiments: what to run.
+        jobs: trainings at a time.
+        dry: only list what would be done.
+    """
+
+    run_dir: str
+    budget: BudgetConfig
+    families: dict[str, tuple[str, ...]]
+    trainings: dict[str, TrainingConfig]
+    tests: dict[str, TestConfig]
+    experiments: dict[str, ExperimentConfig] = field(default_factory=dict)
+    jobs: int = 2
+    dry: bool = False
+
+    def __post_init__(self) -> None:
+        check_range("jobs", self.jobs, 1, 1024)
+        for name, experiment in self.experiments.items():
+            for kind, wanted in (("trainings", experiment.trainings), ("tests", experiment.tests)):
+                _check_known(f"experiment {name}: {kind}", wanted, getattr(self, kind))
+        for name, training in self.trainings.items():
+            _check_known(f"training {name}: family", (training.family,), self.families)
+            if training.after is not None:
+                _check_known(f"training {name}: after", (training.after,), self.trainings)
+
+    def command(self, name: str) -> list[str]:
+        """Everything that tangram-train is told, each setting once: the last word counts."""
+        training = self.trainings[name]
+        budget = self.budget.overrides
+        said = (
+            *self.families[training.family],
+            *budget.get("all", ()),
+            *budget.get(training.family, ()),
+            *training.overrides,
+        )
+        return list({text.partition("=")[0]: text for text in said}.values())
+
+    def wanted(self) -> list[str]:
+        """The trainings of all experiments, those that others begin with before them."""
+        names: dict[str, None] = {}
+        for experiment in self.experiments.values():
+            for name in experiment.trainings:
+                for source in reversed(list(self._sources(name))):
+                    names[source] = None
+        return list(names)
+
+    def _sources(self, name: str) -> Iterator[str]:
+        """A training, the one that it begins with, and so on."""
+        seen: list[str] = []
+        current: str | None = name
+        while current is not None:
+            if current in seen:
+                raise ConfigError(f"training {name} begins with itself: {' <- '.join(seen)}")
+            seen.append(current)
+            yield current
+            current = self.trainings[current].after
+
+    def tests_of(self, training: str) -> list[str]:
+        """The tests of a training in all experiments."""
+        found = [e.tests for e in self.experiments.values() if training in e.trainings]
+        return list(dict.fromkeys(name for tests in found for name in tests))
+
+
+def _check_known(what: str, names: tuple[str, ...], known: Mapping[str, Any]) -> None:
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"{what} '{name}' is not in the catalogue: use {', '.join(known)}")
+
+
+def seed_folder(study: Path, training: str, seed: int) -> Path:
+    """The run folder of one training with one seed."""
+    return study / "trainings" / training / f"seed_{seed}"
+
+
+def test_file(run_dir: Path, test: str) -> Path:
+    """The scores of a test of a run."""
+    return run_dir / "tests" / f"{test}.json"
+
+
+test_file.__test__ = False  # type: ignore[attr-defined] # pytest collects functions of this name
+
+
+def plan_content(config: StudyConfig, source: Mapping[str, Any]) -> dict[str, Any]:
+    """What plan.json says of this command: everything that a report needs to know."""
+    budget = {
+        "name": config.budget.name,
+        "note": config.budget.note,
+        "seeds": list(config.budget.seeds),
+        "test_episodes": config.budget.test_episodes,
+    }
+    wanted = config.wanted()
+    tests = {test: None for name in wanted for test in config.tests_of(name)}
+    return {
+        "format": FORMAT,
+        **source,
+        "budget": budget,
+        "experiments": {name: asdict(e) for name, e in config.experiments.items()},
+        "trainings": {
+            name: {
+                "label": config.trainings[name].label,
+                "family": config.trainings[name].family,
+                "overrides": config.command(name),
+                "after": config.trainings[name].after,
+            }
+            for name in wanted
+        },
+        "tests": {name: asdict(config.tests[name]) for name in tests},
+    }
+
+
+def joined_plan(path: Path, content: dict[str, Any]) -> dict[str, Any]:
+    """A plan together with what earlier commands put into the same folder, their seeds too.
+
+    Raises:
+        ConfigError: the folder was made with another budget, or its plan cannot be read.
+    """
+    if not path.exists():
+        return content
+    try:
+        earlier = json.loads(path.read_text(encoding="utf-8"))
+        known = {n: dict(earlier[n]) for n in ("budget", "experiments", "trainings", "tests")}
+    except (OSError, ValueError, KeyError, TypeError):
+        raise ConfigError(f"cannot read {path}: remove it, or choose another run_dir") from None
+    for name in ("name", "test_episodes"):
+        earlier, now = known["budget"].get(name), content["budget"][name]
+        if earlier != now:
+            raise ConfigError(
+                f"{path.parent} was made with budget.{name}={earlier}, now it is {now}: choose "
+                "another run_dir"
+            )
+    merged = {n: known[n] | content[n] for n in ("experiments", "trainings", "tests")}
+    seeds = sorted({*known["budget"].get("seeds", ()), *content["budget"]["seeds"]})
+    return content | merged | {"budget": content["budget"] | {"seeds": seeds}}

@@ -1,0 +1,184 @@
+"""How figures look, and how they are saved; nothing here touches pyplot's global state."""
+
+import io
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from tangram_agent.files import write_whole
+from tangram_lab.experiments.report.study import Experiment, Study
+
+WIDTH_IN = 9.0  # a README shows it a little smaller than that
+DPI = 160
+WIDE = 30.0  # most / least of values that need a logarithmic axis
+# Okabe and Ito's colours for all kinds of colour vision, without black and yellow, and two of
+# Paul Tol's.
+COLOURS = (
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#CC79A7",
+    "#E69F00",
+    "#56B4E9",
+    "#882255",
+    "#999933",
+)
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<")
+DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (5, 1.5, 1.2, 1.5)))
+GREY, LEVEL, PALE = "#6B7280", "#9CA3AF", "#D8DCE2"
+SETTINGS: dict[Any, Any] = {
+    "axes.edgecolor": "#9CA3AF",
+    "axes.labelcolor": "#374151",
+    "axes.labelsize": 9.5,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlesize": 9.5,
+    "axes.unicode_minus": True,
+    "figure.constrained_layout.h_pad": 0.07,
+    "figure.constrained_layout.w_pad": 0.06,
+    "figure.facecolor": "white",
+    "font.family": "DejaVu Sans",  # comes with matplotlib, so every machine draws the same
+    "font.size": 9.0,
+    "legend.fontsize": 9.0,
+    "legend.frameon": False,
+    "lines.linewidth": 1.6,
+    "svg.hashsalt": "tangram-report",
+    "text.color": "#1F2937",
+    "xtick.color": "#4B5563",
+    "xtick.labelsize": 8.5,
+    "ytick.color": "#4B5563",
+    "ytick.labelsize": 8.5,
+}
+
+Dash = str | tuple[int, tuple[float, ...]]
+
+
+@dataclass(frozen=True)
+class Look:
+    """How one training looks in every figure."""
+
+    colour: str
+    marker: str
+    dash: Dash
+
+
+def looks(study: Study) -> dict[str, Look]:
+    """Training -> look, the same in every figure.
+
+    Colours repeat when there are more trainings than colours, but not within one figure of curves
+    if that can be avoided; then the dashes differ.
+    """
+    groups = [{one.name for one in e.trainings} for e in _figures_first(study.experiments)]
+    chosen: dict[str, int] = {}
+    for group in groups:
+        for name in (one.name for one in study.trainings if one.name in group):
+            if name not in chosen:
+                near = {o for other in groups if name in other for o in other} & set(chosen)
+                chosen[name] = _free({chosen[other] for other in near})
+    return {name: _look(index) for name, index in chosen.items()}
+
+
+def _figures_first(experiments: Iterable[Experiment]) -> list[Experiment]:
+    """A ranking names its rows, so it can do with colours that are left."""
+    return sorted(experiments, key=lambda one: one.kind == "ranking")
+
+
+def _free(taken: set[int]) -> int:
+    return min(index for index in range(len(taken) + 1) if index not in taken)
+
+
+def _look(index: int) -> Look:
+    turn, colour = divmod(index, len(COLOURS))
+    return Look(COLOURS[colour], MARKERS[colour], DASHES[turn % len(DASHES)])
+
+
+@contextmanager
+def drawing() -> Iterator[None]:
+    """Figures that are made and saved inside look like this house's."""
+    with mpl.rc_context(SETTINGS):
+        yield
+
+
+def empty_figure(width_in: float, height_in: float) -> Figure:
+    """A figure without panels of that many inches, and without pyplot's global state."""
+    figure = Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def new_figure(
+    height_in: float, rows: int, columns: int, sharex: bool = False, sharey: bool = False
+) -> tuple[Figure, list[Axes]]:
+    """A figure with its panels, row after row.
+
+    Args:
+        height_in: in inches; the width is that of a README.
+        sharex: all panels have one range of x.
+        sharey: all panels have one range of y.
+    """
+    figure = empty_figure(WIDTH_IN, height_in)
+    panels = figure.subplots(rows, columns, sharex=sharex, sharey=sharey, squeeze=False)
+    for panel in panels.flat:
+        panel.grid(axis="both", color="#E5E7EB", linewidth=0.7)
+        panel.set_axisbelow(True)
+        panel.tick_params(length=2.5)
+    return figure, list(panels.flat)
+
+
+def legend_below(figure: Figure, panel: Axes, columns: int = 4) -> None:
+    """One legend for all panels, under them, from the labels of one; each label once."""
+    handles, labels = panel.get_legend_handles_labels()
+    once = dict(zip(labels[::-1], handles[::-1], strict=True))
+    names = list(dict.fromkeys(labels))
+    if names:
+        figure.legend(
+            [once[name] for name in names],
+            names,
+            loc="outside lower center",
+            ncols=min(columns, len(names)),
+            handlelength=2.4,
+            columnspacing=1.6,
+        )
+
+
+def widen(panel: Axes, axis: str, values: Sequence[float]) -> None:
+    """A logarithmic axis, x or y, where the values need one; its ticks are plain numbers."""
+    if values and min(values) > 0.0 and max(values) / min(values) > WIDE:
+        panel.set(**{f"{axis}scale": "log"})
+        scaled = panel.xaxis if axis == "x" else panel.yaxis
+        scaled.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+        scaled.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        scaled.set_minor_formatter(NullFormatter())
+
+
+def thousands() -> FuncFormatter:
+    """20000 as 20k, 1500 as 1.5k."""
+    return FuncFormatter(
+        lambda value, _: f"{value / 1000:g}k" if abs(value) >= 1000 else f"{value:g}"
+    )
+
+
+def save(figure: Figure, folder: Path, name: str) -> None:
+    """Write a figure as PNG and SVG; the same data gives the same bytes.
+
+    Args:
+        folder: of the files.
+        name: of the files, without an ending.
+
+    Raises:
+        RunError: the files cannot be written.
+    """
+    # Names of the program and times would change with every machine and run.
+    formats = {"png": ("Software",), "svg": ("Date", "Creator")}
+    for kind, left_out in formats.items():
+        data = io.BytesIO()
+        figure.savefig(data, format=kind, metadata=dict.fromkeys(left_out))
+        write_whole(folder / f"{name}.{kind}", data.getvalue())

@@ -1,0 +1,151 @@
+"""Runs the jobs of a study, so many at a time, and goes on when one fails."""
+
+import json
+import os
+import shlex
+import signal
+import sys
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from queue import Empty, SimpleQueue
+from typing import Any
+
+from master.children import Child, describe
+from master.console import sturdy_console
+from master.result import commit, processor, versions
+from master.rundir import RunFolder
+from master.signals import handling
+from tangram_agent.files import write_whole
+from tangram_lab.experiments.jobs import Job, make_jobs, read_object
+from tangram_lab.experiments.plan import PLAN, StudyConfig, joined_plan, plan_content
+from tangram_lab.experiments.progress import StudyProgress
+
+LOOK_S = 0.5
+# A training that is asked to end writes its checkpoint first.
+STOP_S = 60.0
+FAILED_STATUS = 1
+INTERRUPT_STATUS = 130
+
+
+def run_study(config: StudyConfig, resolved: Mapping[str, Mapping[str, Any]]) -> int:
+    """Do everything that is missing.
+
+    Args:
+        config: the study.
+        resolved: the whole config of each training that is wanted.
+
+    Returns:
+        Exit status: 0 when all is done, 1 when a job failed, 130 after a signal.
+
+    Raises:
+        ConfigError: the folder holds trainings with other settings or budget, or is in use.
+    """
+    study, jobs = RunFolder(config.run_dir), make_jobs(config, resolved)
+    for job in jobs:
+        job.check()
+    plan = joined_plan(study.path / PLAN, plan_content(config, _source()))
+    missing = [job for job in jobs if not job.done]
+    console = sturdy_console(sys.stdout)
+    if config.dry:
+        for job in missing:
+            console.print(job.name, highlight=False)
+        console.print(f"{len(missing)} of {len(jobs)} jobs to do in {study.path}", highlight=False)
+        return 0
+    study.prepare("auto")
+    with study.lock():
+        write_whole(study.path / PLAN, _json(plan))
+        with StudyProgress(console, len(jobs), len(jobs) - len(missing)) as progress:
+            return Runner(missing, config.jobs, progress).run()
+
+
+def _source() -> dict[str, object]:
+    """Where the numbers of a study come from."""
+    return {
+        "command": shlex.join(["tangram-experiment", *sys.argv[1:]]),
+        "commit": commit(),
+        "processor": processor(),
+        "cores": len(os.sched_getaffinity(0)),
+        "versions": versions(),
+    }
+
+
+class Runner:
+    """Starts jobs as places become free."""
+
+    def __init__(self, jobs: Sequence[Job], at_once: int, progress: StudyProgress) -> None:
+        self._waiting, self._at_once, self._progress = deque(jobs), at_once, progress
+        self._running: dict[Child, Job] = {}
+        self._events: SimpleQueue[Child | signal.Signals] = SimpleQueue()
+        self._failed: list[Job] = []
+        self._stop_s: float | None = None
+
+    def run(self) -> int:
+        """Until nothing is left to do; returns the exit status."""
+        with handling(self._events.put):
+            try:
+                self._work()
+            finally:
+                self._signal(signal.SIGTERM)  # nobody is left, unless this failed
+        if self._stop_s is not None:
+            self._progress.say("stopped: give the same command again to go on")
+            return INTERRUPT_STATUS
+        for job in self._waiting:
+            self._progress.say(f"{job.name}: not done, what it needs is missing")
+        for job in self._failed:
+            self._progress.say(f"{job.name}: failed, see {job.log}")
+        return FAILED_STATUS if self._failed or self._waiting else 0
+
+    def _work(self) -> None:
+        while self._start_ready() or self._running:
+            self._take(self._next())
+            self._progress.look(list(self._running.values()))
+            if self._stop_s is not None and time.monotonic() >= self._stop_s:
+                self._signal(signal.SIGKILL)
+
+    def _start_ready(self) -> bool:
+        """Start what there is room for; whether anything was started."""
+        started = False
+        for job in list(self._waiting):
+            if self._stop_s is not None or len(self._running) >= self._at_once:
+                break
+            if job.ready:
+                self._waiting.remove(job)
+                self._start(job)
+                started = True
+        return started
+
+    def _start(self, job: Job) -> None:
+        job.prepare()
+        child = Child(job.name, job.arguments, job.log)
+        child.start(self._events.put)
+        self._running[child] = job
+        self._progress.started(job)
+
+    def _next(self) -> "Child | signal.Signals | None":
+        try:
+            return self._events.get(timeout=LOOK_S)
+        except Empty:
+            return None
+
+    def _take(self, event: "Child | signal.Signals | None") -> None:
+        if isinstance(event, signal.Signals):
+            # The first wish ends the trainings with a checkpoint, a later one at once.
+            self._signal(signal.SIGTERM if self._stop_s is None else signal.SIGKILL)
+            self._stop_s = self._stop_s or time.monotonic() + STOP_S
+        elif event is not None:
+            status, job = event.clear(), self._running.pop(event)
+            if job.done:
+                self._progress.finished(job, read_object(job.leaves))
+            elif self._stop_s is None:
+                self._failed.append(job)
+                self._progress.say(f"{job.name} ended with {describe(status)}\n{event.tail()}")
+            self._progress.ended(job)
+
+    def _signal(self, number: signal.Signals) -> None:
+        for child in self._running:
+            child.signal(number)
+
+
+def _json(content: dict[str, object]) -> bytes:
+    return (json.dumps(content, indent=1) + "\n").encode()

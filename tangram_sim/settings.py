@@ -1,0 +1,150 @@
+"""How settings are declared: once, beside their owner, with default, bounds, unit and help.
+
+    @dataclass(frozen=True)
+    class NoiseConfig(Settings, section="noise"):
+        kind: str = setting("none", "which noise", choices=("none", "gaussian"))
+        width: float = setting(0.1, "its deviation", low=0, unit="arena", only={"kind": "gaussian"})
+
+A dataclass of settings checks each value when it is made. What `--help` and docs/settings.md say
+of a setting is what stands here.
+"""
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import MISSING, Field, dataclass, field, fields
+from typing import Any, ClassVar, TypeVar, cast
+
+from tangram_sim.errors import ConfigError
+
+Value = TypeVar("Value")
+Metadata = Mapping[str, "Declaration"]
+KEY = "setting"
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """What is said of a setting besides its type and default.
+
+    Attributes:
+        help: one line.
+        low, high: bounds of the number, or of each number of a list; None: it has none.
+        choices: that a text must be one of; empty: any text.
+        unit: of the number, in the words of docs/settings.md; empty: it has none.
+        only: other settings of the same section -> the value, or the tuple of values, under which
+            this one has an effect. What is not the default is refused under any other.
+    """
+
+    help: str
+    low: float | None = None
+    high: float = math.inf
+    choices: tuple[str, ...] = ()
+    unit: str = ""
+    only: Mapping[str, object] = field(default_factory=dict)
+
+
+def setting(default: Value, help: str, **more: Any) -> Value:  # noqa: A002
+    """A field of a dataclass of settings; `more` are the attributes of `Declaration`."""
+    return field(default=default, metadata=declared(help, **more))
+
+
+def declared(help: str, **more: Any) -> Metadata:  # noqa: A002
+    """The metadata of a setting without a default: `name: str = field(metadata=declared(...))`."""
+    return {KEY: Declaration(help, **more)}
+
+
+class Settings:
+    """Base of frozen dataclasses of settings: each value is checked at birth.
+
+    Attributes:
+        section: under which its settings stand in a config; empty: they stand at the top.
+    """
+
+    section: ClassVar[str] = ""
+
+    def __init_subclass__(cls, section: str = "") -> None:
+        """Name the section of a class."""
+        cls.section = section
+
+    def __post_init__(self) -> None:
+        """Check each setting against its declaration.
+
+        Raises:
+            ConfigError: names the setting, its value and its bound or choices.
+        """
+        for own in declared_fields(type(self)):
+            _check(setting_name(self, own.name), getattr(self, own.name), own.metadata[KEY])
+        for own in declared_fields(type(self)):
+            self._check_effect(own)
+
+    def _check_effect(self, own: "Field[Any]") -> None:
+        value = getattr(self, own.name)
+        if value == own.default:
+            return
+        for name, needed in own.metadata[KEY].only.items():
+            accepted = needed if isinstance(needed, tuple) else (needed,)
+            if getattr(self, name) not in accepted:
+                refuse_ignored(
+                    f"{setting_name(self, own.name)}={told(value)}",
+                    f"{setting_name(self, name)}={told(getattr(self, name))}",
+                    f"set {setting_name(self, name)}={' or '.join(map(told, accepted))}",
+                )
+
+
+def refuse_ignored(given: str, because: str, remedy: str) -> None:
+    """Raise ConfigError for a setting that would change nothing.
+
+    Args:
+        given: the setting with its value.
+        because: the setting with its value that makes it so.
+        remedy: besides leaving the setting out.
+    """
+    raise ConfigError(f"{given} changes nothing with {because}: leave it out, or {remedy}")
+
+
+def declared_fields(kind: type[Any]) -> list["Field[Any]"]:
+    """The fields of a dataclass that are settings; groups within it are not."""
+    return [own for own in fields(kind) if KEY in own.metadata]
+
+
+def setting_name(owner: Settings | type[Settings], name: str) -> str:
+    """A setting's name as it is written on a command line."""
+    return f"{owner.section}.{name}" if owner.section else name
+
+
+def defaults(kind: type[Any]) -> dict[str, Any]:
+    """Name -> default of the settings of a class; `...` stands for none."""
+    return {
+        own.name: ... if own.default is MISSING else own.default for own in declared_fields(kind)
+    }
+
+
+def told(value: object) -> str:
+    """A value as it is written on a command line."""
+    if value is None or isinstance(value, bool):
+        return "null" if value is None else str(value).lower()
+    if isinstance(value, tuple | list):
+        return f"[{','.join(map(told, value))}]"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _check(name: str, value: object, what: Declaration) -> None:
+    if value is None:
+        return  # where None is no value the type says so
+    for one in value if isinstance(value, tuple) else (value,):
+        if what.choices:
+            check_choice(name, cast("str", one), what.choices)
+        if what.low is not None:
+            check_range(name, cast("float", one), what.low, what.high)
+
+
+def check_range(name: str, value: float, low: float, high: float = math.inf) -> None:
+    """Raise ConfigError unless low <= value <= high."""
+    if not low <= value <= high:
+        bound = f"at least {low:g}" if math.isinf(high) else f"between {low:g} and {high:g}"
+        raise ConfigError(f"{name} must be {bound}, got {value}")
+
+
+def check_choice(name: str, value: str, choices: Collection[str]) -> None:
+    """Raise ConfigError unless the value is one of the choices."""
+    if value not in choices:
+        raise ConfigError(f"{name} must be one of {', '.join(choices)}, got '{value}'")
