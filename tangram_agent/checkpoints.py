@@ -24,7 +24,7 @@ import safetensors.numpy
 
 from tangram_sim.errors import RunError
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 MANIFEST = "manifest.json"
 _NAME = re.compile(r"(\d{8,})(?:-(\d+))?")
 _TEMPORARY = ".writing-"

@@ -90,13 +90,13 @@ class AgentConfig(Settings, section="agent"):
     saturation_limit: float = setting(1.0, "pre-activation beyond which the penalty starts", low=0)
     readout: str = setting(
         "pair",
-        "one velocity of the set's next token and one value of the whole scene, or a velocity and a "
-        "value for each pair of a token and a piece of the target",
+        "one velocity of the set's next token and one value of the whole scene, or both for each "
+        "pair of a token and a piece of the target",
         choices=("token", "pair"),
     )
     order: str = setting(
         "learned",
-        "which token is next: the one with the best value, as listed in the set, the largest or any",
+        "which token is next: that of the best value, the first as listed, the largest, or any",
         choices=ORDERS,
         only={"readout": "pair"},
     )
@@ -137,7 +137,9 @@ class AgentConfig(Settings, section="agent"):
         only={"readout": "pair"},
     )
     gamma: float = setting(0.0, "discount, Eq. 5", low=0, high=1)
-    polyak: float = setting(0.995, "rho of the target networks, Eq. 4, which gamma > 0 needs", low=0, high=1)
+    polyak: float = setting(
+        0.995, "rho of the target networks, Eq. 4, which gamma > 0 needs", low=0, high=1
+    )
     acting_average: float = setting(
         0.99, "Polyak average of the actor that plays and is scored; 0 is the actor", low=0, high=1
     )

@@ -2,8 +2,8 @@
 
 One learner for whole scenes and for pairs of a token and a piece: it sees a batch as `Steps`. With
 several tokens what an action is worth falls apart into what it covers of each piece, and hindsight
-knows the geometry: so a pair's value is known at once, and nothing is bootstrapped. What tokens that
-slide push away is learned beside it, for each pair of tokens (see `planning`).
+knows the geometry: so a pair's value is known at once, and nothing is bootstrapped. What tokens
+that slide push away is learned beside it, for each pair of tokens (see `planning`).
 
 Legend: M views, K tokens.
 """
@@ -96,7 +96,9 @@ class Learner:
         updates: number of updates made.
         bootstraps: whether the critic's target counts what follows (Eq. 5): only then are there
             target networks.
-        acting: what plays: a running average of the actor, or of both networks where both play.
+        parts: networks by the names under which a checkpoint has them.
+        playing: what a worker plays with: the actor, or both networks where both play.
+        acting: its running average, which is what workers get.
     """
 
     def __init__(self, setup: Setup, seed: int, device: str = "cpu") -> None:
@@ -118,18 +120,25 @@ class Learner:
             self.target_actor, self.target_critic = _frozen(self.actor), _frozen(self.critic)
             self.parts |= {"target_actor": self.target_actor, "target_critic": self.target_critic}
         self.parts["acting"] = self.acting
+        self.playing = networks.playing
         # Kept as lists: walking the modules takes a fifth of a small network's update.
-        modules = self.parts | {"playing": networks.playing}
-        self._lists = {name: list(module.parameters()) for name, module in modules.items()}
+        self._lists = self.parameter_lists()
         self.actor_optimiser = _adam(self._lists["actor"], self.config.actor_lr)
         self.critic_optimiser = _adam(self._lists["critic"], self.config.critic_lr)
+
+    def parameter_lists(self) -> dict[str, list[Tensor]]:
+        """Parameters by the names of `parts`, and those of `playing`."""
+        modules = self.parts | {"playing": self.playing}
+        return {name: list(module.parameters()) for name, module in modules.items()}
 
     def prepared(self, batch: Transitions, generator: np.random.Generator) -> Batch:
         """What `update` takes, from a batch of transitions: pairs, where the agent sees such."""
         if not self._setup.pairs:
             return batch
         pairs = make_pairs(batch, self._setup, generator)
-        return with_contacts(pairs, batch, self._layout, generator) if self._setup.contacts else pairs
+        return (
+            with_contacts(pairs, batch, self._layout, generator) if self._setup.contacts else pairs
+        )
 
     def update(self, batch: Batch, progress: float = 0.0) -> dict[str, float]:
         """One step of both networks on a batch.
@@ -166,9 +175,8 @@ class Learner:
         return self._of_pairs(batch) if isinstance(batch, PairBatch) else self._of_scenes(batch)
 
     def _of_scenes(self, batch: Transitions) -> Steps:
-        state, placed, goal, action = map(
-            self._tensor, (batch.state, batch.placed, batch.goal, batch.action)
-        )
+        state, placed = self._tensor(batch.state), self._tensor(batch.placed)
+        goal, action = self._tensor(batch.goal), self._tensor(batch.action)
         taken = Scenes(state, placed, goal, self._index(chosen_tokens(batch.action, self._tokens)))
         start = taken if self._tokens == 1 else Scenes(state, placed, goal, next_token(placed))
         following, flags = self._tensor(batch.next_state), self._tensor(batch.next_placed)

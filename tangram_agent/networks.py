@@ -115,10 +115,10 @@ class Actor(nn.Module):
         self.head = Head(graph, net, VELOCITY + self.kfold, at_base=True)
 
     def forward(self, view: View, features: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Velocity (M, 3) in [-1, 1] in the arena's axes, and the pre-activations that are squashed.
+        """Velocity (M, 3) in [-1, 1] in the arena's axes, and what of the outputs is squashed.
 
-        Those are (M, 3), or (M, 2), of the shift, with the k-fold head, whose turn has no bound to
-        run into. Features are as for `Head`.
+        Those are pre-activations (M, 3), or of the shift (M, 2) with the k-fold head, whose turn
+        has no bound to run into. Features are as for `Head`.
         """
         raw = self.head(view, features=features)
         shift, angle = self._squash(raw[:, :2]), self._angle(raw[:, 2:], view)
@@ -143,9 +143,9 @@ class Actor(nn.Module):
 class Critic(nn.Module):
     """Q(s, g, a): what a velocity of the token that is to move is worth.
 
-    An afterstate critic sees the graph as the velocity would leave it, a known rigid motion, instead
-    of the velocity itself. Where tokens push each other a second head tells how far a token that
-    slides to a pose pushes another one out of its place.
+    An afterstate critic sees the graph as the velocity would leave it, a known rigid motion,
+    instead of the velocity itself. Where tokens push each other a second head tells how far a token
+    that slides to a pose pushes another one out of its place.
     """
 
     def __init__(
@@ -192,9 +192,7 @@ class Critic(nn.Module):
         """
         if self.push_head is None:
             return to.new_zeros(len(to))
-        assert isinstance(self.graph, PairGraph)
-        share: Tensor = self.push_head(pairs, told=self.graph.motion(pairs, to)).squeeze(-1)
-        return share
+        return self._value(self.push_head(pairs, told=self.graph.motion(pairs, to)))
 
 
 class Networks(nn.Module):

@@ -208,9 +208,7 @@ class Planner:
 
     def _valued(self, pairs: Pairs, pose: Tensor) -> Tensor:
         """Values (M,) of moving the tokens of pairs to poses (M, 3)."""
-        values: Tensor = self._networks.critic(
-            pairs, self._graph.way(pairs, pose), pairs.at(pose)
-        )
+        values: Tensor = self._networks.critic(pairs, self._graph.way(pairs, pose), pairs.at(pose))
         return values
 
     def _best(self, scene: Scene, candidates: Candidates, pose: Tensor) -> Tensor:

@@ -1,8 +1,8 @@
 """Hindsight experience replay (Sec. III-B): transitions with the goals that they reached.
 
-Where the critic learns the environment's reward, relabelled transitions are made once, when episodes
-go into the replay. With several tokens on pairs it learns what a token covers of one piece of the
-target, which is known for any goal: there goals are made anew for every update, for each pair.
+Where the critic learns the environment's reward, relabelled transitions are made once, when
+episodes go into the replay. With several tokens on pairs it learns what a token covers of one piece
+of the target, which is known for any goal: there goals are made anew for every update and pair.
 
 Legend: E episodes, T steps, B = E * T transitions, P pairs of each, M = B * P, K tokens, V corners.
 """
@@ -138,8 +138,8 @@ class PairBatch:
         goal_flipped: (M,) its side.
         piece: (M,) its index.
         covered: (M,) share of the piece that was covered before the action.
-        reward: (M,) what the action is worth: with several tokens what the token covers newly of the
-            piece, over the larger of both areas, with one the environment's reward.
+        reward: (M,) what the action is worth: with several tokens what the token covers newly of
+            the piece, over the larger of both areas, with one the environment's reward.
         done: (M,) 1 where nothing follows.
     """
 

@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from functools import cached_property
 from typing import Any, TypeVar, cast, get_origin, get_type_hints
 
@@ -14,6 +14,7 @@ from tangram_sim.actions import action_size, corner_bound, horizon
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import Layout, TokensConfig, make_layout
+from tangram_sim.settings import refuse_ignored, told
 
 Settings = TypeVar("Settings")
 
@@ -29,6 +30,32 @@ class Setup:
     reward: RewardConfig
     agent: AgentConfig
     net: NetConfig
+
+    def __post_init__(self) -> None:
+        """Refuse settings that would change nothing.
+
+        Raises:
+            ConfigError: names the setting and the remedy.
+        """
+        agent, one = self.agent, self.layout.tokens == 1
+        if self.credits_pieces:
+            several = f"{self.layout.tokens} tokens and agent.readout=pair"
+            whole = "set agent.readout=token, which values the whole scene"
+            for name, value in _changed(self.reward).items():
+                refuse_ignored(f"reward.{name}={told(value)}", several, whole)
+            if agent.gamma > 0.0:
+                refuse_ignored(f"agent.gamma={told(agent.gamma)}", several, whole)
+            if any(relabel.strategy == "future" for relabel in agent.hindsight):
+                refuse_ignored("agent.hindsight.strategy=future", several, "use final")
+        for name in {"order", "pairs_per_transition"} & _changed(agent).keys() if one else ():
+            given = f"agent.{name}={told(getattr(agent, name))}"
+            refuse_ignored(given, "one token", "take a set of several")
+        if not self.contacts and "push_weight" in _changed(agent):
+            given = f"agent.push_weight={told(agent.push_weight)}"
+            refuse_ignored(given, "tokens that are lifted", "set sim.motion=slide, several tokens")
+        if agent.gamma == 0.0 and "polyak" in _changed(agent):
+            given = f"agent.polyak={told(agent.polyak)}"
+            refuse_ignored(given, "agent.gamma=0", "set agent.gamma above 0")
 
     @cached_property
     def layout(self) -> Layout:
@@ -101,6 +128,12 @@ class Setup:
         """
         own = self.contents()
         return sorted(name for name in own if not _agree(own[name], contents.get(name, own[name])))
+
+
+def _changed(config: RewardConfig | AgentConfig) -> dict[str, Any]:
+    """The settings that are not the default, by name."""
+    every = {own.name: (getattr(config, own.name), own.default) for own in fields(config)}
+    return {name: value for name, (value, default) in every.items() if value != default}
 
 
 def _agree(one: object, other: object) -> bool:

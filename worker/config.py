@@ -12,7 +12,7 @@ from tangram_sim.config import MAX_CORNER_NOISE
 from tangram_sim.errors import ConfigError
 from tangram_sim.settings import check_choice, check_range
 
-CHANGES = ("order", "reapply", "refine_steps", "gamma")  # of how an agent plays
+CHANGES = ("order", "reapply", "refine_steps", "push_weight")  # of how an agent plays
 MAX_EPISODES = 1_000_000
 MAX_ACTIONS = 100
 MAX_SHOWN = 100
@@ -115,7 +115,7 @@ class EvalConfig:
         turns: angles that each puzzle is played at, evenly spread from how it is drawn.
         skip_invalid: leave out puzzles that cannot be played.
         sheet: PNG file for a picture of every puzzle's end.
-        order, reapply, refine_steps, gamma: see `AgentConfig`; None: as the run was trained.
+        order, reapply, refine_steps, push_weight: see `AgentConfig`; None: as the run was trained.
     """
 
     run_dir: str | None = None
@@ -131,7 +131,7 @@ class EvalConfig:
     order: str | None = None
     reapply: int | None = None
     refine_steps: int | None = None
-    gamma: float | None = None
+    push_weight: float | None = None
 
     def __post_init__(self) -> None:
         _check_run(self.run_dir, self.puzzles is not None)

@@ -1,6 +1,8 @@
 """Updates: against a plain per-head attention, and against Stable-Baselines3's on the same MLP."""
 
-from tangram_agent.ddpg import Learner
+import numpy as np
+
+from tangram_agent.learner import Learner
 from tangram_agent.setup import Setup
 from tangram_lab.benchmarks.measure import Bound, Row, Work, compare
 from tangram_lab.benchmarks.peers import compare_updates
@@ -30,7 +32,8 @@ def _against_plain(case: str, setup: Setup, runs: int, bound: Bound) -> Row:
 def updates(setup: Setup, learner: Learner | None = None) -> Work:
     """Updates on one batch; of the project's own learner if none is given."""
     learner = learner or Learner(setup, 0)
-    batch = random_transitions(setup, setup.agent.batch_size)
+    transitions = random_transitions(setup, setup.agent.batch_size)
+    batch = learner.prepared(transitions, np.random.default_rng(0))
 
     def work() -> int:
         learner.update(batch)

@@ -1,5 +1,6 @@
 """The learner as one would write it first, for comparison: the same mathematics, nothing saved."""
 
+import copy
 import math
 from typing import Any
 
@@ -7,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from tangram_agent.attention import EncoderLayer
-from tangram_agent.ddpg import Learner, critic_target, next_token
+from tangram_agent.learner import Learner, Steps, critic_target
 from tangram_agent.setup import Setup
 
 GAMMA = 0.99
@@ -42,10 +43,11 @@ class PlainLearner(Learner):
 
     def __init__(self, setup: Setup, seed: int) -> None:
         super().__init__(setup, seed)
-        for part in (self.actor, self.critic, self.target_actor, self.target_critic, self.acting):
+        for part in (self.actor, self.critic, self.acting):
             for layer in part.modules():
                 if isinstance(layer, EncoderLayer):
                     _take_apart(layer)
+        self.target_actor, self.target_critic = map(copy.deepcopy, (self.actor, self.critic))
         self._lists = self.parameter_lists()
         rates = (self.config.actor_lr, self.config.critic_lr)
         self.actor_optimiser, self.critic_optimiser = (
@@ -71,11 +73,10 @@ class PlainLearner(Learner):
         optimiser.step()
         return norm
 
-    def _target(self, t: dict[str, Tensor]) -> Tensor:
-        after = (t["next_state"], t["next_placed"], t["goal"], next_token(t["next_placed"]))
-        velocity, _ = self.target_actor(*after)
-        value = self.target_critic(*after, velocity)
-        return critic_target(t["reward"], t["done"], value, GAMMA)
+    def _target(self, steps: Steps) -> Tensor:
+        velocity, _ = self.target_actor(steps.follow)
+        value = self.target_critic(steps.follow, velocity)
+        return critic_target(steps.reward, steps.done, value, GAMMA)
 
 
 def _take_apart(layer: EncoderLayer) -> None:

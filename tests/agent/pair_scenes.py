@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
-
 from tangram_agent.pair_values import Lying, newly_covered
 from tangram_agent.pairs import Pairs
+from torch import Tensor
+
 from tangram_agent.setup import Setup
 from tangram_agent.types import Transitions
 from tangram_sim.arrays import Bools, Floats

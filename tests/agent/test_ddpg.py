@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-
 from tangram_agent.ddpg import (
     Learner,
     NotFiniteError,
@@ -18,6 +17,7 @@ from tangram_agent.ddpg import (
     saturation,
     split_action,
 )
+
 from tangram_agent.setup import Setup
 from tangram_agent.types import Transitions
 from tangram_sim.errors import RunError

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from tangram_agent.hindsight import flatten, with_twins
 
 from tangram_agent.config import TwinConfig
-from tangram_agent.hindsight import flatten, with_twins
 from tangram_agent.types import Episodes, Transitions
 from tests.agent.builders import random_episodes, setup
 

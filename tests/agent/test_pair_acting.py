@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-
 from tangram_agent.pair_learner import make_learner
+
 from tangram_agent.payloads import decode_weights, encode_weights
 from tangram_agent.policy import Policy
 from tangram_agent.runs import Run

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-
 from tangram_agent.pair_batch import PairBatch, make_pairs, with_contacts
 from tangram_agent.pair_values import Lying, covered_share, covering, newly_covered
+
 from tangram_sim.actions import chosen_tokens
 from tests.agent.builders import setup
 from tests.agent.pair_scenes import seven, transitions

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-
 from tangram_agent.ddpg import Learner
 from tangram_agent.pair_learner import PairLearner, make_learner
 from tangram_agent.pairs import Pairs
+
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
 from tangram_sim.batch import BatchedEnv

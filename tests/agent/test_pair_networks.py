@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from tangram_agent.pair_networks import PairNetworks
+from tangram_agent.pairs import PairGraph
 
 from tangram_agent.config import NetConfig
 from tangram_agent.networks import initialise
-from tangram_agent.pair_networks import PairNetworks
-from tangram_agent.pairs import PairGraph
 from tests.agent.builders import SMALL
 from tests.agent.pair_scenes import as_tensor, every_pair, random_pairs, random_scene, seven
 

@@ -7,13 +7,13 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
-
-from tangram_agent import pair_policy
-from tangram_agent.networks import initialise
 from tangram_agent.pair_networks import PairNetworks
 from tangram_agent.pair_policy import PairChooser
 from tangram_agent.pair_values import covered_share, covering, worths
 from tangram_agent.pairs import PairGraph, Pairs
+
+from tangram_agent import pair_policy
+from tangram_agent.networks import initialise
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
 from tangram_sim.batch import BatchedEnv

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from shapely.geometry import Polygon
 from shapely.ops import unary_union
-
 from tangram_agent.pair_values import (
     Lying,
     covered_share,
@@ -16,6 +15,7 @@ from tangram_agent.pair_values import (
     pushed_share,
     worths,
 )
+
 from tangram_sim.layout import Layout, TokensConfig, make_layout
 from tests.agent.pair_scenes import SEVEN, random_scene
 

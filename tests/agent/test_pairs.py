@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-
 from tangram_agent.pairs import PairGraph, Pairs
+
 from tangram_sim.fitting import KINDS
 from tangram_sim.layout import Layout, TokensConfig, make_layout
 from tests.agent.pair_scenes import SEVEN, every_pair, random_pairs, random_scene

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import torch
-
 from tangram_agent.ddpg import Learner
 from tangram_agent.pair_learner import make_learner
+
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
 from tangram_agent.types import Weights

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tangram_agent.pair_learner import PairLearner
 
 from master.checkpoint import Restored, restore_run, save_run
 from master.record import Record
 from master.trainer import Trainer
-from tangram_agent.pair_learner import PairLearner
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
 from tests.agent.builders import random_episodes

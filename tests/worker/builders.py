@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 import yaml
+from tangram_agent.pair_learner import make_learner
 
 from tangram_agent.checkpoints import save_checkpoint
 from tangram_agent.config import ServiceConfig
-from tangram_agent.pair_learner import make_learner
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup, make_setup
 from tangram_agent.types import Weights
