@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Thread
 
-from tangram_agent.lifeline import Lifeline
+from tangram_agent.process import Lifeline
 
 # A process that lived for so long starts with a clean record.
 STEADY_S = 60.0

@@ -59,6 +59,11 @@ def _master(settings: Plain) -> int:
 
 def _make_absolute(settings: Plain) -> None:
     """Folders as seen from where the command was started; what is no text is left alone."""
+    from tangram_sim.rewards import absolute_name
+
+    reward = settings["reward"]
+    if isinstance(reward, dict) and isinstance(reward.get("name"), str):
+        reward["name"] = absolute_name(reward["name"])
     for name in ("run_dir", "warm_start"):
         value = settings.get(name)
         if isinstance(value, str) and value.strip():

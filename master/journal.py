@@ -20,9 +20,9 @@ from io import FileIO
 from pathlib import Path
 
 from master.arrivals import EpisodesArrived
-from master.every import Every
 from tangram_agent.frames import pack_header
 from tangram_agent.payloads import EpisodeSpec, encode_episodes
+from tangram_agent.process import Every
 from tangram_sim.errors import RunError
 
 FORMAT = 1

@@ -8,16 +8,13 @@ from contextlib import AbstractContextManager
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from master.checkpoint import check_resumable
-from master.children import MAX_RESTARTS, Child, describe
-from master.commands import master_arguments, worker_child
+from master.checkpointer import check_resumable
+from master.children import MAX_RESTARTS, Child, command, describe, override
 from master.config import LaunchConfig
-from master.console import sturdy_console
-from master.every import Every
-from master.progress import Progress, make_lines
+from master.console import Progress, make_lines, sturdy_console
 from master.rundir import RunFolder
 from master.signals import SAME_WISH_S, handling, show_cursor
-from tangram_agent import lifeline
+from tangram_agent.process import Every, watch_parent
 
 # While the master starts, its connection file is looked for this often.
 LOOK_S = 0.1
@@ -26,6 +23,8 @@ IDLE_S = 1.0
 STOP_S = 120.0
 LEAVE_S = 8.0
 FAILED_STATUS = 1
+PLAYER_NICE = 5
+EVALUATOR_NICE = 10
 
 
 def run_training(config: LaunchConfig, resolved: Mapping[str, Any]) -> int:
@@ -52,7 +51,7 @@ def run_training(config: LaunchConfig, resolved: Mapping[str, Any]) -> int:
     lines = make_lines(sturdy_console(sys.stderr), config.master.service.log_format)
     launcher = Launcher(config, folder, lines)
     with launcher.signals():
-        lifeline.watch(grace_s=STOP_S + 2.0 * LEAVE_S)  # of an experiment that started it
+        watch_parent(grace_s=STOP_S + 2.0 * LEAVE_S)  # of an experiment that started it
         try:
             return launcher.run()
         finally:
@@ -227,3 +226,33 @@ class Launcher:
             hurried = time.monotonic() - began_s >= SAME_WISH_S
             if isinstance(event, signal.Signals) and hurried:
                 return
+
+
+def worker_child(folder: RunFolder, role: str, index: int) -> Child:
+    """A worker that joins by the run's connection file, with a log of its own."""
+    name = role if role == "evaluator" else f"worker {index}"
+    arguments = [
+        *command("worker"),
+        override("connect", str(folder.connection)),
+        f"index={index}",
+        f"role={role}",
+    ]
+    nice = EVALUATOR_NICE if role == "evaluator" else PLAYER_NICE
+    return Child(name, arguments, folder.logs / f"{name.replace(' ', '-')}.log", nice)
+
+
+def master_arguments(config: LaunchConfig, folder: RunFolder) -> list[str]:
+    """How the master is started, as arguments of this Python."""
+    master = config.master
+    in_step = master.service.mode == "lockstep"
+    return [
+        *command("master"),
+        override("from_config", str(folder.config)),
+        override("run_dir", str(folder.path)),
+        *(
+            f"{name}={getattr(master, name)}"
+            for name in ("seed", "max_hours", "max_episodes", "max_updates", "resume")
+        ),
+        *([f"service.lockstep_workers={config.workers}"] if in_step else []),
+        *([override("warm_start", master.warm_start)] if master.warm_start else []),
+    ]

@@ -5,14 +5,13 @@ from collections import deque
 from queue import SimpleQueue
 
 from master.arrivals import EpisodesArrived, ScoresArrived
-from master.every import Every
-from master.keeper import Keeper
+from master.checkpointer import Checkpointer
 from master.lockstep import Lockstep
 from master.parts import Parts
-from master.record import Clock
 from master.report import Reporter, scores_picture
+from master.rundir import Clock
 from master.signals import StopSignals
-from tangram_agent.watchdog import Watchdog
+from tangram_agent.process import Every, Watchdog
 from tangram_agent.wire import Scores
 
 # Between two looks at the sockets: learning goes on for so long, or idleness lasts.
@@ -51,7 +50,15 @@ class Loop:
         self._published, self._dismissed = -1, False
         self._stage = -1
         self._publish = Every(service.publish_seconds)
-        self._keeper = Keeper(parts, self.clock, reporter.progress.notice)
+        self._checkpointer = Checkpointer(
+            service,
+            parts.folder,
+            parts.guard,
+            parts.hub,
+            parts.journal,
+            self.clock,
+            reporter.progress.notice,
+        )
 
     def run(self) -> str:
         """Learn until a bound or a signal ends it; returns which."""
@@ -68,7 +75,7 @@ class Loop:
             self.learn()
             if parts.lockstep is None and self._publish.due():
                 self.publish()
-            self._keeper.tick()
+            self._checkpointer.tick()
             self.tell()
         return reason
 
@@ -80,9 +87,8 @@ class Loop:
         reason = parts.budget.spent(parts.record.loop_s, trainer.updates)
         if reason is None and not parts.budget.takes_episodes(trainer.episodes):
             # The updates that these episodes are worth come first.
-            return (
-                None if trainer.pace.may_update() else f"max_episodes={parts.budget.max_episodes}"
-            )
+            due = trainer.rate_limiter.may_update()
+            return None if due else f"max_episodes={parts.budget.max_episodes}"
         return reason
 
     def receive(self, patience_s: float) -> None:
@@ -101,10 +107,9 @@ class Loop:
     def insert(self) -> None:
         """Move batches into the replay while the learner keeps up; senders of others wait."""
         trainer, budget = self.parts.trainer, self.parts.budget
-        while (
-            self._arrived and trainer.pace.may_insert() and budget.takes_episodes(trainer.episodes)
-        ):
-            if not self._keeper.keep(self._arrived[0]):
+        limiter = trainer.rate_limiter
+        while self._arrived and limiter.may_insert() and budget.takes_episodes(trainer.episodes):
+            if not self._checkpointer.keep(self._arrived[0]):
                 return
             self._insert(self._arrived.popleft())
 
@@ -120,7 +125,7 @@ class Loop:
             self.parts.hub.order(lockstep.orders(self._published, trainer.episodes))
             lockstep.ordered = True
         while (arrival := lockstep.next(trainer.episodes)) is not None:
-            if not self._keeper.keep(arrival):
+            if not self._checkpointer.keep(arrival):
                 return
             self._insert(arrival)
             lockstep.inserted(arrival)
@@ -136,7 +141,7 @@ class Loop:
         """Whether an update is due, and in lockstep whether the round is whole."""
         lockstep, trainer = self.parts.lockstep, self.parts.trainer
         whole = lockstep is None or lockstep.begins_round(trainer.episodes)
-        return whole and trainer.pace.may_update()
+        return whole and trainer.rate_limiter.may_update()
 
     def learn(self) -> None:
         """Updates that are due, for a short while, so that the sockets are served in between."""
@@ -177,7 +182,7 @@ class Loop:
         """Show where the run stands."""
         while not self._news.empty():
             self._reporter.progress.notice(self._news.get(), event="launcher")
-        more = {"queue": len(self._arrived), **self._keeper.numbers()}
+        more = {"queue": len(self._arrived), **self._checkpointer.numbers()}
         self._reporter.tick(self.parts, more)
 
     def finish(self, launched: bool) -> None:
@@ -192,7 +197,7 @@ class Loop:
         self.parts.guard.check()
         self.publish()
         # Before anything that takes time: what was learned is safe from here on.
-        self._keeper.save()
+        self._checkpointer.save()
         self._wait_for_scores(launched)
         self.tell()
         self._reporter.flush(self.parts)

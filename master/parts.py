@@ -8,17 +8,16 @@ from pathlib import Path
 
 from master.arrivals import WelcomeInfo
 from master.budget import Budget
-from master.checkpoint import Restored, restore_run, warm_start
+from master.checkpointer import Restored, restore_run, warm_start
 from master.config import MasterConfig
-from master.guard import Guard
+from master.divergence import DivergenceGuard
 from master.health import OFF, Health
 from master.hub import Hub
 from master.journal import Journal
 from master.keys import Keys, is_loopback, needs_keys, run_keys
 from master.lockstep import Lockstep
-from master.record import Record
 from master.recovery import journal_run_id, read_journal
-from master.rundir import RunFolder
+from master.rundir import Record, RunFolder
 from master.trainer import Trainer, choose_device
 from tangram_agent.addresses import reachable, with_host
 from tangram_agent.config import ServiceConfig
@@ -61,7 +60,7 @@ class Parts:
     record: Record
     budget: Budget
     hub: Hub
-    guard: Guard
+    guard: DivergenceGuard
     journal: Journal
     lockstep: Lockstep | None = None
     health: Health | None = None
@@ -182,7 +181,7 @@ def _open(
         record=record,
         budget=Budget(config),
         hub=hub,
-        guard=Guard(trainer, service.max_bad_updates, folder.bad_batch),
+        guard=DivergenceGuard(trainer, service.max_bad_updates, folder.bad_batch),
         journal=Journal(
             folder.journal, record.run_id, setup.task_digest(), spec, service.journal_sync_seconds
         ),
@@ -234,6 +233,6 @@ def _learn_first(parts: Parts, progress: Callable[[], None]) -> None:
     trainer, lockstep = parts.trainer, parts.lockstep
     if lockstep is None or not lockstep.begins_round(trainer.episodes):
         return
-    while trainer.pace.may_update() and not parts.budget.spent(0.0, trainer.updates):
+    while trainer.rate_limiter.may_update() and not parts.budget.spent(0.0, trainer.updates):
         progress()
         parts.guard.update(parts.share)

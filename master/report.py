@@ -9,16 +9,15 @@ from PIL import Image
 
 from master.arrivals import EpisodesArrived
 from master.budget import Rates
-from master.curve import Curve
-from master.every import Every
-from master.metrics import Means, Metrics
+from master.console import Progress
+from master.metrics import Curve, Means, Metrics
 from master.parts import Parts
-from master.progress import Progress
-from master.record import Record
+from master.rundir import Record
 from master.standing import run_status
 from master.status import Status
 from master.trainer import Trainer
 from tangram_agent.config import ServiceConfig
+from tangram_agent.process import Every
 from tangram_agent.setup import Setup
 from tangram_agent.wire import Scores
 from tangram_sim.drawing import episode_sheet
@@ -129,7 +128,7 @@ class Reporter:
             "replay/fill": len(trainer.replay) / trainer.replay.capacity,
             "rates/transitions_per_s": rates.transitions_per_s(),
             "rates/updates_per_s": rates.updates_per_s(),
-            "pace/lag": trainer.pace.lag,
+            "rate_limiter/lag": trainer.rate_limiter.lag,
             "train/undone_updates": parts.guard.undone,
         }
         values |= {f"hub/{name}": value for name, value in parts.hub.counters.items()}
@@ -155,13 +154,13 @@ class Reporter:
 
 def activity(trainer: Trainer, players: int) -> str:
     """What happens, or what is waited for."""
-    pace, starts = trainer.pace, trainer.setup.agent.learning_starts
-    if pace.may_update():
-        return "learning, workers wait" if players and not pace.may_insert() else "learning"
+    limiter, starts = trainer.rate_limiter, trainer.setup.agent.learning_starts
+    if limiter.may_update():
+        return "learning, workers wait" if players and not limiter.may_insert() else "learning"
     if not players:
         return "waiting for workers to join"
-    if pace.transitions < starts:
-        return f"filling the replay, {pace.transitions:,} of {starts:,}"
+    if limiter.transitions < starts:
+        return f"filling the replay, {limiter.transitions:,} of {starts:,}"
     return "waiting for episodes"
 
 

@@ -8,22 +8,19 @@ from typing import Any
 
 import torch
 
-from master.checkpoint import check_resumable
+from master.checkpointer import check_resumable
 from master.children import override
 from master.config import MasterConfig
-from master.console import sturdy_console
-from master.curve import Curve
+from master.console import Progress, make_progress, notices_from, sturdy_console
 from master.loop import Loop
-from master.metrics import Metrics
+from master.metrics import Curve, Metrics
 from master.parts import Parts, make_parts
-from master.progress import Progress, make_progress, notices_from
 from master.report import Reporter
 from master.result import make_result, show_result
 from master.rundir import RunFolder
 from master.signals import StopSignals
-from tangram_agent import lifeline
+from tangram_agent.process import Watchdog, watch_parent
 from tangram_agent.setup import Setup
-from tangram_agent.watchdog import Watchdog
 
 # A clean end after the parent's death; a large replay takes seconds to write.
 GRACE_S = 30.0
@@ -45,7 +42,7 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
             longer finite.
     """
     news: SimpleQueue[str] = SimpleQueue()
-    launched = lifeline.watch(news.put, GRACE_S)
+    launched = watch_parent(news.put, GRACE_S)
     torch.set_num_threads(config.service.threads)
     folder, console = RunFolder(config.run_dir), sturdy_console(sys.stdout)
     folder.prepare(config.resume)
@@ -70,7 +67,7 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
                 progress.notice(f"workers join with: tangram-worker {where}")
             reason = loop.run()
             loop.finish(launched)
-            result = make_result(parts, reason, loop.clock.wall_s())
+            result = make_result(parts, reason, loop.clock.stopped().wall_s)
             folder.write_result(result)
             metrics.hyperparameters(resolved, parts.record.scores)
             loop.dismiss(f"the run has ended ({reason})")

@@ -1,8 +1,11 @@
-"""The folder of one run: its files, who may write there, and writing them whole."""
+"""The folder of one run, who may write there, and the record of what the run has been through."""
 
 import fcntl
 import json
+import secrets
+import time
 from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import IO, Any
 
@@ -12,7 +15,7 @@ from master.journal import segments
 from tangram_agent.checkpoints import list_checkpoints
 from tangram_agent.files import write_whole
 from tangram_agent.setup import SECTIONS
-from tangram_sim.errors import ConfigError
+from tangram_sim.errors import ConfigError, RunError
 
 PRIVATE = 0o600
 # What a worker must know of the config.
@@ -110,3 +113,74 @@ class RunFolder:
     def write_result(self, result: Mapping[str, Any]) -> None:
         """Write the scores of the run."""
         write_whole(self.result, (json.dumps(dict(result), indent=1) + "\n").encode())
+
+
+@dataclass
+class Record:
+    """Counters that no other part keeps; a checkpoint carries them on.
+
+    Attributes:
+        run_id: tells runs apart; stays when a run is resumed.
+        loop_s: seconds of the loop, waiting for workers included.
+        train_s: seconds of the loop since the first episodes arrived.
+        wall_s: seconds of whole processes.
+        workers: most players connected at a time.
+        scores: of the newest evaluation, by name.
+        scored_version: of the weights that they are of; -1 before the first.
+    """
+
+    run_id: str = field(default_factory=lambda: secrets.token_hex(8))
+    loop_s: float = 0.0
+    train_s: float = 0.0
+    wall_s: float = 0.0
+    workers: int = 0
+    scores: dict[str, float] = field(default_factory=dict)
+    scored_version: int = -1
+
+    def score(self, scores: Mapping[str, float], version: int) -> None:
+        """Note an evaluation."""
+        self.scores, self.scored_version = dict(scores), version
+
+    def state(self) -> dict[str, Any]:
+        """As JSON values."""
+        return asdict(self)
+
+    @staticmethod
+    def of(state: Mapping[str, Any]) -> "Record":
+        """The record in a checkpoint.
+
+        Raises:
+            RunError: it lacks a field.
+        """
+        lacking = [f.name for f in fields(Record) if f.name not in state]
+        if lacking:
+            raise RunError(
+                f"the checkpoint's record lacks {', '.join(lacking)}: start a new run with "
+                "another run_dir"
+            )
+        return Record(**{f.name: state[f.name] for f in fields(Record)})
+
+
+class Clock:
+    """Adds the time of this process to a record.
+
+    Attributes:
+        record: of the run.
+    """
+
+    def __init__(self, record: Record) -> None:
+        self.record, self._wall_s = record, record.wall_s
+        self._begun_s = self._last_s = time.monotonic()
+
+    def advance(self, training: bool) -> None:
+        """Count the time since the last call as the loop's, and as training's if it is that."""
+        now_s = time.monotonic()
+        self.record.loop_s += now_s - self._last_s
+        if training:
+            self.record.train_s += now_s - self._last_s
+        self._last_s = now_s
+
+    def stopped(self) -> Record:
+        """The record, with the seconds of all processes of the run until now."""
+        self.record.wall_s = self._wall_s + time.monotonic() - self._begun_s
+        return self.record

@@ -34,7 +34,7 @@ def run_status(status: Status, parts: Parts, more: Mapping[str, float]) -> RunSt
         "updates_per_s": status.updates_per_s,
         "players": status.players,
         "evaluators": status.evaluators,
-        "lag_updates": trainer.pace.lag,
+        "lag_updates": trainer.rate_limiter.lag,
         "replay": len(trainer.replay),
         "replay_capacity": trainer.replay.capacity,
         "undone_updates": parts.guard.undone,

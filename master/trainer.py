@@ -1,4 +1,4 @@
-"""What learns, without sockets: replay, hindsight, pace and the networks, and their state."""
+"""What learns, without sockets: networks, replay, hindsight, rate limiter, and their state."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from master.pace import Pace
+from master.rate_limiter import RateLimiter
 from tangram_agent.learner import Learner
 from tangram_agent.relabelling import with_relabelled
 from tangram_agent.replay import ReplayBuffer
@@ -30,7 +30,7 @@ class Trainer:
         setup: the task and the agent.
         learner: networks and optimisers.
         replay: transitions played, and relabelled ones.
-        pace: decides whether to learn or to take in episodes.
+        rate_limiter: decides whether to learn or to take in episodes.
         episodes: taken in since the run began.
         batch: of the last update.
     """
@@ -43,7 +43,9 @@ class Trainer:
         self.replay = ReplayBuffer(
             agent.replay_capacity, layout.corner_count, layout.tokens, setup.action_size
         )
-        self.pace = Pace(agent.updates_per_transition, agent.learning_starts, lag_updates)
+        self.rate_limiter = RateLimiter(
+            agent.updates_per_transition, agent.learning_starts, lag_updates
+        )
         self.episodes = 0
         self.batch: Transitions | None = None
         self._generators = {
@@ -68,7 +70,7 @@ class Trainer:
         self.replay.add(
             with_relabelled(episodes, relabels, self.setup.layout, self.reward, generator)
         )
-        self.pace.inserted(episodes.transitions)
+        self.rate_limiter.inserted(episodes.transitions)
         self.episodes += episodes.count
 
     def update(self, share: float) -> dict[str, float]:
@@ -76,14 +78,14 @@ class Trainer:
         self.batch = self.replay.sample(self.setup.agent.batch_size, self._generators["replay"])
         prepared = self.learner.prepared(self.batch, self._generators["hindsight"])
         losses = self.learner.update(prepared, share)
-        self.pace.updated()
+        self.rate_limiter.updated()
         return losses
 
     def go_back(self, state: dict[str, npt.NDArray[Any]]) -> None:
         """Take the learner back to a state of its own; the updates since are due again."""
         before = self.updates
         self.learner.load_state(state)
-        self.pace.updated(self.updates - before)
+        self.rate_limiter.updated(self.updates - before)
 
     def weights(self) -> Weights:
         """The acting weights; their version is the number of updates."""
@@ -92,7 +94,7 @@ class Trainer:
     def state(self) -> tuple[Arrays, dict[str, Any]]:
         """Arrays by file, and JSON values, for a checkpoint.
 
-        The caller sees to it that they are finite, see `guard`.
+        The caller sees to it that they are finite, see `divergence`.
         """
         arrays = {
             ACTING: dict(self.weights().tensors),
@@ -102,7 +104,7 @@ class Trainer:
         generators = {name: g.bit_generator.state for name, g in self._generators.items()}
         counters = {
             "episodes": self.episodes,
-            "pace": self.pace.state(),
+            "rate_limiter": self.rate_limiter.state(),
             "generators": generators,
             SETUP: self.setup.contents(),
         }
@@ -117,7 +119,7 @@ class Trainer:
         check_same_task(self.setup, counters[SETUP])
         self.learner.load_state(arrays[LEARNER])
         self.replay.load_state(arrays["replay"])
-        self.pace.load_state(counters["pace"])
+        self.rate_limiter.load_state(counters["rate_limiter"])
         self.episodes = int(counters["episodes"])
         for name, generator in self._generators.items():
             generator.bit_generator.state = counters["generators"][name]

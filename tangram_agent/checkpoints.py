@@ -34,7 +34,7 @@ Tensors = dict[str, npt.NDArray[Any]]
 
 
 class DiskError(RunError):
-    """The disk does not take a checkpoint."""
+    """A checkpoint could not be written to the disk."""
 
 
 class CorruptError(RunError):
@@ -159,7 +159,7 @@ def _order(path: Path) -> tuple[int, int]:
 
 
 def _free_name(folder: Path, updates: int) -> Path:
-    """One behind all others of that number; a folder cannot be renamed onto a full one."""
+    """An unused name for this number of updates: a full folder cannot be renamed onto."""
     orders = map(_order, list_checkpoints(folder))
     again = max((number for found, number in orders if found == updates), default=-1) + 1
     return folder / (f"{updates:08d}-{again}" if again else f"{updates:08d}")

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from tangram_agent.logs import FORMATS
+from tangram_agent.process import FORMATS
 from tangram_sim.errors import ConfigError
 from tangram_sim.settings import Settings, declared, setting
 

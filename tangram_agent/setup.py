@@ -14,6 +14,7 @@ from tangram_sim.actions import action_size, corner_bound, horizon
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import Layout, TokensConfig, make_layout
+from tangram_sim.rewards import reward_identity
 from tangram_sim.settings import refuse_ignored, told
 
 Settings = TypeVar("Settings")
@@ -104,7 +105,7 @@ class Setup:
         """A digest of each section: two processes with the same ones play the same task."""
         sections = {"tokens": self.layout.fingerprint()}
         for name in SECTIONS[1:]:
-            content = json.dumps(asdict(getattr(self, name)), sort_keys=True)
+            content = json.dumps(self._content(name), sort_keys=True)
             sections[name] = hashlib.sha256(content.encode()).hexdigest()[:16]
         return sections
 
@@ -115,10 +116,16 @@ class Setup:
 
     def contents(self) -> dict[str, Any]:
         """Each section as JSON values, for a checkpoint; tokens by what makes them."""
-        sections: dict[str, Any] = {name: asdict(getattr(self, name)) for name in SECTIONS[1:]}
+        sections: dict[str, Any] = {name: self._content(name) for name in SECTIONS[1:]}
         sections["tokens"] = self.layout.fingerprint()
         plain: dict[str, Any] = json.loads(json.dumps(sections))
         return plain
+
+    def _content(self, name: str) -> dict[str, Any]:
+        if name == "reward":
+            return reward_identity(self.reward)
+        content: dict[str, Any] = asdict(getattr(self, name))
+        return content
 
     def differences(self, contents: Mapping[str, Any]) -> list[str]:
         """The sections in which another setup, known by its contents, is not this one.

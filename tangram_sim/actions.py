@@ -15,12 +15,12 @@ _ROUNDING = 1.0 + 1e-6
 
 
 def action_size(tokens: int, sim: SimConfig) -> int:
-    """A: 3 velocities, before them which token if there are several, and whether it is flipped."""
+    """A, the entries of an action: which token (if several), whether to flip it, 3 velocities."""
     return 3 + (tokens > 1) + sim.allow_flip
 
 
 def horizon(tokens: int, sim: SimConfig) -> int:
-    """T: the actions of an episode, which is over when every token has had its own."""
+    """T, the number of actions in an episode: `actions_per_token` for each token."""
     return tokens * sim.actions_per_token
 
 
@@ -55,9 +55,9 @@ def velocities(actions: Floats, sim: SimConfig) -> Floats:
 
 
 def flips(actions: Floats, layout: Layout, sim: SimConfig) -> Bools:
-    """(B,) which actions (B, A) turn their token over: the entry before the velocities says so.
+    """(B,) which actions (B, A) turn their token over: the entry before the velocities is > 0.
 
-    A token that is its own mirror image, turned, has one side only: it never does.
+    A token whose mirror image is the token itself, turned, has one side only and never flips.
     """
     if not sim.allow_flip:
         return np.zeros(len(actions), dtype=np.bool_)
@@ -66,9 +66,9 @@ def flips(actions: Floats, layout: Layout, sim: SimConfig) -> Bools:
 
 
 def velocities_of(ways: Floats, sim: SimConfig) -> Floats:
-    """(B, 3) of ways (B, 3) in arena units and radians, by the shorter turn.
+    """Velocities (B, 3) that make shifts and turns (B, 3), arena units and radians, the short way.
 
-    What `velocities` scales; a way of more than the arena's width gives entries beyond [-1, 1].
+    The inverse of `velocities`; a shift beyond the arena's width gives entries beyond [-1, 1].
     """
     shortest = np.column_stack([ways[:, :2], wrap(ways[:, 2])])
     velocity: Floats = shortest / (sim.arena, sim.arena, np.pi)

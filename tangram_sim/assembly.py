@@ -146,7 +146,7 @@ def _fit_faults(sketch: Sketch, fits: Sequence[Fit], where: str) -> list[str]:
 
 
 def _size(kind: str, corners: Floats) -> float:
-    """How far the corners lie from their middle, next to the exact shape's."""
+    """Summed distance of the corners from their mean, divided by that of the exact tan."""
     spread = np.linalg.norm(corners - corners.mean(axis=0), axis=1).sum()
     return float(spread / np.linalg.norm(tan(kind).corners, axis=1).sum())
 

@@ -17,7 +17,7 @@ class Camera:
     """A camera of one PyBullet client."""
 
     def __init__(self, client: int, pixels: int, arena: float, top: float) -> None:
-        """Point it.
+        """Point the camera at the arena.
 
         Args:
             client: of the engine.

@@ -1,6 +1,7 @@
 """Settings of the simulated world and of the reward."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import MAX_TOKENS
@@ -170,7 +171,7 @@ class RewardConfig:
 
     Attributes:
         name: overlap (Eq. 14), dense (Eq. 15), pose (corner distances modulo the symmetry), or
-            `package.module:function` for one of the user's own.
+            `path/to/file.py:function` for one of the user's own.
         source: what Eq. 14 is measured on while playing: exact polygons or the camera's pictures.
         sharpness: dense and pose: how steep the logarithm is near the target; larger is steeper.
     """
@@ -180,10 +181,10 @@ class RewardConfig:
     sharpness: float = 100.0
 
     def __post_init__(self) -> None:
-        module, _, function = self.name.partition(":")
-        if self.name not in REWARDS and not (module and function):
+        path, _, function = self.name.rpartition(":")
+        if self.name not in REWARDS and not (path.endswith(".py") and function.isidentifier()):
             raise ConfigError(
-                f"reward.name must be one of {', '.join(REWARDS)} or package.module:function, "
+                f"reward.name must be one of {', '.join(REWARDS)} or path/to/file.py:function, "
                 f"got '{self.name}'"
             )
         check_choice("reward.source", self.source, SOURCES)
@@ -193,3 +194,11 @@ class RewardConfig:
                 f"reward.source=camera measures Eq. 14 only, got reward.name={self.name}: "
                 "set reward.source=polygon"
             )
+
+    @property
+    def own(self) -> tuple[Path, str] | None:
+        """File and function of a reward of the user's own."""
+        if self.name in REWARDS:
+            return None
+        path, _, function = self.name.rpartition(":")
+        return Path(path).expanduser(), function

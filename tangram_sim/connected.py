@@ -44,7 +44,7 @@ def sample_connected(layout: Layout, sim: SimConfig, rng: np.random.Generator) -
 
 @dataclass(frozen=True, eq=False)
 class _Outlines:
-    """Pieces.
+    """Outlines of pieces as complex numbers x + iy.
 
     Attributes:
         corners: (..., C), counter-clockwise.
@@ -59,13 +59,13 @@ class _Outlines:
     count: Ints
 
     def of(self, which: Ints) -> "_Outlines":
-        """Those of some tokens."""
+        """The outlines of these tokens."""
         return _Outlines(
             self.corners[which], self.edges[which], self.lengths[which], self.count[which]
         )
 
     def moved(self, turn: Complex, shift: Complex) -> "_Outlines":
-        """Turned by a unit number, then shifted."""
+        """The outlines turned by a complex number of length 1, then shifted."""
         corners = self.corners * turn + shift
         return _Outlines(corners, self.edges * turn, self.lengths, self.count)
 

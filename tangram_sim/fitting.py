@@ -71,7 +71,7 @@ def _fit_shape(name: str, corners: Floats) -> tuple[float, Fit]:
 
 
 def overlap_depths(outlines: Floats) -> tuple[Floats, Floats]:
-    """How far each piece must move to leave each other one.
+    """How far each piece must move until it no longer overlaps each other piece.
 
     Args:
         outlines: (K, C, 2) convex and counter-clockwise, padded by repeating the last corner.

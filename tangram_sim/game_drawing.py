@@ -1,4 +1,4 @@
-"""Pictures of the game: pieces over the silhouette of a figure, one of them perhaps in the hand."""
+"""Pictures of the game: tokens over the silhouette of their target, perhaps one being moved."""
 
 import math
 from collections.abc import Sequence
@@ -39,7 +39,7 @@ _MIN_TILE, _MAX_TILE = 120, 480
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """A piece that is moved.
+    """The token that is being moved.
 
     Attributes:
         token: its number.

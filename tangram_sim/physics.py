@@ -107,7 +107,7 @@ class PhysicsWorld:
         self._finalizer()
 
     def _lift(self, token: int, command: _Command, flip: bool) -> None:
-        """Carry a token above the others and set it down; what it comes to lie in gives way."""
+        """Carry a token above the others, set it down, and push apart what then overlaps."""
         if self._alone:
             self._carry(token, command, flip, 0.0)
             return
@@ -120,7 +120,7 @@ class PhysicsWorld:
         self._settle()
 
     def _carry(self, token: int, command: _Command, flip: bool, height: float) -> None:
-        """Move a token at a height for a second; all rest after it."""
+        """Move a token at a height for one second, then stop all tokens."""
         if flip or height:
             pose = self._pose(token)
             self._flipped[token] ^= flip
@@ -130,7 +130,7 @@ class PhysicsWorld:
         self._stop_all()
 
     def _slide(self, token: int, command: _Command) -> None:
-        """Push a token along the table, at its velocity whatever is in its way.
+        """Push a token along the table; what is in its way does not slow it down.
 
         The table's friction stops the others as soon as nothing pushes them.
         """
@@ -149,7 +149,7 @@ class PhysicsWorld:
         self._weigh(token, 1.0)
 
     def _settle(self, pinned: int | None = None) -> None:
-        """Push tokens that lie in each other apart, all but a pinned one, without momentum."""
+        """Push overlapping tokens apart, without momentum; a pinned token stays where it is."""
         pose = (0.0, 0.0, 0.0) if pinned is None else self._pose(pinned)
         pybullet.performCollisionDetection(physicsClientId=self._client)
         self._play_steps_of(_SETTLE_S)
@@ -163,7 +163,9 @@ class PhysicsWorld:
         self._play_at_once()
 
     def _forget_contacts(self) -> None:
-        """Part all tokens by height: the engine keeps the contacts of pairs that only move away.
+        """Clear the engine's contacts by putting every token at a height of its own.
+
+        The engine keeps the contacts of pairs that only move apart along the table.
 
         Those of the last episode would throw tokens of the next through the arena.
         """
@@ -172,7 +174,7 @@ class PhysicsWorld:
         pybullet.performCollisionDetection(physicsClientId=self._client)
 
     def _depth(self) -> float:
-        """How deep the two tokens lie in each other that do so most."""
+        """The largest depth by which two tokens overlap, in engine units."""
         contacts = pybullet.getContactPoints(physicsClientId=self._client)
         return max((-contact[_DISTANCE] for contact in contacts), default=0.0)
 
@@ -192,7 +194,7 @@ class PhysicsWorld:
         )
 
     def _play_steps_of(self, seconds: float) -> None:
-        """Let one call of stepSimulation play one step of so long."""
+        """Let one call of stepSimulation play one step of `seconds`."""
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=seconds, numSubSteps=0, physicsClientId=self._client
         )
@@ -236,7 +238,7 @@ class PhysicsWorld:
         return info[0], info[2][2]
 
     def _weigh(self, token: int, times: float) -> None:
-        """Make a token so many times as heavy as it is."""
+        """Set the mass and inertia of a token to `times` its own."""
         mass, inertia = self._masses[token]
         pybullet.changeDynamics(
             self._bodies[token],
@@ -252,7 +254,7 @@ class PhysicsWorld:
         )
 
     def _put(self, token: int, x: float, y: float, angle: float, height: float = 0.0) -> None:
-        """Put a token where it is told, in engine units, on the side that it lies on."""
+        """Set a token's pose, in engine units; it keeps the side that it lies on."""
         cos, sin = math.cos(angle / 2.0), math.sin(angle / 2.0)
         pybullet.resetBasePositionAndOrientation(
             self._bodies[token],

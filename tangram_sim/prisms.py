@@ -1,4 +1,4 @@
-"""Convex polygons as the bodies of an engine: prisms, and how thin and how far inside they are."""
+"""Convex polygons as bodies of the engine: prisms, polygons moved inwards, and their thickness."""
 
 import numpy as np
 

@@ -4,9 +4,12 @@ Every reward lies in about [-1, 1] and is +1 exactly where the goal is reached. 
 arrays.py: achieved and desired are (B, V, 2) corners, rewards are (B,).
 """
 
-import importlib
+import hashlib
+import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -40,18 +43,18 @@ def make_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> RewardF
     if sim.corner_noise > 0.0:
         exact = make_reward(config, layout, replace(sim, corner_noise=0.0))
         return lambda achieved, desired: exact(_fitted(achieved, layout), _fitted(desired, layout))
+    if config.own is not None:
+        function = _load(config.name, *config.own)
+        return lambda achieved, desired: _checked(config.name, function, achieved, desired, layout)
     if config.name == "overlap":
         return lambda achieved, desired: overlap(achieved, desired, layout)
     if config.name == "dense":
         return lambda achieved, desired: dense(achieved, desired, layout, reach, config.sharpness)
-    if config.name == "pose":
-        return lambda achieved, desired: pose(achieved, desired, layout, reach, config.sharpness)
-    function = _load(config.name)
-    return lambda achieved, desired: _checked(config.name, function, achieved, desired, layout)
+    return lambda achieved, desired: pose(achieved, desired, layout, reach, config.sharpness)
 
 
 def check_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> None:
-    """Ask the configured reward once, so that a user's function fails before anything starts.
+    """Call the configured reward once, so that a user's function fails before anything starts.
 
     Raises:
         ConfigError: see `make_reward`.
@@ -161,18 +164,56 @@ def _corner_distance(achieved: Floats, desired: Floats, layout: Layout, token: i
     return best
 
 
-def _load(name: str) -> UserReward:
-    module_name, _, attribute = name.partition(":")
+def reward_identity(config: RewardConfig) -> dict[str, Any]:
+    """The settings of a reward as processes on different machines compare them.
+
+    Of a user's own reward it is the file's content that counts, not the folder that it lies in.
+
+    Raises:
+        ConfigError: the user's file cannot be read.
+    """
+    content = asdict(config)
+    if config.own is not None:
+        path, function = config.own
+        digest = hashlib.sha256(_source(config.name, path)).hexdigest()[:16]
+        content["name"] = f"{digest}:{function}"
+    return content
+
+
+def absolute_name(name: str) -> str:
+    """The name of a reward so that it holds in any folder."""
+    path, colon, function = name.rpartition(":")
+    return f"{Path(path).expanduser().absolute()}{colon}{function}" if colon else name
+
+
+def _source(name: str, path: Path) -> bytes:
     try:
-        module = importlib.import_module(module_name)
+        return path.read_bytes()
+    except OSError as error:
+        raise ConfigError(
+            f"reward.name={name}: cannot read '{path}' on this machine "
+            f"({error.strerror or error}): put a copy there, or say where it lies with "
+            "reward.name=path/to/file.py:function"
+        ) from None
+
+
+def _load(name: str, path: Path, attribute: str) -> UserReward:
+    source = _source(name, path)
+    # Registered as an import would, since dataclasses look their module up. A user's file is not
+    # found by this name, and two files with one name do not meet.
+    module = ModuleType(f"_tangram_reward_{hashlib.sha256(source).hexdigest()[:16]}")
+    module.__file__ = str(path)
+    sys.modules[module.__name__] = module
+    try:
+        exec(compile(source, path, "exec"), module.__dict__)  # noqa: S102
     except Exception as error:  # it is the user's code: anything may go wrong
         raise ConfigError(
-            f"reward.name={name}: cannot import '{module_name}' ({error}): install it, or put its "
-            "folder on PYTHONPATH"
+            f"reward.name={name}: cannot load '{path}' ({type(error).__name__}: {error}): it must "
+            "be one file that needs nothing but installed packages"
         ) from error
     function = getattr(module, attribute, None)
     if function is None:
-        raise ConfigError(f"reward.name={name}: module '{module_name}' has no '{attribute}'")
+        raise ConfigError(f"reward.name={name}: '{path}' has no '{attribute}'")
     if not callable(function):
         raise ConfigError(
             f"reward.name={name}: '{attribute}' is not a function (achieved, desired, layout)"

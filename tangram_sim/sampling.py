@@ -104,7 +104,7 @@ class _Draw:
     spread: float | None
 
     def __call__(self, row: int, size: int, tries: int, reach: float) -> Floats:
-        """(size, 3) poses of one environment, after so many that were blocked."""
+        """Draw (size, 3) poses for one environment, after `tries` poses that were blocked."""
         rng = self.generators[row]
         unit: Floats = 1.0 - 2.0 * rng.random((size, 3))  # in (-1, 1]
         poses: Floats = unit * np.array([reach, reach, np.pi])
@@ -137,7 +137,7 @@ def _place(
 def _try(
     piece: _Piece, obstacles: Floats, draw: _Draw, poses: Floats, open_rows: Ints, limit: int
 ) -> Ints:
-    """Fill the open rows of poses (B, 3) where one of `limit` poses is free; the rows left open."""
+    """Fill the open rows of poses (B, 3) with a free one of `limit` poses; return the rest."""
     chunk = _CHUNK if obstacles.shape[1] else 1
     tries = 0
     while len(open_rows) and tries < limit:

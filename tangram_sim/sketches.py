@@ -64,7 +64,7 @@ def read_text(path: Path) -> str:
 
 
 def parse_sketches(text: str, source: str) -> list[Sketch | list[str]]:
-    """The puzzles of a file in its order; instead of one that is none, its faults.
+    """The puzzles of a file in its order; for a puzzle that cannot be used, its faults.
 
     Args:
         text: JSON.
@@ -146,7 +146,7 @@ def _name_of(entry: Any, where: str) -> str:
 
 
 def checked_name(name: Any, where: str) -> str:
-    """The name of a puzzle, once it is one.
+    """The name of a puzzle, checked.
 
     Raises:
         FaultError: it is empty, too long, or cannot be printed.

@@ -36,7 +36,7 @@ Colour = tuple[int, int, int]
 
 
 def empty_table(side: int) -> Image.Image:
-    """A square canvas with the arena's frame, so many pixels wide."""
+    """A square canvas of `side` pixels with the arena's frame."""
     canvas = Image.new("RGB", (side, side), PAPER)
     edge = MARGIN * side
     frame = (edge, edge, side - edge, side - edge)
@@ -45,7 +45,7 @@ def empty_table(side: int) -> Image.Image:
 
 
 def shown(canvas: Image.Image) -> Image.Image:
-    """The picture that a canvas is drawn for."""
+    """The finished picture: the canvas averaged down to its final size."""
     return canvas.reduce(SAMPLES)
 
 
@@ -86,7 +86,7 @@ def darker(colour: Colour) -> Colour:
 def draw_outline(
     canvas: Image.Image, outline: Sequence[Point], colour: Colour, width: float
 ) -> None:
-    """Draw a closed line so many times as wide as that of a token."""
+    """Draw a closed line, its width a multiple of a token's outline."""
     closed = [*outline, outline[0], outline[1]]
     ImageDraw.Draw(canvas).line(closed, colour, round(width * 1.4 * SAMPLES), joint="curve")
 

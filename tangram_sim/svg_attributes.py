@@ -110,7 +110,7 @@ def _check_length(text: str, where: str) -> None:
 
 
 def _numbers(text: str, where: str) -> list[float]:
-    """Finite numbers apart by blanks, commas or their signs."""
+    """Finite numbers, separated by blanks, commas or their signs."""
     if re.sub(_NUMBER, "", text).strip(", \t\r\n"):
         raise ConfigError(f"{where}: numbers cannot be read from {shown(text)}")
     values = [float(number) for number in re.findall(_NUMBER, text)]

@@ -151,7 +151,7 @@ def _kind(task: StageConfig, rng: np.random.Generator) -> str:
 
 
 def _sides(layout: Layout, sim: SimConfig, generators: Generators) -> Bools:
-    """(B, K): all chiral tokens on their other side in a share of the episodes."""
+    """(B, K) sides: all chiral tokens on the other one in a share `mirrored` of the episodes."""
     flipped = np.zeros((len(generators), layout.tokens), dtype=np.bool_)
     if sim.mirrored > 0.0 and layout.any_chiral:
         flipped[:] = np.array([rng.random() < sim.mirrored for rng in generators])[:, None]
@@ -193,7 +193,7 @@ def _scale(layout: Layout) -> float:
 
 
 def _check_figures_fit(layout: Layout, sim: SimConfig) -> None:
-    """Turned by any angle, a figure is as wide as its extent at most."""
+    """Raise unless every figure fits into the arena at any angle."""
     extent = PuzzleRules().max_extent * _scale(layout)
     if extent > sim.arena:
         raise ConfigError(

@@ -29,7 +29,7 @@ class Window:
     def __init__(
         self, engine: Any, layout: Layout, arena: float, colours: Sequence[Sequence[float]]
     ) -> None:
-        """Open it.
+        """Open the window.
 
         Args:
             engine: the module pybullet, which only `physics` imports.
@@ -58,11 +58,11 @@ class Window:
 
     @property
     def is_open(self) -> bool:
-        """Whether nobody has closed it."""
+        """Whether the window is still open."""
         return bool(self._engine.isConnected(self._client))
 
     def show(self, poses: Floats, rolls: Floats, heights: Floats) -> None:
-        """Put the tokens where they are told.
+        """Show the tokens at these poses.
 
         Args:
             poses: (K, 3) x, y (arena units) and angle.
@@ -79,7 +79,7 @@ class Window:
             self._put(body, pose, math.pi * float(side), -_FLAT_HALF_HEIGHT)
 
     def close(self) -> None:
-        """Close it; calling it twice does no harm."""
+        """Close the window; calling it twice does no harm."""
         if self.is_open:
             self._engine.disconnect(self._client)
 

@@ -33,14 +33,14 @@ def play() -> int:
 
 def _of_the_run(settings: Plain) -> tuple[str, Plain] | None:
     """What the connection file says of the run; nothing where only an address is given."""
-    from tangram_agent import lifeline
-    from worker.connection import await_connection
+    from tangram_agent.process import watch_parent
+    from worker.discovery import await_master
 
-    lifeline.watch()  # already here: a parent may end while the file is waited for
+    watch_parent()  # already here: a parent may end while the file is waited for
     connect = settings.get("connect")
     if not isinstance(connect, str) or not connect.strip() or "://" in connect:
         return None
-    found = await_connection(connect, partial(print, file=sys.stderr, flush=True)).settings
+    found = await_master(connect, partial(print, file=sys.stderr, flush=True)).settings
     return None if found is None else (f"connect={connect}", dict(found))
 
 
@@ -98,7 +98,7 @@ def _play(settings: Plain) -> int:
         _check_tokens(config.tokens, config.run_dir)
 
     if config.compare is not None:
-        from worker.compare import compare_runs
+        from worker.play import compare_runs
 
         return compare_runs(config)
     from worker.play import play_run

@@ -2,28 +2,74 @@
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from rich.console import Console
+from rich.table import Table
 
 from tangram_agent.config import ORDERS
 from tangram_agent.files import write_whole
 from tangram_agent.runs import Run, load_run
 from tangram_agent.setup import Setup
+from tangram_sim.game_drawing import figure_sheet
 from worker.baselines import exact_policy, position_policy, random_policy
 from worker.config import CHANGES, EvalConfig
-from worker.puzzle_scores import of_several, score_puzzles, write_sheet
-from worker.puzzles import find_figures
-from worker.rollout import Choose
-from worker.tables import RUN, Scores, print_faults, puzzles_table, scores_table
-from worker.trials import Trials, adapted, greedy, with_actions, with_corner_noise
+from worker.metrics import assembled, pose_errors, summarise
+from worker.puzzles import Figure, Figures, find_figures, play_figures
+from worker.rollout import Choose, Played
+from worker.test_set import FixedTests, adapted, greedy, with_actions, with_corner_noise
 
 AT_ONCE = 32
+MAX_PICTURES = 100  # on a sheet
+RUN = "this run"
+MAX_LINES = 40  # of puzzles and of faults on the screen
+
+Scores = dict[str, Any]  # numbers, and `coverage_each` of the episodes of several tokens
+
+# Scores in the order of the table, with their labels and digits; the rest is only in the file.
+_REWARDS = {
+    "mean_reward": ("mean reward, polygons [-1, 1]", 3),
+    "mean_reward_camera": ("mean reward, camera [-1, 1]", 3),
+    "mean_train_reward": ("mean reward, as trained on", 3),
+}
+_ERRORS = {
+    "position_error_median": ("position error, median", 4),
+    "position_error_p90": ("position error, 90th percentile", 4),
+    "angle_error_deg_median": ("angle error, median (degrees)", 2),
+    "angle_error_deg_p90": ("angle error, 90th percentile", 2),
+}
+_ONE_TOKEN = {
+    **_REWARDS,
+    "raw_overlap": ("raw overlap [0, 1]", 3),
+    "raw_overlap_p10": ("raw overlap, 10th percentile", 3),
+    **_ERRORS,
+}
+# Short: a table of six policies should fit into 80 columns.
+_SEVERAL = {
+    "coverage": ("covered [0, 1]", 3),
+    "raw_overlap_p10": ("covered, 10th perc.", 3),
+    "iou": ("IoU", 3),
+    "share_solved": ("solved, 95 % covered", 3),
+    "mean_train_reward": ("reward as trained on", 3),
+    "position_error_median": ("position, median", 4),
+    "position_error_p90": ("position, 90th perc.", 4),
+    "angle_error_deg_median": ("angle (°), median", 2),
+    "angle_error_deg_p90": ("angle (°), 90th perc.", 2),
+    "wrong": ("under another shape", 2),
+    "doubly_used": ("under two tokens", 2),
+    "refused": ("refused: was placed", 2),
+    "blocked": ("blocked by others", 2),
+    "actions_used": ("actions", 2),
+    "seconds_per_puzzle": ("seconds", 3),
+}
+_COUNTS = ("wrong", "doubly_used", "refused", "blocked", "actions_used")
 
 
 def evaluate_run(config: EvalConfig) -> int:
@@ -69,14 +115,14 @@ def score_policies(
     setup: Setup, players: Mapping[str, Choose], config: EvalConfig
 ) -> dict[str, Scores]:
     """Scores of each policy, on the same episodes."""
-    with closing(Trials(setup, config.episodes, AT_ONCE, seed=config.seed)) as trials:
-        return {name: _scored(trials, choose) for name, choose in players.items()}
+    with closing(FixedTests(setup, config.episodes, AT_ONCE, seed=config.seed)) as tests:
+        return {name: _scored(tests, choose) for name, choose in players.items()}
 
 
-def _scored(trials: Trials, choose: Choose) -> Scores:
-    played = trials.play(choose)
-    scores: Scores = dict(trials.scores(played))
-    return scores | (of_several(played) if trials.setup.layout.tokens > 1 else {})
+def _scored(tests: FixedTests, choose: Choose) -> Scores:
+    played = tests.play(choose)
+    scores: Scores = dict(tests.scores(played))
+    return scores | (of_several(played) if tests.setup.layout.tokens > 1 else {})
 
 
 def _episodes(run: Run, setup: Setup, config: EvalConfig) -> dict[str, Any]:
@@ -146,3 +192,103 @@ def _told(setup: Setup) -> str:
         sim.backend if setup.layout.tokens == 1 else f"{sim.backend}, {sim.motion}",
     ]
     return ", ".join(parts)
+
+
+def score_puzzles(
+    setup: Setup, figures: Sequence[Figure], players: Mapping[str, Choose], seed: int
+) -> tuple[dict[str, Scores], list[dict[str, Any]], Played]:
+    """Scores of each policy on the same starts; those of the run also one by one.
+
+    Returns:
+        Means over all figures by the policies' names; a mapping for each figure; how the run
+        played them.
+    """
+    scores, played = dict[str, Scores](), dict[str, Played]()
+    for name, choose in players.items():
+        played[name] = play_figures(setup, figures, choose, seed)
+        means = summarise(setup.layout, setup.sim, played[name], own_reward=False)
+        scores[name] = means | of_several(played[name])
+    return scores, _one_by_one(setup, figures, played[RUN]), played[RUN]
+
+
+def of_several(played: Played) -> Scores:
+    """What only evaluations tell: time, and every coverage, for tests on pairs of episodes."""
+    return {
+        "seconds_per_puzzle": float(np.mean(played.seconds)),
+        "coverage_each": np.round(played.overlap, 6).tolist(),
+    }
+
+
+def write_sheet(path: str, setup: Setup, found: Figures, played: Played) -> None:
+    """Write a picture of every figure's end, of at most `MAX_PICTURES`.
+
+    Raises:
+        RunError: the file is not writable.
+    """
+    picture = BytesIO()
+    ends, goals = played.ends[:MAX_PICTURES], played.goals[:MAX_PICTURES]
+    sheet = figure_sheet(setup.layout, setup.sim.arena, ends, goals, found.titles[:MAX_PICTURES])
+    sheet.save(picture, format="PNG")
+    write_whole(Path(path), picture.getvalue())
+
+
+def _one_by_one(setup: Setup, figures: Sequence[Figure], played: Played) -> list[dict[str, Any]]:
+    found = assembled(setup.layout, played)
+    position, angle = pose_errors(setup.layout, played.ends, played.goals)
+    return [
+        {
+            "name": figure.name,
+            "degrees": figure.degrees,
+            "coverage": float(found.coverage[e]),
+            "iou": float(found.iou[e]),
+            "solved": bool(found.solved[e]),
+            **{name: int(getattr(found, name)[e]) for name in _COUNTS},
+            "position_errors": position[e].tolist(),
+            "angle_errors_deg": angle[e].tolist(),
+            "seconds": float(played.seconds[e]),
+        }
+        for e, figure in enumerate(figures)
+    ]
+
+
+def scores_table(title: str, caption: str, scores: Mapping[str, Scores]) -> Table:
+    """One column for each policy, one row for each score."""
+    table = Table(title=title, caption=caption)
+    table.add_column("", no_wrap=True)
+    for name in scores:
+        table.add_column(
+            name.replace("=", " "), justify="right", style="bold" if name == RUN else "dim"
+        )
+    rows = _SEVERAL if "coverage" in scores[RUN] else _ONE_TOKEN
+    for key, (label, digits) in rows.items():
+        if key in scores[RUN]:
+            table.add_row(label, *(f"{values[key]:.{digits}f}" for values in scores.values()))
+    return table
+
+
+def puzzles_table(puzzles: Sequence[Mapping[str, Any]], full: str | None) -> Table:
+    """One line for each puzzle that the run played, the first `MAX_LINES` of them.
+
+    Args:
+        puzzles: scores of each.
+        full: file that has all of them, if any.
+    """
+    left = len(puzzles) - MAX_LINES
+    rest = f"and {left:,} more: all are in {full or 'the file that out= names'}"
+    table = Table(caption=rest if left > 0 else None)
+    for name in ("puzzle", "covered", "IoU", "wrong", "blocked", ""):
+        table.add_column(name, justify="left" if name in ("puzzle", "") else "right")
+    for one in puzzles[:MAX_LINES]:
+        name = f"{one['name']} {one['degrees']:g}°" if one["degrees"] else str(one["name"])
+        shares = (f"{one[key]:.3f}" for key in ("coverage", "iou"))
+        solved = "solved" if one["solved"] else ""
+        table.add_row(name, *shares, str(one["wrong"]), str(one["blocked"]), solved)
+    return table
+
+
+def print_faults(console: Console, faults: Sequence[str]) -> None:
+    """One line for each puzzle that was left out."""
+    for fault in faults[:MAX_LINES]:
+        console.print(f"left out: {fault}", markup=False, soft_wrap=True)
+    if len(faults) > MAX_LINES:
+        console.print(f"left out: {len(faults) - MAX_LINES:,} more", markup=False)

@@ -11,11 +11,11 @@ from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
 from tangram_agent.types import Weights
 from tangram_agent.wire import Scores
+from worker.client import Client
 from worker.config import WorkerConfig
-from worker.link import Link
 from worker.rollout import Played
 from worker.session import joined
-from worker.trials import Trials, greedy
+from worker.test_set import FixedTests, greedy
 
 PICTURES = 12
 POLL_S = 0.2
@@ -61,17 +61,17 @@ def run_evaluator(config: WorkerConfig, setup: Setup) -> int:
         TangramError: a setting that cannot work, or a master that refuses or is gone for long.
     """
     policy, schedule = Policy(setup), _schedule(config.service)
-    trials = Trials(setup, config.service.eval_episodes, config.service.envs)
-    with closing(trials), joined(config, setup, policy) as link:
-        while not link.stopped:
-            link.poll(POLL_S)
-            schedule.offer(link.newest_weights(), time.monotonic())
+    tests = FixedTests(setup, config.service.eval_episodes, config.service.envs)
+    with closing(tests), joined(config, setup, policy) as client:
+        while not client.stopped:
+            client.poll(POLL_S)
+            schedule.offer(client.newest_weights(), time.monotonic())
             weights = schedule.due(time.monotonic())
             if weights is not None:
                 policy.load(weights)
-                scores = _evaluate(trials, policy, link)
+                scores = _evaluate(tests, policy, client)
                 if scores is not None:
-                    link.send_scores(scores)
+                    client.send_scores(scores)
     return 0
 
 
@@ -79,17 +79,17 @@ def _schedule(service: ServiceConfig) -> Schedule:
     return Schedule(service.eval_seconds, max(STILL_S, 4.0 * service.publish_seconds))
 
 
-def _evaluate(trials: Trials, policy: Policy, link: Link) -> Scores | None:
-    """Scores of the policy; None if the link was stopped meanwhile."""
+def _evaluate(tests: FixedTests, policy: Policy, client: Client) -> Scores | None:
+    """Scores of the policy; None if the client was stopped meanwhile."""
     began = time.monotonic()
     groups = []
-    for group in trials.groups(greedy(policy)):
+    for group in tests.groups(greedy(policy)):
         groups.append(group)
-        link.poll()
-        if link.stopped:
+        client.poll()
+        if client.stopped:
             return None
-    played = trials.join(groups)
-    scalars = trials.scores(played) | {"seconds": time.monotonic() - began}
+    played = tests.join(groups)
+    scalars = tests.scores(played) | {"seconds": time.monotonic() - began}
     _log.info(
         "weights %d: mean reward %.3f, raw overlap %.3f, median angle error %.2f degrees (%.1f s)",
         policy.version,

@@ -9,11 +9,10 @@ from tangram_agent.types import Episodes
 from tangram_agent.wire import Go
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.errors import TangramError
+from worker.client import Client
 from worker.config import WorkerConfig
-from worker.link import Link
-from worker.report import Report
 from worker.rollout import Rollout, join_episodes, split_episodes
-from worker.session import joined
+from worker.session import Report, joined
 
 
 def run_player(config: WorkerConfig, setup: Setup) -> int:
@@ -29,34 +28,34 @@ def run_player(config: WorkerConfig, setup: Setup) -> int:
     size = config.service.batch_episodes
     with (
         closing(BatchedEnv(setup.layout, setup.sim, setup.reward, config.service.envs)) as env,
-        joined(config, setup, policy) as link,
+        joined(config, setup, policy) as client,
     ):
-        if not _take_first_weights(link, policy, report):
+        if not _take_first_weights(client, policy, report):
             return 0
-        me = link.welcome
+        me = client.welcome
         if me.lockstep:
             # Nothing may depend on how often a process was started.
-            _play_in_step(link, policy, Rollout(env, me.seed, config.role, me.index, 0), report)
+            _play_in_step(client, policy, Rollout(env, me.seed, config.role, me.index, 0), report)
             return 0
         rollout = Rollout(env, me.seed, config.role, me.index, me.incarnation)
-        while _wait_for_room(link, report):
+        while _wait_for_room(client, report):
             # Weights change here and nowhere else: a batch is played with one version.
-            newest = link.newest_weights()
+            newest = client.newest_weights()
             if newest is not None:
                 policy.load(newest)
-            episodes = _play(rollout, policy, link, groups=math.ceil(size / env.count))
+            episodes = _play(rollout, policy, client, groups=math.ceil(size / env.count))
             for batch in split_episodes(episodes, size):
-                if not link.send(batch, policy.version):
+                if not client.send(batch, policy.version):
                     break
-            link.stats["episodes"] = float(rollout.episode)
+            client.stats["episodes"] = float(rollout.episode)
             report.played(episodes.count, policy.version)
     return 0
 
 
-def _play_in_step(link: Link, policy: Policy, rollout: Rollout, report: Report) -> None:
-    """Play what is ordered, with the weights that are ordered, until the link is stopped."""
+def _play_in_step(client: Client, policy: Policy, rollout: Rollout, report: Report) -> None:
+    """Play what is ordered, with the weights that are ordered, until the client is stopped."""
     done: Go | None = None
-    while (order := link.wait_for_order(done)) is not None:
+    while (order := client.wait_for_order(done)) is not None:
         if order.episodes % rollout.envs:
             raise TangramError(
                 f"the master's lockstep asks for {order.episodes} episodes, no multiple of "
@@ -64,42 +63,42 @@ def _play_in_step(link: Link, policy: Policy, rollout: Rollout, report: Report) 
             )
         while policy.version != order.version:
             with report.waiting("the weights of this round"):
-                newest = link.wait_for_weights()
+                newest = client.wait_for_weights()
             if newest is None:
                 return
             policy.load(newest)
         rollout.episode = order.first_episode
-        episodes = _play(rollout, policy, link, groups=order.episodes // rollout.envs)
-        if episodes.count < order.episodes or not link.send(episodes, policy.version):
+        episodes = _play(rollout, policy, client, groups=order.episodes // rollout.envs)
+        if episodes.count < order.episodes or not client.send(episodes, policy.version):
             return
         report.played(episodes.count, policy.version)
         done = order
 
 
-def _take_first_weights(link: Link, policy: Policy, report: Report) -> bool:
-    """Load the first weights; False if the link was stopped before they came."""
+def _take_first_weights(client: Client, policy: Policy, report: Report) -> bool:
+    """Load the first weights; False if the client was stopped before they came."""
     with report.waiting("no weights yet"):
-        weights = link.wait_for_weights()
+        weights = client.wait_for_weights()
     if weights is None:
         return False
     policy.load(weights)
     return True
 
 
-def _wait_for_room(link: Link, report: Report) -> bool:
-    """Wait until one more batch may be on its way; False if the link was stopped."""
-    link.poll()
-    if link.window_free > 0:
-        return not link.stopped
+def _wait_for_room(client: Client, report: Report) -> bool:
+    """Wait until one more batch may be on its way; False if the client was stopped."""
+    client.poll()
+    if client.window_free > 0:
+        return not client.stopped
     with report.waiting("the master is behind, nothing more is played before it has caught up"):
-        return link.wait_for_window()
+        return client.wait_for_window()
 
 
-def _play(rollout: Rollout, policy: Policy, link: Link, groups: int) -> Episodes:
-    """So many groups of episodes, fewer if the link is stopped."""
+def _play(rollout: Rollout, policy: Policy, client: Client, groups: int) -> Episodes:
+    """So many groups of episodes, fewer if the client is stopped."""
     rollout.follow(policy.version)
     parts = [rollout.play(policy.explore)]
-    while len(parts) < groups and not link.stopped:
-        link.poll()
+    while len(parts) < groups and not client.stopped:
+        client.poll()
         parts.append(rollout.play(policy.explore))
     return join_episodes(parts)

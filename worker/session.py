@@ -3,30 +3,30 @@
 import logging
 import signal
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import TextIO
 
 import torch
 
-from tangram_agent import lifeline
-from tangram_agent.logs import formatter
 from tangram_agent.payloads import EpisodeSpec
 from tangram_agent.policy import Policy
+from tangram_agent.process import Watchdog, formatter, watch_parent
 from tangram_agent.setup import Setup
-from tangram_agent.watchdog import Watchdog
+from worker.client import Client
 from worker.config import WorkerConfig
-from worker.link import Link
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1, signal.SIGUSR2)
+REPORT_S = 30.0
 
 _log = logging.getLogger(__name__)
 
 
 @contextmanager
-def joined(config: WorkerConfig, setup: Setup, policy: Policy) -> Iterator[Link]:
-    """A link to the master that has joined, or that was stopped while it tried.
+def joined(config: WorkerConfig, setup: Setup, policy: Policy) -> Iterator[Client]:
+    """A client to the master that has joined, or that was stopped while it tried.
 
     On leaving, the master is told, after the batches that are on their way, and the signal handlers
     are put back.
@@ -40,7 +40,7 @@ def joined(config: WorkerConfig, setup: Setup, policy: Policy) -> Iterator[Link]
         ConfigError: service.batch_episodes makes messages that are too large.
         TangramError: the master refuses, or does not answer.
     """
-    lifeline.watch()
+    watch_parent()
     # Several workers share one machine: more threads each would only get in each other's way.
     torch.set_num_threads(1)
     service = config.service
@@ -49,7 +49,7 @@ def joined(config: WorkerConfig, setup: Setup, policy: Policy) -> Iterator[Link]
     if config.role == "player":
         spec.check_batch_size(service.batch_episodes)
     watchdog = Watchdog(service.watchdog_seconds)
-    link = Link(
+    client = Client(
         config.connect,
         config.role,
         config.index,
@@ -58,24 +58,24 @@ def joined(config: WorkerConfig, setup: Setup, policy: Policy) -> Iterator[Link]
         policy.shapes,
         service.window,
     )
-    link.on_progress = watchdog.progress
-    with link, stopped_by_signals(link), watchdog:
+    client.on_progress = watchdog.progress
+    with client, stopped_by_signals(client), watchdog:
         _log.info("joining %s", config.connect, extra={"event": "joining"})
-        if link.join():
-            me = link.welcome
+        if client.join():
+            me = client.welcome
             log_as(f"{config.role} {me.index}", service.log_format)
             fields = {"event": "joined", "run_id": me.run_id, "incarnation": me.incarnation}
             _log.info("joined run %s", me.run_id, extra=fields)
-        yield link
-        _log.info("ends: %s", link.stop_reason, extra={"event": "ended"})
+        yield client
+        _log.info("ends: %s", client.stop_reason, extra={"event": "ended"})
 
 
 @contextmanager
-def stopped_by_signals(link: Link) -> Iterator[None]:
-    """The signals stop the link instead of the process, so that it can say BYE."""
+def stopped_by_signals(client: Client) -> Iterator[None]:
+    """The signals stop the client instead of the process, so that it can say BYE."""
 
     def handle(number: int, _frame: FrameType | None) -> None:
-        link.stop(signal.Signals(number).name)
+        client.stop(signal.Signals(number).name)
 
     before = {number: signal.signal(number, handle) for number in SIGNALS}
     try:
@@ -98,3 +98,49 @@ def log_as(who: str, log_format: str) -> None:
 
 class _Lines(logging.StreamHandler[TextIO]):
     """The handler that `log_as` replaces."""
+
+
+class Report:
+    """What a player tells its log: that it waits, and every now and then how fast it plays."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._begin()
+
+    def _begin(self) -> None:
+        self._since = self._clock()
+        self._episodes = 0
+        self._waited = 0.0
+        self._told: set[str] = set()
+
+    @contextmanager
+    def waiting(self, why: str) -> Iterator[None]:
+        """Time that passes inside is no play; each reason is said once between two reports."""
+        if why not in self._told:
+            _log.info("waits: %s", why, extra={"event": "waits"})
+            self._told.add(why)
+        start = self._clock()
+        try:
+            yield
+        finally:
+            self._waited += self._clock() - start
+
+    def played(self, episodes: int, version: int) -> None:
+        """Count episodes; a line when it is time."""
+        self._episodes += episodes
+        passed = self._clock() - self._since
+        if passed < REPORT_S:
+            return
+        values = {
+            "episodes": self._episodes,
+            "seconds": passed,
+            "episodes_per_s": self._episodes / passed,
+            "percent_waiting": 100.0 * self._waited / passed,
+            "weights_version": version,
+        }
+        _log.info(
+            "%d episodes in %.0f s (%.1f/s), %.0f %% of the time waiting, weights %d",
+            *values.values(),
+            extra={"event": "played", **values},
+        )
+        self._begin()

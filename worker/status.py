@@ -13,9 +13,9 @@ from rich.table import Table
 from tangram_agent.decoding import decode_from_master
 from tangram_agent.standing import WORKER_COLUMNS, AskStatus, RunStatus
 from tangram_sim.errors import TangramError, WireError
-from worker.channel import Channel
 from worker.config import StatusConfig
-from worker.connection import estranged, find_connection
+from worker.connection import Sockets
+from worker.discovery import find_master, keys_error
 
 PATIENCE_S = 10.0
 ASK_AGAIN_S = 1.0
@@ -58,27 +58,27 @@ def ask_status(
     Raises:
         TangramError: see `show_status`.
     """
-    found = find_connection(connect)
-    if found is None:
+    address = find_master(connect)
+    if address is None:
         raise TangramError(f"no connection file at {connect}: no master runs there")
-    channel = Channel(context, found)
+    sockets = Sockets(context, address)
     try:
         until_s, ask_s = time.monotonic() + patience_s, 0.0
         while time.monotonic() < until_s:
             if time.monotonic() >= ask_s:
-                channel.send(AskStatus().encode())
+                sockets.send(AskStatus().encode())
                 ask_s = time.monotonic() + ASK_AGAIN_S
-            channel.wait(0.1)
-            if channel.handshake_failed():
-                raise TangramError(estranged(connect, found.endpoint))
-            for frames in channel.messages():
+            sockets.wait(0.1)
+            if sockets.handshake_failed():
+                raise TangramError(keys_error(connect, address.endpoint))
+            for frames in sockets.messages():
                 status = _read(frames)
                 if status is not None:
                     return status
     finally:
-        channel.close()
+        sockets.close()
     raise TangramError(
-        f"the master at {found.endpoint} has not answered for {patience_s:g} s: is it still "
+        f"the master at {address.endpoint} has not answered for {patience_s:g} s: is it still "
         "running?"
     )
 

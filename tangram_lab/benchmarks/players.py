@@ -1,4 +1,4 @@
-"""Synthetic players: many real Links in one process, which send what was played before."""
+"""Synthetic players: many real Clients in one process, which send what was played before."""
 
 import time
 from collections.abc import Iterator
@@ -10,9 +10,9 @@ from pathlib import Path
 from tangram_agent.payloads import EpisodeSpec
 from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes
-from worker.link import Link
+from worker.client import Client
 
-PAUSE_S = 0.002  # between two rounds over all links
+PAUSE_S = 0.002  # between two rounds over all clients
 WINDOW = 4
 
 
@@ -34,9 +34,9 @@ class Ages:
     held: dict[int, int] = field(default_factory=dict)
     _lines: list[str] = field(default_factory=list)
 
-    def look(self, player: int, link: Link) -> None:
+    def look(self, player: int, client: Client) -> None:
         """Take the newest weights."""
-        weights = link.newest_weights()
+        weights = client.newest_weights()
         if weights is not None:
             self.held[player] = weights.version
             self.first.setdefault(weights.version, time.monotonic())
@@ -80,23 +80,23 @@ def play(connect: str, setup: Setup, episodes: Episodes, count: int, path: Path)
     """Let all players send whatever their windows take, until the master sends them home."""
     spec, ages = EpisodeSpec.of(setup), Ages(path)
     with ExitStack() as stack:
-        links = [
+        clients = [
             stack.enter_context(
-                Link(connect, "player", i, setup.fingerprints(), spec, window=WINDOW)
+                Client(connect, "player", i, setup.fingerprints(), spec, window=WINDOW)
             )
             for i in range(count)
         ]
-        while not all(link.stopped for link in links):
-            for player, link in enumerate(links):
-                _step(player, link, episodes, ages)
+        while not all(client.stopped for client in clients):
+            for player, client in enumerate(clients):
+                _step(player, client, episodes, ages)
             ages.write()
             time.sleep(PAUSE_S)
 
 
-def _step(player: int, link: Link, episodes: Episodes, ages: Ages) -> None:
-    link.poll()
-    ages.look(player, link)
+def _step(player: int, client: Client, episodes: Episodes, ages: Ages) -> None:
+    client.poll()
+    ages.look(player, client)
     version = ages.held.get(player)
-    if version is not None and link.window_free and not link.stopped:
+    if version is not None and client.window_free and not client.stopped:
         ages.sent(player)
-        link.send(episodes, version)
+        client.send(episodes, version)

@@ -1,4 +1,4 @@
-"""The way from worker to master: a Link and a Hub, against bare ROUTER-DEALER sockets.
+"""The way from worker to master: a Client and a Hub, against bare ROUTER-DEALER sockets.
 
 Both carry the same frames between two processes, with as many unacknowledged, over TCP on this
 machine. What is counted are the transitions that the master's end takes. Ours are checked on both
@@ -28,8 +28,8 @@ from tangram_lab.benchmarks.episodes import played
 from tangram_lab.benchmarks.measure import Bound, Row, Work, compared, rates, single
 from tangram_lab.benchmarks.setups import several
 from tangram_sim.errors import TangramError
-from worker.link import Link
-from worker.terms import Timing
+from worker.client import Client
+from worker.connection import Timing
 
 STAGE, UNIT = "wire", "transitions/s"
 SHARE = Bound(least=0.6)
@@ -108,7 +108,7 @@ def child(target: Callable[..., None], *arguments: Any) -> Iterator[None]:
 
 @contextmanager
 def ours(case: Case, setup: Setup, episodes: Episodes) -> Iterator[Work]:
-    """A Hub here that takes what a Link in another process sends."""
+    """A Hub here that takes what a Client in another process sends."""
     with connected(case, setup, episodes) as hub:
         yield lambda: take_batches(hub)
 
@@ -134,18 +134,18 @@ def take_batches(hub: Hub) -> int:
 
 
 def send_batches(connect: str, setup: Setup, episodes: Episodes, workers: int) -> None:
-    """Send the same batch through each Link in turn for ever; runs in a process of its own."""
+    """Send the same batch through each Client in turn for ever; runs in a process of its own."""
     timing, spec = Timing(lost_s=PATIENCE_S), EpisodeSpec.of(setup)
     with ExitStack() as stack:
-        links = [
-            Link(connect, "player", i, setup.fingerprints(), spec, window=WINDOW, timing=timing)
+        clients = [
+            Client(connect, "player", i, setup.fingerprints(), spec, window=WINDOW, timing=timing)
             for i in range(workers)
         ]
-        for link in links:
-            stack.enter_context(link)
-            if not link.join():
+        for client in clients:
+            stack.enter_context(client)
+            if not client.join():
                 raise TangramError("the hub does not let the player in")
-        while all(link.send(episodes, 0) for link in links):
+        while all(client.send(episodes, 0) for client in clients):
             pass
 
 

@@ -13,7 +13,7 @@ from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.errors import TangramError
-from worker.link import Link
+from worker.client import Client
 from worker.rollout import Rollout
 
 ENVS = 4
@@ -52,7 +52,7 @@ class Witness(Thread):
 
     def _play(self) -> None:
         setup, policy = self.setup, Policy(self.setup)
-        link = Link(
+        client = Client(
             self._connect,
             "player",
             INDEX,
@@ -61,30 +61,30 @@ class Witness(Thread):
             policy.shapes,
             WINDOW,
         )
-        with closing(BatchedEnv(setup.layout, setup.sim, setup.reward, ENVS)) as env, link:
-            link.on_progress = lambda: self._look(link)
-            if not link.join():
+        with closing(BatchedEnv(setup.layout, setup.sim, setup.reward, ENVS)) as env, client:
+            client.on_progress = lambda: self._look(client)
+            if not client.join():
                 return
-            first = link.wait_for_weights()
+            first = client.wait_for_weights()
             if first is None:
                 return
             policy.load(first)
-            me = link.welcome
+            me = client.welcome
             rollout = Rollout(env, me.seed, "witness", me.index, me.incarnation)
-            while link.wait_for_window():
-                newest = link.newest_weights()
+            while client.wait_for_window():
+                newest = client.newest_weights()
                 if newest is not None:
                     policy.load(newest)
                 episodes = rollout.play(policy.explore)
                 self.sent.append(keys(episodes.corners[:, 0], episodes.actions[:, 0]))
-                if not link.send(episodes, policy.version):
+                if not client.send(episodes, policy.version):
                     self.sent.pop()
-            self._look(link)
+            self._look(client)
 
-    def _look(self, link: Link) -> None:
-        self.acknowledged = link.acknowledged
+    def _look(self, client: Client) -> None:
+        self.acknowledged = client.acknowledged
         if self._ends.is_set():
-            link.stop("the trial is over")
+            client.stop("the trial is over")
 
 
 def keys(states: np.ndarray, actions: np.ndarray) -> list[bytes]:

@@ -7,7 +7,7 @@ from typing import Any
 from tangram_agent.policy import Policy
 from tangram_agent.pretrained import FORMAT, PREFIX
 from tangram_agent.setup import Setup
-from worker.tables import RUN
+from worker.evaluate import RUN
 
 Scores = Mapping[str, float]
 

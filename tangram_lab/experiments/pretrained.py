@@ -27,11 +27,9 @@ from tangram_lab.experiments.card import card_text, make_card
 from tangram_sim.errors import ConfigError, RunError, TangramError
 from tangram_sim.targets import has_all_tans
 from worker.config import EvalConfig
-from worker.evaluate import policies, score_policies
-from worker.puzzle_scores import score_puzzles
+from worker.evaluate import RUN, policies, score_policies, score_puzzles
 from worker.puzzles import find_figures
-from worker.tables import RUN
-from worker.trials import greedy
+from worker.test_set import greedy
 
 PACKAGE = Path(__file__).resolve().parents[2] / "tangram_agent" / "pretrained"
 RESULT = "result.json"

@@ -1,5 +1,6 @@
 """Settings: what is refused, in which words, and what a fingerprint covers."""
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -106,6 +107,21 @@ def test_the_section_that_differs_is_named(section: str, values: dict[str, Any])
     assert make_setup(BASE).fingerprints() == ours
     assert made.differences(other.contents()) == other.differences(made.contents()) == [section]
     assert made.differences(make_setup(BASE).contents()) == []
+
+
+def test_a_master_and_a_worker_with_different_reward_files_differ(tmp_path: Path) -> None:
+    made = []
+    for folder, content in (("one", "a = 1"), ("copy", "a = 1"), ("other", "a = 2")):
+        path = tmp_path / folder / "own.py"
+        path.parent.mkdir()
+        path.write_text(content)
+        made.append(make_setup(changed("reward", name=f"{path}:near")))
+    one, copy, other = made
+    assert one.fingerprints() == copy.fingerprints()
+    assert one.fingerprints()["reward"] != other.fingerprints()["reward"]
+    assert one.task_digest() != other.task_digest()
+    assert one.differences(copy.contents()) == []
+    assert one.differences(other.contents()) == ["reward"]
 
 
 def test_settings_that_only_one_version_knows_do_not_differ() -> None:

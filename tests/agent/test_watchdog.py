@@ -6,13 +6,13 @@ import time
 
 import pytest
 
-from tangram_agent.watchdog import Watchdog
+from tangram_agent.process import Watchdog
 
 pytestmark = pytest.mark.cluster
 
 HANGS = """
 import time, threading
-from tangram_agent.watchdog import Watchdog
+from tangram_agent.process import Watchdog
 def hang_here():
     {hang}
 with Watchdog({seconds}) as dog:

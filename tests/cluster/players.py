@@ -16,8 +16,8 @@ from tangram_agent.payloads import EpisodeSpec
 from tangram_agent.setup import Setup, make_setup
 from tests.agent.builders import random_episodes
 from tests.cluster.processes import started, wait_for_file
-from worker.link import Link
-from worker.terms import Timing
+from worker.client import Client
+from worker.connection import Timing
 
 LIMIT_S = 60.0
 EPISODES = 3  # in each batch
@@ -52,12 +52,14 @@ class Player:
         self._setup, self.index = setup, index
         self._first_tag = FIRST_TAG + 100_000.0 * (index if tag_index is None else tag_index)
         spec = EpisodeSpec.of(setup)
-        self.link = Link(str(connect), "player", index, setup.fingerprints(), spec, None, 4, QUICK)
+        self.client = Client(
+            str(connect), "player", index, setup.fingerprints(), spec, None, 4, QUICK
+        )
         self.sent = 0
 
     @property
     def acknowledged(self) -> int:
-        return self.link.acknowledged
+        return self.client.acknowledged
 
     def tag(self, sequence: int) -> float:
         return self._first_tag + sequence
@@ -79,12 +81,12 @@ class Player:
 
     def step(self) -> None:
         """Send what the window takes, and take what came."""
-        while self.link._talk.joined and self.link.window_free and not self.link.stopped:
+        while self.client.joined and self.client.window_free and not self.client.stopped:
             self.sent += 1
             episodes = random_episodes(self._setup, EPISODES, seed=self.sent)
             tags = np.full_like(episodes.rewards, self.tag(self.sent))
-            assert self.link.send(replace(episodes, rewards=tags), -1)
-        self.link.poll(0.002)
+            assert self.client.send(replace(episodes, rewards=tags), -1)
+        self.client.poll(0.002)
 
 
 def until(players: list[Player], done: Callable[[], Any]) -> None:
@@ -119,8 +121,8 @@ def players(setup: Setup, *connects: str | Path) -> Iterator[list[Player]]:
     with ExitStack() as stack:
         made = [Player(connect, i, setup) for i, connect in enumerate(connects)]
         for player in made:
-            stack.enter_context(player.link)
-            assert player.link.join()
+            stack.enter_context(player.client)
+            assert player.client.join()
         yield made
 
 

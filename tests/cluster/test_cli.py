@@ -79,9 +79,7 @@ WRONG = [
     ("tangram-train run_dir=", "run_dir must name a folder"),
     ("tangram-master +sim.colour=1", 'can not match "colour"'),
     ("tangram-master from_config=nowhere.yaml", "from_config=nowhere.yaml: No such file"),
-    ("tangram-train reward.name=os:getcwd", "reward.name=os:getcwd failed: TypeError"),
-    ("tangram-master reward.name=os:getcwd", "reward.name=os:getcwd failed: TypeError"),
-    ("tangram-worker connect=tcp://127.0.0.1:1 reward.name=os:getcwd", "failed: TypeError"),
+    ("tangram-worker connect=tcp://127.0.0.1:1 reward.name=own.py:none", "cannot read 'own.py' on"),
     ("tangram-train tokens.shapes=[square,square,square] tokens.scale=2.2", "no room for token"),
     ("tangram-worker", "say which master: connect=tcp://host:port"),
     ("tangram-worker connect=tcp://127.0.0.1:1 role=judge", "role must be one of player, evalu"),
@@ -107,6 +105,18 @@ def test_wrong_input_is_one_line(tmp_path: Path, line: str, message: str) -> Non
     assert message in result.stderr
     assert result.stderr.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "line", ["tangram-train", "tangram-master", "tangram-worker connect=tcp://127.0.0.1:1"]
+)
+def test_an_own_reward_that_fails_is_told_before_anything_starts(tmp_path: Path, line: str) -> None:
+    (tmp_path / "own.py").write_text("def near(achieved, desired, layout): return 1 / 0")
+    result = run(tmp_path, *line.split(), "reward.name=own.py:near")
+    assert result.returncode == 2
+    assert "own.py:near failed: ZeroDivisionError" in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["own.py"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)

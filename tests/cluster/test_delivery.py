@@ -46,8 +46,8 @@ def test_acknowledged_batches_survive_kills_of_the_master(
                 if not players:
                     players += [Player(folder, i, setup_of(folder)) for i in range(2)]
                     for player in players:
-                        stack.enter_context(player.link)
-                        player.link.join()
+                        stack.enter_context(player.client)
+                        player.client.join()
                 more_acknowledged(players, 5 + life)
                 if moment == "between two checkpoints":
                     until(players, lambda: list_checkpoints(folder / "checkpoints"))

@@ -58,11 +58,11 @@ def test_a_network_that_swallows_everything_for_a_while(
         proxy.cut(*directions)
         behind, beside = made
         goal = beside.acknowledged + 20
-        until(made, lambda: behind.link.counters["reconnects"] and beside.acknowledged >= goal)
+        until(made, lambda: behind.client.counters["reconnects"] and beside.acknowledged >= goal)
         stuck = behind.acknowledged
         proxy.cut()
         until(made, lambda: behind.acknowledged >= stuck + 5)
-        assert beside.link.counters["reconnects"] == 0
+        assert beside.client.counters["reconnects"] == 0
         finish(made, process)
     assert_exactly_once(folder, made)
 
@@ -71,7 +71,7 @@ def test_a_frozen_master_comes_back(folder: Path) -> None:
     with master(folder) as process, players(setup_of(folder), folder, folder) as made:
         more_acknowledged(made, 3)
         process.send_signal(signal.SIGSTOP)
-        until(made, lambda: all(player.link.counters["reconnects"] for player in made))
+        until(made, lambda: all(player.client.counters["reconnects"] for player in made))
         process.send_signal(signal.SIGCONT)
         more_acknowledged(made, 5)
         finish(made, process)
@@ -95,7 +95,7 @@ def test_a_frozen_worker_harms_nobody_and_comes_back(folder: Path) -> None:
             until([other], lambda: count() == 1.0)
         more_acknowledged([other], 5)
         more_acknowledged(made, 5)
-        assert frozen.link.counters["reconnects"] == 0  # it was greeted anew on its connection
+        assert frozen.client.counters["reconnects"] == 0  # it was greeted anew on its connection
         finish(made, process)
     assert_exactly_once(folder, made)
 
@@ -115,8 +115,8 @@ def test_two_runs_on_one_machine_do_not_meet(tmp_path: Path) -> None:
         stale = tmp_path / "stale.json"
         stale.write_text(json.dumps(content | {"endpoint": other["endpoint"]}))
         wrong = Player(stale, 7, setup_of(folders[0]))
-        with wrong.link, pytest.raises(TangramError, match="the connection file is stale"):
-            wrong.link.join()
+        with wrong.client, pytest.raises(TangramError, match="the connection file is stale"):
+            wrong.client.join()
         for group, process in zip(made, processes, strict=True):
             finish(group, process)
     for path, group in zip(folders, made, strict=True):
@@ -157,7 +157,7 @@ def test_a_full_disk_stops_the_acknowledgements_and_nothing_is_lost(tmp_path: Pa
             (player,) = made
             # Some were on their way; then the window is full, and it waits with what it played.
             until(made, lambda: steps_without_answer(player) == 500)
-            assert player.link.window_free == 0
+            assert player.client.window_free == 0
             assert process.poll() is None
             (inside / "ballast").unlink()
             more_acknowledged(made, 5)

@@ -52,7 +52,7 @@ def test_repeated_swapped_and_damaged_messages_change_nothing(folder: Path) -> N
         told = {"hub/malformed", "hub/rejected", "hub/duplicates"}
         until(made, lambda: told <= numbers(folder).keys())
         _, beside = made
-        assert beside.link.counters.keys().isdisjoint({"reconnects", "malformed", "rejected"})
+        assert beside.client.counters.keys().isdisjoint({"reconnects", "malformed", "rejected"})
         finish(made, process)
     assert_exactly_once(folder, made)
 
@@ -63,10 +63,10 @@ def test_the_newest_of_two_processes_with_one_index_goes_on(folder: Path) -> Non
         with players(setup, folder) as (older,):
             more_acknowledged([older], 5)
             newer = Player(folder, older.index, setup, tag_index=1)
-            with newer.link:
-                assert newer.link.join()
-                until([older, newer], lambda: older.link.stopped)
-                assert older.link.stop_reason.startswith(
+            with newer.client:
+                assert newer.client.join()
+                until([older, newer], lambda: older.client.stopped)
+                assert older.client.stop_reason.startswith(
                     "player 0 was taken over by a newer process"
                 )
                 more_acknowledged([newer], 5)

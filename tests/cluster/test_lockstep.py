@@ -61,7 +61,7 @@ def assert_same(one: Path, other: Path) -> None:
             np.testing.assert_array_equal(tensor, theirs.arrays[stem][name], err_msg=name)
     for name in ("episodes", "generators"):
         assert ours.counters[name] == theirs.counters[name], name
-    assert ours.counters["pace"] == pytest.approx(theirs.counters["pace"])
+    assert ours.counters["rate_limiter"] == pytest.approx(theirs.counters["rate_limiter"])
 
 
 def test_the_same_numbers_come_twice(straight: Path, tmp_path: Path) -> None:

@@ -13,27 +13,25 @@ import torch
 from master.arrivals import EpisodesArrived, ScoresArrived
 from master.budget import Budget
 from master.config import MasterConfig
-from master.curve import Curve
-from master.guard import Guard
+from master.divergence import DivergenceGuard
 from master.journal import Journal
 from master.ledger import Ledger
 from master.lockstep import Lockstep
 from master.loop import Loop
-from master.metrics import Metrics
+from master.metrics import Curve, Metrics
 from master.parts import Parts
 from master.peers import Peer
-from master.record import Record
 from master.report import Reporter
-from master.rundir import RunFolder
+from master.rundir import Record, RunFolder
 from master.signals import StopSignals
 from master.status import Status
 from master.trainer import Trainer
 from tangram_agent.config import ServiceConfig
 from tangram_agent.payloads import EpisodeSpec
+from tangram_agent.process import Watchdog
 from tangram_agent.setup import Setup
 from tangram_agent.standing import RunStatus
 from tangram_agent.types import Weights
-from tangram_agent.watchdog import Watchdog
 from tangram_agent.wire import Go, Scores
 from tests.agent.builders import random_episodes, setup
 
@@ -183,7 +181,7 @@ def loop(
         Record(),
         Budget(settings),
         hub,  # type: ignore[arg-type]
-        Guard(learner, settings.service.max_bad_updates, run_folder.bad_batch),
+        DivergenceGuard(learner, settings.service.max_bad_updates, run_folder.bad_batch),
         journal(run_folder.journal, made),
         Lockstep.of(settings.service),
     )

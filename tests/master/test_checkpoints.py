@@ -1,6 +1,7 @@
 """Checkpoint folders: written whole or not at all, and every changed byte is found."""
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -115,6 +116,26 @@ def test_a_crash_before_the_rename_leaves_the_old_one_valid(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["00000005", "00000006"]
 
 
+def test_all_bytes_and_names_are_on_the_disk_in_the_order_that_a_power_cut_asks_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Files and their folder before the name that counts, the folder with that name after it."""
+    events: list[int | str] = []
+    monkeypatch.setattr(os, "fsync", lambda handle: events.append(os.fstat(handle).st_ino))
+    rename = Path.rename
+
+    def renamed(self: Path, target: Path) -> Path:
+        events.append("renamed")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", renamed)
+    path = save(tmp_path)
+    content = {file.stat().st_ino for file in path.iterdir()}
+    assert len(content) == 3
+    assert set(events[:3]) == content
+    assert events[3:] == [path.stat().st_ino, "renamed", tmp_path.stat().st_ino]
+
+
 def test_a_half_written_folder_is_no_checkpoint(tmp_path: Path) -> None:
     (tmp_path / ".writing-00000009").mkdir()
     (tmp_path / "00000009.corrupt").mkdir()
@@ -157,7 +178,7 @@ def test_a_missing_file_is_found(tmp_path: Path, file: str) -> None:
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"format_version": 2}, "has format 2, this version reads 1: use the version"),
+        ({"format_version": 1}, "has format 1, this version reads 2: use the version"),
         ({"format_version": None}, "manifest.json has no format_version"),
         ({"updates": 6}, "checksum of manifest.json differs"),
         ({"counters": {}}, "checksum of manifest.json differs"),

@@ -14,7 +14,7 @@ LIMIT_S = 30.0
 CODE = """
 import sys
 from master.console import sturdy_console
-from master.progress import make_progress
+from master.console import make_progress
 console = sturdy_console(sys.stdout)
 print(console.is_terminal, file=sys.stderr)
 progress = make_progress(console, "run")

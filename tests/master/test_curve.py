@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from master.curve import Curve
+from master.metrics import Curve
 from tests.master.builders import FakeHub, arrival, loop, scores, small_setup
 
 pytestmark = pytest.mark.fast

@@ -12,10 +12,9 @@ from rich.console import Console
 from master import children as children_module
 from master import launch as launch_module
 from master.children import MAX_RESTARTS, Child
-from master.commands import master_arguments
 from master.config import LaunchConfig, MasterConfig
-from master.launch import Launcher, run_training
-from master.progress import PlainLines
+from master.console import PlainLines
+from master.launch import Launcher, master_arguments, run_training
 from master.rundir import RunFolder
 from tangram_agent.config import ServiceConfig
 from tangram_agent.setup import from_mapping
@@ -71,7 +70,7 @@ def test_a_folder_in_use_is_left_alone(tmp_path: Path) -> None:
 MASTER = """
 import os, signal, sys, threading
 from pathlib import Path
-from tangram_agent import lifeline
+from tangram_agent.process import watch_parent
 folder = Path({folder!r})
 news = open(folder / "news", "w")
 heard = threading.Event()
@@ -79,7 +78,7 @@ def hear(line):
     print(line, file=news, flush=True)
     if "the run ends" in line:
         heard.set()
-lifeline.watch(hear)
+watch_parent(hear)
 def end():
     (folder / "connection.json").unlink()
     sys.exit(0)
@@ -94,8 +93,8 @@ while {condition}:
 """
 WORKER = """
 import signal
-from tangram_agent import lifeline
-lifeline.watch()
+from tangram_agent.process import watch_parent
+watch_parent()
 signal.pause()
 """
 
@@ -327,8 +326,8 @@ def test_a_second_signal_ends_everything_at_once(
 def test_a_signal_that_comes_again_at_once_cuts_nobody_short(tmp_path: Path) -> None:
     leaving = """
 import signal, sys, time
-from tangram_agent import lifeline
-lifeline.watch()
+from tangram_agent.process import watch_parent
+watch_parent()
 def leave(*_):
     time.sleep(0.3)
     print("left in order", flush=True)

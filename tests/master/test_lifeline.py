@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tangram_agent import lifeline
-from tangram_agent.lifeline import VARIABLE, Lifeline
+from tangram_agent.process import VARIABLE, Lifeline, watch_parent
 from tangram_sim.errors import ConfigError
 
 pytestmark = pytest.mark.cluster
@@ -22,13 +21,13 @@ LIMIT_S = 30.0
 # Tells when it watches, then waits for ever; `kind` decides how it takes SIGTERM.
 CHILD = """
     import signal, sys, threading
-    from tangram_agent import lifeline
+    from tangram_agent.process import watch_parent
     kind = sys.argv[1]
     if kind == "orderly":
         signal.signal(signal.SIGTERM, lambda *_: (print("orderly", flush=True), sys.exit(3)))
     if kind == "stubborn":
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    watched = lifeline.watch(lambda line: print("heard", line, flush=True), grace_s=0.2)
+    watched = watch_parent(lambda line: print("heard", line, flush=True), grace_s=0.2)
     print("watches" if watched else "alone", flush=True)
     if watched:
         while True:
@@ -112,7 +111,7 @@ def test_a_variable_that_names_no_file_is_refused(
 ) -> None:
     monkeypatch.setenv(VARIABLE, value)
     with pytest.raises(ConfigError, match=f"{VARIABLE} must be the number of an open file"):
-        lifeline.watch()
+        watch_parent()
     assert VARIABLE not in os.environ
 
 

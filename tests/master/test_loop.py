@@ -16,10 +16,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from master import loop as loop_module
 from master.arrivals import EpisodesArrived
-from master.every import Every
 from master.loop import Loop
 from master.result import make_result
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
+from tangram_agent.process import Every
 from tangram_agent.wire import Go
 from tangram_sim.errors import RunError
 from tests.master.builders import (
@@ -221,7 +221,7 @@ def test_checkpoints_come_on_their_interval(tmp_path: Path) -> None:
     hub = FakeHub(MADE, batches(3))
     service = {"checkpoint_minutes": 1e-3, "keep_checkpoints": 1}
     made = loop(tmp_path, MADE, hub, service, max_updates=6)
-    made._keeper._checkpoint = Every(0.0)
+    made._checkpointer._checkpoint = Every(0.0)
     made.run()
     (path,) = list_checkpoints(tmp_path / "checkpoints")
     counters = load_checkpoint(path, []).counters
@@ -335,7 +335,10 @@ def test_what_is_told(tmp_path: Path) -> None:
     made = loop(tmp_path, MADE, hub, {"publish_seconds": 0.0}, max_updates=4)
     made._news.put("worker 0 ended")
     made.run()
-    made.finish(launched=False) if made.parts.record.scored_version == 4 else made._keeper.save()
+    if made.parts.record.scored_version == 4:
+        made.finish(launched=False)
+    else:
+        made._checkpointer.save()
     made._reporter.flush(made.parts)
     made._reporter.metrics.close()
     assert shown(made).notices == ["worker 0 ended"]
@@ -355,7 +358,7 @@ def test_what_is_told(tmp_path: Path) -> None:
         "weights/age_updates",
         "weights/age_seconds",
         "run/workers",
-        "pace/lag",
+        "rate_limiter/lag",
     }
     assert expected <= set(events.Tags()["scalars"])
 
@@ -375,8 +378,8 @@ def test_what_is_waited_for(
     tmp_path: Path, transitions: int, updates: int, players: int, words: str
 ) -> None:
     made = loop(tmp_path, MADE, FakeHub(MADE, roles=["player"] * players))
-    made.parts.trainer.pace.inserted(transitions)
-    made.parts.trainer.pace.updated(updates)
+    made.parts.trainer.rate_limiter.inserted(transitions)
+    made.parts.trainer.rate_limiter.updated(updates)
     made.tell()
     assert shown(made).statuses[-1].activity == words
 

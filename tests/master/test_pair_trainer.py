@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from tangram_agent.pair_learner import PairLearner
 
-from master.checkpoint import Restored, restore_run, save_run
-from master.record import Record
+from master.checkpointer import Restored, restore_run, save_run
+from master.rundir import Record
 from master.trainer import Trainer
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
@@ -37,7 +37,7 @@ def made_setup(agent: dict[str, Any] | None = None, **sim: Any) -> Setup:
 def play_on(made: Trainer, rounds: int, seed: int = 0) -> None:
     for i in range(rounds):
         made.insert(random_episodes(made.setup, 2, seed=1000 * seed + i))
-        while made.pace.may_update():
+        while made.rate_limiter.may_update():
             made.update(i / rounds)
 
 

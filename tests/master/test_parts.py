@@ -10,12 +10,11 @@ from typing import Any
 
 import pytest
 
-from master.checkpoint import Restored, save_run
+from master.checkpointer import Restored, save_run
 from master.config import MasterConfig
 from master.journal import segments
 from master.parts import PLAIN, UNBOUNDED, Parts, make_parts
-from master.record import Record
-from master.rundir import RunFolder
+from master.rundir import Record, RunFolder
 from tangram_agent.config import ServiceConfig
 from tangram_sim.errors import ConfigError, RunError
 from tests.master.builders import arrival, close_journals, journal, small_setup, trainer

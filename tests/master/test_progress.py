@@ -13,7 +13,7 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from rich.console import Console
 
-from master.progress import (
+from master.console import (
     LivePanel,
     PlainLines,
     make_lines,

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from master.checkpoint import Restored, check_resumable, restore_run, save_run, warm_start
+from master.checkpointer import Restored, check_resumable, restore_run, save_run, warm_start
 from master.journal import segments
-from master.record import Record
-from master.rundir import RunFolder
+from master.rundir import Record, RunFolder
 from master.trainer import Trainer, choose_device
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint, save_checkpoint
 from tangram_agent.setup import SECTIONS
@@ -31,7 +30,7 @@ def play_on(made: Trainer, rounds: int, seed: int = 0) -> None:
     """Insert and learn in turns; hindsight and sampling draw from the trainer's generators."""
     for i in range(rounds):
         made.insert(random_episodes(made.setup, 4, seed=1000 * seed + i))
-        while made.pace.may_update():
+        while made.rate_limiter.may_update():
             made.update(i / rounds)
 
 
@@ -137,12 +136,12 @@ def test_settings_of_the_agent_may_change_on_the_way(tmp_path: Path) -> None:
     save_run(tmp_path, made, REST, keep=1)
     resumed = trainer(small_setup(updates_per_transition=1.0, replay_capacity=32))
     assert restore_run(tmp_path, resumed, pytest.fail) is not None
-    assert (len(resumed.replay), resumed.pace.may_update()) == (32, False)
+    assert (len(resumed.replay), resumed.rate_limiter.may_update()) == (32, False)
     play_on(resumed, 1)
     assert resumed.updates == 6 + 4
 
 
-@pytest.mark.parametrize("lost", ["setup", "pace", "record", "hub", "generators"])
+@pytest.mark.parametrize("lost", ["setup", "rate_limiter", "record", "hub", "generators"])
 def test_a_checkpoint_that_lacks_a_part_is_refused(tmp_path: Path, lost: str) -> None:
     path = save_run(tmp_path, trainer(MADE), REST, keep=1)
     found = load_checkpoint(path)

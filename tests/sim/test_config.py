@@ -65,9 +65,11 @@ def test_refused_stage(settings: dict[str, Any], reason: str) -> None:
 @pytest.mark.parametrize(
     ("settings", "reason"),
     [
-        ({"name": "overlapp"}, "overlap, dense, pose or package.module:function, got 'overlapp'"),
+        ({"name": "overlapp"}, "overlap, dense, pose or path/to/file.py:function, got 'overlapp'"),
         ({"name": ":function"}, "got ':function'"),
-        ({"name": "module:"}, "got 'module:'"),
+        ({"name": "file.py:"}, "got 'file.py:'"),
+        ({"name": "file.py:two words"}, "got 'file.py:two words'"),
+        ({"name": "module:function"}, "got 'module:function'"),
         ({"source": "eyes"}, "reward.source must be one of polygon, camera"),
         ({"sharpness": 0.0}, "reward.sharpness must be between"),
         ({"name": "dense", "source": "camera"}, "set reward.source=polygon"),

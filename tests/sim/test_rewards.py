@@ -12,7 +12,15 @@ from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import Layout
 from tangram_sim.pictures import BACKGROUND, TOKEN_GRAY
-from tangram_sim.rewards import RewardFn, TargetPictures, check_reward, closeness, make_reward
+from tangram_sim.rewards import (
+    RewardFn,
+    TargetPictures,
+    absolute_name,
+    check_reward,
+    closeness,
+    make_reward,
+    reward_identity,
+)
 from tangram_sim.sampling import sample_batch
 from tests.sim.builders import LOPSIDED, SEVEN, TRIO, layout_of, random_poses
 
@@ -216,14 +224,17 @@ def lost(achieved, desired, layout):
 
 @pytest.fixture
 def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "own_rewards_of_a_test.py").write_text(OWN)
-    monkeypatch.syspath_prepend(str(tmp_path))
+    """A user's file in the current folder, and one that cannot be loaded."""
+    (tmp_path / "own.py").write_text(OWN)
+    (tmp_path / "broken.py").write_text("import no_such_package")
+    (tmp_path / "half.py").write_text("def near(")
+    monkeypatch.chdir(tmp_path)
 
 
 @pytest.mark.usefixtures("own")
 def test_a_reward_of_the_users_own() -> None:
     layout = layout_of("square")
-    reward = reward_of("own_rewards_of_a_test:near", layout)
+    reward = reward_of("own.py:near", layout)
     corners = layout.corners(random_poses(np.random.default_rng(0), 5, 1, 1.0))
     np.testing.assert_allclose(reward(corners, corners + 0.25), -0.25)
 
@@ -239,7 +250,7 @@ def test_a_reward_of_the_users_own() -> None:
 )
 def test_what_the_users_own_returns_is_checked(function: str, reason: str) -> None:
     layout = layout_of("square")
-    reward = reward_of(f"own_rewards_of_a_test:{function}", layout)
+    reward = reward_of(f"own.py:{function}", layout)
     corners = layout.corners(random_poses(np.random.default_rng(0), 5, 1, 1.0))
     with pytest.raises(ConfigError, match=reason):
         reward(corners, corners)
@@ -249,9 +260,18 @@ def test_what_the_users_own_returns_is_checked(function: str, reason: str) -> No
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
-        ("no_such_module:near", "cannot import 'no_such_module'"),
-        ("own_rewards_of_a_test:far", "module 'own_rewards_of_a_test' has no 'far'"),
-        ("own_rewards_of_a_test:number", "'number' is not a function"),
+        (
+            "no/such.py:near",
+            r"cannot read 'no/such.py' on this machine \(No such file or",
+        ),
+        ("no/such.py:near", r"put a copy there, or say where it lies with reward\.name=path/to/"),
+        (
+            "broken.py:near",
+            r"cannot load 'broken.py' \(ModuleNotFoundError: No module named 'no",
+        ),
+        ("half.py:near", r"cannot load 'half.py' \(SyntaxError"),
+        ("own.py:far", "'own.py' has no 'far'"),
+        ("own.py:number", "'number' is not a function"),
     ],
 )
 def test_an_own_reward_that_cannot_be_loaded(name: str, reason: str) -> None:
@@ -260,7 +280,7 @@ def test_an_own_reward_that_cannot_be_loaded(name: str, reason: str) -> None:
 
 
 @pytest.mark.usefixtures("own")
-@pytest.mark.parametrize("name", ["overlap", "dense", "pose", "own_rewards_of_a_test:near"])
+@pytest.mark.parametrize("name", ["overlap", "dense", "pose", "own.py:near"])
 def test_a_reward_that_works_passes_the_check(name: str) -> None:
     check_reward(RewardConfig(name), layout_of("square", "small_triangle"), SimConfig())
 
@@ -271,6 +291,40 @@ def test_a_reward_that_works_passes_the_check(name: str) -> None:
 )
 def test_a_reward_that_fails_is_told_before_anything_starts(function: str, reason: str) -> None:
     with pytest.raises(ConfigError, match=reason):
-        check_reward(
-            RewardConfig(f"own_rewards_of_a_test:{function}"), layout_of("square"), SimConfig()
-        )
+        check_reward(RewardConfig(f"own.py:{function}"), layout_of("square"), SimConfig())
+
+
+def test_an_own_reward_counts_by_its_content_wherever_the_file_lies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for folder, content in (("here", OWN), ("there", OWN), ("changed", f"{OWN}\n")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "own.py").write_text(content)
+    monkeypatch.chdir(tmp_path / "here")
+    here = reward_identity(RewardConfig("own.py:near"))
+    assert reward_identity(RewardConfig(f"{tmp_path}/there/own.py:near")) == here
+    assert reward_identity(RewardConfig(f"{tmp_path}/changed/own.py:near")) != here
+    assert reward_identity(RewardConfig("own.py:text")) != here
+    assert reward_identity(RewardConfig("own.py:near", sharpness=2.0)) != here
+
+
+def test_a_file_of_the_users_own_holds_in_every_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", "/home/me")
+    assert absolute_name("a/own.py:near") == f"{tmp_path}/a/own.py:near"
+    assert absolute_name("~/own.py:near") == "/home/me/own.py:near"
+    assert absolute_name("/own.py:near") == "/own.py:near"
+    assert absolute_name("dense") == "dense"
+
+
+def test_files_with_one_name_are_different_rewards(tmp_path: Path) -> None:
+    layout, rewards = layout_of("square"), []
+    for number in (1, 2):
+        path = tmp_path / str(number) / "own.py"
+        path.parent.mkdir()
+        path.write_text(f"def same(achieved, desired, layout): return [{number}] * len(achieved)")
+        rewards.append(reward_of(f"{path}:same", layout))
+    corners = layout.corners(np.zeros((1, 1, 3)))
+    assert [reward(corners, corners)[0] for reward in rewards] == [1, 2]

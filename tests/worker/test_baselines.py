@@ -12,7 +12,7 @@ from tangram_sim.kinematics import wrap
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.sim.builders import SEVEN
 from worker.baselines import exact_policy, random_policy
-from worker.trials import Trials
+from worker.test_set import FixedTests
 
 pytestmark = pytest.mark.fast
 
@@ -25,8 +25,8 @@ SHAPES = ("square", "small_triangle", "parallelogram")
 @pytest.mark.parametrize("actions", [1, 3])
 def test_the_exact_policy_scores_one(backend: str, tokens: dict, actions: int) -> None:
     made = setup(tokens, backend=backend, actions_per_token=actions)
-    with closing(Trials(made, 5, 5)) as trials:
-        scores = trials.scores(trials.play(exact_policy(made.layout, made.sim)))
+    with closing(FixedTests(made, 5, 5)) as tests:
+        scores = tests.scores(tests.play(exact_policy(made.layout, made.sim)))
     assert scores["raw_overlap_p10"] > 0.9999
     assert scores["position_error_p90"] < 1e-4
     assert scores["angle_error_deg_p90"] < 1e-2
@@ -53,9 +53,9 @@ def test_it_turns_no_further_than_the_symmetry_asks_for(shape: str) -> None:
 def test_the_exact_policy_solves_the_game(backend: str, targets: str, allow_flip: bool) -> None:
     sim = {"targets": targets, "starts": "outside", "mirrored": 0.5, "allow_flip": allow_flip}
     made = setup(GAME, backend=backend, pixels=16, **sim)
-    with closing(Trials(made, 8, 8)) as trials:
-        played = trials.play(exact_policy(made.layout, made.sim))
-        scores = trials.scores(played)
+    with closing(FixedTests(made, 8, 8)) as tests:
+        played = tests.play(exact_policy(made.layout, made.sim))
+        scores = tests.scores(played)
     assert scores["raw_overlap_p10"] > 0.999
     assert (scores["share_solved"], scores["wrong"], scores["refused"]) == (1.0, 0.0, 0.0)
     assert scores["angle_error_deg_p90"] < 0.1
@@ -85,8 +85,8 @@ def test_equal_tokens_take_the_nearer_places() -> None:
 @pytest.mark.parametrize("allow_flip", [False, True])
 def test_chance_names_tokens_that_are_left_and_stays_in_the_arena(allow_flip: bool) -> None:
     made = setup(GAME, allow_flip=allow_flip, max_overlap=1.0, pixels=16)
-    with closing(Trials(made, 20, 20)) as trials:
-        played = trials.play(random_policy(made.layout, made.sim))
+    with closing(FixedTests(made, 20, 20)) as tests:
+        played = tests.play(random_policy(made.layout, made.sim))
     assert not played.refused.any()
     assert played.placed[:, -1].all()
     centres = made.layout.poses(played.ends)[..., :2]

@@ -11,9 +11,8 @@ from tangram_sim.errors import ConfigError, RunError
 from tests.agent.builders import PAIR, SQUARE
 from tests.worker.builders import write_run
 from worker.cli import with_absolute_paths
-from worker.compare import compare_runs, distinct_names, equally_long, headed
 from worker.config import PlayConfig, check_compare
-from worker.play import play_episodes
+from worker.play import compare_runs, distinct_names, equally_long, headed, play_episodes
 
 pytestmark = pytest.mark.fast
 

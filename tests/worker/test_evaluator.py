@@ -15,7 +15,7 @@ from tests.worker.builders import policy, weights
 from tests.worker.masters import collect, open_hub, with_master
 from worker.config import WorkerConfig
 from worker.evaluator import Schedule, run_evaluator
-from worker.trials import Trials, greedy
+from worker.test_set import FixedTests, greedy
 
 SERVICE = ServiceConfig(envs=6, eval_episodes=20, eval_seconds=3600.0, publish_seconds=0.1)
 
@@ -43,13 +43,13 @@ def test_the_newest_weights_are_scored_on_the_fixed_tests(tokens: dict | None) -
     versions = [one.scores.weights_version for one in arrived]
     assert versions[0] == 5
     assert versions == sorted(set(versions))
-    with closing(Trials(made, 20, 6)) as trials:
+    with closing(FixedTests(made, 20, 6)) as tests:
         for one in arrived:
             found = one.scores
-            expected = trials.play(greedy(policy(made, found.weights_version)))
+            expected = tests.play(greedy(policy(made, found.weights_version)))
             scalars = dict(found.scalars)
             assert scalars.pop("seconds") >= 0.0
-            assert scalars == pytest.approx(trials.scores(expected), abs=1e-4)
+            assert scalars == pytest.approx(tests.scores(expected), abs=1e-4)
             assert "mean_reward_camera" in scalars
             for name in ("starts", "ends", "goals"):
                 corners = getattr(found, name)

@@ -6,7 +6,7 @@ import pytest
 from tangram_agent.setup import Setup
 from tests.agent.builders import setup
 from tests.sim.builders import layout_of
-from tests.worker.test_assembly import ended
+from tests.worker.test_metrics import ended
 from worker.film import film, frames_per_action
 from worker.rollout import Played
 

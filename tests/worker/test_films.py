@@ -10,9 +10,8 @@ import worker.film as film_module
 from tests.agent.builders import PAIR
 from tests.worker.builders import write_run
 from tests.worker.test_compare import PLAIN_AGENT, compared
-from worker.compare import compare_runs
 from worker.config import PlayConfig
-from worker.play import play_run
+from worker.play import compare_runs, play_run
 
 pytestmark = pytest.mark.slow
 

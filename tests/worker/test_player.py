@@ -17,7 +17,7 @@ import zmq
 from master.arrivals import EpisodesArrived
 from master.hub import Hub
 from tangram_agent.config import ServiceConfig
-from tangram_agent.lifeline import Lifeline
+from tangram_agent.process import Lifeline
 from tangram_agent.setup import Setup
 from tangram_agent.wire import Go
 from tangram_sim.errors import ConfigError, TangramError

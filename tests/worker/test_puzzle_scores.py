@@ -12,8 +12,7 @@ from tangram_sim.errors import ConfigError
 from tests.worker.builders import write_run
 from tests.worker.puzzle_files import GAME, SIM, drawn, write_puzzles
 from worker.config import EvalConfig
-from worker.evaluate import evaluate_run
-from worker.tables import MAX_LINES
+from worker.evaluate import MAX_LINES, evaluate_run
 
 pytestmark = pytest.mark.fast
 

@@ -7,8 +7,8 @@ import pytest
 
 from tangram_sim.config import SimConfig
 from tangram_sim.layout import Layout, TokensConfig, make_layout
+from worker.metrics import pose_errors, summarise
 from worker.rollout import Played
-from worker.scores import pose_errors, summarise
 
 pytestmark = pytest.mark.fast
 

@@ -17,8 +17,8 @@ from tangram_agent.types import Weights
 from tangram_sim.errors import TangramError
 from tests.agent.messages import episodes, hello, weights
 from tests.master.dealers import INFO, Stage, staged
-from tests.worker.standin import QUICK, make_link
-from worker.link import Link
+from tests.worker.standin import QUICK, make_client
+from worker.client import Client
 
 pytestmark = pytest.mark.cluster
 
@@ -40,21 +40,21 @@ def write_file(folder: Path, hub: Hub, keys: Keys | None, run_id: str = "run") -
 
 
 @contextmanager
-def joining(stage: Stage, path: Path | str, timing: object = SHORT) -> Iterator[Link]:
-    """A link that tries to join, while the hub is served."""
-    with make_link(str(path), timing=timing) as link, ThreadPoolExecutor(1) as pool:
-        future = pool.submit(link.join)
+def joining(stage: Stage, path: Path | str, timing: object = SHORT) -> Iterator[Client]:
+    """A client that tries to join, while the hub is served."""
+    with make_client(str(path), timing=timing) as client, ThreadPoolExecutor(1) as pool:
+        future = pool.submit(client.join)
         stage.until(future.done)
         future.result()
-        yield link
+        yield client
 
 
 def test_the_file_lets_a_worker_in_and_everything_works(tmp_path: Path) -> None:
     keys = make_keys()
     with staged(keys=keys) as stage:
         path = write_file(tmp_path, stage.hub, keys)
-        with joining(stage, path) as link:
-            link.send(episodes(), 0)
+        with joining(stage, path) as client:
+            client.send(episodes(), 0)
             stage.until(stage.batches)
             stage.hub.acknowledge(stage.batches()[0])
             # Broadcasts are encrypted with the same keys.
@@ -62,9 +62,9 @@ def test_the_file_lets_a_worker_in_and_everything_works(tmp_path: Path) -> None:
 
             def served() -> bool:
                 stage.hub.publish(weights(version=len(got) + 1))
-                link.poll()
-                got.append(link.newest_weights())
-                return got[-1] is not None and link._talk.spool.first == 2
+                client.poll()
+                got.append(client.newest_weights())
+                return got[-1] is not None and client.outbox.first == 2
 
             stage.until(served)
     assert stage.hub.counters["refused_keys"] == 0
@@ -94,7 +94,9 @@ def test_other_keys_are_turned_away_and_the_worker_names_its_file(
         assert stage.hub.counters["refused_keys"] >= (wrong == "worker")
         assert stage.hub.peers == []
     # It was told at once, too, not only when the patience was over.
-    assert [r.message for r in caplog.records if r.name == "worker.line"] == [str(caught.value)]
+    assert [r.message for r in caplog.records if r.name == "worker.connection"] == [
+        str(caught.value)
+    ]
 
 
 def test_a_file_with_keys_does_not_fit_a_plain_master(tmp_path: Path) -> None:
@@ -119,9 +121,9 @@ def test_a_file_that_becomes_right_is_read_again(tmp_path: Path) -> None:
     with staged(keys=keys) as stage:
         path = write_file(tmp_path, stage.hub, make_keys())
         patient = replace(SHORT, join_s=20.0)
-        with make_link(str(path), timing=patient) as link, ThreadPoolExecutor(1) as pool:
-            future = pool.submit(link.join)
-            stage.until(lambda: link.counters["handshakes_failed"])
+        with make_client(str(path), timing=patient) as client, ThreadPoolExecutor(1) as pool:
+            future = pool.submit(client.join)
+            stage.until(lambda: client.counters["handshakes_failed"])
             write_file(tmp_path, stage.hub, keys)
             stage.until(future.done)
             assert future.result()
@@ -158,10 +160,10 @@ def test_a_connection_that_is_lost_in_the_handshake_is_no_wrong_key(
         content = json.loads(path.read_text())
         path.write_text(json.dumps(content | {"endpoint": f"tcp://127.0.0.1:{port}"}))
         with (
-            make_link(str(path), timing=replace(SHORT, join_s=20.0)) as link,
+            make_client(str(path), timing=replace(SHORT, join_s=20.0)) as client,
             ThreadPoolExecutor(1) as pool,
         ):
-            future = pool.submit(link.join)
+            future = pool.submit(client.join)
             for _ in range(2):
                 near, _ = listener.accept()
                 near.recv(10)
@@ -169,5 +171,5 @@ def test_a_connection_that_is_lost_in_the_handshake_is_no_wrong_key(
             write_file(tmp_path, stage.hub, keys)
             stage.until(future.done)
             assert future.result()
-            assert link.counters["handshakes_failed"] == 0
+            assert client.counters["handshakes_failed"] == 0
     assert "wrong or stale" not in caplog.text

@@ -13,12 +13,11 @@ from tangram_sim.errors import ConfigError, TangramError
 from tangram_sim.geometry import outlines, pairs_overlap
 from tests.worker.builders import write_run
 from tests.worker.puzzle_files import GAME, SIM, drawn, write_puzzles
-from worker import show as show_module
+from worker import film as film_module
 from worker.cli import with_absolute_paths
 from worker.config import PlayConfig, check_puzzle
-from worker.film import Frame
+from worker.film import Frame, film_pictures
 from worker.play import make_show, play_run
-from worker.show import film_pictures
 
 pytestmark = pytest.mark.fast
 
@@ -88,7 +87,7 @@ def test_a_film_has_a_picture_for_each_frame(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("worker.film.MAX_FRAMES", 14)  # drawing takes its time
-    monkeypatch.setattr("worker.show.WIDTH", 120)
+    monkeypatch.setattr("worker.film.WIDTH", 120)
     made = config(tmp_path, puzzle=("cat",))
     pictures = film_pictures(make_show(load_run(made.run_dirs[0]), made))
     assert len(pictures) == 1 + 14 + 1
@@ -122,9 +121,9 @@ class StandIn:
 @pytest.fixture
 def no_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("FRAME_S", "PAUSE_S"):
-        monkeypatch.setattr(show_module, name, 0.0)
+        monkeypatch.setattr(film_module, name, 0.0)
     clock = iter(range(10**6))
-    monkeypatch.setattr(show_module.time, "monotonic", lambda: -next(clock))
+    monkeypatch.setattr(film_module.time, "monotonic", lambda: -next(clock))
 
 
 @pytest.mark.parametrize(("left", "targets"), [(10**6, 2), (5, 1)])
@@ -133,11 +132,11 @@ def test_a_window_shows_one_puzzle_after_the_other_until_it_is_closed(
 ) -> None:
     window = StandIn(left)
     monkeypatch.setattr("tangram_sim.physics.open_window", lambda *_: window)
-    monkeypatch.setattr(show_module.time, "sleep", lambda _: None)
+    monkeypatch.setattr(film_module.time, "sleep", lambda _: None)
     assert play_run(config(tmp_path, puzzle=("cat", "dog"), live=True)) == 0
     assert (window.targets, window.closed) == (targets, True)
     assert len(window.shown) == min(left, 2 * (1 + 1 + 7 * 14 + 1))
-    assert max(heights.max() for _, heights in window.shown) <= show_module.CARRIED
+    assert max(heights.max() for _, heights in window.shown) <= film_module.CARRIED
 
 
 @pytest.mark.parametrize("display", [None, ":399"])

@@ -7,13 +7,13 @@ from typing import Any
 
 import pytest
 
+from master import checkpointer as checkpointer_module
 from master import journal as journal_module
-from master import keeper as keeper_module
-from master.every import Every
+from master.checkpointer import MAKE_ROOM, Checkpointer
 from master.journal import JournalError, segments
-from master.keeper import MAKE_ROOM, Keeper
 from tangram_agent import checkpoints as checkpoints_module
 from tangram_agent.checkpoints import DiskError, list_checkpoints
+from tangram_agent.process import Every
 from tests.master.builders import FakeHub, arrival, close_journals, loop, small_setup
 
 pytestmark = pytest.mark.fast
@@ -28,16 +28,24 @@ def closed() -> Iterator[None]:
 
 
 class Stage:
-    """A keeper, what it told, and a disk that can be full."""
+    """A checkpointer, what it told, and a disk that can be full."""
 
     def __init__(self, folder: Path, patch: pytest.MonkeyPatch) -> None:
         self.full = False
         self.told: list[str] = []
         made = loop(folder, MADE, FakeHub(MADE))
         self.parts, self.folder = made.parts, folder
-        self.keeper = Keeper(made.parts, made.clock, self.told.append)
-        patch.setattr(keeper_module, "RETRY_S", 0.0)
-        self.keeper._retry = Every(0.0)
+        self.checkpointer = Checkpointer(
+            made.parts.config.service,
+            made.parts.folder,
+            made.parts.guard,
+            made.parts.hub,
+            made.parts.journal,
+            made.clock,
+            self.told.append,
+        )
+        patch.setattr(checkpointer_module, "RETRY_S", 0.0)
+        self.checkpointer._retry = Every(0.0)
         kind = journal_module.Journal
         patch.setattr(kind, "_write", self._guarded(kind._write))
         patch.setattr(checkpoints_module, "_write", self._guarded(checkpoints_module._write))
@@ -58,35 +66,35 @@ def stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stage:
 
 def test_a_full_disk_is_told_once_and_the_batch_is_kept_when_there_is_room(stage: Stage) -> None:
     stage.full = True
-    assert [stage.keeper.keep(arrival(MADE, 1)) for _ in range(3)] == [False] * 3
+    assert [stage.checkpointer.keep(arrival(MADE, 1)) for _ in range(3)] == [False] * 3
     where = stage.folder / "journal"
     assert stage.told == [
         f"the journal in {where} cannot be written (No space left on device): {MAKE_ROOM}"
     ]
     stage.full = False
-    assert stage.keeper.keep(arrival(MADE, 1))
+    assert stage.checkpointer.keep(arrival(MADE, 1))
     assert stage.told[1:] == ["the journal can be written again: batches are taken in"]
-    assert stage.keeper.keep(arrival(MADE, 2))
+    assert stage.checkpointer.keep(arrival(MADE, 2))
     stage.full = True
-    assert not stage.keeper.keep(arrival(MADE, 3))
+    assert not stage.checkpointer.keep(arrival(MADE, 3))
     assert len(stage.told) == 3
 
 
 def test_a_disk_that_does_not_take_a_checkpoint_ends_nothing(stage: Stage) -> None:
-    assert stage.keeper.keep(arrival(MADE, 1))
-    first = stage.keeper.save()
-    assert stage.keeper.keep(arrival(MADE, 2))
+    assert stage.checkpointer.keep(arrival(MADE, 1))
+    first = stage.checkpointer.save()
+    assert stage.checkpointer.keep(arrival(MADE, 2))
     stage.full = True
-    stage.keeper._checkpoint = Every(0.0)
-    stage.keeper.tick()
+    stage.checkpointer._checkpoint = Every(0.0)
+    stage.checkpointer.tick()
     assert len(stage.told) == 1
     assert stage.told[0].startswith("warning: cannot write a checkpoint to ")
     assert list((stage.folder / "checkpoints").iterdir()) == [first]
     assert list(segments(stage.folder / "journal")) == [2]
     with pytest.raises(DiskError, match="make room there"):
-        stage.keeper.save()
+        stage.checkpointer.save()
     stage.full = False
-    stage.keeper.tick()
+    stage.checkpointer.tick()
     assert len(list_checkpoints(stage.folder / "checkpoints")) == 2
 
 
@@ -94,8 +102,8 @@ def test_segments_live_as_long_as_a_checkpoint_needs_them(stage: Stage) -> None:
     """Two checkpoints are kept: the older one needs what came between it and the newer one."""
     left = []
     for number in range(1, 5):
-        assert stage.keeper.keep(arrival(MADE, number))
-        stage.keeper.save()
+        assert stage.checkpointer.keep(arrival(MADE, number))
+        stage.checkpointer.save()
         left.append(list(segments(stage.folder / "journal")))
     assert left == [[], [2], [3], [4]]
 
@@ -103,11 +111,11 @@ def test_segments_live_as_long_as_a_checkpoint_needs_them(stage: Stage) -> None:
 def test_a_journal_that_cannot_be_synced_is_told(
     stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert stage.keeper.keep(arrival(MADE, 1))
+    assert stage.checkpointer.keep(arrival(MADE, 1))
 
     def fail() -> None:
         raise JournalError("the journal cannot be written")
 
     monkeypatch.setattr(stage.parts.journal, "tick", fail)
-    stage.keeper.tick()
+    stage.checkpointer.tick()
     assert stage.told == ["warning: the journal cannot be written"]

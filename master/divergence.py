@@ -8,11 +8,11 @@ import numpy as np
 import numpy.typing as npt
 import safetensors.numpy
 
-from master.every import Every
 from master.tally import Tally
 from master.trainer import Trainer
 from tangram_agent.files import write_whole
 from tangram_agent.learner import NotFiniteError
+from tangram_agent.process import Every
 from tangram_agent.types import Weights
 from tangram_sim.errors import RunError
 
@@ -21,8 +21,12 @@ KEEP_S = 0.5
 UNDONE = "undone updates"
 
 
-class Guard:
-    """Updates a trainer, and takes it back to its last good state when one goes wrong."""
+class DivergenceGuard:
+    """Updates a trainer, and takes it back to its last good state when one goes wrong.
+
+    Attributes:
+        trainer: whoever saves its state calls `check` before.
+    """
 
     def __init__(self, trainer: Trainer, limit: int, evidence: Path) -> None:
         """Keep the present state as the first good one.
@@ -36,7 +40,7 @@ class Guard:
             NotFiniteError: the state is not finite already.
         """
         self._tally = Tally()
-        self._trainer, self._limit, self._evidence = trainer, limit, evidence
+        self.trainer, self._limit, self._evidence = trainer, limit, evidence
         self._in_a_row, self._keep = 0, Every(KEEP_S)
         self._good = trainer.learner.state()
         _check_finite(self._good, trainer.updates)
@@ -53,7 +57,7 @@ class Guard:
             RunError: it was one failure too many.
         """
         try:
-            losses = self._trainer.update(share)
+            losses = self.trainer.update(share)
         except NotFiniteError as error:
             self._undo(error)
             return {}
@@ -67,12 +71,12 @@ class Guard:
         Raises:
             RunError: they were not, one time too many.
         """
-        weights = self._trainer.weights()
+        weights = self.trainer.weights()
         try:
             _check_finite(weights.tensors, weights.version)
         except NotFiniteError as error:
             self._undo(error)
-            return self._trainer.weights()
+            return self.trainer.weights()
         return weights
 
     def check(self) -> None:
@@ -81,9 +85,9 @@ class Guard:
         Raises:
             RunError: it was one failure too many.
         """
-        state = self._trainer.learner.state()
+        state = self.trainer.learner.state()
         try:
-            _check_finite(state, self._trainer.updates)
+            _check_finite(state, self.trainer.updates)
         except NotFiniteError as error:
             self._undo(error)
         else:
@@ -98,10 +102,10 @@ class Guard:
                 f"{self._write_batch()}: lower agent.actor_lr and agent.critic_lr or set "
                 "agent.grad_clip=1, and go on from the last checkpoint with resume=auto"
             )
-        self._trainer.go_back(self._good)
+        self.trainer.go_back(self._good)
 
     def _write_batch(self) -> Path:
-        batch = {} if self._trainer.batch is None else vars(self._trainer.batch)
+        batch = {} if self.trainer.batch is None else vars(self.trainer.batch)
         write_whole(self._evidence, safetensors.numpy.save(batch))
         return self._evidence
 

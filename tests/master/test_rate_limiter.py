@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from master.pace import Pace
+from master.rate_limiter import RateLimiter
 from tangram_sim.errors import ConfigError, RunError
 
 pytestmark = pytest.mark.fast
@@ -49,11 +49,12 @@ def test_what_is_allowed(
     may_update: bool,
     may_insert: bool,
 ) -> None:
-    pace = Pace(rate, starts, limit)
-    pace.inserted(transitions)
-    pace.updated(updates)
-    assert (pace.lag, pace.may_update(), pace.may_insert()) == (lag, may_update, may_insert)
-    assert (pace.transitions, pace.updates) == (transitions, updates)
+    limiter = RateLimiter(rate, starts, limit)
+    limiter.inserted(transitions)
+    limiter.updated(updates)
+    assert limiter.lag == lag
+    assert (limiter.may_update(), limiter.may_insert()) == (may_update, may_insert)
+    assert (limiter.transitions, limiter.updates) == (transitions, updates)
 
 
 @given(
@@ -65,18 +66,18 @@ def test_what_is_allowed(
 def test_somebody_may_always_move_and_nobody_runs_ahead(
     rate: float, starts: int, limit: int, wishes: list[tuple[bool, int]]
 ) -> None:
-    pace = Pace(rate, starts, limit)
+    limiter = RateLimiter(rate, starts, limit)
     for insert_first, size in wishes:
-        assert pace.may_update() or pace.may_insert()
-        before, started = pace.lag, pace.transitions >= starts
-        if pace.may_insert() and (insert_first or not pace.may_update()):
-            pace.inserted(size)
+        assert limiter.may_update() or limiter.may_insert()
+        before, started = limiter.lag, limiter.transitions >= starts
+        if limiter.may_insert() and (insert_first or not limiter.may_update()):
+            limiter.inserted(size)
         else:
-            pace.updated()
-        assert pace.updates <= rate * pace.transitions + 1e-6
-        assert pace.updates == 0 or pace.transitions >= starts
+            limiter.updated()
+        assert limiter.updates <= rate * limiter.transitions + 1e-6
+        assert limiter.updates == 0 or limiter.transitions >= starts
         if started:  # a batch is inserted whole
-            assert pace.lag <= max(before, limit - 1 + math.ceil(rate * size))
+            assert limiter.lag <= max(before, limit - 1 + math.ceil(rate * size))
 
 
 @pytest.mark.parametrize(
@@ -102,33 +103,33 @@ def test_somebody_may_always_move_and_nobody_runs_ahead(
 )
 def test_settings_that_would_deadlock(rate: float, starts: int, limit: int, reason: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        Pace(rate, starts, limit)
+        RateLimiter(rate, starts, limit)
     assert str(caught.value).startswith(reason)
 
 
 def test_a_restore_takes_counters_but_not_the_policy() -> None:
-    before = Pace(10.0, 1, 4)
+    before = RateLimiter(10.0, 1, 4)
     before.inserted(100)
     before.updated(990)
-    after = Pace(0.5, 1, 4)
+    after = RateLimiter(0.5, 1, 4)
     after.load_state(json.loads(json.dumps(before.state())))
     # The debt of 10 stays, and new transitions count by the new rate.
     assert (after.transitions, after.updates, after.lag) == (100, 990, 10)
     after.updated(10)
     after.inserted(4)
     assert after.lag == 2
-    again = Pace(10.0, 1, 4)
+    again = RateLimiter(10.0, 1, 4)
     again.load_state(after.state())
     assert again.lag == 2
 
 
 @given(st.floats(1e-3, 10), st.lists(st.integers(1, 100), max_size=20))
 def test_a_round_trip_changes_nothing(rate: float, sizes: list[int]) -> None:
-    plain, restored = Pace(rate, 5, 3), Pace(rate, 5, 3)
+    plain, restored = RateLimiter(rate, 5, 3), RateLimiter(rate, 5, 3)
     for size in sizes:
         plain.inserted(size)
         restored.inserted(size)
-        fresh = Pace(rate, 5, 3)
+        fresh = RateLimiter(rate, 5, 3)
         fresh.load_state(restored.state())
         restored = fresh
         assert restored.lag == plain.lag
@@ -146,5 +147,5 @@ def test_a_round_trip_changes_nothing(rate: float, sizes: list[int]) -> None:
     ],
 )
 def test_malformed_counters_are_refused(state: dict[str, float]) -> None:
-    with pytest.raises(RunError, match="pace must hold transitions, updates and due, got"):
-        Pace(0.1, 1, 1).load_state(state)
+    with pytest.raises(RunError, match="limiter must hold transitions, updates and due, got"):
+        RateLimiter(0.1, 1, 1).load_state(state)

@@ -10,8 +10,8 @@ import torch
 from tangram_agent.ddpg import NotFiniteError
 from torch import nn
 
-from master import guard as guard_module
-from master.guard import Guard
+from master import divergence as divergence_module
+from master.divergence import DivergenceGuard
 from master.trainer import Trainer
 from tangram_sim.errors import RunError
 from tests.agent.builders import random_episodes
@@ -33,7 +33,7 @@ def learning() -> Trainer:
 @pytest.fixture(autouse=True)
 def kept_each_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every good state is kept, however fast the machine is."""
-    monkeypatch.setattr(guard_module, "KEEP_S", 0.0)
+    monkeypatch.setattr(divergence_module, "KEEP_S", 0.0)
 
 
 def fail(made: Trainer, times: int, part: str = "critic_loss") -> None:
@@ -62,37 +62,37 @@ def same(one: dict[str, Any], other: dict[str, Any]) -> bool:
 def test_a_bad_update_is_undone_and_the_next_one_counts(
     learning: Trainer, tmp_path: Path, part: str
 ) -> None:
-    guard = Guard(learning, 3, tmp_path / "bad")
+    guard = DivergenceGuard(learning, 3, tmp_path / "bad")
     for _ in range(2):
         assert guard.update(0.0)
-    good, lag = learning.learner.state(), learning.pace.lag
+    good, lag = learning.learner.state(), learning.rate_limiter.lag
     fail(learning, 1, part)
     assert guard.update(0.0) == {}
     assert same(learning.learner.state(), good)
-    assert (learning.updates, learning.pace.lag, guard.undone) == (2, lag, 1)
+    assert (learning.updates, learning.rate_limiter.lag, guard.undone) == (2, lag, 1)
     assert np.isfinite(list(guard.update(0.0).values())).all()
-    assert (learning.updates, learning.pace.lag, guard.undone) == (3, lag - 1, 1)
+    assert (learning.updates, learning.rate_limiter.lag, guard.undone) == (3, lag - 1, 1)
     assert not (tmp_path / "bad").exists()
 
 
 def test_updates_since_the_last_good_state_are_made_again(
     learning: Trainer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(guard_module, "KEEP_S", 1000.0)
-    guard, lag = Guard(learning, 3, tmp_path / "bad"), learning.pace.lag
+    monkeypatch.setattr(divergence_module, "KEEP_S", 1000.0)
+    guard, lag = DivergenceGuard(learning, 3, tmp_path / "bad"), learning.rate_limiter.lag
     first = learning.learner.state()
     for _ in range(4):
         guard.update(0.0)
     fail(learning, 1)
     guard.update(0.0)
     assert same(learning.learner.state(), first)
-    assert (learning.updates, learning.pace.lag) == (0, lag)
+    assert (learning.updates, learning.rate_limiter.lag) == (0, lag)
 
 
 def test_too_many_in_a_row_end_the_run_and_the_batch_is_kept(
     learning: Trainer, tmp_path: Path
 ) -> None:
-    guard = Guard(learning, 3, tmp_path / "bad")
+    guard = DivergenceGuard(learning, 3, tmp_path / "bad")
     fail(learning, 2)
     assert [bool(guard.update(0.0)) for _ in range(3)] == [False, False, True]
     fail(learning, 99)
@@ -108,7 +108,7 @@ def test_too_many_in_a_row_end_the_run_and_the_batch_is_kept(
 def test_weights_that_went_bad_without_a_loss_are_never_given_out(
     learning: Trainer, tmp_path: Path
 ) -> None:
-    guard = Guard(learning, 2, tmp_path / "bad")
+    guard = DivergenceGuard(learning, 2, tmp_path / "bad")
     guard.update(0.0)
     poison(learning.learner.acting)
     weights = guard.weights()
@@ -123,7 +123,7 @@ def test_weights_that_went_bad_without_a_loss_are_never_given_out(
 def test_a_check_finds_what_no_worker_would_see(
     learning: Trainer, tmp_path: Path, part: str
 ) -> None:
-    guard = Guard(learning, 2, tmp_path / "bad")
+    guard = DivergenceGuard(learning, 2, tmp_path / "bad")
     guard.update(0.0)
     good = learning.learner.state()
     poison(getattr(learning.learner, part))
@@ -134,4 +134,4 @@ def test_a_check_finds_what_no_worker_would_see(
 def test_a_state_that_is_spoilt_already_is_refused(learning: Trainer, tmp_path: Path) -> None:
     poison(learning.learner.critic)
     with pytest.raises(NotFiniteError, match="the weights are not finite after 0 updates"):
-        Guard(learning, 2, tmp_path / "bad")
+        DivergenceGuard(learning, 2, tmp_path / "bad")

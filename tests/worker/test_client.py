@@ -1,4 +1,4 @@
-"""The link with a real hub, over losses and restarts, and with a master that says odd things."""
+"""The client with a real hub, over losses and restarts, and with a master that says odd things."""
 
 import signal
 import threading
@@ -25,24 +25,24 @@ from tangram_agent.wire import (
 from tangram_sim.errors import RunError, TangramError, WireError
 from tests.agent.messages import FINGERPRINTS, SHAPES, episodes, scores, weights, with_header
 from tests.master.dealers import staged
-from tests.worker.links import both, free_port, joined, numbers, served, write_connection
-from tests.worker.standin import QUICK, make_link, standing_in
+from tests.worker.clients import both, free_port, joined, numbers, served, write_connection
+from tests.worker.standin import QUICK, make_client, standing_in
 
 pytestmark = pytest.mark.cluster
 
 
 def test_a_link_joins_and_is_told_what_it_needs() -> None:
-    with staged() as stage, joined(stage, index=5) as link:
-        welcome = link.welcome
+    with staged() as stage, joined(stage, index=5) as client:
+        welcome = client.welcome
         assert (welcome.run_id, welcome.seed, welcome.index) == ("run", 7, 5)
         assert welcome.incarnation == 1
-        assert link.window_free == 3  # the hub's window, which is smaller than the link's
-        assert not link.stopped
+        assert client.window_free == 3  # the hub's window, which is smaller than the client's
+        assert not client.stopped
 
 
 def test_a_link_waits_for_the_connection_file(tmp_path: Path) -> None:
-    with staged() as stage, make_link(str(tmp_path)) as link, ThreadPoolExecutor(1) as pool:
-        future = pool.submit(link.join)
+    with staged() as stage, make_client(str(tmp_path)) as client, ThreadPoolExecutor(1) as pool:
+        future = pool.submit(client.join)
         write_connection(tmp_path, stage.hub.endpoint)
         stage.until(future.done)
         assert future.result() is True
@@ -50,18 +50,18 @@ def test_a_link_waits_for_the_connection_file(tmp_path: Path) -> None:
 
 def test_no_master_at_an_address_says_so() -> None:
     endpoint = f"tcp://127.0.0.1:{free_port()}"
-    with make_link(endpoint, replace(QUICK, join_s=0.2)) as link:
+    with make_client(endpoint, replace(QUICK, join_s=0.2)) as client:
         with pytest.raises(TangramError) as caught:
-            link.join()
+            client.join()
         assert str(caught.value) == (
             f"no master answers at {endpoint} after 0.2 s: is tangram-master running there?"
         )
 
 
 def test_no_connection_file_says_so(tmp_path: Path) -> None:
-    with make_link(str(tmp_path), replace(QUICK, join_s=0.2)) as link:
+    with make_client(str(tmp_path), replace(QUICK, join_s=0.2)) as client:
         with pytest.raises(TangramError) as caught:
-            link.join()
+            client.join()
         assert str(caught.value) == (
             f"no connection file is at {tmp_path} after 0.2 s: is tangram-master running there?"
         )
@@ -69,17 +69,17 @@ def test_no_connection_file_says_so(tmp_path: Path) -> None:
 
 def test_before_joining_there_is_no_welcome(tmp_path: Path) -> None:
     with (
-        make_link(str(tmp_path)) as link,
+        make_client(str(tmp_path)) as client,
         pytest.raises(TangramError, match=r"has not joined a master yet: call join\(\) first"),
     ):
-        _ = link.welcome
+        _ = client.welcome
 
 
 def test_a_refusal_is_raised_with_the_masters_reason() -> None:
     other = FINGERPRINTS | {"net": "other"}
-    with staged() as stage, make_link(stage.hub.endpoint, fingerprints=other) as link:
+    with staged() as stage, make_client(stage.hub.endpoint, fingerprints=other) as client:
         with pytest.raises(TangramError) as caught:
-            served(stage, link.join)
+            served(stage, client.join)
         assert str(caught.value) == (
             f"the master at {stage.hub.endpoint} refused this player: its settings of net differ "
             "from the master's: start both with the same overrides of net"
@@ -87,20 +87,20 @@ def test_a_refusal_is_raised_with_the_masters_reason() -> None:
 
 
 def test_a_master_of_another_protocol_is_an_error() -> None:
-    with standing_in() as master, make_link(master.endpoint) as link:
-        master.until(link, lambda: master.heard)
+    with standing_in() as master, make_client(master.endpoint) as client:
+        master.until(client, lambda: master.heard)
         master.say(with_header(Greet().encode(), v=99))
         with pytest.raises(
             TangramError, match=r"speaks protocol 99, this one .*: install the same"
         ):
-            master.until(link, lambda: False)
+            master.until(client, lambda: False)
 
 
 def test_a_stale_connection_file_is_told(tmp_path: Path) -> None:
-    with staged() as stage, make_link(str(tmp_path)) as link:
+    with staged() as stage, make_client(str(tmp_path)) as client:
         write_connection(tmp_path, stage.hub.endpoint, "an older run")
         with pytest.raises(TangramError) as caught:
-            served(stage, link.join)
+            served(stage, client.join)
         assert str(caught.value) == (
             f"the master at {stage.hub.endpoint} runs 'run', not 'an older run': the connection "
             "file is stale, take the one of a master that is running"
@@ -110,51 +110,51 @@ def test_a_stale_connection_file_is_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize("wait", ["join", "wait_for_window", "wait_for_weights"])
 def test_stop_ends_each_wait(wait: str) -> None:
     """As a signal handler does."""
-    with standing_in() as master, make_link(master.endpoint, window=1) as link:
+    with standing_in() as master, make_client(master.endpoint, window=1) as client:
         if wait != "join":
-            master.welcome(link)
-            assert link.send(episodes(), 1)
-        timer = threading.Timer(0.05, link.stop, ["SIGTERM"])
+            master.welcome(client)
+            assert client.send(episodes(), 1)
+        timer = threading.Timer(0.05, client.stop, ["SIGTERM"])
         timer.start()
-        assert not getattr(link, wait)()
+        assert not getattr(client, wait)()
         timer.join()
-        assert (link.stopped, link.stop_reason) == (True, "SIGTERM")
-        link.stop("again")
-        assert link.stop_reason == "SIGTERM"
-        assert link.send(episodes(), 1) is False
+        assert (client.stopped, client.stop_reason) == (True, "SIGTERM")
+        client.stop("again")
+        assert client.stop_reason == "SIGTERM"
+        assert client.send(episodes(), 1) is False
 
 
 def test_a_real_signal_ends_a_wait(tmp_path: Path) -> None:
-    with make_link(str(tmp_path)) as link:
-        before = signal.signal(signal.SIGALRM, lambda *_: link.stop("SIGALRM"))
+    with make_client(str(tmp_path)) as client:
+        before = signal.signal(signal.SIGALRM, lambda *_: client.stop("SIGALRM"))
         try:
             signal.setitimer(signal.ITIMER_REAL, 0.05)
-            assert link.join() is False
+            assert client.join() is False
         finally:
             signal.signal(signal.SIGALRM, before)
 
 
 def test_batches_arrive_and_are_forgotten_when_they_are_acknowledged() -> None:
-    with staged() as stage, joined(stage) as link:
+    with staged() as stage, joined(stage) as client:
         for number in range(3):
-            assert link.send(episodes(seed=number), number)
+            assert client.send(episodes(seed=number), number)
         stage.counted("batches", 3)
-        assert link.window_free == 0
+        assert client.window_free == 0
         for number, arrival in enumerate(stage.batches()):
             assert (arrival.sequence, arrival.weights_version) == (number + 1, number)
             for field in fields(Episodes):
                 sent = getattr(episodes(seed=number), field.name)
                 np.testing.assert_array_equal(getattr(arrival.episodes, field.name), sent)
             stage.hub.acknowledge(arrival)
-        both(stage, link, lambda: link.window_free == 3)
-        assert link.counters["resent"] == 0
+        both(stage, client, lambda: client.window_free == 3)
+        assert client.counters["resent"] == 0
 
 
 def test_a_full_window_waits_for_an_acknowledgement() -> None:
-    with staged() as stage, joined(stage, window=1) as link, ThreadPoolExecutor(1) as pool:
-        assert link.send(episodes(), 1)
+    with staged() as stage, joined(stage, window=1) as client, ThreadPoolExecutor(1) as pool:
+        assert client.send(episodes(), 1)
         stage.counted("batches")
-        late = pool.submit(link.send, episodes(), 1)
+        late = pool.submit(client.send, episodes(), 1)
         # While it waits it shows that it lives.
         beats = stage.hub.counters["heartbeats"]
         stage.until(lambda: stage.hub.counters["heartbeats"] >= beats + 2)
@@ -167,75 +167,81 @@ def test_a_full_window_waits_for_an_acknowledgement() -> None:
 
 
 def test_a_batch_out_of_bounds_is_not_sent() -> None:
-    with staged() as stage, joined(stage) as link:
+    with staged() as stage, joined(stage) as client:
         bad = episodes()
         bad.rewards[0, 0] = np.nan
         with pytest.raises(WireError, match=r"rewards holds nan at \[0, 0\]"):
-            link.send(bad, 1)
-        assert link.send(episodes(), 1)
+            client.send(bad, 1)
+        assert client.send(episodes(), 1)
         stage.counted("batches")
         assert stage.batches()[0].sequence == 1
 
 
 def test_without_an_acknowledgement_all_is_sent_again_in_order() -> None:
-    with standing_in() as master, make_link(master.endpoint, replace(QUICK, resend_s=0.1)) as link:
-        master.welcome(link)
+    with (
+        standing_in() as master,
+        make_client(master.endpoint, replace(QUICK, resend_s=0.1)) as client,
+    ):
+        master.welcome(client)
         for _ in range(3):
-            assert link.send(episodes(), 1)
-        master.until(link, lambda: len(numbers(master.heard)) >= 6)
+            assert client.send(episodes(), 1)
+        master.until(client, lambda: len(numbers(master.heard)) >= 6)
         assert numbers(master.heard)[:6] == [1, 2, 3, 1, 2, 3]
         master.say(Ack(1, duplicate=False), Ack(1, duplicate=True), Ack(3, duplicate=False))
-        master.until(link, lambda: link.window_free == 3)
+        master.until(client, lambda: client.window_free == 3)
         master.heard.clear()
-        master.until(link, lambda: len(numbers(master.heard)) >= 2)
+        master.until(client, lambda: len(numbers(master.heard)) >= 2)
         assert set(numbers(master.heard)) == {2}
 
 
 def test_a_lost_acknowledgement_is_given_again() -> None:
     with (
         staged() as stage,
-        joined(stage, timing=replace(QUICK, resend_s=0.1)) as link,
+        joined(stage, timing=replace(QUICK, resend_s=0.1)) as client,
         pytest.MonkeyPatch.context() as patch,
     ):
-        assert link.send(episodes(), 1)
+        assert client.send(episodes(), 1)
         stage.counted("batches")
         with patch.context() as lossy:
             lossy.setattr(stage.hub._post, "send", lambda *_: None)
             stage.hub.acknowledge(stage.batches()[0])
-        both(stage, link, lambda: link.window_free == 3)
+        both(stage, client, lambda: client.window_free == 3)
         assert stage.hub.counters["duplicates"] >= 1
         assert len(stage.batches()) == 1
 
 
 def test_what_came_out_of_turn_is_sent_again_with_all_before_it() -> None:
-    with standing_in() as master, make_link(master.endpoint) as link:
-        master.welcome(link)
+    with standing_in() as master, make_client(master.endpoint) as client:
+        master.welcome(client)
         for _ in range(2):
-            assert link.send(episodes(), 1)
-        master.until(link, lambda: numbers(master.heard) == [1, 2])
+            assert client.send(episodes(), 1)
+        master.until(client, lambda: numbers(master.heard) == [1, 2])
         master.say(Reject(reason="batch 2: batch 1 must come first", sequence=2, final=False))
-        master.until(link, lambda: numbers(master.heard) == [1, 2, 1, 2])
-        assert link.counters["out_of_turn"] == 1
+        master.until(client, lambda: numbers(master.heard) == [1, 2, 1, 2])
+        assert client.counters["out_of_turn"] == 1
 
 
 def test_what_is_refused_for_good_is_not_sent_again() -> None:
-    with standing_in() as master, make_link(master.endpoint, replace(QUICK, resend_s=0.1)) as link:
-        master.welcome(link)
+    with (
+        standing_in() as master,
+        make_client(master.endpoint, replace(QUICK, resend_s=0.1)) as client,
+    ):
+        master.welcome(client)
         for _ in range(2):
-            assert link.send(episodes(), 1)
-        master.until(link, lambda: numbers(master.heard) == [1, 2])
+            assert client.send(episodes(), 1)
+        master.until(client, lambda: numbers(master.heard) == [1, 2])
         master.heard.clear()
         master.say(Reject(reason="player 3: rewards holds nan", sequence=1, final=True))
         master.say(Reject(reason="unknown kind", sequence=0, final=True))
-        master.until(link, lambda: link.counters["rejected"] == 2)
+        master.until(client, lambda: client.counters["rejected"] == 2)
         master.heard.clear()
-        master.until(link, lambda: len(numbers(master.heard)) >= 2)
+        master.until(client, lambda: len(numbers(master.heard)) >= 2)
         assert set(numbers(master.heard)) == {2}
 
 
 def test_hello_is_repeated_until_it_is_answered_and_says_the_same() -> None:
-    with standing_in() as master, make_link(master.endpoint) as link:
-        master.until(link, lambda: len(master.heard) == 2)
+    with standing_in() as master, make_client(master.endpoint) as client:
+        master.until(client, lambda: len(master.heard) == 2)
         assert master.heard[0] == master.heard[1]
         [hello] = master.heard[:1]
         assert isinstance(hello, Hello)
@@ -245,71 +251,71 @@ def test_hello_is_repeated_until_it_is_answered_and_says_the_same() -> None:
 def test_weights_come_newest_only_and_once() -> None:
     with staged() as stage:
         stage.hub.publish(weights(version=1))
-        with joined(stage, shapes=SHAPES) as link:
-            first = served(stage, link.wait_for_weights)
+        with joined(stage, shapes=SHAPES) as client:
+            first = served(stage, client.wait_for_weights)
             assert first is not None
             assert first.version == 1
             assert first.tensors.keys() == SHAPES.keys()
-            assert link.newest_weights() is None
+            assert client.newest_weights() is None
             for version in range(2, 9):
                 stage.hub.publish(weights(version))
             seen: list[int] = []
 
             def newest() -> bool:
-                newer = link.newest_weights()
+                newer = client.newest_weights()
                 seen.extend([] if newer is None else [newer.version])
                 return 8 in seen
 
-            both(stage, link, newest)
+            both(stage, client, newest)
             assert seen == sorted(set(seen))
 
 
 def test_who_was_busy_skips_all_broadcasts_but_the_newest() -> None:
-    with standing_in() as master, make_link(master.endpoint) as link:
-        master.welcome(link)
+    with standing_in() as master, make_client(master.endpoint) as client:
+        master.welcome(client)
         frames = [encode_weights("e1", weights(version)) for version in range(500)]
-        master.until(link, lambda: master.broadcast(frames[0]) or link._talk.inbox.version == 0)
+        master.until(client, lambda: master.broadcast(frames[0]) or client.newest.version == 0)
         for frame in frames:
             master.broadcast(frame)
         seen: set[int] = set()
 
         def last() -> bool:
-            seen.add(link._talk.inbox.version)
+            seen.add(client.newest.version)
             return 499 in seen
 
-        master.until(link, last)
+        master.until(client, last)
         assert len(seen) < 250
 
 
 def test_a_missed_broadcast_is_asked_for() -> None:
-    with standing_in() as master, make_link(master.endpoint) as link:
-        master.welcome(link)
+    with standing_in() as master, make_client(master.endpoint) as client:
+        master.welcome(client)
         master.say(Alive(version=4))
-        assert master.await_kind(link, WantWeights) == WantWeights("e1", -1)
+        assert master.await_kind(client, WantWeights) == WantWeights("e1", -1)
         master.say(
             [*with_header(Greet().encode(), kind="weights"), encode_weights("e1", weights(4))]
         )
-        master.until(link, lambda: link._talk.inbox.version == 4)
-        newest = link.newest_weights()
+        master.until(client, lambda: client.newest.version == 4)
+        newest = client.newest_weights()
         assert newest is not None
         assert newest.version == 4
 
 
 def test_weights_of_another_network_are_refused_and_counted() -> None:
-    with standing_in() as master, make_link(master.endpoint, shapes={"a": (1,)}) as link:
-        master.welcome(link)
+    with standing_in() as master, make_client(master.endpoint, shapes={"a": (1,)}) as client:
+        master.welcome(client)
         frame = encode_weights("e1", weights())
-        master.until(link, lambda: master.broadcast(frame) or link.counters["malformed"])
-        assert link.newest_weights() is None
+        master.until(client, lambda: master.broadcast(frame) or client.counters["malformed"])
+        assert client.newest_weights() is None
 
 
 def test_garbage_from_the_master_is_counted() -> None:
-    with standing_in() as master, make_link(master.endpoint) as link:
-        master.welcome(link)
+    with standing_in() as master, make_client(master.endpoint) as client:
+        master.welcome(client)
         for frames in ([b""], [b"\xc1"], with_header(Ack(1, duplicate=True).encode(), sequence=0)):
             master.say(frames)
-        master.until(link, lambda: link.counters["malformed"] == 3)
-        assert not link.stopped
+        master.until(client, lambda: client.counters["malformed"] == 3)
+        assert not client.stopped
 
 
 def test_the_newest_process_of_an_index_wins() -> None:
@@ -321,48 +327,48 @@ def test_the_newest_process_of_an_index_wins() -> None:
 
 def test_stop_ends_a_link_and_it_says_bye() -> None:
     with staged() as stage:
-        with joined(stage) as link:
-            assert link.send(episodes(), 1)
+        with joined(stage) as client:
+            assert client.send(episodes(), 1)
             stage.counted("batches")
             stage.hub.stop("max_updates=10")
-            assert served(stage, link.wait_for_weights) is None
-            assert (link.stopped, link.stop_reason) == (True, "max_updates=10")
+            assert served(stage, client.wait_for_weights) is None
+            assert (client.stopped, client.stop_reason) == (True, "max_updates=10")
         stage.counted("byes")
         assert stage.hub.peers == []
 
 
 def test_a_repeated_stop_is_heard_by_who_missed_the_first() -> None:
-    with standing_in() as master, make_link(master.endpoint) as link:
-        master.until(link, lambda: master.heard)
+    with standing_in() as master, make_client(master.endpoint) as client:
+        master.until(client, lambda: master.heard)
         master.say(Stop("over"))
-        assert link.join() is False
-        assert link.stop_reason == "over"
+        assert client.join() is False
+        assert client.stop_reason == "over"
 
 
 def test_scores_and_stats_arrive() -> None:
-    with staged() as stage, joined(stage, role="evaluator") as link:
-        link.stats["episodes"] = 12.0
-        link.send_scores(scores())
+    with staged() as stage, joined(stage, role="evaluator") as client:
+        client.stats["episodes"] = 12.0
+        client.send_scores(scores())
         stage.counted("scores")
         assert isinstance(stage.arrivals[0], ScoresArrived)
-        both(stage, link, lambda: stage.hub.peers[0].stats == {"episodes": 12.0})
+        both(stage, client, lambda: stage.hub.peers[0].stats == {"episodes": 12.0})
 
 
 def test_scores_for_a_master_that_is_away_are_lost_and_counted() -> None:
-    with standing_in() as master, make_link(master.endpoint) as link:
-        link.send_scores(scores())
-        assert link.counters["lost_scores"] == 1
+    with standing_in() as master, make_client(master.endpoint) as client:
+        client.send_scores(scores())
+        assert client.counters["lost_scores"] == 1
 
 
 def test_a_refused_rejoin_ends_the_worker() -> None:
-    with standing_in() as master, make_link(master.endpoint) as link:
-        master.welcome(link)
+    with standing_in() as master, make_client(master.endpoint) as client:
+        master.welcome(client)
         master.say(Refused("its settings of net differ"))
         with pytest.raises(TangramError, match="refused this player: its settings of net differ"):
-            master.until(link, lambda: False)
+            master.until(client, lambda: False)
 
 
 def test_an_address_that_zeromq_does_not_take() -> None:
-    with make_link("tcp://bad host:5555") as link, pytest.raises(RunError) as caught:
-        link.join()
+    with make_client("tcp://bad host:5555") as client, pytest.raises(RunError) as caught:
+        client.join()
     assert str(caught.value).startswith("cannot connect to tcp://bad host:5555 (")

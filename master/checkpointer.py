@@ -1,18 +1,28 @@
-"""Checkpoints of a whole run: what is in one, and going on from the newest that is whole."""
+"""The checkpointer: batches are on disk before they are acknowledged, the whole run at times.
 
+A run goes on from its newest checkpoint that is whole, and from what the journal holds since.
+
+A disk that takes nothing more ends no run: nothing is acknowledged until there is room again, so
+the workers keep what they played, and wait.
+"""
+
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from master.journal import segments
-from master.record import Record
+from master.arrivals import EpisodesArrived
+from master.divergence import DivergenceGuard
+from master.hub import Hub
+from master.journal import Journal, JournalError, segments
 from master.recovery import check_journal
-from master.rundir import RunFolder
+from master.rundir import Clock, Record, RunFolder
 from master.trainer import LEARNER, Trainer, check_same_task
 from tangram_agent.checkpoints import (
     Checkpoint,
     CorruptError,
+    DiskError,
     list_checkpoints,
     load_checkpoint,
     newest_checkpoint,
@@ -20,11 +30,100 @@ from tangram_agent.checkpoints import (
     set_aside,
     was_set_aside,
 )
+from tangram_agent.config import ServiceConfig
+from tangram_agent.process import Every
 from tangram_agent.runs import CHECKPOINTS, SETUP
 from tangram_agent.setup import make_setup
 from tangram_sim.errors import RunError
 
+MINUTE_S = 60.0
+RETRY_S = 1.0
+MAKE_ROOM = "make room there; until then nothing is acknowledged, and workers keep what they played"
 SEGMENT = "journal"
+
+
+class Checkpointer:
+    """Journals batches, and writes checkpoints when they are due."""
+
+    def __init__(
+        self,
+        service: ServiceConfig,
+        folder: RunFolder,
+        guard: DivergenceGuard,
+        hub: Hub,
+        journal: Journal,
+        clock: Clock,
+        notice: Callable[[str], None],
+    ) -> None:
+        """Write nothing yet.
+
+        Args:
+            service: how often, and how many checkpoints are kept.
+            folder: of the run.
+            guard: of the trainer; only what is finite is saved.
+            hub: its table of duplicates is saved with the rest.
+            journal: open.
+            clock: of the run's record.
+            notice: takes lines for the user.
+        """
+        self._folder, self._guard, self._hub, self._journal = folder, guard, hub, journal
+        self._clock, self._notice = clock, notice
+        self._keep_checkpoints = service.keep_checkpoints
+        self._checkpoint = Every(service.checkpoint_minutes * MINUTE_S)
+        self._failing = False
+        self._saved_s: float | None = None
+        self._retry, self._tell = Every(RETRY_S), Every(MINUTE_S, at_once=True)
+
+    def numbers(self) -> dict[str, float]:
+        """How old the last checkpoint of this process is, and whether the disk takes nothing."""
+        age_s = -1.0 if self._saved_s is None else time.monotonic() - self._saved_s
+        return {"checkpoint_age_s": age_s, "disk_failing": float(self._failing)}
+
+    def keep(self, arrival: EpisodesArrived) -> bool:
+        """Journal a batch; False while the disk does not take it."""
+        if self._failing and not self._retry.due():
+            return False
+        try:
+            self._journal.append(arrival)
+        except JournalError as error:
+            self._failed(f"{error}: {MAKE_ROOM}")
+            return False
+        self._worked()
+        return True
+
+    def tick(self) -> None:
+        """Sync the journal and write a checkpoint when it is time; a full disk is told."""
+        try:
+            self._journal.tick()
+            if self._checkpoint.due():
+                self.save()
+        except (JournalError, DiskError) as error:
+            self._failed(f"warning: {error}")
+
+    def save(self) -> Path:
+        """Write a checkpoint, and drop the segments of the journal that nobody needs any more.
+
+        Raises:
+            RunError: the weights are not finite, one time too many.
+            DiskError: the disk does not take it; what was there before is as it was.
+        """
+        self._guard.check()
+        rest = Restored(self._clock.stopped(), self._hub.state(), self._journal.rotate())
+        folder = self._folder.checkpoints
+        path = save_run(folder, self._guard.trainer, rest, self._keep_checkpoints)
+        self._journal.drop_before(first_needed(folder))
+        self._saved_s = time.monotonic()
+        return path
+
+    def _failed(self, text: str) -> None:
+        self._failing = True
+        if self._tell.due():
+            self._notice(text)
+
+    def _worked(self) -> None:
+        if self._failing:
+            self._failing, self._tell = False, Every(MINUTE_S, at_once=True)
+            self._notice("the journal can be written again: batches are taken in")
 
 
 def check_resumable(folder: RunFolder, resolved: Mapping[str, Any]) -> None:

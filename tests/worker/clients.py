@@ -1,4 +1,4 @@
-"""Links that the tests drive against a staged hub."""
+"""Clients that the tests drive against a staged hub."""
 
 import json
 import socket
@@ -13,8 +13,8 @@ from tangram_agent.wire import (
     ToMaster,
 )
 from tests.master.dealers import Stage
-from tests.worker.standin import make_link
-from worker.link import Link
+from tests.worker.standin import make_client
+from worker.client import Client
 
 Result = TypeVar("Result")
 
@@ -28,17 +28,17 @@ def served(stage: Stage, call: Callable[[], Result]) -> Result:
 
 
 @contextmanager
-def joined(stage: Stage, **more: Any) -> Iterator[Link]:
-    with make_link(stage.hub.endpoint, **more) as link:
-        assert served(stage, link.join)
-        yield link
+def joined(stage: Stage, **more: Any) -> Iterator[Client]:
+    with make_client(stage.hub.endpoint, **more) as client:
+        assert served(stage, client.join)
+        yield client
 
 
-def both(stage: Stage, link: Link, done: Callable[[], Any]) -> None:
-    """Serve the hub and let the link work until something holds."""
+def both(stage: Stage, client: Client, done: Callable[[], Any]) -> None:
+    """Serve the hub and let the client work until something holds."""
 
     def step() -> Any:
-        link.poll()
+        client.poll()
         return done()
 
     stage.until(step)

@@ -18,25 +18,25 @@ from tangram_agent.wire import (
 from tangram_sim.errors import TangramError
 from tests.agent.messages import SHAPES, episodes, weights
 from tests.master.dealers import staged
-from tests.worker.links import both, free_port, joined, served, write_connection
-from tests.worker.standin import LIMIT_S, QUICK, make_link, standing_in
-from worker import link as link_module
-from worker.link import Link
+from tests.worker.clients import both, free_port, joined, served, write_connection
+from tests.worker.standin import LIMIT_S, QUICK, make_client, standing_in
+from worker import client as client_module
+from worker.client import Client
 
 pytestmark = pytest.mark.cluster
 
 
 def test_a_restarted_master_gets_all_that_was_not_acknowledged() -> None:
     port = free_port()
-    with staged(port=port) as stage, make_link(stage.hub.endpoint, shapes=SHAPES) as link:
-        assert served(stage, link.join)
+    with staged(port=port) as stage, make_client(stage.hub.endpoint, shapes=SHAPES) as client:
+        assert served(stage, client.join)
         stage.hub.publish(weights(version=8))
-        both(stage, link, link.newest_weights)
+        both(stage, client, client.newest_weights)
         for number in range(3):
-            assert link.send(episodes(seed=number), 8)
+            assert client.send(episodes(seed=number), 8)
         stage.counted("batches", 3)
         stage.hub.acknowledge(stage.batches()[0])
-        both(stage, link, lambda: link.window_free == 1)
+        both(stage, client, lambda: client.window_free == 1)
         # The second is in the checkpoint, its acknowledgement never leaves.
         stage.hub._registry.peers[0].ledger.held.discard(2)
         state, epoch = stage.hub.state(), stage.hub.epoch
@@ -44,56 +44,59 @@ def test_a_restarted_master_gets_all_that_was_not_acknowledged() -> None:
         with staged(port=port) as again:
             again.hub.load_state(state)
             again.hub.publish(weights(version=1))
-            again.until(lambda: link.poll() or again.batches())
-            assert link.welcome.epoch not in ("", epoch)
-            assert (link.welcome.index, link.welcome.incarnation) == (0, 1)
+            again.until(lambda: client.poll() or again.batches())
+            assert client.welcome.epoch not in ("", epoch)
+            assert (client.welcome.index, client.welcome.incarnation) == (0, 1)
             assert [a.sequence for a in again.batches()] == [3]
             again.hub.acknowledge(again.batches()[0])
-            both(again, link, lambda: link.window_free == 3)
+            both(again, client, lambda: client.window_free == 3)
             # Version 1 of this life is newer than version 8 of the one before.
             found: list[int] = []
 
             def newest() -> bool:
-                newer = link.newest_weights()
+                newer = client.newest_weights()
                 found.extend([] if newer is None else [newer.version])
                 return bool(found)
 
-            both(again, link, newest)
+            both(again, client, newest)
             assert found == [1]
             assert again.hub.counters["lost_batches"] == 0
 
 
 def test_a_master_on_another_port_is_found_through_its_file(tmp_path: Path) -> None:
     quick = replace(QUICK, silence_s=0.3)
-    with make_link(str(tmp_path), quick) as link:
+    with make_client(str(tmp_path), quick) as client:
         with staged() as stage:
             write_connection(tmp_path, stage.hub.endpoint)
-            assert served(stage, link.join)
-            assert link.send(episodes(), 1)
+            assert served(stage, client.join)
+            assert client.send(episodes(), 1)
             stage.counted("batches")
         with staged() as again:
             write_connection(tmp_path, again.hub.endpoint)
-            both(again, link, again.batches)
+            both(again, client, again.batches)
             assert again.batches()[0].sequence == 1
-            assert link.counters["reconnects"] >= 1
+            assert client.counters["reconnects"] >= 1
 
 
 def test_a_connection_that_does_not_answer_is_made_anew() -> None:
-    with standing_in() as master, make_link(master.endpoint, replace(QUICK, silence_s=0.2)) as link:
-        master.welcome(link)
+    with (
+        standing_in() as master,
+        make_client(master.endpoint, replace(QUICK, silence_s=0.2)) as client,
+    ):
+        master.welcome(client)
         first = master.identity
-        assert link.send(episodes(), 1)
-        again = master.await_kind(link, Hello)
+        assert client.send(episodes(), 1)
+        again = master.await_kind(client, Hello)
         assert (again.index, again.incarnation, again.first) == (3, 2, 1)
         assert master.identity != first
 
 
 def test_a_lost_master_is_given_up_in_the_end() -> None:
     timing = replace(QUICK, silence_s=0.1, lost_s=0.3)
-    with standing_in() as master, make_link(master.endpoint, timing) as link:
-        master.welcome(link)
+    with standing_in() as master, make_client(master.endpoint, timing) as client:
+        master.welcome(client)
         with pytest.raises(TangramError) as caught:
-            master.until(link, lambda: False)
+            master.until(client, lambda: False)
         assert str(caught.value) == (
             f"the master at {master.endpoint} has not answered for 0.3 s: is it still running?"
         )
@@ -104,70 +107,72 @@ def test_a_busy_worker_does_not_take_its_own_silence_for_the_masters(
 ) -> None:
     """It did not look for longer than `silence_s`, and the answer was there all the time."""
     now = time.monotonic()
-    monkeypatch.setattr("worker.talk.time", SimpleNamespace(monotonic=lambda: now))
-    with standing_in() as master, make_link(master.endpoint) as link:
-        master.welcome(link)
+    monkeypatch.setattr("worker.client.time", SimpleNamespace(monotonic=lambda: now))
+    with standing_in() as master, make_client(master.endpoint) as client:
+        master.welcome(client)
         now += QUICK.heartbeat_s
-        link.poll()
+        client.poll()
         master.until_heartbeat()
         master.say(Alive(-1))
         now += 2 * QUICK.silence_s
-        link.poll(LIMIT_S)
-        assert link.counters["reconnects"] == 0
+        client.poll(LIMIT_S)
+        assert client.counters["reconnects"] == 0
         # Without the answer it is.
         now += QUICK.heartbeat_s
-        link.poll()
+        client.poll()
         now += 2 * QUICK.silence_s
-        link.poll()
-        assert link.counters["reconnects"] == 1
+        client.poll()
+        assert client.counters["reconnects"] == 1
 
 
 def test_another_run_at_the_same_address_is_an_error() -> None:
-    with standing_in() as master, make_link(master.endpoint) as link:
-        master.welcome(link)
+    with standing_in() as master, make_client(master.endpoint) as client:
+        master.welcome(client)
         master.say(Greet())
         with pytest.raises(TangramError, match="runs 'other', not 'run': the connection file is"):
-            master.welcome(link, run_id="other")
+            master.welcome(client, run_id="other")
 
 
 def test_closing_is_bounded_when_nobody_listens(tmp_path: Path) -> None:
     for connect in (f"tcp://127.0.0.1:{free_port()}", str(tmp_path)):
-        link = make_link(connect)
-        link.poll()
-        link.close()
+        client = make_client(connect)
+        client.poll()
+        client.close()
 
 
 def test_a_waiting_link_says_what_it_waits_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """First the file is missing, then the master does not answer, then it does not acknowledge."""
-    monkeypatch.setattr(link_module, "TELL_S", 0.2)
+    monkeypatch.setattr(client_module, "TELL_S", 0.2)
     caplog.set_level("INFO")
 
     def said(text: str) -> bool:
         return any(text in record.message for record in caplog.records)
 
-    def wait_until_said(link: Link, call: Callable[[], Any], text: str) -> None:
+    def wait_until_said(client: Client, call: Callable[[], Any], text: str) -> None:
         with ThreadPoolExecutor(1) as pool:
             future = pool.submit(call)
             deadline = time.monotonic() + LIMIT_S
             while not said(text):
                 assert time.monotonic() < deadline, [r.message for r in caplog.records]
                 time.sleep(0.01)
-            link.stop("enough")
+            client.stop("enough")
             future.result()
 
-    with make_link(str(tmp_path)) as link:
-        wait_until_said(link, link.join, f"waits for the connection file {tmp_path} since 0 s")
+    with make_client(str(tmp_path)) as client:
+        wait_until_said(client, client.join, f"waits for the connection file {tmp_path} since 0 s")
     write_connection(tmp_path, f"tcp://127.0.0.1:{free_port()}")
-    with make_link(str(tmp_path)) as link:
-        wait_until_said(link, link.join, "waits for an answer of the master at tcp://127.0.0.1:")
-    with staged() as stage, joined(stage, window=1) as link:
-        link.send(episodes(), 0)
+    with make_client(str(tmp_path)) as client:
+        wait_until_said(
+            client, client.join, "waits for an answer of the master at tcp://127.0.0.1:"
+        )
+    with staged() as stage, joined(stage, window=1) as client:
+        client.send(episodes(), 0)
         with ThreadPoolExecutor(1) as pool:
-            future = pool.submit(link.wait_for_window)
+            future = pool.submit(client.wait_for_window)
             stage.until(lambda: said("waits for the master to take what was played since"))
-            link.stop("enough")
+            client.stop("enough")
             stage.until(future.done)
 
 
@@ -175,11 +180,11 @@ def test_a_silent_master_is_told_and_its_return_too(caplog: pytest.LogCaptureFix
     caplog.set_level("INFO")
     timing = replace(QUICK, silence_s=0.3)
     port = free_port()
-    with staged(port=port) as stage, joined(stage, timing=timing) as link:
+    with staged(port=port) as stage, joined(stage, timing=timing) as client:
         endpoint = stage.hub.endpoint
 
         def told(text: str) -> bool:
-            link.poll(0.01)
+            client.poll(0.01)
             return any(text in record.message for record in caplog.records)
 
         deadline = time.monotonic() + LIMIT_S
@@ -193,15 +198,15 @@ def test_a_master_that_moved_is_followed_at_once(tmp_path: Path) -> None:
     patient = replace(QUICK, silence_s=3600.0)
     with staged() as first:
         write_connection(tmp_path, first.hub.endpoint)
-        with make_link(str(tmp_path), timing=patient) as link:
-            assert served(first, link.join)
-            link.send(episodes(), 0)
+        with make_client(str(tmp_path), timing=patient) as client:
+            assert served(first, client.join)
+            client.send(episodes(), 0)
             with staged() as second:
                 write_connection(tmp_path, second.hub.endpoint)
-                both(second, link, second.batches)
+                both(second, client, second.batches)
                 (again,) = second.batches()
                 assert (again.incarnation, again.sequence) == (1, 1)
                 # A file that is being replaced in a clumsy way changes nothing.
                 (tmp_path / "connection.json").write_text("{")
                 heartbeats = second.hub.counters["heartbeats"]
-                both(second, link, lambda: second.hub.counters["heartbeats"] > heartbeats + 5)
+                both(second, client, lambda: second.hub.counters["heartbeats"] > heartbeats + 5)

@@ -11,8 +11,8 @@ from tangram_sim.arrays import Bools, Floats, Singles
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.errors import ConfigError
 from tangram_sim.seeding import episode_generator
+from worker.metrics import summarise
 from worker.rollout import Choose, Generators, Played, join_played, play
-from worker.scores import summarise
 
 
 def greedy(policy: Policy) -> Choose:
@@ -58,7 +58,7 @@ def adapted(run: Run, changes: Mapping[str, Any]) -> Run:
     return run.with_agent(**changes)
 
 
-class Trials:
+class FixedTests:
     """Test episodes that are the same whoever plays them.
 
     Attributes:
@@ -96,7 +96,7 @@ class Trials:
         return join_played(groups, self._episodes)
 
     def scores(self, played: Played) -> dict[str, float]:
-        """See `worker.scores.summarise`."""
+        """See `worker.metrics.summarise`."""
         reward = self.setup.reward
         own_reward = (reward.name, reward.source) != ("overlap", "polygon")
         return summarise(self.setup.layout, self.setup.sim, played, own_reward)

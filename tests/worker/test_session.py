@@ -6,8 +6,7 @@ from datetime import datetime
 
 import pytest
 
-from worker.report import Report
-from worker.session import log_as
+from worker.session import Report, log_as
 
 pytestmark = pytest.mark.fast
 
@@ -21,7 +20,7 @@ class Clock:
 
 
 def test_a_line_every_half_minute_with_rate_and_waiting(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO, "worker.report")
+    caplog.set_level(logging.INFO, "worker.session")
     clock = Clock()
     report = Report(clock)
     report.played(100, 1)
@@ -70,7 +69,7 @@ def test_as_json_every_number_has_a_name(capsys: pytest.CaptureFixture[str]) -> 
 def test_each_reason_to_wait_is_said_once_between_reports(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    caplog.set_level(logging.INFO, "worker.report")
+    caplog.set_level(logging.INFO, "worker.session")
     clock = Clock()
     report = Report(clock)
     for why in ("one", "two", "one"):

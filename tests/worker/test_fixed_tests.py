@@ -11,15 +11,15 @@ from tests.agent.builders import PAIR, SQUARE, setup
 from tests.worker.builders import policy
 from worker.baselines import position_policy, random_policy
 from worker.rollout import Played
-from worker.trials import Trials, greedy, with_actions, with_corner_noise
+from worker.test_set import FixedTests, greedy, with_actions, with_corner_noise
 
 pytestmark = pytest.mark.fast
 
 
 def played(episodes: int, at_once: int, **more: object) -> Played:
     made = setup(pixels=32)
-    with closing(Trials(made, episodes, at_once, **more)) as trials:
-        return trials.play(greedy(policy(made)))
+    with closing(FixedTests(made, episodes, at_once, **more)) as tests:
+        return tests.play(greedy(policy(made)))
 
 
 @pytest.mark.parametrize(("episodes", "at_once"), [(7, 3), (7, 7), (7, 50), (1, 1)])
@@ -33,10 +33,10 @@ def test_the_set_does_not_depend_on_how_many_play_at_a_time(episodes: int, at_on
 
 def test_the_default_set_is_that_of_the_simulation() -> None:
     made = setup(pixels=32)
-    with closing(Trials(made, 3, 3)) as trials:
-        goals = trials.play(greedy(policy(made))).goals
-        trials.env.reset(evaluation_generators(3))
-        np.testing.assert_array_equal(goals, trials.env.goals)
+    with closing(FixedTests(made, 3, 3)) as tests:
+        goals = tests.play(greedy(policy(made))).goals
+        tests.env.reset(evaluation_generators(3))
+        np.testing.assert_array_equal(goals, tests.env.goals)
 
 
 @pytest.mark.parametrize("other", [{"seed": 1}, {"role": "play"}])
@@ -47,8 +47,8 @@ def test_another_name_is_another_set(other: dict) -> None:
 def test_noise_is_off() -> None:
     made = setup(agent={"noise": 1.0, "uniform_share": 1.0}, pixels=32)
     acting = policy(made)
-    with closing(Trials(made, 3, 3)) as trials:
-        found = trials.play(greedy(acting))
+    with closing(FixedTests(made, 3, 3)) as tests:
+        found = tests.play(greedy(acting))
     expected = acting.act(found.starts, found.placed[:, 0], found.goals)
     np.testing.assert_array_equal(found.actions[:, 0], expected)
 
@@ -56,9 +56,9 @@ def test_noise_is_off() -> None:
 def test_the_camera_is_on_though_training_has_none() -> None:
     made = setup(pixels=128)
     assert not made.sim.camera
-    with closing(Trials(made, 20, 10)) as trials:
-        found = trials.play(position_policy(made.layout, made.sim))
-        scores = trials.scores(found)
+    with closing(FixedTests(made, 20, 10)) as tests:
+        found = tests.play(position_policy(made.layout, made.sim))
+        scores = tests.scores(found)
     assert found.camera is not None
     np.testing.assert_allclose(found.camera, 2.0 * found.overlap - 1.0, atol=0.1)
     assert scores["mean_reward_camera"] == pytest.approx(scores["mean_reward"], abs=0.03)
@@ -76,9 +76,9 @@ def test_the_camera_is_on_though_training_has_none() -> None:
 def test_the_trained_reward_is_reported_where_it_is_another(reward: dict, own: bool) -> None:
     made = setup(camera=True, pixels=32)
     made = replace(made, reward=replace(made.reward, **reward))
-    with closing(Trials(made, 3, 3)) as trials:
-        found = trials.play(greedy(policy(made)))
-        scores = trials.scores(found)
+    with closing(FixedTests(made, 3, 3)) as tests:
+        found = tests.play(greedy(policy(made)))
+        scores = tests.scores(found)
     assert scores["mean_reward"] == pytest.approx(float(np.mean(2.0 * found.overlap - 1.0)))
     assert ("mean_train_reward" in scores) == own
 
@@ -86,8 +86,8 @@ def test_the_trained_reward_is_reported_where_it_is_another(reward: dict, own: b
 @pytest.mark.parametrize(("tokens", "actions"), [(SQUARE, 1), (SQUARE, 3), (PAIR, 1), (PAIR, 2)])
 def test_the_position_policy_solves_position_and_nothing_else(tokens: dict, actions: int) -> None:
     made = with_actions(setup(tokens, pixels=32, max_overlap=1.0), actions)
-    with closing(Trials(made, 10, 10)) as trials:
-        found = trials.play(position_policy(made.layout, made.sim))
+    with closing(FixedTests(made, 10, 10)) as tests:
+        found = tests.play(position_policy(made.layout, made.sim))
     centres = made.layout.bases(found.ends), made.layout.bases(found.goals)
     np.testing.assert_allclose(*centres, atol=1e-6)
     assert found.placed[:, -1].all()
@@ -98,9 +98,9 @@ def test_the_position_policy_solves_position_and_nothing_else(tokens: dict, acti
 def test_the_position_policy_reaches_the_plateau_of_the_paper() -> None:
     """A square on its target's centre at a uniform angle: 0.8825 raw, 0.765 scaled."""
     made = setup(pixels=16)
-    with closing(Trials(made, 2000, 200)) as trials:
-        found = trials.play(position_policy(made.layout, made.sim))
-        assert trials.scores(found)["mean_reward"] == pytest.approx(0.765, abs=0.01)
+    with closing(FixedTests(made, 2000, 200)) as tests:
+        found = tests.play(position_policy(made.layout, made.sim))
+        assert tests.scores(found)["mean_reward"] == pytest.approx(0.765, abs=0.01)
 
 
 @pytest.mark.parametrize("flip", [False, True])
@@ -120,8 +120,8 @@ def test_the_number_of_actions_can_be_another_than_in_training() -> None:
     assert with_actions(made, None) is made
     longer = with_actions(made, 5)
     assert longer.horizon == 5
-    with closing(Trials(replace(longer, sim=replace(longer.sim, pixels=16)), 2, 2)) as trials:
-        assert trials.play(greedy(policy(made))).actions.shape == (2, 5, 3)
+    with closing(FixedTests(replace(longer, sim=replace(longer.sim, pixels=16)), 2, 2)) as tests:
+        assert tests.play(greedy(policy(made))).actions.shape == (2, 5, 3)
 
 
 def test_the_noise_can_be_another_than_in_training() -> None:
@@ -131,9 +131,9 @@ def test_the_noise_can_be_another_than_in_training() -> None:
     assert noisy.sim.corner_noise == 0.05
     scores = []
     for tested in (made, noisy, with_corner_noise(noisy, 0.0)):
-        with closing(Trials(tested, 50, 50)) as trials:
-            found = trials.play(position_policy(made.layout, made.sim))
-            scores.append(trials.scores(found)["position_error_median"])
+        with closing(FixedTests(tested, 50, 50)) as tests:
+            found = tests.play(position_policy(made.layout, made.sim))
+            scores.append(tests.scores(found)["position_error_median"])
     assert scores[0] == scores[2] == pytest.approx(0.0, abs=1e-6)
     # the mean of four corners, of token and target each: 0.1 * sqrt(2 / 4), in the plane
     assert scores[1] == pytest.approx(0.1 * np.sqrt(0.5) * np.sqrt(2 * np.log(2)), rel=0.3)

@@ -9,7 +9,7 @@ from tangram_sim.errors import ConfigError, RunError
 ROUNDING = 1e-6
 
 
-class Pace:
+class RateLimiter:
     """The rate limiter between inserts into the replay and updates of the networks.
 
     With n transitions inserted, m updates done, u = updates_per_transition, s = learning_starts
@@ -89,7 +89,8 @@ class Pace:
         values = [state.get(name, -1.0) for name in ("transitions", "updates", "due")]
         if not all(math.isfinite(value) and value >= 0 for value in values):
             raise RunError(
-                f"the checkpoint's pace must hold transitions, updates and due, got {dict(state)}"
+                "the checkpoint's rate limiter must hold transitions, updates and due, got "
+                f"{dict(state)}"
             )
         self.transitions, self.updates = int(values[0]), int(values[1])
         self._base_transitions, self._base_due = self.transitions, values[2]

@@ -12,9 +12,8 @@ from tangram_sim.layout import Layout
 from tangram_sim.puzzles import library
 from tangram_sim.sampling import sample_batch
 from tests.sim.builders import SEVEN, layout_of, random_poses
-from worker.assembly import Assembled, assembled, covered_shares
+from worker.metrics import Assembled, assembled, covered_shares, pose_errors, summarise
 from worker.rollout import Played
-from worker.scores import pose_errors, summarise
 
 pytestmark = pytest.mark.fast
 

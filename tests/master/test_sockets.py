@@ -1,0 +1,35 @@
+"""The master's sockets as a stranger on TCP sees them."""
+
+import socket
+
+import pytest
+
+from master import sockets as sockets_module
+from master.sockets import Sockets
+from master.tally import Tally
+
+pytestmark = pytest.mark.cluster
+
+# ZMTP 3.1 (https://rfc.zeromq.org/spec/37): signature, version, mechanism, not as a server.
+GREETING = b"\xff" + bytes(8) + b"\x7f" + b"\x03\x01" + b"NULL".ljust(20, b"\0") + bytes(32)
+READY = b"\x05READY" + b"\x0bSocket-Type" + b"\0\0\0\x06DEALER"
+COMMAND = b"\x04"
+
+
+def test_a_peer_that_says_nothing_is_asked_whether_it_lives(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A connection that died without a word would stay open, and its queue with it."""
+    monkeypatch.setattr(sockets_module, "PING_MS", sockets_module.PING_MS // 50)
+    sockets = Sockets("127.0.0.1", 0, Tally())
+    try:
+        port = int(sockets.endpoint.rpartition(":")[2])
+        with socket.create_connection(("127.0.0.1", port), timeout=10) as peer:
+            peer.sendall(GREETING + COMMAND + bytes([len(READY)]) + READY)
+            heard = b""
+            while b"\x04PING" not in heard:
+                part = peer.recv(1024)
+                assert part, "the connection was closed"
+                heard += part
+    finally:
+        sockets.close()

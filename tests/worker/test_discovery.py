@@ -1,0 +1,101 @@
+"""Where the master is: an address, or the file that it writes."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tangram_sim.errors import RunError
+from worker.discovery import MasterAddress, await_master, find_master
+
+pytestmark = pytest.mark.fast
+
+REMEDY = (
+    "connect=... takes tcp://host:port, a run folder, or the connection.json that tangram-master "
+    "writes into it"
+)
+
+
+def test_an_address_is_taken_as_it_is() -> None:
+    for address in ("tcp://127.0.0.1:5555", "tcp://learner.lan:1", "tcp://[::1]:65535"):
+        assert find_master(address) == MasterAddress(address, "")
+
+
+@pytest.mark.parametrize(
+    "address",
+    ["udp://h:1", "tcp://h", "tcp://:1", "tcp://h:0", "tcp://h:65536", "tcp://h:x", "tcp://"],
+)
+def test_a_wrong_address_is_refused(address: str) -> None:
+    with pytest.raises(RunError) as caught:
+        find_master(address)
+    assert str(caught.value) == (
+        f"'{address}' (from {address}) is no address: it must be tcp://host:port"
+    )
+
+
+def test_a_file_and_its_folder_are_found(tmp_path: Path) -> None:
+    path = tmp_path / "connection.json"
+    assert find_master(str(path)) is None
+    assert find_master(str(tmp_path)) is None
+    content = {"endpoint": "tcp://h:1", "weights_endpoint": "tcp://h:2", "run_id": "r", "more": 1}
+    path.write_text(json.dumps(content))
+    assert find_master(str(path)) == MasterAddress("tcp://h:1", "r")
+    assert find_master(str(tmp_path)) == MasterAddress("tcp://h:1", "r")
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ("", "JSONDecodeError"),
+        ("{", "JSONDecodeError"),
+        ("[]", "TypeError"),
+        ("{}", "KeyError('endpoint')"),
+        ('{"endpoint": "tcp://h:1"}', "KeyError('run_id')"),
+        ("\x00", "JSONDecodeError"),
+        (
+            '{"endpoint": "tcp://h:1", "run_id": "r", "server_key": "short"}',
+            "ValueError('server_key,",
+        ),
+    ],
+)
+def test_a_file_that_is_no_connection_file(tmp_path: Path, content: str, reason: str) -> None:
+    path = tmp_path / "c.json"
+    path.write_text(content)
+    with pytest.raises(RunError) as caught:
+        find_master(str(path))
+    assert str(caught.value).startswith(f"{path} is no connection file ({reason}")
+    assert str(caught.value).endswith(REMEDY)
+
+
+def test_the_settings_of_the_run_stand_in_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "c.json"
+    content = {"endpoint": "tcp://h:1", "run_id": "r", "settings": {"net": {"width": 3}}}
+    path.write_text(json.dumps(content))
+    found = await_master(str(path), pytest.fail)
+    assert found.settings == {"net": {"width": 3}}
+    assert found == MasterAddress("tcp://h:1", "r")
+    path.write_text(json.dumps(content | {"settings": 3}))
+    with pytest.raises(RunError, match=r"settings must be a map"):
+        find_master(str(path))
+
+
+def test_a_file_that_comes_late_is_waited_for(tmp_path: Path) -> None:
+    path = tmp_path / "c.json"
+    told: list[str] = []
+
+    def tell(line: str) -> None:
+        told.append(line)
+        path.write_text(json.dumps({"endpoint": "tcp://h:1", "run_id": "r"}))
+
+    assert await_master(str(path), tell, 60.0) == MasterAddress("tcp://h:1", "r")
+    assert told == [f"waits for the connection file {path}"]
+    path.unlink()
+    with pytest.raises(RunError, match=r"no connection file is at .*c.json after 0.1 s"):
+        await_master(str(path), lambda _: None, 0.1)
+
+
+def test_an_address_in_a_file_is_checked(tmp_path: Path) -> None:
+    path = tmp_path / "c.json"
+    path.write_text('{"endpoint": "ipc://x", "run_id": "r"}')
+    with pytest.raises(RunError, match=r"'ipc://x' \(from .*c.json\) is no address"):
+        find_master(str(path))

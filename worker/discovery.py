@@ -1,0 +1,128 @@
+"""Where the master is: an address, or the connection file that it writes into its run folder."""
+
+import json
+import re
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from tangram_sim.errors import RunError
+
+FILE_NAME = "connection.json"
+# A master may still be starting, or wait in a queue.
+PATIENCE_S = 60.0
+LOOK_S = 0.2
+SCHEME = "tcp://"
+KEYS = ("server_key", "public_key", "secret_key")
+KEY = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
+
+
+@dataclass(frozen=True)
+class MasterAddress:
+    """Where a master listens, and what it takes to be let in.
+
+    Attributes:
+        endpoint: of its ROUTER socket.
+        run_id: that it must have, empty where any will do.
+        server_key: the master's public CURVE key, empty where nothing is encrypted.
+        public_key, secret_key: the pair of the run's workers.
+        settings: section -> those of the run; None where only an address is known.
+    """
+
+    endpoint: str
+    run_id: str = ""
+    server_key: str = ""
+    public_key: str = ""
+    secret_key: str = field(default="", repr=False)
+    settings: Mapping[str, Any] | None = field(default=None, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        keys = (self.server_key, self.public_key, self.secret_key)
+        if any(keys) and not all(KEY.fullmatch(key) for key in keys):
+            raise ValueError("server_key, public_key and secret_key must be 40 characters of Z85")
+        if not isinstance(self.settings, Mapping | None):
+            raise TypeError("settings must be a map")
+
+
+def find_master(connect: str) -> MasterAddress | None:
+    """The master's address; None while its file is not there.
+
+    Args:
+        connect: tcp://host:port, a connection file, or a run folder that holds one.
+
+    Raises:
+        RunError: neither an address nor a readable connection file.
+    """
+    if "://" in connect:
+        return MasterAddress(_checked(connect, connect))
+    path = Path(connect)
+    if path.is_dir():
+        path /= FILE_NAME
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        endpoint = _checked(str(content["endpoint"]), str(path))
+        keys = {name: str(content.get(name, "")) for name in KEYS}
+        settings = content.get("settings")
+        return MasterAddress(endpoint, str(content["run_id"]), **keys, settings=settings)
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise RunError(
+            f"{path} is no connection file ({error!r}): connect=... takes tcp://host:port, a run "
+            f"folder, or the {FILE_NAME} that tangram-master writes into it"
+        ) from None
+
+
+def await_master(
+    connect: str, tell: Callable[[str], None], patience_s: float = PATIENCE_S
+) -> MasterAddress:
+    """The master's address, also when its file is written later.
+
+    Args:
+        connect: see `find_master`.
+        tell: takes a line for the user.
+        patience_s: most to wait.
+
+    Raises:
+        RunError: neither an address nor a readable connection file, or none in time.
+    """
+    until_s = time.monotonic() + patience_s
+    told = False
+    while (found := find_master(connect)) is None:
+        if time.monotonic() >= until_s:
+            raise RunError(no_file_error(connect, patience_s))
+        if not told:
+            tell(f"waits for the connection file {connect}")
+            told = True
+        time.sleep(LOOK_S)
+    return found
+
+
+def no_file_error(connect: str, patience_s: float) -> str:
+    """That there is no file, for the user."""
+    return (
+        f"no connection file is at {connect} after {patience_s:g} s: is tangram-master running "
+        "there?"
+    )
+
+
+def keys_error(connect: str, endpoint: str) -> str:
+    """Why a handshake fails, for the user, with what `connect` names."""
+    if "://" in connect:
+        return (
+            f"the master at {endpoint} wants keys, or is none: name its connection file instead, "
+            f"connect=RUN_DIR/{FILE_NAME}"
+        )
+    return (
+        f"wrong or stale connection file: what answers at {endpoint} does not take the keys of "
+        f"{connect}; take the file of a master that is running"
+    )
+
+
+def _checked(endpoint: str, source: str) -> str:
+    host, _, port = endpoint.removeprefix(SCHEME).rpartition(":")
+    if not (endpoint.startswith(SCHEME) and host and port.isdecimal() and 0 < int(port) < 65536):
+        raise RunError(f"'{endpoint}' (from {source}) is no address: it must be tcp://host:port")
+    return endpoint
