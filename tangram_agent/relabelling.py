@@ -198,6 +198,8 @@ def make_pairs(batch: Transitions, setup: Setup, generator: np.random.Generator)
     else:
         piece, covered = lying(batch.goal, layout, rows, token), np.zeros(len(rows))
         reward, done = batch.reward.astype(np.float64), batch.done
+    # The same target at any of the turns that look alike: hindsight alone has the token's own turn.
+    piece.pose[:, 2] += _alike(piece.index, layout, generator)
     start = _again(before, after, generator)
     return PairBatch(
         before=before.pose,
@@ -234,6 +236,13 @@ def with_contacts(
     )
 
 
+def _alike(piece: Ints, layout: Layout, generator: np.random.Generator) -> Floats:
+    """(M,) any of the turns by which pieces (M,) look the same."""
+    order = np.array([shape.symmetry for shape in layout.shapes])[piece]
+    turn: Floats = 2.0 * np.pi / order * generator.integers(order)
+    return turn
+
+
 def _again(before: Lying, after: Lying, generator: np.random.Generator) -> Lying:
     """Where tokens (M,) are for the actor: mostly before the action, else after it.
 
@@ -267,7 +276,6 @@ class _Relabelled:
 
     def __init__(self, agent: AgentConfig, layout: Layout, generator: np.random.Generator) -> None:
         self._layout, self._generator = layout, generator
-        self._symmetry = np.array([shape.symmetry for shape in layout.shapes])
         # One row per strategy, the goal that was played first.
         self._spread = np.array([(0.0, 0.0, 0.0), *map(_spread, agent.hindsight)])
 
@@ -287,11 +295,9 @@ class _Relabelled:
         return np.where(self._generator.random(len(token)) < _OTHER_SHAPE, other, own)
 
     def _goals(self, after: Floats, piece: Ints, strategy: Ints) -> Floats:
-        """(M, 3) at the achieved pose or near it, at any of the turns that look alike."""
+        """(M, 3) at the achieved pose or near it."""
         draw = self._generator.standard_normal(after.shape) * self._spread[strategy]
         goal: Floats = after + draw
-        order = self._symmetry[piece]
-        goal[:, 2] += 2.0 * np.pi / order * self._generator.integers(order)
         return goal
 
     def _sides(self, after: Bools, piece: Ints) -> Bools:
