@@ -197,9 +197,9 @@ def make_pairs(batch: Transitions, setup: Setup, generator: np.random.Generator)
         reward, done = newly_covered(after, piece, covered, layout), np.ones(len(rows), np.uint8)
     else:
         piece, covered = lying(batch.goal, layout, rows, token), np.zeros(len(rows))
+        # Most goals are where the token came to lie: else it would know them by its own turn.
+        piece.pose[:, 2] += _alike(piece.index, layout, generator)
         reward, done = batch.reward.astype(np.float64), batch.done
-    # The same target at any of the turns that look alike: hindsight alone has the token's own turn.
-    piece.pose[:, 2] += _alike(piece.index, layout, generator)
     start = _again(before, after, generator)
     return PairBatch(
         before=before.pose,
@@ -295,9 +295,10 @@ class _Relabelled:
         return np.where(self._generator.random(len(token)) < _OTHER_SHAPE, other, own)
 
     def _goals(self, after: Floats, piece: Ints, strategy: Ints) -> Floats:
-        """(M, 3) at the achieved pose or near it."""
+        """(M, 3) at the achieved pose or near it, at any of the turns that look alike."""
         draw = self._generator.standard_normal(after.shape) * self._spread[strategy]
         goal: Floats = after + draw
+        goal[:, 2] += _alike(piece, self._layout, self._generator)
         return goal
 
     def _sides(self, after: Bools, piece: Ints) -> Bools:

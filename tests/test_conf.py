@@ -18,7 +18,7 @@ from conf.help import Plain, choices, group_defaults, help_text, setting_names
 from conf.names import hidden, revealed
 from conf.sweep import check_launcher, refuse_lost_job
 from master.config import LaunchConfig, MasterConfig
-from tangram_agent.config import AgentConfig, NetConfig, ServiceConfig, TwinConfig
+from tangram_agent.config import AgentConfig, NetConfig, RelabelConfig, ServiceConfig
 from tangram_agent.setup import SECTIONS, Setup, from_mapping, make_setup
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.errors import ConfigError, TangramError
@@ -73,7 +73,7 @@ def test_what_is_not_given_is_as_the_tangram_agent_has_it() -> None:
 @pytest.mark.parametrize("name", choices("agent"))
 def test_first_twin_of_a_preset_writes_out_every_field(name: str) -> None:
     twins = compose("train", f"agent={name}")["agent"]["hindsight"]
-    assert set(twins[0]) == field_names(TwinConfig)
+    assert set(twins[0]) == field_names(RelabelConfig)
 
 
 @pytest.mark.parametrize(

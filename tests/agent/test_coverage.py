@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from shapely.geometry import Polygon
 from shapely.ops import unary_union
-from tangram_agent.pair_values import (
+
+from tangram_agent.coverage import (
     Lying,
     covered_share,
     covering,
@@ -15,7 +16,6 @@ from tangram_agent.pair_values import (
     pushed_share,
     worths,
 )
-
 from tangram_sim.layout import Layout, TokensConfig, make_layout
 from tests.agent.pair_scenes import SEVEN, random_scene
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tangram_agent.pair_learner import make_learner
 
+from tangram_agent.learner import Learner
 from tangram_agent.payloads import decode_weights, encode_weights
 from tangram_agent.policy import Policy
 from tangram_agent.runs import Run
@@ -28,7 +28,7 @@ Scene = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 def policy_of(made: Setup) -> Policy:
     policy = Policy(made)
-    policy.load(make_learner(made, 0).acting_weights(7))
+    policy.load(Learner(made, 0).acting_weights(7))
     return policy
 
 
@@ -44,7 +44,7 @@ def generators(count: int) -> list[np.random.Generator]:
 @pytest.mark.parametrize("sim", [{}, {"backend": "physics", "motion": "slide"}])
 def test_weights_travel_to_workers(net: dict[str, Any], sim: dict[str, Any]) -> None:
     made = seven({}, net, **sim)
-    weights = make_learner(made, 0).acting_weights(7)
+    weights = Learner(made, 0).acting_weights(7)
     policy = Policy(made)
     assert {name: tensor.shape for name, tensor in weights.tensors.items()} == policy.shapes
     epoch, arrived = decode_weights(encode_weights("run", weights), policy.shapes)
@@ -61,7 +61,7 @@ def test_an_action_takes_its_token_to_the_pose_that_was_chosen(flip: bool) -> No
     policy, scene = policy_of(made), scene_of(transitions(made, COUNT))
     actions = policy.act(*scene)
     exact = [part.astype(np.float64) for part in scene]
-    choice = policy._chooser.choose(exact[0], exact[1] > 0, exact[2])  # type: ignore[union-attr]
+    choice = policy._planner.choose(exact[0], exact[1] > 0, exact[2])  # type: ignore[union-attr]
     assert actions.shape == (COUNT, 4 + flip)
     assert actions.dtype == np.float32
     np.testing.assert_array_equal(chosen_tokens(actions, 7), choice.token)
@@ -141,14 +141,14 @@ def test_whole_episodes_of_a_token_with_two_sides(readout: str, noise: float) ->
         for _ in range(env.horizon):
             actions = policy.explore(env.seen, env.placed, env.seen_goals, generators(4))
             assert not env.step(actions.astype(np.float64)).refused.any()
-    learner, batch = make_learner(made, 0), transitions(made, 8)
+    learner, batch = Learner(made, 0), transitions(made, 8)
     learner.update(learner.prepared(batch, np.random.default_rng(0)))
     assert learner.updates == 1
 
 
 def test_the_agent_of_the_paper_plays_and_learns_the_game() -> None:
-    made = seven(PAPER | {"readout": "token"}, mirrored=0.5)
-    policy, learner, batch = policy_of(made), make_learner(made, 0), transitions(made, 8)
+    made = seven(PAPER, mirrored=0.5)
+    policy, learner, batch = policy_of(made), Learner(made, 0), transitions(made, 8)
     assert policy.act(*scene_of(batch)).shape == (8, 4)
     learner.update(learner.prepared(batch, np.random.default_rng(0)))
     assert learner.updates == 1
@@ -170,7 +170,8 @@ def test_a_run_plays_on_with_other_settings_of_the_agent() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "error"), [({"order": "x"}, ConfigError), ({"readout": "token"}, RunError)]
+    ("changes", "error"),
+    [({"order": "x"}, ConfigError), ({"readout": "token", "reapply": 2}, RunError)],
 )
 def test_settings_that_the_weights_do_not_fit_are_refused(
     changes: dict[str, Any], error: type[Exception]

@@ -7,13 +7,12 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
-from tangram_agent.pair_networks import PairNetworks
-from tangram_agent.pair_policy import PairChooser
-from tangram_agent.pair_values import covered_share, covering, worths
-from tangram_agent.pairs import PairGraph, Pairs
 
-from tangram_agent import pair_policy
-from tangram_agent.networks import initialise
+from tangram_agent import planning
+from tangram_agent.coverage import covered_share, covering, worths
+from tangram_agent.graph import PairGraph, Pairs
+from tangram_agent.networks import Networks, initialise
+from tangram_agent.planning import Planner
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
 from tangram_sim.batch import BatchedEnv
@@ -44,17 +43,18 @@ def scenes(made: Setup, count: int = COUNT, seed: int = 0) -> tuple[np.ndarray, 
     return corners, placed, goals
 
 
-def random_networks(made: Setup, seed: int = 0) -> PairNetworks:
-    networks = PairNetworks(PairGraph(made.layout, made.sim.arena), made.net, made.contacts)
+def random_networks(made: Setup, seed: int = 0) -> Networks:
+    networks = Networks(made)
     initialise(networks, torch.Generator().manual_seed(seed))
     return networks.requires_grad_(False)
 
 
 def perfect(
     made: Setup, pushes: np.ndarray | None = None, likes: np.ndarray | None = None
-) -> PairChooser:
-    networks = PerfectNetworks(PerfectCritic(made.layout, pushes, likes))
-    return PairChooser(cast("PairNetworks", networks), made)
+) -> Planner:
+    graph = PairGraph(made.layout, made.sim.arena, made.agent)
+    networks = PerfectNetworks(PerfectCritic(made.layout, pushes, likes), graph)
+    return Planner(cast("Networks", networks), made)
 
 
 # Against brute force
@@ -62,7 +62,7 @@ def perfect(
 
 def total(
     made: Setup,
-    networks: PairNetworks,
+    networks: Networks,
     scene: tuple[np.ndarray, ...],
     token: int,
     flip: bool,
@@ -88,11 +88,18 @@ def total(
             as_tensor([share[index]]),
         )
 
+    graph = PairGraph(layout, made.sim.arena, made.agent)
+
+    def proposed(pairs: Pairs) -> np.ndarray:
+        place: np.ndarray = graph.moved(pairs, networks.actor(pairs)[0]).pose[0].numpy()
+        return place
+
     if pose is None:
-        pose = networks.actor(pair(here, piece))[0][0].numpy()
+        pose = proposed(pair(here, piece))
         for _ in range(made.agent.reapply):
-            pose = networks.actor(pair(pose, piece))[0][0].numpy()
-    values = [networks.critic(pair(pose, index)).item() for index in range(layout.tokens)]
+            pose = proposed(pair(pose, piece))
+    still = torch.zeros(1, 3)
+    values = [networks.critic(pair(pose, index), still).item() for index in range(layout.tokens)]
     return sum(values) - worths(covered, layout)[0, token], pose
 
 
@@ -102,12 +109,12 @@ def test_the_best_of_all_is_played(
     monkeypatch: pytest.MonkeyPatch, net: dict[str, Any], options: dict[str, Any]
 ) -> None:
     """With a short list that leaves nothing out."""
-    monkeypatch.setattr(pair_policy, "_SHORT_LIST", 1000)
+    monkeypatch.setattr(planning, "_SHORT_LIST", 1000)
     flip = options.get("allow_flip", False)
     made = setup(TWO, {"reapply": options.get("reapply", 0)}, net, allow_flip=flip)
     networks = random_networks(made)
     corners, placed, goals = scenes(made)
-    choice = PairChooser(networks, made).choose(corners, placed, goals)
+    choice = Planner(networks, made).choose(corners, placed, goals)
     for row in range(COUNT):
         scene = corners[row], placed[row], goals[row]
         every = [
@@ -124,8 +131,9 @@ def test_the_best_of_all_is_played(
 
 @pytest.mark.parametrize("sim", [{}, {"allow_flip": True}, SLIDE])
 def test_a_choice_does_not_depend_on_the_others_of_the_batch(sim: dict[str, Any]) -> None:
-    made = seven({"reapply": 1, "refine_steps": 2, "gamma": 0.5}, **sim)
-    chooser = PairChooser(random_networks(made), made)
+    pushes = {"push_weight": 0.5} if sim == SLIDE else {}
+    made = seven({"reapply": 1, "refine_steps": 2} | pushes, **sim)
+    chooser = Planner(random_networks(made), made)
     corners, placed, goals = scenes(made, COUNT)
     placed[3] = True
     together = chooser.choose(corners, placed, goals)
@@ -140,7 +148,7 @@ def test_a_choice_does_not_depend_on_the_others_of_the_batch(sim: dict[str, Any]
 def test_no_placed_token_is_named_while_others_are_left(order: str) -> None:
     made = seven({"order": order})
     corners, placed, goals = scenes(made, 40)
-    token = PairChooser(random_networks(made), made).choose(corners, placed, goals).token
+    token = Planner(random_networks(made), made).choose(corners, placed, goals).token
     assert not placed[np.arange(40), token].any()
     assert len(set(token)) > 1
 
@@ -149,7 +157,7 @@ def test_where_all_are_placed_the_first_is_named() -> None:
     made = seven()
     corners, _, goals = scenes(made)
     everything = np.ones((COUNT, 7), np.bool_)
-    choice = PairChooser(random_networks(made), made).choose(corners, everything, goals)
+    choice = Planner(random_networks(made), made).choose(corners, everything, goals)
     assert choice.token.tolist() == [0] * COUNT
 
 
@@ -203,9 +211,9 @@ def test_refinement_goes_uphill_on_what_the_critic_says_of_all_pieces(net: dict[
     networks = random_networks(plain)
     scene = scenes(plain)
     one, two, off = (
-        PairChooser(networks, plain).choose(*scene),
-        PairChooser(networks, refined).choose(*scene),
-        PairChooser(networks, refined).choose(*scene, refine=False),
+        Planner(networks, plain).choose(*scene),
+        Planner(networks, refined).choose(*scene),
+        Planner(networks, refined).choose(*scene, refine=False),
     )
     np.testing.assert_array_equal(one.pose, off.pose)
     np.testing.assert_array_equal(one.token, two.token)
@@ -222,10 +230,10 @@ def test_refinement_goes_uphill_on_what_the_critic_says_of_all_pieces(net: dict[
 # With networks that know everything
 
 
-def assembled(made: Setup, chooser: PairChooser, episodes: int) -> tuple[np.ndarray, np.ndarray]:
+def assembled(made: Setup, chooser: Planner, episodes: int) -> tuple[np.ndarray, np.ndarray]:
     """Overlap at the end (B,), and flips (B, T) of whole episodes."""
     policy = Policy(made)
-    policy._chooser = chooser  # perfect networks have no weights to load
+    policy._planner = chooser  # perfect networks have no weights to load
     flips = []
     with closing(BatchedEnv(made.layout, made.sim, made.reward, episodes)) as env:
         env.reset([np.random.default_rng([7, i]) for i in range(episodes)])
@@ -287,10 +295,10 @@ def at(made: Setup, *centres: tuple[float, float]) -> np.ndarray:
     return made.layout.corners(poses)[None]
 
 
-@pytest.mark.parametrize("gamma", [0.0, 1.0])
-def test_a_token_that_would_push_a_placed_one_off_the_target_is_not_played(gamma: float) -> None:
+@pytest.mark.parametrize("weight", [0.0, 1.0])
+def test_a_token_that_would_push_a_placed_one_off_the_target_is_not_played(weight: float) -> None:
     """Token 0 is placed well. Token 1, the better one but for that, would push it away."""
-    made = squares(gamma=gamma)
+    made = squares(push_weight=weight)
     goals = at(made, (0, 0), (0.5, 0), (0.6, 0.6))
     corners = at(made, (0, 0), (-0.5, 0), (-0.8, -0.8))
     placed = np.array([[True, False, False]])
@@ -307,10 +315,10 @@ def test_a_token_that_would_push_a_placed_one_off_the_target_is_not_played(gamma
     assert perfect(made, harmful, LIKES).choose(hardly, placed, goals).token[0] == 1
 
 
-@pytest.mark.parametrize(("gamma", "expected"), [(0.0, 1), (1.0, 2)])
-def test_what_lies_in_the_way_of_others_comes_after_them(gamma: float, expected: int) -> None:
+@pytest.mark.parametrize(("weight", "expected"), [(0.0, 1), (1.0, 2)])
+def test_what_lies_in_the_way_of_others_comes_after_them(weight: float, expected: int) -> None:
     """Token 2 would push token 1 away, wherever that is placed; not the other way round."""
-    made = squares(gamma=gamma)
+    made = squares(push_weight=weight)
     goals = at(made, (0, 0), (0.5, 0), (0.6, 0.6))
     corners = at(made, (0, 0), (-0.5, 0), (-0.8, -0.8))
     pushes = np.zeros((3, 3))
@@ -320,7 +328,7 @@ def test_what_lies_in_the_way_of_others_comes_after_them(gamma: float, expected:
 
 
 def test_where_tokens_are_lifted_nothing_is_pushed() -> None:
-    made = setup({"shapes": ["square"] * 3, "scale": 0.8}, {"gamma": 1.0}, PERCEPTRON)
+    made = setup({"shapes": ["square"] * 3, "scale": 0.8}, {}, PERCEPTRON)
     goals = at(made, (0, 0), (0.5, 0), (0.6, 0.6))
     corners = at(made, (0, 0), (-0.5, 0), (-0.8, -0.8))
     pushes = np.zeros((3, 3))

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import safetensors.numpy
 import torch
-from tangram_agent.ddpg import NotFiniteError
 from torch import nn
 
 from master import divergence as divergence_module
 from master.divergence import DivergenceGuard
 from master.trainer import Trainer
+from tangram_agent.learner import NotFiniteError
 from tangram_sim.errors import RunError
 from tests.agent.builders import random_episodes
 from tests.master.builders import small_setup, trainer
