@@ -1,11 +1,11 @@
 """What the hub is told when it opens, and what it hands on to the loop."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from tangram_agent.payloads import EpisodeSpec
+from tangram_agent.arrays import EpisodeSpec
+from tangram_agent.messages import EpisodeBatch, Scores
 from tangram_agent.types import Episodes
-from tangram_agent.wire import Scores
 
 
 @dataclass(frozen=True)
@@ -31,14 +31,34 @@ class WelcomeInfo:
 
 @dataclass(frozen=True, eq=False)
 class EpisodesArrived:
-    """A new batch that waits for its insert; its arrays are read-only."""
+    """A new batch that waits for its insert; its arrays are read-only.
+
+    Attributes:
+        role, index, incarnation: of its sender.
+        batch: as it was read.
+        frames: as they came, for the journal.
+    """
 
     role: str
     index: int
     incarnation: int
-    sequence: int
-    weights_version: int
-    episodes: Episodes
+    batch: EpisodeBatch
+    frames: Sequence[bytes]
+
+    @property
+    def sequence(self) -> int:
+        """Number of the batch."""
+        return self.batch.sequence
+
+    @property
+    def weights_version(self) -> int:
+        """Of the weights that played it."""
+        return self.batch.weights_version
+
+    @property
+    def episodes(self) -> Episodes:
+        """What was played."""
+        return self.batch.episodes
 
 
 @dataclass(frozen=True, eq=False)

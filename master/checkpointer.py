@@ -15,8 +15,7 @@ from typing import Any
 from master.arrivals import EpisodesArrived
 from master.divergence import DivergenceGuard
 from master.hub import Hub
-from master.journal import Journal, JournalError, segments
-from master.recovery import check_journal
+from master.journal import Journal, JournalError, check_journal, segments
 from master.rundir import Clock, Record, RunFolder
 from master.trainer import LEARNER, Trainer, check_same_task
 from tangram_agent.checkpoints import (

@@ -11,7 +11,7 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 
-from tangram_agent.standing import WORKER_COLUMNS, RunStatus
+from tangram_agent.messages import WORKER_COLUMNS, RunStatus
 from tangram_sim.errors import ConfigError
 
 OFF = -1

@@ -19,13 +19,11 @@ from master.keys import Keys
 from master.orders import Orders
 from master.peers import Peer, RefusedError, Registry
 from master.post import Post
-from tangram_agent.decoding import BatchError, decode_from_worker
-from tangram_agent.frames import ProtocolError
-from tangram_agent.payloads import encode_weights
-from tangram_agent.standing import AskStatus, RunStatus
-from tangram_agent.types import Weights
-from tangram_agent.wire import (
+from tangram_agent.arrays import join_frames
+from tangram_agent.messages import (
     Alive,
+    AskStatus,
+    BatchError,
     Bye,
     EpisodeBatch,
     Go,
@@ -34,13 +32,17 @@ from tangram_agent.wire import (
     Hello,
     Refused,
     Reject,
+    RunStatus,
     Scores,
     Stop,
     ToMaster,
     WantWeights,
     WeightsMessage,
     Welcome,
+    decode_from_worker,
 )
+from tangram_agent.schema import DamagedError, ProtocolError
+from tangram_agent.types import Weights
 from tangram_sim.errors import WireError
 
 # Most messages taken in one poll, so that the loop gets its turn under any load.
@@ -79,7 +81,7 @@ class Hub:
         self.epoch = secrets.token_hex(8)
         self._info, self._silence_s = info, silence_s
         self._registry = Registry(info.fingerprints, silence_s)
-        self._weights: bytes | None = None
+        self._weights: list[bytes] | None = None
         self._version = -1
         self._stop_reason: str | None = None
         self._status: list[bytes] | None = None
@@ -130,8 +132,9 @@ class Hub:
         Raises:
             WireError: they are not finite or too large; nothing is sent.
         """
-        self._weights, self._version = encode_weights(self.epoch, weights), weights.version
-        self._sockets.publish(self._weights)
+        self._weights = WeightsMessage(self.epoch, weights).encode()
+        self._version = weights.version
+        self._sockets.publish(join_frames(self._weights))
         self.counters["published"] += 1
 
     def order(self, orders: Mapping[int, Go]) -> None:
@@ -177,16 +180,25 @@ class Hub:
             message = decode_from_worker(frames, self._info.spec)
         except ProtocolError as error:
             self._post.refuse(identity, "refused_protocol", Refused(str(error)))
+        except DamagedError as error:
+            # Told, so that what was meant comes again, and not final: its number is not believed.
+            reject = Reject(reason=str(error), sequence=0, final=False)
+            self._post.refuse(identity, "damaged", reject)
         except BatchError as error:
-            self._intake.broken(identity, error)
+            if self._stop_reason is None:  # else what comes is not judged any more
+                self._intake.broken(identity, error)
+            else:
+                self._post.send(identity, Stop(self._stop_reason))
         except WireError as error:
             reject = Reject(reason=str(error), sequence=0, final=True)
             self._post.refuse(identity, "malformed", reject)
         else:
-            return self._dispatch(identity, message)
+            return self._dispatch(identity, message, frames)
         return ()
 
-    def _dispatch(self, identity: bytes, message: ToMaster | AskStatus) -> Sequence[Arrival]:
+    def _dispatch(
+        self, identity: bytes, message: ToMaster, frames: Sequence[bytes]
+    ) -> Sequence[Arrival]:
         peer = self._registry.find(identity)
         if isinstance(message, AskStatus):
             if self._status is not None:
@@ -203,15 +215,15 @@ class Hub:
             self._post.refuse(identity, "strangers", Greet())
         else:
             peer.last_seen = time.monotonic()
-            return self._talk(peer, message)
+            return self._talk(peer, message, frames)
         return ()
 
-    def _talk(self, peer: Peer, message: Any) -> Sequence[Arrival]:
+    def _talk(self, peer: Peer, message: Any, frames: Sequence[bytes]) -> Sequence[Arrival]:
         match message:
             case EpisodeBatch(sequence) if peer.role != "player":
                 self._not_its_role(peer, sequence, "episodes come from players only")
             case EpisodeBatch():
-                arrived = self._intake.batch(peer, message)
+                arrived = self._intake.batch(peer, message, frames)
                 if arrived:  # and not one that was sent again
                     self._orders.done(peer)
                 return arrived
@@ -227,7 +239,7 @@ class Hub:
                 self._orders.remind(peer)
             case WantWeights(epoch, version):
                 if self._weights is not None and (epoch, version) != (self.epoch, self._version):
-                    self._sockets.send(peer.identity, WeightsMessage.wrap(self._weights))
+                    self._sockets.send(peer.identity, self._weights)
         return ()
 
     def _not_its_role(self, peer: Peer, sequence: int, rule: str) -> None:

@@ -6,8 +6,7 @@ from master.arrivals import EpisodesArrived
 from master.ledger import Verdict
 from master.peers import Peer, Registry
 from master.post import Post
-from tangram_agent.decoding import BatchError
-from tangram_agent.wire import Ack, EpisodeBatch, Greet, Reject
+from tangram_agent.messages import Ack, BatchError, EpisodeBatch, Greet, Reject
 
 
 class Intake:
@@ -23,7 +22,9 @@ class Intake:
         """
         self._post, self._registry, self._window = post, registry, window
 
-    def batch(self, peer: Peer, batch: EpisodeBatch) -> Sequence[EpisodesArrived]:
+    def batch(
+        self, peer: Peer, batch: EpisodeBatch, frames: Sequence[bytes]
+    ) -> Sequence[EpisodesArrived]:
         """The batch, if it is the next one; else what the worker must know is answered."""
         verdict = peer.ledger.judge(batch.sequence, self._window)
         if verdict is not Verdict.NEW:
@@ -36,8 +37,7 @@ class Intake:
         peer.weights_version = batch.weights_version
         self._post.counters["batches"] += 1
         self._post.counters["episodes"] += batch.episodes.count
-        key = (peer.role, peer.index, peer.incarnation)
-        return [EpisodesArrived(*key, batch.sequence, batch.weights_version, batch.episodes)]
+        return [EpisodesArrived(peer.role, peer.index, peer.incarnation, batch, frames)]
 
     def broken(self, identity: bytes, error: BatchError) -> None:
         """A batch with wrong content: it must not come again, and those after it need not wait."""

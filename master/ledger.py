@@ -8,7 +8,7 @@ that a checkpoint must keep for exactly-once inserts.
 from dataclasses import dataclass, field
 from enum import Enum
 
-from tangram_agent.wire import Ack, Reject
+from tangram_agent.messages import Ack, Reject
 
 
 class Verdict(Enum):

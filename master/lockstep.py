@@ -9,7 +9,7 @@ inserted says which round it is, so a run that was stopped goes on where it was.
 
 from master.arrivals import EpisodesArrived
 from tangram_agent.config import ServiceConfig
-from tangram_agent.wire import Go
+from tangram_agent.messages import Go
 from tangram_sim.errors import ConfigError
 
 

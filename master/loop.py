@@ -11,8 +11,8 @@ from master.parts import Parts
 from master.report import Reporter, scores_picture
 from master.rundir import Clock
 from master.signals import StopSignals
+from tangram_agent.messages import Scores
 from tangram_agent.process import Every, Watchdog
-from tangram_agent.wire import Scores
 
 # Between two looks at the sockets: learning goes on for so long, or idleness lasts.
 LEARN_S = 0.05

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 
 from master.peers import Peer
 from master.post import Post
-from tangram_agent.wire import Go
+from tangram_agent.messages import Go
 
 
 class Orders:

@@ -13,15 +13,14 @@ from master.config import MasterConfig
 from master.divergence import DivergenceGuard
 from master.health import OFF, Health
 from master.hub import Hub
-from master.journal import Journal
+from master.journal import Journal, journal_run_id, read_journal
 from master.keys import Keys, is_loopback, needs_keys, run_keys
 from master.lockstep import Lockstep
-from master.recovery import journal_run_id, read_journal
 from master.rundir import Record, RunFolder
 from master.trainer import Trainer, choose_device
 from tangram_agent.addresses import reachable, with_host
+from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.config import ServiceConfig
-from tangram_agent.payloads import EpisodeSpec
 from tangram_agent.setup import Setup
 
 UNBOUNDED = (
@@ -183,7 +182,7 @@ def _open(
         hub=hub,
         guard=DivergenceGuard(trainer, service.max_bad_updates, folder.bad_batch),
         journal=Journal(
-            folder.journal, record.run_id, setup.task_digest(), spec, service.journal_sync_seconds
+            folder.journal, record.run_id, setup.task_digest(), service.journal_sync_seconds
         ),
         lockstep=lockstep,
         health=health,

@@ -8,8 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from master.ledger import Ledger
-from tangram_agent.decoding import MAX_INDEX
-from tangram_agent.wire import ROLES, Hello, Refused, Stop
+from tangram_agent.messages import MAX_INDEX, ROLES, Hello, Refused, Stop
 from tangram_sim.errors import RunError, TangramError
 
 MAX_PEERS = 4096

@@ -3,7 +3,7 @@
 from master.keys import Keys
 from master.sockets import Sockets
 from master.tally import Tally
-from tangram_agent.wire import Plain
+from tangram_agent.schema import Plain
 
 
 class Post:

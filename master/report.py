@@ -17,9 +17,9 @@ from master.standing import run_status
 from master.status import Status
 from master.trainer import Trainer
 from tangram_agent.config import ServiceConfig
+from tangram_agent.messages import Scores
 from tangram_agent.process import Every
 from tangram_agent.setup import Setup
-from tangram_agent.wire import Scores
 from tangram_sim.drawing import episode_sheet
 
 REMEMBERED_VERSIONS = 4096

@@ -8,7 +8,7 @@ import zmq
 from master.doorkeeper import Doorkeeper
 from master.keys import Keys
 from master.tally import Tally
-from tangram_agent.payloads import MAX_BATCH_BYTES
+from tangram_agent.arrays import MAX_BATCH_BYTES
 from tangram_sim.errors import ConfigError
 
 LINGER_MS = 1000

@@ -8,7 +8,7 @@ import numpy as np
 from master.parts import Parts
 from master.peers import Peer
 from master.status import Status
-from tangram_agent.standing import WORKER_COLUMNS, RunStatus
+from tangram_agent.messages import WORKER_COLUMNS, RunStatus
 from tangram_sim.arrays import Floats
 
 UNKNOWN = -1.0

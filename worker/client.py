@@ -17,12 +17,8 @@ from collections.abc import Callable, Mapping
 from typing import Self
 
 from tangram_agent.addresses import host_of, reachable
-from tangram_agent.decoding import decode_from_master
-from tangram_agent.frames import ProtocolError
-from tangram_agent.payloads import EpisodeSpec, WeightShapes
-from tangram_agent.standing import RunStatus
-from tangram_agent.types import Episodes, Weights
-from tangram_agent.wire import (
+from tangram_agent.arrays import EpisodeSpec, WeightShapes
+from tangram_agent.messages import (
     Ack,
     Alive,
     Bye,
@@ -31,16 +27,19 @@ from tangram_agent.wire import (
     Greet,
     Heartbeat,
     Hello,
-    Plain,
     Refused,
     Reject,
+    RunStatus,
     Scores,
     Stop,
     ToWorker,
     WantWeights,
     WeightsMessage,
     Welcome,
+    decode_from_master,
 )
+from tangram_agent.schema import Plain, ProtocolError
+from tangram_agent.types import Episodes, Weights
 from tangram_sim.errors import TangramError, WireError
 from worker.connection import Connection, Sockets, Timing
 from worker.outbox import NewestWeights, Outbox

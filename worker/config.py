@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from tangram_agent.config import ORDERS, ServiceConfig
-from tangram_agent.decoding import MAX_INDEX
+from tangram_agent.messages import MAX_INDEX, ROLES
 from tangram_agent.pretrained import PREFIX, agent_names
-from tangram_agent.wire import ROLES
 from tangram_sim.config import MAX_CORNER_NOISE
 from tangram_sim.errors import ConfigError
 from tangram_sim.settings import check_choice, check_range

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from tangram_agent.frames import MAX_HEADER
-from tangram_agent.payloads import MAX_WEIGHTS_BYTES
+from tangram_agent.arrays import MAX_WEIGHTS_BYTES
+from tangram_agent.schema import MAX_HEADER
 from tangram_sim.errors import RunError, TangramError
 from worker.discovery import PATIENCE_S, MasterAddress, find_master, keys_error, no_file_error
 

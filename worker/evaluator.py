@@ -7,10 +7,10 @@ from contextlib import closing
 import numpy as np
 
 from tangram_agent.config import ServiceConfig
+from tangram_agent.messages import Scores
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
 from tangram_agent.types import Weights
-from tangram_agent.wire import Scores
 from worker.client import Client
 from worker.config import WorkerConfig
 from worker.rollout import Played
@@ -82,13 +82,15 @@ def _schedule(service: ServiceConfig) -> Schedule:
 def _evaluate(tests: FixedTests, policy: Policy, client: Client) -> Scores | None:
     """Scores of the policy; None if the client was stopped meanwhile."""
     began = time.monotonic()
-    groups = []
-    for group in tests.groups(greedy(policy)):
-        groups.append(group)
+
+    def go_on() -> bool:
         client.poll()
-        if client.stopped:
-            return None
-    played = tests.join(groups)
+        return not client.stopped
+
+    played = tests.play(greedy(policy), go_on)
+    client.poll()
+    if client.stopped:
+        return None
     scalars = tests.scores(played) | {"seconds": time.monotonic() - began}
     _log.info(
         "weights %d: mean reward %.3f, raw overlap %.3f, median angle error %.2f degrees (%.1f s)",

@@ -98,8 +98,8 @@ class Frame:
 
 def film(setup: Setup, played: Played) -> list[Frame]:
     """The start, equally many frames for each action, and the end."""
-    count = frames_per_action(played.actions.shape[1])
-    moves = [_Move(setup, played, t) for t in range(played.actions.shape[1])]
+    count = frames_per_action(played.episodes.actions.shape[1])
+    moves = [_Move(setup, played, t) for t in range(played.episodes.actions.shape[1])]
     frames = [move.at((i + 1) / count) for move in moves for i in range(count)]
     return [moves[0].start(), *frames, frames[-1].at_rest()]
 
@@ -116,7 +116,7 @@ class _Move:
         self._poses, self._way = poses[:, 0], poses[:, 1] - poses[:, 0]
         self._rolls, self._roll = rolls[:, 0], rolls[:, 1] - rolls[:, 0]
         self._stopped, idle = played.blocked[:, step], played.refused[:, step]
-        actions = played.actions[:, step].astype(np.float64)
+        actions = played.episodes.actions[:, step].astype(np.float64)
         self._rows, token = np.arange(len(actions)), chosen_tokens(actions, layout.tokens)
         # A token that was stopped is shown on its way there and back.
         stopped = (self._rows[self._stopped], token[self._stopped])

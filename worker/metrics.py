@@ -68,7 +68,9 @@ def summarise(layout: Layout, sim: SimConfig, played: Played, own_reward: bool) 
     if played.camera is not None:
         scores["mean_reward_camera"] = float(np.mean(played.camera))
     if own_reward:
-        scores["mean_train_reward"] = float(np.mean(played.rewards[:, -1]))
+        scores["mean_train_reward"] = float(
+            np.mean(played.episodes.rewards[:, -1], dtype=np.float64)
+        )
     if layout.tokens > 1:
         scores |= assembled(layout, played).means()
     return scores

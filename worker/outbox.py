@@ -1,6 +1,7 @@
 """What a worker keeps: batches until the master has them, and the newest weights."""
 
-from tangram_agent.payloads import WeightShapes, decode_weights
+from tangram_agent.arrays import WeightShapes
+from tangram_agent.messages import decode_weights
 from tangram_agent.types import Weights
 
 

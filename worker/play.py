@@ -144,7 +144,7 @@ def draw_sheet(setup: Setup, played: Played, corners: Floats, width: int = SHEET
 
 def draw_motion(setup: Setup, played: Played) -> list[Image.Image]:
     """The episodes' frames: start, every action as a motion at constant velocity, end."""
-    count = frames_per_action(played.actions.shape[1])
+    count = frames_per_action(played.episodes.actions.shape[1])
     return with_stills(
         [
             draw_sheet(setup, played, corners)
@@ -263,7 +263,7 @@ def _films(config: PlayConfig, shown: Sequence[tuple[Setup, Played]]) -> list[li
 
 def equally_long(shown: Sequence[tuple[Setup, Played]]) -> list[list[Floats]]:
     """For each run the corners (E, V, 2) of every frame; a shorter film keeps its last one."""
-    count = frames_per_action(max(played.actions.shape[1] for _, played in shown))
+    count = frames_per_action(max(played.episodes.actions.shape[1] for _, played in shown))
     films = [motion(setup.layout, played.corners, count) for setup, played in shown]
     longest = max(map(len, films))
     return [film + [film[-1]] * (longest - len(film)) for film in films]

@@ -3,15 +3,15 @@
 import math
 from contextlib import closing
 
+from tangram_agent.messages import Go
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes
-from tangram_agent.wire import Go
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.errors import TangramError
 from worker.client import Client
 from worker.config import WorkerConfig
-from worker.rollout import Rollout, join_episodes, split_episodes
+from worker.rollout import Rollout, parts
 from worker.session import Report, joined
 
 
@@ -44,7 +44,7 @@ def run_player(config: WorkerConfig, setup: Setup) -> int:
             if newest is not None:
                 policy.load(newest)
             episodes = _play(rollout, policy, client, groups=math.ceil(size / env.count))
-            for batch in split_episodes(episodes, size):
+            for batch in parts(episodes, size):
                 if not client.send(batch, policy.version):
                     break
             client.stats["episodes"] = float(rollout.episode)
@@ -96,9 +96,10 @@ def _wait_for_room(client: Client, report: Report) -> bool:
 
 def _play(rollout: Rollout, policy: Policy, client: Client, groups: int) -> Episodes:
     """So many groups of episodes, fewer if the client is stopped."""
-    rollout.follow(policy.version)
-    parts = [rollout.play(policy.explore)]
-    while len(parts) < groups and not client.stopped:
+
+    def go_on() -> bool:
         client.poll()
-        parts.append(rollout.play(policy.explore))
-    return join_episodes(parts)
+        return not client.stopped
+
+    rollout.follow(policy.version)
+    return rollout.play(policy.explore, groups, go_on)

@@ -19,7 +19,7 @@ from tangram_sim.errors import ConfigError
 from tangram_sim.puzzles import SPLITS, PuzzleFile, library, read_puzzles
 from tangram_sim.seeding import episode_generator
 from tangram_sim.targets import placement, turned_figure
-from worker.rollout import Choose, Played, join_played, play
+from worker.rollout import Choose, Played, play
 
 AT_ONCE = 32
 _ROUNDING = 1e-9
@@ -106,16 +106,11 @@ def play_figures(setup: Setup, figures: Sequence[Figure], choose: Choose, seed: 
     Raises:
         SamplingError: the tokens find no room to start.
     """
-    count = min(AT_ONCE, len(figures))
     sim = replace(setup.sim, camera=False)
-    groups = []
-    with closing(BatchedEnv(setup.layout, sim, RewardConfig(), count)) as env:
-        for first in range(0, len(figures), count):
-            some = [figures[i % len(figures)] for i in range(first, first + count)]
-            targets = (np.stack([f.poses for f in some]), np.stack([f.flipped for f in some]))
-            generators = [_generator(figure, seed) for figure in some]
-            groups.append(play(env, choose, generators, targets))
-    return join_played(groups, len(figures))
+    targets = (np.stack([f.poses for f in figures]), np.stack([f.flipped for f in figures]))
+    at_once = min(AT_ONCE, len(figures))
+    with closing(BatchedEnv(setup.layout, sim, RewardConfig(), at_once)) as env:
+        return play(env, choose, lambda i: _generator(figures[i], seed), len(figures), targets)
 
 
 def _generator(figure: Figure, seed: int) -> np.random.Generator:

@@ -6,11 +6,10 @@ action.
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from tangram_agent.types import Episodes
 from tangram_sim.arrays import Bools, Floats, Singles
@@ -25,31 +24,23 @@ Choose = Callable[[Floats, Bools, Floats, Generators], Singles]
 
 @dataclass(frozen=True, eq=False)
 class Played:
-    """B whole episodes, as the environments saw them.
+    """E whole episodes: what travels of them, and what only the environments know.
 
     Attributes:
-        corners: (B, T + 1, V, 2) before each step and after the last.
-        placed: (B, T + 1, K) which tokens are placed.
-        actions: (B, T, A) in [-1, 1].
-        rewards: (B, T) by the reward that the run trains on.
-        goals: (B, V, 2) corners of the targets.
-        seen: `corners` as the policy saw them.
-        seen_goals: `goals` as the policy saw them.
-        overlap: (B,) raw overlap of exact polygons after the last step.
-        refused: (B, T) where the action named a placed token.
-        blocked: (B, T) where a token could not be set down on others.
-        seconds: (B,) wall time of choosing and moving, an equal share for each of those that were
+        episodes: corners and goals as the policy saw them, its actions and their rewards.
+        corners: (E, T + 1, V, 2) as they are, before each step and after the last.
+        goals: (E, V, 2) corners of the targets as they are.
+        overlap: (E,) raw overlap of exact polygons after the last step.
+        refused: (E, T) where the action named a placed token.
+        blocked: (E, T) where a token could not be set down on others.
+        seconds: (E,) wall time of choosing and moving, an equal share for each of those that were
             played together.
-        camera: (B,) Eq. 14 of the pictures after the last step; None without a camera.
+        camera: (E,) Eq. 14 of the pictures after the last step; None without a camera.
     """
 
+    episodes: Episodes
     corners: Floats
-    placed: Bools
-    actions: Singles
-    rewards: Floats
     goals: Floats
-    seen: Floats
-    seen_goals: Floats
     overlap: Floats
     refused: Bools
     blocked: Bools
@@ -58,69 +49,110 @@ class Played:
 
     @property
     def starts(self) -> Floats:
-        """(B, V, 2) corners of the tokens before the first action."""
+        """(E, V, 2) corners of the tokens before the first action."""
         return self.corners[:, 0]
 
     @property
     def ends(self) -> Floats:
-        """(B, V, 2) corners of the tokens after the last action."""
+        """(E, V, 2) corners of the tokens after the last action."""
         return self.corners[:, -1]
 
-    def episodes(self) -> Episodes:
-        """What travels of them: what the policy saw."""
-        return Episodes(
-            corners=self.seen.astype(np.float32),
-            placed=self.placed.astype(np.uint8),
-            actions=self.actions,
-            rewards=self.rewards.astype(np.float32),
-            goals=self.seen_goals.astype(np.float32),
+    @staticmethod
+    def empty(env: BatchedEnv, count: int) -> "Played":
+        """Room for so many episodes of an environment."""
+        steps, tokens, corners = env.horizon, env.layout.tokens, env.layout.corner_count
+        seen = Episodes(
+            corners=np.empty((count, steps + 1, corners, 2), np.float32),
+            placed=np.empty((count, steps + 1, tokens), np.uint8),
+            actions=np.empty((count, steps, env.action_size), np.float32),
+            rewards=np.empty((count, steps), np.float32),
+            goals=np.empty((count, corners, 2), np.float32),
         )
+        return Played(
+            episodes=seen,
+            corners=np.empty((count, steps + 1, corners, 2)),
+            goals=np.empty((count, corners, 2)),
+            overlap=np.empty(count),
+            refused=np.empty((count, steps), np.bool_),
+            blocked=np.empty((count, steps), np.bool_),
+            seconds=np.empty(count),
+            camera=np.empty(count) if env.sim.camera else None,
+        )
+
+    def first(self, count: int) -> "Played":
+        """The first episodes, nothing copied."""
+        cut: dict[str, Any] = {
+            name: rows[:count] for name, rows in vars(self).items() if isinstance(rows, np.ndarray)
+        }
+        return replace(self, episodes=next(parts(self.episodes, count)), **cut)
+
+
+def parts(episodes: Episodes, size: int) -> Iterator[Episodes]:
+    """The same episodes, at most `size` at a time, nothing copied."""
+    columns: dict[str, Any] = vars(episodes)
+    for first in range(0, episodes.count, size):
+        yield Episodes(**{name: part[first : first + size] for name, part in columns.items()})
 
 
 def play(
-    env: BatchedEnv, choose: Choose, generators: Generators, targets: Sides | None = None
+    env: BatchedEnv,
+    choose: Choose,
+    generator: Callable[[int], np.random.Generator],
+    count: int,
+    targets: Sides | None = None,
+    go_on: Callable[[], bool] = lambda: True,
 ) -> Played:
-    """One episode in every environment.
+    """So many episodes, as many at a time as there are environments.
 
     Args:
         env: where.
         choose: gives the actions.
-        generators: one per environment: it makes the target, then the start, then whatever
-            `choose` draws, so an episode does not depend on those that are played beside it.
-        targets: poses (B, K, 3) and sides (B, K) to assemble instead of targets that are drawn.
+        generator: of the episode with this number, from 0: it makes the target, then the start,
+            then whatever `choose` draws, so an episode does not depend on those played beside it.
+        count: of episodes; the environments that have none left at the end play the first again.
+        targets: poses (E, K, 3) and sides (E, K) to assemble instead of targets that are drawn.
+        go_on: asked before each group but the first; if not, fewer episodes are returned.
     """
+    whole = -(-count // env.count) * env.count
+    played = Played.empty(env, whole)
+    for first in range(0, whole, env.count):
+        if first and not go_on():
+            return played.first(first)
+        numbers = np.arange(first, first + env.count) % count
+        these = None if targets is None else (targets[0][numbers], targets[1][numbers])
+        _play_group(env, choose, [generator(i) for i in numbers.tolist()], these, played, first)
+    return played.first(count)
+
+
+def _play_group(
+    env: BatchedEnv,
+    choose: Choose,
+    generators: Generators,
+    targets: Sides | None,
+    played: Played,
+    first: int,
+) -> None:
+    """One episode in every environment, into the rows from `first` on."""
+    rows, seen = slice(first, first + env.count), played.episodes
     env.reset(generators, targets)
-    corners, seen, placed = [env.corners], [env.seen], [env.placed]
-    actions, results = [], []
+    seen.goals[rows], played.goals[rows] = env.seen_goals, env.goals
     began = time.perf_counter()
-    for _ in range(env.horizon):
-        actions.append(choose(env.seen, env.placed, env.seen_goals, generators))
-        results.append(env.step(actions[-1].astype(np.float64)))
-        corners.append(env.corners)
-        seen.append(env.seen)
-        placed.append(env.placed)
-    seconds = (time.perf_counter() - began) / env.count
-    return Played(
-        corners=np.stack(corners, axis=1),
-        placed=np.stack(placed, axis=1),
-        actions=np.stack(actions, axis=1),
-        rewards=np.stack([result.rewards for result in results], axis=1),
-        goals=env.goals,
-        seen=np.stack(seen, axis=1),
-        seen_goals=env.seen_goals,
-        overlap=results[-1].overlap,
-        refused=np.stack([result.refused for result in results], axis=1),
-        blocked=np.stack([result.blocked for result in results], axis=1),
-        seconds=np.full(env.count, seconds),
-        camera=results[-1].camera_rewards,
-    )
+    for t in range(env.horizon):
+        _look(env, played, rows, t)
+        actions = choose(env.seen, env.placed, env.seen_goals, generators)
+        result = env.step(actions.astype(np.float64))
+        seen.actions[rows, t], seen.rewards[rows, t] = actions, result.rewards
+        played.refused[rows, t], played.blocked[rows, t] = result.refused, result.blocked
+    _look(env, played, rows, env.horizon)
+    played.seconds[rows] = (time.perf_counter() - began) / env.count
+    played.overlap[rows] = result.overlap
+    if played.camera is not None:
+        played.camera[rows] = result.camera_rewards
 
 
-def join_played(parts: Sequence[Played], count: int) -> Played:
-    """The first `count` episodes of all parts, in order."""
-    names = [name for name, column in vars(parts[0]).items() if column is not None]
-    columns: dict[str, Any] = {name: _joined(parts, name)[:count] for name in names}
-    return Played(**({"camera": None} | columns))
+def _look(env: BatchedEnv, played: Played, rows: slice, t: int) -> None:
+    played.corners[rows, t], played.episodes.corners[rows, t] = env.corners, env.seen
+    played.episodes.placed[rows, t] = env.placed
 
 
 class Rollout:
@@ -145,26 +177,17 @@ class Rollout:
         sim = self._env.sim
         self._env.task = sim.stage_task(sim.stage(updates))
 
-    def play(self, choose: Choose) -> Episodes:
-        """The next `env.count` episodes."""
-        numbers = range(self.episode, self.episode + self._env.count)
-        generators = [episode_generator(*self._identity, number) for number in numbers]
-        self.episode += self._env.count
-        return play(self._env, choose, generators).episodes()
-
-
-def join_episodes(parts: Sequence[Episodes]) -> Episodes:
-    """All episodes of all parts, in order."""
-    columns: dict[str, Any] = {name: _joined(parts, name) for name in vars(parts[0])}
-    return Episodes(**columns)
-
-
-def split_episodes(episodes: Episodes, size: int) -> Iterator[Episodes]:
-    """The same episodes in parts of at most `size`."""
-    for first in range(0, episodes.count, size):
-        columns: dict[str, Any] = vars(episodes)
-        yield Episodes(**{name: part[first : first + size] for name, part in columns.items()})
-
-
-def _joined(parts: Sequence[Played] | Sequence[Episodes], name: str) -> npt.NDArray[Any]:
-    return np.concatenate([getattr(part, name) for part in parts])
+    def play(
+        self, choose: Choose, groups: int = 1, go_on: Callable[[], bool] = lambda: True
+    ) -> Episodes:
+        """The next episodes, `groups` times one in every environment; see `play`."""
+        first, count = self.episode, groups * self._env.count
+        played = play(
+            self._env,
+            choose,
+            lambda i: episode_generator(*self._identity, first + i),
+            count,
+            go_on=go_on,
+        )
+        self.episode += played.episodes.count
+        return played.episodes

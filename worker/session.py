@@ -11,7 +11,7 @@ from typing import TextIO
 
 import torch
 
-from tangram_agent.payloads import EpisodeSpec
+from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.policy import Policy
 from tangram_agent.process import Watchdog, formatter, watch_parent
 from tangram_agent.setup import Setup

@@ -10,8 +10,7 @@ import zmq
 from rich.console import Console
 from rich.table import Table
 
-from tangram_agent.decoding import decode_from_master
-from tangram_agent.standing import WORKER_COLUMNS, AskStatus, RunStatus
+from tangram_agent.messages import WORKER_COLUMNS, AskStatus, RunStatus, decode_from_master
 from tangram_sim.errors import TangramError, WireError
 from worker.config import StatusConfig
 from worker.connection import Sockets

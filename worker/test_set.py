@@ -1,8 +1,10 @@
 """A fixed set of test episodes, played with noise off and the camera on."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
+
+import numpy as np
 
 from tangram_agent.policy import Policy
 from tangram_agent.runs import Run
@@ -12,7 +14,7 @@ from tangram_sim.batch import BatchedEnv
 from tangram_sim.errors import ConfigError
 from tangram_sim.seeding import episode_generator
 from worker.metrics import summarise
-from worker.rollout import Choose, Generators, Played, join_played, play
+from worker.rollout import Choose, Generators, Played, play
 
 
 def greedy(policy: Policy) -> Choose:
@@ -81,19 +83,13 @@ class FixedTests:
         self._set = (seed, role, 0, 0)
         self.env = BatchedEnv(setup.layout, self.setup.sim, setup.reward, min(at_once, episodes))
 
-    def groups(self, choose: Choose) -> Iterator[Played]:
-        """All episodes, so many at a time as there are environments; the last may be padded."""
-        for first in range(0, self._episodes, self.env.count):
-            numbers = range(first, first + self.env.count)
-            yield play(self.env, choose, [episode_generator(*self._set, i) for i in numbers])
+    def play(self, choose: Choose, go_on: Callable[[], bool] = lambda: True) -> Played:
+        """All episodes, fewer if `go_on` says so; see `rollout.play`."""
 
-    def play(self, choose: Choose) -> Played:
-        """All episodes."""
-        return self.join(list(self.groups(choose)))
+        def generator(number: int) -> np.random.Generator:
+            return episode_generator(*self._set, number)
 
-    def join(self, groups: list[Played]) -> Played:
-        """All episodes from all groups, without the padding."""
-        return join_played(groups, self._episodes)
+        return play(self.env, choose, generator, self._episodes, go_on=go_on)
 
     def scores(self, played: Played) -> dict[str, float]:
         """See `worker.metrics.summarise`."""

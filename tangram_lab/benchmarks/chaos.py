@@ -15,8 +15,8 @@ from typing import Any
 import yaml
 import zmq
 
+from tangram_agent.messages import WORKER_COLUMNS, RunStatus
 from tangram_agent.setup import make_setup
-from tangram_agent.standing import WORKER_COLUMNS, RunStatus
 from tangram_lab.benchmarks.proxy import DOWN, UP, Proxy
 from tangram_lab.benchmarks.report import show, write
 from tangram_lab.benchmarks.trainings import (

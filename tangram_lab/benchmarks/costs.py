@@ -13,8 +13,7 @@ from master.hub import Hub
 from master.journal import Journal
 from master.peers import Registry
 from master.trainer import Trainer
-from tangram_agent.payloads import EpisodeSpec
-from tangram_agent.wire import Hello
+from tangram_agent.messages import Hello
 from tangram_lab.benchmarks.episodes import played
 from tangram_lab.benchmarks.measure import Row, single
 from tangram_lab.benchmarks.setups import preset
@@ -50,9 +49,9 @@ def measure_costs(runs: int) -> list[Row]:
 
 def _messages(runs: int) -> Iterator[Row]:
     setup = preset()
-    spec, trainer = EpisodeSpec.of(setup), Trainer(setup, 0, "cpu", lag_updates=64)
+    trainer = Trainer(setup, 0, "cpu", lag_updates=64)
     with tempfile.TemporaryDirectory(prefix="tangram-") as folder:
-        journal = Journal(Path(folder), "bench", setup.task_digest(), spec, 1.0)
+        journal = Journal(Path(folder), "bench", setup.task_digest(), 1.0)
         with (
             closing(journal),
             connected(CASE, setup, played(setup, BATCH)) as hub,

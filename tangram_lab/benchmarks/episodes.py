@@ -10,7 +10,7 @@ from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes
 from tangram_sim.arrays import Bools, Floats, Singles
 from tangram_sim.batch import BatchedEnv
-from worker.rollout import Rollout, join_episodes
+from worker.rollout import Rollout
 
 ENVS = 32
 
@@ -27,4 +27,4 @@ def played(setup: Setup, count: int) -> Episodes:
     sim = replace(setup.sim, backend="kinematic")
     with closing(BatchedEnv(setup.layout, sim, setup.reward, ENVS)) as env:
         rollout = Rollout(env, 0, "player", 0, 0)
-        return join_episodes([rollout.play(choose) for _ in range(count // ENVS)])
+        return rollout.play(choose, count // ENVS)

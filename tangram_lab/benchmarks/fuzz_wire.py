@@ -11,12 +11,19 @@ import numpy as np
 import yaml
 import zmq
 
-from tangram_agent.decoding import decode_from_worker
-from tangram_agent.payloads import EpisodeSpec
+from tangram_agent.arrays import EpisodeSpec
+from tangram_agent.messages import (
+    AskStatus,
+    Bye,
+    EpisodeBatch,
+    Heartbeat,
+    Hello,
+    Scores,
+    WantWeights,
+    decode_from_worker,
+)
 from tangram_agent.setup import Setup, make_setup
-from tangram_agent.standing import AskStatus
 from tangram_agent.types import Episodes
-from tangram_agent.wire import Bye, EpisodeBatch, Heartbeat, Hello, Scores, WantWeights
 from tangram_lab.benchmarks.report import show, write
 from tangram_lab.benchmarks.trainings import start_training, wait_for
 from tangram_sim.errors import WireError

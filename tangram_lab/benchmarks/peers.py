@@ -21,7 +21,7 @@ from tangram_lab.benchmarks.setups import preset, with_agent, with_sim
 from tangram_sim.arrays import Bools, Floats, Singles
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.rewards import make_reward
-from worker.rollout import Generators, Rollout, join_episodes
+from worker.rollout import Generators, Rollout, parts
 
 STAGE = "peers"
 ENVS, BATCH, FILLED = 16, 256, 4096
@@ -82,9 +82,9 @@ def _filled(setup: Setup) -> tuple[ReplayBuffer, Episodes]:
     rollout = _rollout(setup)
     size = setup.layout.corner_count, setup.layout.tokens, setup.action_size
     replay = ReplayBuffer(setup.agent.replay_capacity, *size)
-    parts = [rollout.play(_random) for _ in range(FILLED // ENVS)]
-    _take_in(setup, replay)(join_episodes(parts))
-    return replay, join_episodes(parts[:2])
+    episodes = rollout.play(_random, FILLED // ENVS)
+    _take_in(setup, replay)(episodes)
+    return replay, next(parts(episodes, 2 * ENVS))
 
 
 def _take_in(setup: Setup, replay: ReplayBuffer) -> Callable[[Episodes], None]:

@@ -110,8 +110,7 @@ def _exam(model: Any) -> Callable[[], float]:
 
     def exam() -> float:
         generators = evaluation_generators(TESTS)
-        parts = [generators[first : first + AT_ONCE] for first in range(0, TESTS, AT_ONCE)]
-        return float(np.mean([play(env, choose, part).overlap for part in parts]))
+        return float(np.mean(play(env, choose, generators.__getitem__, TESTS).overlap))
 
     return exam
 

@@ -20,10 +20,10 @@ import zmq
 from master.arrivals import EpisodesArrived, WelcomeInfo
 from master.hub import Hub
 from master.keys import Keys, make_keys
-from tangram_agent.payloads import EpisodeSpec
+from tangram_agent.arrays import EpisodeSpec
+from tangram_agent.messages import Ack, EpisodeBatch
 from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes
-from tangram_agent.wire import Ack, EpisodeBatch
 from tangram_lab.benchmarks.episodes import played
 from tangram_lab.benchmarks.measure import Bound, Row, Work, compared, rates, single
 from tangram_lab.benchmarks.setups import several

@@ -7,8 +7,8 @@ from threading import Event, Thread
 
 import numpy as np
 
+from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
-from tangram_agent.payloads import EpisodeSpec
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
 from tangram_sim.batch import BatchedEnv

@@ -1,5 +1,6 @@
 """A task, messages of it, and the ways to break them."""
 
+import zlib
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -7,9 +8,9 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from tangram_agent.payloads import EpisodeSpec
+from tangram_agent.arrays import EpisodeSpec
+from tangram_agent.messages import EpisodeBatch, Hello, Scores
 from tangram_agent.types import Episodes, Weights
-from tangram_agent.wire import EpisodeBatch, Hello, Scores
 from tests.agent.builders import PAIR, random_episodes, setup
 
 BOUND = 4.0
@@ -48,7 +49,15 @@ def hello(
 
 
 def with_header(frames: list[bytes], **changes: Any) -> list[bytes]:
-    """The same message with other header fields; None takes a field away."""
+    """The same message with other header fields, and the checksum of all; None takes one away."""
     values = msgpack.unpackb(frames[0]) | changes
-    kept = {name: value for name, value in values.items() if value is not None}
-    return [msgpack.packb(kept), *frames[1:]]
+    kept = {n: value for n, value in values.items() if value is not None and n != "crc"}
+    return with_checksum([msgpack.packb(kept | {"crc": 2**32 - 1}), *frames[1:]])
+
+
+def with_checksum(frames: list[bytes]) -> list[bytes]:
+    """The same message, intact as far as its checksum tells: as a broken sender would seal it."""
+    body, checksum = frames[0][:-4], 0
+    for part in (body, *frames[1:]):
+        checksum = zlib.crc32(part, checksum)
+    return [body + checksum.to_bytes(4, "big"), *frames[1:]]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tangram_agent.learner import Learner
-from tangram_agent.payloads import decode_weights, encode_weights
+from tangram_agent.messages import decode_weights, encode_weights
 from tangram_agent.policy import Policy
 from tangram_agent.runs import Run
 from tangram_agent.setup import Setup

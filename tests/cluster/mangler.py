@@ -7,7 +7,7 @@ from typing import Self
 
 import zmq
 
-from tangram_agent.payloads import MAX_BATCH_BYTES
+from tangram_agent.arrays import MAX_BATCH_BYTES
 
 KINDS = ("repeated", "swapped", "without its end", "cut short", "random", "oversized")
 SHARE = 0.5  # of the messages that something happens to

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import yaml
 
+from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
-from tangram_agent.payloads import EpisodeSpec
 from tangram_agent.setup import Setup, make_setup
 from tests.agent.builders import random_episodes
 from tests.cluster.processes import started, wait_for_file

@@ -14,7 +14,7 @@ import pytest
 import zmq
 
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
-from tangram_agent.standing import WORKER_COLUMNS
+from tangram_agent.messages import WORKER_COLUMNS
 from tangram_lab.benchmarks.proxy import DOWN, UP, Proxy
 from tangram_sim.errors import TangramError
 from tests.cluster.players import (

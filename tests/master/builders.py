@@ -26,13 +26,12 @@ from master.rundir import Record, RunFolder
 from master.signals import StopSignals
 from master.status import Status
 from master.trainer import Trainer
+from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.config import ServiceConfig
-from tangram_agent.payloads import EpisodeSpec
+from tangram_agent.messages import EpisodeBatch, Go, RunStatus, Scores
 from tangram_agent.process import Watchdog
 from tangram_agent.setup import Setup
-from tangram_agent.standing import RunStatus
 from tangram_agent.types import Weights
-from tangram_agent.wire import Go, Scores
 from tests.agent.builders import random_episodes, setup
 
 # Small tensors on several threads wait for cores that others use, a hundred times longer.
@@ -53,7 +52,8 @@ AGENT: dict[str, Any] = {
 def arrival(made: Setup, sequence: int, count: int = 4, version: int = 0) -> EpisodesArrived:
     """A batch of random episodes from player 0."""
     episodes = random_episodes(made, count, seed=sequence)
-    return EpisodesArrived("player", 0, 1, sequence, version, episodes)
+    batch = EpisodeBatch(sequence, version, episodes)
+    return EpisodesArrived("player", 0, 1, batch, batch.encode(EpisodeSpec.of(made)))
 
 
 def scores(made: Setup, version: int, reward: float = 0.5) -> ScoresArrived:
@@ -68,7 +68,7 @@ _journals: list[Journal] = []
 
 def journal(folder: Path, made: Setup, sync_s: float = 1.0) -> Journal:
     """A journal of the run `run`."""
-    opened = Journal(folder, "run", made.task_digest(), EpisodeSpec.of(made), sync_s)
+    opened = Journal(folder, "run", made.task_digest(), sync_s)
     _journals.append(opened)
     return opened
 

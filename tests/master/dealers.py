@@ -9,8 +9,7 @@ import zmq
 
 from master.arrivals import Arrival, EpisodesArrived, WelcomeInfo
 from master.hub import Hub
-from tangram_agent.decoding import decode_from_master
-from tangram_agent.wire import ToWorker, Welcome
+from tangram_agent.messages import ToWorker, Welcome, decode_from_master
 from tests.agent.messages import FINGERPRINTS, SPEC, batch, hello
 
 LIMIT_S = 20.0

@@ -12,7 +12,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from master import health as health_module
 from master.health import Health
-from tangram_agent.standing import WORKER_COLUMNS, RunStatus
+from tangram_agent.messages import WORKER_COLUMNS, RunStatus
 from tangram_sim.errors import ConfigError
 
 pytestmark = pytest.mark.cluster

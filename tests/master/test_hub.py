@@ -7,10 +7,7 @@ import numpy as np
 import pytest
 
 from master.arrivals import ScoresArrived
-from tangram_agent.decoding import decode_from_master
-from tangram_agent.frames import PROTOCOL
-from tangram_agent.payloads import decode_weights
-from tangram_agent.wire import (
+from tangram_agent.messages import (
     Ack,
     Alive,
     Bye,
@@ -22,7 +19,10 @@ from tangram_agent.wire import (
     WantWeights,
     WeightsMessage,
     Welcome,
+    decode_from_master,
+    decode_weights,
 )
+from tangram_agent.schema import PROTOCOL
 from tangram_sim.errors import WireError
 from tests.agent.messages import (
     FINGERPRINTS,

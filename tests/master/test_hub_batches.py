@@ -5,21 +5,14 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
+from tangram_agent.messages import Ack, Alive, Go, Heartbeat, Reject, ToWorker, Welcome
 from tangram_agent.types import Episodes
-from tangram_agent.wire import (
-    Ack,
-    Alive,
-    Go,
-    Heartbeat,
-    Reject,
-    ToWorker,
-    Welcome,
-)
 from tangram_sim.errors import RunError
 from tests.agent.messages import (
     SPEC,
     batch,
     hello,
+    with_checksum,
     with_header,
 )
 from tests.master.dealers import WINDOW, Dealer, staged
@@ -156,7 +149,7 @@ def test_a_wrong_batch_is_refused_for_good_and_those_after_it_are_taken() -> Non
         frames = batch(1).encode(SPEC)
         rewards = np.frombuffer(frames[4], "<f4").copy()
         rewards[0] = np.nan
-        dealer.say([*frames[:4], rewards.tobytes(), frames[5]])
+        dealer.say(with_checksum([*frames[:4], rewards.tobytes(), frames[5]]))
         assert dealer.hear() == Reject(
             reason="player 5: batch 1: rewards holds nan at [0, 0], must be finite and between "
             "-1e+06 and 1e+06",

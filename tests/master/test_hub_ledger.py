@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from master.ledger import Ledger, Verdict
-from tangram_agent.wire import Ack, Reject
+from tangram_agent.messages import Ack, Reject
 
 pytestmark = pytest.mark.fast
 

@@ -7,13 +7,7 @@ import numpy as np
 import pytest
 
 from master.hub import Hub
-from tangram_agent.wire import (
-    Greet,
-    Heartbeat,
-    Reject,
-    WantWeights,
-    Welcome,
-)
+from tangram_agent.messages import Greet, Heartbeat, Reject, WantWeights, Welcome
 from tangram_sim.errors import ConfigError
 from tests.agent.messages import (
     SPEC,

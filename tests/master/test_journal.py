@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 
 from master import journal as journal_module
 from master.arrivals import EpisodesArrived
-from master.journal import HEAD, JournalError, segments
-from master.recovery import journal_run_id, read_journal
-from tangram_agent.payloads import EpisodeSpec
+from master.journal import HEAD, JournalError, journal_run_id, read_journal, segments
+from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.setup import Setup
 from tangram_sim.errors import RunError
 from tests.agent.builders import PAIR, setup
@@ -190,7 +189,7 @@ def test_what_is_no_journal_is_refused(tmp_path: Path) -> None:
     content = segments(tmp_path)[1].read_bytes()
     (length, _) = HEAD.unpack_from(content)
     segments(tmp_path)[1].write_bytes(content[HEAD.size + length :])  # without its title
-    with pytest.raises(RunError, match=r"is no segment of format 1: choose another run_dir"):
+    with pytest.raises(RunError, match=r"is no segment of format 2: choose another run_dir"):
         read(tmp_path)
 
 

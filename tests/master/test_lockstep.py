@@ -5,7 +5,7 @@ import pytest
 from master.arrivals import EpisodesArrived
 from master.lockstep import Lockstep
 from tangram_agent.config import ServiceConfig
-from tangram_agent.wire import Go
+from tangram_agent.messages import EpisodeBatch, Go
 from tangram_sim.errors import ConfigError
 from tests.agent.builders import random_episodes
 from tests.master.builders import small_setup
@@ -17,7 +17,8 @@ SIZE = 4
 
 
 def batch(index: int, sequence: int = 1) -> EpisodesArrived:
-    return EpisodesArrived("player", index, 1, sequence, 0, random_episodes(MADE, SIZE, index))
+    batch = EpisodeBatch(sequence, 0, random_episodes(MADE, SIZE, index))
+    return EpisodesArrived("player", index, 1, batch, ())
 
 
 def test_a_round_is_inserted_by_index_when_it_is_whole() -> None:

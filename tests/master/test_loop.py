@@ -19,8 +19,8 @@ from master.arrivals import EpisodesArrived
 from master.loop import Loop
 from master.result import make_result
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
+from tangram_agent.messages import Go
 from tangram_agent.process import Every
-from tangram_agent.wire import Go
 from tangram_sim.errors import RunError
 from tests.master.builders import (
     AGENT,
@@ -388,7 +388,8 @@ IN_STEP = {"mode": "lockstep", "lockstep_workers": 2, "envs": BATCH, "batch_epis
 
 
 def played(index: int, sequence: int) -> EpisodesArrived:
-    return replace(arrival(MADE, 10 * index + sequence), index=index, sequence=sequence)
+    made = arrival(MADE, 10 * index + sequence)
+    return replace(made, index=index, batch=replace(made.batch, sequence=sequence))
 
 
 def test_in_lockstep_rounds_are_inserted_by_index_and_learned_before_the_next(

@@ -12,8 +12,11 @@ from tangram_agent.config import ServiceConfig
 from tangram_agent.learner import Learner
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup, make_setup
-from tangram_agent.types import Weights
+from tangram_agent.types import Episodes, Weights
+from tangram_sim.arrays import Floats
+from tangram_sim.layout import Layout
 from tests.agent.builders import SMALL, SQUARE
+from worker.rollout import Played
 
 
 def weights(made: Setup, version: int) -> Weights:
@@ -44,3 +47,29 @@ def write_run(folder: Path, tokens: dict[str, Any] = SQUARE, **sections: Any) ->
     arrays = {"weights": weights(made, 1).tensors, "learner": {"updates": np.array([7])}}
     save_checkpoint(folder / "checkpoints", 7, arrays, {}, keep=1)
     return made
+
+
+def ended(layout: Layout, corners: Floats, goals: Floats, **more: Any) -> Played:
+    """Episodes that were at corners (E, T + 1, V, 2), as if every action had been taken.
+
+    Args:
+        more: other columns of `Played`, and of its episodes.
+    """
+    count, steps = len(corners), corners.shape[1] - 1
+    seen = {
+        "corners": corners.astype(np.float32),
+        "placed": np.zeros((count, steps + 1, layout.tokens), np.uint8),
+        "actions": np.zeros((count, steps, 4), np.float32),
+        "rewards": np.zeros((count, steps), np.float32),
+        "goals": goals.astype(np.float32),
+    }
+    known = {
+        "overlap": np.zeros(count),
+        "refused": np.zeros((count, steps), np.bool_),
+        "blocked": np.zeros((count, steps), np.bool_),
+        "seconds": np.ones(count),
+        "camera": None,
+    }
+    travels = Episodes(**{name: more.get(name, column) for name, column in seen.items()})
+    rest: dict[str, Any] = {name: more.get(name, column) for name, column in known.items()}
+    return Played(episodes=travels, corners=corners, goals=goals, **rest)

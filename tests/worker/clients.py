@@ -8,10 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-from tangram_agent.wire import (
-    EpisodeBatch,
-    ToMaster,
-)
+from tangram_agent.messages import EpisodeBatch, ToMaster
 from tests.master.dealers import Stage
 from tests.worker.standin import make_client
 from worker.client import Client

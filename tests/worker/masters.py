@@ -8,7 +8,7 @@ from typing import TypeVar
 
 from master.arrivals import Arrival, WelcomeInfo
 from master.hub import Hub
-from tangram_agent.payloads import EpisodeSpec
+from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.setup import Setup
 
 LIMIT_S = 60.0

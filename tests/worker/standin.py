@@ -7,8 +7,15 @@ from typing import Any, TypeVar
 
 import zmq
 
-from tangram_agent.decoding import decode_from_worker
-from tangram_agent.wire import Heartbeat, Hello, Plain, ToMaster, WantWeights, Welcome
+from tangram_agent.messages import (
+    Heartbeat,
+    Hello,
+    ToMaster,
+    WantWeights,
+    Welcome,
+    decode_from_worker,
+)
+from tangram_agent.schema import Plain
 from tests.agent.messages import FINGERPRINTS, SPEC
 from worker.client import Client
 from worker.connection import Timing

@@ -88,7 +88,7 @@ def test_chance_names_tokens_that_are_left_and_stays_in_the_arena(allow_flip: bo
     with closing(FixedTests(made, 20, 20)) as tests:
         played = tests.play(random_policy(made.layout, made.sim))
     assert not played.refused.any()
-    assert played.placed[:, -1].all()
+    assert played.episodes.placed[:, -1].all()
     centres = made.layout.poses(played.ends)[..., :2]
     assert 0.9 < np.abs(centres).max() <= 1.0 + 1e-6
     turned = made.layout.flipped(played.ends) != made.layout.flipped(played.starts)

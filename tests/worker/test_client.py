@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 from master.arrivals import ScoresArrived
-from tangram_agent.payloads import encode_weights
-from tangram_agent.types import Episodes
-from tangram_agent.wire import (
+from tangram_agent.messages import (
     Ack,
     Alive,
     Greet,
@@ -21,7 +19,10 @@ from tangram_agent.wire import (
     Reject,
     Stop,
     WantWeights,
+    WeightsMessage,
+    encode_weights,
 )
+from tangram_agent.types import Episodes
 from tangram_sim.errors import RunError, TangramError, WireError
 from tests.agent.messages import FINGERPRINTS, SHAPES, episodes, scores, weights, with_header
 from tests.master.dealers import staged
@@ -292,9 +293,7 @@ def test_a_missed_broadcast_is_asked_for() -> None:
         master.welcome(client)
         master.say(Alive(version=4))
         assert master.await_kind(client, WantWeights) == WantWeights("e1", -1)
-        master.say(
-            [*with_header(Greet().encode(), kind="weights"), encode_weights("e1", weights(4))]
-        )
+        master.say(WeightsMessage("e1", weights(4)).encode())
         master.until(client, lambda: client.newest.version == 4)
         newest = client.newest_weights()
         assert newest is not None

@@ -10,11 +10,7 @@ from typing import Any
 
 import pytest
 
-from tangram_agent.wire import (
-    Alive,
-    Greet,
-    Hello,
-)
+from tangram_agent.messages import Alive, Greet, Hello
 from tangram_sim.errors import TangramError
 from tests.agent.messages import SHAPES, episodes, weights
 from tests.master.dealers import staged

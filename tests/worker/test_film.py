@@ -1,12 +1,14 @@
 """Films of several tokens: who is in the hand, how high, where, and on which side."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tangram_agent.setup import Setup
 from tests.agent.builders import setup
 from tests.sim.builders import layout_of
-from tests.worker.test_metrics import ended
+from tests.worker.builders import ended
 from worker.film import film, frames_per_action
 from worker.rollout import Played
 
@@ -32,13 +34,12 @@ def played(
     end = middle + [[0.0, 0.0, 0.0], way]
     sides = np.array([[False, False], [False, False], [False, flip and not blocked]])
     corners = LAYOUT.corners(np.stack([STARTS, middle, end]), sides)[None]
-    made_up = ended(LAYOUT, corners[:, -1], corners[:, -1])
     stops = {
         "refused": np.array([[False, refused]]),
         "blocked": np.array([[False, blocked]]),
         "actions": actions[None].astype(np.float32),
     }
-    return made, Played(**(vars(made_up) | {"corners": corners} | stops))
+    return made, ended(LAYOUT, corners, corners[:, -1], **stops)
 
 
 def test_one_token_after_the_other_is_in_the_hand_and_none_at_the_ends() -> None:
@@ -64,7 +65,8 @@ def test_only_lifted_tokens_rise(motion: str) -> None:
     made, episode = played((0.1, -0.2, 0.5))
     made = setup(TWO, backend="physics", motion=motion, allow_flip=motion == "lift")
     if motion == "slide":
-        episode = Played(**(vars(episode) | {"actions": np.delete(episode.actions, 1, axis=2)}))
+        actions = np.delete(episode.episodes.actions, 1, axis=2)
+        episode = ended(LAYOUT, episode.corners, episode.goals, actions=actions)
     heights = [frame.height for frame in film(made, episode)]
     assert max(heights) == pytest.approx(float(motion == "lift"), abs=0.01)
     assert [heights[i] for i in (0, COUNT, 2 * COUNT, -1)] == [0.0] * 4
@@ -74,7 +76,7 @@ def test_others_wait_for_what_is_carried_and_give_way_to_what_slides() -> None:
     made, episode = played((0.0, 0.2, 0.0))
     corners = episode.corners.copy()
     corners[:, 1, LAYOUT.corners_of(1)] += 0.1  # the square's landing pushes the parallelogram
-    pushed = Played(**(vars(episode) | {"corners": corners}))
+    pushed = replace(episode, corners=corners)
     other = LAYOUT.corners_of(1)
     before, landed = (film(made, pushed)[i].corners(LAYOUT)[0, other] for i in (COUNT - 1, COUNT))
     np.testing.assert_allclose(before, corners[0, 0, other], atol=1e-9)

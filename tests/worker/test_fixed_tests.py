@@ -26,9 +26,11 @@ def played(episodes: int, at_once: int, **more: object) -> Played:
 def test_the_set_does_not_depend_on_how_many_play_at_a_time(episodes: int, at_once: int) -> None:
     expected, found = played(12, 4), played(episodes, at_once)
     assert len(found.overlap) == episodes
-    for name in ("corners", "goals", "overlap", "actions"):
+    for name in ("corners", "goals", "overlap"):
         column = vars(expected)[name][:episodes]
         np.testing.assert_allclose(vars(found)[name], column, atol=1e-4, err_msg=name)
+    actions = expected.episodes.actions[:episodes]
+    np.testing.assert_allclose(found.episodes.actions, actions, atol=1e-4)
 
 
 def test_the_default_set_is_that_of_the_simulation() -> None:
@@ -49,8 +51,8 @@ def test_noise_is_off() -> None:
     acting = policy(made)
     with closing(FixedTests(made, 3, 3)) as tests:
         found = tests.play(greedy(acting))
-    expected = acting.act(found.starts, found.placed[:, 0], found.goals)
-    np.testing.assert_array_equal(found.actions[:, 0], expected)
+    expected = acting.act(found.starts, found.episodes.placed[:, 0], found.goals)
+    np.testing.assert_array_equal(found.episodes.actions[:, 0], expected)
 
 
 def test_the_camera_is_on_though_training_has_none() -> None:
@@ -90,7 +92,7 @@ def test_the_position_policy_solves_position_and_nothing_else(tokens: dict, acti
         found = tests.play(position_policy(made.layout, made.sim))
     centres = made.layout.bases(found.ends), made.layout.bases(found.goals)
     np.testing.assert_allclose(*centres, atol=1e-6)
-    assert found.placed[:, -1].all()
+    assert found.episodes.placed[:, -1].all()
     angles = made.layout.poses(found.corners)[..., 2]
     np.testing.assert_allclose(angles[:, -1], angles[:, 0], atol=1e-9)
 
@@ -121,7 +123,7 @@ def test_the_number_of_actions_can_be_another_than_in_training() -> None:
     longer = with_actions(made, 5)
     assert longer.horizon == 5
     with closing(FixedTests(replace(longer, sim=replace(longer.sim, pixels=16)), 2, 2)) as tests:
-        assert tests.play(greedy(policy(made))).actions.shape == (2, 5, 3)
+        assert tests.play(greedy(policy(made))).episodes.actions.shape == (2, 5, 3)
 
 
 def test_the_noise_can_be_another_than_in_training() -> None:

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tangram_agent.payloads import encode_weights
+from tangram_agent.messages import encode_weights
 from tangram_agent.types import Weights
 from tangram_sim.errors import WireError
 from tests.agent.messages import SHAPES, weights

@@ -17,9 +17,9 @@ import zmq
 from master.arrivals import EpisodesArrived
 from master.hub import Hub
 from tangram_agent.config import ServiceConfig
+from tangram_agent.messages import Go
 from tangram_agent.process import Lifeline
 from tangram_agent.setup import Setup
-from tangram_agent.wire import Go
 from tangram_sim.errors import ConfigError, TangramError
 from tangram_sim.sampling import sample_poses
 from tangram_sim.seeding import episode_generator

@@ -17,7 +17,7 @@ from tangram_sim.seeding import episode_generator
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.worker.builders import policy
 from worker.baselines import position_policy
-from worker.rollout import Rollout, join_episodes, join_played, play, split_episodes
+from worker.rollout import Rollout, parts, play
 
 pytestmark = pytest.mark.fast
 
@@ -59,9 +59,9 @@ def rolled_out(made: Setup, envs: int, count: int) -> Episodes:
     acting = policy(made)
     with closing(BatchedEnv(made.layout, made.sim, made.reward, envs)) as env:
         rollout = Rollout(env, *IDENTITY)
-        parts = [rollout.play(acting.explore) for _ in range(count // envs)]
+        episodes = rollout.play(acting.explore, count // envs)
         assert rollout.episode == count
-    return join_episodes(parts)
+    return episodes
 
 
 @pytest.mark.parametrize(("tokens", "actions"), [(SQUARE, 1), (SQUARE, 3), (PAIR, 2)])
@@ -118,27 +118,37 @@ def test_physics_plays_what_kinematics_plays() -> None:
 
 
 @pytest.mark.parametrize(("size", "counts"), [(5, [5, 5, 2]), (12, [12]), (40, [12]), (4, [4] * 3)])
-def test_split_and_join_are_inverse(size: int, counts: list[int]) -> None:
+def test_messages_are_parts_of_the_record_in_order(size: int, counts: list[int]) -> None:
     episodes = rolled_out(setup(), envs=4, count=12)
-    parts = list(split_episodes(episodes, size))
-    assert [part.count for part in parts] == counts
-    for name, column in vars(join_episodes(parts)).items():
-        np.testing.assert_array_equal(column, vars(episodes)[name])
+    found = list(parts(episodes, size))
+    assert [part.count for part in found] == counts
+    for name, column in vars(episodes).items():
+        pieces = [vars(part)[name] for part in found]
+        np.testing.assert_array_equal(np.concatenate(pieces), column)
+        assert all(np.shares_memory(piece, column) for piece in pieces)  # nothing is copied
 
 
 @pytest.mark.parametrize("camera", [True, False])
-def test_joined_groups_are_cut_to_the_number_asked_for(camera: bool) -> None:
+def test_as_many_episodes_as_asked_for_in_any_number_of_environments(camera: bool) -> None:
     made = setup(camera=camera, pixels=32)
+    acting = policy(made)
     with closing(BatchedEnv(made.layout, made.sim, made.reward, 3)) as env:
-        numbers = [range(3), range(3, 6)]
-        acting = policy(made)
-        groups = [
-            play(env, acting.explore, [np.random.default_rng(i) for i in few]) for few in numbers
-        ]
-    whole = join_played(groups, 4)
-    assert len(whole.overlap) == len(whole.starts) == len(whole.goals) == 4
-    np.testing.assert_array_equal(whole.corners[3], groups[1].corners[0])
-    assert (whole.camera is None) == (not camera)
+        four = play(env, acting.explore, np.random.default_rng, 4)
+        six = play(env, acting.explore, np.random.default_rng, 6)
+    assert len(four.overlap) == len(four.starts) == four.episodes.count == 4
+    np.testing.assert_array_equal(four.corners, six.corners[:4])
+    np.testing.assert_array_equal(four.episodes.actions, six.episodes.actions[:4])
+    assert (four.camera is None) == (not camera)
+
+
+@pytest.mark.parametrize("groups", [1, 2])
+def test_play_ends_between_groups_when_it_is_told_to(groups: int) -> None:
+    made = setup()
+    answers = iter([True] * (groups - 1) + [False])
+    with closing(BatchedEnv(made.layout, made.sim, made.reward, 3)) as env:
+        rollout = Rollout(env, *IDENTITY)
+        episodes = rollout.play(policy(made).explore, 5, lambda: next(answers))
+    assert episodes.count == rollout.episode == 3 * groups
 
 
 def test_the_policy_sees_noise_and_that_is_what_travels() -> None:
@@ -150,8 +160,8 @@ def test_the_policy_sees_noise_and_that_is_what_travels() -> None:
         return np.zeros((4, 3), np.float32)
 
     with closing(BatchedEnv(made.layout, made.sim, made.reward, 4)) as env:
-        played = play(env, choose, [np.random.default_rng(i) for i in range(4)])
-    episodes = played.episodes()
+        played = play(env, choose, np.random.default_rng, 4)
+    episodes = played.episodes
     np.testing.assert_array_equal(episodes.corners[:, 0], seen[0].astype(np.float32))
     np.testing.assert_array_equal(episodes.goals, seen[1].astype(np.float32))
     for noisy, exact in ((episodes.corners, played.corners), (episodes.goals, played.goals)):
@@ -163,8 +173,8 @@ def test_noise_does_not_change_starts_and_targets() -> None:
     for noise in (0.0, 0.05):
         made = setup(corner_noise=noise)
         with closing(BatchedEnv(made.layout, made.sim, made.reward, 4)) as env:
-            generators = [np.random.default_rng(i) for i in range(4)]
-            played.append(play(env, position_policy(made.layout, made.sim), generators))
+            choose = position_policy(made.layout, made.sim)
+            played.append(play(env, choose, np.random.default_rng, 4))
     np.testing.assert_array_equal(played[0].starts, played[1].starts)
     np.testing.assert_array_equal(played[0].goals, played[1].goals)
     assert played[1].overlap.mean() < played[0].overlap.mean()

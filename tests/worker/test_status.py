@@ -10,7 +10,7 @@ import pytest
 import zmq
 
 from master.keys import make_keys
-from tangram_agent.standing import RunStatus
+from tangram_agent.messages import RunStatus
 from tangram_sim.errors import TangramError
 from tests.master.dealers import Stage, staged
 from tests.master.test_health import STATUS

@@ -1,12 +1,13 @@
-"""Arrays on the wire: raw little-endian frames for episodes and pictures, safetensors for weights.
+"""Arrays on the wire: raw little-endian frames for episodes and tables, safetensors for weights.
 
-Array frames carry neither shape nor dtype: both follow from the number of episodes and from the
-task that sender and receiver agreed on in HELLO. What arrives is checked for its exact size, and
-every value for its bounds; decoding copies nothing, so the arrays are read-only.
+Array frames carry neither shape nor dtype: both follow from the number of rows and from the task
+that sender and receiver agreed on in HELLO. What arrives is checked for its exact size, and every
+value for its bounds; decoding copies nothing, so the arrays are read-only.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+import struct
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
@@ -16,9 +17,8 @@ import numpy.typing as npt
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from tangram_agent.frames import MAX_HEADER, MAX_ID, pack_map, unpack_map
 from tangram_agent.setup import Setup
-from tangram_agent.types import Episodes, Weights
+from tangram_sim.arrays import Singles
 from tangram_sim.errors import ConfigError, WireError
 from tangram_sim.settings import check_range
 
@@ -30,6 +30,8 @@ MAX_WEIGHTS_BYTES = 64 * 2**20
 MAX_REWARD = 1e6
 # Corners and actions are computed in float64; their bounds may be passed by rounding to float32.
 ROUNDING = 1e-6
+LENGTH = struct.Struct("<I")
+MAX_FRAMES = 8  # in one piece of joined data
 
 
 @dataclass(frozen=True)
@@ -177,25 +179,15 @@ def _columns(spec: EpisodeSpec, count: int) -> tuple[Column, ...]:
     )
 
 
-def encode_episodes(episodes: Episodes, spec: EpisodeSpec) -> list[bytes]:
-    """One raw frame per array.
+def encode_columns(
+    arrays: Mapping[str, npt.NDArray[Any]], columns: Sequence[Column]
+) -> list[bytes]:
+    """One raw frame per column, from arrays by name.
 
     Raises:
-        WireError: too many episodes, or a field that a receiver would refuse.
+        WireError: an array that a receiver would refuse.
     """
-    if not 1 <= episodes.count <= spec.max_count:
-        raise WireError(f"a batch holds 1 to {spec.max_count} episodes, got {episodes.count}")
-    columns = spec.columns(episodes.count)
-    return [column.encode(getattr(episodes, column.name)) for column in columns]
-
-
-def decode_episodes(frames: Sequence[bytes], count: int, spec: EpisodeSpec) -> Episodes:
-    """The episodes in one raw frame per array; `count` must be within the spec's limit.
-
-    Raises:
-        WireError: names the field and what is wrong with it.
-    """
-    return Episodes(**decode_columns(frames, spec.columns(count)))
+    return [column.encode(arrays[column.name]) for column in columns]
 
 
 def decode_columns(
@@ -211,45 +203,41 @@ def decode_columns(
     return {c.name: c.decode(f) for c, f in zip(columns, frames, strict=True)}
 
 
-def encode_weights(epoch: str, weights: Weights) -> bytes:
-    """Weights as one frame, because a CONFLATE socket keeps only the last frame of a message.
+def encode_tensors(tensors: Mapping[str, Singles]) -> bytes:
+    """Weights as one frame of safetensors.
 
     Raises:
         WireError: a tensor is not finite, or they are too large.
     """
-    tensors = {name: np.array(t, np.float32, order="C") for name, t in weights.tensors.items()}
-    _check_finite(tensors)
-    data = save(tensors)
+    plain = {name: np.array(t, np.float32, order="C") for name, t in tensors.items()}
+    _check_finite(plain)
+    data = save(plain)
     if len(data) > MAX_WEIGHTS_BYTES:
         raise WireError(
             f"weights: {len(data)} bytes, at most {MAX_WEIGHTS_BYTES}: choose a smaller net"
         )
-    return pack_map("weights", {"epoch": epoch, "version": weights.version, "data": data})
+    return data
 
 
-def decode_weights(frame: bytes, shapes: WeightShapes | None) -> tuple[str, Weights]:
-    """The master's epoch and its weights.
+def decode_tensors(frame: bytes, shapes: WeightShapes | None) -> dict[str, Singles]:
+    """The tensors in a frame made by `encode_tensors`.
 
     Args:
-        frame: as made by `encode_weights`.
+        frame: of at most MAX_WEIGHTS_BYTES.
         shapes: what the tensors must be; None takes any.
 
     Raises:
-        WireError: names the field or tensor and what is wrong with it.
+        WireError: names the tensor and what is wrong with it.
     """
-    fields = unpack_map(frame, MAX_WEIGHTS_BYTES + MAX_HEADER, max_bin=MAX_WEIGHTS_BYTES)
-    if fields.kind != "weights":
-        raise WireError(f"expected weights, got a message of kind '{fields.kind}'")
-    epoch, version = fields.text("epoch", MAX_ID), fields.integer("version", 0)
-    data = fields.data("data")
-    fields.end()
+    if len(frame) > MAX_WEIGHTS_BYTES:
+        raise WireError(f"weights: {len(frame)} bytes, at most {MAX_WEIGHTS_BYTES}")
     try:
-        tensors = load(data)
+        tensors = load(frame)
     # KeyError: a dtype that numpy has not; ValueError: a shape beyond its limits.
     except (SafetensorError, KeyError, ValueError) as error:
         raise WireError(f"weights: not safetensors: {error}") from None
     _check_tensors(tensors, shapes)
-    return epoch, Weights(version, tensors)
+    return tensors
 
 
 def _check_tensors(tensors: dict[str, npt.NDArray[Any]], shapes: WeightShapes | None) -> None:
@@ -269,3 +257,27 @@ def _check_finite(tensors: dict[str, npt.NDArray[Any]]) -> None:
     for name, tensor in tensors.items():
         if not np.isfinite(tensor).all():
             raise WireError(f"weights: {name!r} is not finite")
+
+
+def join_frames(frames: Iterable[bytes]) -> bytes:
+    """Several frames as one piece of data: each behind its length (u32)."""
+    return b"".join(part for frame in frames for part in (LENGTH.pack(len(frame)), frame))
+
+
+def split_frames(data: bytes) -> list[bytes]:
+    """The frames that `join_frames` joined.
+
+    Raises:
+        WireError: a frame is cut short, or there are too many.
+    """
+    frames, start = list[bytes](), 0
+    while start < len(data):
+        if len(frames) == MAX_FRAMES:
+            raise WireError(f"there may be {MAX_FRAMES} joined frames, got more")
+        begin = start + LENGTH.size
+        size = LENGTH.unpack_from(data, start)[0] if begin <= len(data) else 0
+        start = begin + size
+        if start > len(data):
+            raise WireError(f"frame {len(frames) + 1} of joined frames is cut short")
+        frames.append(data[begin:start])
+    return frames

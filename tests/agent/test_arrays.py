@@ -3,7 +3,6 @@
 from dataclasses import fields, replace
 from typing import Any
 
-import msgpack
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,18 +10,20 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from safetensors.numpy import save
 
-from tangram_agent.frames import PROTOCOL, pack_map
-from tangram_agent.payloads import (
+from tangram_agent.arrays import (
     MAX_BATCH_BYTES,
+    MAX_FRAMES,
     MAX_REWARD,
     MAX_WEIGHTS_BYTES,
     EpisodeSpec,
-    decode_episodes,
-    decode_weights,
-    encode_episodes,
-    encode_weights,
+    decode_columns,
+    decode_tensors,
+    encode_columns,
+    encode_tensors,
+    join_frames,
+    split_frames,
 )
-from tangram_agent.types import Episodes, Weights
+from tangram_agent.types import Episodes
 from tangram_sim.errors import ConfigError, WireError
 from tests.agent.builders import PAIR, setup
 from tests.agent.messages import BOUND, SHAPES, SPEC, episodes, weights
@@ -31,6 +32,14 @@ pytestmark = pytest.mark.fast
 
 NAMES = ("corners", "placed", "actions", "rewards", "goals")
 NAN, INF = float("nan"), float("inf")
+
+
+def encode_episodes(sent: Episodes, spec: EpisodeSpec) -> list[bytes]:
+    return encode_columns(vars(sent), spec.columns(sent.count))
+
+
+def decode_episodes(frames: list[bytes], count: int, spec: EpisodeSpec) -> Episodes:
+    return Episodes(**decode_columns(frames, spec.columns(count)))
 
 
 def same(left: Episodes, right: Episodes) -> bool:
@@ -173,9 +182,6 @@ def test_arrays_of_another_task_are_not_sent() -> None:
 
 
 def test_a_batch_holds_a_bounded_number_of_episodes() -> None:
-    none = Episodes(*[getattr(episodes(1), name)[:0] for name in NAMES])
-    with pytest.raises(WireError, match="a batch holds 1 to 4096 episodes, got 0"):
-        encode_episodes(none, SPEC)
     long = EpisodeSpec(16, 64, 1600, 4, BOUND)
     bytes_each = 4 * (1601 * 128 + 1600 * 5 + 128) + 1601 * 16
     assert long.max_count == MAX_BATCH_BYTES // bytes_each
@@ -213,124 +219,109 @@ tensors = hnp.arrays(
 )
 
 
-@given(st.dictionaries(names, tensors, min_size=1, max_size=4), st.integers(0, 2**63 - 1))
-def test_weights_come_back_as_they_were_sent(sent: dict[str, Any], version: int) -> None:
+@given(st.dictionaries(names, tensors, min_size=1, max_size=4))
+def test_tensors_come_back_as_they_were_sent(sent: dict[str, Any]) -> None:
     shapes = {name: tensor.shape for name, tensor in sent.items()}
-    epoch, received = decode_weights(encode_weights("e", Weights(version, sent)), shapes)
-    assert (epoch, received.version) == ("e", version)
-    assert {n: t.shape for n, t in received.tensors.items()} == shapes
-    assert all(np.array_equal(t, sent[n]) for n, t in received.tensors.items())
-
-
-def frame_of(data: bytes, /, **changes: Any) -> bytes:
-    return pack_map("weights", {"epoch": "e", "version": 1, "data": data} | changes)
+    received = decode_tensors(encode_tensors(sent), shapes)
+    assert {n: t.shape for n, t in received.items()} == shapes
+    assert all(np.array_equal(t, sent[n]) for n, t in received.items())
 
 
 def tensor_frame(**arrays: Any) -> bytes:
     good = {name: np.zeros(shape, np.float32) for name, shape in SHAPES.items()}
     given_arrays = {name.replace("__", "."): array for name, array in arrays.items()}
-    kept = {n: t for n, t in (good | given_arrays).items() if t is not None}
-    return frame_of(save(kept))
+    return save({n: t for n, t in (good | given_arrays).items() if t is not None})
 
 
 DATA = save({name: np.zeros(shape, np.float32) for name, shape in SHAPES.items()})
 HUGE_HEADER = (10**15).to_bytes(8, "little") + b"{}"
 
 
+def entry(text: bytes) -> bytes:
+    """One tensor `a` of four bytes, described like this."""
+    described = b'{"a":{%s,"data_offsets":[0,4]}}' % text
+    return len(described).to_bytes(8, "little") + described + bytes(4)
+
+
 @pytest.mark.parametrize(
     ("frame", "reason"),
     [
-        (b"", "the header is not msgpack"),
-        (frame_of(DATA)[:-1], "the header is not msgpack"),
-        (frame_of(b""), "weights: not safetensors: "),
-        (frame_of(DATA[:-1]), "weights: not safetensors: "),
-        (frame_of(DATA + b"\0"), "weights: not safetensors: "),
-        (frame_of(HUGE_HEADER), "weights: not safetensors: "),
-        (frame_of(b"\x80\x04N."), "weights: not safetensors: "),  # a pickle
-        (frame_of(DATA, version=-1), "weights: version must be an integer between 0 and"),
-        (frame_of(DATA, epoch=3), "weights: epoch must be a text of at most 64 characters, got 3"),
-        (frame_of(DATA, data="text"), "weights: data must be bytes, got 'text'"),
-        (frame_of(DATA, more=1), "weights: unknown field 'more'"),
-        (pack_map("other", {"data": DATA}), "expected weights, got a message of kind 'other'"),
-        (msgpack.packb({"v": PROTOCOL + 1}), f"the other side speaks protocol {PROTOCOL + 1}"),
+        (b"", "not safetensors: "),
+        (DATA[:-1], "not safetensors: "),
+        (DATA + b"\0", "not safetensors: "),
+        (HUGE_HEADER, "not safetensors: "),
+        (b"\x80\x04N.", "not safetensors: "),  # a pickle
+        (bytes(MAX_WEIGHTS_BYTES + 1), f"{MAX_WEIGHTS_BYTES + 1} bytes, at most "),
+        (tensor_frame(actor__bias=np.zeros(4, np.float32)), "'actor.bias' must be (3,), got (4,)"),
+        (tensor_frame(actor__bias=None), "'actor.bias' must be (3,), got none"),
+        (tensor_frame(other=np.zeros(4, np.float32)), "'other' must be no such tensor, got (4,)"),
+        (tensor_frame(scale=np.zeros((), np.float64)), "'scale' must be float32, got flo"),
+        (tensor_frame(scale=np.array(NAN, np.float32)), "'scale' is not finite"),
+        (tensor_frame(scale=np.array(INF, np.float32)), "'scale' is not finite"),
+        (entry(b'"dtype":"BF16","shape":[2]'), "not safetensors: 'BF16'"),
         (
-            tensor_frame(actor__bias=np.zeros(4, np.float32)),
-            "weights: 'actor.bias' must be (3,), got (4,)",
-        ),
-        (tensor_frame(actor__bias=None), "weights: 'actor.bias' must be (3,), got none"),
-        (
-            tensor_frame(other=np.zeros(4, np.float32)),
-            "weights: 'other' must be no such tensor, got (4,)",
-        ),
-        (tensor_frame(scale=np.zeros((), np.float64)), "weights: 'scale' must be float32, got flo"),
-        (tensor_frame(scale=np.array(NAN, np.float32)), "weights: 'scale' is not finite"),
-        (tensor_frame(scale=np.array(INF, np.float32)), "weights: 'scale' is not finite"),
-        (
-            frame_of(DATA.replace(b'"dtype":"F32"', b'"dtype":"BF16"')),
-            "weights: not safetensors: ",
+            entry(b'"dtype":"F32","shape":%s' % str([1] * 70).encode()),
+            "not safetensors: maximum supported dimension for an ndarray is",
         ),
     ],
 )
-def test_wrong_weights_are_refused(frame: bytes, reason: str) -> None:
+def test_wrong_tensors_are_refused(frame: bytes, reason: str) -> None:
     with pytest.raises(WireError) as caught:
-        decode_weights(frame, SHAPES)
-    assert str(caught.value).startswith(reason)
+        decode_tensors(frame, SHAPES)
+    assert str(caught.value).startswith(f"weights: {reason}")
 
 
-@pytest.mark.parametrize(
-    ("entry", "reason"),
-    [
-        (b'{"a":{"dtype":"BF16","shape":[2],"data_offsets":[0,4]}}', "'BF16'"),
-        (
-            b'{"a":{"dtype":"F32","shape":%s,"data_offsets":[0,4]}}' % str([1] * 70).encode(),
-            "maximum supported dimension for an ndarray is",
-        ),
-    ],
-)
-def test_tensors_that_numpy_has_not_are_refused(entry: bytes, reason: str) -> None:
-    data = len(entry).to_bytes(8, "little") + entry + bytes(4)
-    with pytest.raises(WireError, match=f"weights: not safetensors: {reason}"):
-        decode_weights(frame_of(data), {"a": (2,)})
-
-
-def test_weights_of_any_shape_pass_where_none_is_expected() -> None:
-    assert decode_weights(tensor_frame(), None)[1].tensors.keys() == SHAPES.keys()
+def test_tensors_of_any_shape_pass_where_none_is_expected() -> None:
+    assert decode_tensors(tensor_frame(), None).keys() == SHAPES.keys()
     with pytest.raises(WireError, match="'scale' is not finite"):
-        decode_weights(tensor_frame(scale=np.array(NAN, np.float32)), None)
+        decode_tensors(tensor_frame(scale=np.array(NAN, np.float32)), None)
 
 
 @pytest.mark.parametrize("value", [NAN, INF, -INF])
-def test_weights_that_are_not_finite_are_not_sent(value: float) -> None:
-    bad = weights()
-    bad.tensors["actor.bias"][1] = value
+def test_tensors_that_are_not_finite_are_not_sent(value: float) -> None:
+    bad = weights().tensors
+    bad["actor.bias"][1] = value
     with pytest.raises(WireError, match=r"weights: 'actor.bias' is not finite"):
-        encode_weights("e", bad)
+        encode_tensors(bad)
 
 
 def test_weights_too_large_to_be_received_are_not_sent() -> None:
-    large = Weights(1, {"a": np.zeros(MAX_WEIGHTS_BYTES // 4, np.float32)})
+    large = {"a": np.zeros(MAX_WEIGHTS_BYTES // 4, np.float32)}
     with pytest.raises(WireError, match=r"weights: .* bytes, at most .*: choose a smaller net"):
-        encode_weights("e", large)
+        encode_tensors(large)
 
 
 def test_transposed_tensors_are_sent_as_what_they_mean() -> None:
     matrix = np.arange(6, dtype=np.float32).reshape(2, 3)
-    _, received = decode_weights(encode_weights("e", Weights(1, {"a": matrix.T})), {"a": (3, 2)})
-    assert np.array_equal(received.tensors["a"], matrix.T)
+    received = decode_tensors(encode_tensors({"a": matrix.T}), {"a": (3, 2)})
+    assert np.array_equal(received["a"], matrix.T)
 
 
 @given(st.binary(max_size=300))
 def test_random_data_raise_nothing_but_wire_errors(data: bytes) -> None:
-    for frame in (data, frame_of(data)):
-        with pytest.raises(WireError):
-            decode_weights(frame, SHAPES)
+    with pytest.raises(WireError):
+        decode_tensors(data, SHAPES)
 
 
 @given(st.integers(0, len(DATA) - 1), st.integers(0, 255))
-def test_mutated_weights_raise_nothing_but_wire_errors(position: int, byte: int) -> None:
-    data = DATA[:position] + bytes([byte]) + DATA[position + 1 :]
+def test_mutated_tensors_raise_nothing_but_wire_errors(position: int, byte: int) -> None:
     try:
-        _, received = decode_weights(frame_of(data), SHAPES)
+        received = decode_tensors(DATA[:position] + bytes([byte]) + DATA[position + 1 :], SHAPES)
     except WireError:
         return
-    assert {n: t.shape for n, t in received.tensors.items()} == SHAPES
+    assert {n: t.shape for n, t in received.items()} == SHAPES
+
+
+@given(st.lists(st.binary(max_size=20), max_size=MAX_FRAMES))
+def test_joined_frames_come_back_and_none_that_is_cut_short(frames: list[bytes]) -> None:
+    data = join_frames(frames)
+    assert split_frames(data) == frames
+    ends = {len(join_frames(frames[:number])) for number in range(len(frames) + 1)}
+    for size in set(range(len(data))) - ends:
+        with pytest.raises(WireError, match="joined frames is cut short"):
+            split_frames(data[:size])
+
+
+def test_joined_frames_are_bounded_in_number() -> None:
+    with pytest.raises(WireError, match="there may be 8 joined frames, got more"):
+        split_frames(join_frames([b""] * (MAX_FRAMES + 1)))

@@ -1,0 +1,461 @@
+"""All messages between workers and the master, each declared once; see `schema` for the rules.
+
+To add a field, add one line to its class; to add a message, write its class and name it in ToMaster
+or ToWorker.
+
+Delivery: batches are numbered from 1 within an incarnation and sent in order, at least once. The
+master acknowledges a batch after its insert, takes them in order, and drops what it had before.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Self, cast
+
+import numpy as np
+
+from tangram_agent.arrays import (
+    MAX_EPISODES,
+    Column,
+    EpisodeSpec,
+    WeightShapes,
+    decode_tensors,
+    encode_tensors,
+    join_frames,
+    split_frames,
+)
+from tangram_agent.schema import (
+    MAX_COUNT,
+    MAX_NUMBER,
+    MAX_TEXT,
+    Between,
+    Bound,
+    Flag,
+    Message,
+    Numbers,
+    Plain,
+    Table,
+    Text,
+    Texts,
+    by_kind,
+    check_frames,
+    opened,
+    read,
+)
+from tangram_agent.types import Episodes, Weights
+from tangram_sim.arrays import Floats, Singles
+from tangram_sim.errors import WireError
+
+ROLES = ("player", "evaluator")
+MAX_ID = 64
+MAX_RUN_ID = 256
+MAX_ADDRESS = 256
+MAX_SEED = 2**63 - 1
+MAX_INDEX = 65_535
+MAX_WINDOW = 1024
+MAX_PICTURES = 64
+MAX_ROWS = 4096
+
+
+class BatchError(WireError):
+    """An intact batch whose content is refused: it would be wrong again if it were sent again.
+
+    Attributes:
+        sequence: number of the batch.
+    """
+
+    def __init__(self, sequence: int, reason: str) -> None:
+        super().__init__(reason)
+        self.sequence = sequence
+
+
+Count = Annotated[int, Between(0)]
+Number = Annotated[int, Between(1)]
+Version = Annotated[int, Between(-1)]  # of weights, -1 for none
+Index = Annotated[int, Between(0, MAX_INDEX)]
+Role = Annotated[str, Text(choices=ROLES)]
+Id = Annotated[str, Text(MAX_ID)]
+Reason = Annotated[str, Text(cut=True)]
+YesOrNo = Annotated[bool, Flag()]
+
+
+# Messages
+
+
+class OfTask(Table):
+    """A message whose arrays belong to the task."""
+
+    def encode(self, spec: EpisodeSpec) -> list[bytes]:
+        """The message's frames; WireError for content that a receiver would refuse."""
+        return self.frames(spec)
+
+
+@dataclass(frozen=True)
+class Hello(Plain):
+    """A process asks to take part, or to go on after it lost the master.
+
+    Attributes:
+        role: player or evaluator; each role counts its own indices.
+        index: wanted, or -1 for any.
+        incarnation: 0 for a new process, else the one that the master gave it.
+        process: random id of the process, the same in each of its HELLOs.
+        first: number of the oldest batch that it may still send.
+        fingerprints: section of the settings -> digest.
+    """
+
+    kind: ClassVar[str] = "hello"
+    role: Role
+    index: Annotated[int, Between(-1, MAX_INDEX)]
+    incarnation: Count
+    process: Annotated[str, Text(MAX_ID, needed=True)]
+    first: Number
+    fingerprints: Annotated[Mapping[str, str], Texts(MAX_ID)]
+
+
+@dataclass(frozen=True)
+class WantWeights(Plain):
+    """A worker asks for the current weights unless they are of this epoch and version."""
+
+    kind: ClassVar[str] = "want_weights"
+    epoch: Id
+    version: Version
+
+
+@dataclass(frozen=True)
+class Heartbeat(Plain):
+    """A sign of life with numbers for the master's log; answered by Alive."""
+
+    kind: ClassVar[str] = "heartbeat"
+    stats: Annotated[Mapping[str, float], Numbers(lenient=True)]
+
+
+@dataclass(frozen=True)
+class Bye(Plain):
+    """A worker leaves of its own accord."""
+
+    kind: ClassVar[str] = "bye"
+    reason: Reason
+
+
+@dataclass(frozen=True)
+class AskStatus(Plain):
+    """Anybody asks how the run stands; no HELLO is needed."""
+
+    kind: ClassVar[str] = "ask_status"
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeBatch(OfTask):
+    """Whole episodes, as played.
+
+    Attributes:
+        sequence: number of the batch, from 1 within an incarnation.
+        weights_version: of the weights that played it; -1 for none.
+        episodes: the arrays.
+    """
+
+    kind: ClassVar[str] = "episodes"
+    sequence: Number
+    weights_version: Version
+    episodes: Episodes
+
+    @classmethod
+    def rows(cls, agreed: EpisodeSpec) -> Between:
+        """Bounded in number and in bytes."""
+        return Between(1, agreed.max_count)
+
+    @classmethod
+    def columns(cls, agreed: EpisodeSpec, count: int) -> Sequence[Column]:
+        """One for each field of Episodes."""
+        return agreed.columns(count)
+
+    def arrays(self) -> Mapping[str, Any]:
+        """The fields of the episodes."""
+        return vars(self.episodes)
+
+    @classmethod
+    def filled(cls, values: dict[str, Any], arrays: dict[str, Any]) -> Self:
+        """With the arrays as episodes."""
+        return cls(**values, episodes=Episodes(**arrays))
+
+
+@dataclass(frozen=True, eq=False)
+class Scores(OfTask):
+    """Results of one evaluation.
+
+    Attributes:
+        weights_version: of the weights that were tested.
+        scalars: name -> value, at most 64.
+        starts, ends, goals: (n, V, 2) float32 corners of n <= 64 test episodes, for pictures.
+    """
+
+    kind: ClassVar[str] = "scores"
+    weights_version: Version
+    scalars: Annotated[Mapping[str, float], Numbers()]
+    starts: Singles
+    ends: Singles
+    goals: Singles
+
+    @classmethod
+    def rows(cls, _agreed: EpisodeSpec) -> Between:
+        """Enough to look at."""
+        return Between(0, MAX_PICTURES)
+
+    @classmethod
+    def columns(cls, agreed: EpisodeSpec, count: int) -> Sequence[Column]:
+        """Corners at the start, at the end and of the goal."""
+        return agreed.pictures(count)
+
+
+@dataclass(frozen=True)
+class Welcome(Plain):
+    """The master takes a process in.
+
+    Attributes:
+        epoch: random id of this life of the master.
+        run_id: of the run.
+        seed: of the run, from which workers derive theirs.
+        index: of the process within its role.
+        incarnation: of the process within its index, from 1.
+        weights_endpoint: of the PUB socket.
+        window: most batches that the master accepts unacknowledged.
+        lockstep: play only what Go says.
+    """
+
+    kind: ClassVar[str] = "welcome"
+    epoch: Id
+    run_id: Annotated[str, Text(MAX_RUN_ID)]
+    seed: Annotated[int, Between(0, MAX_SEED)]  # the user's own, and nothing counts on from it
+    index: Index
+    incarnation: Number
+    weights_endpoint: Annotated[str, Text(MAX_ADDRESS)]
+    window: Annotated[int, Between(1, MAX_WINDOW)]
+    lockstep: YesOrNo
+
+
+@dataclass(frozen=True)
+class Go(Plain):
+    """In lockstep, what a player plays next; it may come more than once.
+
+    Attributes:
+        number: of the round.
+        version: of the weights to play with.
+        first_episode: number of the first episode, from which its generator follows.
+        episodes: how many, in one batch.
+    """
+
+    kind: ClassVar[str] = "go"
+    number: Count
+    version: Version
+    first_episode: Count
+    episodes: Annotated[int, Between(1, MAX_EPISODES)]
+
+
+@dataclass(frozen=True)
+class Refused(Plain):
+    """The master does not take a process in."""
+
+    kind: ClassVar[str] = "refused"
+    reason: Reason
+
+
+@dataclass(frozen=True)
+class Greet(Plain):
+    """The master does not know this connection (it was restarted): say HELLO again."""
+
+    kind: ClassVar[str] = "greet"
+
+
+@dataclass(frozen=True)
+class Ack(Plain):
+    """A batch is in the replay, now or since before (duplicate)."""
+
+    kind: ClassVar[str] = "ack"
+    sequence: Number
+    duplicate: YesOrNo
+
+
+@dataclass(frozen=True)
+class Reject(Plain):
+    """A message is refused.
+
+    Attributes:
+        reason: why.
+        sequence: of the batch, 0 where the message had none, or none to believe.
+        final: the message itself is wrong and must not be sent again; else it came out of turn, or
+            was damaged on its way.
+    """
+
+    kind: ClassVar[str] = "reject"
+    reason: Reason
+    sequence: Count
+    final: YesOrNo
+
+
+@dataclass(frozen=True)
+class Alive(Plain):
+    """The answer to a heartbeat.
+
+    Attributes:
+        version: of the newest broadcast, -1 before the first: one that missed it can ask.
+    """
+
+    kind: ClassVar[str] = "alive"
+    version: Version
+
+
+@dataclass(frozen=True)
+class Stop(Plain):
+    """The worker must end."""
+
+    kind: ClassVar[str] = "stop"
+    reason: Reason
+
+
+@dataclass(frozen=True, eq=False)
+class WeightsMessage(Plain):
+    """The newest weights.
+
+    Attributes:
+        epoch: of the master that made them.
+        weights: the tensors.
+    """
+
+    kind: ClassVar[str] = "weights"
+    epoch: Id
+    weights: Weights
+
+    @classmethod
+    def described(cls, _agreed: Any) -> Mapping[str, Bound]:
+        """Their version."""
+        return {"version": Between(0)}
+
+    def pack(self, _agreed: Any) -> tuple[Mapping[str, int], list[bytes]]:
+        """All tensors in one frame."""
+        return {"version": self.weights.version}, [encode_tensors(self.weights.tensors)]
+
+    @classmethod
+    def unpack(
+        cls, values: dict[str, Any], frames: Sequence[bytes], agreed: WeightShapes | None
+    ) -> Self:
+        """The message, if the tensors have the shapes that a worker agreed on."""
+        check_frames(cls.kind, frames, 1)
+        weights = Weights(values.pop("version"), decode_tensors(frames[0], agreed))
+        return cls(**values, weights=weights)
+
+
+WORKER_COLUMNS = (
+    "evaluator",  # 1, or 0 for a player
+    "index",
+    "incarnation",
+    "silent_s",  # since its last message
+    "behind",  # updates since the weights that its last batch was played with; -1 before one
+    "batches",  # since it joined
+    "episodes",
+    "transitions",
+    "waiting",  # batches that are not acknowledged yet
+)
+
+
+@dataclass(frozen=True, eq=False)
+class RunStatus(Table, Plain):
+    """How a run stands. What a receiver would refuse is left out or cut, see Numbers.
+
+    Attributes:
+        numbers: name -> value.
+        texts: name -> text: what it does or waits for, and who it is.
+        workers: (P, 9) float64, a row for each process; see WORKER_COLUMNS.
+    """
+
+    kind: ClassVar[str] = "status"
+    numbers: Annotated[Mapping[str, float], Numbers(lenient=True)]
+    texts: Annotated[Mapping[str, str], Texts(MAX_TEXT, lenient=True)]
+    workers: Floats
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        rows = np.nan_to_num(self.workers[:MAX_ROWS], nan=-1.0).clip(-1.0, MAX_NUMBER)
+        object.__setattr__(self, "workers", rows)
+
+    @classmethod
+    def rows(cls, _agreed: Any) -> Between:
+        """As many as there may be workers."""
+        return Between(0, MAX_ROWS)
+
+    @classmethod
+    def columns(cls, _agreed: Any, count: int) -> Sequence[Column]:
+        """The table of workers."""
+        return [Column("workers", "<f8", (count, len(WORKER_COLUMNS)), -1.0, MAX_NUMBER)]
+
+
+ToMaster = Hello | EpisodeBatch | Scores | WantWeights | Heartbeat | Bye | AskStatus
+ToWorker = Welcome | Go | Refused | Greet | Ack | Reject | Alive | Stop | WeightsMessage | RunStatus
+
+
+# Reading
+
+
+def decode_from_worker(frames: Sequence[bytes], spec: EpisodeSpec) -> ToMaster:
+    """A worker's message.
+
+    Args:
+        frames: without the identity.
+        spec: the task that arrays must belong to.
+
+    Raises:
+        ProtocolError: the worker speaks another version.
+        DamagedError: the message was changed on its way.
+        BatchError: a numbered batch with wrong content.
+        WireError: anything else that is wrong; the reason names the field.
+    """
+    header = opened(frames)
+    try:
+        return cast("ToMaster", read(_known(header, _FROM_WORKER), header, frames[1:], spec))
+    except WireError as error:
+        sequence = header.get("sequence")
+        if header["kind"] != EpisodeBatch.kind or type(sequence) is not int:
+            raise
+        if not 1 <= sequence <= MAX_COUNT:
+            raise
+        raise BatchError(sequence, str(error)) from None
+
+
+def decode_from_master(frames: Sequence[bytes], shapes: WeightShapes | None) -> ToWorker:
+    """The master's message.
+
+    Args:
+        frames: all of it.
+        shapes: of the tensors that weights must have; None takes any.
+
+    Raises:
+        ProtocolError: the master speaks another version.
+        DamagedError: the message was changed on its way.
+        WireError: anything else that is wrong; the reason names the field.
+    """
+    header = opened(frames)
+    return cast("ToWorker", read(_known(header, _FROM_MASTER), header, frames[1:], shapes))
+
+
+def decode_weights(frame: bytes, shapes: WeightShapes | None) -> tuple[str, Weights]:
+    """The master's epoch and its weights, from a broadcast; errors as in `decode_from_master`."""
+    frames = split_frames(frame)
+    message = read(WeightsMessage, opened(frames), frames[1:], shapes)
+    return message.epoch, message.weights
+
+
+def encode_weights(epoch: str, weights: Weights) -> bytes:
+    """Weights as one frame, because a CONFLATE socket keeps only the last frame of a message.
+
+    Raises:
+        WireError: a tensor is not finite, or they are too large.
+    """
+    return join_frames(WeightsMessage(epoch, weights).encode())
+
+
+_FROM_WORKER, _FROM_MASTER = by_kind(ToMaster), by_kind(ToWorker)
+
+
+def _known(header: Mapping[str, Any], kinds: Mapping[str, type[Message]]) -> type[Message]:
+    cls = kinds.get(header["kind"])
+    if cls is None:
+        raise WireError(f"unknown kind of message {header['kind']!r}")
+    return cls
