@@ -121,9 +121,6 @@ class Graph(Protocol):
     def moved(self, view: Any, velocity: Tensor, /) -> Any:
         """The views after the exact rigid motion of a velocity (M, 3), as the simulation has it."""
 
-    def motion(self, view: Any, to: Tensor, /) -> Tensor:
-        """The way to poses (M, 3) as tokens see it: (M, 4), shift, cosine and sine of the turn."""
-
 
 def next_token(placed: Tensor) -> Tensor:
     """Which token moves, (B,): the first that is not placed (B, K); 0 where all are."""

@@ -177,7 +177,12 @@ class Learner:
     def _of_scenes(self, batch: Transitions) -> Steps:
         state, placed = self._tensor(batch.state), self._tensor(batch.placed)
         goal, action = self._tensor(batch.goal), self._tensor(batch.action)
-        taken = Scenes(state, placed, goal, self._index(chosen_tokens(batch.action, self._tokens)))
+        taken = Scenes(
+            state,
+            placed,
+            goal,
+            self._index(chosen_tokens(batch.action.astype(np.float64), self._tokens)),
+        )
         start = taken if self._tokens == 1 else Scenes(state, placed, goal, next_token(placed))
         following, flags = self._tensor(batch.next_state), self._tensor(batch.next_placed)
         return Steps(

@@ -190,7 +190,7 @@ class Critic(nn.Module):
             pairs: a token where it is, and the other one in the place of the piece.
             to: (M, 3) pose that the token slides to.
         """
-        if self.push_head is None:
+        if self.push_head is None or not isinstance(self.graph, PairGraph):
             return to.new_zeros(len(to))
         return self._value(self.push_head(pairs, told=self.graph.motion(pairs, to)))
 
@@ -200,10 +200,11 @@ class Networks(nn.Module):
 
     def __init__(self, setup: Setup) -> None:
         super().__init__()
-        kind = PairGraph if setup.pairs else SceneGraph
-        graph: Graph = kind(setup.layout, setup.sim.arena, setup.agent)
+        seen = setup.layout, setup.sim.arena, setup.agent
+        graph: Graph = PairGraph(*seen) if setup.pairs else SceneGraph(*seen)
+        contacts = setup.pairs and setup.contacts
         self.actor = Actor(graph, setup.agent, setup.net)
-        self.critic = Critic(graph, setup.agent, setup.net, setup.contacts)
+        self.critic = Critic(graph, setup.agent, setup.net, contacts)
         # Of pairs the critic chooses among what the actor proposes: both play.
         self._both_play = setup.pairs
 

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from functools import cached_property
 from typing import Any, TypeVar, cast, get_origin, get_type_hints
@@ -19,6 +19,9 @@ from tangram_sim.settings import refuse_ignored, told
 
 Settings = TypeVar("Settings")
 
+# Settings of the agent that have no effect but on pairs, and but on pairs of several tokens.
+_PAIRS_ONLY = ("reapply", "refine_steps", "refine_rate")
+_SEVERAL_ONLY = ("order", "pairs_per_transition", "push_weight")
 SECTIONS = ("tokens", "sim", "reward", "agent", "net")
 
 
@@ -39,8 +42,17 @@ class Setup:
             ConfigError: names the setting and the remedy.
         """
         agent, one = self.agent, self.layout.tokens == 1
+        if not self.pairs:  # one token and readout=auto: the section itself refuses readout=token
+            self._refuse(_PAIRS_ONLY, "one token and agent.readout=auto", "set agent.readout=pair")
+        if one:
+            self._refuse(_SEVERAL_ONLY, "one token", "take a set of several")
+        if not self.contacts:
+            slide = "set sim.motion=slide"
+            self._refuse(("push_weight",), "tokens that do not push each other", slide)
+        if agent.gamma == 0.0:
+            self._refuse(("polyak",), "agent.gamma=0", "set agent.gamma above 0")
         if self.credits_pieces:
-            several = f"{self.layout.tokens} tokens and agent.readout=pair"
+            several = f"{self.layout.tokens} tokens on pairs"
             whole = "set agent.readout=token, which values the whole scene"
             for name, value in _changed(self.reward).items():
                 refuse_ignored(f"reward.{name}={told(value)}", several, whole)
@@ -48,15 +60,13 @@ class Setup:
                 refuse_ignored(f"agent.gamma={told(agent.gamma)}", several, whole)
             if any(relabel.strategy == "future" for relabel in agent.hindsight):
                 refuse_ignored("agent.hindsight.strategy=future", several, "use final")
-        for name in {"order", "pairs_per_transition"} & _changed(agent).keys() if one else ():
-            given = f"agent.{name}={told(getattr(agent, name))}"
-            refuse_ignored(given, "one token", "take a set of several")
-        if not self.contacts and "push_weight" in _changed(agent):
-            given = f"agent.push_weight={told(agent.push_weight)}"
-            refuse_ignored(given, "tokens that are lifted", "set sim.motion=slide, several tokens")
-        if agent.gamma == 0.0 and "polyak" in _changed(agent):
-            given = f"agent.polyak={told(agent.polyak)}"
-            refuse_ignored(given, "agent.gamma=0", "set agent.gamma above 0")
+
+    def _refuse(self, names: Iterable[str], because: str, remedy: str) -> None:
+        """Refuse settings of the agent that are not the default."""
+        changed = _changed(self.agent)
+        for name in names:
+            if name in changed:
+                refuse_ignored(f"agent.{name}={told(changed[name])}", because, remedy)
 
     @cached_property
     def layout(self) -> Layout:
@@ -71,6 +81,8 @@ class Setup:
     @property
     def pairs(self) -> bool:
         """Whether the agent acts on pairs of a token and a piece of the target."""
+        if self.agent.readout == "auto":
+            return self.layout.tokens > 1
         return self.agent.readout == "pair"
 
     @property

@@ -127,7 +127,7 @@ def test_with_several_tokens_nothing_is_bootstrapped() -> None:
 
 
 def test_one_token_learns_the_reward_of_its_transition_and_what_follows() -> None:
-    made = setup(agent={"gamma": 0.9}, actions_per_token=2)
+    made = setup(agent={"gamma": 0.9, "readout": "pair"}, actions_per_token=2)
     learner = learner_of(made)
     for module in (learner.target_actor, learner.target_critic):
         for parameter in module.parameters():

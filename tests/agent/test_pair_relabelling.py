@@ -197,7 +197,7 @@ def test_a_quarter_of_the_pairs_is_asked_from_where_the_action_ended() -> None:
 
 def one_token(shape: str) -> tuple[Setup, Transitions, PairBatch]:
     """Transitions of one token as they come out of the replay, and the pairs made of them."""
-    made = setup({"shapes": [shape], "scale": 0.8}, actions_per_token=2)
+    made = setup({"shapes": [shape], "scale": 0.8}, {"readout": "pair"}, actions_per_token=2)
     drawn = transitions(made, COUNT)
     rng = np.random.default_rng(0)
     reward = rng.uniform(-1.0, 1.0, COUNT).astype(np.float32)
