@@ -77,10 +77,10 @@ def _sample(samples: Samples, minute: float, folder: Path) -> None:
 
 
 def _name(line: str) -> str:
-    for words, name in (("-m master", "master"), ("role=evaluator", "evaluator")):
+    for words, name in (("-m tangram_cli master", "master"), ("role=evaluator", "evaluator")):
         if words in line:
             return name
-    return "worker" if "-m worker" in line else "launcher"
+    return "worker" if "-m tangram_cli worker" in line else "launcher"
 
 
 def _row(name: str, points: list[tuple[float, float, int]], minutes: float) -> dict[str, Any]:

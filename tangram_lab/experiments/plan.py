@@ -8,7 +8,7 @@ import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 from tangram_sim.config import MAX_CORNER_NOISE
 from tangram_sim.errors import ConfigError
@@ -16,7 +16,8 @@ from tangram_sim.settings import check_choice, check_range
 from worker.config import MAX_ACTIONS
 
 FORMAT = 1
-KINDS = ("curves", "complexity", "tests", "rewards", "ranking", "game")
+Kind = Literal["curves", "complexity", "tests", "rewards", "ranking", "game"]
+KINDS: tuple[str, ...] = get_args(Kind)
 PLAN = "plan.json"
 
 
