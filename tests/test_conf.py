@@ -296,7 +296,7 @@ def test_entry_hands_over_plain_settings(monkeypatch: pytest.MonkeyPatch) -> Non
     assert seen == [
         {"run_dir": "x", "episodes": 100, "seed": 3, "turns": 1, "skip_invalid": False}
         | dict.fromkeys(("out", "actions", "corner_noise", "puzzles", "sheet"))
-        | dict.fromkeys(("order", "reapply", "refine_steps", "gamma"))
+        | dict.fromkeys(("order", "reapply", "refine_steps", "push_weight"))
     ]
     assert type(seen[0]) is dict
 
