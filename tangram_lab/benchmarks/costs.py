@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
-from master.arrivals import EpisodesArrived
+from master.delivery import EpisodesArrived
 from master.hub import Hub
 from master.journal import Journal
-from master.peers import Registry
+from master.registry import Registry
 from master.trainer import Trainer
 from tangram_agent.messages import Hello
 from tangram_lab.benchmarks.episodes import played

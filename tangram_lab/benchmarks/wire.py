@@ -17,9 +17,9 @@ from typing import Any
 
 import zmq
 
-from master.arrivals import EpisodesArrived, WelcomeInfo
-from master.hub import Hub
-from master.keys import Keys, make_keys
+from master.delivery import EpisodesArrived
+from master.hub import Hub, WelcomeInfo
+from master.security import Keys, make_keys
 from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.messages import Ack, EpisodeBatch
 from tangram_agent.setup import Setup
