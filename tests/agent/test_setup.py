@@ -230,11 +230,7 @@ FUTURE = [{"strategy": "future"}]
     [
         (SEVERAL, {"reward": {"name": "dense"}}, "reward.name=dense changes nothing with 2 tokens"),
         (SEVERAL, {"reward": {"source": "camera"}}, "reward.source=camera changes nothing"),
-        (
-            SEVERAL,
-            {"reward": {"sharpness": 2.0}},
-            "set agent.readout=token, which values the whole",
-        ),
+        (SEVERAL, {"reward": {"name": "pose"}}, "set agent.readout=token, which values the whole"),
         (SEVERAL, {"agent": {"gamma": 0.9}}, "agent.gamma=0.9 changes nothing with 2 tokens"),
         (SEVERAL, {"agent": {"hindsight": FUTURE}}, "strategy=future changes nothing"),
         (SEVERAL, {"agent": {"push_weight": 0.5}}, "agent.push_weight=0.5 .* sim.motion=slide"),
