@@ -17,6 +17,7 @@ pytestmark = pytest.mark.fast
 
 PAPER_MHA: dict[str, Any] = {}
 PAPER_MLP = {"kind": "mlp"}
+NETS: dict[str, Any] = {"mha": SMALL, "mlp": {"kind": "mlp"}}
 
 
 def networks(made: Setup, seed: int = 0) -> tuple[SceneGraph, Actor, Critic]:
@@ -81,7 +82,7 @@ def test_permuting_corners_permutes_nodes_and_leaves_the_rest(piece: str) -> Non
 @pytest.mark.parametrize("squash", ["tanh", "clamp"])
 @pytest.mark.parametrize(("angle_head", "largest"), [("plain", 1.0), ("kfold", 0.25)])
 def test_actions_stay_in_range(kind: str, squash: str, angle_head: str, largest: float) -> None:
-    made = setup(agent={"angle_head": angle_head, "squash": squash}, net={**SMALL, "kind": kind})
+    made = setup(agent={"angle_head": angle_head, "squash": squash}, net=NETS[kind])
     _, actor, _ = networks(made)
     with torch.no_grad():
         for parameter in actor.parameters():
@@ -108,7 +109,7 @@ def test_kfold_head_turns_by_atan2_over_k() -> None:
 @pytest.mark.parametrize("kind", ["mha", "mlp"])
 def test_an_egocentric_agent_sees_no_absolute_pose(afterstate: bool, kind: str) -> None:
     """Turn and shift the whole scene: the value stays, the action turns with it."""
-    made = setup(agent={"afterstate": afterstate}, net={**SMALL, "kind": kind})
+    made = setup(agent={"afterstate": afterstate}, net=NETS[kind])
     _, actor, critic = networks(made)
     scenes = inputs(made)
     angle = torch.tensor(0.7)
@@ -152,7 +153,7 @@ def test_the_critic_appends_the_action_to_the_base_of_its_token() -> None:
 
 @pytest.mark.parametrize("kind", ["mha", "mlp"])
 def test_the_actor_reads_the_base_of_the_token_that_moves(kind: str) -> None:
-    made = setup(PAIR, agent=PAPER, net={**SMALL, "kind": kind})
+    made = setup(PAIR, agent=PAPER, net=NETS[kind])
     _, actor, _ = networks(made)
     scenes = inputs(made)
     first = actor(scenes)[0]
