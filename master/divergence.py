@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 import safetensors.numpy
 
-from master.tally import Tally
+from master.counters import Counters
 from master.trainer import Trainer
-from tangram_agent.ddpg import NotFiniteError
 from tangram_agent.files import write_whole
+from tangram_agent.learner import NotFiniteError
 from tangram_agent.process import Every
 from tangram_agent.types import Weights
 from tangram_sim.errors import RunError
@@ -39,7 +39,7 @@ class DivergenceGuard:
         Raises:
             NotFiniteError: the state is not finite already.
         """
-        self._tally = Tally()
+        self._tally = Counters()
         self.trainer, self._limit, self._evidence = trainer, limit, evidence
         self._in_a_row, self._keep = 0, Every(KEEP_S)
         self._good = trainer.learner.state()

@@ -8,30 +8,34 @@ order. The graph of Sec. IV-A has N = 2V + K nodes: token corners (V), bases (K)
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from tangram_sim.arrays import Bools, Floats, Ints
 from tangram_sim.errors import ConfigError
+from tangram_sim.settings import Settings, declared
 from tangram_sim.shapes import Shape, polygon, tan
 
 MAX_TOKENS = 16
 
 
 @dataclass(frozen=True)
-class TokensConfig:
-    """The pieces of a puzzle.
+class TokensConfig(Settings, section="tokens"):
+    """The pieces of a puzzle."""
 
-    Attributes:
-        shapes: names of tans, or mappings {name, corners} that define a convex polygon.
-        scale: side of the full square that the tans are cut from, in arena units; a polygon of
-            the user's own is scaled by the same number.
-    """
-
-    shapes: tuple[Any, ...]
-    scale: float
+    shapes: tuple[Any, ...] = field(
+        metadata=declared(
+            "names of tans, or mappings {name, corners} of convex polygons with 3 to 16 corners"
+        )
+    )
+    scale: float = field(
+        metadata=declared(
+            "side of the full square that tans are cut from, or factor on a polygon's corners",
+            unit="arena units",
+        )
+    )
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.shapes) <= MAX_TOKENS:

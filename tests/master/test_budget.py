@@ -15,7 +15,9 @@ pytestmark = pytest.mark.fast
 def budget(seconds: float, episodes: int, updates: int, **bounds: Any) -> Budget:
     """A budget of which so much is used."""
     trainer = SimpleNamespace(episodes=episodes, updates=updates)
-    return Budget(MasterConfig("runs/x", **bounds), trainer, Record(loop_s=seconds))  # type: ignore[arg-type]
+    return Budget(
+        MasterConfig("runs/x", **{"max_updates": 0} | bounds), trainer, Record(loop_s=seconds)
+    )  # type: ignore[arg-type]
 
 
 SHARES = [

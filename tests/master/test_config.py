@@ -39,11 +39,11 @@ def test_a_wrong_master_is_refused(settings: dict[str, Any], reason: str) -> Non
 )
 def test_wrong_numbers_of_workers_are_refused(workers: int, reason: str) -> None:
     with pytest.raises(ConfigError, match=reason):
-        LaunchConfig(workers, MasterConfig("runs/x"))
+        LaunchConfig(MasterConfig("runs/x"), workers)
 
 
 def test_settings_come_from_a_plain_mapping() -> None:
     master = {"run_dir": "runs/x", "max_hours": 2, "service": {"port": 5555}}
     config = from_mapping(LaunchConfig, {"workers": 2, "master": master})
     expected = MasterConfig("runs/x", max_hours=2.0, service=ServiceConfig(port=5555))
-    assert config == LaunchConfig(2, expected)
+    assert config == LaunchConfig(expected, 2)

@@ -300,7 +300,6 @@ def test_an_own_reward_counts_by_its_content_wherever_the_file_lies(
     assert reward_identity(RewardConfig(f"{tmp_path}/there/own.py:near")) == here
     assert reward_identity(RewardConfig(f"{tmp_path}/changed/own.py:near")) != here
     assert reward_identity(RewardConfig("own.py:text")) != here
-    assert reward_identity(RewardConfig("own.py:near", sharpness=2.0)) != here
 
 
 def test_a_file_of_the_users_own_holds_in_every_folder(

@@ -1,0 +1,293 @@
+"""What a token sees of a piece: the same wherever the scene lies, and the layout's own corners."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tangram_agent.config import AgentConfig
+from tangram_agent.graph import PairGraph, Pairs
+from tangram_sim.fitting import KINDS
+from tangram_sim.layout import Layout, TokensConfig, make_layout
+from tests.agent.pair_scenes import SEVEN, every_pair, random_pairs, random_scene
+
+pytestmark = pytest.mark.fast
+
+LAYOUT = make_layout(TokensConfig(**SEVEN))
+GRAPH = PairGraph(LAYOUT, 2.0, AgentConfig())
+SEEDS = range(5)
+PARALLELOGRAM, SQUARE = 6, 5
+MIRROR = np.array([shape.mirror or 0.0 for shape in LAYOUT.shapes])
+
+
+def layout_of(*shapes: Any) -> Layout:
+    return make_layout(TokensConfig(shapes, 0.6))
+
+
+def one_pair(
+    token: int, piece: int, pose: Any, goal: Any, flipped: float = 0.0, goal_flipped: float = 0.0
+) -> Pairs:
+    return Pairs(
+        pose=torch.tensor([pose]).float(),
+        flipped=torch.tensor([flipped]),
+        token=torch.tensor([token]),
+        goal=torch.tensor([goal]).float(),
+        goal_flipped=torch.tensor([goal_flipped]),
+        piece=torch.tensor([piece]),
+        covered=torch.zeros(1),
+    )
+
+
+def turned(poses: np.ndarray, angle: float, shift: complex) -> np.ndarray:
+    centres = (poses[:, :2] @ (1.0, 1j)) * np.exp(1j * angle) + shift
+    return np.column_stack([centres.real, centres.imag, poses[:, 2] + angle])
+
+
+def same_views(one: Pairs, other: Pairs, where: Any = slice(None)) -> None:
+    np.testing.assert_allclose(
+        GRAPH.node_features(one)[where], GRAPH.node_features(other)[where], atol=2e-5
+    )
+    np.testing.assert_allclose(GRAPH.vectors(one)[where], GRAPH.vectors(other)[where], atol=2e-5)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_rigid_motion_of_the_whole_scene_changes_nothing(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    (own, sides), (goals, goal_sides) = random_scene(LAYOUT, rng), random_scene(LAYOUT, rng)
+    move = rng.uniform(-np.pi, np.pi), complex(*rng.uniform(-1, 1, 2))
+    same_views(
+        every_pair(own, sides, goals, goal_sides),
+        every_pair(turned(own, *move), sides, turned(goals, *move), goal_sides),
+    )
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_token_with_two_sides_sees_a_mirrored_scene_as_the_scene(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    tokens, pieces = random_scene(LAYOUT, rng), random_scene(LAYOUT, rng)
+    plain = every_pair(*tokens, *pieces)
+    image = every_pair(*LAYOUT.mirrored(*tokens), *LAYOUT.mirrored(*pieces))
+    chiral = plain.token == PARALLELOGRAM
+    assert chiral.sum() == 7
+    same_views(plain, image, chiral)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_token_with_one_side_sees_the_mirror_image(seed: int) -> None:
+    """Its own mirror image is itself, turned: by so much less the scene is turned."""
+    rng = np.random.default_rng(seed)
+    tokens, pieces = random_scene(LAYOUT, rng), random_scene(LAYOUT, rng)
+    plain = every_pair(*tokens, *pieces)
+    image = every_pair(*LAYOUT.mirrored(*tokens), *LAYOUT.mirrored(*pieces))
+    achiral = (plain.token != PARALLELOGRAM).numpy()
+    place = GRAPH.relation(plain)[0].numpy() @ (1.0, 1j)
+    seen = GRAPH.relation(image)[0].numpy() @ (1.0, 1j)
+    expected = place.conj() * np.exp(-1j * MIRROR[plain.token])
+    np.testing.assert_allclose(seen[achiral], expected[achiral], atol=1e-5)
+
+
+def moved(pairs: Pairs, shift: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
+    """Poses after a shift in arena units and a turn in radians as the tokens see them."""
+    velocity = GRAPH.velocity(pairs, shift / 2.0, angle / math.pi)
+    return GRAPH.moved(pairs, velocity).pose
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_way_is_the_velocity_that_moved_takes(seed: int) -> None:
+    pairs, other = random_pairs(LAYOUT, seed), random_pairs(LAYOUT, seed + 100)
+    way = GRAPH.way(pairs, other.pose)
+    assert way[:, 2].abs().max() <= 1.0
+    found = GRAPH.moved(pairs, way).pose
+    np.testing.assert_allclose(found[:, :2], other.pose[:, :2], atol=1e-5)
+    np.testing.assert_allclose(np.exp(1j * (found - other.pose)[:, 2].numpy()), 1.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_moved_is_the_inverse_of_motion(seed: int) -> None:
+    pairs, other = random_pairs(LAYOUT, seed), random_pairs(LAYOUT, seed + 100)
+    way = GRAPH.motion(pairs, other.pose)
+    found = moved(pairs, way[:, :2], torch.atan2(way[:, 3], way[:, 2]))
+    np.testing.assert_allclose(found[:, :2], other.pose[:, :2], atol=1e-5)
+    gap = found[:, 2] - other.pose[:, 2]
+    np.testing.assert_allclose(np.exp(1j * gap.numpy()), 1.0, atol=1e-5)
+
+
+def test_no_motion_goes_further_than_an_action_can() -> None:
+    pairs = one_pair(0, 0, (0.1, 0.2, math.pi / 2), (0.0, 0.0, 0.0))
+    found = moved(pairs, torch.tensor([[0.5, 3.0]]), torch.tensor([0.25]))
+    np.testing.assert_allclose(found, [[0.1 - 2.0, 0.2 + 0.5, math.pi / 2 + 0.25]], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("flipped", "goal_flipped", "expected"),
+    [
+        # The piece is 0.3 ahead and 0.1 to the left of a token that looks along y, turned by 0.5.
+        (0.0, 0.0, (0.3, 0.1, 0.5, 0.0)),
+        (0.0, 1.0, (0.3, 0.1, 0.5, 1.0)),
+        (1.0, 0.0, (0.3, -0.1, -0.5, 1.0)),
+        (1.0, 1.0, (0.3, -0.1, -0.5, 0.0)),
+    ],
+)
+def test_the_relation_of_two_parallelograms(
+    flipped: float, goal_flipped: float, expected: tuple[float, ...]
+) -> None:
+    pose, goal = (0.2, 0.4, math.pi / 2), (0.1, 0.7, math.pi / 2 + 0.5)
+    pairs = one_pair(PARALLELOGRAM, PARALLELOGRAM, pose, goal, flipped, goal_flipped)
+    place, angle, other_side = GRAPH.relation(pairs)
+    found = [*place[0].tolist(), angle.item(), other_side.item()]
+    assert found == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize("token", range(7))
+@pytest.mark.parametrize("flipped", [0.0, 1.0])
+def test_a_token_on_its_piece_sees_it_at_no_place_and_no_angle(token: int, flipped: float) -> None:
+    side = flipped * float(LAYOUT.chiral[token])
+    symmetry = LAYOUT.shapes[token].symmetry
+    for turns in range(symmetry):
+        goal = (0.3, -0.2, 0.7 + 2.0 * math.pi * turns / symmetry)
+        pairs = one_pair(token, token, (0.3, -0.2, 0.7), goal, side, side)
+        place, angle, other_side = GRAPH.relation(pairs)
+        assert place.abs().max() < 1e-6
+        assert np.exp(1j * symmetry * angle.item()) == pytest.approx(1.0, abs=1e-5)
+        assert other_side.item() == 0.0
+
+
+def as_seen(points: np.ndarray, pose: np.ndarray, flipped: float) -> np.ndarray:
+    """Points (C, 2) of the world in a token's frame, straight from the definition."""
+    away = ((points - pose[:2]) @ (1.0, 1j)) * np.exp(-1j * pose[2])
+    return away.conj() if flipped else away
+
+
+def same_points(found: np.ndarray, expected: np.ndarray) -> None:
+    """Each point of one set is one of the other."""
+    gap = np.abs(found[:, None] - expected)
+    assert max(gap.min(axis=0).max(), gap.min(axis=1).max()) < 1e-5
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_nodes_lie_at_the_corners_that_the_layout_gives(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    (own, sides), (goals, goal_sides) = random_scene(LAYOUT, rng), random_scene(LAYOUT, rng)
+    pairs = every_pair(own, sides, goals, goal_sides)
+    nodes = GRAPH.node_features(pairs).numpy()
+    corners = LAYOUT.corners(goals, goal_sides)
+    mine = LAYOUT.corners(own, sides)
+    for i, (token, piece) in enumerate(zip(pairs.token, pairs.piece, strict=True)):
+        frame = own[token], float(sides[token])
+        around = nodes[i, 5:, :2] @ (1.0, 1j)
+        same_points(around, as_seen(corners[LAYOUT.corners_of(int(piece))], *frame))
+        same_points(
+            nodes[i, :4, :2] @ (1.0, 1j), as_seen(mine[LAYOUT.corners_of(int(token))], *frame)
+        )
+        centre = as_seen(goals[piece][None, :2], *frame)
+        offsets = nodes[i, 5:, 2:4] @ (1.0, 1j) * LAYOUT.shapes[int(token)].radius
+        np.testing.assert_allclose(offsets, around - centre, atol=1e-5)
+        assert nodes[i, 4, :4].tolist() == [0.0, 0.0, 0.0, 0.0]
+    assert (nodes[..., 4] == [0, 0, 0, 0, 0, 1, 1, 1, 1]).all()
+
+
+def test_the_numbers_of_a_pair_without_nodes() -> None:
+    """Two squares of side 1, the piece at (1, 0) and turned by 0.2, a third of it covered."""
+    side = layout_of("square").shapes[0].corners
+    layout = make_layout(TokensConfig(("square",), 1.0 / np.ptp(side[:, 0]) * 0.6))
+    pairs = one_pair(0, 0, (0.0, 0.0, 0.0), (1.0, 0.0, 0.2))
+    pairs.covered[:] = 1 / 3
+    found = PairGraph(layout, 2.0, AgentConfig()).vectors(pairs)[0].numpy()
+    radius = math.sqrt(0.5)
+    body = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+    corners = (body @ (1.0, 1j)) * np.exp(0.2j) + 1.0
+    kind = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0]
+    expected = [
+        *(1.0, 0.0),
+        *(math.cos(0.8), math.sin(0.8), math.cos(0.2), math.sin(0.2)),
+        *(np.column_stack([corners.real, corners.imag]).ravel() * 0.3 / radius),
+        *(body.ravel() / radius),
+        *kind,
+        *kind,
+        *(0.0, 1 / 3, 0.0, math.exp(-1.0 / radius)),
+    ]
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_what_all_nodes_of_a_pair_are_told() -> None:
+    """A small triangle and, a fifth away, a square of twice its area; nine tenths are covered."""
+    pairs = one_pair(3, SQUARE, (0.1, 0.1, 0.0), (0.3, 0.1, 0.1))
+    near = math.exp(-0.2 / LAYOUT.shapes[3].radius)
+    pairs.covered[:] = 0.9
+    told = GRAPH.node_features(pairs)[0, :, 5:].numpy()
+    expected = [
+        *(math.cos(0.4), math.sin(0.4), math.cos(0.1), math.sin(0.1)),
+        *(0.0, 0.0, 1.0, 0.0, 0.0, 0.0),
+        *(0.0, 0.0, 0.0, 1.0, 0.0, 0.0),
+        *(math.log(2.0), near, 0.9, 0.0),
+    ]
+    np.testing.assert_allclose(told, np.broadcast_to(expected, told.shape), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("shape", "number"),
+    [
+        *((name, i) for i, name in enumerate(KINDS)),
+        ("parallelogram_mirrored", 4),
+        ({"name": "kite", "corners": [[0, 0], [2, -1], [3, 0], [2, 1]]}, 5),
+    ],
+)
+def test_a_tan_has_its_number_in_every_set(shape: Any, number: int) -> None:
+    graph = PairGraph(layout_of("square", shape), 2.0, AgentConfig())
+    assert graph.kind[1].argmax() == number
+    assert graph.kind.sum(dim=1).tolist() == [1.0, 1.0]
+
+
+def test_edges_are_those_of_the_paper() -> None:
+    """Three corners of the token, its base, three of the piece."""
+    own, base, goal = [1, 1, 1], [1], [1, 1, 1]
+    none = [0, 0, 0]
+    expected = [[*own, *base, *none]] * 3 + [[*own, *base, *goal]] + [[*none, *base, *goal]] * 3
+    found = PairGraph(layout_of("small_triangle"), 2.0, AgentConfig()).adjacency.int().numpy()
+    np.testing.assert_array_equal(found, np.array(expected) - np.eye(7, dtype=int))
+
+
+@pytest.mark.parametrize(("option", "less"), [("offsets", 2), ("orientation", 4)])
+def test_an_option_that_is_off_takes_its_features_away(option: str, less: int) -> None:
+    graph = PairGraph(LAYOUT, 2.0, AgentConfig(**{option: False}))
+    pairs = random_pairs(LAYOUT, 0)
+    assert graph.node_features(pairs).shape[-1] == graph.features == GRAPH.features - less
+    assert graph.vectors(pairs).shape[-1] == graph.inputs < GRAPH.inputs
+
+
+def test_without_the_orientation_no_pair_tells_an_angle() -> None:
+    """A turned square piece whose corners are not told apart: only the corners' places differ."""
+    graph = PairGraph(LAYOUT, 2.0, AgentConfig(orientation=False))
+    one, other = (
+        graph.node_features(one_pair(SQUARE, SQUARE, (0, 0, 0), (0.3, 0.1, angle)))[0, 0, 5:]
+        for angle in (0.0, 0.4)
+    )
+    assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_in_the_arenas_frame_nodes_lie_at_the_layouts_corners(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    (own, sides), (goals, goal_sides) = random_scene(LAYOUT, rng), random_scene(LAYOUT, rng)
+    pairs = every_pair(own, sides, goals, goal_sides)
+    graph = PairGraph(LAYOUT, 2.0, AgentConfig(egocentric=False))
+    nodes = graph.node_features(pairs).numpy()
+    mine, corners = LAYOUT.corners(own, sides), LAYOUT.corners(goals, goal_sides)
+    for i, (token, piece) in enumerate(zip(pairs.token, pairs.piece, strict=True)):
+        points = nodes[i, :, :2] @ (1.0, 1j)
+        same_points(points[:4], mine[LAYOUT.corners_of(int(token))] @ (1.0, 1j))
+        same_points(points[5:], corners[LAYOUT.corners_of(int(piece))] @ (1.0, 1j))
+        centre = goals[piece][:2] @ (1.0, 1j)
+        offsets = nodes[i, 5:, 2:4] @ (1.0, 1j) * LAYOUT.shapes[int(token)].radius
+        np.testing.assert_allclose(offsets, points[5:] - centre, atol=1e-5)
+    shift, angle = torch.rand(49, 2), torch.rand(49)
+    velocity = graph.velocity(pairs, shift, angle)
+    assert torch.equal(velocity, torch.column_stack([shift, angle]))
+    assert torch.equal(graph.as_seen(pairs, velocity), velocity)
+
+
+def test_every_node_sees_every_other_where_the_edges_are_complete() -> None:
+    graph = PairGraph(LAYOUT, 2.0, AgentConfig(edges="complete"))
+    np.testing.assert_array_equal(graph.adjacency, ~np.eye(9, dtype=bool))

@@ -1,0 +1,226 @@
+"""Pairs out of transitions: which goals they have, and that their labels are exact."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tangram_agent.coverage import Lying, covered_share, covering, newly_covered
+from tangram_agent.relabelling import PairBatch, make_pairs, with_contacts
+from tangram_agent.setup import Setup
+from tangram_agent.types import Transitions
+from tangram_sim.actions import chosen_tokens
+from tests.agent.builders import setup
+from tests.agent.pair_scenes import seven, transitions
+
+pytestmark = pytest.mark.fast
+
+NONE = {"strategy": "none", "copies": 5}
+# Spreads are for near misses only.
+FINAL = {"strategy": "final", "copies": 1, "position": 0.1, "angle": 0.5}
+NEAR = {"strategy": "near", "copies": 2, "position": 0.05, "angle": 0.3}
+COUNT, PAIRS = 100, 8
+PARALLELOGRAM = 6
+
+
+def made_pairs(hindsight: list[dict[str, Any]], seed: int = 0) -> PairBatch:
+    made = seven({"hindsight": hindsight, "pairs_per_transition": PAIRS})
+    batch = transitions(made, COUNT)
+    return make_pairs(batch, made, np.random.default_rng(seed))
+
+
+MADE = seven()
+LAYOUT = MADE.layout
+BATCH = transitions(MADE, COUNT)
+ROWS = np.repeat(np.arange(COUNT), PAIRS)
+NAMES = np.array([shape.name for shape in LAYOUT.shapes])
+SYMMETRY = np.array([shape.symmetry for shape in LAYOUT.shapes])
+
+
+def is_played(pairs: PairBatch) -> np.ndarray:
+    """Which pairs have the piece of the goal that was played."""
+    goals = LAYOUT.poses(BATCH.goal.astype(np.float64))[ROWS, pairs.piece]
+    played: np.ndarray = np.isclose(goals, pairs.goal).all(axis=1)
+    return played
+
+
+def turn_gap(pairs: PairBatch) -> np.ndarray:
+    """The angle between token and piece, at the nearest of the turns that look alike."""
+    order = SYMMETRY[pairs.piece]
+    gap: np.ndarray = np.angle(np.exp(1j * order * (pairs.goal - pairs.after)[:, 2])) / order
+    return gap
+
+
+def test_the_token_that_moved_before_and_after() -> None:
+    pairs = made_pairs([FINAL])
+    token = chosen_tokens(BATCH.action.astype(np.float64), 7)[ROWS]
+    np.testing.assert_array_equal(pairs.token, token)
+    for name, corners in (("before", BATCH.state), ("after", BATCH.next_state)):
+        exact = corners.astype(np.float64)
+        found = vars(pairs)
+        np.testing.assert_allclose(found[name], LAYOUT.poses(exact)[ROWS, token])
+        sides = LAYOUT.flipped(exact)[ROWS, token]
+        np.testing.assert_array_equal(found[f"{name}_flipped"], sides)
+        assert sides.any()
+
+
+@pytest.mark.parametrize(
+    ("hindsight", "share"),
+    [([], 1.0), ([NONE], 1.0), ([FINAL], 1 / 2), ([FINAL, NEAR], 1 / 4), ([FINAL, NONE], 1 / 2)],
+)
+def test_the_share_of_goals_that_were_played(hindsight: list[Any], share: float) -> None:
+    assert is_played(made_pairs(hindsight)).mean() == pytest.approx(share, abs=0.05)
+
+
+def test_played_pairs_have_any_piece_and_its_exact_covered_share() -> None:
+    pairs = made_pairs([])
+    counts = np.bincount(pairs.piece, minlength=7) / len(ROWS)
+    np.testing.assert_allclose(counts, 1 / 7, atol=0.05)
+    sides = LAYOUT.flipped(BATCH.goal.astype(np.float64))[ROWS, pairs.piece]
+    np.testing.assert_array_equal(pairs.goal_flipped, sides)
+    table = covering(BATCH.state, BATCH.goal, LAYOUT)
+    expected = covered_share(table, LAYOUT)[ROWS, pairs.token, pairs.piece]
+    np.testing.assert_allclose(pairs.covered, expected)
+    assert 0.05 < (expected > 0.1).mean() < 0.95
+
+
+@pytest.mark.parametrize("hindsight", [[], [FINAL, NEAR]])
+def test_values_are_what_is_newly_covered(hindsight: list[Any]) -> None:
+    pairs = made_pairs(hindsight)
+    token = Lying(pairs.token, pairs.after, pairs.after_flipped)
+    piece = Lying(pairs.piece, pairs.goal, pairs.goal_flipped)
+    expected = newly_covered(token, piece, pairs.covered, LAYOUT)
+    np.testing.assert_array_equal(pairs.reward, expected)
+    assert pairs.reward.min() >= 0.0
+    assert pairs.reward.max() <= 1.0
+
+
+def test_hindsight_is_where_the_token_came_to_lie_and_mostly_a_piece_of_its_shape() -> None:
+    pairs = made_pairs([FINAL])
+    hind = ~is_played(pairs)
+    np.testing.assert_array_equal(pairs.goal[hind, :2], pairs.after[hind, :2])
+    np.testing.assert_allclose(turn_gap(pairs)[hind], 0.0, atol=1e-9)
+    own = NAMES[pairs.piece] == NAMES[pairs.token]
+    # Any shape in 15 %, a part of which is the token's own.
+    assert own[hind].mean() == pytest.approx(1 - 0.15 * 38 / 49, abs=0.03)
+    partly = pairs.covered[hind][pairs.covered[hind] > 0.0]
+    assert len(partly) / hind.sum() == pytest.approx(0.3, abs=0.06)
+    # Any share, whatever the goal that was played had.
+    np.testing.assert_allclose([partly.mean(), partly.std()], [0.5, 12**-0.5], atol=0.06)
+    exact = own & hind & (pairs.covered == 0.0) & (pairs.after_flipped == pairs.goal_flipped)
+    np.testing.assert_allclose(pairs.reward[exact], 1.0)
+    assert exact.sum() > 100
+
+
+def test_of_equal_shapes_both_are_named() -> None:
+    pairs = made_pairs([FINAL])
+    hind = ~is_played(pairs) & np.isin(pairs.token, (0, 1))
+    counts = np.bincount(pairs.piece[hind], minlength=7)
+    assert min(counts[:2]) > 0.3 * hind.sum()
+
+
+def test_the_turns_that_look_alike_are_all_drawn() -> None:
+    pairs = made_pairs([FINAL])
+    for piece, symmetry in enumerate(SYMMETRY):
+        hind = ~is_played(pairs) & (pairs.piece == piece)
+        gap = (pairs.goal - pairs.after)[hind, 2] / (2.0 * np.pi / symmetry)
+        assert set(np.round(gap, 6)) == set(range(symmetry))
+
+
+def test_near_misses_have_the_spread_that_is_set() -> None:
+    pairs = made_pairs([NEAR])
+    near = ~is_played(pairs)
+    gap = np.column_stack([(pairs.goal - pairs.after)[:, :2], turn_gap(pairs)])[near]
+    np.testing.assert_allclose(gap.mean(axis=0), 0.0, atol=0.04)
+    # With four turns that look alike the largest misses are nearer to another one.
+    np.testing.assert_allclose(gap.std(axis=0), [0.05, 0.05, 0.29], rtol=0.1)
+
+
+def test_sides_of_hindsight_are_mostly_the_tokens_own() -> None:
+    pairs = made_pairs([FINAL])
+    hind = ~is_played(pairs) & (pairs.token == PARALLELOGRAM) & (pairs.piece == PARALLELOGRAM)
+    same = pairs.goal_flipped[hind] == pairs.after_flipped[hind]
+    assert 0.75 < same.mean() < 1.0
+    assert not pairs.goal_flipped[pairs.piece != PARALLELOGRAM].any()
+
+
+def test_the_same_generator_gives_the_same_pairs() -> None:
+    one, again, other = (made_pairs([FINAL, NEAR], seed) for seed in (3, 3, 4))
+    for name, column in vars(one).items():
+        np.testing.assert_array_equal(column, vars(again)[name])
+    assert not np.array_equal(one.goal, other.goal)
+
+
+def test_the_transitions_stay_as_they_were() -> None:
+    before = {name: column.copy() for name, column in vars(BATCH).items()}
+    made_pairs([FINAL, NEAR])
+    for name, column in vars(BATCH).items():
+        np.testing.assert_array_equal(column, before[name])
+
+
+def test_contacts_name_another_token_and_what_it_lost() -> None:
+    """Every square is pushed along x by so many tenths of its side as its number says."""
+    made = setup({"shapes": ["square"] * 4, "scale": 1.0}, {"pairs_per_transition": PAIRS})
+    layout, side = made.layout, np.sqrt(2.0) / 4.0
+    before = np.column_stack([np.arange(4.0), np.zeros(4), np.full(4, 0.2)])
+    way = 0.1 * side * np.arange(4)[:, None] * (np.cos(0.2), np.sin(0.2))
+    after = before + np.column_stack([way, np.zeros(4)])
+    drawn = transitions(made, COUNT)
+    batch = replace(
+        drawn,
+        state=np.tile(layout.corners(before), (COUNT, 1, 1)).astype(np.float32),
+        next_state=np.tile(layout.corners(after), (COUNT, 1, 1)).astype(np.float32),
+    )
+    pairs = make_pairs(batch, made, np.random.default_rng(0))
+    found = with_contacts(pairs, batch, layout, np.random.default_rng(1))
+    assert (found.other != found.token).all()
+    assert {(t, o) for t, o in zip(found.token, found.other, strict=True)} == {
+        (t, o) for t in range(4) for o in range(4) if t != o
+    }
+    np.testing.assert_allclose(found.pushed, found.other / 10.0, atol=1e-5)
+    np.testing.assert_allclose(found.other_pose, before[found.other], atol=1e-6)
+    assert not found.other_flipped.any()
+    for name, column in vars(pairs).items():
+        assert vars(found)[name] is column
+
+
+def test_a_quarter_of_the_pairs_is_asked_from_where_the_action_ended() -> None:
+    pairs = made_pairs([FINAL, NEAR])
+    again = (pairs.start == pairs.after).all(axis=1) & (pairs.start != pairs.before).any(axis=1)
+    assert again.mean() == pytest.approx(0.25, abs=0.05)
+    np.testing.assert_array_equal(pairs.start[~again], pairs.before[~again])
+    np.testing.assert_array_equal(
+        pairs.start_flipped, np.where(again, pairs.after_flipped, pairs.before_flipped)
+    )
+
+
+def one_token(shape: str) -> tuple[Setup, Transitions, PairBatch]:
+    """Transitions of one token as they come out of the replay, and the pairs made of them."""
+    made = setup({"shapes": [shape], "scale": 0.8}, {"readout": "pair"}, actions_per_token=2)
+    drawn = transitions(made, COUNT)
+    rng = np.random.default_rng(0)
+    reward = rng.uniform(-1.0, 1.0, COUNT).astype(np.float32)
+    done = (rng.random(COUNT) < 0.5).astype(np.uint8)
+    batch = replace(drawn, reward=reward, done=done)
+    return made, batch, make_pairs(batch, made, np.random.default_rng(1))
+
+
+@pytest.mark.parametrize("shape", ["square", "parallelogram", "large_triangle"])
+def test_one_tokens_pairs_are_the_transitions_with_their_reward(shape: str) -> None:
+    made, batch, pairs = one_token(shape)
+    layout = made.layout
+    np.testing.assert_array_equal(pairs.reward, batch.reward)
+    np.testing.assert_array_equal(pairs.done, batch.done)
+    np.testing.assert_array_equal(pairs.velocity, batch.action)
+    assert not pairs.covered.any()
+    goals, sides = layout.poses(batch.goal.astype(np.float64)), layout.flipped(batch.goal)
+    np.testing.assert_array_equal(pairs.goal_flipped, sides[:, 0])
+    np.testing.assert_array_equal(pairs.goal[:, :2], goals[:, 0, :2])
+    order = layout.shapes[0].symmetry
+    turns = (pairs.goal - goals[:, 0])[:, 2] * order / (2.0 * np.pi)
+    assert set(np.round(turns, 9)) == set(range(order))
+    for name, corners in (("before", batch.state), ("after", batch.next_state)):
+        exact = corners.astype(np.float64)
+        np.testing.assert_allclose(vars(pairs)[name], layout.poses(exact)[:, 0])
+        np.testing.assert_array_equal(vars(pairs)[f"{name}_flipped"], layout.flipped(exact)[:, 0])
