@@ -1,0 +1,139 @@
+"""Delivery: what arrives, which batches of one incarnation were seen, what to do with the next.
+
+A worker numbers its batches from 1 within an incarnation, sends them in order, and again until they
+are acknowledged. So one integer tells old from new, and with the incarnation it is all that a
+checkpoint must keep for exactly-once inserts.
+
+A batch is done with in one of two ways. It was inserted, and is acknowledged. Or it came intact and
+its content is wrong: it is consumed, and refused for good, for it would be as wrong when it came
+again, and a broken worker must not send it for ever. A message that was damaged on its way is
+neither: nothing in it is believed, its number least of all, and what was meant comes again.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+
+from tangram_agent.messages import Ack, EpisodeBatch, Reject, Scores
+from tangram_agent.types import Episodes
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodesArrived:
+    """A new batch that waits for its insert; its arrays are read-only.
+
+    Attributes:
+        role, index, incarnation: of its sender.
+        batch: as it was read.
+        frames: as they came, for the journal.
+    """
+
+    role: str
+    index: int
+    incarnation: int
+    batch: EpisodeBatch
+    frames: Sequence[bytes]
+
+    @property
+    def sequence(self) -> int:
+        """Number of the batch."""
+        return self.batch.sequence
+
+    @property
+    def weights_version(self) -> int:
+        """Of the weights that played it."""
+        return self.batch.weights_version
+
+    @property
+    def episodes(self) -> Episodes:
+        """What was played."""
+        return self.batch.episodes
+
+
+@dataclass(frozen=True, eq=False)
+class ScoresArrived:
+    """Results of an evaluator."""
+
+    index: int
+    incarnation: int
+    scores: Scores
+
+
+Arrival = EpisodesArrived | ScoresArrived
+
+
+class Verdict(Enum):
+    """What to do with a batch; the values name the counters.
+
+    NEW: insert it. HELD: it came before and is not inserted yet. INSERTED: it was inserted before.
+    GAP: one before it is missing. EXCESS: too many are unacknowledged.
+    """
+
+    NEW = "new"
+    HELD = "held_duplicates"
+    INSERTED = "duplicates"
+    GAP = "gaps"
+    EXCESS = "over_window"
+
+
+@dataclass(eq=False)
+class Ledger:
+    """Batches of one incarnation; it outlives connections.
+
+    Attributes:
+        incarnation: whose batches these are.
+        received: number of the last batch that was taken or finally refused.
+        process: random id of the process, empty where a checkpoint does not know it.
+        held: taken, not inserted yet.
+    """
+
+    incarnation: int
+    received: int = 0
+    process: str = ""
+    held: set[int] = field(default_factory=set)
+
+    @property
+    def inserted(self) -> int:
+        """Number of the last batch up to which nothing is held."""
+        return min(self.held, default=self.received + 1) - 1
+
+    def judge(self, sequence: int, window: int) -> Verdict:
+        """What to do with a batch of this number, when at most `window` may be held."""
+        if sequence <= self.received:
+            return Verdict.HELD if sequence in self.held else Verdict.INSERTED
+        if sequence > self.received + 1:
+            return Verdict.GAP
+        return Verdict.EXCESS if len(self.held) >= window else Verdict.NEW
+
+    def answer(self, verdict: Verdict, sequence: int) -> Ack | Reject | None:
+        """What the worker is told of a batch that is not inserted now."""
+        if verdict is Verdict.INSERTED:
+            return Ack(sequence, duplicate=True)
+        if verdict is Verdict.GAP:
+            why = f"batch {self.received + 1} must come first"
+        elif verdict is Verdict.EXCESS:
+            why = f"{len(self.held)} batches are unacknowledged, the most there may be"
+        else:
+            return None  # acknowledged after its insert
+        return Reject(reason=f"batch {sequence}: {why}", sequence=sequence, final=False)
+
+    def take(self, sequence: int) -> None:
+        """The next batch is handed on for insertion."""
+        self.consume(sequence)
+        self.held.add(sequence)
+
+    def release(self, sequence: int) -> bool:
+        """A batch that was taken is inserted now; False if it was not held."""
+        held = sequence in self.held
+        self.held.discard(sequence)
+        return held
+
+    def consume(self, sequence: int) -> None:
+        """The next batch is done with, without an insert."""
+        self.received = sequence
+
+    def skip_to(self, sequence: int) -> int:
+        """Go on at this number; returns how many batches before it were never received."""
+        missing = max(0, sequence - 1 - self.received)
+        self.received += missing
+        return missing

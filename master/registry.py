@@ -1,0 +1,257 @@
+"""Who takes part: indices, incarnations and connections; no sockets.
+
+Each role counts its own indices. A new process of an index gets the next incarnation and wins over
+the older one; a process that comes back after the master was restarted keeps what it had.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from master.delivery import EpisodesArrived, Ledger
+from tangram_agent.messages import MAX_INDEX, ROLES, Hello, Refused, Stop
+from tangram_agent.schema import MAX_COUNT
+from tangram_sim.errors import RunError, TangramError
+
+MAX_PEERS = 4096
+Key = tuple[str, int]
+
+
+class RefusedError(TangramError):
+    """A process that may not take part.
+
+    Attributes:
+        counter: that counts such refusals.
+        answer: to the process.
+    """
+
+    def __init__(self, counter: str, answer: Refused | Stop) -> None:
+        super().__init__(answer.reason)
+        self.counter, self.answer = counter, answer
+
+
+@dataclass(eq=False)
+class Peer:
+    """A connected process.
+
+    Attributes:
+        role, index: its key.
+        incarnation: of its index.
+        process: its random id.
+        identity: of its connection.
+        last_seen: monotonic seconds.
+        ledger: of its batches.
+        stats: numbers of its last heartbeat.
+        weights_version: that its last batch was played with.
+        batches, episodes, transitions: inserted since it joined.
+        damaged: messages in a row that were damaged on their way.
+    """
+
+    role: str
+    index: int
+    incarnation: int
+    process: str
+    identity: bytes
+    last_seen: float
+    ledger: Ledger
+    stats: dict[str, float] = field(default_factory=dict)
+    weights_version: int = -1
+    batches: int = 0
+    episodes: int = 0
+    transitions: int = 0
+    damaged: int = 0
+
+    def inserted(self, arrival: EpisodesArrived) -> None:
+        """Count a batch of its own."""
+        self.batches += 1
+        self.episodes += arrival.episodes.count
+        self.transitions += arrival.episodes.transitions
+
+    @property
+    def key(self) -> Key:
+        """Role and index."""
+        return self.role, self.index
+
+    @property
+    def name(self) -> str:
+        """For messages to people."""
+        return f"{self.role} {self.index}"
+
+
+class Registry:
+    """Peers by connection and by index, and the ledgers that a checkpoint keeps.
+
+    Attributes:
+        lost_batches: numbers that a checkpoint had not seen and a worker has no more.
+    """
+
+    def __init__(self, fingerprints: Mapping[str, str], grace_s: float) -> None:
+        """Nobody takes part yet.
+
+        Args:
+            fingerprints: section of the settings -> digest; a process must have the same.
+            grace_s: after a restart, how long indices wait for their workers.
+        """
+        self.lost_batches = 0
+        self._fingerprints = fingerprints
+        self._grace_s, self._reserved_until = grace_s, 0.0
+        self._by_identity: dict[bytes, Peer] = {}
+        self._by_key: dict[Key, Peer] = {}
+        self._ledgers: dict[Key, Ledger] = {}
+
+    @property
+    def peers(self) -> list[Peer]:
+        """Live ones, by role and index."""
+        return [self._by_key[key] for key in sorted(self._by_key)]
+
+    def find(self, identity: bytes) -> Peer | None:
+        """The peer of a connection."""
+        return self._by_identity.get(identity)
+
+    def at(self, key: Key) -> Peer | None:
+        """The peer of an index."""
+        return self._by_key.get(key)
+
+    def ledger(self, key: Key, incarnation: int) -> Ledger | None:
+        """The batches of an incarnation, unless a newer one has begun."""
+        ledger = self._ledgers.get(key)
+        return ledger if ledger is not None and ledger.incarnation == incarnation else None
+
+    def admit(self, identity: bytes, hello: Hello, now: float) -> tuple[Peer, Peer | None]:
+        """Take a process in: the newest of an index wins.
+
+        Returns:
+            The peer, and the older process that it took the index from.
+
+        Raises:
+            RefusedError: other settings, too many peers, or an index that belongs to a newer
+                incarnation.
+        """
+        self._check_settings(hello)
+        same = next((p for p in self._by_key.values() if p.process == hello.process), None)
+        if same is not None and same.role == hello.role:
+            # A HELLO again, because WELCOME was late or the connection is a new one.
+            self._by_identity.pop(same.identity, None)
+            same.identity, same.last_seen = identity, now
+            self._by_identity[identity] = same
+            return same, None
+        if len(self._by_key) >= MAX_PEERS:
+            reason = f"{MAX_PEERS} processes take part already, the most there can be"
+            raise RefusedError("refused_full", Refused(reason))
+        stranger = self._by_identity.get(identity)
+        if stranger is not None:
+            self.leave(stranger)
+        index = hello.index if hello.index >= 0 else self._free_index(hello.role, now)
+        key = (hello.role, index)
+        ledger = self._open_ledger(key, hello)
+        older = self._by_key.get(key)
+        if older is not None:
+            self.leave(older)
+        peer = Peer(hello.role, index, ledger.incarnation, hello.process, identity, now, ledger)
+        self._by_identity[identity] = self._by_key[key] = peer
+        return peer, older
+
+    def leave(self, peer: Peer) -> None:
+        """Forget a connection; its ledger stays."""
+        self._by_identity.pop(peer.identity, None)
+        self._by_key.pop(peer.key, None)
+
+    def drop_silent(self, now: float, silence_s: float) -> list[Peer]:
+        """Forget the peers that were not heard of for so long, and return them."""
+        silent = [p for p in self._by_key.values() if now - p.last_seen > silence_s]
+        for peer in silent:
+            self.leave(peer)
+        return silent
+
+    def state(self) -> dict[str, dict[str, int]]:
+        """Last incarnation and last inserted batch of each index, for a checkpoint."""
+        return {
+            f"{role}/{index}": {"incarnation": ledger.incarnation, "sequence": ledger.inserted}
+            for (role, index), ledger in sorted(self._ledgers.items())
+        }
+
+    def load_state(self, state: Mapping[str, Mapping[str, int]], now: float) -> None:
+        """Take the ledgers of a checkpoint; their indices wait for their workers for a while.
+
+        Raises:
+            RunError: malformed.
+        """
+        self._ledgers = {_key(name): _ledger(name, entry) for name, entry in state.items()}
+        self._reserved_until = now + self._grace_s
+
+    def recover(self, key: Key, incarnation: int, sequence: int, now: float) -> bool:
+        """Note a batch of the journal as inserted; False if the table has it already."""
+        ledger = self._ledgers.get(key)
+        if ledger is None or incarnation > ledger.incarnation:
+            ledger = self._ledgers[key] = Ledger(incarnation)
+        if incarnation < ledger.incarnation or sequence <= ledger.received:
+            return False
+        ledger.consume(sequence)
+        self._reserved_until = now + self._grace_s
+        return True
+
+    def _check_settings(self, hello: Hello) -> None:
+        odd = differing(self._fingerprints, hello.fingerprints)
+        if not odd:
+            return
+        listed = ", ".join(odd)
+        reason = (
+            f"its settings of {listed} differ from the master's: start both with the same "
+            f"overrides of {listed}"
+        )
+        counter = "refused_tokens" if "tokens" in odd else "refused_settings"
+        raise RefusedError(counter, Refused(reason))
+
+    def _free_index(self, role: str, now: float) -> int:
+        reserved = self._ledgers if now < self._reserved_until else {}
+        for index in range(MAX_INDEX + 1):
+            if (role, index) not in self._by_key and (role, index) not in reserved:
+                return index
+        reason = f"all {MAX_INDEX + 1} indices of role {role} are taken"
+        raise RefusedError("refused_full", Refused(reason))
+
+    def _open_ledger(self, key: Key, hello: Hello) -> Ledger:
+        last = self._ledgers.get(key)
+        if last is None or hello.incarnation > last.incarnation:
+            # A first one, or the checkpoint is older than this incarnation: go on where it is.
+            ledger = Ledger(max(1, hello.incarnation), hello.first - 1)
+        elif hello.incarnation == 0:
+            if last.incarnation == MAX_COUNT:
+                reason = f"{key[0]} {key[1]} has no incarnation left: start with another index"
+                raise RefusedError("refused_full", Refused(reason))
+            ledger = Ledger(last.incarnation + 1, hello.first - 1)
+        elif hello.incarnation < last.incarnation or last.process not in ("", hello.process):
+            reason = (
+                f"{key[0]} {key[1]} was taken over by a newer process "
+                f"(incarnation {last.incarnation}, this is {hello.incarnation})"
+            )
+            raise RefusedError("superseded", Stop(reason))
+        else:
+            ledger = last
+            # Acknowledged after the checkpoint was written, so the worker has them no more.
+            self.lost_batches += ledger.skip_to(hello.first)
+        ledger.process = hello.process
+        self._ledgers[key] = ledger
+        return ledger
+
+
+def differing(ours: Mapping[str, str], theirs: Mapping[str, str]) -> list[str]:
+    """Names of the sections whose digests are not equal."""
+    return sorted(n for n in ours.keys() | theirs.keys() if ours.get(n) != theirs.get(n))
+
+
+def _key(name: str) -> Key:
+    role, _, index = name.partition("/")
+    if role not in ROLES or not index.isdecimal() or int(index) > MAX_INDEX:
+        raise RunError(f"the checkpoint's table of workers has the unknown key '{name}'")
+    return role, int(index)
+
+
+def _ledger(name: str, entry: Mapping[str, int]) -> Ledger:
+    incarnation, sequence = entry.get("incarnation"), entry.get("sequence")
+    for value, low in ((incarnation, 1), (sequence, 0)):
+        if type(value) is not int or not low <= value <= MAX_COUNT:
+            raise RunError(
+                f"the checkpoint's entry of {name} must hold an incarnation from 1 and a sequence "
+                f"from 0, both to {MAX_COUNT}, got {dict(entry)}"
+            )
+    return Ledger(int(incarnation or 0), int(sequence or 0))

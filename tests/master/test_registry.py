@@ -1,0 +1,240 @@
+"""Indices and incarnations: who gets which, who wins, and what a checkpoint keeps."""
+
+import json
+from typing import Any
+
+import pytest
+
+from master.registry import MAX_PEERS, Peer, RefusedError, Registry, differing
+from tangram_agent.schema import MAX_COUNT
+from tangram_sim.errors import RunError
+from tests.agent.messages import FINGERPRINTS, hello
+
+pytestmark = pytest.mark.fast
+
+GRACE_S = 30.0
+
+
+def admitted(registry: Registry, name: str, now: float = 0.0, **fields: Any) -> Peer:
+    """Admit a process whose connection has its own name."""
+    return registry.admit(name.encode(), hello(process=name, **fields), now)[0]
+
+
+def restored(registry: Registry, now: float = 0.0) -> Registry:
+    """The registry of a master that was restarted from its checkpoint."""
+    fresh = Registry(FINGERPRINTS, GRACE_S)
+    fresh.load_state(json.loads(json.dumps(registry.state())), now)
+    return fresh
+
+
+def test_any_index_is_the_lowest_that_is_free_within_the_role() -> None:
+    registry = Registry(FINGERPRINTS, GRACE_S)
+    asked = [("a", -1), ("b", 2), ("c", -1), ("d", -1)]
+    assert [admitted(registry, n, index=i).index for n, i in asked] == [0, 2, 1, 3]
+    assert admitted(registry, "e", role="evaluator").index == 0
+    registry.leave(registry.peers[2])  # player 1
+    fresh = admitted(registry, "f")
+    assert (fresh.index, fresh.incarnation) == (1, 2)
+    assert [p.name for p in registry.peers] == [
+        "evaluator 0",
+        "player 0",
+        "player 1",
+        "player 2",
+        "player 3",
+    ]
+
+
+def test_the_newest_process_of_an_index_wins() -> None:
+    registry = Registry(FINGERPRINTS, GRACE_S)
+    old = admitted(registry, "a", index=3)
+    new, taken_from = registry.admit(b"b", hello(index=3, process="b"), 0.0)
+    assert taken_from is old
+    assert (new.incarnation, registry.peers) == (2, [new])
+    assert registry.find(b"a") is None
+    with pytest.raises(RefusedError, match="taken over") as caught:
+        admitted(registry, "a", index=3, incarnation=1)
+    assert str(caught.value) == (
+        "player 3 was taken over by a newer process (incarnation 2, this is 1)"
+    )
+    assert registry.peers == [new]
+
+
+def test_a_hello_again_changes_nothing_but_the_connection() -> None:
+    registry = Registry(FINGERPRINTS, GRACE_S)
+    first = admitted(registry, "a")
+    first.ledger.take(1)
+    again, taken_from = registry.admit(b"other", hello(process="a"), 9.0)
+    assert (again, taken_from, again.identity, again.last_seen) == (first, None, b"other", 9.0)
+    assert (registry.find(b"a"), registry.find(b"other")) == (None, first)
+    assert first.ledger.held == {1}
+
+
+def test_a_connection_belongs_to_one_process() -> None:
+    registry = Registry(FINGERPRINTS, GRACE_S)
+    admitted(registry, "a")
+    second, _ = registry.admit(b"a", hello(process="b"), 0.0)
+    assert registry.peers == [second]
+    assert registry.find(b"a") is second
+
+
+def test_the_silent_are_forgotten_but_not_their_batches() -> None:
+    registry = Registry(FINGERPRINTS, GRACE_S)
+    peer = admitted(registry, "a", now=0.0)
+    peer.ledger.take(1)
+    busy = admitted(registry, "b", now=5.0)
+    assert registry.drop_silent(10.0, silence_s=10.0) == []
+    assert registry.drop_silent(10.1, silence_s=10.0) == [peer]
+    assert registry.peers == [busy]
+    back = admitted(registry, "a", index=0, incarnation=1)
+    assert (back.incarnation, back.ledger.held) == (1, {1})
+
+
+def test_a_checkpoint_keeps_incarnations_and_inserted_batches() -> None:
+    registry = Registry(FINGERPRINTS, GRACE_S)
+    peer = admitted(registry, "a", index=4)
+    for sequence in (1, 2, 3):
+        peer.ledger.take(sequence)
+    peer.ledger.held -= {1, 3}
+    admitted(registry, "e", role="evaluator")
+    assert registry.state() == {
+        "evaluator/0": {"incarnation": 1, "sequence": 0},
+        "player/4": {"incarnation": 1, "sequence": 1},
+    }
+    # The worker comes back and sends again what the checkpoint has not.
+    back = admitted(restored(registry), "a", index=4, incarnation=1, first=2)
+    assert (back.incarnation, back.ledger.received, back.ledger.held) == (1, 1, set())
+
+
+def test_after_a_restart_a_new_process_does_not_repeat_an_incarnation() -> None:
+    registry = Registry(FINGERPRINTS, GRACE_S)
+    admitted(registry, "a", index=4)
+    assert admitted(restored(registry), "b", index=4).incarnation == 2
+
+
+def test_after_a_restart_an_older_process_is_still_the_older() -> None:
+    registry = Registry(FINGERPRINTS, GRACE_S)
+    admitted(registry, "a", index=0)
+    admitted(registry, "b", index=0)
+    after = restored(registry)
+    with pytest.raises(RefusedError, match="taken over"):
+        admitted(after, "a", index=0, incarnation=1)
+    assert admitted(after, "b", index=0, incarnation=2).incarnation == 2
+
+
+def test_after_a_restart_indices_wait_for_their_workers_for_a_while() -> None:
+    registry = Registry(FINGERPRINTS, GRACE_S)
+    admitted(registry, "a")
+    soon, late = restored(registry, now=100.0), restored(registry, now=100.0)
+    assert admitted(soon, "new", now=100.0 + GRACE_S - 1).index == 1
+    assert admitted(soon, "a", now=100.0 + GRACE_S - 1, index=0, incarnation=1).index == 0
+    assert admitted(late, "new", now=100.0 + GRACE_S).index == 0
+
+
+def test_what_a_checkpoint_missed_is_counted_not_waited_for() -> None:
+    registry = Registry(FINGERPRINTS, GRACE_S)
+    admitted(registry, "a").ledger.take(1)
+    registry.peers[0].ledger.held.clear()
+    after = restored(registry)
+    back = admitted(after, "a", index=0, incarnation=1, first=4)
+    assert (back.ledger.received, after.lost_batches) == (3, 2)
+
+
+def test_an_incarnation_newer_than_the_checkpoint_goes_on_where_it_is() -> None:
+    registry = Registry(FINGERPRINTS, GRACE_S)
+    back = admitted(registry, "a", index=2, incarnation=7, first=12)
+    assert (back.incarnation, back.ledger.received, registry.lost_batches) == (7, 11, 0)
+
+
+def test_incarnations_end_where_messages_could_not_tell_them() -> None:
+    registry = Registry(FINGERPRINTS, GRACE_S)
+    admitted(registry, "a", index=0, incarnation=MAX_COUNT - 1)
+    assert admitted(registry, "b", index=0).incarnation == MAX_COUNT
+    with pytest.raises(RefusedError, match="player 0 has no incarnation left: start with another"):
+        admitted(registry, "c", index=0)
+    assert admitted(registry, "c").incarnation == 1
+
+
+def test_two_processes_never_share_an_incarnation() -> None:
+    """Both were given the same by masters that did not know of each other's."""
+    registry = Registry(FINGERPRINTS, GRACE_S)
+    first = admitted(registry, "a", index=0, incarnation=1)
+    registry.leave(first)
+    with pytest.raises(RefusedError, match="taken over"):
+        admitted(registry, "b", index=0, incarnation=1)
+
+
+def test_batches_of_an_older_incarnation_have_no_ledger() -> None:
+    registry = Registry(FINGERPRINTS, GRACE_S)
+    old = admitted(registry, "a", index=0)
+    assert registry.ledger(old.key, 1) is old.ledger
+    admitted(registry, "b", index=0)
+    assert registry.ledger(old.key, 1) is None
+    assert registry.ledger(("player", 9), 1) is None
+
+
+def test_there_is_a_limit() -> None:
+    registry = Registry(FINGERPRINTS, GRACE_S)
+    for number in range(MAX_PEERS):
+        peer = Peer("player", number, 1, f"p{number}", b"", 0.0, None)  # type: ignore[arg-type]
+        registry._by_key[peer.key] = peer
+    with pytest.raises(RefusedError, match=f"{MAX_PEERS} processes take part already"):
+        admitted(registry, "one more")
+
+
+@pytest.mark.parametrize(
+    ("state", "reason"),
+    [
+        ({"player": {}}, "the checkpoint's table of workers has the unknown key 'player'"),
+        ({"spy/1": {}}, "the checkpoint's table of workers has the unknown key 'spy/1'"),
+        ({"player/-1": {}}, "the checkpoint's table of workers has the unknown key 'player/-1'"),
+        ({"player/65536": {}}, "the checkpoint's table of workers has the unknown key 'player/6"),
+        ({"player/0": {"incarnation": 1}}, "the checkpoint's entry of player/0 must hold an inca"),
+        ({"player/0": {"incarnation": 0, "sequence": 0}}, "the checkpoint's entry of player/0 m"),
+        ({"player/0": {"incarnation": 1, "sequence": -1}}, "the checkpoint's entry of player/0 "),
+        ({"player/0": {"incarnation": "1", "sequence": 0}}, "the checkpoint's entry of player/0"),
+        ({"player/0": {"incarnation": MAX_COUNT + 1, "sequence": 0}}, "the checkpoint's entry of"),
+        ({"player/0": {"incarnation": 1, "sequence": MAX_COUNT + 1}}, "the checkpoint's entry of"),
+    ],
+)
+def test_malformed_tables_are_refused(state: Any, reason: str) -> None:
+    with pytest.raises(RunError) as caught:
+        Registry(FINGERPRINTS, GRACE_S).load_state(state, 0.0)
+    assert str(caught.value).startswith(reason)
+
+
+@pytest.mark.parametrize(
+    ("theirs", "names"),
+    [
+        ({"tokens": "a", "sim": "b"}, []),
+        ({"tokens": "x", "sim": "b"}, ["tokens"]),
+        ({"tokens": "x", "sim": "x"}, ["sim", "tokens"]),
+        ({"tokens": "a"}, ["sim"]),
+        ({"tokens": "a", "sim": "b", "net": "c"}, ["net"]),
+    ],
+)
+def test_sections_that_differ_are_named(theirs: dict[str, str], names: list[str]) -> None:
+    assert differing({"tokens": "a", "sim": "b"}, theirs) == names
+
+
+def test_batches_of_the_journal_are_new_once() -> None:
+    registry = Registry(FINGERPRINTS, GRACE_S)
+    registry.load_state({"player/0": {"incarnation": 2, "sequence": 5}}, 0.0)
+    known, new = ("player", 0), ("player", 1)
+    found = [
+        registry.recover(known, 1, 9, 0.0),  # of a process that was taken over before
+        registry.recover(known, 2, 5, 0.0),  # in the checkpoint
+        registry.recover(known, 2, 6, 0.0),
+        registry.recover(known, 2, 6, 0.0),
+        registry.recover(known, 2, 8, 0.0),  # 7 was refused for good, so the journal has it not
+        registry.recover(known, 3, 1, 0.0),
+        registry.recover(new, 1, 1, 0.0),
+    ]
+    assert found == [False, False, True, False, True, True, True]
+    assert registry.state() == {
+        "player/0": {"incarnation": 3, "sequence": 1},
+        "player/1": {"incarnation": 1, "sequence": 1},
+    }
+    # They wait for their workers like those of a checkpoint.
+    assert admitted(registry, "a", now=1.0).index == 2
+    again = admitted(registry, "b", now=1.0, index=1, incarnation=1, first=2)
+    assert (again.incarnation, again.ledger.inserted) == (1, 1)
