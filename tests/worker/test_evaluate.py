@@ -138,6 +138,7 @@ def test_puzzles_of_a_file_are_scored_together_and_one_by_one(
 
 
 def test_settings_of_the_agents_play_are_played_and_written_down(tmp_path: Path) -> None:
+    write_run(tmp_path / "run", GAME, sim=SIM, agent={"reapply": 0})
     trained = evaluated(tmp_path, puzzles="test")
     listed = evaluated(tmp_path, puzzles="test", order="listed", reapply=1, refine_steps=2)
     assert (trained["order"], trained["reapply"], trained["refine_steps"]) == ("learned", 0, 0)
