@@ -118,6 +118,7 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "agent.refine_rate": (REFINED, 0.02),
     "agent.pairs_per_transition": (SEVERAL, 2),
     "agent.gamma": (PAPER, 0.5),
+    "agent.push_weight": (SLIDE, 0.5),
     "agent.polyak": (PAPER, 0.5),
     "agent.acting_average": (ONE, 0.0),
     "agent.actor_lr": (ONE, 1e-2),
