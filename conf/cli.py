@@ -1,6 +1,6 @@
 """The entry of every command: config, overrides, --help, and errors as one line.
 
-Only `yaml` is loaded before the command line is known to be in order, so --help is instant.
+Nothing heavy is loaded before the command line is known to be in order, so --help is instant.
 """
 
 import difflib
@@ -8,13 +8,15 @@ import os
 import re
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from conf.help import Plain, choices, command_name, help_text, setting_names
+from conf.commands import COMMANDS, GROUPS, Plain
+from conf.help import choices, group_help, help_text, setting_names
 from conf.names import hidden, revealed
 from conf.sweep import LAUNCHER, SWEEP, check_launcher, refuse_lost_job
 from tangram_sim.errors import ConfigError, TangramError
@@ -26,6 +28,7 @@ USAGE_STATUS = 2
 INTERRUPT_STATUS = 130
 CFG_KINDS = ("job", "hydra", "all")
 FLAGS = ("--cfg", *SWEEP)
+OWN_PRESETS = ("--config-dir", "-cd")
 MAKE_RUNS = ("train", "master")  # the commands whose run_dir is made, not read
 MISSING_HINTS = {
     "runs": "say which study: runs=runs/experiments/laptop",
@@ -37,7 +40,7 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
     """Run a command and return its exit status.
 
     Args:
-        config_name: primary config in this package, without .yaml.
+        config_name: of the command, see `conf.commands.COMMANDS`.
         task: takes the resolved config as plain containers and returns the exit status.
         stored: the groups of a run that the settings name otherwise than by `from_config`.
 
@@ -45,16 +48,19 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
         The task's status; 2 after a TangramError or a wrong command line, which are told in one
         line on stderr; 130 after an interrupt.
     """
-    command = command_name(config_name)
+    command = COMMANDS[config_name].name
     arguments = sys.argv[1:]
-    if {"-h", "--help"} & set(arguments):
-        print(help_text(config_name))
-        return 0
     if "--version" in arguments:
         print(f"{command} {version('tangram-rl')}")
         return 0
     try:
-        sys.argv[1:] = hidden(_options_first(arguments), config_name)
+        folder, arguments = _own_presets(arguments)
+        if {"-h", "--help"} & set(arguments):
+            asked = [name for name in arguments if name in COMMANDS[config_name].sections()]
+            print(group_help(asked[0], folder) if asked else help_text(config_name, folder))
+            return 0
+        options = [] if folder is None else [OWN_PRESETS[0], folder]
+        sys.argv[1:] = [*options, *hidden(_options_first(arguments), config_name)]
         check_launcher(sys.argv[1:])
         return _run(config_name, task, stored)
     except TangramError as error:
@@ -62,6 +68,37 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
         return USAGE_STATUS
     except KeyboardInterrupt:
         return INTERRUPT_STATUS
+
+
+def _own_presets(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
+    """The folder of the user's own presets, None if none is named, and the other arguments.
+
+    Raises:
+        ConfigError: no such folder, or a preset that is called as one of ours: hydra would take
+            ours without a word.
+    """
+    rest = [text for argument in arguments for text in _split_option(argument)]
+    at = [number for number, text in enumerate(rest) if text in OWN_PRESETS]
+    if not at:
+        return None, rest
+    if len(at) > 1 or at[0] + 1 == len(rest):
+        raise ConfigError(f"{OWN_PRESETS[0]} takes one folder, as in {OWN_PRESETS[0]} my_presets")
+    folder = Path(rest[at[0] + 1]).expanduser().absolute()
+    if not folder.is_dir():
+        raise ConfigError(f"{OWN_PRESETS[0]}: there is no folder {folder}")
+    for group in (*GROUPS, "experiment", "budget"):
+        taken = {path.stem for path in (folder / group).glob("*.yaml")} & set(choices(group))
+        if taken:
+            raise ConfigError(
+                f"{folder}/{group}/{min(taken)}.yaml is called as a preset that comes with "
+                "tangram-rl: rename it"
+            )
+    return str(folder), rest[: at[0]] + rest[at[0] + 2 :]
+
+
+def _split_option(argument: str) -> list[str]:
+    name, sign, value = argument.partition("=")
+    return [name, value] if sign and name in OWN_PRESETS else [argument]
 
 
 def _options_first(arguments: Sequence[str]) -> list[str]:
@@ -85,9 +122,20 @@ def _options_first(arguments: Sequence[str]) -> list[str]:
             overrides.append(argument)
     if options[-1:] == ["--cfg"]:
         options.append("job")
+    for override in overrides:
+        _refuse_several(override)
     if len(set(FLAGS) & set(options)) > 1:
         raise ConfigError("--cfg and --multirun do not go together: leave one out")
     return [*options, *overrides]
+
+
+def _refuse_several(override: str) -> None:
+    """Refuse a list of presets: hydra would merge them, so that [square,square] is one square."""
+    group, _, value = override.partition("=")
+    if group not in GROUPS or not value.startswith("["):
+        return
+    remedy = f"; for several tokens write tokens.shapes={value}" if group == "tokens" else ""
+    raise ConfigError(f"{group} takes one preset, got {value}{remedy}")
 
 
 def _run(config_name: str, task: Callable[[Plain], int], stored: Stored | None) -> int:
@@ -112,11 +160,12 @@ def _run(config_name: str, task: Callable[[Plain], int], stored: Stored | None) 
 
     # Without it hydra prints errors of the command line itself, over several lines.
     os.environ["HYDRA_FULL_ERROR"] = "1"
+    _register(config_name)
     try:
         hydra.main(version_base="1.3", config_path="pkg://conf", config_name=config_name)(job)()
     except TangramError:
         raise
-    except (HydraException, OmegaConfBaseException, ValueError) as error:
+    except (HydraException, OmegaConfBaseException, ValueError, yaml.YAMLError) as error:
         raise ConfigError(_explain(error, config_name)) from error
     except SystemExit:
         if not errors:
@@ -184,21 +233,41 @@ def _plain(config: Any, stored: Stored | None, config_name: str) -> Plain:
 
 
 def composed(config_name: str, overrides: Sequence[str]) -> Plain:
-    """The config that another command would make of its arguments; only inside of a task.
+    """The config that a command makes of its arguments; within a task its own presets are known.
 
     Raises:
         ConfigError: an argument that it would refuse.
     """
     import hydra
+    from hydra.core.global_hydra import GlobalHydra
     from hydra.errors import HydraException
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
+    _register(config_name)
+    alone = not GlobalHydra().is_initialized()
     try:
-        config = hydra.compose(config_name, list(overrides))
-        return _mapping(OmegaConf.to_container(config, resolve=True))
+        with hydra.initialize_config_module("conf", version_base="1.3") if alone else nullcontext():
+            config = hydra.compose(config_name, hidden(overrides, config_name))
+        settings = _mapping(OmegaConf.to_container(config, resolve=True))
+        return revealed(settings, config_name)
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(_explain(error, config_name)) from error
+
+
+def own_presets() -> str | None:
+    """The folder that --config-dir named; only inside of a task."""
+    from hydra.core.hydra_config import HydraConfig
+
+    sources = HydraConfig.get().runtime.config_sources
+    return next((str(one.path) for one in sources if one.provider == "command-line"), None)
+
+
+def _register(config_name: str) -> None:
+    """Tell hydra of a command: its defaults list, and the defaults that its settings declare."""
+    from hydra.core.config_store import ConfigStore
+
+    ConfigStore.instance().store(name=config_name, node=COMMANDS[config_name].node())
 
 
 def _mapping(container: object) -> Plain:

@@ -1,103 +1,126 @@
-"""What --help prints, read from this package's YAML files, so that it cannot go stale.
+"""What --help prints, made of what the settings' declarations say, so that it cannot go stale.
 
-Only `yaml` is needed for it: a command's help does not wait for hydra.
+Hydra is not loaded for it: a command's help does not wait.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import Field
 from importlib.resources import files
-from importlib.resources.abc import Traversable
+from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
-import yaml
+from conf.commands import COMMANDS, GROUPS, Command, load, plain_default
+from tangram_sim.settings import KEY, Declaration, declared_fields, told
 
-Plain = dict[str, Any]
-
-
-def command_name(config_name: str) -> str:
-    """The console script that a primary config belongs to."""
-    name: str = _primary(config_name)["hydra"]["help"]["app_name"]
-    return name
+WIDTH = 96
 
 
-def help_text(config_name: str) -> str:
-    """What --help prints: purpose, groups, settings and examples, all from the package's files."""
-    about, command = _primary(config_name)["hydra"]["help"], command_name(config_name)
+def help_text(config_name: str, folder: str | None = None) -> str:
+    """What --help prints: purpose, groups, settings and examples.
+
+    Args:
+        config_name: of the command.
+        folder: of the user's own presets.
+    """
+    command = COMMANDS[config_name]
+    given = [group for group in command.groups if group in GROUPS]
+    inside = ["  --help sim   the settings of a group"] if given else []
     return "\n".join(
         [
-            f"{command} [setting=value | group=choice] ...",
+            f"{command.name} [setting=value | group=choice] ...",
             "",
-            about["header"].rstrip(),
-            *_groups_text(config_name, command),
+            command.about,
+            *_groups_text(command, folder),
             "",
             "Settings (with their defaults):",
-            *(f"  {line}" for line in _setting_lines(config_name)),
+            *(f"  {line}" for line in _setting_lines(command)),
             "",
             "Options:",
             "  --cfg job    show the whole config that the other arguments make, and end",
             "  --multirun   run once for each of several values, as in seed=0,1,2",
+            "  --config-dir DIR  a folder of your own presets, as DIR/tokens/mine.yaml",
+            *inside,
             "  --version, --help",
             "",
             "Examples:",
-            *(f"  {line}" for line in about["footer"].splitlines()),
+            *(f"  {line}" for line in command.examples),
         ]
     )
 
 
-def choices(group: str) -> list[str]:
-    """The presets of a config group."""
-    entries = (files("conf") / group).iterdir()
-    return sorted(e.name.removesuffix(".yaml") for e in entries if e.name.endswith(".yaml"))
+def group_help(group: str, folder: str | None = None) -> str:
+    """What `--help GROUP` prints: its presets, and each of its settings."""
+    lines = [
+        _line(own, told_default(plain_default(own)), group)
+        for own in declared_fields(load(GROUPS[group]))
+    ]
+    return "\n".join([f"{group}={'|'.join(choices(group, folder))}", "", *lines])
 
 
-def group_defaults(config_name: str) -> dict[str, list[str]]:
-    """Config group -> presets that are taken by default, of a primary config."""
-    defaults = _primary(config_name)["defaults"]
-    pairs = [pair for item in defaults if isinstance(item, Mapping) for pair in item.items()]
-    return {group: [name] if isinstance(name, str) else name for group, name in pairs}
+def choices(group: str, folder: str | None = None) -> list[str]:
+    """The presets of a config group.
+
+    Args:
+        group: its name.
+        folder: of the user's own presets.
+    """
+    places = [files("conf") / group, *([] if folder is None else [Path(folder) / group])]
+    entries = [entry.name for place in places if place.is_dir() for entry in place.iterdir()]
+    return sorted(name.removesuffix(".yaml") for name in entries if name.endswith(".yaml"))
+
+
+def group_defaults(command: Command) -> dict[str, list[str]]:
+    """Config group -> presets that a command takes by default."""
+    groups = command.groups.items()
+    return {group: [name] if isinstance(name, str) else name for group, name in groups}
 
 
 def setting_names(config_name: str) -> list[str]:
-    """Dotted names of all settings and groups of a command, as its defaults compose them."""
-    names = [name for name in _primary(config_name) if name not in ("defaults", "hydra")]
-    for group, chosen in group_defaults(config_name).items():
-        content = _load(files("conf") / group / f"{chosen[0]}.yaml")
-        names.append(group)
-        names.extend(f"{group}.{key}" for key in content if key != "defaults")
+    """Dotted names of all settings and groups of a command."""
+    command = COMMANDS[config_name]
+    names = [*command.defaults(), *command.groups]
+    names += [f"{group}.{key}" for group, section in command.sections().items() for key in section]
     return names
 
 
-def _groups_text(config_name: str, command: str) -> Iterator[str]:
-    defaults = group_defaults(config_name)
-    if not defaults:
+def told_default(value: Any) -> str:
+    """A default as it is written on a command line."""
+    if isinstance(value, list):
+        return f"[{','.join(map(told_default, value))}]"
+    if isinstance(value, Mapping):
+        return f"{{{','.join(f'{name}:{told_default(one)}' for name, one in value.items())}}}"
+    return told(value)
+
+
+def _groups_text(command: Command, folder: str | None) -> Iterator[str]:
+    if not command.groups:
         return
     yield ""
     yield "Config groups (* is the default):"
-    for group, default in defaults.items():
-        names = [f"{name}*" if name in default else name for name in choices(group)]
+    for group, default in group_defaults(command).items():
+        names = [f"{n}*" if n in default else n for n in choices(group, folder)]
         yield from wrap(
-            f"{group:<8} {', '.join(names)}", 96, initial_indent="  ", subsequent_indent=" " * 11
+            f"{group:<8} {', '.join(names)}", WIDTH, initial_indent="  ", subsequent_indent=" " * 11
         )
-    if "agent" in defaults:
+    if "agent" in command.groups:
         yield "Their values are settings too, as in agent.noise=0.1, tokens.shapes=[square,square];"
-    yield f"`{command} --cfg job` shows all of their values."
+    yield f"`{command.name} --cfg job` shows all of their values."
 
 
-def _setting_lines(config_name: str) -> list[str]:
-    """The lines of a primary config that are neither its defaults list nor hydra's."""
-    lines, shown = [], False
-    for line in (files("conf") / f"{config_name}.yaml").read_text("utf-8").splitlines():
-        if line[:1].isalpha():
-            shown = not line.startswith(("defaults:", "hydra:"))
-        if shown and line.strip():
-            lines.append(line)
-    return lines
+def _setting_lines(command: Command) -> Iterator[str]:
+    defaults = command.defaults()
+    for own in command.fields():
+        yield _line(own, told_default(defaults[own.name]))
 
 
-def _primary(config_name: str) -> Plain:
-    return _load(files("conf") / f"{config_name}.yaml")
+def _line(own: "Field[Any]", default: str, group: str = "") -> str:
+    what: Declaration = own.metadata[KEY]
+    name = f"{group}.{own.name}" if group else own.name
+    choice = f" ({_either(what.choices)})" if what.choices else ""
+    unit = f" ({what.unit})" if what.unit else ""
+    return f"{name}: {default}  # {what.help}{choice}{unit}"
 
 
-def _load(file: Traversable) -> Plain:
-    content: Plain = yaml.safe_load(file.read_text("utf-8"))
-    return content
+def _either(choices: Sequence[str]) -> str:
+    return f"{', '.join(choices[:-1])} or {choices[-1]}"

@@ -7,13 +7,14 @@ a mapping: so such values travel as `tokens={name:square}`.
 from collections.abc import Sequence
 from importlib.resources import files
 
-from conf.help import Plain, group_defaults, setting_names
+from conf.commands import COMMANDS, Plain
 
 
 def plain_names(config_name: str) -> list[str]:
     """The settings of a command that are called like a group that it has not."""
-    own = group_defaults(config_name)
-    return [n for n in setting_names(config_name) if n not in own and (files("conf") / n).is_dir()]
+    command = COMMANDS[config_name]
+    own = [name for name in command.defaults() if name not in command.groups]
+    return [name for name in own if (files("conf") / name).is_dir()]
 
 
 def hidden(arguments: Sequence[str], config_name: str) -> list[str]:

@@ -3,38 +3,57 @@
 from collections import deque
 
 from master.config import MasterConfig
+from master.rundir import Record
+from master.trainer import Trainer
 
 RATE_WINDOW_S = 10.0
 HOUR_S = 3600.0
 
 
 class Budget:
-    """The bounds of a run: hours, episodes and updates; the one used most decides."""
+    """The bounds of a run: hours, episodes and updates; the one used most decides.
 
-    def __init__(self, config: MasterConfig) -> None:
+    Attributes:
+        bounded: there is a bound.
+    """
+
+    def __init__(self, config: MasterConfig, trainer: Trainer, record: Record) -> None:
+        """Count nothing: the counters are read where they are.
+
+        Args:
+            config: has the bounds.
+            trainer: counts episodes and updates.
+            record: counts the loop's seconds.
+        """
+        self._trainer, self._record = trainer, record
         self.max_seconds = config.max_hours * HOUR_S
         self.max_episodes = config.max_episodes
         self.max_updates = config.max_updates
         self.bounded = bool(self.max_seconds or self.max_episodes or self.max_updates)
 
-    def share(self, seconds: float, episodes: int, updates: int) -> float:
+    @property
+    def share(self) -> float:
         """The largest used share, in [0, 1]; 0 where nothing is bounded."""
         pairs = (
-            (seconds, self.max_seconds),
-            (episodes, self.max_episodes),
-            (updates, self.max_updates),
+            (self._record.loop_s, self.max_seconds),
+            (self._trainer.episodes, self.max_episodes),
+            (self._trainer.updates, self.max_updates),
         )
         return min(max((used / bound for used, bound in pairs if bound), default=0.0), 1.0)
 
-    def takes_episodes(self, episodes: int) -> bool:
+    def takes_episodes(self) -> bool:
         """Whether more episodes may enter the replay."""
-        return not self.max_episodes or episodes < self.max_episodes
+        return not self.max_episodes or self._trainer.episodes < self.max_episodes
 
-    def spent(self, seconds: float, updates: int) -> str | None:
+    def updates_spent(self) -> bool:
+        """Whether all updates are made."""
+        return bool(self.max_updates) and self._trainer.updates >= self.max_updates
+
+    def spent(self) -> str | None:
         """The bound at which learning stops at once, or None."""
-        if self.max_updates and updates >= self.max_updates:
+        if self.updates_spent():
             return f"max_updates={self.max_updates}"
-        if self.max_seconds and seconds >= self.max_seconds:
+        if self.max_seconds and self._record.loop_s >= self.max_seconds:
             return f"max_hours={self.max_seconds / HOUR_S:g}"
         return None
 

@@ -6,8 +6,9 @@ A disk that takes nothing more ends no run: nothing is acknowledged until there 
 the workers keep what they played, and wait.
 """
 
+import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,9 +41,15 @@ RETRY_S = 1.0
 MAKE_ROOM = "make room there; until then nothing is acknowledged, and workers keep what they played"
 SEGMENT = "journal"
 
+log = logging.getLogger(__name__)
+
 
 class Checkpointer:
-    """Journals batches, and writes checkpoints when they are due."""
+    """Journals batches, and writes checkpoints when they are due.
+
+    Attributes:
+        failing: the disk takes nothing more.
+    """
 
     def __init__(
         self,
@@ -52,7 +59,6 @@ class Checkpointer:
         hub: Hub,
         journal: Journal,
         clock: Clock,
-        notice: Callable[[str], None],
     ) -> None:
         """Write nothing yet.
 
@@ -63,24 +69,23 @@ class Checkpointer:
             hub: its table of duplicates is saved with the rest.
             journal: open.
             clock: of the run's record.
-            notice: takes lines for the user.
         """
         self._folder, self._guard, self._hub, self._journal = folder, guard, hub, journal
-        self._clock, self._notice = clock, notice
+        self._clock = clock
         self._keep_checkpoints = service.keep_checkpoints
         self._checkpoint = Every(service.checkpoint_minutes * MINUTE_S)
-        self._failing = False
+        self.failing = False
         self._saved_s: float | None = None
         self._retry, self._tell = Every(RETRY_S), Every(MINUTE_S, at_once=True)
 
-    def numbers(self) -> dict[str, float]:
-        """How old the last checkpoint of this process is, and whether the disk takes nothing."""
-        age_s = -1.0 if self._saved_s is None else time.monotonic() - self._saved_s
-        return {"checkpoint_age_s": age_s, "disk_failing": float(self._failing)}
+    @property
+    def age_s(self) -> float:
+        """Seconds since the last checkpoint of this process, -1 before the first."""
+        return -1.0 if self._saved_s is None else time.monotonic() - self._saved_s
 
     def keep(self, arrival: EpisodesArrived) -> bool:
         """Journal a batch; False while the disk does not take it."""
-        if self._failing and not self._retry.due():
+        if self.failing and not self._retry.due():
             return False
         try:
             self._journal.append(arrival)
@@ -97,7 +102,7 @@ class Checkpointer:
             if self._checkpoint.due():
                 self.save()
         except (JournalError, DiskError) as error:
-            self._failed(f"warning: {error}")
+            self._failed(str(error))
 
     def save(self) -> Path:
         """Write a checkpoint, and drop the segments of the journal that nobody needs any more.
@@ -107,7 +112,7 @@ class Checkpointer:
             DiskError: the disk does not take it; what was there before is as it was.
         """
         self._guard.check()
-        rest = Restored(self._clock.stopped(), self._hub.state(), self._journal.rotate())
+        rest = Restored(self._clock.read(), self._hub.state(), self._journal.rotate())
         folder = self._folder.checkpoints
         path = save_run(folder, self._guard.trainer, rest, self._keep_checkpoints)
         self._journal.drop_before(first_needed(folder))
@@ -115,14 +120,14 @@ class Checkpointer:
         return path
 
     def _failed(self, text: str) -> None:
-        self._failing = True
+        self.failing = True
         if self._tell.due():
-            self._notice(text)
+            log.warning(text)
 
     def _worked(self) -> None:
-        if self._failing:
-            self._failing, self._tell = False, Every(MINUTE_S, at_once=True)
-            self._notice("the journal can be written again: batches are taken in")
+        if self.failing:
+            self.failing, self._tell = False, Every(MINUTE_S, at_once=True)
+            log.info("the journal can be written again: batches are taken in")
 
 
 def check_resumable(folder: RunFolder, resolved: Mapping[str, Any]) -> None:
@@ -201,7 +206,7 @@ def first_needed(folder: Path) -> int:
     return min(needed, default=1)
 
 
-def restore_run(folder: Path, trainer: Trainer, warn: Callable[[str], None]) -> Restored | None:
+def restore_run(folder: Path, trainer: Trainer) -> Restored | None:
     """Take over the newest checkpoint that is whole; corrupt ones are renamed, with a warning.
 
     Returns:
@@ -210,7 +215,7 @@ def restore_run(folder: Path, trainer: Trainer, warn: Callable[[str], None]) -> 
     Raises:
         RunError: the checkpoint is of another format, task or network, or none is whole.
     """
-    found = _newest_whole(folder, warn)
+    found = _newest_whole(folder)
     if found is None:
         return None
     try:
@@ -225,13 +230,10 @@ def restore_run(folder: Path, trainer: Trainer, warn: Callable[[str], None]) -> 
         ) from error
 
 
-def warm_start(run_dir: Path, trainer: Trainer) -> str:
+def warm_start(run_dir: Path, trainer: Trainer) -> None:
     """Give the trainer the networks of another run, with fresh optimisers and an empty replay.
 
     The other run may have had other tokens, where the networks do not depend on them (net=mha).
-
-    Returns:
-        A line for the user.
 
     Raises:
         RunError: there is no whole checkpoint, or its networks have other shapes.
@@ -241,18 +243,20 @@ def warm_start(run_dir: Path, trainer: Trainer) -> str:
         trainer.learner.load_networks(content.arrays[LEARNER])
     except RunError as error:
         raise RunError(f"warm_start={run_dir}: {error}") from None
-    return f"begins with the networks of {run_dir} after {content.updates:,} updates"
+    log.info("begins with the networks of %s after %s updates", run_dir, f"{content.updates:,}")
 
 
-def _newest_whole(folder: Path, warn: Callable[[str], None]) -> Checkpoint | None:
+def _newest_whole(folder: Path) -> Checkpoint | None:
     for path in reversed(list_checkpoints(folder)):
         try:
             return load_checkpoint(path)
         except CorruptError as error:
             aside = set_aside(path)
-            warn(
-                f"warning: checkpoint {path} is corrupt ({error.why}): it is {aside.name} now, and "
-                "the one before is taken"
+            log.warning(
+                "checkpoint %s is corrupt (%s): it is %s now, and the one before is taken",
+                path,
+                error.why,
+                aside.name,
             )
     if was_set_aside(folder):
         raise RunError(

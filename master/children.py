@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Thread
 
+import psutil
+
 from tangram_agent.process import Lifeline
 
 # A process that lived for so long starts with a clean record.
@@ -20,7 +22,6 @@ MAX_DELAY_S = 30.0
 HUNG_STATUS = 1  # of a watchdog, though others use it, too
 USAGE_STATUS = 2
 TAIL_LINES = 12
-STOPPED = "T"
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -118,7 +119,7 @@ class Child:
         Returns:
             Whether it was killed.
         """
-        frozen = self._process is not None and _state(self._process.pid) == STOPPED
+        frozen = self._process is not None and _is_stopped(self._process.pid)
         self._frozen_s = self._frozen_s + passed_s if frozen else 0.0
         if not 0.0 < self.patience_s <= self._frozen_s:
             return False
@@ -150,12 +151,12 @@ class Child:
                 return  # ended already; the waiting thread tells
 
 
-def _state(pid: int) -> str:
-    """The kernel's letter for what a process does, empty where there is none."""
+def _is_stopped(pid: int) -> bool:
+    """Whether there is such a process, and a signal has stopped it."""
     try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2][:1]
-    except OSError:
-        return ""
+        return psutil.Process(pid).status() == psutil.STATUS_STOPPED
+    except psutil.Error:
+        return False
 
 
 def describe(status: int) -> str:

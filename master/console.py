@@ -1,13 +1,13 @@
 """What the user sees while a run goes on: a live panel on a terminal, plain lines elsewhere.
 
-The console outlives its terminal: it falls silent instead of failing.
+The console outlives its terminal: it falls silent instead of failing. Lines come through
+`logging`; with service.log_format=json each is one JSON object for programs.
 """
 
 import logging
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict
 from typing import Any, Protocol, TextIO, cast
 
 from rich.console import Console, Group
@@ -17,12 +17,15 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from master.status import Status, duration, left_text, plural, status_line
+from tangram_agent.messages import RunStatus
 from tangram_agent.process import Every, formatter
 
 PANEL_S = 0.5
 LINE_S = 10.0
 PANEL_WIDTH = 76
+TEST = "test/"  # before the names of scores
+
+log = logging.getLogger(__name__)
 
 
 class _Sturdy:
@@ -66,122 +69,98 @@ def sturdy_console(file: TextIO) -> Console:
     return Console(file=cast(TextIO, _Sturdy(file)))
 
 
+# Log lines
+
+
+class _TextFormatter(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        line = record.getMessage()
+        return line if record.levelno <= logging.INFO else f"{record.levelname.lower()}: {line}"
+
+
+class _ConsoleHandler(logging.Handler):
+    """Lines as they are, however long; above a live panel on the same console."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__()
+        self._console = console
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._console.print(self.format(record), soft_wrap=True, markup=False, highlight=False)
+
+
+@contextmanager
+def logging_to(console: Console, log_format: str = "text", who: str = "master") -> Iterator[None]:
+    """Show the log lines of this room on a console.
+
+    Args:
+        console: where to.
+        log_format: text, or json.
+        who: name of the process in JSON.
+    """
+    logger, handler = logging.getLogger("master"), _ConsoleHandler(console)
+    handler.setFormatter(_TextFormatter() if log_format == "text" else formatter(log_format, who))
+    before = logger.level
+    logger.setLevel(logging.INFO)
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(before)
+
+
+# The state of the run
+
+
 class Progress(Protocol):
-    """Shows statuses and notices until it is closed."""
+    """Shows how a run stands until it is closed."""
 
-    def show(self, status: Status) -> None:
+    def show(self, status: RunStatus) -> None:
         """Show a status; cheap, and may be called as often as one likes."""
-
-    def notice(self, line: str, level: str = "info", **fields: Any) -> None:
-        """Show one line at once, and keep it; the fields are for programs."""
 
     def close(self) -> None:
         """Leave the terminal as it was found."""
 
 
 def make_progress(console: Console, title: str, log_format: str = "text") -> Progress:
-    """A live panel where the console is a terminal, lines where it is not, or JSON."""
-    if log_format == "json":
-        return JsonLines(console, "master")
-    return LivePanel(console, title) if console.is_terminal else PlainLines(console)
+    """A live panel where the console is a terminal; lines of the log elsewhere, and for JSON."""
+    if console.is_terminal and log_format == "text":
+        return LivePanel(console, title)
+    return StatusLines()
 
 
-def make_lines(console: Console, log_format: str = "text") -> Progress:
-    """Lines of the process that starts the others, beside whose progress there can be no panel."""
-    return JsonLines(console, "launcher") if log_format == "json" else PlainLines(console)
+class StatusLines:
+    """One log line now and then: for log files, pipes and batch systems."""
 
-
-class _Notices(logging.Handler):
-    def __init__(self, progress: Progress) -> None:
-        super().__init__(logging.WARNING)
-        self._progress = progress
-
-    def emit(self, record: logging.LogRecord) -> None:
-        known = vars(logging.makeLogRecord({}))
-        fields = {name: value for name, value in vars(record).items() if name not in known}
-        self._progress.notice(record.getMessage(), record.levelname.lower(), **fields)
-
-
-@contextmanager
-def notices_from(logger_name: str, progress: Progress) -> Iterator[None]:
-    """Show a logger's warnings as notices: written past a live panel they would be lost."""
-    logger, handler = logging.getLogger(logger_name), _Notices(progress)
-    logger.addHandler(handler)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)
-
-
-def print_line(console: Console, line: str) -> None:
-    """One line as it is, however long."""
-    console.print(line, soft_wrap=True, markup=False, highlight=False)
-
-
-def _with_level(line: str, level: str) -> str:
-    return line if level == "info" else f"{level}: {line}"
-
-
-class PlainLines:
-    """One line now and then: for log files, pipes and batch systems."""
-
-    def __init__(self, console: Console, interval_s: float = LINE_S) -> None:
-        self._console = console
+    def __init__(self, interval_s: float = LINE_S) -> None:
         self._due = Every(interval_s, at_once=True)
 
-    def show(self, status: Status) -> None:
-        """Print the status if the last line is old enough."""
+    def show(self, status: RunStatus) -> None:
+        """Log the status if the last line is old enough; its numbers are for programs."""
         if self._due.due():
-            self.notice(status_line(status))
-
-    def notice(self, line: str, level: str = "info", **_: Any) -> None:
-        """Print one line."""
-        print_line(self._console, _with_level(line, level))
-
-    def close(self) -> None:
-        """Nothing is left to do."""
-
-
-class JsonLines:
-    """One JSON object a line: for programs that collect logs."""
-
-    def __init__(self, console: Console, who: str, interval_s: float = LINE_S) -> None:
-        self._console, self._formatter = console, formatter("json", who)
-        self._due = Every(interval_s, at_once=True)
-
-    def show(self, status: Status) -> None:
-        """Write the status if the last one is old enough."""
-        if self._due.due():
-            self.notice(status.activity, event="status", **asdict(status))
-
-    def notice(self, line: str, level: str = "info", **fields: Any) -> None:
-        """Write one line."""
-        record = logging.makeLogRecord({"levelname": level.upper(), "msg": line} | fields)
-        print_line(self._console, self._formatter.format(record))
+            fields = {"event": "status", **status.texts, **status.numbers}
+            log.info("%s", status_line(status), extra=fields)
 
     def close(self) -> None:
         """Nothing is left to do."""
 
 
 class LivePanel:
-    """A panel that is drawn again in place; notices scroll above it."""
+    """A panel that is drawn again in place; log lines scroll above it."""
 
     def __init__(self, console: Console, title: str, interval_s: float = PANEL_S) -> None:
         self._console, self._title = console, title
         self._due = Every(interval_s, at_once=True)
-        self._last: Status | None = None
+        self._last: RunStatus | None = None
         self._live = Live(console=console, auto_refresh=False, transient=False)
         self._live.start()
 
-    def show(self, status: Status) -> None:
+    def show(self, status: RunStatus) -> None:
         """Draw the panel if the last drawing is old enough."""
         self._last = status
         if self._due.due():
             self._draw(status)
-
-    def notice(self, line: str, level: str = "info", **_: Any) -> None:
-        """Print one line above the panel."""
-        print_line(self._console, _with_level(line, level))
 
     def close(self) -> None:
         """Leave the last status and go below it."""
@@ -189,53 +168,94 @@ class LivePanel:
             self._draw(self._last)
         self._live.stop()
 
-    def _draw(self, status: Status) -> None:
+    def _draw(self, status: RunStatus) -> None:
         self._live.update(status_panel(status, self._title), refresh=True)
 
 
-def status_panel(status: Status, title: str) -> Panel:
+def status_line(status: RunStatus) -> str:
+    """One line for people and for grep."""
+    n = status.numbers
+    parts = [
+        duration(n["elapsed_s"]),
+        f"{n['share']:.0%}{_left(n)}" if n["share"] >= 0 else "",
+        plural(n["episodes"], "episode"),
+        plural(n["updates"], "update"),
+        f"{n['transitions_per_s']:,.0f} transitions/s",
+        f"{n['updates_per_s']:,.1f} updates/s",
+        _scores(n),
+        plural(n["players"], "worker"),
+        status.texts["activity"],
+    ]
+    return " | ".join(part for part in parts if part)
+
+
+def status_panel(status: RunStatus, title: str) -> Panel:
     """The live panel: how far, how fast, how good, and what is waited for."""
+    n = status.numbers
     grid = Table.grid(padding=(0, 3), expand=True)
     for _ in range(2):
         grid.add_column(style="dim", no_wrap=True)
         grid.add_column(justify="right", no_wrap=True)
-    grid.add_row("episodes", f"{status.episodes:,}", "updates", f"{status.updates:,}")
-    grid.add_row(
-        "transitions/s",
-        f"{status.transitions_per_s:,.0f}",
-        "updates/s",
-        f"{status.updates_per_s:,.1f}",
-    )
-    scores = status.scores
+    grid.add_row("episodes", f"{n['episodes']:,.0f}", "updates", f"{n['updates']:,.0f}")
+    rates = f"{n['transitions_per_s']:,.0f}", f"{n['updates_per_s']:,.1f}"
+    grid.add_row("transitions/s", rates[0], "updates/s", rates[1])
     grid.add_row(
         "mean reward",
-        Text(_score(scores, "mean_reward", "{:.3f}"), style="bold green"),
+        Text(_score(n, "mean_reward", "{:.3f}"), style="bold green"),
         "raw overlap",
-        _score(scores, "raw_overlap", "{:.3f}"),
+        _score(n, "raw_overlap", "{:.3f}"),
     )
     grid.add_row(
         "angle error",
-        _score(scores, "angle_error_deg_median", "{:.2f}°"),
+        _score(n, "angle_error_deg_median", "{:.2f}°"),
         "position error",
-        _score(scores, "position_error_median", "{:.4f}"),
+        _score(n, "position_error_median", "{:.4f}"),
     )
-    helpers = f"{plural(status.players, 'worker')}, {plural(status.evaluators, 'evaluator')}"
-    foot = Text(f"{helpers} · {status.activity}", style="dim", no_wrap=True, overflow="ellipsis")
-    body = Group(_bar(status), Text(), grid, Text(), foot)
+    helpers = f"{plural(n['players'], 'worker')}, {plural(n['evaluators'], 'evaluator')}"
+    text = f"{helpers} · {status.texts['activity']}"
+    foot = Text(text, style="dim", no_wrap=True, overflow="ellipsis")
+    body = Group(_bar(n), Text(), grid, Text(), foot)
     return Panel(body, title=title, title_align="left", width=PANEL_WIDTH, padding=(1, 2))
 
 
-def _bar(status: Status) -> Table:
+def duration(seconds: float) -> str:
+    """0:07, 12:34 or 1:02:03."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def plural(count: float, noun: str) -> str:
+    """1 worker, 2 workers."""
+    return f"{count:,.0f} {noun}" if count == 1 else f"{count:,.0f} {noun}s"
+
+
+def _bar(n: Mapping[str, float]) -> Table:
     row = Table.grid(padding=(0, 2), expand=True)
     row.add_column(ratio=1)
     row.add_column(justify="right", no_wrap=True)
-    if status.share is None:
-        row.add_row(Text("no bound: Ctrl-C ends the run", style="dim"), duration(status.elapsed_s))
+    if n["share"] < 0:
+        row.add_row(Text("no bound: Ctrl-C ends the run", style="dim"), duration(n["elapsed_s"]))
         return row
-    bar = ProgressBar(total=1.0, completed=status.share, complete_style="cyan")
-    row.add_row(bar, f"{status.share:4.0%}  {duration(status.elapsed_s)}{left_text(status)}")
+    bar = ProgressBar(total=1.0, completed=n["share"], complete_style="cyan")
+    row.add_row(bar, f"{n['share']:4.0%}  {duration(n['elapsed_s'])}{_left(n)}")
     return row
 
 
-def _score(scores: Mapping[str, float], name: str, pattern: str) -> str:
-    return pattern.format(scores[name]) if name in scores else "-"
+def _left(n: Mapping[str, float]) -> str:
+    """How long it still takes, where that is known."""
+    return f", {duration(n['left_s'])} left" if n["left_s"] > 0 else ""
+
+
+def _scores(n: Mapping[str, float]) -> str:
+    """The scores that matter most, or nothing before the first evaluation."""
+    known = (
+        ("mean_reward", "reward {:.3f}"),
+        ("angle_error_deg_median", "angle {:.2f}°"),
+        ("position_error_median", "position {:.4f}"),
+    )
+    return ", ".join(text.format(n[TEST + name]) for name, text in known if TEST + name in n)
+
+
+def _score(n: Mapping[str, float], name: str, pattern: str) -> str:
+    return pattern.format(n[TEST + name]) if TEST + name in n else "-"

@@ -1,5 +1,6 @@
 """tangram-train: a master, its workers and an evaluator on this machine, and no orphan of them."""
 
+import logging
 import signal
 import sys
 import time
@@ -11,7 +12,7 @@ from typing import Any
 from master.checkpointer import check_resumable
 from master.children import MAX_RESTARTS, Child, command, describe, override
 from master.config import LaunchConfig
-from master.console import Progress, make_lines, sturdy_console
+from master.console import logging_to, sturdy_console
 from master.rundir import RunFolder
 from master.signals import SAME_WISH_S, handling, show_cursor
 from tangram_agent.process import Every, watch_parent
@@ -25,6 +26,8 @@ LEAVE_S = 8.0
 FAILED_STATUS = 1
 PLAYER_NICE = 5
 EVALUATOR_NICE = 10
+
+log = logging.getLogger(__name__)
 
 
 def run_training(config: LaunchConfig, resolved: Mapping[str, Any]) -> int:
@@ -48,9 +51,9 @@ def run_training(config: LaunchConfig, resolved: Mapping[str, Any]) -> int:
         folder.write_config(resolved)
         # Left by a master that was killed; workers must wait for the new one.
         folder.connection.unlink(missing_ok=True)
-    lines = make_lines(sturdy_console(sys.stderr), config.master.service.log_format)
-    launcher = Launcher(config, folder, lines)
-    with launcher.signals():
+    console = sturdy_console(sys.stderr)
+    launcher = Launcher(config, folder)
+    with logging_to(console, config.master.service.log_format, "launcher"), launcher.signals():
         watch_parent(grace_s=STOP_S + 2.0 * LEAVE_S)  # of an experiment that started it
         try:
             return launcher.run()
@@ -61,8 +64,8 @@ def run_training(config: LaunchConfig, resolved: Mapping[str, Any]) -> int:
 class Launcher:
     """Starts the children, restarts those that fail, and ends them in order."""
 
-    def __init__(self, config: LaunchConfig, folder: RunFolder, lines: Progress) -> None:
-        self._folder, self._lines = folder, lines
+    def __init__(self, config: LaunchConfig, folder: RunFolder) -> None:
+        self._folder = folder
         self._events: SimpleQueue[Child | signal.Signals] = SimpleQueue()
         self._master = Child("master", master_arguments(config, folder))
         self._players = [worker_child(folder, "player", i) for i in range(config.workers)]
@@ -96,7 +99,7 @@ class Launcher:
                 self._worker_ended(event)
             elif self._stop_s is not None and time.monotonic() >= self._stop_s:
                 self._kill_all()
-                self._lines.notice(f"the master does not end within {STOP_S:g} s: it is killed")
+                log.info("the master does not end within %g s: it is killed", STOP_S)
 
     def end_all(self) -> None:
         """Wait for the children to leave, then ask them to, then make them; a signal hurries it."""
@@ -130,7 +133,7 @@ class Launcher:
             return
         for child in (self._master, *self._workers):
             if child.kill_frozen(IDLE_S):
-                tell = self._lines.notice if child is self._master else self._say
+                tell = log.info if child is self._master else self._say
                 tell(f"{child.name} has been stopped for {child.patience_s:g} s: it is killed")
 
     def _next_event(self) -> Child | signal.Signals | None:
@@ -173,9 +176,11 @@ class Launcher:
         self._master.arguments = [
             "resume=auto" if text.startswith("resume=") else text for text in self._master.arguments
         ]
-        self._lines.notice(
-            f"the master ended with {describe(status)}: it goes on from what it left "
-            f"({self._master.restarts} of {MAX_RESTARTS})"
+        log.info(
+            "the master ended with %s: it goes on from what it left (%d of %d)",
+            describe(status),
+            self._master.restarts,
+            MAX_RESTARTS,
         )
         return True
 
@@ -211,7 +216,7 @@ class Launcher:
         """Through the master, which owns the terminal while it runs."""
         for line in text.splitlines():
             if not (self._master.alive and self._master.tell(line)):
-                self._lines.notice(line)
+                log.info("%s", line)
 
     def _wait_for(self, children: list[Child]) -> None:
         began_s = time.monotonic()

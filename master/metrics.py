@@ -49,17 +49,24 @@ class Means:
 
 
 class Metrics:
-    """Writes the curves of one run."""
+    """Writes the curves of one run: to TensorBoard, and evaluations to curve.jsonl, too.
 
-    def __init__(self, folder: Path, updates: int = 0) -> None:
-        """Open the folder.
+    What the disk does not take is left out, and told: curves are not worth a run.
+    """
+
+    def __init__(self, folder: Path, curve: Path, updates: int = 0) -> None:
+        """Open the files.
 
         Args:
             folder: of the event files.
+            curve: the file of evaluations; made with the first one.
             updates: of the checkpoint that the run goes on from; later points of an earlier
-                process are hidden, since they happen again.
+                process are hidden or dropped, since they happen again.
         """
-        self._folder = folder
+        self._folder, self._curve = folder, curve
+        if curve.exists():
+            kept = [line for line in _lines(curve) if line["updates"] <= updates]
+            write_whole(curve, "".join(map(_text, kept)).encode())
         self._broken = False
         self._again = Every(RETRY_S)
         self._open(updates + 1 if updates else None)
@@ -76,7 +83,7 @@ class Metrics:
     def scores(
         self, scores: Mapping[str, float], updates: int, episodes: int, seconds: float
     ) -> None:
-        """An evaluation of the weights after so many updates."""
+        """An evaluation of the weights after so many updates, episodes, seconds of training."""
 
         def write() -> None:
             for group, step in (("test_by_episodes", episodes), ("test_by_seconds", seconds)):
@@ -85,6 +92,13 @@ class Metrics:
 
         self.scalars({f"test/{name}": value for name, value in scores.items()}, updates)
         self._try(write)
+        line = {"updates": updates, "episodes": episodes, "train_s": round(seconds, 3), **scores}
+        try:
+            with self._curve.open("a", encoding="utf-8") as file:
+                file.write(_text(line))
+        except OSError as error:
+            why = error.strerror
+            log.warning("%s cannot be written (%s): a score is missing", self._curve, why)
 
     def picture(self, pixels: Pixels, updates: int) -> None:
         """The test episodes (height, width, 3) after so many updates."""
@@ -117,7 +131,7 @@ class Metrics:
         self._axes = SummaryWriter(str(self._folder / "axes"), flush_secs=FLUSH_S)
 
     def _try(self, write: Callable[[], object]) -> None:
-        """Curves are not worth a run: what the disk does not take is left out, and told."""
+        """Write, unless the disk did not take anything a short while ago."""
         if self._broken and not self._again.due():
             return
         try:
@@ -145,35 +159,6 @@ def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, float | 
         else:
             flat[f"{prefix}{name}"] = str(value)
     return flat
-
-
-class Curve:
-    """Appends to curve.jsonl as scores arrive, so that it can be read while the run goes on."""
-
-    def __init__(self, path: Path, updates: int) -> None:
-        """Open the file.
-
-        Args:
-            path: of the file; made with the first line.
-            updates: of the checkpoint that the run goes on from; later lines of an earlier process
-                are dropped, since they happen again.
-        """
-        self._path = path
-        kept = [line for line in _lines(path) if line["updates"] <= updates]
-        if path.exists():
-            write_whole(path, "".join(map(_text, kept)).encode())
-
-    def add(self, scores: Mapping[str, float], updates: int, episodes: int, seconds: float) -> None:
-        """Note the scores of weights after so many updates, episodes, seconds of training.
-
-        What the disk does not take is left out, and told.
-        """
-        line = {"updates": updates, "episodes": episodes, "train_s": round(seconds, 3), **scores}
-        try:
-            with self._path.open("a", encoding="utf-8") as file:
-                file.write(_text(line))
-        except OSError as error:
-            log.warning("%s cannot be written (%s): a score is missing", self._path, error.strerror)
 
 
 def _text(line: Mapping[str, Any]) -> str:

@@ -1,155 +1,116 @@
-"""What goes on in the loop, told to the user and to TensorBoard at bounded rates."""
+"""How the run stands, collected once, and told at bounded rates to everybody who shows it."""
 
+import logging
 import time
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from master.arrivals import EpisodesArrived
-from master.budget import Rates
-from master.console import Progress
-from master.metrics import Curve, Means, Metrics
-from master.parts import Parts
-from master.rundir import Record
-from master.standing import run_status
-from master.status import Status
+from master.budget import Budget, Rates
+from master.checkpointer import Checkpointer
+from master.console import TEST, Progress
+from master.divergence import DivergenceGuard
+from master.hub import Hub
+from master.metrics import Means, Metrics
+from master.peers import Peer
+from master.rundir import Clock, Record
 from master.trainer import Trainer
 from tangram_agent.config import ServiceConfig
-from tangram_agent.messages import Scores
+from tangram_agent.messages import WORKER_COLUMNS, RunStatus, Scores
 from tangram_agent.process import Every
 from tangram_agent.setup import Setup
+from tangram_sim.arrays import Floats
 from tangram_sim.drawing import episode_sheet
 
+UNKNOWN = -1.0
 REMEMBERED_VERSIONS = 4096
 PICTURE_COLUMNS = 4
-CURVE_PIXELS = 120
+CURVE_PIXELS, PICTURE_PIXELS = 120, 240
 PICTURE_S = 30.0
 TICK_S = 0.1
-STAND_S = 1.0
+LISTEN_S = 1.0
+
+log = logging.getLogger(__name__)
 
 
-class Sent:
-    """The state of the run when weights were sent.
-
-    Attributes:
-        at_s: monotonic time.
-        episodes: taken in by then.
-        loop_s, train_s: see `Record`.
-    """
-
-    def __init__(self, at_s: float, episodes: int, record: Record) -> None:
-        self.at_s, self.episodes = at_s, episodes
-        self.loop_s, self.train_s = record.loop_s, record.train_s
-
-
-class Reporter:
-    """Collects what happens between two reports."""
+class StatusCollector:
+    """Puts together how the run stands; whoever shows something of it reads it from there."""
 
     def __init__(
-        self, progress: Progress, metrics: Metrics, curve: Curve, service: ServiceConfig
+        self,
+        name: str,
+        guard: DivergenceGuard,
+        hub: Hub,
+        budget: Budget,
+        clock: Clock,
+        checkpointer: Checkpointer,
     ) -> None:
-        self.progress, self.metrics, self._curve = progress, metrics, curve
-        self._losses, self._play = Means(), Means()
-        self._rates = Rates()
-        self._tick, self._stand = Every(TICK_S, at_once=True), Every(STAND_S, at_once=True)
-        self._log, self._picture = Every(service.log_seconds), Every(PICTURE_S, at_once=True)
-        self._published: OrderedDict[int, Sent] = OrderedDict()
-
-    def published(self, version: int, parts: Parts) -> None:
-        """Note when weights were sent, and which episodes they had learned from."""
-        sent = Sent(time.monotonic(), parts.trainer.episodes, parts.record)
-        self._published.setdefault(version, sent)
-        while len(self._published) > REMEMBERED_VERSIONS:
-            self._published.popitem(last=False)
-
-    def updated(self, losses: Mapping[str, float]) -> None:
-        """Note one update."""
-        self._losses.add(losses)
-
-    def inserted(self, arrival: EpisodesArrived, updates: int) -> None:
-        """Note a batch that went into the replay."""
-        episodes = arrival.episodes
-        values = {
-            "play/reward": float(np.mean(episodes.rewards[:, -1])),
-            "weights/age_updates": float(updates - arrival.weights_version),
-        }
-        sent = self._published.get(arrival.weights_version)
-        if sent is not None:
-            values["weights/age_seconds"] = time.monotonic() - sent.at_s
-        self._play.add(values, episodes.count)
-
-    def scored(self, scores: Scores, parts: Parts) -> None:
-        """Curves and a picture of an evaluation of weights that were sent a while ago."""
-        values = {name: value for name, value in scores.scalars.items() if name != "episodes"}
-        updates = scores.weights_version
-        now = Sent(time.monotonic(), parts.trainer.episodes, parts.record)
-        sent = self._published.get(updates, now)
-        self.metrics.scores(values, updates, sent.episodes, sent.loop_s)
-        self._curve.add(values, updates, sent.episodes, sent.train_s)
-        # Drawing takes time from learning.
-        if len(scores.ends) and self._picture.due():
-            picture = scores_picture(scores, parts.setup, CURVE_PIXELS)
-            self.metrics.picture(np.asarray(picture), updates)
-
-    def tick(self, parts: Parts, more: Mapping[str, float]) -> None:
-        """Show the state of the run, and write the curves when it is time.
+        """Collect nothing yet.
 
         Args:
-            parts: of the run.
-            more: numbers that only the loop knows, for `standing`.
+            name: of the run.
+            guard: of the trainer.
+            hub: counts messages, and knows who takes part.
+            budget: of the run.
+            clock: of the run, with its record.
+            checkpointer: knows how old the last checkpoint is.
         """
-        if not self._tick.due():
-            return
-        trainer = parts.trainer
-        self._rates.mark(time.monotonic(), trainer.transitions, trainer.updates, parts.share)
-        if self._stand.due():
-            standing = run_status(self._status(parts), parts, more)
-            parts.hub.tell(standing)
-            if parts.health is not None:
-                parts.health.update(standing)
-        if self._log.due():
-            self.flush(parts)
-        else:
-            self.progress.show(self._status(parts))
+        self._name, self._guard, self._hub, self._budget = name, guard, hub, budget
+        self._clock, self._checkpointer = clock, checkpointer
+        self._rates = Rates()
 
-    def flush(self, parts: Parts) -> None:
-        """Write the curves now, and show what they say."""
-        self.progress.show(self._status(parts))
-        trainer, rates = parts.trainer, self._rates
-        values = {f"train/{name}": value for name, value in self._losses.take().items()}
-        values |= self._play.take()
-        values |= {
-            "run/episodes": trainer.episodes,
-            "run/seconds": parts.record.loop_s,
-            "run/budget_share": parts.share,
-            "run/workers": parts.count("player"),
-            "replay/fill": len(trainer.replay) / trainer.replay.capacity,
-            "rates/transitions_per_s": rates.transitions_per_s(),
-            "rates/updates_per_s": rates.updates_per_s(),
-            "rate_limiter/lag": trainer.rate_limiter.lag,
-            "train/undone_updates": parts.guard.undone,
+    def mark(self) -> None:
+        """Note the counters, from which rates follow; a few times in a second."""
+        trainer, share = self._guard.trainer, self._budget.share
+        self._rates.mark(time.monotonic(), trainer.transitions, trainer.updates, share)
+
+    def collect(self, queue: int) -> RunStatus:
+        """The present state.
+
+        Args:
+            queue: batches that have come and wait for their insert.
+        """
+        trainer, record, rates = self._guard.trainer, self._clock.read(), self._rates
+        peers, left_s = self._hub.peers, rates.left_s()
+        players = sum(peer.role == "player" for peer in peers)
+        bounded = self._budget.bounded
+        numbers = {
+            "episodes": trainer.episodes,
+            "transitions": trainer.transitions,
+            "updates": trainer.updates,
+            "elapsed_s": record.loop_s,
+            "train_s": record.train_s,
+            "wall_s": record.wall_s,
+            "share": self._budget.share if bounded else UNKNOWN,
+            "left_s": left_s if bounded and left_s is not None else UNKNOWN,
+            "transitions_per_s": rates.transitions_per_s(),
+            "updates_per_s": rates.updates_per_s(),
+            "players": players,
+            "most_players": record.workers,
+            "evaluators": len(peers) - players,
+            "lag_updates": trainer.rate_limiter.lag,
+            "replay": len(trainer.replay),
+            "replay_capacity": trainer.replay.capacity,
+            "undone_updates": self._guard.undone,
+            "queue": queue,
+            "checkpoint_age_s": self._checkpointer.age_s,
+            "disk_failing": self._checkpointer.failing,
+            "scored_updates": record.scored_version,
+            **{f"hub/{name}": count for name, count in sorted(self._hub.counters.items())},
+            **{TEST + name: value for name, value in record.scores.items()},
         }
-        values |= {f"hub/{name}": value for name, value in parts.hub.counters.items()}
-        self.metrics.scalars(values, trainer.updates)
-
-    def _status(self, parts: Parts) -> Status:
-        trainer, rates, bounded = parts.trainer, self._rates, parts.budget.bounded
-        return Status(
-            episodes=trainer.episodes,
-            transitions=trainer.transitions,
-            updates=trainer.updates,
-            elapsed_s=parts.record.loop_s,
-            share=parts.share if bounded else None,
-            left_s=rates.left_s() if bounded else None,
-            transitions_per_s=rates.transitions_per_s(),
-            updates_per_s=rates.updates_per_s(),
-            players=parts.count("player"),
-            evaluators=parts.count("evaluator"),
-            activity=activity(trainer, parts.count("player")),
-            scores=parts.record.scores,
-        )
+        texts = {
+            "run": self._name,
+            "run_id": record.run_id,
+            "activity": activity(trainer, players),
+        }
+        return RunStatus(numbers, texts, _workers(peers, trainer.updates))
 
 
 def activity(trainer: Trainer, players: int) -> str:
@@ -162,6 +123,160 @@ def activity(trainer: Trainer, players: int) -> str:
     if limiter.transitions < starts:
         return f"filling the replay, {limiter.transitions:,} of {starts:,}"
     return "waiting for episodes"
+
+
+def _workers(peers: Sequence[Peer], updates: int) -> Floats:
+    rows = [_row(peer, time.monotonic(), updates) for peer in peers]
+    return np.array(rows, np.float64).reshape(-1, len(WORKER_COLUMNS))
+
+
+def _row(peer: Peer, now_s: float, updates: int) -> list[float]:
+    played = peer.weights_version
+    return [
+        peer.role == "evaluator",
+        peer.index,
+        peer.incarnation,
+        max(0.0, now_s - peer.last_seen),
+        UNKNOWN if played < 0 else max(0, updates - played),
+        peer.batches,
+        peer.episodes,
+        peer.transitions,
+        len(peer.ledger.held),
+    ]
+
+
+@dataclass(frozen=True)
+class Sent:
+    """The state of the run when weights were sent.
+
+    Attributes:
+        at_s: monotonic time.
+        episodes: taken in by then.
+        train_s: seconds of training by then.
+    """
+
+    at_s: float
+    episodes: int
+    train_s: float
+
+
+class Reporter:
+    """Collects what happens between two reports, and passes them on."""
+
+    def __init__(
+        self,
+        trainer: Trainer,
+        record: Record,
+        service: ServiceConfig,
+        status: StatusCollector,
+        progress: Progress,
+        metrics: Metrics,
+        listeners: Sequence[Callable[[RunStatus], None]],
+    ) -> None:
+        """Report nothing yet.
+
+        Args:
+            trainer: which learns.
+            record: takes the scores.
+            service: how often curves are written.
+            status: of the run.
+            progress: for the user.
+            metrics: the curves.
+            listeners: get the status about once in a second.
+        """
+        self._trainer, self._record, self._status = trainer, record, status
+        self._progress, self._metrics, self._listeners = progress, metrics, listeners
+        self._losses, self._play = Means(), Means()
+        self._tick, self._listen = Every(TICK_S, at_once=True), Every(LISTEN_S, at_once=True)
+        self._log, self._picture = Every(service.log_seconds), Every(PICTURE_S, at_once=True)
+        self._published: OrderedDict[int, Sent] = OrderedDict()
+        self._latest: Scores | None = None
+        self._stage = -1
+
+    def published(self, version: int) -> None:
+        """Note when weights were sent, and which episodes they had learned from."""
+        self._published.setdefault(version, self._now())
+        while len(self._published) > REMEMBERED_VERSIONS:
+            self._published.popitem(last=False)
+        # The curriculum goes on with the weights: workers play by those that they get.
+        sim = self._trainer.setup.sim
+        stage = sim.stage(version)
+        if sim.stages and stage != self._stage:
+            log.info("%s, from update %s on", sim.told(stage), f"{version:,}")
+        self._stage = stage
+
+    def updated(self, losses: Mapping[str, float]) -> None:
+        """Note one update."""
+        self._losses.add(losses)
+
+    def inserted(self, arrival: EpisodesArrived) -> None:
+        """Note a batch that went into the replay."""
+        episodes = arrival.episodes
+        values = {
+            "play/reward": float(np.mean(episodes.rewards[:, -1])),
+            "weights/age_updates": float(self._trainer.updates - arrival.weights_version),
+        }
+        sent = self._published.get(arrival.weights_version)
+        if sent is not None:
+            values["weights/age_seconds"] = time.monotonic() - sent.at_s
+        self._play.add(values, episodes.count)
+
+    def scored(self, scores: Scores) -> None:
+        """An evaluation of weights that were sent a while ago: record, curves and a picture."""
+        self._record.score(scores.scalars, scores.weights_version)
+        self._latest = scores
+        values = {name: value for name, value in scores.scalars.items() if name != "episodes"}
+        updates = scores.weights_version
+        sent = self._published.get(updates, self._now())
+        self._metrics.scores(values, updates, sent.episodes, sent.train_s)
+        # Drawing takes time from learning.
+        if len(scores.ends) and self._picture.due():
+            picture = scores_picture(scores, self._trainer.setup, CURVE_PIXELS)
+            self._metrics.picture(np.asarray(picture), updates)
+
+    def tick(self, queue: int) -> None:
+        """Tell how the run stands where it is time, and write the curves; see `collect`."""
+        if not self._tick.due():
+            return
+        self._status.mark()
+        if self._log.due():
+            self.flush(queue)
+            return
+        status = self._status.collect(queue)
+        self._progress.show(status)
+        if self._listen.due():
+            for listen in self._listeners:
+                listen(status)
+
+    def flush(self, queue: int) -> RunStatus:
+        """Tell it now, whatever the time, and return what was told."""
+        status = self._status.collect(queue)
+        self._progress.show(status)
+        for listen in self._listeners:
+            listen(status)
+        values = {f"train/{name}": value for name, value in self._losses.take().items()}
+        values |= self._play.take()
+        for name, value in status.numbers.items():
+            if not name.startswith(TEST):  # those are written when they come
+                values[name if "/" in name else f"run/{name}"] = value
+        self._metrics.scalars(values, self._trainer.updates)
+        return status
+
+    def settings(self, resolved: Mapping[str, Any]) -> None:
+        """Write the whole config beside the curves."""
+        self._metrics.settings(resolved)
+
+    def hyperparameters(self, resolved: Mapping[str, Any]) -> None:
+        """Write what runs are compared by, with the last scores."""
+        self._metrics.hyperparameters(resolved, self._record.scores)
+
+    def draw(self, path: Path) -> None:
+        """Draw the test episodes of the last evaluation, where there is one with pictures."""
+        if self._latest is not None and len(self._latest.ends):
+            scores_picture(self._latest, self._trainer.setup, PICTURE_PIXELS).save(path)
+
+    def _now(self) -> Sent:
+        return Sent(time.monotonic(), self._trainer.episodes, self._record.train_s)
 
 
 def scores_picture(scores: Scores, setup: Setup, pixels: int) -> Image.Image:

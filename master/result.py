@@ -14,9 +14,10 @@ from rich.console import Console
 from rich.table import Table
 
 from master.children import override
-from master.parts import Parts
+from master.console import TEST, duration
 from master.rundir import RunFolder
-from master.status import duration
+from master.trainer import Trainer
+from tangram_agent.messages import RunStatus
 
 PLAIN = re.compile(r"run_dir=[\w./-]+")
 ROOT = Path(__file__).resolve().parent.parent
@@ -34,24 +35,27 @@ SCORES = (
 PACKAGES = ("tangram-rl", "torch", "numpy", "pyzmq", "pybullet")
 
 
-def make_result(parts: Parts, reason: str, wall_s: float) -> dict[str, Any]:
+def make_result(status: RunStatus, trainer: Trainer, seed: int, reason: str) -> dict[str, Any]:
     """The content of result.json; scores are null where no evaluator was there.
 
     `scored_updates` tells which weights the scores are of: the final ones if it equals `updates`.
+
+    Args:
+        status: at the end of the run.
+        trainer: what has learned.
+        seed: of the run.
+        reason: of its end.
     """
-    record, setup, trainer = parts.record, parts.setup, parts.trainer
-    scored = record.scored_version >= 0
+    setup, n = trainer.setup, status.numbers
+    scored = int(n["scored_updates"])
     return {
-        **{name: record.scores.get(name) for name in SCORES},
-        "test_episodes": record.scores.get("episodes"),
-        "scored_updates": record.scored_version if scored else None,
-        "episodes": trainer.episodes,
-        "transitions": trainer.transitions,
-        "updates": trainer.updates,
-        "wall_s": round(wall_s, 3),
-        "train_s": round(record.train_s, 3),
+        **{name: n.get(TEST + name) for name in SCORES},
+        "test_episodes": n.get(f"{TEST}episodes"),
+        "scored_updates": scored if scored >= 0 else None,
+        **{name: int(n[name]) for name in ("episodes", "transitions", "updates")},
+        **{name: round(n[name], 3) for name in ("wall_s", "train_s")},
         "ended_by": reason,
-        "seed": parts.config.seed,
+        "seed": seed,
         "agent": setup.agent.name,
         "net": setup.net.kind,
         "tokens": [shape.name for shape in setup.layout.shapes],
@@ -59,9 +63,9 @@ def make_result(parts: Parts, reason: str, wall_s: float) -> dict[str, Any]:
         "reward": setup.reward.name,
         "backend": setup.sim.backend,
         "device": str(trainer.learner.device),
-        "workers": record.workers,
+        "workers": int(n["most_players"]),
         "parameters": trainer.learner.parameters,
-        "run_id": record.run_id,
+        "run_id": status.texts["run_id"],
         "versions": versions(),
         "commit": commit(),
         "host": platform.node(),

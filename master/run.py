@@ -1,29 +1,58 @@
-"""One run of the master, from its folder to its result."""
+"""One run of the master: its collaborators are made or restored, then the loop begins."""
 
+import logging
+import socket
 import sys
-from collections.abc import Mapping
-from contextlib import closing
-from queue import SimpleQueue
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack, closing
+from pathlib import Path
 from typing import Any
 
 import torch
 
-from master.checkpointer import check_resumable
+from master.arrivals import EpisodesArrived, WelcomeInfo
+from master.budget import Budget
+from master.checkpointer import (
+    Checkpointer,
+    Restored,
+    check_resumable,
+    restore_run,
+    warm_start,
+)
 from master.children import override
 from master.config import MasterConfig
-from master.console import Progress, make_progress, notices_from, sturdy_console
+from master.console import Progress, logging_to, make_progress, sturdy_console
+from master.divergence import DivergenceGuard
+from master.health import OFF, Health
+from master.hub import Hub
+from master.journal import Journal, journal_run_id, read_journal
+from master.keys import Keys, is_loopback, needs_keys, run_keys
+from master.lockstep import Lockstep
 from master.loop import Loop
-from master.metrics import Curve, Metrics
-from master.parts import Parts, make_parts
-from master.report import Reporter
+from master.metrics import Metrics
+from master.report import Reporter, StatusCollector
 from master.result import make_result, show_result
-from master.rundir import RunFolder
+from master.rundir import Clock, Record, RunFolder
 from master.signals import StopSignals
+from master.trainer import Trainer, choose_device
+from tangram_agent.addresses import reachable, with_host
+from tangram_agent.arrays import EpisodeSpec
+from tangram_agent.config import ServiceConfig
 from tangram_agent.process import Watchdog, watch_parent
 from tangram_agent.setup import Setup
 
 # A clean end after the parent's death; a large replay takes seconds to write.
 GRACE_S = 30.0
+UNBOUNDED = (
+    "max_hours, max_episodes and max_updates are all 0: only Ctrl-C or SIGTERM ends this run, and "
+    "learning rates do not decay"
+)
+PLAIN = (
+    "service.security=plain: whoever reaches this address can read what is sent, and send what he "
+    "likes"
+)
+
+log = logging.getLogger(__name__)
 
 
 def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) -> int:
@@ -41,43 +70,215 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
         TangramError: the folder, the port or a checkpoint cannot be used, or the weights are no
             longer finite.
     """
-    news: SimpleQueue[str] = SimpleQueue()
-    launched = watch_parent(news.put, GRACE_S)
-    torch.set_num_threads(config.service.threads)
-    folder, console = RunFolder(config.run_dir), sturdy_console(sys.stdout)
-    folder.prepare(config.resume)
     form = config.service.log_format
-    watchdog = Watchdog(config.service.watchdog_seconds)
-    with folder.lock(), StopSignals() as signals, watchdog:
+    console = sturdy_console(sys.stdout)
+    with ExitStack() as opened:
+        opened.enter_context(logging_to(console, form))
+        launched = watch_parent(_tell_news, GRACE_S)
+        torch.set_num_threads(config.service.threads)
+        folder = RunFolder(config.run_dir)
+        folder.prepare(config.resume)
+        opened.enter_context(folder.lock())
+        signals = opened.enter_context(StopSignals())
+        watchdog = opened.enter_context(Watchdog(config.service.watchdog_seconds))
         if not launched:  # the launcher wrote it, with settings of its own
             check_resumable(folder, resolved)
             folder.write_config(resolved)
-        with (
-            closing(make_progress(console, f"tangram · {folder.path.name}", form)) as progress,
-            notices_from("master", progress),
-            closing(make_parts(config, setup, folder, progress.notice, watchdog.progress)) as parts,
-            closing(Metrics(folder.tensorboard, parts.trainer.updates)) as metrics,
-            closing(
-                Loop(parts, _reporter(parts, progress, metrics), signals, news, watchdog)
-            ) as loop,
-        ):
-            metrics.settings(resolved)
-            if not launched:
-                where = override("connect", str(folder.path))
-                progress.notice(f"workers join with: tangram-worker {where}")
-            reason = loop.run()
-            loop.finish(launched)
-            result = make_result(parts, reason, loop.clock.stopped().wall_s)
-            folder.write_result(result)
-            metrics.hyperparameters(resolved, parts.record.scores)
-            loop.dismiss(f"the run has ended ({reason})")
-            if form == "json":
-                progress.notice(f"the run has ended ({reason})", event="result", **result)
+        title = f"tangram · {folder.path.name}"
+        progress = opened.enter_context(closing(make_progress(console, title, form)))
+        loop, connection = open_run(config, setup, progress, signals, watchdog, opened)
+        loop.reporter.settings(resolved)
+        folder.write_connection(connection)
+        if not launched:
+            where = override("connect", str(folder.path))
+            log.info("workers join with: tangram-worker %s", where)
+        reason = loop.run()
+        result = make_result(loop.finish(launched), loop.guard.trainer, config.seed, reason)
+        folder.write_result(result)
+        loop.reporter.hyperparameters(resolved)
+        loop.dismiss(f"the run has ended ({reason})")
+        if form == "json":
+            log.info("the run has ended (%s)", reason, extra={"event": "result", **result})
     if form != "json":
         show_result(console, folder, result)
     return 0
 
 
-def _reporter(parts: Parts, progress: Progress, metrics: Metrics) -> Reporter:
-    curve = Curve(parts.folder.curve, parts.trainer.updates)
-    return Reporter(progress, metrics, curve, parts.config.service)
+def _tell_news(line: str) -> None:
+    """What the launcher says, which shares the terminal with this process."""
+    log.info("%s", line, extra={"event": "launcher"})
+
+
+def open_run(
+    config: MasterConfig,
+    setup: Setup,
+    progress: Progress,
+    signals: StopSignals,
+    watchdog: Watchdog,
+    opened: ExitStack,
+) -> tuple[Loop, dict[str, str]]:
+    """Make all that a run consists of, from the newest checkpoint where it is to be resumed.
+
+    Args:
+        config: the master's settings; its folder is prepared and locked.
+        setup: the task and the agent.
+        progress: for the user.
+        signals: that end the run.
+        watchdog: hears of every batch of the journal, which may take long to read.
+        opened: closes what is opened here.
+
+    Returns:
+        The loop, and what a worker needs to find this master and to be let in.
+
+    Raises:
+        TangramError: the port or a checkpoint cannot be used, or there is no such device.
+    """
+    service, folder = config.service, RunFolder(config.run_dir)
+    trainer = Trainer(setup, config.seed, choose_device(service.device), service.lag_updates)
+    found = _restore(config, folder, trainer)
+    rest = found or Restored(_new_record(folder.journal), {})
+    run_id = rest.record.run_id
+    guard = DivergenceGuard(trainer, service.max_bad_updates, folder.bad_batch)
+    clock, budget = Clock(rest.record), Budget(config, trainer, rest.record)
+    lockstep = Lockstep.of(service)
+    if not budget.bounded:
+        log.warning(UNBOUNDED)
+    keys = _keys(service, folder)
+    hub = opened.enter_context(_open_hub(config, setup, run_id, keys))
+    health = None
+    if service.http_port != OFF:
+        health = opened.enter_context(closing(Health(service.http_bind, service.http_port)))
+    journal = opened.enter_context(closing(_open_journal(service, setup, folder, run_id)))
+    if found is not None:
+        hub.load_state(rest.hub)
+    batches = _read_journal(setup, folder, rest)
+    _insert_again(batches, hub, guard, budget, lockstep, watchdog)
+    if config.resume == "auto" and (found or trainer.episodes):
+        log.info("goes on after %s updates", f"{trainer.updates:,}")
+    elif config.resume == "auto":
+        log.info("a new run begins")
+    checkpointer = Checkpointer(service, folder, guard, hub, journal, clock)
+    metrics = Metrics(folder.tensorboard, folder.curve, trainer.updates)
+    opened.enter_context(closing(metrics))
+    status = StatusCollector(folder.path.name, guard, hub, budget, clock, checkpointer)
+    listeners = [hub.tell, *([] if health is None else [health.update])]
+    reporter = Reporter(trainer, rest.record, service, status, progress, metrics, listeners)
+    loop = Loop(
+        service=service,
+        folder=folder,
+        hub=hub,
+        guard=guard,
+        lockstep=lockstep,
+        budget=budget,
+        clock=clock,
+        checkpointer=checkpointer,
+        reporter=reporter,
+        signals=signals,
+        watchdog=watchdog,
+    )
+    opened.enter_context(closing(loop))
+    http = None if health is None else health.url
+    return loop, connection_of(service, hub, run_id, http, keys)
+
+
+def connection_of(
+    service: ServiceConfig, hub: Hub, run_id: str, http: str | None, keys: Keys | None
+) -> dict[str, str]:
+    """What a worker needs to find this master, and to be let in.
+
+    Args:
+        service: names the host that workers find it under.
+        hub: with its sockets open.
+        run_id: of the run.
+        http: where /metrics and /healthz are, if they are anywhere.
+        keys: where the sockets are encrypted.
+    """
+    host = service.host or socket.gethostname()
+    announced = with_host if service.host else reachable
+    where = {
+        "endpoint": announced(hub.endpoint, host),
+        "weights_endpoint": announced(hub.weights_endpoint, host),
+        "run_id": run_id,
+    }
+    if http is not None:
+        where["http"] = reachable(http, host)
+    if keys is None:
+        return where
+    return where | {
+        "server_key": keys.server_public,
+        "public_key": keys.worker_public,
+        "secret_key": keys.worker_secret,
+    }
+
+
+def _open_hub(config: MasterConfig, setup: Setup, run_id: str, keys: Keys | None) -> Hub:
+    service = config.service
+    info = WelcomeInfo(
+        run_id=run_id,
+        seed=config.seed,
+        fingerprints=setup.fingerprints(),
+        spec=EpisodeSpec.of(setup),
+        window=service.window,
+        lockstep=service.mode == "lockstep",
+    )
+    place, patience_s = (service.bind, service.port), service.silence_seconds
+    return Hub(*place, info, patience_s, keys, service.weights_port)
+
+
+def _open_journal(service: ServiceConfig, setup: Setup, folder: RunFolder, run_id: str) -> Journal:
+    sync_s = service.journal_sync_seconds
+    return Journal(folder.journal, run_id, setup.task_digest(), sync_s)
+
+
+def _read_journal(setup: Setup, folder: RunFolder, rest: Restored) -> Iterator[EpisodesArrived]:
+    """What was acknowledged after the checkpoint."""
+    digest, spec = setup.task_digest(), EpisodeSpec.of(setup)
+    run_id = rest.record.run_id
+    return read_journal(folder.journal, rest.segment, run_id, digest, spec, log.info)
+
+
+def _keys(service: ServiceConfig, folder: RunFolder) -> Keys | None:
+    """Keys where the sockets must be encrypted."""
+    if needs_keys(service.bind, service.security):
+        return run_keys(folder.keys)
+    if not is_loopback(service.bind):
+        log.warning(PLAIN)
+    return None
+
+
+def _restore(config: MasterConfig, folder: RunFolder, trainer: Trainer) -> Restored | None:
+    """Take over the newest checkpoint, or the networks of another run, where this is asked for."""
+    found = restore_run(folder.checkpoints, trainer) if config.resume == "auto" else None
+    if found is None and config.warm_start is not None:
+        warm_start(Path(config.warm_start), trainer)
+    return found
+
+
+def _new_record(journal: Path) -> Record:
+    """Of the run whose journal it is, which was killed before its first checkpoint, or of none."""
+    run_id = journal_run_id(journal)
+    return Record() if run_id is None else Record(run_id)
+
+
+def _insert_again(
+    batches: Iterable[EpisodesArrived],
+    hub: Hub,
+    guard: DivergenceGuard,
+    budget: Budget,
+    lockstep: Lockstep | None,
+    watchdog: Watchdog,
+) -> None:
+    """Take in batches of the journal that the checkpoint does not cover."""
+    trainer, before = guard.trainer, guard.trainer.episodes
+    for batch in batches:
+        watchdog.progress()
+        if not hub.recover(batch):
+            continue
+        # In lockstep a round begins when the updates of those before it are made.
+        if lockstep is not None and lockstep.begins_round(trainer.episodes):
+            while trainer.rate_limiter.may_update() and not budget.updates_spent():
+                watchdog.progress()
+                guard.update(budget.share)
+        trainer.insert(batch.episodes)
+    if trainer.episodes > before:
+        log.info("%s episodes come back from the journal", f"{trainer.episodes - before:,}")

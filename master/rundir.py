@@ -180,7 +180,7 @@ class Clock:
             self.record.train_s += now_s - self._last_s
         self._last_s = now_s
 
-    def stopped(self) -> Record:
+    def read(self) -> Record:
         """The record, with the seconds of all processes of the run until now."""
         self.record.wall_s = self._wall_s + time.monotonic() - self._begun_s
         return self.record

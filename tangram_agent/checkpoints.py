@@ -22,6 +22,7 @@ import numpy.typing as npt
 import safetensors
 import safetensors.numpy
 
+from tangram_agent.files import sync_folder
 from tangram_sim.errors import RunError
 
 FORMAT_VERSION = 2
@@ -93,7 +94,7 @@ def save_checkpoint(
         final = _free_name(folder, updates)
         # From here on it counts; a crash before leaves the older ones as they are.
         aside.rename(final)
-        _sync(folder)
+        sync_folder(folder)
         for old in list_checkpoints(folder)[:-keep]:
             shutil.rmtree(old)
     except OSError as error:
@@ -187,7 +188,7 @@ def _write_content(
     body = json.loads(json.dumps({"updates": updates, "files": files, "counters": counters}))
     manifest = {"format_version": FORMAT_VERSION, "sha256": _digest(body), **body}
     _write(aside / MANIFEST, json.dumps(manifest, indent=1).encode())
-    _sync(aside)
+    sync_folder(aside)
 
 
 def _write(path: Path, data: bytes) -> None:
@@ -195,14 +196,6 @@ def _write(path: Path, data: bytes) -> None:
         file.write(data)
         file.flush()
         os.fsync(file.fileno())
-
-
-def _sync(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def _digest(body: Mapping[str, Any]) -> str:

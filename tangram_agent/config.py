@@ -18,30 +18,39 @@ class NetConfig(Settings, section="net"):
         "mha", "attention network (Eqs. 8-13) or perceptron", choices=("mha", "mlp")
     )
     hidden: tuple[int, ...] = setting(
-        (64, 64), "mlp: widths of the hidden layers", low=1, high=65536
+        (64, 64), "widths of the hidden layers", low=1, high=65536, only={"kind": "mlp"}
     )
-    width: int = setting(64, "mha: size of a node's embedding", low=1, high=4096)
-    layers: int = setting(3, "mha: rounds of message passing", low=1, high=64)
+    width: int = setting(64, "size of a node's embedding", low=1, high=4096, only={"kind": "mha"})
+    layers: int = setting(3, "rounds of message passing", low=1, high=64, only={"kind": "mha"})
     heads: int = setting(
-        4, "mha: M in Eq. 12, each of the key width d = width / heads", low=1, high=64
+        4,
+        "M in Eq. 12, each of the key width d = width / heads",
+        low=1,
+        high=64,
+        only={"kind": "mha"},
     )
     feed_forward: int = setting(
-        512, "mha: hidden width of g in Eq. 13; 0: the single layer of Eq. 8", low=0, high=65536
+        512,
+        "hidden width of g in Eq. 13; 0: the single layer of Eq. 8",
+        low=0,
+        high=65536,
+        only={"kind": "mha"},
     )
     scale: str = setting(
         "d",
-        "mha: Eq. 10 divides the scores by d (the paper) or by sqrt_d (learn2assemble)",
+        "Eq. 10 divides the scores by d (the paper) or by sqrt_d (learn2assemble)",
         choices=("d", "sqrt_d"),
+        only={"kind": "mha"},
     )
 
     def __post_init__(self) -> None:
+        if not self.hidden:
+            raise ConfigError("net.hidden must name at least one layer, got []")
         super().__post_init__()
         if self.width % self.heads:
             raise ConfigError(
                 f"net.width must be a multiple of net.heads, got {self.width} and {self.heads}"
             )
-        if not self.hidden:
-            raise ConfigError("net.hidden must name at least one layer, got []")
 
 
 @dataclass(frozen=True)
@@ -184,7 +193,11 @@ class ServiceConfig(Settings, section="service"):
         choices=("async", "lockstep"),
     )
     lockstep_workers: int = setting(
-        0, "players that lockstep waits for; tangram-train sets it", low=0, high=4096
+        0,
+        "players that lockstep waits for; tangram-train sets it",
+        low=0,
+        high=4096,
+        only={"mode": "lockstep"},
     )
     security: str = setting(
         "auto",
@@ -196,7 +209,10 @@ class ServiceConfig(Settings, section="service"):
         0, "their port, 0 for any free one (see connection.json), -1 for none", low=-1, high=65535
     )
     publish_seconds: float = setting(
-        0.5, "least time between two broadcasts of weights", low=0, unit="s"
+        0.5,
+        "least time between two broadcasts of weights",
+        low=0,
+        unit="s",
     )
     every_update: bool = setting(False, "broadcast after every update instead, as the paper does")
     envs: int = setting(16, "environments that one worker plays at a time", low=1, high=512)

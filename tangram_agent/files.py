@@ -1,4 +1,4 @@
-"""Writing a file at once: a reader sees the old content or the new, never a part."""
+"""Writing a file at once, and for good: a reader sees the old content or the new, never a part."""
 
 import os
 from pathlib import Path
@@ -30,9 +30,23 @@ def write_whole(path: Path, data: bytes, mode: int = PUBLIC) -> None:
                 file.flush()
                 os.fsync(handle)
             aside.replace(path)
+            sync_folder(path.parent)
         finally:
             aside.unlink(missing_ok=True)
     except OSError as error:
         raise RunError(
             f"cannot write {path} ({error.strerror}): make room there or choose another folder"
         ) from None
+
+
+def sync_folder(folder: Path) -> None:
+    """Wait until the names in a folder are on the disk: without this a power cut undoes a rename.
+
+    Raises:
+        OSError: the disk is broken or full.
+    """
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -9,7 +9,7 @@ from tangram_sim.arrays import Bools, Floats, Ints, Singles
 from tangram_sim.config import SimConfig
 from tangram_sim.kinematics import wrap
 from tangram_sim.layout import Layout
-from tangram_sim.sensing import noise_bound
+from tangram_sim.observation_noise import noise_bound
 
 _ROUNDING = 1.0 + 1e-6
 

@@ -21,8 +21,8 @@ from tangram_sim.arrays import Bools, Floats, Ints
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.geometry import outlines, overlap_share, shared_area
 from tangram_sim.layout import Layout
+from tangram_sim.observation_noise import see
 from tangram_sim.rewards import TargetPictures, make_reward, scaled_overlap
-from tangram_sim.sensing import see
 from tangram_sim.targets import Sides, sample_starts, sample_targets
 from tangram_sim.world import make_world
 

@@ -8,30 +8,34 @@ order. The graph of Sec. IV-A has N = 2V + K nodes: token corners (V), bases (K)
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from tangram_sim.arrays import Bools, Floats, Ints
 from tangram_sim.errors import ConfigError
+from tangram_sim.settings import Settings, declared
 from tangram_sim.shapes import Shape, polygon, tan
 
 MAX_TOKENS = 16
 
 
 @dataclass(frozen=True)
-class TokensConfig:
-    """The pieces of a puzzle.
+class TokensConfig(Settings, section="tokens"):
+    """The pieces of a puzzle."""
 
-    Attributes:
-        shapes: names of tans, or mappings {name, corners} that define a convex polygon.
-        scale: side of the full square that the tans are cut from, in arena units; a polygon of
-            the user's own is scaled by the same number.
-    """
-
-    shapes: tuple[Any, ...]
-    scale: float
+    shapes: tuple[Any, ...] = field(
+        metadata=declared(
+            "names of tans, or mappings {name, corners} of convex polygons with 3 to 16 corners"
+        )
+    )
+    scale: float = field(
+        metadata=declared(
+            "side of the full square that tans are cut from, or factor on a polygon's corners",
+            unit="arena units",
+        )
+    )
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.shapes) <= MAX_TOKENS:
@@ -72,6 +76,8 @@ class Layout:
         padded_corners: (K, C) the corners of each token, filled up to the C of the largest by
             repeating the last.
         areas: (K,) of the tokens, squared arena units.
+        radii: (K,) largest distance of a corner from the token's centre, arena units.
+        symmetries: (K,) turns by a whole part of a circle that map a token onto itself.
         chiral: (K,) tokens whose mirror image no turn gives: they can lie on either side.
         base_weights: (K, V) centre of token k as an affine combination of the corners.
         adjacency: (N, N) edges of the graph, E(i, i) = 0.
@@ -86,6 +92,8 @@ class Layout:
         steps = np.minimum(np.arange(max(sizes)), np.array(sizes)[:, None] - 1)
         self.padded_corners: Ints = self.starts[:-1, None] + steps
         self.areas: Floats = np.array([shape.area for shape in self.shapes])
+        self.radii: Floats = np.array([shape.radius for shape in self.shapes])
+        self.symmetries: Ints = np.array([shape.symmetry for shape in self.shapes])
         self.chiral: Bools = np.array([shape.mirror is None for shape in self.shapes])
         self.any_chiral = bool(self.chiral.any())
         self._centred = np.concatenate(

@@ -59,7 +59,7 @@ class PhysicsWorld:
         self._finalizer = weakref.finalize(self, pybullet.disconnect, self._client)
         self._substeps, self._damping = sim.substeps, sim.damping
         self._slides, self._alone = sim.motion == "slide", layout.tokens == 1
-        self._radius = [shape.radius * self._unit for shape in layout.shapes]
+        self._radius = (layout.radii * self._unit).tolist()
         thin = min(thickness(shape.corners) for shape in layout.shapes) * self._unit
         self._stride = min(_STRIDE, _THIN * thin)
         self._flipped: Bools = np.zeros(layout.tokens, dtype=np.bool_)

@@ -61,7 +61,7 @@ def sample_batch(
     poses = np.empty((len(generators), layout.tokens, 3))
     sides = np.zeros(poses.shape[:2], np.bool_) if flipped is None else flipped
     lies = np.zeros(poses.shape[:2], np.bool_)
-    order = sorted(range(layout.tokens), key=lambda token: -layout.shapes[token].area)
+    order = np.argsort(-layout.areas, kind="stable").tolist()
     bodies = layout.body[layout.padded_corners]
     placed: Floats = np.empty((len(generators), 0, *bodies.shape[1:]))
     if laid is not None:
@@ -169,8 +169,7 @@ def check_fits(layout: Layout, sim: SimConfig) -> Floats:
     Raises:
         SamplingError: a token does not fit into the arena at every angle.
     """
-    radius = np.array([shape.radius for shape in layout.shapes])
-    reach: Floats = sim.arena / 2.0 - radius
+    reach: Floats = sim.arena / 2.0 - layout.radii
     if (reach < 0.0).any():
         worst = layout.shapes[int(np.argmin(reach))]
         raise SamplingError(

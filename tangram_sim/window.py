@@ -1,8 +1,8 @@
 """A window in which one can watch tokens move."""
 
-import ctypes
 import math
 import os
+import subprocess
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -16,6 +16,7 @@ from tangram_sim.prisms import ENGINE_ARENA, prism
 
 # Tokens thick enough to be seen from the side, over a flat target.
 _SHOWN_HALF_HEIGHT, _FLAT_HALF_HEIGHT = 0.03, 0.001
+_PATIENCE_S = 30.0  # with a display that does not answer
 _OUT_OF_SIGHT = (0.0, 0.0, -1e4)  # until it is told where to lie
 _PAPER = " ".join(
     f"--background_color_{name}={value}"
@@ -40,7 +41,7 @@ class Window:
         Raises:
             TangramError: no display.
         """
-        _check_display()
+        _check_display(engine)
         self._engine = engine
         self._unit = ENGINE_ARENA / arena
         self._client = self._engine.connect(self._engine.GUI, options=_PAPER)
@@ -112,23 +113,17 @@ class Window:
         )
 
 
-def _check_display() -> None:
-    """Refuse what the engine would end the process for: on Linux, no X server."""
-    if sys.platform != "linux":
-        return
+def _check_display(engine: Any) -> None:
+    """Refuse what the engine would end this process for: a child process tries it first."""
+    attempt = f"import {engine.__name__} as e; e.disconnect(e.connect(e.GUI))"
     try:
-        x11 = ctypes.CDLL("libX11.so.6")
-    except OSError:
-        raise _no_window("libX11 is not installed") from None
-    x11.XOpenDisplay.restype = ctypes.c_void_p
-    display = x11.XOpenDisplay(None)
-    if not display:
-        named = os.environ.get("DISPLAY")
-        raise _no_window(f"DISPLAY={named} does not answer" if named else "DISPLAY is not set")
-    x11.XCloseDisplay(ctypes.c_void_p(display))
-
-
-def _no_window(why: str) -> TangramError:
-    return TangramError(
-        f"live=true needs a display ({why}): log in with one, or leave live out and write a film"
-    )
+        subprocess.run(
+            [sys.executable, "-c", attempt], capture_output=True, check=True, timeout=_PATIENCE_S
+        )
+    except (subprocess.CalledProcessError, subprocess.TimeoutExpired):
+        display = os.environ.get("DISPLAY")
+        why = f"none answers at DISPLAY={display}" if display else "DISPLAY is not set"
+        raise TangramError(
+            f"live=true needs a display ({why}): log in with one, or leave live out and write a "
+            "film"
+        ) from None

@@ -15,9 +15,21 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 TIERS = ("fast", "cluster", "slow", "slurm")
 
 
+# Fixtures that take many seconds and are made once for all tests that look at what they made.
+SHARED = ("trained", "study", "straight", "made")
+
+
+@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Refuse a test without its tier: it would run nowhere or everywhere, by accident."""
+    """Refuse a test without its tier: it would run nowhere or everywhere, by accident.
+
+    Tests that share a fixture go to one worker of --dist=loadgroup, all others wherever one is
+    free.
+    """
     for item in items:
+        for name in SHARED:
+            if name in getattr(item, "fixturenames", ()):
+                item.add_marker(pytest.mark.xdist_group(name))
         tiers = [name for name in TIERS if item.get_closest_marker(name)]
         if len(tiers) != 1:
             raise pytest.UsageError(

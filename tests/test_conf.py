@@ -1,6 +1,5 @@
-"""Config groups, presets, overrides and help."""
+"""Presets, overrides, help, and the entry of every command."""
 
-import dataclasses
 import re
 import sys
 from collections.abc import Callable
@@ -8,58 +7,44 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import hydra
 import pytest
 import yaml
-from omegaconf import OmegaConf
 
-from conf.cli import entry, with_run_config
-from conf.help import Plain, choices, group_defaults, help_text, setting_names
-from conf.names import hidden, revealed
+from conf.cli import composed, entry, with_run_config
+from conf.commands import COMMANDS, GROUPS, Plain, load
+from conf.help import choices, group_help, help_text, setting_names
 from conf.sweep import check_launcher, refuse_lost_job
-from master.config import LaunchConfig, MasterConfig
-from tangram_agent.config import AgentConfig, NetConfig, ServiceConfig, TwinConfig
-from tangram_agent.setup import SECTIONS, Setup, from_mapping, make_setup
+from tangram_agent.config import AgentConfig, NetConfig, ServiceConfig
+from tangram_agent.setup import Setup, from_mapping, make_setup
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.errors import ConfigError, TangramError
-from tangram_sim.layout import TokensConfig
-from worker.config import EvalConfig, PlayConfig, StatusConfig, WorkerConfig
+from tangram_sim.settings import declared_fields
 
 pytestmark = pytest.mark.fast
 
-GROUPS = {
-    "tokens": TokensConfig,
-    "sim": SimConfig,
-    "reward": RewardConfig,
-    "net": NetConfig,
-    "agent": AgentConfig,
-    "service": ServiceConfig,
-}
-PRIMARIES = ("train", "master", "worker", "status", "eval", "play", "experiments", "report")
 WITH_GROUPS = ("train", "master", "worker")
 PRESETS = [(group, name) for group in GROUPS for name in choices(group)]
 
 
 def compose(primary: str, *overrides: str) -> dict[str, Any]:
-    with hydra.initialize_config_module("conf", version_base="1.3"):
-        config = hydra.compose(primary, hidden(overrides, primary))
-    plain = OmegaConf.to_container(config)
-    assert isinstance(plain, dict)
-    return revealed({str(name): value for name, value in plain.items()}, primary)
+    return composed(primary, overrides)
 
 
-def field_names(kind: Any) -> set[str]:
-    return {field.name for field in dataclasses.fields(kind)}
-
-
-# Config and dataclasses say the same
+# Presets are what differs from the declarations
 
 
 @pytest.mark.parametrize(("group", "name"), PRESETS)
-def test_preset_writes_out_every_field(group: str, name: str) -> None:
-    section = compose("train", f"{group}={name}")[group]
-    assert set(section) == field_names(GROUPS[group])
-    from_mapping(GROUPS[group], section)
+def test_a_preset_sets_what_is_declared_and_differs(group: str, name: str) -> None:
+    text = (files("conf") / group / f"{name}.yaml").read_text("utf-8")
+    assert text.startswith("# ")
+    made = compose("train", f"{group}={name}")[group]
+    from_mapping(load(GROUPS[group]), made)
+    usual = COMMANDS["train"].sections()[group]
+    written = yaml.safe_load(text) or {}
+    own = written.get(group, written)  # of one for the whole config its own section
+    for key in set(own) - {"defaults", "name", "kind", "backend"}:
+        assert key in usual
+        assert made[key] != usual[key], f"{group}={name} says {key} for nothing"
 
 
 def test_what_is_not_given_is_as_the_tangram_agent_has_it() -> None:
@@ -70,40 +55,11 @@ def test_what_is_not_given_is_as_the_tangram_agent_has_it() -> None:
     assert make_setup(compose("train", "agent=paper")).net == NetConfig()
 
 
-@pytest.mark.parametrize("name", choices("agent"))
-def test_first_twin_of_a_preset_writes_out_every_field(name: str) -> None:
-    twins = compose("train", f"agent={name}")["agent"]["hindsight"]
-    assert set(twins[0]) == field_names(TwinConfig)
-
-
-@pytest.mark.parametrize(
-    ("primary", "kinds", "extra"),
-    [
-        ("train", (LaunchConfig, MasterConfig), {"master"}),
-        ("master", (MasterConfig,), set()),
-        ("worker", (WorkerConfig,), set()),
-        ("status", (StatusConfig,), set()),
-        ("eval", (EvalConfig,), set()),
-        ("play", (PlayConfig,), set()),
-    ],
-)
-def test_primary_has_every_field(primary: str, kinds: tuple[Any, ...], extra: set[str]) -> None:
-    groups = SECTIONS if primary in WITH_GROUPS else ()
-    names = set(compose(primary)) - set(groups) - {"from_config"}
-    assert names == set().union(*map(field_names, kinds)) - extra
-
-
 @pytest.mark.parametrize("primary", WITH_GROUPS)
 def test_primaries_with_groups_make_a_setup(primary: str) -> None:
     setup = make_setup(compose(primary))
     assert setup == make_setup(compose("train"))
     assert setup.layout.tokens == 1
-
-
-@pytest.mark.parametrize(("group", "name"), PRESETS)
-def test_preset_says_what_it_is_for(group: str, name: str) -> None:
-    text = (files("conf") / group / f"{name}.yaml").read_text("utf-8")
-    assert text.startswith("# ")
 
 
 @pytest.mark.parametrize(
@@ -147,7 +103,7 @@ def test_net_is_the_agents_unless_it_is_chosen(
     primary: str, overrides: tuple[str, ...], net: str
 ) -> None:
     expected = yaml.safe_load((files("conf") / "net" / f"{net}.yaml").read_text("utf-8"))
-    assert compose(primary, *overrides)["net"] == expected
+    assert compose(primary, *overrides)["net"] == COMMANDS["train"].sections()["net"] | expected
 
 
 @pytest.mark.parametrize("name", ["paper", "mlp"])
@@ -249,15 +205,19 @@ def test_tokens_of_a_command_without_groups_are_a_name(given: str, name: str | N
     settings = compose("play", f"tokens={given}", "out=a.gif")
     assert (settings["tokens"], settings["out"]) == (name, "a.gif")
     assert compose("play")["tokens"] is None
-    assert hidden(["tokens=square", "seed=1"], "train") == ["tokens=square", "seed=1"]
+    assert compose("train", "tokens=square")["tokens"]["shapes"] == ["square"]
 
 
 # Help
 
 
-@pytest.mark.parametrize("primary", PRIMARIES)
-def test_examples_of_the_help_compose(primary: str) -> None:
+@pytest.mark.parametrize("primary", COMMANDS)
+def test_help_explains_every_setting_and_its_examples_compose(primary: str) -> None:
     text = help_text(primary)
+    lines = text.splitlines()
+    for own in COMMANDS[primary].fields():
+        (line,) = [line for line in lines if line.startswith(f"  {own.name}: ")]
+        assert len(line.partition("  # ")[2]) > 5
     examples = [line.split() for line in text.partition("Examples:")[2].strip().splitlines()]
     assert len(examples) == 3
     for command, *overrides in examples:
@@ -265,20 +225,97 @@ def test_examples_of_the_help_compose(primary: str) -> None:
         compose(primary, *overrides)
 
 
-@pytest.mark.parametrize("primary", PRIMARIES)
-def test_help_explains_every_setting(primary: str) -> None:
-    lines = help_text(primary).splitlines()
-    inside = {"families", "trainings", "tests", "experiments"}  # of the catalogue
-    for name in set(compose(primary)) - set(group_defaults(primary)) - inside:
-        (line,) = [line for line in lines if line.startswith(f"  {name}: ")]
-        assert "  # " in line
+@pytest.mark.parametrize("group", GROUPS)
+def test_help_of_a_group_has_a_line_for_each_setting(group: str) -> None:
+    lines = group_help(group).splitlines()
+    assert lines[0] == f"{group}={'|'.join(choices(group))}"
+    names = [line.partition(":")[0] for line in lines[2:]]
+    assert names == [f"{group}.{own.name}" for own in declared_fields(load(GROUPS[group]))]
 
 
 def test_known_settings_are_those_that_compose() -> None:
-    names = set(setting_names("train"))
     top = compose("train")
     dotted = {f"{group}.{key}" for group in GROUPS for key in top[group]}
-    assert names == set(top) | dotted
+    assert set(setting_names("train")) == set(top) | dotted
+
+
+# Presets of one's own
+
+
+@pytest.fixture
+def presets(tmp_path: Path) -> Path:
+    (tmp_path / "tokens").mkdir()
+    mine = "shapes: [square, {name: bar, corners: [[0, 0], [2, 0], [2, 1], [0, 1]]}]\nscale: 0.5\n"
+    (tmp_path / "tokens" / "mine.yaml").write_text(mine)
+    return tmp_path
+
+
+def seen_by_train(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> Plain | int:
+    monkeypatch.setattr(sys, "argv", ["tangram-train", *arguments])
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "")
+    seen: list[Plain] = []
+    status = entry("train", lambda settings: seen.append(settings) or 0)
+    return seen[0] if seen else status
+
+
+@pytest.mark.parametrize("form", ["--config-dir {}", "--config-dir={}", "-cd {}"])
+def test_presets_of_ones_own_are_taken(
+    monkeypatch: pytest.MonkeyPatch, presets: Path, form: str
+) -> None:
+    settings = seen_by_train(monkeypatch, "tokens=mine", *form.format(presets).split(), "seed=3")
+    assert isinstance(settings, dict)
+    assert settings["seed"] == 3
+    assert [shape.name for shape in make_setup(settings).layout.shapes] == ["square", "bar"]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("tokens/mine.yaml", "scale: 1\n", "set tokens.shapes=..., it has no default"),
+        ("tokens/mine.yaml", "shapes: [", "while parsing"),
+        ("tokens/square.yaml", "scale: 1\n", "is called as a preset that comes with tangram-rl"),
+    ],
+)
+def test_wrong_presets_of_ones_own_are_refused(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    presets: Path,
+    name: str,
+    content: str,
+    message: str,
+) -> None:
+    (presets / name).write_text(content)
+    assert seen_by_train(monkeypatch, "tokens=mine", "--config-dir", str(presets)) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--config-dir", "nowhere"], "--config-dir: there is no folder"),
+        (["--config-dir"], "--config-dir takes one folder"),
+        (["tokens=mine"], "unknown tokens 'mine': choose from hexagon"),
+        (["tokens=[square,square]"], "write tokens.shapes=[square,square]"),
+        (["sim=[physics,kinematic]"], "sim takes one preset, got [physics,kinematic]"),
+    ],
+)
+def test_what_would_be_merged_silently_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    message: str,
+) -> None:
+    assert seen_by_train(monkeypatch, *arguments) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_help_names_presets_of_ones_own(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], presets: Path
+) -> None:
+    assert seen_by_train(monkeypatch, "--help", "--config-dir", str(presets)) == 0
+    assert "medium_triangle, mine, pair" in capsys.readouterr().out.replace("\n           ", " ")
 
 
 # The entry of every command

@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 import yaml
-from hydra import compose, initialize_config_module
+
+from conf.cli import composed
 
 pytestmark = pytest.mark.fast
 
@@ -15,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 DOCKER = ROOT / "docker"
 COMPOSE: dict[str, Any] = yaml.safe_load((DOCKER / "docker-compose.yml").read_text())
 # Neither plays nor learns: the gymnasium environment, and the figures of reports.
-LEFT_OUT = {"gymnasium", "matplotlib"}
+LEFT_OUT = {"gymnasium", "matplotlib", "msgspec"}
 
 
 def requirements(name: str) -> set[str]:
@@ -72,8 +73,7 @@ def test_nothing_runs_as_root() -> None:
 def test_commands_of_the_compose_file_are_settings_that_exist(service: str) -> None:
     primary = "master" if service.startswith("master") else "worker"
     overrides = filled(COMPOSE["services"][service]["command"]).split()
-    with initialize_config_module("conf", version_base="1.3"):
-        compose(primary, overrides)
+    composed(primary, overrides)
 
 
 def test_the_command_of_the_master_image_exists() -> None:
@@ -81,9 +81,8 @@ def test_the_command_of_the_master_image_exists() -> None:
     commands = [
         re.findall(r'"([^"]+)"', line) for line in re.findall(r"^CMD (.*)$", text, re.MULTILINE)
     ]
-    with initialize_config_module("conf", version_base="1.3"):
-        compose("worker", commands[0])
-        compose("master", commands[1])
+    composed("worker", commands[0])
+    composed("master", commands[1])
 
 
 def test_every_variable_has_a_default_that_the_file_shows() -> None:

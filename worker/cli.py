@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from conf.cli import composed, entry
-from conf.help import Plain
+from conf.commands import Plain
 
 
 def worker() -> int:

@@ -220,17 +220,10 @@ class Client:
 
         return self._order if self._wait(is_new, "its turn") else None
 
-    def drain(self, timeout_s: float) -> bool:
-        """Wait until all batches are acknowledged, also after `stop`; False if that failed."""
-        deadline = time.monotonic() + timeout_s
-        while self.outbox and not self._dismissed and time.monotonic() < deadline:
-            self.poll(min(STEP_S, timeout_s))
-        return not self.outbox
-
-    def close(self, reason: str = "") -> None:
+    def close(self) -> None:
         """Say BYE and close; takes a second at most, also when nobody listens."""
         if self._connection.sockets is not None:
-            self._connection.sockets.send(Bye(reason or self.stop_reason or "done").encode())
+            self._connection.sockets.send(Bye(self.stop_reason or "done").encode())
         self._connection.close()
 
     def _wait(self, done: Callable[[], bool], what: str, timeout_s: float = math.inf) -> bool:

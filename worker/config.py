@@ -9,7 +9,7 @@ from tangram_agent.messages import MAX_INDEX, ROLES
 from tangram_agent.pretrained import PREFIX, agent_names
 from tangram_sim.config import MAX_CORNER_NOISE
 from tangram_sim.errors import ConfigError
-from tangram_sim.settings import check_choice, check_range
+from tangram_sim.settings import Settings, declared, setting
 
 CHANGES = ("order", "reapply", "refine_steps", "gamma")  # of how an agent plays
 MAX_EPISODES = 1_000_000
@@ -53,96 +53,100 @@ def _check_out(value: str) -> None:
         raise ConfigError(f"out must name a file, got '{value}': set out=scores.json")
 
 
-def _check_actions(value: int | None) -> None:
-    if value is not None:
-        check_range("actions", value, 1, MAX_ACTIONS)
-
-
 @dataclass(frozen=True)
-class WorkerConfig:
-    """One process that plays for a master, or that scores what the master has learned.
+class WorkerConfig(Settings):
+    """One process that plays for a master, or that scores what the master has learned."""
 
-    Attributes:
-        connect: where the master listens, such as tcp://192.168.0.7:5555.
-        role: player (explores, sends episodes) or evaluator (noise off, sends scores).
-        index: number among the workers of a run; -1 lets the master choose.
-        service: sizes and intervals.
-    """
-
-    connect: str
-    role: str = "player"
-    index: int = -1
+    connect: str = field(
+        metadata=declared(
+            "the run: its folder or its connection.json; or only an address, tcp://host:port"
+        )
+    )
+    role: str = setting(
+        "player", "or evaluator: noise off, fixed tests, sends scores", choices=ROLES
+    )
+    index: int = setting(
+        -1, "number of this worker, -1: the master gives one", low=-1, high=MAX_INDEX
+    )
     service: ServiceConfig = field(default_factory=ServiceConfig)
 
     def __post_init__(self) -> None:
         _check_connect(self.connect)
-        check_choice("role", self.role, ROLES)
-        check_range("index", self.index, -1, MAX_INDEX)
+        super().__post_init__()
 
 
 @dataclass(frozen=True)
-class StatusConfig:
-    """How a run stands (tangram-status).
+class StatusConfig(Settings):
+    """How a run stands (tangram-status)."""
 
-    Attributes:
-        connect: where its master listens: tcp://host:port, a connection file or a run folder.
-        every_seconds: ask again after so long; 0 asks once.
-        json: print a JSON object instead of a table.
-    """
-
-    connect: str
-    every_seconds: float = 0.0
-    json: bool = False
+    connect: str = field(
+        metadata=declared("the run: its folder, its connection.json, or tcp://host:port")
+    )
+    every_seconds: float = setting(
+        0.0,
+        "ask again after so long, until Ctrl-C; 0: once",
+        low=0,
+        high=MAX_SECONDS,
+        unit="s",
+    )
+    json: bool = setting(False, "print one JSON object a line instead of a table")
 
     def __post_init__(self) -> None:
         _check_connect(self.connect)
-        check_range("every_seconds", self.every_seconds, 0.0, MAX_SECONDS)
+        super().__post_init__()
 
 
 @dataclass(frozen=True)
-class EvalConfig:
-    """Scores of a finished run on the fixed test set, or on puzzles (tangram-eval).
+class EvalConfig(Settings):
+    """Scores of a finished run on the fixed test set, or on puzzles (tangram-eval)."""
 
-    Attributes:
-        run_dir: folder of the run; None with puzzles: the agent of the game.
-        episodes: how many of the fixed test episodes; of no account with puzzles.
-        actions: actions per token; None is what the run was trained with (Table II: 1 to 5).
-        corner_noise: see `SimConfig`; None is what the run was trained with.
-        seed: of the test episodes; 0 is the fixed test set that training is scored on.
-        out: JSON file for the scores; None prints them only.
-        puzzles: a file, or a split of the library, to assemble instead of random targets.
-        turns: angles that each puzzle is played at, evenly spread from how it is drawn.
-        skip_invalid: leave out puzzles that cannot be played.
-        sheet: PNG file for a picture of every puzzle's end.
-        order, reapply, refine_steps, gamma: see `AgentConfig`; None: as the run was trained.
-    """
-
-    run_dir: str | None = None
-    episodes: int = 100
-    actions: int | None = None
-    corner_noise: float | None = None
-    seed: int = 0
-    out: str | None = None
-    puzzles: str | None = None
-    turns: int = 1
-    skip_invalid: bool = False
-    sheet: str | None = None
-    order: str | None = None
-    reapply: int | None = None
-    refine_steps: int | None = None
-    gamma: float | None = None
+    run_dir: str | None = setting(
+        None, "folder of the run, or pretrained/NAME; with puzzles pretrained/tangram7 if not given"
+    )
+    episodes: int = setting(
+        100,
+        "test episodes, the same ones for every run; not with puzzles",
+        low=1,
+        high=MAX_EPISODES,
+    )
+    actions: int | None = setting(
+        None, "actions for each token, null: as trained", low=1, high=MAX_ACTIONS
+    )
+    corner_noise: float | None = setting(
+        None,
+        "noise on the corners that the agent sees, null: as trained",
+        low=0,
+        high=MAX_CORNER_NOISE,
+        unit="arenas",
+    )
+    seed: int = setting(
+        0, "of the test episodes, and of the starts of puzzles", low=0, high=MAX_SEED
+    )
+    out: str | None = setting(None, "JSON file for the scores; they are printed anyway")
+    puzzles: str | None = setting(
+        None,
+        "instead of random targets: your JSON or SVG file, or test or train of the library",
+    )
+    turns: int = setting(
+        1,
+        "with puzzles: each at so many angles, evenly spread; 1 is as drawn",
+        low=1,
+        high=MAX_TURNS,
+    )
+    skip_invalid: bool = setting(False, "with puzzles: leave out those that cannot be played")
+    sheet: str | None = setting(None, "with puzzles: PNG file, a picture of every puzzle's end")
+    order: str | None = setting(
+        None, "which token is next, see agent.order; null: as trained", choices=ORDERS
+    )
+    reapply: int | None = setting(None, "see agent.reapply; null: as trained")
+    refine_steps: int | None = setting(None, "see agent.refine_steps; null: as trained")
+    gamma: float | None = setting(None, "see agent.gamma; null: as trained")
 
     def __post_init__(self) -> None:
         _check_run(self.run_dir, self.puzzles is not None)
-        check_range("episodes", self.episodes, 1, MAX_EPISODES)
-        check_range("seed", self.seed, 0, MAX_SEED)
-        _check_actions(self.actions)
-        if self.corner_noise is not None:
-            check_range("corner_noise", self.corner_noise, 0.0, MAX_CORNER_NOISE)
+        super().__post_init__()
         if self.out is not None:
             _check_out(self.out)
-        if self.order is not None:
-            check_choice("order", self.order, ORDERS)
         self._check_puzzles()
 
     @property
@@ -157,7 +161,6 @@ class EvalConfig:
         return {name: value for name, value in named.items() if value is not None}
 
     def _check_puzzles(self) -> None:
-        check_range("turns", self.turns, 1, MAX_TURNS)
         needs = {"turns": self.turns > 1, "sheet": self.sheet, "skip_invalid": self.skip_invalid}
         for name, given in needs.items():
             if given and self.puzzles is None:
@@ -203,32 +206,34 @@ def check_puzzle(value: object) -> tuple[str, ...] | None:
 
 
 @dataclass(frozen=True)
-class PlayConfig:
-    """Pictures of finished runs at play (tangram-play): of one, or of several on the same starts.
+class PlayConfig(Settings):
+    """Pictures of a run at play (tangram-play), or of several on the same starts."""
 
-    Attributes:
-        run_dir: folder of the run; None to compare, or with tokens or puzzles.
-        out: file to write: .gif moves, .png shows the ends.
-        episodes: shown side by side; of no account with puzzles.
-        actions: actions per token; None is what each run was trained with.
-        seed: decides which episodes are shown, and where pieces of puzzles start.
-        compare: folders of 2 to 4 runs of the same tokens and arena; None to show one.
-        tokens: the agent of these tokens that comes with the package; with `run_dir` both agree.
-        puzzle: names of puzzles to assemble instead of random targets; None with `puzzles`: all.
-        puzzles: a file, or a split of the library, that they are in; None is all of the library.
-        live: play in a window instead of writing a file.
-    """
-
-    run_dir: str | None = None
-    out: str = "play.gif"
-    episodes: int = 12
-    actions: int | None = None
-    seed: int = 0
-    compare: tuple[str, ...] | None = None
-    tokens: str | None = None
-    puzzle: tuple[str, ...] | None = None
-    puzzles: str | None = None
-    live: bool = False
+    run_dir: str | None = setting(
+        None, "folder of the run, or an agent that comes with tangram-rl: pretrained/square"
+    )
+    out: str = setting("play.gif", ".gif for an animation, .png for one picture")
+    episodes: int = setting(
+        12, "episodes shown side by side; not with puzzles", low=1, high=MAX_SHOWN
+    )
+    actions: int | None = setting(
+        None, "actions for each token, null: as trained", low=1, high=MAX_ACTIONS
+    )
+    seed: int = setting(0, "of the episodes, and of the starts of puzzles", low=0, high=MAX_SEED)
+    compare: tuple[str, ...] | None = setting(
+        None, "folders of 2 to 4 runs, as in [runs/a,runs/b]: all on the same starts"
+    )
+    tokens: str | None = setting(
+        None, "instead of run_dir the agent that comes with tangram-rl for these tokens: square"
+    )
+    puzzle: tuple[str, ...] | None = setting(
+        None, "assemble this puzzle of the library instead of random targets, or several: [cat,dog]"
+    )
+    puzzles: str | None = setting(
+        None,
+        "a JSON or SVG file of your own, or train or test: all in it, or those that puzzle names",
+    )
+    live: bool = setting(False, "play in a window instead of writing a file")
 
     def __post_init__(self) -> None:
         check_compare(self.compare)
@@ -238,9 +243,7 @@ class PlayConfig:
                 f"out must end with {' or '.join(PICTURES)}, got '{self.out}': .gif moves, .png "
                 "shows the ends"
             )
-        check_range("episodes", self.episodes, 1, MAX_SHOWN)
-        _check_actions(self.actions)
-        check_range("seed", self.seed, 0, MAX_SEED)
+        super().__post_init__()
 
     @property
     def plays_puzzles(self) -> bool:

@@ -34,7 +34,7 @@ def pose_errors(layout: Layout, ends: Floats, goals: Floats) -> tuple[Floats, Fl
     """
     pairing = paired(layout, ends, goals)
     position: Floats = np.linalg.norm(pairing.way[..., :2], axis=-1)
-    largest = 180.0 / np.array([shape.symmetry for shape in layout.shapes])
+    largest = 180.0 / layout.symmetries
     turn = np.degrees(np.abs(pairing.way[..., 2]))
     return position, np.where(pairing.other_side, largest, turn)
 

@@ -43,8 +43,7 @@ def paired(layout: Layout, corners: Floats, goals: Floats) -> Pairing:
     turns = _turns(layout)
     ways = _all_ways(layout, corners, goals, turns)
     sides = layout.flipped(corners)[:, :, None] != layout.flipped(goals)[:, None, :]
-    radius = np.array([shape.radius for shape in layout.shapes])
-    cost = np.linalg.norm(ways[..., :2], axis=-1) + radius[:, None] * np.abs(ways[..., 2])
+    cost = np.linalg.norm(ways[..., :2], axis=-1) + layout.radii[:, None] * np.abs(ways[..., 2])
     cost += sides * (cost.sum(axis=(1, 2), keepdims=True) + 1.0)
     target = np.tile(np.arange(layout.tokens), (len(corners), 1))
     for group in _groups(turns):
@@ -82,7 +81,7 @@ def _all_ways(layout: Layout, corners: Floats, goals: Floats, turns: Floats) -> 
     ways: Floats = layout.poses(goals)[:, None] - layout.poses(corners)[:, :, None]
     # A body on its other side is turned the other way.
     turn = np.where(layout.flipped(goals)[:, None], -1.0, 1.0) * np.nan_to_num(turns)
-    period = 2.0 * np.pi / np.array([shape.symmetry for shape in layout.shapes])
+    period = 2.0 * np.pi / layout.symmetries
     ways[..., 2] += turn
     ways[..., 2] -= period * np.round(ways[..., 2] / period)
     return ways

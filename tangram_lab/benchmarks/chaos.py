@@ -91,7 +91,7 @@ class Trial:
 
     def pids(self, words: str) -> list[int]:
         """Processes of the run whose command line holds these words."""
-        return [pid for pid, line in processes_of(self.folder).items() if words in line]
+        return [one.pid for one, line in processes_of(self.folder).items() if words in line]
 
     def strike(self, kind: str) -> None:
         """One fault, and the time until all take part again and learning has gone on."""
@@ -150,7 +150,7 @@ def _garbage(trial: Trial) -> None:
         raw.sendall(trial.dice.randbytes(4096))
 
 
-EVALUATOR, MASTER = "role=evaluator", "-m master"
+EVALUATOR, MASTER = "role=evaluator", "-m tangram_cli master"
 KINDS: dict[str, Callable[[Trial], None]] = {
     "worker killed": _signal("role=player", signal.SIGKILL),
     "worker asked to end": _signal("role=player", signal.SIGTERM),

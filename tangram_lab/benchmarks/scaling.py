@@ -64,7 +64,8 @@ class Run:
 
     def signal(self, number: signal.Signals) -> None:
         """To all processes of the run."""
-        for pid in (*processes_of(self.folder), *self.more):
+        pids = (process.pid for process in processes_of(self.folder))
+        for pid in (*pids, *self.more):
             os.kill(pid, number)
 
     @contextmanager
@@ -83,11 +84,8 @@ class Run:
 
     def cpu_s(self) -> float:
         """CPU time of the processes that name the folder."""
-        ticks = 0
-        for pid in processes_of(self.folder):
-            entries = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-            ticks += int(entries[11]) + int(entries[12])  # user and system
-        return ticks / os.sysconf("SC_CLK_TCK")
+        spent = (process.cpu_times() for process in processes_of(self.folder))
+        return float(sum(one.user + one.system for one in spent))
 
     def rates(self, *names: str) -> dict[str, float]:
         """By how much some numbers grow in a second, and CPU seconds as "cpu"."""
@@ -164,15 +162,13 @@ def _ages(run: Run) -> Sequence[float]:
 
 
 @contextmanager
-def _training(
-    folder: Path, count: int, *settings: str, command: str = "tangram-train"
-) -> Iterator[Run]:
+def _training(folder: Path, count: int, *settings: str, name: str = "train") -> Iterator[Run]:
     """A training or a master with so many players, stopped once all of them have played."""
-    process = start_training(folder, *settings, command=command)
+    process = start_training(folder, *settings, name=name)
     run = Run(folder)
     try:
         wait_for(folder / "connection.json", process)
-        if command == "tangram-train":
+        if name == "train":
             _settle(run, count)
         yield run
     finally:
@@ -193,7 +189,7 @@ def _fed(folder: Path, count: int) -> Iterator[Run]:
     settings = (*ENDLESS, f"service.publish_seconds={PUBLISH_S}")
     connect, ages = folder / "connection.json", folder / "ages"
     with (
-        _training(folder, count, *settings, command="tangram-master") as run,
+        _training(folder, count, *settings, name="master") as run,
         players(connect, setup, played(setup, BATCH), count, ages) as pid,
     ):
         run.more.append(pid)

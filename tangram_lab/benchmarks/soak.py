@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from tangram_lab.benchmarks.report import show, write
 from tangram_lab.benchmarks.trainings import processes_of, result_of, start_training, wait_for
 from tangram_lab.experiments.report.style import COLOURS, WIDTH_IN, drawing, empty_figure, save
@@ -66,21 +68,20 @@ def run_soak(minutes: float, seed: int, out: Path | None, folder: Path) -> int:
 
 
 def _sample(samples: Samples, minute: float, folder: Path) -> None:
-    for pid, line in processes_of(folder).items():
+    for process, line in processes_of(folder).items():
         try:
-            pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-            files = len(list(Path(f"/proc/{pid}/fd").iterdir()))
-        except OSError:
+            memory, files = process.memory_info().rss / MIB, process.num_fds()
+        except psutil.NoSuchProcess:
             continue  # it ended meanwhile
-        points = samples.setdefault(f"{_name(line)} ({pid})", [])
-        points.append((minute, pages * 4096 / MIB, files))
+        points = samples.setdefault(f"{_name(line)} ({process.pid})", [])
+        points.append((minute, memory, files))
 
 
 def _name(line: str) -> str:
-    for words, name in (("-m master", "master"), ("role=evaluator", "evaluator")):
+    for words, name in (("-m tangram_cli master", "master"), ("role=evaluator", "evaluator")):
         if words in line:
             return name
-    return "worker" if "-m worker" in line else "launcher"
+    return "worker" if "-m tangram_cli worker" in line else "launcher"
 
 
 def _row(name: str, points: list[tuple[float, float, int]], minutes: float) -> dict[str, Any]:

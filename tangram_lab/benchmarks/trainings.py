@@ -11,21 +11,21 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import psutil
+
+from master.children import command
 from tangram_sim.errors import TangramError
 
 LOOK_S = 0.3
 PATIENCE_S = 60.0
 
 
-def start_training(
-    folder: Path, *settings: str, command: str = "tangram-train"
-) -> "subprocess.Popen[bytes]":
-    """A training in the background, or a master; what it says goes to `told` in its folder."""
+def start_training(folder: Path, *settings: str, name: str = "train") -> "subprocess.Popen[bytes]":
+    """A training in the background, or a `master`; what it says goes to `told` in its folder."""
     folder.mkdir(parents=True)
-    program = str(Path(sys.executable).with_name(command))
     with (folder / "told").open("wb") as told:
         return subprocess.Popen(
-            [program, f"run_dir={folder}", *settings],
+            [sys.executable, *command(name), f"run_dir={folder}", *settings],
             stdout=told,
             stderr=told,
             start_new_session=True,
@@ -54,17 +54,13 @@ def running(*settings: str) -> Iterator[Path]:
             launcher.wait(PATIENCE_S)
 
 
-def processes_of(folder: Path) -> dict[int, str]:
+def processes_of(folder: Path) -> dict[psutil.Process, str]:
     """Process -> command line, of those that name a run folder."""
     found = {}
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit() and int(entry.name) != os.getpid():
-            try:
-                line = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode()
-            except OSError:
-                continue  # it ended meanwhile
-            if str(folder) in line:
-                found[int(entry.name)] = line
+    for process in psutil.process_iter(["cmdline"]):
+        line = " ".join(process.info["cmdline"] or ())  # none of a process that ended meanwhile
+        if str(folder) in line and process.pid != os.getpid():
+            found[process] = line
     return found
 
 

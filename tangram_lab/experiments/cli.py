@@ -6,7 +6,7 @@ Everything heavy is imported after the config was composed, so --help and wrong 
 from pathlib import Path
 
 from conf.cli import composed, entry
-from conf.help import Plain
+from conf.commands import Plain
 
 
 def experiment() -> int:

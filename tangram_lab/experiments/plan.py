@@ -8,15 +8,16 @@ import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 from tangram_sim.config import MAX_CORNER_NOISE
 from tangram_sim.errors import ConfigError
-from tangram_sim.settings import check_choice, check_range
+from tangram_sim.settings import Settings, check_choice, check_range, declared, setting
 from worker.config import MAX_ACTIONS
 
 FORMAT = 1
-KINDS = ("curves", "complexity", "tests", "rewards", "ranking", "game")
+Kind = Literal["curves", "complexity", "tests", "rewards", "ranking", "game"]
+KINDS: tuple[str, ...] = get_args(Kind)
 PLAN = "plan.json"
 
 
@@ -119,30 +120,27 @@ class BudgetConfig:
 
 
 @dataclass(frozen=True)
-class StudyConfig:
+class StudyConfig(Settings):
     """Experiments, and where and how they are run.
 
     Attributes:
-        run_dir: the study folder.
         budget: of every training.
         families: overrides that the trainings of a family share.
         trainings, tests: the catalogue.
         experiments: what to run.
-        jobs: trainings at a time.
-        dry: only list what would be done.
     """
 
-    run_dir: str
+    run_dir: str = field(metadata=declared("folder of all trainings; experiments share them"))
     budget: BudgetConfig
     families: dict[str, tuple[str, ...]]
     trainings: dict[str, TrainingConfig]
     tests: dict[str, TestConfig]
     experiments: dict[str, ExperimentConfig] = field(default_factory=dict)
-    jobs: int = 2
-    dry: bool = False
+    jobs: int = setting(2, "trainings at a time; a learner keeps one core busy", low=1, high=1024)
+    dry: bool = setting(False, "only list what would be done")
 
     def __post_init__(self) -> None:
-        check_range("jobs", self.jobs, 1, 1024)
+        super().__post_init__()
         for name, experiment in self.experiments.items():
             for kind, wanted in (("trainings", experiment.trainings), ("tests", experiment.tests)):
                 _check_known(f"experiment {name}: {kind}", wanted, getattr(self, kind))

@@ -8,8 +8,9 @@ seeds.
 import argparse
 import hashlib
 import json
+import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -21,9 +22,10 @@ import yaml
 
 from tangram_agent.checkpoints import load_checkpoint, newest_checkpoint
 from tangram_agent.files import write_whole
-from tangram_agent.pretrained import CARD, CARD_TEXT, CONFIG, WEIGHTS
+from tangram_agent.policy import Policy
+from tangram_agent.pretrained import CARD, CARD_TEXT, CONFIG, FORMAT, PREFIX, WEIGHTS
 from tangram_agent.runs import ACTING, CHECKPOINTS, Run, load_run
-from tangram_lab.experiments.card import card_text, make_card
+from tangram_agent.setup import Setup
 from tangram_sim.errors import ConfigError, RunError, TangramError
 from tangram_sim.targets import has_all_tans
 from worker.config import EvalConfig
@@ -159,6 +161,244 @@ def _weights(run: Run) -> bytes:
 def _config(run: Run) -> str:
     """What makes the setup, every value written out; a run's config also names its machine."""
     return yaml.safe_dump(asdict(run.setup), sort_keys=False)
+
+
+# The card: what the agent is, what made it, what it can do
+
+
+Scores = Mapping[str, float]
+
+# What result.json says of a run's effort, for the card.
+_BUDGET = ("updates", "train_s", "wall_s", "cores", "processor", "device", "workers")
+
+# Scores of the card's tables: name -> label, digits.
+_ROWS = {
+    "mean_reward": ("mean reward, exact polygons, -1 to 1", 4),
+    "mean_reward_camera": ("mean reward, camera's pixels, -1 to 1", 4),
+    "raw_overlap": ("raw overlap, 0 to 1", 4),
+    "raw_overlap_p10": ("raw overlap, 10th percentile", 4),
+    "share_solved": ("share of targets covered by 0.95 or more", 3),
+    "iou": ("intersection over union", 4),
+    "wrong": ("pieces under a token of another shape", 2),
+    "blocked": ("placements refused because of other tokens", 2),
+    "angle_error_deg_median": ("angle error, median, degrees", 2),
+    "angle_error_deg_p90": ("angle error, 90th percentile", 2),
+    "position_error_median": ("position error, median, arena units", 4),
+    "position_error_p90": ("position error, 90th percentile", 4),
+}
+
+
+def make_card(
+    name: str,
+    setup: Setup,
+    result: Mapping[str, Any],
+    seeds: Sequence[Mapping[str, Any]],
+    tested: Mapping[str, Scores],
+) -> dict[str, Any]:
+    """The content of card.json but for the tests and the checksum.
+
+    Args:
+        name: of the agent.
+        setup: the task and the agent.
+        result: result.json of the run that ships.
+        seeds: result.json of all runs, by seed.
+        tested: scores of the shipped weights and of the policies to compare with.
+    """
+    return {
+        "format": FORMAT,
+        "name": name,
+        "licence": "MIT",
+        "task": _task(setup),
+        "agent": setup.agent.name,
+        "net": setup.net.kind,
+        "parameters": {"acting": _numbers(setup), "trained": result["parameters"]},
+        "data": {
+            "source": f"simulated by this project ({setup.sim.backend}), random starts and targets",
+            **{key: result[key] for key in ("episodes", "transitions")},
+        },
+        "budget": {key: result[key] for key in _BUDGET},
+        "updates": result["updates"],
+        "seed": result["seed"],
+        "selection": "median of the seeds by final mean_reward (the lower one of two)",
+        "scores": {score: result.get(score) for score in _ROWS},
+        "test_episodes": result["test_episodes"],
+        "seeds": [
+            {key: one.get(key) for key in ("seed", "train_s", "episodes", *_ROWS)} for one in seeds
+        ],
+        "limits": _limits(setup, tested[RUN]),
+        "commit": result["commit"],
+        "versions": result["versions"],
+    }
+
+
+def _task(setup: Setup) -> dict[str, Any]:
+    return {
+        "tokens": [shape.name for shape in setup.layout.shapes],
+        "token_areas": setup.layout.areas.round(9).tolist(),
+        "scale": setup.tokens.scale,
+        "arena": setup.sim.arena,
+        "actions_per_token": setup.sim.actions_per_token,
+        "backend": setup.sim.backend,
+    }
+
+
+def _numbers(setup: Setup) -> int:
+    """Trainable numbers of the acting actor."""
+    return sum(math.prod(shape) for shape in Policy(setup).shapes.values())
+
+
+def _limits(setup: Setup, scores: Scores) -> list[str]:
+    sim, tokens = setup.sim, setup.layout.tokens
+    noise = (
+        f"Corners with noise of {sim.corner_noise:g} of the arena, as in training."
+        if sim.corner_noise
+        else "Exact corners only: it was trained without noise and never saw a wrong corner."
+    )
+    pieces = "One token of this shape and size" if tokens == 1 else "This token set and size"
+    return [
+        f"{pieces}, in an arena of this width: another task needs another training.",
+        noise,
+        "Each corner must be known by its number: the target's corners come in the token's order.",
+        *_motion_limits(setup),
+        f"One of ten tests ends below a raw overlap of {scores['raw_overlap_p10']:.3f}.",
+    ]
+
+
+def _motion_limits(setup: Setup) -> list[str]:
+    if setup.layout.tokens == 1:
+        return ["Nothing stops a token at the arena's edge."]
+    told = {
+        "lift": "Tokens are lifted and set down: it knows nothing of pushes along the table.",
+        "slide": "Tokens slide, and push others by the simulation's friction.",
+    }
+    return [
+        told[setup.sim.motion],
+        "The target's pieces must be known, each by its corners: a silhouette is not enough.",
+    ]
+
+
+def card_text(card: Mapping[str, Any]) -> str:
+    """card.md: the same for people."""
+    lines = [
+        f"# {PREFIX}/{card['name']}",
+        "",
+        _about(card),
+        "",
+        *_usage(card["name"]),
+        *_training(card),
+        *_evaluation(card),
+        "## Limits",
+        "",
+        *(f"- {limit}" for limit in card["limits"]),
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _about(card: Mapping[str, Any]) -> str:
+    task = card["task"]
+    areas = ", ".join(f"{area:g}" for area in task["token_areas"])
+    actions = task["actions_per_token"]
+    if len(task["tokens"]) > 1:
+        return (
+            f"An agent that assembles {len(task['tokens'])} tangram tokens "
+            f"({', '.join(task['tokens'])}; full square of side {task['scale']:g}) in an order of "
+            f"its own, each with {actions} action{'s' * (actions > 1)}, in a square arena of width "
+            f"{task['arena']:g}. Agent `{card['agent']}`, network `{card['net']}` with "
+            f"{card['parameters']['acting']:,} parameters. Licence: {card['licence']}."
+        )
+    return (
+        f"An agent that moves a tangram token ({', '.join(task['tokens'])}; area {areas}) from "
+        f"anywhere in a square arena of width {task['arena']:g} onto its target, position and "
+        f"angle, in {actions} action{'s' * (actions > 1)}. Agent `{card['agent']}`, network "
+        f"`{card['net']}` with {card['parameters']['acting']:,} parameters. "
+        f"Licence: {card['licence']}."
+    )
+
+
+def _usage(name: str) -> list[str]:
+    return [
+        "## How to use it",
+        "",
+        "```bash",
+        f"tangram-eval run_dir={PREFIX}/{name} episodes=400 seed=1",
+        f"tangram-play run_dir={PREFIX}/{name} out={name}.gif",
+        "```",
+        "",
+        "```python",
+        "from tangram_agent.runs import load_run",
+        "",
+        f'run = load_run("{PREFIX}/{name}")',
+        "actions = run.policy.act(corners, placed, goals)  # see docs/inference.md",
+        "```",
+        "",
+    ]
+
+
+def _training(card: Mapping[str, Any]) -> list[str]:
+    data, budget = card["data"], card["budget"]
+    versions = ", ".join(f"{package} {number}" for package, number in card["versions"].items())
+    return [
+        "## Training",
+        "",
+        f"- Data: {data['episodes']:,} episodes with {data['transitions']:,} transitions, "
+        f"{data['source']}; nothing else.",
+        f"- Budget: {budget['updates']:,} updates in {budget['train_s']:.0f} s, "
+        f"{budget['wall_s']:.0f} s in all, on {budget['cores']} cores "
+        f"({budget['processor']}), device {budget['device']}, {budget['workers']} "
+        f"worker{'s' * (budget['workers'] != 1)}.",
+        f"- Code: commit {card['commit'] or 'unknown'}; {versions}.",
+        "",
+    ]
+
+
+def _evaluation(card: Mapping[str, Any]) -> list[str]:
+    seeds, tests = card["seeds"], card["tests"]
+    names = [f"seed {one['seed']}{' (this one)' * (one['seed'] == card['seed'])}" for one in seeds]
+    compared = {"this agent" if name == RUN else name: s for name, s in tests["scores"].items()}
+    return [
+        "## Evaluation",
+        "",
+        f"All seeds after their last update, on the {card['test_episodes']:.0f} fixed tests of "
+        f"the training; the {card['selection']} ships.",
+        "",
+        *_table(dict(zip(names, seeds, strict=True))),
+        "",
+        f"This agent on {tests['episodes']} other tests (seed {tests['seed']}), which nothing was "
+        "chosen on, beside policies that learned nothing:",
+        "",
+        *_table(compared),
+        "",
+        *_puzzles(card),
+    ]
+
+
+def _puzzles(card: Mapping[str, Any]) -> list[str]:
+    """Scores on the figures of the library, where the tokens are all seven tans."""
+    found = card.get("puzzles", {})
+    if not found:
+        return []
+    splits = {f"{name} split": one["scores"] for name, one in found.items()}
+    turns = next(iter(found.values()))["turns"]
+    return [
+        f"On the figures of tangram_sim/puzzles, each at {turns} angles; it trained on random "
+        "targets only, so that neither split was seen:",
+        "",
+        *_table(splits),
+        "",
+    ]
+
+
+def _table(columns: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Markdown: a row for each score, a column for each name."""
+    lines = ["| | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
+    for key, (label, digits) in _ROWS.items():
+        values = [scores.get(key) for scores in columns.values()]
+        if all(value is None for value in values):
+            continue
+        shown = ["-" if value is None else f"{value:.{digits}f}" for value in values]
+        lines.append(f"| {label} | " + " | ".join(shown) + " |")
+    return lines
 
 
 def main() -> int:

@@ -63,12 +63,13 @@ def test_equals_a_naive_oracle_under_random_operations(seed: int) -> None:
         assert rewards(replay) == sorted(oracle)
 
 
-def test_samples_every_kept_transition_alike() -> None:
+@pytest.mark.parametrize(("added", "kept"), [(14, range(5, 15)), (6, range(1, 7))])
+def test_samples_every_kept_transition_alike_and_no_other(added: int, kept: range) -> None:
     replay = buffer(10)
-    replay.add(numbered(0, 14))
-    drawn = replay.sample(20_000, np.random.default_rng(0)).reward
+    replay.add(numbered(1, added))
+    drawn = replay.sample(2000 * len(kept), np.random.default_rng(0)).reward
     values, counts = np.unique(drawn, return_counts=True)
-    assert values.tolist() == list(range(4, 14))
+    assert values.tolist() == list(kept)
     assert counts.min() > 1800
     assert counts.max() < 2200
 

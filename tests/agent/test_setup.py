@@ -206,10 +206,13 @@ def test_wrong_service_settings_are_refused(name: str, value: object, reason: st
 
 
 def test_stages_are_read_from_mappings() -> None:
-    stages = [{"updates": 0, "tokens": 2, "spread": 1}, {"updates": 10, "targets": "connected"}]
+    stages = [
+        {"updates": 0, "tokens": 2, "targets": "gaussian", "spread": 1},
+        {"updates": 10, "targets": "connected"},
+    ]
     read = make_setup(changed("sim", stages=stages)).sim
     assert read.stages == (
-        StageConfig(tokens=2, spread=1.0),
+        StageConfig(tokens=2, targets="gaussian", spread=1.0),
         StageConfig(updates=10, targets="connected"),
     )
     assert read.stage(9) == 1

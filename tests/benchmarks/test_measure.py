@@ -50,7 +50,7 @@ def test_ways_are_measured_in_turns() -> None:
 
 
 def bench(*arguments: str) -> "subprocess.CompletedProcess[str]":
-    command = [Path(sys.executable).with_name("tangram-bench"), *arguments]
+    command = [sys.executable, "-m", "tangram_cli", "bench", *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=110, check=False)
 
 

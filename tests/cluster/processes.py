@@ -6,8 +6,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
+from io import StringIO
 from pathlib import Path
+from unittest import mock
+
+from hydra.core.global_hydra import GlobalHydra
+
+from tangram_cli.commands import COMMANDS
 
 BIN = Path(sys.executable).parent
 LIMIT_S = 60.0
@@ -15,23 +21,7 @@ LIMIT_S = 60.0
 
 def run(command: str, *arguments: str, cwd: Path, limit_s: float = LIMIT_S) -> str:
     """Run a command to its end and return what it printed; a failure shows that."""
-    done = _ended(command, *arguments, cwd=cwd, limit_s=limit_s)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
-
-
-def refused(command: str, *arguments: str, cwd: Path) -> str:
-    """Run a command that must refuse; the one line that it says."""
-    done = _ended(command, *arguments, cwd=cwd, limit_s=LIMIT_S)
-    assert done.returncode == 2, done.stdout + done.stderr
-    (line,) = done.stderr.splitlines()
-    return line
-
-
-def _ended(
-    command: str, *arguments: str, cwd: Path, limit_s: float
-) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
+    done = subprocess.run(
         [BIN / command, *arguments],
         cwd=cwd,
         capture_output=True,
@@ -39,6 +29,44 @@ def _ended(
         timeout=limit_s,
         check=False,
     )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def here(command: str, *arguments: str, cwd: Path) -> tuple[int, str, str]:
+    """Run a command in this process, for what starts no other; its status, output and errors.
+
+    A process of its own takes seconds, most of them for imports.
+    """
+    out, err = StringIO(), StringIO()
+    with (
+        chdir(cwd),
+        redirect_stdout(out),
+        redirect_stderr(err),
+        mock.patch.object(sys, "argv", [command, *arguments]),
+        mock.patch.object(sys, "meta_path", [*sys.meta_path]),
+        mock.patch.dict(os.environ),
+    ):
+        try:
+            status = COMMANDS[command.removeprefix("tangram-")]()
+        finally:
+            GlobalHydra.instance().clear()
+    return status, out.getvalue(), err.getvalue()
+
+
+def run_here(command: str, *arguments: str, cwd: Path) -> str:
+    """As `run`, in this process: for what starts no other."""
+    status, out, err = here(command, *arguments, cwd=cwd)
+    assert status == 0, out + err
+    return out
+
+
+def refused(command: str, *arguments: str, cwd: Path) -> str:
+    """Run a command that must refuse before it starts anything; the one line that it says."""
+    status, out, err = here(command, *arguments, cwd=cwd)
+    assert (status, out) == (2, ""), out + err
+    (line,) = err.splitlines()
+    return line
 
 
 @contextmanager

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from tangram_agent.pretrained import agent_names
-from tests.cluster.processes import refused, run
+from tests.cluster.processes import refused, run, run_here
 from tests.worker.builders import write_run
 
 pytestmark = pytest.mark.cluster
@@ -45,8 +45,8 @@ def test_wrong_choices_of_runs_are_one_line(
 
 @pytest.mark.parametrize("name", agent_names())
 def test_an_agent_of_the_package_is_scored_from_any_folder(tmp_path: Path, name: str) -> None:
-    arguments = (f"run_dir=pretrained/{name}", "episodes=50", "seed=1", "out=scores.json")
-    run("tangram-eval", *arguments, cwd=tmp_path)
+    arguments = (f"run_dir=pretrained/{name}", "episodes=20", "seed=1", "out=scores.json")
+    run_here("tangram-eval", *arguments, cwd=tmp_path)
     scores = json.loads((tmp_path / "scores.json").read_text())
     assert scores["mean_reward"] > 0.9
     assert scores["run_dir"] == f"pretrained/{name}"

@@ -1,4 +1,4 @@
-"""The five commands as processes, started from another folder."""
+"""The commands, started from another folder: their help, and what they refuse."""
 
 import os
 import subprocess
@@ -6,6 +6,8 @@ import sys
 from pathlib import Path
 
 import pytest
+
+from tests.cluster.processes import here, refused
 
 pytestmark = pytest.mark.cluster
 
@@ -98,13 +100,20 @@ WRONG = [
 @pytest.mark.parametrize(("line", "message"), WRONG)
 def test_wrong_input_is_one_line(tmp_path: Path, line: str, message: str) -> None:
     command, *arguments = line.split()
-    result = run(tmp_path, command, *arguments)
-    assert result.returncode == 2
-    assert result.stdout == ""
-    assert result.stderr.startswith(f"{command}: ")
-    assert message in result.stderr
-    assert result.stderr.count("\n") == 1
+    told = refused(command, *arguments, cwd=tmp_path)
+    assert told.startswith(f"{command}: ")
+    assert message in told
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "line", ["tangram-train sed=1", "tangram-worker", "tangram-eval run_dir=x"]
+)
+def test_a_process_says_one_line_and_no_warning(tmp_path: Path, line: str) -> None:
+    result = run(tmp_path, *line.split())
+    assert (result.returncode, result.stdout) == (2, "")
+    assert result.stderr.startswith(f"{line.split(maxsplit=1)[0]}: ")
+    assert result.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -112,10 +121,8 @@ def test_wrong_input_is_one_line(tmp_path: Path, line: str, message: str) -> Non
 )
 def test_an_own_reward_that_fails_is_told_before_anything_starts(tmp_path: Path, line: str) -> None:
     (tmp_path / "own.py").write_text("def near(achieved, desired, layout): return 1 / 0")
-    result = run(tmp_path, *line.split(), "reward.name=own.py:near")
-    assert result.returncode == 2
-    assert "own.py:near failed: ZeroDivisionError" in result.stderr
-    assert result.stderr.count("\n") == 1
+    told = refused(*line.split(), "reward.name=own.py:near", cwd=tmp_path)
+    assert "own.py:near failed: ZeroDivisionError" in told
     assert [path.name for path in tmp_path.iterdir()] == ["own.py"]
 
 
@@ -123,8 +130,8 @@ def test_an_own_reward_that_fails_is_told_before_anything_starts(tmp_path: Path,
 def test_config_and_version_are_shown_and_leave_nothing_behind(
     tmp_path: Path, command: str
 ) -> None:
-    assert run(tmp_path, command, "--version").stdout.startswith(f"{command} 0.")
-    result = run(tmp_path, command, "hydra.verbose=false", "--cfg", "job")
-    assert (result.returncode, result.stderr) == (0, "")
-    assert "hydra" not in result.stdout
+    assert here(command, "--version", cwd=tmp_path)[1].startswith(f"{command} 0.")
+    status, out, err = here(command, "hydra.verbose=false", "--cfg", "job", cwd=tmp_path)
+    assert (status, err) == (0, "")
+    assert "hydra" not in out
     assert list(tmp_path.iterdir()) == []

@@ -7,9 +7,17 @@ from pathlib import Path
 import pytest
 
 from tangram_agent.checkpoints import list_checkpoints
-from tests.cluster.processes import all_ended, pids_of, refused, run, started, wait_for_file
+from tests.cluster.processes import (
+    all_ended,
+    pids_of,
+    refused,
+    run,
+    run_here,
+    started,
+    wait_for_file,
+)
 
-pytestmark = pytest.mark.cluster
+pytestmark = [pytest.mark.cluster, pytest.mark.timeout(300)]
 
 SMALL = ("experiment=[table2]", "budget=smoke", "experiments.table2.tests=[actions_2]")
 LONG = "budget.overrides.tangram=['max_updates=1000000']"
@@ -19,7 +27,7 @@ LONG = "budget.overrides.tangram=['max_updates=1000000']"
 def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of Table II with the smoke budget and one test."""
     folder = tmp_path_factory.mktemp("experiments") / "study"
-    told = run("tangram-experiment", *SMALL, f"run_dir={folder}", cwd=folder.parent, limit_s=110)
+    told = run("tangram-experiment", *SMALL, f"run_dir={folder}", cwd=folder.parent, limit_s=240)
     assert told.startswith("0 of 4 jobs were done before\n")
     assert "\n[4/4] " in told
     return folder
@@ -47,7 +55,7 @@ def test_what_is_done_is_skipped(study: Path) -> None:
         return {path: path.stat().st_mtime_ns for path in study.rglob("*.json")}
 
     before = times()
-    told = run("tangram-experiment", *SMALL, f"run_dir={study}", cwd=study.parent)
+    told = run_here("tangram-experiment", *SMALL, f"run_dir={study}", cwd=study.parent)
     assert told == "4 of 4 jobs were done before\n"
     assert {path for path, when in times().items() if before[path] != when} == {study / "plan.json"}
 
@@ -59,7 +67,7 @@ def test_other_settings_are_refused(study: Path) -> None:
 
 
 def test_a_report_is_drawn(study: Path, tmp_path: Path) -> None:
-    run("tangram-report", f"runs={study}", f"out={tmp_path / 'report'}", cwd=tmp_path)
+    run_here("tangram-report", f"runs={study}", f"out={tmp_path / 'report'}", cwd=tmp_path)
     text = (tmp_path / "report" / "README.md").read_text()
     result, test = scores(study, "tangram")
     assert f"| MHA (tangram) | 1 of 1 | {test['mean_reward']:.3f} |" in text
@@ -84,7 +92,7 @@ def test_a_signal_stops_a_study_and_the_same_command_goes_on(tmp_path: Path) -> 
     done = json.loads((run_dir / "result.json").read_text())
     assert done["ended_by"].startswith("SIG")
 
-    listed = run("tangram-experiment", *arguments, LONG, "dry=true", cwd=tmp_path)
+    listed = run_here("tangram-experiment", *arguments, LONG, "dry=true", cwd=tmp_path)
     assert listed.splitlines()[:2] == ["tangram, seed 0", "tangram, seed 0, test actions_2"]
     bound = f"budget.overrides.tangram=['max_updates={done['updates'] + 5}']"
     settings = run_dir / "config.yaml"

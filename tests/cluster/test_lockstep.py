@@ -85,7 +85,7 @@ def test_kills_in_the_middle_change_nothing(straight: Path, tmp_path: Path) -> N
     folder = tmp_path / "killed"
     settings = (f"run_dir={folder}", *STEP, "service.checkpoint_minutes=0.01")
     with started("tangram-train", *settings, cwd=tmp_path) as process:
-        for victim, updates in (("role=player", 50), ("-m master", 150)):
+        for victim, updates in (("role=player", 50), ("-m tangram_cli master", 150)):
             until_updates(folder, updates)
             found = [pid for pid in pids_of(folder) if victim in _line(pid)]
             os.kill(min(found), signal.SIGKILL)

@@ -105,46 +105,6 @@ def test_the_documented_example_runs(trained: Path, monkeypatch: pytest.MonkeyPa
     assert names["overlap"] > 0.8
 
 
-def test_a_killed_launcher_leaves_no_orphans(tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    with started("tangram-train", f"run_dir={folder}", *QUICK, cwd=tmp_path) as launcher:
-        wait_for_file(folder / "logs" / "worker-0.log", launcher)
-        wait_for_file(folder / "connection.json", launcher)
-        children = [pid for pid in pids_of(folder) if pid != launcher.pid]
-        assert len(children) >= 2
-        launcher.kill()
-        assert all_ended(children, 30)
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_a_training_cleanly(tmp_path: Path, number: signal.Signals) -> None:
-    folder = tmp_path / "run"
-    arguments = (f"run_dir={folder}", *QUICK, "max_updates=100000")
-    with started("tangram-train", *arguments, cwd=tmp_path) as launcher:
-        wait_for_file(folder / "connection.json", launcher)
-        children = pids_of(folder)
-        launcher.send_signal(number)
-        assert all_ended(children, 60)
-        launcher.wait(10)
-    assert list_checkpoints(folder / "checkpoints")
-    assert json.loads((folder / "result.json").read_text())["updates"] < 100_000
-
-
-def test_a_finished_run_is_extended(tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    run("tangram-train", f"run_dir={folder}", *QUICK, "max_updates=40", cwd=tmp_path)
-    first = json.loads((folder / "result.json").read_text())
-    # Up to service.lag_updates of them are owed already; the rest needs new episodes.
-    arguments = (f"run_dir={folder}", *QUICK, "max_updates=200", "resume=auto")
-    printed = run("tangram-train", *arguments, "service.log_format=json", cwd=tmp_path)
-    second = json.loads((folder / "result.json").read_text())
-    assert (first["updates"], second["updates"]) == (40, 200)
-    told = [json.loads(line) for line in printed.splitlines()]
-    assert {"note", "status", "result"} <= {line["event"] for line in told}
-    assert told[-1].items() >= second.items()
-    assert second["episodes"] > first["episodes"]
-
-
 def test_a_refused_resume_leaves_the_run_as_it_was(trained: Path) -> None:
     before = (trained / "config.yaml").read_bytes()
     arguments = (f"run_dir={trained}", "resume=auto", "tokens=parallelogram")
@@ -153,47 +113,61 @@ def test_a_refused_resume_leaves_the_run_as_it_was(trained: Path) -> None:
     assert (trained / "config.yaml").read_bytes() == before
 
 
-def test_the_same_signal_twice_in_a_moment_is_one_wish(tmp_path: Path) -> None:
-    """As `timeout` sends it: to the process, and to its group."""
+def test_a_warm_start_from_nowhere_is_refused(tmp_path: Path) -> None:
+    line = refused("tangram-train", "run_dir=x", *QUICK, "warm_start=nowhere", cwd=tmp_path)
+    assert line.startswith(f"tangram-train: warm_start={tmp_path / 'nowhere'} has no checkpoint")
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        (signal.SIGINT,),
+        # Twice in a moment is one wish: `timeout` sends it to the process, and to its group.
+        (signal.SIGTERM, signal.SIGTERM),
+    ],
+)
+def test_a_signal_ends_a_training_cleanly(tmp_path: Path, numbers: tuple[signal.Signals]) -> None:
     folder = tmp_path / "run"
     arguments = (f"run_dir={folder}", *QUICK, "max_updates=100000")
     with started("tangram-train", *arguments, cwd=tmp_path) as launcher:
         wait_for_file(folder / "connection.json", launcher)
-        launcher.send_signal(signal.SIGTERM)
-        launcher.send_signal(signal.SIGTERM)
-        assert launcher.wait(60) == 0
-    assert (folder / "result.json").exists()
+        children = pids_of(folder)
+        for number in numbers:
+            launcher.send_signal(number)
+        assert all_ended(children, 60)
+        assert launcher.wait(10) == 0
+    assert list_checkpoints(folder / "checkpoints")
+    assert json.loads((folder / "result.json").read_text())["updates"] < 100_000
 
 
-def test_each_job_of_a_multirun_has_a_folder(tmp_path: Path) -> None:
-    arguments = ("--multirun", "seed=0,1", "run_dir=sweep", *QUICK, "max_updates=1")
-    run("tangram-train", *arguments, cwd=tmp_path, limit_s=120)
-    seeds = [json.loads((tmp_path / "sweep" / n / "result.json").read_text())["seed"] for n in "01"]
-    assert seeds == [0, 1]
-
-
-@pytest.mark.parametrize("agent", ["paper", "mlp"])
-def test_every_agent_trains_through_the_same_path(tmp_path: Path, agent: str) -> None:
-    folder = tmp_path / "run"
-    arguments = (f"agent={agent}", "agent.batch_size=16", "max_updates=20", *QUICK)
-    run("tangram-train", f"run_dir={folder}", *arguments, cwd=tmp_path, limit_s=120)
-    result = json.loads((folder / "result.json").read_text())
-    assert (result["agent"], result["updates"]) == (agent, 20)
-    assert result["parameters"] == {"paper": 504_324, "mlp": 13_508}[agent]
-
-
-def test_a_warm_start_begins_with_another_runs_networks_once(trained: Path) -> None:
+def test_a_run_begins_with_anothers_networks_once_and_is_extended(trained: Path) -> None:
     """The folder is named as seen from where the command is given, and shapes may differ."""
     folder = trained.parent / "warm"
     arguments = (f"run_dir={folder}", *QUICK, "tokens=large_triangle", f"warm_start={trained.name}")
-    told = run("tangram-train", *arguments, "max_updates=5", cwd=trained.parent)
+    told = run("tangram-train", *arguments, "max_updates=40", cwd=trained.parent)
     updates = json.loads((trained / "result.json").read_text())["updates"]
     assert f"begins with the networks of {trained} after {updates} updates" in told
-    again = run("tangram-train", *arguments, "max_updates=9", "resume=auto", cwd=trained.parent)
-    assert "begins with the networks" not in again
-    assert "goes on after 5 updates" in again
+    first = json.loads((folder / "result.json").read_text())
+    # Up to service.lag_updates of them are owed already; the rest needs new episodes.
+    more = ("max_updates=200", "resume=auto", "service.log_format=json")
+    printed = run("tangram-train", *arguments, *more, cwd=trained.parent)
+    assert "begins with the networks" not in printed
+    assert "goes on after 40 updates" in printed
+    second = json.loads((folder / "result.json").read_text())
+    assert (first["updates"], second["updates"]) == (40, 200)
+    lines = [json.loads(line) for line in printed.splitlines()]
+    assert {"note", "status", "result"} <= {line["event"] for line in lines}
+    assert lines[-1].items() >= second.items()
+    assert second["episodes"] > first["episodes"]
 
 
-def test_a_warm_start_from_nowhere_is_refused(tmp_path: Path) -> None:
-    line = refused("tangram-train", "run_dir=x", *QUICK, "warm_start=nowhere", cwd=tmp_path)
-    assert line.startswith(f"tangram-train: warm_start={tmp_path / 'nowhere'} has no checkpoint")
+def test_each_job_of_a_multirun_has_a_folder_and_every_agent_trains_the_same_way(
+    tmp_path: Path,
+) -> None:
+    arguments = ("--multirun", "agent=paper,mlp", "run_dir=sweep", "agent.batch_size=16", *QUICK)
+    run("tangram-train", *arguments, "max_updates=20", cwd=tmp_path, limit_s=240)
+    results = [json.loads((tmp_path / "sweep" / n / "result.json").read_text()) for n in "01"]
+    assert [(one["agent"], one["updates"], one["parameters"]) for one in results] == [
+        ("paper", 20, 504_324),
+        ("mlp", 20, 13_508),
+    ]

@@ -1,11 +1,8 @@
 """Every preset of conf/: each experiment is what its name says."""
 
-from typing import Any
-
-import hydra
 import pytest
-from omegaconf import OmegaConf
 
+from conf.cli import composed
 from conf.help import choices
 from tangram_agent.setup import Setup, from_mapping, make_setup
 from tangram_lab.experiments.plan import StudyConfig
@@ -15,24 +12,17 @@ pytestmark = pytest.mark.fast
 PAPERS = ["fig4", "table1", "table2", "fig5", "fig6"]
 
 
-def compose(primary: str, overrides: list[str]) -> dict[str, Any]:
-    with hydra.initialize_config_module("conf", version_base="1.3"):
-        composed = OmegaConf.to_container(hydra.compose(primary, overrides), resolve=True)
-    assert isinstance(composed, dict)
-    return {str(name): value for name, value in composed.items()}
-
-
 def study(budget: str, names: list[str]) -> StudyConfig:
     chosen = f"experiment=[{','.join(names)}]"
-    return from_mapping(StudyConfig, compose("experiments", [f"budget={budget}", chosen]))
+    return from_mapping(StudyConfig, composed("experiments", [f"budget={budget}", chosen]))
 
 
 def setup_of(config: StudyConfig, training: str) -> Setup:
-    return make_setup(compose("train", ["run_dir=x", *config.command(training)]))
+    return make_setup(composed("train", ["run_dir=x", *config.command(training)]))
 
 
 def test_the_papers_figures_and_tables_are_the_default() -> None:
-    config = from_mapping(StudyConfig, compose("experiments", []))
+    config = from_mapping(StudyConfig, composed("experiments", []))
     assert list(config.experiments) == PAPERS
     assert config.budget.name == "laptop"
     assert config.budget.seeds == (0, 1, 2)
@@ -62,6 +52,6 @@ def test_the_papers_budget_is_the_papers() -> None:
 
 def test_the_papers_trainings_publish_and_reward_as_the_paper_does() -> None:
     config = study("laptop", PAPERS)
-    made = compose("train", ["run_dir=x", *config.command("paper")])
+    made = composed("train", ["run_dir=x", *config.command("paper")])
     assert made["service"]["every_update"]
     assert (made["reward"]["source"], made["sim"]["camera"]) == ("camera", True)

@@ -62,7 +62,7 @@ CHANGES = {
         "paper_afterstate": {"agent.afterstate"},
         "paper_near": {"agent.hindsight"},
         "paper_no_hindsight": {"agent.hindsight"},
-        "paper_decay": {"agent.lr_decay", "agent.lr_final"},
+        "paper_decay": {"agent.lr_decay"},
         "paper_all_edges": {"agent.edges"},
         "paper_mlp": {"net.kind"},
     },

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from tangram_lab.experiments.designs import PAPER, TEST, TRAIN
-from tangram_lab.experiments.figures import GRID, figure_pieces, file_text, sheet
-from tangram_lab.experiments.tiling import atoms, tilings
+from tangram_lab.experiments.puzzles import GRID, atoms, figure_pieces, file_text, sheet, tilings
 from tangram_sim.errors import ConfigError
 from tangram_sim.puzzles import PACKAGED, library
 

@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tangram_lab.experiments import camera_picture
-from tangram_lab.experiments.camera_picture import take_shots
-from tangram_lab.experiments.graph_picture import TOKENS, embeddings, node_classes
-from tangram_lab.experiments.pictures import draw_paper_pictures
+from tangram_lab.experiments import pictures
+from tangram_lab.experiments.pictures import (
+    TOKENS,
+    draw_paper_pictures,
+    embeddings,
+    node_classes,
+    take_shots,
+)
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import make_layout
 
@@ -49,8 +53,8 @@ def test_without_the_engine_the_kinematic_camera_is_used_and_named(
         if sim.backend == "physics":
             raise ConfigError("no module named 'pybullet'")
 
-    monkeypatch.setattr(camera_picture, "check_world", refuse)
-    _, caption = camera_picture.draw_camera()
+    monkeypatch.setattr(pictures, "check_world", refuse)
+    _, caption = pictures.draw_camera()
     assert "the kinematic world's camera (PyBullet is not installed)" in caption
 
 

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from tangram_lab.experiments.jobs import Job
-from tangram_lab.experiments.progress import StudyProgress, bound
+from tangram_lab.experiments.runner import StudyProgress, bound
 
 pytestmark = pytest.mark.fast
 

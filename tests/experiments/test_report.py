@@ -10,10 +10,10 @@ from xml.etree import ElementTree as ET
 import pytest
 from PIL import Image
 
-from tangram_lab.experiments.report import write
+from tangram_lab.experiments.report import page as report_page
 from tangram_lab.experiments.report.cli import report, with_absolute_paths
 from tangram_lab.experiments.report.config import ReportConfig
-from tangram_lab.experiments.report.write import write_report
+from tangram_lab.experiments.report.page import write_report
 from tangram_sim.errors import ConfigError, RunError
 from tests.experiments.builders import (
     cells,
@@ -49,7 +49,7 @@ def patch() -> Iterator[pytest.MonkeyPatch]:
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory, patch: pytest.MonkeyPatch) -> Path:
     """A report on the study of the builders."""
-    patch.setattr(write, "draw_paper_pictures", lambda out: [("Puzzle", "p.png", "A cat.")])
+    patch.setattr(report_page, "draw_paper_pictures", lambda out: [("Puzzle", "p.png", "A cat.")])
     runs, out = tmp_path_factory.mktemp("runs"), tmp_path_factory.mktemp("out") / "new" / "report"
     write_study(runs)
     write_report(runs, out)
@@ -193,7 +193,7 @@ def test_figures_are_png_and_svg(made: Path, name: str) -> None:
 
 
 def test_same_runs_give_the_same_bytes(tmp_path: Path, patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(write, "draw_paper_pictures", lambda out: [])
+    patch.setattr(report_page, "draw_paper_pictures", lambda out: [])
     study = plan({"a": experiment("ranking", ["one"])}, {"one": training("one", "x")}, {}, (0,))
     write_plan(tmp_path / "runs", study)
     write_run(tmp_path / "runs", "one", result(0), learning_curve(0, 0.7))
@@ -239,7 +239,7 @@ def test_data_is_free_of_private_names(made: Path) -> None:
 def test_command_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(write, "draw_paper_pictures", lambda out: [])
+    monkeypatch.setattr(report_page, "draw_paper_pictures", lambda out: [])
     monkeypatch.setenv("HYDRA_FULL_ERROR", "")
     monkeypatch.chdir(tmp_path)
     write_plan(tmp_path / "runs", plan({}, {}, {}))
@@ -271,7 +271,7 @@ def test_a_report_that_cannot_be_written(tmp_path: Path) -> None:
 
 
 def test_the_page_itself_may_be_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(write, "draw_paper_pictures", lambda out: [])
+    monkeypatch.setattr(report_page, "draw_paper_pictures", lambda out: [])
     write_study(tmp_path)
     page, data = write_report(tmp_path, tmp_path / "docs" / "results.md")
     assert page == tmp_path / "docs" / "results.md"

@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tangram_lab.experiments.report.game import assembly_table, differences, order_table, paired
-from tangram_lab.experiments.report.reading import read_study
-from tangram_lab.experiments.report.study import Experiment
+from tangram_lab.experiments.report.study import Experiment, read_runs
+from tangram_lab.experiments.report.tables import assembly_table, differences, order_table, paired
 from tests.experiments.builders import (
     experiment,
     plan,
@@ -60,7 +59,7 @@ def study(folder: Path, listed: list[list[float] | None]) -> Experiment:
             baselines["order=listed"] = several(other, mean_reward=0.5)
         test = scores(0.9, baselines, **several(own))
         write_run(folder, "seven", result(seed, tokens=SEVEN), [], {"random": test})
-    return read_study(folder).experiments[0]
+    return read_runs(folder).experiments[0]
 
 
 def cells(line: str) -> list[str]:

@@ -9,9 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tangram_lab.experiments.report.markdown import ANGLE, MINUTES, REWARD
 from tangram_lab.experiments.report.numbers import (
+    ANGLE,
     GRID,
+    MINUTES,
+    REWARD,
     band,
     first_at_least,
     points,

@@ -6,18 +6,13 @@ from typing import Any
 
 import pytest
 
-from tangram_lab.experiments.report import write
-from tangram_lab.experiments.report.closing import closing
-from tangram_lab.experiments.report.markdown import picture, plain, table
-from tangram_lab.experiments.report.paper import value
-from tangram_lab.experiments.report.reading import read_study
-from tangram_lab.experiments.report.references import References
-from tangram_lab.experiments.report.sections import Page, command, section
-from tangram_lab.experiments.report.study import Study
-from tangram_lab.experiments.report.style import COLOURS, looks
-from tangram_lab.experiments.report.sweeps import sweeps
-from tangram_lab.experiments.report.tables import ranking_table
-from tangram_lab.experiments.report.write import write_report
+from tangram_lab.experiments.report import page as report_page
+from tangram_lab.experiments.report.figures import looks, sweeps
+from tangram_lab.experiments.report.page import Page, closing, command, write_report
+from tangram_lab.experiments.report.references import References, papers
+from tangram_lab.experiments.report.study import Study, read_runs
+from tangram_lab.experiments.report.style import COLOURS
+from tangram_lab.experiments.report.tables import picture, plain, ranking_table, table
 from tests.experiments.builders import (
     EXPERIMENTS,
     TESTS,
@@ -38,7 +33,7 @@ pytestmark = pytest.mark.fast
 
 @pytest.fixture(autouse=True)
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(write, "draw_paper_pictures", lambda out: [])
+    monkeypatch.setattr(report_page, "draw_paper_pictures", lambda out: [])
 
 
 def test_every_training_has_one_look_and_neighbours_differ(tmp_path: Path) -> None:
@@ -49,7 +44,7 @@ def test_every_training_has_one_look_and_neighbours_differ(tmp_path: Path) -> No
         "more": experiment("tests", [names[0], *names[9:]]),
     }
     write_plan(tmp_path, plan(experiments, {name: training(name, "x") for name in names}, {}))
-    found = looks(read_study(tmp_path))
+    found = looks(read_runs(tmp_path))
     assert set(found) == set(names)
     assert len({found[name].colour for name in names[8:]}) == 4
     assert found[names[0]].colour not in {found[name].colour for name in names[9:]}
@@ -69,7 +64,7 @@ def small(tmp_path: Path, **changes: Any) -> Study:
     write_run(tmp_path, "square", result(0), [], {"actions_1": scores(0.7)})
     for name in ("triangle", "larger"):
         write_run(tmp_path, name, result(0, tokens=["large_triangle"]), [])
-    return read_study(tmp_path)
+    return read_runs(tmp_path)
 
 
 def test_policies_are_compared_within_their_own_task(tmp_path: Path) -> None:
@@ -80,7 +75,7 @@ def test_policies_are_compared_within_their_own_task(tmp_path: Path) -> None:
     assert references.lacking(one) == [
         "position only, perfect, random (triangle agent; larger agent)"
     ]
-    lines = "\n".join(ranking_table(study, one, references))
+    lines = "\n".join(ranking_table(one, references, study.planned_seeds))
     assert cells(lines, "position only (square)")[0][1:4] == ["0.764", "", "23.80°"]
 
 
@@ -107,7 +102,7 @@ def test_nothing_has_run_yet(tmp_path: Path) -> None:
 def test_tests_that_are_missing_are_told(tmp_path: Path) -> None:
     study = small(tmp_path, t=experiment("tests", ["square", "triangle"], tests=["actions_1"]))
     page = Page(study, tmp_path, "figures", looks(study), References(study))
-    text = "\n".join(section(page, study.experiments[1]))
+    text = "\n".join(page.section(study.experiments[1]))
     assert "- triangle agent: seed 0 not tested with 1 action" in text
     assert "- square agent" not in text
     assert cells(text, "triangle agent") == [
@@ -124,16 +119,16 @@ def test_papers_values_go_to_the_family_only_where_nobody_bears_the_name(tmp_pat
     alone = experiment("curves", ["mlp_large"], "Fig. 4")
     other = experiment("curves", ["mlp"], "Fig. 41")
     write_plan(tmp_path, plan({"both": both, "alone": alone, "other": other}, names, {}))
-    first, second, third = read_study(tmp_path).experiments
-    found = [value(first, one) for one in first.trainings]
+    first, second, third = read_runs(tmp_path).experiments
+    found = [papers(first, one) for one in first.trainings]
     assert [one and one.mean_reward for one in found] == [0.70, None]
-    assert value(second, second.trainings[0]) is not None
-    assert value(third, third.trainings[0]) is None
+    assert papers(second, second.trainings[0]) is not None
+    assert papers(third, third.trainings[0]) is None
 
 
 def test_sweeps_over_noise_and_actions(tmp_path: Path) -> None:
     write_study(tmp_path)
-    experiments = {one.name: one for one in read_study(tmp_path).experiments}
+    experiments = {one.name: one for one in read_runs(tmp_path).experiments}
     (noise,) = sweeps(experiments["noise"])
     (actions,) = sweeps(experiments["table2"])
     assert [x for x, _ in noise.places] == [0.0, 1.0]
@@ -163,16 +158,14 @@ def test_sweeps_over_noise_and_actions(tmp_path: Path) -> None:
 )
 def test_command_of_one_experiment(tmp_path: Path, line: str, expected: str) -> None:
     write_study(tmp_path)
-    study = replace(read_study(tmp_path), command=line)
+    study = replace(read_runs(tmp_path), command=line)
     assert command(study, study.experiments[0]) == expected
 
 
 def test_what_a_training_begins_with_is_told(tmp_path: Path) -> None:
     warm = training("warm", "x") | {"after": "cold"}
     write_plan(tmp_path, plan({}, {"warm": warm}, {}))
-    assert "(`warm`, begins with the networks of `cold`)" in "\n".join(
-        closing(read_study(tmp_path))
-    )
+    assert "(`warm`, begins with the networks of `cold`)" in "\n".join(closing(read_runs(tmp_path)))
 
 
 def test_markdown_is_escaped() -> None:

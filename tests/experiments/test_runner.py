@@ -13,8 +13,7 @@ from rich.console import Console
 
 from tangram_lab.experiments import runner
 from tangram_lab.experiments.jobs import Job
-from tangram_lab.experiments.progress import StudyProgress
-from tangram_lab.experiments.runner import FAILED_STATUS, INTERRUPT_STATUS, Runner
+from tangram_lab.experiments.runner import FAILED_STATUS, INTERRUPT_STATUS, Runner, StudyProgress
 
 pytestmark = pytest.mark.cluster
 

@@ -27,15 +27,15 @@ console = Console(highlight=False, soft_wrap=True)
 
 def outcome(bench: Bench, guard: Guard) -> str:
     """``red``, ``green``, or why neither could be found out. The tree is as before afterwards."""
-    path = bench.tree / guard.file
+    path, rest = guard.removed_from(bench.tree)
     whole = path.read_text()
-    path.write_text(guard.removed_from(bench.tree))
+    path.write_text(rest)
     try:
         status, output = bench.run(guard.tests)
     finally:
         path.write_text(whole)
     if status == NOT_ENDED:
-        return f"not ended after {LIMIT_S:.0f} s"
+        return f"not ended after {LIMIT_S * len(guard.tests):.0f} s"
     told = "; ".join(output.strip().splitlines()[-3:])
     return {PASSED: "green", FAILED: "red"}.get(status, f"tests did not run: {told}")
 
@@ -120,7 +120,7 @@ def main() -> int:
             status, output = bench.run(tests)
         free.put(bench)
         if status != PASSED:
-            console.print(output, markup=False)
+            console.print(f"{output}\nall must be green before a guard is removed", markup=False)
             return 1
         return summary(guards, removed(guards, free, max(1, chosen.jobs)))
 

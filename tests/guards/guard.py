@@ -20,27 +20,27 @@ class Guard:
 
     room: str  # the role or promise it belongs to
     name: str  # what is lost when it goes, as a short sentence
-    file: str  # from the root of the repository
-    old: str  # as it stands in the file, once
+    file: str  # a file, or a folder so that it may move among the files below it
+    old: str  # as it stands there, once
     new: str  # what stands there instead when the guard is removed
     tests: tuple[str, ...]  # files or ids of pytest, of which one must turn red
 
-    def removed_from(self, root: Path) -> str:
-        """The text of the file without the guard.
+    def removed_from(self, root: Path) -> tuple[Path, str]:
+        """The file that holds the guard, and its text without it.
 
         Raises:
-            GuardError: the file is not there, or does not hold ``old`` exactly once.
+            GuardError: there is no such place, or it does not hold ``old`` exactly once.
         """
-        path = root / self.file
-        if not path.is_file():
-            raise GuardError(f"{self.name}: there is no {self.file}; name the file it moved to")
-        text = path.read_text()
-        if (times := text.count(self.old)) != 1:
+        place = root / self.file
+        paths = sorted(place.rglob("*.py")) if place.is_dir() else [place]
+        texts = {path: path.read_text() for path in paths if path.is_file()}
+        if (times := sum(text.count(self.old) for text in texts.values())) != 1:
             raise GuardError(
                 f"{self.name}: {self.file} holds {self.old!r} {times} times, 1 is needed; "
                 "write what stands there now"
             )
-        return text.replace(self.old, self.new)
+        [(path, text)] = [item for item in texts.items() if self.old in item[1]]
+        return path, text.replace(self.old, self.new)
 
 
 def declared(folder: Path = HERE) -> list[Guard]:

@@ -4,7 +4,6 @@ import time
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -12,19 +11,18 @@ import torch
 
 from master.arrivals import EpisodesArrived, ScoresArrived
 from master.budget import Budget
+from master.checkpointer import Checkpointer
 from master.config import MasterConfig
 from master.divergence import DivergenceGuard
 from master.journal import Journal
 from master.ledger import Ledger
 from master.lockstep import Lockstep
 from master.loop import Loop
-from master.metrics import Curve, Metrics
-from master.parts import Parts
+from master.metrics import Metrics
 from master.peers import Peer
-from master.report import Reporter
-from master.rundir import Record, RunFolder
+from master.report import Reporter, StatusCollector
+from master.rundir import Clock, Record, RunFolder
 from master.signals import StopSignals
-from master.status import Status
 from master.trainer import Trainer
 from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.config import ServiceConfig
@@ -140,14 +138,10 @@ class ShownProgress:
     """Keeps what it is told."""
 
     def __init__(self) -> None:
-        self.notices: list[str] = []
-        self.statuses: list[Status] = []
+        self.statuses: list[RunStatus] = []
 
-    def show(self, status: Status) -> None:
+    def show(self, status: RunStatus) -> None:
         self.statuses.append(status)
-
-    def notice(self, line: str, level: str = "info", **fields: Any) -> None:
-        self.notices.append(line if level == "info" else f"{level}: {line}")
 
     def close(self) -> None:
         pass
@@ -173,19 +167,31 @@ def loop(
     run_folder.prepare("auto")
     run_folder.write_config({})
     learner = trainer(made, lag_updates=settings.service.lag_updates)
-    parts = Parts(
-        settings,
-        made,
-        run_folder,
-        learner,
-        Record(),
-        Budget(settings),
-        hub,  # type: ignore[arg-type]
-        DivergenceGuard(learner, settings.service.max_bad_updates, run_folder.bad_batch),
-        journal(run_folder.journal, made),
-        Lockstep.of(settings.service),
+    service, record = settings.service, Record()
+    guard = DivergenceGuard(learner, service.max_bad_updates, run_folder.bad_batch)
+    clock, budget = Clock(record), Budget(settings, learner, record)
+    kept = journal(run_folder.journal, made)
+    checkpointer = Checkpointer(service, run_folder, guard, hub, kept, clock)  # type: ignore[arg-type]
+    status = StatusCollector("run", guard, hub, budget, clock, checkpointer)  # type: ignore[arg-type]
+    metrics = Metrics(run_folder.tensorboard, run_folder.curve)
+    reporter = Reporter(learner, record, service, status, ShownProgress(), metrics, [hub.tell])
+    return Loop(
+        service=service,
+        folder=run_folder,
+        hub=hub,  # type: ignore[arg-type]
+        guard=guard,
+        lockstep=Lockstep.of(service),
+        budget=budget,
+        clock=clock,
+        checkpointer=checkpointer,
+        reporter=reporter,
+        signals=StopSignals(),
+        watchdog=Watchdog(0.0),
     )
-    metrics = Metrics(run_folder.tensorboard)
-    curve = Curve(run_folder.curve, parts.trainer.updates)
-    reporter = Reporter(ShownProgress(), metrics, curve, settings.service)
-    return Loop(parts, reporter, StopSignals(), SimpleQueue(), Watchdog(0.0))
+
+
+def shown(made: Loop) -> list[RunStatus]:
+    """What the loop showed its user."""
+    progress = made.reporter._progress
+    assert isinstance(progress, ShownProgress)
+    return progress.statuses

@@ -1,6 +1,7 @@
 """Batches and checkpoints on their way to the disk, and a disk that is full."""
 
 import errno
+import logging
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ import pytest
 
 from master import checkpointer as checkpointer_module
 from master import journal as journal_module
-from master.checkpointer import MAKE_ROOM, Checkpointer
+from master.checkpointer import MAKE_ROOM
 from master.journal import JournalError, segments
 from tangram_agent import checkpoints as checkpoints_module
 from tangram_agent.checkpoints import DiskError, list_checkpoints
@@ -30,25 +31,22 @@ def closed() -> Iterator[None]:
 class Stage:
     """A checkpointer, what it told, and a disk that can be full."""
 
-    def __init__(self, folder: Path, patch: pytest.MonkeyPatch) -> None:
-        self.full = False
-        self.told: list[str] = []
+    def __init__(
+        self, folder: Path, patch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        caplog.set_level(logging.INFO)
+        self.full, self._caplog = False, caplog
         made = loop(folder, MADE, FakeHub(MADE))
-        self.parts, self.folder = made.parts, folder
-        self.checkpointer = Checkpointer(
-            made.parts.config.service,
-            made.parts.folder,
-            made.parts.guard,
-            made.parts.hub,
-            made.parts.journal,
-            made.clock,
-            self.told.append,
-        )
+        self.folder, self.checkpointer = folder, made.checkpointer
         patch.setattr(checkpointer_module, "RETRY_S", 0.0)
         self.checkpointer._retry = Every(0.0)
         kind = journal_module.Journal
         patch.setattr(kind, "_write", self._guarded(kind._write))
         patch.setattr(checkpoints_module, "_write", self._guarded(checkpoints_module._write))
+
+    @property
+    def told(self) -> list[str]:
+        return self._caplog.messages
 
     def _guarded(self, write: Any) -> Any:
         def guarded(*arguments: Any) -> None:
@@ -60,8 +58,10 @@ class Stage:
 
 
 @pytest.fixture
-def stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stage:
-    return Stage(tmp_path, monkeypatch)
+def stage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> Stage:
+    return Stage(tmp_path, monkeypatch, caplog)
 
 
 def test_a_full_disk_is_told_once_and_the_batch_is_kept_when_there_is_room(stage: Stage) -> None:
@@ -88,7 +88,7 @@ def test_a_disk_that_does_not_take_a_checkpoint_ends_nothing(stage: Stage) -> No
     stage.checkpointer._checkpoint = Every(0.0)
     stage.checkpointer.tick()
     assert len(stage.told) == 1
-    assert stage.told[0].startswith("warning: cannot write a checkpoint to ")
+    assert stage.told[0].startswith("cannot write a checkpoint to ")
     assert list((stage.folder / "checkpoints").iterdir()) == [first]
     assert list(segments(stage.folder / "journal")) == [2]
     with pytest.raises(DiskError, match="make room there"):
@@ -116,6 +116,6 @@ def test_a_journal_that_cannot_be_synced_is_told(
     def fail() -> None:
         raise JournalError("the journal cannot be written")
 
-    monkeypatch.setattr(stage.parts.journal, "tick", fail)
+    monkeypatch.setattr(stage.checkpointer._journal, "tick", fail)
     stage.checkpointer.tick()
-    assert stage.told == ["warning: the journal cannot be written"]
+    assert stage.told == ["the journal cannot be written"]

@@ -1,31 +1,215 @@
-"""Output goes on being possible when nobody reads it any more; with real pipes and terminals."""
+"""What the user sees while a run goes on, also when nobody looks any more."""
 
+import io
+import json
+import logging
 import os
 import subprocess
 import sys
+from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from rich.console import Console
 
-pytestmark = pytest.mark.cluster
+from master.console import (
+    LivePanel,
+    StatusLines,
+    duration,
+    logging_to,
+    make_progress,
+    status_line,
+    status_panel,
+)
+from master.tally import Tally
+from tangram_agent.messages import WORKER_COLUMNS, RunStatus
+
+log = logging.getLogger("master.test")
+
+STATUS = RunStatus(
+    {
+        "episodes": 12345,
+        "transitions": 12345,
+        "updates": 1234,
+        "elapsed_s": 83.2,
+        "share": 0.27,
+        "left_s": 3700.0,
+        "transitions_per_s": 950.4,
+        "updates_per_s": 95.12,
+        "players": 2,
+        "evaluators": 1,
+        "test/mean_reward": 0.9312,
+        "test/raw_overlap": 0.9656,
+        "test/angle_error_deg_median": 1.214,
+        "test/position_error_median": 0.01034,
+    },
+    {"activity": "learning"},
+    np.zeros((0, len(WORKER_COLUMNS))),
+)
+UNSCORED = {name: value for name, value in STATUS.numbers.items() if "/" not in name}
+FRESH = replace(STATUS, numbers=UNSCORED | {"share": -1.0, "left_s": -1.0, "players": 1})
+
+
+def console(**settings: Any) -> Console:
+    return Console(file=io.StringIO(), width=100, **settings)
+
+
+def text(shown: Console) -> str:
+    assert isinstance(shown.file, io.StringIO)
+    return shown.file.getvalue()
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize(
+    ("seconds", "shown"),
+    [(0, "0:00"), (59.6, "1:00"), (754, "12:34"), (3723, "1:02:03"), (360000, "100:00:00")],
+)
+def test_durations(seconds: float, shown: str) -> None:
+    assert duration(seconds) == shown
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize(
+    ("status", "line"),
+    [
+        (
+            STATUS,
+            "1:23 | 27%, 1:01:40 left | 12,345 episodes | 1,234 updates | 950 transitions/s | "
+            "95.1 updates/s | reward 0.931, angle 1.21°, position 0.0103 | 2 workers | learning",
+        ),
+        (
+            FRESH,
+            "1:23 | 12,345 episodes | 1,234 updates | 950 transitions/s | 95.1 updates/s | "
+            "1 worker | learning",
+        ),
+    ],
+)
+def test_a_line_tells_everything(status: RunStatus, line: str) -> None:
+    assert status_line(status) == line
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize(
+    ("status", "words"),
+    [
+        (
+            STATUS,
+            ["27%  1:23, 1:01:40 left", "0.931", "1.21°", "2 workers, 1 evaluator · learning"],
+        ),
+        (FRESH, ["no bound: Ctrl-C ends the run", "mean reward", "1 worker, 1 evaluator"]),
+    ],
+)
+def test_the_panel_tells_everything(status: RunStatus, words: list[str]) -> None:
+    shown = console()
+    shown.print(status_panel(status, "tangram · run"))
+    assert all(word in text(shown) for word in words)
+    assert {len(line) for line in text(shown).splitlines()} == {76}
+
+
+@pytest.mark.fast
+def test_status_lines_come_at_a_bounded_rate_and_others_at_once() -> None:
+    shown = console()
+    lines = StatusLines(interval_s=1000.0)
+    with logging_to(shown):
+        for _ in range(5):
+            lines.show(STATUS)
+        log.info("a [line] %s", "x" * 200)
+        log.warning("with its %s", "level")
+        log.debug("not for the user")
+    log.info("afterwards")
+    assert text(shown).splitlines() == [
+        status_line(STATUS),
+        "a [line] " + "x" * 200,
+        "warning: with its level",
+    ]
+
+
+@pytest.mark.fast
+def test_the_panel_is_drawn_in_place_below_the_log() -> None:
+    shown = console(force_terminal=True)
+    panel = LivePanel(shown, "tangram · run", interval_s=1000.0)
+    panel.show(STATUS)
+    with logging_to(shown):
+        log.info("worker 1 ended")
+    for updates in range(2000, 2100):
+        panel.show(replace(STATUS, numbers={**STATUS.numbers, "updates": updates}))
+    panel.close()
+    assert "worker 1 ended" in text(shown)
+    # Once when it came, below the line, and the last one at the end.
+    assert text(shown).count("tangram · run") <= 4
+    assert "2,098" not in text(shown)
+    assert "2,099" in text(shown)
+    assert text(shown).endswith("\x1b[?25h")  # the cursor is shown again
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize(
+    ("terminal", "log_format", "kind"),
+    [(True, "text", LivePanel), (False, "text", StatusLines), (True, "json", StatusLines)],
+)
+def test_terminals_get_a_panel_and_pipes_and_programs_get_lines(
+    terminal: bool, log_format: str, kind: type
+) -> None:
+    made = make_progress(console(force_terminal=terminal), "run", log_format)
+    made.close()
+    assert isinstance(made, kind)
+
+
+def json_lines(shown: Console) -> list[dict[str, Any]]:
+    lines = [json.loads(line) for line in text(shown).splitlines()]
+    for line in lines:
+        assert datetime.fromisoformat(line.pop("time")).tzinfo is not None
+    return lines
+
+
+@pytest.mark.fast
+def test_programs_read_json() -> None:
+    shown = console()
+    with logging_to(shown, "json"):
+        StatusLines().show(STATUS)
+        log.info("goes [on] %s", "x" * 200)
+        Tally().note("malformed", "no header")
+    with logging_to(shown, "json", "launcher"):
+        log.info("the master ended")
+    common = {"level": "INFO", "process": "master"}
+    status = {"event": "status", "message": status_line(STATUS), **STATUS.texts, **STATUS.numbers}
+    assert json_lines(shown) == [
+        common | status,
+        common | {"event": "note", "message": "goes [on] " + "x" * 200},
+        {
+            "level": "WARNING",
+            "process": "master",
+            "event": "malformed",
+            "message": "malformed (number 1): no header",
+            "count": 1,
+        },
+        common | {"process": "launcher", "event": "note", "message": "the master ended"},
+    ]
+
+
+# With real pipes and terminals
 
 LIMIT_S = 30.0
 # Prints until it is told that its output is gone, then more, and ends in order.
 CODE = """
-import sys
-from master.console import sturdy_console
-from master.console import make_progress
-console = sturdy_console(sys.stdout)
+import logging, sys
+from master.console import logging_to, make_progress, sturdy_console
+console, log = sturdy_console(sys.stdout), logging.getLogger("master.run")
 print(console.is_terminal, file=sys.stderr)
 progress = make_progress(console, "run")
-progress.notice("before")
-sys.stdin.readline()
-for _ in range(3):
-    progress.notice("x" * 100_000)
+with logging_to(console):
+    log.info("before")
+    sys.stdin.readline()
+    for _ in range(3):
+        log.info("x" * 100_000)
 progress.close()
 """
 
 
+@pytest.mark.cluster
 @pytest.mark.parametrize("terminal", [False, True])
 def test_a_reader_that_goes_away_ends_nothing(terminal: bool) -> None:
     ours, theirs = os.openpty() if terminal else os.pipe()
@@ -47,6 +231,7 @@ def test_a_reader_that_goes_away_ends_nothing(terminal: bool) -> None:
     assert (process.returncode, errors) == (0, f"{terminal}\n")
 
 
+@pytest.mark.cluster
 def test_a_terminal_of_few_characters_shows_what_it_can() -> None:
     code = (
         "import sys\nfrom master.console import sturdy_console\n"

@@ -1,6 +1,7 @@
 """HTTP for machines: what Prometheus and a health check see."""
 
 import json
+import socket
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -77,6 +78,17 @@ def test_health_is_lost_when_the_loop_hangs(
 
 def test_other_pages_are_not_there(health: Health) -> None:
     assert fetch(f"{health.url}/etc/passwd")[0] == 404
+
+
+def test_who_connects_and_asks_nothing_is_hung_up_on(
+    health: Health, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each connection holds a thread, and nothing else bounds their number."""
+    limit_s = health_module._Handler.timeout
+    monkeypatch.setattr(health_module._Handler, "timeout", limit_s / 50)
+    port = int(health.url.rpartition(":")[2])
+    with socket.create_connection(("127.0.0.1", port), timeout=10) as idle:
+        assert idle.recv(1) == b""
 
 
 def test_a_port_that_is_taken_is_told(health: Health) -> None:

@@ -7,13 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
 from master import children as children_module
 from master import launch as launch_module
 from master.children import MAX_RESTARTS, Child
 from master.config import LaunchConfig, MasterConfig
-from master.console import PlainLines
+from master.console import logging_to, sturdy_console
 from master.launch import Launcher, master_arguments, run_training
 from master.rundir import RunFolder
 from tangram_agent.config import ServiceConfig
@@ -28,7 +27,7 @@ ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 def test_the_master_gets_its_settings(tmp_path: Path) -> None:
     bounds = {"max_hours": 0.5, "max_updates": 7, "resume": "auto", "warm_start": "a b"}
     master = from_mapping(MasterConfig, {"run_dir": str(tmp_path), "seed": 3, **bounds})
-    arguments = master_arguments(LaunchConfig(2, master), RunFolder(tmp_path))
+    arguments = master_arguments(LaunchConfig(master, 2), RunFolder(tmp_path))
     assert arguments == [
         "-P",
         "-m",
@@ -44,7 +43,7 @@ def test_the_master_gets_its_settings(tmp_path: Path) -> None:
         "warm_start='a b'",
     ]
     in_step = replace(master, service=ServiceConfig(mode="lockstep"), warm_start=None)
-    arguments = master_arguments(LaunchConfig(2, in_step), RunFolder(tmp_path))
+    arguments = master_arguments(LaunchConfig(in_step, 2), RunFolder(tmp_path))
     assert arguments[-1] == "service.lockstep_workers=2"
 
 
@@ -52,7 +51,7 @@ def test_the_master_gets_its_settings(tmp_path: Path) -> None:
 def test_a_folder_with_a_run_is_refused_before_anything_starts(tmp_path: Path) -> None:
     RunFolder(tmp_path).write_result({})
     with pytest.raises(ConfigError, match="holds a run already"):
-        run_training(LaunchConfig(1, MasterConfig(str(tmp_path))), {})
+        run_training(LaunchConfig(MasterConfig(str(tmp_path)), 1), {})
     assert not (tmp_path / "logs").exists()
 
 
@@ -61,7 +60,7 @@ def test_a_folder_in_use_is_left_alone(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
     folder.connection.touch()
     with folder.lock(), pytest.raises(ConfigError, match="in use by another process"):
-        run_training(LaunchConfig(1, MasterConfig(str(tmp_path), resume="auto")), {})
+        run_training(LaunchConfig(MasterConfig(str(tmp_path), resume="auto"), 1), {})
     assert folder.connection.exists()
     assert not folder.config.exists()
 
@@ -108,8 +107,7 @@ def launcher(
     """A launcher whose children run the given code."""
     run = RunFolder(folder)
     run.logs.mkdir()
-    lines = PlainLines(Console(file=(folder / "said").open("w"), width=100))
-    made = Launcher(LaunchConfig(len(players), MasterConfig(str(folder))), run, lines)
+    made = Launcher(LaunchConfig(MasterConfig(str(folder)), len(players)), run)
     values = {"folder": str(folder), "condition": condition, "ending": ending}
     made._master.arguments = ["-c", MASTER.format(**values)]
     for player, code in zip(made._players, players, strict=True):
@@ -120,12 +118,11 @@ def launcher(
 
 def finish(made: Launcher, folder: Path) -> tuple[int, str]:
     """Run to the end; the status, and what was said through the master or beside it."""
-    with made.signals():
+    with (folder / "said").open("w") as said, logging_to(sturdy_console(said)), made.signals():
         try:
             status = made.run()
         finally:
             made.end_all()
-    made._lines._console.file.close()
     for one in [*made._workers, made._master]:
         assert not one.alive
     return status, (folder / "news").read_text() + (folder / "said").read_text()
@@ -346,7 +343,6 @@ while True:
         time.sleep(0.02)
     made._events.put(signal.SIGTERM)
     made.end_all()
-    made._lines._console.file.close()
     assert player.tail() == "plays\nleft in order"
 
 

@@ -1,7 +1,5 @@
 """The loop around a scripted hub: what is acknowledged, learned, sent, kept, and when it ends."""
 
-import json
-import stat
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -16,7 +14,6 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from master import loop as loop_module
 from master.arrivals import EpisodesArrived
-from master.loop import Loop
 from master.result import make_result
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
 from tangram_agent.messages import Go
@@ -25,11 +22,11 @@ from tangram_sim.errors import RunError
 from tests.master.builders import (
     AGENT,
     FakeHub,
-    ShownProgress,
     arrival,
     close_journals,
     loop,
     scores,
+    shown,
     small_setup,
 )
 
@@ -56,12 +53,6 @@ def batches(count: int, size: int = BATCH) -> list[list[Any]]:
     return [[arrival(MADE, sequence, size)] for sequence in range(1, count + 1)]
 
 
-def shown(made: Loop) -> ShownProgress:
-    progress = made._reporter.progress
-    assert isinstance(progress, ShownProgress)
-    return progress
-
-
 def test_a_batch_is_acknowledged_after_its_insert(tmp_path: Path) -> None:
     hub = FakeHub(MADE, batches(3))
     made = loop(tmp_path, MADE, hub, max_updates=6)
@@ -69,7 +60,7 @@ def test_a_batch_is_acknowledged_after_its_insert(tmp_path: Path) -> None:
     acknowledge = hub.acknowledge
 
     def noting(arrived: Any) -> None:
-        inserted.append(made.parts.trainer.episodes)
+        inserted.append(made.guard.trainer.episodes)
         acknowledge(arrived)
 
     hub.acknowledge = noting  # type: ignore[method-assign]
@@ -77,7 +68,7 @@ def test_a_batch_is_acknowledged_after_its_insert(tmp_path: Path) -> None:
     assert hub.values("acknowledge") == [1, 2, 3]
     assert inserted == [4, 8, 12]
     twins = len(MADE.agent.hindsight) + 1
-    assert made.parts.trainer.replay.added == 12 * twins
+    assert made.guard.trainer.replay.added == 12 * twins
 
 
 def test_batches_wait_unacknowledged_while_the_learner_is_behind(tmp_path: Path) -> None:
@@ -90,7 +81,7 @@ def test_batches_wait_unacknowledged_while_the_learner_is_behind(tmp_path: Path)
     assert hub.values("acknowledge") == [1]
     for expected in (2, 4, 6):
         made.learn()
-        assert made.parts.trainer.updates == expected
+        assert made.guard.trainer.updates == expected
         made.insert()
     assert hub.values("acknowledge") == [1, 2, 3]
 
@@ -99,7 +90,7 @@ def test_nothing_is_learned_before_enough_was_played(tmp_path: Path) -> None:
     hub = FakeHub(MADE, batches(1, STARTS - 1))
     made = loop(tmp_path, MADE, hub, max_episodes=STARTS - 1)
     assert made.run() == f"max_episodes={STARTS - 1}"
-    assert made.parts.trainer.updates == 0
+    assert made.guard.trainer.updates == 0
 
 
 def test_sockets_are_served_between_updates(
@@ -111,7 +102,7 @@ def test_sockets_are_served_between_updates(
     clock = iter(np.arange(0.0, 1e5, 0.02))  # every look at the clock takes 20 ms
     monkeypatch.setattr(loop_module.time, "monotonic", lambda: float(next(clock)))
     at_polls: list[int] = []
-    hub.on_poll = lambda: at_polls.append(made.parts.trainer.updates)
+    hub.on_poll = lambda: at_polls.append(made.guard.trainer.updates)
     made.run()
     assert at_polls[-1] == 18
     assert np.diff(at_polls).max() == 2
@@ -133,7 +124,7 @@ def test_the_bounds_end_it(
     hub = FakeHub(MADE, batches(9))
     made = loop(tmp_path, MADE, hub, **bounds)
     assert made.run() == reason
-    assert (made.parts.trainer.episodes, made.parts.trainer.updates) == (episodes, updates)
+    assert (made.guard.trainer.episodes, made.guard.trainer.updates) == (episodes, updates)
 
 
 def test_episodes_beyond_the_bound_are_not_taken(tmp_path: Path) -> None:
@@ -141,15 +132,15 @@ def test_episodes_beyond_the_bound_are_not_taken(tmp_path: Path) -> None:
     made = loop(tmp_path, MADE, hub, {"lag_updates": 64}, max_episodes=8)
     made.run()
     assert hub.values("acknowledge") == [1, 2]
-    assert made.parts.trainer.updates == 4
+    assert made.guard.trainer.updates == 4
 
 
 def test_hours_end_it(tmp_path: Path) -> None:
     made = loop(tmp_path, MADE, FakeHub(MADE), max_hours=1.0)
-    made.parts.record.loop_s = 3599.99
+    made.clock.record.loop_s = 3599.99
     assert made.run() == "max_hours=1"
-    assert made.parts.record.loop_s == pytest.approx(3600.0, abs=10.0)
-    assert made.parts.record.train_s == 0.0
+    assert made.clock.record.loop_s == pytest.approx(3600.0, abs=10.0)
+    assert made.clock.record.train_s == 0.0
 
 
 def test_a_signal_ends_it(tmp_path: Path) -> None:
@@ -158,7 +149,7 @@ def test_a_signal_ends_it(tmp_path: Path) -> None:
 
     def third() -> None:
         if hub.polls == 3:
-            made._signals.reason = "SIGTERM"
+            made.signals.reason = "SIGTERM"
 
     hub.on_poll = third
     assert made.run() == "SIGTERM"
@@ -185,7 +176,7 @@ def test_weights_are_sent_at_a_bounded_rate_or_after_every_update(
 def test_weights_are_sent_once(tmp_path: Path) -> None:
     hub = FakeHub(MADE, [[] for _ in range(5)])
     made = loop(tmp_path, MADE, hub, {"publish_seconds": 0.0})
-    hub.on_poll = lambda: setattr(made._signals, "reason", "SIGINT" if hub.polls > 4 else None)
+    hub.on_poll = lambda: setattr(made.signals, "reason", "SIGINT" if hub.polls > 4 else None)
     made.run()
     assert hub.values("publish") == [0]
 
@@ -197,11 +188,11 @@ def test_weights_that_are_not_finite_are_neither_sent_nor_kept(tmp_path: Path, o
     made = loop(tmp_path, MADE, hub, {"publish_seconds": 0.0, "max_bad_updates": 3}, max_updates=9)
 
     def poison() -> None:
-        if made.parts.trainer.updates >= 2 and (often or not made.parts.guard.undone):
+        if made.guard.trainer.updates >= 2 and (often or not made.guard.undone):
             with torch.no_grad():
-                next(made.parts.trainer.learner.acting.parameters()).fill_(float("nan"))
+                next(made.guard.trainer.learner.acting.parameters()).fill_(float("nan"))
 
-    hub.on_poll, made.parts.guard._keep = poison, Every(1000.0)
+    hub.on_poll, made.guard._keep = poison, Every(1000.0)
     with closing(made):
         if often:
             with pytest.raises(RunError, match=r"not finite after \d updates .*3 times in a row"):
@@ -211,7 +202,7 @@ def test_weights_that_are_not_finite_are_neither_sent_nor_kept(tmp_path: Path, o
             return
         assert made.run() == "max_updates=9"
         made.finish(launched=False)
-    assert (made.parts.guard.undone, hub.values("publish")[-1]) == (1, 9)
+    assert (made.guard.undone, hub.values("publish")[-1]) == (1, 9)
     newest = load_checkpoint(list_checkpoints(tmp_path / "checkpoints")[-1])
     for part in ("weights", "learner"):
         assert all(np.isfinite(array).all() for array in newest.arrays[part].values())
@@ -221,33 +212,20 @@ def test_checkpoints_come_on_their_interval(tmp_path: Path) -> None:
     hub = FakeHub(MADE, batches(3))
     service = {"checkpoint_minutes": 1e-3, "keep_checkpoints": 1}
     made = loop(tmp_path, MADE, hub, service, max_updates=6)
-    made._checkpointer._checkpoint = Every(0.0)
+    made.checkpointer._checkpoint = Every(0.0)
     made.run()
     (path,) = list_checkpoints(tmp_path / "checkpoints")
     counters = load_checkpoint(path, []).counters
     assert counters["hub"]["player/0"]["sequence"] == counters["episodes"] // BATCH
 
 
-def test_the_connection_is_there_while_the_loop_runs(tmp_path: Path) -> None:
+def test_at_the_end_nobody_finds_the_master_any_more(tmp_path: Path) -> None:
     hub = FakeHub(MADE)
     made = loop(tmp_path, MADE, hub)
-    path, seen = tmp_path / "connection.json", []
-
-    def look() -> None:
-        seen.append((json.loads(path.read_text()), stat.S_IMODE(path.stat().st_mode)))
-        made._signals.reason = "SIGTERM"
-
-    hub.on_poll = look
-    made.run()
+    made.folder.connection.touch()
     made.dismiss("the end")
-    content = {
-        "endpoint": hub.endpoint,
-        "weights_endpoint": hub.weights_endpoint,
-        "run_id": made.parts.record.run_id,
-        "settings": {},
-    }
-    assert seen == [(content, 0o600)]
-    assert not path.exists()
+    made.close()
+    assert not made.folder.connection.exists()
     assert hub.values("stop") == ["the end"]
 
 
@@ -257,8 +235,7 @@ def test_the_final_weights_are_waited_for_and_reported(tmp_path: Path) -> None:
     reason = made.run()
     # First the score of older weights comes, which is not the one that counts.
     hub.script.extend([[scores(MADE, 1, reward=0.1)], [], [scores(MADE, 4, reward=0.9)]])
-    made.finish(launched=False)
-    result = make_result(made.parts, reason, wall_s=1.0)
+    result = make_result(made.finish(launched=False), made.guard.trainer, 7, reason)
     assert (result["scored_updates"], result["updates"]) == (4, 4)
     assert (result["mean_reward"], result["mean_reward_camera"]) == (0.9, None)
     assert (result["test_episodes"], result["workers"]) == (100.0, 1)
@@ -272,9 +249,8 @@ def test_without_an_evaluator_nothing_is_waited_for(tmp_path: Path) -> None:
     made = loop(tmp_path, MADE, hub, max_updates=4)
     reason = made.run()
     polls = hub.polls
-    made.finish(launched=False)
+    result = make_result(made.finish(launched=False), made.guard.trainer, 7, reason)
     assert hub.polls == polls
-    result = make_result(made.parts, reason, wall_s=1.0)
     assert result["scored_updates"] is None
     assert result["mean_reward"] is None
     assert not (tmp_path / "test_episodes.png").exists()
@@ -294,15 +270,15 @@ def test_who_is_waited_for(
 ) -> None:
     hub = FakeHub(MADE, [[], [scores(MADE, 0)]], roles)
     made = loop(tmp_path, MADE, hub)
-    made._signals.reason = reason
+    made.signals.reason = reason
     made.finish(launched)
-    assert (made.parts.record.scored_version == 0) is waits
+    assert (made.clock.record.scored_version == 0) is waits
 
 
 def test_a_second_wish_to_end_is_not_kept_waiting(tmp_path: Path) -> None:
     hub = FakeHub(MADE, roles=["evaluator"])
     made = loop(tmp_path, MADE, hub)
-    hub.on_poll = lambda: setattr(made._signals, "reason", "SIGINT")
+    hub.on_poll = lambda: setattr(made.signals, "reason", "SIGINT")
     made.finish(launched=True)
     assert hub.polls == 1
 
@@ -313,54 +289,54 @@ def test_a_lost_evaluator_is_waited_for_only_so_long(
     monkeypatch.setattr(loop_module, "SCORES_S", 0.01)
     made = loop(tmp_path, MADE, FakeHub(MADE, roles=["evaluator"]), {"eval_seconds": 0.0})
     made.finish(launched=True)
-    assert made.parts.record.scored_version == -1
+    assert made.clock.record.scored_version == -1
 
 
 def test_the_learning_rate_follows_the_budget(tmp_path: Path) -> None:
     made = loop(tmp_path, MADE, FakeHub(MADE, batches(5)), max_updates=10)
     seen = []
-    update = made.parts.trainer.update
+    update = made.guard.trainer.update
 
     def noting(share: float) -> dict[str, float]:
         seen.append(share)
         return update(share)
 
-    made.parts.trainer.update = noting  # type: ignore[method-assign]
+    made.guard.trainer.update = noting  # type: ignore[method-assign]
     made.run()
     assert seen == pytest.approx([i / 10 for i in range(10)])
 
 
 def test_what_is_told(tmp_path: Path) -> None:
+    """The same status goes to the terminal, to who asks, to the curves and into the result."""
     hub = FakeHub(MADE, [*batches(2), [scores(MADE, 2)]], ["player", "evaluator"])
     made = loop(tmp_path, MADE, hub, {"publish_seconds": 0.0}, max_updates=4)
-    made._news.put("worker 0 ended")
     made.run()
-    if made.parts.record.scored_version == 4:
-        made.finish(launched=False)
-    else:
-        made._checkpointer.save()
-    made._reporter.flush(made.parts)
-    made._reporter.metrics.close()
-    assert shown(made).notices == ["worker 0 ended"]
-    last = shown(made).statuses[-1]
-    assert (last.episodes, last.updates, last.share) == (8, 4, 1.0)
-    assert (last.players, last.evaluators, last.activity) == (1, 1, "waiting for episodes")
+    last = made.reporter.flush(queue=3)
+    assert shown(made)[-1] is last
+    assert hub.values("tell")[-1] is last
+    expected = {
+        "episodes": 8,
+        "updates": 4,
+        "share": 1.0,
+        "players": 1,
+        "evaluators": 1,
+        "queue": 3,
+    }
+    assert expected.items() <= dict(last.numbers).items()
+    assert last.texts["activity"] == "waiting for episodes"
+    made.reporter._metrics.close()
     events = EventAccumulator(str(tmp_path / "tensorboard"))
     events.Reload()
-    expected = {
+    expected_tags = {
         "train/critic_loss",
         "train/actor_loss",
         "train/q",
         "play/reward",
-        "replay/fill",
-        "rates/transitions_per_s",
-        "rates/updates_per_s",
         "weights/age_updates",
         "weights/age_seconds",
-        "run/workers",
-        "rate_limiter/lag",
     }
-    assert expected <= set(events.Tags()["scalars"])
+    of_status = {n if "/" in n else f"run/{n}" for n in last.numbers if not n.startswith("test/")}
+    assert expected_tags | of_status <= set(events.Tags()["scalars"])
 
 
 @pytest.mark.parametrize(
@@ -378,10 +354,10 @@ def test_what_is_waited_for(
     tmp_path: Path, transitions: int, updates: int, players: int, words: str
 ) -> None:
     made = loop(tmp_path, MADE, FakeHub(MADE, roles=["player"] * players))
-    made.parts.trainer.rate_limiter.inserted(transitions)
-    made.parts.trainer.rate_limiter.updated(updates)
-    made.tell()
-    assert shown(made).statuses[-1].activity == words
+    made.guard.trainer.rate_limiter.inserted(transitions)
+    made.guard.trainer.rate_limiter.updated(updates)
+    made.reporter.tick(0)
+    assert shown(made)[-1].texts["activity"] == words
 
 
 IN_STEP = {"mode": "lockstep", "lockstep_workers": 2, "envs": BATCH, "batch_episodes": BATCH}
@@ -412,7 +388,7 @@ def test_in_lockstep_rounds_are_inserted_by_index_and_learned_before_the_next(
         ("acknowledge", 2),
         ("acknowledge", 2),
     ]
-    goals = made.parts.trainer.replay.state()["goal"]
+    goals = made.guard.trainer.replay.state()["goal"]
     own = len(MADE.agent.hindsight) + 1
     np.testing.assert_array_equal(goals[0], played(0, 1).episodes.goals[0])
     np.testing.assert_array_equal(goals[BATCH * own], played(1, 1).episodes.goals[0])
@@ -422,9 +398,9 @@ def test_in_lockstep_nothing_is_learned_from_half_a_round(tmp_path: Path) -> Non
     """A kill between two inserts left the first player's batch; the other one's must come first."""
     hub = FakeHub(MADE, [[], [], [], [played(1, 1)]])
     made = loop(tmp_path, MADE, hub, IN_STEP, max_updates=4)
-    made.parts.trainer.insert(played(0, 1).episodes)
+    made.guard.trainer.insert(played(0, 1).episodes)
     updates: list[int] = []
-    hub.on_poll = lambda: updates.append(made.parts.trainer.updates)
+    hub.on_poll = lambda: updates.append(made.guard.trainer.updates)
     assert made.run() == "max_updates=4"
     assert updates[:4] == [0, 0, 0, 0]
     assert hub.values("order") == [{1: Go(0, 0, 0, BATCH)}]

@@ -1,7 +1,9 @@
-"""What stands in TensorBoard after a run."""
+"""What stands in TensorBoard and in curve.jsonl after a run."""
 
 import errno
+import json
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from master import metrics as metrics_module
 from master.metrics import Means, Metrics, flatten
+from tests.master.builders import FakeHub, arrival, loop, scores, small_setup
 
 pytestmark = pytest.mark.fast
 
@@ -27,7 +30,7 @@ def points(events: Any, tag: str) -> list[tuple[int, float]]:
 
 
 def test_points_stand_under_their_names_and_steps(tmp_path: Path) -> None:
-    metrics = Metrics(tmp_path)
+    metrics = Metrics(tmp_path, tmp_path / "curve.jsonl")
     metrics.scalars({"train/q": 0.5}, 10)
     metrics.scalars({"train/q": 0.75, "replay/fill": 1.0}, 20)
     metrics.scores({"mean_reward": 0.9}, updates=20, episodes=300, seconds=12.7)
@@ -47,7 +50,7 @@ def test_points_stand_under_their_names_and_steps(tmp_path: Path) -> None:
 
 
 def test_hyperparameters_stand_beside_the_final_scores(tmp_path: Path) -> None:
-    metrics = Metrics(tmp_path)
+    metrics = Metrics(tmp_path, tmp_path / "curve.jsonl")
     metrics.hyperparameters({"agent": {"noise": 0.1}, "seed": 3}, {"mean_reward": 0.9})
     metrics.close()
     events = read(tmp_path / "final")
@@ -62,7 +65,7 @@ def test_points_after_a_checkpoint_are_hidden_when_the_run_goes_on_from_it(
     for updates, value in ((0, 1.0), (20, 2.0)):
         # Files are read in the order of the seconds in their names: two lives are never so close.
         monkeypatch.setattr(time, "time", lambda later=updates: begun + later)
-        metrics = Metrics(tmp_path, updates)
+        metrics = Metrics(tmp_path, tmp_path / "curve.jsonl", updates)
         for step in (10, 20, 30):
             if step > updates:
                 metrics.scalars({"train/q": value}, step)
@@ -92,7 +95,7 @@ def test_a_disk_that_takes_no_curves_leaves_a_gap_and_ends_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(metrics_module, "RETRY_S", 0.0)
-    metrics = Metrics(tmp_path)
+    metrics = Metrics(tmp_path, tmp_path / "curve.jsonl")
     metrics.scalars({"a": 1.0}, 1)
     full = OSError(errno.ENOSPC, "No space left on device")
 
@@ -113,3 +116,62 @@ def test_a_disk_that_takes_no_curves_leaves_a_gap_and_ends_nothing(
         point for file in files if "a" in file.Tags()["scalars"] for point in points(file, "a")
     ]
     assert sorted(step for step, _ in found) == [1, 4]
+
+
+# curve.jsonl
+
+
+def lines(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_lines_are_appended(tmp_path: Path) -> None:
+    path = tmp_path / "curve.jsonl"
+    with closing(Metrics(tmp_path, path)) as metrics:
+        assert not path.exists()
+        metrics.scores({"mean_reward": 0.5}, 10, 320, 1.23456)
+        metrics.scores({"mean_reward": 0.75}, 20, 640, 2.0)
+    assert lines(path) == [
+        {"updates": 10, "episodes": 320, "train_s": 1.235, "mean_reward": 0.5},
+        {"updates": 20, "episodes": 640, "train_s": 2.0, "mean_reward": 0.75},
+    ]
+
+
+@pytest.mark.parametrize(("updates", "kept"), [(0, []), (15, [10]), (20, [10, 20])])
+def test_what_happens_again_is_dropped(tmp_path: Path, updates: int, kept: list[int]) -> None:
+    path = tmp_path / "curve.jsonl"
+    for number in (10, 20):
+        with closing(Metrics(tmp_path, path, number)) as metrics:
+            metrics.scores({}, number, 0, 0.0)
+    Metrics(tmp_path, path, updates).close()
+    assert [line["updates"] for line in lines(path)] == kept
+
+
+def test_a_line_cut_short_is_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "curve.jsonl"
+    path.write_text('{"updates": 10}\n[3]\n{"updates": "x"}\n{"upda')
+    with closing(Metrics(tmp_path, path, 100)) as metrics:
+        metrics.scores({}, 20, 0, 0.0)
+    assert [line["updates"] for line in lines(path)] == [10, 20]
+
+
+def test_the_loop_writes_every_evaluation(tmp_path: Path) -> None:
+    made = small_setup()
+    moved = loop(tmp_path, made, FakeHub(made, [[scores(made, version=0, reward=0.25)]]))
+    moved.receive(0.0)
+    (line,) = lines(tmp_path / "curve.jsonl")
+    assert (line["updates"], line["mean_reward"]) == (0, 0.25)
+
+
+def test_a_point_stands_where_its_weights_were_sent(tmp_path: Path) -> None:
+    """Not where their scores arrive: episodes and time have gone on since."""
+    made = small_setup()
+    script = [[arrival(made, 1)], [arrival(made, 2), scores(made, version=0, reward=0.25)]]
+    moved = loop(tmp_path, made, FakeHub(made, script))
+    moved.publish()
+    for _ in script:
+        moved.receive(0.0)
+        moved.insert()
+    assert moved.guard.trainer.episodes > 0
+    (line,) = lines(tmp_path / "curve.jsonl")
+    assert (line["updates"], line["episodes"], line["train_s"]) == (0, 0, 0.0)

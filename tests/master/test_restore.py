@@ -1,5 +1,6 @@
 """Going on from a checkpoint: bit-equal, past corrupt ones, and never with another task."""
 
+import logging
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -57,7 +58,7 @@ def test_a_run_goes_on_as_if_it_had_never_stopped(tmp_path: Path) -> None:
     rest = Restored(record, HUB, segment=7)
     save_run(tmp_path, stopped, rest, keep=1)
     resumed = trainer(MADE, seed=99)
-    assert restore_run(tmp_path, resumed, pytest.fail) == rest
+    assert restore_run(tmp_path, resumed) == rest
     assert_same(everything(resumed), everything(straight))
     for made in (straight, resumed):
         play_on(made, 5, seed=1)
@@ -74,31 +75,34 @@ def test_another_seed_gives_another_run() -> None:
 
 
 def test_nothing_to_go_on_from(tmp_path: Path) -> None:
-    assert restore_run(tmp_path / "checkpoints", trainer(MADE), pytest.fail) is None
+    assert restore_run(tmp_path / "checkpoints", trainer(MADE)) is None
 
 
-def test_a_corrupt_one_is_set_aside_and_the_one_before_is_taken(tmp_path: Path) -> None:
+def test_a_corrupt_one_is_set_aside_and_the_one_before_is_taken(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     first, second = saved_twice(tmp_path)
     damage(second)
-    warnings: list[str] = []
     resumed = trainer(MADE)
-    assert restore_run(tmp_path, resumed, warnings.append) is not None
+    assert restore_run(tmp_path, resumed) is not None
     assert resumed.updates == 2
-    assert warnings == [
-        f"warning: checkpoint {second} is corrupt (checksum of learner.safetensors differs): it is "
+    assert caplog.messages == [
+        f"checkpoint {second} is corrupt (checksum of learner.safetensors differs): it is "
         f"{second.name}.corrupt now, and the one before is taken"
     ]
     assert list_checkpoints(tmp_path) == [first]
 
 
-def test_a_run_is_not_begun_anew_because_all_are_corrupt(tmp_path: Path) -> None:
+def test_a_run_is_not_begun_anew_because_all_are_corrupt(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     for path in saved_twice(tmp_path):
         damage(path)
     for warnings in (2, 0):  # the second time they are out of the way, and still no new run begins
-        told: list[str] = []
+        caplog.clear()
         with pytest.raises(RunError, match=r"no checkpoint in .* is whole: put one from a backup"):
-            restore_run(tmp_path, trainer(MADE), told.append)
-        assert len(told) == warnings
+            restore_run(tmp_path, trainer(MADE))
+        assert len(caplog.messages) == warnings
 
 
 def saved_twice(folder: Path) -> list[Path]:
@@ -127,7 +131,7 @@ def damage(path: Path) -> None:
 def test_another_task_is_refused(tmp_path: Path, other: Any, reason: str) -> None:
     save_run(tmp_path, trainer(MADE), REST, keep=1)
     with pytest.raises(RunError, match=f"cannot go on from {tmp_path}/00000000: .*{reason}"):
-        restore_run(tmp_path, trainer(other), pytest.fail)
+        restore_run(tmp_path, trainer(other))
 
 
 def test_settings_of_the_agent_may_change_on_the_way(tmp_path: Path) -> None:
@@ -135,7 +139,7 @@ def test_settings_of_the_agent_may_change_on_the_way(tmp_path: Path) -> None:
     play_on(made, 3)
     save_run(tmp_path, made, REST, keep=1)
     resumed = trainer(small_setup(updates_per_transition=1.0, replay_capacity=32))
-    assert restore_run(tmp_path, resumed, pytest.fail) is not None
+    assert restore_run(tmp_path, resumed) is not None
     assert (len(resumed.replay), resumed.rate_limiter.may_update()) == (32, False)
     play_on(resumed, 1)
     assert resumed.updates == 6 + 4
@@ -148,7 +152,7 @@ def test_a_checkpoint_that_lacks_a_part_is_refused(tmp_path: Path, lost: str) ->
     counters = {name: value for name, value in found.counters.items() if name != lost}
     save_checkpoint(tmp_path, 1, found.arrays, counters, keep=1)
     with pytest.raises(RunError, match=f"not that of a run .KeyError: '{lost}'"):
-        restore_run(tmp_path, trainer(MADE), pytest.fail)
+        restore_run(tmp_path, trainer(MADE))
 
 
 def test_a_record_that_lacks_a_field_is_refused() -> None:
@@ -201,10 +205,14 @@ def saved(folder: Path, made: Trainer) -> Path:
     return folder
 
 
-def test_a_warm_start_takes_the_networks_and_nothing_else(tmp_path: Path) -> None:
+def test_a_warm_start_takes_the_networks_and_nothing_else(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     source, fresh = trainer(MADE), trainer(MADE, seed=99)
     play_on(source, 5)
-    line = warm_start(saved(tmp_path, source), fresh)
+    caplog.set_level(logging.INFO)
+    warm_start(saved(tmp_path, source), fresh)
+    (line,) = caplog.messages
     assert line == f"begins with the networks of {tmp_path} after {source.updates} updates"
     ours, theirs = fresh.learner.state(), source.learner.state()
     networks = [name for name in theirs if "optimiser" not in name and name != "updates"]

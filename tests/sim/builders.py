@@ -41,10 +41,14 @@ def perimeter(polygons: Floats) -> Floats:
     return total
 
 
-def pieces(layout: Layout, poses: Floats, flipped: Any = None) -> list[shapely.Polygon]:
-    """The tokens of one layout (K, 3) as polygons."""
-    corners = layout.corners(poses, flipped)
+def polygons(layout: Layout, corners: Floats) -> list[shapely.Polygon]:
+    """The tokens with corners (V, 2)."""
     return [shapely.Polygon(corners[layout.corners_of(k)]) for k in range(layout.tokens)]
+
+
+def pieces(layout: Layout, poses: Floats, flipped: Any = None) -> list[shapely.Polygon]:
+    """The tokens of one layout (K, 3)."""
+    return polygons(layout, layout.corners(poses, flipped))
 
 
 def largest_overlap(layout: Layout, poses: Floats, flipped: Any = None) -> float:

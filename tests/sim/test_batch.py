@@ -36,6 +36,7 @@ def begun(env: BatchedEnv) -> BatchedEnv:
 @pytest.mark.parametrize(
     ("tokens", "first", "expected"),
     [
+        (1, [-1.0, 1.0], [0, 0]),
         (2, [-1.0, -1e-9, 0.0, 1.0], [0, 0, 1, 1]),
         (3, [-1.0, -0.34, -0.33, 0.33, 0.34, 1.0], [0, 0, 1, 1, 2, 2]),
         (7, [-1.0, -0.72, -0.71, 0.0, 0.99, 1.0], [0, 0, 1, 3, 6, 6]),
@@ -45,10 +46,6 @@ def test_first_entry_names_the_token(tokens: int, first: list[float], expected: 
     actions = np.zeros((len(first), 4))
     actions[:, 0] = first
     assert chosen_tokens(actions, tokens).tolist() == expected
-
-
-def test_one_token_needs_no_name() -> None:
-    assert chosen_tokens(np.ones((3, 3)), 1).tolist() == [0, 0, 0]
 
 
 def test_full_scale_crosses_the_arena_and_makes_half_a_turn() -> None:
@@ -264,12 +261,9 @@ def test_an_episode_has_to_begin_and_ends() -> None:
         env.step(np.zeros((4, 3)))
 
 
-def test_one_generator_per_environment() -> None:
+def test_refused_constructions() -> None:
     with pytest.raises(ValueError, match="need 4 generators, got 3"):
         make_env(layout_of("square")).reset(evaluation_generators(3))
-
-
-def test_refused_constructions() -> None:
     with pytest.raises(ValueError, match="at least 1, got 0"):
         make_env(layout_of("square"), 0)
     with pytest.raises(ConfigError, match=r"sim\.camera=true"):

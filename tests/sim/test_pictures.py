@@ -45,6 +45,18 @@ def near_and_far(layout: Layout, sim: SimConfig, size: int) -> tuple[Floats, Flo
     return targets, states
 
 
+def camera_shares(sim: SimConfig, layout: Layout, targets: Floats, states: Floats) -> Floats:
+    """(B,) shares of the targets' pixels that the states cover."""
+    world, shares = make_world(layout, sim), []
+    for target, state in zip(targets, states, strict=True):
+        world.place(target)
+        wanted = TargetPictures(world.picture()[None])
+        world.place(state)
+        shares.append((wanted.rewards(world.picture()[None])[0] + 1.0) / 2.0)
+    world.close()
+    return np.array(shares)
+
+
 @pytest.mark.parametrize("backend", ["physics", "kinematic"])
 @pytest.mark.parametrize(
     ("shapes", "scale", "size"),
@@ -61,14 +73,7 @@ def test_camera_and_polygons_agree(
     layout = layout_of(*shapes, scale=scale)
     sim = SimConfig(backend=backend, pixels=64)
     targets, states = near_and_far(layout, sim, size)
-    world = make_world(layout, sim)
-    camera = np.empty(size)
-    for i in range(size):
-        world.place(targets[i])
-        wanted = world.picture()
-        world.place(states[i])
-        camera[i] = (TargetPictures(wanted[None]).rewards(world.picture()[None])[0] + 1.0) / 2.0
-    world.close()
+    camera = camera_shares(sim, layout, targets, states)
     tokens, goals = layout.corners(states), layout.corners(targets)
     error = camera - overlap_share(tokens, goals, layout)
     bound = camera_bound(layout, tokens, goals, sim.arena / sim.pixels)
@@ -84,18 +89,8 @@ def test_finer_pictures_are_closer() -> None:
     for pixels in (32, 128):
         sim = SimConfig(pixels=pixels)
         targets, states = near_and_far(layout, sim, 100)
-        world = make_world(layout, sim)
-        pairs = []
-        for target, state in zip(targets, states, strict=True):
-            world.place(target)
-            wanted = world.picture()
-            world.place(state)
-            pairs.append(
-                (TargetPictures(wanted[None]).rewards(world.picture()[None])[0] + 1.0) / 2.0
-            )
-        world.close()
         exact = overlap_share(layout.corners(states), layout.corners(targets), layout)
-        mean_errors.append(np.abs(np.array(pairs) - exact).mean())
+        mean_errors.append(np.abs(camera_shares(sim, layout, targets, states) - exact).mean())
     assert mean_errors[1] < mean_errors[0] / 2.5
 
 

@@ -1,10 +1,11 @@
-"""Layouts without overlap, inside the arena, bounded and reproducible."""
+"""Layouts without overlap, apart or edge to edge, inside the arena, bounded and reproducible."""
 
 import numpy as np
 import pytest
 import shapely
 
 from tangram_sim.config import SimConfig
+from tangram_sim.connected import sample_connected
 from tangram_sim.errors import SamplingError
 from tangram_sim.layout import Layout
 from tangram_sim.sampling import sample_batch, sample_poses
@@ -16,6 +17,8 @@ from tests.sim.builders import (
     TRIO,
     largest_overlap,
     layout_of,
+    pieces,
+    polygons,
 )
 
 pytestmark = pytest.mark.fast
@@ -38,9 +41,9 @@ def test_tokens_lie_inside_and_apart(layout: Layout, arena: float) -> None:
     assert poses.shape == (40, layout.tokens, 3)
     assert np.abs(corners).max() <= arena / 2.0
     for tokens in corners / arena:
-        pieces = [shapely.Polygon(tokens[layout.corners_of(k)]) for k in range(layout.tokens)]
-        union = shapely.union_all(pieces, grid_size=1e-9)
-        assert union.area == pytest.approx(sum(p.area for p in pieces), abs=1e-6)
+        own = polygons(layout, tokens)
+        union = shapely.union_all(own, grid_size=1e-9)
+        assert union.area == pytest.approx(sum(p.area for p in own), abs=1e-6)
 
 
 def test_same_generator_gives_the_same_layout_in_any_company() -> None:
@@ -131,3 +134,73 @@ def test_tokens_on_their_other_side_lie_apart_too() -> None:
     apart = [largest_overlap(layout, *pair) for pair in zip(poses, sides, strict=True)]
     unaware = [largest_overlap(layout, one) for one in poses]
     assert max(apart) < 1e-8 < max(unaware)
+
+
+GAME = layout_of(*SEVEN, scale=0.6)
+LAYOUTS = [
+    (GAME, 2.0),
+    (layout_of("square", "square", scale=0.8), 1.0),
+    (layout_of("parallelogram", LOPSIDED, "large_triangle", scale=0.25), 2.0),
+    (layout_of(*SEVEN, scale=0.003), 0.01),
+]
+
+
+def shared_edge(one: shapely.Polygon, other: shapely.Polygon, tolerance: float) -> float:
+    """Length of the outline of one that lies on the other."""
+    return float(one.exterior.intersection(other.buffer(tolerance)).length)
+
+
+@pytest.mark.parametrize(("layout", "arena"), LAYOUTS)
+def test_each_piece_shares_an_edge_and_overlaps_none(layout: Layout, arena: float) -> None:
+    sim = SimConfig(arena=arena)
+    for rng in evaluation_generators(30):
+        poses = sample_connected(layout, sim, rng)
+        own = pieces(layout, poses)
+        assert np.abs(layout.corners(poses)).max() <= arena / 2.0 + 1e-12
+        assert np.abs(poses[:, 2]).max() <= np.pi
+        assert largest_overlap(layout, poses) < 1e-8 * arena**2
+        small = 1e-6 * arena
+        union = shapely.union_all([piece.buffer(small) for piece in own])
+        assert isinstance(union, shapely.Polygon)
+        for k, piece in enumerate(own):
+            others = [shared_edge(piece, other, small) for j, other in enumerate(own) if j != k]
+            # More than what the buffer gives at a corner.
+            assert max(others) > 100.0 * small
+
+
+def test_every_piece_and_every_side_has_its_turn() -> None:
+    """The layouts differ, are turned by any angle and lie anywhere they fit."""
+    poses = np.stack([sample_connected(GAME, SimConfig(), r) for r in evaluation_generators(200)])
+    counts, _ = np.histogram(poses[:, 0, 2], bins=4, range=(-np.pi, np.pi))
+    assert counts.min() > 20
+    assert np.abs(poses[..., :2].mean(axis=(0, 1))).max() < 0.1
+    corners = GAME.corners(poses)
+    assert corners.max(axis=(1, 2)).max() > 0.95
+    assert np.ptp(corners, axis=1).max(axis=1).std() > 0.05
+
+
+def test_the_same_generator_gives_the_same_target() -> None:
+    once = [sample_connected(GAME, SimConfig(), rng) for rng in evaluation_generators(5)]
+    again = [sample_connected(GAME, SimConfig(), rng) for rng in evaluation_generators(5)]
+    np.testing.assert_array_equal(once, again)
+    assert len(np.unique(np.round(once, 9).reshape(5, -1), axis=0)) == 5
+
+
+def test_many_pieces_meet_corner_to_corner() -> None:
+    """Seven of ten are laid so: of two squares one whole side is then shared."""
+    layout, whole = layout_of("square", "square", scale=0.8), 0
+    side = 0.8 * 2.0**0.5 / 4.0
+    for rng in evaluation_generators(200):
+        poses = sample_connected(layout, SimConfig(), rng)
+        whole += abs(np.linalg.norm(poses[0, :2] - poses[1, :2]) - side) < 1e-9
+    assert whole / 200 == pytest.approx(0.7, abs=0.12)
+
+
+def test_no_room_is_told() -> None:
+    rng = np.random.default_rng(0)
+    with pytest.raises(SamplingError, match="does not fit into an arena of width 0.5"):
+        sample_connected(layout_of("square", scale=2.0), SimConfig(arena=0.5), rng)
+    pair, sim = layout_of("square", "square", scale=1.0), SimConfig(arena=0.55, max_tries=64)
+    with pytest.raises(SamplingError, match="no connected target .* 0.55 in 64 tries: raise"):
+        sample_connected(pair, sim, rng)
+    sample_connected(pair, SimConfig(arena=0.85), rng)

@@ -1,15 +1,22 @@
-"""Tokens on their other side: poses, corners, pictures and overlaps of the mirror image."""
+"""Tokens on their other side: geometry, both worlds, and the actions that turn them over."""
+
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tangram_sim.actions import action_size, flips
 from tangram_sim.arrays import Bools, Floats
+from tangram_sim.batch import BatchedEnv
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.geometry import area, outlines, overlap_share
+from tangram_sim.pictures import TOKEN_GRAY, rasterise
 from tangram_sim.rewards import make_reward
+from tangram_sim.seeding import evaluation_generators
 from tangram_sim.shapes import SHAPE_NAMES, mirror_image, polygon, tan, turn_onto
+from tangram_sim.world import World, make_world
 from tests.sim.builders import LOPSIDED, SEVEN, angle_gap, layout_of, random_poses
 
 pytestmark = pytest.mark.fast
@@ -133,3 +140,114 @@ def test_sides_are_told_of_noisy_corners_and_rewarded_as_rigid_pieces() -> None:
     shifted = corners + 0.1
     expected = 2.0 * overlap_share(shifted, corners, layout) - 1.0
     np.testing.assert_allclose(reward(shifted, corners), expected, atol=1e-9)
+
+
+@pytest.fixture(params=["physics", "kinematic"])
+def world(request: pytest.FixtureRequest) -> Any:
+    made = make_world(LAYOUT, SimConfig(backend=request.param))
+    yield made
+    made.close()
+
+
+def test_worlds_place_tokens_on_either_side(world: World) -> None:
+    for poses, sides in zip(*drawn(30), strict=True):
+        world.place(poses, sides)
+        np.testing.assert_array_equal(world.flipped(), sides)
+        np.testing.assert_allclose(world.poses(), poses, atol=1e-9)
+    world.place(poses)
+    assert not world.flipped().any()
+
+
+@pytest.mark.parametrize("backend", ["physics", "kinematic"])
+def test_worlds_turn_tokens_over_and_back(backend: str) -> None:
+    layout = layout_of("parallelogram", "square", LOPSIDED, scale=0.1)
+    world = make_world(layout, SimConfig(backend=backend))
+    start, way = np.array([[-0.5, 0, 0.4], [0.5, 0, 1.0], [0, 0.5, -2.0]]), [0.1, -0.2, 2.5]
+    for token in (0, 2):
+        world.place(start)
+        world.move(token, np.array(way), True)
+        expected, sides = start.copy(), np.arange(3) == token
+        expected[token] += way
+        got = layout.corners(world.poses(), world.flipped())
+        np.testing.assert_allclose(got, layout.corners(expected, sides), atol=1e-6)
+        world.move(token, -np.array(way), True)
+        got = layout.corners(world.poses(), world.flipped())
+        np.testing.assert_allclose(got, layout.corners(start), atol=1e-6)
+    world.close()
+
+
+def test_pictures_show_tokens_on_their_side(world: World) -> None:
+    """Pixel for pixel, but for centres that lie on an edge to rounding."""
+    wrong, seen = 0, 0
+    for poses, sides in zip(*drawn(25), strict=True):
+        world.place(poses, sides)
+        picture = world.picture()
+        exact = rasterise(LAYOUT.corners(poses, sides), LAYOUT, 2.0, 64)
+        wrong += int(np.count_nonzero(picture != exact))
+        other = rasterise(LAYOUT.corners(poses, ~sides & LAYOUT.chiral), LAYOUT, 2.0, 64)
+        seen += int(np.count_nonzero(other != exact))
+        assert (picture == TOKEN_GRAY).any()
+    assert wrong <= 10 < seen
+
+
+def env_of(*shapes: Any, count: int = 32, **sim: Any) -> BatchedEnv:
+    config = SimConfig(**{"backend": "kinematic", "allow_flip": True, **sim})
+    env = BatchedEnv(layout_of(*shapes, scale=0.6), config, RewardConfig(), count)
+    env.reset(evaluation_generators(count))
+    return env
+
+
+def test_an_action_has_an_entry_for_the_flip() -> None:
+    sim = SimConfig(allow_flip=True)
+    assert [action_size(tokens, sim) for tokens in (1, 2, 7)] == [4, 5, 5]
+    assert [action_size(tokens, SimConfig()) for tokens in (1, 2, 7)] == [3, 4, 4]
+    actions = np.zeros((4, 5))
+    actions[:, 0], actions[:, 1] = [-1, -1, 1, 1], [1.0, 0.0, 1e-9, -1.0]
+    pair = layout_of("parallelogram", "parallelogram")
+    assert flips(actions, pair, sim).tolist() == [True, False, True, False]
+    assert not flips(actions[:, 1:], pair, SimConfig()).any()
+
+
+def test_a_token_that_is_its_own_mirror_image_is_never_turned_over() -> None:
+    env = env_of("square", "parallelogram", starts="outside")
+    before = env.corners.copy()
+    result = env.step(np.tile([-1.0, 1.0, 0.0, 0.0, 0.0], (32, 1)))
+    np.testing.assert_allclose(env.corners, before, atol=1e-12)
+    assert not result.blocked.any()
+    env.step(np.tile([1.0, 1.0, 0.0, 0.0, 0.0], (32, 1)))
+    assert np.abs(env.corners - before).max(axis=(1, 2)).min() > 0.01
+
+
+def test_flips_and_starts_on_any_side() -> None:
+    env = env_of("parallelogram", count=64)
+    starts, goals = env.layout.flipped(env.corners), env.layout.flipped(env.goals)
+    assert 16 < starts.sum() < 48
+    assert not goals.any()
+    motion = env.layout.poses(env.goals)[:, 0] - env.layout.poses(env.corners)[:, 0]
+    motion[:, 2] = np.angle(np.exp(1j * motion[:, 2]))
+    flip = np.where(starts != goals, 1.0, -1.0)
+    result = env.step(np.concatenate([flip, motion / [2.0, 2.0, np.pi]], axis=1))
+    np.testing.assert_allclose(result.overlap, 1.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("mirrored", "least", "most"), [(0.0, 0, 0), (0.5, 16, 48), (1.0, 64, 64)])
+def test_share_of_mirrored_episodes(mirrored: float, least: int, most: int) -> None:
+    env = env_of("parallelogram", "square", count=64, allow_flip=False, mirrored=mirrored)
+    goals, starts = env.layout.flipped(env.goals), env.layout.flipped(env.corners)
+    assert least <= goals[:, 0].sum() <= most
+    np.testing.assert_array_equal(starts, goals)  # always within reach
+
+
+@pytest.mark.parametrize("backend", ["physics", "kinematic"])
+def test_the_camera_agrees_on_either_side(backend: str) -> None:
+    env = env_of("parallelogram", count=8, mirrored=1.0, camera=True, backend=backend)
+    env.step(np.zeros((8, 4)))
+    goals = env.layout.poses(env.goals)[:, 0] - env.layout.poses(env.corners)[:, 0]
+    env.reset(evaluation_generators(8))
+    goals[:, 2] = np.angle(np.exp(1j * goals[:, 2]))
+    differs = env.layout.flipped(env.corners) != env.layout.flipped(env.goals)
+    flip = np.where(differs, 1.0, -1.0)
+    result = env.step(np.concatenate([flip, goals / [2.0, 2.0, np.pi]], axis=1))
+    assert result.camera_rewards is not None
+    np.testing.assert_allclose(result.camera_rewards, 1.0, atol=0.02)
+    env.close()

@@ -29,8 +29,8 @@ def test_a_stage_begins_with_its_number_of_updates(updates: int, stage: int) -> 
 
 
 def test_what_a_stage_plays() -> None:
-    sim = SimConfig(stages=STAGES, targets="connected", spread=0.4)
-    assert sim.task == StageConfig(targets="connected", spread=0.4)
+    sim = SimConfig(stages=STAGES, targets="gaussian", spread=0.4)
+    assert sim.task == StageConfig(targets="gaussian", spread=0.4)
     assert [sim.stage_task(stage) for stage in range(3)] == [sim.task, *STAGES]
     assert SimConfig(stages=(StageConfig(),)).stage(0) == 1
     assert SimConfig().stage(99) == 0

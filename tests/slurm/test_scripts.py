@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.test_conf import compose
+from conf.cli import composed
 
 pytestmark = pytest.mark.fast
 
@@ -78,7 +78,7 @@ def test_scripts_stop_at_the_first_error(path: Path) -> None:
 def test_every_setting_is_one_of_the_config(path: Path) -> None:
     for primary, override in settings(path):
         given = ["connect=runs/x"] if primary == "worker" else []
-        compose(primary, *given, override)
+        composed(primary, [*given, override])
 
 
 def test_settings_are_found() -> None:

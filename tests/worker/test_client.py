@@ -1,4 +1,4 @@
-"""The client with a real hub, over losses and restarts, and with a master that says odd things."""
+"""The client with a real hub, over losses and stops, and with a master that says odd things."""
 
 import signal
 import threading
@@ -26,13 +26,24 @@ from tangram_agent.types import Episodes
 from tangram_sim.errors import RunError, TangramError, WireError
 from tests.agent.messages import FINGERPRINTS, SHAPES, episodes, scores, weights, with_header
 from tests.master.dealers import staged
-from tests.worker.clients import both, free_port, joined, numbers, served, write_connection
-from tests.worker.standin import QUICK, make_client, standing_in
+from tests.worker.conversation import (
+    QUICK,
+    both,
+    free_port,
+    joined,
+    make_client,
+    numbers,
+    served,
+    standing_in,
+    write_connection,
+)
 
 pytestmark = pytest.mark.cluster
 
+SENT_AGAIN = replace(QUICK, resend_s=0.1)
 
-def test_a_link_joins_and_is_told_what_it_needs() -> None:
+
+def test_a_client_joins_and_is_told_what_it_needs() -> None:
     with staged() as stage, joined(stage, index=5) as client:
         welcome = client.welcome
         assert (welcome.run_id, welcome.seed, welcome.index) == ("run", 7, 5)
@@ -41,39 +52,28 @@ def test_a_link_joins_and_is_told_what_it_needs() -> None:
         assert not client.stopped
 
 
-def test_a_link_waits_for_the_connection_file(tmp_path: Path) -> None:
-    with staged() as stage, make_client(str(tmp_path)) as client, ThreadPoolExecutor(1) as pool:
+def test_a_client_waits_for_the_connection_file(tmp_path: Path) -> None:
+    with staged() as stage, make_client(tmp_path) as client, ThreadPoolExecutor(1) as pool:
+        with pytest.raises(TangramError, match=r"not joined a master yet: call join\(\) first"):
+            _ = client.welcome
         future = pool.submit(client.join)
         write_connection(tmp_path, stage.hub.endpoint)
         stage.until(future.done)
         assert future.result() is True
 
 
-def test_no_master_at_an_address_says_so() -> None:
+@pytest.mark.parametrize("what", ["address", "file"])
+def test_no_master_in_time_says_where_none_is(tmp_path: Path, what: str) -> None:
     endpoint = f"tcp://127.0.0.1:{free_port()}"
-    with make_client(endpoint, replace(QUICK, join_s=0.2)) as client:
+    with make_client(
+        endpoint if what == "address" else tmp_path, replace(QUICK, join_s=0.2)
+    ) as client:
         with pytest.raises(TangramError) as caught:
             client.join()
-        assert str(caught.value) == (
-            f"no master answers at {endpoint} after 0.2 s: is tangram-master running there?"
-        )
-
-
-def test_no_connection_file_says_so(tmp_path: Path) -> None:
-    with make_client(str(tmp_path), replace(QUICK, join_s=0.2)) as client:
-        with pytest.raises(TangramError) as caught:
-            client.join()
-        assert str(caught.value) == (
-            f"no connection file is at {tmp_path} after 0.2 s: is tangram-master running there?"
-        )
-
-
-def test_before_joining_there_is_no_welcome(tmp_path: Path) -> None:
-    with (
-        make_client(str(tmp_path)) as client,
-        pytest.raises(TangramError, match=r"has not joined a master yet: call join\(\) first"),
-    ):
-        _ = client.welcome
+        nobody = f"no master answers at {endpoint} after 0.2 s"
+        if what == "file":
+            nobody = f"no connection file is at {tmp_path} after 0.2 s"
+        assert str(caught.value) == f"{nobody}: is tangram-master running there?"
 
 
 def test_a_refusal_is_raised_with_the_masters_reason() -> None:
@@ -87,6 +87,14 @@ def test_a_refusal_is_raised_with_the_masters_reason() -> None:
         )
 
 
+def test_a_refused_rejoin_ends_the_worker() -> None:
+    with standing_in() as master, make_client(master.endpoint) as client:
+        master.welcome(client)
+        master.say(Refused("its settings of net differ"))
+        with pytest.raises(TangramError, match="refused this player: its settings of net differ"):
+            master.until(client, lambda: False)
+
+
 def test_a_master_of_another_protocol_is_an_error() -> None:
     with standing_in() as master, make_client(master.endpoint) as client:
         master.until(client, lambda: master.heard)
@@ -98,7 +106,7 @@ def test_a_master_of_another_protocol_is_an_error() -> None:
 
 
 def test_a_stale_connection_file_is_told(tmp_path: Path) -> None:
-    with staged() as stage, make_client(str(tmp_path)) as client:
+    with staged() as stage, make_client(tmp_path) as client:
         write_connection(tmp_path, stage.hub.endpoint, "an older run")
         with pytest.raises(TangramError) as caught:
             served(stage, client.join)
@@ -106,6 +114,12 @@ def test_a_stale_connection_file_is_told(tmp_path: Path) -> None:
             f"the master at {stage.hub.endpoint} runs 'run', not 'an older run': the connection "
             "file is stale, take the one of a master that is running"
         )
+
+
+def test_an_address_that_zeromq_does_not_take() -> None:
+    with make_client("tcp://bad host:5555") as client, pytest.raises(RunError) as caught:
+        client.join()
+    assert str(caught.value).startswith("cannot connect to tcp://bad host:5555 (")
 
 
 @pytest.mark.parametrize("wait", ["join", "wait_for_window", "wait_for_weights"])
@@ -119,14 +133,13 @@ def test_stop_ends_each_wait(wait: str) -> None:
         timer.start()
         assert not getattr(client, wait)()
         timer.join()
-        assert (client.stopped, client.stop_reason) == (True, "SIGTERM")
         client.stop("again")
-        assert client.stop_reason == "SIGTERM"
+        assert (client.stopped, client.stop_reason) == (True, "SIGTERM")
         assert client.send(episodes(), 1) is False
 
 
 def test_a_real_signal_ends_a_wait(tmp_path: Path) -> None:
-    with make_client(str(tmp_path)) as client:
+    with make_client(tmp_path) as client:
         before = signal.signal(signal.SIGALRM, lambda *_: client.stop("SIGALRM"))
         try:
             signal.setitimer(signal.ITIMER_REAL, 0.05)
@@ -179,10 +192,7 @@ def test_a_batch_out_of_bounds_is_not_sent() -> None:
 
 
 def test_without_an_acknowledgement_all_is_sent_again_in_order() -> None:
-    with (
-        standing_in() as master,
-        make_client(master.endpoint, replace(QUICK, resend_s=0.1)) as client,
-    ):
+    with standing_in() as master, make_client(master.endpoint, SENT_AGAIN) as client:
         master.welcome(client)
         for _ in range(3):
             assert client.send(episodes(), 1)
@@ -198,7 +208,7 @@ def test_without_an_acknowledgement_all_is_sent_again_in_order() -> None:
 def test_a_lost_acknowledgement_is_given_again() -> None:
     with (
         staged() as stage,
-        joined(stage, timing=replace(QUICK, resend_s=0.1)) as client,
+        joined(stage, timing=SENT_AGAIN) as client,
         pytest.MonkeyPatch.context() as patch,
     ):
         assert client.send(episodes(), 1)
@@ -223,15 +233,11 @@ def test_what_came_out_of_turn_is_sent_again_with_all_before_it() -> None:
 
 
 def test_what_is_refused_for_good_is_not_sent_again() -> None:
-    with (
-        standing_in() as master,
-        make_client(master.endpoint, replace(QUICK, resend_s=0.1)) as client,
-    ):
+    with standing_in() as master, make_client(master.endpoint, SENT_AGAIN) as client:
         master.welcome(client)
         for _ in range(2):
             assert client.send(episodes(), 1)
-        master.until(client, lambda: numbers(master.heard) == [1, 2])
-        master.heard.clear()
+        master.until(client, lambda: numbers(master.heard)[:2] == [1, 2])
         master.say(Reject(reason="player 3: rewards holds nan", sequence=1, final=True))
         master.say(Reject(reason="unknown kind", sequence=0, final=True))
         master.until(client, lambda: client.counters["rejected"] == 2)
@@ -243,8 +249,8 @@ def test_what_is_refused_for_good_is_not_sent_again() -> None:
 def test_hello_is_repeated_until_it_is_answered_and_says_the_same() -> None:
     with standing_in() as master, make_client(master.endpoint) as client:
         master.until(client, lambda: len(master.heard) == 2)
-        assert master.heard[0] == master.heard[1]
-        [hello] = master.heard[:1]
+        hello, again = master.heard
+        assert hello == again
         assert isinstance(hello, Hello)
         assert (hello.index, hello.incarnation, hello.first) == (-1, 0, 1)
 
@@ -258,8 +264,6 @@ def test_weights_come_newest_only_and_once() -> None:
             assert first.version == 1
             assert first.tensors.keys() == SHAPES.keys()
             assert client.newest_weights() is None
-            for version in range(2, 9):
-                stage.hub.publish(weights(version))
             seen: list[int] = []
 
             def newest() -> bool:
@@ -267,6 +271,8 @@ def test_weights_come_newest_only_and_once() -> None:
                 seen.extend([] if newer is None else [newer.version])
                 return 8 in seen
 
+            for version in range(2, 9):
+                stage.hub.publish(weights(version))
             both(stage, client, newest)
             assert seen == sorted(set(seen))
 
@@ -324,7 +330,7 @@ def test_the_newest_process_of_an_index_wins() -> None:
         assert (new.welcome.incarnation, new.stopped) == (2, False)
 
 
-def test_stop_ends_a_link_and_it_says_bye() -> None:
+def test_stop_ends_a_client_and_it_says_bye() -> None:
     with staged() as stage:
         with joined(stage) as client:
             assert client.send(episodes(), 1)
@@ -344,30 +350,13 @@ def test_a_repeated_stop_is_heard_by_who_missed_the_first() -> None:
         assert client.stop_reason == "over"
 
 
-def test_scores_and_stats_arrive() -> None:
-    with staged() as stage, joined(stage, role="evaluator") as client:
+def test_scores_and_stats_arrive_and_without_a_master_scores_are_lost_and_counted() -> None:
+    with staged() as stage, make_client(stage.hub.endpoint, role="evaluator") as client:
+        client.send_scores(scores())
+        assert client.counters["lost_scores"] == 1
+        assert served(stage, client.join)
         client.stats["episodes"] = 12.0
         client.send_scores(scores())
         stage.counted("scores")
         assert isinstance(stage.arrivals[0], ScoresArrived)
         both(stage, client, lambda: stage.hub.peers[0].stats == {"episodes": 12.0})
-
-
-def test_scores_for_a_master_that_is_away_are_lost_and_counted() -> None:
-    with standing_in() as master, make_client(master.endpoint) as client:
-        client.send_scores(scores())
-        assert client.counters["lost_scores"] == 1
-
-
-def test_a_refused_rejoin_ends_the_worker() -> None:
-    with standing_in() as master, make_client(master.endpoint) as client:
-        master.welcome(client)
-        master.say(Refused("its settings of net differ"))
-        with pytest.raises(TangramError, match="refused this player: its settings of net differ"):
-            master.until(client, lambda: False)
-
-
-def test_an_address_that_zeromq_does_not_take() -> None:
-    with make_client("tcp://bad host:5555") as client, pytest.raises(RunError) as caught:
-        client.join()
-    assert str(caught.value).startswith("cannot connect to tcp://bad host:5555 (")

@@ -1,4 +1,4 @@
-"""The line to a master that is restarted, moved, silent or gone, with a real hub."""
+"""The connection to a master that is restarted, moved, silent or gone."""
 
 import time
 from collections.abc import Callable
@@ -14,8 +14,17 @@ from tangram_agent.messages import Alive, Greet, Hello
 from tangram_sim.errors import TangramError
 from tests.agent.messages import SHAPES, episodes, weights
 from tests.master.dealers import staged
-from tests.worker.clients import both, free_port, joined, served, write_connection
-from tests.worker.standin import LIMIT_S, QUICK, make_client, standing_in
+from tests.worker.conversation import (
+    LIMIT_S,
+    QUICK,
+    both,
+    free_port,
+    joined,
+    make_client,
+    served,
+    standing_in,
+    write_connection,
+)
 from worker import client as client_module
 from worker.client import Client
 
@@ -61,7 +70,7 @@ def test_a_restarted_master_gets_all_that_was_not_acknowledged() -> None:
 
 def test_a_master_on_another_port_is_found_through_its_file(tmp_path: Path) -> None:
     quick = replace(QUICK, silence_s=0.3)
-    with make_client(str(tmp_path), quick) as client:
+    with make_client(tmp_path, quick) as client:
         with staged() as stage:
             write_connection(tmp_path, stage.hub.endpoint)
             assert served(stage, client.join)
@@ -130,13 +139,13 @@ def test_another_run_at_the_same_address_is_an_error() -> None:
 
 
 def test_closing_is_bounded_when_nobody_listens(tmp_path: Path) -> None:
-    for connect in (f"tcp://127.0.0.1:{free_port()}", str(tmp_path)):
+    for connect in (f"tcp://127.0.0.1:{free_port()}", tmp_path):
         client = make_client(connect)
         client.poll()
         client.close()
 
 
-def test_a_waiting_link_says_what_it_waits_for(
+def test_a_waiting_client_says_what_it_waits_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """First the file is missing, then the master does not answer, then it does not acknowledge."""
@@ -156,10 +165,10 @@ def test_a_waiting_link_says_what_it_waits_for(
             client.stop("enough")
             future.result()
 
-    with make_client(str(tmp_path)) as client:
+    with make_client(tmp_path) as client:
         wait_until_said(client, client.join, f"waits for the connection file {tmp_path} since 0 s")
     write_connection(tmp_path, f"tcp://127.0.0.1:{free_port()}")
-    with make_client(str(tmp_path)) as client:
+    with make_client(tmp_path) as client:
         wait_until_said(
             client, client.join, "waits for an answer of the master at tcp://127.0.0.1:"
         )
@@ -194,7 +203,7 @@ def test_a_master_that_moved_is_followed_at_once(tmp_path: Path) -> None:
     patient = replace(QUICK, silence_s=3600.0)
     with staged() as first:
         write_connection(tmp_path, first.hub.endpoint)
-        with make_client(str(tmp_path), timing=patient) as client:
+        with make_client(tmp_path, timing=patient) as client:
             assert served(first, client.join)
             client.send(episodes(), 0)
             with staged() as second:

@@ -12,7 +12,7 @@ from tangram_agent.config import ServiceConfig
 from tangram_sim.errors import TangramError
 from tests.agent.builders import PAIR, setup
 from tests.worker.builders import policy, weights
-from tests.worker.masters import collect, open_hub, with_master
+from tests.worker.conversation import collect, open_hub, with_master
 from worker.config import WorkerConfig
 from worker.evaluator import Schedule, run_evaluator
 from worker.test_set import FixedTests, greedy

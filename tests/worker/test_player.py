@@ -25,7 +25,7 @@ from tangram_sim.sampling import sample_poses
 from tangram_sim.seeding import episode_generator
 from tests.agent.builders import setup
 from tests.worker.builders import policy, weights, write_run
-from tests.worker.masters import LIMIT_S, collect, open_hub, with_master
+from tests.worker.conversation import LIMIT_S, collect, open_hub, with_master
 from worker.config import WorkerConfig
 from worker.player import run_player
 

@@ -17,7 +17,7 @@ from tangram_agent.types import Weights
 from tangram_sim.errors import TangramError
 from tests.agent.messages import episodes, hello, weights
 from tests.master.dealers import INFO, Stage, staged
-from tests.worker.standin import QUICK, make_client
+from tests.worker.conversation import QUICK, make_client
 from worker.client import Client
 
 pytestmark = pytest.mark.cluster

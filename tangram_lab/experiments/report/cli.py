@@ -6,7 +6,7 @@ Everything heavy is imported after the config was composed, so --help and wrong 
 from pathlib import Path
 
 from conf.cli import entry
-from conf.help import Plain
+from conf.commands import Plain
 
 
 def report() -> int:
@@ -20,7 +20,7 @@ def _report(settings: Plain) -> int:
 
     config = from_mapping(ReportConfig, with_absolute_paths(settings))
 
-    from tangram_lab.experiments.report.write import write_report
+    from tangram_lab.experiments.report.page import write_report
 
     for path in write_report(Path(config.runs), Path(config.out)):
         print(f"written: {path}")

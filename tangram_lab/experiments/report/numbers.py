@@ -1,17 +1,17 @@
-"""Medians with their spread, and curves of several seeds on one grid."""
+"""Quantities of tables and figures: their spread over seeds, curves, and how people read them."""
 
 import statistics
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from tangram_lab.experiments.report.records import Row
-from tangram_lab.experiments.report.study import Seed
+from tangram_lab.experiments.report.study import Row, Seed
 from tangram_sim.arrays import Floats
 
-GRID = 200
-KEPT = 60
+NOTHING = "-"
+GRID = 200  # points of a curve of several seeds
+KEPT = 60  # points of a curve in data.json
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,66 @@ def spread(values: Iterable[float]) -> Spread | None:
     """Of any count of numbers; None of none."""
     known = list(values)
     return Spread(statistics.median(known), min(known), max(known)) if known else None
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A quantity of tables and figures.
+
+    Attributes:
+        key: in result.json and in the files of tests.
+        label: head of a column.
+        axis: label of an axis, with its unit.
+        pattern: of one number.
+        factor: number in the table / number in the file.
+    """
+
+    key: str
+    label: str
+    axis: str
+    pattern: str
+    factor: float = 1.0
+
+    def show(self, number: float | None) -> str:
+        """One number, `-` if there is none."""
+        if number is None:
+            return NOTHING
+        text = self.pattern.format(number * self.factor)
+        return text[1:] if text.startswith("-") and not text.strip("-0.°,") else text
+
+    def show_spread(self, values: Mapping[int, float]) -> str:
+        """Median (least to most) over the seeds; only the median where that is all."""
+        known = spread(values.values())
+        if known is None:
+            return NOTHING
+        least, median, most = map(self.show, (known.least, known.median, known.most))
+        return median if least == median == most else f"{median} ({least} to {most})"
+
+    def show_difference(self, ours: Mapping[int, float], theirs: Mapping[int, float]) -> str:
+        """Difference of two medians, with its sign."""
+        one, other = spread(ours.values()), spread(theirs.values())
+        if one is None or other is None:
+            return NOTHING
+        signed = self.pattern.replace("{:", "{:+", 1)
+        return signed.format((one.median - other.median) * self.factor)
+
+
+REWARD = Measure("mean_reward", "mean reward", "mean reward (\N{MINUS SIGN}1 to 1)", "{:.3f}")
+DENSE = Measure(
+    "mean_reward_dense",
+    "mean dense reward",
+    "mean dense reward, Eq. 15 (\N{MINUS SIGN}1 to 1)",
+    "{:.3f}",
+)
+ANGLE = Measure("angle_error_deg_median", "angle error", "angle error, median (degrees)", "{:.2f}°")
+POSITION = Measure(
+    "position_error_median", "position error", "position error, median (arena units)", "{:.4f}"
+)
+EPISODES = Measure("episodes", "episodes", "episodes", "{:,.0f}")
+UPDATES = Measure("updates", "updates", "updates", "{:,.0f}")
+MINUTES = Measure("train_s", "training, min", "training time (minutes)", "{:,.1f}", 1 / 60)
+HOURS = Measure("train_s", "training, h", "training time (hours)", "{:,.2f}", 1 / 3600)
+PARAMETERS = Measure("parameters", "parameters", "parameters", "{:,.0f}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,11 +134,9 @@ def band(curves: Iterable[Sequence[Row]], axis: str, key: str) -> Band | None:
     return Band(grid, values.mean(axis=0), deviation, len(known))
 
 
-def first_at_least(
-    seed: Seed, level: float, axis: str = "episodes", key: str = "mean_reward"
-) -> float | None:
-    """Where the curve first reaches a level; None if it never does."""
-    x, y = points(seed.curve, axis, key)
+def first_at_least(seed: Seed, level: float) -> float | None:
+    """Episodes until a curve first reaches a mean reward; None if it never does."""
+    x, y = points(seed.curve, EPISODES.key, REWARD.key)
     reached = np.flatnonzero(y >= level)
     return float(x[reached[0]]) if len(reached) else None
 

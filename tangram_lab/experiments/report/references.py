@@ -1,18 +1,17 @@
-"""Policies to compare with, as tests of the same task scored them on the same episodes."""
+"""What scores are compared with: policies that learned nothing, and the paper's own numbers."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from tangram_lab.experiments.report.markdown import Measure
-from tangram_lab.experiments.report.records import Row
-from tangram_lab.experiments.report.study import Experiment, Study, Training, Trial
+from tangram_lab.experiments.report.numbers import Measure
+from tangram_lab.experiments.report.study import Experiment, Row, Study, Training, Trial
 
 # Name in the files of tests -> name in the report.
 POSITION, PERFECT, RANDOM = "position only", "perfect", "random"
 NAMES = {"position only": POSITION, "exact": PERFECT, "random": RANDOM}
 # Settings of the simulation that tests set themselves, or that move no token.
 APART = ("sim.actions_per_token", "sim.corner_noise", "sim.camera", "sim.pixels", "sim.max_tries")
-
 # Where tokens fall short of what they are told, no policy here is an oracle.
 INEXACT = "sim.inexact=true"
 
@@ -38,11 +37,11 @@ class Reference:
         """For tables and legends."""
         return f"{self.name} ({self.task})" if self.task else self.name
 
-    def score(self, tests: Sequence[Trial], measure: Measure) -> float | None:
+    def score(self, tests: Iterable[Trial], measure: Measure) -> float | None:
         """Its score in the first of the tests that has one."""
-        found = [self.by_test[one.name] for one in tests if one.name in self.by_test]
-        values = [row[measure.key] for row in found if row.get(measure.key) is not None]
-        return float(values[0]) if values else None
+        rows = (self.by_test.get(one.name, {}) for one in tests)
+        values = (row[measure.key] for row in rows if row.get(measure.key) is not None)
+        return next(map(float, values), None)
 
 
 class References:
@@ -103,13 +102,72 @@ def task_of(training: Training) -> Task:
 
 def _tasks(experiment: Experiment) -> dict[Task, str]:
     """Every task of an experiment, and what tells it from the others."""
-    known = [one for one in experiment.trainings if one.finished]
-    firsts = {task_of(one): one for one in reversed(known)}
-    tasks = list(dict.fromkeys(map(task_of, known)))
-    if len(tasks) == 1:
-        return {tasks[0]: ""}
-    shapes = [firsts[task].tokens for task in tasks]
+    firsts: dict[Task, Training] = {}
+    for one in experiment.trainings:
+        if one.finished:
+            firsts.setdefault(task_of(one), one)
+    shapes = [one.tokens for one in firsts.values()]
+    if len(shapes) == 1:
+        return dict.fromkeys(firsts, "")
     return {
-        task: shape if shapes.count(shape) == 1 else firsts[task].label
-        for task, shape in zip(tasks, shapes, strict=True)
+        task: one.tokens if shapes.count(one.tokens) == 1 else one.label
+        for task, one in firsts.items()
     }
+
+
+@dataclass(frozen=True)
+class Value:
+    """What the paper reports of one of its agents.
+
+    Attributes:
+        mean_reward: that it reliably reaches.
+        after: episodes until then.
+        parameters: of the network.
+        hours: of training.
+        episodes: of training.
+        by_actions: mean rewards with 1, 2, ... actions in sequence.
+    """
+
+    mean_reward: float | None = None
+    after: int | None = None
+    parameters: int | None = None
+    hours: float | None = None
+    episodes: int | None = None
+    by_actions: Sequence[float] = ()
+
+
+# Place in the paper -> name of a training or of a family -> what the paper reports.
+VALUES = {
+    "Fig. 4": {
+        "paper": Value(mean_reward=0.75, after=1_500),
+        "mlp": Value(mean_reward=0.70, after=19_000),
+    },
+    "Table I": {
+        "paper": Value(parameters=504_000, hours=72, episodes=28_000),
+        "mlp": Value(parameters=14_000, hours=48, episodes=100_000),
+    },
+    "Table II": {"paper": Value(by_actions=(0.758, 0.754, 0.754, 0.764, 0.750))},
+}
+
+
+def papers(experiment: Experiment, training: Training) -> Value | None:
+    """The paper's numbers for a training of an experiment, by the place that this names.
+
+    They belong to the training of that very name; where an experiment has none, to its family.
+    """
+    names = {one.name for one in experiment.trainings}
+    for place, known in VALUES.items():
+        if re.search(rf"{re.escape(place)}(?!\w)", experiment.source):
+            if training.name in known:
+                return known[training.name]
+            if training.family in known and training.family not in names:
+                return known[training.family]
+    return None
+
+
+def papers_score(experiment: Experiment, training: Training, trial: Trial) -> float | None:
+    """The paper's mean reward in a test without noise, by its count of actions."""
+    known = papers(experiment, training)
+    if known is None or trial.corner_noise or trial.actions is None:
+        return None
+    return dict(enumerate(known.by_actions, 1)).get(trial.actions)

@@ -1,7 +1,7 @@
 """How figures look, and how they are saved; nothing here touches pyplot's global state."""
 
 import io
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from tangram_agent.files import write_whole
-from tangram_lab.experiments.report.study import Experiment, Study
 
 WIDTH_IN = 9.0  # a README shows it a little smaller than that
 DPI = 160
@@ -68,36 +67,6 @@ class Look:
     colour: str
     marker: str
     dash: Dash
-
-
-def looks(study: Study) -> dict[str, Look]:
-    """Training -> look, the same in every figure.
-
-    Colours repeat when there are more trainings than colours, but not within one figure of curves
-    if that can be avoided; then the dashes differ.
-    """
-    groups = [{one.name for one in e.trainings} for e in _figures_first(study.experiments)]
-    chosen: dict[str, int] = {}
-    for group in groups:
-        for name in (one.name for one in study.trainings if one.name in group):
-            if name not in chosen:
-                near = {o for other in groups if name in other for o in other} & set(chosen)
-                chosen[name] = _free({chosen[other] for other in near})
-    return {name: _look(index) for name, index in chosen.items()}
-
-
-def _figures_first(experiments: Iterable[Experiment]) -> list[Experiment]:
-    """A ranking names its rows, so it can do with colours that are left."""
-    return sorted(experiments, key=lambda one: one.kind == "ranking")
-
-
-def _free(taken: set[int]) -> int:
-    return min(index for index in range(len(taken) + 1) if index not in taken)
-
-
-def _look(index: int) -> Look:
-    turn, colour = divmod(index, len(COLOURS))
-    return Look(COLOURS[colour], MARKERS[colour], DASHES[turn % len(DASHES)])
 
 
 @contextmanager

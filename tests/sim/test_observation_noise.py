@@ -6,9 +6,9 @@ import pytest
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.env import TangramEnv
+from tangram_sim.observation_noise import noise_bound, see
 from tangram_sim.rewards import make_reward
 from tangram_sim.seeding import evaluation_generators
-from tangram_sim.sensing import noise_bound, see
 from tests.sim.builders import TRIO, layout_of
 
 pytestmark = pytest.mark.fast

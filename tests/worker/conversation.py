@@ -1,13 +1,26 @@
-"""A master that says what it is told to, for what a real hub never does."""
+"""Both ends of the conversation: real clients, a real hub, and a master that says what it is told.
 
+`staged` hubs (tests/master/dealers.py) are served by the test's own thread; `with_master` serves a
+hub from another one, because signals belong to the main thread.
+"""
+
+import json
+import socket
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
 from typing import Any, TypeVar
 
 import zmq
 
+from master.arrivals import Arrival, WelcomeInfo
+from master.hub import Hub
+from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.messages import (
+    EpisodeBatch,
     Heartbeat,
     Hello,
     ToMaster,
@@ -16,28 +29,64 @@ from tangram_agent.messages import (
     decode_from_worker,
 )
 from tangram_agent.schema import Plain
+from tangram_agent.setup import Setup
 from tests.agent.messages import FINGERPRINTS, SPEC
+from tests.master.dealers import Stage
 from worker.client import Client
 from worker.connection import Timing
 
 Message = TypeVar("Message")
+Result = TypeVar("Result")
 
-LIMIT_S = 20.0
+LIMIT_S = 60.0
 QUICK = Timing(
     join_s=10.0, retry_s=0.05, heartbeat_s=0.05, resend_s=30.0, silence_s=10.0, lost_s=30.0
 )
 
 
-def make_client(
-    connect: str,
-    timing: Timing = QUICK,
-    index: int = -1,
-    fingerprints: Mapping[str, str] = FINGERPRINTS,
-    role: str = "player",
-    **more: Any,
-) -> Client:
-    """A worker's client."""
-    return Client(connect, role, index, fingerprints, SPEC, timing=timing, **more)
+def make_client(connect: object, timing: Timing = QUICK, **more: Any) -> Client:
+    fields: dict[str, Any] = {"role": "player", "index": -1, "fingerprints": FINGERPRINTS} | more
+    return Client(str(connect), spec=SPEC, timing=timing, **fields)
+
+
+def served(stage: Stage, call: Callable[[], Result]) -> Result:
+    """What a call that waits returns, while the hub is served."""
+    with ThreadPoolExecutor(1) as pool:
+        future = pool.submit(call)
+        stage.until(future.done)
+        return future.result()
+
+
+@contextmanager
+def joined(stage: Stage, **more: Any) -> Iterator[Client]:
+    with make_client(stage.hub.endpoint, **more) as client:
+        assert served(stage, client.join)
+        yield client
+
+
+def both(stage: Stage, client: Client, done: Callable[[], Any]) -> None:
+    """Serve the hub and let the client work until something holds."""
+
+    def step() -> Any:
+        client.poll()
+        return done()
+
+    stage.until(step)
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return int(probe.getsockname()[1])
+
+
+def write_connection(folder: Path, endpoint: str, run_id: str = "run") -> None:
+    aside = folder / "aside"
+    aside.write_text(json.dumps({"endpoint": endpoint, "run_id": run_id}))
+    aside.replace(folder / "connection.json")
+
+
+def numbers(heard: list[ToMaster]) -> list[int]:
+    return [message.sequence for message in heard if isinstance(message, EpisodeBatch)]
 
 
 class StandIn:
@@ -51,8 +100,8 @@ class StandIn:
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]]) -> None:
         self._router, self._pub = context.socket(zmq.ROUTER), context.socket(zmq.PUB)
-        for socket in (self._router, self._pub):
-            socket.bind("tcp://127.0.0.1:*")
+        for one in (self._router, self._pub):
+            one.bind("tcp://127.0.0.1:*")
         self.endpoint = self._router.getsockopt_string(zmq.LAST_ENDPOINT)
         self.heard: list[ToMaster] = []
         self.identity = b""
@@ -132,3 +181,42 @@ def standing_in() -> Iterator[StandIn]:
         yield StandIn(context)
     finally:
         context.destroy(linger=0)
+
+
+# A hub in a thread of its own
+
+
+def open_hub(made: Setup, window: int = 4, seed: int = 11, lockstep: bool = False) -> Hub:
+    """A master's hub on a free port."""
+    spec = replace(EpisodeSpec.of(made), bound=100.0)
+    info = WelcomeInfo("run", seed, made.fingerprints(), spec, window, lockstep)
+    return Hub("127.0.0.1", 0, info)
+
+
+def collect(hub: Hub, enough: Callable[[list[Arrival]], bool]) -> list[Arrival]:
+    """Poll until there is enough."""
+    arrivals: list[Arrival] = []
+    deadline = time.monotonic() + LIMIT_S
+    while not enough(arrivals):
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"{len(arrivals)} arrivals, {dict(hub.counters)}")
+        arrivals += hub.poll(0.05)
+    return arrivals
+
+
+def with_master(
+    hub: Hub, script: Callable[[Hub], Result], worker: Callable[[], int]
+) -> tuple[Result, int]:
+    """Run a worker in this thread while the script serves the hub in another, then stop both."""
+
+    def serve() -> Result:
+        try:
+            return script(hub)
+        finally:
+            hub.stop("the script is over")
+            collect(hub, lambda _: not hub.peers)
+
+    with hub, ThreadPoolExecutor(1) as pool:
+        result = pool.submit(serve)
+        status = worker()
+        return result.result(LIMIT_S), status

@@ -1,0 +1,254 @@
+"""The commands: what each is for, and which settings it takes, as their dataclasses declare them.
+
+A config is made of the declared defaults, then of the presets that are chosen, then of what stands
+on the command line. The YAML files beside this one hold presets only: what differs from the
+defaults.
+"""
+
+from collections.abc import Mapping
+from dataclasses import MISSING, Field, asdict, dataclass, field, is_dataclass
+from importlib import import_module
+from typing import Any
+
+from tangram_sim.settings import Settings, declared_fields, setting
+
+Plain = dict[str, Any]
+NEEDED = "???"  # hydra's word for a value that must be given
+
+# Config group -> the dataclass that declares its settings; in this order presets are merged. An
+# agent brings its own net, net=... on the command line wins; a set of several tokens comes last, as
+# it brings its starts.
+GROUPS = {
+    "sim": "tangram_sim.config:SimConfig",
+    "reward": "tangram_sim.config:RewardConfig",
+    "net": "tangram_agent.config:NetConfig",
+    "agent": "tangram_agent.config:AgentConfig",
+    "service": "tangram_agent.config:ServiceConfig",
+    "tokens": "tangram_sim.layout:TokensConfig",
+}
+RUN: dict[str, str | list[str]] = {
+    "sim": "physics",
+    "reward": "overlap",
+    "net": "mha_narrow",
+    "agent": "tangram",
+    "service": "local",
+    "tokens": "square",
+}
+STUDY: dict[str, str | list[str]] = {
+    "experiment": ["fig4", "table1", "table2", "fig5", "fig6"],
+    "budget": "laptop",
+}
+NEW_RUN = "runs/${now:%Y-%m-%d_%H-%M-%S}"
+
+
+@dataclass(frozen=True)
+class StoredConfig(Settings):
+    """Settings in place of groups."""
+
+    from_config: str | None = setting(
+        None, "config.yaml of a run: takes its groups instead; single values still override"
+    )
+
+
+@dataclass(frozen=True)
+class Command:
+    """A console script.
+
+    Attributes:
+        name: of the script.
+        about: what it does, for --help.
+        examples: three lines.
+        settings: the dataclasses that declare its own settings, as `module:Class`.
+        groups: config group -> presets that are taken by default.
+        plain: configs that are no groups of presets, merged before them.
+        given: own setting -> default that hydra fills in.
+    """
+
+    name: str
+    about: str
+    examples: tuple[str, ...]
+    settings: tuple[str, ...]
+    groups: Mapping[str, str | list[str]] = field(default_factory=dict)
+    plain: tuple[str, ...] = ()
+    given: Mapping[str, str] = field(default_factory=dict)
+
+    def fields(self) -> list["Field[Any]"]:
+        """Its own settings."""
+        return [own for name in self.settings for own in declared_fields(load(name))]
+
+    def defaults(self) -> Plain:
+        """Its own settings with their defaults."""
+        return {own.name: self.given.get(own.name, plain_default(own)) for own in self.fields()}
+
+    def sections(self) -> dict[str, Plain]:
+        """Group -> setting -> default, of the groups whose settings are declared."""
+        return {
+            group: {own.name: plain_default(own) for own in declared_fields(load(GROUPS[group]))}
+            for group in self.groups
+            if group in GROUPS
+        }
+
+    def node(self) -> Plain:
+        """What hydra is told: defaults list, declared defaults, and its own behaviour."""
+        chosen = [{group: preset} for group, preset in self.groups.items()]
+        return {
+            "defaults": ["_self_", *self.plain, *chosen],
+            **self.defaults(),
+            **self.sections(),
+            "hydra": _quiet(),
+        }
+
+
+def load(name: str) -> type[Settings]:
+    """The dataclass that `module:Class` names."""
+    module, _, kind = name.partition(":")
+    loaded: type[Settings] = getattr(import_module(module), kind)
+    return loaded
+
+
+def plain_default(own: "Field[Any]") -> Any:
+    """A setting's default as YAML has it."""
+    return NEEDED if own.default is MISSING else _plain(own.default)
+
+
+def _plain(value: Any) -> Any:
+    if is_dataclass(value) and not isinstance(value, type):
+        return asdict(value)
+    return [_plain(one) for one in value] if isinstance(value, tuple) else value
+
+
+def _quiet() -> Plain:
+    """The commands make their own folders and logs; hydra adds none."""
+    return {
+        "job": {"name": "tangram"},  # of the jobs of a sweep that a launcher submits
+        "run": {"dir": "."},
+        "sweep": {
+            "dir": "runs/sweeps/${now:%Y-%m-%d_%H-%M-%S}",
+            "subdir": "${hydra.job.num}",
+        },
+        "output_subdir": None,
+        "job_logging": {"root": None},
+        "hydra_logging": {"root": None},
+    }
+
+
+COMMANDS = {
+    "train": Command(
+        "tangram-train",
+        """\
+Trains an agent on this machine. It starts a master that learns, workers that play and an
+evaluator, shows the progress, and leaves a run folder with the config, checkpoints,
+TensorBoard curves, result.json and a picture of test episodes.""",
+        (
+            "tangram-train",
+            "tangram-train tokens=parallelogram seed=1 workers=2 run_dir=runs/parallelogram_1",
+            "tangram-train agent=mlp sim=kinematic max_updates=500 agent.batch_size=128",
+        ),
+        (
+            "master.config:MasterConfig",
+            "master.config:LaunchConfig",
+            "conf.commands:StoredConfig",
+        ),
+        RUN,
+        given={"run_dir": NEW_RUN},
+    ),
+    "master": Command(
+        "tangram-master",
+        """\
+Learns. It waits for workers, keeps what they played in a replay buffer, updates the agent
+and broadcasts its weights. Where to join stands in connection.json in the run folder.""",
+        (
+            "tangram-master run_dir=runs/shared service.port=5555",
+            "tangram-master run_dir=runs/shared resume=auto service.port=5555",
+            "tangram-master from_config=runs/shared/config.yaml run_dir=runs/again seed=1",
+        ),
+        ("master.config:MasterConfig", "conf.commands:StoredConfig"),
+        RUN,
+        given={"run_dir": NEW_RUN},
+    ),
+    "worker": Command(
+        "tangram-worker",
+        """\
+Plays. It joins a master, plays episodes with the newest weights and sends them. A run's
+folder, or a copy of its connection.json, is all that it needs. With an address alone its
+tokens, sim, reward, agent and net must be given and be the master's, or it is refused and
+told what differs.""",
+        (
+            "tangram-worker connect=runs/shared",
+            "tangram-worker connect=tcp://127.0.0.1:5555 tokens=square service.envs=64",
+            "tangram-worker connect=runs/shared/connection.json role=evaluator "
+            "service.eval_seconds=30",
+        ),
+        ("worker.config:WorkerConfig", "conf.commands:StoredConfig"),
+        RUN,
+    ),
+    "status": Command(
+        "tangram-status",
+        """\
+Says how a run stands: what it does or waits for, its workers, how fast they are, how old
+their weights and the last checkpoint are. It asks the master, from wherever a worker may be.""",
+        (
+            "tangram-status connect=runs/my_run",
+            "tangram-status connect=runs/my_run every_seconds=2",
+            "tangram-status connect=runs/my_run/connection.json json=true",
+        ),
+        ("worker.config:StatusConfig",),
+    ),
+    "eval": Command(
+        "tangram-eval",
+        """\
+Scores a run. It plays test episodes with the newest weights of a run, noise off, and prints
+mean reward, raw overlap and the errors in position and angle. With several tokens it prints
+how much of the target is covered and how many are solved (95 % covered), and plays puzzles:
+those that come with tangram-rl or your own, see docs/puzzles.md.""",
+        (
+            "tangram-eval run_dir=runs/my_run episodes=1000 out=scores.json",
+            "tangram-eval run_dir=runs/my_run actions=3",
+            "tangram-eval run_dir=runs/my_game puzzles=test turns=8 out=puzzles.json "
+            "sheet=puzzles.png",
+        ),
+        ("worker.config:EvalConfig",),
+    ),
+    "play": Command(
+        "tangram-play",
+        """\
+Shows a run. It plays episodes with the newest weights of a run, noise off, and draws them.
+It assembles puzzles: those that come with tangram-rl or your own, see docs/puzzles.md.
+With compare=[...] several runs play the same episodes side by side.""",
+        (
+            "tangram-play run_dir=runs/my_run out=tests.png episodes=20",
+            "tangram-play tokens=tangram7 puzzle=cat out=cat.gif",
+            "tangram-play compare=[runs/my_run,pretrained/square] out=both.gif episodes=4",
+        ),
+        ("worker.config:PlayConfig",),
+    ),
+    "experiments": Command(
+        "tangram-experiment",
+        """\
+Runs experiments: every training of them over all seeds, then their tests. What is done is
+skipped, what was cut goes on from its checkpoint, so the same command can be given again
+and again. tangram-report draws the figures and tables of what is there.""",
+        (
+            "tangram-experiment dry=true",
+            "tangram-experiment experiment=[fig4,table2] budget=smoke",
+            "tangram-experiment experiment=[ablation_tangram] budget=laptop jobs=8",
+        ),
+        ("tangram_lab.experiments.plan:StudyConfig",),
+        STUDY,
+        plain=("catalogue",),
+        given={"run_dir": "runs/experiments/${budget.name}"},
+    ),
+    "report": Command(
+        "tangram-report",
+        """\
+Reports on a study. It reads the runs that tangram-experiment made, finished or not, and writes
+their curves and tables beside the paper's values, as Markdown. Of a folder whose folders are
+runs, such as a sweep's, it makes one table.""",
+        (
+            "tangram-report runs=runs/experiments/laptop out=report",
+            "tangram-report runs=runs/experiments/laptop out=docs/results.md",
+            "tangram-report runs=runs/my_study out=runs/my_study/report",
+        ),
+        ("tangram_lab.experiments.report.config:ReportConfig",),
+    ),
+}

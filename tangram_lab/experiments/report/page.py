@@ -1,0 +1,346 @@
+"""The page of a report with its figures and its data."""
+
+import json
+import math
+import shlex
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from tangram_agent.files import write_whole
+from tangram_lab.experiments.pictures import draw_paper_pictures
+from tangram_lab.experiments.report.figures import (
+    draw_curves,
+    draw_ranking,
+    draw_single_seeds,
+    draw_sweep,
+    looks,
+    sweeps,
+)
+from tangram_lab.experiments.report.numbers import ANGLE, DENSE, REWARD, thinned
+from tangram_lab.experiments.report.references import References
+from tangram_lab.experiments.report.study import Experiment, Row, Seed, Study, Training, read_runs
+from tangram_lab.experiments.report.style import Look, drawing, save
+from tangram_lab.experiments.report.tables import (
+    assembly_table,
+    complexity_table,
+    details,
+    effort_table,
+    order_table,
+    picture,
+    plain,
+    ranking_table,
+    score_table,
+    shell,
+    single_tests,
+    table,
+    test_table,
+)
+from tangram_sim.errors import RunError
+
+FIGURES = "figures"
+FORMAT = 1  # of data.json
+DIGITS = 6  # of its curves
+HOUR_S = 3600.0
+HOW_TO_READ = (
+    "Scores are those of the fixed tests, exploration off. The mean reward is Eq. 14 on exact "
+    "polygons: -1 is no overlap, 1 is perfect. Where several seeds were trained, numbers are their "
+    "median, with the least and the most in brackets. Three policies that learned nothing stand "
+    "beside them: *position only* asks for the motion to the target's centre and never for a turn, "
+    "*perfect* asks for the exact motion onto the target as it is seen, *random* is chance."
+)
+BAND = (
+    "Mean over the seeds; the band is one standard deviation (n - 1). A curve is drawn over the "
+    "range that all seeds of its training cover."
+)
+DOTS = (
+    "Final scores: a dot for each seed, a tick at the median; the diamonds are what the "
+    "position-only policy scores at the row's task."
+)
+SMALL = "Every seed's test scores while it trains; the first training stands in grey behind each."
+SWEEP = "Median over the seeds; the band goes from the least to the most."
+REACHED = "Episodes are those at the first evaluation in which a seed reached the mean reward."
+
+
+def write_report(runs: Path, out: Path) -> list[Path]:
+    """Report on a study; files of an earlier report in the same place are replaced.
+
+    Args:
+        runs: the study's folder, or one whose folders are runs.
+        out: folder for README.md, data.json and figures/, or the page itself, `NAME.md`, with the
+            others in the folder NAME beside it.
+
+    Returns:
+        The page and the data.
+
+    Raises:
+        RunError: a file of the study is not what it should be, or `out` cannot be written.
+    """
+    study = read_runs(runs)
+    path, beside = (out, out.with_suffix("")) if out.suffix == ".md" else (out / "README.md", out)
+    root, figures = path.parent, (beside / FIGURES).relative_to(path.parent).as_posix()
+    try:
+        (root / figures).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunError(
+            f"cannot make {root / figures} ({error.strerror}): choose another folder with out=..."
+        ) from None
+    page = Page(study, root, figures, looks(study), References(study))
+    data = beside / "data.json"
+    with drawing():
+        lines = [*page.opening(data.relative_to(root).as_posix()), *page.pictures()]
+        for experiment in study.experiments:
+            lines += page.section(experiment)
+    lines += closing(study)
+    write_whole(path, ("\n".join(lines).rstrip() + "\n").encode())
+    write_whole(data, (_json(study_data(study), "") + "\n").encode())
+    return [path, data]
+
+
+@dataclass(frozen=True)
+class Page:
+    """The page, and what its sections share.
+
+    Attributes:
+        study: that is reported on.
+        out: folder of the page.
+        figures: folder of the figures in it.
+        looks: of every training.
+        references: policies to compare with.
+    """
+
+    study: Study
+    out: Path
+    figures: str
+    looks: Mapping[str, Look]
+    references: References
+
+    def opening(self, data: str) -> list[str]:
+        """Title, how to read it, and the experiments."""
+        study = self.study
+        rows = [
+            (f"[{plain(one.title)}](#{one.name})", one.source, finished_count(one.trainings))
+            for one in study.experiments
+        ]
+        return [
+            f"# Experiments, budget `{study.budget}`" if study.plan else "# Runs",
+            "",
+            plain(study.budget_note),
+            "",
+            HOW_TO_READ,
+            "",
+            *table(["experiment", "source", "runs finished"], rows, "---"),
+            f"`tangram-report` wrote this page; [{data}]({data}) holds all of its numbers.",
+            "",
+        ]
+
+    def pictures(self) -> list[str]:
+        """The paper's Figs. 1 to 3, which need no training."""
+        lines: list[str] = []
+        for title, file, caption in (
+            draw_paper_pictures(self.out / self.figures) if self.study.plan else []
+        ):
+            lines += [f"## {plain(title)}", "", *picture(title, f"{self.figures}/{file}")]
+            lines += [f"*{plain(caption)}*", ""]
+        return lines
+
+    def section(self, experiment: Experiment) -> list[str]:
+        """All lines of an experiment; its figures are written on the way."""
+        lines = [f'<a id="{experiment.name}"></a>', "", f"## {plain(experiment.title)}", ""]
+        if self.study.plan:
+            lines += [f"Source: {plain(experiment.source)}. {plain(experiment.note)}", ""]
+        if any(one.finished for one in experiment.trainings):
+            kinds: dict[str, Callable[[Experiment], list[str]]] = {
+                "curves": self._curves,
+                "rewards": self._rewards,
+                "complexity": complexity_table,
+                "tests": self._tests,
+                "ranking": self._ranking,
+                "game": lambda one: [*assembly_table(one), *order_table(one)],
+            }
+            lines += kinds[experiment.kind](experiment)
+            lacking = self.references.lacking(experiment)
+            if lacking and experiment.kind not in ("complexity", "game"):
+                told = plain("; ".join(lacking))
+                lines += [f"Left out, since no test has their scores: {told}.", ""]
+        gaps = [f"- {plain(gap)}" for one in experiment.trainings for gap in _gaps(experiment, one)]
+        lines += ["Missing:", "", *gaps, ""] if gaps else []
+        if not self.study.plan:
+            return lines
+        return [*lines, "Make it again:", "", *shell(command(self.study, experiment))]
+
+    def _figure(self, name: str, title: str, caption: str, drawn: Figure | None) -> list[str]:
+        """Save a figure and embed it; nothing if there was nothing to draw."""
+        if drawn is None:
+            return []
+        save(drawn, self.out / self.figures, name)
+        file = f"{self.figures}/{name}"
+        return [*picture(title, f"{file}.png"), f"*{caption}* ([SVG]({file}.svg))", ""]
+
+    def _curves(self, experiment: Experiment) -> list[str]:
+        drawn = draw_curves(experiment, self.looks, self.references, REWARD)
+        return [
+            *self._figure(experiment.name, experiment.title, BAND, drawn),
+            *score_table(experiment, self.references, REWARD, self.study.planned_seeds),
+            *(*effort_table(experiment), REACHED, ""),
+        ]
+
+    def _rewards(self, experiment: Experiment) -> list[str]:
+        lines = []
+        for measure, name in ((REWARD, experiment.name), (DENSE, f"{experiment.name}_dense")):
+            drawn = draw_curves(experiment, self.looks, self.references, measure)
+            lines += self._figure(name, f"{experiment.title}: {measure.label}", BAND, drawn)
+            lines += score_table(experiment, self.references, measure, self.study.planned_seeds)
+        return [*lines, *effort_table(experiment), REACHED, ""]
+
+    def _tests(self, experiment: Experiment) -> list[str]:
+        lines = []
+        for sweep in sweeps(experiment):
+            drawn = draw_sweep(experiment, self.looks, self.references, sweep)
+            name, title = f"{experiment.name}_{sweep.name}", f"{experiment.title}: {sweep.name}"
+            lines += self._figure(name, title, SWEEP, drawn)
+        for measure in (REWARD, ANGLE):
+            lines += test_table(experiment, self.references, measure)
+        singles = [line for m in (REWARD, ANGLE) for line in single_tests(experiment, m)]
+        return lines + details("Every seed", singles)
+
+    def _ranking(self, experiment: Experiment) -> list[str]:
+        dots = draw_ranking(experiment, self.looks, self.references)
+        singles = draw_single_seeds(experiment, self.looks)
+        curves = (f"{experiment.name}_seeds", f"{experiment.title}: curves", SMALL)
+        return [
+            *self._figure(experiment.name, experiment.title, DOTS, dots),
+            *ranking_table(experiment, self.references, self.study.planned_seeds),
+            *self._figure(*curves, singles),
+        ]
+
+
+def command(study: Study, experiment: Experiment) -> str:
+    """What runs this experiment alone, into the same folder, with the study's other settings."""
+    try:
+        words = shlex.split(study.command)[1:]
+    except ValueError:
+        words = []
+    chosen = f"experiment=[{experiment.name}] budget={study.budget}"
+    kept = (shlex.quote(word) for word in words if _concerns(word, experiment))
+    return " ".join(("tangram-experiment", chosen, *kept))
+
+
+def _concerns(word: str, experiment: Experiment) -> bool:
+    """Whether an argument has a meaning where this experiment is run alone."""
+    key = word.partition("=")[0]
+    if key.startswith("experiments."):
+        return key.startswith(f"experiments.{experiment.name}.")
+    return key not in ("experiment", "budget", "dry")
+
+
+def _gaps(experiment: Experiment, training: Training) -> Iterator[str]:
+    """What is not there."""
+    left = [f"seed {seed.number} {seed.state}" for seed in training.seeds if not seed.finished]
+    if left:
+        count = f"{len(training.finished)} of {len(training.seeds)} seeds"
+        yield f"{training.label} ({count}): {', '.join(left)}"
+    for seed in training.finished:
+        untested = [t.label for t in experiment.tests if t.name not in seed.tests]
+        if untested:
+            yield f"{training.label}: seed {seed.number} not tested with {', '.join(untested)}"
+
+
+# How, where and with what everything was made
+
+
+def closing(study: Study) -> list[str]:
+    """Budget, machine, versions, and every training with its settings."""
+    results = [seed.result for one in study.trainings for seed in one.finished]
+    command = ["The last command that ran trainings of it:", "", *shell(study.command)]
+    return [
+        "## How it was made",
+        "",
+        *([f"Budget `{study.budget}`: {plain(study.budget_note)}", ""] if study.plan else []),
+        *table(["", ""], _facts(study, results), "---"),
+        *(command if study.plan else []),
+        *details("All trainings and their settings", _trainings(study.trainings)),
+    ]
+
+
+def finished_count(trainings: Iterable[Training]) -> str:
+    """How many runs are finished, of how many."""
+    runs = [seed for one in trainings for seed in one.seeds]
+    return f"{sum(seed.finished for seed in runs)} of {len(runs)}"
+
+
+def _facts(study: Study, results: list[Row]) -> list[tuple[str, str]]:
+    commits = [study.commit, *(row["commit"] for row in results)]
+    counts = [row.get("test_episodes") for row in results]
+    while_training = _several(f"{n:,.0f}" for n in counts if isinstance(n, int | float))
+    names = dict.fromkeys(name for row in results for name in row["versions"])
+    versions = [
+        f"{name} {_several(row['versions'][name] for row in results if name in row['versions'])}"
+        for name in names
+    ]
+    hours = sum(row["wall_s"] for row in results) / HOUR_S
+    return [
+        ("runs finished", finished_count(study.trainings)),
+        ("seeds", _several(study.planned_seeds)),
+        ("episodes of every test", f"{study.test_episodes:,}" if study.plan else while_training),
+        ("commit", _several(one for one in commits if one is not None)),
+        ("processor", _several(row["processor"] for row in results)),
+        ("cores", _several(row["cores"] for row in results)),
+        ("versions", ", ".join(versions) or "-"),
+        ("time, all runs added up", f"{hours:,.2f} h"),
+    ]
+
+
+def _several(values: Iterable[object]) -> str:
+    """Each different value once."""
+    return " / ".join(dict.fromkeys(str(value) for value in values)) or "-"
+
+
+def _trainings(trainings: Iterable[Training]) -> list[str]:
+    lines = []
+    for one in trainings:
+        began = f", begins with the networks of `{one.after}`" if one.after else ""
+        settings = " ".join(f"`{text}`" for text in one.overrides) or "(defaults)"
+        lines.append(f"- **{plain(one.label)}** (`{one.name}`{began}): {settings}")
+    return [*lines, ""]
+
+
+# data.json: everything that the report was drawn from, so that the runs may be deleted
+
+
+def study_data(study: Study) -> Row:
+    """The plan, and of every run its state, result, tests and a curve of at most 60 points."""
+    runs = {one.name: [_seed_data(seed) for seed in one.seeds] for one in study.trainings}
+    return {"format": FORMAT, "plan": study.plan, "runs": runs}
+
+
+def _seed_data(seed: Seed) -> Row:
+    points = thinned(seed.curve)
+    names = dict.fromkeys(name for point in points for name in point)
+    return {
+        "seed": seed.number,
+        "state": seed.state,
+        "result": seed.result,
+        "tests": seed.tests,
+        "curve": {name: [_rounded(point.get(name)) for point in points] for name in names},
+    }
+
+
+def _rounded(value: Any) -> Any:
+    if not isinstance(value, float) or not math.isfinite(value):
+        return value
+    return float(f"{value:.{DIGITS}g}")
+
+
+def _json(value: Any, indent: str) -> str:
+    """JSON with a line for each innermost collection, so that changes can be read."""
+    inner = indent + " "
+    if isinstance(value, dict) and any(isinstance(one, dict | list) for one in value.values()):
+        pairs = (f"{inner}{json.dumps(k)}: {_json(v, inner)}" for k, v in value.items())
+        return "{\n" + ",\n".join(pairs) + f"\n{indent}}}"
+    if isinstance(value, list) and any(isinstance(one, dict | list) for one in value):
+        return "[\n" + ",\n".join(inner + _json(one, inner) for one in value) + f"\n{indent}]"
+    return json.dumps(value, ensure_ascii=False)

@@ -1,0 +1,74 @@
+"""What a run has come to: the final table, and commands that can be pasted."""
+
+import io
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from rich.console import Console
+
+from master.result import SCORES, show_result
+from master.rundir import RunFolder
+
+pytestmark = pytest.mark.fast
+
+SCORED = {
+    "mean_reward": 0.9312,
+    "raw_overlap": 0.9656,
+    "angle_error_deg_median": 1.214,
+    "position_error_median": 0.01034,
+}
+
+
+def console() -> Console:
+    return Console(file=io.StringIO(), width=100)
+
+
+def text(shown: Console) -> str:
+    assert isinstance(shown.file, io.StringIO)
+    return shown.file.getvalue()
+
+
+RESULT = dict.fromkeys(SCORES) | {
+    "scored_updates": None,
+    "updates": 1234,
+    "episodes": 5678,
+    "train_s": 61.0,
+    "wall_s": 75.0,
+    "ended_by": "max_updates=1234",
+}
+
+
+@pytest.mark.parametrize(
+    ("change", "words", "without"),
+    [
+        ({}, ["none: no evaluator took part", "1:01 of training, 1:15 in all"], ["mean reward"]),
+        (
+            SCORED | {"scored_updates": 1234},
+            ["0.931 on exact polygons", "- in the camera's", "1.21° (median)", "1,234"],
+            ["weights after"],
+        ),
+        (SCORED | {"scored_updates": 1000}, ["weights after 1,000 updates"], []),
+    ],
+)
+def test_the_final_table(
+    tmp_path: Path, change: dict[str, Any], words: list[str], without: list[str]
+) -> None:
+    shown, folder = console(), RunFolder(tmp_path / ("deep_" * 30))
+    show_result(shown, folder, RESULT | change)
+    assert all(word in text(shown) for word in words)
+    assert not any(word in text(shown) for word in without)
+    assert f"tangram-play run_dir={folder.path} out=play.gif" in text(shown)
+    assert f"tensorboard --logdir {folder.path}/tensorboard" in text(shown)
+    assert "test_episodes.png" not in text(shown)
+
+
+def test_commands_that_are_shown_can_be_pasted(tmp_path: Path) -> None:
+    shown, folder = console(), RunFolder(tmp_path / "it's a=run")
+    show_result(shown, folder, RESULT)
+    curves, play = (shlex.split(line) for line in text(shown).splitlines()[-2:])
+    assert curves[-1] == str(folder.tensorboard)
+    (parsed,) = OverridesParser.create().parse_overrides([play[-2]])
+    assert parsed.value() == str(folder.path)
