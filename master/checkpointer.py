@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from master.arrivals import EpisodesArrived
+from master.delivery import EpisodesArrived
 from master.divergence import DivergenceGuard
 from master.hub import Hub
 from master.journal import Journal, JournalError, check_journal, segments

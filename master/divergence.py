@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import safetensors.numpy
 
-from master.tally import Tally
+from master.counters import Counters
 from master.trainer import Trainer
 from tangram_agent.ddpg import NotFiniteError
 from tangram_agent.files import write_whole
@@ -39,7 +39,7 @@ class DivergenceGuard:
         Raises:
             NotFiniteError: the state is not finite already.
         """
-        self._tally = Tally()
+        self._tally = Counters()
         self.trainer, self._limit, self._evidence = trainer, limit, evidence
         self._in_a_row, self._keep = 0, Every(KEEP_S)
         self._good = trainer.learner.state()

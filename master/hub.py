@@ -4,23 +4,24 @@ Whatever a peer sends, `poll` does not raise: what is wrong is answered with a r
 name, and forgotten. A peer that does not read its answers loses them and nobody waits for it: the
 worker asks again.
 
-Delivery: see `ledger`. A batch is acknowledged only by `acknowledge`, after it was
+Delivery: see `delivery`. A batch is acknowledged only by `acknowledge`, after it was
 journalled and inserted, and the unacknowledged batches of one peer are bounded by `window`.
 """
 
 import secrets
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any, Self
+from dataclasses import dataclass
+from typing import Self
 
-from master.arrivals import Arrival, EpisodesArrived, ScoresArrived, WelcomeInfo
-from master.intake import Intake
-from master.keys import Keys
-from master.orders import Orders
-from master.peers import Peer, RefusedError, Registry
-from master.post import Post
-from tangram_agent.arrays import join_frames
+from master.counters import Counters
+from master.delivery import Arrival, EpisodesArrived, ScoresArrived, Verdict
+from master.registry import Peer, RefusedError, Registry
+from master.security import Keys
+from master.sockets import Sockets
+from tangram_agent.arrays import EpisodeSpec, join_frames
 from tangram_agent.messages import (
+    Ack,
     Alive,
     AskStatus,
     BatchError,
@@ -41,12 +42,35 @@ from tangram_agent.messages import (
     Welcome,
     decode_from_worker,
 )
-from tangram_agent.schema import DamagedError, ProtocolError
+from tangram_agent.schema import DamagedError, Plain, ProtocolError
 from tangram_agent.types import Weights
 from tangram_sim.errors import WireError
 
 # Most messages taken in one poll, so that the loop gets its turn under any load.
 MAX_DRAIN = 256
+# Damaged messages of one peer without an intact batch between them: then it must end.
+MAX_DAMAGED = 100
+
+
+@dataclass(frozen=True)
+class WelcomeInfo:
+    """What the master tells, and asks of, a process that joins.
+
+    Attributes:
+        run_id: of the run.
+        seed: of the run.
+        fingerprints: section of the settings -> digest; a worker's must be equal.
+        spec: the task that arrays are checked against.
+        window: most unacknowledged batches of one peer.
+        lockstep: players wait for orders.
+    """
+
+    run_id: str
+    seed: int
+    fingerprints: Mapping[str, str]
+    spec: EpisodeSpec
+    window: int = 4
+    lockstep: bool = False
 
 
 class Hub:
@@ -85,10 +109,9 @@ class Hub:
         self._version = -1
         self._stop_reason: str | None = None
         self._status: list[bytes] | None = None
-        self._post = Post(bind, port, keys, weights_port)
-        self._sockets, self.counters = self._post.sockets, self._post.counters
-        self._orders = Orders(self._post)
-        self._intake = Intake(self._post, self._registry, info.window)
+        self._orders: dict[int, Go] = {}
+        self.counters = Counters()
+        self._sockets = Sockets(bind, port, self.counters, keys, weights_port)
         self.endpoint = self._sockets.endpoint
         self.weights_endpoint = self._sockets.weights_endpoint
 
@@ -115,7 +138,9 @@ class Hub:
                 received = self._sockets.receive()
                 if received is None:
                     break
-                arrivals.extend(self._receive(*received))
+                arrival = self._receive(*received)
+                if arrival is not None:
+                    arrivals.append(arrival)
             else:  # more is waiting, perhaps from those who seem silent
                 return arrivals
         for peer in self._registry.drop_silent(time.monotonic(), self._silence_s):
@@ -124,7 +149,14 @@ class Hub:
 
     def acknowledge(self, arrival: EpisodesArrived) -> None:
         """Tell the worker that its batch is safe; once for each arrival, after its insert."""
-        self._intake.acknowledge(arrival)
+        key = (arrival.role, arrival.index)
+        ledger = self._registry.ledger(key, arrival.incarnation)
+        if ledger is None or not ledger.release(arrival.sequence):
+            return  # a newer process has the index, or this was told before
+        peer = self._registry.at(key)
+        if peer is not None:
+            peer.inserted(arrival)
+            self._send(peer.identity, Ack(arrival.sequence, duplicate=False))
 
     def publish(self, weights: Weights) -> None:
         """Broadcast weights, and keep them for those who join later.
@@ -138,8 +170,10 @@ class Hub:
         self.counters["published"] += 1
 
     def order(self, orders: Mapping[int, Go]) -> None:
-        """In lockstep: tell players what to play next, by index."""
-        self._orders.give(orders, self.peers)
+        """In lockstep: tell players what to play next, by index, until their batches come."""
+        self._orders = dict(orders)
+        for peer in self.peers:
+            self._remind(peer)
 
     def tell(self, status: RunStatus) -> None:
         """Answer with this whoever asks how the run stands."""
@@ -152,7 +186,7 @@ class Hub:
         """
         self._stop_reason = reason
         for peer in self.peers:
-            self._post.send(peer.identity, Stop(reason))
+            self._send(peer.identity, Stop(reason))
 
     def state(self) -> dict[str, dict[str, int]]:
         """The table of duplicates, for a checkpoint."""
@@ -175,30 +209,27 @@ class Hub:
         """Close the sockets; answers that are on their way get a second."""
         self._sockets.close()
 
-    def _receive(self, identity: bytes, frames: Sequence[bytes]) -> Sequence[Arrival]:
+    def _receive(self, identity: bytes, frames: Sequence[bytes]) -> Arrival | None:
+        """Read a message and answer it; returns what is new."""
+        message: ToMaster | BatchError
         try:
             message = decode_from_worker(frames, self._info.spec)
         except ProtocolError as error:
-            self._post.refuse(identity, "refused_protocol", Refused(str(error)))
+            self._refuse(identity, "refused_protocol", Refused(str(error)))
         except DamagedError as error:
-            # Told, so that what was meant comes again, and not final: its number is not believed.
-            reject = Reject(reason=str(error), sequence=0, final=False)
-            self._post.refuse(identity, "damaged", reject)
+            self._damaged(identity, error)
         except BatchError as error:
-            if self._stop_reason is None:  # else what comes is not judged any more
-                self._intake.broken(identity, error)
-            else:
-                self._post.send(identity, Stop(self._stop_reason))
+            return self._dispatch(identity, error, frames)
         except WireError as error:
-            reject = Reject(reason=str(error), sequence=0, final=True)
-            self._post.refuse(identity, "malformed", reject)
+            self._refuse(identity, "malformed", Reject(str(error), sequence=0, final=True))
         else:
             return self._dispatch(identity, message, frames)
-        return ()
+        return None
 
     def _dispatch(
-        self, identity: bytes, message: ToMaster, frames: Sequence[bytes]
-    ) -> Sequence[Arrival]:
+        self, identity: bytes, message: ToMaster | BatchError, frames: Sequence[bytes]
+    ) -> Arrival | None:
+        """Those who need not take part, and those who may not any more."""
         peer = self._registry.find(identity)
         if isinstance(message, AskStatus):
             if self._status is not None:
@@ -208,57 +239,101 @@ class Hub:
             if peer is not None:
                 self._registry.leave(peer)
         elif self._stop_reason is not None:
-            self._post.send(identity, Stop(self._stop_reason))
+            # Batches, too, right and wrong ones: none is taken, so none may be refused for good.
+            self._send(identity, Stop(self._stop_reason))
         elif isinstance(message, Hello):
             self._hello(identity, message)
         elif peer is None:
-            self._post.refuse(identity, "strangers", Greet())
+            self._refuse(identity, "strangers", Greet())
         else:
             peer.last_seen = time.monotonic()
             return self._talk(peer, message, frames)
-        return ()
+        return None
 
-    def _talk(self, peer: Peer, message: Any, frames: Sequence[bytes]) -> Sequence[Arrival]:
+    def _talk(
+        self, peer: Peer, message: ToMaster | BatchError, frames: Sequence[bytes]
+    ) -> Arrival | None:
         match message:
             case EpisodeBatch(sequence) if peer.role != "player":
                 self._not_its_role(peer, sequence, "episodes come from players only")
             case EpisodeBatch():
-                arrived = self._intake.batch(peer, message, frames)
-                if arrived:  # and not one that was sent again
-                    self._orders.done(peer)
-                return arrived
+                return self._batch(peer, message, frames)
+            case BatchError():
+                self._broken(peer, message)
             case Scores() if peer.role != "evaluator":
                 self._not_its_role(peer, 0, "scores come from evaluators only")
             case Scores():
+                peer.damaged = 0
                 self.counters["scores"] += 1
-                return [ScoresArrived(peer.index, peer.incarnation, message)]
+                return ScoresArrived(peer.index, peer.incarnation, message)
             case Heartbeat(stats):
                 self.counters["heartbeats"] += 1
                 peer.stats = dict(stats)
-                self._post.send(peer.identity, Alive(self._version))
-                self._orders.remind(peer)
+                self._send(peer.identity, Alive(self._version))
+                self._remind(peer)
             case WantWeights(epoch, version):
                 if self._weights is not None and (epoch, version) != (self.epoch, self._version):
                     self._sockets.send(peer.identity, self._weights)
-        return ()
+        return None
+
+    def _batch(
+        self, peer: Peer, batch: EpisodeBatch, frames: Sequence[bytes]
+    ) -> EpisodesArrived | None:
+        """The batch, if it is the next one; else what the worker must know is answered."""
+        peer.damaged = 0
+        verdict = peer.ledger.judge(batch.sequence, self._info.window)
+        if verdict is not Verdict.NEW:
+            self.counters[verdict.value] += 1
+            answer = peer.ledger.answer(verdict, batch.sequence)
+            if answer is not None:
+                self._send(peer.identity, answer)
+            return None
+        peer.ledger.take(batch.sequence)
+        peer.weights_version = batch.weights_version
+        self.counters["batches"] += 1
+        self.counters["episodes"] += batch.episodes.count
+        self._orders.pop(peer.index, None)
+        return EpisodesArrived(peer.role, peer.index, peer.incarnation, batch, frames)
+
+    def _broken(self, peer: Peer, error: BatchError) -> None:
+        """A batch with wrong content: it must not come again, and those after it need not wait."""
+        final = peer.ledger.judge(error.sequence, self._info.window) is Verdict.NEW
+        if final:
+            peer.ledger.consume(error.sequence)
+        reason = f"{peer.name}: batch {error.sequence}: {error}"
+        self._refuse(peer.identity, "rejected", Reject(reason, error.sequence, final))
+
+    def _damaged(self, identity: bytes, error: DamagedError) -> None:
+        """Told, so that what was meant comes again soon, unless that happens time after time."""
+        peer = self._registry.find(identity)
+        if peer is not None:
+            peer.damaged += 1
+            if peer.damaged >= MAX_DAMAGED:
+                reason = (
+                    f"{peer.damaged} messages of {peer.name} in a row were damaged on their way: "
+                    "look at the memory and the network of its machine"
+                )
+                self._refuse(identity, "damaged", Stop(reason))
+                return
+        self._refuse(identity, "damaged", Reject(str(error), sequence=0, final=False))
 
     def _not_its_role(self, peer: Peer, sequence: int, rule: str) -> None:
-        answer = Reject(reason=f"{peer.name}: {rule}", sequence=sequence, final=True)
-        self._post.refuse(peer.identity, "rejected", answer)
+        reason = f"{peer.name}: {rule}"
+        self._refuse(peer.identity, "rejected", Reject(reason, sequence, final=True))
 
     def _hello(self, identity: bytes, hello: Hello) -> None:
         try:
             peer, older = self._registry.admit(identity, hello, time.monotonic())
         except RefusedError as error:
-            self._post.refuse(identity, error.counter, error.answer)
+            self._refuse(identity, error.counter, error.answer)
             return
         if older is not None:
             reason = f"{peer.name} was taken over by a newer process"
-            self._post.refuse(older.identity, "superseded", Stop(reason))
+            self._refuse(older.identity, "superseded", Stop(reason))
         self.counters["welcomed"] += 1
         self.counters["lost_batches"] = self._registry.lost_batches
-        self._post.send(identity, self._welcome(peer))
-        self._orders.remind(peer)
+        self._send(identity, self._welcome(peer))
+        self._remind(peer)
 
     def _welcome(self, peer: Peer) -> Welcome:
         return Welcome(
@@ -271,3 +346,19 @@ class Hub:
             window=self._info.window,
             lockstep=self._info.lockstep,
         )
+
+    def _remind(self, peer: Peer) -> None:
+        """In lockstep: tell a player, who may have missed it, what is still to play."""
+        if peer.role == "player" and peer.index in self._orders:
+            self._send(peer.identity, self._orders[peer.index])
+
+    def _refuse(
+        self, identity: bytes, counter: str, answer: Reject | Refused | Stop | Greet
+    ) -> None:
+        """Send a reason, count it and tell it."""
+        self.counters.note(counter, getattr(answer, "reason", "a connection without HELLO"))
+        self._send(identity, answer)
+
+    def _send(self, identity: bytes, answer: Plain) -> None:
+        """Send to a peer, unless it is gone or does not read."""
+        self._sockets.send(identity, answer.encode())

@@ -24,7 +24,7 @@ from io import FileIO
 from pathlib import Path
 from typing import Any, ClassVar
 
-from master.arrivals import EpisodesArrived
+from master.delivery import EpisodesArrived
 from tangram_agent.arrays import MAX_BATCH_BYTES, MAX_FRAMES, EpisodeSpec, join_frames, split_frames
 from tangram_agent.messages import Count, EpisodeBatch, Id, Index, Number, Role, decode_from_worker
 from tangram_agent.process import Every

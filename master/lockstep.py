@@ -7,7 +7,7 @@ played with. Nothing depends on who is fast or when a process was started again,
 inserted says which round it is, so a run that was stopped goes on where it was.
 """
 
-from master.arrivals import EpisodesArrived
+from master.delivery import EpisodesArrived
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import Go
 from tangram_sim.errors import ConfigError

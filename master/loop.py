@@ -5,9 +5,9 @@ import time
 from collections import deque
 from dataclasses import dataclass, field
 
-from master.arrivals import EpisodesArrived, ScoresArrived
 from master.budget import Budget
 from master.checkpointer import Checkpointer
+from master.delivery import EpisodesArrived, ScoresArrived
 from master.divergence import DivergenceGuard
 from master.hub import Hub
 from master.lockstep import Lockstep

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from master.arrivals import EpisodesArrived
 from master.budget import Budget, Rates
 from master.checkpointer import Checkpointer
 from master.console import TEST, Progress
+from master.delivery import EpisodesArrived
 from master.divergence import DivergenceGuard
 from master.hub import Hub
 from master.metrics import Means, Metrics
-from master.peers import Peer
+from master.registry import Peer
 from master.rundir import Clock, Record
 from master.trainer import Trainer
 from tangram_agent.config import ServiceConfig

@@ -10,7 +10,6 @@ from typing import Any
 
 import torch
 
-from master.arrivals import EpisodesArrived, WelcomeInfo
 from master.budget import Budget
 from master.checkpointer import (
     Checkpointer,
@@ -22,17 +21,18 @@ from master.checkpointer import (
 from master.children import override
 from master.config import MasterConfig
 from master.console import Progress, logging_to, make_progress, sturdy_console
+from master.delivery import EpisodesArrived
 from master.divergence import DivergenceGuard
 from master.health import OFF, Health
-from master.hub import Hub
+from master.hub import Hub, WelcomeInfo
 from master.journal import Journal, journal_run_id, read_journal
-from master.keys import Keys, is_loopback, needs_keys, run_keys
 from master.lockstep import Lockstep
 from master.loop import Loop
 from master.metrics import Metrics
 from master.report import Reporter, StatusCollector
 from master.result import make_result, show_result
 from master.rundir import Clock, Record, RunFolder
+from master.security import Keys, is_loopback, needs_keys, run_keys
 from master.signals import StopSignals
 from master.trainer import Trainer, choose_device
 from tangram_agent.addresses import reachable, with_host

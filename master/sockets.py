@@ -5,9 +5,8 @@ from collections.abc import Sequence
 
 import zmq
 
-from master.doorkeeper import Doorkeeper
-from master.keys import Keys
-from master.tally import Tally
+from master.counters import Counters
+from master.security import Authenticator, Keys
 from tangram_agent.arrays import MAX_BATCH_BYTES
 from tangram_sim.errors import ConfigError
 
@@ -30,13 +29,13 @@ class Sockets:
         self,
         bind: str,
         port: int,
-        counters: Tally,
+        counters: Counters,
         keys: Keys | None = None,
         weights_port: int = 0,
     ) -> None:
         self._counters = counters
         self._context = zmq.Context()
-        self._doorkeeper = Doorkeeper(self._context, keys, counters) if keys else None
+        self._authenticator = Authenticator(self._context, keys, counters) if keys else None
         try:
             self._router = self._open(zmq.ROUTER, bind, port, "service.port")
             self._pub = self._open(zmq.PUB, bind, weights_port, "service.weights_port")
@@ -78,8 +77,8 @@ class Sockets:
         self._close(LINGER_MS)
 
     def _close(self, linger_ms: int) -> None:
-        if self._doorkeeper is not None:
-            self._doorkeeper.close()
+        if self._authenticator is not None:
+            self._authenticator.close()
         self._context.destroy(linger=linger_ms)
 
     def _open(self, kind: int, bind: str, port: int, setting: str) -> zmq.Socket[bytes]:
@@ -93,8 +92,8 @@ class Sockets:
         if kind == zmq.ROUTER:
             # Else answers to those who are gone vanish without a word.
             socket.setsockopt(zmq.ROUTER_MANDATORY, 1)
-        if self._doorkeeper is not None:
-            self._doorkeeper.guard(socket)
+        if self._authenticator is not None:
+            self._authenticator.guard(socket)
         host = f"[{bind}]" if ":" in bind else bind
         try:
             socket.bind(f"tcp://{host}:{port or '*'}")

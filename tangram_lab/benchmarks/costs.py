@@ -8,15 +8,14 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
-from master.arrivals import EpisodesArrived
+from master.delivery import EpisodesArrived
 from master.hub import Hub
 from master.journal import Journal
-from master.peers import Registry
+from master.registry import Registry
 from master.trainer import Trainer
 from tangram_agent.messages import Hello
-from tangram_lab.benchmarks.episodes import played
 from tangram_lab.benchmarks.measure import Row, single
-from tangram_lab.benchmarks.setups import preset
+from tangram_lab.benchmarks.setups import played, preset
 from tangram_lab.benchmarks.wire import Case, connected
 
 STAGE, UNIT = "scaling", "us of CPU"

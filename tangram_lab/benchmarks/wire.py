@@ -17,16 +17,15 @@ from typing import Any
 
 import zmq
 
-from master.arrivals import EpisodesArrived, WelcomeInfo
-from master.hub import Hub
-from master.keys import Keys, make_keys
+from master.delivery import EpisodesArrived
+from master.hub import Hub, WelcomeInfo
+from master.security import Keys, make_keys
 from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.messages import Ack, EpisodeBatch
 from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes
-from tangram_lab.benchmarks.episodes import played
 from tangram_lab.benchmarks.measure import Bound, Row, Work, compared, rates, single
-from tangram_lab.benchmarks.setups import several
+from tangram_lab.benchmarks.setups import played, several
 from tangram_sim.errors import TangramError
 from worker.client import Client
 from worker.connection import Timing

@@ -8,10 +8,10 @@ import torch
 
 from tangram_agent.attention import GraphAttention
 from tangram_agent.ddpg import Learner
-from tangram_lab.benchmarks.bullet import BareLoop
-from tangram_lab.benchmarks.plain import HeadByHead, PlainLearner
+from tangram_lab.benchmarks.learner import HeadByHead, PlainLearner
 from tangram_lab.benchmarks.replay import filled, random_transitions
 from tangram_lab.benchmarks.setups import preset, several, with_agent, with_sim
+from tangram_lab.benchmarks.sim import BareLoop
 from tangram_sim.physics import PhysicsWorld
 
 pytestmark = pytest.mark.fast

@@ -8,17 +8,26 @@ from typing import Self
 import zmq
 
 from tangram_agent.arrays import MAX_BATCH_BYTES
+from tangram_agent.schema import CHECKSUM
 
-KINDS = ("repeated", "swapped", "without its end", "cut short", "random", "oversized")
+DAMAGE = (
+    "without its end",
+    "cut short",
+    "a bit of an array",  # its lowest: what was within its bounds stays there
+    "a bit of the header",
+    "a bit of the checksum",
+)
+KINDS = ("repeated", "swapped", "random", "oversized", *DAMAGE)
 SHARE = 0.5  # of the messages that something happens to
+OVERSIZED = 5  # in each direction: each cuts the connection, or fills it for a while
 Frames = list[bytes]
 
 
 class Mangler:
-    """Every message arrives, and with it what nobody sent.
+    """Messages arrive, and with them what nobody sent.
 
-    Damage comes on the same connection as the message that it is made of, right after it: a batch
-    that is damaged before it ever arrived whole would be refused for good.
+    Damage comes right after the message that it is made of, or in its place, so that it must be
+    sent again.
 
     Attributes:
         port: to connect to.
@@ -73,7 +82,8 @@ class Mangler:
         if kind == "swapped" and (worker, way) not in self._held:
             self._held[worker, way] = frames
             return
-        self._send(worker, way, frames)
+        if kind not in DAMAGE or self._dice.random() < 0.5:
+            self._send(worker, way, frames)
         more = self._more(kind, frames)
         if more is not None:
             self.done[kind, way] += 1
@@ -89,18 +99,37 @@ class Mangler:
             return ""
         if not self._bag[way]:
             self._bag[way] = self._dice.sample(KINDS, k=len(KINDS))
-        return self._bag[way].pop()
+        kind = self._bag[way].pop()
+        return "" if kind == "oversized" and self.done[kind, way] >= OVERSIZED else kind
 
-    def _more(self, kind: str, frames: Frames) -> Frames | None:
+    def _more(self, kind: str, frames: Frames) -> Frames | None:  # noqa: PLR0911  # a table
+        header, *arrays = frames
         match kind:
             case "repeated":
                 return frames
+            case "random":
+                return [self._dice.randbytes(self._dice.randrange(300)) for _ in range(3)]
+            case "oversized":
+                return [header, bytes(MAX_BATCH_BYTES + 1)]
             case "without its end":
                 return frames[:-1] or [b""]
             case "cut short":
                 return [*frames[:-1], frames[-1][: len(frames[-1]) // 2]]
-            case "random":
-                return [self._dice.randbytes(self._dice.randrange(300)) for _ in range(3)]
-            case "oversized":
-                return [frames[0], bytes(MAX_BATCH_BYTES + 1)]
+            case "a bit of an array":
+                if not arrays:  # it has none; the others are damaged in other ways
+                    return None
+                number = self._dice.randrange(len(arrays))
+                place = 4 * self._dice.randrange(len(arrays[number]) // 4)
+                arrays[number] = self._flipped(arrays[number], place, bit=0)
+                return [header, *arrays]
+            case "a bit of the header" | "a bit of the checksum":
+                start = 0 if kind == "a bit of the header" else len(header) - CHECKSUM
+                place = self._dice.randrange(start, len(header))
+                return [self._flipped(header, place, self._dice.randrange(8)), *arrays]
         return None
+
+    @staticmethod
+    def _flipped(frame: bytes, place: int, bit: int) -> bytes:
+        changed = bytearray(frame)
+        changed[place] ^= 1 << bit
+        return bytes(changed)

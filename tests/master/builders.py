@@ -9,17 +9,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from master.arrivals import EpisodesArrived, ScoresArrived
 from master.budget import Budget
 from master.checkpointer import Checkpointer
 from master.config import MasterConfig
+from master.delivery import EpisodesArrived, Ledger, ScoresArrived
 from master.divergence import DivergenceGuard
 from master.journal import Journal
-from master.ledger import Ledger
 from master.lockstep import Lockstep
 from master.loop import Loop
 from master.metrics import Metrics
-from master.peers import Peer
+from master.registry import Peer
 from master.report import Reporter, StatusCollector
 from master.rundir import Clock, Record, RunFolder
 from master.signals import StopSignals

@@ -7,8 +7,8 @@ from typing import Any
 
 import zmq
 
-from master.arrivals import Arrival, EpisodesArrived, WelcomeInfo
-from master.hub import Hub
+from master.delivery import Arrival, EpisodesArrived
+from master.hub import Hub, WelcomeInfo
 from tangram_agent.messages import ToWorker, Welcome, decode_from_master
 from tests.agent.messages import FINGERPRINTS, SPEC, batch, hello
 

@@ -24,7 +24,7 @@ from master.console import (
     status_line,
     status_panel,
 )
-from master.tally import Tally
+from master.counters import Counters
 from tangram_agent.messages import WORKER_COLUMNS, RunStatus
 
 log = logging.getLogger("master.test")
@@ -171,7 +171,7 @@ def test_programs_read_json() -> None:
     with logging_to(shown, "json"):
         StatusLines().show(STATUS)
         log.info("goes [on] %s", "x" * 200)
-        Tally().note("malformed", "no header")
+        Counters().note("malformed", "no header")
     with logging_to(shown, "json", "launcher"):
         log.info("the master ended")
     common = {"level": "INFO", "process": "master"}

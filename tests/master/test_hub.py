@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from master.arrivals import ScoresArrived
+from master.delivery import ScoresArrived
 from tangram_agent.messages import (
     Ack,
     Alive,
@@ -81,7 +81,7 @@ def test_who_does_not_fit_is_told_why(changes: dict[str, Any], counter: str, rea
 
 
 def test_a_full_house_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("master.peers.MAX_PEERS", 1)
+    monkeypatch.setattr("master.registry.MAX_PEERS", 1)
     with staged() as stage:
         stage.dealer().join()
         late = stage.dealer()

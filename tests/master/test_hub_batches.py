@@ -5,7 +5,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from tangram_agent.messages import Ack, Alive, Go, Heartbeat, Reject, ToWorker, Welcome
+from tangram_agent.messages import Ack, Alive, Go, Heartbeat, Reject, Stop, ToWorker, Welcome
 from tangram_agent.types import Episodes
 from tangram_sim.errors import RunError
 from tests.agent.messages import (
@@ -167,6 +167,66 @@ def test_a_wrong_batch_is_refused_for_good_and_those_after_it_are_taken() -> Non
         assert (answer.sequence, answer.final) == (9, False)
         dealer.send(3)
         stage.counted("batches", 2)
+
+
+def flipped(frames: list[bytes], number: int) -> list[bytes]:
+    """The lowest bit of a frame's first byte is another: an array stays within its bounds."""
+    changed = list(frames)
+    changed[number] = bytes([changed[number][0] ^ 1]) + changed[number][1:]
+    return changed
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 4, 5])
+def test_a_damaged_batch_is_no_batch_and_the_true_one_is_taken_after_it(number: int) -> None:
+    with staged() as stage:
+        dealer = stage.dealer()
+        dealer.join()
+        dealer.say(flipped(batch(1).encode(SPEC), number))
+        answer = dealer.hear()
+        assert isinstance(answer, Reject)
+        assert answer.reason.startswith("the message is damaged: its checksum is ")
+        assert (answer.sequence, answer.final) == (0, False)
+        assert (stage.hub.counters["damaged"], stage.arrivals) == (1, [])
+        dealer.send(1)
+        stage.counted("batches")
+        np.testing.assert_array_equal(
+            stage.batches()[0].episodes.corners, batch(1).episodes.corners
+        )
+
+
+def test_who_sends_nothing_but_damaged_batches_must_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("master.hub.MAX_DAMAGED", 3)
+    with staged() as stage:
+        dealer = stage.dealer()
+        dealer.join()
+        damaged = flipped(batch(1).encode(SPEC), 1)
+        for _ in range(2):
+            dealer.say(damaged)
+            assert isinstance(dealer.hear(), Reject)
+        dealer.send(1)  # an intact one: counted from the beginning
+        for _ in range(2):
+            dealer.say(damaged)
+            assert isinstance(dealer.hear(), Reject)
+            dealer.say(Heartbeat({}).encode())  # small messages may come through all the time
+            assert dealer.hear() == Alive(-1)
+        dealer.say(damaged)
+        assert dealer.hear() == Stop(
+            "3 messages of player 0 in a row were damaged on their way: look at the memory and "
+            "the network of its machine"
+        )
+
+
+def test_after_the_end_no_batch_is_refused_for_good() -> None:
+    """It was not inserted, and who forgot it would believe it was; found by the relay's test."""
+    with staged() as stage:
+        dealer = stage.dealer()
+        dealer.join()
+        stage.hub.stop("SIGTERM")
+        assert dealer.hear() == Stop("SIGTERM")
+        for frames in (batch(1).encode(SPEC), with_header(batch(1).encode(SPEC), count=0)):
+            dealer.say(frames)
+            assert dealer.hear() == Stop("SIGTERM")
+        assert stage.hub.state()["player/0"]["sequence"] == 0
 
 
 def test_after_a_restart_duplicates_are_known_and_the_rest_is_taken() -> None:

@@ -92,7 +92,7 @@ def test_who_vanished_is_unreachable_and_nobody_waits() -> None:
 
         def unreachable() -> int:
             # The ROUTER learns of it some time; until then it accepts answers.
-            stage.hub._post.send(identity, Greet())
+            stage.hub._send(identity, Greet())
             return stage.hub.counters["unreachable"]
 
         stage.until(unreachable)

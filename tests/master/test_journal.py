@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from master import journal as journal_module
-from master.arrivals import EpisodesArrived
+from master.delivery import EpisodesArrived
 from master.journal import HEAD, JournalError, journal_run_id, read_journal, segments
 from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.setup import Setup
@@ -189,6 +189,16 @@ def test_what_is_no_journal_is_refused(tmp_path: Path) -> None:
     content = segments(tmp_path)[1].read_bytes()
     (length, _) = HEAD.unpack_from(content)
     segments(tmp_path)[1].write_bytes(content[HEAD.size + length :])  # without its title
+    with pytest.raises(RunError, match=r"is no segment of format 2: choose another run_dir"):
+        read(tmp_path)
+
+
+def test_a_journal_of_another_format_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(journal_module, "FORMAT", 1)
+        journal(tmp_path, MADE).append(arrival(MADE, 1))
     with pytest.raises(RunError, match=r"is no segment of format 2: choose another run_dir"):
         read(tmp_path)
 

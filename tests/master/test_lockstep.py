@@ -2,7 +2,7 @@
 
 import pytest
 
-from master.arrivals import EpisodesArrived
+from master.delivery import EpisodesArrived
 from master.lockstep import Lockstep
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import EpisodeBatch, Go

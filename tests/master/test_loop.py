@@ -13,7 +13,7 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from master import loop as loop_module
-from master.arrivals import EpisodesArrived
+from master.delivery import EpisodesArrived
 from master.result import make_result
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
 from tangram_agent.messages import Go

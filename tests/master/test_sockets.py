@@ -5,8 +5,8 @@ import socket
 import pytest
 
 from master import sockets as sockets_module
+from master.counters import Counters
 from master.sockets import Sockets
-from master.tally import Tally
 
 pytestmark = pytest.mark.cluster
 
@@ -21,7 +21,7 @@ def test_a_peer_that_says_nothing_is_asked_whether_it_lives(
 ) -> None:
     """A connection that died without a word would stay open, and its queue with it."""
     monkeypatch.setattr(sockets_module, "PING_MS", sockets_module.PING_MS // 50)
-    sockets = Sockets("127.0.0.1", 0, Tally())
+    sockets = Sockets("127.0.0.1", 0, Counters())
     try:
         port = int(sockets.endpoint.rpartition(":")[2])
         with socket.create_connection(("127.0.0.1", port), timeout=10) as peer:

@@ -16,8 +16,8 @@ from typing import Any, TypeVar
 
 import zmq
 
-from master.arrivals import Arrival, WelcomeInfo
-from master.hub import Hub
+from master.delivery import Arrival
+from master.hub import Hub, WelcomeInfo
 from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.messages import (
     EpisodeBatch,

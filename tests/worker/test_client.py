@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from master.arrivals import ScoresArrived
+from master.delivery import ScoresArrived
 from tangram_agent.messages import (
     Ack,
     Alive,
@@ -214,7 +214,7 @@ def test_a_lost_acknowledgement_is_given_again() -> None:
         assert client.send(episodes(), 1)
         stage.counted("batches")
         with patch.context() as lossy:
-            lossy.setattr(stage.hub._post, "send", lambda *_: None)
+            lossy.setattr(stage.hub, "_send", lambda *_: None)
             stage.hub.acknowledge(stage.batches()[0])
         both(stage, client, lambda: client.window_free == 3)
         assert stage.hub.counters["duplicates"] >= 1

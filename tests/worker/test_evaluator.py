@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from master.arrivals import Arrival, ScoresArrived
+from master.delivery import Arrival, ScoresArrived
 from master.hub import Hub
 from tangram_agent.config import ServiceConfig
 from tangram_sim.errors import TangramError

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import zmq
 
-from master.arrivals import EpisodesArrived
+from master.delivery import EpisodesArrived
 from master.hub import Hub
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import Go

@@ -12,7 +12,7 @@ import pytest
 import zmq
 
 from master.hub import Hub
-from master.keys import Keys, make_keys
+from master.security import Keys, make_keys
 from tangram_agent.types import Weights
 from tangram_sim.errors import TangramError
 from tests.agent.messages import episodes, hello, weights

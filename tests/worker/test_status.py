@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import zmq
 
-from master.keys import make_keys
+from master.security import make_keys
 from tangram_agent.messages import RunStatus
 from tangram_sim.errors import TangramError
 from tests.master.dealers import Stage, staged

@@ -7,8 +7,9 @@ the older one; a process that comes back after the master was restarted keeps wh
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from master.ledger import Ledger
+from master.delivery import EpisodesArrived, Ledger
 from tangram_agent.messages import MAX_INDEX, ROLES, Hello, Refused, Stop
+from tangram_agent.schema import MAX_COUNT
 from tangram_sim.errors import RunError, TangramError
 
 MAX_PEERS = 4096
@@ -42,6 +43,7 @@ class Peer:
         stats: numbers of its last heartbeat.
         weights_version: that its last batch was played with.
         batches, episodes, transitions: inserted since it joined.
+        damaged: messages in a row that were damaged on their way.
     """
 
     role: str
@@ -56,6 +58,13 @@ class Peer:
     batches: int = 0
     episodes: int = 0
     transitions: int = 0
+    damaged: int = 0
+
+    def inserted(self, arrival: EpisodesArrived) -> None:
+        """Count a batch of its own."""
+        self.batches += 1
+        self.episodes += arrival.episodes.count
+        self.transitions += arrival.episodes.transitions
 
     @property
     def key(self) -> Key:
@@ -206,6 +215,9 @@ class Registry:
             # A first one, or the checkpoint is older than this incarnation: go on where it is.
             ledger = Ledger(max(1, hello.incarnation), hello.first - 1)
         elif hello.incarnation == 0:
+            if last.incarnation == MAX_COUNT:
+                reason = f"{key[0]} {key[1]} has no incarnation left: start with another index"
+                raise RefusedError("refused_full", Refused(reason))
             ledger = Ledger(last.incarnation + 1, hello.first - 1)
         elif hello.incarnation < last.incarnation or last.process not in ("", hello.process):
             reason = (
@@ -237,9 +249,9 @@ def _key(name: str) -> Key:
 def _ledger(name: str, entry: Mapping[str, int]) -> Ledger:
     incarnation, sequence = entry.get("incarnation"), entry.get("sequence")
     for value, low in ((incarnation, 1), (sequence, 0)):
-        if type(value) is not int or value < low:
+        if type(value) is not int or not low <= value <= MAX_COUNT:
             raise RunError(
                 f"the checkpoint's entry of {name} must hold an incarnation from 1 and a sequence "
-                f"from 0, got {dict(entry)}"
+                f"from 0, both to {MAX_COUNT}, got {dict(entry)}"
             )
     return Ledger(int(incarnation or 0), int(sequence or 0))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from master.keys import Keys, is_loopback, make_keys, needs_keys, run_keys
+from master.security import Keys, is_loopback, make_keys, needs_keys, run_keys
 from tangram_sim.errors import RunError
 
 pytestmark = pytest.mark.fast

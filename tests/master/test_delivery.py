@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from master.ledger import Ledger, Verdict
+from master.delivery import Ledger, Verdict
 from tangram_agent.messages import Ack, Reject
 
 pytestmark = pytest.mark.fast

@@ -5,7 +5,8 @@ from typing import Any
 
 import pytest
 
-from master.peers import MAX_PEERS, Peer, RefusedError, Registry, differing
+from master.registry import MAX_PEERS, Peer, RefusedError, Registry, differing
+from tangram_agent.schema import MAX_COUNT
 from tangram_sim.errors import RunError
 from tests.agent.messages import FINGERPRINTS, hello
 
@@ -144,6 +145,15 @@ def test_an_incarnation_newer_than_the_checkpoint_goes_on_where_it_is() -> None:
     assert (back.incarnation, back.ledger.received, registry.lost_batches) == (7, 11, 0)
 
 
+def test_incarnations_end_where_messages_could_not_tell_them() -> None:
+    registry = Registry(FINGERPRINTS, GRACE_S)
+    admitted(registry, "a", index=0, incarnation=MAX_COUNT - 1)
+    assert admitted(registry, "b", index=0).incarnation == MAX_COUNT
+    with pytest.raises(RefusedError, match="player 0 has no incarnation left: start with another"):
+        admitted(registry, "c", index=0)
+    assert admitted(registry, "c").incarnation == 1
+
+
 def test_two_processes_never_share_an_incarnation() -> None:
     """Both were given the same by masters that did not know of each other's."""
     registry = Registry(FINGERPRINTS, GRACE_S)
@@ -182,6 +192,8 @@ def test_there_is_a_limit() -> None:
         ({"player/0": {"incarnation": 0, "sequence": 0}}, "the checkpoint's entry of player/0 m"),
         ({"player/0": {"incarnation": 1, "sequence": -1}}, "the checkpoint's entry of player/0 "),
         ({"player/0": {"incarnation": "1", "sequence": 0}}, "the checkpoint's entry of player/0"),
+        ({"player/0": {"incarnation": MAX_COUNT + 1, "sequence": 0}}, "the checkpoint's entry of"),
+        ({"player/0": {"incarnation": 1, "sequence": MAX_COUNT + 1}}, "the checkpoint's entry of"),
     ],
 )
 def test_malformed_tables_are_refused(state: Any, reason: str) -> None:

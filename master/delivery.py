@@ -1,14 +1,65 @@
-"""Which batches of one incarnation were seen, and what to do with the next.
+"""Delivery: what arrives, which batches of one incarnation were seen, what to do with the next.
 
-Delivery: a worker numbers its batches from 1 within an incarnation, sends them in order, and again
-until they are acknowledged. So one integer tells old from new, and with the incarnation it is all
-that a checkpoint must keep for exactly-once inserts.
+A worker numbers its batches from 1 within an incarnation, sends them in order, and again until they
+are acknowledged. So one integer tells old from new, and with the incarnation it is all that a
+checkpoint must keep for exactly-once inserts.
+
+A batch is done with in one of two ways. It was inserted, and is acknowledged. Or it came intact and
+its content is wrong: it is consumed, and refused for good, for it would be as wrong when it came
+again, and a broken worker must not send it for ever. A message that was damaged on its way is
+neither: nothing in it is believed, its number least of all, and what was meant comes again.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 
-from tangram_agent.messages import Ack, Reject
+from tangram_agent.messages import Ack, EpisodeBatch, Reject, Scores
+from tangram_agent.types import Episodes
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodesArrived:
+    """A new batch that waits for its insert; its arrays are read-only.
+
+    Attributes:
+        role, index, incarnation: of its sender.
+        batch: as it was read.
+        frames: as they came, for the journal.
+    """
+
+    role: str
+    index: int
+    incarnation: int
+    batch: EpisodeBatch
+    frames: Sequence[bytes]
+
+    @property
+    def sequence(self) -> int:
+        """Number of the batch."""
+        return self.batch.sequence
+
+    @property
+    def weights_version(self) -> int:
+        """Of the weights that played it."""
+        return self.batch.weights_version
+
+    @property
+    def episodes(self) -> Episodes:
+        """What was played."""
+        return self.batch.episodes
+
+
+@dataclass(frozen=True, eq=False)
+class ScoresArrived:
+    """Results of an evaluator."""
+
+    index: int
+    incarnation: int
+    scores: Scores
+
+
+Arrival = EpisodesArrived | ScoresArrived
 
 
 class Verdict(Enum):
@@ -70,6 +121,12 @@ class Ledger:
         """The next batch is handed on for insertion."""
         self.consume(sequence)
         self.held.add(sequence)
+
+    def release(self, sequence: int) -> bool:
+        """A batch that was taken is inserted now; False if it was not held."""
+        held = sequence in self.held
+        self.held.discard(sequence)
+        return held
 
     def consume(self, sequence: int) -> None:
         """The next batch is done with, without an insert."""

@@ -1,6 +1,7 @@
-"""CURVE keys of a run: the server's pair, and the one pair that all of its workers share.
+"""Who may connect at all: CURVE encryption, its keys, and ZeroMQ's authentication (ZAP).
 
-They live as long as the run, so that a worker may come back after the master was restarted.
+A run has the server's pair of keys, and one pair that all of its workers share. They live as long
+as the run, so that a worker may come back after the master was restarted.
 """
 
 import ipaddress
@@ -9,11 +10,14 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import zmq
+from zmq.auth.thread import ThreadAuthenticator
 
+from master.counters import Counters
 from tangram_agent.files import write_whole
 from tangram_sim.errors import ConfigError, RunError
 
 PRIVATE = 0o600
+DOMAIN = "tangram"
 
 
 @dataclass(frozen=True)
@@ -79,3 +83,32 @@ def is_loopback(bind: str) -> bool:
         return bind == "localhost" or ipaddress.ip_address(bind).is_loopback
     except ValueError:
         return False  # the name of a host or an interface
+
+
+class Authenticator:
+    """Encrypts sockets of a context, and turns away those with another key."""
+
+    def __init__(
+        self, context: zmq.Context[zmq.Socket[bytes]], keys: Keys, counters: Counters
+    ) -> None:
+        self._keys, self._counters = keys, counters
+        self._thread = ThreadAuthenticator(context)
+        self._thread.start()
+        self._thread.configure_curve_callback(domain=DOMAIN, credentials_provider=self)
+
+    def guard(self, socket: zmq.Socket[bytes]) -> None:
+        """Encrypt a socket that is not bound yet."""
+        socket.setsockopt(zmq.CURVE_SERVER, 1)
+        socket.setsockopt(zmq.CURVE_SECRETKEY, self._keys.server_secret.encode())
+        socket.setsockopt_string(zmq.ZAP_DOMAIN, DOMAIN)
+
+    def callback(self, _domain: str, key: bytes) -> bool:
+        """Whether a key (Z85) may connect; called by the thread."""
+        allowed = key == self._keys.worker_public.encode()
+        if not allowed:
+            self._counters.note("refused_keys", "a worker with the key of another run")
+        return allowed
+
+    def close(self) -> None:
+        """End the thread, before the context is destroyed."""
+        self._thread.stop()

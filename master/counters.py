@@ -6,7 +6,7 @@ from collections import Counter
 log = logging.getLogger(__name__)
 
 
-class Tally(Counter[str]):
+class Counters(Counter[str]):
     """Name -> count."""
 
     def note(self, name: str, reason: str) -> None:
