@@ -123,7 +123,7 @@ def test_paper_presets_add_nothing_to_the_text(name: str) -> None:
     assert not any((agent.egocentric, agent.offsets, agent.orientation, agent.afterstate))
     assert (agent.angle_head, agent.squash, agent.lr_decay) == ("plain", "tanh", "none")
     assert (agent.edges, agent.grad_clip, agent.acting_average) == ("paper", 0.0, 0.0)
-    assert [twin.strategy for twin in agent.hindsight] == ["final"]
+    assert [relabel.strategy for relabel in agent.hindsight] == ["final"]
 
 
 # A run's config in place of the groups
@@ -334,7 +334,7 @@ def test_entry_hands_over_plain_settings(monkeypatch: pytest.MonkeyPatch) -> Non
     assert seen == [
         {"run_dir": "x", "episodes": 100, "seed": 3, "turns": 1, "skip_invalid": False}
         | dict.fromkeys(("out", "actions", "corner_noise", "puzzles", "sheet"))
-        | dict.fromkeys(("order", "reapply", "refine_steps", "gamma"))
+        | dict.fromkeys(("order", "reapply", "refine_steps", "push_weight"))
     ]
     assert type(seen[0]) is dict
 

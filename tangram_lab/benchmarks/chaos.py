@@ -125,12 +125,12 @@ def compare(folder: Path, witness: Witness) -> dict[str, int]:
     """What the last checkpoint of a run has of what a witness sent.
 
     The replay must be large enough to hold the whole run. Each episode of one action stands there
-    with its hindsight twins, which share its state and action.
+    also relabelled, with the same state and action.
     """
     replay = load_checkpoint(list_checkpoints(folder / "checkpoints")[-1]).arrays["replay"]
     found = keys(replay["state"], replay["action"])
     counts = Counter(found)
-    copies = 1 + sum(twin.copies for twin in witness.setup.agent.hindsight)
+    copies = 1 + sum(one.copies for one in witness.setup.agent.hindsight)
     acknowledged = [key for batch in witness.sent[: witness.acknowledged] for key in batch]
     every = [key for batch in witness.sent for key in batch]
     return {

@@ -70,7 +70,7 @@ def _parts(hub: Hub, journal: Journal, trainer: Trainer) -> dict[str, float]:
             assert isinstance(arrival, EpisodesArrived)
             with spent.on("journal"):
                 journal.append(arrival)
-            with spent.on("insert with hindsight twins"):
+            with spent.on("insert and relabel"):
                 trainer.insert(arrival.episodes)
             with spent.on("acknowledge"):
                 hub.acknowledge(arrival)

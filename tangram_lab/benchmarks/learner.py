@@ -1,13 +1,15 @@
 """Updates: against a plain per-head attention, and against Stable-Baselines3's on the same MLP."""
 
+import copy
 import math
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from tangram_agent.attention import EncoderLayer
-from tangram_agent.ddpg import Learner, critic_target, next_token
+from tangram_agent.learner import Learner, Steps, critic_target
 from tangram_agent.setup import Setup
 from tangram_lab.benchmarks.measure import Bound, Row, Work, compare
 from tangram_lab.benchmarks.peers import compare_updates
@@ -36,7 +38,8 @@ def _against_plain(case: str, setup: Setup, runs: int, bound: Bound) -> Row:
 def updates(setup: Setup, learner: Learner | None = None) -> Work:
     """Updates on one batch; of the project's own learner if none is given."""
     learner = learner or Learner(setup, 0)
-    batch = random_transitions(setup, setup.agent.batch_size)
+    transitions = random_transitions(setup, setup.agent.batch_size)
+    batch = learner.prepared(transitions, np.random.default_rng(0))
 
     def work() -> int:
         learner.update(batch)
@@ -80,10 +83,11 @@ class PlainLearner(Learner):
 
     def __init__(self, setup: Setup, seed: int) -> None:
         super().__init__(setup, seed)
-        for part in (self.actor, self.critic, self.target_actor, self.target_critic, self.acting):
+        for part in (self.actor, self.critic, self.acting):
             for layer in part.modules():
                 if isinstance(layer, EncoderLayer):
                     _take_apart(layer)
+        self.target_actor, self.target_critic = map(copy.deepcopy, (self.actor, self.critic))
         self._lists = self.parameter_lists()
         rates = (self.config.actor_lr, self.config.critic_lr)
         self.actor_optimiser, self.critic_optimiser = (
@@ -109,11 +113,10 @@ class PlainLearner(Learner):
         optimiser.step()
         return norm
 
-    def _target(self, t: dict[str, Tensor]) -> Tensor:
-        after = (t["next_state"], t["next_placed"], t["goal"], next_token(t["next_placed"]))
-        velocity, _ = self.target_actor(*after)
-        value = self.target_critic(*after, velocity)
-        return critic_target(t["reward"], t["done"], value, GAMMA)
+    def _target(self, steps: Steps) -> Tensor:
+        velocity, _ = self.target_actor(steps.follow)
+        value = self.target_critic(steps.follow, velocity)
+        return critic_target(steps.reward, steps.done, value, GAMMA)
 
 
 def _take_apart(layer: EncoderLayer) -> None:
