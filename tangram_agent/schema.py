@@ -199,6 +199,11 @@ class Message:
         """Header fields that describe the arrays, for a receiver that agreed on a task."""
         return {}
 
+    @classmethod
+    def refused(cls, _header: Mapping[str, Any], error: WireError) -> WireError:
+        """What is raised for an intact message whose content is wrong."""
+        return error
+
     def pack(self, _agreed: Any) -> tuple[Mapping[str, int], list[bytes]]:
         """What describes the arrays, and their frames."""
         return {}, []
@@ -281,6 +286,18 @@ def read(
         raise WireError(f"expected {cls.kind}, got a message of kind {header['kind']!r}")
     values = {name: value for name, value in header.items() if name != "kind"}
     return cls.unpack(_checked(cls, values, agreed), frames, agreed)
+
+
+def received(frames: Sequence[bytes], kinds: Mapping[str, type[Message]], agreed: Any) -> Message:
+    """The message in these frames, of one of these kinds; errors as in `opened` and `read`."""
+    header = opened(frames)
+    cls = kinds.get(header["kind"])
+    if cls is None:
+        raise WireError(f"unknown kind of message {header['kind']!r}")
+    try:
+        return read(cls, header, frames[1:], agreed)
+    except WireError as error:
+        raise cls.refused(header, error) from None
 
 
 def check_frames(kind: str, frames: Sequence[bytes], count: int) -> None:
