@@ -6,8 +6,16 @@ ARGS ?=
 BUDGET ?= laptop
 SCRIPTS := .ci/install .ci/run $(shell find docker slurm -name "*.sh" -o -name "*.sbatch" 2>/dev/null)
 
+# make takes name=value for a variable of its own and drops what it does not know.
+KNOWN := ARGS BUDGET
+GIVEN := $(foreach name,$(.VARIABLES),$(if $(filter command,$(origin $(name))),$(name)))
+STRAY := $(sort $(filter-out $(KNOWN),$(GIVEN)))
+ifneq ($(STRAY),)
+$(error make knows no $(firstword $(STRAY))=...: settings go into ARGS="...", as in make train ARGS="seed=1 tokens=parallelogram"; BUDGET=... is for make paper)
+endif
+
 .DEFAULT_GOAL := help
-.PHONY: help train test lint format paper bench clean
+.PHONY: help train test lint settings format paper bench clean
 
 help:  ## list these commands
 	@sed -nE 's/^([a-z]+):.*## (.*)/  make \1\t\2/p' Makefile | expand -t 16
@@ -26,6 +34,9 @@ lint: .venv/.installed-dev  ## ruff, mypy, import-linter, hadolint and shellchec
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/hadolint docker/Dockerfile
 	$(BIN)/shellcheck $(SCRIPTS)
+
+settings: .venv/.installed-run  ## write docs/settings.md from the declarations of the settings
+	@$(BIN)/python -m conf.settings
 
 format: .venv/.installed-dev  ## sort and lay out the code
 	$(BIN)/ruff check --fix .

@@ -10,8 +10,8 @@ import safetensors.numpy
 
 from master.counters import Counters
 from master.trainer import Trainer
-from tangram_agent.ddpg import NotFiniteError
 from tangram_agent.files import write_whole
+from tangram_agent.learner import NotFiniteError
 from tangram_agent.process import Every
 from tangram_agent.types import Weights
 from tangram_sim.errors import RunError

@@ -26,6 +26,7 @@ from typing import Any, ClassVar
 
 from master.delivery import EpisodesArrived
 from tangram_agent.arrays import MAX_BATCH_BYTES, MAX_FRAMES, EpisodeSpec, join_frames, split_frames
+from tangram_agent.files import sync_folder
 from tangram_agent.messages import Count, EpisodeBatch, Id, Index, Number, Role, decode_from_worker
 from tangram_agent.process import Every
 from tangram_agent.schema import MAX_HEADER, Plain, ProtocolError, opened, read
@@ -147,6 +148,8 @@ class Journal:
         self._folder.mkdir(parents=True, exist_ok=True)
         # Not "x": a segment that could not be begun for want of room may lie there.
         self._file = FileIO(segment_path(self._folder, self.segment), "w")
+        # Bytes that are synced into a file without a name would be lost with the power.
+        sync_folder(self._folder)
         self._good = 0
         self._write(self._file, _record(self._title, []))
         return self._file
@@ -251,7 +254,7 @@ def read_journal(
     for number in range(first, max(found, default=0) + 1):
         if number not in found:
             path = segment_path(folder, number)
-            warn(f"warning: {path} is missing: the batches that it held are lost")
+            warn(f"{path} is missing: the batches that it held are lost")
             continue
         yield from _segment(found[number], run_id, task, spec, warn)
 
@@ -297,7 +300,7 @@ def _cut_short(path: Path, size: int) -> str:
 
 def _damaged(path: Path, start: int, size: int) -> str:
     return (
-        f"warning: {path} is damaged at byte {start:,}: the {size - start:,} bytes from there on "
+        f"{path} is damaged at byte {start:,}: the {size - start:,} bytes from there on "
         "are lost, with the batches in them"
     )
 

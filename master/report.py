@@ -102,8 +102,9 @@ class StatusCollector:
             "checkpoint_age_s": self._checkpointer.age_s,
             "disk_failing": self._checkpointer.failing,
             "scored_updates": record.scored_version,
-            **{f"hub/{name}": count for name, count in sorted(self._hub.counters.items())},
             **{TEST + name: value for name, value in record.scores.items()},
+            # Last: where there are more numbers than a status takes, these are left out.
+            **{f"hub/{name}": count for name, count in sorted(self._hub.counters.items())},
         }
         texts = {
             "run": self._name,

@@ -234,7 +234,7 @@ def _read_journal(setup: Setup, folder: RunFolder, rest: Restored) -> Iterator[E
     """What was acknowledged after the checkpoint."""
     digest, spec = setup.task_digest(), EpisodeSpec.of(setup)
     run_id = rest.record.run_id
-    return read_journal(folder.journal, rest.segment, run_id, digest, spec, log.info)
+    return read_journal(folder.journal, rest.segment, run_id, digest, spec, log.warning)
 
 
 def _keys(service: ServiceConfig, folder: RunFolder) -> Keys | None:

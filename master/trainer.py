@@ -8,8 +8,8 @@ import numpy.typing as npt
 import torch
 
 from master.rate_limiter import RateLimiter
-from tangram_agent.hindsight import with_twins
-from tangram_agent.pair_learner import make_learner
+from tangram_agent.learner import Learner
+from tangram_agent.relabelling import with_relabelled
 from tangram_agent.replay import ReplayBuffer
 from tangram_agent.runs import ACTING, SETUP
 from tangram_agent.setup import Setup
@@ -29,7 +29,7 @@ class Trainer:
     Attributes:
         setup: the task and the agent.
         learner: networks and optimisers.
-        replay: transitions played and their hindsight twins.
+        replay: transitions played, and relabelled ones.
         rate_limiter: decides whether to learn or to take in episodes.
         episodes: taken in since the run began.
         batch: of the last update.
@@ -39,7 +39,7 @@ class Trainer:
         agent, layout = setup.agent, setup.layout
         self.setup = setup
         self.reward = make_reward(setup.reward, layout, setup.sim)
-        self.learner = make_learner(setup, seed, device)
+        self.learner = Learner(setup, seed, device)
         self.replay = ReplayBuffer(
             agent.replay_capacity, layout.corner_count, layout.tokens, setup.action_size
         )
@@ -59,15 +59,17 @@ class Trainer:
 
     @property
     def transitions(self) -> int:
-        """Transitions played that were taken in, without their twins."""
+        """Transitions played that were taken in, without relabelled ones."""
         return self.episodes * self.setup.horizon
 
     def insert(self, episodes: Episodes) -> None:
-        """Take in episodes as they were played, with their hindsight twins."""
-        # On pairs twins are made anew for every update.
-        twins = () if self.setup.pairs else self.setup.agent.hindsight
+        """Take in episodes as they were played, and relabelled."""
+        # What is credited piece by piece is relabelled anew for every update.
+        relabels = () if self.setup.credits_pieces else self.setup.agent.hindsight
         generator = self._generators["hindsight"]
-        self.replay.add(with_twins(episodes, twins, self.setup.layout, self.reward, generator))
+        self.replay.add(
+            with_relabelled(episodes, relabels, self.setup.layout, self.reward, generator)
+        )
         self.rate_limiter.inserted(episodes.transitions)
         self.episodes += episodes.count
 

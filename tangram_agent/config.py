@@ -54,17 +54,17 @@ class NetConfig(Settings, section="net"):
 
 
 @dataclass(frozen=True)
-class TwinConfig(Settings, section="agent.hindsight"):
-    """One kind of hindsight twin that is added for every transition played."""
+class RelabelConfig(Settings, section="agent.hindsight"):
+    """One kind of other goal that transitions are learned with besides the one that was played."""
 
     strategy: str = field(
         metadata=declared(
             "the goal: final, future, near (the final pose moved by Gaussian noise) or none; "
-            "with several tokens final and future are one: where the token came to lie",
+            "pairs of several tokens: where the token came to lie by its action is final",
             choices=STRATEGIES,
         )
     )
-    copies: int = setting(1, "twins of this kind for each transition", low=1, high=64)
+    copies: int = setting(1, "goals of this kind for each transition", low=1, high=64)
     position: float = setting(0.0, "near: deviation of the goal's shift", low=0, unit="arena units")
     angle: float = setting(0.0, "near: deviation of the goal's turn", low=0, unit="rad")
 
@@ -99,42 +99,56 @@ class AgentConfig(Settings, section="agent"):
     saturation_limit: float = setting(1.0, "pre-activation beyond which the penalty starts", low=0)
     readout: str = setting(
         "auto",
-        "one velocity of the next token, a pose and a value for each pair of a token and a piece "
-        "of the target, or auto: pair for several tokens",
+        "one velocity of the set's next token and one value of the whole scene, or both for each "
+        "pair of a token and a piece of the target, or auto: pair for several tokens",
         choices=("auto", "token", "pair"),
     )
     order: str = setting(
         "learned",
-        "pair: which token is next: the one with the best value, as listed in the set, the largest "
-        "or any",
+        "which token is next: that of the best value, the first as listed, the largest, or any",
         choices=ORDERS,
+        only={"readout": ("auto", "pair")},
     )
     reapply: int = setting(
-        2, "pair: times that the actor is applied again to what it proposed", low=0, high=100
+        2,
+        "times that the actor is applied again to what it proposed",
+        low=0,
+        high=100,
+        only={"readout": ("auto", "pair")},
     )
     refine_steps: int = setting(
         0,
-        "pair: gradient steps uphill on the critic before a pose is played, exploration off",
+        "gradient steps uphill on the critic before a pose is played, exploration off",
         low=0,
         high=10_000,
+        only={"readout": ("auto", "pair")},
     )
     refine_rate: float = setting(
         0.004,
-        "pair: length of the first of these steps",
+        "length of the first of these steps",
         low=1e-9,
         high=1,
         unit="arena units and rad",
+        only={"readout": ("auto", "pair")},
     )
     pairs_per_transition: int = setting(
-        8, "pair: pairs that a transition gives in one update", low=1, high=1024
+        8,
+        "several tokens: pairs that a transition gives in one update",
+        low=1,
+        high=1024,
+        only={"readout": ("auto", "pair")},
     )
-    gamma: float = setting(
-        0.0,
-        "discount, Eq. 5; on pairs the weight of what later tokens push away again",
+    push_weight: float = setting(
+        1.0,
+        "several tokens that slide: weight of what later ones push away of what is set down now",
         low=0,
         high=1,
+        only={"readout": ("auto", "pair")},
     )
-    polyak: float = setting(0.995, "rho of the target networks, Eq. 4", low=0, high=1)
+    gamma: float = setting(0.0, "discount, Eq. 5", low=0, high=1)
+    polyak: float = setting(
+        0.995, "rho of the target networks, Eq. 4, which gamma > 0 needs", low=0, high=1
+    )
     acting_average: float = setting(
         0.99, "Polyak average of the actor that plays and is scored; 0 is the actor", low=0, high=1
     )
@@ -144,7 +158,11 @@ class AgentConfig(Settings, section="agent"):
         "cosine", "of the learning rates over the run's budget", choices=("none", "cosine")
     )
     lr_final: float = setting(
-        0.01, "share of the learning rates that the decay ends at", low=0, high=1
+        0.01,
+        "share of the learning rates that the decay ends at",
+        low=0,
+        high=1,
+        only={"lr_decay": "cosine"},
     )
     grad_clip: float = setting(0.0, "largest norm of a gradient; 0 is no clipping", low=0)
     batch_size: int = setting(64, "transitions in one update", low=1)
@@ -153,18 +171,18 @@ class AgentConfig(Settings, section="agent"):
         0.1, "updates for each transition played", low=1e-9, high=1e3
     )
     learning_starts: int = setting(
-        512, "transitions played before the first update; twins do not count", low=1
+        512, "transitions played before the first update; relabelled ones do not count", low=1
     )
     noise: float = setting(0.05, "deviation of the Gaussian exploration noise on actions", low=0)
     uniform_share: float = setting(0.2, "share of actions drawn uniformly", low=0, high=1)
     # With one action every plain relabel scores +1, so only near misses teach the slope.
-    hindsight: tuple[TwinConfig, ...] = setting(
+    hindsight: tuple[RelabelConfig, ...] = setting(
         (
-            TwinConfig("final"),
-            TwinConfig("near", position=0.1, angle=0.5),
-            TwinConfig("near", position=0.02, angle=0.1),
+            RelabelConfig("final"),
+            RelabelConfig("near", position=0.1, angle=0.5),
+            RelabelConfig("near", position=0.02, angle=0.1),
         ),
-        "the twins added for every transition",
+        "the other goals that every transition is learned with",
     )
 
     def __post_init__(self) -> None:

@@ -1,19 +1,130 @@
-"""Corners and flags -> node features, and the known rigid motion of an action.
+"""What networks see: the graph of Sec. IV-A, of a whole scene or of one token and one piece.
 
-Legend: B batch, K tokens, V corners of all tokens together, N = 2V + K nodes, F features.
-Node order is the layout's: token corners, bases, target corners. A turn is a unit complex number,
-stored as (cos, sin) in the last dimension.
+`SceneGraph` has all tokens and the whole target, as the paper has it. `PairGraph` has one token and
+one piece of the target: with one token that is the whole scene too. Both take the same options
+(`agent.egocentric`, `offsets`, `orientation`, `edges`) and answer the same questions, so the same
+actor and critic work on either.
+
+Legend: M views, K tokens and V corners of a view, C corners of the largest token, N nodes, F
+features. Node order: token corners, bases, target corners. A turn is a unit complex number, stored
+as (cos, sin) in the last dimension. A velocity (M, 3) is normalised: x and y times the arena's
+width, the angle times pi.
 """
 
 import math
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
 
 from tangram_agent.config import AgentConfig
+from tangram_sim.fitting import KINDS, kind_of
 from tangram_sim.layout import Layout
 
 PAPER_FEATURES = 4
+# Every tan has a number of its own, whatever set it is in; other shapes share the last one.
+_KINDS = len(KINDS) + 1
+# Corners in radii are larger than the rest; then a perceptron's inputs are of about one size.
+_CORNER_SCALE = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Scenes:
+    """M whole scenes.
+
+    Attributes:
+        corners: (M, V, 2) of the tokens.
+        placed: (M, K) 1 where a token is placed.
+        goal: (M, V, 2) corners of the target.
+        token: (M,) which one is to move, or has just moved.
+    """
+
+    corners: Tensor
+    placed: Tensor
+    goal: Tensor
+    token: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """M pairs of one token and one piece of the target.
+
+    A pair is seen from its token: relative to its centre, in its own orientation and, where it lies
+    on its other side, through a mirror. So one network knows every token, target and side.
+
+    Attributes:
+        pose: (M, 3) x, y and angle of the token.
+        flipped: (M,) 1 where it lies on its other side.
+        token: (M,) its index.
+        goal: (M, 3) pose of the target's piece.
+        goal_flipped: (M,) 1 where that lies on its other side.
+        piece: (M,) its index.
+        covered: (M,) share of the piece that other tokens cover already.
+    """
+
+    pose: Tensor
+    flipped: Tensor
+    token: Tensor
+    goal: Tensor
+    goal_flipped: Tensor
+    piece: Tensor
+    covered: Tensor
+
+    def at(self, pose: Tensor) -> "Pairs":
+        """The same pairs with their tokens elsewhere."""
+        return replace(self, pose=pose)
+
+
+View = Scenes | Pairs
+
+
+class Graph(Protocol):
+    """What actor and critic ask of a graph; each graph knows views of its own kind.
+
+    Attributes:
+        tokens: K, in view.
+        adjacency: (N, N) edges.
+        features: F, with the options that are switched on.
+        inputs: numbers that a perceptron sees of a view.
+    """
+
+    tokens: int
+    adjacency: Tensor
+
+    @property
+    def features(self) -> int: ...  # noqa: D102
+    @property
+    def inputs(self) -> int: ...  # noqa: D102
+
+    def node_features(self, view: Any, /) -> Tensor:
+        """Features (M, N, F)."""
+
+    def vectors(self, view: Any, /) -> Tensor:
+        """(M, inputs): a view in one row."""
+
+    def base_node(self, view: Any, /) -> Tensor:
+        """Node index (M,) of the base of the token that moves."""
+
+    def slot(self, view: Any, /) -> Tensor:
+        """(M,) which of the tokens in view moves."""
+
+    def symmetry_of(self, view: Any, /) -> Tensor:
+        """(M,) symmetry order of the token that moves."""
+
+    def velocity(self, view: Any, shift: Tensor, angle: Tensor, /) -> Tensor:
+        """The velocity (M, 3) of a shift (M, 2), as the token sees it, and a turn (M,) over pi."""
+
+    def as_seen(self, view: Any, velocity: Tensor, /) -> Tensor:
+        """A velocity (M, 3) as the token sees it."""
+
+    def moved(self, view: Any, velocity: Tensor, /) -> Any:
+        """The views after the exact rigid motion of a velocity (M, 3), as the simulation has it."""
+
+
+def next_token(placed: Tensor) -> Tensor:
+    """Which token moves, (B,): the first that is not placed (B, K); 0 where all are."""
+    return (placed == 0).int().argmax(dim=-1)
 
 
 def turn(vectors: Tensor, by: Tensor) -> Tensor:
@@ -30,8 +141,8 @@ def turn_back(vectors: Tensor, by: Tensor) -> Tensor:
     return torch.stack([x * cos + y * sin, y * cos - x * sin], dim=-1)
 
 
-class TokenGraph(nn.Module):
-    """Builds the graph of Sec. IV-A and the options that an agent may add to it.
+class SceneGraph(nn.Module):
+    """The graph of Sec. IV-A and the options that an agent may add to it.
 
     The edges are a constant of the layout (`adjacency`, (N, N)); only features depend on the state.
     """
@@ -59,7 +170,7 @@ class TokenGraph(nn.Module):
         self.egocentric, self.offsets = agent.egocentric, agent.offsets
         self.orientation = agent.orientation
         owner = torch.as_tensor(layout.token_of_corner)
-        one_hot = torch.nn.functional.one_hot(owner, layout.tokens).T.float()
+        one_hot = nn.functional.one_hot(owner, layout.tokens).T.float()
         symmetry = torch.tensor([float(shape.symmetry) for shape in layout.shapes])
         target_flag = torch.zeros(layout.nodes)
         target_flag[layout.corner_count + layout.tokens :] = 1.0
@@ -68,7 +179,7 @@ class TokenGraph(nn.Module):
             "base_weights": torch.as_tensor(layout.base_weights, dtype=torch.float32),
             "body": torch.as_tensor(layout.body, dtype=torch.float32),
             "members": one_hot,
-            "adjacency": _adjacency(layout, agent.edges),
+            "adjacency": _edges(torch.as_tensor(layout.adjacency), agent.edges),
             "symmetry": symmetry,
             "radius": torch.tensor([shape.radius for shape in layout.shapes]).float(),
             # The target's piece j is token j's counterpart and counts as piece K + j.
@@ -85,16 +196,29 @@ class TokenGraph(nn.Module):
         """F, with the options that are switched on."""
         return PAPER_FEATURES + 2 * self.offsets + 2 * self.orientation
 
-    def base_node(self, token: Tensor) -> Tensor:
-        """Node index (B,) of the base of token (B,)."""
-        return self.corner_count + token
+    @property
+    def inputs(self) -> int:
+        """Numbers that a perceptron sees of a scene."""
+        return self.nodes * self.features
+
+    def base_node(self, scenes: Scenes) -> Tensor:
+        """Node index (M,) of the base of the token that moves."""
+        return self.corner_count + scenes.token
+
+    def slot(self, scenes: Scenes) -> Tensor:
+        """(M,) which of the K tokens in view moves."""
+        return scenes.token
+
+    def symmetry_of(self, scenes: Scenes) -> Tensor:
+        """(M,) symmetry order of the token that moves."""
+        return self.symmetry[scenes.token]
 
     def centres(self, corners: Tensor) -> Tensor:
-        """Centres of area (B, K, 2) of pieces with corners (B, V, 2)."""
+        """Centres of area (M, K, 2) of pieces with corners (M, V, 2)."""
         return self.base_weights @ corners
 
     def headings(self, corners: Tensor, centre: Tensor) -> Tensor:
-        """Orientations (B, K, 2): the least-squares rotations from the body frame.
+        """Orientations (M, K, 2): the least-squares rotations from the body frame.
 
         From its mirror image where a token lies on its other side: the one that fits better.
         """
@@ -107,15 +231,9 @@ class TokenGraph(nn.Module):
             heading = torch.where(turned_over[..., None], mirrored, heading)
         return nn.functional.normalize(heading, dim=-1)
 
-    def node_features(self, corners: Tensor, placed: Tensor, goal: Tensor, token: Tensor) -> Tensor:
-        """Features (B, N, F).
-
-        Args:
-            corners: (B, V, 2) of the tokens.
-            placed: (B, K), 1 where a token is placed.
-            goal: (B, V, 2) corners of the target.
-            token: (B,) the token that the agent is to move or has just moved.
-        """
+    def node_features(self, scenes: Scenes) -> Tensor:
+        """Features (M, N, F)."""
+        corners, goal, token = scenes.corners, scenes.goal, scenes.token
         rows = torch.arange(len(corners), device=corners.device)
         centre, goal_centre = self.centres(corners), self.centres(goal)
         positions = torch.cat([corners, centre, goal], dim=1)
@@ -126,7 +244,7 @@ class TokenGraph(nn.Module):
         if self.egocentric:
             positions = turn_back(positions - centre[rows, token][:, None], reference)
             offset = None if offset is None else turn_back(offset, reference)
-        parts = [positions, self._flags(placed)]
+        parts = [positions, self._flags(scenes.placed)]
         if offset is not None:
             parts.append(offset)
         if self.orientation:
@@ -134,60 +252,273 @@ class TokenGraph(nn.Module):
             parts.append(self._orientation(heading, goal_heading, reference))
         return torch.cat(parts, dim=-1)
 
+    def vectors(self, scenes: Scenes) -> Tensor:
+        """(M, inputs): the features of all nodes in one row."""
+        return self.node_features(scenes).flatten(1)
+
     def _flags(self, placed: Tensor) -> Tensor:
-        """Whether a node is the target's, and whether it is placed: (B, N, 2)."""
+        """Whether a node is the target's, and whether it is placed: (M, N, 2)."""
         flags = torch.cat([placed[:, self.token_of_corner], placed], dim=1)
         flags = nn.functional.pad(flags, (0, self.corner_count), value=1.0)
         return torch.stack([self.target_flag.expand_as(flags), flags], dim=-1)
 
     def _offset(self, corners: Tensor, centre: Tensor, goal: Tensor, goal_centre: Tensor) -> Tensor:
-        """Each node's displacement from its own piece's centre, in radii: (B, N, 2)."""
+        """Each node's displacement from its own piece's centre, in radii: (M, N, 2)."""
         own = corners - centre[:, self.token_of_corner]
         target = goal - goal_centre[:, self.token_of_corner]
         offset = torch.cat([own, torch.zeros_like(centre), target], dim=1)
         return offset / self.radius[self.token_of_node][:, None]
 
     def _orientation(self, heading: Tensor, goal_heading: Tensor, reference: Tensor) -> Tensor:
-        """(cos k*theta, sin k*theta) of each node's piece relative to the token: (B, N, 2)."""
+        """(cos k*theta, sin k*theta) of each node's piece relative to the token: (M, N, 2)."""
         headings = torch.cat([heading, goal_heading], dim=1)
         cos, sin = turn_back(headings, reference).unbind(-1)
-        angle = torch.atan2(sin, cos) * self.symmetry.repeat(2)
-        per_piece = torch.stack([torch.cos(angle), torch.sin(angle)], dim=-1)
+        per_piece = _unit(torch.atan2(sin, cos) * self.symmetry.repeat(2))
         return per_piece[:, self.piece_of_node]
 
-    def to_world(self, corners: Tensor, token: Tensor, shift: Tensor) -> Tensor:
-        """A shift (B, 2) in the token's frame as one in the world's, if the agent is egocentric."""
-        if not self.egocentric:
-            return shift
-        return turn(shift, self._heading(corners, token))
+    def velocity(self, scenes: Scenes, shift: Tensor, angle: Tensor) -> Tensor:
+        """The velocity (M, 3) of a shift (M, 2), as the token sees it, and a turn (M,) over pi."""
+        if self.egocentric:
+            shift = turn(shift, self._heading(scenes))
+        return torch.cat([shift, angle[:, None]], dim=-1).clamp(-1.0, 1.0)
 
-    def to_token(self, corners: Tensor, token: Tensor, shift: Tensor) -> Tensor:
-        """The inverse of `to_world`."""
+    def as_seen(self, scenes: Scenes, velocity: Tensor) -> Tensor:
+        """A velocity (M, 3) as the token sees it."""
         if not self.egocentric:
-            return shift
-        return turn_back(shift, self._heading(corners, token))
+            return velocity
+        shift = turn_back(velocity[:, :2], self._heading(scenes))
+        return torch.cat([shift, velocity[:, 2:]], dim=-1)
 
-    def _heading(self, corners: Tensor, token: Tensor) -> Tensor:
+    def _heading(self, scenes: Scenes) -> Tensor:
+        corners = scenes.corners
         rows = torch.arange(len(corners), device=corners.device)
-        return self.headings(corners, self.centres(corners))[rows, token]
+        return self.headings(corners, self.centres(corners))[rows, scenes.token]
 
-    def move(self, corners: Tensor, token: Tensor, velocity: Tensor) -> Tensor:
-        """Corners (B, V, 2) after the exact rigid motion of a normalised velocity (B, 3).
-
-        The same motion as the simulation's: x and y times the arena's width, the angle times pi.
-        """
+    def moved(self, scenes: Scenes, velocity: Tensor) -> Scenes:
+        """The scenes after the exact rigid motion of a velocity (M, 3)."""
+        corners, token = scenes.corners, scenes.token
         rows = torch.arange(len(corners), device=corners.device)
         centre = self.centres(corners)[rows, token][:, None]
-        angle = velocity[:, 2] * math.pi
-        by = torch.stack([torch.cos(angle), torch.sin(angle)], dim=-1)[:, None]
+        by = _unit(velocity[:, 2] * math.pi)[:, None]
         shift = (velocity[:, :2] * self.arena)[:, None]
         moved = turn(corners - centre, by) + centre + shift
         own = self.token_of_corner[None, :] == token[:, None]
-        return torch.where(own[..., None], moved, corners)
+        return replace(scenes, corners=torch.where(own[..., None], moved, corners))
 
 
-def _adjacency(layout: Layout, edges: str) -> Tensor:
+class PairGraph(nn.Module):
+    """The graph of a pair: the token's corners, its base, the target piece's corners.
+
+    The edges are those of Sec. IV-A. Shapes of fewer corners repeat their last one. Every node also
+    knows both shapes and what of the piece is covered.
+    """
+
+    tokens = 1  # in view
+    body: Tensor
+    symmetry: Tensor
+    radius: Tensor
+    area: Tensor
+    kind: Tensor
+    mirror: Tensor
+    chiral: Tensor
+    adjacency: Tensor
+    target_flag: Tensor
+
+    def __init__(self, layout: Layout, arena: float, agent: AgentConfig) -> None:
+        super().__init__()
+        self.arena = arena
+        self.egocentric, self.offsets = agent.egocentric, agent.offsets
+        self.orientation = agent.orientation
+        self.corners = int(layout.padded_corners.shape[1])
+        self.nodes = 2 * self.corners + 1
+        constants = {
+            "body": torch.as_tensor(layout.body[layout.padded_corners], dtype=torch.float32),
+            "symmetry": torch.tensor([float(shape.symmetry) for shape in layout.shapes]),
+            "radius": torch.tensor([shape.radius for shape in layout.shapes]).float(),
+            "area": torch.as_tensor(layout.areas).float(),
+            "kind": _kinds(layout),
+            "mirror": torch.tensor([shape.mirror or 0.0 for shape in layout.shapes]).float(),
+            "chiral": torch.as_tensor(layout.chiral).float(),
+            "adjacency": _edges(_pair_adjacency(self.corners), agent.edges),
+            "target_flag": (torch.arange(self.nodes) > self.corners).float()[:, None],
+        }
+        for name, value in constants.items():
+            self.register_buffer(name, value, persistent=False)
+
+    @property
+    def features(self) -> int:
+        """F, with the options that are switched on."""
+        return 3 + 2 * self.offsets + 4 * self.orientation + 2 * _KINDS + 4
+
+    @property
+    def inputs(self) -> int:
+        """Numbers that a perceptron sees of a pair."""
+        own = 2 * self.corners * self.offsets
+        return 2 + 4 * self.orientation + 2 * self.corners + own + 2 * _KINDS + 4
+
+    def base_node(self, pairs: Pairs) -> Tensor:
+        """Node index (M,) of the token's base."""
+        return torch.full_like(pairs.token, self.corners)
+
+    def slot(self, pairs: Pairs) -> Tensor:
+        """(M,) which of the tokens in view moves: there is one."""
+        return torch.zeros_like(pairs.token)
+
+    def symmetry_of(self, pairs: Pairs) -> Tensor:
+        """(M,) symmetry order of the token."""
+        return self.symmetry[pairs.token]
+
+    def relation(self, pairs: Pairs) -> tuple[Tensor, Tensor, Tensor]:
+        """The piece as its token sees it.
+
+        Returns:
+            (M, 2) where its centre is, (M,) its angle, and (M,) 1 where it lies on the other side
+            than the token.
+        """
+        place, angle = self._seen(pairs, pairs.goal)
+        # A shape that is its own mirror image is, through the mirror, turned by a known angle.
+        chiral = self.chiral[pairs.piece]
+        angle = angle + pairs.flipped * (1.0 - chiral) * self.mirror[pairs.piece]
+        return place, angle, chiral * (pairs.flipped - pairs.goal_flipped).abs()
+
+    def motion(self, pairs: Pairs, to: Tensor) -> Tensor:
+        """The way to poses (M, 3) as tokens see it: (M, 4), shift, cosine and sine of the turn."""
+        shift, angle = self._seen(pairs, to)
+        return torch.cat([shift, _unit(angle)], dim=-1)
+
+    def _seen(self, pairs: Pairs, to: Tensor) -> tuple[Tensor, Tensor]:
+        """The shift (M, 2) and the turn (M,) to poses (M, 3) as tokens see them.
+
+        Through the mirror y and angles change their sign.
+        """
+        sign = _signs(pairs.flipped)
+        shift = turn_back(to[:, :2] - pairs.pose[:, :2], _unit(pairs.pose[:, 2]))
+        return _mirrored(shift, sign), sign * (to[:, 2] - pairs.pose[:, 2])
+
+    def _to_arena(self, pairs: Pairs, vectors: Tensor) -> Tensor:
+        """Vectors (M, ..., 2) as tokens see them, in the arena's axes."""
+        apart = (...,) + (None,) * (vectors.dim() - 2)
+        sign, heading = _signs(pairs.flipped), _unit(pairs.pose[:, 2])
+        by = heading.view(len(heading), *[1] * (vectors.dim() - 2), 2)
+        return turn(_mirrored(vectors, sign[apart]), by)
+
+    def velocity(self, pairs: Pairs, shift: Tensor, angle: Tensor) -> Tensor:
+        """The velocity (M, 3) of a shift (M, 2), as the token sees it, and a turn (M,) over pi."""
+        if self.egocentric:
+            shift, angle = self._to_arena(pairs, shift), _signs(pairs.flipped) * angle
+        return torch.cat([shift, angle[:, None]], dim=-1).clamp(-1.0, 1.0)
+
+    def as_seen(self, pairs: Pairs, velocity: Tensor) -> Tensor:
+        """A velocity (M, 3) as the token sees it."""
+        if not self.egocentric:
+            return velocity
+        shift, angle = self._seen(pairs, pairs.pose + velocity)
+        return torch.cat([shift, angle[:, None]], dim=-1)
+
+    def moved(self, pairs: Pairs, velocity: Tensor) -> Pairs:
+        """The pairs after the exact rigid motion of a velocity (M, 3), as the simulation has it."""
+        return pairs.at(pairs.pose + velocity * velocity.new_tensor(self._full_scale))
+
+    def way(self, pairs: Pairs, to: Tensor) -> Tensor:
+        """The velocity (M, 3) that takes tokens to poses (M, 3), by the shorter turn."""
+        way = to - pairs.pose
+        turned = torch.remainder(way[:, 2:] + math.pi, 2.0 * math.pi) - math.pi
+        return torch.cat([way[:, :2], turned], dim=-1) / way.new_tensor(self._full_scale)
+
+    @property
+    def _full_scale(self) -> tuple[float, float, float]:
+        return self.arena, self.arena, math.pi
+
+    def vectors(self, pairs: Pairs) -> Tensor:
+        """(M, inputs): a pair in one row, without nodes."""
+        place, angle, other_side = self.relation(pairs)
+        radius = self.radius[pairs.token][:, None, None]
+        own, offset = self._bodies(pairs, angle, other_side)
+        ratio, near = self._sizes(pairs, place)
+        if self.egocentric:
+            where, corners = place, offset + place[:, None]
+        else:
+            own, offset = self._to_arena(pairs, own), self._to_arena(pairs, offset)
+            where, corners = pairs.goal[:, :2], offset + pairs.goal[:, None, :2]
+        parts = [
+            where,
+            *([self._angles(pairs, angle)] if self.orientation else []),
+            (corners / radius * _CORNER_SCALE).flatten(1),
+            *([(own / radius).flatten(1)] if self.offsets else []),
+            self.kind[pairs.token],
+            self.kind[pairs.piece],
+            torch.stack([other_side, pairs.covered, ratio, near], dim=-1),
+        ]
+        return torch.cat(parts, dim=-1)
+
+    def node_features(self, pairs: Pairs) -> Tensor:
+        """(M, N, F): corners of the token, its base, corners of the piece."""
+        place, angle, other_side = self.relation(pairs)
+        own, offset = self._bodies(pairs, angle, other_side)
+        base = torch.zeros_like(own[:, :1])
+        positions = torch.cat([own, base, offset + place[:, None]], dim=1)
+        offsets = torch.cat([own, base, offset], dim=1) / self.radius[pairs.token][:, None, None]
+        if not self.egocentric:
+            positions = self._to_arena(pairs, positions) + pairs.pose[:, None, :2]
+            offsets = self._to_arena(pairs, offsets)
+        ratio, near = self._sizes(pairs, place)
+        of_pair = [
+            *([self._angles(pairs, angle)] if self.orientation else []),
+            self.kind[pairs.token],
+            self.kind[pairs.piece],
+            torch.stack([ratio, near, pairs.covered, other_side], dim=-1),
+        ]
+        everywhere = torch.cat(of_pair, dim=-1)[:, None].expand(-1, self.nodes, -1)
+        target = self.target_flag.expand(len(own), -1, -1)
+        parts = [positions, *([offsets] if self.offsets else []), target, everywhere]
+        return torch.cat(parts, dim=-1)
+
+    def _bodies(self, pairs: Pairs, angle: Tensor, other_side: Tensor) -> tuple[Tensor, Tensor]:
+        """Displacements (M, C, 2) of the token's corners and of the piece's, from their centres."""
+        body = _mirrored(self.body[pairs.piece], _signs(other_side)[:, None])
+        return self.body[pairs.token], turn(body, _unit(angle)[:, None])
+
+    def _sizes(self, pairs: Pairs, place: Tensor) -> tuple[Tensor, Tensor]:
+        """(M,) how much larger the piece is, and (M,) how near, 1 where both centres are one."""
+        ratio = self.area[pairs.piece] / self.area[pairs.token]
+        return ratio.log(), torch.exp(-place.norm(dim=-1) / self.radius[pairs.token])
+
+    def _angles(self, pairs: Pairs, angle: Tensor) -> Tensor:
+        """(M, 4) cosine and sine of the angle, and of it times the piece's symmetry."""
+        return torch.cat([_unit(angle * self.symmetry[pairs.piece]), _unit(angle)], dim=-1)
+
+
+def _unit(angle: Tensor) -> Tensor:
+    """Cosine and sine (..., 2) of angles (...)."""
+    return torch.stack([torch.cos(angle), torch.sin(angle)], dim=-1)
+
+
+def _signs(flipped: Tensor) -> Tensor:
+    """-1 where flipped is 1, and 1 where it is 0."""
+    return 1.0 - 2.0 * flipped
+
+
+def _mirrored(vectors: Tensor, sign: Tensor) -> Tensor:
+    """Vectors (..., 2), their y times a sign (...)."""
+    return torch.stack([vectors[..., 0], sign * vectors[..., 1]], dim=-1)
+
+
+def _kinds(layout: Layout) -> Tensor:
+    names = [kind_of(shape.name) for shape in layout.shapes]
+    numbers = [KINDS.index(name) if name in KINDS else len(KINDS) for name in names]
+    return nn.functional.one_hot(torch.tensor(numbers), _KINDS).float()
+
+
+def _edges(paper: Tensor, edges: str) -> Tensor:
     """(N, N) flags: the edges of Sec. IV-A, or all but those of a node to itself."""
-    if edges == "complete":
-        return ~torch.eye(layout.nodes, dtype=torch.bool)
-    return torch.as_tensor(layout.adjacency)
+    return ~torch.eye(len(paper), dtype=torch.bool) if edges == "complete" else paper
+
+
+def _pair_adjacency(corners: int) -> Tensor:
+    """(N, N): within a piece, corner to base, base to every corner of the target's piece."""
+    count = 2 * corners + 1
+    edges = torch.zeros(count, count, dtype=torch.bool)
+    edges[:corners, :corners] = True
+    edges[corners + 1 :, corners + 1 :] = True
+    edges[corners, :] = edges[:, corners] = True
+    return edges & ~torch.eye(count, dtype=torch.bool)

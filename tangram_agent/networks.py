@@ -1,9 +1,9 @@
-"""Actors and critics: multi-head attention and multi-layer perceptrons.
+"""Actor and critic on either graph: multi-head attention or multi-layer perceptrons.
 
-Legend: B batch, K tokens, V corners, N nodes, F features, W width, A entries of an action.
+Legend: M views, N nodes, F features, W width.
 
-An actor gives for each graph a velocity (B, 3) of the token that is to move and the
-pre-activations that it came from. A critic values a graph and a velocity (B, 3).
+An actor gives for each view a velocity (M, 3) of the token that is to move, and the pre-activations
+that it came from. A critic values a view and a velocity (M, 3).
 """
 
 import math
@@ -13,172 +13,205 @@ from torch import Tensor, nn
 
 from tangram_agent.attention import GraphEncoder
 from tangram_agent.config import AgentConfig, NetConfig
-from tangram_agent.graph import TokenGraph
+from tangram_agent.graph import Graph, PairGraph, Pairs, SceneGraph, View
+from tangram_agent.setup import Setup
 
 VELOCITY = 3
+MOTION = 4  # shift in x and y, and the turn as a cosine and a sine
 
 
-class AttentionReadout(nn.Module):
-    """Encoder with a readout per node: the node's embedding joined to the projected mean."""
+class Head(nn.Module):
+    """Outputs (M, outputs) of views, by attention over the graph or by a perceptron.
 
-    def __init__(self, graph: TokenGraph, net: NetConfig, outputs: int) -> None:
-        super().__init__()
-        self.graph = graph
-        self.encoder = GraphEncoder(graph.features, net)
-        self.context = nn.Linear(net.width, net.width, bias=False)
-        self.readout = nn.Linear(2 * net.width, outputs)
+    Attention reads the mean of all nodes, projected, or (`at_base`) the embedding of the moving
+    token's base joined to it. The paper computes actions for all nodes and extracts the base's: the
+    same numbers. A perceptron has one group of outputs per token in view.
+    """
 
-    def forward(self, features: Tensor, token: Tensor) -> Tensor:
-        """(B, N, F), (B,) -> (B, outputs) read at the token's base.
+    def __init__(
+        self,
+        graph: Graph,
+        net: NetConfig,
+        outputs: int,
+        *,
+        at_base: bool,
+        action: int = 0,
+        told: int = 0,
+    ) -> None:
+        """Make the layers.
 
-        The paper computes actions for all nodes and extracts the base's: the same numbers.
+        Args:
+            graph: what is seen.
+            net: size and kind.
+            outputs: numbers for each view.
+            at_base: read at the token that moves.
+            action: numbers that `forward` appends to the moving token's base node.
+            told: numbers that it tells to every node.
         """
-        nodes, mean = self.encoder(features, self.graph.adjacency)
-        rows = torch.arange(len(nodes), device=nodes.device)
-        base = nodes[rows, self.graph.base_node(token)]
-        outputs: Tensor = self.readout(torch.cat([base, self.context(mean)], dim=-1))
-        return outputs
-
-
-class PerceptronReadout(nn.Module):
-    """The baseline: all node features in one vector, one group of outputs per token."""
-
-    def __init__(self, graph: TokenGraph, net: NetConfig, outputs: int) -> None:
         super().__init__()
-        self.tokens = graph.tokens
-        self.layers = perceptron(graph.nodes * graph.features, net.hidden, outputs * graph.tokens)
-
-    def forward(self, features: Tensor, token: Tensor) -> Tensor:
-        """(B, N, F), (B,) -> (B, outputs) of the token."""
-        outputs: Tensor = self.layers(features.flatten(1))
-        if self.tokens == 1:
-            return outputs
-        groups = outputs.view(len(outputs), self.tokens, -1)
-        chosen: Tensor = groups[torch.arange(len(groups), device=groups.device), token]
-        return chosen
-
-
-class AttentionValue(nn.Module):
-    """Encoder with a global readout: one value from the mean of the nodes."""
-
-    def __init__(self, graph: TokenGraph, net: NetConfig, extra: int) -> None:
-        super().__init__()
-        self.graph = graph
-        self.encoder = GraphEncoder(graph.features + extra, net)
-        self.context = nn.Linear(net.width, net.width, bias=False)
-        self.readout = nn.Linear(net.width, 1)
-
-    def forward(self, features: Tensor, token: Tensor, velocity: Tensor | None) -> Tensor:
-        """(B, N, F), (B,), velocity (B, 3) or None -> (B,).
-
-        The velocity is appended to the token's base node; other nodes carry zeros there.
-        """
-        if velocity is not None:
-            appended = features.new_zeros(len(features), self.graph.nodes, VELOCITY)
-            rows = torch.arange(len(features), device=features.device)
-            appended[rows, self.graph.base_node(token)] = velocity
-            features = torch.cat([features, appended], dim=-1)
-        mean = self.encoder(features, self.graph.adjacency)[1]
-        value: Tensor = self.readout(self.context(mean)).squeeze(-1)
-        return value
-
-
-class PerceptronValue(nn.Module):
-    """The baseline critic: features and velocity in one vector."""
-
-    def __init__(self, graph: TokenGraph, net: NetConfig, extra: int) -> None:
-        super().__init__()
-        self.layers = perceptron(graph.nodes * graph.features + extra, net.hidden, 1)
-
-    def forward(self, features: Tensor, token: Tensor, velocity: Tensor | None) -> Tensor:
-        """(B, N, F), (B,), velocity (B, 3) or None -> (B,)."""
-        del token
-        flat = features.flatten(1)
-        joined = flat if velocity is None else torch.cat([flat, velocity], dim=-1)
-        value: Tensor = self.layers(joined).squeeze(-1)
-        return value
-
-
-class Actor(nn.Module):
-    """pi(s, g): which velocity to give to a token."""
-
-    def __init__(self, graph: TokenGraph, agent: AgentConfig, net: NetConfig) -> None:
-        super().__init__()
-        self.graph = graph
-        self.kfold, self.clamp = agent.angle_head == "kfold", agent.squash == "clamp"
-        outputs = VELOCITY + self.kfold
-        kind = AttentionReadout if net.kind == "mha" else PerceptronReadout
-        self.head = kind(graph, net, outputs)
+        self.graph, self.attends, self.at_base = graph, net.kind == "mha", at_base
+        if self.attends:
+            self.encoder = GraphEncoder(graph.features + action + told, net)
+            self.context = nn.Linear(net.width, net.width, bias=False)
+            self.readout = nn.Linear((1 + at_base) * net.width, outputs)
+        else:
+            groups = graph.tokens if at_base else 1
+            inputs = graph.inputs + action + told
+            self.layers = perceptron(inputs, net.hidden, outputs * groups)
 
     def forward(
         self,
-        corners: Tensor,
-        placed: Tensor,
-        goal: Tensor,
-        token: Tensor,
+        view: View,
+        action: Tensor | None = None,
+        told: Tensor | None = None,
         features: Tensor | None = None,
-    ) -> tuple[Tensor, Tensor]:
-        """Velocity (B, 3) in [-1, 1] in the world's frame, and pre-activations (B, outputs).
+    ) -> Tensor:
+        """(M, outputs) of views, with an action (M, action) or what is told besides (M, told).
 
-        Features (B, N, F) of just this state may be handed in where they were made before.
+        Features, by `see`, may be handed in where they were made before.
         """
-        if features is None:
-            features = self.graph.node_features(corners, placed, goal, token)
-        raw = self.head(features, token)
-        shift = self.graph.to_world(corners, token, self._squash(raw[:, :2]))
-        velocity = torch.cat([shift, self._angle(raw[:, 2:], token)], dim=-1)
-        return velocity.clamp(-1.0, 1.0), raw
+        seen = self.see(view) if features is None else features
+        extra = [part for part in (action, told) if part is not None]
+        outputs: Tensor
+        if not self.attends:
+            outputs = self.layers(torch.cat([seen, *extra], dim=-1) if extra else seen)
+            return self._of_token(outputs, view)
+        base = self.graph.base_node(view)
+        rows = torch.arange(len(seen), device=seen.device)
+        if action is not None:
+            # Other nodes than the base carry zeros there.
+            appended = seen.new_zeros(*seen.shape[:2], action.shape[-1])
+            appended[rows, base] = action
+            seen = torch.cat([seen, appended], dim=-1)
+        if told is not None:
+            seen = torch.cat([seen, told[:, None].expand(-1, seen.shape[1], -1)], dim=-1)
+        nodes, mean = self.encoder(seen, self.graph.adjacency)
+        read = self.context(mean)
+        outputs = self.readout(torch.cat([nodes[rows, base], read], -1) if self.at_base else read)
+        return outputs
+
+    def see(self, view: View) -> Tensor:
+        """What the layers take of views: features of nodes (M, N, F), or one row for each."""
+        seen = self.graph.node_features if self.attends else self.graph.vectors
+        return seen(view)
+
+    def _of_token(self, outputs: Tensor, view: View) -> Tensor:
+        """The moving token's group of a perceptron's outputs."""
+        if not self.at_base or self.graph.tokens == 1:
+            return outputs
+        groups = outputs.view(len(outputs), self.graph.tokens, -1)
+        rows = torch.arange(len(groups), device=groups.device)
+        chosen: Tensor = groups[rows, self.graph.slot(view)]
+        return chosen
+
+
+class Actor(nn.Module):
+    """pi(s, g): which velocity to give to the token that is to move."""
+
+    def __init__(self, graph: Graph, agent: AgentConfig, net: NetConfig) -> None:
+        super().__init__()
+        self.graph = graph
+        self.kfold, self.clamp = agent.angle_head == "kfold", agent.squash == "clamp"
+        self.head = Head(graph, net, VELOCITY + self.kfold, at_base=True)
+
+    def forward(self, view: View, features: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Velocity (M, 3) in [-1, 1] in the arena's axes, and what of the outputs is squashed.
+
+        Those are pre-activations (M, 3), or of the shift (M, 2) with the k-fold head, whose turn
+        has no bound to run into. Features are as for `Head`.
+        """
+        raw = self.head(view, features=features)
+        shift, angle = self._squash(raw[:, :2]), self._angle(raw[:, 2:], view)
+        velocity = self.graph.velocity(view, shift, angle)
+        return velocity, raw[:, :2] if self.kfold else raw
 
     def _squash(self, raw: Tensor) -> Tensor:
         return raw.clamp(-1.0, 1.0) if self.clamp else torch.tanh(raw)
 
-    def _angle(self, raw: Tensor, token: Tensor) -> Tensor:
-        """The turn as a share of pi, (B, 1).
+    def _angle(self, raw: Tensor, view: View) -> Tensor:
+        """The turn as a share of pi, (M,).
 
         The k-fold head needs no more than 1/k of a half turn either way, and has no seam where
         two equally good turns meet.
         """
         if not self.kfold:
-            return self._squash(raw)
-        angle = torch.atan2(raw[:, 1], raw[:, 0]) / self.graph.symmetry[token]
-        return angle[:, None] / math.pi
+            return self._squash(raw)[:, 0]
+        symmetry = self.graph.symmetry_of(view)
+        return torch.atan2(raw[:, 1], raw[:, 0]) / symmetry / math.pi
 
 
 class Critic(nn.Module):
-    """Q(s, g, a): what a velocity of a token is worth."""
+    """Q(s, g, a): what a velocity of the token that is to move is worth.
 
-    def __init__(self, graph: TokenGraph, agent: AgentConfig, net: NetConfig) -> None:
+    An afterstate critic sees the graph as the velocity would leave it, a known rigid motion,
+    instead of the velocity itself. Where tokens push each other a second head tells how far a token
+    that slides to a pose pushes another one out of its place.
+    """
+
+    def __init__(
+        self, graph: Graph, agent: AgentConfig, net: NetConfig, contacts: bool = False
+    ) -> None:
         super().__init__()
         self.graph, self.afterstate = graph, agent.afterstate
-        kind = AttentionValue if net.kind == "mha" else PerceptronValue
-        self.head = kind(graph, net, 0 if agent.afterstate else VELOCITY)
+        action = 0 if agent.afterstate else VELOCITY
+        # The paper's value is read off the whole graph; a pair's also at its token.
+        at_base = isinstance(graph, PairGraph)
+        self.head = Head(graph, net, 1, at_base=at_base, action=action)
+        self.push_head = Head(graph, net, 1, at_base=True, told=MOTION) if contacts else None
 
     def forward(
         self,
-        corners: Tensor,
-        placed: Tensor,
-        goal: Tensor,
-        token: Tensor,
+        view: View,
         velocity: Tensor,
+        after: View | None = None,
         features: Tensor | None = None,
     ) -> Tensor:
-        """Values (B,).
+        """Values (M,).
 
-        An afterstate critic sees the graph as the velocity would leave it, a known rigid motion,
-        instead of the velocity itself. Features are as for the actor; it makes its own.
+        Args:
+            view: what the token is moved in.
+            velocity: (M, 3) in the arena's axes.
+            after: what it came to, where that is known better than by the exact motion.
+            features: of the view, as for `Head`; an afterstate critic makes its own.
         """
         if self.afterstate:
-            moved = self.graph.move(corners, token, velocity)
-            value: Tensor = self.head(
-                self.graph.node_features(moved, placed, goal, token), token, None
-            )
-            return value
-        if features is None:
-            features = self.graph.node_features(corners, placed, goal, token)
-        shift = self.graph.to_token(corners, token, velocity[:, :2])
-        action = torch.cat([shift, velocity[:, 2:]], dim=-1)
-        valued: Tensor = self.head(features, token, action)
-        return valued
+            moved = self.graph.moved(view, velocity) if after is None else after
+            return self._value(self.head(moved))
+        seen = self.graph.as_seen(view, velocity)
+        return self._value(self.head(view, action=seen, features=features))
+
+    def _value(self, outputs: Tensor) -> Tensor:
+        return outputs.squeeze(-1)
+
+    def pushed(self, pairs: Pairs, to: Tensor) -> Tensor:
+        """(M,) share of the other token's area that is pushed away from where it lies.
+
+        Args:
+            pairs: a token where it is, and the other one in the place of the piece.
+            to: (M, 3) pose that the token slides to.
+        """
+        if self.push_head is None or not isinstance(self.graph, PairGraph):
+            return to.new_zeros(len(to))
+        return self._value(self.push_head(pairs, told=self.graph.motion(pairs, to)))
+
+
+class Networks(nn.Module):
+    """Actor and critic of a setup, on the graph that its agent sees."""
+
+    def __init__(self, setup: Setup) -> None:
+        super().__init__()
+        seen = setup.layout, setup.sim.arena, setup.agent
+        graph: Graph = PairGraph(*seen) if setup.pairs else SceneGraph(*seen)
+        contacts = setup.pairs and setup.contacts
+        self.actor = Actor(graph, setup.agent, setup.net)
+        self.critic = Critic(graph, setup.agent, setup.net, contacts)
+        # Of pairs the critic chooses among what the actor proposes: both play.
+        self._both_play = setup.pairs
+
+    @property
+    def playing(self) -> nn.Module:
+        """What a worker needs: the actor, and the critic where it chooses."""
+        return self if self._both_play else self.actor
 
 
 def perceptron(inputs: int, hidden: tuple[int, ...], outputs: int) -> nn.Sequential:

@@ -9,12 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from tangram_agent.ddpg import next_token
-from tangram_agent.graph import TokenGraph
-from tangram_agent.networks import Actor
-from tangram_agent.pair_networks import PairNetworks
-from tangram_agent.pair_policy import PairChooser
-from tangram_agent.pairs import PairGraph
+from tangram_agent.graph import Scenes, next_token
+from tangram_agent.networks import Networks
+from tangram_agent.planning import Planner
 from tangram_agent.setup import Setup
 from tangram_agent.types import Weights
 from tangram_agent.weights import load_arrays, to_arrays
@@ -35,15 +32,9 @@ class Policy:
         self.layout, self.config, self.sim = setup.layout, setup.agent, setup.sim
         self.tokens = setup.layout.tokens
         self.version = -1
-        self._chooser: PairChooser | None = None
-        if setup.pairs:
-            pair_graph = PairGraph(setup.layout, setup.sim.arena)
-            networks = PairNetworks(pair_graph, setup.net, setup.contacts)
-            self._chooser = PairChooser(networks, setup)
-            self._network: torch.nn.Module = networks
-        else:
-            graph = TokenGraph(setup.layout, setup.sim.arena, setup.agent)
-            self._network = Actor(graph, setup.agent, setup.net)
+        networks = Networks(setup)
+        self._network = networks.playing
+        self._planner = Planner(networks, setup) if setup.pairs else None
         self._network.requires_grad_(False)
 
     @property
@@ -79,13 +70,13 @@ class Policy:
             goals: (B, V, 2) corners of the targets.
             refine: take the steps of `agent.refine_steps`, where the agent has such.
         """
-        if self._chooser is None:
+        if self._planner is None:
             token, velocity = self._velocity(corners, placed, goals)
             flip = np.zeros(len(token), dtype=np.bool_)
         else:
             exact = np.asarray(corners, np.float64)
             wanted = np.asarray(goals, np.float64)
-            choice = self._chooser.choose(exact, np.asarray(placed, np.bool_), wanted, refine)
+            choice = self._planner.choose(exact, np.asarray(placed, np.bool_), wanted, refine)
             token, flip = choice.token, choice.flip
             velocity = self._velocity_to(choice.start, choice.pose)
         return make_actions(token, velocity, flip, self.tokens, self.sim)
@@ -97,7 +88,8 @@ class Policy:
         flags = _tensor(placed)
         token = next_token(flags)
         with torch.inference_mode():
-            velocity, _ = self._network(_tensor(corners), flags, _tensor(goals), token)
+            scenes = Scenes(_tensor(corners), flags, _tensor(goals), token)
+            velocity, _ = self._network(scenes)
         return token.numpy(), velocity.numpy()
 
     def _velocity_to(self, pose: Floats, wanted: Floats) -> Singles:
@@ -120,7 +112,7 @@ class Policy:
         for i, (action, generator) in enumerate(zip(actions, generators, strict=True)):
             velocity = action[-3:]
             if generator.random() < self.config.uniform_share:
-                if self._chooser is None:
+                if self._planner is None:
                     velocity[:] = generator.uniform(-1.0, 1.0, 3)
                 else:
                     here = self.layout.poses(np.asarray(corners[i], np.float64))

@@ -120,10 +120,11 @@ def _agent_run(source: Traversable, folder: Path, checkpoint: str | None) -> Run
 
 def _trained_run(folder: Path, checkpoint: str | None) -> Run:
     config = read_config(folder / CONFIG)
-    setup = make_setup(config)
     checkpoints = folder / CHECKPOINTS
     path = checkpoints / checkpoint if checkpoint else newest_checkpoint(checkpoints)
+    # First, as it tells a run of another version by its format.
     content = load_checkpoint(path, [ACTING])
+    setup = make_setup(config)
     # Where it plays may change: another backend or another reward does not change the policy.
     trained = setup.differences(content.counters.get(SETUP, {}))
     odd = [name for name in trained if name in POLICY_SECTIONS]

@@ -2,8 +2,8 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, is_dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from functools import cached_property
 from typing import Any, TypeVar, cast, get_origin, get_type_hints
 
@@ -15,9 +15,13 @@ from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import Layout, TokensConfig, make_layout
 from tangram_sim.rewards import reward_identity
+from tangram_sim.settings import refuse_ignored, told
 
 Settings = TypeVar("Settings")
 
+# Settings of the agent that have no effect but on pairs, and but on pairs of several tokens.
+_PAIRS_ONLY = ("reapply", "refine_steps", "refine_rate")
+_SEVERAL_ONLY = ("order", "pairs_per_transition", "push_weight")
 SECTIONS = ("tokens", "sim", "reward", "agent", "net")
 
 
@@ -30,6 +34,39 @@ class Setup:
     reward: RewardConfig
     agent: AgentConfig
     net: NetConfig
+
+    def __post_init__(self) -> None:
+        """Refuse settings that would change nothing.
+
+        Raises:
+            ConfigError: names the setting and the remedy.
+        """
+        agent, one = self.agent, self.layout.tokens == 1
+        if not self.pairs:  # one token and readout=auto: the section itself refuses readout=token
+            self._refuse(_PAIRS_ONLY, "one token and agent.readout=auto", "set agent.readout=pair")
+        if one:
+            self._refuse(_SEVERAL_ONLY, "one token", "take a set of several")
+        if not self.contacts:
+            slide = "set sim.motion=slide"
+            self._refuse(("push_weight",), "tokens that do not push each other", slide)
+        if agent.gamma == 0.0:
+            self._refuse(("polyak",), "agent.gamma=0", "set agent.gamma above 0")
+        if self.credits_pieces:
+            several = f"{self.layout.tokens} tokens on pairs"
+            whole = "set agent.readout=token, which values the whole scene"
+            for name, value in _changed(self.reward).items():
+                refuse_ignored(f"reward.{name}={told(value)}", several, whole)
+            if agent.gamma > 0.0:
+                refuse_ignored(f"agent.gamma={told(agent.gamma)}", several, whole)
+            if any(relabel.strategy == "future" for relabel in agent.hindsight):
+                refuse_ignored("agent.hindsight.strategy=future", several, "use final")
+
+    def _refuse(self, names: Iterable[str], because: str, remedy: str) -> None:
+        """Refuse settings of the agent that are not the default."""
+        changed = _changed(self.agent)
+        for name in names:
+            if name in changed:
+                refuse_ignored(f"agent.{name}={told(changed[name])}", because, remedy)
 
     @cached_property
     def layout(self) -> Layout:
@@ -47,6 +84,19 @@ class Setup:
         if self.agent.readout == "auto":
             return self.layout.tokens > 1
         return self.agent.readout == "pair"
+
+    @property
+    def credits_pieces(self) -> bool:
+        """Whether the critic learns what a token covers of each piece of the target.
+
+        Else it learns the environment's reward.
+        """
+        return self.pairs and self.layout.tokens > 1
+
+    @property
+    def bootstraps(self) -> bool:
+        """Whether the critic's target counts what follows an action (Eq. 5)."""
+        return self.agent.gamma > 0.0 and self.horizon > 1
 
     @property
     def contacts(self) -> bool:
@@ -97,6 +147,12 @@ class Setup:
         """
         own = self.contents()
         return sorted(name for name in own if not _agree(own[name], contents.get(name, own[name])))
+
+
+def _changed(config: RewardConfig | AgentConfig) -> dict[str, Any]:
+    """The settings that are not the default, by name."""
+    every = {own.name: (getattr(config, own.name), own.default) for own in fields(config)}
+    return {name: value for name, (value, default) in every.items() if value != default}
 
 
 def _agree(one: object, other: object) -> bool:

@@ -81,7 +81,7 @@ class Settings:
         if value == own.default:
             return
         for name, needed in own.metadata[KEY].only.items():
-            accepted = needed if isinstance(needed, tuple) else (needed,)
+            accepted = values_of(needed)
             if getattr(self, name) not in accepted:
                 refuse_ignored(
                     f"{setting_name(self, own.name)}={told(value)}",
@@ -116,6 +116,11 @@ def defaults(kind: type[Any]) -> dict[str, Any]:
     return {
         own.name: ... if own.default is MISSING else own.default for own in declared_fields(kind)
     }
+
+
+def values_of(needed: object) -> tuple[object, ...]:
+    """The values that a condition of `Declaration.only` names, one or several."""
+    return needed if isinstance(needed, tuple) else (needed,)
 
 
 def told(value: object) -> str:

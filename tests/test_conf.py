@@ -13,6 +13,7 @@ import yaml
 from conf.cli import composed, entry, with_run_config
 from conf.commands import COMMANDS, GROUPS, Plain, load
 from conf.help import choices, group_help, help_text, setting_names
+from conf.settings import PAGE, page
 from conf.sweep import check_launcher, refuse_lost_job
 from tangram_agent.config import AgentConfig, NetConfig, ServiceConfig
 from tangram_agent.setup import Setup, from_mapping, make_setup
@@ -122,7 +123,7 @@ def test_paper_presets_add_nothing_to_the_text(name: str) -> None:
     assert not any((agent.egocentric, agent.offsets, agent.orientation, agent.afterstate))
     assert (agent.angle_head, agent.squash, agent.lr_decay) == ("plain", "tanh", "none")
     assert (agent.edges, agent.grad_clip, agent.acting_average) == ("paper", 0.0, 0.0)
-    assert [twin.strategy for twin in agent.hindsight] == ["final"]
+    assert [relabel.strategy for relabel in agent.hindsight] == ["final"]
 
 
 # A run's config in place of the groups
@@ -333,7 +334,7 @@ def test_entry_hands_over_plain_settings(monkeypatch: pytest.MonkeyPatch) -> Non
     assert seen == [
         {"run_dir": "x", "episodes": 100, "seed": 3, "turns": 1, "skip_invalid": False}
         | dict.fromkeys(("out", "actions", "corner_noise", "puzzles", "sheet"))
-        | dict.fromkeys(("order", "reapply", "refine_steps", "gamma"))
+        | dict.fromkeys(("order", "reapply", "refine_steps", "push_weight"))
     ]
     assert type(seen[0]) is dict
 
@@ -407,3 +408,10 @@ def test_a_lost_job_of_a_sweep_is_told_in_one_line() -> None:
     with pytest.raises(TangramError, match="was lost .Job 3 has no output.; the same command"):
         refuse_lost_job(lost("Job 3\nhas no output\n----\nmany lines"))
     refuse_lost_job(ZeroDivisionError())
+
+
+# The page of all settings
+
+
+def test_the_page_of_settings_is_up_to_date() -> None:
+    assert PAGE.read_text("utf-8") == page(), "run: python -m conf.settings"

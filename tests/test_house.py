@@ -103,3 +103,23 @@ def test_every_file_of_conf_is_package_data() -> None:
     ]["conf"]
     packed = {path for pattern in patterns for path in (ROOT / "conf").glob(pattern)}
     assert packed == set((ROOT / "conf").rglob("*.yaml"))
+
+
+# The Makefile
+
+
+@pytest.mark.parametrize(
+    ("given", "refused"),
+    [
+        ("seed=7", True),
+        ("ARG=seed=7", True),
+        ("tokens.scale=2", True),
+        ("ARGS=seed=7 tokens=square", False),
+        ("BUDGET=smoke", False),
+    ],
+)
+def test_make_refuses_a_variable_that_it_would_drop(given: str, refused: bool) -> None:
+    result = run(["make", "--dry-run", "help", given])
+    assert (result.returncode != 0) == refused
+    name = given.partition("=")[0]
+    assert (f'make knows no {name}=...: settings go into ARGS="..."' in result.stderr) == refused

@@ -11,7 +11,7 @@ from tangram_sim.config import MAX_CORNER_NOISE
 from tangram_sim.errors import ConfigError
 from tangram_sim.settings import Settings, declared, setting
 
-CHANGES = ("order", "reapply", "refine_steps", "gamma")  # of how an agent plays
+CHANGES = ("order", "reapply", "refine_steps", "push_weight")  # of how an agent plays
 MAX_EPISODES = 1_000_000
 MAX_ACTIONS = 100
 MAX_SHOWN = 100
@@ -140,7 +140,7 @@ class EvalConfig(Settings):
     )
     reapply: int | None = setting(None, "see agent.reapply; null: as trained")
     refine_steps: int | None = setting(None, "see agent.refine_steps; null: as trained")
-    gamma: float | None = setting(None, "see agent.gamma; null: as trained")
+    push_weight: float | None = setting(None, "see agent.push_weight; null: as trained")
 
     def __post_init__(self) -> None:
         _check_run(self.run_dir, self.puzzles is not None)

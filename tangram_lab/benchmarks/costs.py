@@ -14,9 +14,8 @@ from master.journal import Journal
 from master.registry import Registry
 from master.trainer import Trainer
 from tangram_agent.messages import Hello
-from tangram_lab.benchmarks.episodes import played
 from tangram_lab.benchmarks.measure import Row, single
-from tangram_lab.benchmarks.setups import preset
+from tangram_lab.benchmarks.setups import played, preset
 from tangram_lab.benchmarks.wire import Case, connected
 
 STAGE, UNIT = "scaling", "us of CPU"
@@ -71,7 +70,7 @@ def _parts(hub: Hub, journal: Journal, trainer: Trainer) -> dict[str, float]:
             assert isinstance(arrival, EpisodesArrived)
             with spent.on("journal"):
                 journal.append(arrival)
-            with spent.on("insert with hindsight twins"):
+            with spent.on("insert and relabel"):
                 trainer.insert(arrival.episodes)
             with spent.on("acknowledge"):
                 hub.acknowledge(arrival)

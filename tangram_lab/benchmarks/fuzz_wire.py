@@ -25,7 +25,7 @@ from tangram_agent.messages import (
 from tangram_agent.schema import CHECKSUM, DamagedError, checksum
 from tangram_agent.setup import Setup, make_setup
 from tangram_agent.types import Episodes
-from tangram_lab.benchmarks.report import show, write
+from tangram_lab.benchmarks.measure import show, write
 from tangram_lab.benchmarks.trainings import start_training, wait_for
 from tangram_sim.errors import WireError
 from worker.status import ask_status

@@ -10,11 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from tangram_agent.setup import Setup
-from tangram_lab.benchmarks.episodes import played
 from tangram_lab.benchmarks.learner import updates
 from tangram_lab.benchmarks.measure import Row, Work, rate, told
 from tangram_lab.benchmarks.replay import filled
-from tangram_lab.benchmarks.setups import preset, several
+from tangram_lab.benchmarks.setups import played, preset, several
 from tangram_lab.benchmarks.sim import Episodes
 from tangram_lab.benchmarks.wire import LARGE, connected, take_batches
 from tangram_lab.experiments.report.style import COLOURS, WIDTH_IN, drawing, empty_figure, save

@@ -1,10 +1,18 @@
 """Updates: against a plain per-head attention, and against Stable-Baselines3's on the same MLP."""
 
-from tangram_agent.ddpg import Learner
+import copy
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from tangram_agent.attention import EncoderLayer
+from tangram_agent.learner import Learner, Steps, critic_target
 from tangram_agent.setup import Setup
 from tangram_lab.benchmarks.measure import Bound, Row, Work, compare
 from tangram_lab.benchmarks.peers import compare_updates
-from tangram_lab.benchmarks.plain import PlainLearner
 from tangram_lab.benchmarks.replay import random_transitions
 from tangram_lab.benchmarks.setups import preset, several, with_agent
 
@@ -30,10 +38,89 @@ def _against_plain(case: str, setup: Setup, runs: int, bound: Bound) -> Row:
 def updates(setup: Setup, learner: Learner | None = None) -> Work:
     """Updates on one batch; of the project's own learner if none is given."""
     learner = learner or Learner(setup, 0)
-    batch = random_transitions(setup, setup.agent.batch_size)
+    transitions = random_transitions(setup, setup.agent.batch_size)
+    batch = learner.prepared(transitions, np.random.default_rng(0))
 
     def work() -> int:
         learner.update(batch)
         return 1
 
     return work
+
+
+# A plain per-head attention, and a learner with it
+
+
+GAMMA = 0.99
+
+
+class HeadByHead(nn.Module):
+    """Eqs. 9-12, one small matrix for each head's keys, queries and values."""
+
+    def __init__(self, width: int, heads: int, scale: float) -> None:
+        super().__init__()
+        key_width = width // heads
+        self.scale = scale
+        self.query, self.key, self.value = (
+            nn.ModuleList(nn.Linear(width, key_width, bias=False) for _ in range(heads))
+            for _ in range(3)
+        )
+        self.combine = nn.ModuleList(nn.Linear(key_width, width, bias=False) for _ in range(heads))
+
+    def forward(self, nodes: Tensor, edges: Tensor) -> Tensor:
+        """Messages (B, N, W) from nodes (B, N, W) along edges (N, N)."""
+        message = torch.zeros_like(nodes)
+        every: Any = zip(self.query, self.key, self.value, self.combine, strict=True)
+        for query, key, value, combine in every:
+            scores = query(nodes) @ key(nodes).transpose(1, 2) * self.scale
+            weights = torch.softmax(scores.masked_fill(~edges, -math.inf), dim=-1)
+            message = message + combine(weights @ value(nodes))
+        return message
+
+
+class PlainLearner(Learner):
+    """Head by head, with both target networks asked and moved in every update."""
+
+    def __init__(self, setup: Setup, seed: int) -> None:
+        super().__init__(setup, seed)
+        for part in (self.actor, self.critic, self.acting):
+            for layer in part.modules():
+                if isinstance(layer, EncoderLayer):
+                    _take_apart(layer)
+        self.target_actor, self.target_critic = map(copy.deepcopy, (self.actor, self.critic))
+        self._lists = self.parameter_lists()
+        rates = (self.config.actor_lr, self.config.critic_lr)
+        self.actor_optimiser, self.critic_optimiser = (
+            torch.optim.Adam(part.parameters(), lr=rate, foreach=False)
+            for part, rate in zip((self.actor, self.critic), rates, strict=True)
+        )
+
+    def update(self, batch: Any, progress: float = 0.0) -> dict[str, float]:
+        """See `Learner`; the targets follow parameter by parameter."""
+        losses = super().update(batch, progress)
+        pairs = ((self.target_actor, self.actor), (self.target_critic, self.critic))
+        with torch.no_grad():
+            for target, source in pairs:
+                for old, new in zip(target.parameters(), source.parameters(), strict=True):
+                    old.mul_(self.config.polyak).add_(new, alpha=1.0 - self.config.polyak)
+        return losses
+
+    def _step(self, part: str, loss: Tensor) -> Tensor:
+        optimiser = self._optimisers()[part]
+        optimiser.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        norm = nn.utils.clip_grad_norm_(getattr(self, part).parameters(), math.inf)
+        optimiser.step()
+        return norm
+
+    def _target(self, steps: Steps) -> Tensor:
+        velocity, _ = self.target_actor(steps.follow)
+        value = self.target_critic(steps.follow, velocity)
+        return critic_target(steps.reward, steps.done, value, GAMMA)
+
+
+def _take_apart(layer: EncoderLayer) -> None:
+    joint = layer.attention
+    width = joint.combine.in_features
+    apart: Any = HeadByHead(width, joint.heads, joint.scale)
+    layer.attention = apart

@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from tangram_agent.ddpg import Learner
-from tangram_agent.hindsight import with_twins
+from tangram_agent.learner import Learner
 from tangram_agent.policy import Policy
+from tangram_agent.relabelling import with_relabelled
 from tangram_agent.replay import ReplayBuffer
 from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes, Transitions
 from tangram_lab.benchmarks.measure import Bound, Row, Work, compare
 from tangram_lab.benchmarks.sb3 import Rival, label, make_envs, make_model, observation
-from tangram_lab.benchmarks.setups import preset, with_agent
+from tangram_lab.benchmarks.setups import preset, with_agent, with_sim
 from tangram_sim.arrays import Bools, Floats, Singles
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.rewards import make_reward
@@ -92,8 +92,8 @@ def _take_in(setup: Setup, replay: ReplayBuffer) -> Callable[[Episodes], None]:
     generator = np.random.default_rng(0)
 
     def take_in(episodes: Episodes) -> None:
-        twins = setup.agent.hindsight
-        replay.add(with_twins(episodes, twins, setup.layout, reward, generator))
+        relabels = setup.agent.hindsight
+        replay.add(with_relabelled(episodes, relabels, setup.layout, reward, generator))
 
     return take_in
 
@@ -127,7 +127,7 @@ def _their_play() -> Work:
 
 
 def _our_hindsight(setup: Setup, replay: ReplayBuffer, episodes: Episodes) -> Work:
-    """Twins are made as episodes come in: a message of 32, then as many batches."""
+    """Other goals are made as episodes come in: a message of 32, then as many batches."""
     take_in, generator = _take_in(setup, replay), np.random.default_rng(0)
 
     def learn() -> float:
@@ -190,7 +190,10 @@ def _batches(
     dones[::2] = 0.0
     return (
         (_our_update(setup, final), _their_update(model, theirs)),
-        (_our_update(setup, open_half), _their_update(model, theirs._replace(dones=dones))),
+        (
+            _our_update(with_sim(setup, actions_per_token=2), open_half),
+            _their_update(model, theirs._replace(dones=dones)),
+        ),
     )
 
 

@@ -17,10 +17,9 @@ import numpy as np
 import zmq
 
 from tangram_lab.benchmarks.costs import measure_costs
-from tangram_lab.benchmarks.episodes import played
 from tangram_lab.benchmarks.measure import Bound, Row, compared, single
 from tangram_lab.benchmarks.players import players, read_ages
-from tangram_lab.benchmarks.setups import preset
+from tangram_lab.benchmarks.setups import played, preset
 from tangram_lab.benchmarks.trainings import processes_of, start_training, wait_for
 from tangram_sim.errors import TangramError
 from worker.status import ask_status

@@ -1,15 +1,22 @@
 """Setups of the presets, as the measurements use them."""
 
+from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 import conf
 from tangram_agent.setup import SECTIONS, Setup, make_setup
+from tangram_agent.types import Episodes
+from tangram_sim.arrays import Bools, Floats, Singles
 from tangram_sim.assembly import COUNTS
+from tangram_sim.batch import BatchedEnv
 from tangram_sim.layout import TokensConfig
+from worker.rollout import Rollout
 
 
 def preset(agent: str = "tangram", tokens: str = "square") -> Setup:
@@ -52,3 +59,24 @@ def with_sim(setup: Setup, **values: Any) -> Setup:
 def with_agent(setup: Setup, **values: Any) -> Setup:
     """Another agent."""
     return replace(setup, agent=replace(setup.agent, **values))
+
+
+# Episodes that were played with them
+
+
+ENVS = 32
+
+
+def played(setup: Setup, count: int) -> Episodes:
+    """Episodes of random actions, without an engine; `count` is a multiple of ENVS."""
+
+    def choose(
+        _corners: Floats, _placed: Bools, _goals: Floats, generators: Sequence[np.random.Generator]
+    ) -> Singles:
+        rows = [generator.uniform(-1.0, 1.0, setup.action_size) for generator in generators]
+        return np.array(rows, np.float32)
+
+    sim = replace(setup.sim, backend="kinematic")
+    with closing(BatchedEnv(setup.layout, sim, setup.reward, ENVS)) as env:
+        rollout = Rollout(env, 0, "player", 0, 0)
+        return rollout.play(choose, count // ENVS)

@@ -8,7 +8,7 @@ from typing import Any
 
 import psutil
 
-from tangram_lab.benchmarks.report import show, write
+from tangram_lab.benchmarks.measure import show, write
 from tangram_lab.benchmarks.trainings import processes_of, result_of, start_training, wait_for
 from tangram_lab.experiments.report.style import COLOURS, WIDTH_IN, drawing, empty_figure, save
 

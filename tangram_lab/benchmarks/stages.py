@@ -8,11 +8,10 @@ import torch
 from tangram_lab.benchmarks.acting import measure_acting
 from tangram_lab.benchmarks.growth import draw_growth, measure_growth
 from tangram_lab.benchmarks.learner import measure_learner
-from tangram_lab.benchmarks.measure import Row
+from tangram_lab.benchmarks.measure import Row, page, show, write
 from tangram_lab.benchmarks.peers import measure_peers
 from tangram_lab.benchmarks.profile import show_profile
 from tangram_lab.benchmarks.replay import measure_replay
-from tangram_lab.benchmarks.report import page, show, write
 from tangram_lab.benchmarks.scaling import measure_scaling
 from tangram_lab.benchmarks.sim import measure_sim
 from tangram_lab.benchmarks.train import measure_train

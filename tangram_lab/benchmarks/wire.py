@@ -24,9 +24,8 @@ from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.messages import Ack, EpisodeBatch
 from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes
-from tangram_lab.benchmarks.episodes import played
 from tangram_lab.benchmarks.measure import Bound, Row, Work, compared, rates, single
-from tangram_lab.benchmarks.setups import several
+from tangram_lab.benchmarks.setups import played, several
 from tangram_sim.errors import TangramError
 from worker.client import Client
 from worker.connection import Timing

@@ -52,7 +52,7 @@ class TestConfig:
     order: str | None = None
     reapply: int | None = None
     refine_steps: int | None = None
-    gamma: float | None = None
+    push_weight: float | None = None
 
     @property
     def asked(self) -> dict[str, Any]:

@@ -11,6 +11,7 @@ SQUARE = {"shapes": ["square"], "scale": 1.131370849898476}  # side 0.4
 PAIR = {"shapes": ["square", "large_triangle"], "scale": 0.8}
 
 PAPER = {
+    "readout": "token",
     "egocentric": False,
     "offsets": False,
     "orientation": False,
@@ -22,8 +23,10 @@ PAPER = {
     "acting_average": 0.0,
     "lr_decay": "none",
 }
-# One proposal and one twin: what most tests need.
-PLAIN: dict[str, Any] = {"reapply": 0, "hindsight": [{"strategy": "final"}]}
+# One relabelled goal, and on pairs one proposal: what most tests need.
+PLAIN: dict[str, Any] = {"hindsight": [{"strategy": "final"}]}
+PROPOSAL = {"reapply": 0}
+SCENE = {"readout": "token"}  # ours, on whole scenes
 SMALL = {"width": 16, "layers": 2, "heads": 2, "feed_forward": 32}
 
 
@@ -34,12 +37,15 @@ def setup(
     **sim: Any,
 ) -> Setup:
     """A setup on the kinematic backend with a small network."""
+    given = PLAIN | (agent or {})
+    several = given.get("readout", "auto") == "auto" and len(tokens["shapes"]) > 1
+    pairs = several or given.get("readout") == "pair"
     return make_setup(
         {
             "tokens": tokens,
             "sim": {"backend": "kinematic", **sim},
             "reward": {},
-            "agent": PLAIN | (agent or {}),
+            "agent": PROPOSAL | given if pairs else given,
             "net": net,
         }
     )

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tangram_agent.pair_values import Lying, newly_covered
-from tangram_agent.pairs import Pairs
+from tangram_agent.coverage import Lying, newly_covered
+from tangram_agent.graph import PairGraph, Pairs
 from tangram_agent.setup import Setup
 from tangram_agent.types import Transitions
 from tangram_sim.arrays import Bools, Floats
@@ -92,7 +92,8 @@ class PerfectCritic:
     pushes: Floats | None = None
     likes: Floats | None = None
 
-    def __call__(self, pairs: Pairs) -> Tensor:
+    def __call__(self, before: Pairs, velocity: Tensor, pairs: Pairs) -> Tensor:
+        del before, velocity  # as an afterstate critic does
         parts = {
             name: part.detach().numpy().astype(np.float64) for name, part in vars(pairs).items()
         }
@@ -115,10 +116,11 @@ class PerfectNetworks:
 
     critic: PerfectCritic
 
-    @staticmethod
-    def actor(pairs: Pairs) -> tuple[Tensor, Tensor]:
-        """The piece's own pose."""
-        return pairs.goal.clone(), pairs.goal[:, :2]
+    graph: PairGraph
+
+    def actor(self, pairs: Pairs) -> tuple[Tensor, Tensor]:
+        """The way to the piece's own pose."""
+        return self.graph.way(pairs, pairs.goal), pairs.goal[:, :2]
 
 
 def as_tensor(array: Any) -> Tensor:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tangram_agent.graph import TokenGraph
+from tangram_agent.graph import SceneGraph, Scenes
 from tangram_agent.setup import Setup
 from tangram_sim.layout import Layout
 from tests.agent.builders import PAIR, PAPER, SQUARE, random_transitions, setup
@@ -16,8 +16,8 @@ pytestmark = pytest.mark.fast
 NO_TOKEN = torch.zeros(1, dtype=torch.long)
 
 
-def graph_of(made: Setup) -> TokenGraph:
-    return TokenGraph(made.layout, made.sim.arena, made.agent)
+def graph_of(made: Setup) -> SceneGraph:
+    return SceneGraph(made.layout, made.sim.arena, made.agent)
 
 
 def corners(layout: Layout, *poses: tuple[float, float, float]) -> torch.Tensor:
@@ -31,7 +31,7 @@ def test_paper_features_equal_those_of_the_layout(tokens: dict[str, object]) -> 
     placed = np.random.default_rng(0).integers(0, 2, batch.placed.shape)
     parts = (np.asarray(part, np.float32) for part in (batch.state, placed, batch.goal))
     found = graph_of(made).node_features(
-        *(torch.from_numpy(part) for part in parts), torch.zeros(6, dtype=torch.long)
+        Scenes(*(torch.from_numpy(part) for part in parts), torch.zeros(6, dtype=torch.long))
     )
     expected = made.layout.node_features(batch.state, placed, batch.goal)
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-6)
@@ -41,7 +41,7 @@ def test_offsets_are_corner_directions_of_every_piece() -> None:
     """The square's corners lie on the diagonals; its base has no offset."""
     made = setup(agent={**PAPER, "offsets": True})
     scene = corners(made.layout, (0.3, -0.2, 0.0)), corners(made.layout, (-0.5, 0.1, math.pi / 4))
-    features = graph_of(made).node_features(scene[0], torch.zeros(1, 1), scene[1], NO_TOKEN)
+    features = graph_of(made).node_features(Scenes(scene[0], torch.zeros(1, 1), scene[1], NO_TOKEN))
     half = math.sqrt(0.5)
     expected = [
         *([-half, -half], [half, -half], [half, half], [-half, half]),
@@ -57,7 +57,7 @@ def test_offsets_are_corner_directions_of_every_piece() -> None:
 def test_orientation_is_k_times_the_angle_to_the_token(shape: str, symmetry: int) -> None:
     made = setup({"shapes": [shape], "scale": 1}, agent={**PAPER, "orientation": True})
     scene = corners(made.layout, (0, 0, 0.5)), corners(made.layout, (1, 0, 0.8))
-    features = graph_of(made).node_features(scene[0], torch.zeros(1, 1), scene[1], NO_TOKEN)
+    features = graph_of(made).node_features(Scenes(scene[0], torch.zeros(1, 1), scene[1], NO_TOKEN))
     count = made.layout.corner_count
     angle = 0.3 * symmetry
     expected = np.array([[1.0, 0.0]] * (count + 1) + [[math.cos(angle), math.sin(angle)]] * count)
@@ -70,7 +70,7 @@ def test_the_egocentric_frame_is_the_moving_tokens() -> None:
     scene = corners(layout, (0.3, 0.1, 0.4), (-0.6, 0.2, -1.0))
     goal = corners(layout, (0.0, 0.5, 2.0), (0.4, -0.3, 0.1))
     second = torch.tensor([1])
-    features = graph_of(made).node_features(scene, torch.zeros(1, 2), goal, second)[0]
+    features = graph_of(made).node_features(Scenes(scene, torch.zeros(1, 2), goal, second))[0]
     own = layout.corners_of(1)
     np.testing.assert_allclose(features[own, :2].numpy(), layout.body[own], atol=1e-6)
     cos, sin = math.cos(1.0), math.sin(1.0)
@@ -84,9 +84,9 @@ def test_the_egocentric_frame_is_the_moving_tokens() -> None:
 def test_move_is_the_rigid_motion_of_the_simulation(velocity: tuple[float, float, float]) -> None:
     made = setup(PAIR)
     layout, poses = made.layout, np.array([[0.3, 0.1, 0.4], [-0.6, 0.2, -1.0]])
-    moved = graph_of(made).move(
-        corners(layout, *map(tuple, poses)), torch.tensor([1]), torch.tensor([velocity])
-    )
+    start = corners(layout, *map(tuple, poses))
+    scene = Scenes(start, torch.zeros(1, 2), start, torch.tensor([1]))
+    moved = graph_of(made).moved(scene, torch.tensor([velocity])).corners
     poses[1] += np.array(velocity) * [2.0, 2.0, math.pi]
     np.testing.assert_allclose(moved[0].numpy(), layout.corners(poses), atol=1e-6)
 
@@ -95,11 +95,11 @@ def test_frames_of_world_and_token_are_inverse() -> None:
     made = setup()
     graph = graph_of(made)
     state = torch.from_numpy(random_transitions(made, 8).state)
-    token = torch.zeros(8, dtype=torch.long)
-    shift = torch.rand(8, 2, generator=torch.Generator().manual_seed(0))
-    there = graph.to_world(state, token, shift)
-    assert (there - shift).abs().max() > 0.1
-    torch.testing.assert_close(graph.to_token(state, token, there), shift)
+    scenes = Scenes(state, torch.zeros(8, 1), state, torch.zeros(8, dtype=torch.long))
+    seen = torch.rand(8, 3, generator=torch.Generator().manual_seed(0)) / 2.0
+    there = graph.velocity(scenes, seen[:, :2], seen[:, 2])
+    assert (there - seen)[:, :2].abs().max() > 0.1
+    torch.testing.assert_close(graph.as_seen(scenes, there), seen)
 
 
 def test_constants_are_no_weights() -> None:

@@ -1,13 +1,14 @@
 """Sizes of Table I, symmetries, and the ranges of what actors give."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from tangram_agent.graph import TokenGraph
+from tangram_agent.graph import SceneGraph, Scenes
 from tangram_agent.networks import Actor, Critic, initialise, parameter_count
 from tangram_agent.setup import Setup
 from tests.agent.builders import PAIR, PAPER, SMALL, SQUARE, random_transitions, setup
@@ -16,10 +17,11 @@ pytestmark = pytest.mark.fast
 
 PAPER_MHA: dict[str, Any] = {}
 PAPER_MLP = {"kind": "mlp"}
+NETS: dict[str, Any] = {"mha": SMALL, "mlp": {"kind": "mlp"}}
 
 
-def networks(made: Setup, seed: int = 0) -> tuple[TokenGraph, Actor, Critic]:
-    graph = TokenGraph(made.layout, made.sim.arena, made.agent)
+def networks(made: Setup, seed: int = 0) -> tuple[SceneGraph, Actor, Critic]:
+    graph = SceneGraph(made.layout, made.sim.arena, made.agent)
     actor, critic = Actor(graph, made.agent, made.net), Critic(graph, made.agent, made.net)
     generator = torch.Generator().manual_seed(seed)
     initialise(actor, generator)
@@ -27,11 +29,11 @@ def networks(made: Setup, seed: int = 0) -> tuple[TokenGraph, Actor, Critic]:
     return graph, actor, critic
 
 
-def inputs(made: Setup, count: int = 5) -> tuple[torch.Tensor, ...]:
+def inputs(made: Setup, count: int = 5) -> Scenes:
     batch = random_transitions(made, count)
     parts = (batch.state, batch.placed, batch.goal)
     state, placed, goal = (torch.from_numpy(np.asarray(part, np.float32)) for part in parts)
-    return state, placed, goal, torch.zeros(count, dtype=torch.long)
+    return Scenes(state, placed, goal, torch.zeros(count, dtype=torch.long))
 
 
 @pytest.mark.parametrize(
@@ -57,39 +59,35 @@ def test_the_literal_reading_of_g_is_a_switch() -> None:
 def test_permuting_corners_permutes_nodes_and_leaves_the_rest(piece: str) -> None:
     made = setup(agent=PAPER)
     graph, actor, critic = networks(made)
-    state, placed, goal, token = inputs(made)
+    scenes = inputs(made)
     velocity = torch.full((5, 3), 0.3)
     order = torch.tensor([2, 0, 3, 1])
-    swapped = (state[:, order], goal) if piece == "token" else (state, goal[:, order])
+    name = "corners" if piece == "token" else "goal"
+    swapped = replace(scenes, **{name: vars(scenes)[name][:, order]})
     first = 0 if piece == "token" else 5
     nodes = torch.arange(graph.nodes)
     nodes[first : first + 4] = first + order
 
-    features = graph.node_features(state, placed, goal, token)
-    again = graph.node_features(swapped[0], placed, swapped[1], token)
+    features = graph.node_features(scenes)
+    again = graph.node_features(swapped)
     before, mean = actor.head.encoder(features, graph.adjacency)
     after, mean_again = actor.head.encoder(again, graph.adjacency)
     torch.testing.assert_close(after, before[:, nodes], atol=1e-6, rtol=1e-5)
     torch.testing.assert_close(mean_again, mean, atol=1e-6, rtol=1e-5)
-    torch.testing.assert_close(
-        actor(swapped[0], placed, swapped[1], token)[0], actor(state, placed, goal, token)[0]
-    )
-    torch.testing.assert_close(
-        critic(swapped[0], placed, swapped[1], token, velocity),
-        critic(state, placed, goal, token, velocity),
-    )
+    torch.testing.assert_close(actor(swapped)[0], actor(scenes)[0])
+    torch.testing.assert_close(critic(swapped, velocity), critic(scenes, velocity))
 
 
 @pytest.mark.parametrize("kind", ["mha", "mlp"])
 @pytest.mark.parametrize("squash", ["tanh", "clamp"])
 @pytest.mark.parametrize(("angle_head", "largest"), [("plain", 1.0), ("kfold", 0.25)])
 def test_actions_stay_in_range(kind: str, squash: str, angle_head: str, largest: float) -> None:
-    made = setup(agent={"angle_head": angle_head, "squash": squash}, net={**SMALL, "kind": kind})
+    made = setup(agent={"angle_head": angle_head, "squash": squash}, net=NETS[kind])
     _, actor, _ = networks(made)
     with torch.no_grad():
         for parameter in actor.parameters():
             parameter.mul_(20.0)
-    velocity, raw = actor(*inputs(made, 64))
+    velocity, raw = actor(inputs(made, 64))
     assert raw[:, :2].abs().max() > 1.0
     assert velocity[:, :2].abs().max() <= 1.0
     assert velocity[:, :2].abs().max() > 0.9
@@ -99,8 +97,11 @@ def test_actions_stay_in_range(kind: str, squash: str, angle_head: str, largest:
 def test_kfold_head_turns_by_atan2_over_k() -> None:
     made = setup(agent={"angle_head": "kfold"})
     _, actor, _ = networks(made)
-    velocity, raw = actor(*inputs(made))
-    expected = torch.atan2(raw[:, 3], raw[:, 2]) / 4 / math.pi
+    scenes = inputs(made)
+    velocity, raw = actor(scenes)
+    outputs = actor.head(scenes)
+    assert torch.equal(raw, outputs[:, :2])  # the turn has no bound to run into
+    expected = torch.atan2(outputs[:, 3], outputs[:, 2]) / 4 / math.pi
     torch.testing.assert_close(velocity[:, 2], expected)
 
 
@@ -108,35 +109,32 @@ def test_kfold_head_turns_by_atan2_over_k() -> None:
 @pytest.mark.parametrize("kind", ["mha", "mlp"])
 def test_an_egocentric_agent_sees_no_absolute_pose(afterstate: bool, kind: str) -> None:
     """Turn and shift the whole scene: the value stays, the action turns with it."""
-    made = setup(agent={"afterstate": afterstate}, net={**SMALL, "kind": kind})
+    made = setup(agent={"afterstate": afterstate}, net=NETS[kind])
     _, actor, critic = networks(made)
-    state, placed, goal, token = inputs(made)
+    scenes = inputs(made)
     angle = torch.tensor(0.7)
     turn = torch.tensor([[angle.cos(), -angle.sin()], [angle.sin(), angle.cos()]])
 
     def moved(points: torch.Tensor) -> torch.Tensor:
         return points @ turn.T + torch.tensor([0.1, -0.2])
 
-    velocity = actor(state, placed, goal, token)[0]
-    velocity_moved = actor(moved(state), placed, moved(goal), token)[0]
+    image = replace(scenes, corners=moved(scenes.corners), goal=moved(scenes.goal))
+    velocity, velocity_moved = actor(scenes)[0], actor(image)[0]
     expected = torch.cat([velocity[:, :2] @ turn.T, velocity[:, 2:]], dim=1)
     torch.testing.assert_close(velocity_moved, expected, atol=1e-5, rtol=1e-4)
-    value = critic(state, placed, goal, token, velocity)
-    torch.testing.assert_close(
-        critic(moved(state), placed, moved(goal), token, expected), value, atol=1e-5, rtol=1e-4
-    )
+    value = critic(scenes, velocity)
+    torch.testing.assert_close(critic(image, expected), value, atol=1e-5, rtol=1e-4)
 
 
 def test_afterstate_critic_depends_on_where_the_action_leads_only() -> None:
     made = setup()
     _, _, critic = networks(made)
-    state, placed, goal, token = inputs(made)
+    scenes = inputs(made)
     velocity = torch.rand(5, 3, generator=torch.Generator().manual_seed(0)) - 0.5
-    there = critic.graph.move(state, token, velocity)
-    torch.testing.assert_close(
-        critic(state, placed, goal, token, velocity),
-        critic(there, placed, goal, token, torch.zeros(5, 3)),
-    )
+    there = critic.graph.moved(scenes, velocity)
+    value = critic(scenes, velocity)
+    torch.testing.assert_close(value, critic(there, torch.zeros(5, 3)))
+    assert torch.equal(critic(scenes, torch.zeros(5, 3), there), critic(there, torch.zeros(5, 3)))
 
 
 def test_the_critic_appends_the_action_to_the_base_of_its_token() -> None:
@@ -144,8 +142,8 @@ def test_the_critic_appends_the_action_to_the_base_of_its_token() -> None:
     graph, _, critic = networks(made)
     seen = []
     critic.head.encoder.register_forward_pre_hook(lambda _, args: seen.append(args[0]))
-    state, placed, goal, _ = inputs(made, 2)
-    critic(state, placed, goal, torch.tensor([0, 1]), torch.tensor([[0.1, 0.2, 0.3]] * 2))
+    scenes = replace(inputs(made, 2), token=torch.tensor([0, 1]))
+    critic(scenes, torch.tensor([[0.1, 0.2, 0.3]] * 2))
     appended = seen[0][:, :, 4:]
     corners = made.layout.corner_count
     expected = torch.zeros(2, graph.nodes, 3)
@@ -155,11 +153,11 @@ def test_the_critic_appends_the_action_to_the_base_of_its_token() -> None:
 
 @pytest.mark.parametrize("kind", ["mha", "mlp"])
 def test_the_actor_reads_the_base_of_the_token_that_moves(kind: str) -> None:
-    made = setup(PAIR, agent=PAPER, net={**SMALL, "kind": kind})
+    made = setup(PAIR, agent=PAPER, net=NETS[kind])
     _, actor, _ = networks(made)
-    state, placed, goal, token = inputs(made)
-    first = actor(state, placed, goal, token)[0]
-    second = actor(state, placed, goal, token + 1)[0]
+    scenes = inputs(made)
+    first = actor(scenes)[0]
+    second = actor(replace(scenes, token=scenes.token + 1))[0]
     assert (first - second).abs().max() > 1e-3
 
 

@@ -1,29 +1,49 @@
 """Actor and critic of pairs: what turning and mirroring a scene does to them."""
 
+import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from tangram_agent.config import NetConfig
-from tangram_agent.networks import initialise
-from tangram_agent.pair_networks import PairNetworks
-from tangram_agent.pairs import PairGraph
+from tangram_agent.graph import Pairs
+from tangram_agent.networks import Networks, initialise
 from tests.agent.builders import SMALL
-from tests.agent.pair_scenes import as_tensor, every_pair, random_pairs, random_scene, seven
+from tests.agent.pair_scenes import (
+    PERCEPTRON,
+    as_tensor,
+    every_pair,
+    random_pairs,
+    random_scene,
+    seven,
+)
 
 pytestmark = pytest.mark.fast
 
 LAYOUT = seven().layout
-NETS = {"mha": NetConfig(**SMALL), "mlp": NetConfig("mlp", (16, 16))}
+NETS = {"mha": SMALL, "mlp": PERCEPTRON}
+SLIDE = {"backend": "physics", "motion": "slide"}
 PARALLELOGRAM = 6
 
 
-def networks(kind: str, contacts: bool = True, seed: int = 0) -> PairNetworks:
-    made = PairNetworks(PairGraph(LAYOUT, 2.0), NETS[kind], contacts)
+def networks(kind: str, contacts: bool = True, seed: int = 0, **agent: Any) -> Networks:
+    made = Networks(seven(agent, NETS[kind], **(SLIDE if contacts else {})))
     initialise(made, torch.Generator().manual_seed(seed))
     return made.requires_grad_(False)
+
+
+def pose_of(made: Networks, pairs: Pairs) -> torch.Tensor:
+    """Where the actor puts the tokens of pairs."""
+    moved: Pairs = made.critic.graph.moved(pairs, made.actor(pairs)[0])
+    return moved.pose
+
+
+def value_of(made: Networks, pairs: Pairs) -> torch.Tensor:
+    """Values of pairs whose tokens stay where they are."""
+    values: torch.Tensor = made.critic(pairs, torch.zeros(len(pairs.pose), 3))
+    return values
 
 
 def same_angles(found: torch.Tensor, expected: torch.Tensor) -> None:
@@ -43,11 +63,11 @@ def test_proposals_turn_with_the_scene(kind: str) -> None:
     plain = every_pair(own, sides, goals, goal_sides)
     image = every_pair(moved(own), sides, moved(goals), goal_sides)
     # The arena's bound on actions is a square, which does not turn with the scene.
-    near = made.actor(plain)[0].sub(plain.pose)[:, :2].norm(dim=-1) < 1.9
-    pose, turned = made.actor(plain)[0], made.actor(image)[0]
+    near = pose_of(made, plain).sub(plain.pose)[:, :2].norm(dim=-1) < 1.9
+    pose, turned = pose_of(made, plain), pose_of(made, image)
     assert near.float().mean() > 0.9
     np.testing.assert_allclose(turned[near], as_tensor(moved(pose.numpy()))[near], atol=1e-4)
-    np.testing.assert_allclose(made.critic(image), made.critic(plain), atol=1e-5)
+    np.testing.assert_allclose(value_of(made, image), value_of(made, plain), atol=1e-5)
     pushed = [made.critic.pushed(one, to) for one, to in ((plain, pose), (image, turned))]
     np.testing.assert_allclose(pushed[0][near], pushed[1][near], atol=1e-5)
 
@@ -58,12 +78,13 @@ def test_a_token_on_its_other_side_does_what_its_mirror_image_does(kind: str) ->
     tokens, pieces = random_scene(LAYOUT, rng), random_scene(LAYOUT, rng)
     plain = every_pair(*tokens, *pieces)
     image = every_pair(*LAYOUT.mirrored(*tokens), *LAYOUT.mirrored(*pieces))
-    pose, seen = made.actor(plain)[0], made.actor(image)[0]
+    pose, seen = pose_of(made, plain), pose_of(made, image)
     chiral = plain.token == PARALLELOGRAM
     expected = pose * torch.tensor([1.0, -1.0, -1.0])
     np.testing.assert_allclose(seen[chiral, :2], expected[chiral, :2], atol=1e-5)
     same_angles(seen[chiral, 2], expected[chiral, 2])
-    np.testing.assert_allclose(made.critic(image)[chiral], made.critic(plain)[chiral], atol=1e-5)
+    values = [value_of(made, pairs)[chiral] for pairs in (image, plain)]
+    np.testing.assert_allclose(*values, atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", NETS)
@@ -71,8 +92,8 @@ def test_an_actor_that_says_nothing_leaves_the_token_where_it_is(kind: str) -> N
     made, pairs = networks(kind), random_pairs(LAYOUT, 0)
     for parameter in made.parameters():
         parameter.zero_()
-    np.testing.assert_array_equal(made.actor(pairs)[0], pairs.pose)
-    assert not made.critic(pairs).any()
+    np.testing.assert_array_equal(pose_of(made, pairs), pairs.pose)
+    assert not value_of(made, pairs).any()
 
 
 @pytest.mark.parametrize("kind", NETS)
@@ -80,18 +101,19 @@ def test_a_shift_is_as_wide_as_the_arena_at_most(kind: str) -> None:
     made, pairs = networks(kind), random_pairs(LAYOUT, 0)
     for parameter in made.parameters():
         parameter.mul_(100.0)
-    pose, raw = made.actor(pairs)
+    velocity, raw = made.actor(pairs)
     assert raw.abs().max() > 10.0
-    assert (pose - pairs.pose)[:, :2].abs().max() <= 2.0 + 1e-6
+    assert velocity.abs().max() <= 1.0
+    assert (pose_of(made, pairs) - pairs.pose)[:, :2].abs().max() <= 2.0 + 1e-6
 
 
 @pytest.mark.parametrize("kind", NETS)
 def test_the_critic_knows_how_much_is_covered_and_which_side_it_is(kind: str) -> None:
     made, pairs = networks(kind), random_pairs(LAYOUT, 0)
-    value = made.critic(pairs)
-    other = made.critic(replace(pairs, covered=1.0 - pairs.covered))
+    value = value_of(made, pairs)
+    other = value_of(made, replace(pairs, covered=1.0 - pairs.covered))
     assert (value - other).abs().min() > 0.0
-    flipped = made.critic(replace(pairs, goal_flipped=1.0 - pairs.goal_flipped))
+    flipped = value_of(made, replace(pairs, goal_flipped=1.0 - pairs.goal_flipped))
     changed = (value - flipped).abs() > 0.0
     # Only a parallelogram has two sides.
     assert changed.tolist() == (pairs.piece == PARALLELOGRAM).tolist()
@@ -108,3 +130,58 @@ def test_what_is_pushed_depends_on_where_the_token_slides(kind: str) -> None:
     own = dict(alone.named_parameters())
     more = set(dict(made.named_parameters())) - set(own)
     assert {name.split(".")[1] for name in more} == {"push_head"}
+
+
+@pytest.mark.parametrize(("token", "most"), [(0, math.pi), (5, math.pi / 4), (6, math.pi / 2)])
+def test_a_turn_is_no_longer_than_symmetry_needs(token: int, most: float) -> None:
+    pairs = replace(random_pairs(LAYOUT, 0), token=torch.full((49,), token))
+    pairs = replace(pairs, flipped=torch.zeros(49))
+    made = networks("mlp")
+    outputs = made.actor.head(pairs)
+    found = made.actor(pairs)[0][:, 2] * math.pi
+    expected = torch.atan2(outputs[:, 3], outputs[:, 2]) * most / math.pi
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", NETS)
+@pytest.mark.parametrize(
+    "option",
+    [
+        {"egocentric": False},
+        {"offsets": False},
+        {"orientation": False},
+        {"afterstate": False},
+        {"squash": "tanh"},
+        {"angle_head": "plain"},
+    ],
+)
+def test_every_option_changes_what_pairs_give(kind: str, option: dict[str, Any]) -> None:
+    pairs, way = random_pairs(LAYOUT, 0), torch.full((49, 3), 0.1)
+    plain, other = networks(kind), networks(kind, **option)
+    for name, parameter in other.named_parameters():
+        own = dict(plain.named_parameters())[name]
+        if own.shape == parameter.shape:
+            parameter.copy_(own)
+    same_actor = torch.allclose(plain.actor(pairs)[0], other.actor(pairs)[0])
+    same_critic = torch.allclose(plain.critic(pairs, way), other.critic(pairs, way))
+    assert (same_actor, same_critic) == {
+        "afterstate": (True, False),
+        "squash": (False, True),
+        "angle_head": (False, True),
+    }.get(next(iter(option)), (False, False))
+
+
+def test_complete_edges_change_what_attention_gives() -> None:
+    pairs = random_pairs(LAYOUT, 0)
+    assert not torch.allclose(
+        networks("mha").actor(pairs)[0], networks("mha", edges="complete").actor(pairs)[0]
+    )
+
+
+@pytest.mark.parametrize("afterstate", [True, False])
+def test_the_value_of_an_action_without_the_afterstate_is_of_the_action(afterstate: bool) -> None:
+    made = networks("mha", afterstate=afterstate)
+    pairs, way = random_pairs(LAYOUT, 0), torch.full((49, 3), 0.1)
+    moved = made.critic.graph.moved(pairs, way)
+    same = torch.allclose(made.critic(pairs, way), value_of(made, moved), atol=1e-6)
+    assert same == afterstate

@@ -1,330 +1,180 @@
-"""Choosing among pairs: against brute force, and with networks that know the geometry exactly."""
+"""Policies of several tokens: the actions they give, exploring, and weights over the wire."""
 
 from contextlib import closing
-from itertools import product
-from typing import Any, cast
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
-from tangram_agent import pair_policy
-from tangram_agent.networks import initialise
-from tangram_agent.pair_networks import PairNetworks
-from tangram_agent.pair_policy import PairChooser
-from tangram_agent.pair_values import covered_share, covering, worths
-from tangram_agent.pairs import PairGraph, Pairs
+from tangram_agent.learner import Learner
+from tangram_agent.messages import decode_weights, encode_weights
 from tangram_agent.policy import Policy
+from tangram_agent.runs import Run
 from tangram_agent.setup import Setup
+from tangram_agent.types import Transitions
+from tangram_sim.actions import chosen_tokens, flips, velocities
 from tangram_sim.batch import BatchedEnv
-from tests.agent.builders import SMALL, setup
-from tests.agent.pair_scenes import (
-    PERCEPTRON,
-    TWO,
-    PerfectCritic,
-    PerfectNetworks,
-    as_tensor,
-    random_scene,
-    seven,
-)
+from tangram_sim.errors import ConfigError, RunError
+from tests.agent.builders import PAPER, SMALL, setup
+from tests.agent.pair_scenes import PERCEPTRON, TWO, seven, transitions
 
 pytestmark = pytest.mark.fast
 
-COUNT = 6
-SLIDE = {"backend": "physics", "motion": "slide"}
+COUNT = 200
+PARALLELOGRAM = 6
+Scene = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
-def scenes(made: Setup, count: int = COUNT, seed: int = 0) -> tuple[np.ndarray, ...]:
-    """Corners, placed and goals of random scenes; every one has a token left."""
-    rng = np.random.default_rng(seed)
-    layout = made.layout
-    corners, goals = (layout.corners(*random_scene(layout, rng, count)) for _ in range(2))
-    placed = rng.random((count, layout.tokens)) < 0.5
-    placed[:, 0] &= ~placed.all(axis=1)
-    return corners, placed, goals
-
-
-def random_networks(made: Setup, seed: int = 0) -> PairNetworks:
-    networks = PairNetworks(PairGraph(made.layout, made.sim.arena), made.net, made.contacts)
-    initialise(networks, torch.Generator().manual_seed(seed))
-    return networks.requires_grad_(False)
-
-
-def perfect(
-    made: Setup, pushes: np.ndarray | None = None, likes: np.ndarray | None = None
-) -> PairChooser:
-    networks = PerfectNetworks(PerfectCritic(made.layout, pushes, likes))
-    return PairChooser(cast("PairNetworks", networks), made)
-
-
-# Against brute force
-
-
-def total(
-    made: Setup,
-    networks: PairNetworks,
-    scene: tuple[np.ndarray, ...],
-    token: int,
-    flip: bool,
-    pose: np.ndarray | None = None,
-    piece: int = 0,
-) -> tuple[float, np.ndarray]:
-    """Value over all pieces of one token's pose, by default the actor's own for one piece."""
-    layout = made.layout
-    corners, _, goals = (part[None] for part in scene)
-    covered = covering(corners, goals, layout)
-    share = covered_share(covered, layout)[0, token]
-    here, side = layout.poses(corners)[0, token], layout.flipped(corners)[0, token] ^ flip
-    wanted, sides = layout.poses(goals)[0], layout.flipped(goals)[0]
-
-    def pair(where: np.ndarray, index: int) -> Pairs:
-        return Pairs(
-            as_tensor([where]),
-            as_tensor([side]),
-            torch.tensor([token]),
-            as_tensor([wanted[index]]),
-            as_tensor([sides[index]]),
-            torch.tensor([index]),
-            as_tensor([share[index]]),
-        )
-
-    if pose is None:
-        pose = networks.actor(pair(here, piece))[0][0].numpy()
-        for _ in range(made.agent.reapply):
-            pose = networks.actor(pair(pose, piece))[0][0].numpy()
-    values = [networks.critic(pair(pose, index)).item() for index in range(layout.tokens)]
-    return sum(values) - worths(covered, layout)[0, token], pose
-
-
-@pytest.mark.parametrize("net", [SMALL, PERCEPTRON])
-@pytest.mark.parametrize("options", [{}, {"reapply": 2}, {"allow_flip": True}])
-def test_the_best_of_all_is_played(
-    monkeypatch: pytest.MonkeyPatch, net: dict[str, Any], options: dict[str, Any]
-) -> None:
-    """With a short list that leaves nothing out."""
-    monkeypatch.setattr(pair_policy, "_SHORT_LIST", 1000)
-    flip = options.get("allow_flip", False)
-    made = setup(TWO, {"reapply": options.get("reapply", 0)}, net, allow_flip=flip)
-    networks = random_networks(made)
-    corners, placed, goals = scenes(made)
-    choice = PairChooser(networks, made).choose(corners, placed, goals)
-    for row in range(COUNT):
-        scene = corners[row], placed[row], goals[row]
-        every = [
-            (*total(made, networks, scene, token, turned, piece=piece), token, turned)
-            for token, turned, piece in product(range(2), (False, True), range(2))
-            if not placed[row, token] and (not turned or (flip and made.layout.chiral[token]))
-        ]
-        _, pose, token, turned = max(every, key=lambda one: one[0])
-        assert (choice.token[row], choice.flip[row]) == (token, turned)
-        np.testing.assert_allclose(choice.pose[row], pose, atol=1e-5)
-        start = made.layout.poses(corners[row])[token]
-        np.testing.assert_allclose(choice.start[row], start)
-
-
-@pytest.mark.parametrize("sim", [{}, {"allow_flip": True}, SLIDE])
-def test_a_choice_does_not_depend_on_the_others_of_the_batch(sim: dict[str, Any]) -> None:
-    made = seven({"reapply": 1, "refine_steps": 2, "gamma": 0.5}, **sim)
-    chooser = PairChooser(random_networks(made), made)
-    corners, placed, goals = scenes(made, COUNT)
-    placed[3] = True
-    together = chooser.choose(corners, placed, goals)
-    for row in range(COUNT):
-        one = slice(row, row + 1)
-        alone = chooser.choose(corners[one], placed[one], goals[one])
-        for name, column in vars(alone).items():
-            np.testing.assert_allclose(column[0], vars(together)[name][row], atol=1e-5)
-
-
-@pytest.mark.parametrize("order", ["learned", "listed", "size", "random"])
-def test_no_placed_token_is_named_while_others_are_left(order: str) -> None:
-    made = seven({"order": order})
-    corners, placed, goals = scenes(made, 40)
-    token = PairChooser(random_networks(made), made).choose(corners, placed, goals).token
-    assert not placed[np.arange(40), token].any()
-    assert len(set(token)) > 1
-
-
-def test_where_all_are_placed_the_first_is_named() -> None:
-    made = seven()
-    corners, _, goals = scenes(made)
-    everything = np.ones((COUNT, 7), np.bool_)
-    choice = PairChooser(random_networks(made), made).choose(corners, everything, goals)
-    assert choice.token.tolist() == [0] * COUNT
-
-
-@pytest.mark.parametrize(
-    ("order", "expected"),
-    # In the set: parallelogram, small, large, square, large.
-    [("listed", [0, 1, 2, 3, 4]), ("size", [2, 4, 0, 3, 1])],
-)
-def test_orders_that_are_not_learned(order: str, expected: list[int]) -> None:
-    shapes = ["parallelogram", "small_triangle", "large_triangle", "square", "large_triangle"]
-    made = setup({"shapes": shapes, "scale": 0.5}, {"order": order})
-    assert named_in_turn(made, 0) == expected
-
-
-def named_in_turn(made: Setup, goal: int) -> list[int]:
-    """The tokens of a whole episode, as they are named."""
-    chooser = perfect(made)
-    corners, _, goals = scenes(made, 8)
-    placed = np.zeros((1, made.layout.tokens), np.bool_)
-    named: list[int] = []
-    for step in range(made.layout.tokens):
-        # The tokens lie elsewhere at every step, the goal stays.
-        choice = chooser.choose(corners[step : step + 1], placed, goals[goal : goal + 1])
-        named.append(int(choice.token[0]))
-        placed[0, named[-1]] = True
-    return named
-
-
-def test_a_random_order_is_one_for_each_target() -> None:
-    made = seven({"order": "random"})
-    orders = [named_in_turn(made, goal) for goal in range(8)]
-    assert all(sorted(order) == list(range(7)) for order in orders)
-    assert len({tuple(order) for order in orders}) == 8
-    # At every step the first one that is left of an order that does not change.
-    assert orders == [named_in_turn(made, goal) for goal in range(8)]
-    chooser, (corners, placed, goals) = perfect(made), scenes(made, 8)
-    found = chooser.choose(corners, placed, goals).token
-    expected = [
-        next(token for token in order if not flags[token])
-        for order, flags in zip(orders, placed, strict=True)
-    ]
-    assert found.tolist() == expected
-
-
-# Refinement
-
-
-@pytest.mark.parametrize("net", [SMALL, PERCEPTRON])
-def test_refinement_goes_uphill_on_what_the_critic_says_of_all_pieces(net: dict[str, Any]) -> None:
-    plain, refined = (seven({"refine_steps": n}, net) for n in (0, 20))
-    networks = random_networks(plain)
-    scene = scenes(plain)
-    one, two, off = (
-        PairChooser(networks, plain).choose(*scene),
-        PairChooser(networks, refined).choose(*scene),
-        PairChooser(networks, refined).choose(*scene, refine=False),
-    )
-    np.testing.assert_array_equal(one.pose, off.pose)
-    np.testing.assert_array_equal(one.token, two.token)
-    for row in range(COUNT):
-        part = scene[0][row], scene[1][row], scene[2][row]
-        token = int(one.token[row])
-        before, after = (
-            total(plain, networks, part, token, False, choice.pose[row])[0] for choice in (one, two)
-        )
-        assert after > before
-    assert not any(parameter.requires_grad for parameter in networks.parameters())
-
-
-# With networks that know everything
-
-
-def assembled(made: Setup, chooser: PairChooser, episodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Overlap at the end (B,), and flips (B, T) of whole episodes."""
+def policy_of(made: Setup) -> Policy:
     policy = Policy(made)
-    policy._chooser = chooser  # perfect networks have no weights to load
-    flips = []
-    with closing(BatchedEnv(made.layout, made.sim, made.reward, episodes)) as env:
-        env.reset([np.random.default_rng([7, i]) for i in range(episodes)])
+    policy.load(Learner(made, 0).acting_weights(7))
+    return policy
+
+
+def scene_of(batch: Transitions) -> Scene:
+    return batch.state, batch.placed, batch.goal
+
+
+def generators(count: int) -> list[np.random.Generator]:
+    return [np.random.default_rng(i) for i in range(count)]
+
+
+@pytest.mark.parametrize("net", [SMALL, PERCEPTRON])
+@pytest.mark.parametrize("sim", [{}, {"backend": "physics", "motion": "slide"}])
+def test_weights_travel_to_workers(net: dict[str, Any], sim: dict[str, Any]) -> None:
+    made = seven({}, net, **sim)
+    weights = Learner(made, 0).acting_weights(7)
+    policy = Policy(made)
+    assert {name: tensor.shape for name, tensor in weights.tensors.items()} == policy.shapes
+    epoch, arrived = decode_weights(encode_weights("run", weights), policy.shapes)
+    policy.load(arrived)
+    assert (epoch, policy.version) == ("run", 7)
+    for name, tensor in policy.weights().tensors.items():
+        np.testing.assert_array_equal(tensor, weights.tensors[name])
+
+
+@pytest.mark.parametrize("flip", [False, True])
+def test_an_action_takes_its_token_to_the_pose_that_was_chosen(flip: bool) -> None:
+    """By the simulation's own reading of actions."""
+    made = seven(allow_flip=flip)
+    policy, scene = policy_of(made), scene_of(transitions(made, COUNT))
+    actions = policy.act(*scene)
+    exact = [part.astype(np.float64) for part in scene]
+    choice = policy._planner.choose(exact[0], exact[1] > 0, exact[2])  # type: ignore[union-attr]
+    assert actions.shape == (COUNT, 4 + flip)
+    assert actions.dtype == np.float32
+    np.testing.assert_array_equal(chosen_tokens(actions, 7), choice.token)
+    np.testing.assert_array_equal(flips(actions, made.layout, made.sim), choice.flip)
+    assert choice.flip.any() == flip
+    found = made.layout.poses(exact[0])[np.arange(COUNT), choice.token]
+    found += velocities(actions, made.sim)
+    np.testing.assert_allclose(found[:, :2], choice.pose[:, :2], atol=1e-5)
+    np.testing.assert_allclose(np.exp(1j * (found - choice.pose)[:, 2]), 1.0, atol=1e-5)
+    # By the shorter turn: no entry is cut off.
+    assert np.abs(actions).max() <= 1.0
+
+
+def test_refinement_is_for_acting_and_not_for_exploring() -> None:
+    agent = {"refine_steps": 5, "noise": 0.0, "uniform_share": 0.0}
+    made = seven(agent, PERCEPTRON)
+    policy, scene = policy_of(made), scene_of(transitions(made, 8))
+    refined, plain = policy.act(*scene), policy.act(*scene, refine=False)
+    assert not np.allclose(refined, plain, atol=1e-4)
+    np.testing.assert_array_equal(policy.explore(*scene, generators(8)), plain)
+
+
+def test_noise_moves_the_velocity_and_leaves_the_choice_alone() -> None:
+    made = seven({"noise": 0.05, "uniform_share": 0.0}, PERCEPTRON, allow_flip=True)
+    policy, scene = policy_of(made), scene_of(transitions(made, COUNT))
+    plain, noisy = policy.act(*scene), policy.explore(*scene, generators(COUNT))
+    np.testing.assert_array_equal(noisy[:, :2], plain[:, :2])
+    inside = np.abs(plain[:, 2:]) < 0.8
+    assert (noisy - plain)[:, 2:][inside].std() == pytest.approx(0.05, rel=0.1)
+
+
+def test_a_share_of_actions_takes_any_token_that_is_left_anywhere() -> None:
+    made = seven({"noise": 0.0, "uniform_share": 1.0}, PERCEPTRON, allow_flip=True)
+    policy, scene = policy_of(made), scene_of(transitions(made, COUNT, placed=0.5))
+    scene[1][:, 0] = 0
+    actions = policy.explore(*scene, generators(COUNT))
+    token = chosen_tokens(actions, 7)
+    assert not scene[1][np.arange(COUNT), token].any()
+    assert set(token) == set(range(7))
+    poses = made.layout.poses(scene[0].astype(np.float64))[np.arange(COUNT), token]
+    end = poses + velocities(actions, made.sim)
+    assert np.abs(end[:, :2]).max() <= 1.0 + 1e-5
+    np.testing.assert_allclose(end[:, :2].std(axis=0), 1.0 / np.sqrt(3.0), rtol=0.1)
+    assert abs(np.exp(1j * end[:, 2]).mean()) < 0.15
+    assert set(actions[:, 1]) == {-1.0, 1.0}
+    turned = flips(actions, made.layout, made.sim)
+    assert 0.2 < turned[token == PARALLELOGRAM].mean() < 0.8
+
+
+def test_where_all_are_placed_exploring_names_the_first() -> None:
+    made = seven({"uniform_share": 1.0}, PERCEPTRON)
+    scene = scene_of(transitions(made, 4, placed=1.1))
+    actions = policy_of(made).explore(*scene, generators(4))
+    assert chosen_tokens(actions, 7).tolist() == [0] * 4
+
+
+@pytest.mark.parametrize("sim", [{}, {"allow_flip": True}])
+def test_exploring_does_not_depend_on_the_batching(sim: dict[str, Any]) -> None:
+    made = seven({"uniform_share": 0.5}, PERCEPTRON, **sim)
+    policy, scene = policy_of(made), scene_of(transitions(made, 8))
+    together = policy.explore(*scene, generators(8))
+    for i in range(8):
+        one = [part[i : i + 1] for part in scene]
+        alone = policy.explore(*one, [np.random.default_rng(i)])
+        np.testing.assert_allclose(alone[0], together[i], atol=1e-5)
+
+
+@pytest.mark.parametrize("readout", ["pair", "token"])
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+def test_whole_episodes_of_a_token_with_two_sides(readout: str, noise: float) -> None:
+    """Every readout plays every task, also one whose tokens may be turned over."""
+    agent = {"readout": readout}
+    made = setup(TWO, agent, PERCEPTRON, allow_flip=True, corner_noise=noise)
+    policy = policy_of(made)
+    with closing(BatchedEnv(made.layout, made.sim, made.reward, 4)) as env:
+        env.reset(generators(4))
         for _ in range(env.horizon):
-            actions = policy.act(env.corners, env.placed, env.goals)
-            flips.append(actions[:, -4] > 0.0)
-            result = env.step(actions.astype(np.float64))
-            assert not result.refused.any()
-        return result.overlap, np.stack(flips, axis=1)
+            actions = policy.explore(env.seen, env.placed, env.seen_goals, generators(4))
+            assert not env.step(actions.astype(np.float64)).refused.any()
+    learner, batch = Learner(made, 0), transitions(made, 8)
+    learner.update(learner.prepared(batch, np.random.default_rng(0)))
+    assert learner.updates == 1
+
+
+def test_the_agent_of_the_paper_plays_and_learns_the_game() -> None:
+    made = seven(PAPER, mirrored=0.5)
+    policy, learner, batch = policy_of(made), Learner(made, 0), transitions(made, 8)
+    assert policy.act(*scene_of(batch)).shape == (8, 4)
+    learner.update(learner.prepared(batch, np.random.default_rng(0)))
+    assert learner.updates == 1
+
+
+def run_of(made: Setup) -> Run:
+    return Run(Path("run"), {}, made, 7, policy_of(made))
+
+
+def test_a_run_plays_on_with_other_settings_of_the_agent() -> None:
+    run = run_of(seven({}, PERCEPTRON))
+    scene = scene_of(transitions(run.setup, 8))
+    other = run.with_agent(refine_steps=20, order="listed")
+    assert (other.setup.agent.refine_steps, run.setup.agent.refine_steps) == (20, 0)
+    assert other.policy.version == 7
+    left = [int(np.argmin(flags)) for flags in scene[1]]
+    assert chosen_tokens(other.policy.act(*scene), 7).tolist() == left
+    assert not np.allclose(other.policy.act(*scene), run.policy.act(*scene), atol=1e-3)
 
 
 @pytest.mark.parametrize(
-    "sim", [{}, {"mirrored": 0.5}, {"mirrored": 0.5, "allow_flip": True}, {"targets": "connected"}]
+    ("changes", "error"),
+    [({"order": "x"}, ConfigError), ({"readout": "token", "reapply": 2}, RunError)],
 )
-@pytest.mark.parametrize("order", ["learned", "random"])
-def test_perfect_networks_assemble_everything(sim: dict[str, Any], order: str) -> None:
-    made = seven({"order": order}, starts="outside", **sim)
-    overlap, _ = assembled(made, perfect(made), 12)
-    assert overlap.min() > 0.999
-
-
-def test_a_token_is_turned_over_just_where_its_piece_lies_on_the_other_side() -> None:
-    made = setup(
-        {"shapes": ["parallelogram"], "scale": 0.8},
-        {"readout": "pair"},
-        allow_flip=True,
-        mirrored=0.5,
-    )
-    rng = np.random.default_rng(0)
-    (poses, sides), (goals, goal_sides) = (random_scene(made.layout, rng, 40) for _ in range(2))
-    choice = perfect(made).choose(
-        made.layout.corners(poses, sides),
-        np.zeros((40, 1), np.bool_),
-        made.layout.corners(goals, goal_sides),
-    )
-    np.testing.assert_array_equal(choice.flip, (sides ^ goal_sides)[:, 0])
-    assert 5 < choice.flip.sum() < 35
-
-
-def test_without_flips_no_token_is_turned_over() -> None:
-    made = seven(mirrored=0.5)
-    corners, placed, goals = scenes(made, 20)
-    placed[:] = [True] * 6 + [False]
-    assert not perfect(made).choose(corners, placed, goals).flip.any()
-
-
-# Tokens that push each other
-
-
-def squares(**agent: Any) -> Setup:
-    return setup({"shapes": ["square"] * 3, "scale": 0.8}, agent, PERCEPTRON, **SLIDE)
-
-
-LIKES = np.array([1.0, 1.0, 0.9])  # of tokens that cover as much, the second
-
-
-def at(made: Setup, *centres: tuple[float, float]) -> np.ndarray:
-    poses = np.array([[x, y, 0.0] for x, y in centres])
-    return made.layout.corners(poses)[None]
-
-
-@pytest.mark.parametrize("gamma", [0.0, 1.0])
-def test_a_token_that_would_push_a_placed_one_off_the_target_is_not_played(gamma: float) -> None:
-    """Token 0 is placed well. Token 1, the better one but for that, would push it away."""
-    made = squares(gamma=gamma)
-    goals = at(made, (0, 0), (0.5, 0), (0.6, 0.6))
-    corners = at(made, (0, 0), (-0.5, 0), (-0.8, -0.8))
-    placed = np.array([[True, False, False]])
-    harmless, harmful = np.zeros((3, 3)), np.zeros((3, 3))
-    harmful[1, 0] = 0.9
-    harmless[1, 2] = harmless[2, 1] = 0.9  # what is still to come may be pushed
-    assert perfect(made, harmless, LIKES).choose(corners, placed, goals).token[0] == 1
-    assert perfect(made, harmful, LIKES).choose(corners, placed, goals).token[0] == 2
-    # One that lies beside the target may be pushed.
-    elsewhere = at(made, (-0.8, 0.8), (-0.5, 0), (-0.8, -0.8))
-    assert perfect(made, harmful, LIKES).choose(elsewhere, placed, goals).token[0] == 1
-    # And one that covers a tenth of its piece costs a tenth of what it would.
-    hardly = at(made, (-0.9 * 0.8 * 2**0.5 / 4, 0), (-0.5, 0), (-0.8, -0.8))
-    assert perfect(made, harmful, LIKES).choose(hardly, placed, goals).token[0] == 1
-
-
-@pytest.mark.parametrize(("gamma", "expected"), [(0.0, 1), (1.0, 2)])
-def test_what_lies_in_the_way_of_others_comes_after_them(gamma: float, expected: int) -> None:
-    """Token 2 would push token 1 away, wherever that is placed; not the other way round."""
-    made = squares(gamma=gamma)
-    goals = at(made, (0, 0), (0.5, 0), (0.6, 0.6))
-    corners = at(made, (0, 0), (-0.5, 0), (-0.8, -0.8))
-    pushes = np.zeros((3, 3))
-    pushes[2, 1] = 0.8
-    found = perfect(made, pushes, LIKES).choose(corners, np.array([[True, False, False]]), goals)
-    assert found.token[0] == expected
-
-
-def test_where_tokens_are_lifted_nothing_is_pushed() -> None:
-    made = setup({"shapes": ["square"] * 3, "scale": 0.8}, {"gamma": 1.0}, PERCEPTRON)
-    goals = at(made, (0, 0), (0.5, 0), (0.6, 0.6))
-    corners = at(made, (0, 0), (-0.5, 0), (-0.8, -0.8))
-    pushes = np.zeros((3, 3))
-    pushes[1, 0] = pushes[2, 1] = 1.0  # what would speak against token 1, now and later
-    everything = perfect(made, pushes, LIKES)
-    placed = np.array([[True, False, False]])
-    assert everything.choose(corners, placed, goals).token[0] == 1
+def test_settings_that_the_weights_do_not_fit_are_refused(
+    changes: dict[str, Any], error: type[Exception]
+) -> None:
+    with pytest.raises(error):
+        run_of(seven({}, PERCEPTRON)).with_agent(**changes)

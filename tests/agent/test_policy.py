@@ -2,27 +2,25 @@
 
 import numpy as np
 import pytest
-import torch
 
-from tangram_agent.ddpg import Learner
-from tangram_agent.pair_learner import make_learner
+from tangram_agent.learner import Learner
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
 from tangram_agent.types import Weights
 from tangram_sim.errors import RunError
-from tests.agent.builders import PAIR, random_transitions, setup
+from tests.agent.builders import PAIR, SCENE, random_transitions, setup
 
 pytestmark = pytest.mark.fast
 
 
 def policy_of(made: Setup) -> Policy:
     policy = Policy(made)
-    policy.load(make_learner(made, seed=0).acting_weights(7))
+    policy.load(Learner(made, seed=0).acting_weights(7))
     return policy
 
 
 def test_load_takes_weights_and_version() -> None:
-    made = setup()
+    made = setup(agent=SCENE)
     policy = Policy(made)
     assert policy.version == -1
     weights = Learner(made, seed=0).acting_weights(7)
@@ -32,7 +30,7 @@ def test_load_takes_weights_and_version() -> None:
 
 
 def test_weights_are_a_copy() -> None:
-    made = setup()
+    made = setup(agent=SCENE)
     learner = Learner(made, seed=0)
     weights = learner.acting_weights(0)
     before = {name: value.copy() for name, value in weights.tensors.items()}
@@ -43,24 +41,23 @@ def test_weights_are_a_copy() -> None:
 
 def test_weights_of_another_network_are_refused() -> None:
     with pytest.raises(RunError, match="on one side only"):
-        Policy(setup()).load(Weights(0, {}))
+        Policy(setup(agent=SCENE)).load(Weights(0, {}))
 
 
 def test_acting_is_the_acting_network_of_the_learner() -> None:
-    made = setup(agent={"acting_average": 0.5})
+    made = setup(agent=SCENE | {"acting_average": 0.5})
     learner = Learner(made, seed=0)
     batch = random_transitions(made, 8)
     learner.update(batch)
     policy = Policy(made)
     policy.load(learner.acting_weights(1))
-    t = [torch.from_numpy(np.asarray(x, "f4")) for x in (batch.state, batch.placed, batch.goal)]
-    expected = learner.acting(*t, torch.zeros(8, dtype=torch.long))[0].detach().numpy()
+    expected = learner.acting(learner.steps(batch).view)[0].detach().numpy()
     found = policy.act(batch.state, batch.placed, batch.goal)
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_with_several_tokens_the_next_one_is_named() -> None:
-    made = setup(PAIR, agent={"readout": "token"})
+    made = setup(PAIR, agent=SCENE)
     batch = random_transitions(made, 2)
     actions = policy_of(made).act(batch.state, np.array([[0, 0], [1, 0]]), batch.goal)
     assert actions.shape == (2, 4)
@@ -75,7 +72,7 @@ def explore(made: Setup, count: int = 500) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_gaussian_noise_has_the_spread_that_is_set() -> None:
-    plain, noisy = explore(setup(agent={"noise": 0.05, "uniform_share": 0.0}))
+    plain, noisy = explore(setup(agent=SCENE | {"noise": 0.05, "uniform_share": 0.0}))
     inside = np.abs(plain) < 0.8
     gap = (noisy - plain)[inside]
     assert gap.std() == pytest.approx(0.05, rel=0.1)
@@ -83,16 +80,14 @@ def test_gaussian_noise_has_the_spread_that_is_set() -> None:
 
 
 def test_a_share_of_actions_is_uniform() -> None:
-    plain, noisy = explore(setup(agent={"noise": 0.0, "uniform_share": 0.3}))
+    plain, noisy = explore(setup(agent=SCENE | {"noise": 0.0, "uniform_share": 0.3}))
     drawn = np.abs(noisy - plain).max(axis=1) > 1e-6
     assert drawn.mean() == pytest.approx(0.3, abs=0.06)
     assert noisy[drawn].std() == pytest.approx(1 / np.sqrt(3), rel=0.1)
 
 
 def test_exploring_stays_in_range_and_keeps_the_choice_of_token() -> None:
-    plain, noisy = explore(
-        setup(PAIR, agent={"readout": "token", "noise": 2.0, "uniform_share": 0.5})
-    )
+    plain, noisy = explore(setup(PAIR, agent=SCENE | {"noise": 2.0, "uniform_share": 0.5}))
     assert np.abs(noisy).max() <= 1.0
     np.testing.assert_array_equal(noisy[:, 0], plain[:, 0])
 

@@ -10,7 +10,7 @@ import safetensors.numpy
 import yaml
 
 from tangram_agent import pretrained
-from tangram_agent.ddpg import Learner
+from tangram_agent.learner import Learner
 from tangram_agent.policy import Policy
 from tangram_agent.pretrained import CARD, CONFIG, WEIGHTS, agent_names, is_name
 from tangram_agent.runs import load_run

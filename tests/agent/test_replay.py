@@ -96,13 +96,15 @@ def test_a_smaller_buffer_takes_over_the_newest() -> None:
         ("done", 2, "'done' holds flags other than 0 and 1"),
     ],
 )
-def test_check_valid_finds_bad_numbers(name: str, value: float, reason: str) -> None:
+def test_bad_numbers_are_found_and_not_taken_over(name: str, value: float, reason: str) -> None:
     replay = buffer(4)
     replay.add(numbered(0, 2))
     replay.check_valid()
     replay.state()[name].reshape(-1)[0] = value
     with pytest.raises(RunError, match=reason):
         replay.check_valid()
+    with pytest.raises(RunError, match=reason):
+        buffer(4).load_state(replay.state())
 
 
 @pytest.mark.parametrize("name", ["reward", "state", "counters"])

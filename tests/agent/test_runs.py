@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from tangram_agent.checkpoints import save_checkpoint
-from tangram_agent.ddpg import Learner
+from tangram_agent.learner import Learner
 from tangram_agent.policy import Policy
 from tangram_agent.runs import load_run
 from tangram_sim.errors import RunError, TangramError

@@ -218,3 +218,49 @@ def test_stages_are_read_from_mappings() -> None:
     assert read.stage(9) == 1
     one, other = (make_setup(changed("sim", stages=s)).fingerprints() for s in (stages, []))
     assert one["sim"] != other["sim"]
+
+
+SEVERAL = {"shapes": ["square", "square"]}
+ONE = {"shapes": ["square"]}
+FUTURE = [{"strategy": "future"}]
+
+
+@pytest.mark.parametrize(
+    ("tokens", "sections", "reason"),
+    [
+        (SEVERAL, {"reward": {"name": "dense"}}, "reward.name=dense changes nothing with 2 tokens"),
+        (SEVERAL, {"reward": {"source": "camera"}}, "reward.source=camera changes nothing"),
+        (SEVERAL, {"reward": {"name": "pose"}}, "set agent.readout=token, which values the whole"),
+        (SEVERAL, {"agent": {"gamma": 0.9}}, "agent.gamma=0.9 changes nothing with 2 tokens"),
+        (SEVERAL, {"agent": {"hindsight": FUTURE}}, "strategy=future changes nothing"),
+        (SEVERAL, {"agent": {"push_weight": 0.5}}, "agent.push_weight=0.5 .* sim.motion=slide"),
+        (SEVERAL, {"agent": {"readout": "token", "order": "size"}}, "agent.order=size changes"),
+        (ONE, {"agent": {"order": "size"}}, "agent.order=size changes nothing with one token"),
+        (ONE, {"agent": {"pairs_per_transition": 2}}, "changes nothing with one token"),
+        (ONE, {"agent": {"reapply": 0}}, "agent.reapply=0 .* set agent.readout=pair"),
+        (ONE, {"agent": {"refine_steps": 5}}, "agent.refine_steps=5 changes nothing"),
+        (ONE, {"agent": {"polyak": 0.9}}, "agent.polyak=0.9 changes nothing with agent.gamma=0"),
+        (ONE, {"agent": {"lr_decay": "none", "lr_final": 0.5}}, "agent.lr_final=0.5 changes"),
+    ],
+)
+def test_what_would_change_nothing_is_refused(
+    tokens: dict[str, Any], sections: dict[str, Any], reason: str
+) -> None:
+    config = changed("tokens", **tokens) | sections
+    with pytest.raises(ConfigError, match=reason):
+        make_setup(config)
+
+
+@pytest.mark.parametrize(
+    ("tokens", "sections"),
+    [
+        (SEVERAL, {"reward": {"name": "dense"}, "agent": {"readout": "token"}}),
+        (SEVERAL, {"agent": {"readout": "token", "gamma": 0.9, "hindsight": FUTURE}}),
+        (SEVERAL, {"agent": {"push_weight": 0.5}, "sim": {"motion": "slide"}}),
+        (SEVERAL, {"agent": {"order": "size", "reapply": 0, "pairs_per_transition": 2}}),
+        (ONE, {"reward": {"name": "dense"}, "agent": {"gamma": 0.9, "polyak": 0.9}}),
+        (ONE, {"reward": {"name": "pose"}, "agent": {"readout": "pair", "reapply": 0}}),
+    ],
+)
+def test_what_has_an_effect_is_taken(tokens: dict[str, Any], sections: dict[str, Any]) -> None:
+    make_setup(changed("tokens", **tokens) | sections)

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from tangram_agent.attention import GraphAttention
-from tangram_agent.ddpg import Learner
-from tangram_lab.benchmarks.bullet import BareLoop
-from tangram_lab.benchmarks.plain import HeadByHead, PlainLearner
+from tangram_agent.learner import Learner
+from tangram_lab.benchmarks.learner import HeadByHead, PlainLearner
 from tangram_lab.benchmarks.replay import filled, random_transitions
 from tangram_lab.benchmarks.setups import preset, several, with_agent, with_sim
+from tangram_lab.benchmarks.sim import BareLoop
 from tangram_sim.physics import PhysicsWorld
 
 pytestmark = pytest.mark.fast
@@ -55,7 +55,7 @@ def test_the_plain_learner_moves_its_targets() -> None:
     setup = with_agent(preset(), batch_size=16)
     plain = PlainLearner(setup, seed=0)
     before = [parameter.clone() for parameter in plain.target_critic.parameters()]
-    plain.update(random_transitions(setup, 16))
+    plain.update(plain.prepared(random_transitions(setup, 16), np.random.default_rng(0)))
     after = plain.target_critic.parameters()
     assert any(not torch.equal(old, new) for old, new in zip(before, after, strict=True))
 

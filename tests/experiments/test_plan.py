@@ -1,16 +1,58 @@
-"""What a study consists of, and what it refuses."""
+"""Which trainings and tests a study consists of, what it refuses, and the processes it needs."""
 
 import json
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
-from tangram_lab.experiments.plan import joined_plan, plan_content
+from tangram_agent.setup import from_mapping
+from tangram_lab.experiments.jobs import Job, make_jobs
+from tangram_lab.experiments.plan import StudyConfig, joined_plan, plan_content
 from tangram_sim.errors import ConfigError
-from tests.experiments.studies import content, experiment, study
 
 pytestmark = pytest.mark.fast
+
+
+def content(run_dir: Path, **changes: Any) -> dict[str, Any]:
+    """The settings of a study of two experiments that share a training."""
+    settings = {
+        "run_dir": str(run_dir),
+        "budget": {
+            "name": "tiny",
+            "note": "Nothing is learned.",
+            "seeds": [0, 1],
+            "test_episodes": 5,
+            "overrides": {"all": ["a=1", "b=1"], "ours": ["b=2"]},
+        },
+        "families": {"ours": ["agent=tangram"], "theirs": ["agent=paper"]},
+        "trainings": {
+            "square": {"label": "square", "family": "ours"},
+            "paper": {"label": "paper", "family": "theirs", "overrides": ["b=3", "c=1"]},
+            "warm": {"label": "warm", "family": "ours", "after": "square"},
+        },
+        "tests": {
+            "twice": {"label": "2 actions", "actions": 2},
+            "noisy": {"label": "1 % noise", "corner_noise": 0.01},
+        },
+        "experiments": {
+            "one": experiment(["paper", "square"], ["twice"]),
+            "two": experiment(["square", "warm"], ["twice", "noisy"]),
+        },
+    }
+    return settings | changes
+
+
+def experiment(trainings: list[str], tests: list[str]) -> dict[str, Any]:
+    """A table of these trainings and tests."""
+    texts = {"title": "A title", "source": "Table I", "note": "A note.", "kind": "tests"}
+    return texts | {"trainings": trainings, "tests": tests}
+
+
+def study(run_dir: Path, **changes: Any) -> StudyConfig:
+    """The study as tangram-experiment would make it."""
+    return from_mapping(StudyConfig, content(run_dir, **changes))
 
 
 @pytest.mark.parametrize(
@@ -72,16 +114,19 @@ def test_what_does_not_exist_is_refused(
         study(tmp_path, **changes)
 
 
-@pytest.mark.parametrize("seeds", [[], [1, 1]])
-def test_seeds_are_different(tmp_path: Path, seeds: list[int]) -> None:
+@pytest.mark.parametrize(
+    ("seeds", "message"),
+    [
+        ([], "must be different numbers, got"),
+        ([1, 1], "must be different numbers, got"),
+        ([0, -1], "must be at least 0, got -1"),
+    ],
+)
+def test_seeds_are_different_and_not_negative(
+    tmp_path: Path, seeds: list[int], message: str
+) -> None:
     budget = content(tmp_path)["budget"] | {"seeds": seeds}
-    with pytest.raises(ConfigError, match="budget.seeds must be different numbers, got"):
-        study(tmp_path, budget=budget)
-
-
-def test_seeds_are_not_negative(tmp_path: Path) -> None:
-    budget = content(tmp_path)["budget"] | {"seeds": [0, -1]}
-    with pytest.raises(ConfigError, match="budget.seeds must be at least 0, got -1"):
+    with pytest.raises(ConfigError, match=f"budget.seeds {message}"):
         study(tmp_path, budget=budget)
 
 
@@ -166,3 +211,166 @@ def test_a_plan_that_cannot_be_read_is_refused(tmp_path: Path, text: str) -> Non
     path.write_text(text)
     with pytest.raises(ConfigError, match=r"cannot read .*plan.json: remove it"):
         joined_plan(path, plan_content(study(tmp_path), {}))
+
+
+# Processes
+
+
+def resolved(config: StudyConfig, **changes: Any) -> dict[str, dict[str, Any]]:
+    """A config for each training, as far as jobs look at it."""
+    agent = {"gamma": 0.0, "hindsight": [{"strategy": "final"}]}
+    return {name: {"agent": agent, "max_updates": 3} | changes for name in config.wanted()}
+
+
+def jobs_of(folder: Path, **changes: Any) -> dict[str, Job]:
+    config = study(folder, **changes)
+    return {job.name: job for job in make_jobs(config, resolved(config))}
+
+
+def test_all_trainings_of_a_seed_come_before_the_next_seed(tmp_path: Path) -> None:
+    twice, both = ("", ", test twice"), ("", ", test twice", ", test noisy")
+    assert list(jobs_of(tmp_path)) == [
+        f"{name}, seed {seed}{test}"
+        for seed in (0, 1)
+        for name, tests in (("paper", twice), ("square", both), ("warm", both))
+        for test in tests
+    ]
+
+
+def test_a_training_is_a_command_that_can_go_on(tmp_path: Path) -> None:
+    job = jobs_of(tmp_path)["paper, seed 1"]
+    run_dir = tmp_path / "trainings" / "paper" / "seed_1"
+    assert job.command == (
+        *("train", f"run_dir='{run_dir}'", "seed=1", "resume=auto"),
+        *("agent=paper", "a=1", "b=3", "c=1"),
+    )
+    assert (job.run_dir, job.leaves, job.needs) == (run_dir, run_dir / "result.json", None)
+    assert job.settings["max_updates"] == 3
+    assert job.log == run_dir / "training.log"
+
+
+def test_a_warm_start_waits_for_its_source(tmp_path: Path) -> None:
+    jobs = jobs_of(tmp_path)
+    job, source = jobs["warm, seed 1"], tmp_path / "trainings" / "square" / "seed_1"
+    assert job.command[-1] == f"warm_start='{source}'"
+    assert job.needs is jobs["square, seed 1"]
+    assert not job.ready
+    end(source / "result.json", "max_updates=3")
+    assert job.ready
+
+
+@pytest.mark.parametrize(
+    ("test", "setting"), [("twice", "actions=2"), ("noisy", "corner_noise=0.01")]
+)
+def test_a_test_follows_its_training(tmp_path: Path, test: str, setting: str) -> None:
+    jobs = jobs_of(tmp_path)
+    job = jobs[f"square, seed 0, test {test}"]
+    run_dir = tmp_path / "trainings" / "square" / "seed_0"
+    out = run_dir / "tests" / f"{test}.json"
+    assert job.command == (
+        *("eval", f"run_dir='{run_dir}'", f"out='{out}'", "episodes=5"),
+        setting,
+    )
+    assert job.needs is jobs["square, seed 0"]
+    assert (job.leaves, job.trains) == (out, False)
+
+
+def end(path: Path, ended_by: str = "max_updates=3", updates: int = 3, scored: Any = 3) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    content = {"ended_by": ended_by, "updates": updates, "scored_updates": scored}
+    path.write_text(json.dumps(content))
+
+
+@pytest.mark.parametrize(
+    ("ended_by", "scored", "done"),
+    [
+        ("max_updates=3", 3, True),
+        ("max_episodes=8", 3, True),
+        ("max_hours=1.0", 3, True),
+        ("SIGTERM", 3, False),
+        ("max_updates=3", 2, False),
+        ("max_updates=3", None, False),
+        (3, 3, False),
+    ],
+)
+def test_a_training_is_done_when_its_final_weights_are_scored(
+    tmp_path: Path, ended_by: str, scored: int | None, done: bool
+) -> None:
+    job = jobs_of(tmp_path)["paper, seed 0"]
+    end(job.leaves, ended_by, scored=scored)
+    assert job.done is done
+
+
+@pytest.mark.parametrize("text", [None, "", "[]", '{"ended_by": 3}', '{"ended_by"', "\xff"])
+def test_what_cannot_be_read_is_not_done(tmp_path: Path, text: str | None) -> None:
+    for job in list(jobs_of(tmp_path).values())[:2]:
+        job.prepare()
+        if text is not None:
+            job.leaves.write_text(text, encoding="latin-1")
+        assert not job.done
+
+
+@pytest.mark.parametrize(
+    ("changes", "done"),
+    [
+        ({}, True),
+        ({"mean_reward": 0.5}, True),
+        ({"actions": 3}, False),
+        ({"episodes": 6}, False),
+        ({"updates": 2}, False),
+    ],
+)
+def test_a_test_is_done_when_it_is_that_of_the_final_weights(
+    tmp_path: Path, changes: dict[str, Any], done: bool
+) -> None:
+    job = jobs_of(tmp_path)["square, seed 0, test twice"]
+    end(job.run_dir / "result.json")
+    job.prepare()
+    assert not job.done
+    job.leaves.write_text(json.dumps({"actions": 2, "episodes": 5, "updates": 3} | changes))
+    assert job.done is done
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({}, None),
+        ({"max_updates": 4}, "max_updates=3, now 4"),
+        ({"agent": {"gamma": 0.5}}, "agent.gamma=0.0, now 0.5"),
+        ({"agent": {"hindsight": []}}, r"agent.hindsight=.*, now \[\]"),
+        ({"agent": {"newer": 1}, "service": {"envs": 1}}, None),
+    ],
+)
+def test_other_settings_in_the_same_folder_are_refused(
+    tmp_path: Path, changes: dict[str, Any], message: str | None
+) -> None:
+    config = study(tmp_path)
+    job = make_jobs(config, resolved(config))[0]
+    job.check()
+    job.prepare()
+    job.check()
+    (job.run_dir / "config.yaml").write_text(yaml.safe_dump(dict(job.settings)))
+    changed = make_jobs(config, resolved(config, **changes))[0]
+    if message is None:
+        changed.check()
+        return
+    with pytest.raises(ConfigError, match=f"was trained with other settings .{message}.: remove"):
+        changed.check()
+
+
+@pytest.mark.parametrize(
+    ("changes", "done"), [({}, True), ({"source": "train"}, False), ({"turns": 1}, False)]
+)
+def test_a_test_of_puzzles_is_known_by_their_source(
+    tmp_path: Path, changes: dict[str, Any], done: bool
+) -> None:
+    """Under `puzzles` its file has the scores of each."""
+    tests = {"figures": {"label": "figures", "puzzles": "test", "turns": 8}}
+    one = {"one": experiment(["square"], ["figures"])}
+    job = jobs_of(tmp_path, tests=tests, experiments=one)["square, seed 0, test figures"]
+    assert job.command[-2:] == ("puzzles=test", "turns=8")
+    end(job.run_dir / "result.json")
+    job.prepare()
+    told = {"source": "test", "turns": 8, "updates": 3, "puzzles": [{"name": "cat"}]}
+    job.leaves.write_text(json.dumps(told | changes))
+    assert job.done is done

@@ -69,97 +69,94 @@ def part(page: str, name: str) -> str:
 # Pages
 
 
-def test_scores_of_an_experiment(page: str) -> None:
-    text = part(page, "fig4")
+HEAD = ["seeds", "paper", "mean reward, median (least to most)", "seed 0", "seed 1", "seed 2"]
+REWARD, ANGLE = "0.758 (0.750 to 0.762)", "24.20° (23.80° to 25.00°)"
+FIG4, FIG6, TABLE1, TABLE2, RANKING = "fig4", "fig6", "table1", "table2", "ablation"
+
+
+@pytest.mark.parametrize(
+    ("name", "label", "row", "cut", "expected"),
+    [
+        (FIG4, "training", 0, slice(None), HEAD),
+        (
+            FIG4,
+            "MHA (paper)",
+            0,
+            slice(None),
+            ["3 of 3", "0.75", REWARD, "0.758", "0.750", "0.762"],
+        ),
+        (FIG4, "MLP", 0, slice(3), ["2 of 3", "0.70", "0.695 (0.690 to 0.700)"]),
+        (FIG4, "MLP", 0, slice(3, None), ["0.700", "0.690", "-"]),
+        (FIG4, "ours", 0, slice(3), ["2 of 3", "-", "0.996 (0.995 to 0.996)"]),
+        (FIG4, "ours", 0, slice(3, None), ["0.996", "0.995", "-"]),
+        (FIG4, "position only", 0, slice(None), ["", "", "0.764", "", "", ""]),
+        (FIG4, "perfect", 0, slice(None), ["", "", "1.000", "", "", ""]),
+        (FIG4, "random", 0, slice(None), ["", "", "-0.960", "", "", ""]),
+        # How much it took.
+        (FIG4, "MHA (paper)", 1, slice(1), ["0.75 after 1,500"]),
+        (FIG4, "MHA (paper)", 1, slice(3, 6), [ANGLE, "0.0005", "20,640"]),
+        (FIG4, "MHA (paper)", 1, slice(6, None), ["2,000", "1.0 (0.9 to 1.1)"]),
+        (FIG4, "ours", 1, slice(1), ["-"]),
+        # Both rewards.
+        (FIG6, "random", 0, slice(None), ["", "-0.960", "", "", ""]),
+        (FIG6, "random", 1, slice(None), ["", "-0.620", "", "", ""]),
+        # The paper's beside ours.
+        (TABLE1, "MHA (paper)", 0, slice(4), ["3 of 3", "504,000", "32,600", "72"]),
+        (TABLE1, "MHA (paper)", 0, slice(4, 7), ["0.02 (0.01 to 0.02)", "28,000", "20,640"]),
+        (TABLE1, "MHA (paper)", 0, slice(7, None), ["2,000", REWARD]),
+        (TABLE2, "MHA (paper)", 0, slice(None), ["3 of 3", REWARD, "0.748 (0.740 to 0.752)"]),
+        (TABLE2, "MHA (paper)", 1, slice(1, 2), [ANGLE]),
+        (TABLE2, "MHA (paper)", 3, slice(None), ["1", "0.750", "0.740"]),
+        (TABLE2, "MHA (paper), the paper's", 0, slice(None), ["", "0.758", "0.754"]),
+        (TABLE2, "position only", 0, slice(None), ["", "0.764", "0.764"]),
+        (TABLE2, "position only", 1, slice(None), ["", "23.80°", "23.80°"]),
+        # A ranking compares with the first.
+        (RANKING, "ours", 0, slice(2, 5, 2), ["reference", "reference"]),
+        (RANKING, "MHA (paper)", 0, slice(1, 5), [REWARD, "-0.238", ANGLE, "+23.75°"]),
+        (RANKING, "MHA (paper)", 0, slice(6, None), ["0.758", "0.750", "0.762"]),
+        # How it was made.
+        (None, "runs finished", 0, slice(None), ["7 of 9"]),
+        (None, "seeds", 0, slice(None), ["0 / 1 / 2"]),
+        (None, "commit", 0, slice(None), ["0123abc"]),
+        (None, "processor", 0, slice(None), ["AMD EPYC"]),
+        (None, "cores", 0, slice(None), ["2"]),
+        (None, "versions", 0, slice(None), ["python 3.11.7, torch 2.13.0"]),
+        (None, "time, all runs added up", 0, slice(None), ["0.12 h"]),
+    ],
+)
+def test_the_cells_of_its_tables(
+    page: str, name: str | None, label: str, row: int, cut: slice, expected: list[str]
+) -> None:
+    assert cells(page if name is None else part(page, name), label)[row][cut] == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "label", "count"),
+    [
+        *((FIG4, policy, 1) for policy in ("position only", "perfect", "random")),
+        (FIG6, "random", 2),
+        (TABLE1, "MHA (paper)", 1),
+        (TABLE2, "MHA (paper), the paper's", 1),
+        (TABLE2, "position only", 2),
+        (None, "runs finished", 1),
+    ],
+)
+def test_rows_stand_once_in_each_table(page: str, name: str | None, label: str, count: int) -> None:
+    assert len(cells(page if name is None else part(page, name), label)) == count
+
+
+def test_texts_around_the_tables(page: str) -> None:
+    text = part(page, FIG4)
     assert "## A curves title" in text
     assert "Source: Fig. 4. What curves are." in text
-    assert cells(text, "training")[0] == [
-        "seeds",
-        "paper",
-        "mean reward, median (least to most)",
-        "seed 0",
-        "seed 1",
-        "seed 2",
-    ]
-    paper, mlp, ours = (cells(text, label)[0] for label in ("MHA (paper)", "MLP", "ours"))
-    assert paper == ["3 of 3", "0.75", "0.758 (0.750 to 0.762)", "0.758", "0.750", "0.762"]
-    assert mlp == ["2 of 3", "0.70", "0.695 (0.690 to 0.700)", "0.700", "0.690", "-"]
-    assert ours == ["2 of 3", "-", "0.996 (0.995 to 0.996)", "0.996", "0.995", "-"]
-    assert cells(text, "position only") == [["", "", "0.764", "", "", ""]]
-    assert cells(text, "perfect") == [["", "", "1.000", "", "", ""]]
-    assert cells(text, "random") == [["", "", "-0.960", "", "", ""]]
-
-
-def test_effort_of_an_experiment(page: str) -> None:
-    text = part(page, "fig4")
-    paper, ours = cells(text, "MHA (paper)")[1], cells(text, "ours")[1]
-    assert paper[0] == "0.75 after 1,500"
-    assert paper[3] == "24.20° (23.80° to 25.00°)"
-    assert paper[4:] == ["0.0005", "20,640", "2,000", "1.0 (0.9 to 1.1)"]
-    assert ours[0] == "-"
-
-
-def test_missing_seeds_are_told(page: str) -> None:
-    text = part(page, "fig4")
     assert "- MLP (2 of 3 seeds): seed 2 not started" in text
     assert "- ours (2 of 3 seeds): seed 2 not finished" in text
     assert "- MHA" not in text
     assert "| [A curves title](#fig4) | Fig. 4 | 7 of 9 |" in page
-
-
-def test_both_rewards(page: str) -> None:
-    text = part(page, "fig6")
-    assert "mean dense reward, median (least to most)" in text
-    assert cells(text, "random") == [["", "-0.960", "", "", ""], ["", "-0.620", "", "", ""]]
-
-
-def test_complexity_beside_the_papers(page: str) -> None:
-    text = part(page, "table1")
-    assert cells(text, "MHA (paper)") == [
-        [
-            "3 of 3",
-            "504,000",
-            "32,600",
-            "72",
-            "0.02 (0.01 to 0.02)",
-            "28,000",
-            "20,640",
-            "2,000",
-            "0.758 (0.750 to 0.762)",
-        ]
-    ]
-    assert "![" not in text
-    assert "Left out" not in text
-
-
-def test_tests_beside_the_papers(page: str) -> None:
-    text = part(page, "table2")
-    rewards, angles = cells(text, "MHA (paper)")[:2]
-    assert rewards == ["3 of 3", "0.758 (0.750 to 0.762)", "0.748 (0.740 to 0.752)"]
-    assert angles[1] == "24.20° (23.80° to 25.00°)"
-    assert cells(text, "MHA (paper), the paper's") == [["", "0.758", "0.754"]]
-    assert cells(text, "position only") == [["", "0.764", "0.764"], ["", "23.80°", "23.80°"]]
-    assert ["1", "0.750", "0.740"] in cells(text, "MHA (paper)")
-
-
-def test_ranking_compares_with_the_first(page: str) -> None:
-    text = part(page, "ablation")
-    ours, paper = cells(text, "ours")[0], cells(text, "MHA (paper)")[0]
-    assert ours[2] == ours[4] == "reference"
-    assert paper[1:3] == ["0.758 (0.750 to 0.762)", "-0.238"]
-    assert paper[3:5] == ["24.20° (23.80° to 25.00°)", "+23.75°"]
-    assert paper[6:] == ["0.758", "0.750", "0.762"]
-
-
-def test_closing(page: str) -> None:
+    assert "mean dense reward, median (least to most)" in part(page, FIG6)
+    assert "![" not in part(page, TABLE1)
+    assert "Left out" not in part(page, TABLE1)
     assert "Budget `laptop`: Narrower MHA." in page
-    assert cells(page, "runs finished") == [["7 of 9"]]
-    assert cells(page, "seeds") == [["0 / 1 / 2"]]
-    assert cells(page, "commit") == [["0123abc"]]
-    assert cells(page, "processor") == [["AMD EPYC"]]
-    assert cells(page, "cores") == [["2"]]
-    assert cells(page, "versions") == [["python 3.11.7, torch 2.13.0"]]
-    assert cells(page, "time, all runs added up") == [["0.12 h"]]
     assert "- **MLP** (`mlp`): `agent=mlp`" in page
     assert "- **ours** (`ours`): (defaults)" in page
     assert "secret-host" not in page
@@ -210,7 +207,10 @@ def test_same_runs_give_the_same_bytes(tmp_path: Path, patch: pytest.MonkeyPatch
 
 
 def test_data_holds_all_numbers(made: Path) -> None:
-    data = json.loads((made / "data.json").read_text())
+    text = (made / "data.json").read_text()
+    assert "secret-host" not in text
+    assert "/home/somebody" not in text
+    data = json.loads(text)
     assert data["plan"]["budget"]["name"] == "laptop"
     assert set(data["runs"]) == {"paper", "mlp", "ours"}
     seed = data["runs"]["paper"][1]
@@ -225,12 +225,6 @@ def test_data_holds_all_numbers(made: Path) -> None:
     cut = data["runs"]["ours"][2]
     assert (cut["state"], cut["result"], len(cut["curve"]["updates"])) == ("not finished", {}, 3)
     assert data["runs"]["mlp"][2]["state"] == "not started"
-
-
-def test_data_is_free_of_private_names(made: Path) -> None:
-    text = (made / "data.json").read_text()
-    assert "secret-host" not in text
-    assert "/home/somebody" not in text
 
 
 # The command

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from master import loop as loop_module
 from master.delivery import EpisodesArrived
@@ -26,7 +25,6 @@ from tests.master.builders import (
     close_journals,
     loop,
     scores,
-    shown,
     small_setup,
 )
 
@@ -304,60 +302,6 @@ def test_the_learning_rate_follows_the_budget(tmp_path: Path) -> None:
     made.guard.trainer.update = noting  # type: ignore[method-assign]
     made.run()
     assert seen == pytest.approx([i / 10 for i in range(10)])
-
-
-def test_what_is_told(tmp_path: Path) -> None:
-    """The same status goes to the terminal, to who asks, to the curves and into the result."""
-    hub = FakeHub(MADE, [*batches(2), [scores(MADE, 2)]], ["player", "evaluator"])
-    made = loop(tmp_path, MADE, hub, {"publish_seconds": 0.0}, max_updates=4)
-    made.run()
-    last = made.reporter.flush(queue=3)
-    assert shown(made)[-1] is last
-    assert hub.values("tell")[-1] is last
-    expected = {
-        "episodes": 8,
-        "updates": 4,
-        "share": 1.0,
-        "players": 1,
-        "evaluators": 1,
-        "queue": 3,
-    }
-    assert expected.items() <= dict(last.numbers).items()
-    assert last.texts["activity"] == "waiting for episodes"
-    made.reporter._metrics.close()
-    events = EventAccumulator(str(tmp_path / "tensorboard"))
-    events.Reload()
-    expected_tags = {
-        "train/critic_loss",
-        "train/actor_loss",
-        "train/q",
-        "play/reward",
-        "weights/age_updates",
-        "weights/age_seconds",
-    }
-    of_status = {n if "/" in n else f"run/{n}" for n in last.numbers if not n.startswith("test/")}
-    assert expected_tags | of_status <= set(events.Tags()["scalars"])
-
-
-@pytest.mark.parametrize(
-    ("transitions", "updates", "players", "words"),
-    [
-        (0, 0, 0, "waiting for workers to join"),
-        (3, 0, 1, "filling the replay, 3 of 4"),
-        (4, 0, 1, "learning, workers wait"),
-        (4, 0, 0, "learning"),
-        (4, 1, 1, "learning"),
-        (4, 2, 1, "waiting for episodes"),
-    ],
-)
-def test_what_is_waited_for(
-    tmp_path: Path, transitions: int, updates: int, players: int, words: str
-) -> None:
-    made = loop(tmp_path, MADE, FakeHub(MADE, roles=["player"] * players))
-    made.guard.trainer.rate_limiter.inserted(transitions)
-    made.guard.trainer.rate_limiter.updated(updates)
-    made.reporter.tick(0)
-    assert shown(made)[-1].texts["activity"] == words
 
 
 IN_STEP = {"mode": "lockstep", "lockstep_workers": 2, "envs": BATCH, "batch_episodes": BATCH}

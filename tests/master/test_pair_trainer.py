@@ -9,7 +9,6 @@ import pytest
 from master.checkpointer import Restored, restore_run, save_run
 from master.rundir import Record
 from master.trainer import Trainer
-from tangram_agent.pair_learner import PairLearner
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
 from tests.agent.builders import random_episodes
@@ -58,7 +57,6 @@ def test_replay_holds_what_was_played_and_no_twins() -> None:
     """Twins are made anew for every update, of the token that moved."""
     made = trainer(made_setup(**LIFT))
     made.insert(random_episodes(made.setup, 2))
-    assert isinstance(made.learner, PairLearner)
     assert made.transitions == len(made.replay) == 14
     numbers = made.update(0.0)
     assert made.updates == 1

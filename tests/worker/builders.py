@@ -9,7 +9,7 @@ import yaml
 
 from tangram_agent.checkpoints import save_checkpoint
 from tangram_agent.config import ServiceConfig
-from tangram_agent.pair_learner import make_learner
+from tangram_agent.learner import Learner
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup, make_setup
 from tangram_agent.types import Episodes, Weights
@@ -21,7 +21,7 @@ from worker.rollout import Played
 
 def weights(made: Setup, version: int) -> Weights:
     """Random weights; every version has its own, and all of them move the tokens visibly."""
-    return make_learner(made, seed=version).acting_weights(version)
+    return Learner(made, seed=version).acting_weights(version)
 
 
 def policy(made: Setup, version: int = 1) -> Policy:

@@ -1,55 +1,148 @@
 """Settings of the worker's commands: each wrong value is refused with what to do."""
 
+from pathlib import Path
+
 import pytest
 
 from tangram_sim.errors import ConfigError
-from worker.config import EvalConfig, PlayConfig, WorkerConfig
+from worker.cli import with_absolute_paths
+from worker.config import EvalConfig, PlayConfig, WorkerConfig, check_compare, check_puzzle
 
 pytestmark = pytest.mark.fast
 
-
-@pytest.mark.parametrize(
-    ("wrong", "reason"),
-    [
+RUN = {"run_dir": "runs/one"}
+TESTED = RUN | {"puzzles": "test"}
+TWO = {"compare": ("a", "b")}
+OF_A_RUN = [
+    ({"run_dir": ""}, "set run_dir=runs/my_run"),
+    ({"episodes": 0}, "episodes must be between 1 and"),
+    ({"episodes": 1_000_001}, "episodes must be between 1 and"),
+    ({"actions": 0}, "actions must be between 1 and 100, got 0"),
+    ({"actions": 101}, "actions must be between 1 and 100, got 101"),
+    ({"seed": -1}, "seed must be between 0 and"),
+    ({"seed": 2**63}, "seed must be between 0 and"),
+]
+WRONG = {
+    WorkerConfig: [
         ({"connect": " "}, "set connect=tcp://HOST:PORT"),
         ({"role": "dancer"}, "role must be one of player, evaluator, got 'dancer'"),
         ({"index": -2}, "index must be between -1 and 65535, got -2"),
         ({"index": 65536}, "index must be between -1 and 65535, got 65536"),
     ],
-)
-def test_wrong_worker_settings(wrong: dict, reason: str) -> None:
+    EvalConfig: [
+        *OF_A_RUN,
+        *[({"out": out}, "out must name a file") for out in ("", "/", ".")],
+        (TESTED | {"turns": 0}, "turns must be between 1 and 360, got 0"),
+        (TESTED | {"turns": 361}, "turns must be between 1 and 360, got 361"),
+        (TESTED | {"sheet": "ends.gif"}, "sheet must end with .png, got 'ends.gif'"),
+        (TESTED | {"order": "best"}, "must be one of learned, listed, size, random, got 'best'"),
+        ({"turns": 2}, "turns is for puzzles: set puzzles=test, or leave turns out"),
+        ({"sheet": "a.png"}, "sheet is for puzzles: set puzzles=test, or leave sheet out"),
+        ({"skip_invalid": True}, "skip_invalid is for puzzles: set puzzles=test, or leave"),
+    ],
+    PlayConfig: [
+        *OF_A_RUN,
+        *[
+            ({"out": out}, "out must end with .gif or .png, got")
+            for out in ("film.mp4", "film", "", "gif", "film.GIF.txt")
+        ],
+        ({"run_dir": None}, "say which run: run_dir=runs/..., or which ones: compare=[runs/a,"),
+        ({"run_dir": "a"} | TWO, "run_dir=a and compare do not go together"),
+        ({"run_dir": " "}, "run_dir must name"),
+        *[
+            ({"run_dir": None, "compare": runs}, "compare must list 2 to 4")
+            for runs in ((), ("a",), ("a", "b", "c", "d", "e"), ("a", ""))
+        ],
+        ({"run_dir": None, "compare": ("a", "a")}, "different runs"),
+        *[
+            ({"run_dir": None} | TWO | {name: value}, f"{name}={value} and compare do not go")
+            for name, value in (
+                ("tokens", "square"),
+                ("puzzle", ("cat",)),
+                ("puzzles", "test"),
+                ("live", True),
+            )
+        ],
+    ],
+}
+CASES = [(kind, *case) for kind, cases in WRONG.items() for case in cases]
+
+
+@pytest.mark.parametrize(("kind", "wrong", "reason"), CASES)
+def test_wrong_settings_are_refused_with_what_to_do(kind: type, wrong: dict, reason: str) -> None:
+    right = {"connect": "tcp://127.0.0.1:5555"} if kind is WorkerConfig else RUN
+    kind(**right)
     with pytest.raises(ConfigError) as caught:
-        WorkerConfig(**({"connect": "tcp://127.0.0.1:5555"} | wrong))
+        kind(**(right | wrong))
     assert reason in str(caught.value)
 
 
-@pytest.mark.parametrize("kind", [EvalConfig, PlayConfig])
+@pytest.mark.parametrize("value", ["a,b", {"a": 1}, 3, [1, 2]])
+def test_what_is_no_list_of_folders_is_refused(value: object) -> None:
+    with pytest.raises(ConfigError, match="set compare=\\[runs/a,runs/b\\]"):
+        check_compare(value)
+
+
 @pytest.mark.parametrize(
-    ("wrong", "reason"),
+    ("value", "names"),
+    [(None, None), ("cat", ("cat",)), (8, ("8",)), (["cat", "dog"], ("cat", "dog"))],
+)
+def test_one_puzzle_or_several(value: object, names: tuple[str, ...] | None) -> None:
+    assert check_puzzle(value) == names
+
+
+@pytest.mark.parametrize("value", ["", [], {"a": 1}, [["cat"]]])
+def test_what_names_no_puzzle_is_refused(value: object) -> None:
+    with pytest.raises(ConfigError, match="set puzzle=cat or puzzle=.cat,dog."):
+        check_puzzle(value)
+
+
+@pytest.mark.parametrize(
+    ("settings", "run_dir"),
     [
-        ({"run_dir": ""}, "set run_dir=runs/my_run"),
-        ({"episodes": 0}, "episodes must be between 1 and"),
-        ({"episodes": 1_000_001}, "episodes must be between 1 and"),
-        ({"actions": 0}, "actions must be between 1 and 100, got 0"),
-        ({"actions": 101}, "actions must be between 1 and 100, got 101"),
-        ({"seed": -1}, "seed must be between 0 and"),
-        ({"seed": 2**63}, "seed must be between 0 and"),
+        ({"tokens": "square"}, "pretrained/square"),
+        ({"tokens": "square", "run_dir": "a"}, "a"),
+        ({"puzzle": ("cat",)}, "pretrained/tangram7"),
+        ({"puzzles": "test"}, "pretrained/tangram7"),
+        ({"puzzles": "test", "tokens": "tangram3"}, "pretrained/tangram3"),
     ],
 )
-def test_wrong_settings_of_the_tools(kind: type, wrong: dict, reason: str) -> None:
-    kind(run_dir="runs/one")
-    with pytest.raises(ConfigError) as caught:
-        kind(**({"run_dir": "runs/one"} | wrong))
-    assert reason in str(caught.value)
+def test_which_run_is_played(monkeypatch: pytest.MonkeyPatch, settings: dict, run_dir: str) -> None:
+    monkeypatch.setattr("worker.config.agent_names", lambda: ["tangram7"])
+    assert PlayConfig(**settings).run_dirs == (run_dir,)
 
 
-@pytest.mark.parametrize("out", ["film.mp4", "film", "", "gif", "film.GIF.txt"])
-def test_a_picture_of_another_kind_is_refused_with_the_choices(out: str) -> None:
-    with pytest.raises(ConfigError, match=r"out must end with \.gif or \.png, got"):
-        PlayConfig("runs/one", out=out)
+def test_puzzles_are_for_the_agent_of_the_game_if_there_is_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("worker.config.agent_names", lambda: ["square", "tangram7"])
+    assert EvalConfig(puzzles="test").run == "pretrained/tangram7"
+    assert EvalConfig("runs/one", puzzles="test").run == "runs/one"
+    with pytest.raises(ConfigError, match="say which run: run_dir=runs/..."):
+        EvalConfig()
+    monkeypatch.setattr("worker.config.agent_names", lambda: ["square"])
+    for without in (lambda: EvalConfig(puzzles="test"), lambda: PlayConfig(puzzle=("cat",))):
+        with pytest.raises(ConfigError, match="say which run"):
+            without()
 
 
-@pytest.mark.parametrize("out", ["", "/", "."])
-def test_scores_need_a_file_name(out: str) -> None:
-    with pytest.raises(ConfigError, match="out must name a file"):
-        EvalConfig("runs/one", out=out)
+def test_paths_are_seen_from_the_callers_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pretrained" / "mine").mkdir(parents=True)
+    mine = f"{tmp_path}/pretrained/mine"
+    for name, given, seen in (
+        ("run_dir", None, None),
+        ("run_dir", "pretrained/x", "pretrained/x"),
+        (
+            "compare",
+            ["runs/a", "/b", "pretrained/square", "pretrained/mine"],
+            [f"{tmp_path}/runs/a", "/b", "pretrained/square", mine],
+        ),
+        ("out", "pretrained/x.png", f"{tmp_path}/pretrained/x.png"),
+        ("sheet", "a.png", f"{tmp_path}/a.png"),
+        ("puzzles", "mine.json", f"{tmp_path}/mine.json"),
+        ("puzzles", "test", "test"),
+    ):
+        assert with_absolute_paths({name: given}) == {name: seen}

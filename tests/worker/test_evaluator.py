@@ -9,7 +9,6 @@ import pytest
 from master.delivery import Arrival, ScoresArrived
 from master.hub import Hub
 from tangram_agent.config import ServiceConfig
-from tangram_sim.errors import TangramError
 from tests.agent.builders import PAIR, setup
 from tests.worker.builders import policy, weights
 from tests.worker.conversation import collect, open_hub, with_master
@@ -88,21 +87,6 @@ def test_a_long_evaluation_keeps_in_touch_and_can_be_stopped() -> None:
     arrived, status = with_master(hub, script, lambda: run_evaluator(config(hub, service), made))
     assert (arrived, status) == ([], 0)
     assert hub.counters["scores"] == 0
-
-
-@pytest.mark.cluster
-def test_an_evaluator_with_other_settings_is_refused() -> None:
-    made, other = setup(), setup(PAIR)
-    hub = open_hub(made)
-
-    def worker() -> int:
-        with pytest.raises(TangramError, match="tokens"):
-            run_evaluator(config(hub), other)
-        return 0
-
-    with_master(
-        hub, lambda hub: collect(hub, lambda _: hub.counters["refused_tokens"] == 1), worker
-    )
 
 
 # (time, version that arrives or 0, version that must be given or 0); interval 10, still 2

@@ -27,6 +27,7 @@ from tests.agent.builders import setup
 from tests.worker.builders import policy, weights, write_run
 from tests.worker.conversation import LIMIT_S, collect, open_hub, with_master
 from worker.config import WorkerConfig
+from worker.evaluator import run_evaluator
 from worker.player import run_player
 
 pytestmark = pytest.mark.cluster
@@ -270,13 +271,14 @@ def test_a_process_whose_parent_is_gone_takes_its_leave(tmp_path: Path, role: st
                 process.kill()
 
 
-def test_a_player_with_other_settings_is_refused() -> None:
+@pytest.mark.parametrize("role", ["player", "evaluator"])
+def test_a_worker_with_other_settings_is_refused(role: str) -> None:
     made, other = greedy_setup(), setup(agent={"noise": 0.1})
-    hub = open_hub(made)
+    hub, run = open_hub(made), run_player if role == "player" else run_evaluator
 
     def worker() -> int:
         with pytest.raises(TangramError, match="agent"):
-            run_player(config(hub), other)
+            run(config(hub, role=role), other)
         return 0
 
     with_master(

@@ -7,7 +7,7 @@ import pytest
 from shapely.geometry import Polygon
 from shapely.ops import unary_union
 
-from tangram_agent.pair_values import (
+from tangram_agent.coverage import (
     Lying,
     covered_share,
     covering,

@@ -1,6 +1,7 @@
-"""tangram-eval on puzzles and on several tokens: what is written, printed and drawn."""
+"""tangram-eval on run folders with random weights: what is scored, written, printed and drawn."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -8,39 +9,110 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tangram_sim.errors import ConfigError
+from tangram_sim.errors import ConfigError, RunError
+from tests.agent.builders import PAIR, SQUARE
 from tests.worker.builders import write_run
 from tests.worker.puzzle_files import GAME, SIM, drawn, write_puzzles
-from worker.config import EvalConfig
+from worker.config import EvalConfig, PlayConfig
 from worker.evaluate import MAX_LINES, evaluate_run
+from worker.play import play_run
 
 pytestmark = pytest.mark.fast
 
+SCORES = {
+    *("mean_reward", "mean_reward_camera", "raw_overlap", "raw_overlap_p10", "episodes"),
+    *("angle_error_deg_median", "angle_error_deg_p90"),
+    *("position_error_median", "position_error_p90"),
+}
 MEANS = {
-    "coverage",
-    "iou",
-    "share_solved",
-    "wrong",
-    "doubly_used",
-    "refused",
-    "blocked",
-    "actions_used",
-    "seconds_per_puzzle",
-    "coverage_each",
-    "position_error_median",
-    "angle_error_deg_median",
+    *("coverage", "iou", "share_solved", "wrong", "doubly_used", "refused", "blocked"),
+    *("actions_used", "seconds_per_puzzle", "coverage_each"),
+    *("position_error_median", "angle_error_deg_median"),
 }
 ORDERS = {"order=listed", "order=size", "order=random"}
 
 
-def evaluated(folder: Path, **settings: Any) -> dict[str, Any]:
+def evaluated(folder: Path, tokens: dict[str, Any] = GAME, **settings: Any) -> dict[str, Any]:
     """The report of a run of random weights."""
     if not (folder / "run").exists():
-        write_run(folder / "run", GAME, sim=SIM)
+        write_run(folder / "run", tokens, **({"sim": SIM} if tokens is GAME else {}))
     out = folder / "scores.json"
     assert evaluate_run(EvalConfig(str(folder / "run"), out=str(out), **settings)) == 0
     report: dict[str, Any] = json.loads(out.read_text())
     return report
+
+
+# One token
+
+
+def test_evaluation_writes_scores_and_prints_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = evaluated(tmp_path, SQUARE, episodes=40)
+    assert set(report) >= SCORES | {"seconds", "baselines"}
+    facts = {"episodes": 40, "actions": 1, "updates": 7, "tokens": ["square"], "agent": "tangram"}
+    assert {name: report[name] for name in facts} == facts
+    baselines = report["baselines"]
+    assert set(baselines) == {"exact", "position only", "random"}
+    assert baselines["position only"]["position_error_median"] < 1e-6
+    assert baselines["random"]["mean_reward"] < baselines["position only"]["mean_reward"]
+    printed = capsys.readouterr().out
+    for told in (f"{report['mean_reward']:.3f}", "run after 7 updates", "position only"):
+        assert told in printed
+    assert "40 fixed tests, 1 action a token" in printed
+
+
+def test_evaluation_repeats_itself_and_other_tests_differ(tmp_path: Path) -> None:
+    def scores(**more: int) -> dict:
+        report = evaluated(tmp_path, SQUARE, episodes=5, **more)
+        return {name: report[name] for name in SCORES}
+
+    assert scores() == scores()
+    assert scores() != scores(seed=1)
+    assert scores() != scores(actions=3)
+
+
+def test_the_number_of_actions_is_written_down(tmp_path: Path) -> None:
+    assert evaluated(tmp_path, PAIR, episodes=2, actions=4)["actions"] == 4
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda run: evaluate_run(EvalConfig(str(run), out=str(run.with_name("out.json")))),
+        lambda run: play_run(PlayConfig(str(run), out=str(run.with_name("out.gif")))),
+    ],
+    ids=["eval", "play"],
+)
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (lambda run: run.rename(run.with_name("gone")), "no run folder"),
+        (lambda run: (run / "config.yaml").unlink(), "is this a run folder"),
+        (lambda run: (run / "checkpoints" / "00000007").rename(run / "x"), "no checkpoint"),
+        (
+            lambda run: (run / "checkpoints" / "00000007" / "weights.safetensors").write_bytes(b""),
+            "is corrupt",
+        ),
+        (
+            lambda run: (run / "config.yaml").write_text(
+                (run / "config.yaml").read_text().replace("width: 16", "width: 32")
+            ),
+            "another",
+        ),
+    ],
+)
+def test_a_run_that_cannot_be_used(
+    tmp_path: Path, use: Callable, spoil: Callable, reason: str
+) -> None:
+    write_run(tmp_path / "run")
+    spoil(tmp_path / "run")
+    with pytest.raises((RunError, ConfigError), match=reason):
+        use(tmp_path / "run")
+    assert list(tmp_path.glob("out*")) == []
+
+
+# Several tokens
 
 
 def test_puzzles_of_a_file_are_scored_together_and_one_by_one(
@@ -66,6 +138,7 @@ def test_puzzles_of_a_file_are_scored_together_and_one_by_one(
 
 
 def test_settings_of_the_agents_play_are_played_and_written_down(tmp_path: Path) -> None:
+    write_run(tmp_path / "run", GAME, sim=SIM, agent={"reapply": 0})
     trained = evaluated(tmp_path, puzzles="test")
     listed = evaluated(tmp_path, puzzles="test", order="listed", reapply=1, refine_steps=2)
     assert (trained["order"], trained["reapply"], trained["refine_steps"]) == ("learned", 0, 0)
@@ -131,39 +204,3 @@ def test_an_agent_without_a_choice_of_order(tmp_path: Path) -> None:
     assert set(evaluated(tmp_path, puzzles="test")["baselines"]) == {"exact", "random"}
     with pytest.raises(ConfigError, match="order, reapply: the agent of .* leave it out"):
         evaluated(tmp_path, puzzles="test", order="size", reapply=1)
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"turns": 0}, "turns must be between 1 and 360, got 0"),
-        ({"turns": 361}, "turns must be between 1 and 360, got 361"),
-        ({"sheet": "ends.gif"}, "sheet must end with .png, got 'ends.gif'"),
-        ({"order": "best"}, "order must be one of learned, listed, size, random, got 'best'"),
-    ],
-)
-def test_wrong_settings_of_puzzles(settings: dict, message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        EvalConfig("runs/one", **({"puzzles": "test"} | settings))
-
-
-@pytest.mark.parametrize("settings", [{"turns": 2}, {"sheet": "a.png"}, {"skip_invalid": True}])
-def test_settings_of_puzzles_need_puzzles(settings: dict) -> None:
-    (name,) = settings
-    with pytest.raises(ConfigError, match=f"{name} is for puzzles: set puzzles=test, or leave"):
-        EvalConfig("runs/one", **settings)
-
-
-@pytest.mark.parametrize("names", [["square"], ["square", "tangram7"]])
-def test_puzzles_are_played_by_the_agent_of_the_game_if_there_is_one(
-    monkeypatch: pytest.MonkeyPatch, names: list[str]
-) -> None:
-    monkeypatch.setattr("worker.config.agent_names", lambda: names)
-    with pytest.raises(ConfigError, match="say which run: run_dir=runs/..."):
-        EvalConfig()
-    if "tangram7" in names:
-        assert EvalConfig(puzzles="test").run == "pretrained/tangram7"
-        assert EvalConfig("runs/one", puzzles="test").run == "runs/one"
-    else:
-        with pytest.raises(ConfigError, match="say which run: run_dir=runs/..."):
-            EvalConfig(puzzles="test")

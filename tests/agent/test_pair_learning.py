@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import torch
 
-from tangram_agent.ddpg import Learner
-from tangram_agent.pair_learner import PairLearner, make_learner
-from tangram_agent.pairs import Pairs
+from tangram_agent.graph import Pairs
+from tangram_agent.learner import Learner
 from tangram_agent.policy import Policy
+from tangram_agent.relabelling import ContactBatch, PairBatch
 from tangram_agent.setup import Setup
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.errors import RunError
-from tests.agent.builders import SMALL, setup
+from tests.agent.builders import SMALL, random_transitions, setup
 from tests.agent.pair_scenes import PERCEPTRON, TWO, seven, transitions
 
 pytestmark = pytest.mark.fast
@@ -30,17 +30,15 @@ SLIDE = {"backend": "physics", "motion": "slide"}
 CASES: dict[str, dict[str, Any]] = {
     "mha": {"agent": AGENT},
     "mlp": {"agent": AGENT, "net": PERCEPTRON},
-    "slide": {"agent": AGENT | {"gamma": 0.5}, "net": PERCEPTRON, **SLIDE},
+    "slide": {"agent": AGENT, "net": PERCEPTRON, **SLIDE},
 }
 
 
-def learner_of(made: Setup, seed: int = 0) -> PairLearner:
-    learner = make_learner(made, seed)
-    assert isinstance(learner, PairLearner)
-    return learner
+def learner_of(made: Setup, seed: int = 0) -> Learner:
+    return Learner(made, seed)
 
 
-def play(learner: PairLearner, made: Setup, seeds: range, progress: float = 0.25) -> list[Any]:
+def play(learner: Learner, made: Setup, seeds: range, progress: float = 0.25) -> list[Any]:
     """Updates on transitions and pairs that the seeds draw."""
     numbers = []
     for seed in seeds:
@@ -49,59 +47,44 @@ def play(learner: PairLearner, made: Setup, seeds: range, progress: float = 0.25
     return numbers
 
 
-def tensors(learner: PairLearner, made: Setup, seed: int = 0) -> dict[str, torch.Tensor]:
-    """A prepared batch as the losses see it."""
-    batch = learner.prepared(transitions(made, 8, seed), np.random.default_rng(seed))
-    t = {name: torch.from_numpy(np.asarray(c, np.float32)) for name, c in vars(batch).items()}
-    learner.look(t)
-    return t
-
-
-@pytest.mark.parametrize(
-    ("tokens", "agent", "pairs"),
-    [
-        (TWO, {}, True),
-        (TWO, {"readout": "token"}, False),
-        ({"shapes": ["square"], "scale": 1.0}, {}, False),
-        ({"shapes": ["square"], "scale": 1.0}, {"readout": "pair"}, True),
-    ],
-)
-def test_which_learner_a_setup_has(tokens: Any, agent: Any, pairs: bool) -> None:
-    learner = make_learner(setup(tokens, agent), 0)
-    assert type(learner) is (PairLearner if pairs else Learner)
-
-
-def pairs_of(t: dict[str, torch.Tensor], when: str) -> Pairs:
-    columns = ("token", "goal", "goal_flipped", "piece", "covered")
-    return Pairs(t[when], t[f"{when}_flipped"], *(t[name] for name in columns))
-
-
 @pytest.mark.parametrize("case", CASES)
 def test_the_losses_by_hand(case: str) -> None:
     """Before the first update the acting networks are the learner's own."""
     made = seven(**CASES[case])
     learner = learner_of(made)
-    t, own = tensors(learner, made), learner.acting
-    value = own.critic(pairs_of(t, "after"))
-    expected = (value - t["value"]).square().mean()
-    if made.contacts:
+    batch = learner.prepared(transitions(made, 8, 0), np.random.default_rng(0))
+    assert isinstance(batch, PairBatch)
+    t = {name: torch.from_numpy(np.asarray(c, np.float32)) for name, c in vars(batch).items()}
+    for name in {"token", "piece", "other"} & t.keys():
+        t[name] = t[name].long()
+    steps, own, still = learner.steps(batch), learner.acting, torch.zeros(32, 3)
+
+    def pairs_of(when: str) -> Pairs:
+        columns = ("token", "goal", "goal_flipped", "piece", "covered")
+        return Pairs(t[when], t[f"{when}_flipped"], *(t[name] for name in columns))
+
+    value = own.critic(pairs_of("after"), still)
+    loss, q = learner.critic_loss(steps)
+    expected = (value - t["reward"]).square().mean().item()
+    assert loss.item() == pytest.approx(expected, rel=1e-6)
+    np.testing.assert_allclose(q.detach(), value, atol=1e-6)
+    start = pairs_of("start")
+    velocity, raw = own.actor(start)
+    gain, penalty = learner.actor_loss(steps)
+    assert gain.item() == pytest.approx(-own.critic(start, velocity).mean().item(), rel=1e-5)
+    assert penalty.item() == pytest.approx(torch.relu(raw.abs() - 1.0).square().mean().item())
+    assert isinstance(batch, ContactBatch) == made.contacts
+    if isinstance(batch, ContactBatch):
         meeting = replace(
-            pairs_of(t, "before"),
+            pairs_of("before"),
             goal=t["other_pose"],
             goal_flipped=t["other_flipped"],
             piece=t["other"],
             covered=torch.zeros(32),
         )
         pushed = own.critic.pushed(meeting, t["after"])
-        expected = expected + (pushed - t["pushed"]).square().mean()
-    loss, q = learner.critic_loss(t)
-    assert loss.item() == pytest.approx(expected.item(), rel=1e-6)
-    np.testing.assert_allclose(q.detach(), value, atol=1e-6)
-    before = pairs_of(t, "start")
-    pose, raw = own.actor(before)
-    gain, penalty = learner.actor_loss(t)
-    assert gain.item() == pytest.approx(-own.critic(before.at(pose)).mean().item(), rel=1e-5)
-    assert penalty.item() == pytest.approx(torch.relu(raw.abs() - 1.0).square().mean().item())
+        expected = (pushed - t["pushed"]).square().mean().item()
+        assert learner.push_loss(batch).item() == pytest.approx(expected, rel=1e-6)
 
 
 def changed(one: dict[str, Any], other: dict[str, Any]) -> set[str]:
@@ -137,14 +120,25 @@ def test_the_critic_learns_what_is_pushed_where_tokens_push(case: str, moves: se
     assert found == moves
 
 
-def test_nothing_is_bootstrapped() -> None:
-    """The target networks are spoilt, the discount is high, and no episode has ended."""
-    made = seven(AGENT | {"gamma": 0.99}, PERCEPTRON)
-    plain, spoilt = learner_of(made), learner_of(made)
-    for module in (spoilt.target_actor, spoilt.target_critic):
+def test_with_several_tokens_nothing_is_bootstrapped() -> None:
+    learner = learner_of(seven(**CASES["mlp"]))
+    assert not learner.bootstraps
+    assert set(learner.parts) == {"actor", "critic", "acting"}
+
+
+def test_one_token_learns_the_reward_of_its_transition_and_what_follows() -> None:
+    made = setup(agent={"gamma": 0.9, "readout": "pair"}, actions_per_token=2)
+    learner = learner_of(made)
+    for module in (learner.target_actor, learner.target_critic):
         for parameter in module.parameters():
-            parameter.fill_(float("nan"))
-    assert play(plain, made, range(2)) == play(spoilt, made, range(2))
+            parameter.mul_(1.5)
+    batch = random_transitions(made, 8, done=None)
+    assert 0 < batch.done.sum() < 8
+    steps = learner.steps(learner.prepared(batch, np.random.default_rng(0)))
+    follow = learner.target_critic(steps.follow, learner.target_actor(steps.follow)[0])
+    y = torch.from_numpy(batch.reward) + 0.9 * follow * (1 - torch.from_numpy(batch.done))
+    loss, q = learner.critic_loss(steps)
+    assert loss.item() == pytest.approx((q - y).square().mean().item(), rel=1e-5)
 
 
 def test_what_plays_is_the_average_of_both_networks() -> None:
@@ -186,7 +180,7 @@ def test_the_seed_decides() -> None:
 def test_the_state_of_another_network_is_refused(other: dict[str, Any]) -> None:
     state = learner_of(seven(**CASES["mlp"])).state()
     with pytest.raises(RunError, match="weights of another"):
-        make_learner(seven(**CASES["mlp"] | other), 0).load_state(state)
+        Learner(seven(**CASES["mlp"] | other), 0).load_state(state)
 
 
 @pytest.mark.parametrize("net", [SMALL, PERCEPTRON])
@@ -203,12 +197,12 @@ def test_noise_on_the_corners_does_no_harm() -> None:
     noise = {name: 0.2 * rng.standard_normal(batch.state.shape) for name in names}
     noisy = {name: (vars(batch)[name] + noise[name]).astype(np.float32) for name in names}
     pairs = learner.prepared(replace(batch, **noisy), rng)
-    for share in (pairs.covered, pairs.value):
+    for share in (pairs.covered, pairs.reward):
         assert 0.0 <= share.min() < share.max() <= 1.0
     learner.update(pairs)
 
 
-def coverage(learner: PairLearner, made: Setup, episodes: int) -> float:
+def coverage(learner: Learner, made: Setup, episodes: int) -> float:
     """Mean overlap of episodes that the acting weights play."""
     policy = Policy(made)
     policy.load(learner.acting_weights(0))
@@ -253,7 +247,7 @@ def golden(made: Setup) -> dict[str, float]:
 
 @pytest.mark.parametrize("case", CASES)
 def test_golden_values_of_two_updates(case: str) -> None:
-    """Rewrite them with `python -m tests.agent.test_pair_learner` when a change is meant."""
+    """Rewrite them with `python -m tests.agent.test_pair_learning` when a change is meant."""
     expected = json.loads(GOLDEN.read_text())[case]
     assert golden(seven(**CASES[case])) == pytest.approx(expected, rel=1e-3, abs=1e-5)
 

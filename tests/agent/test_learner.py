@@ -1,6 +1,7 @@
 """Eqs. 3-6: hand-made targets, goldens, and what must have no effect."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,34 +9,29 @@ import numpy as np
 import pytest
 import torch
 
-from tangram_agent.ddpg import (
+from tangram_agent.graph import Scenes, next_token
+from tangram_agent.learner import (
     Learner,
     NotFiniteError,
     average_so_far,
     critic_target,
-    next_token,
     polyak_update,
     saturation,
-    split_action,
 )
 from tangram_agent.setup import Setup
 from tangram_agent.types import Transitions
 from tangram_sim.errors import RunError
-from tests.agent.builders import PAIR, PAPER, SMALL, random_transitions, setup
+from tests.agent.builders import PAIR, PAPER, SCENE, SMALL, random_transitions, setup
 
 pytestmark = pytest.mark.fast
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "ddpg.json"
 CASES: dict[str, dict[str, Any]] = {
-    "tangram": {"agent": {}},
-    "paper": {"agent": PAPER},
-    "mlp": {"agent": PAPER, "net": {"kind": "mlp"}},
-    "pair": {"tokens": PAIR, "agent": {"gamma": 0.9}},
+    "tangram": {"agent": SCENE},
+    "paper": {"agent": PAPER, "actions_per_token": 2},
+    "mlp": {"agent": PAPER, "net": {"kind": "mlp"}, "actions_per_token": 2},
+    "several": {"tokens": PAIR, "agent": SCENE | {"gamma": 0.9}},
 }
-
-
-def tensors(learner: Learner, batch: Transitions) -> dict[str, torch.Tensor]:
-    return {name: torch.from_numpy(np.asarray(c, "f4")) for name, c in vars(batch).items()}
 
 
 def weights(learner: Learner) -> dict[str, np.ndarray]:
@@ -73,7 +69,7 @@ def test_a_young_average_forgets_its_start(rho: float, updates: int, expected: f
 
 
 def test_after_the_first_update_the_actor_itself_plays() -> None:
-    learner = Learner(setup(agent={"acting_average": 0.99}), seed=0)
+    learner = Learner(setup(agent=SCENE | {"acting_average": 0.99}), seed=0)
     learner.update(random_transitions(setup(), 16, done=None))
     pairs = zip(learner.acting.parameters(), learner.actor.parameters(), strict=True)
     assert all(torch.equal(average, own) for average, own in pairs)
@@ -91,24 +87,6 @@ def test_the_first_unplaced_token_moves(placed: list[int], token: int) -> None:
     assert next_token(torch.tensor([placed])).tolist() == [token]
 
 
-@pytest.mark.parametrize(
-    ("selector", "token"), [(-1.0, 0), (-0.34, 0), (-0.3, 1), (0.3, 1), (0.34, 2), (1.0, 2)]
-)
-def test_the_first_entry_of_an_action_names_the_token(selector: float, token: int) -> None:
-    action = torch.tensor([[selector, 0.1, 0.2, 0.3]])
-    found, velocity = split_action(action, 3)
-    assert found.tolist() == [token]
-    assert velocity.tolist() == action[:, 1:].tolist()
-
-
-def test_the_entry_that_turns_a_token_over_is_no_velocity() -> None:
-    """Tokens turned over: an entry between the token's and the velocity."""
-    found, velocity = split_action(torch.tensor([[0.9, 1.0, 0.1, 0.2, 0.3]]), 2)
-    assert found.tolist() == [1]
-    assert velocity[0].tolist() == pytest.approx([0.1, 0.2, 0.3])
-    assert split_action(torch.tensor([[1.0, 0.1, 0.2, 0.3]]), 1)[1].shape == (1, 3)
-
-
 def test_the_critic_loss_is_the_mean_squared_bellman_error() -> None:
     """Against the value by hand: y from the target networks, one transition at a time."""
     made = setup(agent={**PAPER, "gamma": 0.9}, actions_per_token=2)
@@ -118,28 +96,37 @@ def test_the_critic_loss_is_the_mean_squared_bellman_error() -> None:
             parameter.mul_(1.5)
     batch = random_transitions(made, 6, done=None)
     assert 0 < batch.done.sum() < 6
-    t = tensors(learner, batch)
-    token, errors = torch.zeros(1, dtype=torch.long), []
+    steps, errors = learner.steps(batch), []
     for i in range(6):
-        row = {name: column[i : i + 1] for name, column in t.items()}
-        after = (row["next_state"], row["next_placed"], row["goal"], token)
-        follow = learner.target_critic(*after, learner.target_actor(*after)[0])
-        y = row["reward"] + 0.9 * follow * (1 - row["done"])
-        q = learner.critic(row["state"], row["placed"], row["goal"], token, row["action"])
+        row = learner.steps(Transitions(**{n: c[i : i + 1] for n, c in vars(batch).items()}))
+        follow = learner.target_critic(row.follow, learner.target_actor(row.follow)[0])
+        y = batch.reward[i] + 0.9 * follow * (1 - int(batch.done[i]))
+        q = learner.critic(row.view, torch.from_numpy(batch.action[i : i + 1]))
         errors.append((q - y).item() ** 2)
-    loss, _ = learner.critic_loss(t)
+    loss, _ = learner.critic_loss(steps)
     assert loss.item() == pytest.approx(sum(errors) / 6, rel=1e-5)
 
 
 def test_the_actor_loss_is_minus_the_value_of_its_actions() -> None:
-    learner = Learner(setup(), seed=0)
-    t = tensors(learner, random_transitions(setup(), 6))
-    token = torch.zeros(6, dtype=torch.long)
-    velocity, raw = learner.actor(t["state"], t["placed"], t["goal"], token)
-    value = learner.critic(t["state"], t["placed"], t["goal"], token, velocity)
-    loss, penalty = learner.actor_loss(t)
-    assert loss.item() == pytest.approx(-value.mean().item(), rel=1e-6)
-    assert penalty.item() == pytest.approx(torch.relu(raw.abs() - 2).square().mean().item())
+    made = setup(agent=SCENE)
+    learner = Learner(made, seed=0)
+    steps = learner.steps(random_transitions(made, 6))
+    velocity, raw = learner.actor(steps.start)
+    loss, penalty = learner.actor_loss(steps)
+    assert loss.item() == pytest.approx(-learner.critic(steps.start, velocity).mean().item(), 1e-6)
+    assert penalty.item() == pytest.approx(torch.relu(raw.abs() - 1).square().mean().item())
+
+
+def test_the_token_that_moved_is_valued_and_the_next_one_is_asked() -> None:
+    made = setup(PAIR, agent=SCENE)
+    batch = replace(random_transitions(made, 3), placed=np.array([[0, 0], [1, 0], [1, 1]], "u1"))
+    batch.action[:, 0] = [0.5, 0.5, -0.5]
+    steps = Learner(made, seed=0).steps(batch)
+    assert isinstance(steps.view, Scenes)
+    assert isinstance(steps.start, Scenes)
+    assert steps.view.token.tolist() == [1, 1, 0]
+    assert steps.start.token.tolist() == [0, 1, 0]
+    assert steps.velocity.shape == (3, 3)
 
 
 def spoil_targets(learner: Learner) -> None:
@@ -148,8 +135,23 @@ def spoil_targets(learner: Learner) -> None:
             parameter.fill_(float("nan"))
 
 
-def test_target_networks_have_no_effect_where_every_transition_ends() -> None:
-    made = setup(agent={"gamma": 0.99})
+@pytest.mark.parametrize(
+    ("agent", "actions", "there"),
+    [({"gamma": 0.9}, 1, False), ({}, 2, False), ({"gamma": 0.9}, 2, True)],
+)
+@pytest.mark.parametrize("readout", ["token", "pair"])
+def test_target_networks_are_there_where_something_bootstraps(
+    agent: dict[str, Any], actions: int, there: bool, readout: str
+) -> None:
+    made = setup(agent=agent | {"readout": readout}, actions_per_token=actions)
+    learner = Learner(made, seed=0)
+    assert learner.bootstraps == there
+    assert hasattr(learner, "target_actor") == there
+    assert any(name.startswith("target_critic.") for name in learner.state()) == there
+
+
+def test_target_networks_are_not_asked_where_every_transition_ends() -> None:
+    made = setup(agent=SCENE | {"gamma": 0.99}, actions_per_token=2)
     plain, spoilt = Learner(made, seed=0), Learner(made, seed=0)
     spoil_targets(spoilt)
     for seed in range(3):
@@ -162,7 +164,7 @@ def test_target_networks_have_no_effect_where_every_transition_ends() -> None:
 
 
 def test_target_networks_matter_where_an_episode_goes_on() -> None:
-    made = setup(agent={"gamma": 0.99})
+    made = setup(agent=SCENE | {"gamma": 0.99}, actions_per_token=2)
     spoilt = Learner(made, seed=0)
     spoil_targets(spoilt)
     with pytest.raises(NotFiniteError, match="update 1 is not finite .critic_loss=nan"):
@@ -171,7 +173,8 @@ def test_target_networks_matter_where_an_episode_goes_on() -> None:
 
 
 def test_an_update_moves_each_network_and_drags_the_averages() -> None:
-    made = setup(agent={"gamma": 0.9, "polyak": 0.9, "acting_average": 0.5})
+    agent = SCENE | {"gamma": 0.9, "polyak": 0.9, "acting_average": 0.5}
+    made = setup(agent=agent, actions_per_token=2)
     learner = Learner(made, seed=0)
     learner.updates = 1000  # the acting average is no longer young
     before = weights(learner)
@@ -188,7 +191,7 @@ def test_an_update_moves_each_network_and_drags_the_averages() -> None:
 
 def test_the_actor_step_leaves_the_critic_alone() -> None:
     """The critic's own step uses the critic's loss only: spoil the actor, the critic agrees."""
-    made = setup()
+    made = setup(agent=SCENE)
     plain, spoilt = Learner(made, seed=0), Learner(made, seed=0)
     with torch.no_grad():
         for parameter in spoilt.actor.parameters():
@@ -199,8 +202,25 @@ def test_the_actor_step_leaves_the_critic_alone() -> None:
     assert largest_change(weights(plain), weights(spoilt), "critic") == 0.0
 
 
+@pytest.mark.parametrize("readout", ["token", "pair"])
+def test_the_penalty_counts_by_its_weight(readout: str) -> None:
+    """Where the value is flat, the actor's gradient is that of the penalty: twice the weight."""
+    norms = []
+    for weight in (0.5, 1.0):
+        agent = {"readout": readout, "saturation_penalty": weight, "saturation_limit": 0.0}
+        made = setup(agent=agent)
+        learner = Learner(made, seed=0)
+        with torch.no_grad():
+            learner.critic.head.readout.weight.zero_()
+        batch = learner.prepared(random_transitions(made, 16), np.random.default_rng(0))
+        steps = learner.steps(batch)
+        norms.append(learner._actor_step(steps, None)["actor_gradient"].item())
+    assert norms[1] == pytest.approx(2.0 * norms[0], rel=1e-5)
+    assert norms[0] > 0.0
+
+
 def test_the_penalty_pulls_a_saturated_actor_back() -> None:
-    made = setup(agent={"saturation_penalty": 1.0, "squash": "tanh", "angle_head": "plain"})
+    made = setup(agent=SCENE | {"squash": "tanh", "angle_head": "plain"})
     learner = Learner(made, seed=0)
     with torch.no_grad():
         learner.actor.head.readout.bias.fill_(6.0)
@@ -216,20 +236,20 @@ def test_the_penalty_pulls_a_saturated_actor_back() -> None:
     ("progress", "share"), [(0.0, 1.0), (0.5, 0.505), (1.0, 0.01), (2.0, 0.01), (-1.0, 1.0)]
 )
 def test_cosine_decay_of_the_learning_rate(progress: float, share: float) -> None:
-    learner = Learner(setup(agent={"lr_decay": "cosine", "actor_lr": 2e-3}), seed=0)
+    learner = Learner(setup(agent=SCENE | {"actor_lr": 2e-3}), seed=0)
     learner.update(random_transitions(setup(), 4), progress)
     assert learner.actor_optimiser.param_groups[0]["lr"] == pytest.approx(2e-3 * share)
     assert learner.critic_optimiser.param_groups[0]["lr"] == pytest.approx(1e-3 * share)
 
 
 def test_without_decay_the_learning_rate_stays() -> None:
-    learner = Learner(setup(agent={"lr_decay": "none"}), seed=0)
+    learner = Learner(setup(agent=SCENE | {"lr_decay": "none"}), seed=0)
     learner.update(random_transitions(setup(), 4), 0.9)
     assert learner.actor_optimiser.param_groups[0]["lr"] == 1e-3
 
 
 def test_gradients_are_clipped_to_the_norm() -> None:
-    made = setup(agent={"grad_clip": 1e-3})
+    made = setup(agent=SCENE | {"grad_clip": 1e-3})
     learner = Learner(made, seed=0)
     learner.update(random_transitions(made, 16))
     norms = [p.grad.norm() for p in learner.critic.parameters() if p.grad is not None]
@@ -255,14 +275,14 @@ def test_a_restored_learner_goes_on_bit_for_bit(case: str) -> None:
 @pytest.mark.parametrize(
     ("other", "reason"),
     [
-        ({"tokens": PAIR}, None),  # attention serves any token set: its weights fit
-        ({"net": {"kind": "mlp"}}, "on one side only"),
-        ({"net": {**SMALL, "width": 32}}, "weights of another layout"),
-        ({"agent": {"offsets": False}}, "weights of another layout"),
+        ({"tokens": PAIR, "agent": SCENE}, None),  # attention serves any token set: its weights fit
+        ({"net": {"kind": "mlp"}, "agent": SCENE}, "on one side only"),
+        ({"net": {**SMALL, "width": 32}, "agent": SCENE}, "weights of another layout"),
+        ({"agent": SCENE | {"offsets": False}}, "weights of another layout"),
     ],
 )
 def test_weights_of_another_network_are_refused(other: dict[str, Any], reason: str | None) -> None:
-    state = weights(Learner(setup(), seed=0))
+    state = weights(Learner(setup(agent=SCENE), seed=0))
     learner = Learner(setup(**other), seed=0)
     if reason is None:
         learner.load_state(state)
@@ -284,7 +304,7 @@ def golden(made: Setup) -> dict[str, float]:
         metrics = learner.update(random_transitions(made, 32, i, done=None), 0.25)
         result |= {f"{name}_{i}": value for name, value in metrics.items()}
     state = learner.state()
-    for part in ("actor", "critic", "target_actor", "target_critic", "acting"):
+    for part in learner.parts:
         values = [v.astype(np.float64) for k, v in state.items() if k.startswith(f"{part}.")]
         result[f"{part}_abs_sum"] = float(sum(np.abs(v).sum() for v in values))
     return result
@@ -292,7 +312,7 @@ def golden(made: Setup) -> dict[str, float]:
 
 @pytest.mark.parametrize("case", CASES)
 def test_golden_values_of_two_updates(case: str) -> None:
-    """Rewrite them with `python -m tests.agent.test_ddpg` when a change is meant."""
+    """Rewrite them with `python -m tests.agent.test_learner` when a change is meant."""
     expected = json.loads(GOLDEN.read_text())[case]
     assert golden(setup(**CASES[case])) == pytest.approx(expected, rel=1e-3, abs=1e-5)
 

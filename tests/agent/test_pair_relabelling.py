@@ -6,8 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tangram_agent.pair_batch import PairBatch, make_pairs, with_contacts
-from tangram_agent.pair_values import Lying, covered_share, covering, newly_covered
+from tangram_agent.coverage import Lying, covered_share, covering, newly_covered
+from tangram_agent.relabelling import PairBatch, make_pairs, with_contacts
+from tangram_agent.setup import Setup
+from tangram_agent.types import Transitions
 from tangram_sim.actions import chosen_tokens
 from tests.agent.builders import setup
 from tests.agent.pair_scenes import seven, transitions
@@ -25,7 +27,7 @@ PARALLELOGRAM = 6
 def made_pairs(hindsight: list[dict[str, Any]], seed: int = 0) -> PairBatch:
     made = seven({"hindsight": hindsight, "pairs_per_transition": PAIRS})
     batch = transitions(made, COUNT)
-    return make_pairs(batch, made.agent, made.layout, np.random.default_rng(seed))
+    return make_pairs(batch, made, np.random.default_rng(seed))
 
 
 MADE = seven()
@@ -89,9 +91,9 @@ def test_values_are_what_is_newly_covered(hindsight: list[Any]) -> None:
     token = Lying(pairs.token, pairs.after, pairs.after_flipped)
     piece = Lying(pairs.piece, pairs.goal, pairs.goal_flipped)
     expected = newly_covered(token, piece, pairs.covered, LAYOUT)
-    np.testing.assert_array_equal(pairs.value, expected)
-    assert pairs.value.min() >= 0.0
-    assert pairs.value.max() <= 1.0
+    np.testing.assert_array_equal(pairs.reward, expected)
+    assert pairs.reward.min() >= 0.0
+    assert pairs.reward.max() <= 1.0
 
 
 def test_hindsight_is_where_the_token_came_to_lie_and_mostly_a_piece_of_its_shape() -> None:
@@ -107,7 +109,7 @@ def test_hindsight_is_where_the_token_came_to_lie_and_mostly_a_piece_of_its_shap
     # Any share, whatever the goal that was played had.
     np.testing.assert_allclose([partly.mean(), partly.std()], [0.5, 12**-0.5], atol=0.06)
     exact = own & hind & (pairs.covered == 0.0) & (pairs.after_flipped == pairs.goal_flipped)
-    np.testing.assert_allclose(pairs.value[exact], 1.0)
+    np.testing.assert_allclose(pairs.reward[exact], 1.0)
     assert exact.sum() > 100
 
 
@@ -170,7 +172,7 @@ def test_contacts_name_another_token_and_what_it_lost() -> None:
         state=np.tile(layout.corners(before), (COUNT, 1, 1)).astype(np.float32),
         next_state=np.tile(layout.corners(after), (COUNT, 1, 1)).astype(np.float32),
     )
-    pairs = make_pairs(batch, made.agent, layout, np.random.default_rng(0))
+    pairs = make_pairs(batch, made, np.random.default_rng(0))
     found = with_contacts(pairs, batch, layout, np.random.default_rng(1))
     assert (found.other != found.token).all()
     assert {(t, o) for t, o in zip(found.token, found.other, strict=True)} == {
@@ -191,3 +193,34 @@ def test_a_quarter_of_the_pairs_is_asked_from_where_the_action_ended() -> None:
     np.testing.assert_array_equal(
         pairs.start_flipped, np.where(again, pairs.after_flipped, pairs.before_flipped)
     )
+
+
+def one_token(shape: str) -> tuple[Setup, Transitions, PairBatch]:
+    """Transitions of one token as they come out of the replay, and the pairs made of them."""
+    made = setup({"shapes": [shape], "scale": 0.8}, {"readout": "pair"}, actions_per_token=2)
+    drawn = transitions(made, COUNT)
+    rng = np.random.default_rng(0)
+    reward = rng.uniform(-1.0, 1.0, COUNT).astype(np.float32)
+    done = (rng.random(COUNT) < 0.5).astype(np.uint8)
+    batch = replace(drawn, reward=reward, done=done)
+    return made, batch, make_pairs(batch, made, np.random.default_rng(1))
+
+
+@pytest.mark.parametrize("shape", ["square", "parallelogram", "large_triangle"])
+def test_one_tokens_pairs_are_the_transitions_with_their_reward(shape: str) -> None:
+    made, batch, pairs = one_token(shape)
+    layout = made.layout
+    np.testing.assert_array_equal(pairs.reward, batch.reward)
+    np.testing.assert_array_equal(pairs.done, batch.done)
+    np.testing.assert_array_equal(pairs.velocity, batch.action)
+    assert not pairs.covered.any()
+    goals, sides = layout.poses(batch.goal.astype(np.float64)), layout.flipped(batch.goal)
+    np.testing.assert_array_equal(pairs.goal_flipped, sides[:, 0])
+    np.testing.assert_array_equal(pairs.goal[:, :2], goals[:, 0, :2])
+    order = layout.shapes[0].symmetry
+    turns = (pairs.goal - goals[:, 0])[:, 2] * order / (2.0 * np.pi)
+    assert set(np.round(turns, 9)) == set(range(order))
+    for name, corners in (("before", batch.state), ("after", batch.next_state)):
+        exact = corners.astype(np.float64)
+        np.testing.assert_allclose(vars(pairs)[name], layout.poses(exact)[:, 0])
+        np.testing.assert_array_equal(vars(pairs)[f"{name}_flipped"], layout.flipped(exact)[:, 0])

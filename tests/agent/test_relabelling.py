@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from tangram_agent.config import TwinConfig
-from tangram_agent.hindsight import flatten, with_twins
+from tangram_agent.config import RelabelConfig
+from tangram_agent.relabelling import flatten, with_relabelled
 from tangram_agent.types import Episodes, Transitions
 from tests.agent.builders import random_episodes, setup
 
@@ -61,8 +61,8 @@ PLAYED = [
 ]
 
 
-def twins(*kinds: TwinConfig, seed: int = 0) -> Transitions:
-    return with_twins(EPISODE, kinds, LAYOUT, same, np.random.default_rng(seed))
+def relabelled(*kinds: RelabelConfig, seed: int = 0) -> Transitions:
+    return with_relabelled(EPISODE, kinds, LAYOUT, same, np.random.default_rng(seed))
 
 
 def test_flatten_gives_what_was_played() -> None:
@@ -70,12 +70,12 @@ def test_flatten_gives_what_was_played() -> None:
 
 
 def test_none_adds_nothing() -> None:
-    assert rows(twins(TwinConfig("none", copies=4))) == PLAYED
-    assert rows(twins()) == PLAYED
+    assert rows(relabelled(RelabelConfig("none", copies=4))) == PLAYED
+    assert rows(relabelled()) == PLAYED
 
 
-def test_final_twins_end_in_success() -> None:
-    assert rows(twins(TwinConfig("final"))) == [
+def test_final_goals_end_in_success() -> None:
+    assert rows(relabelled(RelabelConfig("final"))) == [
         *PLAYED,
         (0, 0.1, -0.2, 1, 0, 0, 0, 3),
         (1, 0.2, -0.1, 2, 0, 0, 0, 3),
@@ -83,20 +83,20 @@ def test_final_twins_end_in_success() -> None:
     ]
 
 
-def test_future_twins_take_a_state_from_this_step_on() -> None:
+def test_future_goals_take_a_state_from_this_step_on() -> None:
     seen: set[tuple[object, object]] = set()
     for seed in range(40):
-        for row in rows(twins(TwinConfig("future"), seed=seed))[3:]:
+        for row in rows(relabelled(RelabelConfig("future"), seed=seed))[3:]:
             reached, goal, reward = row[3], row[7], row[2]
             seen.add((reached, goal))
             assert reward == (1.0 if goal == reached else pytest.approx(0.1 * (reached - goal)))
     assert seen == {(1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3)}
 
 
-def test_near_twins_are_the_final_pose_moved_a_little() -> None:
+def test_near_goals_are_the_final_pose_moved_a_little() -> None:
     episodes = random_episodes(MADE, 400)
-    kind = TwinConfig("near", position=0.05, angle=0.3)
-    batch = with_twins(episodes, (kind,), LAYOUT, same, np.random.default_rng(1))
+    kind = RelabelConfig("near", position=0.05, angle=0.3)
+    batch = with_relabelled(episodes, (kind,), LAYOUT, same, np.random.default_rng(1))
     goals = LAYOUT.poses(batch.goal[1200:].astype(np.float64))[:, 0]
     finals = LAYOUT.poses(episodes.corners[:, -1].astype(np.float64))[:, 0]
     gap = goals - np.repeat(finals, STEPS, axis=0)
@@ -108,7 +108,7 @@ def test_near_twins_are_the_final_pose_moved_a_little() -> None:
 
 
 def test_copies_and_kinds_stand_one_after_the_other() -> None:
-    batch = twins(TwinConfig("final", copies=2), TwinConfig("near", position=1.0))
+    batch = relabelled(RelabelConfig("final", copies=2), RelabelConfig("near", position=1.0))
     found = rows(batch)
     assert found[:3] == PLAYED
     assert [row[7] for row in found[3:9]] == [3] * 6
@@ -116,10 +116,10 @@ def test_copies_and_kinds_stand_one_after_the_other() -> None:
 
 
 def test_rewards_are_those_of_the_given_function() -> None:
-    """The played reward stays, whatever the function says; every twin's is recomputed."""
-    zero = with_twins(
+    """The played reward stays, whatever the function says; for another goal it is computed anew."""
+    zero = with_relabelled(
         EPISODE,
-        (TwinConfig("final"),),
+        (RelabelConfig("final"),),
         LAYOUT,
         lambda achieved, _: np.full(len(achieved), 0.5),
         np.random.default_rng(0),
@@ -127,12 +127,12 @@ def test_rewards_are_those_of_the_given_function() -> None:
     np.testing.assert_allclose(zero.reward, [-0.9, -0.8, -0.7, 0.5, 0.5, 0.5])
 
 
-def test_near_twins_lie_on_the_side_that_was_reached() -> None:
+def test_near_goals_lie_on_the_side_that_was_reached() -> None:
     made = setup({"shapes": ["parallelogram"], "scale": 1.0}, actions_per_token=STEPS)
     layout = made.layout
     path = np.array([[[0.1 * t, 0.0, 0.0]] for t in range(4)])
     corners = layout.corners(path, np.ones((4, 1), dtype=bool)).astype(np.float32)
     episode = Episodes(corners[None], EPISODE.placed, A[None], EPISODE.rewards, corners[None, 0])
-    kind = TwinConfig("near", copies=20, position=0.01, angle=0.1)
-    batch = with_twins(episode, [kind], layout, same, np.random.default_rng(0))
+    kind = RelabelConfig("near", copies=20, position=0.01, angle=0.1)
+    batch = with_relabelled(episode, [kind], layout, same, np.random.default_rng(0))
     assert layout.flipped(batch.goal.astype(np.float64)).all()

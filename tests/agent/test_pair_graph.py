@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from tangram_agent.pairs import PairGraph, Pairs
+from tangram_agent.config import AgentConfig
+from tangram_agent.graph import PairGraph, Pairs
 from tangram_sim.fitting import KINDS
 from tangram_sim.layout import Layout, TokensConfig, make_layout
 from tests.agent.pair_scenes import SEVEN, every_pair, random_pairs, random_scene
@@ -15,7 +16,7 @@ from tests.agent.pair_scenes import SEVEN, every_pair, random_pairs, random_scen
 pytestmark = pytest.mark.fast
 
 LAYOUT = make_layout(TokensConfig(**SEVEN))
-GRAPH = PairGraph(LAYOUT, 2.0)
+GRAPH = PairGraph(LAYOUT, 2.0, AgentConfig())
 SEEDS = range(5)
 PARALLELOGRAM, SQUARE = 6, 5
 MIRROR = np.array([shape.mirror or 0.0 for shape in LAYOUT.shapes])
@@ -87,11 +88,27 @@ def test_a_token_with_one_side_sees_the_mirror_image(seed: int) -> None:
     np.testing.assert_allclose(seen[achiral], expected[achiral], atol=1e-5)
 
 
+def moved(pairs: Pairs, shift: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
+    """Poses after a shift in arena units and a turn in radians as the tokens see them."""
+    velocity = GRAPH.velocity(pairs, shift / 2.0, angle / math.pi)
+    return GRAPH.moved(pairs, velocity).pose
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_way_is_the_velocity_that_moved_takes(seed: int) -> None:
+    pairs, other = random_pairs(LAYOUT, seed), random_pairs(LAYOUT, seed + 100)
+    way = GRAPH.way(pairs, other.pose)
+    assert way[:, 2].abs().max() <= 1.0
+    found = GRAPH.moved(pairs, way).pose
+    np.testing.assert_allclose(found[:, :2], other.pose[:, :2], atol=1e-5)
+    np.testing.assert_allclose(np.exp(1j * (found - other.pose)[:, 2].numpy()), 1.0, atol=1e-5)
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_moved_is_the_inverse_of_motion(seed: int) -> None:
     pairs, other = random_pairs(LAYOUT, seed), random_pairs(LAYOUT, seed + 100)
     way = GRAPH.motion(pairs, other.pose)
-    found = GRAPH.moved(pairs, way[:, :2], torch.atan2(way[:, 3], way[:, 2]))
+    found = moved(pairs, way[:, :2], torch.atan2(way[:, 3], way[:, 2]))
     np.testing.assert_allclose(found[:, :2], other.pose[:, :2], atol=1e-5)
     gap = found[:, 2] - other.pose[:, 2]
     np.testing.assert_allclose(np.exp(1j * gap.numpy()), 1.0, atol=1e-5)
@@ -99,7 +116,7 @@ def test_moved_is_the_inverse_of_motion(seed: int) -> None:
 
 def test_no_motion_goes_further_than_an_action_can() -> None:
     pairs = one_pair(0, 0, (0.1, 0.2, math.pi / 2), (0.0, 0.0, 0.0))
-    found = GRAPH.moved(pairs, torch.tensor([[0.5, 3.0]]), torch.tensor([0.25]))
+    found = moved(pairs, torch.tensor([[0.5, 3.0]]), torch.tensor([0.25]))
     np.testing.assert_allclose(found, [[0.1 - 2.0, 0.2 + 0.5, math.pi / 2 + 0.25]], atol=1e-6)
 
 
@@ -177,7 +194,7 @@ def test_the_numbers_of_a_pair_without_nodes() -> None:
     layout = make_layout(TokensConfig(("square",), 1.0 / np.ptp(side[:, 0]) * 0.6))
     pairs = one_pair(0, 0, (0.0, 0.0, 0.0), (1.0, 0.0, 0.2))
     pairs.covered[:] = 1 / 3
-    found = PairGraph(layout, 2.0).vectors(pairs)[0].numpy()
+    found = PairGraph(layout, 2.0, AgentConfig()).vectors(pairs)[0].numpy()
     radius = math.sqrt(0.5)
     body = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
     corners = (body @ (1.0, 1j)) * np.exp(0.2j) + 1.0
@@ -218,7 +235,7 @@ def test_what_all_nodes_of_a_pair_are_told() -> None:
     ],
 )
 def test_a_tan_has_its_number_in_every_set(shape: Any, number: int) -> None:
-    graph = PairGraph(layout_of("square", shape), 2.0)
+    graph = PairGraph(layout_of("square", shape), 2.0, AgentConfig())
     assert graph.kind[1].argmax() == number
     assert graph.kind.sum(dim=1).tolist() == [1.0, 1.0]
 
@@ -228,12 +245,49 @@ def test_edges_are_those_of_the_paper() -> None:
     own, base, goal = [1, 1, 1], [1], [1, 1, 1]
     none = [0, 0, 0]
     expected = [[*own, *base, *none]] * 3 + [[*own, *base, *goal]] + [[*none, *base, *goal]] * 3
-    found = PairGraph(layout_of("small_triangle"), 2.0).adjacency.int().numpy()
+    found = PairGraph(layout_of("small_triangle"), 2.0, AgentConfig()).adjacency.int().numpy()
     np.testing.assert_array_equal(found, np.array(expected) - np.eye(7, dtype=int))
 
 
-@pytest.mark.parametrize(("token", "most"), [(0, math.pi), (SQUARE, math.pi / 4), (6, math.pi / 2)])
-def test_a_turn_is_no_longer_than_symmetry_needs(token: int, most: float) -> None:
-    raw = torch.tensor([[1.0, 0.0], [0.0, 2.0], [0.0, -2.0], [-1.0, 1e-9]])
-    found = GRAPH.turn_of(raw, torch.full((4,), token))
-    assert found.tolist() == pytest.approx([0.0, most / 2, -most / 2, most], abs=1e-6)
+@pytest.mark.parametrize(("option", "less"), [("offsets", 2), ("orientation", 4)])
+def test_an_option_that_is_off_takes_its_features_away(option: str, less: int) -> None:
+    graph = PairGraph(LAYOUT, 2.0, AgentConfig(**{option: False}))
+    pairs = random_pairs(LAYOUT, 0)
+    assert graph.node_features(pairs).shape[-1] == graph.features == GRAPH.features - less
+    assert graph.vectors(pairs).shape[-1] == graph.inputs < GRAPH.inputs
+
+
+def test_without_the_orientation_no_pair_tells_an_angle() -> None:
+    """A turned square piece whose corners are not told apart: only the corners' places differ."""
+    graph = PairGraph(LAYOUT, 2.0, AgentConfig(orientation=False))
+    one, other = (
+        graph.node_features(one_pair(SQUARE, SQUARE, (0, 0, 0), (0.3, 0.1, angle)))[0, 0, 5:]
+        for angle in (0.0, 0.4)
+    )
+    assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_in_the_arenas_frame_nodes_lie_at_the_layouts_corners(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    (own, sides), (goals, goal_sides) = random_scene(LAYOUT, rng), random_scene(LAYOUT, rng)
+    pairs = every_pair(own, sides, goals, goal_sides)
+    graph = PairGraph(LAYOUT, 2.0, AgentConfig(egocentric=False))
+    nodes = graph.node_features(pairs).numpy()
+    mine, corners = LAYOUT.corners(own, sides), LAYOUT.corners(goals, goal_sides)
+    for i, (token, piece) in enumerate(zip(pairs.token, pairs.piece, strict=True)):
+        points = nodes[i, :, :2] @ (1.0, 1j)
+        same_points(points[:4], mine[LAYOUT.corners_of(int(token))] @ (1.0, 1j))
+        same_points(points[5:], corners[LAYOUT.corners_of(int(piece))] @ (1.0, 1j))
+        centre = goals[piece][:2] @ (1.0, 1j)
+        offsets = nodes[i, 5:, 2:4] @ (1.0, 1j) * LAYOUT.shapes[int(token)].radius
+        np.testing.assert_allclose(offsets, points[5:] - centre, atol=1e-5)
+    shift, angle = torch.rand(49, 2), torch.rand(49)
+    velocity = graph.velocity(pairs, shift, angle)
+    assert torch.equal(velocity, torch.column_stack([shift, angle]))
+    assert torch.equal(graph.as_seen(pairs, velocity), velocity)
+
+
+def test_every_node_sees_every_other_where_the_edges_are_complete() -> None:
+    graph = PairGraph(LAYOUT, 2.0, AgentConfig(edges="complete"))
+    np.testing.assert_array_equal(graph.adjacency, ~np.eye(9, dtype=bool))

@@ -1,0 +1,106 @@
+"""`python -m conf.settings` writes docs/settings.md: every setting, as its declaration says."""
+
+from collections.abc import Iterator
+from dataclasses import Field
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from conf.commands import COMMANDS, GROUPS, load, plain_default
+from conf.help import choices, told_default
+from tangram_sim.settings import KEY, Declaration, declared_fields, told, values_of
+
+PAGE = Path(__file__).parents[1] / "docs" / "settings.md"
+# Lists of settings inside of a setting.
+NESTED = {
+    "sim.stages": "tangram_sim.config:StageConfig",
+    "agent.hindsight": "tangram_agent.config:TwinConfig",
+}
+INTRODUCTION = """\
+# Settings
+
+Written by `python -m conf.settings` from the declarations in the code; a test checks that it is up
+to date. A setting is given as `name=value`, a preset of a group as `group=preset`. `null` is no
+value, and `???` stands where one must be given. A value that could have no effect beside the others
+is refused.
+
+Presets of your own lie in a folder, `my_presets/tokens/mine.yaml`, and say only what differs from
+the defaults: `tangram-train --config-dir my_presets tokens=mine`."""
+
+
+def page() -> str:
+    """The text of docs/settings.md."""
+    parts = [INTRODUCTION]
+    for command in COMMANDS.values():
+        rows = [_row(own, own.name, command.defaults()[own.name]) for own in command.fields()]
+        groups = ", ".join(command.groups)
+        taken = [f"Groups: {groups}."] if groups else []
+        parts += [f"## {command.name}", *taken, _table(rows)]
+    for group, name in (GROUPS | NESTED).items():
+        fields = declared_fields(load(name))
+        rows = [_row(own, f"{group}.{own.name}", plain_default(own)) for own in fields]
+        if group in GROUPS:
+            parts += [f"## {group}", _presets(group), _table(rows)]
+        else:
+            parts += [f"## Entries of {group}", _table(rows)]
+    return "\n\n".join(parts) + "\n"
+
+
+def count() -> int:
+    """How many settings are declared; what several commands share counts once."""
+    names = {name for command in COMMANDS.values() for name in command.settings}
+    declarations = names | {*GROUPS.values(), *NESTED.values()}
+    return sum(len(declared_fields(load(name))) for name in declarations)
+
+
+def _table(rows: list[str]) -> str:
+    return "\n".join(["| setting | default | values | what it is |", "|---|---|---|---|", *rows])
+
+
+def _row(own: "Field[Any]", name: str, default: Any) -> str:
+    what: Declaration = own.metadata[KEY]
+    text = told_default(default) or '""'
+    said = f"{what.help}{_only(own.metadata[KEY], name)}".replace("|", "\\|")
+    return f"| `{name}` | `{text}` | {_values(own, what)} | {said} |"
+
+
+def _values(own: "Field[Any]", what: Declaration) -> str:
+    if what.choices:
+        return ", ".join(what.choices)
+    unit = f" {what.unit}" if what.unit else ""
+    if what.low is None:
+        return "true, false" if isinstance(own.default, bool) else unit.strip()
+    if what.high < float("inf"):
+        return f"{what.low:g} to {what.high:g}{unit}"
+    return f"from {what.low:g}{unit}"
+
+
+def _only(what: Declaration, name: str) -> str:
+    section = name.rpartition(".")[0]
+    conditions = [
+        f"{section}.{other}={' or '.join(map(told, values_of(needed)))}"
+        for other, needed in what.only.items()
+    ]
+    return f" (only with {', '.join(conditions)})" if conditions else ""
+
+
+def _presets(group: str) -> str:
+    return "\n".join(_preset(group))
+
+
+def _preset(group: str) -> Iterator[str]:
+    for name in choices(group):
+        text = (files("conf") / group / f"{name}.yaml").read_text("utf-8")
+        about = next(line for line in text.splitlines() if not line.startswith("# @"))
+        changed = [key for key in yaml.safe_load(text) or {} if key != "defaults"]
+        yield f"- `{group}={name}`: {about.removeprefix('# ')}{_sets(changed)}"
+
+
+def _sets(names: list[str]) -> str:
+    return f" Sets {', '.join(names)}." if names else ""
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")

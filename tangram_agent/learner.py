@@ -1,0 +1,370 @@
+"""Deep deterministic policy gradient, Eqs. 3-6, with the parts that make it learn the angle.
+
+One learner for whole scenes and for pairs of a token and a piece: it sees a batch as `Steps`. With
+several tokens what an action is worth falls apart into what it covers of each piece, and hindsight
+knows the geometry: so a pair's value is known at once, and nothing is bootstrapped. What tokens
+that slide push away is learned beside it, for each pair of tokens (see `planning`).
+
+Legend: M views, K tokens.
+"""
+
+import copy
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+
+from tangram_agent.config import AgentConfig
+from tangram_agent.graph import Pairs, Scenes, View, next_token
+from tangram_agent.networks import VELOCITY, Networks, initialise, parameter_count
+from tangram_agent.relabelling import ContactBatch, PairBatch, make_pairs, with_contacts
+from tangram_agent.setup import Setup
+from tangram_agent.types import Transitions, Weights
+from tangram_agent.weights import load_arrays, to_arrays, under
+from tangram_sim.actions import chosen_tokens
+from tangram_sim.arrays import Bools, Floats, Ints
+from tangram_sim.errors import RunError
+
+Array = npt.NDArray[Any]
+Batch = Transitions | PairBatch
+_COUNTER = "updates"
+
+
+def critic_target(reward: Tensor, done: Tensor, next_value: Tensor, gamma: float) -> Tensor:
+    """The target y of Eq. 5, (B,).
+
+    The paper's equation lacks (1 - d), but after the end of an episode nothing can follow.
+    """
+    return reward + gamma * (1.0 - done) * next_value
+
+
+def saturation(raw: Tensor, limit: float) -> Tensor:
+    """Mean of relu(|z| - limit)^2 over pre-activations z: keeps tanh or clamp from going flat."""
+    return torch.relu(raw.abs() - limit).square().mean()
+
+
+def polyak_update(targets: list[Tensor], sources: list[Tensor], rho: float) -> None:
+    """Eq. 4: target <- rho * target + (1 - rho) * source, parameter by parameter."""
+    with torch.no_grad():
+        torch._foreach_lerp_(targets, sources, 1.0 - rho)
+
+
+def average_so_far(rho: float, updates: int) -> float:
+    """Rho of a running average after so many updates: less at first, while it is mostly its start.
+
+    A constant 0.99 holds the random weights of the start for hundreds of updates.
+    """
+    return min(rho, updates / (updates + 9.0))
+
+
+class NotFiniteError(RunError):
+    """Numbers of an update, or weights, that are not finite."""
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """A batch as both losses see it.
+
+    Attributes:
+        view: where the action was taken.
+        velocity: (M, 3) of the action, in the arena's axes.
+        reward: (M,) what the critic learns, less what follows.
+        done: (M,) 1 where nothing follows.
+        start: where the actor is asked from: mostly the same view.
+        follow: what the action came to.
+        seen_after: that too where an afterstate critic is to see it as it was, else it sees the
+            exact motion.
+    """
+
+    view: View
+    velocity: Tensor
+    reward: Tensor
+    done: Tensor
+    start: View
+    follow: View
+    seen_after: View | None = None
+
+
+class Learner:
+    """Actor, critic, their targets and optimisers.
+
+    Attributes:
+        updates: number of updates made.
+        bootstraps: whether the critic's target counts what follows (Eq. 5): only then are there
+            target networks.
+        parts: networks by the names under which a checkpoint has them.
+        playing: what a worker plays with: the actor, or both networks where both play.
+        acting: its running average, which is what workers get.
+    """
+
+    def __init__(self, setup: Setup, seed: int, device: str = "cpu") -> None:
+        self.config: AgentConfig = setup.agent
+        self.device = torch.device(device)
+        self.updates = 0
+        self.bootstraps = setup.bootstraps
+        self._setup, self._layout, self._tokens = setup, setup.layout, setup.layout.tokens
+        networks = Networks(setup)
+        self.actor, self.critic = networks.actor, networks.critic
+        generator = torch.Generator().manual_seed(seed)
+        initialise(self.actor, generator)
+        initialise(self.critic, generator)
+        self.parameters = parameter_count(self.actor, self.critic)
+        networks.to(self.device)
+        self.acting = _frozen(networks.playing)
+        self.parts: dict[str, nn.Module] = {"actor": self.actor, "critic": self.critic}
+        if self.bootstraps:
+            self.target_actor, self.target_critic = _frozen(self.actor), _frozen(self.critic)
+            self.parts |= {"target_actor": self.target_actor, "target_critic": self.target_critic}
+        self.parts["acting"] = self.acting
+        self.playing = networks.playing
+        # Kept as lists: walking the modules takes a fifth of a small network's update.
+        self._lists = self.parameter_lists()
+        self.actor_optimiser = _adam(self._lists["actor"], self.config.actor_lr)
+        self.critic_optimiser = _adam(self._lists["critic"], self.config.critic_lr)
+
+    def parameter_lists(self) -> dict[str, list[Tensor]]:
+        """Parameters by the names of `parts`, and those of `playing`."""
+        modules = self.parts | {"playing": self.playing}
+        return {name: list(module.parameters()) for name, module in modules.items()}
+
+    def prepared(self, batch: Transitions, generator: np.random.Generator) -> Batch:
+        """What `update` takes, from a batch of transitions: pairs, where the agent sees such."""
+        if not self._setup.pairs:
+            return batch
+        pairs = make_pairs(batch, self._setup, generator)
+        return (
+            with_contacts(pairs, batch, self._layout, generator) if self._setup.contacts else pairs
+        )
+
+    def update(self, batch: Batch, progress: float = 0.0) -> dict[str, float]:
+        """One step of both networks on a batch.
+
+        Args:
+            batch: B transitions; see `prepared`.
+            progress: used share of the run's budget, in [0, 1]; decides the learning rate.
+
+        Returns:
+            critic_loss, actor_loss, q (mean value of the batch's actions), saturation, and the
+            norms of the gradients, critic_gradient and actor_gradient.
+
+        Raises:
+            NotFiniteError: one of these is not finite. The update does not count, and the networks
+                may be spoilt: load a state from before.
+        """
+        self._set_learning_rate(progress)
+        steps = self.steps(batch)
+        # Made once where critic and actor see the same: as it stands, from the same token.
+        features = None
+        if not self.config.afterstate and steps.start is steps.view:
+            features = self.actor.head.see(steps.view)
+        pushes = self.push_loss(batch) if isinstance(batch, ContactBatch) else None
+        values = self._critic_step(steps, features, pushes) | self._actor_step(steps, features)
+        self._follow()
+        # One wait for the device, after everything has been asked of it.
+        numbers = dict(zip(values, torch.stack(list(values.values())).tolist(), strict=True))
+        _check_finite(self.updates + 1, numbers)
+        self.updates += 1
+        return numbers
+
+    def steps(self, batch: Batch) -> Steps:
+        """A batch as tensors on the device."""
+        return self._of_pairs(batch) if isinstance(batch, PairBatch) else self._of_scenes(batch)
+
+    def _of_scenes(self, batch: Transitions) -> Steps:
+        state, placed = self._tensor(batch.state), self._tensor(batch.placed)
+        goal, action = self._tensor(batch.goal), self._tensor(batch.action)
+        taken = Scenes(
+            state,
+            placed,
+            goal,
+            self._index(chosen_tokens(batch.action.astype(np.float64), self._tokens)),
+        )
+        start = taken if self._tokens == 1 else Scenes(state, placed, goal, next_token(placed))
+        following, flags = self._tensor(batch.next_state), self._tensor(batch.next_placed)
+        return Steps(
+            view=taken,
+            velocity=action[:, -VELOCITY:],
+            reward=self._tensor(batch.reward),
+            done=self._tensor(batch.done),
+            start=start,
+            follow=Scenes(following, flags, goal, next_token(flags)),
+        )
+
+    def _of_pairs(self, batch: PairBatch) -> Steps:
+        after = self._pairs(batch, batch.after, batch.after_flipped)
+        return Steps(
+            view=self._pairs(batch, batch.before, batch.before_flipped),
+            velocity=self._tensor(batch.velocity),
+            reward=self._tensor(batch.reward),
+            done=self._tensor(batch.done),
+            start=self._pairs(batch, batch.start, batch.start_flipped),
+            follow=after,
+            seen_after=after,
+        )
+
+    def _pairs(self, batch: PairBatch, pose: Floats, flipped: Bools) -> Pairs:
+        """The pairs (M,) with their tokens where they lay at some time."""
+        return Pairs(
+            pose=self._tensor(pose),
+            flipped=self._tensor(flipped),
+            token=self._index(batch.token),
+            goal=self._tensor(batch.goal),
+            goal_flipped=self._tensor(batch.goal_flipped),
+            piece=self._index(batch.piece),
+            covered=self._tensor(batch.covered),
+        )
+
+    def critic_loss(self, steps: Steps, features: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Mean squared Bellman error of Eq. 3, and the values (M,)."""
+        with torch.no_grad():
+            y = self._target(steps)
+        q = self.critic(steps.view, steps.velocity, steps.seen_after, features)
+        return (q - y).square().mean(), q
+
+    def actor_loss(self, steps: Steps, features: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Minus the value of the actor's own actions (Eq. 6), and the saturation penalty."""
+        velocity, raw = self.actor(steps.start, features)
+        q = self.critic(steps.start, velocity, None, features)
+        return -q.mean(), saturation(raw, self.config.saturation_limit)
+
+    def push_loss(self, batch: ContactBatch) -> Tensor:
+        """Mean squared error of what tokens that slide push away."""
+        before = self._pairs(batch, batch.before, batch.before_flipped)
+        # Where tokens meet, the other one has the place of a piece that nothing covers.
+        meeting = replace(
+            before,
+            goal=self._tensor(batch.other_pose),
+            goal_flipped=self._tensor(batch.other_flipped),
+            piece=self._index(batch.other),
+            covered=torch.zeros_like(before.covered),
+        )
+        share = self.critic.pushed(meeting, self._tensor(batch.after))
+        return (share - self._tensor(batch.pushed)).square().mean()
+
+    def _target(self, steps: Steps) -> Tensor:
+        """Eq. 5; the target networks are not asked where no transition goes on."""
+        if not self.bootstraps or bool(steps.done.all()):
+            return steps.reward
+        velocity, _ = self.target_actor(steps.follow)
+        following = self.target_critic(steps.follow, velocity)
+        return critic_target(steps.reward, steps.done, following, self.config.gamma)
+
+    def _follow(self) -> None:
+        """Targets and the acting average, a little of the way to the networks."""
+        lists, config = self._lists, self.config
+        if self.bootstraps:
+            polyak_update(lists["target_critic"], lists["critic"], config.polyak)
+            polyak_update(lists["target_actor"], lists["actor"], config.polyak)
+        rho = average_so_far(config.acting_average, self.updates)
+        polyak_update(lists["acting"], lists["playing"], rho)
+
+    def _critic_step(
+        self, steps: Steps, features: Tensor | None, pushes: Tensor | None
+    ) -> dict[str, Tensor]:
+        loss, q = self.critic_loss(steps, features)
+        if pushes is not None:
+            loss = loss + pushes
+        norm = self._step("critic", loss)
+        return {"critic_loss": loss.detach(), "q": q.detach().mean(), "critic_gradient": norm}
+
+    def _actor_step(self, steps: Steps, features: Tensor | None) -> dict[str, Tensor]:
+        value_loss, penalty = self.actor_loss(steps, features)
+        loss = value_loss + self.config.saturation_penalty * penalty
+        norm = self._step("actor", loss)
+        return {
+            "actor_loss": value_loss.detach(),
+            "saturation": penalty.detach(),
+            "actor_gradient": norm,
+        }
+
+    def _step(self, part: str, loss: Tensor) -> Tensor:
+        """One step of one network, whatever else the loss depends on; its gradient's norm."""
+        parameters = self._lists[part]
+        gradients = torch.autograd.grad(loss, parameters)
+        norm = nn.utils.get_total_norm(gradients)
+        for parameter, gradient in zip(parameters, gradients, strict=True):
+            parameter.grad = gradient
+        if self.config.grad_clip > 0.0:
+            nn.utils.clip_grads_with_norm_(parameters, self.config.grad_clip, norm)
+        self._optimisers()[part].step()
+        return norm
+
+    def _set_learning_rate(self, progress: float) -> None:
+        factor = 1.0
+        if self.config.lr_decay == "cosine":
+            share = min(max(progress, 0.0), 1.0)
+            low = self.config.lr_final
+            factor = low + (1.0 - low) * 0.5 * (1.0 + math.cos(math.pi * share))
+        self.actor_optimiser.param_groups[0]["lr"] = self.config.actor_lr * factor
+        self.critic_optimiser.param_groups[0]["lr"] = self.config.critic_lr * factor
+
+    def _tensor(self, column: Array) -> Tensor:
+        return torch.from_numpy(np.asarray(column, np.float32)).to(self.device)
+
+    def _index(self, column: Ints) -> Tensor:
+        return torch.from_numpy(np.asarray(column, np.int64)).to(self.device)
+
+    def acting_weights(self, version: int) -> Weights:
+        """A copy of the weights that workers play with."""
+        return Weights(version, to_arrays(self.acting))
+
+    def state(self) -> dict[str, Array]:
+        """Everything that the next update depends on, as arrays for a checkpoint."""
+        state: dict[str, Array] = {_COUNTER: np.array([self.updates], np.int64)}
+        for part, module in self.parts.items():
+            for name, value in to_arrays(module).items():
+                state[f"{part}.{name}"] = value
+        for part, optimiser in self._optimisers().items():
+            for i, slots in optimiser.state_dict()["state"].items():
+                for name, value in slots.items():
+                    state[f"{part}_optimiser.{i}.{name}"] = value.cpu().numpy().copy()
+        return state
+
+    def load_state(self, state: dict[str, Array]) -> None:
+        """Take over a state from `state()`.
+
+        Raises:
+            RunError: tensors are missing or have other shapes: another layout or another net.
+        """
+        if _COUNTER not in state:
+            raise RunError("learner state: no counter of updates: not a learner's checkpoint")
+        self.load_networks(state)
+        for part, optimiser in self._optimisers().items():
+            slots = under(f"{part}_optimiser.", state)
+            content: dict[int, dict[str, Tensor]] = {}
+            for key, value in slots.items():
+                i, name = key.split(".", 1)
+                content.setdefault(int(i), {})[name] = torch.from_numpy(np.array(value))
+            groups = optimiser.state_dict()["param_groups"]
+            optimiser.load_state_dict({"state": content, "param_groups": groups})
+        self.updates = int(state[_COUNTER][0])
+
+    def load_networks(self, state: dict[str, Array]) -> None:
+        """Take over the networks of a state, and nothing else.
+
+        Raises:
+            RunError: tensors are missing or have other shapes.
+        """
+        for part, module in self.parts.items():
+            load_arrays(module, under(f"{part}.", state))
+
+    def _optimisers(self) -> dict[str, torch.optim.Adam]:
+        return {"actor": self.actor_optimiser, "critic": self.critic_optimiser}
+
+
+def _frozen(module: nn.Module) -> nn.Module:
+    return copy.deepcopy(module).requires_grad_(False)
+
+
+def _adam(parameters: list[Tensor], rate: float) -> torch.optim.Adam:
+    return torch.optim.Adam(parameters, lr=rate, fused=True)
+
+
+def _check_finite(updates: int, numbers: dict[str, float]) -> None:
+    if not all(map(math.isfinite, numbers.values())):
+        listed = ", ".join(f"{name}={value:g}" for name, value in numbers.items())
+        raise NotFiniteError(f"update {updates} is not finite ({listed})")

@@ -1,0 +1,324 @@
+"""Choosing among proposals: a pose for every pair of a token and a piece, and the best one played.
+
+The critic values each proposal for its own piece; the best few are then valued for all pieces of
+the target, as an action is worth the sum of what it covers, less what sliding there costs.
+
+Legend: B environments, K tokens, V corners, M candidates (pairs of all environments, row after
+row), N meetings of a token with another.
+"""
+
+import zlib
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tangram_agent.coverage import covered_share, covering, worths
+from tangram_agent.graph import PairGraph, Pairs
+from tangram_agent.networks import Critic, Networks
+from tangram_agent.setup import Setup
+from tangram_sim.arrays import Bools, Floats, Ints
+from tangram_sim.layout import Layout
+
+_SHORT_LIST = 8  # proposals of an environment that are valued for all pieces
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """M actions that may be played: each takes a token to a piece of the target.
+
+    Attributes:
+        row: (M,) environment, in order.
+        token: (M,) which token.
+        flip: (M,) 1 where it is turned over.
+        piece: (M,) which piece it is meant for.
+    """
+
+    row: Tensor
+    token: Tensor
+    flip: Tensor
+    piece: Tensor
+
+    def at(self, index: Tensor) -> "Candidates":
+        """Some of them."""
+        return Candidates(*(part[index] for part in vars(self).values()))
+
+    def best(self, value: Tensor, most: int) -> Tensor:
+        """Indices (M',) of the best of each row by a value (M,), row after row."""
+        table, first = self._table(value)
+        best = table.topk(min(most, table.shape[1]), dim=1)
+        return (best.indices + first[:, None])[best.values > -torch.inf]
+
+    def _table(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        """Values (M,) row by row, (B, L), filled up with -inf, and where each row begins, (B,)."""
+        counts = torch.bincount(self.row)
+        first = counts.cumsum(0) - counts
+        table = torch.full((len(counts), int(counts.max())), -torch.inf)
+        table[self.row, torch.arange(len(self.row)) - first[self.row]] = value
+        return table, first
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """B environments as tensors; sides are 1 where a token lies on its other one.
+
+    Attributes:
+        pose: (B, K, 3) of the tokens.
+        flipped: (B, K) their sides.
+        goal: (B, K, 3) of the target's pieces.
+        goal_flipped: (B, K) their sides.
+        covered: (B, K, K) share of the second, a piece, that tokens other than the first cover.
+        worth: (B, K) sum of the values of what each token covers.
+    """
+
+    pose: Tensor
+    flipped: Tensor
+    goal: Tensor
+    goal_flipped: Tensor
+    covered: Tensor
+    worth: Tensor
+
+    def pairs(self, c: Candidates) -> Pairs:
+        """The pairs (M,) of candidates; a token that is turned over has changed its side."""
+        return Pairs(
+            pose=self.pose[c.row, c.token],
+            flipped=self._side(c),
+            token=c.token,
+            goal=self.goal[c.row, c.piece],
+            goal_flipped=self.goal_flipped[c.row, c.piece],
+            piece=c.piece,
+            covered=self.covered[c.row, c.token, c.piece],
+        )
+
+    def meetings(self, movers: Candidates, other: Candidates, where: Tensor) -> Pairs:
+        """Pairs (M,) of tokens that move and of others that lie at poses (M, 3) in the same rows.
+
+        Where tokens meet, the other one has the place of a piece that nothing covers.
+        """
+        return Pairs(
+            pose=self.pose[movers.row, movers.token],
+            flipped=self._side(movers),
+            token=movers.token,
+            goal=where,
+            goal_flipped=self._side(other),
+            piece=other.token,
+            covered=torch.zeros(len(where)),
+        )
+
+    def _side(self, c: Candidates) -> Tensor:
+        return (self.flipped[c.row, c.token] - c.flip).abs()
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """What B environments play.
+
+    Attributes:
+        token: (B,) which token.
+        flip: (B,) whether it is turned over.
+        start: (B, 3) where it lies.
+        pose: (B, 3) where it goes.
+    """
+
+    token: Ints
+    flip: Bools
+    start: Floats
+    pose: Floats
+
+
+class Planner:
+    """Chooses token, side and pose."""
+
+    def __init__(self, networks: Networks, setup: Setup) -> None:
+        self._networks, self._layout, self._agent = networks, setup.layout, setup.agent
+        self._graph = PairGraph(setup.layout, setup.sim.arena, setup.agent)
+        self._contacts = setup.contacts
+        self._turns_over = setup.layout.chiral & setup.sim.allow_flip
+
+    def choose(self, corners: Floats, placed: Bools, goals: Floats, refine: bool = True) -> Choice:
+        """What to play; where all tokens are placed, some action of the first one.
+
+        Args:
+            corners: (B, V, 2) of the tokens.
+            placed: (B, K) which tokens are placed.
+            goals: (B, V, 2) of the target.
+            refine: take the gradient steps that the agent is configured for.
+        """
+        start = self._layout.poses(corners)
+        scene = self._scene(corners, start, goals)
+        with torch.no_grad():
+            candidates, pose = self._short_list(scene, self._open(placed, goals))
+            best = self._best(scene, candidates, pose)
+        chosen, pose = candidates.at(best), pose[best]
+        if refine and self._agent.refine_steps:
+            pose = self._refined(scene, chosen, pose)
+        token = chosen.token.numpy()
+        return Choice(
+            token=token,
+            flip=chosen.flip.numpy() > 0.5,
+            start=start[np.arange(len(token)), token],
+            pose=pose.numpy().astype(np.float64),
+        )
+
+    def _scene(self, corners: Floats, start: Floats, goals: Floats) -> Scene:
+        layout = self._layout
+        covered = covering(corners, goals, layout)
+        return Scene(
+            pose=_tensor(start),
+            flipped=_tensor(layout.flipped(corners)),
+            goal=_tensor(layout.poses(goals)),
+            goal_flipped=_tensor(layout.flipped(goals)),
+            covered=_tensor(covered_share(covered, layout)),
+            worth=_tensor(worths(covered, layout)),
+        )
+
+    def _open(self, placed: Bools, goals: Floats) -> Bools:
+        """(B, K) tokens that may be next, at least one in each row."""
+        is_open: Bools = ~np.asarray(placed, np.bool_)
+        is_open[~is_open.any(axis=1), 0] = True
+        if self._agent.order == "learned":
+            return is_open
+        # The first one that is left, by rank.
+        rank = np.where(is_open, _ranks(self._agent.order, self._layout, goals), np.inf)
+        return np.asarray(np.arange(rank.shape[1]) == rank.argmin(axis=1)[:, None])
+
+    def _short_list(self, scene: Scene, is_open: Bools) -> tuple[Candidates, Tensor]:
+        """The best few of all pairs that may be played, by their own piece's value, and poses.
+
+        The actor is applied again to its own proposals as often as it is configured.
+        """
+        sides = np.stack([is_open, is_open & self._turns_over], axis=-1)
+        every = np.broadcast_to(sides[..., None], (*sides.shape, self._layout.tokens))
+        row, token, flip, piece = map(torch.from_numpy, np.nonzero(every))
+        candidates = Candidates(row, token, flip.float(), piece)
+        pairs = scene.pairs(candidates)
+        pose = self._proposed(pairs)
+        best = candidates.best(self._valued(pairs, pose), _SHORT_LIST)
+        candidates, pose = candidates.at(best), pose[best]
+        pairs = scene.pairs(candidates)
+        for _ in range(self._agent.reapply):
+            pose = self._proposed(pairs.at(pose))
+        return candidates, pose
+
+    def _proposed(self, pairs: Pairs) -> Tensor:
+        """Poses (M, 3) that the actor gives to the tokens of pairs."""
+        velocity, _ = self._networks.actor(pairs)
+        return self._graph.moved(pairs, velocity).pose
+
+    def _valued(self, pairs: Pairs, pose: Tensor) -> Tensor:
+        """Values (M,) of moving the tokens of pairs to poses (M, 3)."""
+        values: Tensor = self._networks.critic(pairs, self._graph.way(pairs, pose), pairs.at(pose))
+        return values
+
+    def _best(self, scene: Scene, candidates: Candidates, pose: Tensor) -> Tensor:
+        """Index (B,) of the best candidate of each row."""
+        # What a token covers already it gives up.
+        total = self._total(scene, candidates, pose) - scene.worth[candidates.row, candidates.token]
+        if self._contacts:
+            critic, weight = self._networks.critic, self._agent.push_weight
+            total = total - damage(critic, weight, scene, candidates, pose, total)
+        return candidates.best(total, 1)
+
+    def _total(self, scene: Scene, candidates: Candidates, pose: Tensor) -> Tensor:
+        """(M,) values of poses (M, 3) over all pieces of the target."""
+        count = self._layout.tokens
+        every = candidates.at(torch.arange(len(pose)).repeat_interleave(count))
+        pairs = scene.pairs(replace(every, piece=torch.arange(count).repeat(len(pose))))
+        values = self._valued(pairs, pose.repeat_interleave(count, dim=0))
+        return values.view(-1, count).sum(dim=1)
+
+    def _refined(self, scene: Scene, chosen: Candidates, pose: Tensor) -> Tensor:
+        """Poses (B, 3) after gradient steps uphill on what the critic says they cover."""
+        with torch.enable_grad():
+            moved = pose.clone().requires_grad_(True)
+            optimiser = torch.optim.Adam([moved], lr=self._agent.refine_rate)
+            for _ in range(self._agent.refine_steps):
+                loss = -self._total(scene, chosen, moved).sum()
+                (moved.grad,) = torch.autograd.grad(loss, [moved])
+                optimiser.step()
+        return moved.detach()
+
+
+def damage(
+    critic: Critic,
+    weight: float,
+    scene: Scene,
+    candidates: Candidates,
+    pose: Tensor,
+    value: Tensor,
+) -> Tensor:
+    """(M,) what sliding to poses (M, 3) costs.
+
+    Now: each other token's worth, times the share that it is pushed away. Later, with a
+    weight: the candidate's own value (M,), times the share that every token which is still to come
+    pushes it away on the way to the best pose known for it. So what lies in the way of others is
+    placed after them. A token without a candidate is not counted.
+    """
+    now = _pushed_now(critic, scene, candidates, pose)
+    if weight == 0.0:
+        return now
+    return now + weight * value * _pushed_later(critic, scene, candidates, pose, value)
+
+
+def _pushed_now(critic: Critic, scene: Scene, candidates: Candidates, pose: Tensor) -> Tensor:
+    """(M,) sum over other tokens of the share that each is pushed away times its worth."""
+    index, token = torch.nonzero(scene.worth[candidates.row] > 0.0, as_tuple=True)
+    apart = candidates.token[index] != token
+    index, token = index[apart], token[apart]
+    movers = candidates.at(index)
+    lying = replace(movers, token=token, flip=torch.zeros(len(token)))
+    where = scene.pose[movers.row, token]
+    share = _pushed(critic, scene, movers, pose[index], lying, where)
+    cost = share * scene.worth[movers.row, token]
+    return torch.zeros(len(pose)).index_add(0, index, cost)
+
+
+def _pushed_later(
+    critic: Critic, scene: Scene, candidates: Candidates, pose: Tensor, value: Tensor
+) -> Tensor:
+    """(M,) sum over the tokens to come of the share that each pushes a candidate away."""
+    same = candidates.row[:, None] == candidates.row
+    apart = candidates.token[:, None] != candidates.token
+    index, mover = torch.nonzero(same & apart & _leaders(candidates, value), as_tuple=True)
+    movers, lying = candidates.at(mover), candidates.at(index)
+    share = _pushed(critic, scene, movers, pose[mover], lying, pose[index])
+    return torch.zeros(len(pose)).index_add(0, index, share)
+
+
+def _pushed(
+    critic: Critic,
+    scene: Scene,
+    movers: Candidates,
+    to: Tensor,
+    lying: Candidates,
+    where: Tensor,
+) -> Tensor:
+    """(N,) shares that tokens which slide to poses (N, 3) push others, at poses (N, 3), away."""
+    return critic.pushed(scene.meetings(movers, lying, where), to).clamp(0.0, 1.0)
+
+
+def _leaders(candidates: Candidates, value: Tensor) -> Tensor:
+    """(M,) which candidate is the best one of its token in its row, by a value (M,)."""
+    key = candidates.row * (int(candidates.token.max()) + 1) + candidates.token
+    best = torch.full((int(key.max()) + 1,), -torch.inf).scatter_reduce(0, key, value, "amax")
+    return value >= best[key]
+
+
+def _ranks(order: str, layout: Layout, goals: Floats) -> Floats:
+    """(B, K) which token comes first, by a rule that was not learned."""
+    count = layout.tokens
+    if order == "size":
+        # Equal areas stay in the set's order, whatever their rounding.
+        size = np.round(layout.areas / layout.areas.max(), 9)
+        rank = np.argsort(np.argsort(-size, kind="stable"))
+        return np.broadcast_to(rank, (len(goals), count))
+    if order == "random":
+        # By the target, which stays for the whole episode: a policy has no memory.
+        seeds = [zlib.crc32(np.asarray(goal, np.float32).tobytes()) for goal in goals]
+        return np.stack([np.random.default_rng(seed).permutation(count) for seed in seeds])
+    return np.broadcast_to(np.arange(count), (len(goals), count))
+
+
+def _tensor(array: Floats | Bools) -> Tensor:
+    return torch.from_numpy(np.array(array, np.float32))

@@ -1,0 +1,338 @@
+"""Choosing among pairs: against brute force, and with networks that know the geometry exactly."""
+
+from contextlib import closing
+from itertools import product
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import torch
+
+from tangram_agent import planning
+from tangram_agent.coverage import covered_share, covering, worths
+from tangram_agent.graph import PairGraph, Pairs
+from tangram_agent.networks import Networks, initialise
+from tangram_agent.planning import Planner
+from tangram_agent.policy import Policy
+from tangram_agent.setup import Setup
+from tangram_sim.batch import BatchedEnv
+from tests.agent.builders import SMALL, setup
+from tests.agent.pair_scenes import (
+    PERCEPTRON,
+    TWO,
+    PerfectCritic,
+    PerfectNetworks,
+    as_tensor,
+    random_scene,
+    seven,
+)
+
+pytestmark = pytest.mark.fast
+
+COUNT = 6
+SLIDE = {"backend": "physics", "motion": "slide"}
+
+
+def scenes(made: Setup, count: int = COUNT, seed: int = 0) -> tuple[np.ndarray, ...]:
+    """Corners, placed and goals of random scenes; every one has a token left."""
+    rng = np.random.default_rng(seed)
+    layout = made.layout
+    corners, goals = (layout.corners(*random_scene(layout, rng, count)) for _ in range(2))
+    placed = rng.random((count, layout.tokens)) < 0.5
+    placed[:, 0] &= ~placed.all(axis=1)
+    return corners, placed, goals
+
+
+def random_networks(made: Setup, seed: int = 0) -> Networks:
+    networks = Networks(made)
+    initialise(networks, torch.Generator().manual_seed(seed))
+    return networks.requires_grad_(False)
+
+
+def perfect(
+    made: Setup, pushes: np.ndarray | None = None, likes: np.ndarray | None = None
+) -> Planner:
+    graph = PairGraph(made.layout, made.sim.arena, made.agent)
+    networks = PerfectNetworks(PerfectCritic(made.layout, pushes, likes), graph)
+    return Planner(cast("Networks", networks), made)
+
+
+# Against brute force
+
+
+def total(
+    made: Setup,
+    networks: Networks,
+    scene: tuple[np.ndarray, ...],
+    token: int,
+    flip: bool,
+    pose: np.ndarray | None = None,
+    piece: int = 0,
+) -> tuple[float, np.ndarray]:
+    """Value over all pieces of one token's pose, by default the actor's own for one piece."""
+    layout = made.layout
+    corners, _, goals = (part[None] for part in scene)
+    covered = covering(corners, goals, layout)
+    share = covered_share(covered, layout)[0, token]
+    here, side = layout.poses(corners)[0, token], layout.flipped(corners)[0, token] ^ flip
+    wanted, sides = layout.poses(goals)[0], layout.flipped(goals)[0]
+
+    def pair(where: np.ndarray, index: int) -> Pairs:
+        return Pairs(
+            as_tensor([where]),
+            as_tensor([side]),
+            torch.tensor([token]),
+            as_tensor([wanted[index]]),
+            as_tensor([sides[index]]),
+            torch.tensor([index]),
+            as_tensor([share[index]]),
+        )
+
+    graph = PairGraph(layout, made.sim.arena, made.agent)
+
+    def proposed(pairs: Pairs) -> np.ndarray:
+        place: np.ndarray = graph.moved(pairs, networks.actor(pairs)[0]).pose[0].numpy()
+        return place
+
+    if pose is None:
+        pose = proposed(pair(here, piece))
+        for _ in range(made.agent.reapply):
+            pose = proposed(pair(pose, piece))
+    still = torch.zeros(1, 3)
+    values = [networks.critic(pair(pose, index), still).item() for index in range(layout.tokens)]
+    return sum(values) - worths(covered, layout)[0, token], pose
+
+
+@pytest.mark.parametrize("net", [SMALL, PERCEPTRON])
+@pytest.mark.parametrize("options", [{}, {"reapply": 2}, {"allow_flip": True}])
+def test_the_best_of_all_is_played(
+    monkeypatch: pytest.MonkeyPatch, net: dict[str, Any], options: dict[str, Any]
+) -> None:
+    """With a short list that leaves nothing out."""
+    monkeypatch.setattr(planning, "_SHORT_LIST", 1000)
+    flip = options.get("allow_flip", False)
+    made = setup(TWO, {"reapply": options.get("reapply", 0)}, net, allow_flip=flip)
+    networks = random_networks(made)
+    corners, placed, goals = scenes(made)
+    choice = Planner(networks, made).choose(corners, placed, goals)
+    for row in range(COUNT):
+        scene = corners[row], placed[row], goals[row]
+        every = [
+            (*total(made, networks, scene, token, turned, piece=piece), token, turned)
+            for token, turned, piece in product(range(2), (False, True), range(2))
+            if not placed[row, token] and (not turned or (flip and made.layout.chiral[token]))
+        ]
+        _, pose, token, turned = max(every, key=lambda one: one[0])
+        assert (choice.token[row], choice.flip[row]) == (token, turned)
+        np.testing.assert_allclose(choice.pose[row], pose, atol=1e-5)
+        start = made.layout.poses(corners[row])[token]
+        np.testing.assert_allclose(choice.start[row], start)
+
+
+@pytest.mark.parametrize("sim", [{}, {"allow_flip": True}, SLIDE])
+def test_a_choice_does_not_depend_on_the_others_of_the_batch(sim: dict[str, Any]) -> None:
+    pushes = {"push_weight": 0.5} if sim == SLIDE else {}
+    made = seven({"reapply": 1, "refine_steps": 2} | pushes, **sim)
+    chooser = Planner(random_networks(made), made)
+    corners, placed, goals = scenes(made, COUNT)
+    placed[3] = True
+    together = chooser.choose(corners, placed, goals)
+    for row in range(COUNT):
+        one = slice(row, row + 1)
+        alone = chooser.choose(corners[one], placed[one], goals[one])
+        for name, column in vars(alone).items():
+            np.testing.assert_allclose(column[0], vars(together)[name][row], atol=1e-5)
+
+
+@pytest.mark.parametrize("order", ["learned", "listed", "size", "random"])
+def test_no_placed_token_is_named_while_others_are_left(order: str) -> None:
+    made = seven({"order": order})
+    corners, placed, goals = scenes(made, 40)
+    token = Planner(random_networks(made), made).choose(corners, placed, goals).token
+    assert not placed[np.arange(40), token].any()
+    assert len(set(token)) > 1
+
+
+def test_where_all_are_placed_the_first_is_named() -> None:
+    made = seven()
+    corners, _, goals = scenes(made)
+    everything = np.ones((COUNT, 7), np.bool_)
+    choice = Planner(random_networks(made), made).choose(corners, everything, goals)
+    assert choice.token.tolist() == [0] * COUNT
+
+
+@pytest.mark.parametrize(
+    ("order", "expected"),
+    # In the set: parallelogram, small, large, square, large.
+    [("listed", [0, 1, 2, 3, 4]), ("size", [2, 4, 0, 3, 1])],
+)
+def test_orders_that_are_not_learned(order: str, expected: list[int]) -> None:
+    shapes = ["parallelogram", "small_triangle", "large_triangle", "square", "large_triangle"]
+    made = setup({"shapes": shapes, "scale": 0.5}, {"order": order})
+    assert named_in_turn(made, 0) == expected
+
+
+def named_in_turn(made: Setup, goal: int) -> list[int]:
+    """The tokens of a whole episode, as they are named."""
+    chooser = perfect(made)
+    corners, _, goals = scenes(made, 8)
+    placed = np.zeros((1, made.layout.tokens), np.bool_)
+    named: list[int] = []
+    for step in range(made.layout.tokens):
+        # The tokens lie elsewhere at every step, the goal stays.
+        choice = chooser.choose(corners[step : step + 1], placed, goals[goal : goal + 1])
+        named.append(int(choice.token[0]))
+        placed[0, named[-1]] = True
+    return named
+
+
+def test_a_random_order_is_one_for_each_target() -> None:
+    made = seven({"order": "random"})
+    orders = [named_in_turn(made, goal) for goal in range(8)]
+    assert all(sorted(order) == list(range(7)) for order in orders)
+    assert len({tuple(order) for order in orders}) == 8
+    # At every step the first one that is left of an order that does not change.
+    assert orders == [named_in_turn(made, goal) for goal in range(8)]
+    chooser, (corners, placed, goals) = perfect(made), scenes(made, 8)
+    found = chooser.choose(corners, placed, goals).token
+    expected = [
+        next(token for token in order if not flags[token])
+        for order, flags in zip(orders, placed, strict=True)
+    ]
+    assert found.tolist() == expected
+
+
+# Refinement
+
+
+@pytest.mark.parametrize("net", [SMALL, PERCEPTRON])
+def test_refinement_goes_uphill_on_what_the_critic_says_of_all_pieces(net: dict[str, Any]) -> None:
+    plain, refined = (seven({"refine_steps": n}, net) for n in (0, 20))
+    networks = random_networks(plain)
+    scene = scenes(plain)
+    one, two, off = (
+        Planner(networks, plain).choose(*scene),
+        Planner(networks, refined).choose(*scene),
+        Planner(networks, refined).choose(*scene, refine=False),
+    )
+    np.testing.assert_array_equal(one.pose, off.pose)
+    np.testing.assert_array_equal(one.token, two.token)
+    for row in range(COUNT):
+        part = scene[0][row], scene[1][row], scene[2][row]
+        token = int(one.token[row])
+        before, after = (
+            total(plain, networks, part, token, False, choice.pose[row])[0] for choice in (one, two)
+        )
+        assert after > before
+    assert not any(parameter.requires_grad for parameter in networks.parameters())
+
+
+# With networks that know everything
+
+
+def assembled(made: Setup, chooser: Planner, episodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Overlap at the end (B,), and flips (B, T) of whole episodes."""
+    policy = Policy(made)
+    policy._planner = chooser  # perfect networks have no weights to load
+    flips = []
+    with closing(BatchedEnv(made.layout, made.sim, made.reward, episodes)) as env:
+        env.reset([np.random.default_rng([7, i]) for i in range(episodes)])
+        for _ in range(env.horizon):
+            actions = policy.act(env.corners, env.placed, env.goals)
+            flips.append(actions[:, -4] > 0.0)
+            result = env.step(actions.astype(np.float64))
+            assert not result.refused.any()
+        return result.overlap, np.stack(flips, axis=1)
+
+
+@pytest.mark.parametrize(
+    "sim", [{}, {"mirrored": 0.5}, {"mirrored": 0.5, "allow_flip": True}, {"targets": "connected"}]
+)
+@pytest.mark.parametrize("order", ["learned", "random"])
+def test_perfect_networks_assemble_everything(sim: dict[str, Any], order: str) -> None:
+    made = seven({"order": order}, starts="outside", **sim)
+    overlap, _ = assembled(made, perfect(made), 12)
+    assert overlap.min() > 0.999
+
+
+def test_a_token_is_turned_over_just_where_its_piece_lies_on_the_other_side() -> None:
+    made = setup(
+        {"shapes": ["parallelogram"], "scale": 0.8},
+        {"readout": "pair"},
+        allow_flip=True,
+        mirrored=0.5,
+    )
+    rng = np.random.default_rng(0)
+    (poses, sides), (goals, goal_sides) = (random_scene(made.layout, rng, 40) for _ in range(2))
+    choice = perfect(made).choose(
+        made.layout.corners(poses, sides),
+        np.zeros((40, 1), np.bool_),
+        made.layout.corners(goals, goal_sides),
+    )
+    np.testing.assert_array_equal(choice.flip, (sides ^ goal_sides)[:, 0])
+    assert 5 < choice.flip.sum() < 35
+
+
+def test_without_flips_no_token_is_turned_over() -> None:
+    made = seven(mirrored=0.5)
+    corners, placed, goals = scenes(made, 20)
+    placed[:] = [True] * 6 + [False]
+    assert not perfect(made).choose(corners, placed, goals).flip.any()
+
+
+# Tokens that push each other
+
+
+def squares(**agent: Any) -> Setup:
+    return setup({"shapes": ["square"] * 3, "scale": 0.8}, agent, PERCEPTRON, **SLIDE)
+
+
+LIKES = np.array([1.0, 1.0, 0.9])  # of tokens that cover as much, the second
+
+
+def at(made: Setup, *centres: tuple[float, float]) -> np.ndarray:
+    poses = np.array([[x, y, 0.0] for x, y in centres])
+    return made.layout.corners(poses)[None]
+
+
+@pytest.mark.parametrize("weight", [0.0, 1.0])
+def test_a_token_that_would_push_a_placed_one_off_the_target_is_not_played(weight: float) -> None:
+    """Token 0 is placed well. Token 1, the better one but for that, would push it away."""
+    made = squares(push_weight=weight)
+    goals = at(made, (0, 0), (0.5, 0), (0.6, 0.6))
+    corners = at(made, (0, 0), (-0.5, 0), (-0.8, -0.8))
+    placed = np.array([[True, False, False]])
+    harmless, harmful = np.zeros((3, 3)), np.zeros((3, 3))
+    harmful[1, 0] = 0.9
+    harmless[1, 2] = harmless[2, 1] = 0.9  # what is still to come may be pushed
+    assert perfect(made, harmless, LIKES).choose(corners, placed, goals).token[0] == 1
+    assert perfect(made, harmful, LIKES).choose(corners, placed, goals).token[0] == 2
+    # One that lies beside the target may be pushed.
+    elsewhere = at(made, (-0.8, 0.8), (-0.5, 0), (-0.8, -0.8))
+    assert perfect(made, harmful, LIKES).choose(elsewhere, placed, goals).token[0] == 1
+    # And one that covers a tenth of its piece costs a tenth of what it would.
+    hardly = at(made, (-0.9 * 0.8 * 2**0.5 / 4, 0), (-0.5, 0), (-0.8, -0.8))
+    assert perfect(made, harmful, LIKES).choose(hardly, placed, goals).token[0] == 1
+
+
+@pytest.mark.parametrize(("weight", "expected"), [(0.0, 1), (1.0, 2)])
+def test_what_lies_in_the_way_of_others_comes_after_them(weight: float, expected: int) -> None:
+    """Token 2 would push token 1 away, wherever that is placed; not the other way round."""
+    made = squares(push_weight=weight)
+    goals = at(made, (0, 0), (0.5, 0), (0.6, 0.6))
+    corners = at(made, (0, 0), (-0.5, 0), (-0.8, -0.8))
+    pushes = np.zeros((3, 3))
+    pushes[2, 1] = 0.8
+    found = perfect(made, pushes, LIKES).choose(corners, np.array([[True, False, False]]), goals)
+    assert found.token[0] == expected
+
+
+def test_where_tokens_are_lifted_nothing_is_pushed() -> None:
+    made = setup({"shapes": ["square"] * 3, "scale": 0.8}, {}, PERCEPTRON)
+    goals = at(made, (0, 0), (0.5, 0), (0.6, 0.6))
+    corners = at(made, (0, 0), (-0.5, 0), (-0.8, -0.8))
+    pushes = np.zeros((3, 3))
+    pushes[1, 0] = pushes[2, 1] = 1.0  # what would speak against token 1, now and later
+    everything = perfect(made, pushes, LIKES)
+    placed = np.array([[True, False, False]])
+    assert everything.choose(corners, placed, goals).token[0] == 1

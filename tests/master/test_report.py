@@ -1,0 +1,101 @@
+"""How the run stands: collected once, the same everywhere, and never the end of the loop."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from master.result import SCORES, make_result
+from tests.master.builders import (
+    FakeHub,
+    arrival,
+    close_journals,
+    loop,
+    scores,
+    shown,
+    small_setup,
+)
+
+pytestmark = pytest.mark.fast
+
+MADE = small_setup()
+
+
+@pytest.fixture(autouse=True)
+def closed() -> Iterator[None]:
+    yield
+    close_journals()
+
+
+def test_what_is_told(tmp_path: Path) -> None:
+    """The same status goes to the terminal, to who asks, to the curves and into the result."""
+    hub = FakeHub(
+        MADE, [[arrival(MADE, 1)], [arrival(MADE, 2)], [scores(MADE, 2)]], ["player", "evaluator"]
+    )
+    made = loop(tmp_path, MADE, hub, {"publish_seconds": 0.0}, max_updates=4)
+    made.run()
+    last = made.reporter.flush(queue=3)
+    assert shown(made)[-1] is last
+    assert hub.values("tell")[-1] is last
+    expected = {
+        "episodes": 8,
+        "updates": 4,
+        "share": 1.0,
+        "players": 1,
+        "evaluators": 1,
+        "queue": 3,
+    }
+    assert expected.items() <= dict(last.numbers).items()
+    assert last.texts["activity"] == "waiting for episodes"
+    made.reporter._metrics.close()
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    expected_tags = {
+        "train/critic_loss",
+        "train/actor_loss",
+        "train/q",
+        "play/reward",
+        "weights/age_updates",
+        "weights/age_seconds",
+    }
+    of_status = {n if "/" in n else f"run/{n}" for n in last.numbers if not n.startswith("test/")}
+    assert expected_tags | of_status <= set(events.Tags()["scalars"])
+
+
+@pytest.mark.parametrize(
+    ("transitions", "updates", "players", "words"),
+    [
+        (0, 0, 0, "waiting for workers to join"),
+        (3, 0, 1, "filling the replay, 3 of 4"),
+        (4, 0, 1, "learning, workers wait"),
+        (4, 0, 0, "learning"),
+        (4, 1, 1, "learning"),
+        (4, 2, 1, "waiting for episodes"),
+    ],
+)
+def test_what_is_waited_for(
+    tmp_path: Path, transitions: int, updates: int, players: int, words: str
+) -> None:
+    made = loop(tmp_path, MADE, FakeHub(MADE, roles=["player"] * players))
+    made.guard.trainer.rate_limiter.inserted(transitions)
+    made.guard.trainer.rate_limiter.updated(updates)
+    made.reporter.tick(0)
+    assert shown(made)[-1].texts["activity"] == words
+
+
+def test_a_status_that_cannot_be_told_as_it_is_ends_nothing_and_keeps_the_scores(
+    tmp_path: Path,
+) -> None:
+    """More counters than a message takes, numbers beyond its bounds, and none at all."""
+    hub = FakeHub(MADE)
+    hub.counters.update({f"event{i}": 2**70 for i in range(100)})
+    made = loop(tmp_path, MADE, hub)
+    found = dict.fromkeys(SCORES, 0.5) | {"raw_overlap": float("nan"), "mean_reward": 1e300}
+    made.clock.record.score(found, version=0)
+    status = made.reporter.flush(queue=0)
+    assert hub.values("tell") == [status]
+    status.encode()
+    result = make_result(status, made.guard.trainer, seed=0, reason="SIGTERM")
+    assert (result["raw_overlap"], result["mean_reward"]) == (None, 1e18)
+    assert result["position_error_p90"] == 0.5

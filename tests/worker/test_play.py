@@ -1,0 +1,345 @@
+"""tangram-play: which episodes are shown, what is drawn of them, and runs side by side."""
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import worker.film as film_module
+from tangram_agent.runs import load_run
+from tangram_sim.errors import ConfigError, RunError, TangramError
+from tangram_sim.geometry import outlines, pairs_overlap
+from tests.agent.builders import PAIR, SQUARE, setup
+from tests.worker.builders import write_run
+from tests.worker.puzzle_files import GAME, SIM, drawn, write_puzzles
+from worker.config import PlayConfig
+from worker.film import Show, film_pictures
+from worker.play import (
+    compare_runs,
+    distinct_names,
+    equally_long,
+    headed,
+    make_show,
+    motion,
+    play_episodes,
+    play_run,
+)
+
+fast, slow = pytest.mark.fast, pytest.mark.slow
+PLAIN_AGENT = {"egocentric": False, "angle_head": "plain"}
+
+
+def of_square(folder: Path, **settings: Any) -> PlayConfig:
+    if not (folder / "run").exists():
+        write_run(folder / "run", settings.pop("run_of", SQUARE))
+    return PlayConfig(str(folder / "run"), **settings)
+
+
+def of_game(folder: Path, **settings: Any) -> PlayConfig:
+    if not (folder / "run").exists():
+        write_run(folder / "run", GAME, sim=SIM)
+    return PlayConfig(str(folder / "run"), **settings)
+
+
+def shown(config: PlayConfig) -> Show:
+    return make_show(load_run(config.run_dirs[0]), config)
+
+
+# Episodes of one run
+
+
+@fast
+def test_a_picture_shows_all_episodes(tmp_path: Path) -> None:
+    sizes = []
+    for episodes in (1, 4, 12):
+        out = tmp_path / f"{episodes}.png"
+        play_run(of_square(tmp_path, out=str(out), episodes=episodes))
+        with Image.open(out) as picture:
+            assert picture.format == "PNG"
+            sizes.append(picture.size)
+    assert sizes[0][0] < sizes[1][0]
+    assert sizes[0][1] < sizes[1][1]
+    assert max(sizes[2]) < 900
+
+
+@fast
+def test_another_seed_shows_other_episodes(tmp_path: Path) -> None:
+    plays = [shown(of_square(tmp_path, episodes=2, seed=seed)).played for seed in (0, 0, 1)]
+    np.testing.assert_array_equal(plays[0].starts, plays[1].starts)
+    assert (plays[0].starts != plays[2].starts).all()
+
+
+@fast
+def test_motion_is_even_and_ends_where_the_episode_did() -> None:
+    """A token moved by (0.4, -0.2) and turned by 170 degrees past the cut of the angle."""
+    layout = setup().layout
+    start, end = np.array([[0.0, 0.0, 2.0]]), np.array([[0.4, -0.2, 2.0 + np.radians(170.0)]])
+    corners = layout.corners(np.stack([start, end, end])[None])
+    frames = motion(layout, corners, count=4)
+    assert len(frames) == 1 + 2 * 4
+    for i, frame in enumerate(frames):
+        expected = layout.corners(start + min(i / 4, 1.0) * (end - start))
+        np.testing.assert_allclose(frame[0], expected, atol=1e-9)
+
+
+@slow
+@pytest.mark.parametrize(("episodes", "actions"), [(4, None), (1, 2)])
+def test_an_animation_has_frames_that_move(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    episodes: int,
+    actions: int | None,
+) -> None:
+    monkeypatch.setattr(film_module, "FRAMES_PER_ACTION", 6)  # drawing takes its time
+    out = tmp_path / "film.gif"
+    made = of_square(tmp_path, run_of=PAIR, out=str(out), episodes=episodes, actions=actions)
+    assert play_run(made) == 0
+    with Image.open(out) as film:
+        assert film.format == "GIF"
+        assert film.n_frames > 10
+        first = np.asarray(film.convert("RGB"))
+        film.seek(film.n_frames - 1)
+        assert (np.asarray(film.convert("RGB")) != first).any()
+    assert f"{out}: {episodes} episodes, raw overlap 0." in capsys.readouterr().out
+    assert list(tmp_path.glob(".film*")) == []
+
+
+# Puzzles, and random targets of several tokens
+
+
+@fast
+def test_puzzles_by_name_start_beside_their_figures_and_elsewhere_with_another_seed(
+    tmp_path: Path,
+) -> None:
+    shows = [
+        shown(of_game(tmp_path, puzzle=("cat", "sun_over_mountains"), seed=seed))
+        for seed in (0, 0, 1)
+    ]
+    assert shows[0].titles == ["cat", "sun over mountains"]
+    starts, layout = [show.played.starts for show in shows], shows[0].setup.layout
+    assert (starts[0] == starts[1]).all()
+    assert (starts[0] != starts[2]).all()
+    for start, goal in zip(starts[0], shows[0].played.goals, strict=True):
+        tokens, pieces = outlines(start[None], layout)[0], outlines(goal[None], layout)[0]
+        assert not pairs_overlap(np.repeat(tokens, 7, axis=0), np.tile(pieces, (7, 1, 1))).any()
+
+
+@fast
+@pytest.mark.parametrize(
+    ("names", "titles"), [(None, ["my cat", "my fish"]), (("my_fish",), ["my fish"])]
+)
+def test_puzzles_of_a_file(tmp_path: Path, names: tuple[str] | None, titles: list[str]) -> None:
+    path = write_puzzles(tmp_path / "mine.json", drawn("cat"), drawn("fish"))
+    assert shown(of_game(tmp_path, puzzles=str(path), puzzle=names)).titles == titles
+
+
+@fast
+def test_unknown_and_too_many_puzzles(tmp_path: Path) -> None:
+    out = tmp_path / "x.png"
+    with pytest.raises(ConfigError, match="no puzzle 'unicorn' in the library: choose from square"):
+        play_run(of_game(tmp_path, puzzle=("unicorn",), out=str(out)))
+    many = [drawn("cat") | {"name": f"cat_{i}"} for i in range(101)]
+    path = write_puzzles(tmp_path / "many.json", *many)
+    with pytest.raises(ConfigError, match="there are 101 puzzles, at most 100 .* puzzle=.cat_0"):
+        play_run(of_game(tmp_path, puzzles=str(path), out=str(out)))
+    assert not out.exists()
+
+
+@fast
+@pytest.mark.parametrize(
+    ("what", "told"),
+    [
+        ({"puzzle": ("cat", "dog")}, "2 puzzles, covered 0."),
+        ({"episodes": 2}, "2 episodes, raw overlap 0."),
+    ],
+)
+def test_a_picture_of_several_tokens_shows_the_ends(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], what: dict[str, Any], told: str
+) -> None:
+    out = tmp_path / "two.png"
+    assert play_run(of_game(tmp_path, out=str(out), **what)) == 0
+    assert f"{out}: {told}" in capsys.readouterr().out
+    with Image.open(out) as picture:
+        assert picture.format == "PNG"
+        assert picture.width > 1.5 * picture.height
+
+
+@fast
+def test_a_film_has_a_picture_for_each_frame(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(film_module, "MAX_FRAMES", 14)  # drawing takes its time
+    monkeypatch.setattr(film_module, "WIDTH", 120)
+    pictures = film_pictures(shown(of_game(tmp_path, puzzle=("cat",), seed=2)))
+    assert len(pictures) == 1 + 14 + 1
+    assert all((np.asarray(a) != np.asarray(b)).any() for a, b in pairwise(pictures))
+
+
+class StandIn:
+    """A window that notes what it is shown."""
+
+    def __init__(self, closes_after: int) -> None:
+        self.shown: list[np.ndarray] = []
+        self.targets, self.left, self.closed = 0, closes_after, False
+
+    @property
+    def is_open(self) -> bool:
+        return len(self.shown) < self.left
+
+    def show(self, poses: np.ndarray, rolls: np.ndarray, heights: np.ndarray) -> None:
+        assert (poses.shape, rolls.shape, heights.shape) == ((7, 3), (7,), (7,))
+        self.shown.append(heights)
+
+    def show_target(self, poses: np.ndarray, flipped: np.ndarray) -> None:
+        self.targets += 1
+
+    def close(self) -> None:
+        self.closed = True
+
+
+@fast
+@pytest.mark.parametrize(("left", "targets"), [(10**6, 2), (5, 1)])
+def test_a_window_shows_one_puzzle_after_the_other_until_it_is_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left: int, targets: int
+) -> None:
+    window, clock = StandIn(left), iter(range(10**6))
+    for name in ("FRAME_S", "PAUSE_S"):
+        monkeypatch.setattr(film_module, name, 0.0)
+    monkeypatch.setattr(film_module.time, "monotonic", lambda: -next(clock))
+    monkeypatch.setattr(film_module.time, "sleep", lambda _: None)
+    monkeypatch.setattr("tangram_sim.physics.open_window", lambda *_: window)
+    assert play_run(of_game(tmp_path, puzzle=("cat", "dog"), live=True)) == 0
+    assert (window.targets, window.closed) == (targets, True)
+    assert len(window.shown) == min(left, 2 * (1 + 1 + 7 * 14 + 1))
+    assert max(heights.max() for heights in window.shown) <= film_module.CARRIED
+
+
+@fast
+@pytest.mark.parametrize("display", [None, ":399"])
+def test_no_window_without_a_display(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, display: str | None
+) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    if display is not None:
+        monkeypatch.setenv("DISPLAY", display)
+    with pytest.raises(TangramError, match="live=true needs a display .*write a film"):
+        play_run(of_game(tmp_path, puzzle=("cat",), live=True))
+
+
+# Runs side by side
+
+
+def compared(folder: Path, *names: str, **more: Any) -> PlayConfig:
+    runs = tuple(str(folder / name) for name in names)
+    return PlayConfig(compare=runs, **({"out": str(folder / "both.gif"), "episodes": 2} | more))
+
+
+def played_by_two(folder: Path, episodes: int, **second: Any) -> list[Any]:
+    """Setups and episodes of two runs of the square, the second with other sections."""
+    write_run(folder / "first")
+    write_run(folder / "second", **second)
+    config = compared(folder, "first", "second", episodes=episodes)
+    return [play_episodes(load_run(run), config) for run in config.run_dirs]
+
+
+@fast
+@pytest.mark.parametrize("count", [2, 4])
+def test_every_run_has_a_column(tmp_path: Path, count: int) -> None:
+    names = [f"run_{number}" for number in range(count)]
+    for name in names:
+        write_run(tmp_path / name)
+    out = tmp_path / "ends.png"
+    compare_runs(compared(tmp_path, *names, out=str(out), episodes=4))
+    with Image.open(out) as picture:
+        assert picture.format == "PNG"
+        assert 1000 < picture.width < 1300
+
+
+@fast
+def test_all_have_the_same_starts_and_targets(tmp_path: Path) -> None:
+    (_, one), (_, other) = played_by_two(tmp_path, 3, agent=PLAIN_AGENT, sim={"backend": "physics"})
+    np.testing.assert_allclose(one.starts, other.starts, atol=1e-6)
+    np.testing.assert_array_equal(one.goals, other.goals)
+    assert (one.ends != other.ends).any()
+
+
+@fast
+def test_a_shorter_episode_waits_for_the_longer_one(tmp_path: Path) -> None:
+    plays = played_by_two(tmp_path, 1, sim={"backend": "kinematic", "actions_per_token": 3})
+    films = equally_long(plays)
+    assert len(films[0]) == len(films[1]) == 1 + 3 * 20
+    np.testing.assert_array_equal(films[0][-1], films[0][20])
+
+
+def own(side: float) -> dict[str, Any]:
+    corners = [[0.0, 0.0], [side, 0.0], [0.0, 0.3]]
+    return {"tokens": {"shapes": [{"name": "own", "corners": corners}], "scale": 1.0}}
+
+
+@fast
+@pytest.mark.parametrize(
+    ("first", "other", "reason"),
+    [
+        ({}, {"tokens": {"shapes": ["small_triangle"], "scale": 1.6}}, r"is \[small_triangle\]"),
+        ({}, {"tokens": PAIR}, r"tokens is \[square, large_triangle\]"),
+        ({}, {"tokens": SQUARE | {"scale": 0.5}}, "of scale 0.5 here"),
+        ({}, {"sim": {"backend": "kinematic", "arena": 3.0}}, "sim.arena is 3 here and 2 there"),
+        (own(0.3), own(0.4), "their tokens have other corners"),
+    ],
+)
+def test_runs_of_another_task_are_refused(
+    tmp_path: Path, first: dict, other: dict, reason: str
+) -> None:
+    write_run(tmp_path / "first", **first)
+    write_run(tmp_path / "second", **other)
+    with pytest.raises(RunError, match=reason) as caught:
+        compare_runs(compared(tmp_path, "first", "second"))
+    assert str(tmp_path / "second") in str(caught.value)
+    assert not (tmp_path / "both.gif").exists()
+
+
+@fast
+@pytest.mark.parametrize(
+    ("folders", "names"),
+    [
+        (["runs/a", "runs/b"], ["a", "b"]),
+        (["paper/seed_0", "mlp/seed_0"], ["paper/seed_0", "mlp/seed_0"]),
+        (["x/a/s", "x/b/s", "y/b/s"], ["x/a/s", "x/b/s", "y/b/s"]),
+        (["square", "pretrained/square"], ["square", "pretrained/square"]),
+    ],
+)
+def test_labels_tell_the_runs_apart(folders: list[str], names: list[str]) -> None:
+    assert distinct_names([Path(folder) for folder in folders]) == names
+
+
+@fast
+def test_a_long_name_stays_inside_its_column() -> None:
+    panel = Image.new("RGB", (200, 50), "white")
+    picture = np.asarray(headed(panel, "a_long_name/" * 20, "score").convert("L"))
+    assert (picture[:, -4:] > 200).all()
+
+
+@slow
+def test_two_agents_move_side_by_side(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_run(tmp_path / "first")
+    write_run(tmp_path / "second", agent=PLAIN_AGENT)
+    assert compare_runs(compared(tmp_path, "first", "second", episodes=1)) == 0
+    printed = capsys.readouterr().out
+    assert f"{tmp_path / 'both.gif'}: 1 episodes; first: mean raw overlap 0." in printed
+    assert "; second: mean raw overlap 0." in printed
+    with Image.open(tmp_path / "both.gif") as film:
+        assert film.n_frames > 10
+        assert film.width > film.height
+        begin = halves(film)
+        film.seek(film.n_frames - 1)
+        assert all((a != b).any() for a, b in zip(begin, halves(film), strict=True))
+
+
+def halves(film: Image.Image) -> tuple[np.ndarray, np.ndarray]:
+    pixels = np.asarray(film.convert("RGB"))
+    middle = pixels.shape[1] // 2
+    return pixels[:, : middle - 12], pixels[:, middle + 12 :]
