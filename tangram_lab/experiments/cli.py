@@ -5,7 +5,7 @@ Everything heavy is imported after the config was composed, so --help and wrong 
 
 from pathlib import Path
 
-from conf.cli import composed, entry
+from conf.cli import composed, entry, own_presets
 from conf.commands import Plain
 
 
@@ -29,7 +29,7 @@ def _experiment(settings: Plain) -> int:
 
     from tangram_lab.experiments.runner import run_study
 
-    return run_study(config, resolved)
+    return run_study(config, resolved, own_presets())
 
 
 def _resolved(name: str, overrides: list[str]) -> Plain:

@@ -117,12 +117,15 @@ def read_object(path: Path) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def make_jobs(config: StudyConfig, resolved: Mapping[str, Mapping[str, Any]]) -> list[Job]:
+def make_jobs(
+    config: StudyConfig, resolved: Mapping[str, Mapping[str, Any]], presets: str | None = None
+) -> list[Job]:
     """All trainings seed by seed, each followed by its tests.
 
     Args:
         config: the study.
         resolved: the whole config of each training that is wanted.
+        presets: the folder of the user's own presets, where the study was given one.
     """
     jobs: list[Job] = []
     for seed in config.budget.seeds:
@@ -130,18 +133,24 @@ def make_jobs(config: StudyConfig, resolved: Mapping[str, Mapping[str, Any]]) ->
         for name in config.wanted():
             source = config.trainings[name].after
             needs = None if source is None else trainings[source]
-            trainings[name] = _training(config, name, seed, needs, resolved[name])
+            trainings[name] = _training(config, name, seed, needs, resolved[name], presets)
             tests = (_test(config, trainings[name], test) for test in config.tests_of(name))
             jobs += [trainings[name], *tests]
     return jobs
 
 
 def _training(
-    config: StudyConfig, name: str, seed: int, needs: Job | None, settings: Mapping[str, Any]
+    config: StudyConfig,
+    name: str,
+    seed: int,
+    needs: Job | None,
+    settings: Mapping[str, Any],
+    presets: str | None,
 ) -> Job:
     run_dir = seed_folder(Path(config.run_dir), name, seed)
     told = (
         "train",
+        *([] if presets is None else [f"--config-dir={presets}"]),
         override("run_dir", str(run_dir)),
         f"seed={seed}",
         "resume=auto",

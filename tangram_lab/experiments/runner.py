@@ -134,12 +134,15 @@ FAILED_STATUS = 1
 INTERRUPT_STATUS = 130
 
 
-def run_study(config: StudyConfig, resolved: Mapping[str, Mapping[str, Any]]) -> int:
+def run_study(
+    config: StudyConfig, resolved: Mapping[str, Mapping[str, Any]], presets: str | None
+) -> int:
     """Do everything that is missing.
 
     Args:
         config: the study.
         resolved: the whole config of each training that is wanted.
+        presets: the folder of the user's own presets, None where there is none.
 
     Returns:
         Exit status: 0 when all is done, 1 when a job failed, 130 after a signal.
@@ -147,7 +150,7 @@ def run_study(config: StudyConfig, resolved: Mapping[str, Mapping[str, Any]]) ->
     Raises:
         ConfigError: the folder holds trainings with other settings or budget, or is in use.
     """
-    study, jobs = RunFolder(config.run_dir), make_jobs(config, resolved)
+    study, jobs = RunFolder(config.run_dir), make_jobs(config, resolved, presets)
     for job in jobs:
         job.check()
     plan = joined_plan(study.path / PLAN, plan_content(config, _source()))

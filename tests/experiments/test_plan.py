@@ -249,6 +249,13 @@ def test_a_training_is_a_command_that_can_go_on(tmp_path: Path) -> None:
     assert job.log == run_dir / "training.log"
 
 
+def test_trainings_are_told_where_ones_own_presets_lie(tmp_path: Path) -> None:
+    config = study(tmp_path)
+    trainings = [job for job in make_jobs(config, resolved(config), "/mine") if job.trains]
+    assert {job.command[1] for job in trainings} == {"--config-dir=/mine"}
+    assert all("--config-dir=/mine" not in job.command for job in jobs_of(tmp_path).values())
+
+
 def test_a_warm_start_waits_for_its_source(tmp_path: Path) -> None:
     jobs = jobs_of(tmp_path)
     job, source = jobs["warm, seed 1"], tmp_path / "trainings" / "square" / "seed_1"
