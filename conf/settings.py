@@ -16,7 +16,7 @@ PAGE = Path(__file__).parents[1] / "docs" / "settings.md"
 # Lists of settings inside of a setting.
 NESTED = {
     "sim.stages": "tangram_sim.config:StageConfig",
-    "agent.hindsight": "tangram_agent.config:TwinConfig",
+    "agent.hindsight": "tangram_agent.config:RelabelConfig",
 }
 INTRODUCTION = """\
 # Settings

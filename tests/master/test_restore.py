@@ -50,7 +50,9 @@ def assert_same(one: dict[str, Any], other: dict[str, Any]) -> None:
             np.testing.assert_array_equal(value, other[name], err_msg=name)
 
 
-def test_a_run_goes_on_as_if_it_had_never_stopped(tmp_path: Path) -> None:
+def test_a_run_goes_on_as_if_it_had_never_stopped(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     straight, stopped = trainer(MADE), trainer(MADE)
     play_on(straight, 5)
     play_on(stopped, 5)
@@ -59,6 +61,7 @@ def test_a_run_goes_on_as_if_it_had_never_stopped(tmp_path: Path) -> None:
     save_run(tmp_path, stopped, rest, keep=1)
     resumed = trainer(MADE, seed=99)
     assert restore_run(tmp_path, resumed) == rest
+    assert caplog.messages == []
     assert_same(everything(resumed), everything(straight))
     for made in (straight, resumed):
         play_on(made, 5, seed=1)

@@ -1,0 +1,269 @@
+"""No setting is ignored: each changes what is played or learned, or is refused with the reason."""
+
+import ast
+import hashlib
+from contextlib import closing
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from conf.commands import COMMANDS, GROUPS, load
+from conf.settings import NESTED
+from master.trainer import Trainer
+from tangram_agent.policy import Policy
+from tangram_agent.setup import Setup, make_setup
+from tangram_sim.batch import BatchedEnv
+from tangram_sim.errors import SamplingError, TangramError
+from tangram_sim.settings import declared_fields
+from worker.rollout import Rollout
+
+pytestmark = pytest.mark.fast
+
+ROOT = Path(__file__).parents[1]
+Config = dict[str, dict[str, Any]]
+
+# A small run of each kind, which the rows below change.
+AGENT = {
+    "batch_size": 4,
+    "replay_capacity": 256,
+    "learning_starts": 8,
+    "updates_per_transition": 0.5,
+    "uniform_share": 0.25,
+}
+ONE: Config = {
+    "tokens": {"shapes": ["large_triangle"], "scale": 0.8},
+    "sim": {"backend": "kinematic"},
+    "reward": {},
+    "agent": AGENT,
+    "net": {"width": 8, "layers": 1, "heads": 2, "feed_forward": 8},
+}
+SEVERAL: Config = ONE | {
+    "tokens": {"shapes": ["large_triangle", "parallelogram"], "scale": 0.8},
+    "sim": {"backend": "kinematic", "arena": 3.0},
+}
+
+
+def over(base: Config, **sections: dict[str, Any]) -> Config:
+    return base | {name: base[name] | values for name, values in sections.items()}
+
+
+PAPER = over(
+    ONE, agent={"squash": "tanh", "afterstate": False, "gamma": 0.9}, sim={"actions_per_token": 2}
+)
+MLP = ONE | {"net": {"kind": "mlp", "hidden": [8]}}
+PHYSICS = over(ONE, sim={"backend": "physics"})
+INEXACT = over(PHYSICS, sim={"inexact": True})
+GAUSSIAN = over(SEVERAL, sim={"targets": "gaussian"})
+SLIDE = over(SEVERAL, sim={"backend": "physics", "motion": "slide"})
+SEEN = over(ONE, sim={"camera": True, "arena": 1.2})
+CAMERA = over(SEEN, reward={"source": "camera"})
+DENSE = over(ONE, reward={"name": "dense"})
+REFINED = over(SEVERAL, agent={"refine_steps": 1, "refine_rate": 0.01})
+NEAR = {"strategy": "near", "copies": 1, "position": 0.1, "angle": 0.1}
+NEAR_ONE = over(ONE, agent={"hindsight": [NEAR]})
+STAGE = {"updates": 2, "tokens": 1, "targets": "gaussian", "spread": 0.2}
+STAGES = over(SEVERAL, sim={"stages": [STAGE]})
+
+# Setting -> a run in which it has an effect, and another value.
+SHOWS: dict[str, tuple[Config, object]] = {
+    "tokens.shapes": (ONE, ["square"]),
+    "tokens.scale": (ONE, 0.7),
+    "sim.backend": (SEVERAL, "physics"),
+    "sim.arena": (ONE, 2.5),
+    "sim.actions_per_token": (ONE, 2),
+    "sim.substeps": (INEXACT, 1),
+    "sim.damping": (INEXACT, 0.5),
+    "sim.corner_noise": (ONE, 0.01),
+    "sim.motion": (over(SEVERAL, sim={"backend": "physics"}), "slide"),
+    "sim.max_overlap": (over(SEVERAL, sim={"arena": 1.6, "max_overlap": 1.0}), 0.0),
+    "sim.targets": (SEVERAL, "connected"),
+    "sim.spread": (GAUSSIAN, 0.05),
+    "sim.starts": (SEVERAL, "outside"),
+    "sim.mirrored": (SEVERAL, 1.0),
+    "sim.allow_flip": (SEVERAL, True),
+    "sim.stages": (SEVERAL, [STAGE]),
+    "sim.camera": (ONE, True),
+    "sim.pixels": (CAMERA, 32),
+    "sim.max_tries": (over(SEVERAL, tokens={"scale": 2.2}), 1),
+    "sim.stages.updates": (STAGES, 100),
+    "sim.stages.tokens": (STAGES, 2),
+    "sim.stages.targets": (over(STAGES, sim={"stages": [STAGE | {"spread": 0.2}]}), "connected"),
+    "sim.stages.spread": (STAGES, 0.02),
+    "reward.name": (ONE, "pose"),
+    "reward.source": (SEEN, "camera"),
+    "reward.sharpness": (DENSE, 10.0),
+    "net.kind": (ONE | {"net": {}}, "mlp"),
+    "net.hidden": (MLP, [9]),
+    "net.width": (ONE, 16),
+    "net.layers": (ONE, 2),
+    "net.heads": (ONE, 1),
+    "net.feed_forward": (ONE, 9),
+    "net.scale": (ONE, "sqrt_d"),
+    "agent.egocentric": (ONE, False),
+    "agent.offsets": (ONE, False),
+    "agent.orientation": (ONE, False),
+    "agent.edges": (ONE, "complete"),
+    "agent.afterstate": (ONE, False),
+    "agent.angle_head": (ONE, "plain"),
+    "agent.squash": (ONE, "tanh"),
+    "agent.saturation_penalty": (over(ONE, agent={"saturation_limit": 0.0}), 9.0),
+    "agent.saturation_limit": (over(ONE, agent={"saturation_limit": 0.0}), 0.01),
+    "agent.readout": (SEVERAL, "token"),
+    "agent.order": (SEVERAL, "listed"),
+    "agent.reapply": (SEVERAL, 0),
+    "agent.refine_steps": (REFINED, 2),
+    "agent.refine_rate": (REFINED, 0.02),
+    "agent.pairs_per_transition": (SEVERAL, 2),
+    "agent.gamma": (PAPER, 0.5),
+    "agent.push_weight": (SLIDE, 0.5),
+    "agent.polyak": (PAPER, 0.5),
+    "agent.acting_average": (ONE, 0.0),
+    "agent.actor_lr": (ONE, 1e-2),
+    "agent.critic_lr": (ONE, 1e-2),
+    "agent.lr_decay": (ONE, "none"),
+    "agent.lr_final": (ONE, 0.5),
+    "agent.grad_clip": (ONE, 1e-3),
+    "agent.batch_size": (ONE, 5),
+    "agent.replay_capacity": (ONE, 8),
+    "agent.updates_per_transition": (ONE, 0.25),
+    "agent.learning_starts": (ONE, 16),
+    "agent.noise": (ONE, 0.2),
+    "agent.uniform_share": (ONE, 1.0),
+    "agent.hindsight": (ONE, [{"strategy": "final"}]),
+    "agent.hindsight.strategy": (NEAR_ONE, "none"),
+    "agent.hindsight.copies": (NEAR_ONE, 2),
+    "agent.hindsight.position": (NEAR_ONE, 0.2),
+    "agent.hindsight.angle": (NEAR_ONE, 0.2),
+}
+# What shows elsewhere, and where.
+ELSEWHERE = {
+    "agent.name": "the label of a run in reports",
+    "sim.inexact": "allows damping and few substeps: tests/sim/test_config.py",
+}
+
+
+def changed(base: Config, name: str, value: object) -> Config:
+    """A config with another value of a setting, or of the first entry of a list of them."""
+    section, *inner, key = name.split(".")
+    if not inner:
+        return over(base, **{section: {key: value}})
+    first, *others = base[section][inner[0]]
+    return over(base, **{section: {inner[0]: [first | {key: value}, *others]}})
+
+
+@cache
+def trace(config: str) -> str:
+    """The digest of the run that a config makes, in which many rows begin alike."""
+    return digest_of(make_setup(ast.literal_eval(config)))
+
+
+def digest_of(setup: Setup) -> str:
+    """A digest of a short seeded run: what is played, learned, and played by what was learned."""
+    digest = hashlib.sha256()
+
+    def note(*arrays: Any) -> None:
+        for array in arrays:
+            digest.update(np.ascontiguousarray(array).tobytes())
+
+    trainer, policy = Trainer(setup, 0, "cpu", lag_updates=64), Policy(setup)
+    try:
+        env = BatchedEnv(setup.layout, setup.sim, setup.reward, 4)
+    except SamplingError:
+        return "no room"
+    with closing(env):
+        rollout = Rollout(env, 0, "player", 0, 0)
+        for turn in range(4):
+            policy.load(trainer.weights())
+            rollout.follow(trainer.updates)
+            try:
+                played = rollout.play(policy.explore)
+            except SamplingError:
+                return f"no room in episode {turn}"
+            note(played.corners, played.actions, played.rewards, played.goals)
+            trainer.insert(played)
+            while trainer.rate_limiter.may_update():
+                trainer.update(0.25 * turn)
+        policy.load(trainer.weights())
+        note(policy.act(env.seen, env.placed * 0, env.seen_goals))
+        result = env.reset([np.random.default_rng(i) for i in range(4)])
+        result = env.step(np.zeros((4, setup.action_size)))
+        note(result.rewards, *([] if result.camera_rewards is None else [result.camera_rewards]))
+    for name, arrays in sorted(trainer.state()[0].items()):
+        for key in sorted(arrays):
+            note(f"{name}.{key}".encode(), arrays[key])
+    return digest.hexdigest()
+
+
+@pytest.mark.parametrize("name", SHOWS)
+def test_a_setting_changes_a_run(name: str) -> None:
+    base, value = SHOWS[name]
+    assert trace(repr(base)) != trace(repr(changed(base, name, value)))
+
+
+@pytest.mark.parametrize("base", [ONE, SEVERAL])
+def test_an_equal_run_has_an_equal_trace(base: Config) -> None:
+    assert digest_of(make_setup(base)) == trace(repr(base))
+
+
+def test_every_setting_of_a_run_is_walked() -> None:
+    groups = {name: kind for name, kind in (GROUPS | NESTED).items() if name != "service"}
+    declared = {
+        f"{g}.{own.name}" for g, kind in groups.items() for own in declared_fields(load(kind))
+    }
+    assert SHOWS.keys() | ELSEWHERE.keys() == declared
+    assert not SHOWS.keys() & ELSEWHERE.keys()
+
+
+# What the service and the tools are told
+
+
+def read_names() -> set[str]:
+    """Every attribute and text in the packages, but where settings are declared."""
+    names: set[str] = set()
+    for package in ("master", "worker", "tangram_agent", "tangram_sim", "tangram_lab", "conf"):
+        for path in (ROOT / package).rglob("*.py"):
+            if path.name in ("config.py", "commands.py"):
+                continue
+            for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+                if isinstance(node, ast.Attribute):
+                    names.add(node.attr)
+                elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                    names.add(node.value)
+    return names
+
+
+def test_every_setting_of_a_command_is_read() -> None:
+    owners = [*(load(name) for c in COMMANDS.values() for name in c.settings)]
+    declared = {
+        own.name for kind in (*owners, load(GROUPS["service"])) for own in declared_fields(kind)
+    }
+    assert declared <= read_names()
+
+
+# What could have no effect
+
+
+@pytest.mark.parametrize(
+    ("base", "name", "value", "because"),
+    [
+        (ONE, "net.hidden", [8], "net.kind=mha"),
+        (MLP, "net.width", 32, "net.kind=mlp"),
+        (MLP, "net.layers", 2, "net.kind=mlp"),
+        (MLP, "net.heads", 2, "net.kind=mlp"),
+        (MLP, "net.feed_forward", 8, "net.kind=mlp"),
+        (MLP, "net.scale", "sqrt_d", "net.kind=mlp"),
+        (ONE, "sim.substeps", 16, "sim.backend=kinematic"),
+        (ONE, "sim.inexact", True, "sim.backend=kinematic"),
+        (ONE, "sim.spread", 0.1, "sim.targets=uniform"),
+        (SLIDE, "sim.max_overlap", 0.1, "sim.motion=slide"),
+        (ONE, "reward.sharpness", 10.0, "reward.name=overlap"),
+    ],
+)
+def test_a_setting_without_effect_is_refused(
+    base: Config, name: str, value: object, because: str
+) -> None:
+    with pytest.raises(TangramError, match=f"^{name}=.* changes nothing with {because}: leave it"):
+        make_setup(changed(base, name, value))
