@@ -117,10 +117,13 @@ class Ledger:
             return None  # acknowledged after its insert
         return Reject(reason=f"batch {sequence}: {why}", sequence=sequence, final=False)
 
-    def take(self, sequence: int) -> None:
-        """The next batch is handed on for insertion."""
-        self.consume(sequence)
-        self.held.add(sequence)
+    def take(self, sequence: int, window: int) -> Verdict:
+        """What to do with a batch of this number; the next one is held until its insert."""
+        verdict = self.judge(sequence, window)
+        if verdict is Verdict.NEW:
+            self.consume(sequence)
+            self.held.add(sequence)
+        return verdict
 
     def release(self, sequence: int) -> bool:
         """A batch that was taken is inserted now; False if it was not held."""

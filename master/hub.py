@@ -281,14 +281,13 @@ class Hub:
     ) -> EpisodesArrived | None:
         """The batch, if it is the next one; else what the worker must know is answered."""
         peer.damaged = 0
-        verdict = peer.ledger.judge(batch.sequence, self._info.window)
+        verdict = peer.ledger.take(batch.sequence, self._info.window)
         if verdict is not Verdict.NEW:
             self.counters[verdict.value] += 1
             answer = peer.ledger.answer(verdict, batch.sequence)
             if answer is not None:
                 self._send(peer.identity, answer)
             return None
-        peer.ledger.take(batch.sequence)
         peer.weights_version = batch.weights_version
         self.counters["batches"] += 1
         self.counters["episodes"] += batch.episodes.count

@@ -30,7 +30,6 @@ from tangram_agent.schema import (
     Between,
     Bound,
     Flag,
-    Message,
     Numbers,
     Plain,
     Table,
@@ -40,6 +39,7 @@ from tangram_agent.schema import (
     check_frames,
     opened,
     read,
+    received,
 )
 from tangram_agent.types import Episodes, Weights
 from tangram_sim.arrays import Floats, Singles
@@ -171,6 +171,14 @@ class EpisodeBatch(OfTask):
     def arrays(self) -> Mapping[str, Any]:
         """The fields of the episodes."""
         return vars(self.episodes)
+
+    @classmethod
+    def refused(cls, header: Mapping[str, Any], error: WireError) -> WireError:
+        """With the batch's number, where it has one."""
+        sequence = header.get("sequence")
+        if type(sequence) is int and 1 <= sequence <= MAX_COUNT:
+            return BatchError(sequence, str(error))
+        return error
 
     @classmethod
     def filled(cls, values: dict[str, Any], arrays: dict[str, Any]) -> Self:
@@ -407,16 +415,7 @@ def decode_from_worker(frames: Sequence[bytes], spec: EpisodeSpec) -> ToMaster:
         BatchError: a numbered batch with wrong content.
         WireError: anything else that is wrong; the reason names the field.
     """
-    header = opened(frames)
-    try:
-        return cast("ToMaster", read(_known(header, _FROM_WORKER), header, frames[1:], spec))
-    except WireError as error:
-        sequence = header.get("sequence")
-        if header["kind"] != EpisodeBatch.kind or type(sequence) is not int:
-            raise
-        if not 1 <= sequence <= MAX_COUNT:
-            raise
-        raise BatchError(sequence, str(error)) from None
+    return cast("ToMaster", received(frames, _FROM_WORKER, spec))
 
 
 def decode_from_master(frames: Sequence[bytes], shapes: WeightShapes | None) -> ToWorker:
@@ -431,8 +430,7 @@ def decode_from_master(frames: Sequence[bytes], shapes: WeightShapes | None) -> 
         DamagedError: the message was changed on its way.
         WireError: anything else that is wrong; the reason names the field.
     """
-    header = opened(frames)
-    return cast("ToWorker", read(_known(header, _FROM_MASTER), header, frames[1:], shapes))
+    return cast("ToWorker", received(frames, _FROM_MASTER, shapes))
 
 
 def decode_weights(frame: bytes, shapes: WeightShapes | None) -> tuple[str, Weights]:
@@ -452,10 +450,3 @@ def encode_weights(epoch: str, weights: Weights) -> bytes:
 
 
 _FROM_WORKER, _FROM_MASTER = by_kind(ToMaster), by_kind(ToWorker)
-
-
-def _known(header: Mapping[str, Any], kinds: Mapping[str, type[Message]]) -> type[Message]:
-    cls = kinds.get(header["kind"])
-    if cls is None:
-        raise WireError(f"unknown kind of message {header['kind']!r}")
-    return cls

@@ -182,20 +182,27 @@ class Message:
 
     kind: ClassVar[str]
     bounds: ClassVar[Mapping[str, Bound]]  # of the fields that carry one, in their order
+    _fitted: ClassVar[Mapping[str, Bound]]
 
     def __init_subclass__(cls) -> None:
         hints = get_type_hints(cls, include_extras=True)
         found = {name: getattr(hint, "__metadata__", (None,))[0] for name, hint in hints.items()}
         cls.bounds = {name: bound for name, bound in found.items() if bound is not None}
+        cls._fitted = {n: b for n, b in cls.bounds.items() if type(b).fit is not Bound.fit}
 
     def __post_init__(self) -> None:
-        for name, bound in self.bounds.items():
+        for name, bound in self._fitted.items():
             object.__setattr__(self, name, bound.fit(getattr(self, name)))
 
     @classmethod
     def described(cls, _agreed: Any) -> Mapping[str, Bound]:
         """Header fields that describe the arrays, for a receiver that agreed on a task."""
         return {}
+
+    @classmethod
+    def refused(cls, _header: Mapping[str, Any], error: WireError) -> WireError:
+        """What is raised for an intact message whose content is wrong."""
+        return error
 
     def pack(self, _agreed: Any) -> tuple[Mapping[str, int], list[bytes]]:
         """What describes the arrays, and their frames."""
@@ -281,6 +288,18 @@ def read(
     return cls.unpack(_checked(cls, values, agreed), frames, agreed)
 
 
+def received(frames: Sequence[bytes], kinds: Mapping[str, type[Message]], agreed: Any) -> Message:
+    """The message in these frames, of one of these kinds; errors as in `opened` and `read`."""
+    header = opened(frames)
+    cls = kinds.get(header["kind"])
+    if cls is None:
+        raise WireError(f"unknown kind of message {header['kind']!r}")
+    try:
+        return read(cls, header, frames[1:], agreed)
+    except WireError as error:
+        raise cls.refused(header, error) from None
+
+
 def check_frames(kind: str, frames: Sequence[bytes], count: int) -> None:
     """Raise WireError unless there are so many frames after the header."""
     if len(frames) != count:
@@ -291,11 +310,10 @@ def check_frames(kind: str, frames: Sequence[bytes], count: int) -> None:
 def _checked(cls: type[Message], values: dict[str, Any], agreed: Any) -> dict[str, Any]:
     """All header fields and no others, each within its bound."""
     bounds = {**cls.bounds, **cls.described(agreed)}
-    for name in bounds:
-        _require(cls.kind, values, name)
-    unknown = values.keys() - bounds.keys()
-    if unknown:
-        raise WireError(f"{cls.kind}: unknown field {_shown(min(unknown))}")
+    if values.keys() != bounds.keys():
+        for name in bounds:
+            _require(cls.kind, values, name)
+        raise WireError(f"{cls.kind}: unknown field {_shown(min(values.keys() - bounds.keys()))}")
     return {n: bound.check(f"{cls.kind}: {n}", values[n]) for n, bound in bounds.items()}
 
 
@@ -313,7 +331,7 @@ def seal(kind: str, fields: Mapping[str, object], frames: Sequence[bytes]) -> li
     if len(header) > MAX_HEADER:
         raise WireError(f"{kind}: the header has {len(header)} bytes, at most {MAX_HEADER}")
     body = header[:-CHECKSUM]
-    return [body + _checksum(body, frames).to_bytes(CHECKSUM, "big"), *frames]
+    return [body + checksum(body, frames).to_bytes(CHECKSUM, "big"), *frames]
 
 
 def opened(frames: Sequence[bytes]) -> dict[str, Any]:
@@ -334,7 +352,7 @@ def opened(frames: Sequence[bytes]) -> dict[str, Any]:
         # Neither a message of this version nor one that was damaged behind its header.
         _check_version(_unpacked(header))
         raise DamagedError("the message is damaged: it has no checksum")
-    found = _checksum(body, frames[1:])
+    found = checksum(body, frames[1:])
     if found != int.from_bytes(sent, "big"):
         raise DamagedError(
             f"the message is damaged: its checksum is {found:08x}, sent was {sent.hex()}"
@@ -345,7 +363,8 @@ def opened(frames: Sequence[bytes]) -> dict[str, Any]:
     return {name: value for name, value in fields.items() if name not in ("v", "crc")}
 
 
-def _checksum(body: bytes, frames: Sequence[bytes]) -> int:
+def checksum(body: bytes, frames: Sequence[bytes]) -> int:
+    """CRC-32 of a header without its own checksum, and of the frames after it."""
     found = zlib.crc32(body)
     for frame in frames:
         found = zlib.crc32(frame, found)

@@ -22,6 +22,7 @@ from tangram_agent.messages import (
     WantWeights,
     decode_from_worker,
 )
+from tangram_agent.schema import CHECKSUM, DamagedError, checksum
 from tangram_agent.setup import Setup, make_setup
 from tangram_agent.types import Episodes
 from tangram_lab.benchmarks.measure import show, write
@@ -91,15 +92,31 @@ def mutated(frames: Sequence[bytes], dice: random.Random) -> list[bytes]:
     return changed
 
 
+def resealed(frames: Sequence[bytes]) -> list[bytes]:
+    """The message with the checksum that it should have: what a hostile sender would send."""
+    if not frames:
+        return []
+    body = frames[0][:-CHECKSUM]
+    return [body + checksum(body, frames[1:]).to_bytes(CHECKSUM, "big"), *frames[1:]]
+
+
+def fuzzed(valid: Sequence[Sequence[bytes]], dice: random.Random) -> list[bytes]:
+    """A mutated message; the checksum stops every second one, and the others go on behind it."""
+    frames = mutated(dice.choice(valid), dice)
+    return resealed(frames) if dice.random() < 0.5 else frames
+
+
 def fuzz_decoder(setup: Setup, count: int, seed: int) -> tuple[Counter[str], list[str]]:
     """How many messages were taken and refused, and what the decoder should never have raised."""
     dice, spec = random.Random(seed), EpisodeSpec.of(setup)
     valid, ends, wrong = valid_messages(setup), Counter[str](), list[str]()
     for _ in range(count):
-        frames = mutated(dice.choice(valid), dice)
+        frames = fuzzed(valid, dice)
         try:
             decode_from_worker(frames, spec)
             ends["taken: still a valid message"] += 1
+        except DamagedError:
+            ends["refused by its checksum"] += 1
         except WireError:
             ends["refused with a reason"] += 1
         except Exception as error:  # noqa: BLE001  # this is what is looked for
@@ -131,7 +148,7 @@ def fuzz_master(folder: Path, count: int, seed: int) -> dict[str, Any]:
             stranger.setsockopt(zmq.LINGER, 5000)
             stranger.connect(endpoint)
             for number in range(count):
-                stranger.send_multipart(mutated(dice.choice(valid), dice) or [b""])
+                stranger.send_multipart(fuzzed(valid, dice) or [b""])
                 while stranger.poll(0):
                     stranger.recv_multipart()
                 if number % PAUSE_EVERY == 0:

@@ -76,8 +76,7 @@ def test_over_any_losses_each_batch_is_inserted_once_and_in_order(
     for action, number in steps:
         if action == "send":
             sequence = number + 1
-            if ledger.judge(sequence, WINDOW) is Verdict.NEW:
-                ledger.take(sequence)
+            if ledger.take(sequence, WINDOW) is Verdict.NEW:
                 held.append(sequence)
         elif action == "insert" and held:
             sequence = held.pop(number % len(held))

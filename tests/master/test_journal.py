@@ -2,10 +2,13 @@
 
 import errno
 import os
+import zlib
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
 from hypothesis import given
@@ -13,7 +16,7 @@ from hypothesis import strategies as st
 
 from master import journal as journal_module
 from master.delivery import EpisodesArrived
-from master.journal import HEAD, JournalError, journal_run_id, read_journal, segments
+from master.journal import FORMAT, HEAD, JournalError, Title, journal_run_id, read_journal, segments
 from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.setup import Setup
 from tangram_sim.errors import RunError
@@ -195,14 +198,41 @@ def test_what_is_no_journal_is_refused(tmp_path: Path) -> None:
         read(tmp_path)
 
 
-def test_a_journal_of_another_format_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with monkeypatch.context() as patch:
-        patch.setattr(journal_module, "FORMAT", 1)
-        journal(tmp_path, MADE).append(arrival(MADE, 1))
+def record(header: bytes, rest: bytes = b"") -> bytes:
+    """A whole record as far as its checksum tells."""
+    body = len(header).to_bytes(2, "little") + header + rest
+    return HEAD.pack(len(body), zlib.crc32(body)) + body
+
+
+def test_a_journal_of_another_version_or_format_is_refused(tmp_path: Path) -> None:
+    before = {"v": 2, "kind": "segment", "format": 1, "run_id": "run", "task": MADE.task_digest()}
+    (tmp_path / "00000001.log").write_bytes(record(msgpack.packb(before)))
+    with pytest.raises(RunError, match=r"was written by another version of tangram-rl: go on with"):
+        journal_run_id(tmp_path)
+    [later] = Title(FORMAT + 1, "run", MADE.task_digest()).encode()
+    (tmp_path / "00000001.log").write_bytes(record(later))
     with pytest.raises(RunError, match=r"is no segment of format 2: choose another run_dir"):
         read(tmp_path)
+
+
+def test_the_checksum_of_each_batch_is_checked_when_it_is_read_back(tmp_path: Path) -> None:
+    """What was damaged before it was written, or by whoever wrote the record anew."""
+    one = arrival(MADE, 1)
+    bad = [*one.frames[:-1], bytes([one.frames[-1][0] ^ 1]) + one.frames[-1][1:]]
+    kept = journal(tmp_path, MADE)
+    kept.append(replace(one, frames=bad))
+    with pytest.raises(
+        RunError, match=r"holds what cannot be read \(the message is damaged: its ch"
+    ):
+        read(tmp_path)
+
+
+def test_the_frames_are_kept_as_they_came(tmp_path: Path) -> None:
+    one = arrival(MADE, 1)
+    journal(tmp_path, MADE).append(one)
+    content = segments(tmp_path)[1].read_bytes()
+    assert all(frame in content for frame in one.frames)
+    assert list(read(tmp_path)[0].frames) == list(one.frames)
 
 
 class Disk:

@@ -13,6 +13,7 @@ from tests.agent.messages import FINGERPRINTS, hello
 pytestmark = pytest.mark.fast
 
 GRACE_S = 30.0
+WINDOW = 4
 
 
 def admitted(registry: Registry, name: str, now: float = 0.0, **fields: Any) -> Peer:
@@ -62,7 +63,7 @@ def test_the_newest_process_of_an_index_wins() -> None:
 def test_a_hello_again_changes_nothing_but_the_connection() -> None:
     registry = Registry(FINGERPRINTS, GRACE_S)
     first = admitted(registry, "a")
-    first.ledger.take(1)
+    first.ledger.take(1, WINDOW)
     again, taken_from = registry.admit(b"other", hello(process="a"), 9.0)
     assert (again, taken_from, again.identity, again.last_seen) == (first, None, b"other", 9.0)
     assert (registry.find(b"a"), registry.find(b"other")) == (None, first)
@@ -80,7 +81,7 @@ def test_a_connection_belongs_to_one_process() -> None:
 def test_the_silent_are_forgotten_but_not_their_batches() -> None:
     registry = Registry(FINGERPRINTS, GRACE_S)
     peer = admitted(registry, "a", now=0.0)
-    peer.ledger.take(1)
+    peer.ledger.take(1, WINDOW)
     busy = admitted(registry, "b", now=5.0)
     assert registry.drop_silent(10.0, silence_s=10.0) == []
     assert registry.drop_silent(10.1, silence_s=10.0) == [peer]
@@ -93,7 +94,7 @@ def test_a_checkpoint_keeps_incarnations_and_inserted_batches() -> None:
     registry = Registry(FINGERPRINTS, GRACE_S)
     peer = admitted(registry, "a", index=4)
     for sequence in (1, 2, 3):
-        peer.ledger.take(sequence)
+        peer.ledger.take(sequence, WINDOW)
     peer.ledger.held -= {1, 3}
     admitted(registry, "e", role="evaluator")
     assert registry.state() == {
@@ -132,7 +133,7 @@ def test_after_a_restart_indices_wait_for_their_workers_for_a_while() -> None:
 
 def test_what_a_checkpoint_missed_is_counted_not_waited_for() -> None:
     registry = Registry(FINGERPRINTS, GRACE_S)
-    admitted(registry, "a").ledger.take(1)
+    admitted(registry, "a").ledger.take(1, WINDOW)
     registry.peers[0].ledger.held.clear()
     after = restored(registry)
     back = admitted(after, "a", index=0, incarnation=1, first=4)
