@@ -53,8 +53,8 @@ def assert_same(one: dict[str, Any], other: dict[str, Any]) -> None:
         np.testing.assert_array_equal(value, other[name], err_msg=name)
 
 
-def test_replay_holds_what_was_played_and_no_twins() -> None:
-    """Twins are made anew for every update, of the token that moved."""
+def test_replay_holds_what_was_played_and_nothing_relabelled() -> None:
+    """Other goals are made anew for every update, of the token that moved."""
     made = trainer(made_setup(**LIFT))
     made.insert(random_episodes(made.setup, 2))
     assert made.transitions == len(made.replay) == 14
@@ -72,7 +72,7 @@ def test_a_run_goes_on_as_if_it_had_never_stopped(tmp_path: Path, sim: dict[str,
     play_on(straight, 2)
     play_on(stopped, 2)
     save_run(tmp_path, stopped, Restored(Record(), {}), keep=1)
-    assert restore_run(tmp_path, resumed, pytest.fail) is not None
+    assert restore_run(tmp_path, resumed) is not None
     for one in (straight, resumed):
         play_on(one, 2, seed=1)
     assert resumed.updates > 4
