@@ -185,14 +185,14 @@ def _is_elsewhere() -> bool:
 
 
 def _in_sweep(status: int) -> int:
-    """An exit status as it is, unless nobody at home would hear of it."""
+    """An exit status; in a job of a sweep that runs elsewhere a failure is raised instead."""
     if status and _is_elsewhere():
         raise TangramError(f"a job of the sweep ended with status {status}: see its log")
     return status
 
 
 def _as_ours(error: Exception) -> TangramError:
-    """A full disk, a folder without permission or too little memory, in one line."""
+    """A full disk, missing permission or too little memory as an error of one line."""
     if isinstance(error, TangramError):
         return error
     if isinstance(error, OSError):

@@ -11,14 +11,14 @@ from conf.commands import COMMANDS, Plain
 
 
 def plain_names(config_name: str) -> list[str]:
-    """The settings of a command that are called like a group that it has not."""
+    """The settings of a command with the name of a group that the command does not have."""
     command = COMMANDS[config_name]
     own = [name for name in command.defaults() if name not in command.groups]
     return [name for name in own if (files("conf") / name).is_dir()]
 
 
 def hidden(arguments: Sequence[str], config_name: str) -> list[str]:
-    """The arguments as hydra must see them."""
+    """The arguments with settings that share a group's name written so that hydra takes them."""
     names = plain_names(config_name)
     split = [argument.partition("=") for argument in arguments]
     return [
@@ -28,6 +28,6 @@ def hidden(arguments: Sequence[str], config_name: str) -> list[str]:
 
 
 def revealed(settings: Plain, config_name: str) -> Plain:
-    """The settings as they were meant."""
+    """The settings of a composed config, with what `hidden` did undone."""
     own = {name: settings[name] for name in plain_names(config_name)}
     return settings | {n: v["name"] for n, v in own.items() if isinstance(v, dict) and "name" in v}

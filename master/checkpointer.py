@@ -84,7 +84,7 @@ class Checkpointer:
         return -1.0 if self._saved_s is None else time.monotonic() - self._saved_s
 
     def keep(self, arrival: EpisodesArrived) -> bool:
-        """Journal a batch; False while the disk does not take it."""
+        """Journal a batch; False while the disk cannot be written to."""
         if self.failing and not self._retry.due():
             return False
         try:

@@ -132,7 +132,7 @@ class Ledger:
         return held
 
     def consume(self, sequence: int) -> None:
-        """The next batch is done with, without an insert."""
+        """The next batch is refused for good: it counts as done, without an insert."""
         self.received = sequence
 
     def skip_to(self, sequence: int) -> int:

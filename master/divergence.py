@@ -22,7 +22,7 @@ UNDONE = "undone updates"
 
 
 class DivergenceGuard:
-    """Updates a trainer, and takes it back to its last good state when one goes wrong.
+    """Runs a trainer's updates; one that is not finite takes it back to its last good state.
 
     Attributes:
         trainer: whoever saves its state calls `check` before.

@@ -124,4 +124,4 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, *_: object) -> None:
-        """Nothing: a scraper asks every few seconds."""
+        """Log nothing: a scraper asks every few seconds."""

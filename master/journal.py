@@ -73,7 +73,7 @@ class JournalError(RunError):
 
 
 class Journal:
-    """The end at which batches are added.
+    """Appends batches to the journal.
 
     Attributes:
         segment: number of the segment that the next batch goes to.

@@ -83,7 +83,7 @@ class Launcher:
         return handling(self._events.put)
 
     def run(self) -> int:
-        """Until the master has ended; returns the exit status for the user."""
+        """Run until the master has ended; returns the exit status for the user."""
         self._master.start(self._events.put)
         while True:
             self._start_due()
@@ -102,7 +102,7 @@ class Launcher:
                 log.info("the master does not end within %g s: it is killed", STOP_S)
 
     def end_all(self) -> None:
-        """Wait for the children to leave, then ask them to, then make them; a signal hurries it."""
+        """Wait for the children to end, then ask them to, then kill them; a signal hurries it."""
         steps = [signal.SIGTERM, signal.SIGKILL]
         children = [*self._workers, self._master]
         if self._sent_home:
@@ -213,7 +213,7 @@ class Launcher:
             self._stop("no worker is left: the run ends")
 
     def _say(self, text: str) -> None:
-        """Through the master, which owns the terminal while it runs."""
+        """Show a line through the master, which owns the terminal while it runs."""
         for line in text.splitlines():
             if not (self._master.alive and self._master.tell(line)):
                 log.info("%s", line)

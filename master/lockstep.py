@@ -33,7 +33,7 @@ class Lockstep:
 
     @staticmethod
     def of(service: ServiceConfig) -> "Lockstep | None":
-        """What the settings ask for, None where workers play as they like.
+        """The lockstep of the settings, None in any other mode.
 
         Raises:
             ConfigError: the number of players is not known, or batches are no whole groups.
@@ -76,7 +76,7 @@ class Lockstep:
         return self._arrived[index]
 
     def inserted(self, arrival: EpisodesArrived) -> None:
-        """It was inserted: with the last of a round the next one begins."""
+        """Note that a batch was inserted; with the last one of a round the next round begins."""
         del self._arrived[arrival.index]
         if not self._arrived:
             self.ordered = False

@@ -176,7 +176,7 @@ class Loop:
         return self.reporter.flush(len(self._arrived))
 
     def dismiss(self, reason: str) -> None:
-        """Send all peers home and wait a moment for them to leave."""
+        """Tell all peers to end, and wait a moment for them to leave."""
         self._dismissed = True
         # First: it would bring new ones, and a launcher restarts who ends while it is there.
         self.folder.connection.unlink(missing_ok=True)
@@ -186,7 +186,7 @@ class Loop:
             self.hub.poll(IDLE_S)
 
     def close(self) -> None:
-        """Let nobody wait for a master that failed."""
+        """Tell all peers to end if that was not done: the master failed."""
         if not self._dismissed:
             self.dismiss("the master failed")
 
@@ -200,7 +200,7 @@ class Loop:
         return sum(peer.role == role for peer in self.hub.peers)
 
     def _wait_for_scores(self, launched: bool) -> None:
-        """Bounded, and not where nobody could score the weights."""
+        """Wait a bounded time for scores, if there is an evaluator that can send them."""
         record, signalled = self.clock.record, self.signals.reason is not None
         limit_s = SIGNALLED_SCORES_S if signalled else SCORES_S + self.service.eval_seconds
         begun_s = time.monotonic()

@@ -69,11 +69,11 @@ class RateLimiter:
         return self.lag < self._limit
 
     def inserted(self, transitions: int) -> None:
-        """Count transitions that went into the replay; hindsight twins do not count."""
+        """Count transitions that went into the replay; relabelled ones do not count."""
         self.transitions += transitions
 
     def updated(self, count: int = 1) -> None:
-        """Count updates that were done; a negative count takes back such that were undone."""
+        """Count updates that were done; a negative count takes back updates that were undone."""
         self.updates += count
 
     def state(self) -> dict[str, float]:

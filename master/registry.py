@@ -73,12 +73,12 @@ class Peer:
 
     @property
     def name(self) -> str:
-        """For messages to people."""
+        """Role and index in words, for messages to people."""
         return f"{self.role} {self.index}"
 
 
 class Registry:
-    """Peers by connection and by index, and the ledgers that a checkpoint keeps.
+    """Peers by connection and by index, and the ledger of batches of each, for a checkpoint.
 
     Attributes:
         lost_batches: numbers that a checkpoint had not seen and a worker has no more.

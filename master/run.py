@@ -105,7 +105,7 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
 
 
 def _tell_news(line: str) -> None:
-    """What the launcher says, which shares the terminal with this process."""
+    """Show the lines of the launcher, which shares the terminal with this process."""
     log.info("%s", line, extra={"event": "launcher"})
 
 
@@ -255,7 +255,7 @@ def _restore(config: MasterConfig, folder: RunFolder, trainer: Trainer) -> Resto
 
 
 def _new_record(journal: Path) -> Record:
-    """Of the run whose journal it is, which was killed before its first checkpoint, or of none."""
+    """A new record, of the run whose journal lies here if it was killed before a checkpoint."""
     run_id = journal_run_id(journal)
     return Record() if run_id is None else Record(run_id)
 

@@ -142,7 +142,7 @@ class Record:
         self.scores, self.scored_version = dict(scores), version
 
     def state(self) -> dict[str, Any]:
-        """As JSON values."""
+        """The record as JSON values."""
         return asdict(self)
 
     @staticmethod

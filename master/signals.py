@@ -18,7 +18,7 @@ SHOW_CURSOR = b"\x1b[?25h\n"
 
 
 def heeded(numbers: Iterable[signal.Signals] = SIGNALS) -> list[signal.Signals]:
-    """Those that are not ignored: nohup and scripts hide some from what they start."""
+    """The signals that are not ignored: nohup and scripts let children ignore some."""
     return [number for number in numbers if signal.getsignal(number) != signal.SIG_IGN]
 
 
@@ -67,6 +67,6 @@ class StopSignals:
 
 
 def show_cursor() -> None:
-    """Where a live panel was killed, which had hidden it, nobody else will show it again."""
+    """Show the cursor again, which a live panel that was killed had hidden."""
     if sys.stdout.isatty():
         os.write(sys.stdout.fileno(), SHOW_CURSOR)

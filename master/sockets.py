@@ -58,7 +58,7 @@ class Sockets:
         return identity, frames
 
     def send(self, identity: bytes, frames: Sequence[bytes]) -> None:
-        """Send to a peer, unless it is gone or does not read: counted, and forgotten."""
+        """Send to a peer; if it is gone or does not read, count that and drop the message."""
         try:
             self._router.send_multipart([identity, *frames], zmq.NOBLOCK)
         except zmq.Again:

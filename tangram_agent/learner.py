@@ -54,7 +54,7 @@ def polyak_update(targets: list[Tensor], sources: list[Tensor], rho: float) -> N
 
 
 def average_so_far(rho: float, updates: int) -> float:
-    """Rho of a running average after so many updates: less at first, while it is mostly its start.
+    """Rho of a running average after `updates` updates: smaller at first, to forget the start.
 
     A constant 0.99 holds the random weights of the start for hundreds of updates.
     """
@@ -254,7 +254,7 @@ class Learner:
         return critic_target(steps.reward, steps.done, following, self.config.gamma)
 
     def _follow(self) -> None:
-        """Targets and the acting average, a little of the way to the networks."""
+        """Move target networks and the acting average a little towards the networks."""
         lists, config = self._lists, self.config
         if self.bootstraps:
             polyak_update(lists["target_critic"], lists["critic"], config.polyak)

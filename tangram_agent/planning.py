@@ -41,7 +41,7 @@ class Candidates:
     piece: Tensor
 
     def at(self, index: Tensor) -> "Candidates":
-        """Some of them."""
+        """The candidates at these indices."""
         return Candidates(*(part[index] for part in vars(self).values()))
 
     def best(self, value: Tensor, most: int) -> Tensor:

@@ -115,7 +115,7 @@ class Watchdog:
     """
 
     def __init__(self, seconds: float) -> None:
-        """Wait until it is entered.
+        """Make the watchdog; it begins to watch when it is entered.
 
         Args:
             seconds: without progress before the end; 0 is never.

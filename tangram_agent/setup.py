@@ -156,7 +156,7 @@ def _changed(config: RewardConfig | AgentConfig) -> dict[str, Any]:
 
 
 def _agree(one: object, other: object) -> bool:
-    """Whether two JSON values are equal in all that both say."""
+    """Whether two JSON values are equal in all keys that both have."""
     if isinstance(one, dict) and isinstance(other, dict):
         return all(_agree(one[name], other[name]) for name in one.keys() & other.keys())
     if isinstance(one, list) and isinstance(other, list):

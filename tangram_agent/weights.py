@@ -40,5 +40,5 @@ def to_arrays(module: nn.Module) -> dict[str, Array]:
 
 
 def under(prefix: str, state: dict[str, Array]) -> dict[str, Array]:
-    """The arrays whose names begin so, by the rest of their names."""
+    """The arrays whose names begin with a prefix, by the rest of their names."""
     return {name.removeprefix(prefix): v for name, v in state.items() if name.startswith(prefix)}

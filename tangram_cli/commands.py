@@ -1,4 +1,4 @@
-"""The door of every command: our packages are found before other modules of their names.
+"""The entry of every command: our packages are found before other modules of their names.
 
 `conf`, `master` and `worker` are names that files of a user may have, too. A `master.py` in the
 current folder or on PYTHONPATH would be imported in place of ours, so whoever comes through this

@@ -1,4 +1,4 @@
-"""Three policies to compare with: chance, the paper's plateau, and a perfect hand.
+"""Three policies to compare with: chance, the position-only oracle and the exact oracle.
 
 Legend: B environments, K tokens, V corners, A entries of an action.
 """

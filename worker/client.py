@@ -337,7 +337,7 @@ class Client:
                 self._handle_membership(message, now)
 
     def _handle_membership(self, message: ToWorker, now: float) -> None:
-        """Whether this process takes part."""
+        """Handle an answer that says whether this process takes part."""
         match message:
             case Welcome():
                 self._take_part(message, now)

@@ -76,7 +76,7 @@ class Sockets:
         self._connect(self._dealer, address.endpoint)
 
     def subscribe(self, weights_endpoint: str) -> None:
-        """Listen for weights there, and nowhere else."""
+        """Subscribe to the weights of this address only."""
         if weights_endpoint == self._weights_endpoint:
             return
         self._drop_sub()
@@ -135,7 +135,7 @@ class Sockets:
         return failed
 
     def close(self, linger_ms: int = 0) -> None:
-        """Close both sockets; what is queued gets so long."""
+        """Close both sockets; queued messages get this long to leave."""
         self._drop_sub()
         self._dealer.disable_monitor()
         self._monitor.close(0)
@@ -199,7 +199,7 @@ class Connection:
         return self.address.endpoint if self.address else self._connect
 
     def lacks(self, joined: bool) -> str:
-        """What nothing goes on without, empty while the master answers one that has `joined`."""
+        """What this process waits for, empty while the master answers one that has `joined`."""
         if self.address is None:
             return f"the connection file {self._connect}"
         if not joined or self._lost_at is not None:
@@ -207,7 +207,7 @@ class Connection:
         return ""
 
     def no_master(self, patience_s: float) -> str:
-        """Why nobody could be joined for so long, for the user."""
+        """The error that no master could be joined for this long, for the user."""
         if self.keys_refused:
             return keys_error(self._connect, self.place)
         if self.address is None:
@@ -226,7 +226,7 @@ class Connection:
         return True
 
     def drop(self) -> None:
-        """Close a connection that leads nowhere."""
+        """Close a connection that brings no answers."""
         self._counters["reconnects"] += 1
         if self._lost_at is None:
             self._lost_at = self._asked_at
@@ -236,12 +236,12 @@ class Connection:
             self.sockets = None
 
     def asked(self, now: float) -> None:
-        """A question was sent."""
+        """Note that a message was sent that asks for an answer."""
         if self._asked_at is None:
             self._asked_at = now
 
     def answered(self) -> None:
-        """Anything came."""
+        """Note that a message came."""
         if self._lost_at is not None:
             log.info("the master at %s answers again", self.place, extra={"event": "found_again"})
         self._asked_at = self._lost_at = None

@@ -101,7 +101,7 @@ def await_master(
 
 
 def no_file_error(connect: str, patience_s: float) -> str:
-    """That there is no file, for the user."""
+    """The error that there is no connection file, for the user."""
     return (
         f"no connection file is at {connect} after {patience_s:g} s: is tangram-master running "
         "there?"
@@ -109,7 +109,7 @@ def no_file_error(connect: str, patience_s: float) -> str:
 
 
 def keys_error(connect: str, endpoint: str) -> str:
-    """Why a handshake fails, for the user, with what `connect` names."""
+    """The error that a handshake fails, for the user, with what `connect` names."""
     if "://" in connect:
         return (
             f"the master at {endpoint} wants keys, or is none: name its connection file instead, "

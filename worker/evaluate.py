@@ -182,7 +182,7 @@ def _title(run: Run) -> str:
 
 
 def _told(setup: Setup) -> str:
-    """How was played, in words."""
+    """The settings of the test, in words."""
     sim = setup.sim
     noise = sim.corner_noise
     parts = [

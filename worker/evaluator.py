@@ -38,7 +38,7 @@ class Schedule:
         self._arrived = self._began = -np.inf
 
     def offer(self, weights: Weights | None, now: float) -> None:
-        """Newer weights arrived; None: none did."""
+        """Note newer weights; None if none arrived."""
         if weights is not None:
             self._newest, self._arrived = weights, now
 

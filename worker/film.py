@@ -1,4 +1,4 @@
-"""Episodes of several tokens as a film: one piece after the other is taken, carried and set down.
+"""Episodes of several tokens as a film: one token after the other is taken, carried and set down.
 
 The film is drawn picture by picture, or shown in a window.
 
@@ -91,7 +91,7 @@ class Frame:
         return turned + pose[..., :2]
 
     def at_rest(self) -> "Frame":
-        """The same with nothing in the hand."""
+        """The same frame with no token being moved."""
         stopped = np.zeros_like(self.stopped)
         return replace(self, held=np.full_like(self.held, -1), height=0.0, stopped=stopped)
 
@@ -127,12 +127,12 @@ class _Move:
         self._token, self._held = token, np.where(idle, -1, token)
 
     def start(self) -> Frame:
-        """Before it."""
+        """The frame before the action."""
         frame = Frame(self._poses, self._rolls, self._held, 0.0, self._stopped, self._step)
         return frame.at_rest()
 
     def at(self, share: float) -> Frame:
-        """After a share of the action's time in (0, 1]."""
+        """The frame after a share of the action's time in (0, 1]."""
         way = share * share * (3.0 - 2.0 * share)  # gently off and on
         # What is carried leaves the others alone until it is set down; what slides pushes them.
         others = 0.0 if self._lifts and share < 1.0 else way
@@ -150,7 +150,7 @@ class _Move:
 
 
 def film_pictures(show: Show) -> list[Image.Image]:
-    """All episodes side by side, piece after piece."""
+    """All episodes side by side, token after token."""
     layout, played = show.setup.layout, show.played
     below = [
         captions(layout, played.corners[:, t], played.goals, show.titles)

@@ -66,7 +66,7 @@ class NewestWeights:
         return self._fresh is not None
 
     def begin(self, epoch: str) -> None:
-        """The master lives its life `epoch`; versions start anew if that is another one."""
+        """Note the master's epoch; a restarted master has another, and versions start anew."""
         if epoch != self.epoch:
             self.epoch, self.version, self._fresh = epoch, -1, None
 

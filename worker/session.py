@@ -86,7 +86,7 @@ def stopped_by_signals(client: Client) -> Iterator[None]:
 
 
 def log_as(who: str, log_format: str) -> None:
-    """Log lines of this room go to stderr, with the time and who writes them."""
+    """Write the log lines of this process to stderr, with the time and who writes them."""
     logger = logging.getLogger("worker")
     logger.setLevel(logging.INFO)
     for former in [h for h in logger.handlers if isinstance(h, _Lines)]:
@@ -115,7 +115,7 @@ class Report:
 
     @contextmanager
     def waiting(self, why: str) -> Iterator[None]:
-        """Time that passes inside is no play; each reason is said once between two reports."""
+        """Count the time inside as waiting; each reason is logged once between two reports."""
         if why not in self._told:
             _log.info("waits: %s", why, extra={"event": "waits"})
             self._told.add(why)

@@ -33,7 +33,7 @@ class Spent:
 
     @contextmanager
     def on(self, name: str) -> Iterator[None]:
-        """Add what is done now."""
+        """Add the CPU time of what is done inside."""
         begin = time.thread_time()
         try:
             yield

@@ -156,7 +156,7 @@ def single(
 
 
 def told(row: Row) -> Row:
-    """Say at once what was found: the whole takes long."""
+    """Print a row at once, since the whole takes long."""
     ratio = "" if row.ratio is None else f", {row.ratio:.3g} times {row.against}"
     Console(stderr=True).print(
         f"{row.stage}: {row.case}: {row.ours:,.4g} {row.unit}{ratio}", highlight=False

@@ -140,7 +140,7 @@ def _our_hindsight(setup: Setup, replay: ReplayBuffer, episodes: Episodes) -> Wo
 
 
 def _their_hindsight(model: Any) -> Work:
-    """Goals are made up as a batch is drawn; their rewards, too."""
+    """Their goals and rewards are relabelled while a batch is drawn."""
     envs = make_envs(ENVS)
     before, actions = envs.reset(), np.zeros((ENVS, 3), np.float32)
     after, rewards, dones, infos = envs.step(actions)

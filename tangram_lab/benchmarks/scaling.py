@@ -69,7 +69,7 @@ class Run:
 
     @contextmanager
     def awake(self) -> Iterator[None]:
-        """Let it go on for a while."""
+        """Let the stopped processes run while inside."""
         self.signal(signal.SIGCONT)
         try:
             yield
