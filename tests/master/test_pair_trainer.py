@@ -1,5 +1,6 @@
 """A master whose agent has several tokens: taking in, learning, going on, and its curriculum."""
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -89,8 +90,12 @@ def test_workers_take_the_weights_of_the_master() -> None:
 
 @pytest.mark.parametrize(("stages", "expected"), [(STAGES, TOLD), ([], [])])
 def test_the_master_says_once_when_a_stage_begins(
-    tmp_path: Path, stages: list[dict[str, Any]], expected: list[str]
+    tmp_path: Path,
+    stages: list[dict[str, Any]],
+    expected: list[str],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
+    caplog.set_level(logging.INFO)
     made = made_setup({"updates_per_transition": 1.0}, stages=stages)
     hub = FakeHub(made, [[arrival(made, 1, count=1)]])
     # Every update is published: the stage is that of what workers get.
@@ -98,5 +103,4 @@ def test_the_master_says_once_when_a_stage_begins(
     told.run()
     close_journals()
     assert hub.values("publish") == list(range(8))
-    notices = told._reporter.progress.notices  # type: ignore[attr-defined]
-    assert [line for line in notices if "stage" in line] == expected
+    assert [line for line in caplog.messages if "stage" in line] == expected
