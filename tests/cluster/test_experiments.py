@@ -120,7 +120,7 @@ def test_wrong_settings_are_told_before_anything_starts(tmp_path: Path) -> None:
     arguments = (*SMALL, f"run_dir={tmp_path / 'study'}")
     wrong = "families.paper=['agent=paper','net.heads=3']"
     line = refused("tangram-experiment", *arguments, wrong, cwd=tmp_path)
-    assert "training paper: net.width must be a multiple of net.heads, got 16 and 3" in line
+    assert "training paper: net.width must be a multiple of net.heads, got 32 and 3" in line
     line = refused("tangram-experiment", *arguments, "families.paper=['agnt=x']", cwd=tmp_path)
     assert "training paper: unknown setting 'agnt' (did you mean 'agent'?)" in line
     assert not (tmp_path / "study").exists()
