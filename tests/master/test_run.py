@@ -65,7 +65,8 @@ def opened_run(
 ) -> Iterator[tuple[Loop, dict[str, str]]]:
     """The loop of a run with its sockets open, and what workers are told of it."""
     RunFolder(folder).prepare(resume)
-    config = MasterConfig(str(folder), resume=resume, service=ServiceConfig(**service))
+    made = ServiceConfig(**service)
+    config = MasterConfig(str(folder), resume=resume, max_updates=0, service=made)
     with ExitStack() as opened:
         watchdog, signals = Watchdog(0.0), StopSignals()
         yield open_run(config, MADE, ShownProgress(), signals, watchdog, opened)
