@@ -7,7 +7,7 @@ hub from another one, because signals belong to the main thread.
 import json
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -95,6 +95,7 @@ class StandIn:
     Attributes:
         endpoint: of the ROUTER.
         heard: messages but heartbeats.
+        stats: of the last heartbeat.
         identity: of the connection that was heard last.
     """
 
@@ -104,6 +105,7 @@ class StandIn:
             one.bind("tcp://127.0.0.1:*")
         self.endpoint = self._router.getsockopt_string(zmq.LAST_ENDPOINT)
         self.heard: list[ToMaster] = []
+        self.stats: Mapping[str, float] = {}
         self.identity = b""
 
     def listen(self) -> ToMaster | None:
@@ -112,7 +114,9 @@ class StandIn:
             return None
         self.identity, *frames = self._router.recv_multipart()
         message = decode_from_worker(frames, SPEC)
-        if not isinstance(message, Heartbeat):
+        if isinstance(message, Heartbeat):
+            self.stats = message.stats
+        else:
             self.heard.append(message)
         return message
 

@@ -241,6 +241,8 @@ def test_what_is_refused_for_good_is_not_sent_again() -> None:
         master.say(Reject(reason="player 3: rewards holds nan", sequence=1, final=True))
         master.say(Reject(reason="unknown kind", sequence=0, final=True))
         master.until(client, lambda: client.counters["rejected"] == 2)
+        client.stats["rejected"] = 2.0
+        master.until(client, lambda: master.stats)  # what was sent before that has been heard
         master.heard.clear()
         master.until(client, lambda: len(numbers(master.heard)) >= 2)
         assert set(numbers(master.heard)) == {2}
