@@ -353,6 +353,18 @@ def test_entry_runs_once_for_each_value(monkeypatch: pytest.MonkeyPatch, tmp_pat
     [
         (TangramError("port 5 is taken"), 2, "tangram-eval: port 5 is taken\n"),
         (KeyboardInterrupt(), 130, ""),
+        (
+            OSError(28, "No space left on device", "/runs/x"),
+            2,
+            "tangram-eval: cannot use /runs/x (No space left on device): make room or choose a "
+            "folder that you may write to\n",
+        ),
+        (
+            MemoryError("4 GiB"),
+            2,
+            "tangram-eval: not enough memory (4 GiB): lower agent.replay_capacity, "
+            "agent.batch_size or service.envs\n",
+        ),
     ],
 )
 def test_entry_turns_errors_into_a_line_and_a_status(
@@ -367,6 +379,24 @@ def test_entry_turns_errors_into_a_line_and_a_status(
 
     assert start(monkeypatch, task) == status
     assert capsys.readouterr() == ("", line)
+
+
+@pytest.mark.parametrize("option", ["--seed=3", "-seed=3"])
+def test_a_setting_with_dashes_is_told_how_it_is_spelt(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], option: str
+) -> None:
+    assert start(monkeypatch, lambda settings: 0, option) == 2
+    assert "settings carry no dashes, as in seed=3; --help lists them" in capsys.readouterr().err
+
+
+def test_the_jobs_of_a_sweep_have_a_folder_each(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["tangram-train", "-m", "seed=1,2", "run_dir=runs"])
+    folders: list[object] = []
+    assert entry("train", lambda settings: folders.append(settings["run_dir"]) or 0) == 0
+    assert folders == ["runs/0", "runs/1"]
 
 
 def test_entry_does_not_hide_a_fault_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:
