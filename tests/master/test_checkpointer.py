@@ -6,12 +6,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
 
 from master import checkpointer as checkpointer_module
 from master import journal as journal_module
-from master.checkpointer import MAKE_ROOM
+from master.checkpointer import MAKE_ROOM, restore_run
 from master.journal import JournalError, segments
+from master.trainer import Trainer
 from tangram_agent import checkpoints as checkpoints_module
 from tangram_agent.checkpoints import DiskError, list_checkpoints
 from tangram_agent.process import Every
@@ -96,6 +99,18 @@ def test_a_disk_that_does_not_take_a_checkpoint_ends_nothing(stage: Stage) -> No
     stage.full = False
     stage.checkpointer.tick()
     assert len(list_checkpoints(stage.folder / "checkpoints")) == 2
+
+
+def test_only_what_is_finite_is_saved(stage: Stage) -> None:
+    """The last good state is, when the weights were spoilt after the last look at them."""
+    trainer = stage.checkpointer._guard.trainer
+    with torch.no_grad():
+        next(trainer.learner.actor.parameters()).fill_(float("nan"))
+    stage.checkpointer.save()
+    saved = Trainer(MADE, 0, "cpu", 64)
+    assert restore_run(stage.folder / "checkpoints", saved) is not None
+    for name, array in saved.learner.state().items():
+        assert np.isfinite(array).all(), name
 
 
 def test_segments_live_as_long_as_a_checkpoint_needs_them(stage: Stage) -> None:
