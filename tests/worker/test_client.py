@@ -248,8 +248,18 @@ def test_what_is_refused_for_good_is_not_sent_again() -> None:
         assert set(numbers(master.heard)) == {2}
 
 
+def test_whoever_watches_sees_a_client_at_work(tmp_path: Path) -> None:
+    seen: list[int] = []
+    with make_client(tmp_path) as client:
+        client.on_progress = lambda: seen.append(len(seen))
+        client.poll()
+        client.poll()
+    assert seen == [0, 1]
+
+
 def test_hello_is_repeated_until_it_is_answered_and_says_the_same() -> None:
-    with standing_in() as master, make_client(master.endpoint) as client:
+    patient = replace(QUICK, silence_s=3600.0)  # a new connection would say it, too
+    with standing_in() as master, make_client(master.endpoint, patient) as client:
         master.until(client, lambda: len(master.heard) == 2)
         hello, again = master.heard
         assert hello == again
