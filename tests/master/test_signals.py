@@ -52,8 +52,10 @@ def test_a_signal_that_is_ignored_stays_ignored() -> None:
 
 
 @pytest.mark.cluster
-@pytest.mark.parametrize("number", [*ENDING, SUBMITIT])
-@pytest.mark.parametrize("kind", ["orderly", "stuck"])
+@pytest.mark.parametrize(
+    ("number", "kind"),
+    [(signal.SIGTERM, "orderly"), *((number, "stuck") for number in (*ENDING, SUBMITIT))],
+)
 def test_the_first_signal_asks_and_the_second_ends(number: signal.Signals, kind: str) -> None:
     command = [sys.executable, "-c", SIGNALLED, kind]
     environ = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}

@@ -64,6 +64,13 @@ def joined(stage: Stage, **more: Any) -> Iterator[Client]:
         yield client
 
 
+@contextmanager
+def welcomed(master: "StandIn", timing: Timing = QUICK, **more: Any) -> Iterator[Client]:
+    with make_client(master.endpoint, timing, **more) as client:
+        master.welcome(client)
+        yield client
+
+
 def both(stage: Stage, client: Client, done: Callable[[], Any]) -> None:
     """Serve the hub and let the client work until something holds."""
 
