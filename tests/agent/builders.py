@@ -94,12 +94,15 @@ def random_transitions(made: Setup, count: int, seed: int = 0, done: int | None 
 def watched_disk(monkeypatch: pytest.MonkeyPatch) -> list[int | str]:
     """What reaches the disk, as it does: inodes that are synced, and "renamed"."""
     events: list[int | str] = []
-    monkeypatch.setattr(os, "fsync", lambda handle: events.append(os.fstat(handle).st_ino))
-    for name in ("rename", "replace"):
 
-        def renamed(own: Path, target: Path, move: Any = getattr(Path, name)) -> Path:
+    def noted(move: Any) -> Any:
+        def renamed(own: Path, target: Path) -> Path:
             events.append("renamed")
             return move(own, target)
 
-        monkeypatch.setattr(Path, name, renamed)
+        return renamed
+
+    monkeypatch.setattr(os, "fsync", lambda handle: events.append(os.fstat(handle).st_ino))
+    for name in ("rename", "replace"):
+        monkeypatch.setattr(Path, name, noted(getattr(Path, name)))
     return events
