@@ -14,7 +14,7 @@ from tangram_agent.messages import Heartbeat, Reject, ToWorker, Welcome, decode_
 from tangram_agent.schema import Plain
 from tests.agent.messages import FINGERPRINTS, SPEC, batch, hello
 
-LIMIT_S = 20.0
+LIMIT_S = 100.0
 WINDOW = 3
 INFO = WelcomeInfo("run", 7, FINGERPRINTS, SPEC, WINDOW)
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from master import children as children_module
 from master.children import MAX_RESTARTS, Child, describe, environment, override
 
-LIMIT_S = 30.0
+LIMIT_S = 100.0
 
 
 @pytest.mark.fast

@@ -161,7 +161,7 @@ def test_programs_read_json() -> None:
 
 # With real pipes and terminals
 
-LIMIT_S = 30.0
+LIMIT_S = 100.0
 # Prints until it is told that its output is gone, then more, and ends in order.
 CODE = """
 import logging, sys

@@ -19,7 +19,7 @@ from tangram_agent.config import ServiceConfig
 from tangram_agent.setup import from_mapping
 from tangram_sim.errors import ConfigError
 
-LIMIT_S = 30.0
+LIMIT_S = 100.0
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 
 

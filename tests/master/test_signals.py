@@ -12,7 +12,7 @@ import pytest
 
 from master.signals import SUBMITIT, StopSignals, heeded
 
-LIMIT_S = 30.0
+LIMIT_S = 100.0
 
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)

@@ -11,7 +11,7 @@ from master.hub import Hub
 from tangram_agent.config import ServiceConfig
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.worker.builders import policy, weights
-from tests.worker.conversation import LIMIT_S, QUICK, collect, open_hub, with_master
+from tests.worker.conversation import QUICK, collect, open_hub, with_master
 from worker.config import WorkerConfig
 from worker.evaluator import Schedule, run_evaluator
 from worker.test_set import FixedTests, greedy
@@ -20,7 +20,7 @@ from worker.test_set import FixedTests, greedy
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Heartbeats come often."""
-    monkeypatch.setattr("worker.client.Timing", lambda: replace(QUICK, join_s=LIMIT_S))
+    monkeypatch.setattr("worker.client.Timing", lambda: QUICK)
 
 
 SERVICE = ServiceConfig(envs=6, eval_episodes=20, eval_seconds=3600.0, publish_seconds=0.1)

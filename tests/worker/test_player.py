@@ -36,7 +36,7 @@ pytestmark = pytest.mark.cluster
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Heartbeats come often."""
-    monkeypatch.setattr("worker.client.Timing", lambda: replace(QUICK, join_s=LIMIT_S))
+    monkeypatch.setattr("worker.client.Timing", lambda: QUICK)
 
 
 SERVICE = ServiceConfig(envs=4, batch_episodes=6, window=2)
