@@ -122,9 +122,9 @@ def _over_text(command: Command) -> Iterator[str]:
         return
     yield ""
     sections = " and ".join(command.over)
-    yield f"Any setting of {sections} may be given in place of what the run was trained with, as in"
-    yield "sim.corner_noise=0.01 agent.order=size, but what was for learning only or is built into its"
-    yield "weights."
+    yield f"Besides, settings of {sections} in place of what the run was trained with, as in"
+    yield "sim.corner_noise=0.01 agent.order=size. What was for learning only, or is built into the"
+    yield "weights, is refused."
 
 
 def _setting_lines(command: Command) -> Iterator[str]:
