@@ -47,7 +47,7 @@ def test_every_training_is_done_and_tested(study: Path) -> None:
     for training in ("paper", "tangram"):
         result, test = scores(study, training)
         assert (result["updates"], result["agent"], result["seed"]) == (20, training, 0)
-        assert (test["actions"], test["episodes"], test["updates"]) == (2, 16, 20)
+        assert (test["sim"]["actions_per_token"], test["episodes"], test["updates"]) == (2, 16, 20)
         assert None not in (result["mean_reward"], result["mean_reward_dense"])
 
 

@@ -69,14 +69,14 @@ def test_eval_repeats_the_scores_of_the_run_and_applies_several_actions(
     trained: Path, tmp_path: Path, actions: int | None
 ) -> None:
     out = tmp_path / "scores.json"
-    more = () if actions is None else (f"actions={actions}", "episodes=30")
+    more = () if actions is None else (f"sim.actions_per_token={actions}", "episodes=30")
     printed = run_here("tangram-eval", f"run_dir={trained}", f"out={out}", *more, cwd=tmp_path)
     result, scores = (json.loads(p.read_text()) for p in (trained / "result.json", out))
     assert f"{scores['raw_overlap']:.3f}" in printed
     if actions is None:
         assert scores["mean_reward"] == pytest.approx(result["mean_reward"], abs=1e-4)
     else:
-        assert scores["actions"] == actions
+        assert scores["sim"]["actions_per_token"] == actions
         assert scores["mean_reward"] > 0.8
 
 
