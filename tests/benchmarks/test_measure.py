@@ -28,10 +28,10 @@ def test_the_ratio_is_the_median_of_the_turns() -> None:
         (Bound(most=0.2), 0.2, True, "<= 0.2"),
         (Bound(most=0.2), 0.3, False, "<= 0.2"),
         (Bound(1.0, 2.0), 3.0, False, ">= 1, <= 2"),
-        (Bound(), 3.0, None, ""),
+        (None, 3.0, None, ""),
     ],
 )
-def test_bounds(bound: Bound, value: float, held: bool | None, text: str) -> None:
+def test_bounds(bound: Bound | None, value: float, held: bool | None, text: str) -> None:
     row = single(LABELS, [value], bound)
     assert (row.held, row.target) == (held, text)
 
