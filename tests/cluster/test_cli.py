@@ -73,7 +73,7 @@ WRONG = [
     ("tangram-eval run_dir=pretrained/square agent.order=size", "nothing with one token"),
     ("tangram-play tokens=pair run_dir=pretrained/square", "do not agree: the run moves square"),
     ("tangram-play runs_dir=x", "unknown setting 'runs_dir' (did you mean 'run_dir'?)"),
-    ("tangram-play run_dir=a compare=[b,c]", "run_dir=a and compare do not go together"),
+    ("tangram-play run_dir=a compare=[b,c]", "changes nothing with compare=["),
     ("tangram-play compare=one", "compare must list 2 to 4 folders of runs, got 'one'"),
     ("tangram-play run_dir=pretrained/nobody", "no pretrained agent 'nobody': choose from"),
 ]
