@@ -13,7 +13,7 @@ from tests.sim.builders import SEVEN, layout_of
 
 pytestmark = pytest.mark.fast
 
-PAIR = layout_of("square", "square")
+SQUARE, PAIR = layout_of("square"), layout_of("square", "square")
 
 
 def scene(size: int = 120, active: int | None = None) -> Image.Image:
@@ -44,12 +44,10 @@ def test_tokens_and_targets_lie_where_they_should(size: int) -> None:
     assert min(target) > 200  # pale
 
 
-def test_edges_are_smooth() -> None:
-    square = layout_of("square")
-    corners = square.corners(np.array([[0.0, 0.0, 0.3]]))
-    away = square.corners(np.array([[5.0, 5.0, 0.0]]))
-    image = draw_scene(square, 2.0, corners, away, 100)
-    assert len(set(image.get_flattened_data())) > 20
+def test_edges_are_smooth_and_tokens_outside_the_arena_are_cut() -> None:
+    turned, away = (SQUARE.corners(np.array([pose])) for pose in ([0, 0, 0.3], [50, -50, 0.0]))
+    assert len(set(draw_scene(SQUARE, 2.0, turned, away, 100).get_flattened_data())) > 20
+    assert draw_scene(SQUARE, 2.0, away, away, 64).size == (64, 64)
 
 
 def test_the_active_token_is_marked() -> None:
@@ -60,19 +58,11 @@ def test_the_active_token_is_marked() -> None:
 
 
 def test_every_tan_has_its_own_colour() -> None:
-    layout = layout_of(*SEVEN, scale=0.3)
-    poses = np.zeros((7, 3))
+    layout, poses = layout_of(*SEVEN, scale=0.3), np.zeros((7, 3))
     poses[:, 0] = np.linspace(-0.85, 0.85, 7)
-    away = layout.corners(poses + [0.0, 0.5, 0.0])
-    image = draw_scene(layout, 2.0, layout.corners(poses), away, 400)
-    colours = {at(image, x, 0.0) for x in poses[:, 0]}
-    assert len(colours) == 7
-
-
-def test_tokens_outside_the_arena_are_cut() -> None:
-    square = layout_of("square")
-    far = square.corners(np.array([[50.0, -50.0, 0.0]]))
-    assert draw_scene(square, 2.0, far, far, 64).size == (64, 64)
+    corners, away = layout.corners(poses), layout.corners(poses + [0.0, 0.5, 0.0])
+    image = draw_scene(layout, 2.0, corners, away, 400)
+    assert len({at(image, x, 0.0) for x in poses[:, 0]}) == 7
 
 
 def test_contact_sheet_of_twelve() -> None:
@@ -107,10 +97,9 @@ def test_gif_keeps_pictures_and_pace(tmp_path: Path) -> None:
 
 
 def test_where_a_token_started_is_a_pale_ghost_with_a_way() -> None:
-    square = layout_of("square")
-    start, end, away = (square.corners(np.array([[x, 0.0, 0.0]])) for x in (-0.6, 0.6, 5.0))
-    plain = draw_scene(square, 2.0, end, away, 200)
-    shown = draw_scene(square, 2.0, end, away, 200, start=start)
+    start, end, away = (SQUARE.corners(np.array([[x, 0.0, 0.0]])) for x in (-0.6, 0.6, 5.0))
+    plain = draw_scene(SQUARE, 2.0, end, away, 200)
+    shown = draw_scene(SQUARE, 2.0, end, away, 200, start=start)
     assert at(plain, -0.6, 0.05) == (255, 255, 255)
     assert 200 < min(at(shown, -0.6, 0.05)) < 255
     changed = np.nonzero((np.asarray(plain) != np.asarray(shown)).any(axis=-1))
@@ -118,10 +107,9 @@ def test_where_a_token_started_is_a_pale_ghost_with_a_way() -> None:
 
 
 def test_an_episode_sheet_says_how_much_is_covered() -> None:
-    square = layout_of("square")
-    ends = square.corners(np.array([[[0.0, 0.0, 0.0]], [[0.5, 0.5, 0.3]]]))
-    sheet = episode_sheet(square, 2.0, ends[::-1], ends, ends, columns=2, size=120)
-    plain = contact_sheet([draw_scene(square, 2.0, e, e, 120) for e in ends], columns=2)
+    ends = SQUARE.corners(np.array([[[0.0, 0.0, 0.0]], [[0.5, 0.5, 0.3]]]))
+    sheet = episode_sheet(SQUARE, 2.0, ends[::-1], ends, ends, columns=2, size=120)
+    plain = contact_sheet([draw_scene(SQUARE, 2.0, e, e, 120) for e in ends], columns=2)
     assert sheet.width == plain.width
     assert sheet.height > plain.height  # captions
     ink = np.asarray(sheet.convert("L"))[-16:]

@@ -13,8 +13,7 @@ from tangram_sim.arrays import Floats
 from tangram_sim.errors import ConfigError
 from tangram_sim.puzzles import load_puzzle, parse_svg_puzzle, read_puzzles
 from tangram_sim.svg_attributes import path_points, polygon_points, transform_matrix
-from tests.sim.drawings import FIGURES, figure
-from tests.sim.test_fitting import distance
+from tests.sim.drawings import FIGURES, distance, figure
 
 pytestmark = pytest.mark.fast
 
