@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 
 from tangram_sim.config import RewardConfig
 from tangram_sim.env import TangramEnv
-from tangram_sim.errors import ConfigError, SamplingError
+from tangram_sim.errors import ConfigError
 from tangram_sim.register import ENV_ID, register
 from tests.sim.builders import SEVEN, TRIO
 
@@ -74,10 +74,9 @@ def test_made_by_module_and_name(made: list[Any]) -> None:
     assert isinstance(made[0].unwrapped, TangramEnv)
 
 
-@pytest.mark.parametrize("backend", ["physics", "kinematic"])
-def test_a_seed_fixes_whole_episodes_and_those_that_follow(backend: str, made: list[Any]) -> None:
+def test_a_seed_fixes_whole_episodes_and_those_that_follow(made: list[Any]) -> None:
     def play(seed: int) -> list[float]:
-        env = TangramEnv(TRIO, 0.8, backend=backend)
+        env = TangramEnv(TRIO, 0.8)
         made.append(env)
         env.action_space.seed(seed)
         numbers: list[float] = []
@@ -212,9 +211,3 @@ def test_render() -> None:
 def test_refused_settings(settings: dict[str, Any], reason: str) -> None:
     with pytest.raises(ConfigError, match=reason):
         kinematic(**settings)
-
-
-def test_an_impossible_layout_is_told_at_reset() -> None:
-    env = kinematic(arena=0.4)
-    with pytest.raises(SamplingError, match=r"raise sim\.arena"):
-        env.reset(seed=0)

@@ -64,25 +64,21 @@ def test_mean_overlap_of_a_right_place_at_any_angle(shape: str, expected: float)
     assert got.mean() == pytest.approx(expected, abs=6e-4)
 
 
+ZERO = (math.sqrt(101.0) - 1.0) / 100.0
+
+
 @pytest.mark.parametrize(
-    ("share", "sharpness", "expected"),
-    [  # of the reach
-        (0.0, 100.0, 1.0),
-        (0.001, 100.0, 0.958696),
-        (0.01, 100.0, 0.699619),
-        ((math.sqrt(101.0) - 1.0) / 100.0, 100.0, 0.0),
-        (0.1, 100.0, -0.039147),
-        (1.0, 100.0, -1.0),
-        (1.5, 100.0, -1.174280),
-        (0.0, 1.0, 1.0),
-        (0.5, 1.0, -0.169925),
-        (1.0, 1.0, -1.0),
-        (0.1, 1e4, -0.500201),
+    ("sharpness", "expected"),  # at shares of the reach
+    [
+        (100.0, {0: 1, 0.001: 0.958696, 0.01: 0.699619, ZERO: 0, 0.1: -0.039147, 1: -1}),
+        (100.0, {1.5: -1.174280}),
+        (1.0, {0: 1, 0.5: -0.169925, 1: -1}),
+        (1e4, {0.1: -0.500201}),
     ],
 )
-def test_closeness(share: float, sharpness: float, expected: float) -> None:
-    got = closeness(np.array([share * 3.0]), 3.0, sharpness)
-    assert got[0] == pytest.approx(expected, abs=1e-6)
+def test_closeness(sharpness: float, expected: dict[float, float]) -> None:
+    got = closeness(3.0 * np.array(list(expected)), 3.0, sharpness)
+    np.testing.assert_allclose(got, list(expected.values()), atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["dense", "pose"])
@@ -99,9 +95,8 @@ def test_a_shift_counts_by_its_length(name: str) -> None:
 
 def test_dense_is_the_mean_over_tokens_and_blind_to_the_angle() -> None:
     layout = layout_of("square", "small_triangle")
-    goal = layout.corners(np.zeros((1, 2, 3)))
-    state = layout.corners(np.array([[[0.5, 0.0, 1.0], [0.0, 0.0, 2.0]]]))
-    got = reward_of("dense", layout)(state, goal)[0]
+    goal, state = layout.corners(np.array([[[0, 0, 0], [0, 0, 0]], [[0.5, 0, 1.0], [0, 0, 2.0]]]))
+    got = reward_of("dense", layout)(state[None], goal[None])[0]
     assert got == pytest.approx((closeness(np.array(0.5), REACH, 100.0) + 1.0) / 2.0)
 
 

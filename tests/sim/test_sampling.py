@@ -61,13 +61,6 @@ def test_tokens_lie_inside_and_apart(layout: Layout, arena: float) -> None:
     assert max(largest_overlap(layout, one) for one in poses) < 1e-7 * arena**2
 
 
-def test_rejected_draws_of_one_environment_do_not_shift_the_others() -> None:
-    layout, sim = layout_of(*SEVEN, scale=0.8), SimConfig()
-    together = sample_batch(layout, sim, evaluation_generators(20))
-    alone = [sample_poses(layout, sim, rng) for rng in evaluation_generators(20)]
-    np.testing.assert_array_equal(together, alone)
-
-
 def test_positions_and_angles_are_uniform() -> None:
     layout, sim = layout_of("square"), SimConfig()
     rng = np.random.default_rng(0)

@@ -1,5 +1,6 @@
 """What every backend must do, and what the engine must not get wrong."""
 
+import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -242,31 +243,6 @@ def test_worlds_do_not_share_bodies_and_close_twice(make: WorldMaker) -> None:
     np.testing.assert_allclose(second.poses(), [[0.0, 0.5, 0.0]], atol=1e-12)
 
 
-def test_backends_agree_over_a_long_walk() -> None:
-    layout = layout_of(*TRIO, scale=0.001)  # so small that they do not meet
-    worlds = [make_world(layout, SimConfig(backend=name)) for name in ("physics", "kinematic")]
-    rng = np.random.default_rng(5)
-    start: Floats = random_poses(rng, 1, 3, 1.0)[0]
-    for world in worlds:
-        world.place(start)
-    for _ in range(200):
-        token = int(rng.integers(3))
-        velocity = rng.uniform(-1.0, 1.0, 3) * [2.0, 2.0, np.pi]
-        for world in worlds:
-            world.move(token, velocity)
-    engine, exact = (world.poses() for world in worlds)
-    np.testing.assert_allclose(engine[:, :2], exact[:, :2], atol=1e-9)
-    assert angle_gap(engine[:, 2], exact[:, 2]).max() < 1e-9
-    worlds[0].close()
-
-
-def test_a_missing_engine_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "pybullet", None)
-    monkeypatch.delitem(__import__("sys").modules, "tangram_sim.physics", raising=False)
-    with pytest.raises(ConfigError, match=r"set\s+sim\.backend=kinematic"):
-        make_world(layout_of("square"), SimConfig())
-
-
 def test_a_token_that_does_not_fit_is_refused_before_a_world_is_made() -> None:
     check_world(layout_of("square"), SimConfig())
     with pytest.raises(SamplingError, match="does not fit into an arena of width 2"):
@@ -286,7 +262,13 @@ def test_every_stage_is_tried_before_a_world_is_made() -> None:
         check_world(layout, SimConfig(stages=(StageConfig(targets="figures"),)))
 
 
-def test_a_missing_engine_is_told_before_a_world_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_engine_is_named_also_before_a_world_is_made(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    monkeypatch.delitem(sys.modules, "tangram_sim.physics", raising=False)
+    with pytest.raises(ConfigError, match=r"set\s+sim\.backend=kinematic"):
+        make_world(layout_of("square"), SimConfig())
     monkeypatch.setattr(world_module, "find_spec", lambda name: None)
     check_world(layout_of("square"), SimConfig(backend="kinematic"))
     with pytest.raises(ConfigError, match=r"needs PyBullet .*: install pybullet, or set"):
