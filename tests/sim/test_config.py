@@ -8,7 +8,7 @@ import pytest
 
 from tangram_sim.config import RewardConfig, SimConfig, StageConfig
 from tangram_sim.errors import ConfigError
-from tangram_sim.settings import Settings, declared, defaults, setting
+from tangram_sim.settings import Settings, declared, setting
 
 pytestmark = pytest.mark.fast
 
@@ -22,13 +22,13 @@ class NoiseConfig(Settings, section="noise"):
     width: float = setting(0.1, "its deviation", low=0, only={"kind": ("gaussian", "wide")})
     sizes: tuple[int, ...] = setting((1, 2), "of its parts", low=1, high=4)
     share: float | None = setting(None, "of what is noisy", low=0, high=1)
+    blur: float = setting(0.0, "of its edges", low=0, unless={"share": (None, 0.0)})
 
 
 @dataclass(frozen=True)
 class TopConfig(Settings):
     """Settings without a section."""
 
-    name: str = field(metadata=declared("must be given"))
     jobs: int = setting(2, "at a time", low=1)
 
 
@@ -36,6 +36,7 @@ UNUSED = (
     "^noise.width=0.2 changes nothing with noise.kind=none: leave it out, or set "
     "noise.kind=gaussian or wide$"
 )
+BLURRED = "leave it out, or give noise.share another value$"
 UNSORTED = (StageConfig(updates=5), StageConfig(updates=1))
 TWICE = (StageConfig(updates=5), StageConfig(updates=5))
 REFUSED = [
@@ -47,7 +48,9 @@ REFUSED = [
     (NoiseConfig, {"sizes": (1, 5)}, "^noise.sizes must be between 1 and 4, got 5$"),
     (NoiseConfig, {"share": 1.5}, "^noise.share must be between 0 and 1, got 1.5$"),
     (NoiseConfig, {"width": 0.2}, UNUSED),
-    (TopConfig, {"name": "x", "jobs": 0}, "^jobs must be at least 1, got 0$"),
+    (NoiseConfig, {"blur": 0.5}, f"^noise.blur=0.5 .* with noise.share=null: {BLURRED}"),
+    (NoiseConfig, {"blur": 0.5, "share": 0.0}, f"^noise.blur=0.5 .* noise.share=0: {BLURRED}"),
+    (TopConfig, {"jobs": 0}, "^jobs must be at least 1, got 0$"),
     (SimConfig, {"backend": "x"}, "sim.backend must be one of physics, kinematic, got 'x'"),
     (SimConfig, {"arena": 0.0}, "sim.arena must be between 0.001 and 1000"),
     (SimConfig, {"actions_per_token": 0}, "sim.actions_per_token must be between 1 and 100, got 0"),
@@ -96,7 +99,7 @@ def test_bounds_and_what_is_not_given_are_taken() -> None:
     made = NoiseConfig(9, "wide", 0.0, (), 0.0)
     assert (made.width, made.sizes, made.share) == (0.0, (), 0.0)
     assert NoiseConfig(0).width == 0.1
-    assert defaults(TopConfig) == {"name": ..., "jobs": 2}
+    assert NoiseConfig(0, share=0.5, blur=0.5).blur == 0.5
     inexact = SimConfig(inexact=True, substeps=1, damping=0.04)
     assert (inexact.substeps, inexact.damping) == (1, 0.04)
     assert SimConfig().substeps >= 4

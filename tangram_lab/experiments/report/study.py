@@ -107,16 +107,29 @@ class Trial:
 
     Attributes:
         label: for people.
-        actions: for each token; None as trained.
-        corner_noise: standard deviation of the noise on the corners that the agent sees, as a
-            share of the arena; None without noise.
+        overrides: arguments of tangram-eval.
         name: in the plan and of its files.
     """
 
     label: str
-    actions: Annotated[int, msgspec.Meta(ge=0)] | None
-    corner_noise: float | None
+    overrides: tuple[str, ...] = ()
     name: str = ""
+
+    @property
+    def actions(self) -> int | None:
+        """For each token; None as trained."""
+        asked = self._asked("sim.actions_per_token")
+        return None if asked is None else int(asked)
+
+    @property
+    def corner_noise(self) -> float | None:
+        """Deviation of the noise on the corners that the agent sees, in arenas; None as trained."""
+        asked = self._asked("sim.corner_noise")
+        return None if asked is None else float(asked)
+
+    def _asked(self, name: str) -> str | None:
+        told = (text.partition("=") for text in self.overrides)
+        return {key: value for key, _, value in told}.get(name)
 
 
 @dataclass(frozen=True)
