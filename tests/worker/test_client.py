@@ -19,10 +19,9 @@ from tangram_agent.messages import (
     Stop,
     WantWeights,
     WeightsMessage,
-    encode_weights,
 )
 from tangram_sim.errors import RunError, TangramError, WireError
-from tests.agent.messages import SHAPES, episodes, scores, weights, with_header
+from tests.agent.messages import SHAPES, broadcast, episodes, scores, weights, with_header
 from tests.master.dealers import Stage
 from tests.worker.conversation import (
     QUICK,
@@ -234,7 +233,7 @@ def test_weights_come_newest_only_and_once(stage: Stage) -> None:
 
 def test_who_was_busy_skips_all_broadcasts_but_the_newest(master: StandIn) -> None:
     with welcomed(master) as client:
-        frames = [encode_weights("e1", weights(version)) for version in range(500)]
+        frames = [broadcast(weights(version), "e1") for version in range(500)]
         master.until(client, lambda: master.broadcast(frames[0]) or client.newest.version == 0)
         for frame in frames:
             master.broadcast(frame)
@@ -264,7 +263,7 @@ def test_garbage_and_weights_of_another_network_are_refused_and_counted(master: 
         for frames in ([b""], [b"\xc1"], with_header(Ack(1, duplicate=True).encode(), sequence=0)):
             master.say(frames)
         master.until(client, lambda: client.counters["malformed"] == 3)
-        frame = encode_weights("e1", weights())
+        frame = broadcast(weights(), "e1")
         master.until(client, lambda: master.broadcast(frame) or client.counters["malformed"] > 3)
         assert client.newest_weights() is None
         assert not client.stopped
