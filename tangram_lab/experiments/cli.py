@@ -25,10 +25,12 @@ def _experiment(settings: Plain) -> int:
         raise ConfigError("experiments are chosen by their presets: experiment=[fig4,table2]")
     config = from_mapping(StudyConfig, _with_absolute(settings, "run_dir"))
     resolved = {name: _resolved(name, config.command(name)) for name in config.wanted()}
+    tests = dict.fromkeys(test for name in resolved for test in config.tests_of(name))
+    asked = {name: _asked(name, config.test_command(name)) for name in tests}
 
     from tangram_lab.experiments.runner import run_study
 
-    return run_study(config, resolved, own_presets())
+    return run_study(config, resolved, asked, own_presets())
 
 
 def _resolved(name: str, overrides: list[str]) -> Plain:
@@ -41,6 +43,21 @@ def _resolved(name: str, overrides: list[str]) -> Plain:
     except ConfigError as error:
         raise ConfigError(f"training {name}: {error}") from None
     return settings
+
+
+def _asked(name: str, overrides: list[str]) -> Plain:
+    """What a test asks of tangram-eval, so that a wrong one is told before any training starts."""
+    from tangram_agent.setup import from_mapping
+    from worker.cli import with_absolute_paths, with_changes
+    from worker.config import EvalConfig
+
+    try:
+        settings = with_changes(with_absolute_paths(composed("eval", ["run_dir=x", *overrides])))
+        from_mapping(EvalConfig, settings)
+    except ConfigError as error:
+        raise ConfigError(f"test {name}: {error}") from None
+    given = {text.partition("=")[0] for text in overrides}
+    return {name: settings[name] for name in given & settings.keys()} | dict(settings["changes"])
 
 
 @dataclass(frozen=True)

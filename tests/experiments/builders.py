@@ -21,7 +21,9 @@ def training(label: str, family: str, *overrides: str, after: str | None = None)
 
 
 def trial(label: str, actions: int | None = None, corner_noise: float | None = None) -> Row:
-    return {"label": label, "actions": actions, "corner_noise": corner_noise}
+    asked = {"sim.actions_per_token": actions, "sim.corner_noise": corner_noise}
+    overrides = [f"{name}={value}" for name, value in asked.items() if value is not None]
+    return {"label": label, "overrides": overrides}
 
 
 def experiment(kind: str, trainings: list[str], source: str = "beyond", **more: Any) -> Row:
@@ -32,7 +34,7 @@ def experiment(kind: str, trainings: list[str], source: str = "beyond", **more: 
 def plan(experiments: Row, trainings: Row, tests: Row, seeds: tuple[int, ...] = (0, 1, 2)) -> Row:
     budget = {"name": "laptop", "note": "Narrower MHA.", "seeds": list(seeds), "test_episodes": 100}
     return {
-        "format": 1,
+        "format": 2,
         "command": "tangram-experiment experiment=[all] budget=laptop run_dir=runs/paper jobs=2",
         "commit": "0123abc",
         "budget": budget,

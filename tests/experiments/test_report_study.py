@@ -97,7 +97,7 @@ def budget(**changes: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"format": 2}, "its format is 2, but this version reads 1"),
+        ({"format": 1}, "its format is 1, but this version reads 2"),
         ({"budget": {}}, "missing required field `name` - at `$.budget`; run its tangram-experi"),
         ({"budget": []}, "Expected `object`, got `array` - at `$.budget`"),
         *(
@@ -108,7 +108,7 @@ def budget(**changes: Any) -> dict[str, Any]:
         ({"command": 3}, "Expected `str`, got `int` - at `$.command`"),
         ({"trainings": {"paper": {}}}, "missing required field `label` - at `$.trainings[...]`"),
         ({"trainings": {"../x": PAPER}}, "'../x' is no name of"),
-        ({"tests": {"a b": {"label": "", "actions": 1, "corner_noise": None}}}, "'a b' is no name"),
+        ({"tests": {"a b": {"label": ""}}}, "'a b' is no name"),
         ({"trainings": {}}, "its trainings lack 'paper'"),
         ({"tests": {}}, "its tests lack 'actions_1'"),
     ],

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from tangram_sim.errors import ConfigError
-from tangram_sim.settings import Settings, declared, defaults, setting
+from tangram_sim.settings import Settings, declared, setting
 
 pytestmark = pytest.mark.fast
 
@@ -21,6 +21,7 @@ class NoiseConfig(Settings, section="noise"):
     width: float = setting(0.1, "its deviation", low=0, only={"kind": ("gaussian", "wide")})
     sizes: tuple[int, ...] = setting((1, 2), "of its parts", low=1, high=4)
     share: float | None = setting(None, "of what is noisy", low=0, high=1)
+    blur: float = setting(0.0, "of its edges", low=0, unless={"share": (None, 0.0)})
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,16 @@ class TopConfig(Settings):
             "noise.width=0.2 changes nothing with noise.kind=none: leave it out, or set "
             "noise.kind=gaussian or wide",
         ),
+        (
+            {"blur": 0.5},
+            "noise.blur=0.5 changes nothing with noise.share=null: leave it out, or give "
+            "noise.share another value",
+        ),
+        (
+            {"blur": 0.5, "share": 0.0},
+            "noise.blur=0.5 changes nothing with noise.share=0: leave it out, or give "
+            "noise.share another value",
+        ),
     ],
 )
 def test_a_wrong_value_is_refused(values: dict[str, Any], reason: str) -> None:
@@ -62,5 +73,4 @@ def test_bounds_and_what_is_not_given_are_taken() -> None:
     made = NoiseConfig(9, "wide", 0.0, (), 0.0)
     assert (made.width, made.sizes, made.share) == (0.0, (), 0.0)
     assert NoiseConfig(0).width == 0.1
-    assert defaults(NoiseConfig)["seed"] is ...
-    assert defaults(TopConfig) == {"jobs": 2}
+    assert NoiseConfig(0, share=0.5, blur=0.5).blur == 0.5

@@ -14,6 +14,7 @@ from tangram_lab.experiments.plan import (
     FORMAT,
     PLAN,
     ExperimentConfig,
+    TestConfig,
     TrainingConfig,
     seed_folder,
     test_file,
@@ -96,13 +97,26 @@ class Training(TrainingConfig):
 
 
 @dataclass(frozen=True)
-class Trial:
-    """A test: actions for each token, None as trained; noise as a share of the arena."""
+class Trial(TestConfig):
+    """A test with its name in the plan and of its files."""
 
-    label: str
-    actions: int | None
-    corner_noise: float | None
     name: str = ""
+
+    @property
+    def actions(self) -> int | None:
+        """For each token; None as trained."""
+        asked = self._asked("sim.actions_per_token")
+        return None if asked is None else int(asked)
+
+    @property
+    def corner_noise(self) -> float | None:
+        """Deviation of the noise on the corners that the agent sees, in arenas; None as trained."""
+        asked = self._asked("sim.corner_noise")
+        return None if asked is None else float(asked)
+
+    def _asked(self, name: str) -> str | None:
+        told = (text.partition("=") for text in self.overrides)
+        return {key: value for key, _, value in told}.get(name)
 
 
 @dataclass(frozen=True)
@@ -157,7 +171,7 @@ class _Plan:
     budget: Budget
     experiments: dict[str, ExperimentConfig]
     trainings: dict[str, TrainingConfig]
-    tests: dict[str, Trial]
+    tests: dict[str, TestConfig]
 
 
 _SCORES = ("mean_reward_dense", "angle_error_deg_median", "position_error_median")
@@ -221,7 +235,7 @@ def read_runs(folder: Path) -> Study:
 
 def _planned(folder: Path) -> Study:
     content, plan = _read_plan(folder / PLAN)
-    tests = {name: replace(one, name=name) for name, one in plan.tests.items()}
+    tests = {name: Trial(**vars(one), name=name) for name, one in plan.tests.items()}
     trainings = {
         name: Training(
             **vars(one),
