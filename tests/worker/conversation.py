@@ -40,7 +40,7 @@ Result = TypeVar("Result")
 
 LIMIT_S = 100.0
 QUICK = Timing(
-    join_s=90.0, retry_s=0.05, heartbeat_s=0.05, resend_s=90.0, silence_s=60.0, lost_s=90.0
+    join_s=90.0, retry_s=0.05, heartbeat_s=0.05, resend_s=90.0, silence_s=60.0, lost_s=600.0
 )
 
 
