@@ -22,7 +22,7 @@ from tests.agent.pair_scenes import PERCEPTRON, TWO, seven, transitions
 
 pytestmark = pytest.mark.fast
 
-COUNT = 200
+COUNT = 120
 PARALLELOGRAM = 6
 SLIDE = {"backend": "physics", "motion": "slide"}
 Scene = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -101,16 +101,17 @@ def test_with_several_tokens_the_next_one_is_named() -> None:
 def test_an_action_takes_its_token_to_the_pose_that_was_chosen(flip: bool) -> None:
     """By the simulation's own reading of actions."""
     made = seven(allow_flip=flip)
-    policy, scene = policy_of(made), scene_of(transitions(made, COUNT))
+    count = 40
+    policy, scene = policy_of(made), scene_of(transitions(made, count))
     actions = policy.act(*scene)
     exact = [part.astype(np.float64) for part in scene]
     choice = policy._planner.choose(exact[0], exact[1] > 0, exact[2])  # type: ignore[union-attr]
-    assert actions.shape == (COUNT, 4 + flip)
+    assert actions.shape == (count, 4 + flip)
     assert actions.dtype == np.float32
     np.testing.assert_array_equal(chosen_tokens(actions, 7), choice.token)
     np.testing.assert_array_equal(flips(actions, made.layout, made.sim), choice.flip)
     assert choice.flip.any() == flip
-    found = made.layout.poses(exact[0])[np.arange(COUNT), choice.token]
+    found = made.layout.poses(exact[0])[np.arange(count), choice.token]
     found += velocities(actions, made.sim)
     np.testing.assert_allclose(found[:, :2], choice.pose[:, :2], atol=1e-5)
     np.testing.assert_allclose(np.exp(1j * (found - choice.pose)[:, 2]), 1.0, atol=1e-5)
