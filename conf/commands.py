@@ -155,7 +155,6 @@ TensorBoard curves, result.json and a picture of test episodes.""",
         ),
         (
             "master.config:MasterConfig",
-            "master.config:LaunchConfig",
             "conf.commands:StoredConfig",
         ),
         RUN,
@@ -198,7 +197,7 @@ Says how a run stands: what it does or waits for, its workers, how fast they are
 their weights and the last checkpoint are. It asks the master, from wherever a worker may be.""",
         (
             "tangram-status connect=runs/my_run",
-            "tangram-status connect=runs/my_run every_seconds=2",
+            "watch -n 2 tangram-status connect=runs/my_run",
             "tangram-status connect=runs/my_run/connection.json json=true",
         ),
         ("worker.config:StatusConfig",),

@@ -70,7 +70,6 @@ def test_flatten_gives_what_was_played() -> None:
 
 
 def test_none_adds_nothing() -> None:
-    assert rows(relabelled(RelabelConfig("none", copies=4))) == PLAYED
     assert rows(relabelled()) == PLAYED
 
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from master.config import LaunchConfig, MasterConfig
+from master.config import MasterConfig
 from tangram_agent.config import ServiceConfig
 from tangram_agent.setup import from_mapping
 from tangram_sim.errors import ConfigError
@@ -39,11 +39,10 @@ def test_a_wrong_master_is_refused(settings: dict[str, Any], reason: str) -> Non
 )
 def test_wrong_numbers_of_workers_are_refused(workers: int, reason: str) -> None:
     with pytest.raises(ConfigError, match=reason):
-        LaunchConfig(MasterConfig("runs/x"), workers)
+        MasterConfig("runs/x", workers=workers)
 
 
 def test_settings_come_from_a_plain_mapping() -> None:
-    master = {"run_dir": "runs/x", "max_hours": 2, "service": {"port": 5555}}
-    config = from_mapping(LaunchConfig, {"workers": 2, "master": master})
-    expected = MasterConfig("runs/x", max_hours=2.0, service=ServiceConfig(port=5555))
-    assert config == LaunchConfig(expected, 2)
+    given = {"run_dir": "runs/x", "max_hours": 2, "workers": 2, "service": {"port": 5555}}
+    expected = MasterConfig("runs/x", max_hours=2.0, workers=2, service=ServiceConfig(port=5555))
+    assert from_mapping(MasterConfig, given) == expected

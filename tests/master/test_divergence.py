@@ -63,7 +63,7 @@ def same(one: dict[str, Any], other: dict[str, Any]) -> bool:
 def test_a_bad_update_is_undone_and_the_next_one_counts(
     learning: Trainer, tmp_path: Path, part: str
 ) -> None:
-    guard = DivergenceGuard(learning, 3, tmp_path / "bad")
+    guard = DivergenceGuard(learning, tmp_path / "bad", 3)
     for _ in range(2):
         assert guard.update(0.0)
     good, lag = learning.learner.state(), learning.rate_limiter.lag
@@ -80,7 +80,7 @@ def test_updates_since_the_last_good_state_are_made_again(
     learning: Trainer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(divergence_module, "KEEP_S", 1000.0)
-    guard, lag = DivergenceGuard(learning, 3, tmp_path / "bad"), learning.rate_limiter.lag
+    guard, lag = DivergenceGuard(learning, tmp_path / "bad", 3), learning.rate_limiter.lag
     first = learning.learner.state()
     for _ in range(4):
         guard.update(0.0)
@@ -93,7 +93,7 @@ def test_updates_since_the_last_good_state_are_made_again(
 def test_too_many_in_a_row_end_the_run_and_the_batch_is_kept(
     learning: Trainer, tmp_path: Path
 ) -> None:
-    guard = DivergenceGuard(learning, 3, tmp_path / "bad")
+    guard = DivergenceGuard(learning, tmp_path / "bad", 3)
     fail(learning, 2)
     assert [bool(guard.update(0.0)) for _ in range(3)] == [False, False, True]
     fail(learning, 99)
@@ -109,7 +109,7 @@ def test_too_many_in_a_row_end_the_run_and_the_batch_is_kept(
 def test_weights_that_went_bad_without_a_loss_are_never_given_out(
     learning: Trainer, tmp_path: Path
 ) -> None:
-    guard = DivergenceGuard(learning, 2, tmp_path / "bad")
+    guard = DivergenceGuard(learning, tmp_path / "bad", 2)
     guard.update(0.0)
     poison(learning.learner.acting)
     weights = guard.weights()
@@ -124,7 +124,7 @@ def test_weights_that_went_bad_without_a_loss_are_never_given_out(
 def test_a_check_finds_what_no_worker_would_see(
     learning: Trainer, tmp_path: Path, part: str
 ) -> None:
-    guard = DivergenceGuard(learning, 2, tmp_path / "bad")
+    guard = DivergenceGuard(learning, tmp_path / "bad", 2)
     guard.update(0.0)
     good = learning.learner.state()
     poison(getattr(learning.learner, part))
@@ -135,4 +135,4 @@ def test_a_check_finds_what_no_worker_would_see(
 def test_a_state_that_is_spoilt_already_is_refused(learning: Trainer, tmp_path: Path) -> None:
     poison(learning.learner.critic)
     with pytest.raises(NotFiniteError, match="the weights are not finite after 0 updates"):
-        DivergenceGuard(learning, 2, tmp_path / "bad")
+        DivergenceGuard(learning, tmp_path / "bad", 2)

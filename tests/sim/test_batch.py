@@ -168,7 +168,7 @@ def near_goals(env: BatchedEnv) -> Floats:
 def test_camera_reports_and_pays(backend: str) -> None:
     results = []
     for source in ("polygon", "camera"):
-        env = make_env(layout_of("square"), 8, source=source, backend=backend, camera=True)
+        env = make_env(layout_of("square"), 8, source=source, backend=backend, pixels=64)
         begun(env)
         results.append(env.step(near_goals(env)))
         env.close()
@@ -183,7 +183,7 @@ def test_camera_reports_and_pays(backend: str) -> None:
 
 
 def test_the_camera_sees_each_episodes_own_target() -> None:
-    env = make_env(layout_of("square"), 8, camera=True)
+    env = make_env(layout_of("square"), 8, pixels=64)
     generators = evaluation_generators(8)
     for _ in range(3):
         env.reset(generators)
@@ -266,5 +266,5 @@ def test_refused_constructions() -> None:
         make_env(layout_of("square")).reset(evaluation_generators(3))
     with pytest.raises(ValueError, match="at least 1, got 0"):
         make_env(layout_of("square"), 0)
-    with pytest.raises(ConfigError, match=r"sim\.camera=true"):
+    with pytest.raises(ConfigError, match=r"set sim\.pixels=64"):
         make_env(layout_of("square"), source="camera")

@@ -39,7 +39,7 @@ def kinematic(**settings: Any) -> TangramEnv:
     "settings",
     [
         {},
-        {"shapes": TRIO, "scale": 0.8, "camera": True, "actions_per_token": 2, "reward": "pose"},
+        {"shapes": TRIO, "scale": 0.8, "pixels": 64, "actions_per_token": 2, "reward": "pose"},
         {"shapes": SEVEN, "scale": 0.6, "allow_flip": True, "starts": "outside"},
         {"shapes": SEVEN, "scale": 0.6, "targets": "figures", "mirrored": 0.5},
         {"shapes": SEVEN, "scale": 0.6, "motion": "slide", "targets": "connected"},
@@ -168,11 +168,11 @@ def test_compute_reward_is_the_reward_of_the_step(reward: str) -> None:
 
 
 def test_camera_is_reported_and_may_pay() -> None:
-    seen = kinematic(camera=True)
+    seen = kinematic(pixels=64)
     seen.reset(seed=0)
     _, _, _, _, info = seen.step(np.zeros(3, dtype=np.float32))
     assert -1.0 <= info["reward_camera"] <= 1.0
-    paid = kinematic(camera=True, reward=RewardConfig(source="camera"))
+    paid = kinematic(pixels=64, reward=RewardConfig(source="camera"))
     paid.reset(seed=0)
     _, reward, _, _, info = paid.step(np.zeros(3, dtype=np.float32))
     assert reward == info["reward_camera"]

@@ -197,9 +197,9 @@ def test_a_target_without_pixels_is_refused() -> None:
 
 def test_camera_as_source_needs_the_camera() -> None:
     config = RewardConfig(source="camera")
-    with pytest.raises(ConfigError, match=r"set sim\.camera=true"):
+    with pytest.raises(ConfigError, match=r"set sim\.pixels=64"):
         make_reward(config, layout_of("square"), SIM)
-    make_reward(config, layout_of("square"), SimConfig(backend="kinematic", camera=True))
+    make_reward(config, layout_of("square"), SimConfig(backend="kinematic", pixels=16))
 
 
 OWN = """

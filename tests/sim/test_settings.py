@@ -43,17 +43,17 @@ class TopConfig(Settings):
         ({"share": 1.5}, "noise.share must be between 0 and 1, got 1.5"),
         (
             {"width": 0.2},
-            "noise.width=0.2 changes nothing with noise.kind=none: leave it out, or set "
+            "noise.width=0.2 changes nothing with noise.kind=none: leave it at 0.1, or set "
             "noise.kind=gaussian or wide",
         ),
         (
             {"blur": 0.5},
-            "noise.blur=0.5 changes nothing with noise.share=null: leave it out, or give "
+            "noise.blur=0.5 changes nothing with noise.share=null: leave it at 0, or give "
             "noise.share another value",
         ),
         (
             {"blur": 0.5, "share": 0.0},
-            "noise.blur=0.5 changes nothing with noise.share=0: leave it out, or give "
+            "noise.blur=0.5 changes nothing with noise.share=0: leave it at 0, or give "
             "noise.share another value",
         ),
     ],

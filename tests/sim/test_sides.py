@@ -144,7 +144,7 @@ def test_sides_are_told_of_noisy_corners_and_rewarded_as_rigid_pieces() -> None:
 
 @pytest.fixture(params=["physics", "kinematic"])
 def world(request: pytest.FixtureRequest) -> Any:
-    made = make_world(LAYOUT, SimConfig(backend=request.param))
+    made = make_world(LAYOUT, SimConfig(backend=request.param, pixels=64))
     yield made
     made.close()
 
@@ -240,7 +240,7 @@ def test_share_of_mirrored_episodes(mirrored: float, least: int, most: int) -> N
 
 @pytest.mark.parametrize("backend", ["physics", "kinematic"])
 def test_the_camera_agrees_on_either_side(backend: str) -> None:
-    env = env_of("parallelogram", count=8, mirrored=1.0, camera=True, backend=backend)
+    env = env_of("parallelogram", count=8, mirrored=1.0, pixels=64, backend=backend)
     env.step(np.zeros((8, 4)))
     goals = env.layout.poses(env.goals)[:, 0] - env.layout.poses(env.corners)[:, 0]
     env.reset(evaluation_generators(8))

@@ -75,7 +75,7 @@ def test_enough_substeps_turn_fully(substeps: int) -> None:
 @pytest.mark.parametrize(("substeps", "missing"), [(1, 60), (2, 20), (3, 5)])
 def test_fewer_substeps_than_the_bound_turn_too_little(substeps: int, missing: float) -> None:
     """Why `SimConfig` refuses them: a step of Bullet is exact up to a turn of 45 degrees."""
-    world = make_world(layout_of("square"), SimConfig(substeps=substeps, inexact=True))
+    world = make_world(layout_of("square"), SimConfig(substeps=substeps))
     assert errors(world, 2.0)[1] > missing
     world.close()
 
@@ -83,7 +83,7 @@ def test_fewer_substeps_than_the_bound_turn_too_little(substeps: int, missing: f
 @pytest.mark.parametrize(("substeps", "way", "turn"), [(8, 0.967, 0.957), (1, 0.94, 0.903)])
 def test_damping_makes_tokens_fall_short(substeps: int, way: float, turn: float) -> None:
     """With Bullet's own 0.04 a tenth of a turn is missing, and more of a faster one."""
-    sim = SimConfig(damping=0.04, inexact=True, substeps=substeps)
+    sim = SimConfig(damping=0.04, substeps=substeps)
     world = make_world(layout_of("square"), sim)
     world.place(np.zeros((1, 3)))
     world.move(0, np.array([0.5, 0.0, 1.0]))
@@ -133,7 +133,7 @@ def test_placing_stops_and_forgets(make: WorldMaker) -> None:
 
 
 def test_nothing_stops_a_token_at_the_arenas_edge(make: WorldMaker) -> None:
-    world = make(layout_of("square"))
+    world = make(layout_of("square"), pixels=64)
     world.place(np.array([[0.8, 0.0, 0.0]]))
     world.move(0, np.array([2.0, 0.0, 0.0]))
     assert world.poses()[0, 0] == pytest.approx(2.8)

@@ -32,7 +32,7 @@ from worker.player import run_player
 
 pytestmark = pytest.mark.cluster
 
-SERVICE = ServiceConfig(envs=4, batch_episodes=6, window=2)
+SERVICE = ServiceConfig(envs=4, batch_episodes=6)
 
 
 def config(hub: Hub, service: ServiceConfig = SERVICE, **more: object) -> WorkerConfig:

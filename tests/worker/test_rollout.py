@@ -71,7 +71,8 @@ def test_episodes_equal_a_naive_loop_however_they_are_batched(
     tokens: dict, actions: int, envs: int
 ) -> None:
     # The naive loop sets tokens down wherever they are told to.
-    made = setup(tokens, CURIOUS, actions_per_token=actions, max_overlap=1.0)
+    several = {"max_overlap": 1.0} if len(tokens["shapes"]) > 1 else {}
+    made = setup(tokens, CURIOUS, actions_per_token=actions, **several)
     episodes = rolled_out(made, envs, 32)
     for number in range(32):
         expected = naive_episode(made, policy(made), episode_generator(*IDENTITY, number))
@@ -131,7 +132,7 @@ def test_messages_are_parts_of_the_record_in_order(size: int, counts: list[int])
 
 @pytest.mark.parametrize("camera", [True, False])
 def test_as_many_episodes_as_asked_for_in_any_number_of_environments(camera: bool) -> None:
-    made = setup(camera=camera, pixels=32)
+    made = setup(pixels=32 * camera)
     acting = policy(made)
     with closing(BatchedEnv(made.layout, made.sim, made.reward, 3)) as env:
         four = play(env, acting.explore, np.random.default_rng, 4)
