@@ -53,8 +53,8 @@ class SimConfig(Settings, section="sim"):
     )
     substeps: int = setting(
         8,
-        "least simulation steps in one action of one second; with fewer than 4 a lifted token turns "
-        "less than it is told",
+        "least simulation steps in one action of one second; with fewer than 4 a lifted token "
+        "turns less than it is told",
         low=1,
         high=1000,
         only={"backend": "physics"},
