@@ -260,6 +260,6 @@ runs, such as a sweep's, it makes one table.""",
             "tangram-report runs=runs/experiments/laptop out=docs/results.md",
             "tangram-report runs=runs/my_study out=runs/my_study/report",
         ),
-        ("tangram_lab.experiments.report.config:ReportConfig",),
+        ("tangram_lab.experiments.cli:ReportConfig",),
     ),
 }

@@ -8,21 +8,15 @@ import pytest
 
 from tangram_agent.files import write_whole
 from tangram_sim.errors import RunError
+from tests.agent.builders import watched_disk
 
 pytestmark = pytest.mark.fast
-
-
-def test_a_file_appears_in_folders_that_are_made(tmp_path: Path) -> None:
-    target = tmp_path / "some" / "folder" / "scores.json"
-    write_whole(target, b"new")
-    assert target.read_bytes() == b"new"
-    assert list(target.parent.iterdir()) == [target]
 
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    target = tmp_path / "result.json"
+    target = tmp_path / "some" / "folder" / "result.json"  # folders are made
     write_whole(target, b"old")
 
     def full(handle: int) -> None:
@@ -33,7 +27,7 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(
         with pytest.raises(RunError, match=r"cannot write .*result\.json \(No space left"):
             write_whole(target, b"new")
     assert target.read_bytes() == b"old"
-    assert list(tmp_path.iterdir()) == [target]
+    assert list(target.parent.iterdir()) == [target]
     write_whole(target, b"new")
     assert target.read_bytes() == b"new"
 
@@ -42,18 +36,10 @@ def test_bytes_are_on_the_disk_before_the_name_and_the_name_before_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A rename is durable only when its folder is synced."""
-    events: list[int | str] = []
-    monkeypatch.setattr(os, "fsync", lambda handle: events.append(os.fstat(handle).st_ino))
-    replace = Path.replace
-
-    def replaced(self: Path, target: Path) -> Path:
-        events.append("replaced")
-        return replace(self, target)
-
-    monkeypatch.setattr(Path, "replace", replaced)
+    events = watched_disk(monkeypatch)
     write_whole(tmp_path / "result.json", b"new")
     file = (tmp_path / "result.json").stat().st_ino
-    assert events == [file, "replaced", tmp_path.stat().st_ino]
+    assert events == [file, "renamed", tmp_path.stat().st_ino]
 
 
 def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path) -> None:

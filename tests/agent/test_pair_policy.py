@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tangram_agent.learner import Learner
-from tangram_agent.messages import decode_weights, encode_weights
+from tangram_agent.messages import decode_weights
 from tangram_agent.policy import Policy
 from tangram_agent.runs import Run
 from tangram_agent.setup import Setup
@@ -17,6 +17,7 @@ from tangram_sim.actions import chosen_tokens, flips, velocities
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.errors import ConfigError
 from tests.agent.builders import PAPER, SMALL, setup
+from tests.agent.messages import broadcast
 from tests.agent.pair_scenes import PERCEPTRON, TWO, seven, transitions
 
 pytestmark = pytest.mark.fast
@@ -47,7 +48,7 @@ def test_weights_travel_to_workers(net: dict[str, Any], sim: dict[str, Any]) -> 
     weights = Learner(made, 0).acting_weights(7)
     policy = Policy(made)
     assert {name: tensor.shape for name, tensor in weights.tensors.items()} == policy.shapes
-    epoch, arrived = decode_weights(encode_weights("run", weights), policy.shapes)
+    epoch, arrived = decode_weights(broadcast(weights, "run"), policy.shapes)
     policy.load(arrived)
     assert (epoch, policy.version) == ("run", 7)
     for name, tensor in policy.weights().tensors.items():
