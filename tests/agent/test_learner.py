@@ -252,7 +252,7 @@ def test_the_penalty_pulls_a_saturated_actor_back() -> None:
 
 
 DECAY = {0.0: 1.0, 0.5: 0.505, 1.0: 0.01, 2.0: 0.01, -1.0: 1.0}
-UNDECAYED = {"lr_decay": "none"}
+UNDECAYED = {"lr_final": 1.0}
 
 
 @pytest.mark.parametrize(
