@@ -1,8 +1,11 @@
 """Small setups, layouts and episodes that the tests of the agent share."""
 
+import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from tangram_agent.setup import Setup, make_setup
 from tangram_agent.types import Episodes, Transitions
@@ -86,3 +89,20 @@ def random_transitions(made: Setup, count: int, seed: int = 0, done: int | None 
         done=ends.astype(np.uint8),
         goal=corners[:, 2],
     )
+
+
+def watched_disk(monkeypatch: pytest.MonkeyPatch) -> list[int | str]:
+    """What reaches the disk, as it does: inodes that are synced, and "renamed"."""
+    events: list[int | str] = []
+
+    def noted(move: Any) -> Any:
+        def renamed(own: Path, target: Path) -> Path:
+            events.append("renamed")
+            return move(own, target)
+
+        return renamed
+
+    monkeypatch.setattr(os, "fsync", lambda handle: events.append(os.fstat(handle).st_ino))
+    for name in ("rename", "replace"):
+        monkeypatch.setattr(Path, name, noted(getattr(Path, name)))
+    return events

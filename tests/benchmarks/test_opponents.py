@@ -87,14 +87,10 @@ def test_a_bare_episode_is_as_long_as_ours() -> None:
     assert moved == bare.bodies
 
 
-def test_a_filled_buffer_is_full() -> None:
+def test_a_filled_buffer_is_full_and_several_tokens_are_a_valid_task() -> None:
     replay = filled(preset(), 1000)
     assert (len(replay), replay.capacity) == (1000, 1000)
     replay.check_valid()
     assert replay.sample(8, np.random.default_rng(0)).state.any()
-
-
-def test_several_tokens_are_a_valid_task() -> None:
     for count in range(1, 8):
-        setup = several(count)
-        assert setup.layout.tokens == count == setup.horizon
+        assert several(count).layout.tokens == several(count).horizon == count

@@ -11,10 +11,10 @@ import zmq
 
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
 from tangram_sim.errors import TangramError
-from tests.cluster.processes import pids_of, refused, run, started
+from tests.cluster.processes import LIMIT_S, pids_of, refused, run, started
 from worker.status import ask_status
 
-pytestmark = [pytest.mark.cluster, pytest.mark.timeout(130)]
+pytestmark = pytest.mark.cluster
 
 UPDATES = 400
 STEP = (
@@ -27,7 +27,6 @@ STEP = (
     "service.eval_seconds=1000",
     "service.eval_episodes=4",
 )
-LIMIT_S = 60.0
 
 
 @pytest.fixture(scope="module")

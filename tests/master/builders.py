@@ -1,5 +1,6 @@
 """Small runs that the tests of the master share: everything real but the sockets."""
 
+import io
 import time
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping
@@ -8,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from rich.console import Console
 
 from master.budget import Budget
 from master.checkpointer import Checkpointer
@@ -194,3 +196,33 @@ def shown(made: Loop) -> list[RunStatus]:
     progress = made.reporter._progress
     assert isinstance(progress, ShownProgress)
     return progress.statuses
+
+
+def play_on(made: Trainer, rounds: int, seed: int = 0, count: int = 4) -> None:
+    """Insert and learn in turns; hindsight and sampling draw from the trainer's generators."""
+    for i in range(rounds):
+        made.insert(random_episodes(made.setup, count, seed=1000 * seed + i))
+        while made.rate_limiter.may_update():
+            made.update(i / rounds)
+
+
+def assert_same_state(one: Trainer, other: Trainer) -> None:
+    """Every array and every counter is equal to the last bit."""
+    (ours, counters), (theirs, their_counters) = one.state(), other.state()
+    assert counters == their_counters
+    assert ours.keys() == theirs.keys()
+    for stem, arrays in ours.items():
+        assert arrays.keys() == theirs[stem].keys()
+        for name, array in arrays.items():
+            np.testing.assert_array_equal(array, theirs[stem][name], err_msg=name)
+
+
+def screen(**settings: Any) -> Console:
+    """A terminal or a file of 100 columns."""
+    return Console(file=io.StringIO(), width=100, **settings)
+
+
+def text(shown: Console) -> str:
+    """All that was written to it."""
+    assert isinstance(shown.file, io.StringIO)
+    return shown.file.getvalue()
