@@ -326,7 +326,7 @@ def take_shots(backend: str = "physics") -> Shots:
     camera follows the same convention.
     """
     layout = make_layout(TOKENS)
-    sim = SimConfig(backend=backend, camera=True, pixels=PIXELS)
+    sim = SimConfig(backend=backend, pixels=PIXELS)
     try:
         check_world(layout, sim)
     except ConfigError:

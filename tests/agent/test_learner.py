@@ -243,7 +243,7 @@ def test_cosine_decay_of_the_learning_rate(progress: float, share: float) -> Non
 
 
 def test_without_decay_the_learning_rate_stays() -> None:
-    learner = Learner(setup(agent=SCENE | {"lr_decay": "none"}), seed=0)
+    learner = Learner(setup(agent=SCENE | {"lr_final": 1.0}), seed=0)
     learner.update(random_transitions(setup(), 4), 0.9)
     assert learner.actor_optimiser.param_groups[0]["lr"] == 1e-3
 
