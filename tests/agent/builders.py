@@ -24,7 +24,7 @@ PAPER = {
     "saturation_penalty": 0.0,
     "gamma": 0.99,
     "acting_average": 0.0,
-    "lr_decay": "none",
+    "lr_final": 1.0,
 }
 # One relabelled goal, and on pairs one proposal: what most tests need.
 PLAIN: dict[str, Any] = {"hindsight": [{"strategy": "final"}]}

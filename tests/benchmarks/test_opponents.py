@@ -62,7 +62,7 @@ def test_the_plain_learner_moves_its_targets() -> None:
 
 @pytest.mark.parametrize("count", [1, 7])
 def test_the_bare_loop_takes_the_same_pictures(count: int) -> None:
-    setup = with_sim(several(count), camera=True, pixels=128)
+    setup = with_sim(several(count), pixels=128)
     poses = np.array([[0.3 * k - 0.9, 0.2, 0.4 * k] for k in range(count)])
     with closing(PhysicsWorld(setup.layout, setup.sim)) as world:
         world.place(poses)

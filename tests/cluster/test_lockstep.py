@@ -99,15 +99,15 @@ def _line(pid: int) -> str:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ((), "service.mode=lockstep waits for a known number of workers: set"),
         (
-            ("service.lockstep_workers=2", "service.envs=5"),
+            ("service.mode=lockstep", "service.envs=5"),
             "service.batch_episodes=32 must be a multiple of service.envs=5 in lockstep",
         ),
+        (("workers=2",), "workers=2 changes nothing with service.mode=async in tangram-master"),
     ],
 )
 def test_what_lockstep_needs_is_asked_for(
     tmp_path: Path, settings: tuple[str, ...], message: str
 ) -> None:
-    arguments = (f"run_dir={tmp_path / 'run'}", "service.mode=lockstep", *settings)
+    arguments = (f"run_dir={tmp_path / 'run'}", *settings)
     assert message in refused("tangram-master", *arguments, cwd=tmp_path)

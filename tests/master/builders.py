@@ -159,29 +159,34 @@ def trainer(made: Setup, seed: int = 0, lag_updates: int = 2) -> Trainer:
 
 
 def loop(
-    folder: Path, made: Setup, hub: FakeHub, service: dict[str, Any] | None = None, **config: Any
+    folder: Path,
+    made: Setup,
+    hub: FakeHub,
+    service: dict[str, Any] | None = None,
+    lag_updates: int = 2,
+    **config: Any,
 ) -> Loop:
     """A loop around a fake hub, in a run folder that exists."""
-    lag = {"lag_updates": 2, "publish_seconds": 1000.0}
-    settings = MasterConfig(str(folder), service=ServiceConfig(**lag | (service or {})), **config)
+    given = {"publish_seconds": 1000.0} if service is None else service
+    settings = MasterConfig(str(folder), service=ServiceConfig(**given), **config)
     run_folder = RunFolder(folder)
     run_folder.prepare("auto")
     run_folder.write_config({})
-    learner = trainer(made, lag_updates=settings.service.lag_updates)
+    learner = trainer(made, lag_updates=lag_updates)
     service, record = settings.service, Record()
-    guard = DivergenceGuard(learner, service.max_bad_updates, run_folder.bad_batch)
+    guard = DivergenceGuard(learner, run_folder.bad_batch, limit=3)
     clock, budget = Clock(record), Budget(settings, learner, record)
     kept = journal(run_folder.journal, made)
     checkpointer = Checkpointer(service, run_folder, guard, hub, kept, clock)  # type: ignore[arg-type]
     status = StatusCollector("run", guard, hub, budget, clock, checkpointer)  # type: ignore[arg-type]
     metrics = Metrics(run_folder.tensorboard, run_folder.curve)
-    reporter = Reporter(learner, record, service, status, ShownProgress(), metrics, [hub.tell])
+    reporter = Reporter(learner, record, status, ShownProgress(), metrics, [hub.tell])
     return Loop(
         service=service,
         folder=run_folder,
         hub=hub,  # type: ignore[arg-type]
         guard=guard,
-        lockstep=Lockstep.of(service),
+        lockstep=Lockstep.of(service, settings.workers),
         budget=budget,
         clock=clock,
         checkpointer=checkpointer,

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from master.config import LaunchConfig, MasterConfig
+from master.config import MasterConfig
 from tangram_agent.config import ServiceConfig
 from tangram_agent.setup import from_mapping
 from tangram_sim.errors import ConfigError
@@ -27,14 +27,11 @@ pytestmark = pytest.mark.fast
     ],
 )
 def test_wrong_settings_are_refused(settings: dict[str, Any], reason: str) -> None:
-    given = {"run_dir": "runs/x", "workers": 1} | settings
-    workers = given.pop("workers")
     with pytest.raises(ConfigError, match=reason):
-        LaunchConfig(MasterConfig(**given), workers)
+        MasterConfig(**{"run_dir": "runs/x"} | settings)
 
 
 def test_settings_come_from_a_plain_mapping() -> None:
-    master = {"run_dir": "runs/x", "max_hours": 2, "service": {"port": 5555}}
-    config = from_mapping(LaunchConfig, {"workers": 2, "master": master})
-    expected = MasterConfig("runs/x", max_hours=2.0, service=ServiceConfig(port=5555))
-    assert config == LaunchConfig(expected, 2)
+    given = {"run_dir": "runs/x", "max_hours": 2, "workers": 2, "service": {"port": 5555}}
+    expected = MasterConfig("runs/x", max_hours=2.0, workers=2, service=ServiceConfig(port=5555))
+    assert from_mapping(MasterConfig, given) == expected

@@ -39,7 +39,7 @@ Guarded = Callable[[int], DivergenceGuard]
 def guarded(learning: Trainer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Guarded:
     """Makes a guard that keeps every good state, however fast the machine is."""
     monkeypatch.setattr(divergence_module, "KEEP_S", 0.0)
-    return lambda limit: DivergenceGuard(learning, limit, tmp_path / "bad")
+    return lambda limit: DivergenceGuard(learning, tmp_path / "bad", limit)
 
 
 def fail(made: Trainer, times: int, part: str = "critic_loss") -> None:

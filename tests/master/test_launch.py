@@ -11,7 +11,7 @@ import pytest
 from master import children as children_module
 from master import launch as launch_module
 from master.children import MAX_RESTARTS, Child
-from master.config import LaunchConfig, MasterConfig
+from master.config import MasterConfig
 from master.console import logging_to, sturdy_console
 from master.launch import Launcher, master_arguments, run_training
 from master.rundir import RunFolder
@@ -26,8 +26,10 @@ ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 @pytest.mark.fast
 def test_the_master_gets_its_settings(tmp_path: Path) -> None:
     bounds = {"max_hours": 0.5, "max_updates": 7, "resume": "auto", "warm_start": "a b"}
-    master = from_mapping(MasterConfig, {"run_dir": str(tmp_path), "seed": 3, **bounds})
-    arguments = master_arguments(LaunchConfig(master, 2), RunFolder(tmp_path))
+    master = from_mapping(
+        MasterConfig, {"run_dir": str(tmp_path), "seed": 3, "workers": 2, **bounds}
+    )
+    arguments = master_arguments(master, RunFolder(tmp_path))
     assert arguments == [
         "-P",
         "-m",
@@ -43,15 +45,15 @@ def test_the_master_gets_its_settings(tmp_path: Path) -> None:
         "warm_start='a b'",
     ]
     in_step = replace(master, service=ServiceConfig(mode="lockstep"), warm_start=None)
-    arguments = master_arguments(LaunchConfig(in_step, 2), RunFolder(tmp_path))
-    assert arguments[-1] == "service.lockstep_workers=2"
+    arguments = master_arguments(in_step, RunFolder(tmp_path))
+    assert arguments[-1] == "workers=2"
 
 
 @pytest.mark.fast
 def test_a_folder_with_a_run_is_refused_before_anything_starts(tmp_path: Path) -> None:
     RunFolder(tmp_path).write_result({})
     with pytest.raises(ConfigError, match="holds a run already"):
-        run_training(LaunchConfig(MasterConfig(str(tmp_path)), 1), {})
+        run_training(MasterConfig(str(tmp_path)), {})
     assert not (tmp_path / "logs").exists()
 
 
@@ -60,7 +62,7 @@ def test_a_folder_in_use_is_left_alone(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
     folder.connection.touch()
     with folder.lock(), pytest.raises(ConfigError, match="in use by another process"):
-        run_training(LaunchConfig(MasterConfig(str(tmp_path), resume="auto"), 1), {})
+        run_training(MasterConfig(str(tmp_path), resume="auto"), {})
     assert folder.connection.exists()
     assert not folder.config.exists()
 
@@ -114,7 +116,7 @@ def launcher(
     """A launcher whose children run the given code."""
     run = RunFolder(folder)
     run.logs.mkdir()
-    made = Launcher(LaunchConfig(MasterConfig(str(folder)), len(players)), run)
+    made = Launcher(MasterConfig(str(folder), workers=len(players)), run)
     code = MASTER.format(folder=str(folder), condition=condition, ending=ending)
     if stubborn:
         code = code.replace("SIGTERM, told", "SIGTERM, signal.SIG_IGN")

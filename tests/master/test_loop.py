@@ -79,7 +79,7 @@ def test_sockets_are_served_between_updates(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hub = FakeHub(MADE, batches(1, 40))
-    made = loop(tmp_path, MADE, hub, {"lag_updates": 64}, max_updates=20)
+    made = loop(tmp_path, MADE, hub, lag_updates=64, max_updates=20)
     monkeypatch.setattr(loop_module, "LEARN_S", 0.09)
     clock = iter(np.arange(0.0, 1e5, 0.02))  # every look at the clock takes 20 ms
     monkeypatch.setattr(loop_module.time, "monotonic", lambda: float(next(clock)))
@@ -111,7 +111,7 @@ def test_the_bounds_end_it(
 
 def test_episodes_beyond_the_bound_are_not_taken(tmp_path: Path) -> None:
     hub = FakeHub(MADE, [[arrival(MADE, i, BATCH) for i in range(1, 6)]])
-    made = loop(tmp_path, MADE, hub, {"lag_updates": 64}, max_episodes=8)
+    made = loop(tmp_path, MADE, hub, lag_updates=64, max_episodes=8)
     made.run()
     assert hub.values("acknowledge") == [1, 2]
     assert made.guard.trainer.updates == 4
@@ -137,7 +137,7 @@ def test_a_signal_ends_it(tmp_path: Path) -> None:
     ("service", "updates", "versions"),
     [
         ({"publish_seconds": 1000.0}, 4, [0, 4]),
-        ({"publish_seconds": 1000.0, "every_update": True}, 4, [0, 1, 2, 3, 4]),
+        ({"publish_seconds": 0.0}, 4, [0, 1, 2, 3, 4]),
         ({"publish_seconds": 0.0}, 0, [0]),
     ],
 )
@@ -156,7 +156,7 @@ def test_weights_are_sent_once_and_at_a_bounded_rate_or_after_every_update(
 def test_weights_that_are_not_finite_are_neither_sent_nor_kept(tmp_path: Path, often: bool) -> None:
     """Once is mended, again and again ends the run; the hub of these tests takes finite ones."""
     hub = FakeHub(MADE, batches(9))
-    made = loop(tmp_path, MADE, hub, {"publish_seconds": 0.0, "max_bad_updates": 3}, max_updates=9)
+    made = loop(tmp_path, MADE, hub, {"publish_seconds": 0.0}, max_updates=9)
 
     def poison() -> None:
         if made.guard.trainer.updates >= 2 and (often or not made.guard.undone):
@@ -181,7 +181,7 @@ def test_weights_that_are_not_finite_are_neither_sent_nor_kept(tmp_path: Path, o
 
 def test_checkpoints_come_on_their_interval(tmp_path: Path) -> None:
     hub = FakeHub(MADE, batches(3))
-    service = {"checkpoint_minutes": 1e-3, "keep_checkpoints": 1}
+    service = {"checkpoint_minutes": 1e-3, "keep_checkpoints": 1, "publish_seconds": 1000.0}
     made = loop(tmp_path, MADE, hub, service, max_updates=6)
     made.checkpointer._checkpoint = Every(0.0)
     made.run()
@@ -269,7 +269,7 @@ def test_the_learning_rate_follows_the_budget(tmp_path: Path) -> None:
     assert seen == pytest.approx([i / 10 for i in range(10)])
 
 
-IN_STEP = {"mode": "lockstep", "lockstep_workers": 2, "envs": BATCH, "batch_episodes": BATCH}
+IN_STEP = {"mode": "lockstep", "envs": BATCH, "batch_episodes": BATCH}
 
 
 def played(index: int, sequence: int) -> EpisodesArrived:
@@ -282,7 +282,7 @@ def test_in_lockstep_rounds_are_inserted_by_index_and_learned_before_the_next(
 ) -> None:
     """The second player is quicker; 8 transitions are worth 4 updates."""
     hub = FakeHub(MADE, [[played(1, 1)], [], [played(0, 1)], [], [played(0, 2), played(1, 2)]])
-    made = loop(tmp_path, MADE, hub, IN_STEP, max_updates=8)
+    made = loop(tmp_path, MADE, hub, IN_STEP, workers=2, max_updates=8)
     assert made.run() == "max_updates=8"
     done = [(kind, value) for kind, value in hub.log if kind != "tell"]
     first = {i: Go(0, 0, 0, BATCH) for i in range(2)}
@@ -306,7 +306,7 @@ def test_in_lockstep_rounds_are_inserted_by_index_and_learned_before_the_next(
 def test_in_lockstep_nothing_is_learned_from_half_a_round(tmp_path: Path) -> None:
     """A kill between two inserts left the first player's batch; the other one's must come first."""
     hub = FakeHub(MADE, [[], [], [], [played(1, 1)]])
-    made = loop(tmp_path, MADE, hub, IN_STEP, max_updates=4)
+    made = loop(tmp_path, MADE, hub, IN_STEP, workers=2, max_updates=4)
     made.guard.trainer.insert(played(0, 1).episodes)
     updates: list[int] = []
     hub.on_poll = lambda: updates.append(made.guard.trainer.updates)

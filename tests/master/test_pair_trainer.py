@@ -59,7 +59,7 @@ def test_the_master_says_once_when_a_stage_begins(
     made = made_setup({"updates_per_transition": 1.0}, stages=stages)
     hub = FakeHub(made, [[arrival(made, 1, count=1)]])
     # Every update is published: the stage is that of what workers get.
-    told = loop(tmp_path / "run", made, hub, {"every_update": True}, max_updates=7)
+    told = loop(tmp_path / "run", made, hub, {"publish_seconds": 0.0}, max_updates=7)
     told.run()
     assert hub.values("publish") == list(range(8))
     assert [line for line in caplog.messages if "stage" in line] == expected

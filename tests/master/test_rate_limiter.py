@@ -91,7 +91,7 @@ def test_somebody_may_always_move_and_nobody_runs_ahead(
         (
             0.1,
             0,
-            "service.lag_updates must be at least 1, got 0: no transition could ever be inserted, "
+            "the lag must be at least 1 update, got 0: no transition could ever be inserted, "
             "so learner and workers would wait for each other for ever",
         ),
         *(

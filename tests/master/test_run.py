@@ -33,7 +33,6 @@ MADE = small_setup()
 BATCH = 4
 STEP: dict[str, Any] = {
     "mode": "lockstep",
-    "lockstep_workers": 1,
     "envs": BATCH,
     "batch_episodes": BATCH,
 }

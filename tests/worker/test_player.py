@@ -39,7 +39,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("worker.client.Timing", lambda: QUICK)
 
 
-SERVICE = ServiceConfig(envs=4, batch_episodes=6, window=2)
+SERVICE = ServiceConfig(envs=4, batch_episodes=6)
 
 
 def config(hub: Hub, service: ServiceConfig = SERVICE, **more: object) -> WorkerConfig:
