@@ -65,7 +65,6 @@ WRONG = [
     ("tangram-master from_config=nowhere.yaml", "from_config=nowhere.yaml: No such file"),
     ("tangram-worker connect=tcp://127.0.0.1:1 reward.name=own.py:none", "cannot read 'own.py' on"),
     ("tangram-train tokens.shapes=[square,square,square] tokens.scale=2.2", "no room for token"),
-    ("tangram-train run_dir=x warm_start=nowhere", "nowhere has no checkpoint"),
     ("tangram-worker", "say which master: connect=tcp://host:port"),
     ("tangram-eval", "say which run: run_dir=runs/..."),
     ("tangram-play", "say which run: run_dir=runs/..."),
@@ -110,6 +109,11 @@ def test_an_own_reward_that_fails_is_told_before_anything_starts(tmp_path: Path,
     told = refused(*line.split(), "reward.name=own.py:near", cwd=tmp_path)
     assert "own.py:near failed: ZeroDivisionError" in told
     assert [path.name for path in tmp_path.iterdir()] == ["own.py"]
+
+
+def test_a_warm_start_from_nowhere_is_refused(tmp_path: Path) -> None:
+    line = refused("tangram-train", "run_dir=x", "warm_start=nowhere", cwd=tmp_path)
+    assert line.startswith(f"tangram-train: warm_start={tmp_path / 'nowhere'} has no checkpoint")
 
 
 # A user's own master.py, worker.py and conf.py, in the current folder and on PYTHONPATH
