@@ -40,12 +40,13 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(film_module, "WIDTH", 120)
 
 
+ANYWHERE = SIM | {"starts": "anywhere"}  # a run may have trained with other starts
 PLAIN_AGENT = {"egocentric": False, "angle_head": "plain"}
 
 
 def of_square(folder: Path, run_of: dict[str, Any] = SQUARE, **settings: Any) -> PlayConfig:
     if not (folder / "run").exists():
-        write_run(folder / "run", run_of, **({"sim": SIM} if run_of is GAME else {}))
+        write_run(folder / "run", run_of, **({"sim": ANYWHERE} if run_of is GAME else {}))
     return PlayConfig(str(folder / "run"), **settings)
 
 
