@@ -202,6 +202,8 @@ def test_a_window_shows_one_puzzle_after_the_other_until_it_is_closed(
 def test_no_window_without_a_display(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, display: str | None
 ) -> None:
+    """The engine would end the process."""
+    monkeypatch.setattr("pybullet.connect", lambda *_, **__: pytest.fail("a window is opened"))
     monkeypatch.delenv("DISPLAY", raising=False)
     if display is not None:
         monkeypatch.setenv("DISPLAY", display)
