@@ -98,30 +98,30 @@ class AgentConfig(Settings, section="agent"):
     )
     saturation_limit: float = setting(1.0, "pre-activation beyond which the penalty starts", low=0)
     readout: str = setting(
-        "auto",
-        "one velocity of the set's next token and one value of the whole scene, or both for each "
-        "pair of a token and a piece of the target, or auto: pair for several tokens",
-        choices=("auto", "token", "pair"),
+        "pair",
+        "a velocity and a value for each pair of a token and a piece of the target; or, as in the "
+        "paper, one velocity of the set's next token and one value of the whole scene",
+        choices=("pair", "token"),
     )
     order: str = setting(
         "learned",
         "which token is next: that of the best value, the first as listed, the largest, or any",
         choices=ORDERS,
-        only={"readout": ("auto", "pair")},
+        only={"readout": "pair"},
     )
     reapply: int = setting(
         2,
         "times that the actor is applied again to what it proposed",
         low=0,
         high=100,
-        only={"readout": ("auto", "pair")},
+        only={"readout": "pair"},
     )
     refine_steps: int = setting(
         0,
         "gradient steps uphill on the critic before a pose is played, exploration off",
         low=0,
         high=10_000,
-        only={"readout": ("auto", "pair")},
+        only={"readout": "pair"},
     )
     refine_rate: float = setting(
         0.004,
@@ -129,21 +129,21 @@ class AgentConfig(Settings, section="agent"):
         low=1e-9,
         high=1,
         unit="arena units and rad",
-        only={"readout": ("auto", "pair")},
+        only={"readout": "pair"},
     )
     pairs_per_transition: int = setting(
         8,
         "several tokens: pairs that a transition gives in one update",
         low=1,
         high=1024,
-        only={"readout": ("auto", "pair")},
+        only={"readout": "pair"},
     )
     push_weight: float = setting(
         1.0,
         "several tokens that slide: weight of what later ones push away of what is set down now",
         low=0,
         high=1,
-        only={"readout": ("auto", "pair")},
+        only={"readout": "pair"},
     )
     gamma: float = setting(0.0, "discount, Eq. 5", low=0, high=1)
     polyak: float = setting(

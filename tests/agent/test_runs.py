@@ -11,7 +11,7 @@ from tangram_agent.learner import Learner
 from tangram_agent.policy import Policy
 from tangram_agent.runs import load_run
 from tangram_sim.errors import RunError, TangramError
-from tests.agent.builders import PLAIN, SMALL, SQUARE, random_transitions, setup
+from tests.agent.builders import PLAIN, PROPOSAL, SMALL, SQUARE, random_transitions, setup
 
 pytestmark = pytest.mark.fast
 
@@ -20,7 +20,7 @@ CONFIG = {
     "tokens": SQUARE,
     "sim": {"backend": "kinematic"},
     "reward": {},
-    "agent": PLAIN,
+    "agent": PLAIN | PROPOSAL,
     "net": SMALL,
 }
 
@@ -83,7 +83,7 @@ def test_a_missing_folder_is_refused(tmp_path: Path) -> None:
     ("section", "content"),
     [
         ("tokens", {"shapes": ["parallelogram"], "scale": 1.0}),
-        ("agent", {"egocentric": False}),
+        ("agent", {"egocentric": False, "reapply": 0}),
         ("net", {**SMALL, "heads": 1}),
     ],
 )
