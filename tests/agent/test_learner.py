@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from tangram_agent.graph import Scenes, next_token
 from tangram_agent.learner import (
     Learner,
     NotFiniteError,
@@ -18,6 +17,7 @@ from tangram_agent.learner import (
     polyak_update,
     saturation,
 )
+from tangram_agent.scenes import Scenes, next_token
 from tangram_agent.setup import Setup
 from tangram_agent.types import Transitions
 from tangram_sim.errors import RunError

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from tangram_agent.graph import SceneGraph, Scenes
 from tangram_agent.networks import Actor, Critic, initialise, parameter_count
+from tangram_agent.scenes import SceneGraph, Scenes
 from tangram_agent.setup import Setup
 from tests.agent.builders import PAIR, PAPER, SCENE, SMALL, SQUARE, random_transitions, setup
 

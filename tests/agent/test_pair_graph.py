@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tangram_agent.config import AgentConfig
-from tangram_agent.graph import PairGraph, Pairs
+from tangram_agent.pairs import PairGraph, Pairs
 from tangram_sim.fitting import KINDS
 from tangram_sim.layout import Layout, TokensConfig, make_layout
 from tests.agent.pair_scenes import SEVEN, every_pair, random_pairs, random_scene

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from tangram_agent.graph import Pairs
 from tangram_agent.learner import Learner
+from tangram_agent.pairs import Pairs
 from tangram_agent.policy import Policy
 from tangram_agent.relabelling import ContactBatch, PairBatch
 from tangram_agent.setup import Setup
