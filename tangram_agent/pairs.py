@@ -13,6 +13,7 @@ from tangram_sim.layout import Layout
 
 # Every tan has a number of its own, whatever set it is in; other shapes share the last one.
 _KINDS = len(KINDS) + 1
+_ANGLES = 5  # numbers that tell a piece's angle
 # Corners in radii are larger than the rest; then a perceptron's inputs are of about one size.
 _CORNER_SCALE = 0.3
 
@@ -89,13 +90,13 @@ class PairGraph(nn.Module):
     @property
     def features(self) -> int:
         """F, with the options that are switched on."""
-        return 3 + 2 * self.offsets + 4 * self.orientation + 2 * _KINDS + 4
+        return 3 + 2 * self.offsets + _ANGLES * self.orientation + 2 * _KINDS + 4
 
     @property
     def inputs(self) -> int:
         """Numbers that a perceptron sees of a pair."""
         own = 2 * self.corners * self.offsets
-        return 2 + 4 * self.orientation + 2 * self.corners + own + 2 * _KINDS + 4
+        return 2 + _ANGLES * self.orientation + 2 * self.corners + own + 2 * _KINDS + 4
 
     def base_node(self, pairs: Pairs) -> Tensor:
         """Node index (M,) of the token's base."""
@@ -225,8 +226,15 @@ class PairGraph(nn.Module):
         return ratio.log(), torch.exp(-place.norm(dim=-1) / self.radius[pairs.token])
 
     def _angles(self, pairs: Pairs, angle: Tensor) -> Tensor:
-        """(M, 4) cosine and sine of the angle, and of it times the piece's symmetry."""
-        return torch.cat([unit(angle * self.symmetry[pairs.piece]), unit(angle)], dim=-1)
+        """(M, 5): cosine and sine of the angle, and of it times the piece's symmetry; how aligned.
+
+        The reward has a cusp where both are aligned. Of smooth features the critic's maximum comes
+        to lie beside it: trained agents were 0.02 to 0.14 degrees off, each by its own angle.
+        """
+        symmetry = self.symmetry[pairs.piece]
+        folded = unit(angle * symmetry)
+        aligned = torch.exp(-torch.atan2(folded[:, 1], folded[:, 0]).abs() / symmetry)
+        return torch.cat([folded, unit(angle), aligned[:, None]], dim=-1)
 
 
 def _signs(flipped: Tensor) -> Tensor:
