@@ -57,7 +57,11 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
         folder, arguments = _own_presets(arguments)
         if {"-h", "--help"} & set(arguments):
             asked = [name for name in arguments if name in COMMANDS[config_name].sections()]
-            print(group_help(asked[0], folder) if asked else help_text(config_name, folder))
+            print(
+                group_help(config_name, asked[0], folder)
+                if asked
+                else help_text(config_name, folder)
+            )
             return 0
         options = [] if folder is None else [OWN_PRESETS[0], folder]
         sys.argv[1:] = [*options, *hidden(_options_first(arguments), config_name)]

@@ -38,6 +38,7 @@ STUDY: dict[str, str | list[str]] = {
     "experiment": ["fig4", "table1", "table2", "fig5", "fig6"],
     "budget": "laptop",
 }
+OVER = ("sim", "agent")
 NEW_RUN = "runs/${now:%Y-%m-%d_%H-%M-%S}"
 
 
@@ -62,6 +63,7 @@ class Command:
         groups: config group -> presets that are taken by default.
         plain: configs that are no groups of presets, merged before them.
         given: own setting -> default that hydra fills in.
+        over: sections of a trained run, of which any setting can be laid over the run's.
     """
 
     name: str
@@ -71,6 +73,7 @@ class Command:
     groups: Mapping[str, str | list[str]] = field(default_factory=dict)
     plain: tuple[str, ...] = ()
     given: Mapping[str, str] = field(default_factory=dict)
+    over: tuple[str, ...] = ()
 
     def fields(self) -> list["Field[Any]"]:
         """Its own settings."""
@@ -81,10 +84,16 @@ class Command:
         return {own.name: self.given.get(own.name, plain_default(own)) for own in self.fields()}
 
     def sections(self) -> dict[str, Plain]:
-        """Group -> setting -> default, of the groups whose settings are declared."""
+        """Group -> setting -> default, of the groups whose settings are declared.
+
+        What is laid over a run has no default: null is as the run was trained.
+        """
         return {
-            group: {own.name: plain_default(own) for own in declared_fields(load(GROUPS[group]))}
-            for group in self.groups
+            group: {
+                own.name: None if group in self.over else plain_default(own)
+                for own in declared_fields(load(GROUPS[group]))
+            }
+            for group in (*self.groups, *self.over)
             if group in GROUPS
         }
 
@@ -203,11 +212,12 @@ how much of the target is covered and how many are solved (95 % covered), and pl
 those that come with tangram-rl or your own, see docs/puzzles.md.""",
         (
             "tangram-eval run_dir=runs/my_run episodes=1000 out=scores.json",
-            "tangram-eval run_dir=runs/my_run actions=3",
+            "tangram-eval run_dir=runs/my_run sim.actions_per_token=3 sim.corner_noise=0.01",
             "tangram-eval run_dir=runs/my_game puzzles=test turns=8 out=puzzles.json "
             "sheet=puzzles.png",
         ),
         ("worker.config:EvalConfig",),
+        over=OVER,
     ),
     "play": Command(
         "tangram-play",
@@ -221,6 +231,7 @@ With compare=[...] several runs play the same episodes side by side.""",
             "tangram-play compare=[runs/my_run,pretrained/square] out=both.gif episodes=4",
         ),
         ("worker.config:PlayConfig",),
+        over=OVER,
     ),
     "experiments": Command(
         "tangram-experiment",
@@ -249,6 +260,6 @@ runs, such as a sweep's, it makes one table.""",
             "tangram-report runs=runs/experiments/laptop out=docs/results.md",
             "tangram-report runs=runs/my_study out=runs/my_study/report",
         ),
-        ("tangram_lab.experiments.report.config:ReportConfig",),
+        ("tangram_lab.experiments.cli:ReportConfig",),
     ),
 }

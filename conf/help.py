@@ -11,7 +11,7 @@ from textwrap import wrap
 from typing import Any
 
 from conf.commands import COMMANDS, GROUPS, Command, load, plain_default
-from tangram_sim.settings import KEY, Declaration, declared_fields, told
+from tangram_sim.settings import KEY, PLAY, Declaration, declared_fields, told
 
 WIDTH = 96
 
@@ -24,8 +24,7 @@ def help_text(config_name: str, folder: str | None = None) -> str:
         folder: of the user's own presets.
     """
     command = COMMANDS[config_name]
-    given = [group for group in command.groups if group in GROUPS]
-    inside = ["  --help sim   the settings of a group"] if given else []
+    inside = ["  --help sim   the settings of a group"] if command.sections() else []
     return "\n".join(
         [
             f"{command.name} [setting=value | group=choice] ...",
@@ -35,6 +34,7 @@ def help_text(config_name: str, folder: str | None = None) -> str:
             "",
             "Settings (with their defaults):",
             *(f"  {line}" for line in _setting_lines(command)),
+            *_over_text(command),
             "",
             "Options:",
             "  --cfg job    show the whole config that the other arguments make, and end",
@@ -49,13 +49,22 @@ def help_text(config_name: str, folder: str | None = None) -> str:
     )
 
 
-def group_help(group: str, folder: str | None = None) -> str:
-    """What `--help GROUP` prints: its presets, and each of its settings."""
-    lines = [
-        _line(own, told_default(plain_default(own)), group)
-        for own in declared_fields(load(GROUPS[group]))
-    ]
-    return "\n".join([f"{group}={'|'.join(choices(group, folder))}", "", *lines])
+def group_help(config_name: str, group: str, folder: str | None = None) -> str:
+    """What `--help GROUP` prints: its presets, and each of its settings that the command takes."""
+    if group in COMMANDS[config_name].over:
+        first = f"{group}.name=value: in place of what the run was trained with"
+        lines = [_line(own, "null", group) for own in playable(group).values()]
+    else:
+        first = f"{group}={'|'.join(choices(group, folder))}"
+        declared = declared_fields(load(GROUPS[group]))
+        lines = [_line(own, told_default(plain_default(own)), group) for own in declared]
+    return "\n".join([first, "", *lines])
+
+
+def playable(group: str) -> dict[str, "Field[Any]"]:
+    """The settings of a group that may be others when a trained run plays, by their whole names."""
+    declared = declared_fields(load(GROUPS[group]))
+    return {f"{group}.{own.name}": own for own in declared if own.metadata[KEY].part == PLAY}
 
 
 def choices(group: str, folder: str | None = None) -> list[str]:
@@ -106,6 +115,16 @@ def _groups_text(command: Command, folder: str | None) -> Iterator[str]:
     if "agent" in command.groups:
         yield "Their values are settings too, as in agent.noise=0.1, tokens.shapes=[square,square];"
     yield f"`{command.name} --cfg job` shows all of their values."
+
+
+def _over_text(command: Command) -> Iterator[str]:
+    if not command.over:
+        return
+    yield ""
+    sections = " and ".join(command.over)
+    yield f"Besides, settings of {sections} in place of what the run was trained with, as in"
+    yield "sim.corner_noise=0.01 agent.order=size. What was for learning only, or is built into the"
+    yield "weights, is refused."
 
 
 def _setting_lines(command: Command) -> Iterator[str]:

@@ -8,8 +8,8 @@ from typing import Any
 
 import yaml
 
-from conf.commands import COMMANDS, GROUPS, load, plain_default
-from conf.help import choices, told_default
+from conf.commands import COMMANDS, GROUPS, Command, load, plain_default
+from conf.help import choices, playable, told_default
 from tangram_sim.settings import KEY, Declaration, declared_fields, told, values_of
 
 PAGE = Path(__file__).parents[1] / "docs" / "settings.md"
@@ -37,7 +37,7 @@ def page() -> str:
         rows = [_row(own, own.name, command.defaults()[own.name]) for own in command.fields()]
         groups = ", ".join(command.groups)
         taken = [f"Groups: {groups}."] if groups else []
-        parts += [f"## {command.name}", *taken, _table(rows)]
+        parts += [f"## {command.name}", *taken, *_laid_over(command), _table(rows)]
     for group, name in (GROUPS | NESTED).items():
         fields = declared_fields(load(name))
         rows = [_row(own, f"{group}.{own.name}", plain_default(own)) for own in fields]
@@ -46,6 +46,16 @@ def page() -> str:
         else:
             parts += [f"## Entries of {group}", _table(rows)]
     return "\n\n".join(parts) + "\n"
+
+
+def _laid_over(command: Command) -> Iterator[str]:
+    """Which settings of a run a command may set."""
+    if command.over:
+        names = ", ".join(f"`{name}`" for group in command.over for name in playable(group))
+        yield (
+            "In place of what the run was trained with, as in `sim.corner_noise=0.01`: "
+            f"{names}. The others of {' and '.join(command.over)} are refused."
+        )
 
 
 def count() -> int:
@@ -79,11 +89,18 @@ def _values(own: "Field[Any]", what: Declaration) -> str:
 
 def _only(what: Declaration, name: str) -> str:
     section = name.rpartition(".")[0]
+    before = f"{section}." if section else ""
     conditions = [
-        f"{section}.{other}={' or '.join(map(told, values_of(needed)))}"
-        for other, needed in what.only.items()
+        *(("only with", before + other, values_of(v)) for other, v in what.only.items()),
+        *(("not with", before + other, values_of(v)) for other, v in what.unless.items()),
     ]
-    return f" (only with {', '.join(conditions)})" if conditions else ""
+    return "".join(f" ({_condition(*one)})" for one in conditions)
+
+
+def _condition(word: str, other: str, values: tuple[object, ...]) -> str:
+    if values == (None,):  # with no value is without it
+        return f"{'not' if word == 'only with' else 'only'} with {other}"
+    return f"{word} {other}={' or '.join(map(told, values))}"
 
 
 def _presets(group: str) -> str:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 from tangram_agent.process import FORMATS
 from tangram_sim.errors import ConfigError
-from tangram_sim.settings import Settings, declared, setting
+from tangram_sim.settings import LEARNING, NETWORK, Settings, declared, setting
 
 ORDERS = ("learned", "listed", "size", "random")
 STRATEGIES = ("final", "future", "near", "none")
@@ -73,35 +73,49 @@ class RelabelConfig(Settings, section="agent.hindsight"):
 class AgentConfig(Settings, section="agent"):
     """DDPG, hindsight and the ways in which an agent may see the graph."""
 
-    name: str = setting("tangram", "the preset's name, for reports")
+    name: str = setting("tangram", "the preset's name, for reports", part=LEARNING)
     egocentric: bool = setting(
-        True, "coordinates relative to the moving token, in its own orientation"
+        True, "coordinates relative to the moving token, in its own orientation", part=NETWORK
     )
     offsets: bool = setting(
-        True, "each corner's displacement from its token's centre as node features"
+        True, "each corner's displacement from its token's centre as node features", part=NETWORK
     )
     orientation: bool = setting(
-        True, "(cos k*theta, sin k*theta) of each target relative to the moving token"
+        True, "(cos k*theta, sin k*theta) of each target relative to the moving token", part=NETWORK
     )
     edges: str = setting(
         "paper",
         "of the graph: paper (Sec. IV-A) or complete (every node sees every other)",
         choices=("paper", "complete"),
+        part=NETWORK,
     )
-    afterstate: bool = setting(True, "the critic sees the graph as the action would leave it")
+    afterstate: bool = setting(
+        True, "the critic sees the graph as the action would leave it", part=NETWORK
+    )
     angle_head: str = setting(
-        "kfold", "one output, or two with angle = atan2 / k", choices=("plain", "kfold")
+        "kfold",
+        "one output, or two with angle = atan2 / k",
+        choices=("plain", "kfold"),
+        part=NETWORK,
     )
-    squash: str = setting("clamp", "of the actor's outputs", choices=("tanh", "clamp"))
+    squash: str = setting(
+        "clamp", "of the actor's outputs", choices=("tanh", "clamp"), part=NETWORK
+    )
     saturation_penalty: float = setting(
-        1.0, "weight of mean(relu(|z| - saturation_limit)^2) in the actor's loss", low=0
+        1.0,
+        "weight of mean(relu(|z| - saturation_limit)^2) in the actor's loss",
+        low=0,
+        part=LEARNING,
     )
-    saturation_limit: float = setting(1.0, "pre-activation beyond which the penalty starts", low=0)
+    saturation_limit: float = setting(
+        1.0, "pre-activation beyond which the penalty starts", low=0, part=LEARNING
+    )
     readout: str = setting(
         "pair",
         "a velocity and a value for each pair of a token and a piece of the target; or, as in the "
         "paper, one velocity of the set's next token and one value of the whole scene",
         choices=("pair", "token"),
+        part=NETWORK,
     )
     order: str = setting(
         "learned",
@@ -137,6 +151,7 @@ class AgentConfig(Settings, section="agent"):
         low=1,
         high=1024,
         only={"readout": "pair"},
+        part=LEARNING,
     )
     push_weight: float = setting(
         1.0,
@@ -145,17 +160,32 @@ class AgentConfig(Settings, section="agent"):
         high=1,
         only={"readout": "pair"},
     )
-    gamma: float = setting(0.0, "discount, Eq. 5", low=0, high=1)
+    gamma: float = setting(0.0, "discount, Eq. 5", low=0, high=1, part=LEARNING)
     polyak: float = setting(
-        0.995, "rho of the target networks, Eq. 4, which gamma > 0 needs", low=0, high=1
+        0.995,
+        "rho of the target networks, Eq. 4, which gamma > 0 needs",
+        low=0,
+        high=1,
+        part=LEARNING,
     )
     acting_average: float = setting(
-        0.99, "Polyak average of the actor that plays and is scored; 0 is the actor", low=0, high=1
+        0.99,
+        "Polyak average of the actor that plays and is scored; 0 is the actor",
+        low=0,
+        high=1,
+        part=LEARNING,
     )
-    actor_lr: float = setting(1e-3, "the actor's learning rate at the start", low=1e-9, high=1e3)
-    critic_lr: float = setting(1e-3, "the critic's learning rate at the start", low=1e-9, high=1e3)
+    actor_lr: float = setting(
+        1e-3, "the actor's learning rate at the start", low=1e-9, high=1e3, part=LEARNING
+    )
+    critic_lr: float = setting(
+        1e-3, "the critic's learning rate at the start", low=1e-9, high=1e3, part=LEARNING
+    )
     lr_decay: str = setting(
-        "cosine", "of the learning rates over the run's budget", choices=("none", "cosine")
+        "cosine",
+        "of the learning rates over the run's budget",
+        choices=("none", "cosine"),
+        part=LEARNING,
     )
     lr_final: float = setting(
         0.01,
@@ -163,18 +193,28 @@ class AgentConfig(Settings, section="agent"):
         low=0,
         high=1,
         only={"lr_decay": "cosine"},
+        part=LEARNING,
     )
-    grad_clip: float = setting(0.0, "largest norm of a gradient; 0 is no clipping", low=0)
-    batch_size: int = setting(64, "transitions in one update", low=1)
-    replay_capacity: int = setting(200_000, "transitions kept", low=1)
+    grad_clip: float = setting(
+        0.0, "largest norm of a gradient; 0 is no clipping", low=0, part=LEARNING
+    )
+    batch_size: int = setting(64, "transitions in one update", low=1, part=LEARNING)
+    replay_capacity: int = setting(200_000, "transitions kept", low=1, part=LEARNING)
     updates_per_transition: float = setting(
-        0.1, "updates for each transition played", low=1e-9, high=1e3
+        0.1, "updates for each transition played", low=1e-9, high=1e3, part=LEARNING
     )
     learning_starts: int = setting(
-        512, "transitions played before the first update; relabelled ones do not count", low=1
+        512,
+        "transitions played before the first update; relabelled ones do not count",
+        low=1,
+        part=LEARNING,
     )
-    noise: float = setting(0.05, "deviation of the Gaussian exploration noise on actions", low=0)
-    uniform_share: float = setting(0.2, "share of actions drawn uniformly", low=0, high=1)
+    noise: float = setting(
+        0.05, "deviation of the Gaussian exploration noise on actions", low=0, part=LEARNING
+    )
+    uniform_share: float = setting(
+        0.2, "share of actions drawn uniformly", low=0, high=1, part=LEARNING
+    )
     # With one action every plain relabel scores +1, so only near misses teach the slope.
     hindsight: tuple[RelabelConfig, ...] = setting(
         (
@@ -183,6 +223,7 @@ class AgentConfig(Settings, section="agent"):
             RelabelConfig("near", position=0.02, angle=0.1),
         ),
         "the other goals that every transition is learned with",
+        part=LEARNING,
     )
 
     def __post_init__(self) -> None:

@@ -20,7 +20,6 @@ from tangram_agent.arrays import (
     WeightShapes,
     decode_tensors,
     encode_tensors,
-    join_frames,
     split_frames,
 )
 from tangram_agent.schema import (
@@ -438,15 +437,6 @@ def decode_weights(frame: bytes, shapes: WeightShapes | None) -> tuple[str, Weig
     frames = split_frames(frame)
     message = read(WeightsMessage, opened(frames), frames[1:], shapes)
     return message.epoch, message.weights
-
-
-def encode_weights(epoch: str, weights: Weights) -> bytes:
-    """Weights as one frame, because a CONFLATE socket keeps only the last frame of a message.
-
-    Raises:
-        WireError: a tensor is not finite, or they are too large.
-    """
-    return join_frames(WeightsMessage(epoch, weights).encode())
 
 
 _FROM_WORKER, _FROM_MASTER = by_kind(ToMaster), by_kind(ToWorker)

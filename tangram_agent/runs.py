@@ -4,7 +4,8 @@
 a whole example. `load_run("pretrained/square")` gives one of the agents that come with the package.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
@@ -16,13 +17,26 @@ from tangram_agent.policy import Policy
 from tangram_agent.pretrained import is_agent, is_name, packaged, read_agent
 from tangram_agent.setup import Setup, make_setup
 from tangram_agent.types import Weights
-from tangram_sim.errors import RunError
+from tangram_sim.errors import ConfigError, RunError
+from tangram_sim.settings import (
+    KEY,
+    LEARNING,
+    NETWORK,
+    Settings,
+    declared_fields,
+    refuse_ignored,
+    setting_name,
+    told,
+)
 
 CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"
 ACTING = "weights"  # the checkpoint's file of acting weights
 POLICY_SECTIONS = ("tokens", "agent", "net")
 SETUP = "setup"  # the checkpoint's counter that tells the setup
+ANOTHER = "train a run with it"
+
+Changes = Mapping[str, Mapping[str, Any]]  # section -> setting -> value
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,17 +58,44 @@ class Run:
     updates: int
     policy: Policy
 
-    def with_agent(self, **changes: Any) -> "Run":
-        """The same weights with other settings of the agent, such as refine_steps=20.
+    def with_settings(self, changes: Changes) -> "Run":
+        """The same weights, played with other settings: `{"agent": {"refine_steps": 20}}`.
 
         Raises:
-            ConfigError: a value that cannot be used.
-            RunError: the settings ask for other networks.
+            ConfigError: a setting that the weights were trained for or that was for learning only,
+                or a value that this run cannot be played with.
         """
-        setup = replace(self.setup, agent=replace(self.setup.agent, **changes))
+        given = [f"{s}.{name}={told(v)}" for s, own in changes.items() for name, v in own.items()]
+        if not given:
+            return self
+        config = asdict(self.setup)
+        for section, values in changes.items():
+            _check_playable(getattr(self.setup, section), values)
+            config[section] |= values
+        try:
+            setup = make_setup(config)
+        except ConfigError as error:
+            raise ConfigError(f"{self.folder} with {', '.join(given)}: {error}") from None
         policy = Policy(setup)
         policy.load(self.policy.weights())
         return replace(self, setup=setup, policy=policy)
+
+
+def _check_playable(trained: Settings, values: Mapping[str, Any]) -> None:
+    """Refuse what is no matter of a trained run's play."""
+    for own in declared_fields(type(trained)):
+        if own.name not in values:
+            continue
+        name = setting_name(trained, own.name)
+        given, part = f"{name}={told(values[own.name])}", own.metadata[KEY].part
+        if part == LEARNING:
+            refuse_ignored(given, "a trained run, which only plays", ANOTHER)
+        if part == NETWORK:
+            was = told(getattr(trained, own.name))
+            raise ConfigError(
+                f"{given} does not fit this run, whose weights were trained with {name}={was}: "
+                f"leave it out, or {ANOTHER}"
+            )
 
 
 def read_config(path: Path) -> dict[str, Any]:

@@ -45,7 +45,7 @@ status = partial(run, "worker.cli", "status")
 evaluate = partial(run, "worker.cli", "evaluate")
 play = partial(run, "worker.cli", "play")
 experiment = partial(run, "tangram_lab.experiments.cli", "experiment")
-report = partial(run, "tangram_lab.experiments.report.cli", "report")
+report = partial(run, "tangram_lab.experiments.cli", "report")
 bench = partial(run, "tangram_lab.benchmarks.cli", "main")
 
 COMMANDS: dict[str, Callable[[], int]] = {

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import MAX_TOKENS
-from tangram_sim.settings import Settings, check_range, setting
+from tangram_sim.settings import LEARNING, NETWORK, Settings, check_range, setting
 
 BACKENDS = ("physics", "kinematic")
 REWARDS = ("overlap", "dense", "pose")
@@ -45,7 +45,7 @@ class SimConfig(Settings, section="sim"):
         "physics", "PyBullet, or the exact rigid motion without an engine", choices=BACKENDS
     )
     arena: float = setting(
-        2.0, "side of the square arena", low=1e-3, high=1e3, unit="as the tokens"
+        2.0, "side of the square arena", low=1e-3, high=1e3, unit="as the tokens", part=NETWORK
     )
     actions_per_token: int = setting(
         1, "actions after which a token counts as placed", low=1, high=100
@@ -116,7 +116,9 @@ class SimConfig(Settings, section="sim"):
         False, "starts on any side; an action may turn its token over (lift only)"
     )
     stages: tuple[StageConfig, ...] = setting(
-        (), "a curriculum, as in [{updates:0,tokens:2},{updates:500}]; tests are the whole task"
+        (),
+        "a curriculum, as in [{updates:0,tokens:2},{updates:500}]; tests are the whole task",
+        part=LEARNING,
     )
     camera: bool = setting(False, "take the pictures and report Eq. 14 from them at every step")
     pixels: int = setting(64, "side of the camera's square picture", low=16, high=1024)

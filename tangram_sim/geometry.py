@@ -217,11 +217,3 @@ def outlines_at(body: Floats, poses: Floats, flipped: Bools) -> Floats:
     turned = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
     moved: Floats = turned + poses[:, None, :2]
     return moved
-
-
-def any_overlap(corners: Floats, layout: Layout, tolerance: float = 1e-9) -> Bools:
-    """Whether any two tokens of a layout overlap by more than `tolerance` in area: (B,)."""
-    own, pairs = outlines(corners, layout), np.triu_indices(layout.tokens, 1)
-    first, second = (own[:, side].reshape(-1, *own.shape[2:]) for side in pairs)
-    overlaps = pairs_overlap(first, second, tolerance).reshape(len(corners), -1)
-    return np.asarray(overlaps.any(axis=1))

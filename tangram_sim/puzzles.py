@@ -95,11 +95,6 @@ def _built(
     return PuzzleFile(tuple(puzzles), tuple(faults))
 
 
-def puzzle_names(split: str | None = None) -> list[str]:
-    """The puzzles that come with the package, those of one of `SPLITS` or all."""
-    return [puzzle.name for puzzle in library(split)]
-
-
 def load_puzzle(name: str, scale: float = 0.6) -> Puzzle:
     """A puzzle of the package.
 

@@ -11,7 +11,7 @@ of a setting is what stands here.
 
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import MISSING, Field, dataclass, field, fields
+from dataclasses import Field, dataclass, field, fields
 from typing import Any, ClassVar, TypeVar, cast
 
 from tangram_sim.errors import ConfigError
@@ -19,6 +19,8 @@ from tangram_sim.errors import ConfigError
 Value = TypeVar("Value")
 Metadata = Mapping[str, "Declaration"]
 KEY = "setting"
+# What a setting is a part of: see `Declaration.part`.
+PLAY, NETWORK, LEARNING = "play", "network", "learning"
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,9 @@ class Declaration:
         unit: of the number, in the words of docs/settings.md; empty: it has none.
         only: other settings of the same section -> the value, or the tuple of values, under which
             this one has an effect. What is not the default is refused under any other.
+        unless: the same the other way round: the values under which this one has none.
+        part: of a run: PLAY may be another when a trained run plays, NETWORK is what its weights
+            were trained for, and LEARNING is over by then.
     """
 
     help: str
@@ -39,7 +44,9 @@ class Declaration:
     high: float = math.inf
     choices: tuple[str, ...] = ()
     unit: str = ""
-    only: Mapping[str, object] = field(default_factory=dict)
+    only: dict[str, object] = field(default_factory=dict)
+    unless: dict[str, object] = field(default_factory=dict)
+    part: str = PLAY
 
 
 def setting(default: Value, help: str, **more: Any) -> Value:  # noqa: A002
@@ -77,17 +84,17 @@ class Settings:
             self._check_effect(own)
 
     def _check_effect(self, own: "Field[Any]") -> None:
-        value = getattr(self, own.name)
+        value, what = getattr(self, own.name), own.metadata[KEY]
         if value == own.default:
             return
-        for name, needed in own.metadata[KEY].only.items():
-            accepted = values_of(needed)
-            if getattr(self, name) not in accepted:
-                refuse_ignored(
-                    f"{setting_name(self, own.name)}={told(value)}",
-                    f"{setting_name(self, name)}={told(getattr(self, name))}",
-                    f"set {setting_name(self, name)}={' or '.join(map(told, accepted))}",
-                )
+        given = f"{setting_name(self, own.name)}={told(value)}"
+        for name, needed in (what.only | what.unless).items():
+            other, values = setting_name(self, name), values_of(needed)
+            if (getattr(self, name) in values) == (name in what.unless):
+                named = f"set {other}={' or '.join(map(told, values))}"
+                left_out = f"leave {other} out" if values == (None,) else named
+                remedy = left_out if name in what.only else f"give {other} another value"
+                refuse_ignored(given, f"{other}={told(getattr(self, name))}", remedy)
 
 
 def refuse_ignored(given: str, because: str, remedy: str) -> None:
@@ -109,13 +116,6 @@ def declared_fields(kind: type[Any]) -> list["Field[Any]"]:
 def setting_name(owner: Settings | type[Settings], name: str) -> str:
     """A setting's name as it is written on a command line."""
     return f"{owner.section}.{name}" if owner.section else name
-
-
-def defaults(kind: type[Any]) -> dict[str, Any]:
-    """Name -> default of the settings of a class; `...` stands for none."""
-    return {
-        own.name: ... if own.default is MISSING else own.default for own in declared_fields(kind)
-    }
 
 
 def values_of(needed: object) -> tuple[object, ...]:

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from conf.cli import composed, entry, with_run_config
-from conf.commands import COMMANDS, GROUPS, Plain, load
+from conf.commands import COMMANDS, GROUPS, OVER, Plain, load
 from conf.help import choices, group_help, help_text, setting_names
 from conf.settings import PAGE, page
 from conf.sweep import check_launcher, refuse_lost_job
@@ -19,7 +19,7 @@ from tangram_agent.config import AgentConfig, NetConfig, ServiceConfig
 from tangram_agent.setup import Setup, from_mapping, make_setup
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.errors import ConfigError, TangramError
-from tangram_sim.settings import declared_fields
+from tangram_sim.settings import KEY, PLAY, declared_fields
 
 pytestmark = pytest.mark.fast
 
@@ -228,10 +228,27 @@ def test_help_explains_every_setting_and_its_examples_compose(primary: str) -> N
 
 @pytest.mark.parametrize("group", GROUPS)
 def test_help_of_a_group_has_a_line_for_each_setting(group: str) -> None:
-    lines = group_help(group).splitlines()
+    lines = group_help("train", group).splitlines()
     assert lines[0] == f"{group}={'|'.join(choices(group))}"
     names = [line.partition(":")[0] for line in lines[2:]]
     assert names == [f"{group}.{own.name}" for own in declared_fields(load(GROUPS[group]))]
+
+
+@pytest.mark.parametrize("group", OVER)
+def test_help_of_what_is_laid_over_a_run_has_what_it_may_be_played_with(group: str) -> None:
+    names = [line.partition(":")[0] for line in group_help("eval", group).splitlines()[2:]]
+    kinds = {own.name: own.metadata[KEY].part for own in declared_fields(load(GROUPS[group]))}
+    assert names == [f"{group}.{name}" for name, part in kinds.items() if part == PLAY]
+    refused = {"sim": "sim.arena", "agent": "agent.batch_size"}[group]
+    assert refused not in names
+
+
+def test_settings_are_laid_over_a_run_one_by_one() -> None:
+    made = compose("eval", "run_dir=x", "sim.corner_noise=0.01", "agent.order=size")
+    given = {f"{s}.{n}": v for s in OVER for n, v in made[s].items() if v is not None}
+    assert given == {"sim.corner_noise": 0.01, "agent.order": "size"}
+    with pytest.raises(ConfigError, match="did you mean 'sim.corner_noise'"):
+        compose("eval", "run_dir=x", "sim.corner_nois=0.01")
 
 
 def test_known_settings_are_those_that_compose() -> None:
@@ -333,8 +350,8 @@ def test_entry_hands_over_plain_settings(monkeypatch: pytest.MonkeyPatch) -> Non
     assert start(monkeypatch, lambda settings: seen.append(settings) or 5, "seed=3") == 5
     assert seen == [
         {"run_dir": "x", "episodes": 100, "seed": 3, "turns": 1, "skip_invalid": False}
-        | dict.fromkeys(("out", "actions", "corner_noise", "puzzles", "sheet"))
-        | dict.fromkeys(("order", "reapply", "refine_steps", "push_weight"))
+        | dict.fromkeys(("out", "puzzles", "sheet"))
+        | {s: dict.fromkeys(own) for s, own in COMMANDS["train"].sections().items() if s in OVER}
     ]
     assert type(seen[0]) is dict
 

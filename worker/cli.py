@@ -80,7 +80,7 @@ def _evaluate(settings: Plain) -> int:
     from tangram_agent.setup import from_mapping
     from worker.config import EvalConfig
 
-    config = from_mapping(EvalConfig, with_absolute_paths(settings))
+    config = from_mapping(EvalConfig, with_changes(with_absolute_paths(settings)))
 
     from worker.evaluate import evaluate_run
 
@@ -93,6 +93,7 @@ def _play(settings: Plain) -> int:
 
     check_compare(settings.get("compare"))  # before a text is taken for a list of letters
     settings = with_absolute_paths(settings) | {"puzzle": check_puzzle(settings.get("puzzle"))}
+    settings = with_changes(settings)
     config = from_mapping(PlayConfig, settings)
     if config.tokens is not None and config.run_dir is not None:
         _check_tokens(config.tokens, config.run_dir)
@@ -123,6 +124,14 @@ def _check_tokens(name: str, run_dir: str) -> None:
             f"tokens={name} and run_dir={run_dir} do not agree: the run moves {shapes}; leave one "
             "of both out"
         )
+
+
+def with_changes(settings: Plain) -> Plain:
+    """The settings that are laid over a run's, in one mapping; null is as the run was trained."""
+    laid = {name: values for name, values in settings.items() if isinstance(values, dict)}
+    given = {s: {n: v for n, v in own.items() if v is not None} for s, own in laid.items()}
+    rest = {name: value for name, value in settings.items() if name not in laid}
+    return rest | {"changes": {section: own for section, own in given.items() if own}}
 
 
 def with_absolute_paths(settings: Plain) -> Plain:

@@ -1,19 +1,20 @@
 """Settings of a worker process and of the tools that show what a run has learned."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tangram_agent.config import ORDERS, ServiceConfig
+from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import MAX_INDEX, ROLES
 from tangram_agent.pretrained import PREFIX, agent_names
-from tangram_sim.config import MAX_CORNER_NOISE
 from tangram_sim.errors import ConfigError
-from tangram_sim.settings import Settings, declared, setting
+from tangram_sim.settings import Settings, declared, refuse_ignored, setting, told
 
-CHANGES = ("order", "reapply", "refine_steps", "push_weight")  # of how an agent plays
+Changes = dict[str, dict[str, Any]]  # section -> setting -> value: of a run that was trained
+OF_TARGETS = ("targets", "spread", "mirrored")  # settings of sim that say nothing of a puzzle
+OF_PICTURES = ("camera", "pixels")
 MAX_EPISODES = 1_000_000
-MAX_ACTIONS = 100
 MAX_SHOWN = 100
 MAX_TURNS = 360
 GAME = "tangram7"  # the agent that plays puzzles unless another is named
@@ -39,6 +40,13 @@ def _check_run(run_dir: str | None, puzzles: bool) -> None:
         _check_run_dir(run_dir)
     elif not (puzzles and GAME in agent_names()):
         raise ConfigError("say which run: run_dir=runs/...")
+
+
+def _refuse(changes: Changes, names: Iterable[str], because: str, remedy: str) -> None:
+    """Refuse settings of sim that would change nothing here."""
+    for name in names:
+        if name in changes.get("sim", {}):
+            refuse_ignored(f"sim.{name}={told(changes['sim'][name])}", because, remedy)
 
 
 def _check_connect(value: str) -> None:
@@ -98,26 +106,21 @@ class StatusConfig(Settings):
 
 @dataclass(frozen=True)
 class EvalConfig(Settings):
-    """Scores of a finished run on the fixed test set, or on puzzles (tangram-eval)."""
+    """Scores of a finished run on the fixed test set, or on puzzles (tangram-eval).
+
+    Attributes:
+        changes: settings of sim and agent that are not to be as the run was trained with.
+    """
 
     run_dir: str | None = setting(
         None, "folder of the run, or pretrained/NAME; with puzzles pretrained/tangram7 if not given"
     )
     episodes: int = setting(
         100,
-        "test episodes, the same ones for every run; not with puzzles",
+        "test episodes, the same ones for every run",
         low=1,
         high=MAX_EPISODES,
-    )
-    actions: int | None = setting(
-        None, "actions for each token, null: as trained", low=1, high=MAX_ACTIONS
-    )
-    corner_noise: float | None = setting(
-        None,
-        "noise on the corners that the agent sees, null: as trained",
-        low=0,
-        high=MAX_CORNER_NOISE,
-        unit="arenas",
+        only={"puzzles": None},
     )
     seed: int = setting(
         0, "of the test episodes, and of the starts of puzzles", low=0, high=MAX_SEED
@@ -129,44 +132,33 @@ class EvalConfig(Settings):
     )
     turns: int = setting(
         1,
-        "with puzzles: each at so many angles, evenly spread; 1 is as drawn",
+        "each puzzle at so many angles, evenly spread; 1 is as drawn",
         low=1,
         high=MAX_TURNS,
+        unless={"puzzles": None},
     )
-    skip_invalid: bool = setting(False, "with puzzles: leave out those that cannot be played")
-    sheet: str | None = setting(None, "with puzzles: PNG file, a picture of every puzzle's end")
-    order: str | None = setting(
-        None, "which token is next, see agent.order; null: as trained", choices=ORDERS
+    skip_invalid: bool = setting(
+        False, "leave out puzzles that cannot be played", unless={"puzzles": None}
     )
-    reapply: int | None = setting(None, "see agent.reapply; null: as trained")
-    refine_steps: int | None = setting(None, "see agent.refine_steps; null: as trained")
-    push_weight: float | None = setting(None, "see agent.push_weight; null: as trained")
+    sheet: str | None = setting(
+        None, "PNG file, a picture of every puzzle's end", unless={"puzzles": None}
+    )
+    changes: Changes = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         _check_run(self.run_dir, self.puzzles is not None)
         super().__post_init__()
         if self.out is not None:
             _check_out(self.out)
-        self._check_puzzles()
+        if self.sheet is not None and Path(self.sheet).suffix != ".png":
+            raise ConfigError(f"sheet must end with .png, got '{self.sheet}'")
+        if self.puzzles is not None:
+            _refuse(self.changes, (*OF_TARGETS, *OF_PICTURES), "puzzles", "leave puzzles out")
 
     @property
     def run(self) -> str:
         """The run to score."""
         return self.run_dir or game_run()
-
-    @property
-    def agent_changes(self) -> dict[str, Any]:
-        """What is set of the agent's play."""
-        named = {name: getattr(self, name) for name in CHANGES}
-        return {name: value for name, value in named.items() if value is not None}
-
-    def _check_puzzles(self) -> None:
-        needs = {"turns": self.turns > 1, "sheet": self.sheet, "skip_invalid": self.skip_invalid}
-        for name, given in needs.items():
-            if given and self.puzzles is None:
-                raise ConfigError(f"{name} is for puzzles: set puzzles=test, or leave {name} out")
-        if self.sheet is not None and Path(self.sheet).suffix != ".png":
-            raise ConfigError(f"sheet must end with .png, got '{self.sheet}'")
 
 
 def check_compare(value: object) -> None:
@@ -207,33 +199,50 @@ def check_puzzle(value: object) -> tuple[str, ...] | None:
 
 @dataclass(frozen=True)
 class PlayConfig(Settings):
-    """Pictures of a run at play (tangram-play), or of several on the same starts."""
+    """Pictures of a run at play (tangram-play), or of several on the same starts.
+
+    Attributes:
+        changes: settings of sim and agent that are not to be as the runs were trained with.
+    """
 
     run_dir: str | None = setting(
-        None, "folder of the run, or an agent that comes with tangram-rl: pretrained/square"
+        None,
+        "folder of the run, or an agent that comes with tangram-rl: pretrained/square",
+        only={"compare": None},
     )
-    out: str = setting("play.gif", ".gif for an animation, .png for one picture")
+    out: str = setting(
+        "play.gif", ".gif for an animation, .png for one picture", only={"live": False}
+    )
     episodes: int = setting(
-        12, "episodes shown side by side; not with puzzles", low=1, high=MAX_SHOWN
-    )
-    actions: int | None = setting(
-        None, "actions for each token, null: as trained", low=1, high=MAX_ACTIONS
+        12,
+        "episodes shown side by side",
+        low=1,
+        high=MAX_SHOWN,
+        only={"puzzle": None, "puzzles": None},
     )
     seed: int = setting(0, "of the episodes, and of the starts of puzzles", low=0, high=MAX_SEED)
     compare: tuple[str, ...] | None = setting(
         None, "folders of 2 to 4 runs, as in [runs/a,runs/b]: all on the same starts"
     )
     tokens: str | None = setting(
-        None, "instead of run_dir the agent that comes with tangram-rl for these tokens: square"
+        None,
+        "instead of run_dir the agent that comes with tangram-rl for these tokens: square",
+        only={"compare": None},
     )
     puzzle: tuple[str, ...] | None = setting(
-        None, "assemble this puzzle of the library instead of random targets, or several: [cat,dog]"
+        None,
+        "assemble this puzzle of the library instead of random targets, or several: [cat,dog]",
+        only={"compare": None},
     )
     puzzles: str | None = setting(
         None,
         "a JSON or SVG file of your own, or train or test: all in it, or those that puzzle names",
+        only={"compare": None},
     )
-    live: bool = setting(False, "play in a window instead of writing a file")
+    live: bool = setting(
+        False, "play in a window instead of writing a file", only={"compare": None}
+    )
+    changes: Changes = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_compare(self.compare)
@@ -244,6 +253,9 @@ class PlayConfig(Settings):
                 "shows the ends"
             )
         super().__post_init__()
+        _refuse(self.changes, OF_PICTURES, "tangram-play, which draws corners", "use tangram-eval")
+        if self.plays_puzzles:
+            _refuse(self.changes, (*OF_TARGETS, "starts"), "puzzles", "leave puzzles out")
 
     @property
     def plays_puzzles(self) -> bool:
@@ -257,21 +269,13 @@ class PlayConfig(Settings):
         return self.compare or (self.run_dir or named,)
 
     def _check_one_of_both(self) -> None:
-        if self.compare is not None:
-            self._check_compared_alone()
-        elif self.run_dir is not None:
+        if self.run_dir is not None:
             _check_run_dir(self.run_dir)
-        elif self.tokens is None and not (self.plays_puzzles and GAME in agent_names()):
+        elif (
+            self.compare is None
+            and self.tokens is None
+            and not (self.plays_puzzles and GAME in agent_names())
+        ):
             raise ConfigError(
                 "say which run: run_dir=runs/..., or which ones: compare=[runs/a,runs/b]"
             )
-
-    def _check_compared_alone(self) -> None:
-        names = ("run_dir", "tokens", "puzzle", "puzzles", "live")
-        others: dict[str, Any] = {name: getattr(self, name) for name in names}
-        for name, value in others.items():
-            if value not in (None, False):
-                raise ConfigError(
-                    f"{name}={value} and compare do not go together: give run_dir=... to show one "
-                    "run, or compare=[a,b] to show several on random targets"
-                )

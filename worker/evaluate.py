@@ -20,11 +20,11 @@ from tangram_agent.runs import Run, load_run
 from tangram_agent.setup import Setup
 from tangram_sim.game_drawing import figure_sheet
 from worker.baselines import exact_policy, position_policy, random_policy
-from worker.config import CHANGES, EvalConfig
+from worker.config import EvalConfig
 from worker.metrics import assembled, pose_errors, summarise
 from worker.puzzles import Figure, Figures, find_figures, play_figures
 from worker.rollout import Choose, Played
-from worker.test_set import FixedTests, adapted, greedy, with_actions, with_corner_noise
+from worker.test_set import FixedTests, greedy
 
 AT_ONCE = 32
 MAX_PICTURES = 100  # on a sheet
@@ -88,9 +88,8 @@ def evaluate_run(config: EvalConfig) -> int:
     """
     torch.set_num_threads(1)
     began = time.monotonic()
-    run = adapted(load_run(config.run), config.agent_changes)
-    setup = with_corner_noise(with_actions(run.setup, config.actions), config.corner_noise)
-    report = (_episodes if config.puzzles is None else _puzzles)(run, setup, config)
+    run = load_run(config.run).with_settings(config.changes)
+    report = (_episodes if config.puzzles is None else _puzzles)(run, config)
     if config.out is not None:
         report |= {"seconds": time.monotonic() - began}
         write_whole(Path(config.out), (json.dumps(report, indent=1) + "\n").encode())
@@ -98,13 +97,15 @@ def evaluate_run(config: EvalConfig) -> int:
     return 0
 
 
-def policies(run: Run, setup: Setup) -> dict[str, Choose]:
+def policies(run: Run) -> dict[str, Choose]:
     """The run, and those to compare it with, by their names in tables and files."""
-    layout, sim = setup.layout, setup.sim
+    layout, sim = run.setup.layout, run.setup.sim
     fixed = [order for order in ORDERS if order not in ("learned", run.setup.agent.order)]
     fixed = fixed if run.setup.pairs and layout.tokens > 1 else []
     result = {RUN: greedy(run.policy)}
-    result |= {f"order={name}": greedy(run.with_agent(order=name).policy) for name in fixed}
+    for name in fixed:
+        other = run.with_settings({"agent": {"order": name}})
+        result[f"order={name}"] = greedy(other.policy)
     result["exact"] = exact_policy(layout, sim)
     if layout.tokens == 1:
         result["position only"] = position_policy(layout, sim)
@@ -125,20 +126,20 @@ def _scored(tests: FixedTests, choose: Choose) -> Scores:
     return scores | (of_several(played) if tests.setup.layout.tokens > 1 else {})
 
 
-def _episodes(run: Run, setup: Setup, config: EvalConfig) -> dict[str, Any]:
+def _episodes(run: Run, config: EvalConfig) -> dict[str, Any]:
     """Play the test episodes and print the scores; the file's content."""
-    scores = score_policies(setup, policies(run, setup), config)
+    scores = score_policies(run.setup, policies(run), config)
     tests = "fixed tests" if config.seed == 0 else f"tests of seed {config.seed}"
-    caption = f"{config.episodes:,} {tests}, {_told(setup)}; positions in arena units"
+    caption = f"{config.episodes:,} {tests}, {_told(run.setup)}; positions in arena units"
     Console(highlight=False).print(scores_table(_title(run), caption, scores))
-    return {**_report(run, setup, config, scores), "episodes": config.episodes}
+    return {**_report(run, config, scores), "episodes": config.episodes}
 
 
-def _puzzles(run: Run, setup: Setup, config: EvalConfig) -> dict[str, Any]:
+def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
     """Assemble the puzzles, print the scores and draw the sheet; the file's content."""
-    source = str(config.puzzles)
+    source, setup = str(config.puzzles), run.setup
     found = find_figures(source, setup, None, config.turns, config.skip_invalid)
-    scores, lines, played = score_puzzles(setup, found.figures, policies(run, setup), config.seed)
+    scores, lines, played = score_puzzles(setup, found.figures, policies(run), config.seed)
     console = Console(highlight=False)
     count = len(found.figures)
     caption = f"{count:,} puzzles of {Path(source).name}, {_told(setup)}; positions in arena units"
@@ -148,7 +149,7 @@ def _puzzles(run: Run, setup: Setup, config: EvalConfig) -> dict[str, Any]:
     if config.sheet is not None:
         write_sheet(config.sheet, setup, found, played)
         console.print(f"written: {config.sheet}", markup=False, soft_wrap=True)
-    return _report(run, setup, config, scores) | {
+    return _report(run, config, scores) | {
         "source": source,
         "turns": config.turns,
         "skipped": list(found.faults),
@@ -156,23 +157,17 @@ def _puzzles(run: Run, setup: Setup, config: EvalConfig) -> dict[str, Any]:
     }
 
 
-def _report(
-    run: Run, setup: Setup, config: EvalConfig, scores: Mapping[str, Scores]
-) -> dict[str, Any]:
+def _report(run: Run, config: EvalConfig, scores: Mapping[str, Scores]) -> dict[str, Any]:
     """The file's content: the run's scores on top, by the same names as in result.json."""
-    agent = asdict(run.setup.agent)
+    setup = run.setup
     return {
         **scores[RUN],
-        "actions": setup.sim.actions_per_token,
-        "corner_noise": setup.sim.corner_noise,
         "test_seed": config.seed,
         "run_dir": str(run.folder),
         "updates": run.updates,
         "tokens": [shape.name for shape in setup.layout.shapes],
-        "agent": agent["name"],
-        **{name: agent[name] for name in CHANGES},
-        "backend": setup.sim.backend,
-        "motion": setup.sim.motion,
+        "sim": asdict(setup.sim),
+        "agent": asdict(setup.agent),
         "baselines": {name: values for name, values in scores.items() if name != RUN},
     }
 

@@ -25,7 +25,7 @@ from worker.config import MAX_SHOWN, PlayConfig
 from worker.film import Show, film_pictures, frames_per_action, show_live
 from worker.puzzles import find_figures, play_figures
 from worker.rollout import Played
-from worker.test_set import FixedTests, greedy, with_actions
+from worker.test_set import FixedTests, greedy
 
 AT_ONCE = 32
 FRAME_MS = 50
@@ -52,7 +52,7 @@ def play_run(config: PlayConfig) -> int:
     """
     torch.set_num_threads(1)
     (run_dir,) = config.run_dirs
-    show = make_show(load_run(run_dir), config)
+    show = make_show(load_run(run_dir).with_settings(config.changes), config)
     if config.live:
         show_live(show)
         return 0
@@ -69,18 +69,16 @@ def make_show(run: Run, config: PlayConfig) -> Show:
     """
     if config.plays_puzzles:
         return puzzle_show(run, config)
-    setup, played = play_episodes(run, config)
     titles = [f"target {i + 1}" for i in range(config.episodes)]
-    return Show(setup, played, titles, "episodes")
+    return Show(run.setup, play_episodes(run, config), titles, "episodes")
 
 
-def play_episodes(run: Run, config: PlayConfig) -> tuple[Setup, Played]:
-    """The episodes that the settings name, played by a run; the task as it was played."""
-    setup = with_actions(run.setup, config.actions)
+def play_episodes(run: Run, config: PlayConfig) -> Played:
+    """The episodes that the settings name, played by a run."""
     with closing(
-        FixedTests(setup, config.episodes, AT_ONCE, role="play", seed=config.seed)
+        FixedTests(run.setup, config.episodes, AT_ONCE, role="play", seed=config.seed)
     ) as tests:
-        return setup, tests.play(greedy(run.policy))
+        return tests.play(greedy(run.policy))
 
 
 def puzzle_show(run: Run, config: PlayConfig) -> Show:
@@ -89,8 +87,7 @@ def puzzle_show(run: Run, config: PlayConfig) -> Show:
     Raises:
         ConfigError: puzzles that the run cannot play, or too many of them.
     """
-    setup = with_actions(run.setup, config.actions)
-    setup = replace(setup, sim=replace(setup.sim, starts="outside"))
+    setup = replace(run.setup, sim=replace(run.setup.sim, starts="outside"))
     found = find_figures(config.puzzles, setup, config.puzzle)
     if len(found.figures) > MAX_SHOWN:
         raise ConfigError(
@@ -192,9 +189,9 @@ def compare_runs(config: PlayConfig) -> int:
             first, or `out` is not writable.
     """
     torch.set_num_threads(1)
-    runs = [load_run(run_dir) for run_dir in config.run_dirs]
+    runs = [load_run(run_dir).with_settings(config.changes) for run_dir in config.run_dirs]
     check_same_task(runs)
-    shown = [play_episodes(run, config) for run in runs]
+    shown = [(run.setup, play_episodes(run, config)) for run in runs]
     labels = distinct_names([run.folder for run in runs])
     scores = [f"mean raw overlap {played.overlap.mean():.3f}" for _, played in shown]
     panels = [

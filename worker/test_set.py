@@ -1,17 +1,14 @@
 """A fixed set of test episodes, played with noise off and the camera on."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from tangram_agent.policy import Policy
-from tangram_agent.runs import Run
 from tangram_agent.setup import Setup
 from tangram_sim.arrays import Bools, Floats, Singles
 from tangram_sim.batch import BatchedEnv
-from tangram_sim.errors import ConfigError
 from tangram_sim.seeding import episode_generator
 from worker.metrics import summarise
 from worker.rollout import Choose, Generators, Played, play
@@ -24,40 +21,6 @@ def greedy(policy: Policy) -> Choose:
         return policy.act(corners, placed, goals)
 
     return choose
-
-
-def with_actions(setup: Setup, actions: int | None) -> Setup:
-    """The setup with another number of actions per token; None leaves it as it is.
-
-    A policy does not know the length of an episode, so one that was trained on single actions can
-    be tested on several, as in Table II.
-    """
-    if actions is None:
-        return setup
-    return replace(setup, sim=replace(setup.sim, actions_per_token=actions))
-
-
-def with_corner_noise(setup: Setup, noise: float | None) -> Setup:
-    """The setup with other noise on the corners that a policy sees; None leaves it as it is."""
-    if noise is None:
-        return setup
-    return replace(setup, sim=replace(setup.sim, corner_noise=noise))
-
-
-def adapted(run: Run, changes: Mapping[str, Any]) -> Run:
-    """The run with other settings of its agent's play, the same weights; none leaves it as it is.
-
-    Raises:
-        ConfigError: the agent has no such choice, or a value is out of its range.
-    """
-    if not changes:
-        return run
-    if not run.setup.pairs:
-        raise ConfigError(
-            f"{', '.join(changes)}: the agent of {run.folder} has no such choice; leave it out, or "
-            "name a run of several tokens with agent.readout=pair"
-        )
-    return run.with_agent(**changes)
 
 
 class FixedTests:

@@ -13,7 +13,8 @@ from tangram_lab.experiments.plan import StudyConfig, seed_folder, test_file
 from tangram_sim.errors import ConfigError
 
 RESULT = "result.json"
-IN_FILES = {"puzzles": "source"}  # settings of a test that its file calls otherwise
+# Settings of a test that its file calls otherwise.
+IN_FILES = {"puzzles": "source", "seed": "test_seed"}
 BOUNDS = ("max_updates", "max_episodes", "max_hours")
 
 
@@ -59,8 +60,7 @@ class Job:
         """A test of the final weights, with the settings that are asked for."""
         trained = read_object(self.run_dir / RESULT)
         told = {IN_FILES.get(name, name): value for name, value in self.settings.items()}
-        wanted = {**told, "updates": trained.get("updates")}
-        return bool(content) and all(content.get(name) == wanted[name] for name in wanted)
+        return bool(content) and _says(content, {**told, "updates": trained.get("updates")})
 
     @property
     def arguments(self) -> list[str]:
@@ -84,6 +84,13 @@ class Job:
                 f"{self.run_dir} was trained with other settings ({', '.join(found)}): remove it, "
                 "or choose another run_dir"
             )
+
+
+def _says(content: object, wanted: object) -> bool:
+    """Whether a file's content has all that is wanted, and perhaps more."""
+    if isinstance(content, Mapping) and isinstance(wanted, Mapping):
+        return all(_says(content.get(name), value) for name, value in wanted.items())
+    return content == wanted
 
 
 def _trained(content: Mapping[str, Any]) -> bool:
@@ -118,13 +125,17 @@ def read_object(path: Path) -> dict[str, Any]:
 
 
 def make_jobs(
-    config: StudyConfig, resolved: Mapping[str, Mapping[str, Any]], presets: str | None = None
+    config: StudyConfig,
+    resolved: Mapping[str, Mapping[str, Any]],
+    asked: Mapping[str, Mapping[str, Any]],
+    presets: str | None = None,
 ) -> list[Job]:
     """All trainings seed by seed, each followed by its tests.
 
     Args:
         config: the study.
         resolved: the whole config of each training that is wanted.
+        asked: the settings of each test of them.
         presets: the folder of the user's own presets, where the study was given one.
     """
     jobs: list[Job] = []
@@ -134,7 +145,9 @@ def make_jobs(
             source = config.trainings[name].after
             needs = None if source is None else trainings[source]
             trainings[name] = _training(config, name, seed, needs, resolved[name], presets)
-            tests = (_test(config, trainings[name], test) for test in config.tests_of(name))
+            tests = (
+                _test(config, trainings[name], test, asked[test]) for test in config.tests_of(name)
+            )
             jobs += [trainings[name], *tests]
     return jobs
 
@@ -160,16 +173,13 @@ def _training(
     return Job(f"{name}, seed {seed}", told, run_dir, run_dir / RESULT, needs, settings)
 
 
-def _test(config: StudyConfig, training: Job, name: str) -> Job:
-    test, out = config.tests[name], test_file(training.run_dir, name)
-    settings = test.asked
-    if test.puzzles is None:
-        settings = {"episodes": config.budget.test_episodes, **settings}
+def _test(config: StudyConfig, training: Job, name: str, asked: Mapping[str, Any]) -> Job:
+    out = test_file(training.run_dir, name)
     told = (
         "eval",
         override("run_dir", str(training.run_dir)),
         override("out", str(out)),
-        *(f"{key}={value}" for key, value in settings.items()),
+        *config.test_command(name),
     )
     label = f"{training.name}, test {name}"
-    return Job(label, told, training.run_dir, out, training, settings, trains=False)
+    return Job(label, told, training.run_dir, out, training, asked, trains=False)

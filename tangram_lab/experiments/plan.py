@@ -10,12 +10,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from tangram_sim.config import MAX_CORNER_NOISE
 from tangram_sim.errors import ConfigError
 from tangram_sim.settings import Settings, check_choice, check_range, declared, setting
-from worker.config import MAX_ACTIONS
 
-FORMAT = 1
+FORMAT = 2
 Kind = Literal["curves", "complexity", "tests", "rewards", "ranking", "game"]
 KINDS: tuple[str, ...] = get_args(Kind)
 PLAN = "plan.json"
@@ -40,31 +38,17 @@ class TrainingConfig:
 
 @dataclass(frozen=True)
 class TestConfig:
-    """Settings of tangram-eval for a trained agent; None is what it was trained with."""
+    """One test of a trained agent.
+
+    Attributes:
+        label: for figures and tables.
+        overrides: of tangram-eval.
+    """
 
     __test__ = False  # pytest collects classes of this name
 
     label: str
-    actions: int | None = None
-    corner_noise: float | None = None
-    puzzles: str | None = None
-    turns: int | None = None
-    order: str | None = None
-    reapply: int | None = None
-    refine_steps: int | None = None
-    push_weight: float | None = None
-
-    @property
-    def asked(self) -> dict[str, Any]:
-        """The settings that are not as trained, by their names in tangram-eval and in its file."""
-        values = {name: value for name, value in asdict(self).items() if name != "label"}
-        return {name: value for name, value in values.items() if value is not None}
-
-    def __post_init__(self) -> None:
-        if self.actions is not None:
-            check_range("tests.actions", self.actions, 1, MAX_ACTIONS)
-        if self.corner_noise is not None:
-            check_range("tests.corner_noise", self.corner_noise, 0.0, MAX_CORNER_NOISE)
+    overrides: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -161,6 +145,13 @@ class StudyConfig(Settings):
         )
         return list({text.partition("=")[0]: text for text in said}.values())
 
+    def test_command(self, name: str) -> list[str]:
+        """Everything that tangram-eval is told; puzzles are as many as there are."""
+        overrides = self.tests[name].overrides
+        if any(text.startswith("puzzles=") for text in overrides):
+            return list(overrides)
+        return [f"episodes={self.budget.test_episodes}", *overrides]
+
     def wanted(self) -> list[str]:
         """The trainings of all experiments, those that others begin with before them."""
         names: dict[str, None] = {}
@@ -238,15 +229,21 @@ def joined_plan(path: Path, content: dict[str, Any]) -> dict[str, Any]:
     """A plan together with what earlier commands put into the same folder, their seeds too.
 
     Raises:
-        ConfigError: the folder was made with another budget, or its plan cannot be read.
+        ConfigError: the folder was made with another budget or by another version, or its plan
+            cannot be read.
     """
     if not path.exists():
         return content
     try:
         earlier = json.loads(path.read_text(encoding="utf-8"))
+        found = earlier["format"]
         known = {n: dict(earlier[n]) for n in ("budget", "experiments", "trainings", "tests")}
     except (OSError, ValueError, KeyError, TypeError):
         raise ConfigError(f"cannot read {path}: remove it, or choose another run_dir") from None
+    if found != FORMAT:
+        raise ConfigError(
+            f"{path} is of format {found}, and this version writes {FORMAT}: choose another run_dir"
+        )
     for name in ("name", "test_episodes"):
         earlier, now = known["budget"].get(name), content["budget"][name]
         if earlier != now:

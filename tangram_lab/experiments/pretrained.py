@@ -81,11 +81,10 @@ def publish(
     chosen = median(seeds)
     weights = _weights(chosen.run)
     config = EvalConfig(str(chosen.run.folder), episodes=tests, seed=TEST_SEED)
-    setup = chosen.run.setup
-    scores = score_policies(setup, policies(chosen.run, setup), config)
+    scores = score_policies(chosen.run.setup, policies(chosen.run), config)
     card = make_card(name, chosen.run.setup, chosen.result, [one.result for one in seeds], scores)
     card |= {"tests": {"episodes": tests, "seed": TEST_SEED, "scores": scores}}
-    if has_all_tans(setup.layout):
+    if has_all_tans(chosen.run.setup.layout):
         card |= {"puzzles": {split: _on_figures(chosen.run, split) for split in FIGURES}}
     card |= {"sha256": hashlib.sha256(weights).hexdigest()}
     folder = target / name

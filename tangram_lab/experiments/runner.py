@@ -135,13 +135,17 @@ INTERRUPT_STATUS = 130
 
 
 def run_study(
-    config: StudyConfig, resolved: Mapping[str, Mapping[str, Any]], presets: str | None
+    config: StudyConfig,
+    resolved: Mapping[str, Mapping[str, Any]],
+    asked: Mapping[str, Mapping[str, Any]],
+    presets: str | None,
 ) -> int:
     """Do everything that is missing.
 
     Args:
         config: the study.
         resolved: the whole config of each training that is wanted.
+        asked: the settings of each test of them.
         presets: the folder of the user's own presets, None where there is none.
 
     Returns:
@@ -150,7 +154,7 @@ def run_study(
     Raises:
         ConfigError: the folder holds trainings with other settings or budget, or is in use.
     """
-    study, jobs = RunFolder(config.run_dir), make_jobs(config, resolved, presets)
+    study, jobs = RunFolder(config.run_dir), make_jobs(config, resolved, asked, presets)
     for job in jobs:
         job.check()
     plan = joined_plan(study.path / PLAN, plan_content(config, _source()))

@@ -8,8 +8,8 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from tangram_agent.arrays import EpisodeSpec
-from tangram_agent.messages import EpisodeBatch, Hello, Scores
+from tangram_agent.arrays import EpisodeSpec, join_frames
+from tangram_agent.messages import EpisodeBatch, Hello, Scores, WeightsMessage
 from tangram_agent.types import Episodes, Weights
 from tests.agent.builders import PAIR, random_episodes, setup
 
@@ -30,6 +30,11 @@ def batch(sequence: int = 1, count: int = 3) -> EpisodeBatch:
 
 def weights(version: int = 5, value: float = 0.5) -> Weights:
     return Weights(version, {n: np.full(s, value, np.float32) for n, s in SHAPES.items()})
+
+
+def broadcast(sent: Weights, epoch: str = "e") -> bytes:
+    """Weights as one frame, because a CONFLATE socket keeps only the last frame of a message."""
+    return join_frames(WeightsMessage(epoch, sent).encode())
 
 
 def scores(count: int = 2) -> Scores:

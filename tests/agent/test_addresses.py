@@ -22,15 +22,9 @@ def test_a_wildcard_becomes_a_host(address: str, host: str, seen: str) -> None:
     assert reachable(address, host) == seen
 
 
-@pytest.mark.parametrize(
-    ("address", "host"),
-    [
-        ("tcp://10.0.0.1:5", "10.0.0.1"),
-        ("tcp://[fe80::1]:5", "[fe80::1]"),
-        ("http://a.b:80", "a.b"),
-    ],
-)
-def test_hosts(address: str, host: str) -> None:
+@pytest.mark.parametrize("host", ["10.0.0.1", "[fe80::1]", "a.b"])
+def test_hosts(host: str) -> None:
+    address = f"tcp://{host}:5"
     assert host_of(address) == host
-    assert with_host(address, "x").count("x") == 1
+    assert with_host(address, "x") == "tcp://x:5"
     assert with_host(address, host) == address

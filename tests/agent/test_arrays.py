@@ -1,6 +1,7 @@
 """Arrays and weights on the wire: exact sizes, bounds on every value, names of what is wrong."""
 
-from dataclasses import fields, replace
+import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -43,30 +44,21 @@ def decode_episodes(frames: list[bytes], count: int, spec: EpisodeSpec) -> Episo
 
 
 def same(left: Episodes, right: Episodes) -> bool:
-    return all(
-        np.array_equal(getattr(left, f.name), getattr(right, f.name)) for f in fields(Episodes)
-    )
+    return all(np.array_equal(vars(left)[name], vars(right)[name]) for name in NAMES)
 
 
 @st.composite
 def tasks(draw: st.DrawFn) -> tuple[EpisodeSpec, Episodes]:
     """A task and episodes within its bounds."""
-    size = st.integers(1, 4)
-    spec = EpisodeSpec(draw(size), draw(size), draw(size), draw(size), draw(st.floats(0.5, 100)))
-    count = draw(st.integers(1, 3))
-
-    def array(dtype: type[Any], shape: tuple[int, ...], bound: float) -> Any:
-        if dtype is np.uint8:
-            return draw(hnp.arrays(dtype, shape, elements=st.integers(0, 1)))
-        limit = float(np.float32(bound))
-        return draw(hnp.arrays(dtype, shape, elements=st.floats(-limit, limit, width=32)))
-
-    columns = {c.name: c for c in spec.columns(count)}
-    bounds = {"corners": spec.bound, "goals": spec.bound, "actions": 1.0, "rewards": MAX_REWARD}
-    arrays = {
-        name: array(np.uint8 if name == "placed" else np.float32, c.shape, bounds.get(name, 1.0))
-        for name, c in columns.items()
-    }
+    sizes = [draw(st.integers(1, 4)) for _ in range(4)]
+    spec, count = EpisodeSpec(*sizes, draw(st.floats(0.5, 100))), draw(st.integers(1, 3))
+    bounds = {"actions": 1.0, "rewards": MAX_REWARD}
+    arrays = {}
+    for column in spec.columns(count):
+        limit = float(np.float32(bounds.get(column.name, spec.bound)))
+        flags, numbers = st.integers(0, 1), st.floats(-limit, limit, width=32)
+        kind = (np.uint8, flags) if column.name == "placed" else (np.float32, numbers)
+        arrays[column.name] = draw(hnp.arrays(kind[0], column.shape, elements=kind[1]))
     return spec, Episodes(**arrays)
 
 
@@ -75,13 +67,7 @@ def test_episodes_come_back_as_they_were_sent(task: tuple[EpisodeSpec, Episodes]
     spec, sent = task
     received = decode_episodes(encode_episodes(sent, spec), sent.count, spec)
     assert same(sent, received)
-    assert [getattr(received, name).dtype for name in NAMES] == [
-        np.float32,
-        np.uint8,
-        np.float32,
-        np.float32,
-        np.float32,
-    ]
+    assert [vars(received)[name].dtype.str for name in NAMES] == ["<f4", "|u1", *["<f4"] * 3]
 
 
 def test_frames_are_raw_little_endian_bytes_in_the_order_of_the_fields() -> None:
@@ -93,9 +79,7 @@ def test_frames_are_raw_little_endian_bytes_in_the_order_of_the_fields() -> None
 
 def test_decoding_copies_nothing() -> None:
     frames = encode_episodes(episodes(2), SPEC)
-    received = decode_episodes(frames, 2, SPEC)
-    for name, frame in zip(NAMES, frames, strict=True):
-        array = getattr(received, name)
+    for array, frame in zip(vars(decode_episodes(frames, 2, SPEC)).values(), frames, strict=True):
         assert np.shares_memory(array, np.frombuffer(frame, np.uint8))
         assert not array.flags.writeable
 
@@ -104,6 +88,9 @@ def test_other_memory_orders_and_dtypes_are_sent_as_what_they_mean() -> None:
     sent = episodes(2)
     odd = replace(sent, corners=np.asfortranarray(sent.corners.astype(np.float64)))
     assert encode_episodes(odd, SPEC) == encode_episodes(sent, SPEC)
+    matrix = np.arange(6, dtype=np.float32).reshape(2, 3)
+    received = decode_tensors(encode_tensors({"a": matrix.T}), {"a": (3, 2)})
+    assert np.array_equal(received["a"], matrix.T)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -113,12 +100,9 @@ def test_each_frame_has_its_exact_size(name: str, change: int | None) -> None:
     number = NAMES.index(name)
     size = len(frames[number])
     frames[number] = b"" if change is None else (frames[number] + b"\0")[: size + change]
-    with pytest.raises(WireError) as caught:
+    told = f"{name} must have {size} bytes for the shape {SPEC.columns(2)[number].shape}, got "
+    with pytest.raises(WireError, match=f"^{re.escape(told)}{len(frames[number])}$"):
         decode_episodes(frames, 2, SPEC)
-    shape = SPEC.columns(2)[number].shape
-    assert str(caught.value) == (
-        f"{name} must have {size} bytes for the shape {shape}, got {len(frames[number])}"
-    )
 
 
 @pytest.mark.parametrize("frames", [[], [b""] * 4, [b""] * 6])
@@ -127,24 +111,14 @@ def test_there_is_one_frame_for_each_array(frames: list[bytes]) -> None:
         decode_episodes(frames, 2, SPEC)
 
 
-BAD_VALUES = [
-    ("corners", NAN, "corners holds nan at [1, 0, 0, 0], must be finite and between -4 and 4"),
-    ("corners", INF, "corners holds inf at [1, 0, 0, 0], must be finite and between -4 and 4"),
-    ("corners", -INF, "corners holds -inf at [1, 0, 0, 0], must be finite and between -4 and 4"),
-    ("corners", 4.001, "corners holds 4.001 at [1, 0, 0, 0], must be finite and between -4 and 4"),
-    ("corners", -4.001, "corners holds -4.001 at [1, 0, 0, 0], must be finite and between -4 an"),
-    ("goals", NAN, "goals holds nan at [1, 0, 0], must be finite and between -4 and 4"),
-    ("goals", 4.001, "goals holds 4.001 at [1, 0, 0], must be finite and between -4 and 4"),
-    ("placed", 2, "placed holds 2 at [1, 0, 0], must be finite and between 0 and 1"),
-    ("placed", 255, "placed holds 255 at [1, 0, 0], must be finite and between 0 and 1"),
-    ("actions", NAN, "actions holds nan at [1, 0, 0], must be finite and between -1 and 1"),
-    ("actions", 1.00001, "actions holds 1.00001 at [1, 0, 0], must be finite and between -1 and"),
-    ("actions", -1.00001, "actions holds -1.00001 at [1, 0, 0], must be finite and between -1 a"),
-    ("rewards", NAN, "rewards holds nan at [1, 0], must be finite and between -1e+06 and 1e+06"),
-    ("rewards", INF, "rewards holds inf at [1, 0], must be finite and between -1e+06 and 1e+06"),
-    ("rewards", 1.1e6, "rewards holds 1.1e+06 at [1, 0], must be finite and between -1e+06 and "),
-    ("rewards", -1.1e6, "rewards holds -1.1e+06 at [1, 0], must be finite and between -1e+06 an"),
-]
+BOUNDED: dict[str, tuple[str, str, list[float]]] = {
+    "corners": ("[1, 0, 0, 0]", "-4 and 4", [NAN, INF, -INF, 4.001, -4.001]),
+    "goals": ("[1, 0, 0]", "-4 and 4", [NAN, 4.001]),
+    "placed": ("[1, 0, 0]", "0 and 1", [2, 255]),
+    "actions": ("[1, 0, 0]", "-1 and 1", [NAN, 1.00001, -1.00001]),
+    "rewards": ("[1, 0]", "-1e+06 and 1e+06", [NAN, INF, 1.1e6, -1.1e6]),
+}
+BAD_VALUES = [(name, value) for name, (*_, values) in BOUNDED.items() for value in values]
 
 
 def spoiled(name: str, value: float) -> Episodes:
@@ -154,16 +128,14 @@ def spoiled(name: str, value: float) -> Episodes:
     return replace(sent, **{name: array})
 
 
-@pytest.mark.parametrize(("name", "value", "reason"), BAD_VALUES)
-def test_values_out_of_bounds_are_named(name: str, value: float, reason: str) -> None:
-    bad = spoiled(name, value)
-    frames = [getattr(bad, n).tobytes() for n in NAMES]
-    with pytest.raises(WireError) as caught:
-        decode_episodes(frames, 2, SPEC)
-    assert str(caught.value).startswith(reason)
-    with pytest.raises(WireError) as caught:
+@pytest.mark.parametrize(("name", "value"), BAD_VALUES)
+def test_values_out_of_bounds_are_named(name: str, value: float) -> None:
+    bad, (place, bounds, _) = spoiled(name, value), BOUNDED[name]
+    told = f"{name} holds {value:g} at {place}, must be finite and between {bounds}"
+    with pytest.raises(WireError, match=f"^{re.escape(told)}"):
+        decode_episodes([vars(bad)[n].tobytes() for n in NAMES], 2, SPEC)
+    with pytest.raises(WireError, match=f"^{re.escape(told)}"):
         encode_episodes(bad, SPEC)
-    assert str(caught.value).startswith(reason)
 
 
 @pytest.mark.parametrize(
@@ -186,15 +158,12 @@ def test_a_batch_holds_a_bounded_number_of_episodes() -> None:
     bytes_each = 4 * (1601 * 128 + 1600 * 5 + 128) + 1601 * 16
     assert long.max_count == MAX_BATCH_BYTES // bytes_each
     long.check_batch_size(long.max_count)
-    with pytest.raises(ConfigError) as caught:
-        long.check_batch_size(long.max_count + 1)
-    assert str(caught.value) == (
+    message = (
         "39 episodes of 1600 steps with 64 corners are too many for one message, at most 38: "
         "lower service.batch_episodes or sim.actions_per_token"
     )
-
-
-def test_a_task_of_which_no_episode_fits_is_refused() -> None:
+    with pytest.raises(ConfigError, match=f"^{message}$"):
+        long.check_batch_size(long.max_count + 1)
     with pytest.raises(ConfigError, match=r"1 episodes of 100000 steps .* at most 0: lower"):
         EpisodeSpec(16, 64, 100_000, 4, BOUND)
 
@@ -259,16 +228,12 @@ def entry(text: bytes) -> bytes:
         (tensor_frame(scale=np.array(NAN, np.float32)), "'scale' is not finite"),
         (tensor_frame(scale=np.array(INF, np.float32)), "'scale' is not finite"),
         (entry(b'"dtype":"BF16","shape":[2]'), "not safetensors: 'BF16'"),
-        (
-            entry(b'"dtype":"F32","shape":%s' % str([1] * 70).encode()),
-            "not safetensors: maximum supported dimension for an ndarray is",
-        ),
+        (entry(b'"dtype":"F32","shape":%s' % str([1] * 70).encode()), "not safetensors: maximum "),
     ],
 )
 def test_wrong_tensors_are_refused(frame: bytes, reason: str) -> None:
-    with pytest.raises(WireError) as caught:
+    with pytest.raises(WireError, match=f"^{re.escape(f'weights: {reason}')}"):
         decode_tensors(frame, SHAPES)
-    assert str(caught.value).startswith(f"weights: {reason}")
 
 
 def test_tensors_of_any_shape_pass_where_none_is_expected() -> None:
@@ -278,23 +243,14 @@ def test_tensors_of_any_shape_pass_where_none_is_expected() -> None:
 
 
 @pytest.mark.parametrize("value", [NAN, INF, -INF])
-def test_tensors_that_are_not_finite_are_not_sent(value: float) -> None:
+def test_tensors_that_are_not_finite_or_too_large_to_be_received_are_not_sent(value: float) -> None:
     bad = weights().tensors
     bad["actor.bias"][1] = value
     with pytest.raises(WireError, match=r"weights: 'actor.bias' is not finite"):
         encode_tensors(bad)
-
-
-def test_weights_too_large_to_be_received_are_not_sent() -> None:
     large = {"a": np.zeros(MAX_WEIGHTS_BYTES // 4, np.float32)}
     with pytest.raises(WireError, match=r"weights: .* bytes, at most .*: choose a smaller net"):
         encode_tensors(large)
-
-
-def test_transposed_tensors_are_sent_as_what_they_mean() -> None:
-    matrix = np.arange(6, dtype=np.float32).reshape(2, 3)
-    received = decode_tensors(encode_tensors({"a": matrix.T}), {"a": (3, 2)})
-    assert np.array_equal(received["a"], matrix.T)
 
 
 @given(st.binary(max_size=300))

@@ -34,12 +34,9 @@ def at(index: int, pose: Any, flipped: bool = False) -> Lying:
     return Lying(np.array([index]), np.array([pose], np.float64), np.array([flipped]))
 
 
-def test_areas_are_those_of_the_game() -> None:
-    np.testing.assert_allclose(LAYOUT.areas, AREAS)
-
-
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_single_outlines_are_the_layouts_corners(seed: int) -> None:
+    np.testing.assert_allclose(LAYOUT.areas, AREAS)
     poses, sides = random_scene(LAYOUT, np.random.default_rng(seed))
     found = Lying(np.arange(7), poses, sides).outlines(LAYOUT)
     for outline, expected in zip(found, polygons(LAYOUT.corners(poses, sides)), strict=True):
@@ -47,7 +44,7 @@ def test_single_outlines_are_the_layouts_corners(seed: int) -> None:
         assert Polygon(outline).exterior.is_ccw
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_what_lies_is_found_in_corners(seed: int) -> None:
     poses, sides = random_scene(LAYOUT, np.random.default_rng(seed), 3)
     rows, index = np.array([0, 2, 1, 2]), np.array([PARALLELOGRAM, SQUARE, LARGE, PARALLELOGRAM])
@@ -57,7 +54,7 @@ def test_what_lies_is_found_in_corners(seed: int) -> None:
     np.testing.assert_array_equal(found.index, index)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_covering_shares_and_worths_against_shapely(seed: int) -> None:
     rng = np.random.default_rng(seed)
     (poses, sides), (goals, goal_sides) = (random_scene(LAYOUT, rng, 2) for _ in range(2))
@@ -93,17 +90,15 @@ def test_the_share_of_tokens_that_do_not_overlap_is_that_of_their_union() -> Non
     np.testing.assert_allclose(covered_share(found, LAYOUT)[0] + own, [expected] * 7, atol=1e-9)
 
 
-def test_tokens_on_top_of_each_other_cover_no_more_than_the_piece() -> None:
-    poses = np.tile([0.1, 0.2, 0.3], (7, 1))
-    corners = LAYOUT.corners(poses)[None]
-    share = covered_share(covering(corners, corners, LAYOUT), LAYOUT)
-    assert share.max() == 1.0
-
-
-def test_a_token_that_is_to_move_covers_nothing_for_itself() -> None:
-    corners = LAYOUT.corners(np.column_stack([np.arange(7) - 3.0, np.zeros((7, 2))]))[None]
-    share = covered_share(covering(corners, corners, LAYOUT), LAYOUT)[0]
-    np.testing.assert_allclose(share, 1.0 - np.eye(7), atol=1e-9)
+def test_a_piece_is_covered_once_and_by_others_than_the_token_that_is_to_move() -> None:
+    heap, row = np.tile([0.1, 0.2, 0.3], (7, 1)), np.zeros((7, 3))
+    row[:, 0] = np.arange(7) - 3.0
+    for poses, expected in ((heap, None), (row, 1.0 - np.eye(7))):
+        corners = LAYOUT.corners(poses)[None]
+        share = covered_share(covering(corners, corners, LAYOUT), LAYOUT)[0]
+        assert share.max() == pytest.approx(1.0, abs=1e-9)
+        if expected is not None:
+            np.testing.assert_allclose(share, expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("noise", [0.01, 0.1, 0.4])
@@ -157,16 +152,11 @@ def test_a_square_beside_its_piece(shift: tuple[float, float], expected: float) 
 
 def test_the_other_side_of_a_parallelogram_is_another_shape() -> None:
     upright, over = at(PARALLELOGRAM, (0, 0, 0.3)), at(PARALLELOGRAM, (0, 0, 0.3), flipped=True)
-    expected = (
-        Polygon(upright.outlines(LAYOUT)[0]).intersection(Polygon(over.outlines(LAYOUT)[0])).area
-    )
-    for own, wanted, value in (
-        (upright, upright, 1.0),
-        (over, over, 1.0),
-        (upright, over, expected / AREAS[PARALLELOGRAM]),
-    ):
+    one, other = (Polygon(lying.outlines(LAYOUT)[0]) for lying in (upright, over))
+    crossed = one.intersection(other).area / AREAS[PARALLELOGRAM]
+    assert crossed < 0.9
+    for own, wanted, value in ((upright, upright, 1), (over, over, 1), (upright, over, crossed)):
         assert newly_covered(own, wanted, np.zeros(1), LAYOUT)[0] == pytest.approx(value)
-    assert expected < 0.9 * AREAS[PARALLELOGRAM]
 
 
 def test_values_against_shapely_stay_between_0_and_1() -> None:

@@ -1,6 +1,7 @@
 """Messages: each comes back as it was sent, and each field that is wrong is named."""
 
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
 from typing import Any
@@ -37,7 +38,6 @@ from tangram_agent.messages import (
     decode_from_master,
     decode_from_worker,
     decode_weights,
-    encode_weights,
 )
 from tangram_agent.schema import (
     PROTOCOL,
@@ -58,6 +58,7 @@ from tests.agent.messages import (
     SHAPES,
     SPEC,
     batch,
+    broadcast,
     episodes,
     hello,
     scores,
@@ -180,15 +181,12 @@ def wrong(bound: Bound) -> list[Any]:
         case Flag():
             return [0, "yes"]
         case Text(longest, choices, needed):
-            return (
-                [1, {}, "x" * (longest + 1) if longest < 1024 else 2.0]
-                + (["spy"] if choices else []) * bool(choices)
-                + [""] * needed
-            )
+            long = "x" * (longest + 1) if longest < 1024 else 2.0
+            return [1, {}, long, *["spy"] * bool(choices), *[""] * needed]
         case Numbers():
             return [1, "x", {"a": NAN}, {"a": 2e18}, {"a": "1"}, {"a": True}, {"A": 1.0}]
         case Texts(longest):
-            return [1, {"a": 1}, {"A": "x"}] + [{"a": "x" * (longest + 1)}] * (longest < 1024)
+            return [1, {"a": 1}, {"A": "x"}, *[{"a": "x" * (longest + 1)}] * (longest < 1024)]
     raise AssertionError(bound)
 
 
@@ -216,14 +214,10 @@ def test_a_field_or_a_frame_too_many_or_another_kind_is_refused(kind: str) -> No
     with pytest.raises(ProtocolError, match=f"speaks protocol {PROTOCOL + 1}, this one"):
         decode(with_header(frames, v=PROTOCOL + 1), kind)
     for name in ("other", "\x1b[0m"):
-        with pytest.raises(WireError) as caught:
+        with pytest.raises(WireError, match=f"^{re.escape(f'unknown kind of message {name!r}')}$"):
             decode(with_header(frames, kind=name), kind)
-        assert str(caught.value) == f"unknown kind of message {name!r}"
-    other: Callable[..., Message] = (
-        decode_from_master if kind in by_kind(ToMaster) else decode_from_worker
-    )
     with pytest.raises(WireError, match=f"unknown kind of message '{kind}'"):
-        other(frames, SPEC)
+        decode(frames, "welcome" if kind in by_kind(ToMaster) else "hello")
 
 
 words = st.text("abc_./9", min_size=1, max_size=64)
@@ -238,11 +232,9 @@ def values_of(bound: Bound) -> st.SearchStrategy[Any]:
             return st.booleans()
         case Text(longest, choices, needed, cut):
             # Lone surrogates cannot be encoded; no text of ours holds them but reasons.
-            text = st.text(
-                st.characters(exclude_categories=() if cut else ["Cs"]), max_size=longest
-            )
-            kept = text.filter(lambda t: bool(t) or not needed)
-            return st.sampled_from(sorted(choices)) if choices else kept.map(lambda t: t[:200])
+            letters = st.characters(exclude_categories=() if cut else ["Cs"])
+            text = st.text(letters, min_size=int(needed), max_size=min(longest, 200))
+            return st.sampled_from(sorted(choices)) if choices else text
         case Numbers():
             return st.dictionaries(words, st.floats(-1e18, 1e18), max_size=5)
         case Texts():
@@ -268,9 +260,8 @@ def test_batches_come_back_as_they_were_sent(
     received = decode_from_worker(sent.encode(SPEC), SPEC)
     assert isinstance(received, EpisodeBatch)
     assert (received.sequence, received.weights_version) == (sequence, version)
-    for field in fields(Episodes):
-        left, right = getattr(received.episodes, field.name), getattr(sent.episodes, field.name)
-        np.testing.assert_array_equal(left, right)
+    for name, array in vars(sent.episodes).items():
+        np.testing.assert_array_equal(vars(received.episodes)[name], array)
 
 
 @given(st.integers(0, MAX_PICTURES), values_of(Numbers()), st.integers(-1, BIG))
@@ -286,7 +277,7 @@ def test_scores_come_back_as_they_were_sent(
         np.testing.assert_array_equal(getattr(received, name), getattr(sent, name))
 
 
-@pytest.mark.parametrize("rows", [0, 1, 3])
+@pytest.mark.parametrize("rows", [0, 3])
 def test_a_status_comes_back_as_it_was_sent(rows: int) -> None:
     sent = status(rows)
     found = decode_from_master(sent.encode(), None)
@@ -319,7 +310,7 @@ def test_weights_come_back_as_they_were_sent(sent: dict[str, float], version: in
     """As one frame for all, and as a message to one who asked."""
     tensors = {name: np.full((2, 1), value, np.float32) for name, value in sent.items()}
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(sent, (2, 1))
-    epoch, received = decode_weights(encode_weights("e", Weights(version, tensors)), shapes)
+    epoch, received = decode_weights(broadcast(Weights(version, tensors)), shapes)
     message = decode_from_master(WeightsMessage("e", received).encode(), shapes)
     assert isinstance(message, WeightsMessage)
     assert (epoch, message.epoch, message.weights.version) == ("e", "e", version)
@@ -330,8 +321,8 @@ def test_weights_come_back_as_they_were_sent(sent: dict[str, float], version: in
     ("frame", "reason"),
     [
         (b"", "the message is empty"),
-        (encode_weights("e", weights())[:-1], "frame 2 of joined frames is cut short"),
-        (encode_weights("e", weights(value=1.0))[:-1] + b"\xff", "the message is damaged: its"),
+        (broadcast(weights())[:-1], "frame 2 of joined frames is cut short"),
+        (broadcast(weights(value=1.0))[:-1] + b"\xff", "the message is damaged: its"),
     ],
 )
 def test_a_broadcast_that_is_no_weights_is_refused(frame: bytes, reason: str) -> None:
@@ -339,32 +330,40 @@ def test_a_broadcast_that_is_no_weights_is_refused(frame: bytes, reason: str) ->
         decode_weights(frame, SHAPES)
 
 
+def with_last(frames: list[bytes], number: int, value: float) -> list[bytes]:
+    """The same message with another value at the end of an array."""
+    array = np.frombuffer(frames[number], "<f4").copy()
+    array[-1] = value
+    return with_checksum([*frames[:number], array.tobytes(), *frames[number + 1 :]])
+
+
+EPISODES, SCORES, STATUS = (EXAMPLES[kind] for kind in ("episodes", "scores", "status"))
+
+
 @pytest.mark.parametrize(
     ("frames", "reason"),
     [
+        (with_header(EPISODES, count=2), "corners must have 560 bytes for the shape (2, 5, 7, 2)"),
+        (with_checksum(EPISODES[:-1]), "there must be 5 array frames, got 4"),
         (
-            with_header(batch(9).encode(SPEC), count=2),
-            "corners must have 560 bytes for the shape (2, 5, 7, 2), got 840",
-        ),
-        (with_checksum(batch(9).encode(SPEC)[:-1]), "there must be 5 array frames, got 4"),
-        (
-            with_header(scores().encode(SPEC), count=1),
+            with_header(SCORES, count=1),
             "starts must have 56 bytes for the shape (1, 7, 2), got 112",
         ),
-        (with_header(status().encode(), count=4), "workers must have 288 bytes for the shape (4, "),
+        (with_last(SCORES, 1, NAN), "starts holds nan at [1, 6, 1]"),
+        (with_last(SCORES, 2, 4.5), "ends holds 4.5 at [1, 6, 1]"),
+        (with_last(SCORES, 3, -4.5), "goals holds -4.5 at [1, 6, 1]"),
+        (with_header(STATUS, count=4), "workers must have 288 bytes for the shape (4, "),
         (
-            with_checksum([status().encode()[0], b"\xff" * 8 * 3 * COLUMNS]),
-            "workers holds nan at [0, 0], must be finite and between -1 and 1e+18",
+            with_checksum([STATUS[0], b"\xff" * 8 * 3 * COLUMNS]),
+            "workers holds nan at [0, 0], must",
         ),
     ],
 )
 def test_arrays_that_are_not_what_their_header_says_are_refused(
     frames: list[bytes], reason: str
 ) -> None:
-    kind = "status" if "workers" in reason else "episodes"
-    with pytest.raises(WireError) as caught:
-        decode(frames, kind)
-    assert str(caught.value).startswith(reason)
+    with pytest.raises(WireError, match=f"^{re.escape(reason)}") as caught:
+        decode(frames, "status" if "workers" in reason else "episodes")
     if isinstance(caught.value, BatchError):
         assert caught.value.sequence == 9
 
@@ -374,18 +373,6 @@ def test_a_batch_without_a_number_is_no_batch(sequence: object) -> None:
     with pytest.raises(WireError, match=r"episodes: .*sequence") as caught:
         decode_from_worker(with_header(batch().encode(SPEC), sequence=sequence), SPEC)
     assert not isinstance(caught.value, BatchError)
-
-
-@pytest.mark.parametrize(
-    ("number", "name", "value"), [(1, "starts", NAN), (2, "ends", 4.5), (3, "goals", -4.5)]
-)
-def test_pictures_out_of_bounds_are_refused(number: int, name: str, value: float) -> None:
-    frames = scores().encode(SPEC)
-    array = np.frombuffer(frames[number], "<f4").copy()
-    array[-1] = value
-    frames[number] = array.tobytes()
-    with pytest.raises(WireError, match=rf"{name} holds {value:g} at \[1, 6, 1\]"):
-        decode_from_worker(with_checksum(frames), SPEC)
 
 
 def test_what_a_receiver_would_refuse_is_not_sent() -> None:
@@ -404,7 +391,7 @@ def test_what_a_receiver_would_refuse_is_not_sent() -> None:
     with pytest.raises(WireError, match=f"alive: version {INTEGER} -1 and {BIG}, got -2"):
         Alive(-2).encode()
     with pytest.raises(WireError, match=f"weights: version {INTEGER} 0 and {BIG}, got -1"):
-        encode_weights("e", weights(version=-1))
+        broadcast(weights(version=-1))
 
 
 @pytest.mark.parametrize("kind", [Bye, Refused, Stop])

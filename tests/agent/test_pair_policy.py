@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 
 from tangram_agent.learner import Learner
-from tangram_agent.messages import decode_weights, encode_weights
+from tangram_agent.messages import decode_weights
 from tangram_agent.policy import Policy
 from tangram_agent.runs import Run
 from tangram_agent.setup import Setup
 from tangram_agent.types import Transitions
 from tangram_sim.actions import chosen_tokens, flips, velocities
 from tangram_sim.batch import BatchedEnv
-from tangram_sim.errors import ConfigError, RunError
+from tangram_sim.errors import ConfigError
 from tests.agent.builders import PAPER, SMALL, setup
+from tests.agent.messages import broadcast
 from tests.agent.pair_scenes import PERCEPTRON, TWO, seven, transitions
 
 pytestmark = pytest.mark.fast
@@ -47,7 +48,7 @@ def test_weights_travel_to_workers(net: dict[str, Any], sim: dict[str, Any]) -> 
     weights = Learner(made, 0).acting_weights(7)
     policy = Policy(made)
     assert {name: tensor.shape for name, tensor in weights.tensors.items()} == policy.shapes
-    epoch, arrived = decode_weights(encode_weights("run", weights), policy.shapes)
+    epoch, arrived = decode_weights(broadcast(weights, "run"), policy.shapes)
     policy.load(arrived)
     assert (epoch, policy.version) == ("run", 7)
     for name, tensor in policy.weights().tensors.items():
@@ -161,7 +162,7 @@ def run_of(made: Setup) -> Run:
 def test_a_run_plays_on_with_other_settings_of_the_agent() -> None:
     run = run_of(seven({}, PERCEPTRON))
     scene = scene_of(transitions(run.setup, 8))
-    other = run.with_agent(refine_steps=20, order="listed")
+    other = run.with_settings({"agent": {"refine_steps": 20, "order": "listed"}})
     assert (other.setup.agent.refine_steps, run.setup.agent.refine_steps) == (20, 0)
     assert other.policy.version == 7
     left = [int(np.argmin(flags)) for flags in scene[1]]
@@ -170,11 +171,33 @@ def test_a_run_plays_on_with_other_settings_of_the_agent() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "error"),
-    [({"order": "x"}, ConfigError), ({"readout": "token", "reapply": 2}, RunError)],
+    ("section", "name", "value", "reason"),
+    [
+        ("agent", "order", "x", "run with agent.order=x: agent.order must be one of learned,"),
+        ("agent", "order", 1, "wrong config: .*agent.order"),
+        ("agent", "odd", 1, "wrong config: .*odd"),
+        ("agent", "batch_size", 9, "agent.batch_size=9 changes nothing with a trained run, which"),
+        ("sim", "stages", (), "changes nothing with a trained run, which only plays: leave it out"),
+        ("agent", "readout", "token", "agent.readout=token does not fit this run, whose weights"),
+        ("sim", "arena", 3.0, "trained with sim.arena=2: leave it out, or train a run with it"),
+        (
+            "sim",
+            "motion",
+            "slide",
+            "run with sim.motion=slide: sim.motion=slide needs the engine's",
+        ),
+    ],
 )
-def test_settings_that_the_weights_do_not_fit_are_refused(
-    changes: dict[str, Any], error: type[Exception]
+def test_settings_that_a_trained_run_cannot_play_with_are_refused(
+    section: str, name: str, value: Any, reason: str
 ) -> None:
-    with pytest.raises(error):
-        run_of(seven({}, PERCEPTRON)).with_agent(**changes)
+    with pytest.raises(ConfigError, match=reason):
+        run_of(seven({}, PERCEPTRON)).with_settings({section: {name: value}})
+
+
+def test_settings_of_the_world_are_those_that_are_played_in() -> None:
+    run = run_of(seven({}, PERCEPTRON))
+    other = run.with_settings({"sim": {"allow_flip": True, "corner_noise": 0.01}})
+    assert (other.setup.sim.allow_flip, other.setup.sim.corner_noise) == (True, 0.01)
+    assert other.policy.act(*scene_of(transitions(other.setup, 8))).shape == (8, 5)
+    assert run.with_settings({"sim": {}}) is run

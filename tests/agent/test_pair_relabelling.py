@@ -1,6 +1,7 @@
 """Pairs out of transitions: which goals they have, and that their labels are exact."""
 
 from dataclasses import replace
+from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -8,9 +9,9 @@ import pytest
 
 from tangram_agent.coverage import Lying, covered_share, covering, newly_covered
 from tangram_agent.relabelling import PairBatch, make_pairs, with_contacts
-from tangram_agent.setup import Setup
 from tangram_agent.types import Transitions
 from tangram_sim.actions import chosen_tokens
+from tangram_sim.layout import Layout
 from tests.agent.builders import setup
 from tests.agent.pair_scenes import seven, transitions
 
@@ -24,23 +25,23 @@ COUNT, PAIRS = 100, 8
 PARALLELOGRAM = 6
 
 
-def made_pairs(hindsight: list[dict[str, Any]], seed: int = 0) -> PairBatch:
-    made = seven({"hindsight": hindsight, "pairs_per_transition": PAIRS})
-    batch = transitions(made, COUNT)
-    return make_pairs(batch, made, np.random.default_rng(seed))
-
-
 MADE = seven()
 LAYOUT = MADE.layout
 BATCH = transitions(MADE, COUNT)
+EXACT = {name: column.astype(np.float64) for name, column in vars(BATCH).items()}
 ROWS = np.repeat(np.arange(COUNT), PAIRS)
 NAMES = np.array([shape.name for shape in LAYOUT.shapes])
 SYMMETRY = np.array([shape.symmetry for shape in LAYOUT.shapes])
 
 
+def made_pairs(hindsight: list[dict[str, Any]], seed: int = 0) -> PairBatch:
+    made = seven({"hindsight": hindsight, "pairs_per_transition": PAIRS})
+    return make_pairs(BATCH, made, np.random.default_rng(seed))
+
+
 def is_played(pairs: PairBatch) -> np.ndarray:
     """Which pairs have the piece of the goal that was played."""
-    goals = LAYOUT.poses(BATCH.goal.astype(np.float64))[ROWS, pairs.piece]
+    goals = LAYOUT.poses(EXACT["goal"])[ROWS, pairs.piece]
     played: np.ndarray = np.isclose(goals, pairs.goal).all(axis=1)
     return played
 
@@ -52,17 +53,23 @@ def turn_gap(pairs: PairBatch) -> np.ndarray:
     return gap
 
 
+def check_ends(pairs: PairBatch, layout: Layout, batch: Transitions, token: Any) -> None:
+    """Poses and sides before and after the action are those of the token that moved."""
+    rows = np.repeat(np.arange(COUNT), len(pairs.token) // COUNT)
+    for name, corners in (("before", batch.state), ("after", batch.next_state)):
+        exact = corners.astype(np.float64)
+        np.testing.assert_allclose(vars(pairs)[name], layout.poses(exact)[rows, token])
+        sides = layout.flipped(exact)[rows, token]
+        np.testing.assert_array_equal(vars(pairs)[f"{name}_flipped"], sides)
+
+
 def test_the_token_that_moved_before_and_after() -> None:
     pairs = made_pairs([FINAL])
-    token = chosen_tokens(BATCH.action.astype(np.float64), 7)[ROWS]
+    token = chosen_tokens(EXACT["action"], 7)[ROWS]
     np.testing.assert_array_equal(pairs.token, token)
-    for name, corners in (("before", BATCH.state), ("after", BATCH.next_state)):
-        exact = corners.astype(np.float64)
-        found = vars(pairs)
-        np.testing.assert_allclose(found[name], LAYOUT.poses(exact)[ROWS, token])
-        sides = LAYOUT.flipped(exact)[ROWS, token]
-        np.testing.assert_array_equal(found[f"{name}_flipped"], sides)
-        assert sides.any()
+    check_ends(pairs, LAYOUT, BATCH, token)
+    assert pairs.before_flipped.any()
+    assert pairs.after_flipped.any()
 
 
 @pytest.mark.parametrize(
@@ -77,7 +84,7 @@ def test_played_pairs_have_any_piece_and_its_exact_covered_share() -> None:
     pairs = made_pairs([])
     counts = np.bincount(pairs.piece, minlength=7) / len(ROWS)
     np.testing.assert_allclose(counts, 1 / 7, atol=0.05)
-    sides = LAYOUT.flipped(BATCH.goal.astype(np.float64))[ROWS, pairs.piece]
+    sides = LAYOUT.flipped(EXACT["goal"])[ROWS, pairs.piece]
     np.testing.assert_array_equal(pairs.goal_flipped, sides)
     table = covering(BATCH.state, BATCH.goal, LAYOUT)
     expected = covered_share(table, LAYOUT)[ROWS, pairs.token, pairs.piece]
@@ -92,8 +99,7 @@ def test_values_are_what_is_newly_covered(hindsight: list[Any]) -> None:
     piece = Lying(pairs.piece, pairs.goal, pairs.goal_flipped)
     expected = newly_covered(token, piece, pairs.covered, LAYOUT)
     np.testing.assert_array_equal(pairs.reward, expected)
-    assert pairs.reward.min() >= 0.0
-    assert pairs.reward.max() <= 1.0
+    assert 0.0 <= pairs.reward.min() <= pairs.reward.max() <= 1.0
 
 
 def test_hindsight_is_where_the_token_came_to_lie_and_mostly_a_piece_of_its_shape() -> None:
@@ -113,19 +119,14 @@ def test_hindsight_is_where_the_token_came_to_lie_and_mostly_a_piece_of_its_shap
     assert exact.sum() > 100
 
 
-def test_of_equal_shapes_both_are_named() -> None:
+def test_equal_shapes_and_the_turns_that_look_alike_are_all_drawn() -> None:
     pairs = made_pairs([FINAL])
-    hind = ~is_played(pairs) & np.isin(pairs.token, (0, 1))
-    counts = np.bincount(pairs.piece[hind], minlength=7)
-    assert min(counts[:2]) > 0.3 * hind.sum()
-
-
-def test_the_turns_that_look_alike_are_all_drawn() -> None:
-    pairs = made_pairs([FINAL])
+    hind = ~is_played(pairs)
+    equal = hind & np.isin(pairs.token, (0, 1))
+    assert np.bincount(pairs.piece[equal])[:2].min() > 0.3 * equal.sum()
     for piece, symmetry in enumerate(SYMMETRY):
-        hind = ~is_played(pairs) & (pairs.piece == piece)
-        gap = (pairs.goal - pairs.after)[hind, 2] / (2.0 * np.pi / symmetry)
-        assert set(np.round(gap, 6)) == set(range(symmetry))
+        gap = (pairs.goal - pairs.after)[hind & (pairs.piece == piece), 2]
+        assert set(np.round(gap / (2.0 * np.pi / symmetry), 6)) == set(range(symmetry))
 
 
 def test_near_misses_have_the_spread_that_is_set() -> None:
@@ -145,16 +146,12 @@ def test_sides_of_hindsight_are_mostly_the_tokens_own() -> None:
     assert not pairs.goal_flipped[pairs.piece != PARALLELOGRAM].any()
 
 
-def test_the_same_generator_gives_the_same_pairs() -> None:
+def test_the_same_generator_gives_the_same_pairs_and_the_transitions_stay() -> None:
+    before = {name: column.copy() for name, column in vars(BATCH).items()}
     one, again, other = (made_pairs([FINAL, NEAR], seed) for seed in (3, 3, 4))
     for name, column in vars(one).items():
         np.testing.assert_array_equal(column, vars(again)[name])
     assert not np.array_equal(one.goal, other.goal)
-
-
-def test_the_transitions_stay_as_they_were() -> None:
-    before = {name: column.copy() for name, column in vars(BATCH).items()}
-    made_pairs([FINAL, NEAR])
     for name, column in vars(BATCH).items():
         np.testing.assert_array_equal(column, before[name])
 
@@ -175,9 +172,8 @@ def test_contacts_name_another_token_and_what_it_lost() -> None:
     pairs = make_pairs(batch, made, np.random.default_rng(0))
     found = with_contacts(pairs, batch, layout, np.random.default_rng(1))
     assert (found.other != found.token).all()
-    assert {(t, o) for t, o in zip(found.token, found.other, strict=True)} == {
-        (t, o) for t in range(4) for o in range(4) if t != o
-    }
+    met = set(zip(found.token.tolist(), found.other.tolist(), strict=True))
+    assert met == set(permutations(range(4), 2))
     np.testing.assert_allclose(found.pushed, found.other / 10.0, atol=1e-5)
     np.testing.assert_allclose(found.other_pose, before[found.other], atol=1e-6)
     assert not found.other_flipped.any()
@@ -190,26 +186,19 @@ def test_a_quarter_of_the_pairs_is_asked_from_where_the_action_ended() -> None:
     again = (pairs.start == pairs.after).all(axis=1) & (pairs.start != pairs.before).any(axis=1)
     assert again.mean() == pytest.approx(0.25, abs=0.05)
     np.testing.assert_array_equal(pairs.start[~again], pairs.before[~again])
-    np.testing.assert_array_equal(
-        pairs.start_flipped, np.where(again, pairs.after_flipped, pairs.before_flipped)
-    )
-
-
-def one_token(shape: str) -> tuple[Setup, Transitions, PairBatch]:
-    """Transitions of one token as they come out of the replay, and the pairs made of them."""
-    made = setup({"shapes": [shape], "scale": 0.8}, {"readout": "pair"}, actions_per_token=2)
-    drawn = transitions(made, COUNT)
-    rng = np.random.default_rng(0)
-    reward = rng.uniform(-1.0, 1.0, COUNT).astype(np.float32)
-    done = (rng.random(COUNT) < 0.5).astype(np.uint8)
-    batch = replace(drawn, reward=reward, done=done)
-    return made, batch, make_pairs(batch, made, np.random.default_rng(1))
+    sides = np.where(again, pairs.after_flipped, pairs.before_flipped)
+    np.testing.assert_array_equal(pairs.start_flipped, sides)
 
 
 @pytest.mark.parametrize("shape", ["square", "parallelogram", "large_triangle"])
 def test_one_tokens_pairs_are_the_transitions_with_their_reward(shape: str) -> None:
-    made, batch, pairs = one_token(shape)
-    layout = made.layout
+    """As they come out of the replay."""
+    made = setup({"shapes": [shape], "scale": 0.8}, {"readout": "pair"}, actions_per_token=2)
+    layout, rng = made.layout, np.random.default_rng(0)
+    reward = rng.uniform(-1.0, 1.0, COUNT).astype(np.float32)
+    done = (rng.random(COUNT) < 0.5).astype(np.uint8)
+    batch = replace(transitions(made, COUNT), reward=reward, done=done)
+    pairs = make_pairs(batch, made, np.random.default_rng(1))
     np.testing.assert_array_equal(pairs.reward, batch.reward)
     np.testing.assert_array_equal(pairs.done, batch.done)
     np.testing.assert_array_equal(pairs.velocity, batch.action)
@@ -220,7 +209,4 @@ def test_one_tokens_pairs_are_the_transitions_with_their_reward(shape: str) -> N
     order = layout.shapes[0].symmetry
     turns = (pairs.goal - goals[:, 0])[:, 2] * order / (2.0 * np.pi)
     assert set(np.round(turns, 9)) == set(range(order))
-    for name, corners in (("before", batch.state), ("after", batch.next_state)):
-        exact = corners.astype(np.float64)
-        np.testing.assert_allclose(vars(pairs)[name], layout.poses(exact)[:, 0])
-        np.testing.assert_array_equal(vars(pairs)[f"{name}_flipped"], layout.flipped(exact)[:, 0])
+    check_ends(pairs, layout, batch, 0)

@@ -78,15 +78,9 @@ def total(
     wanted, sides = layout.poses(goals)[0], layout.flipped(goals)[0]
 
     def pair(where: np.ndarray, index: int) -> Pairs:
-        return Pairs(
-            as_tensor([where]),
-            as_tensor([side]),
-            torch.tensor([token]),
-            as_tensor([wanted[index]]),
-            as_tensor([sides[index]]),
-            torch.tensor([index]),
-            as_tensor([share[index]]),
-        )
+        own = as_tensor([where]), as_tensor([side]), torch.tensor([token])
+        goal = as_tensor([wanted[index]]), as_tensor([sides[index]]), torch.tensor([index])
+        return Pairs(*own, *goal, as_tensor([share[index]]))
 
     graph = PairGraph(layout, made.sim.arena, made.agent)
 
@@ -151,14 +145,8 @@ def test_no_placed_token_is_named_while_others_are_left(order: str) -> None:
     token = Planner(random_networks(made), made).choose(corners, placed, goals).token
     assert not placed[np.arange(40), token].any()
     assert len(set(token)) > 1
-
-
-def test_where_all_are_placed_the_first_is_named() -> None:
-    made = seven()
-    corners, _, goals = scenes(made)
-    everything = np.ones((COUNT, 7), np.bool_)
-    choice = Planner(random_networks(made), made).choose(corners, everything, goals)
-    assert choice.token.tolist() == [0] * COUNT
+    nothing = Planner(random_networks(made), made).choose(corners, placed | True, goals)
+    assert not nothing.token.any()
 
 
 @pytest.mark.parametrize(
@@ -194,12 +182,10 @@ def test_a_random_order_is_one_for_each_target() -> None:
     # At every step the first one that is left of an order that does not change.
     assert orders == [named_in_turn(made, goal) for goal in range(8)]
     chooser, (corners, placed, goals) = perfect(made), scenes(made, 8)
-    found = chooser.choose(corners, placed, goals).token
-    expected = [
-        next(token for token in order if not flags[token])
-        for order, flags in zip(orders, placed, strict=True)
-    ]
-    assert found.tolist() == expected
+    for token, order, flags in zip(
+        chooser.choose(corners, placed, goals).token, orders, placed, strict=True
+    ):
+        assert token == next(one for one in order if not flags[one])
 
 
 # Refinement
@@ -210,20 +196,14 @@ def test_refinement_goes_uphill_on_what_the_critic_says_of_all_pieces(net: dict[
     plain, refined = (seven({"refine_steps": n}, net) for n in (0, 20))
     networks = random_networks(plain)
     scene = scenes(plain)
-    one, two, off = (
-        Planner(networks, plain).choose(*scene),
-        Planner(networks, refined).choose(*scene),
-        Planner(networks, refined).choose(*scene, refine=False),
-    )
+    one, two = (Planner(networks, made).choose(*scene) for made in (plain, refined))
+    off = Planner(networks, refined).choose(*scene, refine=False)
     np.testing.assert_array_equal(one.pose, off.pose)
     np.testing.assert_array_equal(one.token, two.token)
     for row in range(COUNT):
-        part = scene[0][row], scene[1][row], scene[2][row]
-        token = int(one.token[row])
-        before, after = (
-            total(plain, networks, part, token, False, choice.pose[row])[0] for choice in (one, two)
-        )
-        assert after > before
+        own = tuple(part[row] for part in scene), int(one.token[row]), False
+        values = [total(plain, networks, *own, choice.pose[row])[0] for choice in (one, two)]
+        assert values[1] > values[0]
     assert not any(parameter.requires_grad for parameter in networks.parameters())
 
 
@@ -256,20 +236,13 @@ def test_perfect_networks_assemble_everything(sim: dict[str, Any], order: str) -
 
 
 def test_a_token_is_turned_over_just_where_its_piece_lies_on_the_other_side() -> None:
-    made = setup(
-        {"shapes": ["parallelogram"], "scale": 0.8},
-        {"readout": "pair"},
-        allow_flip=True,
-        mirrored=0.5,
-    )
+    tokens = {"shapes": ["parallelogram"], "scale": 0.8}
+    made = setup(tokens, {"readout": "pair"}, allow_flip=True, mirrored=0.5)
     rng = np.random.default_rng(0)
-    (poses, sides), (goals, goal_sides) = (random_scene(made.layout, rng, 40) for _ in range(2))
-    choice = perfect(made).choose(
-        made.layout.corners(poses, sides),
-        np.zeros((40, 1), np.bool_),
-        made.layout.corners(goals, goal_sides),
-    )
-    np.testing.assert_array_equal(choice.flip, (sides ^ goal_sides)[:, 0])
+    own, wanted = (random_scene(made.layout, rng, 40) for _ in range(2))
+    corners, goals = made.layout.corners(*own), made.layout.corners(*wanted)
+    choice = perfect(made).choose(corners, np.zeros((40, 1), np.bool_), goals)
+    np.testing.assert_array_equal(choice.flip, (own[1] ^ wanted[1])[:, 0])
     assert 5 < choice.flip.sum() < 35
 
 
@@ -283,56 +256,48 @@ def test_without_flips_no_token_is_turned_over() -> None:
 # Tokens that push each other
 
 
-def squares(**agent: Any) -> Setup:
-    return setup({"shapes": ["square"] * 3, "scale": 0.8}, agent, PERCEPTRON, **SLIDE)
-
-
 LIKES = np.array([1.0, 1.0, 0.9])  # of tokens that cover as much, the second
+GOALS, STARTS = ((0, 0), (0.5, 0), (0.6, 0.6)), ((0, 0), (-0.5, 0), (-0.8, -0.8))
 
 
-def at(made: Setup, *centres: tuple[float, float]) -> np.ndarray:
-    poses = np.array([[x, y, 0.0] for x, y in centres])
-    return made.layout.corners(poses)[None]
-
-
-@pytest.mark.parametrize("weight", [0.0, 1.0])
-def test_a_token_that_would_push_a_placed_one_off_the_target_is_not_played(weight: float) -> None:
-    """Token 0 is placed well. Token 1, the better one but for that, would push it away."""
-    made = squares(push_weight=weight)
-    goals = at(made, (0, 0), (0.5, 0), (0.6, 0.6))
-    corners = at(made, (0, 0), (-0.5, 0), (-0.8, -0.8))
+def named(pushes: dict[tuple[int, int], float], first: Any = (0, 0), **settings: Any) -> int:
+    """Which of two squares is played while the first one lies somewhere and is placed."""
+    agent = {"push_weight": settings.pop("weight")} if "weight" in settings else {}
+    made = setup({"shapes": ["square"] * 3, "scale": 0.8}, agent, PERCEPTRON, **settings)
+    table = np.zeros((3, 3))
+    for (token, other), share in pushes.items():
+        table[token, other] = share
+    corners, goals = (
+        made.layout.corners(np.array([(*centre, 0.0) for centre in centres]))[None]
+        for centres in ((first, *STARTS[1:]), GOALS)
+    )
     placed = np.array([[True, False, False]])
-    harmless, harmful = np.zeros((3, 3)), np.zeros((3, 3))
-    harmful[1, 0] = 0.9
-    harmless[1, 2] = harmless[2, 1] = 0.9  # what is still to come may be pushed
-    assert perfect(made, harmless, LIKES).choose(corners, placed, goals).token[0] == 1
-    assert perfect(made, harmful, LIKES).choose(corners, placed, goals).token[0] == 2
-    # One that lies beside the target may be pushed.
-    elsewhere = at(made, (-0.8, 0.8), (-0.5, 0), (-0.8, -0.8))
-    assert perfect(made, harmful, LIKES).choose(elsewhere, placed, goals).token[0] == 1
-    # And one that covers a tenth of its piece costs a tenth of what it would.
-    hardly = at(made, (-0.9 * 0.8 * 2**0.5 / 4, 0), (-0.5, 0), (-0.8, -0.8))
-    assert perfect(made, harmful, LIKES).choose(hardly, placed, goals).token[0] == 1
+    return int(perfect(made, table, LIKES).choose(corners, placed, goals).token[0])
 
 
-@pytest.mark.parametrize(("weight", "expected"), [(0.0, 1), (1.0, 2)])
-def test_what_lies_in_the_way_of_others_comes_after_them(weight: float, expected: int) -> None:
-    """Token 2 would push token 1 away, wherever that is placed; not the other way round."""
-    made = squares(push_weight=weight)
-    goals = at(made, (0, 0), (0.5, 0), (0.6, 0.6))
-    corners = at(made, (0, 0), (-0.5, 0), (-0.8, -0.8))
-    pushes = np.zeros((3, 3))
-    pushes[2, 1] = 0.8
-    found = perfect(made, pushes, LIKES).choose(corners, np.array([[True, False, False]]), goals)
-    assert found.token[0] == expected
+HARMFUL = {(1, 0): 0.9}
+HARDLY = (-0.9 * 0.8 * 2**0.5 / 4, 0)  # on a tenth of its piece
+
+
+@pytest.mark.parametrize(
+    ("pushes", "first", "weight", "expected"),
+    [
+        (HARMFUL, (0, 0), 1.0, 2),  # what is placed well would be pushed away
+        (HARMFUL, (0, 0), 0.0, 2),
+        ({(1, 2): 0.9, (2, 1): 0.9}, (0, 0), 1.0, 1),  # what is still to come may be pushed
+        ({(1, 2): 0.9, (2, 1): 0.9}, (0, 0), 0.0, 1),
+        (HARMFUL, (-0.8, 0.8), 1.0, 1),  # and what lies beside the target
+        (HARMFUL, HARDLY, 1.0, 1),  # which costs a tenth of what it would
+        ({(2, 1): 0.8}, (0, 0), 0.0, 1),
+        ({(2, 1): 0.8}, (0, 0), 1.0, 2),  # what lies in the way of others comes after them
+    ],
+)
+def test_a_token_is_played_where_it_pushes_none_off_the_target(
+    pushes: dict[tuple[int, int], float], first: Any, weight: float, expected: int
+) -> None:
+    assert named(pushes, first, weight=weight, **SLIDE) == expected
 
 
 def test_where_tokens_are_lifted_nothing_is_pushed() -> None:
-    made = setup({"shapes": ["square"] * 3, "scale": 0.8}, {}, PERCEPTRON)
-    goals = at(made, (0, 0), (0.5, 0), (0.6, 0.6))
-    corners = at(made, (0, 0), (-0.5, 0), (-0.8, -0.8))
-    pushes = np.zeros((3, 3))
-    pushes[1, 0] = pushes[2, 1] = 1.0  # what would speak against token 1, now and later
-    everything = perfect(made, pushes, LIKES)
-    placed = np.array([[True, False, False]])
-    assert everything.choose(corners, placed, goals).token[0] == 1
+    """Not what would speak against token 1, now and later."""
+    assert named({(1, 0): 1.0, (2, 1): 1.0}) == 1

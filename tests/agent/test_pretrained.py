@@ -21,13 +21,8 @@ pytestmark = pytest.mark.fast
 
 MADE = setup()
 TENSORS = Learner(MADE, seed=3).acting_weights(1).tensors
-SECTIONS = {
-    "tokens": SQUARE,
-    "sim": {"backend": "kinematic"},
-    "reward": {},
-    "agent": PLAIN | PROPOSAL,
-    "net": SMALL,
-}
+WORLD = {"tokens": SQUARE, "sim": {"backend": "kinematic"}, "reward": {}}
+SECTIONS = WORLD | {"agent": PLAIN | PROPOSAL, "net": SMALL}
 
 
 def write_agent(folder: Path, **card: object) -> Path:
@@ -62,22 +57,13 @@ def test_an_agent_is_found_by_its_name(package: Path, run_dir: str | Path) -> No
     np.testing.assert_array_equal(run.policy.act(*scene), expected.act(*scene))
 
 
-def test_a_folder_of_that_name_wins(package: Path) -> None:
+def test_a_folder_is_read_from_anywhere_and_wins_over_the_package(
+    package: Path, tmp_path: Path
+) -> None:
     write_agent(Path("pretrained/square"), updates=99)
     assert load_run("pretrained/square").updates == 99
-
-
-def test_an_agents_folder_is_read_from_anywhere(tmp_path: Path) -> None:
     folder = write_agent(tmp_path / "mine")
     assert load_run(folder).folder == folder
-
-
-def test_an_unknown_name_lists_those_that_there_are(package: Path) -> None:
-    with pytest.raises(
-        RunError,
-        match="no pretrained agent 'cat': choose from pretrained/other, pretrained/square",
-    ):
-        load_run("pretrained/cat")
 
 
 @pytest.mark.parametrize("run_dir", ["runs/pretrained/square", "/pretrained/square", "square"])
@@ -87,7 +73,10 @@ def test_only_the_plain_name_means_the_package(package: Path, run_dir: str) -> N
         load_run(run_dir)
 
 
-def test_an_agent_has_no_checkpoints(package: Path) -> None:
+def test_an_unknown_name_lists_those_that_there_are(package: Path) -> None:
+    known = "no pretrained agent 'cat': choose from pretrained/other, pretrained/square"
+    with pytest.raises(RunError, match=known):
+        load_run("pretrained/cat")
     with pytest.raises(RunError, match="has no checkpoint 00000010"):
         load_run("pretrained/square", "00000010")
 

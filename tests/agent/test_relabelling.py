@@ -39,15 +39,14 @@ def rows(batch: Transitions) -> list[tuple[object, ...]]:
         hits = [t for t in range(4) if np.allclose(points, S[t])]
         return hits[0] if hits else "G" if np.allclose(points, G) else "?"
 
+    flags = [batch.placed[:, 0], batch.next_placed[:, 0], batch.done]
     return [
         (
             time_of(batch.state[i]),
             round(float(batch.action[i, 0]), 3),
             round(float(batch.reward[i]), 3),
             time_of(batch.next_state[i]),
-            int(batch.placed[i, 0]),
-            int(batch.next_placed[i, 0]),
-            int(batch.done[i]),
+            *(int(flag[i]) for flag in flags),
             time_of(batch.goal[i]),
         )
         for i in range(batch.count)
@@ -65,11 +64,8 @@ def relabelled(*kinds: RelabelConfig, seed: int = 0) -> Transitions:
     return with_relabelled(EPISODE, kinds, LAYOUT, same, np.random.default_rng(seed))
 
 
-def test_flatten_gives_what_was_played() -> None:
+def test_what_was_played_stays_and_none_adds_nothing() -> None:
     assert rows(flatten(EPISODE)) == PLAYED
-
-
-def test_none_adds_nothing() -> None:
     assert rows(relabelled(RelabelConfig("none", copies=4))) == PLAYED
     assert rows(relabelled()) == PLAYED
 
@@ -117,14 +113,9 @@ def test_copies_and_kinds_stand_one_after_the_other() -> None:
 
 def test_rewards_are_those_of_the_given_function() -> None:
     """The played reward stays, whatever the function says; for another goal it is computed anew."""
-    zero = with_relabelled(
-        EPISODE,
-        (RelabelConfig("final"),),
-        LAYOUT,
-        lambda achieved, _: np.full(len(achieved), 0.5),
-        np.random.default_rng(0),
-    )
-    np.testing.assert_allclose(zero.reward, [-0.9, -0.8, -0.7, 0.5, 0.5, 0.5])
+    half, kinds = (lambda achieved, _: np.full(len(achieved), 0.5)), [RelabelConfig("final")]
+    batch = with_relabelled(EPISODE, kinds, LAYOUT, half, np.random.default_rng(0))
+    np.testing.assert_allclose(batch.reward, [-0.9, -0.8, -0.7, 0.5, 0.5, 0.5])
 
 
 def test_near_goals_lie_on_the_side_that_was_reached() -> None:

@@ -1,5 +1,6 @@
 """Bounds, headers and checksums: what is not whole, small, flat and known is refused."""
 
+import re
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
@@ -73,10 +74,8 @@ UNPACKED = "the header is not msgpack within the limits: "
     ],
 )
 def test_what_is_out_of_bounds_is_named(bound: Bound, value: object, reason: str) -> None:
-    with pytest.raises(WireError) as caught:
+    with pytest.raises(WireError, match=f"^here[.: ]*{re.escape(reason)}$"):
         bound.check("here", value)
-    assert str(caught.value).startswith("here")
-    assert str(caught.value)[4:].lstrip(".: ") == reason
 
 
 @pytest.mark.parametrize(
@@ -109,11 +108,8 @@ def test_lenient_numbers_never_fail_and_keep_what_fits(values: dict[str, Any]) -
     assert bound.check("here", fitted) == fitted
     good = {k: v for k, v in values.items() if k in ("a", "b/c") and abs(v) <= MAX_NUMBER}
     assert {k: fitted[k] for k in good} == good or len(fitted) == MAX_ENTRIES
-
-
-def test_lenient_numbers_are_brought_to_their_bounds() -> None:
-    fitted = Numbers(lenient=True).fit({"a": INF, "b": -2e18, "c": NAN, "D": 1.0, "e": 10**400})
-    assert fitted == {"a": MAX_NUMBER, "b": -MAX_NUMBER, "e": MAX_NUMBER}
+    beyond = bound.fit({"a": INF, "b": -2e18, "c": NAN, "D": 1.0, "e": 10**400})
+    assert beyond == {"a": MAX_NUMBER, "b": -MAX_NUMBER, "e": MAX_NUMBER}
 
 
 @given(st.dictionaries(words, st.text(max_size=40).map(lambda t: t * 40), max_size=70))
@@ -217,13 +213,12 @@ def test_what_comes_with_too_many_frames_or_none_is_refused() -> None:
 @pytest.mark.parametrize("frame", [packed(v=PROTOCOL + 1), bare(v=2), bare(v=0, crc="none")])
 def test_another_version_says_what_to_install(frame: bytes) -> None:
     """A later one that has kept the checksum, and earlier ones that had none."""
-    with pytest.raises(ProtocolError) as caught:
-        opened([frame])
-    version = msgpack.unpackb(frame)["v"]
-    assert str(caught.value) == (
-        f"the other side speaks protocol {version}, this one {PROTOCOL}: "
+    message = (
+        f"the other side speaks protocol {msgpack.unpackb(frame)['v']}, this one {PROTOCOL}: "
         "install the same version of tangram on both"
     )
+    with pytest.raises(ProtocolError, match=f"^{message}$"):
+        opened([frame])
 
 
 def test_a_header_too_large_to_be_received_is_not_packed() -> None:
@@ -250,14 +245,17 @@ def test_no_bit_of_a_message_may_change(number: int) -> None:
         assert mark or isinstance(caught.value, DamagedError)
 
 
+ONE, TWO, THREE, FOUR = SEALED
+
+
 @pytest.mark.parametrize(
     "frames",
     [
-        SEALED[:-1],
-        [SEALED[0], *SEALED[2:]],
-        [SEALED[0], SEALED[3], SEALED[2], SEALED[1]],
-        [*SEALED, b"more"],
-        [SEALED[0], *Probe(3).encode()],
+        [ONE, TWO, THREE],
+        [ONE, THREE, FOUR],
+        [ONE, FOUR, THREE, TWO],
+        [ONE, TWO, THREE, FOUR, b"more"],
+        [ONE, *Probe(3).encode()],
         [bare(a=3)],
     ],
 )

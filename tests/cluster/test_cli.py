@@ -90,7 +90,7 @@ WRONG = [
     ("tangram-play", "say which run: run_dir=runs/..."),
     ("tangram-eval run_dir=pretrained/square puzzles=test", "puzzle 'trapezoid' has the pieces"),
     ("tangram-eval run_dir=pretrained/square puzzles=nowhere.json", "nowhere.json"),
-    ("tangram-eval run_dir=pretrained/square order=size", "has no such choice"),
+    ("tangram-eval run_dir=pretrained/square agent.order=size", "nothing with one token"),
     ("tangram-play tokens=nobody", "no pretrained agent 'nobody': choose from pretrained/"),
     ("tangram-play tokens=pair run_dir=pretrained/square", "do not agree: the run moves square"),
     ("tangram-play runs_dir=x", "unknown setting 'runs_dir' (did you mean 'run_dir'?)"),

@@ -45,7 +45,7 @@ def scores(study: Path, training: str) -> tuple[dict[str, float], dict[str, floa
 def test_every_training_is_done_and_tested(study: Path, training: str) -> None:
     result, test = scores(study, training)
     assert (result["updates"], result["agent"], result["seed"]) == (20, training, 0)
-    assert (test["actions"], test["episodes"], test["updates"]) == (2, 16, 20)
+    assert (test["sim"]["actions_per_token"], test["episodes"], test["updates"]) == (2, 16, 20)
     assert result["mean_reward"] is not None
     assert result["mean_reward_dense"] is not None
 

@@ -81,10 +81,15 @@ def test_eval_applies_several_actions_in_sequence(
     trained: Path, tmp_path: Path, actions: int
 ) -> None:
     out = tmp_path / "scores.json"
-    arguments = (f"run_dir={trained}", f"out={out}", f"actions={actions}", "episodes=30")
+    arguments = (
+        f"run_dir={trained}",
+        f"out={out}",
+        f"sim.actions_per_token={actions}",
+        "episodes=30",
+    )
     run("tangram-eval", *arguments, cwd=tmp_path)
     scores = json.loads(out.read_text())
-    assert scores["actions"] == actions
+    assert scores["sim"]["actions_per_token"] == actions
     assert scores["mean_reward"] > 0.8
 
 

@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from tangram_agent.setup import from_mapping
+from tangram_lab.experiments.cli import _asked
 from tangram_lab.experiments.jobs import Job, make_jobs
 from tangram_lab.experiments.plan import StudyConfig, joined_plan, plan_content
 from tangram_sim.errors import ConfigError
@@ -33,8 +34,8 @@ def content(run_dir: Path, **changes: Any) -> dict[str, Any]:
             "warm": {"label": "warm", "family": "ours", "after": "square"},
         },
         "tests": {
-            "twice": {"label": "2 actions", "actions": 2},
-            "noisy": {"label": "1 % noise", "corner_noise": 0.01},
+            "twice": {"label": "2 actions", "overrides": ["sim.actions_per_token=2"]},
+            "noisy": {"label": "1 % noise", "overrides": ["sim.corner_noise=0.01"]},
         },
         "experiments": {
             "one": experiment(["paper", "square"], ["twice"]),
@@ -96,11 +97,6 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         {"experiments": {"x": experiment(["square"], []) | {"labels": {"paper": "x"}}}},
         "labels must be one of square, got 'paper'",
     ),
-    ({"tests": {"twice": {"label": "x", "actions": 0}}}, "tests.actions must be between 1 and 100"),
-    (
-        {"tests": {"noisy": {"label": "x", "corner_noise": 0.5}}},
-        "tests.corner_noise must be between 0 and 0.2, got 0.5",
-    ),
     ({"families": {"ours": []}}, "training paper: family 'theirs' is not in the catalogue"),
     ({"trainings": {"square": WARM}, "experiments": {}}, "training square: after 'warm' is not in"),
 ]
@@ -145,7 +141,7 @@ def test_a_circle_of_warm_starts_is_refused(tmp_path: Path) -> None:
 
 def test_the_plan_says_everything_that_a_report_needs(tmp_path: Path) -> None:
     plan = plan_content(study(tmp_path), {"command": "tangram-experiment x", "commit": "abc"})
-    assert (plan["format"], plan["command"], plan["commit"]) == (1, "tangram-experiment x", "abc")
+    assert (plan["format"], plan["command"], plan["commit"]) == (2, "tangram-experiment x", "abc")
     assert plan["budget"] == {
         "name": "tiny",
         "note": "Nothing is learned.",
@@ -159,8 +155,8 @@ def test_the_plan_says_everything_that_a_report_needs(tmp_path: Path) -> None:
         "overrides": ["agent=tangram", "a=1", "b=2"],
         "after": "square",
     }
-    told = {name: value for name, value in plan["tests"]["noisy"].items() if value is not None}
-    assert told == {"label": "1 % noise", "corner_noise": 0.01}
+    told = {"label": "1 % noise", "overrides": ("sim.corner_noise=0.01",)}
+    assert plan["tests"]["noisy"] == told
 
 
 def test_a_plan_keeps_what_was_there(tmp_path: Path) -> None:
@@ -205,6 +201,13 @@ def test_seeds_may_be_added_and_none_is_forgotten(
     assert joined["budget"]["seeds"] == expected
 
 
+def test_a_plan_of_another_version_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "plan.json"
+    path.write_text(json.dumps(plan_content(study(tmp_path), {}) | {"format": 1}))
+    with pytest.raises(ConfigError, match="is of format 1, and this version writes 2: choose"):
+        joined_plan(path, plan_content(study(tmp_path), {}))
+
+
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"budget": 1}'])
 def test_a_plan_that_cannot_be_read_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "plan.json"
@@ -222,9 +225,14 @@ def resolved(config: StudyConfig, **changes: Any) -> dict[str, dict[str, Any]]:
     return {name: {"agent": agent, "max_updates": 3} | changes for name in config.wanted()}
 
 
+def asked(config: StudyConfig) -> dict[str, dict[str, Any]]:
+    """What tests ask for, as tangram-experiment composes it."""
+    return {name: _asked(name, config.test_command(name)) for name in config.tests}
+
+
 def jobs_of(folder: Path, **changes: Any) -> dict[str, Job]:
     config = study(folder, **changes)
-    return {job.name: job for job in make_jobs(config, resolved(config))}
+    return {job.name: job for job in make_jobs(config, resolved(config), asked(config))}
 
 
 def test_all_trainings_of_a_seed_come_before_the_next_seed(tmp_path: Path) -> None:
@@ -251,7 +259,8 @@ def test_a_training_is_a_command_that_can_go_on(tmp_path: Path) -> None:
 
 def test_trainings_are_told_where_ones_own_presets_lie(tmp_path: Path) -> None:
     config = study(tmp_path)
-    trainings = [job for job in make_jobs(config, resolved(config), "/mine") if job.trains]
+    jobs = make_jobs(config, resolved(config), asked(config), "/mine")
+    trainings = [job for job in jobs if job.trains]
     assert {job.command[1] for job in trainings} == {"--config-dir=/mine"}
     assert all("--config-dir=/mine" not in job.command for job in jobs_of(tmp_path).values())
 
@@ -267,7 +276,7 @@ def test_a_warm_start_waits_for_its_source(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("test", "setting"), [("twice", "actions=2"), ("noisy", "corner_noise=0.01")]
+    ("test", "setting"), [("twice", "sim.actions_per_token=2"), ("noisy", "sim.corner_noise=0.01")]
 )
 def test_a_test_follows_its_training(tmp_path: Path, test: str, setting: str) -> None:
     jobs = jobs_of(tmp_path)
@@ -322,7 +331,8 @@ def test_what_cannot_be_read_is_not_done(tmp_path: Path, text: str | None) -> No
     [
         ({}, True),
         ({"mean_reward": 0.5}, True),
-        ({"actions": 3}, False),
+        ({"sim": {"actions_per_token": 3}}, False),
+        ({"sim": None}, False),
         ({"episodes": 6}, False),
         ({"updates": 2}, False),
     ],
@@ -334,7 +344,8 @@ def test_a_test_is_done_when_it_is_that_of_the_final_weights(
     end(job.run_dir / "result.json")
     job.prepare()
     assert not job.done
-    job.leaves.write_text(json.dumps({"actions": 2, "episodes": 5, "updates": 3} | changes))
+    told = {"sim": {"actions_per_token": 2, "arena": 2.0}, "episodes": 5, "updates": 3}
+    job.leaves.write_text(json.dumps(told | changes))
     assert job.done is done
 
 
@@ -352,12 +363,12 @@ def test_other_settings_in_the_same_folder_are_refused(
     tmp_path: Path, changes: dict[str, Any], message: str | None
 ) -> None:
     config = study(tmp_path)
-    job = make_jobs(config, resolved(config))[0]
+    job = make_jobs(config, resolved(config), asked(config))[0]
     job.check()
     job.prepare()
     job.check()
     (job.run_dir / "config.yaml").write_text(yaml.safe_dump(dict(job.settings)))
-    changed = make_jobs(config, resolved(config, **changes))[0]
+    changed = make_jobs(config, resolved(config, **changes), asked(config))[0]
     if message is None:
         changed.check()
         return
@@ -372,7 +383,7 @@ def test_a_test_of_puzzles_is_known_by_their_source(
     tmp_path: Path, changes: dict[str, Any], done: bool
 ) -> None:
     """Under `puzzles` its file has the scores of each."""
-    tests = {"figures": {"label": "figures", "puzzles": "test", "turns": 8}}
+    tests = {"figures": {"label": "figures", "overrides": ["puzzles=test", "turns=8"]}}
     one = {"one": experiment(["square"], ["figures"])}
     job = jobs_of(tmp_path, tests=tests, experiments=one)["square, seed 0, test figures"]
     assert job.command[-2:] == ("puzzles=test", "turns=8")
@@ -381,3 +392,24 @@ def test_a_test_of_puzzles_is_known_by_their_source(
     told = {"source": "test", "turns": 8, "updates": 3, "puzzles": [{"name": "cat"}]}
     job.leaves.write_text(json.dumps(told | changes))
     assert job.done is done
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("actions=2", "unknown setting 'actions'"),
+        ("sim.actions_per_tokn=2", ".* .did you mean 'sim.actions_per_token'"),
+        (
+            "agent.reapply=0 puzzles=test sim.targets=mixed",
+            "sim.targets=mixed changes nothing with",
+        ),
+    ],
+)
+def test_a_wrong_test_is_told_before_all_trainings(
+    tmp_path: Path, override: str, message: str
+) -> None:
+    config = study(
+        tmp_path, tests={"odd": {"label": "x", "overrides": override.split()}}, experiments={}
+    )
+    with pytest.raises(ConfigError, match=f"test odd: {message}"):
+        asked(config)

@@ -7,7 +7,6 @@ import shapely
 
 from tangram_sim.arrays import Floats
 from tangram_sim.layout import Layout, TokensConfig, make_layout
-from tangram_sim.shapes import polygon_area
 
 SQUARE_SCALE = 0.8 * 2.0**0.5  # the square's side is then 0.4
 SEVEN = (
@@ -34,13 +33,6 @@ def random_poses(rng: np.random.Generator, size: int, tokens: int, spread: float
     return unit * np.array([spread, spread, np.pi])
 
 
-def perimeter(polygons: Floats) -> Floats:
-    """(B,) of polygons (B, M, 2)."""
-    edges = np.roll(polygons, -1, axis=1) - polygons
-    total: Floats = np.linalg.norm(edges, axis=-1).sum(axis=1)
-    return total
-
-
 def polygons(layout: Layout, corners: Floats) -> list[shapely.Polygon]:
     """The tokens with corners (V, 2)."""
     return [shapely.Polygon(corners[layout.corners_of(k)]) for k in range(layout.tokens)]
@@ -61,7 +53,3 @@ def angle_gap(first: Floats, second: Floats) -> Floats:
     """Absolute difference of angles in radians, in [0, pi]."""
     gap: Floats = np.abs(np.angle(np.exp(1j * (np.asarray(first) - np.asarray(second)))))
     return gap
-
-
-def total_area(layout: Layout) -> float:
-    return sum(polygon_area(shape.corners) for shape in layout.shapes)

@@ -1,9 +1,15 @@
 """Files of puzzles, as people might draw them."""
 
 import json
+from collections.abc import Sequence
 from copy import deepcopy
+from itertools import permutations
 from typing import Any
 
+import numpy as np
+
+from tangram_sim.arrays import Floats
+from tangram_sim.assembly import Puzzle
 from tangram_sim.puzzles import PACKAGED
 
 SQUARE = ((0, 0), (1, 0), (1, 1), (0, 1))
@@ -26,3 +32,36 @@ def figure(name: str) -> dict[str, Any]:
 def file_of(*entries: Any) -> dict[str, Any]:
     """The content of a file of these puzzles."""
     return {"format": "tangram-puzzles", "version": 1, "puzzles": list(entries)}
+
+
+def moved(points: Floats, angle: float, shift: Sequence[float]) -> Floats:
+    cos, sin = np.cos(angle), np.sin(angle)
+    turned: Floats = points @ np.array([[cos, sin], [-sin, cos]]) + shift
+    return turned
+
+
+def same_corners(first: Floats, second: Floats) -> float:
+    """The largest distance of corners (V, 2) that are the same in some order."""
+    orders = permutations(range(len(first)))
+    return min(float(np.linalg.norm(first - second[list(o)], axis=1).max()) for o in orders)
+
+
+def distance(corners: Floats, true: Puzzle, angle: float) -> float:
+    """Of a loaded figure from the true one, turned; pieces of one kind may be swapped."""
+    goal = moved(true.corners, angle, (0.0, 0.0))
+    goal -= (goal.min(axis=0) + goal.max(axis=0)) / 2.0
+    own = [true.layout.corners_of(k) for k in range(7)]
+    total = 0.0
+    for group in ((0, 1), (2,), (3, 4), (5,), (6,)):
+        assert len({true.pieces[k] for k in group}) == 1
+        total = max(
+            total,
+            min(
+                max(
+                    same_corners(corners[own[k]], goal[own[other]])
+                    for k, other in zip(group, order, strict=True)
+                )
+                for order in permutations(group)
+            ),
+        )
+    return total

@@ -1,4 +1,4 @@
-"""Episodes of many environments in step: what moves, what is refused, what is paid."""
+"""Episodes of many environments in step: what moves, what is refused or blocked, what is paid."""
 
 from typing import Any
 
@@ -7,8 +7,9 @@ import pytest
 
 from tangram_sim.actions import chosen_tokens, velocities
 from tangram_sim.arrays import Floats
-from tangram_sim.batch import BatchedEnv
+from tangram_sim.batch import BatchedEnv, StepResult
 from tangram_sim.config import RewardConfig, SimConfig
+from tangram_sim.env import TangramEnv
 from tangram_sim.errors import ConfigError
 from tangram_sim.geometry import overlap_share
 from tangram_sim.layout import Layout
@@ -19,18 +20,31 @@ from tests.sim.builders import SEVEN, TRIO, layout_of
 pytestmark = pytest.mark.fast
 
 PAIR = layout_of("square", "small_triangle")
+SQUARE = layout_of("square")
+GAME = layout_of(*SEVEN, scale=0.6)
+BOTH = pytest.mark.parametrize("backend", ["physics", "kinematic"])
 
 
-def make_env(
+def made(
     layout: Layout, count: int = 4, reward: str = "overlap", source: str = "polygon", **sim: Any
 ) -> BatchedEnv:
-    settings = {"backend": "kinematic", **sim}
-    return BatchedEnv(layout, SimConfig(**settings), RewardConfig(reward, source), count)
+    config = SimConfig(**{"backend": "kinematic", **sim})
+    return BatchedEnv(layout, config, RewardConfig(reward, source), count)
 
 
-def begun(env: BatchedEnv) -> BatchedEnv:
-    env.reset(evaluation_generators(env.count))
+def begun(layout: Layout, count: int = 4, **settings: Any) -> BatchedEnv:
+    env = made(layout, count, **settings)
+    env.reset(evaluation_generators(count))
     return env
+
+
+def onto(env: BatchedEnv, deviation: float = 0.0) -> Floats:
+    """Actions that move each environment's only token onto its target, or about so."""
+    motion = (env.layout.poses(env.goals) - env.layout.poses(env.corners))[:, 0]
+    motion[:, 2] = np.angle(np.exp(1j * motion[:, 2]))
+    noise = np.random.default_rng(0).normal(0.0, 1.0, motion.shape)
+    actions: Floats = (motion + deviation * noise) / [env.sim.arena, env.sim.arena, np.pi]
+    return actions
 
 
 @pytest.mark.parametrize(
@@ -57,96 +71,61 @@ def test_full_scale_crosses_the_arena_and_makes_half_a_turn() -> None:
     np.testing.assert_allclose(velocities(named, sim), expected)
 
 
-@pytest.mark.parametrize("backend", ["physics", "kinematic"])
+@BOTH
 @pytest.mark.parametrize("arena", [2.0, 0.7])
 def test_every_pose_is_reached_in_one_action(backend: str, arena: float) -> None:
-    layout = layout_of("square", scale=0.5 * arena)
-    env = make_env(layout, 4, backend=backend, arena=arena)
-    generators = evaluation_generators(4)
-    for _ in range(16):
-        env.reset(generators)
-        start, goal = layout.poses(env.corners)[:, 0], layout.poses(env.goals)[:, 0]
-        motion = goal - start
-        motion[:, 2] = np.angle(np.exp(1j * motion[:, 2]))
-        actions = motion / [arena, arena, np.pi]
-        assert np.abs(actions).max() <= 1.0
-        result = env.step(actions)
-        np.testing.assert_allclose(result.overlap, 1.0, atol=1e-6)
-        np.testing.assert_allclose(result.rewards, 1.0, atol=1e-6)
-        assert result.done
+    env = begun(layout_of("square", scale=0.5 * arena), 16, backend=backend, arena=arena)
+    actions = onto(env)
+    assert np.abs(actions).max() <= 1.0
+    result = env.step(actions)
+    np.testing.assert_allclose([result.overlap, result.rewards], 1.0, atol=1e-6)
+    assert result.done
     env.close()
 
 
-def test_shapes_and_sizes() -> None:
-    env = make_env(layout_of(*SEVEN, scale=0.6), 5, actions_per_token=2)
-    assert (env.horizon, env.action_size) == (14, 4)
-    begun(env)
-    assert env.corners.shape == env.goals.shape == (5, 23, 2)
-    assert env.placed.shape == (5, 7)
-    assert not env.placed.any()
-    assert make_env(layout_of("square"), actions_per_token=3).action_size == 3
+ONE, TWO, NONE = [1] * 4 + [0] * 3, [0] * 4 + [1] * 3, [0] * 7
 
 
 def test_an_episode_of_two_tokens() -> None:
     """One environment each: both tokens, the same token twice, the second first."""
-    env = begun(make_env(PAIR, 3))
-    begin = env.corners.copy()
-    first = np.array([[-1.0, 0.1, 0, 0], [-1.0, 0.1, 0, 0], [1.0, 0.1, 0, 0]])
-    result = env.step(first)
-    assert (result.done, result.refused.tolist()) == (False, [False] * 3)
-    assert env.placed.tolist() == [[True, False], [True, False], [False, True]]
-    moved = (env.corners - begin)[..., 0] / 0.2
-    np.testing.assert_allclose(moved, [[1] * 4 + [0] * 3] * 2 + [[0] * 4 + [1] * 3], atol=1e-9)
-    before = env.corners.copy()
-    second = np.array([[1.0, 0, 0.1, 0], [-1.0, 0, 0.1, 0], [-1.0, 0, 0.1, 0]])
-    result = env.step(second)
-    assert (result.done, result.refused.tolist()) == (True, [False, True, False])
-    assert env.placed.tolist() == [[True, True], [True, False], [True, True]]
-    moved = (env.corners - before)[..., 1] / 0.2
-    rows = [[0] * 4 + [1] * 3, [0] * 7, [1] * 4 + [0] * 3]
-    np.testing.assert_allclose(moved, rows, atol=1e-9)
+    env = begun(PAIR, 3)
+    for axis, chosen, refused, placed, moved in (
+        (0, [-1, -1, 1], [0, 0, 0], [[1, 0], [1, 0], [0, 1]], [ONE, ONE, TWO]),
+        (1, [1, -1, -1], [0, 1, 0], [[1, 1], [1, 0], [1, 1]], [TWO, NONE, ONE]),
+    ):
+        before, actions = env.corners, np.zeros((3, 4))
+        actions[:, 0], actions[:, 1 + axis] = chosen, 0.1
+        result = env.step(actions)
+        assert (result.done, result.refused.tolist()) == (axis == 1, refused)
+        assert env.placed.tolist() == placed
+        np.testing.assert_allclose((env.corners - before)[..., axis] / 0.2, moved, atol=1e-9)
 
 
 def test_several_actions_for_each_token() -> None:
-    env = begun(make_env(PAIR, 1, actions_per_token=2))
-    action = np.array([[-1.0, 0.1, 0, 0]])
-    flags = []
+    env, flags = begun(PAIR, 1, actions_per_token=2), []
     for _ in range(env.horizon):
-        result = env.step(action)
-        flags.append((env.placed[0].tolist(), bool(result.refused[0]), result.done))
-    assert flags == [
-        ([False, False], False, False),
-        ([True, False], False, False),
-        ([True, False], True, False),
-        ([True, False], True, True),
-    ]
+        result = env.step(np.array([[-1.0, 0.1, 0, 0]]))
+        flags.append((*env.placed[0].tolist(), bool(result.refused[0]), result.done))
+    assert flags == [(0, 0, 0, 0), (1, 0, 0, 0), (1, 0, 1, 0), (1, 0, 1, 1)]
 
 
-def test_the_next_episode_begins_anew() -> None:
-    env = begun(make_env(PAIR))
-    first = env.corners.copy()
-    for _ in range(env.horizon):
-        env.step(np.full((4, 4), -1.0))
-    begun(env)
-    assert env.steps_done == 0
-    assert not env.placed.any()
-    np.testing.assert_array_equal(env.corners, first)
-
-
-def test_targets_and_starts_differ_and_come_from_the_generators() -> None:
-    env = begun(make_env(PAIR))
-    targets = env.goals.copy()
-    assert np.abs(env.corners - targets).max() > 0.1
-    generators = evaluation_generators(4)
-    sampled = sample_batch(PAIR, env.sim, generators)
-    np.testing.assert_allclose(targets, PAIR.corners(sampled))
-    sampled = sample_batch(PAIR, env.sim, generators)
-    np.testing.assert_allclose(env.corners, PAIR.corners(sampled))
+def test_each_episode_begins_anew_and_comes_from_the_generators() -> None:
+    env, generators = begun(PAIR), evaluation_generators(4)
+    targets, starts = (PAIR.corners(sample_batch(PAIR, env.sim, generators)) for _ in range(2))
+    assert np.abs(starts - targets).max() > 0.1
+    for _ in range(2):
+        assert env.steps_done == 0
+        assert not env.placed.any()
+        np.testing.assert_allclose(env.goals, targets)
+        np.testing.assert_allclose(env.corners, starts)
+        for _ in range(env.horizon):
+            env.step(np.full((4, 4), -1.0))
+        env.reset(evaluation_generators(4))
 
 
 @pytest.mark.parametrize("reward", ["overlap", "dense", "pose"])
 def test_rewards_are_those_of_the_reward_function(reward: str) -> None:
-    env = begun(make_env(layout_of(*TRIO), 16, reward=reward))
+    env = begun(layout_of(*TRIO), 16, reward=reward)
     rng = np.random.default_rng(0)
     for _ in range(env.horizon):
         result = env.step(rng.uniform(-0.3, 0.3, (16, 4)))
@@ -156,84 +135,41 @@ def test_rewards_are_those_of_the_reward_function(reward: str) -> None:
         assert result.camera_rewards is None
 
 
-def near_goals(env: BatchedEnv) -> Floats:
-    """Actions of one token that end within about its size of the target."""
-    start, goal = env.layout.poses(env.corners)[:, 0], env.layout.poses(env.goals)[:, 0]
-    noise = np.random.default_rng(0).normal(0.0, 0.1, start.shape)
-    actions: Floats = (goal - start + noise) / [env.sim.arena, env.sim.arena, np.pi]
-    return actions
-
-
-@pytest.mark.parametrize("backend", ["physics", "kinematic"])
-def test_camera_reports_and_pays(backend: str) -> None:
-    results = []
-    for source in ("polygon", "camera"):
-        env = make_env(layout_of("square"), 8, source=source, backend=backend, camera=True)
-        begun(env)
-        results.append(env.step(near_goals(env)))
+@BOTH
+def test_camera_reports_and_pays_by_each_episodes_own_target(backend: str) -> None:
+    sources, generators = ("polygon", "camera"), [evaluation_generators(8) for _ in range(2)]
+    envs = [made(SQUARE, 8, source=one, backend=backend, camera=True) for one in sources]
+    for _ in range(2):
+        results = []
+        for env, own in zip(envs, generators, strict=True):
+            env.reset(own)
+            results.append(env.step(onto(env, 0.1)))
+        exact, seen = results
+        assert exact.camera_rewards is not None
+        np.testing.assert_array_equal(exact.camera_rewards, seen.camera_rewards)
+        np.testing.assert_array_equal(seen.rewards, seen.camera_rewards)
+        assert 1e-6 < np.abs(seen.rewards - exact.rewards).max() < 0.2
+        assert np.abs(seen.rewards - exact.rewards).mean() < 0.05
+        assert seen.rewards.max() > 0.5
+    for env in envs:
         env.close()
-    exact, seen = results
-    assert exact.camera_rewards is not None
-    assert seen.camera_rewards is not None
-    np.testing.assert_array_equal(exact.camera_rewards, seen.camera_rewards)
-    np.testing.assert_array_equal(seen.rewards, seen.camera_rewards)
-    assert np.abs(seen.rewards - exact.rewards).max() > 1e-6
-    assert np.abs(seen.rewards - exact.rewards).mean() < 0.05
-    assert seen.rewards.max() > 0.5
-
-
-def test_the_camera_sees_each_episodes_own_target() -> None:
-    env = make_env(layout_of("square"), 8, camera=True)
-    generators = evaluation_generators(8)
-    for _ in range(3):
-        env.reset(generators)
-        result = env.step(near_goals(env))
-        assert result.camera_rewards is not None
-        assert np.abs(result.camera_rewards - result.rewards).max() < 0.2
-
-
-def test_physics_and_kinematic_play_the_same_episodes() -> None:
-    layout = layout_of(*TRIO)
-    envs = [
-        begun(make_env(layout, 4, backend=backend, actions_per_token=2))
-        for backend in ("physics", "kinematic")
-    ]
-    rng = np.random.default_rng(0)
-    for _ in range(envs[0].horizon):
-        actions = rng.uniform(-1.0, 1.0, (4, 4))
-        results = [env.step(actions) for env in envs]
-        np.testing.assert_allclose(envs[0].corners, envs[1].corners, atol=1e-9)
-        np.testing.assert_array_equal(envs[0].placed, envs[1].placed)
-        np.testing.assert_array_equal(results[0].refused, results[1].refused)
-        np.testing.assert_allclose(results[0].rewards, results[1].rewards, atol=1e-7)
-    envs[0].close()
 
 
 @pytest.mark.parametrize("actions_per_token", [1, 3])
 def test_no_corner_leaves_the_bound(actions_per_token: int) -> None:
-    layout = layout_of("square")
-    env = make_env(layout, 256, actions_per_token=actions_per_token)
-    largest = 0.0
-    for _ in range(4):
-        begun(env)
-        away = np.sign(layout.poses(env.corners)[:, 0])
-        for _ in range(env.horizon):
-            env.step(away)
-        largest = max(largest, float(np.abs(env.corners).max()))
-    assert 0.9 * env.bound < largest <= env.bound
+    env = begun(SQUARE, 1000, actions_per_token=actions_per_token)
+    away = np.sign(env.layout.poses(env.corners)[:, 0])
+    for _ in range(env.horizon):
+        env.step(away)
+    assert 0.9 * env.bound < np.abs(env.corners).max() <= env.bound
 
 
-def test_actions_beyond_the_box_count_as_its_bound() -> None:
-    envs = [begun(make_env(layout_of("square"))) for _ in range(2)]
-    envs[0].step(np.full((4, 3), 7.0))
+def test_actions_beyond_the_box_count_as_its_bound_in_either_precision() -> None:
+    envs = [begun(SQUARE) for _ in range(2)]
+    envs[0].step(np.full((4, 3), 7.0, dtype=np.float32))  # type: ignore[arg-type]
     envs[1].step(np.full((4, 3), 1.0))
     np.testing.assert_array_equal(envs[0].corners, envs[1].corners)
-
-
-def test_single_precision_actions_are_welcome() -> None:
-    env = begun(make_env(PAIR))
-    env.step(np.full((4, 4), 0.25, dtype=np.float32))  # type: ignore[arg-type]
-    assert env.corners.dtype == np.float64
+    assert envs[0].corners.dtype == np.float64
 
 
 @pytest.mark.parametrize(
@@ -246,25 +182,135 @@ def test_single_precision_actions_are_welcome() -> None:
     ],
 )
 def test_refused_actions(actions: Floats, reason: str) -> None:
-    env = begun(make_env(layout_of("square")))
+    env = begun(SQUARE)
     with pytest.raises(ValueError, match=reason):
         env.step(actions)
     assert env.steps_done == 0
 
 
 def test_an_episode_has_to_begin_and_ends() -> None:
-    env = make_env(layout_of("square"))
+    env, still = made(SQUARE), np.zeros((4, 3))
     with pytest.raises(RuntimeError, match="call reset first"):
-        env.step(np.zeros((4, 3)))
-    begun(env).step(np.zeros((4, 3)))
+        env.step(still)
+    with pytest.raises(ValueError, match="need 4 generators, got 3"):
+        env.reset(evaluation_generators(3))
+    env.reset(evaluation_generators(4))
+    env.step(still)
     with pytest.raises(RuntimeError, match="episode of 1 steps is over"):
-        env.step(np.zeros((4, 3)))
+        env.step(still)
 
 
 def test_refused_constructions() -> None:
-    with pytest.raises(ValueError, match="need 4 generators, got 3"):
-        make_env(layout_of("square")).reset(evaluation_generators(3))
     with pytest.raises(ValueError, match="at least 1, got 0"):
-        make_env(layout_of("square"), 0)
-    with pytest.raises(ConfigError, match=r"sim\.camera=true"):
-        make_env(layout_of("square"), source="camera")
+        made(SQUARE, 0)
+    with pytest.raises(ConfigError, match=r"set sim\.camera=true"):
+        made(SQUARE, source="camera")
+
+
+# Placements on others: how much is allowed, what a refused one costs, and what stays.
+
+SQUARES = layout_of("square", "square", scale=2.0**0.5)  # sides of 0.5
+TRIPLE = layout_of("square", "square", "square", scale=2.0**0.5)
+SIDE, BESIDE = 0.5, [[-1.5, 0.0, 0.0], [0.0, 0.0, 0.0]]
+
+
+def lie(env: BatchedEnv, starts: Any) -> BatchedEnv:
+    """The environments with their tokens where they are told (B, K, 3)."""
+    for world, poses in zip(env._worlds, np.array(starts), strict=True):
+        world.place(poses)
+    env._look()
+    return env
+
+
+def lying(layout: Layout, starts: Any, **sim: Any) -> BatchedEnv:
+    return lie(begun(layout, len(starts), **{"arena": 4.0, **sim}), starts)
+
+
+def put_first_at(env: BatchedEnv, *places: float) -> StepResult:
+    """Move token 0 of each environment to (x, 0)."""
+    way = np.array([(x, 0.0) for x in places]) - env.layout.poses(env.corners)[:, 0, :2]
+    return env.step(np.insert(way / env.sim.arena, [0, 2], [-1.0, 0.0], axis=1))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.5, 1.0])
+@BOTH
+def test_the_bound_is_exact(share: float, backend: str) -> None:
+    """Squares side by side: what is shared is as wide as the way that is too short."""
+    env = lying(SQUARES, [BESIDE] * 3, max_overlap=share, backend=backend)
+    off = 1e-4 if share < 1.0 else 0.0
+    wanted, before = np.array([share - off, share, share + off]), env.corners
+    result = put_first_at(env, *(SIDE * (wanted - 1.0) - [0.0, 1e-9, 0.0]))
+    np.testing.assert_allclose(result.covered, np.maximum(wanted, 0.0), atol=1e-6)
+    assert result.blocked.tolist() == [False, False, share < 1.0]
+    assert not result.refused.any()
+    moved = np.abs(env.corners - before).max(axis=(1, 2)) > 0.5
+    np.testing.assert_array_equal(moved, ~result.blocked)
+    assert env.placed.tolist() == [[True, False]] * 3
+    env.close()
+
+
+def test_a_blocked_action_is_one_of_the_tokens_and_a_refused_one_is_not_blocked() -> None:
+    env = lying(SQUARES, [BESIDE], actions_per_token=2)
+    before, flags = env.corners, []
+    for x in (-0.1, -0.2, -1.0, -0.1):
+        result = put_first_at(env, x)
+        flags.append((result.blocked[0], result.refused[0], env.placed[0, 0]))
+    assert flags == [(True, False, False), (True, False, True), *[(False, True, True)] * 2]
+    np.testing.assert_array_equal(env.corners, before)
+
+
+GAP = 0.35  # between two tokens, on which a third lies by 0.15 of its area each
+
+
+@pytest.mark.parametrize(
+    ("starts", "covered"),
+    [
+        ([[0, 1.5, 0], [-(GAP + SIDE) / 2, 0, 0], [(GAP + SIDE) / 2, 0, 0]], 0.3),  # adds up
+        ([[0, 1.5, 0], [-(GAP + SIDE) / 2, 0, 0], [(GAP + SIDE) / 2 + 0.075, 0, 0]], 0.15),
+        ([[-1.5, 0, 0], [1.0, 0, 0], [1.1, 0.1, 0.2]], 0.0),  # others on each other do not count
+    ],
+)
+def test_what_lies_on_several_tokens_adds_up(starts: list[list[float]], covered: float) -> None:
+    result = put_first_at(lying(TRIPLE, [starts]), 0.0)
+    np.testing.assert_allclose(result.covered, [covered], atol=1e-9)
+    assert result.blocked.tolist() == [covered > 0.2]
+
+
+def test_the_side_that_it_would_lie_on_counts() -> None:
+    layout = layout_of("parallelogram", "square", scale=1.0)
+    corner = np.array([0.375, 0.125]) + layout.shapes[1].radius * 0.5
+    starts = [[[0.0, 0.0, 0.0], [corner[0], -corner[1], 0.0]]] * 2
+    env = lying(layout, starts, arena=2.0, max_overlap=0.0, allow_flip=True)
+    result = env.step(np.array([[-1.0, flip, 0.0, 0.0, 0.0] for flip in (-1.0, 1.0)]))
+    assert (result.covered > 0.0).tolist() == result.blocked.tolist() == [False, True]
+
+
+def test_both_worlds_play_the_same_episodes_while_no_overlap_is_allowed() -> None:
+    rng, blocked, refused = np.random.default_rng(0), 0, 0
+    settings = {"max_overlap": 0.0, "actions_per_token": 2}
+    envs = [begun(GAME, 12, backend=name, **settings) for name in ("physics", "kinematic")]
+    for _ in range(10):
+        actions = rng.uniform(-0.6, 0.6, (12, 4))
+        one, two = (env.step(actions) for env in envs)
+        np.testing.assert_array_equal(one.blocked, two.blocked)
+        np.testing.assert_array_equal(one.refused, two.refused)
+        np.testing.assert_array_equal(envs[0].placed, envs[1].placed)
+        np.testing.assert_allclose(one.covered, two.covered, atol=1e-6)
+        np.testing.assert_allclose(one.rewards, two.rewards, atol=1e-6)
+        np.testing.assert_allclose(envs[0].corners, envs[1].corners, atol=1e-6)
+        blocked, refused = blocked + one.blocked.sum(), refused + one.refused.sum()
+    assert min(blocked, refused) > 5
+    envs[0].close()
+
+
+def test_the_gymnasium_environment_tells_why() -> None:
+    env = TangramEnv(("square", "square"), 2.0**0.5, backend="kinematic", arena=4.0)
+    env.reset(seed=0)
+    lie(env.batch, [BESIDE])
+    *_, info = env.step(np.array([-1.0, (1.5 - 0.73 * SIDE) / 4.0, 0.0, 0.0], dtype=np.float32))
+    assert info["blocked"].startswith(
+        "token 0 would lie on others by 27.000% of its area, at most 20.000% allowed: set it down"
+    )
+    assert "refused" not in info
+    *_, info = env.step(np.array([1.0, 0.1, 0.0, 0.0], dtype=np.float32))
+    assert "blocked" not in info

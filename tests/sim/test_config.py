@@ -1,90 +1,105 @@
-"""Settings that cannot work are refused with the value, the bound and what to do."""
+"""Each declared bound, choice and condition is checked when a dataclass of settings is made."""
 
 import math
+from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
 
 from tangram_sim.config import RewardConfig, SimConfig, StageConfig
 from tangram_sim.errors import ConfigError
+from tangram_sim.settings import Settings, declared, setting
 
 pytestmark = pytest.mark.fast
 
 
-@pytest.mark.parametrize(
-    ("settings", "reason"),
-    [
-        ({"backend": "mujoco"}, "sim.backend must be one of physics, kinematic, got 'mujoco'"),
-        ({"arena": 0.0}, "sim.arena must be between 0.001 and 1000"),
-        ({"arena": math.nan}, "sim.arena must be between"),
-        ({"actions_per_token": 0}, "sim.actions_per_token must be between 1 and 100, got 0"),
-        ({"substeps": 3}, "sim.substeps must be between 4 and 1000, got 3"),
-        ({"substeps": 0, "inexact": True}, "sim.substeps must be between 1 and 1000, got 0"),
-        ({"damping": 0.04}, "sim.damping must be 0, got 0.04: .* set sim.inexact=true"),
-        ({"damping": 1.5, "inexact": True}, "sim.damping must be between 0 and 1, got 1.5"),
-        ({"corner_noise": 0.3}, "sim.corner_noise must be between 0 and 0.2, got 0.3"),
-        ({"pixels": 15}, "sim.pixels must be between 16 and 1024, got 15"),
-        ({"pixels": 1025}, "sim.pixels must be between 16 and 1024, got 1025"),
-        ({"max_tries": 0}, "sim.max_tries must be between 1"),
-        ({"motion": "fly"}, "sim.motion must be one of lift, slide, got 'fly'"),
-        ({"max_overlap": 1.1}, "sim.max_overlap must be between 0 and 1, got 1.1"),
-        ({"max_overlap": -0.1}, "sim.max_overlap must be between 0 and 1, got -0.1"),
-        ({"targets": "chaos"}, "sim.targets must be one of uniform, .* mixed, got 'chaos'"),
-        ({"spread": 0.0}, "sim.spread must be between 0.001 and 1, got 0"),
-        ({"starts": "here"}, "sim.starts must be one of anywhere, outside, got 'here'"),
-        ({"mirrored": 2.0}, "sim.mirrored must be between 0 and 1, got 2"),
-        ({"mirrored": math.nan}, "sim.mirrored must be between 0 and 1, got nan"),
-        (
-            {"stages": (StageConfig(updates=5), StageConfig(updates=5))},
-            "sim.stages must begin one after the other, got updates .5, 5.: sort them",
-        ),
-        ({"stages": (StageConfig(updates=5), StageConfig(updates=1))}, "got updates .5, 1."),
-        ({"stages": ({"updates": 0},)}, "sim.stages must list stages, got {'updates': 0}"),
-    ],
+@dataclass(frozen=True)
+class NoiseConfig(Settings, section="noise"):
+    """Of a made-up section."""
+
+    seed: int = field(default=1, metadata=declared("of the noise", low=0, high=9))
+    kind: str = setting("none", "which noise", choices=("none", "gaussian", "wide"))
+    width: float = setting(0.1, "its deviation", low=0, only={"kind": ("gaussian", "wide")})
+    sizes: tuple[int, ...] = setting((1, 2), "of its parts", low=1, high=4)
+    share: float | None = setting(None, "of what is noisy", low=0, high=1)
+    blur: float = setting(0.0, "of its edges", low=0, unless={"share": (None, 0.0)})
+
+
+@dataclass(frozen=True)
+class TopConfig(Settings):
+    """Settings without a section."""
+
+    jobs: int = setting(2, "at a time", low=1)
+
+
+UNUSED = (
+    "^noise.width=0.2 changes nothing with noise.kind=none: leave it out, or set "
+    "noise.kind=gaussian or wide$"
 )
-def test_refused_sim(settings: dict[str, Any], reason: str) -> None:
+BLURRED = "leave it out, or give noise.share another value$"
+UNSORTED = (StageConfig(updates=5), StageConfig(updates=1))
+TWICE = (StageConfig(updates=5), StageConfig(updates=5))
+REFUSED = [
+    (NoiseConfig, {"seed": -1}, "^noise.seed must be between 0 and 9, got -1$"),
+    (NoiseConfig, {"seed": 10}, "^noise.seed must be between 0 and 9, got 10$"),
+    (NoiseConfig, {"kind": "x"}, "^noise.kind must be one of none, gaussian, wide, got 'x'$"),
+    (NoiseConfig, {"kind": "wide", "width": -1.0}, "^noise.width must be at least 0, got -1.0$"),
+    (NoiseConfig, {"kind": "wide", "width": math.nan}, "^noise.width must be at least 0, got nan$"),
+    (NoiseConfig, {"sizes": (1, 5)}, "^noise.sizes must be between 1 and 4, got 5$"),
+    (NoiseConfig, {"share": 1.5}, "^noise.share must be between 0 and 1, got 1.5$"),
+    (NoiseConfig, {"width": 0.2}, UNUSED),
+    (NoiseConfig, {"blur": 0.5}, f"^noise.blur=0.5 .* with noise.share=null: {BLURRED}"),
+    (NoiseConfig, {"blur": 0.5, "share": 0.0}, f"^noise.blur=0.5 .* noise.share=0: {BLURRED}"),
+    (TopConfig, {"jobs": 0}, "^jobs must be at least 1, got 0$"),
+    (SimConfig, {"backend": "x"}, "sim.backend must be one of physics, kinematic, got 'x'"),
+    (SimConfig, {"arena": 0.0}, "sim.arena must be between 0.001 and 1000"),
+    (SimConfig, {"actions_per_token": 0}, "sim.actions_per_token must be between 1 and 100, got 0"),
+    (SimConfig, {"substeps": 3}, "sim.substeps must be between 4 and 1000, got 3"),
+    (SimConfig, {"substeps": 0, "inexact": True}, "must be between 1 and 1000, got 0"),
+    (SimConfig, {"damping": 0.04}, "sim.damping must be 0, got 0.04: .* set sim.inexact=true"),
+    (SimConfig, {"damping": 1.5, "inexact": True}, "must be between 0 and 1, got 1.5"),
+    (SimConfig, {"corner_noise": 0.3}, "sim.corner_noise must be between 0 and 0.2, got 0.3"),
+    (SimConfig, {"pixels": 15}, "sim.pixels must be between 16 and 1024, got 15"),
+    (SimConfig, {"max_tries": 0}, "sim.max_tries must be between 1"),
+    (SimConfig, {"motion": "fly"}, "sim.motion must be one of lift, slide, got 'fly'"),
+    (SimConfig, {"motion": "slide", "backend": "kinematic"}, "needs .* got sim.backend=kinematic"),
+    (SimConfig, {"motion": "slide", "allow_flip": True}, "allow_flip=true needs sim.motion=lift"),
+    (SimConfig, {"max_overlap": 1.1}, "sim.max_overlap must be between 0 and 1, got 1.1"),
+    (SimConfig, {"targets": "x"}, "sim.targets must be one of uniform, .* mixed, got 'x'"),
+    (SimConfig, {"spread": 0.0}, "sim.spread must be between 0.001 and 1, got 0"),
+    (SimConfig, {"starts": "x"}, "sim.starts must be one of anywhere, outside, got 'x'"),
+    (SimConfig, {"mirrored": 2.0}, "sim.mirrored must be between 0 and 1, got 2"),
+    (SimConfig, {"stages": UNSORTED}, "must begin one after the other, got updates .5, 1.: sort"),
+    (SimConfig, {"stages": TWICE}, "must begin one after the other, got updates .5, 5.: sort them"),
+    (SimConfig, {"stages": ({"updates": 0},)}, "must list stages, got {'updates': 0}"),
+    (StageConfig, {"updates": -1}, "sim.stages.updates must be at least 0, got -1"),
+    (StageConfig, {"tokens": 17}, "sim.stages.tokens must be between 0 and 16, got 17"),
+    (StageConfig, {"targets": "x"}, "sim.stages.targets must be one of uniform"),
+    (StageConfig, {"spread": 1.5}, "sim.stages.spread must be between 0.001 and 1, got 1.5"),
+    (RewardConfig, {"name": "x"}, "overlap, dense, pose or path/to/file.py:function, got 'x'"),
+    (RewardConfig, {"name": ":function"}, "got ':function'"),
+    (RewardConfig, {"name": "file.py:"}, "got 'file.py:'"),
+    (RewardConfig, {"name": "file.py:two words"}, "got 'file.py:two words'"),
+    (RewardConfig, {"name": "module:function"}, "got 'module:function'"),
+    (RewardConfig, {"source": "eyes"}, "reward.source must be one of polygon, camera"),
+    (RewardConfig, {"sharpness": 0.0}, "reward.sharpness must be between"),
+    (RewardConfig, {"name": "dense", "source": "camera"}, "set reward.source=polygon"),
+]
+
+
+@pytest.mark.parametrize(("made", "values", "reason"), REFUSED)
+def test_a_wrong_value_is_refused(
+    made: type[Settings], values: dict[str, Any], reason: str
+) -> None:
     with pytest.raises(ConfigError, match=reason):
-        SimConfig(**settings)
+        made(**values)
 
 
-@pytest.mark.parametrize(
-    ("settings", "reason"),
-    [
-        ({"updates": -1}, "sim.stages.updates must be at least 0, got -1"),
-        ({"tokens": -1}, "sim.stages.tokens must be between 0 and 16, got -1"),
-        ({"tokens": 17}, "sim.stages.tokens must be between 0 and 16, got 17"),
-        ({"targets": "chaos"}, "sim.stages.targets must be one of uniform"),
-        ({"spread": 1.5}, "sim.stages.spread must be between 0.001 and 1, got 1.5"),
-    ],
-)
-def test_refused_stage(settings: dict[str, Any], reason: str) -> None:
-    with pytest.raises(ConfigError, match=reason):
-        StageConfig(**settings)
-
-
-@pytest.mark.parametrize(
-    ("settings", "reason"),
-    [
-        ({"name": "overlapp"}, "overlap, dense, pose or path/to/file.py:function, got 'overlapp'"),
-        ({"name": ":function"}, "got ':function'"),
-        ({"name": "file.py:"}, "got 'file.py:'"),
-        ({"name": "file.py:two words"}, "got 'file.py:two words'"),
-        ({"name": "module:function"}, "got 'module:function'"),
-        ({"source": "eyes"}, "reward.source must be one of polygon, camera"),
-        ({"sharpness": 0.0}, "reward.sharpness must be between"),
-        ({"name": "dense", "source": "camera"}, "set reward.source=polygon"),
-    ],
-)
-def test_refused_reward(settings: dict[str, Any], reason: str) -> None:
-    with pytest.raises(ConfigError, match=reason):
-        RewardConfig(**settings)
-
-
-def test_an_inexact_world_is_made_on_request() -> None:
-    sim = SimConfig(inexact=True, substeps=1, damping=0.04)
-    assert (sim.substeps, sim.damping) == (1, 0.04)
-
-
-def test_defaults_work() -> None:
+def test_bounds_and_what_is_not_given_are_taken() -> None:
+    made = NoiseConfig(9, "wide", 0.0, (), 0.0)
+    assert (made.width, made.sizes, made.share) == (0.0, (), 0.0)
+    assert NoiseConfig(0).width == 0.1
+    assert NoiseConfig(0, share=0.5, blur=0.5).blur == 0.5
+    inexact = SimConfig(inexact=True, substeps=1, damping=0.04)
+    assert (inexact.substeps, inexact.damping) == (1, 0.04)
     assert SimConfig().substeps >= 4
-    assert RewardConfig().name == "overlap"

@@ -8,12 +8,11 @@ from PIL import Image
 
 from tangram_sim.drawing import contact_sheet, draw_scene, episode_sheet, save_gif
 from tangram_sim.game_drawing import Held, captions, draw_game, figure_sheet, tiles
-from tangram_sim.puzzles import load_puzzle
 from tests.sim.builders import SEVEN, layout_of
 
 pytestmark = pytest.mark.fast
 
-PAIR = layout_of("square", "square")
+SQUARE, PAIR = layout_of("square"), layout_of("square", "square")
 
 
 def scene(size: int = 120, active: int | None = None) -> Image.Image:
@@ -26,30 +25,25 @@ def scene(size: int = 120, active: int | None = None) -> Image.Image:
 def at(image: Image.Image, x: float, y: float) -> tuple[int, ...]:
     """Colour at a point of the arena of width 2, whose margin is 4 % of the picture."""
     side = image.size[0]
-    pixel = image.getpixel((side * (0.5 + 0.46 * x), side * (0.5 - 0.46 * y)))
-    assert isinstance(pixel, tuple)
-    return pixel
+    return image.getpixel((side * (0.5 + 0.46 * x), side * (0.5 - 0.46 * y)))  # type: ignore[return-value]
 
 
-@pytest.mark.parametrize("size", [60, 120, 241])
+@pytest.mark.parametrize("size", [60, 241])
 def test_tokens_and_targets_lie_where_they_should(size: int) -> None:
     image = scene(size)
     assert image.size == (size, size)
-    first, second, target, table = (
-        at(image, x, y) for x, y in [(0.5, 0.5), (-0.5, 0.5), (0.5, -0.5), (0.0, 0.0)]
-    )
+    places = [(0.5, 0.5), (-0.5, 0.5), (0.5, -0.5), (0.0, 0.0)]
+    first, second, target, table = (at(image, *place) for place in places)
     assert table == (255, 255, 255)
     assert len({first, second, target, table}) == 4
     assert at(image, -0.5, -0.5) == target
     assert min(target) > 200  # pale
 
 
-def test_edges_are_smooth() -> None:
-    square = layout_of("square")
-    corners = square.corners(np.array([[0.0, 0.0, 0.3]]))
-    away = square.corners(np.array([[5.0, 5.0, 0.0]]))
-    image = draw_scene(square, 2.0, corners, away, 100)
-    assert len(set(image.get_flattened_data())) > 20
+def test_edges_are_smooth_and_tokens_outside_the_arena_are_cut() -> None:
+    turned, away = (SQUARE.corners(np.array([pose])) for pose in ([0, 0, 0.3], [50, -50, 0.0]))
+    assert len(set(draw_scene(SQUARE, 2.0, turned, away, 100).get_flattened_data())) > 20
+    assert draw_scene(SQUARE, 2.0, away, away, 64).size == (64, 64)
 
 
 def test_the_active_token_is_marked() -> None:
@@ -60,19 +54,11 @@ def test_the_active_token_is_marked() -> None:
 
 
 def test_every_tan_has_its_own_colour() -> None:
-    layout = layout_of(*SEVEN, scale=0.3)
-    poses = np.zeros((7, 3))
+    layout, poses = layout_of(*SEVEN, scale=0.3), np.zeros((7, 3))
     poses[:, 0] = np.linspace(-0.85, 0.85, 7)
-    away = layout.corners(poses + [0.0, 0.5, 0.0])
-    image = draw_scene(layout, 2.0, layout.corners(poses), away, 400)
-    colours = {at(image, x, 0.0) for x in poses[:, 0]}
-    assert len(colours) == 7
-
-
-def test_tokens_outside_the_arena_are_cut() -> None:
-    square = layout_of("square")
-    far = square.corners(np.array([[50.0, -50.0, 0.0]]))
-    assert draw_scene(square, 2.0, far, far, 64).size == (64, 64)
+    corners, away = layout.corners(poses), layout.corners(poses + [0.0, 0.5, 0.0])
+    image = draw_scene(layout, 2.0, corners, away, 400)
+    assert len({at(image, x, 0.0) for x in poses[:, 0]}) == 7
 
 
 def test_contact_sheet_of_twelve() -> None:
@@ -80,8 +66,7 @@ def test_contact_sheet_of_twelve() -> None:
     assert sheet.size[0] == 1000
     assert contact_sheet([scene(240)] * 2, columns=4).size[0] < 600
     # Each picture stands where it should, whole.
-    first = sheet.crop((8, 8, 248, 248))
-    assert np.array_equal(np.asarray(first), np.asarray(scene(240)))
+    assert np.array_equal(np.asarray(sheet.crop((8, 8, 248, 248))), np.asarray(scene(240)))
 
 
 def test_refused_sheets_and_films(tmp_path: Path) -> None:
@@ -107,10 +92,9 @@ def test_gif_keeps_pictures_and_pace(tmp_path: Path) -> None:
 
 
 def test_where_a_token_started_is_a_pale_ghost_with_a_way() -> None:
-    square = layout_of("square")
-    start, end, away = (square.corners(np.array([[x, 0.0, 0.0]])) for x in (-0.6, 0.6, 5.0))
-    plain = draw_scene(square, 2.0, end, away, 200)
-    shown = draw_scene(square, 2.0, end, away, 200, start=start)
+    start, end, away = (SQUARE.corners(np.array([[x, 0.0, 0.0]])) for x in (-0.6, 0.6, 5.0))
+    plain = draw_scene(SQUARE, 2.0, end, away, 200)
+    shown = draw_scene(SQUARE, 2.0, end, away, 200, start=start)
     assert at(plain, -0.6, 0.05) == (255, 255, 255)
     assert 200 < min(at(shown, -0.6, 0.05)) < 255
     changed = np.nonzero((np.asarray(plain) != np.asarray(shown)).any(axis=-1))
@@ -118,14 +102,12 @@ def test_where_a_token_started_is_a_pale_ghost_with_a_way() -> None:
 
 
 def test_an_episode_sheet_says_how_much_is_covered() -> None:
-    square = layout_of("square")
-    ends = square.corners(np.array([[[0.0, 0.0, 0.0]], [[0.5, 0.5, 0.3]]]))
-    sheet = episode_sheet(square, 2.0, ends[::-1], ends, ends, columns=2, size=120)
-    plain = contact_sheet([draw_scene(square, 2.0, e, e, 120) for e in ends], columns=2)
+    ends = SQUARE.corners(np.array([[[0.0, 0.0, 0.0]], [[0.5, 0.5, 0.3]]]))
+    sheet = episode_sheet(SQUARE, 2.0, ends[::-1], ends, ends, columns=2, size=120)
+    plain = contact_sheet([draw_scene(SQUARE, 2.0, e, e, 120) for e in ends], columns=2)
     assert sheet.width == plain.width
     assert sheet.height > plain.height  # captions
-    ink = np.asarray(sheet.convert("L"))[-16:]
-    assert ink.min() < 120
+    assert np.asarray(sheet.convert("L"))[-16:].min() < 120
 
 
 GOAL = PAIR.corners(np.array([[0.2, -0.5, 0.0], [-0.2, -0.5, 0.0]]))
@@ -158,25 +140,19 @@ def dark(image: Image.Image) -> float:
     return float((np.asarray(image.convert("L"))[:size, size:] < 245).mean())
 
 
-def test_a_lifted_piece_is_larger_and_throws_a_shadow() -> None:
+def test_a_lifted_piece_is_larger_throws_a_shadow_and_is_a_line_on_its_edge() -> None:
     shares = [dark(game(held=Held(0, height))) for height in (0.0, 0.5, 1.0)]
     assert shares[0] < shares[1] < shares[2]
+    turning = STARTS.copy()
+    turning[:4, 1] = 0.5  # half way of being turned over
+    assert dark(game(turning, Held(0, 1.0))) > 0.0
 
 
 def test_a_piece_that_cannot_be_set_down_is_marked_in_red() -> None:
-    red = [
-        int(((pixels[..., 0] > 180) & (pixels[..., 1:].max(axis=-1) < 80)).sum())
-        for pixels in (np.asarray(game(held=Held(0, 0.5, stopped))) for stopped in (False, True))
-    ]
+    shown = [np.asarray(game(held=Held(0, 0.5, stopped))) for stopped in (False, True)]
+    red = [((one[..., 0] > 180) & (one[..., 1:].max(axis=-1) < 80)).sum() for one in shown]
     assert red[0] == 0
     assert red[1] > 50
-
-
-def test_a_piece_on_its_edge_is_a_line() -> None:
-    """As it is seen half way of being turned over."""
-    corners = STARTS.copy()
-    corners[:4, 1] = 0.5
-    assert dark(game(corners, Held(0, 1.0))) > 0.0
 
 
 @pytest.mark.parametrize(
@@ -194,10 +170,9 @@ def test_captions_tell_name_and_share() -> None:
 
 
 def test_a_sheet_has_a_picture_for_every_figure() -> None:
-    cat = load_puzzle("cat")
-    ends = np.stack([cat.corners] * 3)
-    sheet = figure_sheet(cat.layout, 2.0, ends, ends, ["a", "b", "c"])
+    ends = np.stack([GOAL] * 3)
+    sheet = figure_sheet(PAIR, 2.0, ends, ends, ["a", "b", "c"])
     assert 1200 < sheet.width < 1400
-    left, tile = np.asarray(sheet), (sheet.width - 13) // 3
-    # The same figure three times: what is 413 pixels further on is the same picture.
-    np.testing.assert_array_equal(left[:400, 13:413], left[:400, 13 + tile : 413 + tile])
+    shown, tile = np.asarray(sheet), (sheet.width - 13) // 3
+    # The same figure three times: what is a tile further on is the same picture.
+    np.testing.assert_array_equal(shown[:400, 13:413], shown[:400, 13 + tile : 413 + tile])

@@ -9,20 +9,22 @@ from hypothesis import strategies as st
 from tangram_sim.arrays import Floats
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry import (
-    any_overlap,
     area,
     clip,
+    outlines,
     overlap_area,
     overlap_share,
+    pairs_overlap,
     union_area,
 )
 from tangram_sim.layout import Layout
 from tangram_sim.sampling import sample_batch
 from tangram_sim.shapes import SHAPE_NAMES, tan
-from tests.sim.builders import SEVEN, TRIO, layout_of, polygons, random_poses, total_area
+from tests.sim.builders import SEVEN, TRIO, layout_of, polygons, random_poses
 
 pytestmark = pytest.mark.fast
 
+UNIT = [[0, 0], [1, 0], [1, 1], [0, 1]]
 quick = settings(deadline=None, max_examples=60)
 names = st.sampled_from(SHAPE_NAMES)
 poses = st.tuples(*[st.floats(-1.0, 1.0)] * 2, st.floats(-np.pi, np.pi))
@@ -63,18 +65,19 @@ def test_union_area_equals_shapely(shapes: tuple[str, ...]) -> None:
     np.testing.assert_allclose(union_area(tokens, layout), unions, atol=1e-7)
 
 
-def test_any_overlap_equals_shapely() -> None:
-    layout = layout_of(*TRIO, scale=1.0)
-    corners = layout.corners(random_poses(np.random.default_rng(1), 200, 3, 0.7))
+def test_pairs_overlap_as_shapely_says_and_touching_is_none() -> None:
+    layout = layout_of("parallelogram", "square", scale=1.0)
+    corners = layout.corners(random_poses(np.random.default_rng(1), 200, 2, 0.4))
     expected = []
     for tokens in corners:
-        a, b, c = polygons(layout, tokens)
-        pairs = ((a, b), (a, c), (b, c))
-        expected.append(
-            any(shapely.intersection(p, q, grid_size=1e-9).area > 1e-8 for p, q in pairs)
-        )
-    assert any_overlap(corners, layout).tolist() == expected
+        shared = shapely.intersection(*polygons(layout, tokens), grid_size=1e-9)
+        expected.append(shared.area > 1e-8)
+    first, second = outlines(corners, layout).swapaxes(0, 1)
+    assert pairs_overlap(first, second).tolist() == expected
     assert 20 < sum(expected) < 180
+    side, gaps = np.array([UNIT] * 5), [0.0, 0.5, 1.0 - 1e-6, 1.0, 1.5]
+    moved = side + np.array([[[gap, 0.0]] for gap in gaps])
+    assert pairs_overlap(side, moved).tolist() == [True, True, True, False, False]
 
 
 @given(names, names, poses, poses)
@@ -108,57 +111,31 @@ def test_pieces_that_share_an_edge_only_touch(
 
 def test_coincident_edges_inside() -> None:
     """A corner piece of a square, both on the grid: two edges coincide, the rest is inside."""
-    unit = np.array([[[0, 0], [1, 0], [1, 1], [0, 1]]], dtype=float)
-    assert area(clip(unit, unit * 0.5))[0] == 0.25
-    assert area(clip(unit * 0.5, unit))[0] == 0.25
-    assert area(clip(unit, unit + np.array([1.0, 0.0])))[0] == 0.0
-    assert area(clip(unit, unit + np.array([3.0, 0.0])))[0] == 0.0
+    unit = np.array([UNIT], dtype=float)
+    cases = [(unit, unit * 0.5), (unit * 0.5, unit), (unit, unit + [1, 0]), (unit, unit + [3, 0])]
+    assert [area(clip(*pair))[0] for pair in cases] == [0.25, 0.25, 0.0, 0.0]
 
 
-def test_batch_rows_do_not_influence_each_other() -> None:
-    layout = layout_of(*SEVEN, scale=0.6)
-    rng = np.random.default_rng(3)
-    tokens = layout.corners(random_poses(rng, 16, 7, 0.5))
-    targets = layout.corners(random_poses(rng, 16, 7, 0.5))
-    together = overlap_area(tokens, targets, layout)
-    alone = [
-        overlap_area(t[None], g[None], layout)[0] for t, g in zip(tokens, targets, strict=True)
-    ]
-    np.testing.assert_allclose(together, alone, atol=1e-12)
-
-
-def test_tokens_that_cover_each_other_count_once() -> None:
-    layout = layout_of("square", "square", scale=1.0)
-    goal = layout.corners(np.array([[[0.0, 0, 0], [2, 0, 0]]]))
-    both_on_one = layout.corners(np.array([[[0.0, 0, 0], [0, 0, 0]]]))
-    swapped = layout.corners(np.array([[[2.0, 0, 0], [0, 0, 0]]]))
-    assert overlap_share(both_on_one, goal, layout)[0] == pytest.approx(0.5)
-    assert overlap_share(swapped, goal, layout)[0] == pytest.approx(1.0)
-    assert overlap_share(goal, goal, layout)[0] == pytest.approx(1.0)
-
-
-def test_share_is_of_the_targets_area() -> None:
-    layout = layout_of("square", "small_triangle", scale=1.0)
-    goal = layout.corners(np.array([[[0.0, 0, 0], [2, 0, 0]]]))
-    only_square = layout.corners(np.array([[[0.0, 0, 0], [9, 9, 0]]]))
-    assert total_area(layout) == pytest.approx(3 / 16)
-    assert overlap_share(only_square, goal, layout)[0] == pytest.approx(2 / 3)
-
-
-def test_any_overlap_of_touching_and_crossing() -> None:
-    layout = layout_of("square", "square", scale=np.sqrt(8.0))  # side 1
-    gaps = np.array([0.0, 0.5, 1.0 - 1e-6, 1.0, 1.5])
-    poses = np.zeros((5, 2, 3))
-    poses[:, 1, 0] = gaps
-    assert any_overlap(layout.corners(poses), layout).tolist() == [True, True, True, False, False]
+@pytest.mark.parametrize(
+    ("second", "places", "share"),
+    [
+        ("square", (0.0, 0.0), 1 / 2),  # both on one: counted once
+        ("square", (2.0, 0.0), 1.0),  # swapped
+        ("square", (0.0, 2.0), 1.0),
+        ("small_triangle", (0.0, 9.0), 2 / 3),  # of the target's area, not of what lies there
+    ],
+)
+def test_the_share_is_of_the_targets_area_and_counts_a_place_once(
+    second: str, places: tuple[float, float], share: float
+) -> None:
+    layout = layout_of("square", second, scale=1.0)
+    poses = np.zeros((2, 1, 2, 3))
+    poses[0, 0, :, 0], poses[1, 0, :, 0] = places, (0.0, 2.0)
+    assert overlap_share(*layout.corners(poses), layout)[0] == pytest.approx(share)
 
 
 def _placed(name: str, pose: tuple[float, ...]) -> Floats:
-    return _moved(tan(name).corners[None], pose)
-
-
-def _moved(polygons: Floats, pose: tuple[float, ...]) -> Floats:
     x, y, angle = pose
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    moved: Floats = polygons @ turn.T + [x, y]
+    moved: Floats = tan(name).corners[None] @ turn.T + [x, y]
     return moved

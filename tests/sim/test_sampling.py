@@ -1,4 +1,6 @@
-"""Layouts without overlap, apart or edge to edge, inside the arena, bounded and reproducible."""
+"""Streams of randomness, and layouts: apart or edge to edge, inside the arena, bounded."""
+
+import itertools
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from tangram_sim.connected import sample_connected
 from tangram_sim.errors import SamplingError
 from tangram_sim.layout import Layout
 from tangram_sim.sampling import sample_batch, sample_poses
-from tangram_sim.seeding import evaluation_generators
+from tangram_sim.seeding import episode_generator, evaluation_generators
 from tests.sim.builders import (
     LOPSIDED,
     SEVEN,
@@ -18,10 +20,29 @@ from tests.sim.builders import (
     largest_overlap,
     layout_of,
     pieces,
-    polygons,
 )
 
 pytestmark = pytest.mark.fast
+
+
+def test_every_argument_gives_another_stream() -> None:
+    """Also where a plain list of integers would be padded or joined to the same entropy."""
+    values = (0, 1, 2**32, 2**64)
+    keys = itertools.product(values, ("player", "evaluator"), values, values, values)
+    draws = [episode_generator(*key).integers(2**63) for key in keys]
+    assert len(set(draws)) == len(draws) == 2 * 4**4
+
+
+def test_streams_do_not_change_between_versions() -> None:
+    """A run that is resumed, and the test set, rely on it."""
+    assert episode_generator(1, "player", 2, 3, 4).random() == 0.7262557940995327
+    assert evaluation_generators(1)[0].random() == 0.3233672278778038
+
+
+def test_a_small_test_set_is_the_beginning_of_a_large_one() -> None:
+    small, large = ([rng.random() for rng in evaluation_generators(size)] for size in (3, 100))
+    assert small == large[:3]
+    assert len(set(large)) == 100
 
 
 @pytest.mark.parametrize(
@@ -29,30 +50,15 @@ pytestmark = pytest.mark.fast
     [
         (layout_of("square"), 2.0),
         (layout_of(*TRIO, LOPSIDED, scale=0.2), 2.0),
-        (layout_of(*SEVEN, scale=0.6), 2.0),
         (layout_of(*SEVEN, scale=0.9), 2.0),  # a fifth of the arena is filled
         (layout_of("square", "square", scale=0.01), 0.02),
     ],
 )
 def test_tokens_lie_inside_and_apart(layout: Layout, arena: float) -> None:
-    sim = SimConfig(arena=arena)
-    poses = sample_batch(layout, sim, evaluation_generators(40))
-    corners = layout.corners(poses)
+    poses = sample_batch(layout, SimConfig(arena=arena), evaluation_generators(40))
     assert poses.shape == (40, layout.tokens, 3)
-    assert np.abs(corners).max() <= arena / 2.0
-    for tokens in corners / arena:
-        own = polygons(layout, tokens)
-        union = shapely.union_all(own, grid_size=1e-9)
-        assert union.area == pytest.approx(sum(p.area for p in own), abs=1e-6)
-
-
-def test_same_generator_gives_the_same_layout_in_any_company() -> None:
-    """Rejected draws of one environment must not shift the others."""
-    layout, sim = layout_of(*SEVEN, scale=0.8), SimConfig()
-    together = sample_batch(layout, sim, evaluation_generators(20))
-    alone = [sample_poses(layout, sim, rng) for rng in evaluation_generators(20)]
-    np.testing.assert_array_equal(together, alone)
-    assert len(np.unique(together.reshape(20, -1), axis=0)) == 20
+    assert np.abs(layout.corners(poses)).max() <= arena / 2.0
+    assert max(largest_overlap(layout, one) for one in poses) < 1e-7 * arena**2
 
 
 def test_positions_and_angles_are_uniform() -> None:
@@ -77,19 +83,13 @@ def test_an_arena_that_is_too_small_is_refused() -> None:
     sample_poses(layout_of("small_triangle"), SimConfig(arena=0.6), np.random.default_rng(0))
 
 
-def test_giving_up_names_the_numbers() -> None:
-    layout, sim = layout_of("square", "square"), SimConfig(arena=0.6, max_tries=37)
-    with pytest.raises(
-        SamplingError, match=r"'square' beside 1 others in 37 tries .* 0\.6: raise sim\.arena"
-    ):
-        sample_poses(layout, sim, np.random.default_rng(0))
-
-
-def test_tries_are_bounded_exactly() -> None:
+def test_tries_are_bounded_exactly_and_giving_up_names_the_numbers() -> None:
     """The last chunk is cut: 5 tries are 4 and 1, whatever the chunk."""
     layout, sim = layout_of("square", "square"), SimConfig(arena=0.6, max_tries=5)
     rng, twin = np.random.default_rng(0), np.random.default_rng(0)
-    with pytest.raises(SamplingError):
+    with pytest.raises(
+        SamplingError, match=r"'square' beside 1 others in 5 tries .* 0\.6: raise sim\.arena"
+    ):
         sample_poses(layout, sim, rng)
     twin.random((1 + 5, 3))
     assert rng.random() == twin.random()
@@ -139,7 +139,6 @@ def test_tokens_on_their_other_side_lie_apart_too() -> None:
 GAME = layout_of(*SEVEN, scale=0.6)
 LAYOUTS = [
     (GAME, 2.0),
-    (layout_of("square", "square", scale=0.8), 1.0),
     (layout_of("parallelogram", LOPSIDED, "large_triangle", scale=0.25), 2.0),
     (layout_of(*SEVEN, scale=0.003), 0.01),
 ]
@@ -153,7 +152,7 @@ def shared_edge(one: shapely.Polygon, other: shapely.Polygon, tolerance: float) 
 @pytest.mark.parametrize(("layout", "arena"), LAYOUTS)
 def test_each_piece_shares_an_edge_and_overlaps_none(layout: Layout, arena: float) -> None:
     sim = SimConfig(arena=arena)
-    for rng in evaluation_generators(30):
+    for rng in evaluation_generators(20):
         poses = sample_connected(layout, sim, rng)
         own = pieces(layout, poses)
         assert np.abs(layout.corners(poses)).max() <= arena / 2.0 + 1e-12
@@ -177,13 +176,6 @@ def test_every_piece_and_every_side_has_its_turn() -> None:
     corners = GAME.corners(poses)
     assert corners.max(axis=(1, 2)).max() > 0.95
     assert np.ptp(corners, axis=1).max(axis=1).std() > 0.05
-
-
-def test_the_same_generator_gives_the_same_target() -> None:
-    once = [sample_connected(GAME, SimConfig(), rng) for rng in evaluation_generators(5)]
-    again = [sample_connected(GAME, SimConfig(), rng) for rng in evaluation_generators(5)]
-    np.testing.assert_array_equal(once, again)
-    assert len(np.unique(np.round(once, 9).reshape(5, -1), axis=0)) == 5
 
 
 def test_many_pieces_meet_corner_to_corner() -> None:

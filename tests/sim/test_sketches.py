@@ -36,14 +36,8 @@ def message_of(text: str) -> str:
         ('{\n"format": }', "my.json is not JSON that can be read: check line 2"),
         ("[" * 100_000, "my.json is not JSON that can be read: check its nesting and numbers"),
         ("9" * 5000, "my.json is not JSON that can be read: check its nesting and numbers"),
-        (
-            "[]",
-            "my.json must be a mapping with exactly the keys format, version, puzzles, got []",
-        ),
-        (
-            '{"format": 1, "format": 2}',
-            "my.json: a key is given twice among ['format', 'format']: remove one",
-        ),
+        ("[]", "my.json must be a mapping with exactly the keys format, version, puzzles, got []"),
+        ('{"a": 1, "a": 2}', "my.json: a key is given twice among ['a', 'a']: remove one"),
     ],
 )
 def test_what_is_no_mapping_is_refused(text: str, message: str) -> None:
@@ -57,38 +51,32 @@ def test_what_is_no_mapping_is_refused(text: str, message: str) -> None:
         ({"format": "chess"}, "my.json: format must be 'tangram-puzzles', got 'chess'"),
         (
             {"version": 2},
-            "my.json: version must be 1, got 2: write the file anew, or read it with the release "
-            "that wrote it",
+            "must be 1, got 2: write the file anew, or read it with the release that ",
         ),
         ({"version": True}, "my.json: version must be 1, got True"),
         ({"version": 1.0}, "my.json: version must be 1, got 1.0"),
         ({"puzzles": []}, "my.json: puzzles must be a list of 1 to 1000, got 0"),
         ({"puzzles": {}}, "my.json: puzzles must be a list of 1 to 1000, got {}"),
-        (
-            {"puzzles": [1] * (MAX_PUZZLES + 1)},
-            "my.json: puzzles must be a list of 1 to 1000, got 1001",
-        ),
+        ({"puzzles": [1] * (MAX_PUZZLES + 1)}, "puzzles must be a list of 1 to 1000, got 1001"),
     ],
 )
 def test_a_wrong_head_is_refused(change: dict[str, Any], message: str) -> None:
     assert message in message_of(json.dumps(file_of(figure("cat")) | change))
 
 
-def test_files_are_bounded(tmp_path: Path) -> None:
-    path = tmp_path / "large.json"
-    path.write_bytes(b" " * (MAX_BYTES + 1))
-    with pytest.raises(ConfigError, match=f"larger than {MAX_BYTES} bytes: split it"):
-        read_puzzles(path)
-    assert "longer than" in message_of(" " * (MAX_BYTES + 1))
-
-
 def test_files_that_cannot_be_read_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "my.json"
+    for content, reason in (
+        (b" " * (MAX_BYTES + 1), f"larger than {MAX_BYTES} bytes: split it"),
+        (b"\xff\xfe{\x00}\x00", "is not UTF-8: save it as UTF-8"),
+    ):
+        file.write_bytes(content)
+        with pytest.raises(ConfigError, match=reason):
+            read_puzzles(file)
+    assert "longer than" in message_of(" " * (MAX_BYTES + 1))
     for path in (tmp_path, tmp_path / "missing.json", Path("/dev/zero")):
         with pytest.raises(ConfigError, match="is no file: check the path"):
             read_puzzles(path)
-    (tmp_path / "binary.json").write_bytes(b"\xff\xfe{\x00}\x00")
-    with pytest.raises(ConfigError, match="is not UTF-8: save it as UTF-8"):
-        read_puzzles(tmp_path / "binary.json")
 
 
 def test_a_file_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
@@ -98,6 +86,11 @@ def test_a_file_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
 
 
 # One puzzle
+
+
+CORNER = "piece 3 (small_triangle): a corner must be [x, y], finite and within +-1e+06"
+NO_CORNERS: list[Any] = [7, [1], [1, 2, 3], ["1", 2], [None, 2], [True, 2], [float("nan"), 0]]
+NO_CORNERS += [[0, float("inf")], [0, -2e6], [10**30, 0]]
 
 
 def at(path: str, value: Any) -> Callable[[Any], None]:
@@ -126,44 +119,15 @@ def at(path: str, value: Any) -> Callable[[Any], None]:
         (at("pieces", [0] * 17), "puzzle 'cat': pieces must be a list of 1 to 16, got 17"),
         (at("pieces.0", 3), "puzzle 'cat', piece 1 must have exactly the keys shape, corners, go"),
         (at("pieces.0.angle", 3), "puzzle 'cat', piece 1 must have exactly the keys shape, corne"),
-        (
-            at("pieces.2.shape", "disc"),
-            f"puzzle 'cat', piece 3: shape must be one of {KINDS}, got 'disc'",
-        ),
+        (at("pieces.2.shape", "disc"), f"piece 3: shape must be one of {KINDS}, got 'disc'"),
         (at("pieces.2.shape", []), f"puzzle 'cat', piece 3: shape must be one of {KINDS}, got []"),
         (
             at("pieces.2.corners", None),
-            "puzzle 'cat', piece 3 (small_triangle): corners must be a list of 3 pairs, got None",
+            "(small_triangle): corners must be a list of 3 pairs, got N",
         ),
-        (
-            at("pieces.0.corners", [[0, 0]] * 3),
-            "puzzle 'cat', piece 1 (square): corners must be a list of 4 pairs, got 3",
-        ),
-        *(
-            (
-                at("pieces.2.corners.1", value),
-                "puzzle 'cat', piece 3 (small_triangle): a corner must be [x, y], finite and "
-                f"within +-1e+06, got {value!r}",
-            )
-            for value in (
-                7,
-                [1],
-                [1, 2, 3],
-                ["1", 2],
-                [None, 2],
-                [True, 2],
-                [float("nan"), 0],
-                [0, float("inf")],
-                [0, -2e6],
-                [10**30, 0],
-            )
-        ),
-        (
-            at("pieces.0.corners", [[0, 0]] * 4),
-            "puzzle 'cat', piece 1 (square): a corner is 0.25 units off the exact shape, at most "
-            "0.03 allowed: it is 0 times as large as it should be; draw the full square with side "
-            "1",
-        ),
+        (at("pieces.0.corners", [[0, 0]] * 3), "corners must be a list of 4 pairs, got 3"),
+        (at("pieces.0.corners", [[0, 0]] * 4), "it is 0 times as large as it should be; draw the"),
+        *((at("pieces.2.corners.1", value), f"{CORNER}, got {value!r}") for value in NO_CORNERS),
     ],
 )
 def test_a_fault_is_named_and_the_rest_is_loaded(
@@ -212,7 +176,7 @@ PLACES = st.sampled_from(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(PLACES, VALUES)
 def test_whatever_stands_in_a_file_is_a_puzzle_or_a_fault(place: str, value: Any) -> None:
     cat = figure("cat")

@@ -1,14 +1,17 @@
-"""Targets of every kind, and starts that keep clear of them."""
+"""Targets of every kind, starts that keep clear of them, and the stages of a curriculum."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import shapely
 
-from tangram_sim.assembly import Puzzle
-from tangram_sim.config import SimConfig, StageConfig
+from tangram_sim.arrays import Bools
+from tangram_sim.batch import BatchedEnv
+from tangram_sim.config import RewardConfig, SimConfig, StageConfig
 from tangram_sim.errors import ConfigError
+from tangram_sim.geometry import overlap_area
 from tangram_sim.layout import Layout
 from tangram_sim.puzzles import library
 from tangram_sim.seeding import evaluation_generators
@@ -18,6 +21,7 @@ from tests.sim.builders import SEVEN, TRIO, largest_overlap, layout_of, pieces
 pytestmark = pytest.mark.fast
 
 GAME = layout_of(*SEVEN, scale=0.6)
+TRIPLE = layout_of(*TRIO, scale=0.6)
 KINDS = ("uniform", "gaussian", "connected", "figures", "mixed")
 PUZZLES = [*library("train"), *library("test")]
 
@@ -26,35 +30,30 @@ def union(layout: Layout, poses: np.ndarray, flipped: np.ndarray | None = None) 
     return shapely.union_all(pieces(layout, poses, flipped), grid_size=1e-9)
 
 
-def reflected(shape: shapely.Geometry) -> shapely.Geometry:
-    return shapely.transform(shape, lambda points: points * [1.0, -1.0])
-
-
 def test_every_figure_of_the_library_is_laid_with_the_games_tokens() -> None:
     """And so is its mirror image; some need the parallelogram's other side."""
     turned_over = 0
+    other = layout_of("parallelogram_mirrored", *SEVEN[:6][::-1], scale=0.6)
     for puzzle in PUZZLES:
+        before, figure = puzzle.poses.copy(), union(puzzle.layout, puzzle.poses)
+        reflected = shapely.transform(figure, lambda points: points * [1.0, -1.0])
         poses, flipped = placement(puzzle, GAME)
-        figure = union(puzzle.layout, puzzle.poses)
         assert union(GAME, poses, flipped).symmetric_difference(figure).area < 1e-7
         image = union(GAME, *GAME.mirrored(poses, flipped))
-        assert image.symmetric_difference(reflected(figure)).area < 1e-7
+        assert image.symmetric_difference(reflected).area < 1e-7
         turned_over += bool(flipped.any())
+        # Tokens in another order and with the mirrored piece will do.
+        laid = union(other, *placement(puzzle, other))
+        assert laid.symmetric_difference(figure).area < 1e-7
+        poses[:] = 9.0
+        np.testing.assert_array_equal(puzzle.poses, before)
     assert 0 < turned_over < len(PUZZLES)
-
-
-def test_tokens_in_another_order_and_with_the_mirrored_piece_will_do() -> None:
-    layout = layout_of("parallelogram_mirrored", *SEVEN[:6][::-1], scale=0.6)
-    for puzzle in PUZZLES[:10]:
-        poses, flipped = placement(puzzle, layout)
-        figure = union(puzzle.layout, puzzle.poses)
-        assert union(layout, poses, flipped).symmetric_difference(figure).area < 1e-7
 
 
 @pytest.mark.parametrize(
     ("layout", "reason"),
     [
-        (layout_of(*TRIO, scale=0.6), "has 7 pieces, and there are 3 tokens: set tokens=tangram7"),
+        (TRIPLE, "has 7 pieces, and there are 3 tokens: set tokens=tangram7"),
         (layout_of(*SEVEN, "square", scale=0.6), "cannot be assembled .* set tokens=tangram7"),
         (layout_of(*SEVEN, scale=0.8), "of scale 0.6: .* tokens.scale=0.6"),
         (layout_of(*["square"] * 7, scale=0.6), "cannot be assembled from the tokens square, "),
@@ -70,6 +69,13 @@ def sampled(kind: str, count: int = 24, **settings: object) -> tuple[np.ndarray,
     return sample_targets(GAME, sim, sim.task, evaluation_generators(count))
 
 
+def begun(task: StageConfig, count: int = 12, **sim: Any) -> BatchedEnv:
+    env = BatchedEnv(GAME, SimConfig(backend="kinematic", **sim), RewardConfig(), count)
+    env.task = task
+    env.reset(evaluation_generators(count))
+    return env
+
+
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("mirrored", [0.0, 0.5, 1.0])
 def test_targets_lie_inside_and_apart(kind: str, mirrored: float) -> None:
@@ -83,19 +89,15 @@ def test_targets_lie_inside_and_apart(kind: str, mirrored: float) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_target_depends_on_its_own_generator_only(kind: str) -> None:
-    sim = SimConfig(targets=kind, mirrored=0.5, starts="outside", allow_flip=True)
-    done = np.zeros((6, 7), dtype=np.bool_)
-
-    def layouts(which: slice) -> list[np.ndarray]:
-        generators = evaluation_generators(6)[which]
-        targets = sample_targets(GAME, sim, sim.task, generators)
-        return [*targets, *sample_starts(GAME, sim, targets, done[which], generators)]
-
-    together = layouts(slice(0, 6))
-    for b in range(6):
-        for all_of_them, one in zip(together, layouts(slice(b, b + 1)), strict=True):
-            np.testing.assert_array_equal(all_of_them[b], one[0])
+@pytest.mark.parametrize("tokens", [0, 3])
+def test_an_episode_depends_on_its_own_generator_only(kind: str, tokens: int) -> None:
+    """Rejected draws of one environment do not shift the others."""
+    task, settings = StageConfig(tokens=tokens, targets=kind), {"mirrored": 0.5, "allow_flip": True}
+    together, alone = (begun(task, n, starts="outside", **settings) for n in (6, 1))
+    for b, generator in enumerate(evaluation_generators(6)):
+        alone.reset([generator])
+        for name in ("goals", "corners", "placed"):
+            np.testing.assert_array_equal(getattr(together, name)[b], getattr(alone, name)[0])
 
 
 def test_figures_are_those_of_the_train_split_turned() -> None:
@@ -130,48 +132,44 @@ def test_gaussian_centres_have_the_spread_that_was_asked_for(spread: float) -> N
 
 
 def test_a_narrow_gaussian_widens_until_there_is_room() -> None:
-    poses, _ = sampled("gaussian", 10, spread=0.001)
-    for one in poses:
-        assert largest_overlap(GAME, one) < 1e-8
-    wide = np.abs(sampled("uniform", 10)[0][..., :2]).mean()
+    poses, _ = sampled("gaussian", 5, spread=0.001)
+    assert max(largest_overlap(GAME, one) for one in poses) < 1e-8
+    wide = np.abs(sampled("uniform", 5)[0][..., :2]).mean()
     assert np.abs(poses[..., :2]).mean() < 0.7 * wide
 
 
 @pytest.mark.parametrize(
-    ("layout", "sim", "reason"),
+    ("layout", "settings", "reason"),
     [
-        (GAME, SimConfig(targets="figures"), None),
-        (GAME, SimConfig(allow_flip=True), None),
-        (GAME, SimConfig(stages=(StageConfig(tokens=7),)), None),
-        (layout_of(*TRIO), SimConfig(targets="figures"), "needs all seven tans, got tokens para"),
-        (
-            layout_of(*TRIO),
-            SimConfig(stages=(StageConfig(targets="figures"),)),
-            "sim.targets=figures needs all seven tans",
-        ),
+        (TRIPLE, {"targets": "figures"}, "figures needs all seven tans, got tokens para"),
+        (TRIPLE, {"stages": (StageConfig(targets="figures"),)}, "figures needs all seven tans"),
         (
             layout_of(*SEVEN, scale=0.8),
-            SimConfig(targets="figures"),
+            {"targets": "figures"},
             r"an arena of width 2\.48 for tokens.scale=0.8, got 2: raise sim.arena, or lower",
         ),
         (
             layout_of("square"),
-            SimConfig(allow_flip=True),
+            {"allow_flip": True},
             "allow_flip=true needs a token that is not .* got tokens square: set sim.allow_flip",
         ),
         (
             GAME,
-            SimConfig(stages=(StageConfig(), StageConfig(updates=9, tokens=8))),
+            {"stages": (StageConfig(), StageConfig(updates=9, tokens=8))},
             r"at most the 7 that there are, got 8 \(in the stage from update 9\); 0 moves all",
         ),
     ],
 )
-def test_tasks_that_tokens_cannot_play(layout: Layout, sim: SimConfig, reason: str | None) -> None:
-    if reason is None:
-        check_targets(layout, sim)
-        return
+def test_tasks_that_tokens_cannot_play(
+    layout: Layout, settings: dict[str, Any], reason: str
+) -> None:
     with pytest.raises(ConfigError, match=reason):
-        check_targets(layout, sim)
+        check_targets(layout, SimConfig(**settings))
+
+
+def test_the_game_can_be_played_in_every_way() -> None:
+    stages = (StageConfig(tokens=7),)
+    check_targets(GAME, SimConfig(targets="figures", allow_flip=True, stages=stages))
 
 
 def starts_of(sim: SimConfig, layout: Layout, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -179,14 +177,10 @@ def starts_of(sim: SimConfig, layout: Layout, count: int) -> tuple[np.ndarray, n
     generators = evaluation_generators(count)
     targets = sample_targets(layout, sim, sim.task, generators)
     done = np.zeros((count, layout.tokens), dtype=np.bool_)
-    poses, sides = sample_starts(layout, sim, targets, done, generators)
-    on = [
-        union(layout, poses[b], sides[b])
-        .intersection(union(layout, targets[0][b], targets[1][b]))
-        .area
-        for b in range(count)
-    ]
-    return np.concatenate([poses, sides[..., None]], axis=-1), np.array(on)
+    starts = sample_starts(layout, sim, targets, done, generators)
+    np.testing.assert_array_equal(starts[1], targets[1])  # always within reach
+    corners, goals = layout.corners(*starts), layout.corners(*targets)
+    return starts[0], overlap_area(corners, goals, layout)
 
 
 @pytest.mark.parametrize("kind", ["uniform", "connected", "figures"])
@@ -200,11 +194,89 @@ def test_starts_lie_on_the_target_where_there_is_no_other_room() -> None:
     layout = layout_of("square", scale=2.0**0.5 * 2.0)  # a side of 1
     starts, on = starts_of(SimConfig(starts="outside", arena=1.6), layout, 12)
     assert on.min() > 0.0
-    assert np.abs(layout.corners(starts[..., :3])).max() <= 0.8
+    assert np.abs(layout.corners(starts)).max() <= 0.8
 
 
-def test_a_puzzle_is_unchanged_by_being_placed() -> None:
-    puzzle: Puzzle = PUZZLES[0]
-    before = puzzle.poses.copy()
-    placement(puzzle, GAME)[0][:] = 9.0
-    np.testing.assert_array_equal(puzzle.poses, before)
+# Stages: which is played when, and what lies on its target already.
+
+STAGES = (
+    StageConfig(updates=10, tokens=1),
+    StageConfig(updates=50, tokens=3, targets="gaussian", spread=0.3),
+)
+
+
+@pytest.mark.parametrize(
+    ("updates", "stage"), [(0, 0), (9, 0), (10, 1), (49, 1), (50, 2), (1_000_000, 2)]
+)
+def test_a_stage_begins_with_its_number_of_updates(updates: int, stage: int) -> None:
+    assert SimConfig(stages=STAGES).stage(updates) == stage
+
+
+def test_what_a_stage_plays() -> None:
+    sim = SimConfig(stages=STAGES, targets="gaussian", spread=0.4)
+    assert sim.task == StageConfig(targets="gaussian", spread=0.4)
+    assert [sim.stage_task(stage) for stage in range(3)] == [sim.task, *STAGES]
+    assert SimConfig(stages=(StageConfig(),)).stage(0) == 1
+    assert SimConfig().stage(99) == 0
+
+
+def on_target(env: BatchedEnv) -> Bools:
+    """(B, K) which tokens lie exactly on their targets."""
+    gap = np.abs(env.corners - env.goals).max(axis=2)
+    own = [gap[:, env.layout.corners_of(k)].max(axis=1) for k in range(env.layout.tokens)]
+    return np.stack(own, axis=1) < 1e-9
+
+
+@pytest.mark.parametrize("tokens", [1, 3, 6])
+@pytest.mark.parametrize("targets", ["uniform", "connected", "figures"])
+def test_the_others_lie_on_their_targets_and_are_placed(tokens: int, targets: str) -> None:
+    env = begun(StageConfig(tokens=tokens, targets=targets), mirrored=0.5, allow_flip=True)
+    assert (env.placed.sum(axis=1) == 7 - tokens).all()
+    np.testing.assert_array_equal(on_target(env), env.placed)
+    assert len(np.unique(env.placed, axis=0)) > 3  # drawn for each
+
+
+def test_tokens_to_move_start_clear_of_those_that_lie() -> None:
+    """Also where starts may be anywhere: they lie on the table, not on each other."""
+    env = begun(StageConfig(tokens=3), count=40)
+    for poses, sides in zip(GAME.poses(env.corners), GAME.flipped(env.corners), strict=True):
+        assert largest_overlap(GAME, poses, sides) < 1e-8
+
+
+@pytest.mark.parametrize("tokens", [7, 9])
+def test_all_tokens_or_more_are_the_whole_task(tokens: int) -> None:
+    env, whole = begun(StageConfig(tokens=tokens)), begun(StageConfig())
+    assert not env.placed.any()
+    np.testing.assert_array_equal(env.corners, whole.corners)
+
+
+def test_what_lies_on_its_target_is_refused_and_the_rest_fills_the_episode() -> None:
+    env = begun(StageConfig(tokens=1), count=4)
+    placed = env.placed.argmax(axis=1)
+    before = env.corners.copy()
+    actions = np.full((4, 4), 0.3)
+    actions[:, 0] = (placed + 0.5) / 3.5 - 1.0
+    assert env.step(actions).refused.all()
+    np.testing.assert_array_equal(env.corners, before)
+    actions[:, 0] = (env.placed.argmin(axis=1) + 0.5) / 3.5 - 1.0
+    result = env.step(actions)
+    assert not result.refused.any()
+    assert env.placed.all()
+    assert not result.done
+
+
+def test_the_next_episode_is_that_of_the_task() -> None:
+    env = begun(StageConfig(tokens=2))
+    env.task = env.sim.task
+    env.reset(evaluation_generators(12))
+    assert not env.placed.any()
+
+
+def test_given_targets_are_played() -> None:
+    env, other = begun(StageConfig()), begun(StageConfig(targets="figures"), mirrored=0.5)
+    poses, sides = GAME.poses(other.goals), GAME.flipped(other.goals)
+    env.reset(evaluation_generators(12), (poses, sides))
+    np.testing.assert_allclose(env.goals, other.goals, atol=1e-9)
+    assert env.steps_done == 0
+    with pytest.raises(ValueError, match="need 12 generators, got 3"):
+        env.reset(evaluation_generators(3), (poses, sides))

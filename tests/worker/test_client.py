@@ -20,11 +20,18 @@ from tangram_agent.messages import (
     Stop,
     WantWeights,
     WeightsMessage,
-    encode_weights,
 )
 from tangram_agent.types import Episodes
 from tangram_sim.errors import RunError, TangramError, WireError
-from tests.agent.messages import FINGERPRINTS, SHAPES, episodes, scores, weights, with_header
+from tests.agent.messages import (
+    FINGERPRINTS,
+    SHAPES,
+    broadcast,
+    episodes,
+    scores,
+    weights,
+    with_header,
+)
 from tests.master.dealers import staged
 from tests.worker.conversation import (
     QUICK,
@@ -292,7 +299,7 @@ def test_weights_come_newest_only_and_once() -> None:
 def test_who_was_busy_skips_all_broadcasts_but_the_newest() -> None:
     with standing_in() as master, make_client(master.endpoint) as client:
         master.welcome(client)
-        frames = [encode_weights("e1", weights(version)) for version in range(500)]
+        frames = [broadcast(weights(version), "e1") for version in range(500)]
         master.until(client, lambda: master.broadcast(frames[0]) or client.newest.version == 0)
         for frame in frames:
             master.broadcast(frame)
@@ -321,7 +328,7 @@ def test_a_missed_broadcast_is_asked_for() -> None:
 def test_weights_of_another_network_are_refused_and_counted() -> None:
     with standing_in() as master, make_client(master.endpoint, shapes={"a": (1,)}) as client:
         master.welcome(client)
-        frame = encode_weights("e1", weights())
+        frame = broadcast(weights(), "e1")
         master.until(client, lambda: master.broadcast(frame) or client.counters["malformed"])
         assert client.newest_weights() is None
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from tangram_sim.errors import ConfigError
-from worker.cli import with_absolute_paths
+from worker.cli import with_absolute_paths, with_changes
 from worker.config import EvalConfig, PlayConfig, WorkerConfig, check_compare, check_puzzle
 
 pytestmark = pytest.mark.fast
@@ -17,8 +17,6 @@ OF_A_RUN = [
     ({"run_dir": ""}, "set run_dir=runs/my_run"),
     ({"episodes": 0}, "episodes must be between 1 and"),
     ({"episodes": 1_000_001}, "episodes must be between 1 and"),
-    ({"actions": 0}, "actions must be between 1 and 100, got 0"),
-    ({"actions": 101}, "actions must be between 1 and 100, got 101"),
     ({"seed": -1}, "seed must be between 0 and"),
     ({"seed": 2**63}, "seed must be between 0 and"),
 ]
@@ -35,10 +33,19 @@ WRONG = {
         (TESTED | {"turns": 0}, "turns must be between 1 and 360, got 0"),
         (TESTED | {"turns": 361}, "turns must be between 1 and 360, got 361"),
         (TESTED | {"sheet": "ends.gif"}, "sheet must end with .png, got 'ends.gif'"),
-        (TESTED | {"order": "best"}, "must be one of learned, listed, size, random, got 'best'"),
-        ({"turns": 2}, "turns is for puzzles: set puzzles=test, or leave turns out"),
-        ({"sheet": "a.png"}, "sheet is for puzzles: set puzzles=test, or leave sheet out"),
-        ({"skip_invalid": True}, "skip_invalid is for puzzles: set puzzles=test, or leave"),
+        (TESTED | {"episodes": 5}, "episodes=5 changes nothing with puzzles=test: leave it out"),
+        *[
+            ({name: value}, f"{name}={shown} changes nothing with puzzles=null: leave it out, or")
+            for name, value, shown in (
+                ("turns", 2, "2"),
+                ("sheet", "a.png", "a.png"),
+                ("skip_invalid", True, "true"),
+            )
+        ],
+        *[
+            (TESTED | {"changes": {"sim": {name: 1}}}, f"sim.{name}=1 changes nothing with puzzles")
+            for name in ("targets", "spread", "mirrored", "pixels")
+        ],
     ],
     PlayConfig: [
         *OF_A_RUN,
@@ -47,7 +54,18 @@ WRONG = {
             for out in ("film.mp4", "film", "", "gif", "film.GIF.txt")
         ],
         ({"run_dir": None}, "say which run: run_dir=runs/..., or which ones: compare=[runs/a,"),
-        ({"run_dir": "a"} | TWO, "run_dir=a and compare do not go together"),
+        ({"run_dir": "a"} | TWO, "run_dir=a changes nothing with compare=[a,b]: leave it out, or"),
+        ({"puzzles": "test", "episodes": 5}, "episodes=5 changes nothing with puzzles=test"),
+        ({"puzzle": ("cat",), "episodes": 5}, "episodes=5 changes nothing with puzzle=[cat]"),
+        ({"live": True, "out": "a.gif"}, "out=a.gif changes nothing with live=true: leave it out"),
+        ({"changes": {"sim": {"pixels": 16}}}, "sim.pixels=16 changes nothing with tangram-play,"),
+        *[
+            (
+                {"puzzle": ("cat",), "changes": {"sim": {name: 1}}},
+                f"sim.{name}=1 changes nothing with puzzles: leave it out, or leave puzzles out",
+            )
+            for name in ("targets", "spread", "mirrored", "starts")
+        ],
         ({"run_dir": " "}, "run_dir must name"),
         *[
             ({"run_dir": None, "compare": runs}, "compare must list 2 to 4")
@@ -55,12 +73,15 @@ WRONG = {
         ],
         ({"run_dir": None, "compare": ("a", "a")}, "different runs"),
         *[
-            ({"run_dir": None} | TWO | {name: value}, f"{name}={value} and compare do not go")
-            for name, value in (
-                ("tokens", "square"),
-                ("puzzle", ("cat",)),
-                ("puzzles", "test"),
-                ("live", True),
+            (
+                {"run_dir": None} | TWO | {name: value},
+                f"{name}={shown} changes nothing with compare",
+            )
+            for name, value, shown in (
+                ("tokens", "square", "square"),
+                ("puzzle", ("cat",), "[cat]"),
+                ("puzzles", "test", "test"),
+                ("live", True, "true"),
             )
         ],
     ],
@@ -146,3 +167,8 @@ def test_paths_are_seen_from_the_callers_folder(
         ("puzzles", "test", "test"),
     ):
         assert with_absolute_paths({name: given}) == {name: seen}
+
+
+def test_what_is_laid_over_a_run_is_what_was_given() -> None:
+    given = {"sim": {"arena": None, "corner_noise": 0.0}, "agent": {"order": None}, "seed": 3}
+    assert with_changes(given) == {"seed": 3, "changes": {"sim": {"corner_noise": 0.0}}}

@@ -11,7 +11,7 @@ from tests.agent.builders import PAIR, SQUARE, setup
 from tests.worker.builders import policy
 from worker.baselines import position_policy, random_policy
 from worker.rollout import Played
-from worker.test_set import FixedTests, greedy, with_actions, with_corner_noise
+from worker.test_set import FixedTests, greedy
 
 pytestmark = pytest.mark.fast
 
@@ -87,7 +87,7 @@ def test_the_trained_reward_is_reported_where_it_is_another(reward: dict, own: b
 
 @pytest.mark.parametrize(("tokens", "actions"), [(SQUARE, 1), (SQUARE, 3), (PAIR, 1), (PAIR, 2)])
 def test_the_position_policy_solves_position_and_nothing_else(tokens: dict, actions: int) -> None:
-    made = with_actions(setup(tokens, pixels=32, max_overlap=1.0), actions)
+    made = setup(tokens, pixels=32, max_overlap=1.0, actions_per_token=actions)
     with closing(FixedTests(made, 10, 10)) as tests:
         found = tests.play(position_policy(made.layout, made.sim))
     centres = made.layout.bases(found.ends), made.layout.bases(found.goals)
@@ -118,24 +118,17 @@ def test_the_random_policy_fills_the_action_space_from_the_episodes_generators(f
 
 
 def test_the_number_of_actions_can_be_another_than_in_training() -> None:
-    made = setup()
-    assert with_actions(made, None) is made
-    longer = with_actions(made, 5)
-    assert longer.horizon == 5
-    with closing(FixedTests(replace(longer, sim=replace(longer.sim, pixels=16)), 2, 2)) as tests:
-        assert tests.play(greedy(policy(made))).episodes.actions.shape == (2, 5, 3)
+    with closing(FixedTests(setup(pixels=16, actions_per_token=5), 2, 2)) as tests:
+        assert tests.play(greedy(policy(setup()))).episodes.actions.shape == (2, 5, 3)
 
 
-def test_the_noise_can_be_another_than_in_training() -> None:
-    made = setup(pixels=16)
-    assert with_corner_noise(made, None) is made
-    noisy = with_corner_noise(made, 0.05)
-    assert noisy.sim.corner_noise == 0.05
+def test_noise_on_the_corners_is_seen_and_not_scored() -> None:
     scores = []
-    for tested in (made, noisy, with_corner_noise(noisy, 0.0)):
-        with closing(FixedTests(tested, 50, 50)) as tests:
+    for noise in (0.0, 0.05):
+        made = setup(pixels=16, corner_noise=noise)
+        with closing(FixedTests(made, 50, 50)) as tests:
             found = tests.play(position_policy(made.layout, made.sim))
             scores.append(tests.scores(found)["position_error_median"])
-    assert scores[0] == scores[2] == pytest.approx(0.0, abs=1e-6)
+    assert scores[0] == pytest.approx(0.0, abs=1e-6)
     # the mean of four corners, of token and target each: 0.1 * sqrt(2 / 4), in the plane
     assert scores[1] == pytest.approx(0.1 * np.sqrt(0.5) * np.sqrt(2 * np.log(2)), rel=0.3)

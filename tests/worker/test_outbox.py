@@ -4,10 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tangram_agent.messages import encode_weights
 from tangram_agent.types import Weights
 from tangram_sim.errors import WireError
-from tests.agent.messages import SHAPES, weights
+from tests.agent.messages import SHAPES, broadcast, weights
 from worker.outbox import NewestWeights, Outbox
 
 pytestmark = pytest.mark.fast
@@ -65,5 +64,5 @@ def test_only_weights_that_fit_are_kept() -> None:
     kept = NewestWeights({"other": (1,)})
     kept.begin("a")
     with pytest.raises(WireError, match=r"'actor.bias' must be no such tensor, got"):
-        kept.offer_frame(encode_weights("a", weights()))
+        kept.offer_frame(broadcast(weights(), "a"))
     assert kept.take() is None

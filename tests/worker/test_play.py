@@ -10,6 +10,7 @@ from PIL import Image
 
 import worker.film as film_module
 from tangram_agent.runs import load_run
+from tangram_agent.setup import Setup
 from tangram_sim.errors import ConfigError, RunError, TangramError
 from tangram_sim.geometry import outlines, pairs_overlap
 from tests.agent.builders import PAIR, SQUARE, setup
@@ -27,6 +28,7 @@ from worker.play import (
     play_episodes,
     play_run,
 )
+from worker.rollout import Played
 
 fast, slow = pytest.mark.fast, pytest.mark.slow
 PLAIN_AGENT = {"egocentric": False, "angle_head": "plain"}
@@ -96,7 +98,8 @@ def test_an_animation_has_frames_that_move(
 ) -> None:
     monkeypatch.setattr(film_module, "FRAMES_PER_ACTION", 6)  # drawing takes its time
     out = tmp_path / "film.gif"
-    made = of_square(tmp_path, run_of=PAIR, out=str(out), episodes=episodes, actions=actions)
+    changes = {} if actions is None else {"sim": {"actions_per_token": actions}}
+    made = of_square(tmp_path, run_of=PAIR, out=str(out), episodes=episodes, changes=changes)
     assert play_run(made) == 0
     with Image.open(out) as film:
         assert film.format == "GIF"
@@ -238,12 +241,13 @@ def compared(folder: Path, *names: str, **more: Any) -> PlayConfig:
     return PlayConfig(compare=runs, **({"out": str(folder / "both.gif"), "episodes": 2} | more))
 
 
-def played_by_two(folder: Path, episodes: int, **second: Any) -> list[Any]:
+def played_by_two(folder: Path, episodes: int, **second: Any) -> list[tuple[Setup, Played]]:
     """Setups and episodes of two runs of the square, the second with other sections."""
     write_run(folder / "first")
     write_run(folder / "second", **second)
     config = compared(folder, "first", "second", episodes=episodes)
-    return [play_episodes(load_run(run), config) for run in config.run_dirs]
+    runs = [load_run(run) for run in config.run_dirs]
+    return [(run.setup, play_episodes(run, config)) for run in runs]
 
 
 @fast

@@ -9,7 +9,7 @@ from tangram_agent.setup import Setup
 from tangram_sim.arrays import Floats
 from tangram_sim.errors import ConfigError
 from tangram_sim.geometry import overlap_share
-from tangram_sim.puzzles import load_puzzle, puzzle_names
+from tangram_sim.puzzles import library, load_puzzle
 from tests.agent.builders import PAIR, setup
 from tests.worker.puzzle_files import GAME, SIM, drawn, write_puzzles
 from worker.baselines import exact_policy, random_policy
@@ -24,7 +24,8 @@ def game(**sim: object) -> Setup:
 
 @pytest.mark.parametrize("split", ["train", "test"])
 def test_a_split_of_the_library_is_found_by_its_name(split: str) -> None:
-    assert [one.name for one in find_figures(split, game()).figures] == puzzle_names(split)
+    named = [puzzle.name for puzzle in library(split)]
+    assert [one.name for one in find_figures(split, game()).figures] == named
 
 
 def test_without_a_file_the_whole_library_is_meant() -> None:

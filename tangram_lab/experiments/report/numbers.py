@@ -2,7 +2,7 @@
 
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,38 +14,36 @@ GRID = 200  # points of a curve of several seeds
 KEPT = 60  # points of a curve in data.json
 
 
-@dataclass(frozen=True)
-class Spread:
-    """Median, least and most of some numbers."""
+class Spread(NamedTuple):
+    """Of some numbers."""
 
-    median: float
     least: float
+    median: float
     most: float
 
 
 def spread(values: Iterable[float]) -> Spread | None:
     """Of any count of numbers; None of none."""
     known = list(values)
-    return Spread(statistics.median(known), min(known), max(known)) if known else None
+    return Spread(min(known), statistics.median(known), max(known)) if known else None
 
 
-@dataclass(frozen=True)
-class Measure:
+class Measure(NamedTuple):
     """A quantity of tables and figures.
 
     Attributes:
         key: in result.json and in the files of tests.
         label: head of a column.
-        axis: label of an axis, with its unit.
         pattern: of one number.
         factor: number in the table / number in the file.
+        axis: label of an axis, with its unit; empty of what only tables show.
     """
 
     key: str
     label: str
-    axis: str
     pattern: str
     factor: float = 1.0
+    axis: str = ""
 
     def show(self, number: float | None) -> str:
         """One number, `-` if there is none."""
@@ -59,7 +57,7 @@ class Measure:
         known = spread(values.values())
         if known is None:
             return NOTHING
-        least, median, most = map(self.show, (known.least, known.median, known.most))
+        least, median, most = map(self.show, known)
         return median if least == median == most else f"{median} ({least} to {most})"
 
     def show_difference(self, ours: Mapping[int, float], theirs: Mapping[int, float]) -> str:
@@ -71,36 +69,28 @@ class Measure:
         return signed.format((one.median - other.median) * self.factor)
 
 
-REWARD = Measure("mean_reward", "mean reward", "mean reward (\N{MINUS SIGN}1 to 1)", "{:.3f}")
+REWARD = Measure("mean_reward", "mean reward", "{:.3f}", axis="mean reward (\N{MINUS SIGN}1 to 1)")
 DENSE = Measure(
     "mean_reward_dense",
     "mean dense reward",
-    "mean dense reward, Eq. 15 (\N{MINUS SIGN}1 to 1)",
     "{:.3f}",
+    axis="mean dense reward, Eq. 15 (\N{MINUS SIGN}1 to 1)",
 )
-ANGLE = Measure("angle_error_deg_median", "angle error", "angle error, median (degrees)", "{:.2f}°")
-POSITION = Measure(
-    "position_error_median", "position error", "position error, median (arena units)", "{:.4f}"
+ANGLE = Measure(
+    "angle_error_deg_median", "angle error", "{:.2f}°", axis="angle error, median (degrees)"
 )
-EPISODES = Measure("episodes", "episodes", "episodes", "{:,.0f}")
-UPDATES = Measure("updates", "updates", "updates", "{:,.0f}")
-MINUTES = Measure("train_s", "training, min", "training time (minutes)", "{:,.1f}", 1 / 60)
-HOURS = Measure("train_s", "training, h", "training time (hours)", "{:,.2f}", 1 / 3600)
-PARAMETERS = Measure("parameters", "parameters", "parameters", "{:,.0f}")
+POSITION = Measure("position_error_median", "position error", "{:.4f}")
+EPISODES = Measure("episodes", "episodes", "{:,.0f}", axis="episodes")
+UPDATES = Measure("updates", "updates", "{:,.0f}", axis="updates (gradient steps)")
+MINUTES = Measure("train_s", "training, min", "{:,.1f}", 1 / 60, "training time (minutes)")
+HOURS = Measure("train_s", "training, h", "{:,.2f}", 1 / 3600)
+PARAMETERS = Measure("parameters", "parameters", "{:,.0f}")
 
 
-@dataclass(frozen=True, eq=False)
-class Band:
-    """A curve of several seeds.
+class Band(NamedTuple):
+    """A curve of several seeds: its mean, and their standard deviation (n - 1), None of one."""
 
-    Attributes:
-        x: (G,) grid, rising.
-        mean: (G,) over the seeds.
-        deviation: (G,) standard deviation over the seeds (n - 1); None of one seed.
-        seeds: how many.
-    """
-
-    x: Floats
+    x: Floats  # (G,) rising
     mean: Floats
     deviation: Floats | None
     seeds: int
@@ -123,9 +113,7 @@ def band(curves: Iterable[Sequence[Row]], axis: str, key: str) -> Band | None:
         None if there is no curve, or no range that all of them cover.
     """
     known = [(x, y) for x, y in (points(curve, axis, key) for curve in curves) if len(x)]
-    if not known:
-        return None
-    low, high = max(x[0] for x, _ in known), min(x[-1] for x, _ in known)
+    low, high = max((x[0] for x, _ in known), default=0), min((x[-1] for x, _ in known), default=0)
     if low >= high:
         return None
     grid = np.linspace(low, high, GRID)

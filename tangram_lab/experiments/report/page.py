@@ -1,9 +1,8 @@
 """The page of a report with its figures and its data."""
 
 import json
-import math
 import shlex
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,13 +16,12 @@ from tangram_lab.experiments.report.figures import (
     draw_ranking,
     draw_single_seeds,
     draw_sweep,
-    looks,
     sweeps,
 )
 from tangram_lab.experiments.report.numbers import ANGLE, DENSE, REWARD, thinned
-from tangram_lab.experiments.report.references import References
+from tangram_lab.experiments.report.references import lacking
 from tangram_lab.experiments.report.study import Experiment, Row, Seed, Study, Training, read_runs
-from tangram_lab.experiments.report.style import Look, drawing, save
+from tangram_lab.experiments.report.style import drawing, save
 from tangram_lab.experiments.report.tables import (
     assembly_table,
     complexity_table,
@@ -41,10 +39,8 @@ from tangram_lab.experiments.report.tables import (
 )
 from tangram_sim.errors import RunError
 
-FIGURES = "figures"
 FORMAT = 1  # of data.json
 DIGITS = 6  # of its curves
-HOUR_S = 3600.0
 HOW_TO_READ = (
     "Scores are those of the fixed tests, exploration off. The mean reward is Eq. 14 on exact "
     "polygons: -1 is no overlap, 1 is perfect. Where several seeds were trained, numbers are their "
@@ -81,17 +77,16 @@ def write_report(runs: Path, out: Path) -> list[Path]:
     """
     study = read_runs(runs)
     path, beside = (out, out.with_suffix("")) if out.suffix == ".md" else (out / "README.md", out)
-    root, figures = path.parent, (beside / FIGURES).relative_to(path.parent).as_posix()
+    figures, data = beside / "figures", beside / "data.json"
     try:
-        (root / figures).mkdir(parents=True, exist_ok=True)
+        figures.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunError(
-            f"cannot make {root / figures} ({error.strerror}): choose another folder with out=..."
+            f"cannot make {figures} ({error.strerror}): choose another folder with out=..."
         ) from None
-    page = Page(study, root, figures, looks(study), References(study))
-    data = beside / "data.json"
+    page = Page(study, path.parent, figures.relative_to(path.parent).as_posix())
     with drawing():
-        lines = [*page.opening(data.relative_to(root).as_posix()), *page.pictures()]
+        lines = [*page.opening(data.relative_to(path.parent).as_posix()), *page.pictures()]
         for experiment in study.experiments:
             lines += page.section(experiment)
     lines += closing(study)
@@ -102,21 +97,11 @@ def write_report(runs: Path, out: Path) -> list[Path]:
 
 @dataclass(frozen=True)
 class Page:
-    """The page, and what its sections share.
-
-    Attributes:
-        study: that is reported on.
-        out: folder of the page.
-        figures: folder of the figures in it.
-        looks: of every training.
-        references: policies to compare with.
-    """
+    """The page of a study: its folder, and the folder of the figures in it."""
 
     study: Study
     out: Path
     figures: str
-    looks: Mapping[str, Look]
-    references: References
 
     def opening(self, data: str) -> list[str]:
         """Title, how to read it, and the experiments."""
@@ -126,12 +111,8 @@ class Page:
             for one in study.experiments
         ]
         return [
-            f"# Experiments, budget `{study.budget}`" if study.plan else "# Runs",
-            "",
-            plain(study.budget_note),
-            "",
-            HOW_TO_READ,
-            "",
+            *(f"# Experiments, budget `{study.budget.name}`" if study.plan else "# Runs", ""),
+            *(plain(study.budget.note), "", HOW_TO_READ, ""),
             *table(["experiment", "source", "runs finished"], rows, "---"),
             f"`tangram-report` wrote this page; [{data}]({data}) holds all of its numbers.",
             "",
@@ -155,16 +136,16 @@ class Page:
         if any(one.finished for one in experiment.trainings):
             kinds: dict[str, Callable[[Experiment], list[str]]] = {
                 "curves": self._curves,
-                "rewards": self._rewards,
+                "rewards": self._curves,
                 "complexity": complexity_table,
                 "tests": self._tests,
                 "ranking": self._ranking,
                 "game": lambda one: [*assembly_table(one), *order_table(one)],
             }
             lines += kinds[experiment.kind](experiment)
-            lacking = self.references.lacking(experiment)
-            if lacking and experiment.kind not in ("complexity", "game"):
-                told = plain("; ".join(lacking))
+            left_out = lacking(self.study, experiment)
+            if left_out and experiment.kind not in ("complexity", "game"):
+                told = plain("; ".join(left_out))
                 lines += [f"Left out, since no test has their scores: {told}.", ""]
         gaps = [f"- {plain(gap)}" for one in experiment.trainings for gap in _gaps(experiment, one)]
         lines += ["Missing:", "", *gaps, ""] if gaps else []
@@ -180,41 +161,33 @@ class Page:
         file = f"{self.figures}/{name}"
         return [*picture(title, f"{file}.png"), f"*{caption}* ([SVG]({file}.svg))", ""]
 
-    def _curves(self, experiment: Experiment) -> list[str]:
-        drawn = draw_curves(experiment, self.looks, self.references, REWARD)
-        return [
-            *self._figure(experiment.name, experiment.title, BAND, drawn),
-            *score_table(experiment, self.references, REWARD, self.study.planned_seeds),
-            *(*effort_table(experiment), REACHED, ""),
-        ]
+    def _curves(self, one: Experiment) -> list[str]:
+        """Of one reward or of both."""
+        lines, both = [], one.kind == "rewards"
+        for measure in (REWARD, DENSE) if both else (REWARD,):
+            drawn = draw_curves(self.study, one, measure)
+            name, title = one.name + "_dense" * (measure is DENSE), f": {measure.label}" * both
+            lines += self._figure(name, one.title + title, BAND, drawn)
+            lines += score_table(self.study, one, measure)
+        return [*lines, *effort_table(one), REACHED, ""]
 
-    def _rewards(self, experiment: Experiment) -> list[str]:
+    def _tests(self, one: Experiment) -> list[str]:
         lines = []
-        for measure, name in ((REWARD, experiment.name), (DENSE, f"{experiment.name}_dense")):
-            drawn = draw_curves(experiment, self.looks, self.references, measure)
-            lines += self._figure(name, f"{experiment.title}: {measure.label}", BAND, drawn)
-            lines += score_table(experiment, self.references, measure, self.study.planned_seeds)
-        return [*lines, *effort_table(experiment), REACHED, ""]
-
-    def _tests(self, experiment: Experiment) -> list[str]:
-        lines = []
-        for sweep in sweeps(experiment):
-            drawn = draw_sweep(experiment, self.looks, self.references, sweep)
-            name, title = f"{experiment.name}_{sweep.name}", f"{experiment.title}: {sweep.name}"
+        for sweep in sweeps(one):
+            drawn = draw_sweep(self.study, one, sweep)
+            name, title = f"{one.name}_{sweep.name}", f"{one.title}: {sweep.name}"
             lines += self._figure(name, title, SWEEP, drawn)
         for measure in (REWARD, ANGLE):
-            lines += test_table(experiment, self.references, measure)
-        singles = [line for m in (REWARD, ANGLE) for line in single_tests(experiment, m)]
+            lines += test_table(self.study, one, measure)
+        singles = [line for m in (REWARD, ANGLE) for line in single_tests(one, m)]
         return lines + details("Every seed", singles)
 
-    def _ranking(self, experiment: Experiment) -> list[str]:
-        dots = draw_ranking(experiment, self.looks, self.references)
-        singles = draw_single_seeds(experiment, self.looks)
-        curves = (f"{experiment.name}_seeds", f"{experiment.title}: curves", SMALL)
+    def _ranking(self, one: Experiment) -> list[str]:
+        dots, singles = draw_ranking(self.study, one), draw_single_seeds(self.study, one)
         return [
-            *self._figure(experiment.name, experiment.title, DOTS, dots),
-            *ranking_table(experiment, self.references, self.study.planned_seeds),
-            *self._figure(*curves, singles),
+            *self._figure(one.name, one.title, DOTS, dots),
+            *ranking_table(self.study, one),
+            *self._figure(f"{one.name}_seeds", f"{one.title}: curves", SMALL, singles),
         ]
 
 
@@ -224,7 +197,7 @@ def command(study: Study, experiment: Experiment) -> str:
         words = shlex.split(study.command)[1:]
     except ValueError:
         words = []
-    chosen = f"experiment=[{experiment.name}] budget={study.budget}"
+    chosen = f"experiment=[{experiment.name}] budget={study.budget.name}"
     kept = (shlex.quote(word) for word in words if _concerns(word, experiment))
     return " ".join(("tangram-experiment", chosen, *kept))
 
@@ -241,8 +214,7 @@ def _gaps(experiment: Experiment, training: Training) -> Iterator[str]:
     """What is not there."""
     left = [f"seed {seed.number} {seed.state}" for seed in training.seeds if not seed.finished]
     if left:
-        count = f"{len(training.finished)} of {len(training.seeds)} seeds"
-        yield f"{training.label} ({count}): {', '.join(left)}"
+        yield f"{training.label} ({finished_count([training])} seeds): {', '.join(left)}"
     for seed in training.finished:
         untested = [t.label for t in experiment.tests if t.name not in seed.tests]
         if untested:
@@ -254,15 +226,14 @@ def _gaps(experiment: Experiment, training: Training) -> Iterator[str]:
 
 def closing(study: Study) -> list[str]:
     """Budget, machine, versions, and every training with its settings."""
-    results = [seed.result for one in study.trainings for seed in one.finished]
-    command = ["The last command that ran trainings of it:", "", *shell(study.command)]
+    name, note = study.budget.name, plain(study.budget.note)
     return [
-        "## How it was made",
-        "",
-        *([f"Budget `{study.budget}`: {plain(study.budget_note)}", ""] if study.plan else []),
-        *table(["", ""], _facts(study, results), "---"),
-        *(command if study.plan else []),
-        *details("All trainings and their settings", _trainings(study.trainings)),
+        *("## How it was made", ""),
+        *([f"Budget `{name}`: {note}", ""] if study.plan else []),
+        *table(["", ""], _facts(study), "---"),
+        *(["The last command that ran trainings of it:", ""] if study.plan else []),
+        *(shell(study.command) if study.plan else []),
+        *details("All trainings and their settings", [*map(_settings, study.trainings), ""]),
     ]
 
 
@@ -272,20 +243,22 @@ def finished_count(trainings: Iterable[Training]) -> str:
     return f"{sum(seed.finished for seed in runs)} of {len(runs)}"
 
 
-def _facts(study: Study, results: list[Row]) -> list[tuple[str, str]]:
-    commits = [study.commit, *(row["commit"] for row in results)]
+def _facts(study: Study) -> list[tuple[str, str]]:
+    results = [seed.result for one in study.trainings for seed in one.finished]
     counts = [row.get("test_episodes") for row in results]
     while_training = _several(f"{n:,.0f}" for n in counts if isinstance(n, int | float))
+    commits = [study.commit, *(row["commit"] for row in results)]
     names = dict.fromkeys(name for row in results for name in row["versions"])
     versions = [
         f"{name} {_several(row['versions'][name] for row in results if name in row['versions'])}"
         for name in names
     ]
-    hours = sum(row["wall_s"] for row in results) / HOUR_S
+    hours = sum(row["wall_s"] for row in results) / 3600
+    planned = f"{study.budget.test_episodes:,}"
     return [
         ("runs finished", finished_count(study.trainings)),
-        ("seeds", _several(study.planned_seeds)),
-        ("episodes of every test", f"{study.test_episodes:,}" if study.plan else while_training),
+        ("seeds", _several(study.budget.seeds)),
+        ("episodes of every test", planned if study.plan else while_training),
         ("commit", _several(one for one in commits if one is not None)),
         ("processor", _several(row["processor"] for row in results)),
         ("cores", _several(row["cores"] for row in results)),
@@ -299,13 +272,10 @@ def _several(values: Iterable[object]) -> str:
     return " / ".join(dict.fromkeys(str(value) for value in values)) or "-"
 
 
-def _trainings(trainings: Iterable[Training]) -> list[str]:
-    lines = []
-    for one in trainings:
-        began = f", begins with the networks of `{one.after}`" if one.after else ""
-        settings = " ".join(f"`{text}`" for text in one.overrides) or "(defaults)"
-        lines.append(f"- **{plain(one.label)}** (`{one.name}`{began}): {settings}")
-    return [*lines, ""]
+def _settings(one: Training) -> str:
+    began = f", begins with the networks of `{one.after}`" if one.after else ""
+    settings = " ".join(f"`{text}`" for text in one.overrides) or "(defaults)"
+    return f"- **{plain(one.label)}** (`{one.name}`{began}): {settings}"
 
 
 # data.json: everything that the report was drawn from, so that the runs may be deleted
@@ -330,9 +300,7 @@ def _seed_data(seed: Seed) -> Row:
 
 
 def _rounded(value: Any) -> Any:
-    if not isinstance(value, float) or not math.isfinite(value):
-        return value
-    return float(f"{value:.{DIGITS}g}")
+    return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
 
 
 def _json(value: Any, indent: str) -> str:

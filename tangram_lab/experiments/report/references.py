@@ -1,7 +1,7 @@
 """What scores are compared with: policies that learned nothing, and the paper's own numbers."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from tangram_lab.experiments.report.numbers import Measure
@@ -25,7 +25,7 @@ class Reference:
     Attributes:
         name: position only, perfect or random.
         task: what tells the task from the experiment's others; empty if it has only one.
-        by_test: name of a test -> its scores there.
+        by_test: name of a test -> its scores there, the tests that are most like training first.
     """
 
     name: str
@@ -37,57 +37,59 @@ class Reference:
         """For tables and legends."""
         return f"{self.name} ({self.task})" if self.task else self.name
 
-    def score(self, tests: Iterable[Trial], measure: Measure) -> float | None:
-        """Its score in the first of the tests that has one."""
-        rows = (self.by_test.get(one.name, {}) for one in tests)
-        values = (row[measure.key] for row in rows if row.get(measure.key) is not None)
-        return next(map(float, values), None)
+    def score(self, measure: Measure, test: Trial | None = None) -> float | None:
+        """Its score in a test, or in the first that has one."""
+        rows = self.by_test.values() if test is None else [self.by_test.get(test.name, {})]
+        known = (row[measure.key] for row in rows if row.get(measure.key) is not None)
+        return next(map(float, known), None)
 
 
-class References:
-    """All that the tests of a study know of such policies.
+def references(study: Study, experiment: Experiment) -> list[Reference]:
+    """Every policy that a test of the study has, at every task of an experiment."""
+    return [one for one in _all(study, experiment) if one.by_test]
 
-    Attributes:
-        plain: the tests of the study, those most like training first: without noise, one action.
-    """
 
-    def __init__(self, study: Study) -> None:
-        self.plain = sorted(study.tests, key=lambda t: (bool(t.corner_noise), t.actions or 1))
-        self._scores: dict[tuple[str, Task], dict[str, Row]] = {}
-        for training in study.trainings:
-            for seed in training.finished:
-                for test, row in seed.tests.items():
-                    for key, scores in row.get("baselines", {}).items():
-                        by_test = self._scores.setdefault((key, task_of(training)), {})
-                        by_test.setdefault(test, scores)
+def lacking(study: Study, experiment: Experiment) -> list[str]:
+    """The policies that no test of the study has, and for which tasks."""
+    tasks: dict[str, list[str]] = {}
+    for one in _all(study, experiment):
+        if not one.by_test:
+            tasks.setdefault(one.name, []).append(one.task)
+    names: dict[str, list[str]] = {}
+    for name, group in tasks.items():
+        names.setdefault("; ".join(filter(None, group)), []).append(name)
+    return [", ".join(n) + f" ({group})" * bool(group) for group, n in names.items()]
 
-    def of(self, experiment: Experiment) -> list[Reference]:
-        """Every known policy at every task of an experiment."""
-        return [one for one in self._all(experiment) if one.by_test]
 
-    def lacking(self, experiment: Experiment) -> list[str]:
-        """The policies that no test of the study has, and for which tasks."""
-        tasks: dict[str, list[str]] = {}
-        for one in self._all(experiment):
-            if not one.by_test:
-                tasks.setdefault(one.name, []).append(one.task)
-        names: dict[str, list[str]] = {}
-        for name, group in tasks.items():
-            names.setdefault("; ".join(filter(None, group)), []).append(name)
-        return [", ".join(n) + f" ({group})" * bool(group) for group, n in names.items()]
+def position(study: Study, training: Training) -> Reference:
+    """The position-only policy at a training's task."""
+    return Reference(POSITION, "", _scores(study, POSITION, task_of(training)))
 
-    def _all(self, experiment: Experiment) -> list[Reference]:
-        return [
-            Reference(name, label, self._scores.get((key, task), {}))
-            for key, name in NAMES.items()
-            for task, label in _tasks(experiment).items()
-            if INEXACT not in task
-        ]
 
-    def position(self, training: Training, measure: Measure) -> float | None:
-        """What the position-only policy scores at a training's task."""
-        known = self._scores.get((POSITION, task_of(training)), {})
-        return Reference(POSITION, "", known).score(self.plain, measure)
+def _all(study: Study, experiment: Experiment) -> Iterator[Reference]:
+    firsts: dict[Task, Training] = {}
+    for one in experiment.trainings:
+        if one.finished:
+            firsts.setdefault(task_of(one), one)
+    shapes = [one.tokens for one in firsts.values()]
+    for key, name in NAMES.items():
+        for task, one in firsts.items():
+            if INEXACT not in task:
+                label = one.tokens if shapes.count(one.tokens) == 1 else one.label
+                yield Reference(name, label * (len(shapes) > 1), _scores(study, key, task))
+
+
+def _scores(study: Study, key: str, task: Task) -> dict[str, Row]:
+    """Name of a test -> what a policy scored there at a task, by the first file that tells it."""
+    found: dict[str, Row] = {}
+    seeds = [seed for one in study.trainings if task_of(one) == task for seed in one.finished]
+    # Without noise, one action.
+    for test in sorted(study.tests, key=lambda t: (bool(t.corner_noise), t.actions or 1)):
+        for seed in seeds:
+            scores = seed.tests.get(test.name, {}).get("baselines", {}).get(key)
+            if scores is not None:
+                found.setdefault(test.name, scores)
+    return found
 
 
 def task_of(training: Training) -> Task:
@@ -100,57 +102,23 @@ def task_of(training: Training) -> Task:
     return (training.tokens, *settings)
 
 
-def _tasks(experiment: Experiment) -> dict[Task, str]:
-    """Every task of an experiment, and what tells it from the others."""
-    firsts: dict[Task, Training] = {}
-    for one in experiment.trainings:
-        if one.finished:
-            firsts.setdefault(task_of(one), one)
-    shapes = [one.tokens for one in firsts.values()]
-    if len(shapes) == 1:
-        return dict.fromkeys(firsts, "")
-    return {
-        task: one.tokens if shapes.count(one.tokens) == 1 else one.label
-        for task, one in firsts.items()
-    }
-
-
-@dataclass(frozen=True)
-class Value:
-    """What the paper reports of one of its agents.
-
-    Attributes:
-        mean_reward: that it reliably reaches.
-        after: episodes until then.
-        parameters: of the network.
-        hours: of training.
-        episodes: of training.
-        by_actions: mean rewards with 1, 2, ... actions in sequence.
-    """
-
-    mean_reward: float | None = None
-    after: int | None = None
-    parameters: int | None = None
-    hours: float | None = None
-    episodes: int | None = None
-    by_actions: Sequence[float] = ()
-
-
-# Place in the paper -> name of a training or of a family -> what the paper reports.
-VALUES = {
+# Place in the paper -> name of a training or of a family -> what the paper reports: the mean reward
+# that it reliably reaches, after so many episodes; parameters, hours and episodes; the mean rewards
+# with 1, 2, ... actions in sequence.
+VALUES: dict[str, dict[str, Row]] = {
     "Fig. 4": {
-        "paper": Value(mean_reward=0.75, after=1_500),
-        "mlp": Value(mean_reward=0.70, after=19_000),
+        "paper": {"mean_reward": 0.75, "after": 1_500},
+        "mlp": {"mean_reward": 0.70, "after": 19_000},
     },
     "Table I": {
-        "paper": Value(parameters=504_000, hours=72, episodes=28_000),
-        "mlp": Value(parameters=14_000, hours=48, episodes=100_000),
+        "paper": {"parameters": 504_000, "hours": 72, "episodes": 28_000},
+        "mlp": {"parameters": 14_000, "hours": 48, "episodes": 100_000},
     },
-    "Table II": {"paper": Value(by_actions=(0.758, 0.754, 0.754, 0.764, 0.750))},
+    "Table II": {"paper": {"by_actions": (0.758, 0.754, 0.754, 0.764, 0.750)}},
 }
 
 
-def papers(experiment: Experiment, training: Training) -> Value | None:
+def papers(experiment: Experiment, training: Training) -> Row:
     """The paper's numbers for a training of an experiment, by the place that this names.
 
     They belong to the training of that very name; where an experiment has none, to its family.
@@ -162,12 +130,12 @@ def papers(experiment: Experiment, training: Training) -> Value | None:
                 return known[training.name]
             if training.family in known and training.family not in names:
                 return known[training.family]
-    return None
+    return {}
 
 
 def papers_score(experiment: Experiment, training: Training, trial: Trial) -> float | None:
     """The paper's mean reward in a test without noise, by its count of actions."""
-    known = papers(experiment, training)
-    if known is None or trial.corner_noise or trial.actions is None:
+    if trial.corner_noise or trial.actions is None:
         return None
-    return dict(enumerate(known.by_actions, 1)).get(trial.actions)
+    told = papers(experiment, training).get("by_actions", ())
+    return dict(enumerate(told, 1)).get(trial.actions)

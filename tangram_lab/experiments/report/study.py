@@ -3,19 +3,26 @@
 import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import msgspec
 
 from tangram_agent.runs import CONFIG, read_config
-from tangram_lab.experiments.plan import FORMAT, PLAN, Kind, seed_folder, test_file
-from tangram_sim.errors import RunError
+from tangram_lab.experiments.plan import (
+    FORMAT,
+    PLAN,
+    ExperimentConfig,
+    TestConfig,
+    TrainingConfig,
+    seed_folder,
+    test_file,
+)
+from tangram_sim.errors import ConfigError, RunError
 
 Row = dict[str, Any]
-Checked = TypeVar("Checked")
-Named = TypeVar("Named", "Training", "Trial")
+Count = Annotated[int, msgspec.Meta(ge=0)]
 
 PRIVATE = ("host", "run_dir")  # say nothing to anybody else
 PLAIN = re.compile(r"[A-Za-z0-9][\w.-]*", re.ASCII)
@@ -39,7 +46,7 @@ class Seed:
     Attributes:
         number: the seed.
         state: `finished`, or why there is no result.
-        result: content of result.json without the host's name; empty unless it is finished.
+        result: content of result.json without the host's name; empty unless there is one.
         curve: evaluations in the order of training, also of a run that is not finished.
         tests: name of a test -> content of its file.
     """
@@ -57,22 +64,12 @@ class Seed:
 
 
 @dataclass(frozen=True)
-class Training:
-    """One setting, trained with several seeds.
+class Training(TrainingConfig):
+    """One setting with its name in folders and files, and every planned seed in the plan's order.
 
-    Attributes:
-        label: for people.
-        family: the paper's architecture or another group that it belongs to.
-        overrides: arguments of tangram-train.
-        after: the training whose networks it began with, or None.
-        name: in the plan, in folders and files.
-        seeds: every planned one, in the plan's order.
+    Its overrides are all arguments of tangram-train.
     """
 
-    label: str
-    family: str
-    overrides: tuple[str, ...]
-    after: str | None = None
     name: str = ""
     seeds: tuple[Seed, ...] = ()
 
@@ -87,12 +84,10 @@ class Training:
         names = self.finished[0].result["tokens"] if self.finished else []
         return ", ".join(names).replace("_", " ")
 
-    def values(self, key: str) -> dict[int, float]:
-        """Seed -> a number of its result, where there is one."""
-        return self.each(lambda seed: seed.result.get(key))
-
-    def scores(self, test: str, key: str) -> dict[int, float]:
-        """Seed -> a score in a test, where there is one."""
+    def values(self, key: str, test: str | None = None) -> dict[int, float]:
+        """Seed -> a number of its result, or its score in a test, where there is one."""
+        if test is None:
+            return self.each(lambda seed: seed.result.get(key))
         return self.each(lambda seed: seed.tests.get(test, {}).get(key))
 
     def each(self, number: Callable[[Seed], float | None]) -> dict[int, float]:
@@ -102,36 +97,31 @@ class Training:
 
 
 @dataclass(frozen=True)
-class Trial:
-    """A test of the plan.
+class Trial(TestConfig):
+    """A test with its name in the plan and of its files."""
 
-    Attributes:
-        label: for people.
-        actions: for each token; None as trained.
-        corner_noise: standard deviation of the noise on the corners that the agent sees, as a
-            share of the arena; None without noise.
-        name: in the plan and of its files.
-    """
-
-    label: str
-    actions: Annotated[int, msgspec.Meta(ge=0)] | None
-    corner_noise: float | None
     name: str = ""
+
+    @property
+    def actions(self) -> int | None:
+        """For each token; None as trained."""
+        asked = self._asked("sim.actions_per_token")
+        return None if asked is None else int(asked)
+
+    @property
+    def corner_noise(self) -> float | None:
+        """Deviation of the noise on the corners that the agent sees, in arenas; None as trained."""
+        asked = self._asked("sim.corner_noise")
+        return None if asked is None else float(asked)
+
+    def _asked(self, name: str) -> str | None:
+        told = (text.partition("=") for text in self.overrides)
+        return {key: value for key, _, value in told}.get(name)
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """A question, and the trainings and tests that answer it.
-
-    Attributes:
-        name: in the plan and in the names of files.
-        title: for people.
-        source: where it stands in the paper, such as `Fig. 4`.
-        kind: one of `tangram_lab.experiments.plan.KINDS`.
-        note: one or two sentences.
-        trainings: in the order to show; a ranking compares with the first.
-        tests: in the order to show.
-    """
+    """A question, and the trainings and tests that answer it; a ranking compares with the first."""
 
     name: str
     title: str
@@ -143,6 +133,16 @@ class Experiment:
 
 
 @dataclass(frozen=True)
+class Budget:
+    """Its name, how it differs from the paper's, and what it plans for every training and test."""
+
+    name: str
+    note: str
+    seeds: tuple[Count, ...]
+    test_episodes: Count = 0
+
+
+@dataclass(frozen=True)
 class Study:
     """A folder of tangram-experiment that was read.
 
@@ -150,19 +150,12 @@ class Study:
         plan: content of plan.json; empty for runs that nobody planned.
         command: that made it.
         commit: of the source tree that planned it, or None.
-        budget: name of the budget.
-        budget_note: how it differs from the paper's.
-        test_episodes: of every test.
-        experiments: in the plan's order, as are trainings and tests.
     """
 
     plan: Row
     command: str
     commit: str | None
-    budget: str
-    budget_note: str
-    planned_seeds: tuple[int, ...]
-    test_episodes: int
+    budget: Budget
     experiments: tuple[Experiment, ...]
     trainings: tuple[Training, ...]
     tests: tuple[Trial, ...]
@@ -172,77 +165,31 @@ class Study:
 
 
 @dataclass(frozen=True)
-class _Budget:
-    name: str
-    note: str
-    seeds: tuple[Annotated[int, msgspec.Meta(ge=0)], ...]
-    test_episodes: Annotated[int, msgspec.Meta(ge=0)]
-
-
-@dataclass(frozen=True)
-class _Experiment:
-    title: str
-    source: str
-    kind: Kind
-    note: str
-    trainings: tuple[str, ...]
-    tests: tuple[str, ...]
-    labels: dict[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
 class _Plan:
     command: str
     commit: str | None
-    budget: _Budget
-    experiments: dict[str, _Experiment]
-    trainings: dict[str, Training]
-    tests: dict[str, Trial]
+    budget: Budget
+    experiments: dict[str, ExperimentConfig]
+    trainings: dict[str, TrainingConfig]
+    tests: dict[str, TestConfig]
 
 
-@dataclass(frozen=True)
-class _Result:
-    mean_reward: float | None
-    mean_reward_dense: float | None
-    angle_error_deg_median: float | None
-    position_error_median: float | None
-    updates: float
-    episodes: float
-    train_s: float
-    wall_s: float
-    parameters: float
-    tokens: tuple[str, ...]
-    ended_by: str
-    processor: str
-    cores: Annotated[int, msgspec.Meta(ge=0)]
-    commit: str | None
-    versions: dict[str, str]
-
-
-@dataclass(frozen=True)
-class _Scores:
-    mean_reward_dense: float | None = None
-    angle_error_deg_median: float | None = None
-    position_error_median: float | None = None
-
-
-@dataclass(frozen=True)
-class _Baseline(_Scores):
-    mean_reward: float | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Point(_Scores):
-    updates: float
-    episodes: float
-    train_s: float
-    mean_reward: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Test(_Scores):
-    mean_reward: float
-    baselines: dict[str, _Baseline] = field(default_factory=dict)
+_SCORES = ("mean_reward_dense", "angle_error_deg_median", "position_error_median")
+_MAY = [(name, float | None, None) for name in _SCORES]
+_BASELINE: Any = msgspec.defstruct("_BASELINE", [("mean_reward", float | None, None), *_MAY])
+_TEST = msgspec.defstruct(
+    "_TEST", [("mean_reward", float), ("baselines", dict[str, _BASELINE], {}), *_MAY]
+)
+_POINT = msgspec.defstruct("_POINT", [*((name, float) for name in (*AXES, "mean_reward")), *_MAY])
+_RESULT = msgspec.defstruct(
+    "_RESULT",
+    [
+        *((name, float | None) for name in ("mean_reward", *_SCORES)),
+        *((name, float) for name in (*AXES, "wall_s", "parameters")),
+        *(("tokens", tuple[str, ...]), ("ended_by", str), ("processor", str), ("cores", Count)),
+        *(("commit", str | None), ("versions", dict[str, str])),
+    ],
+)
 
 
 def _read(path: Path, remedy: str) -> bytes:
@@ -252,21 +199,20 @@ def _read(path: Path, remedy: str) -> bytes:
         raise RunError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
 
 
-def _parsed(
-    text: bytes, kind: type[Checked], path: Path, remedy: str, line: int = 0
-) -> tuple[Row, Checked]:
+def _parsed(text: bytes, kind: Any, place: str, remedy: str) -> tuple[Row, Any]:
     """A JSON mapping as it stands, and what must be in it, checked."""
-    at = f"line {line}: " if line else ""
     try:
         row = msgspec.json.decode(text, type=Row)
         return row, msgspec.convert(row, kind)
-    except msgspec.ValidationError as error:
-        raise RunError(f"{path}: {at}{error}; {remedy}") from None
+    except (msgspec.ValidationError, ConfigError) as error:
+        raise RunError(f"{place}: {error}; {remedy}") from None
     except (ValueError, RecursionError) as error:
-        raise RunError(f"{path}: {at}it is not JSON ({error}); {remedy}") from None
+        raise RunError(f"{place}: it is not JSON ({error}); {remedy}") from None
 
 
-def _without_private(row: Row) -> Row:
+def _content(path: Path, kind: Any, remedy: str) -> Row:
+    """The content of a file, checked, without what nobody else is told."""
+    row, _ = _parsed(_read(path, remedy), kind, str(path), remedy)
     return {name: value for name, value in row.items() if name not in PRIVATE}
 
 
@@ -288,24 +234,11 @@ def read_runs(folder: Path) -> Study:
 
 
 def _planned(folder: Path) -> Study:
-    path = folder / PLAN
-    content, _ = _parsed(_read(path, REMAKE), Row, path, REMAKE)
-    if content.get("format") != FORMAT:
-        raise RunError(
-            f"{path}: its format is {content.get('format')!r}, but this version reads "
-            f"{FORMAT}: use the version of tangram-report that fits, or make the study again"
-        )
-    _, plan = _parsed(_read(path, REMAKE), _Plan, path, REMAKE)
-    for name in (*plan.experiments, *plan.trainings, *plan.tests):
-        if not PLAIN.fullmatch(name):  # it becomes the name of files and folders
-            raise RunError(
-                f"{path}: '{name}' is no name of an experiment, a training or a test: use letters, "
-                "digits, '.', '_' and '-'"
-            )
-    tests = {name: replace(one, name=name) for name, one in plan.tests.items()}
+    content, plan = _read_plan(folder / PLAN)
+    tests = {name: Trial(**vars(one), name=name) for name, one in plan.tests.items()}
     trainings = {
-        name: replace(
-            one,
+        name: Training(
+            **vars(one),
             name=name,
             seeds=tuple(
                 read_seed(seed_folder(folder, name, seed), seed, tests)
@@ -314,48 +247,44 @@ def _planned(folder: Path) -> Study:
         )
         for name, one in plan.trainings.items()
     }
-    return Study(
-        plan=content,
-        command=plan.command,
-        commit=plan.commit,
-        budget=plan.budget.name,
-        budget_note=plan.budget.note,
-        planned_seeds=plan.budget.seeds,
-        test_episodes=plan.budget.test_episodes,
-        experiments=tuple(
-            _experiment(path, name, one, trainings, tests) for name, one in plan.experiments.items()
-        ),
-        trainings=tuple(trainings.values()),
-        tests=tuple(tests.values()),
+    experiments = tuple(
+        Experiment(
+            *(name, one.title, one.source, one.kind, one.note),
+            trainings=tuple(
+                replace(trainings[t], label=one.labels.get(t, trainings[t].label))
+                for t in one.trainings
+            ),
+            tests=tuple(tests[t] for t in one.tests),
+        )
+        for name, one in plan.experiments.items()
     )
+    known = (experiments, tuple(trainings.values()), tuple(tests.values()))
+    return Study(content, plan.command, plan.commit, plan.budget, *known)
 
 
-def _experiment(
-    path: Path,
-    name: str,
-    planned: _Experiment,
-    trainings: Mapping[str, Training],
-    tests: Mapping[str, Trial],
-) -> Experiment:
-    chosen = _chosen(path, "trainings", planned.trainings, trainings)
-    return Experiment(
-        name=name,
-        title=planned.title,
-        source=planned.source,
-        kind=planned.kind,
-        note=planned.note,
-        trainings=tuple(replace(o, label=planned.labels.get(o.name, o.label)) for o in chosen),
-        tests=_chosen(path, "tests", planned.tests, tests),
-    )
-
-
-def _chosen(
-    path: Path, key: str, names: Sequence[str], known: Mapping[str, Named]
-) -> tuple[Named, ...]:
-    for name in names:
-        if name not in known:
-            raise RunError(f"{path}: its {key} lack '{name}', which an experiment names; {REMAKE}")
-    return tuple(known[name] for name in names)
+def _read_plan(path: Path) -> tuple[Row, _Plan]:
+    text = _read(path, REMAKE)
+    content, _ = _parsed(text, Row, str(path), REMAKE)
+    if content.get("format") != FORMAT:
+        raise RunError(
+            f"{path}: its format is {content.get('format')!r}, but this version reads "
+            f"{FORMAT}: use the version of tangram-report that fits, or make the study again"
+        )
+    plan: _Plan = _parsed(text, _Plan, str(path), REMAKE)[1]
+    for name in (*plan.experiments, *plan.trainings, *plan.tests):
+        if not PLAIN.fullmatch(name):  # it becomes the name of files and folders
+            raise RunError(
+                f"{path}: '{name}' is no name of an experiment, a training or a test: use letters, "
+                "digits, '.', '_' and '-'"
+            )
+    for one in plan.experiments.values():
+        for key, names in (("trainings", one.trainings), ("tests", one.tests)):
+            for name in names:
+                if name not in content[key]:
+                    raise RunError(
+                        f"{path}: its {key} lack '{name}', which an experiment names; {REMAKE}"
+                    )
+    return content, plan
 
 
 def read_seed(folder: Path, seed: int, tests: Iterable[str]) -> Seed:
@@ -366,22 +295,18 @@ def read_seed(folder: Path, seed: int, tests: Iterable[str]) -> Seed:
     """
     result: Row = {}
     state = "not finished" if folder.exists() else "not started"
-    path, curve = folder / "result.json", folder / "curve.jsonl"
-    if path.exists():
-        result, checked = _parsed(_read(path, RETRAIN), _Result, path, RETRAIN)
-        stopped = checked.ended_by.startswith("SIG")
-        state = f"stopped by {checked.ended_by}" if stopped else "finished"
+    if (path := folder / "result.json").exists():
+        result = _content(path, _RESULT, RETRAIN)
+        stopped = result["ended_by"].startswith("SIG")
+        state = f"stopped by {result['ended_by']}" if stopped else "finished"
+    curve = folder / "curve.jsonl"
     files = {name: test_file(folder, name) for name in tests}
     return Seed(
         number=seed,
         state=state,
-        result=_without_private(result),
+        result=result,
         curve=tuple(_curve(curve)) if curve.exists() else (),
-        tests={
-            name: _without_private(_parsed(_read(file, RETEST), _Test, file, RETEST)[0])
-            for name, file in files.items()
-            if file.exists()
-        },
+        tests={n: _content(file, _TEST, RETEST) for n, file in files.items() if file.exists()},
     )
 
 
@@ -389,7 +314,7 @@ def _curve(path: Path) -> Iterator[Row]:
     """The points of a curve; a last line without its end is still being written."""
     last: Row = dict.fromkeys(AXES, 0)
     for number, line in enumerate(_read(path, RETRAIN).split(b"\n")[:-1], 1):
-        row, _ = _parsed(line, _Point, path, RETRAIN, number)
+        row, _ = _parsed(line, _POINT, f"{path}: line {number}", RETRAIN)
         if any(row[axis] < last[axis] for axis in AXES):
             raise RunError(f"{path}: line {number} goes back in {', '.join(AXES)}; {RETRAIN}")
         last = row
@@ -415,20 +340,24 @@ def _unplanned(folder: Path, configs: Iterable[Path]) -> Study:
                 "of them out of the folder"
             )
         runs[seed] = path.parent
-    settings_of_all = [settings for settings, _ in groups.values()]
-    trainings = tuple(
-        Training(
-            label=_label(settings, settings_of_all),
-            family=str(settings.get(AGENT)),
-            overrides=tuple(_told(settings, _differing(settings_of_all))),
-            name=f"setting_{number}",
-            seeds=tuple(read_seed(runs[seed], seed, ()) for seed in sorted(runs)),
+    everything = [settings for settings, _ in groups.values()]
+    trainings: list[Training] = []
+    for settings, runs in groups.values():
+        agent = str(settings.get(AGENT))
+        alike = [other for other in everything if other.get(AGENT) == settings.get(AGENT)]
+        trainings.append(
+            Training(
+                label=", ".join([agent, *_told(settings, alike)]),
+                family=agent,
+                overrides=tuple(_told(settings, everything)),
+                name=f"setting_{len(trainings)}",
+                seeds=tuple(read_seed(runs[seed], seed, ()) for seed in sorted(runs)),
+            )
         )
-        for number, (settings, runs) in enumerate(groups.values())
-    )
-    seeds = tuple(sorted({seed for _, runs in groups.values() for seed in runs}))
-    only = Experiment("runs", f"Runs of {folder.name}", "", "ranking", NOTE, trainings, ())
-    return Study({}, "", None, "", NOTE, seeds, 0, (only,), trainings, ())
+    budget = Budget("", NOTE, tuple(sorted({seed for _, runs in groups.values() for seed in runs})))
+    rows = tuple(trainings)
+    only = Experiment("runs", f"Runs of {folder.name}", "", "ranking", NOTE, rows, ())
+    return Study({}, "", None, budget, (only,), rows, ())
 
 
 def _by_number(name: str) -> tuple[int, str]:
@@ -445,25 +374,10 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
             yield f"{prefix}{key}", value
 
 
-def _label(own: Row, settings: Sequence[Row]) -> str:
-    """The agent, and what tells this setting from the others of that agent."""
-    alike = [other for other in settings if other.get(AGENT) == own.get(AGENT)]
-    return ", ".join([str(own.get(AGENT)), *_told(own, _differing(alike))])
-
-
-def _told(own: Row, names: Sequence[str]) -> list[str]:
-    shown = {
-        name: own[name]
-        if isinstance(own[name], str)
-        else json.dumps(own[name], separators=(",", ":"))
-        for name in names
-        if name in own
-    }
-    return [f"{name}={value}" for name, value in shown.items()]
-
-
-def _differing(settings: Sequence[Row]) -> list[str]:
-    """The settings that are not the same everywhere, in the config's order."""
-    names = dict.fromkeys(name for one in settings for name in one)
-    first = settings[0]
-    return [name for name in names if any(one.get(name) != first.get(name) for one in settings)]
+def _told(own: Row, others: Sequence[Row]) -> Iterator[str]:
+    """The settings that are not the same in all the others, in the config's order."""
+    for name in dict.fromkeys(name for one in others for name in one):
+        if name in own and any(one.get(name) != others[0].get(name) for one in others):
+            value = own[name]
+            text = value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
+            yield f"{name}={text}"

@@ -1,7 +1,8 @@
 """The tables of each kind of experiment, and the pieces of Markdown that pages are made of."""
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,24 +19,23 @@ from tangram_lab.experiments.report.numbers import (
     Measure,
     first_at_least,
 )
-from tangram_lab.experiments.report.references import References, Value, papers, papers_score
-from tangram_lab.experiments.report.study import Experiment, Row, Training, Trial
+from tangram_lab.experiments.report.references import papers, papers_score, references
+from tangram_lab.experiments.report.study import Experiment, Row, Study, Training, Trial
 from tangram_sim.arrays import Floats
 
 SPREAD = "median (least to most)"
 LEVELS = (0.70, 0.75)  # that the paper tells of in Fig. 4
 # With several tokens.
-COVERAGE = Measure("coverage", "coverage", "covered share of the target", "{:.4f}")
+COVERAGE = Measure("coverage", "coverage", "{:.4f}")
 GAME_MEASURES = (
     COVERAGE,
-    Measure("share_solved", "solved", "targets covered by 0.95 or more (%)", "{:.1f} %", 100),
-    Measure("iou", "IoU", "intersection over union", "{:.3f}"),
-    POSITION,
-    ANGLE,
-    Measure("wrong", "wrong pieces", "wrong pieces per target", "{:.2f}"),
-    Measure("doubly_used", "doubly used", "pieces used twice per target", "{:.2f}"),
-    Measure("blocked", "refused placements", "refused placements per target", "{:.2f}"),
-    Measure("seconds_per_puzzle", "ms per target", "time per target (ms)", "{:,.0f}", 1000),
+    Measure("share_solved", "solved", "{:.1f} %", 100),
+    Measure("iou", "IoU", "{:.3f}"),
+    *(POSITION, ANGLE),
+    Measure("wrong", "wrong pieces", "{:.2f}"),
+    Measure("doubly_used", "doubly used", "{:.2f}"),
+    Measure("blocked", "refused placements", "{:.2f}"),
+    Measure("seconds_per_puzzle", "ms per target", "{:,.0f}", 1000),
 )
 EACH = "coverage_each"  # of a test's file: the coverage of every episode
 ORDERS = ("order=listed", "order=size", "order=random")
@@ -52,10 +52,13 @@ NORMAL = 1.96
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], rest: str = "---:") -> list[str]:
-    """A table; the columns after the first are numbers, unless `rest` is `---`."""
-    ruler = ["---", *[rest] * (len(head) - 1)]
-    escaped = [[plain(cell).replace("|", "\\|") for cell in row] for row in (head, *rows)]
-    escaped.insert(1, ruler)
+    """A table; the columns after the first are numbers, unless `rest` is `---`.
+
+    A row that is too short ends with empty cells.
+    """
+    full = [[*row, *[""] * (len(head) - len(row))] for row in (head, *rows)]
+    escaped = [[plain(cell).replace("|", "\\|") for cell in row] for row in full]
+    escaped.insert(1, ["---", *[rest] * (len(head) - 1)])
     return [*(f"| {' | '.join(cells)} |" for cells in escaped), ""]
 
 
@@ -80,144 +83,146 @@ def picture(title: str, file: str) -> list[str]:
     return [f"![{alternative}]({file})", ""]
 
 
-# One token
+# One token: columns, each a head and the cell of a training
 
 
-def score_table(
-    experiment: Experiment, references: References, measure: Measure, seeds: Sequence[int]
+Cell = Callable[[Training], str]
+Column = tuple[str, Cell]
+
+LABEL: Column = ("training", lambda one: one.label)
+SEEDS: Column = ("seeds", lambda one: f"{len(one.finished)} of {len(one.seeds)}")
+
+
+def _table(
+    columns: Sequence[Column], trainings: Iterable[Training], others: Iterable[Sequence[str]] = ()
 ) -> list[str]:
+    rows = [[cell(one) for _, cell in columns] for one in trainings]
+    return table([head for head, _ in columns], [*rows, *others])
+
+
+def _over_seeds(measure: Measure, test: str | None = None) -> Cell:
+    return lambda one: measure.show_spread(one.values(measure.key, test))
+
+
+def _measured(*measures: Measure) -> list[Column]:
+    return [(measure.label, _over_seeds(measure)) for measure in measures]
+
+
+def _tested(measure: Measure, tests: Iterable[Trial]) -> list[Column]:
+    return [(test.label, _over_seeds(measure, test.name)) for test in tests]
+
+
+def _each_seed(study: Study, measure: Measure) -> list[Column]:
+    def cell(seed: int) -> Cell:
+        return lambda one: measure.show(one.values(measure.key).get(seed))
+
+    return [(f"seed {seed}", cell(seed)) for seed in study.budget.seeds]
+
+
+def _papers(experiment: Experiment, head: str, pattern: str) -> Column:
+    def cell(one: Training) -> str:
+        try:
+            return pattern.format_map(papers(experiment, one))
+        except KeyError:
+            return NOTHING
+
+    return head, cell
+
+
+def _if_any(column: Column, experiment: Experiment) -> list[Column]:
+    return [column] if any(column[1](one) != NOTHING for one in experiment.trainings) else []
+
+
+def score_table(study: Study, experiment: Experiment, measure: Measure) -> list[str]:
     """Final scores: the paper's, ours over the seeds, every seed, and policies without learning."""
-    known = {one.name: papers(experiment, one) for one in experiment.trainings}
-    told = {name: value.mean_reward for name, value in known.items() if value is not None}
-    beside = measure is REWARD and any(value is not None for value in told.values())
-    head = ["training", "seeds", *["paper"] * beside, f"{measure.label}, {SPREAD}"]
-    rows = [
-        [
-            one.label,
-            seed_count(one),
-            *[_show(told.get(one.name), "{:.2f}")] * beside,
-            measure.show_spread(one.values(measure.key)),
-            *(measure.show(one.values(measure.key).get(seed)) for seed in seeds),
-        ]
-        for one in experiment.trainings
+    told = _papers(experiment, "paper", "{mean_reward:.2f}")
+    paper = _if_any(told, experiment) if measure is REWARD else []
+    ours = (f"{measure.label}, {SPREAD}", _over_seeds(measure))
+    columns = [LABEL, SEEDS, *paper, ours, *_each_seed(study, measure)]
+    others = [
+        [policy.label, *[""] * (1 + len(paper)), measure.show(policy.score(measure))]
+        for policy in references(study, experiment)
     ]
-    for reference in references.of(experiment):
-        score = measure.show(reference.score(references.plain, measure))
-        rows.append([reference.label, "", *[""] * beside, score, *[""] * len(seeds)])
-    return table([*head, *(f"seed {seed}" for seed in seeds)], rows)
+    return _table(columns, experiment.trainings, others)
 
 
 def effort_table(experiment: Experiment) -> list[str]:
     """How soon the paper's two rewards were reached, the errors at the end, and what it took."""
-    known = {one.name: papers(experiment, one) for one in experiment.trainings}
-    told = {
-        name: f"{value.mean_reward:.2f} after {value.after:,}"
-        for name, value in known.items()
-        if value is not None and value.mean_reward is not None and value.after is not None
-    }
-    shown = (ANGLE, POSITION, EPISODES, UPDATES, MINUTES)
-    head = ["training", *["paper, episodes"] * bool(told)]
-    head += [*(f"{level:.2f} after, episodes" for level in LEVELS), *(m.label for m in shown)]
-    rows = (
-        [
-            one.label,
-            *[told.get(one.name, NOTHING)] * bool(told),
-            *(_soon(one, level) for level in LEVELS),
-            *(measure.show_spread(one.values(measure.key)) for measure in shown),
-        ]
-        for one in experiment.trainings
-    )
-    return table(head, rows)
+    paper = _papers(experiment, "paper, episodes", "{mean_reward:.2f} after {after:,}")
+    soon = [(f"{level:.2f} after, episodes", _soon(level)) for level in LEVELS]
+    took = _measured(ANGLE, POSITION, EPISODES, UPDATES, MINUTES)
+    return _table([LABEL, *_if_any(paper, experiment), *soon, *took], experiment.trainings)
 
 
-def _soon(training: Training, level: float) -> str:
+def _soon(level: float) -> Cell:
     """Episodes until a mean reward was first reached, and by how many seeds if not by all."""
-    reached = training.each(lambda seed: first_at_least(seed, level))
-    few = 0 < len(reached) < len(training.finished)
-    count = f", {len(reached)} of {len(training.finished)} seeds" if few else ""
-    return EPISODES.show_spread(reached) + count
+
+    def cell(one: Training) -> str:
+        reached = one.each(lambda seed: first_at_least(seed, level))
+        few = 0 < len(reached) < len(one.finished)
+        count = f", {len(reached)} of {len(one.finished)} seeds" if few else ""
+        return EPISODES.show_spread(reached) + count
+
+    return cell
 
 
 def complexity_table(experiment: Experiment) -> list[str]:
     """Table I: parameters, time and episodes, the paper's beside ours."""
-    head = ["training", "seeds", "paper: parameters", "parameters", "paper: time, h"]
-    head += [HOURS.label, "paper: episodes", "episodes", UPDATES.label, REWARD.label]
-    rows = []
-    for one in experiment.trainings:
-        value = papers(experiment, one) or Value()
-        parameters, hours, episodes, updates, reward = (
-            measure.show_spread(one.values(measure.key))
-            for measure in (PARAMETERS, HOURS, EPISODES, UPDATES, REWARD)
-        )
-        cells = [_show(value.parameters, "{:,}"), parameters, _show(value.hours, "{:g}"), hours]
-        cells += [_show(value.episodes, "{:,}"), episodes, updates, reward]
-        rows.append([one.label, seed_count(one), *cells])
-    return table(head, rows)
+    columns = [
+        *(LABEL, SEEDS, _papers(experiment, "paper: parameters", "{parameters:,}")),
+        *(*_measured(PARAMETERS), _papers(experiment, "paper: time, h", "{hours:g}")),
+        *(*_measured(HOURS), _papers(experiment, "paper: episodes", "{episodes:,}")),
+        *_measured(EPISODES, UPDATES, REWARD),
+    ]
+    return _table(columns, experiment.trainings)
 
 
-def test_table(experiment: Experiment, references: References, measure: Measure) -> list[str]:
+def test_table(study: Study, experiment: Experiment, measure: Measure) -> list[str]:
     """Rows are trainings, columns are tests; the paper's values and other policies below."""
     tests, rows = experiment.tests, []
+    columns = [LABEL, SEEDS, *_tested(measure, tests)]
     for one in experiment.trainings:
-        cells = [measure.show_spread(one.scores(test.name, measure.key)) for test in tests]
-        rows.append([one.label, seed_count(one), *cells])
-        told = [papers_score(experiment, one, test) for test in tests]
-        if measure is REWARD and any(value is not None for value in told):
-            rows.append([f"{one.label}, the paper's", "", *map(measure.show, told)])
-    for reference in references.of(experiment):
-        scores = [reference.score([test], measure) for test in tests]
+        rows.append([cell(one) for _, cell in columns])
+        paper = [papers_score(experiment, one, test) for test in tests]
+        if measure is REWARD and any(paper):
+            rows.append([f"{one.label}, the paper's", "", *map(measure.show, paper)])
+    for policy in references(study, experiment):
+        scores = [policy.score(measure, test) for test in tests]
         if any(score is not None for score in scores):
-            rows.append([reference.label, "", *map(measure.show, scores)])
-    return table([f"{measure.label}, {SPREAD}", "seeds", *(t.label for t in tests)], rows)
+            rows.append([policy.label, "", *map(measure.show, scores)])
+    return table([f"{measure.label}, {SPREAD}", "seeds", *(test.label for test in tests)], rows)
 
 
 def single_tests(experiment: Experiment, measure: Measure) -> list[str]:
     """Every seed of every training in every test."""
-    rows = (
-        [
-            one.label,
-            str(seed.number),
-            *(
-                measure.show(one.scores(test.name, measure.key).get(seed.number))
-                for test in experiment.tests
-            ),
-        ]
-        for one in experiment.trainings
-        for seed in one.finished
-    )
-    return table([measure.label, "seed", *(test.label for test in experiment.tests)], rows)
+    alone = [replace(one, seeds=(seed,)) for one in experiment.trainings for seed in one.finished]
+    number: Column = ("seed", lambda one: str(one.seeds[0].number))
+    columns = [(measure.label, LABEL[1]), number, *_tested(measure, experiment.tests)]
+    return _table(columns, alone)
 
 
-def ranking_table(
-    experiment: Experiment, references: References, seeds: Sequence[int]
-) -> list[str]:
+def ranking_table(study: Study, experiment: Experiment) -> list[str]:
     """Every training beside the first: medians and their differences, and every seed."""
     first = experiment.trainings[0]
-    head = ["training", "seeds", f"{REWARD.label}, {SPREAD}", "difference"]
-    head += [f"{ANGLE.label}, {SPREAD}", "difference", MINUTES.label]
-    rows = []
-    for one in experiment.trainings:
-        cells = [one.label, seed_count(one)]
-        for measure in (REWARD, ANGLE):
-            values, others = one.values(measure.key), first.values(measure.key)
-            apart = "reference" if one is first else measure.show_difference(values, others)
-            cells += [measure.show_spread(values), apart]
-        rewards = one.values(REWARD.key)
-        cells.append(MINUTES.show_spread(one.values(MINUTES.key)))
-        rows.append(cells + [REWARD.show(rewards.get(seed)) for seed in seeds])
-    for reference in references.of(experiment):
-        reward, angle = (m.show(reference.score(references.plain, m)) for m in (REWARD, ANGLE))
-        rows.append([reference.label, "", reward, "", angle, "", "", *[""] * len(seeds)])
-    return table([*head, *(f"seed {seed}" for seed in seeds)], rows)
+    columns = [LABEL, SEEDS]
+    for measure in (REWARD, ANGLE):
+        columns.append((f"{measure.label}, {SPREAD}", _over_seeds(measure)))
+        columns.append(("difference", _difference(measure, first)))
+    columns += [*_measured(MINUTES), *_each_seed(study, REWARD)]
+    others = [
+        [one.label, "", REWARD.show(one.score(REWARD)), "", ANGLE.show(one.score(ANGLE))]
+        for one in references(study, experiment)
+    ]
+    return _table(columns, experiment.trainings, others)
 
 
-def seed_count(training: Training) -> str:
-    """How many seeds are finished, of how many."""
-    return f"{len(training.finished)} of {len(training.seeds)}"
+def _difference(measure: Measure, first: Training) -> Cell:
+    def cell(one: Training) -> str:
+        if one is first:
+            return "reference"
+        return measure.show_difference(one.values(measure.key), first.values(measure.key))
 
-
-def _show(value: float | None, pattern: str) -> str:
-    return NOTHING if value is None else pattern.format(value)
+    return cell
 
 
 # Several tokens
@@ -230,8 +235,8 @@ def assembly_table(experiment: Experiment) -> list[str]:
         [
             one.label,
             test.label,
-            str(len(one.scores(test.name, COVERAGE.key))),
-            *(measure.show_spread(one.scores(test.name, measure.key)) for measure in GAME_MEASURES),
+            str(len(one.values(COVERAGE.key, test.name))),
+            *(m.show_spread(one.values(m.key, test.name)) for m in GAME_MEASURES),
             MINUTES.show_spread(one.values(MINUTES.key)),
         ]
         for one in experiment.trainings
@@ -246,7 +251,7 @@ def _baseline_rows(experiment: Experiment) -> Iterator[list[str]]:
     for one in experiment.trainings:
         for test in experiment.tests:
             task = (one.tokens, test.label)
-            if task in seen or not one.scores(test.name, COVERAGE.key):
+            if task in seen or not one.values(COVERAGE.key, test.name):
                 continue
             seen.add(task)
             count = len(one.finished[0].result["tokens"])
@@ -268,9 +273,9 @@ def order_table(experiment: Experiment) -> list[str]:
     rows = []
     for one in experiment.trainings:
         for test in experiment.tests:
-            learned = one.scores(test.name, COVERAGE.key)
+            learned = one.values(COVERAGE.key, test.name)
             shown = [paired(differences(one, test, name)) for name in ORDERS]
-            if any(text != NOTHING for text in shown):
+            if {*shown} - {NOTHING}:
                 rows.append([one.label, test.label, COVERAGE.show_spread(learned), *shown])
     return [plain(ORDER_NOTE), "", *table(head, rows)] if rows else []
 
