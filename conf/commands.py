@@ -155,7 +155,6 @@ TensorBoard curves, result.json and a picture of test episodes.""",
         ),
         (
             "master.config:MasterConfig",
-            "master.config:LaunchConfig",
             "conf.commands:StoredConfig",
         ),
         RUN,
@@ -195,10 +194,11 @@ told what differs.""",
         "tangram-status",
         """\
 Says how a run stands: what it does or waits for, its workers, how fast they are, how old
-their weights and the last checkpoint are. It asks the master, from wherever a worker may be.""",
+their weights and the last checkpoint are. It asks the master, from wherever a worker may be;
+`watch tangram-status connect=...` asks every two seconds.""",
         (
             "tangram-status connect=runs/my_run",
-            "tangram-status connect=runs/my_run every_seconds=2",
+            "tangram-status connect=tcp://127.0.0.1:5555",
             "tangram-status connect=runs/my_run/connection.json json=true",
         ),
         ("worker.config:StatusConfig",),

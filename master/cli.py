@@ -20,17 +20,14 @@ def master() -> int:
 
 
 def _train(settings: Plain) -> int:
-    from master.config import LaunchConfig, MasterConfig
+    from master.config import MasterConfig
     from tangram_agent.setup import SECTIONS, from_mapping, make_setup
     from tangram_sim.rewards import check_reward
     from tangram_sim.world import check_world
 
     _make_absolute(settings)
     rest = {name: value for name, value in settings.items() if name not in SECTIONS}
-    workers = rest.pop("workers", None)
-    config = from_mapping(
-        LaunchConfig, {"workers": workers, "master": from_mapping(MasterConfig, rest)}
-    )
+    config = from_mapping(MasterConfig, rest)
     # The children check it again; a wrong task is refused before any of them starts.
     setup = make_setup(settings)
     check_world(setup.layout, setup.sim)
@@ -45,10 +42,14 @@ def _master(settings: Plain) -> int:
     from master.config import MasterConfig
     from tangram_agent.setup import SECTIONS, from_mapping, make_setup
     from tangram_sim.rewards import check_reward
+    from tangram_sim.settings import refuse_ignored
 
     _make_absolute(settings)
     rest = {name: value for name, value in settings.items() if name not in SECTIONS}
     config = from_mapping(MasterConfig, rest)
+    if config.workers > 1 and config.service.mode == "async":
+        given, alone = f"workers={config.workers}", "service.mode=async in tangram-master"
+        refuse_ignored(given, alone, "start them with tangram-worker", 1)
     setup = make_setup(settings)
     check_reward(setup.reward, setup.layout, setup.sim)
 

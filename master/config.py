@@ -1,4 +1,4 @@
-"""Settings of one master process and of a whole training on one machine."""
+"""Settings of a run: of its master, and of a whole training on one machine."""
 
 from dataclasses import dataclass, field
 
@@ -11,7 +11,7 @@ MAX_WORKERS = 1024
 
 @dataclass(frozen=True)
 class MasterConfig(Settings):
-    """One run of the learner."""
+    """One run, of a master alone or with its workers on this machine."""
 
     run_dir: str = field(metadata=declared("folder of the run, made if it is missing"))
     seed: int = setting(0, "of everything random in the run", low=0, high=2**63 - 1)
@@ -24,26 +24,14 @@ class MasterConfig(Settings):
         choices=("none", "auto"),
     )
     warm_start: str | None = setting(None, "folder of a run whose networks this run begins with")
-    service: ServiceConfig = field(default_factory=ServiceConfig)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.run_dir.strip():
-            raise ConfigError("run_dir must name a folder, got '': set run_dir=runs/my_run")
-
-
-@dataclass(frozen=True)
-class LaunchConfig(Settings):
-    """A master, its workers and an evaluator on this machine.
-
-    Attributes:
-        master: the learner's settings.
-    """
-
-    master: MasterConfig
     workers: int = setting(
-        1, "processes that play; one evaluator joins them", low=1, high=MAX_WORKERS
+        1,
+        "processes that play, one evaluator joins them; tangram-master starts none and, in "
+        "lockstep, waits for so many",
+        low=1,
+        high=MAX_WORKERS,
     )
+    service: ServiceConfig = field(default_factory=ServiceConfig)
 
     def __post_init__(self) -> None:
         if self.workers < 1:
@@ -52,3 +40,5 @@ class LaunchConfig(Settings):
                 "tangram-master alone waits for workers from elsewhere"
             )
         super().__post_init__()
+        if not self.run_dir.strip():
+            raise ConfigError("run_dir must name a folder, got '': set run_dir=runs/my_run")

@@ -18,6 +18,7 @@ from tangram_sim.errors import RunError
 
 # Going back further costs updates, keeping more often costs time.
 KEEP_S = 0.5
+MAX_BAD_UPDATES = 10  # undone in a row, then the run ends
 UNDONE = "undone updates"
 
 
@@ -28,13 +29,13 @@ class DivergenceGuard:
         trainer: whoever saves its state calls `check` before.
     """
 
-    def __init__(self, trainer: Trainer, limit: int, evidence: Path) -> None:
+    def __init__(self, trainer: Trainer, evidence: Path, limit: int = MAX_BAD_UPDATES) -> None:
         """Keep the present state as the first good one.
 
         Args:
             trainer: as made or restored.
-            limit: failures in a row, without good weights between them, that end the run.
-            evidence: where the batch of the last failure is then written to.
+            evidence: where the batch of the last failure is written to when the run ends.
+            limit: failures in a row, without good weights between them, that end it.
 
         Raises:
             NotFiniteError: the state is not finite already.

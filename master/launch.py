@@ -11,7 +11,7 @@ from typing import Any
 
 from master.checkpointer import check_resumable
 from master.children import MAX_RESTARTS, Child, command, describe, override
-from master.config import LaunchConfig
+from master.config import MasterConfig
 from master.console import logging_to, sturdy_console
 from master.rundir import RunFolder
 from master.signals import SAME_WISH_S, handling, show_cursor
@@ -30,11 +30,11 @@ EVALUATOR_NICE = 10
 log = logging.getLogger(__name__)
 
 
-def run_training(config: LaunchConfig, resolved: Mapping[str, Any]) -> int:
+def run_training(config: MasterConfig, resolved: Mapping[str, Any]) -> int:
     """Train until the master is done, and leave no process behind.
 
     Args:
-        config: the settings of launcher and master.
+        config: the settings of the run.
         resolved: the whole config as plain values, for config.yaml, which the children read.
 
     Returns:
@@ -43,8 +43,8 @@ def run_training(config: LaunchConfig, resolved: Mapping[str, Any]) -> int:
     Raises:
         TangramError: the run folder cannot be used.
     """
-    folder = RunFolder(config.master.run_dir)
-    folder.prepare(config.master.resume)
+    folder = RunFolder(config.run_dir)
+    folder.prepare(config.resume)
     with folder.lock():
         check_resumable(folder, resolved)
         folder.logs.mkdir(exist_ok=True)
@@ -53,7 +53,7 @@ def run_training(config: LaunchConfig, resolved: Mapping[str, Any]) -> int:
         folder.connection.unlink(missing_ok=True)
     console = sturdy_console(sys.stderr)
     launcher = Launcher(config, folder)
-    with logging_to(console, config.master.service.log_format, "launcher"), launcher.signals():
+    with logging_to(console, config.service.log_format, "launcher"), launcher.signals():
         watch_parent(grace_s=STOP_S + 2.0 * LEAVE_S)  # of an experiment that started it
         try:
             return launcher.run()
@@ -64,14 +64,14 @@ def run_training(config: LaunchConfig, resolved: Mapping[str, Any]) -> int:
 class Launcher:
     """Starts the children, restarts those that fail, and ends them in order."""
 
-    def __init__(self, config: LaunchConfig, folder: RunFolder) -> None:
+    def __init__(self, config: MasterConfig, folder: RunFolder) -> None:
         self._folder = folder
         self._events: SimpleQueue[Child | signal.Signals] = SimpleQueue()
         self._master = Child("master", master_arguments(config, folder))
         self._players = [worker_child(folder, "player", i) for i in range(config.workers)]
         self._evaluator = worker_child(folder, "evaluator", -1)
         for child in (self._master, *self._workers):
-            child.patience_s = config.master.service.watchdog_seconds
+            child.patience_s = config.service.watchdog_seconds
         self._look = Every(IDLE_S)
         self._stop_s: float | None = None
         self._signalled_s: float | None = None
@@ -246,18 +246,17 @@ def worker_child(folder: RunFolder, role: str, index: int) -> Child:
     return Child(name, arguments, folder.logs / f"{name.replace(' ', '-')}.log", nice)
 
 
-def master_arguments(config: LaunchConfig, folder: RunFolder) -> list[str]:
+def master_arguments(config: MasterConfig, folder: RunFolder) -> list[str]:
     """How the master is started, as arguments of this Python."""
-    master = config.master
-    in_step = master.service.mode == "lockstep"
+    in_step = config.service.mode == "lockstep"
     return [
         *command("master"),
         override("from_config", str(folder.config)),
         override("run_dir", str(folder.path)),
         *(
-            f"{name}={getattr(master, name)}"
+            f"{name}={getattr(config, name)}"
             for name in ("seed", "max_hours", "max_episodes", "max_updates", "resume")
         ),
-        *([f"service.lockstep_workers={config.workers}"] if in_step else []),
-        *([override("warm_start", master.warm_start)] if master.warm_start else []),
+        *([f"workers={config.workers}"] if in_step else []),
+        *([override("warm_start", config.warm_start)] if config.warm_start else []),
     ]

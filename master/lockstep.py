@@ -32,25 +32,20 @@ class Lockstep:
         self.ordered = False
 
     @staticmethod
-    def of(service: ServiceConfig) -> "Lockstep | None":
+    def of(service: ServiceConfig, workers: int) -> "Lockstep | None":
         """The lockstep of the settings, None in any other mode.
 
         Raises:
-            ConfigError: the number of players is not known, or batches are no whole groups.
+            ConfigError: batches are no whole groups.
         """
         if service.mode != "lockstep":
             return None
-        if service.lockstep_workers < 1:
-            raise ConfigError(
-                "service.mode=lockstep waits for a known number of workers: set "
-                "service.lockstep_workers=..., or use tangram-train workers=..."
-            )
         if service.batch_episodes % service.envs:
             raise ConfigError(
                 f"service.batch_episodes={service.batch_episodes} must be a multiple of "
                 f"service.envs={service.envs} in lockstep: set one of them"
             )
-        return Lockstep(service.lockstep_workers, service.batch_episodes)
+        return Lockstep(workers, service.batch_episodes)
 
     def begins_round(self, episodes: int) -> bool:
         """Whether, with so many episodes inserted, the next one is the first of a round."""

@@ -78,8 +78,7 @@ class Loop:
             else:
                 self.insert_round(self.lockstep)
             self.learn()
-            if self.lockstep is None and self._publish.due():
-                self.publish()
+            self.publish_due()
             self.checkpointer.tick()
             self.reporter.tick(len(self._arrived))
         return reason
@@ -137,8 +136,12 @@ class Loop:
         until_s = time.monotonic() + LEARN_S
         while self.may_learn() and time.monotonic() < until_s and self.budget.spent() is None:
             self.reporter.updated(self.guard.update(self.budget.share))
-            if self.service.every_update:
-                self.publish()
+            self.publish_due()
+
+    def publish_due(self) -> None:
+        """Send the weights where it is time; in lockstep they go with the orders."""
+        if self.lockstep is None and self._publish.due():
+            self.publish()
 
     def publish(self) -> None:
         """Send the acting weights, unless these were sent before.

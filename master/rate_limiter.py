@@ -5,6 +5,8 @@ from collections.abc import Mapping
 
 from tangram_sim.errors import ConfigError, RunError
 
+# Updates that the learner may lag behind before workers must wait: some seconds of learning.
+LAG_UPDATES = 64
 # Sums such as 0.29 * 100 end just below the integer that is meant.
 ROUNDING = 1e-6
 
@@ -35,7 +37,7 @@ class RateLimiter:
     """
 
     def __init__(
-        self, updates_per_transition: float, learning_starts: int, lag_updates: int
+        self, updates_per_transition: float, learning_starts: int, lag_updates: int = LAG_UPDATES
     ) -> None:
         if not (math.isfinite(updates_per_transition) and updates_per_transition > 0):
             raise ConfigError(
@@ -44,7 +46,7 @@ class RateLimiter:
             )
         if lag_updates < 1:
             raise ConfigError(
-                f"service.lag_updates must be at least 1, got {lag_updates}: no transition could "
+                f"the lag must be at least 1 update, got {lag_updates}: no transition could "
                 "ever be inserted, so learner and workers would wait for each other for ever"
             )
         self._rate, self._starts, self._limit = updates_per_transition, learning_starts, lag_updates

@@ -21,7 +21,6 @@ from master.metrics import Means, Metrics
 from master.registry import Peer
 from master.rundir import Clock, Record
 from master.trainer import Trainer
-from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import WORKER_COLUMNS, RunStatus, Scores
 from tangram_agent.process import Every
 from tangram_agent.setup import Setup
@@ -35,6 +34,7 @@ CURVE_PIXELS, PICTURE_PIXELS = 120, 240
 PICTURE_S = 30.0
 TICK_S = 0.1
 LISTEN_S = 1.0
+LOG_S = 2.0  # between two lines of progress, and of the curves
 
 log = logging.getLogger(__name__)
 
@@ -168,7 +168,6 @@ class Reporter:
         self,
         trainer: Trainer,
         record: Record,
-        service: ServiceConfig,
         status: StatusCollector,
         progress: Progress,
         metrics: Metrics,
@@ -179,7 +178,6 @@ class Reporter:
         Args:
             trainer: which learns.
             record: takes the scores.
-            service: how often curves are written.
             status: of the run.
             progress: for the user.
             metrics: the curves.
@@ -189,7 +187,7 @@ class Reporter:
         self._progress, self._metrics, self._listeners = progress, metrics, listeners
         self._losses, self._play = Means(), Means()
         self._tick, self._listen = Every(TICK_S, at_once=True), Every(LISTEN_S, at_once=True)
-        self._log, self._picture = Every(service.log_seconds), Every(PICTURE_S, at_once=True)
+        self._log, self._picture = Every(LOG_S), Every(PICTURE_S, at_once=True)
         self._published: OrderedDict[int, Sent] = OrderedDict()
         self._latest: Scores | None = None
         self._stage = -1

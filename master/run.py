@@ -38,6 +38,7 @@ from master.trainer import Trainer, choose_device
 from tangram_agent.addresses import reachable, with_host
 from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.config import ServiceConfig
+from tangram_agent.messages import WINDOW
 from tangram_agent.process import Watchdog, watch_parent
 from tangram_agent.setup import Setup
 
@@ -134,13 +135,13 @@ def open_run(
         TangramError: the port or a checkpoint cannot be used, or there is no such device.
     """
     service, folder = config.service, RunFolder(config.run_dir)
-    trainer = Trainer(setup, config.seed, choose_device(service.device), service.lag_updates)
+    trainer = Trainer(setup, config.seed, choose_device(service.device))
     found = _restore(config, folder, trainer)
     rest = found or Restored(_new_record(folder.journal), {})
     run_id = rest.record.run_id
-    guard = DivergenceGuard(trainer, service.max_bad_updates, folder.bad_batch)
+    guard = DivergenceGuard(trainer, folder.bad_batch)
     clock, budget = Clock(rest.record), Budget(config, trainer, rest.record)
-    lockstep = Lockstep.of(service)
+    lockstep = Lockstep.of(service, config.workers)
     if not budget.bounded:
         log.warning(UNBOUNDED)
     keys = _keys(service, folder)
@@ -162,7 +163,7 @@ def open_run(
     opened.enter_context(closing(metrics))
     status = StatusCollector(folder.path.name, guard, hub, budget, clock, checkpointer)
     listeners = [hub.tell, *([] if health is None else [health.update])]
-    reporter = Reporter(trainer, rest.record, service, status, progress, metrics, listeners)
+    reporter = Reporter(trainer, rest.record, status, progress, metrics, listeners)
     loop = Loop(
         service=service,
         folder=folder,
@@ -218,7 +219,7 @@ def _open_hub(config: MasterConfig, setup: Setup, run_id: str, keys: Keys | None
         seed=config.seed,
         fingerprints=setup.fingerprints(),
         spec=EpisodeSpec.of(setup),
-        window=service.window,
+        window=WINDOW,
         lockstep=service.mode == "lockstep",
     )
     place, patience_s = (service.bind, service.port), service.silence_seconds

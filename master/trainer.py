@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from master.rate_limiter import RateLimiter
+from master.rate_limiter import LAG_UPDATES, RateLimiter
 from tangram_agent.learner import Learner
 from tangram_agent.relabelling import with_relabelled
 from tangram_agent.replay import ReplayBuffer
@@ -35,7 +35,9 @@ class Trainer:
         batch: of the last update.
     """
 
-    def __init__(self, setup: Setup, seed: int, device: str, lag_updates: int) -> None:
+    def __init__(
+        self, setup: Setup, seed: int, device: str, lag_updates: int = LAG_UPDATES
+    ) -> None:
         agent, layout = setup.agent, setup.layout
         self.setup = setup
         self.reward = make_reward(setup.reward, layout, setup.sim)

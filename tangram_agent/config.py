@@ -7,7 +7,7 @@ from tangram_sim.errors import ConfigError
 from tangram_sim.settings import LEARNING, NETWORK, Settings, declared, setting
 
 ORDERS = ("learned", "listed", "size", "random")
-STRATEGIES = ("final", "future", "near", "none")
+STRATEGIES = ("final", "future", "near")
 
 
 @dataclass(frozen=True)
@@ -59,14 +59,18 @@ class RelabelConfig(Settings, section="agent.hindsight"):
 
     strategy: str = field(
         metadata=declared(
-            "the goal: final, future, near (the final pose moved by Gaussian noise) or none; "
+            "the goal: final, future or near (the final pose moved by Gaussian noise); "
             "pairs of several tokens: where the token came to lie by its action is final",
             choices=STRATEGIES,
         )
     )
     copies: int = setting(1, "goals of this kind for each transition", low=1, high=64)
-    position: float = setting(0.0, "near: deviation of the goal's shift", low=0, unit="arena units")
-    angle: float = setting(0.0, "near: deviation of the goal's turn", low=0, unit="rad")
+    position: float = setting(
+        0.0, "deviation of the goal's shift", low=0, unit="arena units", only={"strategy": "near"}
+    )
+    angle: float = setting(
+        0.0, "deviation of the goal's turn", low=0, unit="rad", only={"strategy": "near"}
+    )
 
 
 @dataclass(frozen=True)
@@ -108,7 +112,11 @@ class AgentConfig(Settings, section="agent"):
         part=LEARNING,
     )
     saturation_limit: float = setting(
-        1.0, "pre-activation beyond which the penalty starts", low=0, part=LEARNING
+        1.0,
+        "pre-activation beyond which the penalty starts",
+        low=0,
+        unless={"saturation_penalty": 0.0},
+        part=LEARNING,
     )
     readout: str = setting(
         "pair",
@@ -144,6 +152,7 @@ class AgentConfig(Settings, section="agent"):
         high=1,
         unit="arena units and rad",
         only={"readout": "pair"},
+        unless={"refine_steps": 0},
     )
     pairs_per_transition: int = setting(
         8,
@@ -160,11 +169,18 @@ class AgentConfig(Settings, section="agent"):
         high=1,
         only={"readout": "pair"},
     )
-    gamma: float = setting(0.0, "discount, Eq. 5", low=0, high=1, part=LEARNING)
+    gamma: float = setting(
+        0.0,
+        "discount, Eq. 5; one action in an episode leaves nothing to discount",
+        low=0,
+        high=1,
+        part=LEARNING,
+    )
     polyak: float = setting(
         0.995,
-        "rho of the target networks, Eq. 4, which gamma > 0 needs",
+        "rho of the target networks, Eq. 4",
         low=0,
+        unless={"gamma": 0.0},
         high=1,
         part=LEARNING,
     )
@@ -181,18 +197,11 @@ class AgentConfig(Settings, section="agent"):
     critic_lr: float = setting(
         1e-3, "the critic's learning rate at the start", low=1e-9, high=1e3, part=LEARNING
     )
-    lr_decay: str = setting(
-        "cosine",
-        "of the learning rates over the run's budget",
-        choices=("none", "cosine"),
-        part=LEARNING,
-    )
     lr_final: float = setting(
         0.01,
-        "share of the learning rates that the decay ends at",
+        "share of the learning rates that their cosine over the run's budget ends at; 1: no decay",
         low=0,
         high=1,
-        only={"lr_decay": "cosine"},
         part=LEARNING,
     )
     grad_clip: float = setting(
@@ -222,7 +231,7 @@ class AgentConfig(Settings, section="agent"):
             RelabelConfig("near", position=0.1, angle=0.5),
             RelabelConfig("near", position=0.02, angle=0.1),
         ),
-        "the other goals that every transition is learned with",
+        "the other goals that every transition is learned with; []: none",
         part=LEARNING,
     )
 
@@ -251,56 +260,35 @@ class ServiceConfig(Settings, section="service"):
         "nobody waits for anybody, or lockstep: slower, and the same seed gives the same weights",
         choices=("async", "lockstep"),
     )
-    lockstep_workers: int = setting(
-        0,
-        "players that lockstep waits for; tangram-train sets it",
-        low=0,
-        high=4096,
-        only={"mode": "lockstep"},
-    )
     security: str = setting(
         "auto",
         "encrypted by the connection file's keys, plain, or auto: curve but on loopback",
         choices=("auto", "curve", "plain"),
     )
-    http_bind: str = setting("127.0.0.1", "address of the master's /metrics and /healthz")
+    http_bind: str = setting(
+        "127.0.0.1", "address of the master's /metrics and /healthz", unless={"http_port": -1}
+    )
     http_port: int = setting(
         0, "their port, 0 for any free one (see connection.json), -1 for none", low=-1, high=65535
     )
     publish_seconds: float = setting(
         0.5,
-        "least time between two broadcasts of weights",
+        "least time between two broadcasts of weights; 0: after every update, as the paper does",
         low=0,
         unit="s",
+        only={"mode": "async"},
     )
-    every_update: bool = setting(False, "broadcast after every update instead, as the paper does")
     envs: int = setting(16, "environments that one worker plays at a time", low=1, high=512)
     batch_episodes: int = setting(32, "episodes in one message", low=1, high=4096)
-    window: int = setting(
-        4,
-        "messages of a worker that may be unacknowledged; a full window pauses play",
-        low=1,
-        high=1024,
-    )
-    # Without any lag a worker would wait for updates that wait for its episodes.
-    lag_updates: int = setting(
-        64, "updates that the learner may lag behind before workers must wait", low=1
-    )
     eval_seconds: float = setting(10.0, "least time between two evaluations", low=0, unit="s")
     eval_episodes: int = setting(100, "fixed test episodes of one evaluation", low=1, high=100_000)
     log_format: str = setting(
         "text", "of the lines that processes write: for people or for programs", choices=FORMATS
     )
-    log_seconds: float = setting(
-        2.0, "time between two lines of progress and TensorBoard scalars", low=1e-3, unit="s"
-    )
     checkpoint_minutes: float = setting(5.0, "time between two checkpoints", low=1e-3, unit="min")
     keep_checkpoints: int = setting(2, "newest checkpoints kept", low=1, high=1000)
     journal_sync_seconds: float = setting(
         1.0, "time between two syncs of the journal to disk; 0: with each batch", low=0, unit="s"
-    )
-    max_bad_updates: int = setting(
-        10, "updates in a row that are undone because they are not finite, then the run ends", low=1
     )
     # Heartbeats come every two seconds.
     silence_seconds: float = setting(

@@ -295,11 +295,8 @@ class Learner:
         return norm
 
     def _set_learning_rate(self, progress: float) -> None:
-        factor = 1.0
-        if self.config.lr_decay == "cosine":
-            share = min(max(progress, 0.0), 1.0)
-            low = self.config.lr_final
-            factor = low + (1.0 - low) * 0.5 * (1.0 + math.cos(math.pi * share))
+        share, low = min(max(progress, 0.0), 1.0), self.config.lr_final
+        factor = low + (1.0 - low) * 0.5 * (1.0 + math.cos(math.pi * share))
         self.actor_optimiser.param_groups[0]["lr"] = self.config.actor_lr * factor
         self.critic_optimiser.param_groups[0]["lr"] = self.config.critic_lr * factor
 

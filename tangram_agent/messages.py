@@ -50,6 +50,7 @@ MAX_RUN_ID = 256
 MAX_ADDRESS = 256
 MAX_SEED = 2**63 - 1
 MAX_INDEX = 65_535
+WINDOW = 4  # messages of a worker that may be unacknowledged; a full window pauses play
 MAX_WINDOW = 1024
 MAX_PICTURES = 64
 MAX_ROWS = 4096

@@ -53,7 +53,7 @@ def with_relabelled(
     goals = [
         _goals(episodes, relabel, layout, generator)
         for relabel in relabels
-        for _ in range(_count(relabel))
+        for _ in range(relabel.copies)
     ]
     if not goals:
         return flatten(episodes)
@@ -68,14 +68,7 @@ def with_relabelled(
 
 def _spread(relabel: RelabelConfig) -> tuple[float, float, float]:
     """Standard deviations of a goal's shift and turn."""
-    if relabel.strategy != "near":
-        return 0.0, 0.0, 0.0
     return relabel.position, relabel.position, relabel.angle
-
-
-def _count(relabel: RelabelConfig) -> int:
-    """Other goals of one kind for each transition."""
-    return 0 if relabel.strategy == "none" else relabel.copies
 
 
 def _goals(
@@ -258,7 +251,7 @@ def _again(before: Lying, after: Lying, generator: np.random.Generator) -> Lying
 
 def _strategies(agent: AgentConfig, count: int, generator: np.random.Generator) -> Ints:
     """(M,) 0 for the goal that was played, i for the i-th kind of hindsight."""
-    parts = np.array([1, *map(_count, agent.hindsight)])
+    parts = np.array([1, *(relabel.copies for relabel in agent.hindsight)])
     return generator.choice(len(parts), size=count, p=parts / parts.sum())
 
 

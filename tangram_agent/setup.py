@@ -16,6 +16,7 @@ from tangram_sim.errors import ConfigError
 from tangram_sim.layout import Layout, TokensConfig, make_layout
 from tangram_sim.rewards import reward_identity
 from tangram_sim.settings import refuse_ignored, told
+from tangram_sim.targets import check_targets
 
 Settings = TypeVar("Settings")
 
@@ -40,14 +41,15 @@ class Setup:
         Raises:
             ConfigError: names the setting and the remedy.
         """
+        check_targets(self.layout, self.sim)
         agent, one = self.agent, self.layout.tokens == 1
+        if self.net.kind == "mlp":
+            self._refuse(("edges",), "net.kind=mlp", "set net.kind=mha")
         if one:
             self._refuse(_SEVERAL_ONLY, "one token", "take a set of several")
         if not self.contacts:
             slide = "set sim.motion=slide"
             self._refuse(("push_weight",), "tokens that do not push each other", slide)
-        if agent.gamma == 0.0:
-            self._refuse(("polyak",), "agent.gamma=0", "set agent.gamma above 0")
         if self.credits_pieces:
             several = f"{self.layout.tokens} tokens on pairs"
             whole = "set agent.readout=token, which values the whole scene"
@@ -63,7 +65,8 @@ class Setup:
         changed = _changed(self.agent)
         for name in names:
             if name in changed:
-                refuse_ignored(f"agent.{name}={told(changed[name])}", because, remedy)
+                usual = getattr(AgentConfig, name)
+                refuse_ignored(f"agent.{name}={told(changed[name])}", because, remedy, usual)
 
     @cached_property
     def layout(self) -> Layout:

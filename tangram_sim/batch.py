@@ -186,11 +186,11 @@ class BatchedEnv:
         # World after world, here and in `_move`: the engine's memory of each fills the cache.
         pictures = []
         for b, world in enumerate(self._worlds):
-            if self.sim.camera:
+            if self.sim.pixels:
                 world.place(targets[0][b], targets[1][b])
                 pictures.append(world.picture())
             world.place(starts[0][b], starts[1][b])
-        if self.sim.camera:
+        if self.sim.pixels:
             self._targets = TargetPictures(np.stack(pictures))
 
     def _move(self, tokens: Ints, velocity: Floats, flip: Bools, idle: Bools) -> Floats | None:
@@ -199,7 +199,7 @@ class BatchedEnv:
         for b, world in enumerate(self._worlds):
             if not idle[b]:
                 world.move(int(tokens[b]), velocity[b], bool(flip[b]))
-            if self.sim.camera:
+            if self.sim.pixels:
                 pictures.append(world.picture())
         self._look()
         return None if self._targets is None else self._targets.rewards(np.stack(pictures))

@@ -5,14 +5,15 @@ from pathlib import Path
 
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import MAX_TOKENS
-from tangram_sim.settings import LEARNING, NETWORK, Settings, check_range, setting
+from tangram_sim.settings import LEARNING, NETWORK, Settings, setting
 
 BACKENDS = ("physics", "kinematic")
 REWARDS = ("overlap", "dense", "pose")
 SOURCES = ("polygon", "camera")
 # A step of Bullet is exact up to a turn of pi / 4 and turns too little beyond, so a half turn
 # needs four.
-MIN_SUBSTEPS = 4
+EXACT_SUBSTEPS = 4
+MIN_PIXELS = 16
 # A fifth of the arena is a whole token: nothing is left to see beyond.
 MAX_CORNER_NOISE = 0.2
 MOTIONS = ("lift", "slide")
@@ -52,22 +53,18 @@ class SimConfig(Settings, section="sim"):
     )
     substeps: int = setting(
         8,
-        "simulation steps in one action of one second, at least 4",
+        "least simulation steps in one action of one second; with fewer than 4 a lifted token "
+        "turns less than it is told",
         low=1,
         high=1000,
         only={"backend": "physics"},
     )
     damping: float = setting(
         0.0,
-        "linear and angular, needs sim.inexact; Bullet's own default is 0.04",
+        "linear and angular; above 0 a token stops short of where it is told to go; Bullet's own "
+        "default is 0.04",
         low=0,
         high=1,
-        only={"backend": "physics"},
-    )
-    inexact: bool = setting(
-        False,
-        "allow damping and fewer than 4 substeps, with which tokens fall short of what they are "
-        "told, for experiments",
         only={"backend": "physics"},
     )
     corner_noise: float = setting(
@@ -120,10 +117,13 @@ class SimConfig(Settings, section="sim"):
         "a curriculum, as in [{updates:0,tokens:2},{updates:500}]; tests are the whole task",
         part=LEARNING,
     )
-    camera: bool = setting(False, "take the pictures and report Eq. 14 from them at every step")
-    pixels: int = setting(64, "side of the camera's square picture", low=16, high=1024)
-    max_tries: int = setting(
-        1000, "random poses tried for one token before sampling gives up", low=1, high=1_000_000
+    pixels: int = setting(
+        0,
+        "side of the camera's square pictures, from at least 16; 0: none are taken, but by "
+        "evaluators, which report Eq. 14 by them",
+        low=0,
+        high=1024,
+        part=LEARNING,
     )
 
     @property
@@ -161,12 +161,8 @@ class SimConfig(Settings, section="sim"):
                 "sim.allow_flip=true needs sim.motion=lift, got slide: a token that stays on the "
                 "table cannot be turned over"
             )
-        check_range("sim.substeps", self.substeps, 1 if self.inexact else MIN_SUBSTEPS, 1000)
-        if self.damping > 0.0 and not self.inexact:
-            raise ConfigError(
-                f"sim.damping must be 0, got {self.damping}: tokens would stop short of what they "
-                "are told; set sim.inexact=true for an experiment on that"
-            )
+        if 0 < self.pixels < MIN_PIXELS:
+            raise ConfigError(f"sim.pixels must be 0 or at least {MIN_PIXELS}, got {self.pixels}")
 
     def _check_stages(self) -> None:
         entries: tuple[object, ...] = tuple(self.stages)

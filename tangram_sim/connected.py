@@ -13,7 +13,7 @@ from tangram_sim.config import SimConfig
 from tangram_sim.errors import SamplingError
 from tangram_sim.kinematics import wrap
 from tangram_sim.layout import Layout
-from tangram_sim.sampling import check_fits
+from tangram_sim.sampling import MAX_TRIES, check_fits
 
 _CHUNK = 16  # candidates that are checked together
 _ALIGNED = 0.7  # share of pieces that meet another corner to corner
@@ -28,7 +28,7 @@ def sample_connected(layout: Layout, sim: SimConfig, rng: np.random.Generator) -
 
     Raises:
         SamplingError: a token does not fit into the arena, or no place was found for one in
-            `sim.max_tries` tries.
+            `MAX_TRIES` tries.
     """
     check_fits(layout, sim)
     bodies = _bodies(layout)
@@ -85,7 +85,7 @@ def _attached(
     piece: _Outlines, laid: _Outlines, sim: SimConfig, rng: np.random.Generator
 ) -> tuple[complex, complex]:
     """Turn and shift of a piece that touches one of the others and overlaps none."""
-    for _ in range(-(-sim.max_tries // _CHUNK)):
+    for _ in range(-(-MAX_TRIES // _CHUNK)):
         turn, shift = _candidates(piece, laid, rng)
         moved = piece.moved(turn[:, None], shift[:, None])
         free = _apart(moved, laid, _TOUCHING * sim.arena) & (_extent(moved, laid) < sim.arena)
@@ -93,8 +93,8 @@ def _attached(
             first = int(np.argmax(free))
             return complex(turn[first]), complex(shift[first])
     raise SamplingError(
-        f"no connected target within an arena of width {sim.arena:g} in {sim.max_tries} tries: "
-        "raise sim.arena or sim.max_tries, or lower tokens.scale"
+        f"no connected target within an arena of width {sim.arena:g} in {MAX_TRIES} tries: "
+        "raise sim.arena, or lower tokens.scale"
     )
 
 

@@ -68,7 +68,8 @@ class PhysicsWorld:
         for token in range(layout.tokens):
             self._weigh(token, 1.0)
         self._play_at_once()
-        self._camera = Camera(self._client, sim.pixels, ENGINE_ARENA, _HALF_HEIGHT)
+        if sim.pixels:
+            self._camera = Camera(self._client, sim.pixels, ENGINE_ARENA, _HALF_HEIGHT)
 
     def place(self, poses: Floats, flipped: Bools | None = None) -> None:
         """See `World.place`."""

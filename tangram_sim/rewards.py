@@ -36,8 +36,8 @@ def make_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> RewardF
         ConfigError: the camera is to be the source but is off, or a user's function that cannot
             be loaded; later, when called, one whose output has the wrong shape or is not finite.
     """
-    if config.source == "camera" and not sim.camera:
-        raise ConfigError("reward.source=camera needs the camera: set sim.camera=true")
+    if config.source == "camera" and not sim.pixels:
+        raise ConfigError("reward.source=camera needs pictures: set sim.pixels=64")
     # The longest distance of two points of the arena.
     reach = sim.arena * np.sqrt(2.0)
     if sim.corner_noise > 0.0:

@@ -19,6 +19,7 @@ from tangram_sim.errors import SamplingError
 from tangram_sim.geometry import outlines, outlines_at, pairs_overlap
 from tangram_sim.layout import Layout
 
+MAX_TRIES = 1000  # random poses tried for one token before sampling gives up
 _CHUNK = 4  # poses drawn at once when some may overlap: fewer, larger checks
 _CLEAR_TRIES = 64  # outside of what is only to be avoided; then anywhere
 _WIDENING = 1.02  # of a Gaussian with every pose that was blocked: there is room in the end
@@ -46,7 +47,7 @@ def sample_batch(
 
     Args:
         layout: the tokens.
-        sim: the arena, and how long to try.
+        sim: the arena.
         generators: one for each of B environments.
         flipped: (B, K) tokens that lie on their other side; None: none does.
         avoid: (B, M, C, 2) outlines that tokens keep clear of where there is room.
@@ -54,7 +55,7 @@ def sample_batch(
         spread: deviation of Gaussian centres (Sec. VIII), as a share of the arena; None: uniform.
 
     Raises:
-        SamplingError: a token does not fit into the arena, or `sim.max_tries` poses for one all
+        SamplingError: a token does not fit into the arena, or `MAX_TRIES` poses for one all
             overlapped those before it.
     """
     reach = check_fits(layout, sim)
@@ -129,7 +130,7 @@ def _place(
     if avoid is not None:
         both = np.concatenate([placed, avoid], axis=1)
         open_rows = _try(piece, both, draw, poses, open_rows, _CLEAR_TRIES)
-    open_rows = _try(piece, placed, draw, poses, open_rows, draw.sim.max_tries)
+    open_rows = _try(piece, placed, draw, poses, open_rows, MAX_TRIES)
     if len(open_rows):
         raise _exhausted(piece.name, placed.shape[1], draw.sim)
 
@@ -182,6 +183,6 @@ def check_fits(layout: Layout, sim: SimConfig) -> Floats:
 
 def _exhausted(name: str, before: int, sim: SimConfig) -> SamplingError:
     return SamplingError(
-        f"no room for token '{name}' beside {before} others in {sim.max_tries} tries in an "
-        f"arena of width {sim.arena:g}: raise sim.arena or sim.max_tries, or lower tokens.scale"
+        f"no room for token '{name}' beside {before} others in {MAX_TRIES} tries in an "
+        f"arena of width {sim.arena:g}: raise sim.arena, or lower tokens.scale"
     )

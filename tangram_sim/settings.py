@@ -94,18 +94,20 @@ class Settings:
                 named = f"set {other}={' or '.join(map(told, values))}"
                 left_out = f"leave {other} out" if values == (None,) else named
                 remedy = left_out if name in what.only else f"give {other} another value"
-                refuse_ignored(given, f"{other}={told(getattr(self, name))}", remedy)
+                refuse_ignored(given, f"{other}={told(getattr(self, name))}", remedy, own.default)
 
 
-def refuse_ignored(given: str, because: str, remedy: str) -> None:
+def refuse_ignored(given: str, because: str, remedy: str, default: object = None) -> None:
     """Raise ConfigError for a setting that would change nothing.
 
     Args:
         given: the setting with its value.
         because: the setting with its value that makes it so.
         remedy: besides leaving the setting out.
+        default: of the setting, which a preset may have changed.
     """
-    raise ConfigError(f"{given} changes nothing with {because}: leave it out, or {remedy}")
+    left = "out" if default is None else f"at {told(default)}"
+    raise ConfigError(f"{given} changes nothing with {because}: leave it {left}, or {remedy}")
 
 
 def declared_fields(kind: type[Any]) -> list["Field[Any]"]:

@@ -20,6 +20,7 @@ from tangram_sim.kinematics import wrap
 from tangram_sim.layout import Layout
 from tangram_sim.puzzles import library
 from tangram_sim.sampling import sample_batch
+from tangram_sim.settings import refuse_ignored, told
 from tangram_sim.shapes import Shape, mirror_image, tan, turn_onto
 
 Generators = Sequence[np.random.Generator]
@@ -83,13 +84,20 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
 
     Raises:
         ConfigError: figures of tokens that are not all seven tans or too large for the arena, flips
-            of tokens that look the same on both sides, or a stage that moves more than there are.
+            or other sides of tokens that look the same on both, an overlap of one token with
+            others, or a stage that moves more than there are.
     """
     if sim.allow_flip and not layout.any_chiral:
         raise ConfigError(
             "sim.allow_flip=true needs a token that is not its own mirror image, got tokens "
             f"{', '.join(shape.name for shape in layout.shapes)}: set sim.allow_flip=false"
         )
+    if sim.mirrored and not layout.any_chiral:
+        alike, chiral = "tokens that are their own mirror images", "take a set with a parallelogram"
+        refuse_ignored(f"sim.mirrored={told(sim.mirrored)}", alike, chiral, 0.0)
+    if sim.max_overlap != SimConfig.max_overlap and layout.tokens == 1:
+        given = f"sim.max_overlap={told(sim.max_overlap)}"
+        refuse_ignored(given, "one token", "take a set of several", SimConfig.max_overlap)
     for stage in sim.stages:
         if stage.tokens > layout.tokens:
             raise ConfigError(

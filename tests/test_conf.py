@@ -121,7 +121,7 @@ def test_where_the_paper_is_silent_its_presets_follow_the_hindsight_paper(name: 
 def test_paper_presets_add_nothing_to_the_text(name: str) -> None:
     agent = make_setup(compose("train", f"agent={name}")).agent
     assert not any((agent.egocentric, agent.offsets, agent.orientation, agent.afterstate))
-    assert (agent.angle_head, agent.squash, agent.lr_decay) == ("plain", "tanh", "none")
+    assert (agent.angle_head, agent.squash, agent.lr_final) == ("plain", "tanh", 1.0)
     assert (agent.edges, agent.grad_clip, agent.acting_average) == ("paper", 0.0, 0.0)
     assert [relabel.strategy for relabel in agent.hindsight] == ["final"]
 

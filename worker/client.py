@@ -19,6 +19,7 @@ from typing import Self
 from tangram_agent.addresses import host_of, reachable
 from tangram_agent.arrays import EpisodeSpec, WeightShapes
 from tangram_agent.messages import (
+    WINDOW,
     Ack,
     Alive,
     Bye,
@@ -81,7 +82,7 @@ class Client:
         fingerprints: Mapping[str, str],
         spec: EpisodeSpec,
         shapes: WeightShapes | None = None,
-        window: int = 4,
+        window: int = WINDOW,
         timing: Timing | None = None,
     ) -> None:
         self.stats: dict[str, float] = {}

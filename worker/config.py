@@ -13,14 +13,12 @@ from tangram_sim.settings import Settings, declared, refuse_ignored, setting, to
 
 Changes = dict[str, dict[str, Any]]  # section -> setting -> value: of a run that was trained
 OF_TARGETS = ("targets", "spread", "mirrored")  # settings of sim that say nothing of a puzzle
-OF_PICTURES = ("camera", "pixels")
 MAX_EPISODES = 1_000_000
 MAX_SHOWN = 100
 MAX_TURNS = 360
 GAME = "tangram7"  # the agent that plays puzzles unless another is named
 PICTURES = (".gif", ".png")
 MIN_COMPARED, MAX_COMPARED = 2, 4
-MAX_SECONDS = 86_400.0
 MAX_SEED = 2**63 - 1
 
 
@@ -90,13 +88,6 @@ class StatusConfig(Settings):
     connect: str = field(
         metadata=declared("the run: its folder, its connection.json, or tcp://host:port")
     )
-    every_seconds: float = setting(
-        0.0,
-        "ask again after so long, until Ctrl-C; 0: once",
-        low=0,
-        high=MAX_SECONDS,
-        unit="s",
-    )
     json: bool = setting(False, "print one JSON object a line instead of a table")
 
     def __post_init__(self) -> None:
@@ -153,7 +144,7 @@ class EvalConfig(Settings):
         if self.sheet is not None and Path(self.sheet).suffix != ".png":
             raise ConfigError(f"sheet must end with .png, got '{self.sheet}'")
         if self.puzzles is not None:
-            _refuse(self.changes, (*OF_TARGETS, *OF_PICTURES), "puzzles", "leave puzzles out")
+            _refuse(self.changes, OF_TARGETS, "puzzles", "leave puzzles out")
 
     @property
     def run(self) -> str:
@@ -253,7 +244,6 @@ class PlayConfig(Settings):
                 "shows the ends"
             )
         super().__post_init__()
-        _refuse(self.changes, OF_PICTURES, "tangram-play, which draws corners", "use tangram-eval")
         if self.plays_puzzles:
             _refuse(self.changes, (*OF_TARGETS, "starts"), "puzzles", "leave puzzles out")
 

@@ -106,7 +106,7 @@ def play_figures(setup: Setup, figures: Sequence[Figure], choose: Choose, seed: 
     Raises:
         SamplingError: the tokens find no room to start.
     """
-    sim = replace(setup.sim, camera=False)
+    sim = replace(setup.sim, pixels=0)
     targets = (np.stack([f.poses for f in figures]), np.stack([f.flipped for f in figures]))
     at_once = min(AT_ONCE, len(figures))
     with closing(BatchedEnv(setup.layout, sim, RewardConfig(), at_once)) as env:

@@ -76,7 +76,7 @@ class Played:
             refused=np.empty((count, steps), np.bool_),
             blocked=np.empty((count, steps), np.bool_),
             seconds=np.empty(count),
-            camera=np.empty(count) if env.sim.camera else None,
+            camera=np.empty(count) if env.sim.pixels else None,
         )
 
     def first(self, count: int) -> "Played":

@@ -56,7 +56,6 @@ def joined(config: WorkerConfig, setup: Setup, policy: Policy) -> Iterator[Clien
         setup.fingerprints(),
         spec,
         policy.shapes,
-        service.window,
     )
     client.on_progress = watchdog.progress
     with client, stopped_by_signals(client), watchdog:

@@ -23,7 +23,7 @@ UNKNOWN = -1.0
 
 
 def show_status(config: StatusConfig) -> int:
-    """Print the status once, or again and again.
+    """Print the status.
 
     Returns:
         Exit status 0.
@@ -33,15 +33,12 @@ def show_status(config: StatusConfig) -> int:
     """
     console = Console()
     with zmq.Context() as context:
-        while True:
-            status = ask_status(config.connect, context)
-            if config.json:
-                console.print(json.dumps(_plain(status)), soft_wrap=True, highlight=False)
-            else:
-                _print(console, status)
-            if not config.every_seconds:
-                return 0
-            time.sleep(config.every_seconds)
+        status = ask_status(config.connect, context)
+    if config.json:
+        console.print(json.dumps(_plain(status)), soft_wrap=True, highlight=False)
+    else:
+        _print(console, status)
+    return 0
 
 
 def ask_status(

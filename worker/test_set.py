@@ -23,6 +23,9 @@ def greedy(policy: Policy) -> Choose:
     return choose
 
 
+PIXELS = 64  # of a picture's side, where training takes none
+
+
 class FixedTests:
     """Test episodes that are the same whoever plays them.
 
@@ -41,7 +44,7 @@ class FixedTests:
             at_once: most episodes played at a time.
             role, seed: name the set; the defaults name `seeding.evaluation_generators`.
         """
-        self.setup = replace(setup, sim=replace(setup.sim, camera=True))
+        self.setup = replace(setup, sim=replace(setup.sim, pixels=setup.sim.pixels or PIXELS))
         self._episodes = episodes
         self._set = (seed, role, 0, 0)
         self.env = BatchedEnv(setup.layout, self.setup.sim, setup.reward, min(at_once, episodes))

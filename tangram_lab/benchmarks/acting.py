@@ -27,10 +27,9 @@ def measure_acting(runs: int) -> list[Row]:
         one = ("one at a time", act(setup, 1))
         rows.append(compare(labels, act(setup, BATCH), one, runs, Bound(least=8.0)))
     for pixels in (128, 64, 0):
-        sim = {"camera": pixels > 0, "pixels": pixels or 64}
         pictures = f"pictures of {pixels} px" if pixels else "no pictures"
         shares, speeds = zip(
-            *(_worker(with_sim(preset(), **sim)) for _ in range(runs)), strict=True
+            *(_worker(with_sim(preset(), pixels=pixels)) for _ in range(runs)), strict=True
         )
         labels = ("acting", f"share of a worker's time, {pictures}", "share")
         rows.append(single(labels, shares, Bound(most=0.2)))

@@ -43,7 +43,6 @@ from worker.status import ask_status
 
 
 ENVS = 4
-WINDOW = 4
 INDEX = 1000
 
 
@@ -85,7 +84,6 @@ class Witness(Thread):
             setup.fingerprints(),
             EpisodeSpec.of(setup),
             policy.shapes,
-            WINDOW,
         )
         with closing(BatchedEnv(setup.layout, setup.sim, setup.reward, ENVS)) as env, client:
             client.on_progress = lambda: self._look(client)

@@ -48,7 +48,7 @@ def measure_costs(runs: int) -> list[Row]:
 
 def _messages(runs: int) -> Iterator[Row]:
     setup = preset()
-    trainer = Trainer(setup, 0, "cpu", lag_updates=64)
+    trainer = Trainer(setup, 0, "cpu")
     with tempfile.TemporaryDirectory(prefix="tangram-") as folder:
         journal = Journal(Path(folder), "bench", setup.task_digest(), 1.0)
         with (

@@ -13,7 +13,6 @@ from tangram_agent.types import Episodes
 from worker.client import Client
 
 PAUSE_S = 0.002  # between two rounds over all clients
-WINDOW = 4
 
 
 @dataclass
@@ -81,9 +80,7 @@ def play(connect: str, setup: Setup, episodes: Episodes, count: int, path: Path)
     spec, ages = EpisodeSpec.of(setup), Ages(path)
     with ExitStack() as stack:
         clients = [
-            stack.enter_context(
-                Client(connect, "player", i, setup.fingerprints(), spec, window=WINDOW)
-            )
+            stack.enter_context(Client(connect, "player", i, setup.fingerprints(), spec))
             for i in range(count)
         ]
         while not all(client.stopped for client in clients):

@@ -24,7 +24,7 @@ def show_profile(out: Path | None) -> None:
     parts.append(_updates("update of the paper's MHA", preset("paper")))
     parts.append(_updates("update of the paper's MLP", preset("mlp")))
     for name, setup in (("1 token", preset()), ("7 tokens", several(7))):
-        with closing(Episodes(with_sim(setup, camera=True))) as episodes:
+        with closing(Episodes(with_sim(setup, pixels=64))) as episodes:
             parts.append(_calls(f"16 episodes, {name}, 64 px", episodes.play))
     text = "\n".join(parts)
     print(text)

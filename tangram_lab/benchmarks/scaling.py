@@ -40,7 +40,7 @@ ENDLESS = ("max_updates=0", "service.checkpoint_minutes=60", "service.http_port=
 # Play is slow, learning is next to nothing, and the evaluator rests.
 PLAYING = (
     *ENDLESS,
-    "sim.camera=true",
+    "sim.pixels=64",
     "agent.updates_per_transition=0.001",
     "service.eval_seconds=3600",
     "service.eval_episodes=1",

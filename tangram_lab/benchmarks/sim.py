@@ -39,7 +39,7 @@ class BareLoop:
         )
         unit = 2.0 / sim.arena
         self.bodies = [self._body(shape.corners * unit) for shape in layout.shapes]
-        self.pixels = sim.pixels if sim.camera else 0
+        self.pixels = sim.pixels
         self.horizon = horizon
         self.camera = _camera()
         rng = np.random.default_rng(0)
@@ -143,8 +143,8 @@ def measure_sim(runs: int) -> list[Row]:
     for count, setup in ((1, preset()), (7, several(7))):
         for pixels in PIXELS:
             case = f"{_tokens(count)}, {pixels} px"
-            rows.append(_row(case, with_sim(setup, camera=True, pixels=pixels), runs, TARGET))
-        rows.append(_row(f"{_tokens(count)}, no pictures", with_sim(setup, camera=False), runs))
+            rows.append(_row(case, with_sim(setup, pixels=pixels), runs, TARGET))
+        rows.append(_row(f"{_tokens(count)}, no pictures", with_sim(setup, pixels=0), runs))
     return rows
 
 

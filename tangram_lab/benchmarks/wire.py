@@ -21,7 +21,7 @@ from master.delivery import EpisodesArrived
 from master.hub import Hub, WelcomeInfo
 from master.security import Keys, make_keys
 from tangram_agent.arrays import EpisodeSpec
-from tangram_agent.messages import Ack, EpisodeBatch
+from tangram_agent.messages import WINDOW, Ack, EpisodeBatch
 from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes
 from tangram_lab.benchmarks.measure import Bound, Row, Work, compared, rates, single
@@ -34,7 +34,6 @@ STAGE, UNIT = "wire", "transitions/s"
 SHARE = Bound(least=0.6)
 FLOOR = Bound(least=500_000)
 SPAN_S = 1.0
-WINDOW = 4  # the default of service.window
 BARE_MESSAGES = 16  # between two looks at the clock
 PATIENCE_S = 20.0
 SEQUENCE = 1000  # of the bare batches: its header is as long as most

@@ -1,8 +1,11 @@
 """Small setups, layouts and episodes that the tests of the agent share."""
 
+import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from tangram_agent.setup import Setup, make_setup
 from tangram_agent.types import Episodes, Transitions
@@ -21,7 +24,7 @@ PAPER = {
     "saturation_penalty": 0.0,
     "gamma": 0.99,
     "acting_average": 0.0,
-    "lr_decay": "none",
+    "lr_final": 1.0,
 }
 # One relabelled goal, and on pairs one proposal: what most tests need.
 PLAIN: dict[str, Any] = {"hindsight": [{"strategy": "final"}]}
@@ -84,3 +87,20 @@ def random_transitions(made: Setup, count: int, seed: int = 0, done: int | None 
         done=ends.astype(np.uint8),
         goal=corners[:, 2],
     )
+
+
+def watched_disk(monkeypatch: pytest.MonkeyPatch) -> list[int | str]:
+    """What reaches the disk, as it does: inodes that are synced, and "renamed"."""
+    events: list[int | str] = []
+
+    def noted(move: Any) -> Any:
+        def renamed(own: Path, target: Path) -> Path:
+            events.append("renamed")
+            return move(own, target)
+
+        return renamed
+
+    monkeypatch.setattr(os, "fsync", lambda handle: events.append(os.fstat(handle).st_ino))
+    for name in ("rename", "replace"):
+        monkeypatch.setattr(Path, name, noted(getattr(Path, name)))
+    return events

@@ -8,6 +8,7 @@ import pytest
 
 from tangram_agent.files import write_whole
 from tangram_sim.errors import RunError
+from tests.agent.builders import watched_disk
 
 pytestmark = pytest.mark.fast
 
@@ -35,18 +36,10 @@ def test_bytes_are_on_the_disk_before_the_name_and_the_name_before_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A rename is durable only when its folder is synced."""
-    events: list[int | str] = []
-    monkeypatch.setattr(os, "fsync", lambda handle: events.append(os.fstat(handle).st_ino))
-    replace = Path.replace
-
-    def replaced(self: Path, target: Path) -> Path:
-        events.append("replaced")
-        return replace(self, target)
-
-    monkeypatch.setattr(Path, "replace", replaced)
+    events = watched_disk(monkeypatch)
     write_whole(tmp_path / "result.json", b"new")
     file = (tmp_path / "result.json").stat().st_ino
-    assert events == [file, "replaced", tmp_path.stat().st_ino]
+    assert events == [file, "renamed", tmp_path.stat().st_ino]
 
 
 def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path) -> None:

@@ -66,7 +66,6 @@ def relabelled(*kinds: RelabelConfig, seed: int = 0) -> Transitions:
 
 def test_what_was_played_stays_and_none_adds_nothing() -> None:
     assert rows(flatten(EPISODE)) == PLAYED
-    assert rows(relabelled(RelabelConfig("none", copies=4))) == PLAYED
     assert rows(relabelled()) == PLAYED
 
 

@@ -28,16 +28,12 @@ def test_the_ratio_is_the_median_of_the_turns() -> None:
         (Bound(most=0.2), 0.2, True, "<= 0.2"),
         (Bound(most=0.2), 0.3, False, "<= 0.2"),
         (Bound(1.0, 2.0), 3.0, False, ">= 1, <= 2"),
+        (None, 3.0, None, ""),
     ],
 )
-def test_bounds(bound: Bound, value: float, held: bool, text: str) -> None:
+def test_bounds(bound: Bound | None, value: float, held: bool | None, text: str) -> None:
     row = single(LABELS, [value], bound)
     assert (row.held, row.target) == (held, text)
-
-
-@pytest.mark.fast
-def test_without_a_bound_nothing_is_held() -> None:
-    assert single(LABELS, [1.0, 3.0, 2.0]).held is None
 
 
 @pytest.mark.fast

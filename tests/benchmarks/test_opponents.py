@@ -62,7 +62,7 @@ def test_the_plain_learner_moves_its_targets() -> None:
 
 @pytest.mark.parametrize("count", [1, 7])
 def test_the_bare_loop_takes_the_same_pictures(count: int) -> None:
-    setup = with_sim(several(count), camera=True, pixels=128)
+    setup = with_sim(several(count), pixels=128)
     poses = np.array([[0.3 * k - 0.9, 0.2, 0.4 * k] for k in range(count)])
     with closing(PhysicsWorld(setup.layout, setup.sim)) as world:
         world.place(poses)
@@ -87,14 +87,10 @@ def test_a_bare_episode_is_as_long_as_ours() -> None:
     assert moved == bare.bodies
 
 
-def test_a_filled_buffer_is_full() -> None:
+def test_a_filled_buffer_is_full_and_several_tokens_are_a_valid_task() -> None:
     replay = filled(preset(), 1000)
     assert (len(replay), replay.capacity) == (1000, 1000)
     replay.check_valid()
     assert replay.sample(8, np.random.default_rng(0)).state.any()
-
-
-def test_several_tokens_are_a_valid_task() -> None:
     for count in range(1, 8):
-        setup = several(count)
-        assert setup.layout.tokens == count == setup.horizon
+        assert several(count).layout.tokens == several(count).horizon == count

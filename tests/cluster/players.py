@@ -15,11 +15,10 @@ from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
 from tangram_agent.setup import Setup, make_setup
 from tests.agent.builders import random_episodes
-from tests.cluster.processes import started, wait_for_file
+from tests.cluster.processes import LIMIT_S, started, wait_for_file
 from worker.client import Client
 from worker.connection import Timing
 
-LIMIT_S = 60.0
 EPISODES = 3  # in each batch
 FIRST_TAG = 2.0  # rewards of hindsight twins are at most 1
 QUICK = Timing(retry_s=0.2, heartbeat_s=0.2, resend_s=1.0, silence_s=1.5)

@@ -16,19 +16,21 @@ from hydra.core.global_hydra import GlobalHydra
 from tangram_cli.commands import COMMANDS
 
 BIN = Path(sys.executable).parent
-LIMIT_S = 60.0
+LIMIT_S = 600.0  # waits end by what they wait for; a busy machine takes minutes to start a master
 
 
-def run(command: str, *arguments: str, cwd: Path, limit_s: float = LIMIT_S) -> str:
-    """Run a command to its end and return what it printed; a failure shows that."""
-    done = subprocess.run(
-        [BIN / command, *arguments],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        timeout=limit_s,
-        check=False,
+def ended(
+    *command: str | Path, cwd: Path, env: dict[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """A command that has run to its end."""
+    return subprocess.run(
+        command, cwd=cwd, env=env, capture_output=True, text=True, timeout=LIMIT_S, check=False
     )
+
+
+def run(command: str, *arguments: str, cwd: Path) -> str:
+    """Run a command to its end and return what it printed; a failure shows that."""
+    done = ended(BIN / command, *arguments, cwd=cwd)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 

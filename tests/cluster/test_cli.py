@@ -1,63 +1,46 @@
 """The commands, started from another folder: their help, and what they refuse."""
 
+import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from tests.cluster.processes import here, refused
+from tangram_cli.commands import COMMANDS, COMMON_NAMES
+from tests.cluster.processes import BIN, ended, here, refused
 
 pytestmark = pytest.mark.cluster
 
-COMMANDS = (
-    "tangram-train",
-    "tangram-master",
-    "tangram-worker",
-    "tangram-eval",
-    "tangram-play",
-    "tangram-experiment",
-    "tangram-report",
-)
-WITH_GROUPS = COMMANDS[:3]
+ROOT = Path(__file__).parents[2]
+TRAINING = ("tangram-train", "tangram-master", "tangram-worker")
+WITH_HELP = (*TRAINING, "tangram-eval", "tangram-play", "tangram-experiment", "tangram-report")
 # One of the settings that a command's help explains.
 SETTING = {
     "tangram-worker": "role: player",
     "tangram-experiment": "jobs: 2",
     "tangram-report": "runs: ???",
 }
-LIMIT_S = 60
 
 
-def run(folder: Path, *command: str) -> subprocess.CompletedProcess[str]:
-    """A console script of this environment, started in a folder of its own."""
-    script, *arguments = command
-    environment = {
-        k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "HYDRA_FULL_ERROR")
-    }
-    return subprocess.run(
-        [str(Path(sys.executable).with_name(script)), *arguments],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=LIMIT_S,
-        check=False,
-    )
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help(tmp_path: Path, command: str) -> None:
-    result = run(tmp_path, command, "--help")
-    assert (result.returncode, result.stderr) == (0, "")
-    text, _, examples = result.stdout.partition("Examples:\n")
+@pytest.mark.parametrize("command", WITH_HELP)
+def test_help_config_and_version_are_shown_and_leave_nothing_behind(
+    tmp_path: Path, command: str
+) -> None:
+    status, out, err = here(command, "--help", cwd=tmp_path)
+    assert (status, err) == (0, "")
+    text, _, examples = out.partition("Examples:\n")
     assert [line.split()[0] for line in examples.strip().splitlines()] == [command] * 3
-    if command in WITH_GROUPS:
+    if command in TRAINING:
         assert "  agent    mlp, paper, tangram*\n" in text
         for group in ("tokens", "sim", "reward", "net", "service"):
             assert f"\n  {group} " in text
     assert SETTING.get(command, "seed: 0") in text
+    assert here(command, "--version", cwd=tmp_path)[1].startswith(f"{command} 0.")
+    status, out, err = here(command, "hydra.verbose=false", "--cfg", "job", cwd=tmp_path)
+    assert (status, err) == (0, "")
+    assert "hydra" not in out
+    assert list(tmp_path.iterdir()) == []
 
 
 WRONG = [
@@ -76,7 +59,6 @@ WRONG = [
     ("tangram-train tokens=pentagon", "unknown tokens 'pentagon': choose from hexagon, large_tri"),
     ("tangram-train tokens.shapes=[blob]", "unknown shape 'blob': choose from large_triangle"),
     ("tangram-master tokens.shapes=[blob]", "unknown shape 'blob': choose from large_triangle"),
-    ("tangram-train workers=0", "workers must be at least 1, got 0"),
     ("tangram-train seed=abc", 'field "seed" - should be "int"'),
     ("tangram-train run_dir=", "run_dir must name a folder"),
     ("tangram-master +sim.colour=1", 'can not match "colour"'),
@@ -84,16 +66,16 @@ WRONG = [
     ("tangram-worker connect=tcp://127.0.0.1:1 reward.name=own.py:none", "cannot read 'own.py' on"),
     ("tangram-train tokens.shapes=[square,square,square] tokens.scale=2.2", "no room for token"),
     ("tangram-worker", "say which master: connect=tcp://host:port"),
-    ("tangram-worker connect=tcp://127.0.0.1:1 role=judge", "role must be one of player, evalu"),
     ("tangram-eval", "say which run: run_dir=runs/..."),
-    ("tangram-eval run_dir=runs/x episodes=0", "episodes must be between 1 and"),
     ("tangram-play", "say which run: run_dir=runs/..."),
     ("tangram-eval run_dir=pretrained/square puzzles=test", "puzzle 'trapezoid' has the pieces"),
     ("tangram-eval run_dir=pretrained/square puzzles=nowhere.json", "nowhere.json"),
     ("tangram-eval run_dir=pretrained/square agent.order=size", "nothing with one token"),
-    ("tangram-play tokens=nobody", "no pretrained agent 'nobody': choose from pretrained/"),
     ("tangram-play tokens=pair run_dir=pretrained/square", "do not agree: the run moves square"),
     ("tangram-play runs_dir=x", "unknown setting 'runs_dir' (did you mean 'run_dir'?)"),
+    ("tangram-play run_dir=a compare=[b,c]", "changes nothing with compare=["),
+    ("tangram-play compare=one", "compare must list 2 to 4 folders of runs, got 'one'"),
+    ("tangram-play run_dir=pretrained/nobody", "no pretrained agent 'nobody': choose from"),
 ]
 
 
@@ -110,10 +92,13 @@ def test_wrong_input_is_one_line(tmp_path: Path, line: str, message: str) -> Non
     "line", ["tangram-train sed=1", "tangram-worker", "tangram-eval run_dir=x"]
 )
 def test_a_process_says_one_line_and_no_warning(tmp_path: Path, line: str) -> None:
-    result = run(tmp_path, *line.split())
-    assert (result.returncode, result.stdout) == (2, "")
-    assert result.stderr.startswith(f"{line.split(maxsplit=1)[0]}: ")
-    assert result.stderr.count("\n") == 1
+    """A console script of this environment."""
+    command, *arguments = line.split()
+    env = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "HYDRA_FULL_ERROR")}
+    done = ended(BIN / command, *arguments, cwd=tmp_path, env=env)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith(f"{command}: ")
+    assert done.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -126,12 +111,20 @@ def test_an_own_reward_that_fails_is_told_before_anything_starts(tmp_path: Path,
     assert [path.name for path in tmp_path.iterdir()] == ["own.py"]
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_config_and_version_are_shown_and_leave_nothing_behind(
-    tmp_path: Path, command: str
-) -> None:
-    assert here(command, "--version", cwd=tmp_path)[1].startswith(f"{command} 0.")
-    status, out, err = here(command, "hydra.verbose=false", "--cfg", "job", cwd=tmp_path)
-    assert (status, err) == (0, "")
-    assert "hydra" not in out
-    assert list(tmp_path.iterdir()) == []
+# A user's own master.py, worker.py and conf.py, in the current folder and on PYTHONPATH
+
+
+@pytest.mark.parametrize("command", ["train", "trian"])
+def test_every_process_is_started_from_our_packages(tmp_path: Path, command: str) -> None:
+    for name in COMMON_NAMES:
+        (tmp_path / f"{name}.py").write_text("raise RuntimeError('the own file of a user')\n")
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
+    quick = ("run_dir=run", "sim=kinematic", "max_updates=3", "service.eval_seconds=1")
+    module = (sys.executable, "-m", "tangram_cli")
+    done = ended(*module, command, *quick, cwd=tmp_path, env=env)
+    if command == "trian":
+        told = f"tangram_cli: name a command: {', '.join(COMMANDS)}\n"
+        assert (done.returncode, done.stderr) == (1, told)
+        return
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert json.loads((tmp_path / "run" / "result.json").read_text())["updates"] == 3

@@ -17,7 +17,7 @@ from tests.cluster.players import (
     until,
 )
 
-pytestmark = [pytest.mark.cluster, pytest.mark.timeout(130)]
+pytestmark = pytest.mark.cluster
 
 
 def writing(folder: Path) -> bool:

@@ -36,7 +36,7 @@ EVALUATOR, INDEX, INCARNATION, EPISODES = map(
     WORKER_COLUMNS.index, ("evaluator", "index", "incarnation", "episodes")
 )
 
-pytestmark = [pytest.mark.cluster, pytest.mark.timeout(130)]
+pytestmark = pytest.mark.cluster
 
 
 def port_of(folder: Path) -> int:

@@ -27,7 +27,7 @@ from tests.cluster.players import (
 from tests.cluster.processes import started
 from worker.status import ask_status
 
-pytestmark = [pytest.mark.cluster, pytest.mark.timeout(130)]
+pytestmark = pytest.mark.cluster
 
 
 def endpoint_of(folder: Path) -> str:

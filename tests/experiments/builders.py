@@ -141,7 +141,7 @@ TRAININGS = {
     "mlp": training("MLP", "mlp", "agent=mlp"),
     "ours": training("ours", "tangram"),
     "triangle": training("tri|angle <b>", "tangram", "tokens=triangle", after="ours"),
-    "inexact": training("inexact", "tangram", "sim.inexact=true"),
+    "inexact": training("inexact", "tangram", "sim.damping=0.04"),
     "seven": training("seven tokens", "game", "tokens=tangram7"),
 }
 TESTS = {

@@ -53,5 +53,5 @@ def test_the_papers_budget_is_the_papers() -> None:
 def test_the_papers_trainings_publish_and_reward_as_the_paper_does() -> None:
     config = study("laptop", PAPERS)
     made = composed("train", ["run_dir=x", *config.command("paper")])
-    assert made["service"]["every_update"]
-    assert (made["reward"]["source"], made["sim"]["camera"]) == ("camera", True)
+    assert made["service"]["publish_seconds"] == 0.0
+    assert (made["reward"]["source"], made["sim"]["pixels"]) == ("camera", 64)

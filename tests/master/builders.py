@@ -1,5 +1,6 @@
 """Small runs that the tests of the master share: everything real but the sockets."""
 
+import io
 import time
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping
@@ -8,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from rich.console import Console
 
 from master.budget import Budget
 from master.checkpointer import Checkpointer
@@ -157,29 +159,34 @@ def trainer(made: Setup, seed: int = 0, lag_updates: int = 2) -> Trainer:
 
 
 def loop(
-    folder: Path, made: Setup, hub: FakeHub, service: dict[str, Any] | None = None, **config: Any
+    folder: Path,
+    made: Setup,
+    hub: FakeHub,
+    service: dict[str, Any] | None = None,
+    lag_updates: int = 2,
+    **config: Any,
 ) -> Loop:
     """A loop around a fake hub, in a run folder that exists."""
-    lag = {"lag_updates": 2, "publish_seconds": 1000.0}
-    settings = MasterConfig(str(folder), service=ServiceConfig(**lag | (service or {})), **config)
+    given = {"publish_seconds": 1000.0} if service is None else service
+    settings = MasterConfig(str(folder), service=ServiceConfig(**given), **config)
     run_folder = RunFolder(folder)
     run_folder.prepare("auto")
     run_folder.write_config({})
-    learner = trainer(made, lag_updates=settings.service.lag_updates)
+    learner = trainer(made, lag_updates=lag_updates)
     service, record = settings.service, Record()
-    guard = DivergenceGuard(learner, service.max_bad_updates, run_folder.bad_batch)
+    guard = DivergenceGuard(learner, run_folder.bad_batch, limit=3)
     clock, budget = Clock(record), Budget(settings, learner, record)
     kept = journal(run_folder.journal, made)
     checkpointer = Checkpointer(service, run_folder, guard, hub, kept, clock)  # type: ignore[arg-type]
     status = StatusCollector("run", guard, hub, budget, clock, checkpointer)  # type: ignore[arg-type]
     metrics = Metrics(run_folder.tensorboard, run_folder.curve)
-    reporter = Reporter(learner, record, service, status, ShownProgress(), metrics, [hub.tell])
+    reporter = Reporter(learner, record, status, ShownProgress(), metrics, [hub.tell])
     return Loop(
         service=service,
         folder=run_folder,
         hub=hub,  # type: ignore[arg-type]
         guard=guard,
-        lockstep=Lockstep.of(service),
+        lockstep=Lockstep.of(service, settings.workers),
         budget=budget,
         clock=clock,
         checkpointer=checkpointer,
@@ -194,3 +201,33 @@ def shown(made: Loop) -> list[RunStatus]:
     progress = made.reporter._progress
     assert isinstance(progress, ShownProgress)
     return progress.statuses
+
+
+def play_on(made: Trainer, rounds: int, seed: int = 0, count: int = 4) -> None:
+    """Insert and learn in turns; hindsight and sampling draw from the trainer's generators."""
+    for i in range(rounds):
+        made.insert(random_episodes(made.setup, count, seed=1000 * seed + i))
+        while made.rate_limiter.may_update():
+            made.update(i / rounds)
+
+
+def assert_same_state(one: Trainer, other: Trainer) -> None:
+    """Every array and every counter is equal to the last bit."""
+    (ours, counters), (theirs, their_counters) = one.state(), other.state()
+    assert counters == their_counters
+    assert ours.keys() == theirs.keys()
+    for stem, arrays in ours.items():
+        assert arrays.keys() == theirs[stem].keys()
+        for name, array in arrays.items():
+            np.testing.assert_array_equal(array, theirs[stem][name], err_msg=name)
+
+
+def screen(**settings: Any) -> Console:
+    """A terminal or a file of 100 columns."""
+    return Console(file=io.StringIO(), width=100, **settings)
+
+
+def text(shown: Console) -> str:
+    """All that was written to it."""
+    assert isinstance(shown.file, io.StringIO)
+    return shown.file.getvalue()

@@ -9,10 +9,12 @@ import zmq
 
 from master.delivery import Arrival, EpisodesArrived
 from master.hub import Hub, WelcomeInfo
-from tangram_agent.messages import ToWorker, Welcome, decode_from_master
+from tangram_agent.arrays import WeightShapes
+from tangram_agent.messages import Heartbeat, Reject, ToWorker, Welcome, decode_from_master
+from tangram_agent.schema import Plain
 from tests.agent.messages import FINGERPRINTS, SPEC, batch, hello
 
-LIMIT_S = 20.0
+LIMIT_S = 100.0
 WINDOW = 3
 INFO = WelcomeInfo("run", 7, FINGERPRINTS, SPEC, WINDOW)
 
@@ -28,21 +30,23 @@ class Stage:
     def __init__(self, hub: Hub) -> None:
         self.hub = hub
         self.arrivals: list[Arrival] = []
-        self._dealers: list[Dealer] = []
+        self._sockets: list[zmq.Socket[bytes]] = []
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
 
     def dealer(self) -> "Dealer":
         """Another connection."""
-        made = Dealer(self, self._context.socket(zmq.DEALER))
-        self._dealers.append(made)
-        return made
+        return Dealer(self, self._open(zmq.DEALER))
 
     def subscriber(self) -> zmq.Socket[bytes]:
         """A connection to the broadcasts."""
-        socket = self._context.socket(zmq.SUB)
+        socket = self._open(zmq.SUB)
         socket.setsockopt(zmq.SUBSCRIBE, b"")
         socket.connect(self.hub.weights_endpoint)
         return socket
+
+    def _open(self, kind: int) -> zmq.Socket[bytes]:
+        self._sockets.append(self._context.socket(kind))  # it lives until all are closed
+        return self._sockets[-1]
 
     def until(self, done: Callable[[], Any]) -> None:
         """Serve the hub until something holds, within a limit."""
@@ -77,24 +81,36 @@ class Dealer:
         self.stage, self.socket = stage, socket
         socket.connect(stage.hub.endpoint)
 
-    def say(self, frames: list[bytes]) -> None:
-        """Send a message."""
-        self.socket.send_multipart(frames)
+    def say(self, message: Plain | list[bytes]) -> None:
+        self.socket.send_multipart(message if isinstance(message, list) else message.encode())
 
     def send(self, *sequences: int) -> None:
         """Send batches with these numbers."""
         for sequence in sequences:
             self.say(batch(sequence).encode(SPEC))
 
-    def hear(self) -> ToWorker:
+    def hear(self, shapes: WeightShapes | None = None) -> ToWorker:
         """The hub's next answer."""
         self.stage.until(lambda: self.socket.poll(0))
-        return decode_from_master(self.socket.recv_multipart(), None)
+        return decode_from_master(self.socket.recv_multipart(), shapes)
+
+    def ask(self, message: Plain | list[bytes]) -> ToWorker:
+        """Say something, and hear the next answer."""
+        self.say(message)
+        return self.hear()
+
+    def beat(self) -> list[ToWorker]:
+        """All the answers up to that to a heartbeat and those that come with it."""
+        self.say(Heartbeat({}))
+        self.say([b"no message"])
+        answers: list[ToWorker] = []
+        while not isinstance(answer := self.hear(), Reject):
+            answers.append(answer)
+        return answers
 
     def join(self, **fields: Any) -> Welcome:
         """Say HELLO and be welcomed."""
-        self.say(hello(**fields).encode())
-        answer = self.hear()
+        answer = self.ask(hello(**fields))
         assert isinstance(answer, Welcome), answer
         return answer
 

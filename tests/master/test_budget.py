@@ -20,41 +20,30 @@ def budget(seconds: float, episodes: int, updates: int, **bounds: Any) -> Budget
     )  # type: ignore[arg-type]
 
 
-SHARES = [
-    ({}, (1e9, 10**9, 10**9), 0.0),
-    ({"max_updates": 100}, (1e9, 10**9, 25), 0.25),
-    ({"max_episodes": 100}, (0.0, 50, 0), 0.5),
-    ({"max_hours": 1}, (900.0, 0, 0), 0.25),
-    ({"max_hours": 1, "max_updates": 100}, (900.0, 0, 10), 0.25),
-    ({"max_hours": 1, "max_updates": 100}, (900.0, 0, 30), 0.3),
-    ({"max_updates": 100}, (0.0, 0, 101), 1.0),
+# bounds, (seconds, episodes, updates) -> share, what ends learning
+USED = [
+    ({}, (1e9, 10**9, 10**9), 0.0, None),
+    ({"max_updates": 100}, (1e9, 10**9, 25), 0.25, None),
+    ({"max_updates": 100}, (0.0, 0, 99), 0.99, None),
+    ({"max_updates": 100}, (0.0, 0, 100), 1.0, "max_updates=100"),
+    ({"max_updates": 100}, (0.0, 0, 101), 1.0, "max_updates=100"),
+    ({"max_episodes": 100}, (0.0, 50, 0), 0.5, None),
+    ({"max_hours": 0.5}, (1799.0, 0, 10**9), 1799 / 1800, None),
+    ({"max_hours": 0.5}, (1800.0, 0, 0), 1.0, "max_hours=0.5"),
+    ({"max_hours": 1, "max_updates": 100}, (900.0, 0, 10), 0.25, None),
+    ({"max_hours": 1, "max_updates": 100}, (900.0, 0, 30), 0.3, None),
 ]
 
 
-@pytest.mark.parametrize(("bounds", "used", "share"), SHARES)
-def test_the_share_used_most_decides(
-    bounds: dict[str, Any], used: tuple[float, int, int], share: float
+@pytest.mark.parametrize(("bounds", "used", "share", "reason"), USED)
+def test_the_share_used_most_decides_and_a_bound_ends_learning(
+    bounds: dict[str, Any], used: tuple[float, int, int], share: float, reason: str | None
 ) -> None:
-    assert budget(*used, **bounds).share == pytest.approx(share)
-    assert budget(*used, **bounds).bounded == bool(bounds)
-
-
-@pytest.mark.parametrize(
-    ("bounds", "seconds", "updates", "reason"),
-    [
-        ({}, 1e9, 10**9, None),
-        ({"max_updates": 10}, 1e9, 9, None),
-        ({"max_updates": 10}, 0.0, 10, "max_updates=10"),
-        ({"max_hours": 0.5}, 1799.0, 10**9, None),
-        ({"max_hours": 0.5}, 1800.0, 0, "max_hours=0.5"),
-    ],
-)
-def test_what_ends_learning(
-    bounds: dict[str, Any], seconds: float, updates: int, reason: str | None
-) -> None:
-    made = budget(seconds, 0, updates, **bounds)
+    made = budget(*used, **bounds)
+    assert made.share == pytest.approx(share)
+    assert made.bounded == bool(bounds)
     assert made.spent() == reason
-    assert made.updates_spent() == (reason == "max_updates=10")
+    assert made.updates_spent() == (reason == "max_updates=100")
 
 
 @pytest.mark.parametrize(

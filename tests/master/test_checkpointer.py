@@ -2,7 +2,6 @@
 
 import errno
 import logging
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from master import checkpointer as checkpointer_module
 from master import journal as journal_module
 from master.checkpointer import MAKE_ROOM, restore_run
 from master.journal import JournalError, segments
@@ -18,17 +16,11 @@ from master.trainer import Trainer
 from tangram_agent import checkpoints as checkpoints_module
 from tangram_agent.checkpoints import DiskError, list_checkpoints
 from tangram_agent.process import Every
-from tests.master.builders import FakeHub, arrival, close_journals, loop, small_setup
+from tests.master.builders import FakeHub, arrival, loop, small_setup
 
 pytestmark = pytest.mark.fast
 
 MADE = small_setup()
-
-
-@pytest.fixture(autouse=True)
-def closed() -> Iterator[None]:
-    yield
-    close_journals()
 
 
 class Stage:
@@ -39,17 +31,17 @@ class Stage:
     ) -> None:
         caplog.set_level(logging.INFO)
         self.full, self._caplog = False, caplog
-        made = loop(folder, MADE, FakeHub(MADE))
-        self.folder, self.checkpointer = folder, made.checkpointer
-        patch.setattr(checkpointer_module, "RETRY_S", 0.0)
+        self.folder, self.checkpointer = folder, loop(folder, MADE, FakeHub(MADE)).checkpointer
         self.checkpointer._retry = Every(0.0)
-        kind = journal_module.Journal
-        patch.setattr(kind, "_write", self._guarded(kind._write))
-        patch.setattr(checkpoints_module, "_write", self._guarded(checkpoints_module._write))
+        for writer in (journal_module.Journal, checkpoints_module):
+            patch.setattr(writer, "_write", self._guarded(writer._write))
 
     @property
     def told(self) -> list[str]:
         return self._caplog.messages
+
+    def keep(self, number: int) -> bool:
+        return self.checkpointer.keep(arrival(MADE, number))
 
     def _guarded(self, write: Any) -> Any:
         def guarded(*arguments: Any) -> None:
@@ -69,24 +61,24 @@ def stage(
 
 def test_a_full_disk_is_told_once_and_the_batch_is_kept_when_there_is_room(stage: Stage) -> None:
     stage.full = True
-    assert [stage.checkpointer.keep(arrival(MADE, 1)) for _ in range(3)] == [False] * 3
+    assert [stage.keep(1) for _ in range(3)] == [False] * 3
     where = stage.folder / "journal"
     assert stage.told == [
         f"the journal in {where} cannot be written (No space left on device): {MAKE_ROOM}"
     ]
     stage.full = False
-    assert stage.checkpointer.keep(arrival(MADE, 1))
+    assert stage.keep(1)
     assert stage.told[1:] == ["the journal can be written again: batches are taken in"]
-    assert stage.checkpointer.keep(arrival(MADE, 2))
+    assert stage.keep(2)
     stage.full = True
-    assert not stage.checkpointer.keep(arrival(MADE, 3))
+    assert not stage.keep(3)
     assert len(stage.told) == 3
 
 
 def test_a_disk_that_does_not_take_a_checkpoint_ends_nothing(stage: Stage) -> None:
-    assert stage.checkpointer.keep(arrival(MADE, 1))
+    assert stage.keep(1)
     first = stage.checkpointer.save()
-    assert stage.checkpointer.keep(arrival(MADE, 2))
+    assert stage.keep(2)
     stage.full = True
     stage.checkpointer._checkpoint = Every(0.0)
     stage.checkpointer.tick()
@@ -117,7 +109,7 @@ def test_segments_live_as_long_as_a_checkpoint_needs_them(stage: Stage) -> None:
     """Two checkpoints are kept: the older one needs what came between it and the newer one."""
     left = []
     for number in range(1, 5):
-        assert stage.checkpointer.keep(arrival(MADE, number))
+        assert stage.keep(number)
         stage.checkpointer.save()
         left.append(list(segments(stage.folder / "journal")))
     assert left == [[], [2], [3], [4]]
@@ -126,7 +118,7 @@ def test_segments_live_as_long_as_a_checkpoint_needs_them(stage: Stage) -> None:
 def test_a_journal_that_cannot_be_synced_is_told(
     stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert stage.checkpointer.keep(arrival(MADE, 1))
+    assert stage.keep(1)
 
     def fail() -> None:
         raise JournalError("the journal cannot be written")

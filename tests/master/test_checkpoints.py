@@ -1,7 +1,7 @@
 """Checkpoint folders: written whole or not at all, and every changed byte is found."""
 
 import json
-import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from tangram_agent.checkpoints import (
     set_aside,
 )
 from tangram_sim.errors import RunError
+from tests.agent.builders import watched_disk
 
 pytestmark = pytest.mark.fast
 
@@ -84,17 +85,12 @@ def test_names_are_ordered_as_numbers(tmp_path: Path) -> None:
     assert newest_checkpoint(tmp_path).name == "1000000000"
 
 
-def test_the_same_number_again_replaces_nothing_before_it_is_whole(tmp_path: Path) -> None:
-    first = save(tmp_path, keep=1)
-    second = save(tmp_path, keep=1)
-    assert (first.name, second.name, names(tmp_path)) == ("00000005", "00000005-1", ["00000005-1"])
-
-
-def test_the_newest_of_one_number_is_the_last_written(tmp_path: Path) -> None:
+@pytest.mark.parametrize("keep", [1, 2])
+def test_the_newest_of_one_number_is_the_last_written(tmp_path: Path, keep: int) -> None:
     """A run that waits for workers writes many without an update between."""
-    written = [save(tmp_path, keep=2).name for _ in range(5)]
+    written = [save(tmp_path, keep=keep).name for _ in range(5)]
     assert written == ["00000005", *(f"00000005-{i}" for i in range(1, 5))]
-    assert names(tmp_path) == written[-2:]
+    assert names(tmp_path) == written[-keep:]
 
 
 def test_a_crash_before_the_rename_leaves_the_old_one_valid(
@@ -120,15 +116,7 @@ def test_all_bytes_and_names_are_on_the_disk_in_the_order_that_a_power_cut_asks_
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Files and their folder before the name that counts, the folder with that name after it."""
-    events: list[int | str] = []
-    monkeypatch.setattr(os, "fsync", lambda handle: events.append(os.fstat(handle).st_ino))
-    rename = Path.rename
-
-    def renamed(self: Path, target: Path) -> Path:
-        events.append("renamed")
-        return rename(self, target)
-
-    monkeypatch.setattr(Path, "rename", renamed)
+    events = watched_disk(monkeypatch)
     path = save(tmp_path)
     content = {file.stat().st_ino for file in path.iterdir()}
     assert len(content) == 3
@@ -143,64 +131,58 @@ def test_a_half_written_folder_is_no_checkpoint(tmp_path: Path) -> None:
     assert names(tmp_path) == []
 
 
+def turned(place: int) -> Callable[[bytes], bytes]:
+    def turn(data: bytes) -> bytes:
+        at = min(place, len(data) - 1) % len(data)
+        return data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]
+
+    return turn
+
+
+HARMS: dict[str, Callable[[bytes], bytes | None]] = {
+    **{f"byte {place}": turned(place) for place in (0, 300, -1)},
+    "cut": lambda data: data[: len(data) // 2],
+    "missing": lambda _: None,
+}
+
+
 @pytest.mark.parametrize("file", FILES)
-@pytest.mark.parametrize("position", [0, 300, -1])
-def test_every_changed_byte_is_found(tmp_path: Path, file: str, position: int) -> None:
+@pytest.mark.parametrize("harm", HARMS)
+def test_every_harm_to_a_file_is_found(tmp_path: Path, file: str, harm: str) -> None:
     path = save(tmp_path)
-    data = bytearray((path / file).read_bytes())
-    data[min(position, len(data) - 1)] ^= 0x01
-    (path / file).write_bytes(data)
+    rest = HARMS[harm]((path / file).read_bytes())
+    (path / file).unlink()
+    if rest is not None:
+        (path / file).write_bytes(rest)
     with pytest.raises(CorruptError) as caught:
         load_checkpoint(path)
-    assert file in caught.value.why
+    why = caught.value.why
+    assert file in why
+    assert (why == f"{file} is missing") == (harm == "missing")
     assert str(caught.value) == (
-        f"checkpoint {path} is corrupt ({caught.value.why}): delete it to use the one before"
+        f"checkpoint {path} is corrupt ({why}): delete it to use the one before"
     )
 
 
-@pytest.mark.parametrize("file", FILES)
-def test_a_cut_file_is_found(tmp_path: Path, file: str) -> None:
-    path = save(tmp_path)
-    data = (path / file).read_bytes()
-    (path / file).write_bytes(data[: len(data) // 2])
-    with pytest.raises(CorruptError, match=file):
-        load_checkpoint(path)
-
-
-@pytest.mark.parametrize("file", FILES)
-def test_a_missing_file_is_found(tmp_path: Path, file: str) -> None:
-    path = save(tmp_path)
-    (path / file).unlink()
-    with pytest.raises(CorruptError, match=f"corrupt \\({file} is missing\\)"):
-        load_checkpoint(path)
-
-
 @pytest.mark.parametrize(
-    ("change", "reason"),
+    ("change", "kind", "reason"),
     [
-        ({"format_version": 1}, "has format 1, this version reads 2: use the version"),
-        ({"format_version": None}, "manifest.json has no format_version"),
-        ({"updates": 6}, "checksum of manifest.json differs"),
-        ({"counters": {}}, "checksum of manifest.json differs"),
-        ({"files": {}}, "checksum of manifest.json differs"),
+        ({"format_version": 1}, RunError, "has format 1, this version reads 2: use the version"),
+        ({"format_version": None}, CorruptError, "manifest.json has no format_version"),
+        ({"updates": 6}, CorruptError, "checksum of manifest.json differs"),
+        ({"counters": {}}, CorruptError, "checksum of manifest.json differs"),
+        ({"files": {}}, CorruptError, "checksum of manifest.json differs"),
     ],
 )
-def test_a_changed_manifest_is_refused(
-    tmp_path: Path, change: dict[str, object], reason: str
+def test_a_changed_manifest_is_refused_and_another_format_is_not_taken_for_corrupt(
+    tmp_path: Path, change: dict[str, object], kind: type[RunError], reason: str
 ) -> None:
     path = save(tmp_path)
     manifest = json.loads((path / "manifest.json").read_text())
     (path / "manifest.json").write_text(json.dumps(manifest | change))
-    with pytest.raises(RunError, match=reason):
+    with pytest.raises(RunError, match=reason) as caught:
         load_checkpoint(path)
-
-
-def test_another_format_is_not_taken_for_corrupt(tmp_path: Path) -> None:
-    path = save(tmp_path)
-    (path / "manifest.json").write_text('{"format_version": 99}')
-    with pytest.raises(RunError) as caught:
-        load_checkpoint(path)
-    assert not isinstance(caught.value, CorruptError)
+    assert type(caught.value) is kind
 
 
 def test_a_stem_that_was_never_there(tmp_path: Path) -> None:
@@ -208,19 +190,18 @@ def test_a_stem_that_was_never_there(tmp_path: Path) -> None:
         load_checkpoint(save(tmp_path), ["optimiser"])
 
 
-@pytest.mark.parametrize("made", [False, True])
-def test_no_checkpoint_is_told(tmp_path: Path, made: bool) -> None:
+def test_a_folder_without_a_checkpoint_and_one_that_cannot_be_written_are_told(
+    tmp_path: Path,
+) -> None:
     folder = tmp_path / "checkpoints"
-    if made:
-        folder.mkdir()
-    with pytest.raises(RunError, match=f"no checkpoint in {folder}: train the run first"):
-        newest_checkpoint(folder)
-
-
-def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
-    (tmp_path / "checkpoints").write_text("a file is in the way")
+    for _ in range(2):
+        with pytest.raises(RunError, match=f"no checkpoint in {folder}: train the run first"):
+            newest_checkpoint(folder)
+        folder.mkdir(exist_ok=True)
+    folder.rmdir()
+    folder.write_text("a file is in the way")
     with pytest.raises(RunError, match=r"cannot write a checkpoint to .*: make room there"):
-        save(tmp_path / "checkpoints")
+        save(folder)
 
 
 def test_a_corrupt_one_is_set_aside_and_no_longer_counts(tmp_path: Path) -> None:

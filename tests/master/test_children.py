@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import time
 from pathlib import Path
 from queue import SimpleQueue
 
@@ -15,18 +14,7 @@ from hypothesis import strategies as st
 from master import children as children_module
 from master.children import MAX_RESTARTS, Child, describe, environment, override
 
-LIMIT_S = 30.0
-
-
-def child(code: str, log: Path | None = None) -> Child:
-    return Child("worker 0", ["-c", code], log)
-
-
-def run_once(made: Child) -> int:
-    ended: SimpleQueue[Child] = SimpleQueue()
-    made.start(ended.put)
-    assert ended.get(timeout=LIMIT_S) is made
-    return made.clear()
+LIMIT_S = 100.0
 
 
 @pytest.mark.fast
@@ -45,52 +33,55 @@ def test_any_path_is_read_back_from_an_override(value: str) -> None:
     assert (parsed.key_or_group, parsed.value()) == ("run_dir", value)
 
 
-@pytest.mark.fast
-def test_restarts_come_later_and_later_and_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    made, starts = child(""), []
-    made._started_s = 50.0
-    monkeypatch.setattr(children_module.time, "monotonic", lambda: 100.0)
-    for _ in range(MAX_RESTARTS):
-        assert made.plan_restart(1)
-        starts.append(made.next_start_s)
-    assert starts == [100.5, 101.0, 102.0, 104.0, 108.0]
-    assert not made.plan_restart(1)
+# (how long it lived, how long it was stopped, its status, restarts in a row or None to give up)
+LIVES = {
+    "restarts end": [
+        *((59.0, 0.0, 1, i) for i in range(1, MAX_RESTARTS + 1)),
+        (59.0, 0.0, 1, None),
+    ],
+    "wrong input is not tried again": [(1.0, 0.0, 2, None)],
+    "a steady life clears the record": [(59.0, 0.0, -9, 1), (59.0, 0.0, -9, 2), (60.0, 0.0, -9, 1)],
+    "one that only hung had none": [
+        *((300.0, 0.0, 1, 1), (359.0, 0.0, 1, 2), (360.0, 0.0, 1, 1)),
+        (300.0, 300.0, -9, 2),  # stopped, and killed for that
+    ],
+}
 
 
 @pytest.mark.fast
-def test_wrong_input_is_not_tried_again() -> None:
-    assert not child("").plan_restart(2)
-
-
-@pytest.mark.fast
-def test_a_steady_life_clears_the_record(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = child("")
-    made.restarts = MAX_RESTARTS
-    monkeypatch.setattr(children_module, "STEADY_S", -1.0)
-    assert made.plan_restart(1)
-    assert made.restarts == 1
+@pytest.mark.parametrize("lives", LIVES.values(), ids=LIVES)
+def test_restarts_come_later_and_later_and_end(
+    monkeypatch: pytest.MonkeyPatch, lives: list[tuple[float, float, int, int | None]]
+) -> None:
+    monkeypatch.setattr(children_module.time, "monotonic", lambda: 1000.0)
+    made = Child("worker", [], patience_s=300.0)
+    for lived_s, made._frozen_s, status, restarts in lives:
+        made._started_s = 1000.0 - lived_s
+        assert made.plan_restart(status) == (restarts is not None)
+        if restarts is not None:
+            assert made.restarts == restarts
+            assert made.next_start_s == 1000.0 + 0.5 * 2 ** (restarts - 1)
 
 
 @pytest.mark.cluster
-def test_output_and_status_of_a_child(tmp_path: Path) -> None:
-    made = child("print('said'); raise SystemExit(7)", tmp_path / "log")
-    assert [run_once(made), run_once(made)] == [7, 7]
-    assert made.tail() == "said\nsaid"
+def test_a_child_has_its_own_session_niceness_thread_and_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    code = (
+        "import os, json, sys; sys.stdin.read(); print(json.dumps([os.getsid(0) == os.getpid(), "
+        "os.environ['OMP_NUM_THREADS']])); raise SystemExit(7)"
+    )
+    made = Child("worker 0", ["-c", code], tmp_path / "log")
+    ended: SimpleQueue[Child] = SimpleQueue()
+    for lives in (1, 2):
+        made.start(ended.put)
+        assert ended.get(timeout=LIMIT_S) is made
+        assert made.clear() == 7
+        assert [json.loads(line) for line in made.tail().splitlines()] == [[True, "1"]] * lives
     assert not made.alive
 
-
-@pytest.mark.cluster
-def test_a_child_has_its_own_session_niceness_and_one_thread(tmp_path: Path) -> None:
-    code = (
-        "import os, json, sys; sys.stdin.read(); "
-        "print(json.dumps([os.getsid(0) == os.getpid(), os.environ['OMP_NUM_THREADS']]))"
-    )
-    made = child(code, tmp_path / "log")
-    assert run_once(made) == 0
-    assert json.loads(made.tail()) == [True, environment()["OMP_NUM_THREADS"]]
-
     polite = Child("polite", ["-c", "import signal; signal.pause()"], tmp_path / "log", nice=3)
-    ended: SimpleQueue[Child] = SimpleQueue()
     polite.start(ended.put)
     assert polite._process is not None
     nice = os.getpriority(os.PRIO_PROCESS, polite._process.pid)
@@ -101,14 +92,9 @@ def test_a_child_has_its_own_session_niceness_and_one_thread(tmp_path: Path) -> 
 
 
 @pytest.mark.fast
-@pytest.mark.parametrize(("given", "expected"), [(None, "1"), ("4", "4")])
-def test_the_users_own_number_of_threads_wins(
-    monkeypatch: pytest.MonkeyPatch, given: str | None, expected: str
-) -> None:
-    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    if given is not None:
-        monkeypatch.setenv("OMP_NUM_THREADS", given)
-    assert environment()["OMP_NUM_THREADS"] == expected
+def test_the_users_own_number_of_threads_wins(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "4")
+    assert environment()["OMP_NUM_THREADS"] == "4"
 
 
 @pytest.mark.cluster
@@ -133,17 +119,3 @@ def test_a_process_that_is_stopped_for_a_while_is_left_alone() -> None:
     finally:
         made.signal(signal.SIGKILL)
         assert made.clear() == -signal.SIGKILL
-
-
-@pytest.mark.fast
-def test_a_process_that_only_hung_has_no_steady_life() -> None:
-    made = Child("worker", [], patience_s=300.0)
-    lives = [(300.0, 1, 1), (359.0, 1, 2), (360.0, 1, 1), (59.0, -9, 2), (60.0, -9, 1)]
-    for lived_s, status, restarts in lives:
-        made._started_s = time.monotonic() - lived_s
-        assert made.plan_restart(status)
-        assert made.restarts == restarts
-    made._frozen_s = 300.0  # and was killed for that
-    made._started_s = time.monotonic() - 300.0
-    assert made.plan_restart(-9)
-    assert made.restarts == 2

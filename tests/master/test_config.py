@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from master.config import LaunchConfig, MasterConfig
+from master.config import MasterConfig
 from tangram_agent.config import ServiceConfig
 from tangram_agent.setup import from_mapping
 from tangram_sim.errors import ConfigError
@@ -22,28 +22,16 @@ pytestmark = pytest.mark.fast
         ({"max_episodes": -1}, "max_episodes must be at least 0, got -1"),
         ({"max_updates": -1}, "max_updates must be at least 0, got -1"),
         ({"resume": "maybe"}, "resume must be one of none, auto, got 'maybe'"),
+        ({"workers": 0}, "workers must be at least 1, got 0: without one nothing is played"),
+        ({"workers": 1025}, "workers must be between 1 and 1024, got 1025"),
     ],
 )
-def test_a_wrong_master_is_refused(settings: dict[str, Any], reason: str) -> None:
+def test_wrong_settings_are_refused(settings: dict[str, Any], reason: str) -> None:
     with pytest.raises(ConfigError, match=reason):
         MasterConfig(**{"run_dir": "runs/x"} | settings)
 
 
-@pytest.mark.parametrize(
-    ("workers", "reason"),
-    [
-        (0, "workers must be at least 1, got 0: without one nothing is played"),
-        (-2, "workers must be at least 1, got -2"),
-        (1025, "workers must be between 1 and 1024, got 1025"),
-    ],
-)
-def test_wrong_numbers_of_workers_are_refused(workers: int, reason: str) -> None:
-    with pytest.raises(ConfigError, match=reason):
-        LaunchConfig(MasterConfig("runs/x"), workers)
-
-
 def test_settings_come_from_a_plain_mapping() -> None:
-    master = {"run_dir": "runs/x", "max_hours": 2, "service": {"port": 5555}}
-    config = from_mapping(LaunchConfig, {"workers": 2, "master": master})
-    expected = MasterConfig("runs/x", max_hours=2.0, service=ServiceConfig(port=5555))
-    assert config == LaunchConfig(expected, 2)
+    given = {"run_dir": "runs/x", "max_hours": 2, "workers": 2, "service": {"port": 5555}}
+    expected = MasterConfig("runs/x", max_hours=2.0, workers=2, service=ServiceConfig(port=5555))
+    assert from_mapping(MasterConfig, given) == expected

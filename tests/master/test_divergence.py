@@ -1,5 +1,6 @@
 """Updates that are not finite are undone, and end the run when they go on."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +32,14 @@ def learning() -> Trainer:
     return made
 
 
-@pytest.fixture(autouse=True)
-def kept_each_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every good state is kept, however fast the machine is."""
+Guarded = Callable[[int], DivergenceGuard]
+
+
+@pytest.fixture
+def guarded(learning: Trainer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Guarded:
+    """Makes a guard that keeps every good state, however fast the machine is."""
     monkeypatch.setattr(divergence_module, "KEEP_S", 0.0)
+    return lambda limit: DivergenceGuard(learning, tmp_path / "bad", limit)
 
 
 def fail(made: Trainer, times: int, part: str = "critic_loss") -> None:
@@ -61,9 +66,9 @@ def same(one: dict[str, Any], other: dict[str, Any]) -> bool:
 
 @pytest.mark.parametrize("part", ["critic_loss", "actor_loss"])
 def test_a_bad_update_is_undone_and_the_next_one_counts(
-    learning: Trainer, tmp_path: Path, part: str
+    learning: Trainer, guarded: Guarded, tmp_path: Path, part: str
 ) -> None:
-    guard = DivergenceGuard(learning, 3, tmp_path / "bad")
+    guard = guarded(3)
     for _ in range(2):
         assert guard.update(0.0)
     good, lag = learning.learner.state(), learning.rate_limiter.lag
@@ -77,10 +82,10 @@ def test_a_bad_update_is_undone_and_the_next_one_counts(
 
 
 def test_updates_since_the_last_good_state_are_made_again(
-    learning: Trainer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    learning: Trainer, guarded: Guarded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(divergence_module, "KEEP_S", 1000.0)
-    guard, lag = DivergenceGuard(learning, 3, tmp_path / "bad"), learning.rate_limiter.lag
+    guard, lag = guarded(3), learning.rate_limiter.lag
     first = learning.learner.state()
     for _ in range(4):
         guard.update(0.0)
@@ -91,9 +96,9 @@ def test_updates_since_the_last_good_state_are_made_again(
 
 
 def test_too_many_in_a_row_end_the_run_and_the_batch_is_kept(
-    learning: Trainer, tmp_path: Path
+    learning: Trainer, guarded: Guarded, tmp_path: Path
 ) -> None:
-    guard = DivergenceGuard(learning, 3, tmp_path / "bad")
+    guard = guarded(3)
     fail(learning, 2)
     assert [bool(guard.update(0.0)) for _ in range(3)] == [False, False, True]
     fail(learning, 99)
@@ -107,9 +112,9 @@ def test_too_many_in_a_row_end_the_run_and_the_batch_is_kept(
 
 
 def test_weights_that_went_bad_without_a_loss_are_never_given_out(
-    learning: Trainer, tmp_path: Path
+    learning: Trainer, guarded: Guarded
 ) -> None:
-    guard = DivergenceGuard(learning, 2, tmp_path / "bad")
+    guard = guarded(2)
     guard.update(0.0)
     poison(learning.learner.acting)
     weights = guard.weights()
@@ -122,9 +127,9 @@ def test_weights_that_went_bad_without_a_loss_are_never_given_out(
 
 @pytest.mark.parametrize("part", ["critic", "actor", "target_actor"])
 def test_a_check_finds_what_no_worker_would_see(
-    learning: Trainer, tmp_path: Path, part: str
+    learning: Trainer, guarded: Guarded, part: str
 ) -> None:
-    guard = DivergenceGuard(learning, 2, tmp_path / "bad")
+    guard = guarded(2)
     guard.update(0.0)
     good = learning.learner.state()
     poison(getattr(learning.learner, part))
@@ -132,7 +137,7 @@ def test_a_check_finds_what_no_worker_would_see(
     assert (guard.undone, same(learning.learner.state(), good)) == (1, True)
 
 
-def test_a_state_that_is_spoilt_already_is_refused(learning: Trainer, tmp_path: Path) -> None:
+def test_a_state_that_is_spoilt_already_is_refused(learning: Trainer, guarded: Guarded) -> None:
     poison(learning.learner.critic)
     with pytest.raises(NotFiniteError, match="the weights are not finite after 0 updates"):
-        DivergenceGuard(learning, 2, tmp_path / "bad")
+        guarded(2)

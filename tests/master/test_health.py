@@ -53,31 +53,34 @@ def test_metrics_are_those_of_the_last_status(health: Health) -> None:
     code, text = fetch(f"{health.url}/metrics")
     found = samples(text)
     assert code == 200
-    assert found[("tangram_updates",)] == 7.0
-    assert found[("tangram_share",)] == -1.0
-    assert found[("tangram_test_mean_reward",)] == 0.5
-    assert found[("tangram_hub_events_total", "batches")] == 2.0
-    assert found[("tangram_worker_behind", "player", "3")] == 8.0
-    assert found[("tangram_worker_silent_s", "evaluator", "0")] == 1.5
+    assert (
+        found.items()
+        >= {
+            ("tangram_updates",): 7.0,
+            ("tangram_share",): -1.0,
+            ("tangram_test_mean_reward",): 0.5,
+            ("tangram_hub_events_total", "batches"): 2.0,
+            ("tangram_worker_behind", "player", "3"): 8.0,
+            ("tangram_worker_silent_s", "evaluator", "0"): 1.5,
+        }.items()
+    )
     per_worker = [name for name in found if name[0].startswith("tangram_worker_")]
     assert len(per_worker) == 2 * (len(WORKER_COLUMNS) - 3)
-
-
-def test_health_is_lost_when_the_loop_hangs(
-    health: Health, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    health.update(STATUS)
-    code, text = fetch(f"{health.url}/healthz")
-    assert (code, json.loads(text)["status"]) == (200, "ok")
-    assert json.loads(text)["activity"] == "learning"
-    monkeypatch.setattr(health_module, "STALLED_S", 0.0)
-    code, text = fetch(f"{health.url}/healthz")
-    assert code == 503
-    assert json.loads(text)["status"].startswith("the loop has hung for 0 s")
-
-
-def test_other_pages_are_not_there(health: Health) -> None:
     assert fetch(f"{health.url}/etc/passwd")[0] == 404
+
+
+@pytest.mark.parametrize(
+    ("stalled_s", "code", "status"), [(60.0, 200, "ok"), (0.0, 503, "the loop has hung for 0 s")]
+)
+def test_health_is_lost_when_the_loop_hangs(
+    health: Health, monkeypatch: pytest.MonkeyPatch, stalled_s: float, code: int, status: str
+) -> None:
+    monkeypatch.setattr(health_module, "STALLED_S", stalled_s)
+    health.update(STATUS)
+    found, text = fetch(f"{health.url}/healthz")
+    assert found == code
+    assert json.loads(text)["status"].startswith(status)
+    assert json.loads(text)["activity"] == "learning"
 
 
 def test_who_connects_and_asks_nothing_is_hung_up_on(

@@ -3,7 +3,6 @@
 import errno
 import os
 import zlib
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,18 +19,12 @@ from master.journal import FORMAT, HEAD, JournalError, Title, journal_run_id, re
 from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.setup import Setup
 from tangram_sim.errors import RunError
-from tests.agent.builders import PAIR, setup
+from tests.agent.builders import PAIR, setup, watched_disk
 from tests.master.builders import arrival, close_journals, journal, small_setup
 
 pytestmark = pytest.mark.fast
 
 MADE = small_setup()
-
-
-@pytest.fixture(autouse=True)
-def closed() -> Iterator[None]:
-    yield
-    close_journals()
 
 
 def read(
@@ -77,54 +70,36 @@ def test_nothing_is_written_before_the_first_batch(tmp_path: Path) -> None:
     assert journal_run_id(tmp_path / "journal") is None
 
 
-def test_a_batch_is_with_the_operating_system_when_append_returns(tmp_path: Path) -> None:
-    kept = journal(tmp_path, MADE, sync_s=1000.0)
-    sizes = []
-    for number in (1, 2):
-        kept.append(arrival(MADE, number))
-        sizes.append(segments(tmp_path)[1].stat().st_size)
-    assert 0 < sizes[0] < sizes[1]
-
-
 @pytest.mark.parametrize(("sync_s", "syncs"), [(0.0, 3), (1000.0, 0)])
-def test_syncs_come_on_their_interval(
+def test_batches_are_with_the_operating_system_at_once_and_synced_on_their_interval(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sync_s: float, syncs: int
 ) -> None:
     """First the folder, or the file of a new segment would have no name after a power cut."""
-    done: list[int] = []
-    monkeypatch.setattr(os, "fsync", lambda handle: done.append(os.fstat(handle).st_ino))
+    done, sizes = watched_disk(monkeypatch), [0]
     kept = journal(tmp_path, MADE, sync_s)
     for number in (1, 2, 3):
         kept.append(arrival(MADE, number))
+        sizes.append(segments(tmp_path)[1].stat().st_size)
+    assert sizes == sorted(set(sizes))
     folder, file = (path.stat().st_ino for path in (tmp_path, *tmp_path.iterdir()))
     assert done == [folder, *[file] * syncs]
     kept.close()
     assert done == [folder, *[file] * max(syncs, 1)]
 
 
-def test_every_life_and_every_checkpoint_begins_a_segment(tmp_path: Path) -> None:
-    first = journal(tmp_path, MADE)
-    first.append(arrival(MADE, 1))
-    second = journal(tmp_path, MADE)
-    second.append(arrival(MADE, 2))
-    assert second.rotate() == 3
-    assert second.rotate() == 3  # nothing came since
-    second.append(arrival(MADE, 3))
-    assert list(segments(tmp_path)) == [1, 2, 3]
-    assert sequences(tmp_path) == [1, 2, 3]
-    assert sequences(tmp_path, first=3) == [3]
-    assert sequences(tmp_path, first=4) == []
-
-
-def test_covered_segments_are_dropped_and_never_the_current_one(tmp_path: Path) -> None:
+def test_every_life_and_every_checkpoint_begins_a_segment_and_covered_ones_are_dropped(
+    tmp_path: Path,
+) -> None:
+    journal(tmp_path, MADE).append(arrival(MADE, 1))
     kept = journal(tmp_path, MADE)
-    for number in (1, 2, 3):
-        kept.append(arrival(MADE, number))
-        if number < 3:
-            kept.rotate()
+    kept.append(arrival(MADE, 2))
+    assert [kept.rotate() for _ in range(2)] == [3, 3]  # nothing came in between
+    kept.append(arrival(MADE, 3))
+    assert list(segments(tmp_path)) == [1, 2, 3]
+    assert [sequences(tmp_path, first=n) for n in (1, 3, 4)] == [[1, 2, 3], [3], []]
     kept.drop_before(2)
     assert list(segments(tmp_path)) == [2, 3]
-    kept.drop_before(99)
+    kept.drop_before(99)  # never the current one
     assert list(segments(tmp_path)) == [3]
     kept.append(arrival(MADE, 4))
     assert sequences(tmp_path, first=3) == [3, 4]
@@ -180,22 +155,11 @@ def test_a_missing_segment_is_told_and_the_others_are_read(tmp_path: Path) -> No
     ]
 
 
-def test_another_run_or_task_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("other", [{"run_id": "other"}, {"made": setup(PAIR)}])
+def test_another_run_or_task_is_refused(tmp_path: Path, other: dict[str, Any]) -> None:
     journal(tmp_path, MADE).append(arrival(MADE, 1))
     with pytest.raises(RunError, match="of another run, task or version"):
-        read(tmp_path, run_id="other")
-    with pytest.raises(RunError, match="of another run, task or version"):
-        read(tmp_path, made=setup(PAIR))
-
-
-def test_what_is_no_journal_is_refused(tmp_path: Path) -> None:
-    kept = journal(tmp_path, MADE)
-    kept.append(arrival(MADE, 1))
-    content = segments(tmp_path)[1].read_bytes()
-    (length, _) = HEAD.unpack_from(content)
-    segments(tmp_path)[1].write_bytes(content[HEAD.size + length :])  # without its title
-    with pytest.raises(RunError, match=r"is no segment of format 2: choose another run_dir"):
-        read(tmp_path)
+        read(tmp_path, **other)
 
 
 def record(header: bytes, rest: bytes = b"") -> bytes:
@@ -204,63 +168,63 @@ def record(header: bytes, rest: bytes = b"") -> bytes:
     return HEAD.pack(len(body), zlib.crc32(body)) + body
 
 
-def test_a_journal_of_another_version_or_format_is_refused(tmp_path: Path) -> None:
+def test_what_is_no_journal_and_one_of_another_version_or_format_are_refused(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "00000001.log"
     before = {"v": 2, "kind": "segment", "format": 1, "run_id": "run", "task": MADE.task_digest()}
-    (tmp_path / "00000001.log").write_bytes(record(msgpack.packb(before)))
+    path.write_bytes(record(msgpack.packb(before)))
     with pytest.raises(RunError, match=r"was written by another version of tangram-rl: go on with"):
         journal_run_id(tmp_path)
     [later] = Title(FORMAT + 1, "run", MADE.task_digest()).encode()
-    (tmp_path / "00000001.log").write_bytes(record(later))
-    with pytest.raises(RunError, match=r"is no segment of format 2: choose another run_dir"):
-        read(tmp_path)
+    journal(tmp_path / "whole", MADE).append(arrival(MADE, 1))
+    whole = segments(tmp_path / "whole")[1].read_bytes()
+    untitled = whole[HEAD.size + HEAD.unpack_from(whole)[0] :]
+    for content in (record(later), untitled):
+        path.write_bytes(content)
+        with pytest.raises(RunError, match=r"is no segment of format 2: choose another run_dir"):
+            read(tmp_path)
 
 
-def test_the_checksum_of_each_batch_is_checked_when_it_is_read_back(tmp_path: Path) -> None:
+def test_the_frames_are_kept_as_they_came_and_their_checksum_is_checked(tmp_path: Path) -> None:
     """What was damaged before it was written, or by whoever wrote the record anew."""
-    one = arrival(MADE, 1)
-    bad = [*one.frames[:-1], bytes([one.frames[-1][0] ^ 1]) + one.frames[-1][1:]]
-    kept = journal(tmp_path, MADE)
-    kept.append(replace(one, frames=bad))
-    with pytest.raises(
-        RunError, match=r"holds what cannot be read \(the message is damaged: its ch"
-    ):
-        read(tmp_path)
-
-
-def test_the_frames_are_kept_as_they_came(tmp_path: Path) -> None:
-    one = arrival(MADE, 1)
-    journal(tmp_path, MADE).append(one)
+    one, kept = arrival(MADE, 1), journal(tmp_path, MADE)
+    kept.append(one)
     content = segments(tmp_path)[1].read_bytes()
     assert all(frame in content for frame in one.frames)
     assert list(read(tmp_path)[0].frames) == list(one.frames)
+    bad = [*one.frames[:-1], bytes([one.frames[-1][0] ^ 1]) + one.frames[-1][1:]]
+    kept.append(replace(one, frames=bad))
+    reason = r"holds what cannot be read \(the message is damaged: its ch"
+    with pytest.raises(RunError, match=reason):
+        read(tmp_path)
 
 
 class Disk:
     """Writes as long as there is room; stands in for os-level writes of a file."""
 
-    def __init__(self, room: int) -> None:
-        self.room = room
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.room = 10**9
+        opened, disk = journal_module.FileIO, self
 
-    def write(self, file: Any, data: memoryview) -> int:
-        if not self.room:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        size = min(len(data), self.room)
-        self.room -= size
-        return int(os.write(file.fileno(), data[:size]))
+        class Full(opened):  # type: ignore[misc, valid-type]
+            def write(self, data: memoryview) -> int:
+                if not disk.room:
+                    raise OSError(errno.ENOSPC, "No space left on device")
+                size = min(len(data), disk.room)
+                disk.room -= size
+                return int(os.write(self.fileno(), data[:size]))
+
+        monkeypatch.setattr(journal_module, "FileIO", Full)
 
 
 @pytest.fixture
 def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
-    """A disk with room for less than one batch."""
-    made = Disk(room=300)
-    opened = journal_module.FileIO
+    return Disk(monkeypatch)
 
-    class Full(opened):  # type: ignore[misc, valid-type]
-        def write(self, data: Any) -> int:
-            return made.write(self, data)
 
-    monkeypatch.setattr(journal_module, "FileIO", Full)
-    return made
+def fail(*_: int) -> None:
+    raise OSError(errno.EIO, "Input/output error")
 
 
 @pytest.mark.parametrize("room", [0, 30, 300])
@@ -284,13 +248,8 @@ def test_a_record_that_cannot_be_taken_back_ends_its_segment(
     tmp_path: Path, disk: Disk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A disk that fails altogether: neither written on nor cut back."""
-    disk.room = 10**9
     kept = journal(tmp_path, MADE)
     kept.append(arrival(MADE, 1))
-
-    def fail(*_: int) -> None:
-        raise OSError(errno.EIO, "Input/output error")
-
     with monkeypatch.context() as patch:
         patch.setattr(journal_module.os, "ftruncate", fail)
         disk.room = 30
@@ -308,10 +267,6 @@ def test_a_record_that_cannot_be_taken_back_ends_its_segment(
 def test_a_sync_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     kept = journal(tmp_path, MADE, sync_s=1000.0)
     kept.append(arrival(MADE, 1))
-
-    def fail(_: int) -> None:
-        raise OSError(errno.EIO, "Input/output error")
-
     with monkeypatch.context() as patch:
         patch.setattr(journal_module.os, "fsync", fail)
         with pytest.raises(JournalError, match="Input/output error"):

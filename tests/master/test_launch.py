@@ -2,7 +2,7 @@
 
 import signal
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import pytest
 from master import children as children_module
 from master import launch as launch_module
 from master.children import MAX_RESTARTS, Child
-from master.config import LaunchConfig, MasterConfig
+from master.config import MasterConfig
 from master.console import logging_to, sturdy_console
 from master.launch import Launcher, master_arguments, run_training
 from master.rundir import RunFolder
@@ -19,15 +19,17 @@ from tangram_agent.config import ServiceConfig
 from tangram_agent.setup import from_mapping
 from tangram_sim.errors import ConfigError
 
-LIMIT_S = 30.0
+LIMIT_S = 100.0
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 
 
 @pytest.mark.fast
 def test_the_master_gets_its_settings(tmp_path: Path) -> None:
     bounds = {"max_hours": 0.5, "max_updates": 7, "resume": "auto", "warm_start": "a b"}
-    master = from_mapping(MasterConfig, {"run_dir": str(tmp_path), "seed": 3, **bounds})
-    arguments = master_arguments(LaunchConfig(master, 2), RunFolder(tmp_path))
+    master = from_mapping(
+        MasterConfig, {"run_dir": str(tmp_path), "seed": 3, "workers": 2, **bounds}
+    )
+    arguments = master_arguments(master, RunFolder(tmp_path))
     assert arguments == [
         "-P",
         "-m",
@@ -43,15 +45,15 @@ def test_the_master_gets_its_settings(tmp_path: Path) -> None:
         "warm_start='a b'",
     ]
     in_step = replace(master, service=ServiceConfig(mode="lockstep"), warm_start=None)
-    arguments = master_arguments(LaunchConfig(in_step, 2), RunFolder(tmp_path))
-    assert arguments[-1] == "service.lockstep_workers=2"
+    arguments = master_arguments(in_step, RunFolder(tmp_path))
+    assert arguments[-1] == "workers=2"
 
 
 @pytest.mark.fast
 def test_a_folder_with_a_run_is_refused_before_anything_starts(tmp_path: Path) -> None:
     RunFolder(tmp_path).write_result({})
     with pytest.raises(ConfigError, match="holds a run already"):
-        run_training(LaunchConfig(MasterConfig(str(tmp_path)), 1), {})
+        run_training(MasterConfig(str(tmp_path)), {})
     assert not (tmp_path / "logs").exists()
 
 
@@ -60,7 +62,7 @@ def test_a_folder_in_use_is_left_alone(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
     folder.connection.touch()
     with folder.lock(), pytest.raises(ConfigError, match="in use by another process"):
-        run_training(LaunchConfig(MasterConfig(str(tmp_path), resume="auto"), 1), {})
+        run_training(MasterConfig(str(tmp_path), resume="auto"), {})
     assert folder.connection.exists()
     assert not folder.config.exists()
 
@@ -98,22 +100,59 @@ signal.pause()
 """
 
 
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(launch_module, "LEAVE_S", 0.2)
+    monkeypatch.setattr(children_module, "FIRST_DELAY_S", 0.01)
+
+
 def launcher(
     folder: Path,
     ending: str = "end()",
     condition: str = "True",
     players: Sequence[str] = (WORKER, WORKER),
+    stubborn: bool = False,
 ) -> Launcher:
     """A launcher whose children run the given code."""
     run = RunFolder(folder)
     run.logs.mkdir()
-    made = Launcher(LaunchConfig(MasterConfig(str(folder)), len(players)), run)
-    values = {"folder": str(folder), "condition": condition, "ending": ending}
-    made._master.arguments = ["-c", MASTER.format(**values)]
-    for player, code in zip(made._players, players, strict=True):
-        player.arguments = ["-c", code]
+    made = Launcher(MasterConfig(str(folder), workers=len(players)), run)
+    code = MASTER.format(folder=str(folder), condition=condition, ending=ending)
+    if stubborn:
+        code = code.replace("SIGTERM, told", "SIGTERM, signal.SIG_IGN")
+    made._master.arguments = ["-c", code]
+    for player, own in zip(made._players, players, strict=True):
+        player.arguments = ["-c", own]
     made._evaluator.arguments = ["-c", WORKER]
     return made
+
+
+def signalled(
+    made: Launcher, number: signal.Signals, when: Callable[[], bool], patch: pytest.MonkeyPatch
+) -> None:
+    """Let the launcher get a signal whenever it looks after its children and something holds."""
+    start = made._start_due
+
+    def start_and_signal() -> None:
+        start()
+        if when():
+            signal.raise_signal(number)
+
+    patch.setattr(made, "_start_due", start_and_signal)
+
+
+def comes_back(folder: Path, end: str) -> str:
+    """A worker that ends in this way the first time, and leaves a file the second time."""
+    return f"""
+import os, signal
+from pathlib import Path
+first = Path({str(folder / "first")!r})
+if first.exists():
+    Path({str(folder / "came_back")!r}).touch()
+else:
+    first.touch()
+    os.kill(os.getpid(), signal.{end})
+{WORKER}"""
 
 
 def finish(made: Launcher, folder: Path) -> tuple[int, str]:
@@ -144,10 +183,8 @@ def logs(*names: str) -> str:
     ],
 )
 def test_everything_ends_with_the_master(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str, status: int, said: str
+    tmp_path: Path, ending: str, status: int, said: str
 ) -> None:
-    monkeypatch.setattr(launch_module, "LEAVE_S", 0.2)
-    monkeypatch.setattr(children_module, "FIRST_DELAY_S", 0.01)
     started = logs("worker-0", "worker-1", "evaluator")
     result, told = finish(launcher(tmp_path, ending, started), tmp_path)
     assert result == status
@@ -161,7 +198,6 @@ def test_everything_ends_with_the_master(
 def test_a_master_that_is_killed_goes_on_and_its_workers_stay(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(children_module, "FIRST_DELAY_S", 0.01)
     ending = """
 if "resume=auto" in sys.argv:
     end()
@@ -187,7 +223,10 @@ os.kill(os.getpid(), 9)
 
 
 @pytest.mark.cluster
-def test_workers_that_the_master_sent_home_may_leave_in_order(tmp_path: Path) -> None:
+def test_workers_that_the_master_sent_home_may_leave_in_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(launch_module, "LEAVE_S", LIMIT_S)
     leaving = f"""
 import signal
 from pathlib import Path
@@ -205,9 +244,7 @@ print("left in order", flush=True)
 
 
 @pytest.mark.cluster
-def test_workers_start_only_when_the_master_can_be_reached(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_workers_start_only_when_the_master_can_be_reached(tmp_path: Path) -> None:
     made = launcher(tmp_path)
     made._master.arguments = ["-c", f"open({str(tmp_path / 'news')!r}, 'w'); raise SystemExit(2)"]
     assert finish(made, tmp_path)[0] == 2
@@ -215,61 +252,28 @@ def test_workers_start_only_when_the_master_can_be_reached(
 
 
 @pytest.mark.cluster
-def test_a_worker_that_dies_is_started_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("end", "told"),
+    [("SIGKILL", []), ("SIGSTOP", ["worker 0 has been stopped for 0.3 s: it is killed"])],
+)
+def test_a_worker_that_dies_or_stays_stopped_is_started_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: str, told: list[str]
 ) -> None:
-    monkeypatch.setattr(launch_module, "LEAVE_S", 0.2)
-    mark = tmp_path / "came_back"
-    once = f"""
-from pathlib import Path
-if Path({str(tmp_path / "died")!r}).exists():
-    Path({str(mark)!r}).touch()
-else:
-    Path({str(tmp_path / "died")!r}).touch()
-    import os; os.kill(os.getpid(), 9)
-{WORKER}"""
-    made = launcher(tmp_path, condition=f"not Path({str(mark)!r}).exists()", players=[once])
-    status, told = finish(made, tmp_path)
-    assert status == 0
-    assert told == (
-        f"worker 0 ended with SIGKILL: it is started again (1 of {MAX_RESTARTS}); "
-        f"see {tmp_path}/logs/worker-0.log\n"
-    )
-
-
-@pytest.mark.cluster
-def test_a_process_that_stays_stopped_is_killed_and_started_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(launch_module, "LEAVE_S", 0.2)
     monkeypatch.setattr(launch_module, "IDLE_S", 0.1)
-    mark = tmp_path / "came_back"
-    once = f"""
-import os, signal
-from pathlib import Path
-if Path({str(tmp_path / "stopped")!r}).exists():
-    Path({str(mark)!r}).touch()
-else:
-    Path({str(tmp_path / "stopped")!r}).touch()
-    os.kill(os.getpid(), signal.SIGSTOP)
-{WORKER}"""
-    made = launcher(tmp_path, condition=f"not Path({str(mark)!r}).exists()", players=[once])
+    waits = f"not Path({str(tmp_path / 'came_back')!r}).exists()"
+    made = launcher(tmp_path, condition=waits, players=[comes_back(tmp_path, end)])
     made._players[0].patience_s = 0.3
-    status, told = finish(made, tmp_path)
+    status, said = finish(made, tmp_path)
     assert status == 0
-    assert told.splitlines() == [
-        "worker 0 has been stopped for 0.3 s: it is killed",
+    assert said.splitlines() == [
+        *told,
         f"worker 0 ended with SIGKILL: it is started again (1 of {MAX_RESTARTS}); "
         f"see {tmp_path}/logs/worker-0.log",
     ]
 
 
 @pytest.mark.cluster
-def test_when_no_worker_can_be_kept_the_run_ends_with_the_reason(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(launch_module, "LEAVE_S", 0.2)
-    monkeypatch.setattr(children_module, "FIRST_DELAY_S", 0.01)
+def test_when_no_worker_can_be_kept_the_run_ends_with_the_reason(tmp_path: Path) -> None:
     players = ["raise SystemExit('wrong tokens')", "print('bad input'); raise SystemExit(2)"]
     status, told = finish(launcher(tmp_path, players=players), tmp_path)
     assert status == 1
@@ -284,17 +288,9 @@ def test_when_no_worker_can_be_kept_the_run_ends_with_the_reason(
 def test_a_signal_ends_the_master_in_order(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
-    monkeypatch.setattr(launch_module, "LEAVE_S", 0.2)
     before = signal.signal(number, signal.SIG_DFL)  # nohup and scripts may have it ignored
-    made = launcher(tmp_path, condition="True", ending="")
-    start = made._start_due
-
-    def start_and_signal() -> None:
-        start()
-        if made._players[0].alive and made._stop_s is None:
-            signal.raise_signal(number)
-
-    monkeypatch.setattr(made, "_start_due", start_and_signal)
+    made = launcher(tmp_path, ending="")
+    signalled(made, number, lambda: made._players[0].alive and made._stop_s is None, monkeypatch)
     status, told = finish(made, tmp_path)
     signal.signal(number, before)
     assert status == 0
@@ -302,25 +298,29 @@ def test_a_signal_ends_the_master_in_order(
 
 
 @pytest.mark.cluster
-def test_a_second_signal_ends_everything_at_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("signals", ["one", "many"])
+def test_a_master_that_does_not_end_is_killed_by_the_second_signal_or_the_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, signals: str
 ) -> None:
-    made = launcher(tmp_path)
-    stubborn = made._master.arguments[1].replace("SIGTERM, told", "SIGTERM, signal.SIG_IGN")
-    made._master.arguments = ["-c", stubborn]
-    start = made._start_due
+    monkeypatch.setattr(launch_module, "STOP_S", 0.2 if signals == "one" else 1000.0)
+    made = launcher(tmp_path, stubborn=True)
 
-    def start_and_signal() -> None:
-        start()
-        if (tmp_path / "connection.json").exists():
-            signal.raise_signal(signal.SIGINT)
+    def reachable() -> bool:
+        there = (tmp_path / "connection.json").exists()
+        return there and (signals == "many" or made._stop_s is None)
 
-    monkeypatch.setattr(made, "_start_due", start_and_signal)
-    assert finish(made, tmp_path)[0] == 137
+    signalled(made, signal.SIGINT, reachable, monkeypatch)
+    status, told = finish(made, tmp_path)
+    assert status == 137
+    killed = "the master does not end within 0.2 s: it is killed"
+    assert (killed in told) == (signals == "one")
 
 
 @pytest.mark.cluster
-def test_a_signal_that_comes_again_at_once_cuts_nobody_short(tmp_path: Path) -> None:
+def test_a_signal_that_comes_again_at_once_cuts_nobody_short(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(launch_module, "LEAVE_S", LIMIT_S)
     leaving = """
 import signal, sys, time
 from tangram_agent.process import watch_parent
@@ -344,24 +344,3 @@ while True:
     made._events.put(signal.SIGTERM)
     made.end_all()
     assert player.tail() == "plays\nleft in order"
-
-
-@pytest.mark.cluster
-def test_a_master_that_does_not_end_is_killed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(launch_module, "STOP_S", 0.2)
-    made = launcher(tmp_path)
-    stubborn = made._master.arguments[1].replace("SIGTERM, told", "SIGTERM, signal.SIG_IGN")
-    made._master.arguments = ["-c", stubborn]
-    start = made._start_due
-
-    def start_and_stop() -> None:
-        start()
-        if made._stop_s is None and (tmp_path / "connection.json").exists():
-            signal.raise_signal(signal.SIGTERM)
-
-    monkeypatch.setattr(made, "_start_due", start_and_stop)
-    status, told = finish(made, tmp_path)
-    assert status == 137
-    assert "the master does not end within 0.2 s: it is killed" in told

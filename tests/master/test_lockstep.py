@@ -77,10 +77,8 @@ def test_a_player_too_many_holds_nothing_up() -> None:
 
 
 def test_the_settings_must_fit() -> None:
-    assert Lockstep.of(ServiceConfig()) is None
+    assert Lockstep.of(ServiceConfig(), 2) is None
     step = {"mode": "lockstep", "envs": 4, "batch_episodes": 8}
-    assert Lockstep.of(ServiceConfig(lockstep_workers=2, **step)) is not None
-    with pytest.raises(ConfigError, match=r"set service\.lockstep_workers=\.\.\."):
-        Lockstep.of(ServiceConfig(**step))
+    assert Lockstep.of(ServiceConfig(**step), 2) is not None
     with pytest.raises(ConfigError, match=r"must be a multiple of service\.envs=3 in lockstep"):
-        Lockstep.of(ServiceConfig(lockstep_workers=2, **(step | {"envs": 3})))
+        Lockstep.of(ServiceConfig(**(step | {"envs": 3})), 2)

@@ -1,6 +1,5 @@
 """The loop around a scripted hub: what is acknowledged, learned, sent, kept, and when it ends."""
 
-from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -19,10 +18,8 @@ from tangram_agent.messages import Go
 from tangram_agent.process import Every
 from tangram_sim.errors import RunError
 from tests.master.builders import (
-    AGENT,
     FakeHub,
     arrival,
-    close_journals,
     loop,
     scores,
     small_setup,
@@ -31,19 +28,13 @@ from tests.master.builders import (
 pytestmark = pytest.mark.fast
 
 MADE = small_setup()
-STARTS, BATCH = AGENT["learning_starts"], 4
+BATCH = 4
 
 
 @pytest.fixture(autouse=True)
 def unhurried(monkeypatch: pytest.MonkeyPatch) -> None:
     """All updates that are due come in one go, however busy the machine is."""
     monkeypatch.setattr(loop_module, "LEARN_S", 600.0)
-
-
-@pytest.fixture(autouse=True)
-def closed() -> Iterator[None]:
-    yield
-    close_journals()
 
 
 def batches(count: int, size: int = BATCH) -> list[list[Any]]:
@@ -84,18 +75,11 @@ def test_batches_wait_unacknowledged_while_the_learner_is_behind(tmp_path: Path)
     assert hub.values("acknowledge") == [1, 2, 3]
 
 
-def test_nothing_is_learned_before_enough_was_played(tmp_path: Path) -> None:
-    hub = FakeHub(MADE, batches(1, STARTS - 1))
-    made = loop(tmp_path, MADE, hub, max_episodes=STARTS - 1)
-    assert made.run() == f"max_episodes={STARTS - 1}"
-    assert made.guard.trainer.updates == 0
-
-
 def test_sockets_are_served_between_updates(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hub = FakeHub(MADE, batches(1, 40))
-    made = loop(tmp_path, MADE, hub, {"lag_updates": 64}, max_updates=20)
+    made = loop(tmp_path, MADE, hub, lag_updates=64, max_updates=20)
     monkeypatch.setattr(loop_module, "LEARN_S", 0.09)
     clock = iter(np.arange(0.0, 1e5, 0.02))  # every look at the clock takes 20 ms
     monkeypatch.setattr(loop_module.time, "monotonic", lambda: float(next(clock)))
@@ -127,7 +111,7 @@ def test_the_bounds_end_it(
 
 def test_episodes_beyond_the_bound_are_not_taken(tmp_path: Path) -> None:
     hub = FakeHub(MADE, [[arrival(MADE, i, BATCH) for i in range(1, 6)]])
-    made = loop(tmp_path, MADE, hub, {"lag_updates": 64}, max_episodes=8)
+    made = loop(tmp_path, MADE, hub, lag_updates=64, max_episodes=8)
     made.run()
     assert hub.values("acknowledge") == [1, 2]
     assert made.guard.trainer.updates == 4
@@ -144,46 +128,35 @@ def test_hours_end_it(tmp_path: Path) -> None:
 def test_a_signal_ends_it(tmp_path: Path) -> None:
     hub = FakeHub(MADE)
     made = loop(tmp_path, MADE, hub)
-
-    def third() -> None:
-        if hub.polls == 3:
-            made.signals.reason = "SIGTERM"
-
-    hub.on_poll = third
+    hub.on_poll = lambda: setattr(made.signals, "reason", "SIGTERM" if hub.polls == 3 else None)
     assert made.run() == "SIGTERM"
     assert hub.polls == 3
 
 
 @pytest.mark.parametrize(
-    ("service", "versions"),
+    ("service", "updates", "versions"),
     [
-        ({"publish_seconds": 1000.0}, [0, 4]),
-        ({"publish_seconds": 1000.0, "every_update": True}, [0, 1, 2, 3, 4]),
+        ({"publish_seconds": 1000.0}, 4, [0, 4]),
+        ({"publish_seconds": 0.0}, 4, [0, 1, 2, 3, 4]),
+        ({"publish_seconds": 0.0}, 0, [0]),
     ],
 )
-def test_weights_are_sent_at_a_bounded_rate_or_after_every_update(
-    tmp_path: Path, service: dict[str, Any], versions: list[int]
+def test_weights_are_sent_once_and_at_a_bounded_rate_or_after_every_update(
+    tmp_path: Path, service: dict[str, Any], updates: int, versions: list[int]
 ) -> None:
-    hub = FakeHub(MADE, batches(2))
-    made = loop(tmp_path, MADE, hub, service, max_updates=4)
+    hub = FakeHub(MADE, batches(updates // 2))
+    made = loop(tmp_path, MADE, hub, service, max_updates=updates)
+    hub.on_poll = lambda: setattr(made.signals, "reason", "SIGINT" if hub.polls > 4 else None)
     made.run()
     made.finish(launched=False)
     assert hub.values("publish") == versions
-
-
-def test_weights_are_sent_once(tmp_path: Path) -> None:
-    hub = FakeHub(MADE, [[] for _ in range(5)])
-    made = loop(tmp_path, MADE, hub, {"publish_seconds": 0.0})
-    hub.on_poll = lambda: setattr(made.signals, "reason", "SIGINT" if hub.polls > 4 else None)
-    made.run()
-    assert hub.values("publish") == [0]
 
 
 @pytest.mark.parametrize("often", [False, True])
 def test_weights_that_are_not_finite_are_neither_sent_nor_kept(tmp_path: Path, often: bool) -> None:
     """Once is mended, again and again ends the run; the hub of these tests takes finite ones."""
     hub = FakeHub(MADE, batches(9))
-    made = loop(tmp_path, MADE, hub, {"publish_seconds": 0.0, "max_bad_updates": 3}, max_updates=9)
+    made = loop(tmp_path, MADE, hub, {"publish_seconds": 0.0}, max_updates=9)
 
     def poison() -> None:
         if made.guard.trainer.updates >= 2 and (often or not made.guard.undone):
@@ -208,7 +181,7 @@ def test_weights_that_are_not_finite_are_neither_sent_nor_kept(tmp_path: Path, o
 
 def test_checkpoints_come_on_their_interval(tmp_path: Path) -> None:
     hub = FakeHub(MADE, batches(3))
-    service = {"checkpoint_minutes": 1e-3, "keep_checkpoints": 1}
+    service = {"checkpoint_minutes": 1e-3, "keep_checkpoints": 1, "publish_seconds": 1000.0}
     made = loop(tmp_path, MADE, hub, service, max_updates=6)
     made.checkpointer._checkpoint = Every(0.0)
     made.run()
@@ -242,21 +215,10 @@ def test_the_final_weights_are_waited_for_and_reported(tmp_path: Path) -> None:
     assert load_checkpoint(list_checkpoints(tmp_path / "checkpoints")[-1]).updates == 4
 
 
-def test_without_an_evaluator_nothing_is_waited_for(tmp_path: Path) -> None:
-    hub = FakeHub(MADE, batches(2))
-    made = loop(tmp_path, MADE, hub, max_updates=4)
-    reason = made.run()
-    polls = hub.polls
-    result = make_result(made.finish(launched=False), made.guard.trainer, 7, reason)
-    assert hub.polls == polls
-    assert result["scored_updates"] is None
-    assert result["mean_reward"] is None
-    assert not (tmp_path / "test_episodes.png").exists()
-
-
 @pytest.mark.parametrize(
     ("launched", "roles", "reason", "waits"),
     [
+        (False, ["player"], None, False),
         (True, [], None, True),
         (True, [], "SIGTERM", False),
         (False, ["evaluator"], None, True),
@@ -269,8 +231,11 @@ def test_who_is_waited_for(
     hub = FakeHub(MADE, [[], [scores(MADE, 0)]], roles)
     made = loop(tmp_path, MADE, hub)
     made.signals.reason = reason
-    made.finish(launched)
+    result = make_result(made.finish(launched), made.guard.trainer, 7, "over")
+    assert hub.polls == 2 * waits
     assert (made.clock.record.scored_version == 0) is waits
+    assert (result["scored_updates"], result["mean_reward"]) == ((0, 0.5) if waits else (None,) * 2)
+    assert (tmp_path / "test_episodes.png").exists() is waits
 
 
 def test_a_second_wish_to_end_is_not_kept_waiting(tmp_path: Path) -> None:
@@ -304,7 +269,7 @@ def test_the_learning_rate_follows_the_budget(tmp_path: Path) -> None:
     assert seen == pytest.approx([i / 10 for i in range(10)])
 
 
-IN_STEP = {"mode": "lockstep", "lockstep_workers": 2, "envs": BATCH, "batch_episodes": BATCH}
+IN_STEP = {"mode": "lockstep", "envs": BATCH, "batch_episodes": BATCH}
 
 
 def played(index: int, sequence: int) -> EpisodesArrived:
@@ -317,7 +282,7 @@ def test_in_lockstep_rounds_are_inserted_by_index_and_learned_before_the_next(
 ) -> None:
     """The second player is quicker; 8 transitions are worth 4 updates."""
     hub = FakeHub(MADE, [[played(1, 1)], [], [played(0, 1)], [], [played(0, 2), played(1, 2)]])
-    made = loop(tmp_path, MADE, hub, IN_STEP, max_updates=8)
+    made = loop(tmp_path, MADE, hub, IN_STEP, workers=2, max_updates=8)
     assert made.run() == "max_updates=8"
     done = [(kind, value) for kind, value in hub.log if kind != "tell"]
     first = {i: Go(0, 0, 0, BATCH) for i in range(2)}
@@ -341,7 +306,7 @@ def test_in_lockstep_rounds_are_inserted_by_index_and_learned_before_the_next(
 def test_in_lockstep_nothing_is_learned_from_half_a_round(tmp_path: Path) -> None:
     """A kill between two inserts left the first player's batch; the other one's must come first."""
     hub = FakeHub(MADE, [[], [], [], [played(1, 1)]])
-    made = loop(tmp_path, MADE, hub, IN_STEP, max_updates=4)
+    made = loop(tmp_path, MADE, hub, IN_STEP, workers=2, max_updates=4)
     made.guard.trainer.insert(played(0, 1).episodes)
     updates: list[int] = []
     hub.on_poll = lambda: updates.append(made.guard.trainer.updates)

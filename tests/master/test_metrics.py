@@ -36,6 +36,7 @@ def test_points_stand_under_their_names_and_steps(tmp_path: Path) -> None:
     metrics.scores({"mean_reward": 0.9}, updates=20, episodes=300, seconds=12.7)
     metrics.picture(np.full((4, 6, 3), 255, np.uint8), 20)
     metrics.settings({"agent": {"noise": 0.1}})
+    metrics.hyperparameters({"agent": {"noise": 0.1}, "seed": 3}, {"mean_reward": 0.9})
     metrics.close()
     events = read(tmp_path)
     assert points(events, "train/q") == [(10, 0.5), (20, 0.75)]
@@ -47,15 +48,9 @@ def test_points_stand_under_their_names_and_steps(tmp_path: Path) -> None:
     (picture,) = events.Images("test/pictures")
     assert (picture.step, picture.width, picture.height) == (20, 6, 4)
     assert "noise: 0.1" in str(events.Tensors("config/text_summary")[0].tensor_proto)
-
-
-def test_hyperparameters_stand_beside_the_final_scores(tmp_path: Path) -> None:
-    metrics = Metrics(tmp_path, tmp_path / "curve.jsonl")
-    metrics.hyperparameters({"agent": {"noise": 0.1}, "seed": 3}, {"mean_reward": 0.9})
-    metrics.close()
-    events = read(tmp_path / "final")
-    assert points(events, "final/mean_reward") == [(0, 0.9)]
-    assert "_hparams_/session_start_info" in events.summary_metadata
+    final = read(tmp_path / "final")
+    assert points(final, "final/mean_reward") == [(0, 0.9)]
+    assert "_hparams_/session_start_info" in final.summary_metadata
 
 
 def test_points_after_a_checkpoint_are_hidden_when_the_run_goes_on_from_it(
@@ -97,10 +92,9 @@ def test_a_disk_that_takes_no_curves_leaves_a_gap_and_ends_nothing(
     monkeypatch.setattr(metrics_module, "RETRY_S", 0.0)
     metrics = Metrics(tmp_path, tmp_path / "curve.jsonl")
     metrics.scalars({"a": 1.0}, 1)
-    full = OSError(errno.ENOSPC, "No space left on device")
 
     def fail(*_: object) -> None:
-        raise full
+        raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
         patch.setattr(SummaryWriter, "add_scalar", fail)
@@ -112,10 +106,8 @@ def test_a_disk_that_takes_no_curves_leaves_a_gap_and_ends_nothing(
     told = "curves cannot be written (No space left on device): a gap is left in them"
     assert told in {record.message for record in caplog.records}
     files = [read(path) for path in tmp_path.glob("events.*")]
-    found = [
-        point for file in files if "a" in file.Tags()["scalars"] for point in points(file, "a")
-    ]
-    assert sorted(step for step, _ in found) == [1, 4]
+    steps = [p[0] for file in files if "a" in file.Tags()["scalars"] for p in points(file, "a")]
+    assert sorted(steps) == [1, 4]
 
 
 # curve.jsonl
@@ -155,14 +147,6 @@ def test_a_line_cut_short_is_left_out(tmp_path: Path) -> None:
     assert [line["updates"] for line in lines(path)] == [10, 20]
 
 
-def test_the_loop_writes_every_evaluation(tmp_path: Path) -> None:
-    made = small_setup()
-    moved = loop(tmp_path, made, FakeHub(made, [[scores(made, version=0, reward=0.25)]]))
-    moved.receive(0.0)
-    (line,) = lines(tmp_path / "curve.jsonl")
-    assert (line["updates"], line["mean_reward"]) == (0, 0.25)
-
-
 def test_a_point_stands_where_its_weights_were_sent(tmp_path: Path) -> None:
     """Not where their scores arrive: episodes and time have gone on since."""
     made = small_setup()
@@ -175,3 +159,4 @@ def test_a_point_stands_where_its_weights_were_sent(tmp_path: Path) -> None:
     assert moved.guard.trainer.episodes > 0
     (line,) = lines(tmp_path / "curve.jsonl")
     assert (line["updates"], line["episodes"], line["train_s"]) == (0, 0, 0.0)
+    assert line["mean_reward"] == 0.25

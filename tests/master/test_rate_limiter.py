@@ -14,47 +14,52 @@ pytestmark = pytest.mark.fast
 
 
 @pytest.mark.parametrize(
-    ("rate", "starts", "limit", "transitions", "updates", "lag", "may_update", "may_insert"),
+    (
+        "settings",
+        "transitions",
+        "updates",
+        "lag",
+        "may_update",
+        "may_insert",
+    ),  # rate, starts, limit
     [
         # Nothing is due before learning starts; with the last of them all is.
-        (0.5, 10, 4, 0, 0, 0, False, True),
-        (0.5, 10, 4, 9, 0, 0, False, True),
-        (0.5, 10, 4, 10, 0, 5, True, False),
+        ((0.5, 10, 4), 0, 0, 0, False, True),
+        ((0.5, 10, 4), 9, 0, 0, False, True),
+        ((0.5, 10, 4), 10, 0, 5, True, False),
         # The lag's bound: at it no insert, below it both.
-        (0.5, 10, 4, 10, 1, 4, True, False),
-        (0.5, 10, 4, 10, 2, 3, True, True),
-        (0.5, 10, 4, 10, 4, 1, True, True),
+        ((0.5, 10, 4), 10, 1, 4, True, False),
+        ((0.5, 10, 4), 10, 2, 3, True, True),
+        ((0.5, 10, 4), 10, 4, 1, True, True),
         # Up to date: the learner waits.
-        (0.5, 10, 4, 10, 5, 0, False, True),
+        ((0.5, 10, 4), 10, 5, 0, False, True),
         # Half an update is none.
-        (0.5, 10, 4, 11, 5, 0, False, True),
-        (0.5, 10, 4, 12, 5, 1, True, True),
+        ((0.5, 10, 4), 11, 5, 0, False, True),
+        ((0.5, 10, 4), 12, 5, 1, True, True),
         # More updates than transitions.
-        (4.0, 1, 1, 1, 0, 4, True, False),
-        (4.0, 1, 1, 1, 3, 1, True, False),
-        (4.0, 1, 1, 1, 4, 0, False, True),
+        ((4.0, 1, 1), 1, 0, 4, True, False),
+        ((4.0, 1, 1), 1, 3, 1, True, False),
+        ((4.0, 1, 1), 1, 4, 0, False, True),
         # 0.29 * 100 is 28.999999999999996.
-        (0.29, 1, 9, 100, 28, 1, True, True),
+        ((0.29, 1, 9), 100, 28, 1, True, True),
         # Ahead, after a restore with other settings.
-        (0.5, 1, 9, 10, 7, 0, False, True),
+        ((0.5, 1, 9), 10, 7, 0, False, True),
     ],
 )
 def test_what_is_allowed(
-    rate: float,
-    starts: int,
-    limit: int,
+    settings: tuple[float, int, int],
     transitions: int,
     updates: int,
     lag: int,
     may_update: bool,
     may_insert: bool,
 ) -> None:
-    limiter = RateLimiter(rate, starts, limit)
+    limiter = RateLimiter(*settings)
     limiter.inserted(transitions)
     limiter.updated(updates)
-    assert limiter.lag == lag
+    found = (limiter.transitions, limiter.updates, limiter.lag)
+    assert found == (transitions, updates, lag)
     assert (limiter.may_update(), limiter.may_insert()) == (may_update, may_insert)
-    assert (limiter.transitions, limiter.updates) == (transitions, updates)
 
 
 @given(
@@ -81,29 +86,23 @@ def test_somebody_may_always_move_and_nobody_runs_ahead(
 
 
 @pytest.mark.parametrize(
-    ("rate", "starts", "limit", "reason"),
+    ("rate", "limit", "reason"),
     [
         (
             0.1,
-            1,
             0,
-            "service.lag_updates must be at least 1, got 0: no transition could ever be inserted, "
+            "the lag must be at least 1 update, got 0: no transition could ever be inserted, "
             "so learner and workers would wait for each other for ever",
         ),
-        (
-            0.0,
-            1,
-            1,
-            "agent.updates_per_transition must be positive and finite, got 0.0: nothing would "
-            "ever be learned",
+        *(
+            (rate, 1, f"agent.updates_per_transition must be positive and finite, got {rate}: no")
+            for rate in (0.0, math.nan, math.inf)
         ),
-        (math.nan, 1, 1, "agent.updates_per_transition must be positive and finite, got nan"),
-        (math.inf, 1, 1, "agent.updates_per_transition must be positive and finite, got inf"),
     ],
 )
-def test_settings_that_would_deadlock(rate: float, starts: int, limit: int, reason: str) -> None:
+def test_settings_that_would_deadlock(rate: float, limit: int, reason: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        RateLimiter(rate, starts, limit)
+        RateLimiter(rate, 1, limit)
     assert str(caught.value).startswith(reason)
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from master.registry import MAX_PEERS, Peer, RefusedError, Registry, differing
+from master.registry import Peer, RefusedError, Registry, differing
 from tangram_agent.schema import MAX_COUNT
 from tangram_sim.errors import RunError
 from tests.agent.messages import FINGERPRINTS, hello
@@ -28,58 +28,62 @@ def restored(registry: Registry, now: float = 0.0) -> Registry:
     return fresh
 
 
-def test_any_index_is_the_lowest_that_is_free_within_the_role() -> None:
-    registry = Registry(FINGERPRINTS, GRACE_S)
+@pytest.fixture
+def registry() -> Registry:
+    return Registry(FINGERPRINTS, GRACE_S)
+
+
+def test_any_index_is_the_lowest_that_is_free_within_the_role(registry: Registry) -> None:
     asked = [("a", -1), ("b", 2), ("c", -1), ("d", -1)]
     assert [admitted(registry, n, index=i).index for n, i in asked] == [0, 2, 1, 3]
     assert admitted(registry, "e", role="evaluator").index == 0
     registry.leave(registry.peers[2])  # player 1
     fresh = admitted(registry, "f")
     assert (fresh.index, fresh.incarnation) == (1, 2)
-    assert [p.name for p in registry.peers] == [
-        "evaluator 0",
-        "player 0",
-        "player 1",
-        "player 2",
-        "player 3",
-    ]
+    names = ["evaluator 0", "player 0", "player 1", "player 2", "player 3"]
+    assert [p.name for p in registry.peers] == names
 
 
-def test_the_newest_process_of_an_index_wins() -> None:
-    registry = Registry(FINGERPRINTS, GRACE_S)
+def test_the_newest_process_of_an_index_wins_also_after_a_restart(registry: Registry) -> None:
     old = admitted(registry, "a", index=3)
+    assert registry.ledger(old.key, 1) is old.ledger
     new, taken_from = registry.admit(b"b", hello(index=3, process="b"), 0.0)
     assert taken_from is old
     assert (new.incarnation, registry.peers) == (2, [new])
     assert registry.find(b"a") is None
-    with pytest.raises(RefusedError, match="taken over") as caught:
-        admitted(registry, "a", index=3, incarnation=1)
-    assert str(caught.value) == (
-        "player 3 was taken over by a newer process (incarnation 2, this is 1)"
-    )
+    assert registry.ledger(old.key, 1) is None
+    assert registry.ledger(("player", 9), 1) is None
+    for one in (registry, restored(registry)):
+        with pytest.raises(RefusedError) as caught:
+            admitted(one, "a", index=3, incarnation=1)
+        assert str(caught.value) == (
+            "player 3 was taken over by a newer process (incarnation 2, this is 1)"
+        )
     assert registry.peers == [new]
+    assert admitted(restored(registry), "b", index=3, incarnation=2).incarnation == 2
+    assert admitted(restored(registry), "c", index=3).incarnation == 3  # none is repeated
 
 
-def test_a_hello_again_changes_nothing_but_the_connection() -> None:
-    registry = Registry(FINGERPRINTS, GRACE_S)
+def test_two_processes_never_share_an_incarnation(registry: Registry) -> None:
+    """Both were given the same by masters that did not know of each other's."""
+    registry.leave(admitted(registry, "a", index=0, incarnation=1))
+    with pytest.raises(RefusedError, match="taken over"):
+        admitted(registry, "b", index=0, incarnation=1)
+
+
+def test_a_hello_again_changes_nothing_but_the_connection(registry: Registry) -> None:
     first = admitted(registry, "a")
     first.ledger.take(1, WINDOW)
     again, taken_from = registry.admit(b"other", hello(process="a"), 9.0)
     assert (again, taken_from, again.identity, again.last_seen) == (first, None, b"other", 9.0)
     assert (registry.find(b"a"), registry.find(b"other")) == (None, first)
     assert first.ledger.held == {1}
+    # A connection belongs to one process.
+    second, _ = registry.admit(b"other", hello(process="b"), 9.0)
+    assert (registry.peers, registry.find(b"other")) == ([second], second)
 
 
-def test_a_connection_belongs_to_one_process() -> None:
-    registry = Registry(FINGERPRINTS, GRACE_S)
-    admitted(registry, "a")
-    second, _ = registry.admit(b"a", hello(process="b"), 0.0)
-    assert registry.peers == [second]
-    assert registry.find(b"a") is second
-
-
-def test_the_silent_are_forgotten_but_not_their_batches() -> None:
-    registry = Registry(FINGERPRINTS, GRACE_S)
+def test_the_silent_are_forgotten_but_not_their_batches(registry: Registry) -> None:
     peer = admitted(registry, "a", now=0.0)
     peer.ledger.take(1, WINDOW)
     busy = admitted(registry, "b", now=5.0)
@@ -90,8 +94,7 @@ def test_the_silent_are_forgotten_but_not_their_batches() -> None:
     assert (back.incarnation, back.ledger.held) == (1, {1})
 
 
-def test_a_checkpoint_keeps_incarnations_and_inserted_batches() -> None:
-    registry = Registry(FINGERPRINTS, GRACE_S)
+def test_a_checkpoint_keeps_incarnations_and_inserted_batches(registry: Registry) -> None:
     peer = admitted(registry, "a", index=4)
     for sequence in (1, 2, 3):
         peer.ledger.take(sequence, WINDOW)
@@ -101,29 +104,16 @@ def test_a_checkpoint_keeps_incarnations_and_inserted_batches() -> None:
         "evaluator/0": {"incarnation": 1, "sequence": 0},
         "player/4": {"incarnation": 1, "sequence": 1},
     }
-    # The worker comes back and sends again what the checkpoint has not.
-    back = admitted(restored(registry), "a", index=4, incarnation=1, first=2)
-    assert (back.incarnation, back.ledger.received, back.ledger.held) == (1, 1, set())
+    # The worker comes back and sends again what the checkpoint has not; of what it has not either
+    # nothing is waited for.
+    for first, received, lost in ((2, 1, 0), (5, 4, 3)):
+        after = restored(registry)
+        back = admitted(after, "a", index=4, incarnation=1, first=first)
+        assert (back.incarnation, back.ledger.received, back.ledger.held) == (1, received, set())
+        assert after.lost_batches == lost
 
 
-def test_after_a_restart_a_new_process_does_not_repeat_an_incarnation() -> None:
-    registry = Registry(FINGERPRINTS, GRACE_S)
-    admitted(registry, "a", index=4)
-    assert admitted(restored(registry), "b", index=4).incarnation == 2
-
-
-def test_after_a_restart_an_older_process_is_still_the_older() -> None:
-    registry = Registry(FINGERPRINTS, GRACE_S)
-    admitted(registry, "a", index=0)
-    admitted(registry, "b", index=0)
-    after = restored(registry)
-    with pytest.raises(RefusedError, match="taken over"):
-        admitted(after, "a", index=0, incarnation=1)
-    assert admitted(after, "b", index=0, incarnation=2).incarnation == 2
-
-
-def test_after_a_restart_indices_wait_for_their_workers_for_a_while() -> None:
-    registry = Registry(FINGERPRINTS, GRACE_S)
+def test_after_a_restart_indices_wait_for_their_workers_for_a_while(registry: Registry) -> None:
     admitted(registry, "a")
     soon, late = restored(registry, now=100.0), restored(registry, now=100.0)
     assert admitted(soon, "new", now=100.0 + GRACE_S - 1).index == 1
@@ -131,23 +121,12 @@ def test_after_a_restart_indices_wait_for_their_workers_for_a_while() -> None:
     assert admitted(late, "new", now=100.0 + GRACE_S).index == 0
 
 
-def test_what_a_checkpoint_missed_is_counted_not_waited_for() -> None:
-    registry = Registry(FINGERPRINTS, GRACE_S)
-    admitted(registry, "a").ledger.take(1, WINDOW)
-    registry.peers[0].ledger.held.clear()
-    after = restored(registry)
-    back = admitted(after, "a", index=0, incarnation=1, first=4)
-    assert (back.ledger.received, after.lost_batches) == (3, 2)
-
-
-def test_an_incarnation_newer_than_the_checkpoint_goes_on_where_it_is() -> None:
-    registry = Registry(FINGERPRINTS, GRACE_S)
+def test_an_incarnation_newer_than_the_checkpoint_goes_on_where_it_is(registry: Registry) -> None:
     back = admitted(registry, "a", index=2, incarnation=7, first=12)
     assert (back.incarnation, back.ledger.received, registry.lost_batches) == (7, 11, 0)
 
 
-def test_incarnations_end_where_messages_could_not_tell_them() -> None:
-    registry = Registry(FINGERPRINTS, GRACE_S)
+def test_incarnations_end_where_messages_could_not_tell_them(registry: Registry) -> None:
     admitted(registry, "a", index=0, incarnation=MAX_COUNT - 1)
     assert admitted(registry, "b", index=0).incarnation == MAX_COUNT
     with pytest.raises(RefusedError, match="player 0 has no incarnation left: start with another"):
@@ -155,51 +134,25 @@ def test_incarnations_end_where_messages_could_not_tell_them() -> None:
     assert admitted(registry, "c").incarnation == 1
 
 
-def test_two_processes_never_share_an_incarnation() -> None:
-    """Both were given the same by masters that did not know of each other's."""
-    registry = Registry(FINGERPRINTS, GRACE_S)
-    first = admitted(registry, "a", index=0, incarnation=1)
-    registry.leave(first)
-    with pytest.raises(RefusedError, match="taken over"):
-        admitted(registry, "b", index=0, incarnation=1)
-
-
-def test_batches_of_an_older_incarnation_have_no_ledger() -> None:
-    registry = Registry(FINGERPRINTS, GRACE_S)
-    old = admitted(registry, "a", index=0)
-    assert registry.ledger(old.key, 1) is old.ledger
-    admitted(registry, "b", index=0)
-    assert registry.ledger(old.key, 1) is None
-    assert registry.ledger(("player", 9), 1) is None
-
-
-def test_there_is_a_limit() -> None:
-    registry = Registry(FINGERPRINTS, GRACE_S)
-    for number in range(MAX_PEERS):
-        peer = Peer("player", number, 1, f"p{number}", b"", 0.0, None)  # type: ignore[arg-type]
-        registry._by_key[peer.key] = peer
-    with pytest.raises(RefusedError, match=f"{MAX_PEERS} processes take part already"):
-        admitted(registry, "one more")
+BAD = [(0, 0), (1, -1), ("1", 0), (MAX_COUNT + 1, 0), (1, MAX_COUNT + 1)]
+KEY = "the checkpoint's table of workers has the unknown key '{}'"
+ENTRY = "the checkpoint's entry of player/0 must hold an incarnation from 1 and a sequence from 0, "
 
 
 @pytest.mark.parametrize(
     ("state", "reason"),
     [
-        ({"player": {}}, "the checkpoint's table of workers has the unknown key 'player'"),
-        ({"spy/1": {}}, "the checkpoint's table of workers has the unknown key 'spy/1'"),
-        ({"player/-1": {}}, "the checkpoint's table of workers has the unknown key 'player/-1'"),
-        ({"player/65536": {}}, "the checkpoint's table of workers has the unknown key 'player/6"),
-        ({"player/0": {"incarnation": 1}}, "the checkpoint's entry of player/0 must hold an inca"),
-        ({"player/0": {"incarnation": 0, "sequence": 0}}, "the checkpoint's entry of player/0 m"),
-        ({"player/0": {"incarnation": 1, "sequence": -1}}, "the checkpoint's entry of player/0 "),
-        ({"player/0": {"incarnation": "1", "sequence": 0}}, "the checkpoint's entry of player/0"),
-        ({"player/0": {"incarnation": MAX_COUNT + 1, "sequence": 0}}, "the checkpoint's entry of"),
-        ({"player/0": {"incarnation": 1, "sequence": MAX_COUNT + 1}}, "the checkpoint's entry of"),
+        *(({key: {}}, KEY.format(key)) for key in ("player", "spy/1", "player/-1", "player/65536")),
+        ({"player/0": {"incarnation": 1}}, ENTRY),
+        *(
+            ({"player/0": {"incarnation": incarnation, "sequence": sequence}}, ENTRY)
+            for incarnation, sequence in BAD
+        ),
     ],
 )
-def test_malformed_tables_are_refused(state: Any, reason: str) -> None:
+def test_malformed_tables_are_refused(registry: Registry, state: Any, reason: str) -> None:
     with pytest.raises(RunError) as caught:
-        Registry(FINGERPRINTS, GRACE_S).load_state(state, 0.0)
+        registry.load_state(state, 0.0)
     assert str(caught.value).startswith(reason)
 
 
@@ -217,8 +170,7 @@ def test_sections_that_differ_are_named(theirs: dict[str, str], names: list[str]
     assert differing({"tokens": "a", "sim": "b"}, theirs) == names
 
 
-def test_batches_of_the_journal_are_new_once() -> None:
-    registry = Registry(FINGERPRINTS, GRACE_S)
+def test_batches_of_the_journal_are_new_once(registry: Registry) -> None:
     registry.load_state({"player/0": {"incarnation": 2, "sequence": 5}}, 0.0)
     known, new = ("player", 0), ("player", 1)
     found = [

@@ -1,6 +1,5 @@
 """How the run stands: collected once, the same everywhere, and never the end of the loop."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,7 +9,6 @@ from master.result import SCORES, make_result
 from tests.master.builders import (
     FakeHub,
     arrival,
-    close_journals,
     loop,
     scores,
     shown,
@@ -20,12 +18,6 @@ from tests.master.builders import (
 pytestmark = pytest.mark.fast
 
 MADE = small_setup()
-
-
-@pytest.fixture(autouse=True)
-def closed() -> Iterator[None]:
-    yield
-    close_journals()
 
 
 def test_what_is_told(tmp_path: Path) -> None:

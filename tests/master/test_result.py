@@ -1,16 +1,15 @@
 """What a run has come to: the final table, and commands that can be pasted."""
 
-import io
 import shlex
 from pathlib import Path
 from typing import Any
 
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from rich.console import Console
 
 from master.result import SCORES, show_result
 from master.rundir import RunFolder
+from tests.master.builders import screen, text
 
 pytestmark = pytest.mark.fast
 
@@ -20,15 +19,6 @@ SCORED = {
     "angle_error_deg_median": 1.214,
     "position_error_median": 0.01034,
 }
-
-
-def console() -> Console:
-    return Console(file=io.StringIO(), width=100)
-
-
-def text(shown: Console) -> str:
-    assert isinstance(shown.file, io.StringIO)
-    return shown.file.getvalue()
 
 
 RESULT = dict.fromkeys(SCORES) | {
@@ -56,7 +46,7 @@ RESULT = dict.fromkeys(SCORES) | {
 def test_the_final_table(
     tmp_path: Path, change: dict[str, Any], words: list[str], without: list[str]
 ) -> None:
-    shown, folder = console(), RunFolder(tmp_path / ("deep_" * 30))
+    shown, folder = screen(), RunFolder(tmp_path / ("deep_" * 30))
     show_result(shown, folder, RESULT | change)
     assert all(word in text(shown) for word in words)
     assert not any(word in text(shown) for word in without)
@@ -66,7 +56,7 @@ def test_the_final_table(
 
 
 def test_commands_that_are_shown_can_be_pasted(tmp_path: Path) -> None:
-    shown, folder = console(), RunFolder(tmp_path / "it's a=run")
+    shown, folder = screen(), RunFolder(tmp_path / "it's a=run")
     show_result(shown, folder, RESULT)
     curves, play = (shlex.split(line) for line in text(shown).splitlines()[-2:])
     assert curves[-1] == str(folder.tensorboard)

@@ -22,7 +22,6 @@ from tangram_sim.errors import ConfigError, RunError
 from tests.master.builders import (
     ShownProgress,
     arrival,
-    close_journals,
     journal,
     small_setup,
     trainer,
@@ -34,16 +33,9 @@ MADE = small_setup()
 BATCH = 4
 STEP: dict[str, Any] = {
     "mode": "lockstep",
-    "lockstep_workers": 1,
     "envs": BATCH,
     "batch_episodes": BATCH,
 }
-
-
-@pytest.fixture(autouse=True)
-def closed() -> Iterator[None]:
-    yield
-    close_journals()
 
 
 Told = Callable[[], list[str]]
@@ -65,7 +57,7 @@ def opened_run(
 ) -> Iterator[tuple[Loop, dict[str, str]]]:
     """The loop of a run with its sockets open, and what workers are told of it."""
     RunFolder(folder).prepare(resume)
-    made = ServiceConfig(**service)
+    made = ServiceConfig(**{"http_port": -1} | service)
     config = MasterConfig(str(folder), resume=resume, max_updates=0, service=made)
     with ExitStack() as opened:
         watchdog, signals = Watchdog(0.0), StopSignals()
@@ -101,55 +93,36 @@ def test_a_long_journal_is_no_standstill(tmp_path: Path, monkeypatch: pytest.Mon
             assert len(beats) == 3 + updates
 
 
-def test_without_a_port_nothing_is_served(tmp_path: Path) -> None:
-    with opened_run(tmp_path, http_port=-1) as (_, connection):
-        assert "http" not in connection
-
-
-def test_what_the_checkpoint_covers_is_not_read(tmp_path: Path, told: Told) -> None:
+@pytest.mark.parametrize("corrupt", [False, True])
+def test_of_the_journal_what_the_whole_checkpoint_does_not_cover_is_read(
+    tmp_path: Path, told: Told, corrupt: bool
+) -> None:
+    """The one before a corrupt checkpoint has a longer journal."""
     kept, learner = journal(tmp_path / "journal", MADE), trainer(MADE)
     for number in (1, 2):
-        kept.append(arrival(MADE, number))
-        learner.insert(arrival(MADE, number).episodes)
-    table = {"player/0": {"incarnation": 1, "sequence": 2}}
-    rest = Restored(Record("run"), table, kept.rotate())
-    save_run(tmp_path / "checkpoints", learner, rest, keep=2)
-    kept.append(arrival(MADE, 3))
-    segments(tmp_path / "journal")[1].write_bytes(b"nobody reads this")
-    with opened_run(tmp_path) as (made, _):
-        assert made.guard.trainer.episodes == 3 * BATCH
-        assert made.hub.state() == {"player/0": {"incarnation": 1, "sequence": 3}}
-    assert told()[-2:] == ["4 episodes come back from the journal", "goes on after 0 updates"]
-
-
-def test_the_one_before_a_corrupt_checkpoint_has_a_longer_journal(
-    tmp_path: Path, told: Told
-) -> None:
-    kept, learner = journal(tmp_path / "journal", MADE), trainer(MADE)
-    for number in (1, 2, 3):
         kept.append(arrival(MADE, number))
         learner.insert(arrival(MADE, number).episodes)
         table = {"player/0": {"incarnation": 1, "sequence": number}}
         rest = Restored(Record("run"), table, kept.rotate())
         path = save_run(tmp_path / "checkpoints", learner, rest, keep=2)
-    (path / "replay.safetensors").unlink()
+    kept.append(arrival(MADE, 3))
+    segments(tmp_path / "journal")[1].write_bytes(b"nobody reads this")
+    if corrupt:
+        (path / "replay.safetensors").unlink()
     with opened_run(tmp_path) as (made, _):
         assert made.guard.trainer.episodes == 3 * BATCH
         assert made.hub.state() == {"player/0": {"incarnation": 1, "sequence": 3}}
-    assert "4 episodes come back from the journal" in told()
+    back = 8 if corrupt else 4
+    assert told()[-2:] == [f"{back} episodes come back from the journal", "goes on after 0 updates"]
 
 
-def test_a_journal_of_another_run_is_refused_and_the_port_is_free_again(tmp_path: Path) -> None:
-    kept, learner = journal(tmp_path / "journal", MADE), trainer(MADE)
-    kept.append(arrival(MADE, 1))
-    save_run(tmp_path / "checkpoints", learner, Restored(Record("another"), {}), keep=2)
-    with pytest.raises(RunError, match="is of another run"), opened_run(tmp_path):
-        pass
-
-
-def test_a_folder_with_a_journal_is_no_place_for_a_new_run(tmp_path: Path) -> None:
+def test_a_journal_of_another_run_and_a_new_run_in_its_folder_are_refused(tmp_path: Path) -> None:
     journal(tmp_path / "journal", MADE).append(arrival(MADE, 1))
     with pytest.raises(ConfigError, match="holds a run"), opened_run(tmp_path, resume="none"):
+        pass
+    rest = Restored(Record("another"), {})
+    save_run(tmp_path / "checkpoints", trainer(MADE), rest, keep=2)
+    with pytest.raises(RunError, match="is of another run"), opened_run(tmp_path):
         pass
 
 
@@ -175,7 +148,10 @@ def test_outside_of_loopback_the_connection_carries_keys(tmp_path: Path, told: T
 def test_the_connection_names_a_host_that_others_reach(
     tmp_path: Path, settings: dict[str, str], host: str
 ) -> None:
-    with opened_run(tmp_path, http_bind=settings["bind"], **settings) as (made, connection):
+    with opened_run(tmp_path, http_bind=settings["bind"], http_port=0, **settings) as (
+        made,
+        connection,
+    ):
         ports = [int(made.hub.endpoint.rpartition(":")[2])]
         ports.append(int(made.hub.weights_endpoint.rpartition(":")[2]))
     assert connection["endpoint"] == f"tcp://{host}:{ports[0]}"
@@ -207,6 +183,6 @@ def test_plain_transport_is_warned_of_where_others_reach_it(
     tmp_path: Path, told: Told, bind: str, warned: bool
 ) -> None:
     with opened_run(tmp_path, bind=bind, security="plain") as (_, connection):
-        assert set(connection) == {"endpoint", "weights_endpoint", "run_id", "http"}
+        assert set(connection) == {"endpoint", "weights_endpoint", "run_id"}
     assert (PLAIN in told()) is warned
     assert not (tmp_path / "keys.json").exists()

@@ -12,31 +12,25 @@ import yaml
 
 from master.rundir import RunFolder
 from tangram_agent.checkpoints import save_checkpoint
+from tangram_agent.files import write_whole
 from tangram_sim.errors import ConfigError
 
 pytestmark = pytest.mark.fast
 
 
-def finished(folder: RunFolder) -> None:
-    folder.path.mkdir()
-    folder.write_result({})
+LEFT: dict[str, Callable[[RunFolder], object]] = {
+    "a result": lambda folder: folder.write_result({}),
+    "a checkpoint": lambda folder: save_checkpoint(
+        folder.checkpoints, 1, {"weights": {"a": np.zeros(1)}}, {}, keep=1
+    ),
+    "curves": lambda folder: write_whole(folder.tensorboard / "events", b""),
+}
 
 
-def checkpointed(folder: RunFolder) -> None:
-    save_checkpoint(folder.checkpoints, 1, {"weights": {"a": np.zeros(1)}}, {}, keep=1)
-
-
-def with_curves(folder: RunFolder) -> None:
-    folder.tensorboard.mkdir(parents=True)
-    (folder.tensorboard / "events").touch()
-
-
-@pytest.mark.parametrize("leave", [finished, checkpointed, with_curves])
-def test_a_folder_with_a_run_is_refused_unless_resumed(
-    tmp_path: Path, leave: Callable[[RunFolder], None]
-) -> None:
-    folder = RunFolder(tmp_path / "run")
-    leave(folder)
+@pytest.mark.parametrize("left", LEFT)
+def test_a_folder_with_a_run_is_refused_unless_resumed(tmp_path: Path, left: str) -> None:
+    folder = RunFolder(tmp_path)
+    LEFT[left](folder)
     with pytest.raises(ConfigError, match=r"holds a run already: choose another .* resume=auto"):
         folder.prepare("none")
     folder.prepare("auto")
@@ -62,20 +56,15 @@ def test_only_one_master_works_in_a_folder(tmp_path: Path) -> None:
     RunFolder(tmp_path).lock().close()
 
 
-def test_what_is_written_is_read_back(tmp_path: Path) -> None:
-    folder = RunFolder(tmp_path)
-    config = {"sim": {"arena": 2.0}, "tokens": {"shapes": ["square"]}, "seed": 0}
-    folder.write_config(config)
-    assert yaml.safe_load(folder.config.read_text()) == config
-    assert list(yaml.safe_load(folder.config.read_text())) == list(config)
-    folder.write_result({"mean_reward": None})
-    assert json.loads(folder.result.read_text()) == {"mean_reward": None}
-
-
-def test_only_the_user_may_read_the_connection(tmp_path: Path) -> None:
+def test_what_is_written_is_read_back_and_only_the_user_may_read_the_connection(
+    tmp_path: Path,
+) -> None:
     folder = RunFolder(tmp_path)
     config = {"tokens": {"shapes": ["square"]}, "service": {"envs": 4}, "seed": 0}
     folder.write_config(config)
+    assert list(yaml.safe_load(folder.config.read_text()).items()) == list(config.items())
+    folder.write_result({"mean_reward": None})
+    assert json.loads(folder.result.read_text()) == {"mean_reward": None}
     folder.connection.touch(0o644)
     before = os.umask(0)
     try:

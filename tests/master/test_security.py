@@ -23,45 +23,34 @@ def test_a_run_keeps_its_keys_and_only_the_user_reads_them(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    "content",
+    "change",
     [
+        {"more": 1},
+        {"server_secret": "x" * 40},
+        {"worker_secret": "short"},
+        {"worker_public": make_keys().worker_public},
+        {"server_public": 7},
         "",
         "[]",
         "{}",
-        json.dumps(asdict(make_keys()) | {"more": 1}),
-        json.dumps(asdict(make_keys()) | {"server_secret": "x" * 40}),
-        json.dumps(asdict(make_keys()) | {"worker_secret": "short"}),
-        json.dumps(asdict(make_keys()) | {"worker_public": make_keys().worker_public}),
-        json.dumps(asdict(make_keys()) | {"server_public": 7}),
     ],
 )
-def test_a_file_that_holds_something_else_is_refused(tmp_path: Path, content: str) -> None:
+def test_a_file_that_holds_something_else_is_refused(tmp_path: Path, change: object) -> None:
     path = tmp_path / "keys.json"
-    path.write_text(content)
+    whole = isinstance(change, str)
+    path.write_text(str(change) if whole else json.dumps(asdict(make_keys()) | dict(change)))
     with pytest.raises(RunError, match=r"keys\.json does not hold the run's keys .*: delete it"):
         run_keys(path)
 
 
-@pytest.mark.parametrize(
-    ("bind", "loopback"),
-    [
-        ("127.0.0.1", True),
-        ("127.9.9.9", True),
-        ("localhost", True),
-        ("::1", True),
-        ("0.0.0.0", False),  # noqa: S104
-        ("10.0.0.1", False),
-        ("::", False),
-        ("*", False),
-        ("eth0", False),
-        ("node7.cluster", False),
-    ],
-)
-def test_everything_but_loopback_is_encrypted_unless_it_is_asked_for_by_name(
-    bind: str, loopback: bool
-) -> None:
-    assert is_loopback(bind) is loopback
-    assert needs_keys(bind, "auto") is not loopback
+LOOPBACK = ("127.0.0.1", "127.9.9.9", "localhost", "::1")
+REACHABLE = ("0.0.0.0", "10.0.0.1", "::", "*", "eth0", "node7.cluster")  # noqa: S104
+
+
+@pytest.mark.parametrize("bind", [*LOOPBACK, *REACHABLE])
+def test_everything_but_loopback_is_encrypted_unless_it_is_asked_for_by_name(bind: str) -> None:
+    assert is_loopback(bind) is (bind in LOOPBACK)
+    assert needs_keys(bind, "auto") is (bind in REACHABLE)
     assert needs_keys(bind, "curve") is True
     assert needs_keys(bind, "plain") is False
 

@@ -138,7 +138,7 @@ def test_rewards_are_those_of_the_reward_function(reward: str) -> None:
 @BOTH
 def test_camera_reports_and_pays_by_each_episodes_own_target(backend: str) -> None:
     sources, generators = ("polygon", "camera"), [evaluation_generators(8) for _ in range(2)]
-    envs = [made(SQUARE, 8, source=one, backend=backend, camera=True) for one in sources]
+    envs = [made(SQUARE, 8, source=one, backend=backend, pixels=64) for one in sources]
     for _ in range(2):
         results = []
         for env, own in zip(envs, generators, strict=True):
@@ -203,7 +203,7 @@ def test_an_episode_has_to_begin_and_ends() -> None:
 def test_refused_constructions() -> None:
     with pytest.raises(ValueError, match="at least 1, got 0"):
         made(SQUARE, 0)
-    with pytest.raises(ConfigError, match=r"set sim\.camera=true"):
+    with pytest.raises(ConfigError, match=r"set sim\.pixels=64"):
         made(SQUARE, source="camera")
 
 

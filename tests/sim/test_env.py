@@ -35,7 +35,7 @@ def kinematic(**settings: Any) -> TangramEnv:
 GAME = {"shapes": SEVEN, "scale": 0.6}
 PLAYED = [
     {},
-    {"shapes": TRIO, "scale": 0.8, "camera": True, "actions_per_token": 2, "reward": "pose"},
+    {"shapes": TRIO, "scale": 0.8, "pixels": 64, "actions_per_token": 2, "reward": "pose"},
     GAME | {"allow_flip": True, "starts": "outside"},
     GAME | {"targets": "figures", "mirrored": 0.5},
     GAME | {"motion": "slide", "targets": "connected"},
@@ -145,7 +145,7 @@ def test_success_is_the_overlap_that_was_asked_for(bound: float, expected: bool)
 
 @pytest.mark.parametrize("source", ["polygon", "camera"])
 def test_camera_is_reported_and_may_pay(source: str) -> None:
-    info = nearly(kinematic(camera=True, reward=RewardConfig(source=source)))
+    info = nearly(kinematic(pixels=64, reward=RewardConfig(source=source)))
     assert 0.7 < info["reward_camera"] <= 1.0
     assert (info["reward"] == info["reward_camera"]) == (source == "camera")
 

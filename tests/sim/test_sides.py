@@ -123,7 +123,7 @@ def test_sides_are_told_of_noisy_corners_and_rewarded_as_rigid_pieces() -> None:
 
 @pytest.fixture(params=["physics", "kinematic"])
 def world(request: pytest.FixtureRequest) -> Iterator[World]:
-    made = make_world(LAYOUT, SimConfig(backend=request.param))
+    made = make_world(LAYOUT, SimConfig(backend=request.param, pixels=64))
     yield made
     made.close()
 
@@ -209,7 +209,7 @@ def test_flips_and_starts_on_any_side() -> None:
 
 @pytest.mark.parametrize("backend", ["physics", "kinematic"])
 def test_the_camera_agrees_on_either_side(backend: str) -> None:
-    env = env_of("parallelogram", count=8, mirrored=1.0, camera=True, backend=backend)
+    env = env_of("parallelogram", count=8, mirrored=1.0, pixels=64, backend=backend)
     env.step(np.zeros((8, 4)))  # whose target is forgotten
     env.reset(evaluation_generators(8))
     result = env.step(onto_targets(env))

@@ -78,7 +78,7 @@ def test_commanded_pose_is_reached_in_every_unit(
 )
 def test_how_much_of_a_turn_is_missing(substeps: int, least: float, most: float) -> None:
     """Why `SimConfig` refuses less than 4: a step of Bullet is exact up to 45 degrees."""
-    world = make_world(layout_of("square"), SimConfig(substeps=substeps, inexact=substeps < 4))
+    world = make_world(layout_of("square"), SimConfig(substeps=substeps))
     assert least <= errors(world, 2.0)[1] < most
     world.close()
 
@@ -86,7 +86,7 @@ def test_how_much_of_a_turn_is_missing(substeps: int, least: float, most: float)
 @pytest.mark.parametrize(("substeps", "way", "turn"), [(8, 0.967, 0.957), (1, 0.94, 0.903)])
 def test_damping_makes_tokens_fall_short(substeps: int, way: float, turn: float) -> None:
     """With Bullet's own 0.04 a tenth of a turn is missing, and more of a faster one."""
-    sim = SimConfig(damping=0.04, inexact=True, substeps=substeps)
+    sim = SimConfig(damping=0.04, substeps=substeps)
     world = make_world(layout_of("square"), sim)
     world.place(np.zeros((1, 3)))
     world.move(0, np.array([0.5, 0.0, 1.0]))
@@ -136,7 +136,7 @@ def test_placing_stops_and_forgets(make: WorldMaker) -> None:
 
 
 def test_nothing_stops_a_token_at_the_arenas_edge(make: WorldMaker) -> None:
-    world = make(layout_of("square"))
+    world = make(layout_of("square"), pixels=64)
     world.place(np.array([[0.8, 0.0, 0.0]]))
     world.move(0, np.array([2.0, 0.0, 0.0]))
     assert world.poses()[0, 0] == pytest.approx(2.8)

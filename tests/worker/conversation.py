@@ -38,9 +38,9 @@ from worker.connection import Timing
 Message = TypeVar("Message")
 Result = TypeVar("Result")
 
-LIMIT_S = 60.0
+LIMIT_S = 100.0
 QUICK = Timing(
-    join_s=10.0, retry_s=0.05, heartbeat_s=0.05, resend_s=30.0, silence_s=10.0, lost_s=30.0
+    join_s=90.0, retry_s=0.05, heartbeat_s=0.05, resend_s=90.0, silence_s=60.0, lost_s=600.0
 )
 
 
@@ -61,6 +61,13 @@ def served(stage: Stage, call: Callable[[], Result]) -> Result:
 def joined(stage: Stage, **more: Any) -> Iterator[Client]:
     with make_client(stage.hub.endpoint, **more) as client:
         assert served(stage, client.join)
+        yield client
+
+
+@contextmanager
+def welcomed(master: "StandIn", timing: Timing = QUICK, **more: Any) -> Iterator[Client]:
+    with make_client(master.endpoint, timing, **more) as client:
+        master.welcome(client)
         yield client
 
 

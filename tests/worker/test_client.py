@@ -1,9 +1,8 @@
 """The client with a real hub, over losses and stops, and with a master that says odd things."""
 
-import signal
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,27 +20,19 @@ from tangram_agent.messages import (
     WantWeights,
     WeightsMessage,
 )
-from tangram_agent.types import Episodes
 from tangram_sim.errors import RunError, TangramError, WireError
-from tests.agent.messages import (
-    FINGERPRINTS,
-    SHAPES,
-    broadcast,
-    episodes,
-    scores,
-    weights,
-    with_header,
-)
-from tests.master.dealers import staged
+from tests.agent.messages import SHAPES, broadcast, episodes, scores, weights, with_header
+from tests.master.dealers import Stage
 from tests.worker.conversation import (
     QUICK,
+    StandIn,
     both,
     free_port,
     joined,
     make_client,
     numbers,
     served,
-    standing_in,
+    welcomed,
     write_connection,
 )
 
@@ -50,70 +41,57 @@ pytestmark = pytest.mark.cluster
 SENT_AGAIN = replace(QUICK, resend_s=0.1)
 
 
-def test_a_client_joins_and_is_told_what_it_needs() -> None:
-    with staged() as stage, joined(stage, index=5) as client:
-        welcome = client.welcome
-        assert (welcome.run_id, welcome.seed, welcome.index) == ("run", 7, 5)
-        assert welcome.incarnation == 1
-        assert client.window_free == 3  # the hub's window, which is smaller than the client's
-        assert not client.stopped
-
-
-def test_a_client_waits_for_the_connection_file(tmp_path: Path) -> None:
-    with staged() as stage, make_client(tmp_path) as client, ThreadPoolExecutor(1) as pool:
+def test_a_client_waits_for_the_connection_file_and_is_told_what_it_needs(
+    stage: Stage, tmp_path: Path
+) -> None:
+    with make_client(tmp_path, index=5) as client, ThreadPoolExecutor(1) as pool:
         with pytest.raises(TangramError, match=r"not joined a master yet: call join\(\) first"):
             _ = client.welcome
         future = pool.submit(client.join)
         write_connection(tmp_path, stage.hub.endpoint)
         stage.until(future.done)
         assert future.result() is True
+        welcome = client.welcome
+        assert (welcome.run_id, welcome.seed, welcome.index) == ("run", 7, 5)
+        assert (welcome.incarnation, client.stopped) == (1, False)
+        assert client.window_free == 3  # the hub's window, which is smaller than the client's
 
 
 @pytest.mark.parametrize("what", ["address", "file"])
 def test_no_master_in_time_says_where_none_is(tmp_path: Path, what: str) -> None:
     endpoint = f"tcp://127.0.0.1:{free_port()}"
-    with make_client(
-        endpoint if what == "address" else tmp_path, replace(QUICK, join_s=0.2)
-    ) as client:
+    connect, nobody = {
+        "address": (endpoint, f"no master answers at {endpoint} after 0.2 s"),
+        "file": (tmp_path, f"no connection file is at {tmp_path} after 0.2 s"),
+    }[what]
+    with make_client(connect, replace(QUICK, join_s=0.2)) as client:
         with pytest.raises(TangramError) as caught:
             client.join()
-        nobody = f"no master answers at {endpoint} after 0.2 s"
-        if what == "file":
-            nobody = f"no connection file is at {tmp_path} after 0.2 s"
         assert str(caught.value) == f"{nobody}: is tangram-master running there?"
 
 
-def test_a_refusal_is_raised_with_the_masters_reason() -> None:
-    other = FINGERPRINTS | {"net": "other"}
-    with staged() as stage, make_client(stage.hub.endpoint, fingerprints=other) as client:
-        with pytest.raises(TangramError) as caught:
-            served(stage, client.join)
-        assert str(caught.value) == (
-            f"the master at {stage.hub.endpoint} refused this player: its settings of net differ "
-            "from the master's: start both with the same overrides of net"
-        )
-
-
-def test_a_refused_rejoin_ends_the_worker() -> None:
-    with standing_in() as master, make_client(master.endpoint) as client:
-        master.welcome(client)
-        master.say(Refused("its settings of net differ"))
-        with pytest.raises(TangramError, match="refused this player: its settings of net differ"):
-            master.until(client, lambda: False)
-
-
-def test_a_master_of_another_protocol_is_an_error() -> None:
-    with standing_in() as master, make_client(master.endpoint) as client:
+@pytest.mark.parametrize(
+    ("answer", "reason"),
+    [
+        (Refused("its settings of net differ"), "refused this player: its settings of net differ"),
+        (with_header(Greet().encode(), v=99), "speaks protocol 99, this one .*: install the same"),
+    ],
+)
+@pytest.mark.parametrize("before", [True, False])
+def test_a_master_that_does_not_fit_ends_a_worker(
+    master: StandIn, answer: Refused | list[bytes], reason: str, before: bool
+) -> None:
+    with make_client(master.endpoint) as client:
         master.until(client, lambda: master.heard)
-        master.say(with_header(Greet().encode(), v=99))
-        with pytest.raises(
-            TangramError, match=r"speaks protocol 99, this one .*: install the same"
-        ):
+        if before:  # it had been welcomed
+            master.welcome(client)
+        master.say(answer)
+        with pytest.raises(TangramError, match=reason):
             master.until(client, lambda: False)
 
 
-def test_a_stale_connection_file_is_told(tmp_path: Path) -> None:
-    with staged() as stage, make_client(tmp_path) as client:
+def test_a_stale_connection_file_is_told(stage: Stage, tmp_path: Path) -> None:
+    with make_client(tmp_path) as client:
         write_connection(tmp_path, stage.hub.endpoint, "an older run")
         with pytest.raises(TangramError) as caught:
             served(stage, client.join)
@@ -130,9 +108,9 @@ def test_an_address_that_zeromq_does_not_take() -> None:
 
 
 @pytest.mark.parametrize("wait", ["join", "wait_for_window", "wait_for_weights"])
-def test_stop_ends_each_wait(wait: str) -> None:
+def test_stop_ends_each_wait(master: StandIn, wait: str) -> None:
     """As a signal handler does."""
-    with standing_in() as master, make_client(master.endpoint, window=1) as client:
+    with make_client(master.endpoint, window=1) as client:
         if wait != "join":
             master.welcome(client)
             assert client.send(episodes(), 1)
@@ -145,37 +123,11 @@ def test_stop_ends_each_wait(wait: str) -> None:
         assert client.send(episodes(), 1) is False
 
 
-def test_a_real_signal_ends_a_wait(tmp_path: Path) -> None:
-    with make_client(tmp_path) as client:
-        before = signal.signal(signal.SIGALRM, lambda *_: client.stop("SIGALRM"))
-        try:
-            signal.setitimer(signal.ITIMER_REAL, 0.05)
-            assert client.join() is False
-        finally:
-            signal.signal(signal.SIGALRM, before)
-
-
-def test_batches_arrive_and_are_forgotten_when_they_are_acknowledged() -> None:
-    with staged() as stage, joined(stage) as client:
-        for number in range(3):
-            assert client.send(episodes(seed=number), number)
-        stage.counted("batches", 3)
-        assert client.window_free == 0
-        for number, arrival in enumerate(stage.batches()):
-            assert (arrival.sequence, arrival.weights_version) == (number + 1, number)
-            for field in fields(Episodes):
-                sent = getattr(episodes(seed=number), field.name)
-                np.testing.assert_array_equal(getattr(arrival.episodes, field.name), sent)
-            stage.hub.acknowledge(arrival)
-        both(stage, client, lambda: client.window_free == 3)
-        assert client.counters["resent"] == 0
-
-
-def test_a_full_window_waits_for_an_acknowledgement() -> None:
-    with staged() as stage, joined(stage, window=1) as client, ThreadPoolExecutor(1) as pool:
+def test_a_full_window_waits_for_an_acknowledgement(stage: Stage) -> None:
+    with joined(stage, window=1) as client, ThreadPoolExecutor(1) as pool:
         assert client.send(episodes(), 1)
         stage.counted("batches")
-        late = pool.submit(client.send, episodes(), 1)
+        late = pool.submit(client.send, episodes(), 2)
         # While it waits it shows that it lives.
         beats = stage.hub.counters["heartbeats"]
         stage.until(lambda: stage.hub.counters["heartbeats"] >= beats + 2)
@@ -185,10 +137,13 @@ def test_a_full_window_waits_for_an_acknowledgement() -> None:
         stage.until(late.done)
         assert late.result() is True
         stage.counted("batches", 2)
+        told = [(batch.sequence, batch.weights_version) for batch in stage.batches()]
+        assert told == [(1, 1), (2, 2)]
+        assert client.counters["resent"] == 0
 
 
-def test_a_batch_out_of_bounds_is_not_sent() -> None:
-    with staged() as stage, joined(stage) as client:
+def test_a_batch_out_of_bounds_is_not_sent(stage: Stage) -> None:
+    with joined(stage) as client:
         bad = episodes()
         bad.rewards[0, 0] = np.nan
         with pytest.raises(WireError, match=r"rewards holds nan at \[0, 0\]"):
@@ -198,9 +153,8 @@ def test_a_batch_out_of_bounds_is_not_sent() -> None:
         assert stage.batches()[0].sequence == 1
 
 
-def test_without_an_acknowledgement_all_is_sent_again_in_order() -> None:
-    with standing_in() as master, make_client(master.endpoint, SENT_AGAIN) as client:
-        master.welcome(client)
+def test_without_an_acknowledgement_all_is_sent_again_in_order(master: StandIn) -> None:
+    with welcomed(master, SENT_AGAIN) as client:
         for _ in range(3):
             assert client.send(episodes(), 1)
         master.until(client, lambda: len(numbers(master.heard)) >= 6)
@@ -212,25 +166,8 @@ def test_without_an_acknowledgement_all_is_sent_again_in_order() -> None:
         assert set(numbers(master.heard)) == {2}
 
 
-def test_a_lost_acknowledgement_is_given_again() -> None:
-    with (
-        staged() as stage,
-        joined(stage, timing=SENT_AGAIN) as client,
-        pytest.MonkeyPatch.context() as patch,
-    ):
-        assert client.send(episodes(), 1)
-        stage.counted("batches")
-        with patch.context() as lossy:
-            lossy.setattr(stage.hub, "_send", lambda *_: None)
-            stage.hub.acknowledge(stage.batches()[0])
-        both(stage, client, lambda: client.window_free == 3)
-        assert stage.hub.counters["duplicates"] >= 1
-        assert len(stage.batches()) == 1
-
-
-def test_what_came_out_of_turn_is_sent_again_with_all_before_it() -> None:
-    with standing_in() as master, make_client(master.endpoint) as client:
-        master.welcome(client)
+def test_what_came_out_of_turn_is_sent_again_with_all_before_it(master: StandIn) -> None:
+    with welcomed(master) as client:
         for _ in range(2):
             assert client.send(episodes(), 1)
         master.until(client, lambda: numbers(master.heard) == [1, 2])
@@ -239,9 +176,8 @@ def test_what_came_out_of_turn_is_sent_again_with_all_before_it() -> None:
         assert client.counters["out_of_turn"] == 1
 
 
-def test_what_is_refused_for_good_is_not_sent_again() -> None:
-    with standing_in() as master, make_client(master.endpoint, SENT_AGAIN) as client:
-        master.welcome(client)
+def test_what_is_refused_for_good_is_not_sent_again(master: StandIn) -> None:
+    with welcomed(master, SENT_AGAIN) as client:
         for _ in range(2):
             assert client.send(episodes(), 1)
         master.until(client, lambda: numbers(master.heard)[:2] == [1, 2])
@@ -264,9 +200,9 @@ def test_whoever_watches_sees_a_client_at_work(tmp_path: Path) -> None:
     assert seen == [0, 1]
 
 
-def test_hello_is_repeated_until_it_is_answered_and_says_the_same() -> None:
+def test_hello_is_repeated_until_it_is_answered_and_says_the_same(master: StandIn) -> None:
     patient = replace(QUICK, silence_s=3600.0)  # a new connection would say it, too
-    with standing_in() as master, make_client(master.endpoint, patient) as client:
+    with make_client(master.endpoint, patient) as client:
         master.until(client, lambda: len(master.heard) == 2)
         hello, again = master.heard
         assert hello == again
@@ -274,31 +210,29 @@ def test_hello_is_repeated_until_it_is_answered_and_says_the_same() -> None:
         assert (hello.index, hello.incarnation, hello.first) == (-1, 0, 1)
 
 
-def test_weights_come_newest_only_and_once() -> None:
-    with staged() as stage:
-        stage.hub.publish(weights(version=1))
-        with joined(stage, shapes=SHAPES) as client:
-            first = served(stage, client.wait_for_weights)
-            assert first is not None
-            assert first.version == 1
-            assert first.tensors.keys() == SHAPES.keys()
-            assert client.newest_weights() is None
-            seen: list[int] = []
+def test_weights_come_newest_only_and_once(stage: Stage) -> None:
+    stage.hub.publish(weights(version=1))
+    with joined(stage, shapes=SHAPES) as client:
+        first = served(stage, client.wait_for_weights)
+        assert first is not None
+        assert first.version == 1
+        assert first.tensors.keys() == SHAPES.keys()
+        assert client.newest_weights() is None
+        seen: list[int] = []
 
-            def newest() -> bool:
-                newer = client.newest_weights()
-                seen.extend([] if newer is None else [newer.version])
-                return 8 in seen
+        def newest() -> bool:
+            newer = client.newest_weights()
+            seen.extend([] if newer is None else [newer.version])
+            return 8 in seen
 
-            for version in range(2, 9):
-                stage.hub.publish(weights(version))
-            both(stage, client, newest)
-            assert seen == sorted(set(seen))
+        for version in range(2, 9):
+            stage.hub.publish(weights(version))
+        both(stage, client, newest)
+        assert seen == sorted(set(seen))
 
 
-def test_who_was_busy_skips_all_broadcasts_but_the_newest() -> None:
-    with standing_in() as master, make_client(master.endpoint) as client:
-        master.welcome(client)
+def test_who_was_busy_skips_all_broadcasts_but_the_newest(master: StandIn) -> None:
+    with welcomed(master) as client:
         frames = [broadcast(weights(version), "e1") for version in range(500)]
         master.until(client, lambda: master.broadcast(frames[0]) or client.newest.version == 0)
         for frame in frames:
@@ -313,9 +247,8 @@ def test_who_was_busy_skips_all_broadcasts_but_the_newest() -> None:
         assert len(seen) < 250
 
 
-def test_a_missed_broadcast_is_asked_for() -> None:
-    with standing_in() as master, make_client(master.endpoint) as client:
-        master.welcome(client)
+def test_a_missed_broadcast_is_asked_for(master: StandIn) -> None:
+    with welcomed(master) as client:
         master.say(Alive(version=4))
         assert master.await_kind(client, WantWeights) == WantWeights("e1", -1)
         master.say(WeightsMessage("e1", weights(4)).encode())
@@ -325,52 +258,40 @@ def test_a_missed_broadcast_is_asked_for() -> None:
         assert newest.version == 4
 
 
-def test_weights_of_another_network_are_refused_and_counted() -> None:
-    with standing_in() as master, make_client(master.endpoint, shapes={"a": (1,)}) as client:
-        master.welcome(client)
-        frame = broadcast(weights(), "e1")
-        master.until(client, lambda: master.broadcast(frame) or client.counters["malformed"])
-        assert client.newest_weights() is None
-
-
-def test_garbage_from_the_master_is_counted() -> None:
-    with standing_in() as master, make_client(master.endpoint) as client:
-        master.welcome(client)
+def test_garbage_and_weights_of_another_network_are_refused_and_counted(master: StandIn) -> None:
+    with welcomed(master, shapes={"a": (1,)}) as client:
         for frames in ([b""], [b"\xc1"], with_header(Ack(1, duplicate=True).encode(), sequence=0)):
             master.say(frames)
         master.until(client, lambda: client.counters["malformed"] == 3)
+        frame = broadcast(weights(), "e1")
+        master.until(client, lambda: master.broadcast(frame) or client.counters["malformed"] > 3)
+        assert client.newest_weights() is None
         assert not client.stopped
 
 
-def test_the_newest_process_of_an_index_wins() -> None:
-    with staged() as stage, joined(stage, index=0) as old, joined(stage, index=0) as new:
-        both(stage, old, lambda: old.stopped)
-        assert old.stop_reason == "player 0 was taken over by a newer process"
-        assert (new.welcome.incarnation, new.stopped) == (2, False)
+def test_stop_ends_a_client_and_it_says_bye(stage: Stage) -> None:
+    with joined(stage) as client:
+        assert client.send(episodes(), 1)
+        stage.counted("batches")
+        stage.hub.stop("max_updates=10")
+        assert served(stage, client.wait_for_weights) is None
+        assert (client.stopped, client.stop_reason) == (True, "max_updates=10")
+    stage.counted("byes")
+    assert stage.hub.peers == []
 
 
-def test_stop_ends_a_client_and_it_says_bye() -> None:
-    with staged() as stage:
-        with joined(stage) as client:
-            assert client.send(episodes(), 1)
-            stage.counted("batches")
-            stage.hub.stop("max_updates=10")
-            assert served(stage, client.wait_for_weights) is None
-            assert (client.stopped, client.stop_reason) == (True, "max_updates=10")
-        stage.counted("byes")
-        assert stage.hub.peers == []
-
-
-def test_a_repeated_stop_is_heard_by_who_missed_the_first() -> None:
-    with standing_in() as master, make_client(master.endpoint) as client:
+def test_a_repeated_stop_is_heard_by_who_missed_the_first(master: StandIn) -> None:
+    with make_client(master.endpoint) as client:
         master.until(client, lambda: master.heard)
         master.say(Stop("over"))
         assert client.join() is False
         assert client.stop_reason == "over"
 
 
-def test_scores_and_stats_arrive_and_without_a_master_scores_are_lost_and_counted() -> None:
-    with staged() as stage, make_client(stage.hub.endpoint, role="evaluator") as client:
+def test_scores_and_stats_arrive_and_without_a_master_scores_are_lost_and_counted(
+    stage: Stage,
+) -> None:
+    with make_client(stage.hub.endpoint, role="evaluator") as client:
         client.send_scores(scores())
         assert client.counters["lost_scores"] == 1
         assert served(stage, client.join)

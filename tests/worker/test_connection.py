@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,12 +16,13 @@ from tests.master.dealers import staged
 from tests.worker.conversation import (
     LIMIT_S,
     QUICK,
+    StandIn,
     both,
     free_port,
     joined,
     make_client,
     served,
-    standing_in,
+    welcomed,
     write_connection,
 )
 from worker import client as client_module
@@ -83,12 +83,8 @@ def test_a_master_on_another_port_is_found_through_its_file(tmp_path: Path) -> N
             assert client.counters["reconnects"] >= 1
 
 
-def test_a_connection_that_does_not_answer_is_made_anew() -> None:
-    with (
-        standing_in() as master,
-        make_client(master.endpoint, replace(QUICK, silence_s=0.2)) as client,
-    ):
-        master.welcome(client)
+def test_a_connection_that_does_not_answer_is_made_anew(master: StandIn) -> None:
+    with welcomed(master, replace(QUICK, silence_s=0.2)) as client:
         first = master.identity
         assert client.send(episodes(), 1)
         again = master.await_kind(client, Hello)
@@ -96,10 +92,8 @@ def test_a_connection_that_does_not_answer_is_made_anew() -> None:
         assert master.identity != first
 
 
-def test_a_lost_master_is_given_up_in_the_end() -> None:
-    timing = replace(QUICK, silence_s=0.1, lost_s=0.3)
-    with standing_in() as master, make_client(master.endpoint, timing) as client:
-        master.welcome(client)
+def test_a_lost_master_is_given_up_in_the_end(master: StandIn) -> None:
+    with welcomed(master, replace(QUICK, silence_s=0.1, lost_s=0.3)) as client:
         with pytest.raises(TangramError) as caught:
             master.until(client, lambda: False)
         assert str(caught.value) == (
@@ -108,13 +102,12 @@ def test_a_lost_master_is_given_up_in_the_end() -> None:
 
 
 def test_a_busy_worker_does_not_take_its_own_silence_for_the_masters(
-    monkeypatch: pytest.MonkeyPatch,
+    master: StandIn, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It did not look for longer than `silence_s`, and the answer was there all the time."""
     now = time.monotonic()
     monkeypatch.setattr("worker.client.time", SimpleNamespace(monotonic=lambda: now))
-    with standing_in() as master, make_client(master.endpoint) as client:
-        master.welcome(client)
+    with welcomed(master) as client:
         now += QUICK.heartbeat_s
         client.poll()
         master.until_heartbeat()
@@ -130,9 +123,8 @@ def test_a_busy_worker_does_not_take_its_own_silence_for_the_masters(
         assert client.counters["reconnects"] == 1
 
 
-def test_another_run_at_the_same_address_is_an_error() -> None:
-    with standing_in() as master, make_client(master.endpoint) as client:
-        master.welcome(client)
+def test_another_run_at_the_same_address_is_an_error(master: StandIn) -> None:
+    with welcomed(master) as client:
         master.say(Greet())
         with pytest.raises(TangramError, match="runs 'other', not 'run': the connection file is"):
             master.welcome(client, run_id="other")
@@ -146,39 +138,29 @@ def test_closing_is_bounded_when_nobody_listens(tmp_path: Path) -> None:
 
 
 def test_a_waiting_client_says_what_it_waits_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    master: StandIn,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """First the file is missing, then the master does not answer, then it does not acknowledge."""
-    monkeypatch.setattr(client_module, "TELL_S", 0.2)
+    monkeypatch.setattr(client_module, "TELL_S", 0.05)
     caplog.set_level("INFO")
 
-    def said(text: str) -> bool:
-        return any(text in record.message for record in caplog.records)
-
-    def wait_until_said(client: Client, call: Callable[[], Any], text: str) -> None:
-        with ThreadPoolExecutor(1) as pool:
-            future = pool.submit(call)
-            deadline = time.monotonic() + LIMIT_S
-            while not said(text):
-                assert time.monotonic() < deadline, [r.message for r in caplog.records]
-                time.sleep(0.01)
-            client.stop("enough")
-            future.result()
+    def until_said(client: Client, wait: Callable[[], Any], text: str) -> None:
+        client.on_progress = lambda: text in caplog.text and client.stop("enough")
+        wait()
+        assert text in caplog.text
 
     with make_client(tmp_path) as client:
-        wait_until_said(client, client.join, f"waits for the connection file {tmp_path} since 0 s")
-    write_connection(tmp_path, f"tcp://127.0.0.1:{free_port()}")
-    with make_client(tmp_path) as client:
-        wait_until_said(
-            client, client.join, "waits for an answer of the master at tcp://127.0.0.1:"
-        )
-    with staged() as stage, joined(stage, window=1) as client:
+        until_said(client, client.join, f"waits for the connection file {tmp_path} since 0 s")
+    nobody = f"tcp://127.0.0.1:{free_port()}"
+    with make_client(nobody) as client:
+        until_said(client, client.join, f"waits for an answer of the master at {nobody}")
+    with welcomed(master, window=1) as client:
         client.send(episodes(), 0)
-        with ThreadPoolExecutor(1) as pool:
-            future = pool.submit(client.wait_for_window)
-            stage.until(lambda: said("waits for the master to take what was played since"))
-            client.stop("enough")
-            stage.until(future.done)
+        text = "waits for the master to take what was played since"
+        until_said(client, client.wait_for_window, text)
 
 
 def test_a_silent_master_is_told_and_its_return_too(caplog: pytest.LogCaptureFixture) -> None:

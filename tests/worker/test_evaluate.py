@@ -14,7 +14,7 @@ from tests.agent.builders import PAIR, SQUARE
 from tests.worker.builders import write_run
 from tests.worker.puzzle_files import GAME, SIM, drawn, write_puzzles
 from worker.config import EvalConfig, PlayConfig
-from worker.evaluate import MAX_LINES, evaluate_run
+from worker.evaluate import evaluate_run
 from worker.play import play_run
 
 pytestmark = pytest.mark.fast
@@ -48,9 +48,9 @@ def evaluated(folder: Path, tokens: dict[str, Any] = GAME, **settings: Any) -> d
 def test_evaluation_writes_scores_and_prints_them(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    report = evaluated(tmp_path, SQUARE, episodes=40)
+    report = evaluated(tmp_path, SQUARE, episodes=10)
     assert set(report) >= SCORES | {"seconds", "baselines"}
-    facts = {"episodes": 40, "updates": 7, "tokens": ["square"]}
+    facts = {"episodes": 10, "updates": 7, "tokens": ["square"]}
     assert {name: report[name] for name in facts} == facts
     assert (report["sim"]["actions_per_token"], report["agent"]["name"]) == (1, "tangram")
     baselines = report["baselines"]
@@ -60,7 +60,7 @@ def test_evaluation_writes_scores_and_prints_them(
     printed = capsys.readouterr().out
     for told in (f"{report['mean_reward']:.3f}", "run after 7 updates", "position only"):
         assert told in printed
-    assert "40 fixed tests, 1 action a token" in printed
+    assert "10 fixed tests, 1 action a token" in printed
 
 
 def test_evaluation_repeats_itself_and_other_tests_differ(tmp_path: Path) -> None:
@@ -80,50 +80,56 @@ def test_settings_of_the_world_are_played_and_written_down(tmp_path: Path) -> No
     assert report["actions_used"] == 8
 
 
-@pytest.mark.parametrize(
-    "use",
-    [
-        lambda run: evaluate_run(EvalConfig(str(run), out=str(run.with_name("out.json")))),
-        lambda run: play_run(PlayConfig(str(run), out=str(run.with_name("out.gif")))),
-    ],
-    ids=["eval", "play"],
-)
+USES: dict[str, Callable[[str, str], int]] = {
+    "eval": lambda run, out: evaluate_run(EvalConfig(run, out=out)),
+    "play": lambda run, out: play_run(PlayConfig(run, out=out)),
+}
+
+
+def emptied(run: Path) -> None:
+    (run / "checkpoints" / "00000007" / "weights.safetensors").write_bytes(b"")
+
+
+def widened(run: Path) -> None:
+    path = run / "config.yaml"
+    path.write_text(path.read_text().replace("width: 16", "width: 32"))
+
+
+@pytest.mark.parametrize("command", USES)
 @pytest.mark.parametrize(
     ("spoil", "reason"),
     [
         (lambda run: run.rename(run.with_name("gone")), "no run folder"),
         (lambda run: (run / "config.yaml").unlink(), "is this a run folder"),
         (lambda run: (run / "checkpoints" / "00000007").rename(run / "x"), "no checkpoint"),
-        (
-            lambda run: (run / "checkpoints" / "00000007" / "weights.safetensors").write_bytes(b""),
-            "is corrupt",
-        ),
-        (
-            lambda run: (run / "config.yaml").write_text(
-                (run / "config.yaml").read_text().replace("width: 16", "width: 32")
-            ),
-            "another",
-        ),
+        (emptied, "is corrupt"),
+        (widened, "another"),
     ],
 )
 def test_a_run_that_cannot_be_used(
-    tmp_path: Path, use: Callable, spoil: Callable, reason: str
+    tmp_path: Path, command: str, spoil: Callable, reason: str
 ) -> None:
-    write_run(tmp_path / "run")
-    spoil(tmp_path / "run")
+    run = tmp_path / "run"
+    write_run(run)
+    spoil(run)
     with pytest.raises((RunError, ConfigError), match=reason):
-        use(tmp_path / "run")
+        USES[command](str(run), str(tmp_path / "out.gif"))
     assert list(tmp_path.glob("out*")) == []
 
 
 # Several tokens
 
 
+@pytest.fixture
+def two(tmp_path: Path) -> str:
+    """A file of two puzzles."""
+    return str(write_puzzles(tmp_path / "mine.json", drawn("cat"), drawn("fish")))
+
+
 def test_puzzles_of_a_file_are_scored_together_and_one_by_one(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, two: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = write_puzzles(tmp_path / "mine.json", drawn("cat"), drawn("fish"))
-    report = evaluated(tmp_path, puzzles=str(path), turns=2)
+    report = evaluated(tmp_path, puzzles=two, turns=2)
     assert set(report) >= MEANS | {"sim", "agent"}
     assert set(report["baselines"]) == ORDERS | {"exact", "random"}
     assert [(one["name"], one["degrees"]) for one in report["puzzles"]] == [
@@ -141,26 +147,26 @@ def test_puzzles_of_a_file_are_scored_together_and_one_by_one(
     assert "my_fish 180°" in printed
 
 
-def test_settings_of_the_agents_play_are_played_and_written_down(tmp_path: Path) -> None:
+def test_settings_of_the_agents_play_are_played_and_written_down(tmp_path: Path, two: str) -> None:
     write_run(tmp_path / "run", GAME, sim=SIM, agent={"reapply": 0})
-    trained = evaluated(tmp_path, puzzles="test")
+    trained = evaluated(tmp_path, puzzles=two)
     asked = {"order": "listed", "reapply": 1, "refine_steps": 2}
-    listed = evaluated(tmp_path, puzzles="test", changes={"agent": asked})
+    listed = evaluated(tmp_path, puzzles=two, changes={"agent": asked})
     assert [trained["agent"][name] for name in asked] == ["learned", 0, 0]
     assert [listed["agent"][name] for name in asked] == ["listed", 1, 2]
     assert set(listed["baselines"]) == {"order=size", "order=random", "exact", "random"}
-    plain = evaluated(tmp_path, puzzles="test", changes={"agent": {"order": "listed"}})
+    plain = evaluated(tmp_path, puzzles=two, changes={"agent": {"order": "listed"}})
     assert plain["coverage"] == trained["baselines"]["order=listed"]["coverage"]
     assert [one["coverage"] for one in plain["puzzles"]] != [
         one["coverage"] for one in listed["puzzles"]
     ]
 
 
-def test_the_same_seed_gives_the_same_scores(tmp_path: Path) -> None:
-    one, two, other = (evaluated(tmp_path, puzzles="test", seed=seed) for seed in (3, 3, 4))
+def test_the_same_seed_gives_the_same_scores(tmp_path: Path, two: str) -> None:
+    one, again, other = (evaluated(tmp_path, puzzles=two, seed=seed) for seed in (3, 3, 4))
     timed = {"seconds", "seconds_per_puzzle", "puzzles", "baselines"}
     assert {k: v for k, v in one.items() if k not in timed} == {
-        k: v for k, v in two.items() if k not in timed
+        k: v for k, v in again.items() if k not in timed
     }
     assert one["coverage"] != other["coverage"]
 
@@ -176,14 +182,20 @@ def test_random_targets_of_several_tokens_get_the_same_scores(tmp_path: Path) ->
         assert np.mean(scores["coverage_each"]) == pytest.approx(scores["coverage"], abs=1e-6)
 
 
-def test_a_long_list_is_cut_on_the_screen_only(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_a_long_list_is_cut_on_the_screen_only_and_the_sheet_shows_every_puzzle(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    report = evaluated(tmp_path, puzzles="test", turns=3)
-    assert len(report["puzzles"]) == 42
+    monkeypatch.setattr("worker.evaluate.MAX_LINES", 12)
+    sheet = tmp_path / "ends.png"
+    report = evaluated(tmp_path, puzzles="test", sheet=str(sheet))
+    assert len(report["puzzles"]) == 14
     printed = capsys.readouterr().out
-    assert printed.count("│ camel") == 3
-    assert f"and {42 - MAX_LINES} more: all are in" in " ".join(printed.split())
+    assert printed.count("│ camel") == 1
+    assert "and 2 more: all are in" in " ".join(printed.split())
+    with Image.open(sheet) as picture:
+        assert picture.format == "PNG"
+        assert 1000 < picture.width < 1400
+        assert 600 < picture.height < picture.width
 
 
 def test_puzzles_that_were_left_out_are_told(
@@ -195,18 +207,9 @@ def test_puzzles_that_were_left_out_are_told(
     assert "left out: puzzle 'my_fish' has the pieces" in capsys.readouterr().out
 
 
-def test_the_sheet_shows_every_puzzle(tmp_path: Path) -> None:
-    sheet = tmp_path / "ends.png"
-    evaluated(tmp_path, puzzles="test", sheet=str(sheet))
-    with Image.open(sheet) as picture:
-        assert picture.format == "PNG"
-        assert 1000 < picture.width < 1400
-        assert 600 < picture.height < picture.width
-
-
-def test_an_agent_without_a_choice_of_order(tmp_path: Path) -> None:
+def test_an_agent_without_a_choice_of_order(tmp_path: Path, two: str) -> None:
     write_run(tmp_path / "run", GAME, sim=SIM, agent={"readout": "token"})
-    assert set(evaluated(tmp_path, puzzles="test")["baselines"]) == {"exact", "random"}
+    assert set(evaluated(tmp_path, puzzles=two)["baselines"]) == {"exact", "random"}
     reason = "run with agent.order=size: agent.order=size changes nothing with agent.readout=token"
     with pytest.raises(ConfigError, match=reason):
-        evaluated(tmp_path, puzzles="test", changes={"agent": {"order": "size"}})
+        evaluated(tmp_path, puzzles=two, changes={"agent": {"order": "size"}})

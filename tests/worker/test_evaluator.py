@@ -9,12 +9,19 @@ import pytest
 from master.delivery import Arrival, ScoresArrived
 from master.hub import Hub
 from tangram_agent.config import ServiceConfig
-from tests.agent.builders import PAIR, setup
+from tests.agent.builders import PAIR, SQUARE, setup
 from tests.worker.builders import policy, weights
-from tests.worker.conversation import collect, open_hub, with_master
+from tests.worker.conversation import QUICK, collect, open_hub, with_master
 from worker.config import WorkerConfig
 from worker.evaluator import Schedule, run_evaluator
 from worker.test_set import FixedTests, greedy
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Heartbeats come often."""
+    monkeypatch.setattr("worker.client.Timing", lambda: QUICK)
+
 
 SERVICE = ServiceConfig(envs=6, eval_episodes=20, eval_seconds=3600.0, publish_seconds=0.1)
 
@@ -24,9 +31,9 @@ def config(hub: Hub, service: ServiceConfig = SERVICE) -> WorkerConfig:
 
 
 @pytest.mark.cluster
-@pytest.mark.parametrize("tokens", [None, PAIR])
-def test_the_newest_weights_are_scored_on_the_fixed_tests(tokens: dict | None) -> None:
-    made = setup(tokens, pixels=32) if tokens else setup(pixels=32)
+@pytest.mark.parametrize("tokens", [SQUARE, PAIR])
+def test_the_newest_weights_are_scored_on_the_fixed_tests(tokens: dict) -> None:
+    made = setup(tokens, pixels=32)
 
     def script(hub: Hub) -> list[ScoresArrived]:
         hub.publish(weights(made, 5))
@@ -58,8 +65,7 @@ def test_the_newest_weights_are_scored_on_the_fixed_tests(tokens: dict | None) -
 
 @pytest.mark.cluster
 def test_few_tests_have_few_pictures_and_physics_a_real_camera() -> None:
-    made = setup(pixels=64)
-    made = replace(made, sim=replace(made.sim, backend="physics"))
+    made = setup(pixels=64, backend="physics")
     service = replace(SERVICE, eval_episodes=3)
 
     def script(hub: Hub) -> list[ScoresArrived]:

@@ -5,7 +5,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -25,14 +25,21 @@ from tangram_sim.sampling import sample_poses
 from tangram_sim.seeding import episode_generator
 from tests.agent.builders import setup
 from tests.worker.builders import policy, weights, write_run
-from tests.worker.conversation import LIMIT_S, collect, open_hub, with_master
+from tests.worker.conversation import LIMIT_S, QUICK, collect, open_hub, with_master
 from worker.config import WorkerConfig
 from worker.evaluator import run_evaluator
 from worker.player import run_player
 
 pytestmark = pytest.mark.cluster
 
-SERVICE = ServiceConfig(envs=4, batch_episodes=6, window=2)
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Heartbeats come often."""
+    monkeypatch.setattr("worker.client.Timing", lambda: QUICK)
+
+
+SERVICE = ServiceConfig(envs=4, batch_episodes=6)
 
 
 def config(hub: Hub, service: ServiceConfig = SERVICE, **more: object) -> WorkerConfig:
@@ -42,6 +49,20 @@ def config(hub: Hub, service: ServiceConfig = SERVICE, **more: object) -> Worker
 def greedy_setup(**sim: object) -> Setup:
     """No noise at all: actions follow from corners and weights."""
     return setup(agent={"noise": 0.0, "uniform_share": 0.0}, **sim)
+
+
+def assert_episodes(
+    made: Setup,
+    arrived: list[EpisodesArrived],
+    identity: tuple[int, str, int, int],
+    numbers: Sequence[int],
+) -> None:
+    """The batches are these episodes, by their targets."""
+    goals = np.concatenate([batch.episodes.goals for batch in arrived])
+    for number, goal in zip(numbers, goals, strict=True):
+        rng = episode_generator(*identity, number)
+        expected = made.layout.corners(sample_poses(made.layout, made.sim, rng))
+        np.testing.assert_allclose(goal, expected, atol=1e-6)
 
 
 def test_weights_change_between_batches_only_and_batches_tell_which() -> None:
@@ -96,11 +117,7 @@ def test_messages_hold_the_episodes_of_this_worker_in_order() -> None:
     arrived, _ = with_master(hub, script, lambda: run_player(config(hub, index=7), made))
     assert [batch.episodes.count for batch in arrived[:5]] == [6, 2, 6, 2, 6]
     assert {(batch.index, batch.incarnation) for batch in arrived} == {(7, 1)}
-    goals = np.concatenate([batch.episodes.goals for batch in arrived[:5]])
-    for number, goal in enumerate(goals):
-        rng = episode_generator(3, "player", 7, 1, number)
-        expected = made.layout.corners(sample_poses(made.layout, made.sim, rng))
-        np.testing.assert_allclose(goal, expected, atol=1e-6)
+    assert_episodes(made, arrived[:5], (3, "player", 7, 1), range(22))
 
 
 def test_nothing_is_played_ahead_while_the_window_is_full() -> None:
@@ -126,17 +143,6 @@ def test_nothing_is_played_ahead_while_the_window_is_full() -> None:
     assert [(batch.sequence, batch.weights_version) for batch in after] == [(3, 2)]
 
 
-def test_a_player_without_weights_waits_and_ends_on_stop() -> None:
-    made = greedy_setup()
-    hub = open_hub(made)
-    arrived, status = with_master(
-        hub,
-        lambda hub: collect(hub, lambda _: hub.counters["welcomed"] > 0),
-        lambda: run_player(config(hub), made),
-    )
-    assert (arrived, status) == ([], 0)
-
-
 def test_in_lockstep_what_is_ordered_is_played_and_nothing_else() -> None:
     made = greedy_setup()
 
@@ -154,31 +160,21 @@ def test_in_lockstep_what_is_ordered_is_played_and_nothing_else() -> None:
     assert status == 0
     told = [(batch.sequence, batch.weights_version, batch.episodes.count) for batch in arrived]
     assert told == [(1, 0, 8), (2, 1, 8), (3, 2, 8)]
-    goals = np.concatenate([batch.episodes.goals for batch in arrived])
     numbers = [16 * batch + i for batch in range(3) for i in range(8)]
-    for number, goal in zip(numbers, goals, strict=True):
-        rng = episode_generator(3, "player", 0, 0, number)  # incarnation 0 whichever this is
-        expected = made.layout.corners(sample_poses(made.layout, made.sim, rng))
-        np.testing.assert_allclose(goal, expected, atol=1e-6)
+    assert_episodes(made, arrived, (3, "player", 0, 0), numbers)  # 0 in every incarnation
 
 
 def test_in_lockstep_a_player_with_other_environments_says_so() -> None:
-    made = greedy_setup()
-
-    def worker() -> int:
-        with pytest.raises(
-            TangramError, match=r"asks for 6 episodes, no multiple of service\.envs=4"
-        ):
-            run_player(config(hub), made)
-        return 0
+    made, hub = greedy_setup(), open_hub(greedy_setup(), lockstep=True)
 
     def script(hub: Hub) -> None:
         hub.publish(weights(made, 0))
         hub.order({0: Go(0, 0, 0, 6)})
         collect(hub, lambda _: hub.counters["byes"] == 1)
 
-    hub = open_hub(made, lockstep=True)
-    with_master(hub, script, worker)
+    refusal = r"asks for 6 episodes, no multiple of service\.envs=4"
+    with pytest.raises(TangramError, match=refusal):
+        with_master(hub, script, lambda: run_player(config(hub), made))
 
 
 @pytest.fixture
@@ -240,23 +236,13 @@ def test_a_signal_ends_a_player_that_no_master_answers(
         assert heard.result(LIMIT_S)
 
 
-@pytest.mark.parametrize("role", ["player", "evaluator"])
-def test_a_process_whose_parent_is_gone_takes_its_leave(tmp_path: Path, role: str) -> None:
+def test_a_process_whose_parent_is_gone_takes_its_leave(tmp_path: Path) -> None:
     """As tangram-train starts a worker; the master lives on and asks for nothing."""
     made = write_run(tmp_path)
     lifeline = Lifeline()
     with open_hub(made) as hub:
-        command = [
-            *(
-                sys.executable,
-                "-m",
-                "tangram_cli",
-                "worker",
-                f"connect={hub.endpoint}",
-                f"role={role}",
-            ),
-            *(f"from_config={tmp_path / 'config.yaml'}", "service.envs=2"),
-        ]
+        given = (f"connect={hub.endpoint}", f"from_config={tmp_path / 'config.yaml'}")
+        command = [sys.executable, "-m", "tangram_cli", "worker", *given, "service.envs=2"]
         with subprocess.Popen(
             command, env=lifeline.environment(os.environ), pass_fds=(lifeline.read_end,)
         ) as process:
@@ -271,19 +257,16 @@ def test_a_process_whose_parent_is_gone_takes_its_leave(tmp_path: Path, role: st
                 process.kill()
 
 
-@pytest.mark.parametrize("role", ["player", "evaluator"])
-def test_a_worker_with_other_settings_is_refused(role: str) -> None:
-    made, other = greedy_setup(), setup(agent={"noise": 0.1})
-    hub, run = open_hub(made), run_player if role == "player" else run_evaluator
+@pytest.mark.parametrize("run", [run_player, run_evaluator])
+def test_a_worker_with_other_settings_is_refused(run: Callable[..., int]) -> None:
+    hub, other = open_hub(greedy_setup()), setup(agent={"noise": 0.1})
+    role = "player" if run is run_player else "evaluator"
 
-    def worker() -> int:
-        with pytest.raises(TangramError, match="agent"):
-            run(config(hub, role=role), other)
-        return 0
+    def script(hub: Hub) -> None:
+        collect(hub, lambda _: hub.counters["refused_settings"] == 1)
 
-    with_master(
-        hub, lambda hub: collect(hub, lambda _: hub.counters["refused_settings"] == 1), worker
-    )
+    with pytest.raises(TangramError, match="agent"):
+        with_master(hub, script, lambda: run(config(hub, role=role), other))
 
 
 def test_messages_that_would_be_too_large_are_refused_at_the_start() -> None:

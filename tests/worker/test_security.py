@@ -2,9 +2,7 @@
 
 import json
 import socket
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,12 +15,17 @@ from tangram_agent.types import Weights
 from tangram_sim.errors import TangramError
 from tests.agent.messages import episodes, hello, weights
 from tests.master.dealers import INFO, Stage, staged
-from tests.worker.conversation import QUICK, make_client
-from worker.client import Client
+from tests.worker.conversation import QUICK, both, make_client, served
 
 pytestmark = pytest.mark.cluster
 
-SHORT = replace(QUICK, join_s=1.5, retry_s=0.1)
+HASTY = replace(QUICK, join_s=0.1, retry_s=0.1)
+
+
+@pytest.fixture(autouse=True)
+def unlingering(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody waits for a BYE to those who took no key."""
+    monkeypatch.setattr("worker.connection.LINGER_MS", 0)
 
 
 def write_file(folder: Path, hub: Hub, keys: Keys | None, run_id: str = "run") -> Path:
@@ -39,80 +42,63 @@ def write_file(folder: Path, hub: Hub, keys: Keys | None, run_id: str = "run") -
     return path
 
 
-@contextmanager
-def joining(stage: Stage, path: Path | str, timing: object = SHORT) -> Iterator[Client]:
-    """A client that tries to join, while the hub is served."""
-    with make_client(str(path), timing=timing) as client, ThreadPoolExecutor(1) as pool:
-        future = pool.submit(client.join)
-        stage.until(future.done)
-        future.result()
-        yield client
+def turned_away(stage: Stage, connect: object) -> str:
+    """Why a client that got no further than the handshake is given up."""
+    with make_client(connect, HASTY) as client:
+        both(stage, client, lambda: client.counters["handshakes_failed"])
+        with pytest.raises(TangramError) as caught:
+            served(stage, client.join)
+    return str(caught.value)
 
 
 def test_the_file_lets_a_worker_in_and_everything_works(tmp_path: Path) -> None:
     keys = make_keys()
-    with staged(keys=keys) as stage:
-        path = write_file(tmp_path, stage.hub, keys)
-        with joining(stage, path) as client:
-            client.send(episodes(), 0)
-            stage.until(stage.batches)
-            stage.hub.acknowledge(stage.batches()[0])
-            # Broadcasts are encrypted with the same keys.
-            got: list[Weights | None] = []
+    with staged(keys=keys) as stage, make_client(write_file(tmp_path, stage.hub, keys)) as client:
+        assert served(stage, client.join)
+        client.send(episodes(), 0)
+        stage.until(stage.batches)
+        stage.hub.acknowledge(stage.batches()[0])
+        # Broadcasts are encrypted with the same keys.
+        got: list[Weights | None] = []
 
-            def served() -> bool:
-                stage.hub.publish(weights(version=len(got) + 1))
-                client.poll()
-                got.append(client.newest_weights())
-                return got[-1] is not None and client.outbox.first == 2
+        def heard() -> bool:
+            stage.hub.publish(weights(version=len(got) + 1))
+            got.append(client.newest_weights())
+            return got[-1] is not None and client.outbox.first == 2
 
-            stage.until(served)
-    assert stage.hub.counters["refused_keys"] == 0
+        both(stage, client, heard)
+        assert stage.hub.counters["refused_keys"] == 0
 
 
-@pytest.mark.parametrize("wrong", ["server", "worker", "both", "none"])
+@pytest.mark.parametrize("wrong", ["server", "worker", "both", "none", "of a plain master"])
 def test_other_keys_are_turned_away_and_the_worker_names_its_file(
     tmp_path: Path, wrong: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     keys, other = make_keys(), make_keys()
-    given: dict[str, Keys | None] = {
+    given: Keys | None = {
         "server": replace(keys, server_public=other.server_public),
         "worker": replace(
             keys, worker_public=other.worker_public, worker_secret=other.worker_secret
         ),
-        "both": other,
         "none": None,
-    }
-    with staged(keys=keys) as stage:
-        path = write_file(tmp_path, stage.hub, given[wrong])
-        with pytest.raises(TangramError) as caught, joining(stage, path):
-            pass
-        assert str(caught.value) == (
+    }.get(wrong, other)
+    with staged(keys=None if wrong == "of a plain master" else keys) as stage:
+        path = write_file(tmp_path, stage.hub, given)
+        reason = turned_away(stage, path)
+        assert reason == (
             f"wrong or stale connection file: what answers at {stage.hub.endpoint} does not take "
             f"the keys of {path}; take the file of a master that is running"
         )
         assert stage.hub.counters["refused_keys"] >= (wrong == "worker")
         assert stage.hub.peers == []
     # It was told at once, too, not only when the patience was over.
-    assert [r.message for r in caplog.records if r.name == "worker.connection"] == [
-        str(caught.value)
-    ]
-
-
-def test_a_file_with_keys_does_not_fit_a_plain_master(tmp_path: Path) -> None:
-    with staged() as stage:
-        path = write_file(tmp_path, stage.hub, make_keys())
-        with pytest.raises(TangramError, match="wrong or stale"), joining(stage, path):
-            pass
+    assert [r.message for r in caplog.records if r.name == "worker.connection"] == [reason]
 
 
 def test_an_address_alone_is_not_enough() -> None:
-    with (
-        staged(keys=make_keys()) as stage,
-        pytest.raises(TangramError, match=r"wants keys, or is none: name its connection file"),
-        joining(stage, stage.hub.endpoint),
-    ):
-        pass
+    with staged(keys=make_keys()) as stage:
+        reason = turned_away(stage, stage.hub.endpoint)
+    assert "wants keys, or is none: name its connection file" in reason
 
 
 def test_a_file_that_becomes_right_is_read_again(tmp_path: Path) -> None:
@@ -120,13 +106,10 @@ def test_a_file_that_becomes_right_is_read_again(tmp_path: Path) -> None:
     keys = make_keys()
     with staged(keys=keys) as stage:
         path = write_file(tmp_path, stage.hub, make_keys())
-        patient = replace(SHORT, join_s=20.0)
-        with make_client(str(path), timing=patient) as client, ThreadPoolExecutor(1) as pool:
-            future = pool.submit(client.join)
-            stage.until(lambda: client.counters["handshakes_failed"])
+        with make_client(path) as client:
+            both(stage, client, lambda: client.counters["handshakes_failed"])
             write_file(tmp_path, stage.hub, keys)
-            stage.until(future.done)
-            assert future.result()
+            both(stage, client, lambda: client.joined)
 
 
 def test_a_stranger_without_keys_is_not_heard_at_all() -> None:
@@ -159,10 +142,7 @@ def test_a_connection_that_is_lost_in_the_handshake_is_no_wrong_key(
         path = write_file(tmp_path, stage.hub, keys)
         content = json.loads(path.read_text())
         path.write_text(json.dumps(content | {"endpoint": f"tcp://127.0.0.1:{port}"}))
-        with (
-            make_client(str(path), timing=replace(SHORT, join_s=20.0)) as client,
-            ThreadPoolExecutor(1) as pool,
-        ):
+        with make_client(path) as client, ThreadPoolExecutor(1) as pool:
             future = pool.submit(client.join)
             for _ in range(2):
                 near, _ = listener.accept()

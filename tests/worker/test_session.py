@@ -19,9 +19,15 @@ class Clock:
         return self.now
 
 
-def test_a_line_every_half_minute_with_rate_and_waiting(caplog: pytest.LogCaptureFixture) -> None:
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+def test_a_line_every_half_minute_with_rate_and_waiting(
+    clock: Clock, caplog: pytest.LogCaptureFixture
+) -> None:
     caplog.set_level(logging.INFO, "worker.session")
-    clock = Clock()
     report = Report(clock)
     report.played(100, 1)
     with report.waiting("the master is behind"):
@@ -41,9 +47,8 @@ def test_a_line_every_half_minute_with_rate_and_waiting(caplog: pytest.LogCaptur
     ]
 
 
-def test_as_json_every_number_has_a_name(capsys: pytest.CaptureFixture[str]) -> None:
+def test_as_json_every_number_has_a_name(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
     log_as("player 3", "json")
-    clock = Clock()
     report = Report(clock)
     with report.waiting("the master is behind"):
         clock.now += 30.0
@@ -67,10 +72,9 @@ def test_as_json_every_number_has_a_name(capsys: pytest.CaptureFixture[str]) -> 
 
 
 def test_each_reason_to_wait_is_said_once_between_reports(
-    caplog: pytest.LogCaptureFixture,
+    clock: Clock, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "worker.session")
-    clock = Clock()
     report = Report(clock)
     for why in ("one", "two", "one"):
         with report.waiting(why):
