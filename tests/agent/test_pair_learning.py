@@ -21,7 +21,7 @@ pytestmark = pytest.mark.fast
 
 TWINS = [{"strategy": "final"}, {"strategy": "near", "position": 0.1, "angle": 0.5}]
 AGENT = {"hindsight": TWINS, "pairs_per_transition": 4}
-UPDATES = 80
+UPDATES = 120
 SLIDE = {"backend": "physics", "motion": "slide"}
 CASES: dict[str, dict[str, Any]] = {
     "mha": {"agent": AGENT},
