@@ -14,7 +14,7 @@ from tangram_agent.policy import Policy
 from tangram_agent.relabelling import ContactBatch, PairBatch
 from tangram_agent.setup import Setup
 from tangram_sim.batch import BatchedEnv
-from tests.agent.builders import random_transitions, setup
+from tests.agent.builders import setup
 from tests.agent.pair_scenes import PERCEPTRON, TWO, seven, transitions
 
 pytestmark = pytest.mark.fast
@@ -95,21 +95,6 @@ def test_with_several_tokens_nothing_is_bootstrapped() -> None:
     learner = Learner(seven(**CASES["mlp"]), 0)
     assert not learner.bootstraps
     assert set(learner.parts) == {"actor", "critic", "acting"}
-
-
-def test_one_token_learns_the_reward_of_its_transition_and_what_follows() -> None:
-    made = setup(agent={"gamma": 0.9, "readout": "pair"}, actions_per_token=2)
-    learner = Learner(made, 0)
-    for module in (learner.target_actor, learner.target_critic):
-        for parameter in module.parameters():
-            parameter.mul_(1.5)
-    batch = random_transitions(made, 8, done=None)
-    assert 0 < batch.done.sum() < 8
-    steps = learner.steps(learner.prepared(batch, np.random.default_rng(0)))
-    follow = learner.target_critic(steps.follow, learner.target_actor(steps.follow)[0])
-    y = torch.from_numpy(batch.reward) + 0.9 * follow * (1 - torch.from_numpy(batch.done))
-    loss, q = learner.critic_loss(steps)
-    assert loss.item() == pytest.approx((q - y).square().mean().item(), rel=1e-5)
 
 
 def test_what_plays_is_the_average_of_both_networks() -> None:
