@@ -170,8 +170,8 @@ _ROWS = {
     "iou": ("intersection over union", 4),
     "wrong": ("pieces under a token of another shape", 2),
     "blocked": ("placements refused because of other tokens", 2),
-    "angle_error_deg_median": ("angle error, median, degrees", 2),
-    "angle_error_deg_p90": ("angle error, 90th percentile", 2),
+    "angle_error_deg_median": ("angle error, median, degrees", 3),
+    "angle_error_deg_p90": ("angle error, 90th percentile", 3),
     "position_error_median": ("position error, median, arena units", 4),
     "position_error_p90": ("position error, 90th percentile", 4),
 }

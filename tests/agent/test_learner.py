@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from tangram_agent.graph import Scenes, next_token
 from tangram_agent.learner import (
     Learner,
     NotFiniteError,
@@ -19,6 +18,7 @@ from tangram_agent.learner import (
     polyak_update,
     saturation,
 )
+from tangram_agent.scenes import Scenes, next_token
 from tangram_agent.setup import Setup
 from tangram_sim.errors import RunError
 from tests.agent.builders import PAIR, PAPER, SCENE, SMALL, random_transitions, setup

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from tangram_agent.graph import Pairs
 from tangram_agent.learner import Learner
+from tangram_agent.pairs import Pairs
 from tangram_agent.policy import Policy
 from tangram_agent.relabelling import ContactBatch, PairBatch
 from tangram_agent.setup import Setup
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.fast
 
 TWINS = [{"strategy": "final"}, {"strategy": "near", "position": 0.1, "angle": 0.5}]
 AGENT = {"hindsight": TWINS, "pairs_per_transition": 4}
-UPDATES = 80
+UPDATES = 120
 SLIDE = {"backend": "physics", "motion": "slide"}
 CASES: dict[str, dict[str, Any]] = {
     "mha": {"agent": AGENT},

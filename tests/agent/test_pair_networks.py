@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from tangram_agent.graph import Pairs
 from tangram_agent.networks import Networks, initialise
+from tangram_agent.pairs import Pairs
 from tests.agent.builders import SMALL
 from tests.agent.pair_scenes import (
     PERCEPTRON,

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from tangram_lab.experiments.report.page import write_report
-from tangram_lab.experiments.report.study import Budget, read_runs
+from tangram_lab.experiments.report.study import Budget, Trial, read_runs
 from tangram_sim.errors import RunError
 from tests.experiments.builders import (
     cells,
@@ -193,6 +193,12 @@ def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
     (tmp_path / RUN / "tests/actions_1.json").mkdir()
     with pytest.raises(RunError, match="cannot be read (.*); delete the file"):
         read_runs(tmp_path)
+
+
+def test_a_test_that_asks_for_no_number() -> None:
+    trial = Trial("noise", ("sim.corner_noise=x",), "noise")
+    with pytest.raises(RunError, match="test noise: sim.corner_noise must be a number, got 'x'"):
+        _ = trial.corner_noise
 
 
 @pytest.mark.parametrize("axis", ["updates", "episodes", "train_s"])

@@ -103,9 +103,18 @@ class Trial(TestConfig):
     name: str = ""
 
     def asked(self, setting: str) -> float | None:
-        """A number that it asks of tangram-eval; None as trained."""
+        """A number that it asks of tangram-eval; None as trained.
+
+        Raises:
+            RunError: something else stands there.
+        """
         told = {text.partition("=")[0]: text.partition("=")[2] for text in self.overrides}
-        return float(told[setting]) if setting in told else None
+        try:
+            return float(told[setting]) if setting in told else None
+        except ValueError:
+            raise RunError(
+                f"test {self.name}: {setting} must be a number, got '{told[setting]}': mend plan.json"
+            ) from None
 
     @property
     def actions(self) -> float | None:
