@@ -130,12 +130,16 @@ def launcher(
 def signalled(
     made: Launcher, number: signal.Signals, when: Callable[[], bool], patch: pytest.MonkeyPatch
 ) -> None:
-    """Let the launcher get a signal whenever it looks after its children and something holds."""
+    """Let the launcher get a signal whenever it looks after its children and something holds.
+
+    It comes twice, as from a time limit that signals a process and then its whole group.
+    """
     start = made._start_due
 
     def start_and_signal() -> None:
         start()
         if when():
+            signal.raise_signal(number)
             signal.raise_signal(number)
 
     patch.setattr(made, "_start_due", start_and_signal)

@@ -201,8 +201,7 @@ def test_whoever_watches_sees_a_client_at_work(tmp_path: Path) -> None:
 
 
 def test_hello_is_repeated_until_it_is_answered_and_says_the_same(master: StandIn) -> None:
-    patient = replace(QUICK, silence_s=3600.0)  # a new connection would say it, too
-    with make_client(master.endpoint, patient) as client:
+    with make_client(master.endpoint) as client:
         master.until(client, lambda: len(master.heard) == 2)
         hello, again = master.heard
         assert hello == again

@@ -167,10 +167,9 @@ def test_a_silent_master_is_told_and_its_return_too(caplog: pytest.LogCaptureFix
 
 def test_a_master_that_moved_is_followed_at_once(tmp_path: Path) -> None:
     """Its new address stands in the file; nobody waits for the old one to be silent."""
-    patient = replace(QUICK, silence_s=3600.0)
     with staged() as first:
         write_connection(tmp_path, first.hub.endpoint)
-        with make_client(tmp_path, timing=patient) as client:
+        with make_client(tmp_path) as client:
             assert served(first, client.join)
             client.send(episodes(), 0)
             with staged() as second:

@@ -123,7 +123,7 @@ def test_a_master_that_gets_the_right_keys_is_joined_without_waiting_for_silence
     others = replace(keys, worker_public=other.worker_public, worker_secret=other.worker_secret)
     with staged(port=port, keys=others) as stage:
         path = write_file(tmp_path, stage.hub, keys)
-        with make_client(path, replace(QUICK, silence_s=3600.0)) as client:
+        with make_client(path) as client:
             both(stage, client, lambda: client.counters["handshakes_failed"])
             stage.hub.close()
             with staged(port=port, keys=keys) as again:
