@@ -22,9 +22,8 @@ from tangram_agent.process import Every, Watchdog
 LEARN_S = 0.05
 IDLE_S = 0.05
 # At the end: for the scores of the final weights, the same after a signal, and for goodbyes.
-SCORES_S = 60.0
+SCORES_S = 120.0
 SIGNALLED_SCORES_S = 8.0
-JOIN_S = 30.0  # for an evaluator that has not joined yet, or was given up
 LEAVE_S = 5.0
 
 log = logging.getLogger(__name__)
@@ -211,8 +210,8 @@ class Loop:
         while record.scored_version != self._trainer.updates:
             waited_s = time.monotonic() - begun_s
             hurried = self.signals.reason is not None and not signalled
-            late = signalled or not launched or waited_s >= JOIN_S
-            hopeless = late and not self._count("evaluator")
+            # One that was launched may still be loading: on a busy machine that takes a minute.
+            hopeless = (signalled or not launched) and not self._count("evaluator")
             if waited_s >= limit_s or hurried or hopeless:
                 return
             if not told:

@@ -25,7 +25,7 @@ import safetensors.numpy
 from tangram_agent.files import sync_folder
 from tangram_sim.errors import RunError
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 MANIFEST = "manifest.json"
 _NAME = re.compile(r"(\d{8,})(?:-(\d+))?")
 _TEMPORARY = ".writing-"

@@ -119,31 +119,31 @@ class AgentConfig(Settings, section="agent"):
         part=LEARNING,
     )
     readout: str = setting(
-        "auto",
-        "one velocity of the set's next token and one value of the whole scene, or both for each "
-        "pair of a token and a piece of the target, or auto: pair for several tokens",
-        choices=("auto", "token", "pair"),
+        "pair",
+        "a velocity and a value for each pair of a token and a piece of the target; or, as in the "
+        "paper, one velocity of the set's next token and one value of the whole scene",
+        choices=("pair", "token"),
         part=NETWORK,
     )
     order: str = setting(
         "learned",
         "which token is next: that of the best value, the first as listed, the largest, or any",
         choices=ORDERS,
-        only={"readout": ("auto", "pair")},
+        only={"readout": "pair"},
     )
     reapply: int = setting(
         2,
         "times that the actor is applied again to what it proposed",
         low=0,
         high=100,
-        only={"readout": ("auto", "pair")},
+        only={"readout": "pair"},
     )
     refine_steps: int = setting(
         0,
         "gradient steps uphill on the critic before a pose is played, exploration off",
         low=0,
         high=10_000,
-        only={"readout": ("auto", "pair")},
+        only={"readout": "pair"},
     )
     refine_rate: float = setting(
         0.004,
@@ -151,7 +151,7 @@ class AgentConfig(Settings, section="agent"):
         low=1e-9,
         high=1,
         unit="arena units and rad",
-        only={"readout": ("auto", "pair")},
+        only={"readout": "pair"},
         unless={"refine_steps": 0},
     )
     pairs_per_transition: int = setting(
@@ -159,7 +159,7 @@ class AgentConfig(Settings, section="agent"):
         "several tokens: pairs that a transition gives in one update",
         low=1,
         high=1024,
-        only={"readout": ("auto", "pair")},
+        only={"readout": "pair"},
         part=LEARNING,
     )
     push_weight: float = setting(
@@ -167,7 +167,7 @@ class AgentConfig(Settings, section="agent"):
         "several tokens that slide: weight of what later ones push away of what is set down now",
         low=0,
         high=1,
-        only={"readout": ("auto", "pair")},
+        only={"readout": "pair"},
     )
     gamma: float = setting(
         0.0,

@@ -19,9 +19,10 @@ import torch
 from torch import Tensor, nn
 
 from tangram_agent.config import AgentConfig
-from tangram_agent.graph import Pairs, Scenes, View, next_token
-from tangram_agent.networks import VELOCITY, Networks, initialise, parameter_count
+from tangram_agent.networks import VELOCITY, Networks, View, initialise, parameter_count
+from tangram_agent.pairs import Pairs
 from tangram_agent.relabelling import ContactBatch, PairBatch, make_pairs, with_contacts
+from tangram_agent.scenes import Scenes, next_token
 from tangram_agent.setup import Setup
 from tangram_agent.types import Transitions, Weights
 from tangram_agent.weights import load_arrays, to_arrays, under

@@ -13,8 +13,12 @@ from torch import Tensor, nn
 
 from tangram_agent.attention import GraphEncoder
 from tangram_agent.config import AgentConfig, NetConfig
-from tangram_agent.graph import Graph, PairGraph, Pairs, SceneGraph, View
+from tangram_agent.graph import Graph
+from tangram_agent.pairs import PairGraph, Pairs
+from tangram_agent.scenes import SceneGraph, Scenes
 from tangram_agent.setup import Setup
+
+View = Scenes | Pairs
 
 VELOCITY = 3
 MOTION = 4  # shift in x and y, and the turn as a cosine and a sine

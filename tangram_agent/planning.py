@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from tangram_agent.coverage import covered_share, covering, worths
-from tangram_agent.graph import PairGraph, Pairs
 from tangram_agent.networks import Critic, Networks
+from tangram_agent.pairs import PairGraph, Pairs
 from tangram_agent.setup import Setup
 from tangram_sim.arrays import Bools, Floats, Ints
 from tangram_sim.layout import Layout

@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from tangram_agent.graph import Scenes, next_token
 from tangram_agent.networks import Networks
 from tangram_agent.planning import Planner
+from tangram_agent.scenes import Scenes, next_token
 from tangram_agent.setup import Setup
 from tangram_agent.types import Weights
 from tangram_agent.weights import load_arrays, to_arrays

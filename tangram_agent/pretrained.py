@@ -24,7 +24,7 @@ CONFIG = "config.yaml"
 WEIGHTS = "weights.safetensors"
 CARD = "card.json"
 CARD_TEXT = "card.md"
-FORMAT = 1
+FORMAT = 2
 PACKAGED: Traversable = files("tangram_agent") / PREFIX
 
 

@@ -20,8 +20,7 @@ from tangram_sim.targets import check_targets
 
 Settings = TypeVar("Settings")
 
-# Settings of the agent that have no effect but on pairs, and but on pairs of several tokens.
-_PAIRS_ONLY = ("reapply", "refine_steps", "refine_rate")
+# Settings of the agent that have no effect but on pairs of several tokens.
 _SEVERAL_ONLY = ("order", "pairs_per_transition", "push_weight")
 SECTIONS = ("tokens", "sim", "reward", "agent", "net")
 
@@ -44,8 +43,6 @@ class Setup:
         """
         check_targets(self.layout, self.sim)
         agent, one = self.agent, self.layout.tokens == 1
-        if not self.pairs:  # one token and readout=auto: the section itself refuses readout=token
-            self._refuse(_PAIRS_ONLY, "one token and agent.readout=auto", "set agent.readout=pair")
         if self.net.kind == "mlp":
             self._refuse(("edges",), "net.kind=mlp", "set net.kind=mha")
         if one:
@@ -84,8 +81,6 @@ class Setup:
     @property
     def pairs(self) -> bool:
         """Whether the agent acts on pairs of a token and a piece of the target."""
-        if self.agent.readout == "auto":
-            return self.layout.tokens > 1
         return self.agent.readout == "pair"
 
     @property

@@ -1,6 +1,5 @@
 """Presets, overrides, help, and the entry of every command."""
 
-import re
 import sys
 from collections.abc import Callable
 from importlib.resources import files
@@ -268,21 +267,27 @@ def presets(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def seen_by_train(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> Plain | int:
-    monkeypatch.setattr(sys, "argv", ["tangram-train", *arguments])
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "")
-    seen: list[Plain] = []
-    status = entry("train", lambda settings: seen.append(settings) or 0)
-    return seen[0] if seen else status
+Entered = Callable[..., tuple[int, list[Plain]]]
+
+
+@pytest.fixture
+def entered(monkeypatch: pytest.MonkeyPatch) -> Entered:
+    """Runs a command line; its status, and the settings that its task was given."""
+
+    def run(line: str, task: Callable[[Plain], int] = lambda _: 0) -> tuple[int, list[Plain]]:
+        command, *arguments = line.split()
+        seen: list[Plain] = []
+        monkeypatch.setattr(sys, "argv", [f"tangram-{command}", *arguments])
+        monkeypatch.setenv("HYDRA_FULL_ERROR", "")  # restores what the entry sets
+        return entry(command, lambda settings: seen.append(settings) or task(settings)), seen
+
+    return run
 
 
 @pytest.mark.parametrize("form", ["--config-dir {}", "--config-dir={}", "-cd {}"])
-def test_presets_of_ones_own_are_taken(
-    monkeypatch: pytest.MonkeyPatch, presets: Path, form: str
-) -> None:
-    settings = seen_by_train(monkeypatch, "tokens=mine", *form.format(presets).split(), "seed=3")
-    assert isinstance(settings, dict)
-    assert settings["seed"] == 3
+def test_presets_of_ones_own_are_taken(entered: Entered, presets: Path, form: str) -> None:
+    status, [settings] = entered(f"train tokens=mine {form.format(presets)} seed=3")
+    assert (status, settings["seed"]) == (0, 3)
     assert [shape.name for shape in make_setup(settings).layout.shapes] == ["square", "bar"]
 
 
@@ -295,7 +300,7 @@ def test_presets_of_ones_own_are_taken(
     ],
 )
 def test_wrong_presets_of_ones_own_are_refused(
-    monkeypatch: pytest.MonkeyPatch,
+    entered: Entered,
     capsys: pytest.CaptureFixture[str],
     presets: Path,
     name: str,
@@ -303,89 +308,62 @@ def test_wrong_presets_of_ones_own_are_refused(
     message: str,
 ) -> None:
     (presets / name).write_text(content)
-    assert seen_by_train(monkeypatch, "tokens=mine", "--config-dir", str(presets)) == 2
+    assert entered(f"train tokens=mine --config-dir {presets}") == (2, [])
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--config-dir", "nowhere"], "--config-dir: there is no folder"),
-        (["--config-dir"], "--config-dir takes one folder"),
-        (["tokens=mine"], "unknown tokens 'mine': choose from hexagon"),
-        (["tokens=[square,square]"], "write tokens.shapes=[square,square]"),
-        (["sim=[physics,kinematic]"], "sim takes one preset, got [physics,kinematic]"),
-    ],
-)
-def test_what_would_be_merged_silently_is_refused(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    arguments: list[str],
-    message: str,
-) -> None:
-    assert seen_by_train(monkeypatch, *arguments) == 2
-    assert message in capsys.readouterr().err
-
-
 def test_help_names_presets_of_ones_own(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], presets: Path
+    entered: Entered, capsys: pytest.CaptureFixture[str], presets: Path
 ) -> None:
-    assert seen_by_train(monkeypatch, "--help", "--config-dir", str(presets)) == 0
+    assert entered(f"train --help --config-dir {presets}") == (0, [])
     assert "medium_triangle, mine, pair" in capsys.readouterr().out.replace("\n           ", " ")
 
 
 # The entry of every command
 
 
-def start(monkeypatch: pytest.MonkeyPatch, task: Callable[[Plain], int], *overrides: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["tangram-eval", "run_dir=x", *overrides])
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "")  # restores what the entry sets
-    return entry("eval", task)
-
-
-def test_entry_hands_over_plain_settings(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[Plain] = []
-    assert start(monkeypatch, lambda settings: seen.append(settings) or 5, "seed=3") == 5
-    assert seen == [
+def test_entry_hands_over_plain_settings(entered: Entered) -> None:
+    status, [settings] = entered("eval run_dir=x seed=3", lambda _: 5)
+    assert status == 5
+    assert type(settings) is dict
+    assert settings == (
         {"run_dir": "x", "episodes": 100, "seed": 3, "turns": 1, "skip_invalid": False}
         | dict.fromkeys(("out", "puzzles", "sheet"))
         | {s: dict.fromkeys(own) for s, own in COMMANDS["train"].sections().items() if s in OVER}
-    ]
-    assert type(seen[0]) is dict
-
-
-def test_entry_runs_once_for_each_value(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.chdir(tmp_path)
-    seeds: list[int] = []
-    status = start(
-        monkeypatch, lambda s: seeds.append(s["seed"]) or s["seed"] % 3, "-m", "seed=1,2,3", "out=y"
     )
-    assert (seeds, status) == ([1, 2, 3], 2)
+
+
+def test_entry_runs_once_for_each_value_and_the_jobs_of_a_sweep_have_a_folder_each(
+    entered: Entered, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    status, seen = entered("eval run_dir=x -m seed=1,2,3 out=y", lambda one: one["seed"] % 3)
+    assert (status, [one["seed"] for one in seen]) == (2, [1, 2, 3])
+    status, seen = entered("train -m seed=1,2 run_dir=runs")
+    assert (status, [one["run_dir"] for one in seen]) == (0, ["runs/0", "runs/1"])
+
+
+ROOM = "make room or choose a folder that you may write to"
+LOWER = "lower agent.replay_capacity, agent.batch_size or service.envs"
 
 
 @pytest.mark.parametrize(
     ("raised", "status", "line"),
     [
-        (TangramError("port 5 is taken"), 2, "tangram-eval: port 5 is taken\n"),
+        (TangramError("port 5 is taken"), 2, "port 5 is taken"),
         (KeyboardInterrupt(), 130, ""),
         (
             OSError(28, "No space left on device", "/runs/x"),
             2,
-            "tangram-eval: cannot use /runs/x (No space left on device): make room or choose a "
-            "folder that you may write to\n",
+            f"cannot use /runs/x (No space left on device): {ROOM}",
         ),
-        (
-            MemoryError("4 GiB"),
-            2,
-            "tangram-eval: not enough memory (4 GiB): lower agent.replay_capacity, "
-            "agent.batch_size or service.envs\n",
-        ),
+        (MemoryError("4 GiB"), 2, f"not enough memory (4 GiB): {LOWER}"),
     ],
 )
 def test_entry_turns_errors_into_a_line_and_a_status(
-    monkeypatch: pytest.MonkeyPatch,
+    entered: Entered,
     capsys: pytest.CaptureFixture[str],
     raised: BaseException,
     status: int,
@@ -394,49 +372,42 @@ def test_entry_turns_errors_into_a_line_and_a_status(
     def task(settings: Plain) -> int:
         raise raised
 
-    assert start(monkeypatch, task) == status
-    assert capsys.readouterr() == ("", line)
+    assert entered("eval run_dir=x", task)[0] == status
+    assert capsys.readouterr() == ("", f"tangram-eval: {line}\n" if line else "")
 
 
-@pytest.mark.parametrize("option", ["--seed=3", "-seed=3"])
-def test_a_setting_with_dashes_is_told_how_it_is_spelt(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], option: str
-) -> None:
-    assert start(monkeypatch, lambda settings: 0, option) == 2
-    assert "settings carry no dashes, as in seed=3; --help lists them" in capsys.readouterr().err
-
-
-def test_the_jobs_of_a_sweep_have_a_folder_each(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["tangram-train", "-m", "seed=1,2", "run_dir=runs"])
-    folders: list[object] = []
-    assert entry("train", lambda settings: folders.append(settings["run_dir"]) or 0) == 0
-    assert folders == ["runs/0", "runs/1"]
-
-
-def test_entry_does_not_hide_a_fault_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_entry_does_not_hide_a_fault_of_ours(entered: Entered) -> None:
     with pytest.raises(ZeroDivisionError):
-        start(monkeypatch, lambda settings: 1 // 0)
+        entered("eval run_dir=x", lambda settings: 1 // 0)
+
+
+SLURM = "hydra/launcher=submitit_slurm"
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("line", "message"),
     [
-        (["hydra/launcher=submitit_slurm"], "is for the jobs of a sweep: add --multirun"),
-        (["-m", "hydra/launcher=submitit_slurm"], "needs a plugin: pip install 'tangram-rl.slurm"),
+        ("train --config-dir nowhere", "--config-dir: there is no folder"),
+        ("train --config-dir", "--config-dir takes one folder"),
+        ("train tokens=mine", "unknown tokens 'mine': choose from hexagon"),
+        ("train tokens=[square,square]", "write tokens.shapes=[square,square]"),
+        ("train sim=[physics,kinematic]", "sim takes one preset, got [physics,kinematic]"),
+        ("eval run_dir=x --seed=3", "settings carry no dashes, as in seed=3; --help lists them"),
+        ("eval run_dir=x -seed=3", "settings carry no dashes, as in seed=3; --help lists them"),
+        (f"eval run_dir=x {SLURM}", "is for the jobs of a sweep: add --multirun"),
+        (f"eval run_dir=x -m {SLURM}", "needs a plugin: pip install 'tangram-rl[slurm]"),
     ],
 )
-def test_a_launcher_that_cannot_work_is_refused(
+def test_what_would_be_taken_for_something_else_is_refused(
+    entered: Entered,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-    arguments: list[str],
+    line: str,
     message: str,
 ) -> None:
     monkeypatch.setattr("conf.sweep.find_spec", lambda name: None)
-    assert start(monkeypatch, lambda settings: 0, *arguments) == 2
-    assert re.search(message, capsys.readouterr().err)
+    assert entered(line) == (2, [])
+    assert message in capsys.readouterr().err
 
 
 def test_slurm_is_asked_for_only_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,8 +5,9 @@ W width of an embedding.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import closing
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -29,7 +30,6 @@ from tangram_lab.experiments.report.style import (
 )
 from tangram_sim.actions import velocities
 from tangram_sim.arrays import Floats, Pixels
-from tangram_sim.assembly import Puzzle
 from tangram_sim.config import SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import Layout, TokensConfig, make_layout
@@ -43,35 +43,15 @@ from worker.baselines import position_policy
 FRAME = "#9CA3AF"
 
 
-def bare(panel: Axes) -> None:
-    """No grid, no ticks, no frame, and both axes of one scale."""
+def bare(panel: Axes, framed: bool = False) -> None:
+    """No grid, no ticks, both axes of one scale, and no frame unless asked for."""
     panel.grid(visible=False)
     panel.set_xticks([])
     panel.set_yticks([])
     panel.set_aspect("equal")
     for spine in panel.spines.values():
-        spine.set_visible(False)
-
-
-def show_arena(panel: Axes, arena: float) -> None:
-    """The square playground around the origin, with its frame."""
-    bare(panel)
-    half = arena / 2.0
-    panel.set_xlim(-half, half)
-    panel.set_ylim(-half, half)
-    for spine in panel.spines.values():
-        spine.set_visible(True)
+        spine.set_visible(framed)
         spine.set_color(FRAME)
-
-
-def draw_tokens(panel: Axes, layout: Layout, corners: Floats, opacity: float = 0.85) -> None:
-    """Tokens with corners (V, 2), each in its own colour."""
-    for k in range(layout.tokens):
-        colour = COLOURS[k % len(COLOURS)]
-        outline = corners[layout.corners_of(k)]
-        panel.add_patch(
-            Polygon(outline, facecolor=(colour, opacity), edgecolor="white", linewidth=1.2)
-        )
 
 
 # Fig. 1: the puzzle, and all three
@@ -93,35 +73,35 @@ def draw_paper_pictures(out: Path) -> list[tuple[str, str, str]]:
     Raises:
         RunError: the files cannot be written.
     """
+    drawn = (
+        ("fig1_puzzle", "Fig. 1: the puzzle", draw_puzzle),
+        ("fig2_graph", "Fig. 2: the graph of a single token", draw_graph),
+        ("fig3_camera", "Fig. 3: what the camera sees", draw_camera),
+    )
     shown = []
-    cat = load_puzzle("cat_of_six", CAT_SCALE)
     with drawing():
-        for name, title, (figure, caption) in (
-            (
-                "fig1_puzzle",
-                "Fig. 1: the puzzle",
-                draw_puzzle(cat),
-            ),
-            ("fig2_graph", "Fig. 2: the graph of a single token", draw_graph()),
-            ("fig3_camera", "Fig. 3: what the camera sees", draw_camera()),
-        ):
+        for name, title, draw in drawn:
+            figure, caption = draw()
             save(figure, out, name)
             shown.append((title, f"{name}.png", caption))
     return shown
 
 
-def draw_puzzle(puzzle: Puzzle) -> tuple[Figure, str]:
-    """The cat and a random start of its tokens, side by side; and what they are."""
-    sim = SimConfig(backend="kinematic")
-    start = sample_poses(puzzle.layout, sim, np.random.default_rng(START_SEED))
+def draw_puzzle() -> tuple[Figure, str]:
+    """A cat and a random start of its tokens, side by side; and what they are."""
+    puzzle, sim = load_puzzle("cat_of_six", CAT_SCALE), SimConfig(backend="kinematic")
+    layout, half = puzzle.layout, sim.arena / 2.0
+    start = sample_poses(layout, sim, np.random.default_rng(START_SEED))
     figure = empty_figure(WIDTH_IN * 0.8, WIDTH_IN * 0.42)
     panels = figure.subplots(1, 2)
-    for panel, poses, label in zip(
-        panels, (puzzle.poses, start), ("(a) target", "(b) random start"), strict=True
-    ):
-        show_arena(panel, sim.arena)
-        draw_tokens(panel, puzzle.layout, puzzle.layout.corners(poses))
-        panel.set_xlabel(label)
+    shown = ((puzzle.poses, "(a) target"), (start, "(b) random start"))
+    for panel, (poses, label) in zip(panels, shown, strict=True):
+        bare(panel, framed=True)
+        panel.set(xlim=(-half, half), ylim=(-half, half), xlabel=label)
+        corners = layout.corners(poses)
+        for k in range(layout.tokens):
+            face, outline = (COLOURS[k % len(COLOURS)], 0.85), corners[layout.corners_of(k)]
+            panel.add_patch(Polygon(outline, facecolor=face, edgecolor="white", linewidth=1.2))
     caption = (
         "Fig. 1: (a) a sitting cat of six tokens as the target, (b) the same tokens at a random "
         "start without overlap."
@@ -192,12 +172,10 @@ def _draw_edges(panel: Axes, layout: Layout, positions: Floats, width: float) ->
     pairs = [(i, j) for i, j in np.argwhere(np.triu(layout.adjacency)).tolist()]
     across = [{kinds[i], kinds[j]} == {1, 2} for i, j in pairs]
     for between, colour, style in ((True, BETWEEN, "dashed"), (False, WITHIN, "solid")):
-        lines = [
-            positions[[i, j]] for (i, j), far in zip(pairs, across, strict=True) if far == between
-        ]
-        panel.add_collection(
-            LineCollection(lines, colors=colour, linewidths=width, linestyles=style, zorder=1)
-        )
+        own = [pair for pair, far in zip(pairs, across, strict=True) if far == between]
+        lines = LineCollection([positions[list(pair)] for pair in own], linestyles=style, zorder=1)
+        lines.set(color=colour, linewidth=width)
+        panel.add_collection(lines)
 
 
 def _draw_stages(panel: Axes, layout: Layout, features: Floats) -> None:
@@ -250,17 +228,9 @@ def _draw_strips(panel: Axes, at: Floats, values: Floats, kinds: Sequence[int]) 
         for i, colour in enumerate(row):
             corner = (x - cell / 2.0, y + height / 2.0 - cell * (i + 1))
             panel.add_patch(Rectangle(corner, cell, cell, facecolor=colour, zorder=3))
-        panel.add_patch(
-            Rectangle(
-                (x - cell / 2.0, y - height / 2.0),
-                cell,
-                height,
-                fill=False,
-                edgecolor=CLASS_COLOURS[kind],
-                linewidth=1.1,
-                zorder=4,
-            )
-        )
+        frame = Rectangle((x - cell / 2.0, y - height / 2.0), cell, height, fill=False, zorder=4)
+        frame.set(edgecolor=CLASS_COLOURS[kind], linewidth=1.1)
+        panel.add_patch(frame)
 
 
 def _shades(values: Floats) -> list[list[tuple[float, float, float]]]:
@@ -323,15 +293,8 @@ SEED = 5
 TARGET, TOKEN, BOTH = (to_rgb(colour) for colour in (COLOURS[4], COLOURS[5], COLOURS[0]))
 
 
-@dataclass(frozen=True, eq=False)
-class Shots:
-    """What the camera saw of one episode.
-
-    Attributes:
-        backend: the world that it was played in.
-        target, start, end: grayscale pictures (P, P).
-        reward: Eq. 14 of target and end, in [-1, 1].
-    """
+class Shots(NamedTuple):
+    """Grayscale pictures (P, P) that the camera of a backend took of an episode, and Eq. 14."""
 
     backend: str
     target: Pixels
@@ -345,11 +308,14 @@ def draw_camera() -> tuple[Figure, str]:
     shots = take_shots()
     figure = empty_figure(WIDTH_IN, WIDTH_IN * 0.28)
     panels = figure.subplots(1, 4)
-    pictures = (shots.target, shots.start, shots.end)
+    gray = [np.repeat(one[..., None], 3, axis=-1) for one in (shots.target, shots.start, shots.end)]
     labels = ("(a) target", "(b) initial position", "(c) after action a")
-    for panel, picture, label in zip(panels, pictures, labels, strict=False):
-        _show(panel, np.repeat(picture[..., None], 3, axis=-1), label)
-    _show(panels[3], _overlap(shots.target, shots.end), f"(d) overlap, r = {shots.reward:.3f}")
+    overlap = f"(d) overlap, r = {shots.reward:.3f}"
+    pictures = [*gray, _overlap(shots.target, shots.end)]
+    for panel, picture, label in zip(panels, pictures, (*labels, overlap), strict=True):
+        bare(panel, framed=True)
+        panel.imshow(picture, interpolation="nearest")
+        panel.set_xlabel(label)
     return figure, _camera_caption(shots)
 
 
@@ -371,18 +337,14 @@ def take_shots(backend: str = "physics") -> Shots:
     placed = np.zeros((1, 1), dtype=np.bool_)
     corners, goals = layout.corners(start)[None], layout.corners(target)[None]
     action = policy(corners, placed, goals, [generator])
-    world = make_world(layout, sim)
-    try:
+    with closing(make_world(layout, sim)) as world:
         world.place(target)
-        target_picture = world.picture()
+        wanted = world.picture()
         world.place(start)
-        start_picture = world.picture()
+        first = world.picture()
         world.move(0, velocities(action.astype(np.float64), sim)[0])
-        end_picture = world.picture()
-    finally:
-        world.close()
-    reward = TargetPictures(target_picture[None]).rewards(end_picture[None])[0]
-    return Shots(sim.backend, target_picture, start_picture, end_picture, reward)
+        end = world.picture()
+    return Shots(backend, wanted, first, end, TargetPictures(wanted[None]).rewards(end[None])[0])
 
 
 def _overlap(target: Pixels, end: Pixels) -> Floats:
@@ -393,15 +355,6 @@ def _overlap(target: Pixels, end: Pixels) -> Floats:
     image[covered] = TOKEN
     image[wanted & covered] = BOTH
     return image
-
-
-def _show(panel: Axes, image: Pixels | Floats, label: str) -> None:
-    bare(panel)
-    panel.imshow(image, interpolation="nearest")
-    panel.set_xlabel(label)
-    for spine in panel.spines.values():
-        spine.set_visible(True)
-        spine.set_color(FRAME)
 
 
 def _camera_caption(shots: Shots) -> str:

@@ -11,9 +11,9 @@ import json
 import math
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import safetensors.numpy
@@ -40,14 +40,8 @@ FIGURES, TURNS = ("test", "train"), 4  # splits of the library, and angles of ea
 TESTS, TEST_SEED = 400, 1  # tests that no choice was made on: training is scored on seed 0
 
 
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """A finished run of one seed.
-
-    Attributes:
-        run: the run, with its final weights.
-        result: content of its result.json.
-    """
+class Candidate(NamedTuple):
+    """A finished run of one seed, with its final weights, and the content of its result.json."""
 
     run: Run
     result: dict[str, Any]
@@ -82,13 +76,14 @@ def publish(
     weights = _weights(chosen.run)
     config = EvalConfig(str(chosen.run.folder), episodes=tests, seed=TEST_SEED)
     scores = score_policies(chosen.run.setup, policies(chosen.run), config)
-    card = make_card(name, chosen.run.setup, chosen.result, [one.result for one in seeds], scores)
+    card = make_card(name, chosen, seeds, scores)
     card |= {"tests": {"episodes": tests, "seed": TEST_SEED, "scores": scores}}
     if has_all_tans(chosen.run.setup.layout):
         card |= {"puzzles": {split: _on_figures(chosen.run, split) for split in FIGURES}}
     card |= {"sha256": hashlib.sha256(weights).hexdigest()}
     folder = target / name
-    write_whole(folder / CONFIG, _config(chosen.run).encode())
+    # What makes the setup, every value written out; a run's config also names its machine.
+    write_whole(folder / CONFIG, yaml.safe_dump(asdict(chosen.run.setup), sort_keys=False).encode())
     write_whole(folder / WEIGHTS, weights)
     write_whole(folder / CARD_TEXT, card_text(card).encode())
     write_whole(folder / CARD, (json.dumps(card, indent=1) + "\n").encode())
@@ -157,11 +152,6 @@ def _weights(run: Run) -> bytes:
     return data
 
 
-def _config(run: Run) -> str:
-    """What makes the setup, every value written out; a run's config also names its machine."""
-    return yaml.safe_dump(asdict(run.setup), sort_keys=False)
-
-
 # The card: what the agent is, what made it, what it can do
 
 
@@ -180,29 +170,28 @@ _ROWS = {
     "iou": ("intersection over union", 4),
     "wrong": ("pieces under a token of another shape", 2),
     "blocked": ("placements refused because of other tokens", 2),
-    "angle_error_deg_median": ("angle error, median, degrees", 2),
-    "angle_error_deg_p90": ("angle error, 90th percentile", 2),
+    "angle_error_deg_median": ("angle error, median, degrees", 3),
+    "angle_error_deg_p90": ("angle error, 90th percentile", 3),
     "position_error_median": ("position error, median, arena units", 4),
     "position_error_p90": ("position error, 90th percentile", 4),
 }
 
 
 def make_card(
-    name: str,
-    setup: Setup,
-    result: Mapping[str, Any],
-    seeds: Sequence[Mapping[str, Any]],
-    tested: Mapping[str, Scores],
+    name: str, chosen: Candidate, seeds: Sequence[Candidate], tested: Mapping[str, Scores]
 ) -> dict[str, Any]:
-    """The content of card.json but for the tests and the checksum.
+    """The content of card.json but for the tests, the puzzles and the checksum.
 
     Args:
         name: of the agent.
-        setup: the task and the agent.
-        result: result.json of the run that ships.
-        seeds: result.json of all runs, by seed.
+        chosen: the run that ships.
+        seeds: all runs, by seed.
         tested: scores of the shipped weights and of the policies to compare with.
     """
+    setup, result = chosen.run.setup, chosen.result
+    acting = sum(math.prod(shape) for shape in Policy(setup).shapes.values())
+    source = f"simulated by this project ({setup.sim.backend}), random starts and targets"
+    each = ("seed", "train_s", "episodes", *_ROWS)
     return {
         "format": FORMAT,
         "name": name,
@@ -210,24 +199,21 @@ def make_card(
         "task": _task(setup),
         "agent": setup.agent.name,
         "net": setup.net.kind,
-        "parameters": {"acting": _numbers(setup), "trained": result["parameters"]},
-        "data": {
-            "source": f"simulated by this project ({setup.sim.backend}), random starts and targets",
-            **{key: result[key] for key in ("episodes", "transitions")},
-        },
-        "budget": {key: result[key] for key in _BUDGET},
-        "updates": result["updates"],
-        "seed": result["seed"],
+        "parameters": {"acting": acting, "trained": result["parameters"]},
+        "data": {"source": source, **_picked(result, "episodes", "transitions")},
+        "budget": _picked(result, *_BUDGET),
+        **_picked(result, "updates", "seed"),
         "selection": "median of the seeds by final mean_reward (the lower one of two)",
         "scores": {score: result.get(score) for score in _ROWS},
         "test_episodes": result["test_episodes"],
-        "seeds": [
-            {key: one.get(key) for key in ("seed", "train_s", "episodes", *_ROWS)} for one in seeds
-        ],
+        "seeds": [{key: one.result.get(key) for key in each} for one in seeds],
         "limits": _limits(setup, tested[RUN]),
-        "commit": result["commit"],
-        "versions": result["versions"],
+        **_picked(result, "commit", "versions"),
     }
+
+
+def _picked(result: Mapping[str, Any], *names: str) -> dict[str, Any]:
+    return {name: result[name] for name in names}
 
 
 def _task(setup: Setup) -> dict[str, Any]:
@@ -241,154 +227,118 @@ def _task(setup: Setup) -> dict[str, Any]:
     }
 
 
-def _numbers(setup: Setup) -> int:
-    """Trainable numbers of the acting actor."""
-    return sum(math.prod(shape) for shape in Policy(setup).shapes.values())
-
-
 def _limits(setup: Setup, scores: Scores) -> list[str]:
-    sim, tokens = setup.sim, setup.layout.tokens
+    sim, one = setup.sim, setup.layout.tokens == 1
+    pieces = "One token of this shape and size" if one else "This token set and size"
     noise = (
         f"Corners with noise of {sim.corner_noise:g} of the arena, as in training."
         if sim.corner_noise
         else "Exact corners only: it was trained without noise and never saw a wrong corner."
     )
-    pieces = "One token of this shape and size" if tokens == 1 else "This token set and size"
+    several = [
+        {
+            "lift": "Tokens are lifted and set down: it knows nothing of pushes along the table.",
+            "slide": "Tokens slide, and push others by the simulation's friction.",
+        }[sim.motion],
+        "The target's pieces must be known, each by its corners: a silhouette is not enough.",
+    ]
     return [
         f"{pieces}, in an arena of this width: another task needs another training.",
         noise,
         "Each corner must be known by its number: the target's corners come in the token's order.",
-        *_motion_limits(setup),
+        *(["Nothing stops a token at the arena's edge."] if one else several),
         f"One of ten tests ends below a raw overlap of {scores['raw_overlap_p10']:.3f}.",
-    ]
-
-
-def _motion_limits(setup: Setup) -> list[str]:
-    if setup.layout.tokens == 1:
-        return ["Nothing stops a token at the arena's edge."]
-    told = {
-        "lift": "Tokens are lifted and set down: it knows nothing of pushes along the table.",
-        "slide": "Tokens slide, and push others by the simulation's friction.",
-    }
-    return [
-        told[setup.sim.motion],
-        "The target's pieces must be known, each by its corners: a silhouette is not enough.",
     ]
 
 
 def card_text(card: Mapping[str, Any]) -> str:
     """card.md: the same for people."""
-    lines = [
-        f"# {PREFIX}/{card['name']}",
-        "",
-        _about(card),
-        "",
-        *_usage(card["name"]),
-        *_training(card),
-        *_evaluation(card),
-        "## Limits",
-        "",
-        *(f"- {limit}" for limit in card["limits"]),
-        "",
-    ]
-    return "\n".join(lines)
+    name, data, budget = card["name"], card["data"], card["budget"]
+    versions = ", ".join(f"{package} {number}" for package, number in card["versions"].items())
+    seeds, tests = card["seeds"], card["tests"]
+    names = [f"seed {one['seed']}{' (this one)' * (one['seed'] == card['seed'])}" for one in seeds]
+    compared = {"this agent" if one == RUN else one: s for one, s in tests["scores"].items()}
+    limits = "\n".join(f"- {limit}" for limit in card["limits"])
+    return f"""\
+# {PREFIX}/{name}
+
+{_about(card)} Agent `{card["agent"]}`, network `{card["net"]}` with \
+{card["parameters"]["acting"]:,} parameters. Licence: {card["licence"]}.
+
+## How to use it
+
+```bash
+tangram-eval run_dir={PREFIX}/{name} episodes=400 seed=1
+tangram-play run_dir={PREFIX}/{name} out={name}.gif
+```
+
+```python
+from tangram_agent.runs import load_run
+
+run = load_run("{PREFIX}/{name}")
+actions = run.policy.act(corners, placed, goals)  # see docs/inference.md
+```
+
+## Training
+
+- Data: {data["episodes"]:,} episodes with {data["transitions"]:,} transitions, \
+{data["source"]}; nothing else.
+- Budget: {budget["updates"]:,} updates in {budget["train_s"]:.0f} s, {budget["wall_s"]:.0f} s \
+in all, on {budget["cores"]} cores ({budget["processor"]}), device {budget["device"]}, \
+{budget["workers"]} worker{"s" * (budget["workers"] != 1)}.
+- Code: commit {card["commit"] or "unknown"}; {versions}.
+
+## Evaluation
+
+All seeds after their last update, on the {card["test_episodes"]:.0f} fixed tests of the \
+training; the {card["selection"]} ships.
+
+{_table(dict(zip(names, seeds, strict=True)))}
+
+This agent on {tests["episodes"]} other tests (seed {tests["seed"]}), which nothing was chosen \
+on, beside policies that learned nothing:
+
+{_table(compared)}
+
+{_puzzles(card)}## Limits
+
+{limits}
+"""
 
 
 def _about(card: Mapping[str, Any]) -> str:
     task = card["task"]
-    areas = ", ".join(f"{area:g}" for area in task["token_areas"])
-    actions = task["actions_per_token"]
+    tokens, count = ", ".join(task["tokens"]), task["actions_per_token"]
+    arena, actions = f"{task['arena']:g}", f"{count} action{'s' * (count > 1)}"
     if len(task["tokens"]) > 1:
         return (
-            f"An agent that assembles {len(task['tokens'])} tangram tokens "
-            f"({', '.join(task['tokens'])}; full square of side {task['scale']:g}) in an order of "
-            f"its own, each with {actions} action{'s' * (actions > 1)}, in a square arena of width "
-            f"{task['arena']:g}. Agent `{card['agent']}`, network `{card['net']}` with "
-            f"{card['parameters']['acting']:,} parameters. Licence: {card['licence']}."
+            f"An agent that assembles {len(task['tokens'])} tangram tokens ({tokens}; full square "
+            f"of side {task['scale']:g}) in an order of its own, each with {actions}, in a square "
+            f"arena of width {arena}."
         )
+    areas = ", ".join(f"{area:g}" for area in task["token_areas"])
     return (
-        f"An agent that moves a tangram token ({', '.join(task['tokens'])}; area {areas}) from "
-        f"anywhere in a square arena of width {task['arena']:g} onto its target, position and "
-        f"angle, in {actions} action{'s' * (actions > 1)}. Agent `{card['agent']}`, network "
-        f"`{card['net']}` with {card['parameters']['acting']:,} parameters. "
-        f"Licence: {card['licence']}."
+        f"An agent that moves a tangram token ({tokens}; area {areas}) from anywhere in a square "
+        f"arena of width {arena} onto its target, position and angle, in {actions}."
     )
 
 
-def _usage(name: str) -> list[str]:
-    return [
-        "## How to use it",
-        "",
-        "```bash",
-        f"tangram-eval run_dir={PREFIX}/{name} episodes=400 seed=1",
-        f"tangram-play run_dir={PREFIX}/{name} out={name}.gif",
-        "```",
-        "",
-        "```python",
-        "from tangram_agent.runs import load_run",
-        "",
-        f'run = load_run("{PREFIX}/{name}")',
-        "actions = run.policy.act(corners, placed, goals)  # see docs/inference.md",
-        "```",
-        "",
-    ]
-
-
-def _training(card: Mapping[str, Any]) -> list[str]:
-    data, budget = card["data"], card["budget"]
-    versions = ", ".join(f"{package} {number}" for package, number in card["versions"].items())
-    return [
-        "## Training",
-        "",
-        f"- Data: {data['episodes']:,} episodes with {data['transitions']:,} transitions, "
-        f"{data['source']}; nothing else.",
-        f"- Budget: {budget['updates']:,} updates in {budget['train_s']:.0f} s, "
-        f"{budget['wall_s']:.0f} s in all, on {budget['cores']} cores "
-        f"({budget['processor']}), device {budget['device']}, {budget['workers']} "
-        f"worker{'s' * (budget['workers'] != 1)}.",
-        f"- Code: commit {card['commit'] or 'unknown'}; {versions}.",
-        "",
-    ]
-
-
-def _evaluation(card: Mapping[str, Any]) -> list[str]:
-    seeds, tests = card["seeds"], card["tests"]
-    names = [f"seed {one['seed']}{' (this one)' * (one['seed'] == card['seed'])}" for one in seeds]
-    compared = {"this agent" if name == RUN else name: s for name, s in tests["scores"].items()}
-    return [
-        "## Evaluation",
-        "",
-        f"All seeds after their last update, on the {card['test_episodes']:.0f} fixed tests of "
-        f"the training; the {card['selection']} ships.",
-        "",
-        *_table(dict(zip(names, seeds, strict=True))),
-        "",
-        f"This agent on {tests['episodes']} other tests (seed {tests['seed']}), which nothing was "
-        "chosen on, beside policies that learned nothing:",
-        "",
-        *_table(compared),
-        "",
-        *_puzzles(card),
-    ]
-
-
-def _puzzles(card: Mapping[str, Any]) -> list[str]:
+def _puzzles(card: Mapping[str, Any]) -> str:
     """Scores on the figures of the library, where the tokens are all seven tans."""
-    found = card.get("puzzles", {})
+    found = card.get("puzzles")
     if not found:
-        return []
-    splits = {f"{name} split": one["scores"] for name, one in found.items()}
+        return ""
     turns = next(iter(found.values()))["turns"]
-    return [
-        f"On the figures of tangram_sim/puzzles, each at {turns} angles; it trained on random "
-        "targets only, so that neither split was seen:",
-        "",
-        *_table(splits),
-        "",
-    ]
+    return f"""\
+On the figures of tangram_sim/puzzles, each at {turns} angles; it trained on random targets \
+only, so that neither split was seen:
+
+{_table({f"{name} split": one["scores"] for name, one in found.items()})}
+
+"""
 
 
-def _table(columns: Mapping[str, Mapping[str, Any]]) -> list[str]:
+def _table(columns: Mapping[str, Mapping[str, Any]]) -> str:
     """Markdown: a row for each score, a column for each name."""
     lines = ["| | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
     for key, (label, digits) in _ROWS.items():
@@ -397,7 +347,7 @@ def _table(columns: Mapping[str, Mapping[str, Any]]) -> list[str]:
             continue
         shown = ["-" if value is None else f"{value:.{digits}f}" for value in values]
         lines.append(f"| {label} | " + " | ".join(shown) + " |")
-    return lines
+    return "\n".join(lines)
 
 
 def main() -> int:

@@ -41,14 +41,12 @@ def setup(
 ) -> Setup:
     """A setup on the kinematic backend with a small network."""
     given = PLAIN | (agent or {})
-    several = given.get("readout", "auto") == "auto" and len(tokens["shapes"]) > 1
-    pairs = several or given.get("readout") == "pair"
     return make_setup(
         {
             "tokens": tokens,
             "sim": {"backend": "kinematic", **sim},
             "reward": {},
-            "agent": PROPOSAL | given if pairs else given,
+            "agent": given if given.get("readout") == "token" else PROPOSAL | given,
             "net": net,
         }
     )

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from tangram_agent.coverage import Lying, newly_covered
-from tangram_agent.graph import PairGraph, Pairs
+from tangram_agent.pairs import PairGraph, Pairs
 from tangram_agent.setup import Setup
 from tangram_agent.types import Transitions
 from tangram_sim.arrays import Bools, Floats

@@ -16,18 +16,15 @@ from tangram_agent.coverage import (
     pushed_share,
     worths,
 )
-from tangram_sim.layout import Layout, TokensConfig, make_layout
+from tangram_sim.layout import TokensConfig, make_layout
 from tests.agent.pair_scenes import SEVEN, random_scene
+from tests.sim.builders import polygons
 
 pytestmark = pytest.mark.fast
 
 LAYOUT = make_layout(TokensConfig(**SEVEN))
 LARGE, MEDIUM, SMALL, SQUARE, PARALLELOGRAM = 0, 2, 3, 5, 6
 AREAS = 0.6**2 * np.array([4, 4, 2, 1, 1, 2, 2]) / 16.0
-
-
-def polygons(corners: np.ndarray, layout: Layout = LAYOUT) -> list[Polygon]:
-    return [Polygon(corners[layout.corners_of(k)]) for k in range(layout.tokens)]
 
 
 def at(index: int, pose: Any, flipped: bool = False) -> Lying:
@@ -39,7 +36,9 @@ def test_single_outlines_are_the_layouts_corners(seed: int) -> None:
     np.testing.assert_allclose(LAYOUT.areas, AREAS)
     poses, sides = random_scene(LAYOUT, np.random.default_rng(seed))
     found = Lying(np.arange(7), poses, sides).outlines(LAYOUT)
-    for outline, expected in zip(found, polygons(LAYOUT.corners(poses, sides)), strict=True):
+    for outline, expected in zip(
+        found, polygons(LAYOUT, LAYOUT.corners(poses, sides)), strict=True
+    ):
         assert Polygon(outline).symmetric_difference(expected).area < 1e-12
         assert Polygon(outline).exterior.is_ccw
 
@@ -61,7 +60,7 @@ def test_covering_shares_and_worths_against_shapely(seed: int) -> None:
     corners, wanted = LAYOUT.corners(poses, sides), LAYOUT.corners(goals, goal_sides)
     expected = np.zeros((2, 7, 7))
     for b in range(2):
-        own, pieces = polygons(corners[b]), polygons(wanted[b])
+        own, pieces = polygons(LAYOUT, corners[b]), polygons(LAYOUT, wanted[b])
         for i, j in np.ndindex(7, 7):
             expected[b, i, j] = own[i].intersection(pieces[j]).area
     found = covering(corners, wanted, LAYOUT)
@@ -82,8 +81,8 @@ def test_the_share_of_tokens_that_do_not_overlap_is_that_of_their_union() -> Non
     goals, goal_sides = random_scene(LAYOUT, rng)
     goals[:, :2] *= (5.0, 0.2)
     corners, wanted = LAYOUT.corners(poses, sides), LAYOUT.corners(goals, goal_sides)
-    union = unary_union(polygons(corners))
-    expected = [piece.intersection(union).area / piece.area for piece in polygons(wanted)]
+    union = unary_union(polygons(LAYOUT, corners))
+    expected = [piece.intersection(union).area / piece.area for piece in polygons(LAYOUT, wanted)]
     found = covering(corners[None], wanted[None], LAYOUT)
     assert max(expected) > 0.3
     own = found[0] / AREAS

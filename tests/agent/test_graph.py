@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tangram_agent.graph import SceneGraph, Scenes
+from tangram_agent.scenes import SceneGraph, Scenes
 from tangram_agent.setup import Setup
 from tangram_sim.layout import Layout
 from tests.agent.builders import PAIR, PAPER, SQUARE, random_transitions, setup

@@ -1,6 +1,7 @@
-"""Eqs. 3-6: hand-made targets, goldens, and what must have no effect."""
+"""Eqs. 3-6 with either readout: hand-made targets, goldens, and what must have no effect."""
 
 import json
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from tangram_agent.graph import Scenes, next_token
 from tangram_agent.learner import (
     Learner,
     NotFiniteError,
@@ -18,29 +18,66 @@ from tangram_agent.learner import (
     polyak_update,
     saturation,
 )
+from tangram_agent.scenes import Scenes, next_token
 from tangram_agent.setup import Setup
-from tangram_agent.types import Transitions
 from tangram_sim.errors import RunError
 from tests.agent.builders import PAIR, PAPER, SCENE, SMALL, random_transitions, setup
+from tests.agent.pair_scenes import PERCEPTRON, TWO, seven, transitions
 
 pytestmark = pytest.mark.fast
 
-GOLDEN = Path(__file__).parents[1] / "golden" / "ddpg.json"
-CASES: dict[str, dict[str, Any]] = {
-    "tangram": {"agent": SCENE},
-    "paper": {"agent": PAPER, "actions_per_token": 2},
-    "mlp": {"agent": PAPER, "net": {"kind": "mlp"}, "actions_per_token": 2},
-    "several": {"tokens": PAIR, "agent": SCENE | {"gamma": 0.9}},
+GOLDEN = Path(__file__).parents[1] / "golden"
+TARGETS = ("target_actor", "target_critic")
+MLP = {"kind": "mlp"}
+NEAR = {"strategy": "near", "position": 0.1, "angle": 0.5}
+TWINS = {"hindsight": [{"strategy": "final"}, NEAR], "pairs_per_transition": 4}
+SLIDE = {"backend": "physics", "motion": "slide"}
+# File of golden values, and name there -> setup.
+CASES: dict[tuple[str, str], Callable[[], Setup]] = {
+    ("ddpg", "tangram"): lambda: setup(agent=SCENE),
+    ("ddpg", "paper"): lambda: setup(agent=PAPER, actions_per_token=2),
+    ("ddpg", "mlp"): lambda: setup(agent=PAPER, net=MLP, actions_per_token=2),
+    ("ddpg", "several"): lambda: setup(PAIR, SCENE | {"gamma": 0.9}),
+    ("pairs", "mha"): lambda: seven(TWINS),
+    ("pairs", "mlp"): lambda: seven(TWINS, PERCEPTRON),
+    ("pairs", "slide"): lambda: seven(TWINS, PERCEPTRON, **SLIDE),
 }
 
 
-def weights(learner: Learner) -> dict[str, np.ndarray]:
+def play(learner: Learner, made: Setup, seeds: range, progress: float = 0.25) -> list[Any]:
+    """Updates on what the seeds draw."""
+    numbers = []
+    for seed in seeds:
+        drawn = (
+            transitions(made, 16, seed)
+            if made.pairs
+            else random_transitions(made, 32, seed, done=None)
+        )
+        batch = learner.prepared(drawn, np.random.default_rng(seed))
+        numbers.append(learner.update(batch, progress))
+    return numbers
+
+
+def changed(one: dict[str, Any], other: dict[str, Any]) -> set[str]:
+    """The parts of a state in which two differ."""
+    return {name.split(".")[0] for name in one if not np.array_equal(one[name], other[name])}
+
+
+def scaled(learner: Learner, parts: Iterable[str], factor: float) -> Learner:
+    """The learner with every weight of some parts multiplied."""
+    with torch.no_grad():
+        for part in parts:
+            for parameter in getattr(learner, part).parameters():
+                parameter.mul_(factor)
+    return learner
+
+
+def copied(learner: Learner) -> dict[str, Any]:
     return {name: value.copy() for name, value in learner.state().items()}
 
 
-def largest_change(before: dict[str, np.ndarray], after: dict[str, np.ndarray], part: str) -> float:
+def largest_change(before: dict[str, Any], after: dict[str, Any], part: str) -> float:
     names = [name for name in before if name.startswith(f"{part}.")]
-    assert names
     return max(float(np.abs(before[name] - after[name]).max()) for name in names)
 
 
@@ -87,24 +124,20 @@ def test_the_first_unplaced_token_moves(placed: list[int], token: int) -> None:
     assert next_token(torch.tensor([placed])).tolist() == [token]
 
 
-def test_the_critic_loss_is_the_mean_squared_bellman_error() -> None:
-    """Against the value by hand: y from the target networks, one transition at a time."""
-    made = setup(agent={**PAPER, "gamma": 0.9}, actions_per_token=2)
-    learner = Learner(made, seed=0)
-    for module in (learner.target_actor, learner.target_critic):
-        for parameter in module.parameters():
-            parameter.mul_(1.5)
+@pytest.mark.parametrize("agent", [PAPER, {"readout": "pair"}])
+def test_the_critic_loss_is_the_mean_squared_bellman_error(agent: dict[str, Any]) -> None:
+    """Against the value by hand: y from the target networks, 0 after the end."""
+    made = setup(agent=agent | {"gamma": 0.9}, actions_per_token=2)
+    learner = scaled(Learner(made, seed=0), TARGETS, 1.5)
     batch = random_transitions(made, 6, done=None)
     assert 0 < batch.done.sum() < 6
-    steps, errors = learner.steps(batch), []
-    for i in range(6):
-        row = learner.steps(Transitions(**{n: c[i : i + 1] for n, c in vars(batch).items()}))
-        follow = learner.target_critic(row.follow, learner.target_actor(row.follow)[0])
-        y = batch.reward[i] + 0.9 * follow * (1 - int(batch.done[i]))
-        q = learner.critic(row.view, torch.from_numpy(batch.action[i : i + 1]))
-        errors.append((q - y).item() ** 2)
-    loss, _ = learner.critic_loss(steps)
-    assert loss.item() == pytest.approx(sum(errors) / 6, rel=1e-5)
+    steps = learner.steps(learner.prepared(batch, np.random.default_rng(0)))
+    follow = learner.target_critic(steps.follow, learner.target_actor(steps.follow)[0])
+    y = torch.from_numpy(batch.reward) + 0.9 * follow * (1 - torch.from_numpy(batch.done))
+    loss, q = learner.critic_loss(steps)
+    assert loss.item() == pytest.approx((q - y).square().mean().item(), rel=1e-5)
+    if not made.pairs:  # those move their tokens on before they are valued
+        torch.testing.assert_close(q, learner.critic(steps.view, torch.from_numpy(batch.action)))
 
 
 def test_the_actor_loss_is_minus_the_value_of_its_actions() -> None:
@@ -129,12 +162,6 @@ def test_the_token_that_moved_is_valued_and_the_next_one_is_asked() -> None:
     assert steps.velocity.shape == (3, 3)
 
 
-def spoil_targets(learner: Learner) -> None:
-    for module in (learner.target_actor, learner.target_critic):
-        for parameter in module.parameters():
-            parameter.fill_(float("nan"))
-
-
 @pytest.mark.parametrize(
     ("agent", "actions", "there"),
     [({"gamma": 0.9}, 1, False), ({}, 2, False), ({"gamma": 0.9}, 2, True)],
@@ -150,26 +177,17 @@ def test_target_networks_are_there_where_something_bootstraps(
     assert any(name.startswith("target_critic.") for name in learner.state()) == there
 
 
-def test_target_networks_are_not_asked_where_every_transition_ends() -> None:
+def test_target_networks_matter_just_where_an_episode_goes_on() -> None:
     made = setup(agent=SCENE | {"gamma": 0.99}, actions_per_token=2)
-    plain, spoilt = Learner(made, seed=0), Learner(made, seed=0)
-    spoil_targets(spoilt)
+    plain = Learner(made, seed=0)
+    spoilt = scaled(Learner(made, seed=0), TARGETS, float("nan"))
     for seed in range(3):
-        batch = random_transitions(made, 16, seed)
-        plain.update(batch)
-        spoilt.update(batch)
-    a, b = weights(plain), weights(spoilt)
-    for part in ("actor", "critic", "acting"):
-        assert largest_change(a, b, part) == 0.0
-
-
-def test_target_networks_matter_where_an_episode_goes_on() -> None:
-    made = setup(agent=SCENE | {"gamma": 0.99}, actions_per_token=2)
-    spoilt = Learner(made, seed=0)
-    spoil_targets(spoilt)
-    with pytest.raises(NotFiniteError, match="update 1 is not finite .critic_loss=nan"):
+        for learner in (plain, spoilt):
+            learner.update(random_transitions(made, 16, seed))
+    assert changed(plain.state(), spoilt.state()) == set(TARGETS)
+    with pytest.raises(NotFiniteError, match="update 4 is not finite .critic_loss=nan"):
         spoilt.update(random_transitions(made, 16, done=None))
-    assert spoilt.updates == 0
+    assert spoilt.updates == 3
 
 
 def test_an_update_moves_each_network_and_drags_the_averages() -> None:
@@ -177,9 +195,9 @@ def test_an_update_moves_each_network_and_drags_the_averages() -> None:
     made = setup(agent=agent, actions_per_token=2)
     learner = Learner(made, seed=0)
     learner.updates = 1000  # the acting average is no longer young
-    before = weights(learner)
-    learner.update(random_transitions(made, 16, done=None))
-    after = weights(learner)
+    before = copied(learner)
+    play(learner, made, range(1))
+    after = learner.state()
     for part in ("actor", "critic"):
         moved = largest_change(before, after, part)
         assert moved > 1e-4
@@ -189,17 +207,16 @@ def test_an_update_moves_each_network_and_drags_the_averages() -> None:
     assert learner.updates == after["updates"][0] == 1001
 
 
-def test_the_actor_step_leaves_the_critic_alone() -> None:
+@pytest.mark.parametrize("case", [("ddpg", "tangram"), ("pairs", "slide")])
+def test_the_actor_step_leaves_the_critic_alone(case: tuple[str, str]) -> None:
     """The critic's own step uses the critic's loss only: spoil the actor, the critic agrees."""
-    made = setup(agent=SCENE)
-    plain, spoilt = Learner(made, seed=0), Learner(made, seed=0)
-    with torch.no_grad():
-        for parameter in spoilt.actor.parameters():
-            parameter.mul_(-3.0)
-    batch = random_transitions(made, 16)
-    plain.update(batch)
-    spoilt.update(batch)
-    assert largest_change(weights(plain), weights(spoilt), "critic") == 0.0
+    made = CASES[case]()
+    plain, spoilt = Learner(made, seed=0), scaled(Learner(made, seed=0), ["actor"], -3.0)
+    for learner in (plain, spoilt):
+        play(learner, made, range(2))
+    parts = changed(plain.state(), spoilt.state())
+    assert "actor" in parts
+    assert not {"critic", "critic_optimiser"} & parts
 
 
 @pytest.mark.parametrize("readout", ["token", "pair"])
@@ -232,20 +249,24 @@ def test_the_penalty_pulls_a_saturated_actor_back() -> None:
     assert last < 0.5 * first
 
 
+DECAY = {0.0: 1.0, 0.5: 0.505, 1.0: 0.01, 2.0: 0.01, -1.0: 1.0}
+UNDECAYED = {"lr_final": 1.0}
+
+
 @pytest.mark.parametrize(
-    ("progress", "share"), [(0.0, 1.0), (0.5, 0.505), (1.0, 0.01), (2.0, 0.01), (-1.0, 1.0)]
+    ("options", "progress", "share"),
+    [
+        *(({}, progress, share) for progress, share in DECAY.items()),
+        (UNDECAYED, 0.9, 1.0),
+    ],
 )
-def test_cosine_decay_of_the_learning_rate(progress: float, share: float) -> None:
-    learner = Learner(setup(agent=SCENE | {"actor_lr": 2e-3}), seed=0)
+def test_cosine_decay_of_the_learning_rate(
+    options: dict[str, Any], progress: float, share: float
+) -> None:
+    learner = Learner(setup(agent=SCENE | {"actor_lr": 2e-3} | options), seed=0)
     learner.update(random_transitions(setup(), 4), progress)
     assert learner.actor_optimiser.param_groups[0]["lr"] == pytest.approx(2e-3 * share)
     assert learner.critic_optimiser.param_groups[0]["lr"] == pytest.approx(1e-3 * share)
-
-
-def test_without_decay_the_learning_rate_stays() -> None:
-    learner = Learner(setup(agent=SCENE | {"lr_final": 1.0}), seed=0)
-    learner.update(random_transitions(setup(), 4), 0.9)
-    assert learner.actor_optimiser.param_groups[0]["lr"] == 1e-3
 
 
 def test_gradients_are_clipped_to_the_norm() -> None:
@@ -257,52 +278,55 @@ def test_gradients_are_clipped_to_the_norm() -> None:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_restored_learner_goes_on_bit_for_bit(case: str) -> None:
-    made = setup(**CASES[case])
-    first, second = Learner(made, seed=0), Learner(made, seed=9)
-    for seed in range(2):
-        first.update(random_transitions(made, 8, seed, done=None), 0.1)
-    second.load_state(weights(first))
-    for seed in range(2, 4):
-        batch = random_transitions(made, 8, seed, done=None)
-        assert first.update(batch, 0.2) == second.update(batch, 0.2)
-    a, b = weights(first), weights(second)
-    assert a.keys() == b.keys()
-    for name in a:
-        np.testing.assert_array_equal(a[name], b[name])
+def test_a_restored_learner_goes_on_bit_for_bit(case: tuple[str, str]) -> None:
+    made = CASES[case]()
+    first, again, second = (Learner(made, seed) for seed in (0, 0, 9))
+    assert changed(first.state(), again.state()) == set()
+    assert {"actor", "critic"} <= changed(first.state(), second.state())
+    play(first, made, range(2), 0.1)
+    second.load_state(copied(first))
+    assert play(first, made, range(2, 4)) == play(second, made, range(2, 4))
+    assert first.state().keys() == second.state().keys()
+    assert changed(first.state(), second.state()) == set()
 
 
 @pytest.mark.parametrize(
-    ("other", "reason"),
+    ("made", "other", "reason"),
     [
-        ({"tokens": PAIR, "agent": SCENE}, None),  # attention serves any token set: its weights fit
-        ({"net": {"kind": "mlp"}, "agent": SCENE}, "on one side only"),
-        ({"net": {**SMALL, "width": 32}, "agent": SCENE}, "weights of another layout"),
-        ({"agent": SCENE | {"offsets": False}}, "weights of another layout"),
+        (setup(agent=SCENE), setup(agent=SCENE, net=MLP), "on one side only"),
+        (setup(agent=SCENE), setup(agent=SCENE, net={**SMALL, "width": 32}), "of another layout"),
+        (setup(agent=SCENE), setup(agent=SCENE | {"offsets": False}), "of another layout"),
+        (seven(TWINS, PERCEPTRON), seven(TWINS), "weights of another"),
+        (seven(TWINS, PERCEPTRON), seven(TWINS, MLP | {"hidden": [8]}), "weights of another"),
+        (seven(TWINS, PERCEPTRON), seven(SCENE, PERCEPTRON), "weights of another"),
     ],
 )
-def test_weights_of_another_network_are_refused(other: dict[str, Any], reason: str | None) -> None:
-    state = weights(Learner(setup(agent=SCENE), seed=0))
-    learner = Learner(setup(**other), seed=0)
-    if reason is None:
-        learner.load_state(state)
-    else:
-        with pytest.raises(RunError, match=reason):
-            learner.load_state(state)
-
-
-def test_a_state_that_is_no_learners_is_refused() -> None:
+def test_weights_of_another_network_are_refused(made: Setup, other: Setup, reason: str) -> None:
+    with pytest.raises(RunError, match=reason):
+        Learner(other, seed=0).load_state(Learner(made, seed=0).state())
     with pytest.raises(RunError, match="not a learner's checkpoint"):
-        Learner(setup(), seed=0).load_state({})
+        Learner(made, seed=0).load_state({})
+
+
+@pytest.mark.parametrize(
+    ("made", "other"),
+    [
+        (setup(agent=SCENE), setup(PAIR, SCENE)),  # attention serves any token set
+        (setup(TWO, TWINS), seven(TWINS)),
+        (setup(TWO, TWINS, PERCEPTRON), seven(TWINS, PERCEPTRON)),  # with as many corners
+    ],
+)
+def test_one_network_serves_other_sets_of_tokens(made: Setup, other: Setup) -> None:
+    learner = Learner(other, 0)
+    learner.load_state(Learner(made, 1).state())
+    assert "actor" not in changed(learner.state(), Learner(made, 1).state())
 
 
 def golden(made: Setup) -> dict[str, float]:
     """Losses of the first two updates, and sums over the weights after them."""
     learner = Learner(made, seed=1)
-    result = {}
-    for i in range(2):
-        metrics = learner.update(random_transitions(made, 32, i, done=None), 0.25)
-        result |= {f"{name}_{i}": value for name, value in metrics.items()}
+    numbers = play(learner, made, range(2))
+    result = {f"{name}_{i}": v for i, one in enumerate(numbers) for name, v in one.items()}
     state = learner.state()
     for part in learner.parts:
         values = [v.astype(np.float64) for k, v in state.items() if k.startswith(f"{part}.")]
@@ -311,12 +335,13 @@ def golden(made: Setup) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_golden_values_of_two_updates(case: str) -> None:
+def test_golden_values_of_two_updates(case: tuple[str, str]) -> None:
     """Rewrite them with `python -m tests.agent.test_learner` when a change is meant."""
-    expected = json.loads(GOLDEN.read_text())[case]
-    assert golden(setup(**CASES[case])) == pytest.approx(expected, rel=1e-3, abs=1e-5)
+    expected = json.loads((GOLDEN / f"{case[0]}.json").read_text())[case[1]]
+    assert golden(CASES[case]()) == pytest.approx(expected, rel=1e-3, abs=1e-5)
 
 
 if __name__ == "__main__":
-    values = {case: golden(setup(**options)) for case, options in CASES.items()}
-    GOLDEN.write_text(json.dumps(values, indent=1) + "\n")
+    for name in {file for file, _ in CASES}:
+        found = {case: golden(made()) for (file, case), made in CASES.items() if file == name}
+        (GOLDEN / f"{name}.json").write_text(json.dumps(found, indent=1) + "\n")

@@ -160,45 +160,23 @@ def decode(frames: Sequence[bytes], kind: str) -> Message:
     return decode_from_master(frames, SHAPES)
 
 
-DESCRIBED: dict[str, dict[str, Bound]] = {
-    "episodes": {"count": Between(1, SPEC.max_count)},
-    "scores": {"count": Between(0, 64)},
-    "status": {"count": Between(0, 4096)},
-    "weights": {"version": Between(0, BIG)},
+DESCRIBED = {
+    "episodes": ["count"],
+    "scores": ["count"],
+    "status": ["count"],
+    "weights": ["version"],
 }
-FIELDS = [
-    (kind, name, bound)
-    for kind, bounds in BOUNDS.items()
-    for name, bound in (bounds | DESCRIBED.get(kind, {})).items()
-]
+FIELDS = [(kind, name) for kind in BOUNDS for name in (*BOUNDS[kind], *DESCRIBED.get(kind, ()))]
 
 
-def wrong(bound: Bound) -> list[Any]:
-    """Values just outside, and of other types."""
-    match bound:
-        case Between(low, high):
-            return [low - 1, high + 1, float(low), str(low), True, {}]
-        case Flag():
-            return [0, "yes"]
-        case Text(longest, choices, needed):
-            long = "x" * (longest + 1) if longest < 1024 else 2.0
-            return [1, {}, long, *["spy"] * bool(choices), *[""] * needed]
-        case Numbers():
-            return [1, "x", {"a": NAN}, {"a": 2e18}, {"a": "1"}, {"a": True}, {"A": 1.0}]
-        case Texts(longest):
-            return [1, {"a": 1}, {"A": "x"}, *[{"a": "x" * (longest + 1)}] * (longest < 1024)]
-    raise AssertionError(bound)
-
-
-@pytest.mark.parametrize(("kind", "name", "bound"), FIELDS)
+@pytest.mark.parametrize(("kind", "name"), FIELDS)
 def test_each_field_is_refused_out_of_its_bound_and_where_it_is_missing(
-    kind: str, name: str, bound: Bound
+    kind: str, name: str
 ) -> None:
-    for value in wrong(bound):
-        with pytest.raises(WireError) as caught:
+    """What each bound refuses stands in test_schema.py; 0.5 is out of every one."""
+    for value, told in ((0.5, "must "), ({"A": 1}, "(must|a name is) ")):
+        with pytest.raises(WireError, match=f"^{kind}: {name}.*{told}") as caught:
             decode(with_header(EXAMPLES[kind], **{name: value}), kind)
-        assert str(caught.value).startswith(f"{kind}: {name}"), value
-        assert " must " in str(caught.value) or " a name is " in str(caught.value)
         assert isinstance(caught.value, BatchError) == (kind == "episodes" and name != "sequence")
     with pytest.raises(WireError, match=f"{kind}: the field {name} is missing"):
         decode(with_header(EXAMPLES[kind], **{name: None}), kind)
@@ -352,6 +330,13 @@ EPISODES, SCORES, STATUS = (EXAMPLES[kind] for kind in ("episodes", "scores", "s
         (with_last(SCORES, 1, NAN), "starts holds nan at [1, 6, 1]"),
         (with_last(SCORES, 2, 4.5), "ends holds 4.5 at [1, 6, 1]"),
         (with_last(SCORES, 3, -4.5), "goals holds -4.5 at [1, 6, 1]"),
+        (
+            with_header(EPISODES, count=0),
+            f"episodes: count {INTEGER} 1 and {SPEC.max_count}, got 0",
+        ),
+        (with_header(EPISODES, count=SPEC.max_count + 1), f"episodes: count {INTEGER} 1 and"),
+        (with_header(SCORES, count=65), f"scores: count {INTEGER} 0 and 64, got 65"),
+        (with_header(STATUS, count=4097), f"status: count {INTEGER} 0 and 4096, got 4097"),
         (with_header(STATUS, count=4), "workers must have 288 bytes for the shape (4, "),
         (
             with_checksum([STATUS[0], b"\xff" * 8 * 3 * COLUMNS]),
@@ -363,7 +348,7 @@ def test_arrays_that_are_not_what_their_header_says_are_refused(
     frames: list[bytes], reason: str
 ) -> None:
     with pytest.raises(WireError, match=f"^{re.escape(reason)}") as caught:
-        decode(frames, "status" if "workers" in reason else "episodes")
+        decode(frames, "status" if b"status" in frames[0] else "episodes")
     if isinstance(caught.value, BatchError):
         assert caught.value.sequence == 9
 

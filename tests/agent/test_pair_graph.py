@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tangram_agent.config import AgentConfig
-from tangram_agent.graph import PairGraph, Pairs
+from tangram_agent.pairs import PairGraph, Pairs
 from tangram_sim.fitting import KINDS
 from tangram_sim.layout import Layout, TokensConfig, make_layout
 from tests.agent.pair_scenes import SEVEN, every_pair, random_pairs, random_scene
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.fast
 LAYOUT = make_layout(TokensConfig(**SEVEN))
 GRAPH = PairGraph(LAYOUT, 2.0, AgentConfig())
 SEEDS = range(3)
-PARALLELOGRAM, SQUARE = 6, 5
+PARALLELOGRAM, SQUARE, TRIANGLE = 6, 5, 0
 MIRROR = np.array([shape.mirror or 0.0 for shape in LAYOUT.shapes])
 
 
@@ -198,7 +198,7 @@ def test_the_numbers_of_a_pair_without_nodes() -> None:
     kind = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0]
     expected = [
         *(1.0, 0.0),
-        *(math.cos(0.8), math.sin(0.8), math.cos(0.2), math.sin(0.2)),
+        *(math.cos(0.8), math.sin(0.8), math.cos(0.2), math.sin(0.2), math.exp(-0.2)),
         *(np.column_stack([corners.real, corners.imag]).ravel() * 0.3 / radius),
         *(body.ravel() / radius),
         *kind,
@@ -215,12 +215,31 @@ def test_what_all_nodes_of_a_pair_are_told() -> None:
     pairs.covered[:] = 0.9
     told = GRAPH.node_features(pairs)[0, :, 5:].numpy()
     expected = [
-        *(math.cos(0.4), math.sin(0.4), math.cos(0.1), math.sin(0.1)),
+        *(math.cos(0.4), math.sin(0.4), math.cos(0.1), math.sin(0.1), math.exp(-0.1)),
         *(0.0, 0.0, 1.0, 0.0, 0.0, 0.0),
         *(0.0, 0.0, 0.0, 1.0, 0.0, 0.0),
         *(math.log(2.0), near, 0.9, 0.0),
     ]
     np.testing.assert_allclose(told, np.broadcast_to(expected, told.shape), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("piece", "angle", "off"),
+    [
+        (SQUARE, 0.0, 0.0),
+        (SQUARE, math.pi / 2 - 0.1, 0.1),
+        (SQUARE, -math.pi / 4, math.pi / 4),
+        (SQUARE, 3 * math.pi + 0.2, 0.2),
+        (PARALLELOGRAM, math.pi - 0.3, 0.3),
+        (TRIANGLE, math.pi - 0.3, math.pi - 0.3),
+    ],
+)
+def test_a_pair_tells_how_aligned_it_is_with_a_cusp_where_it_is(
+    piece: int, angle: float, off: float
+) -> None:
+    pairs = one_pair(piece, piece, (0.0, 0.0, 0.0), (0.0, 0.0, angle))
+    aligned = GRAPH.node_features(pairs)[0, 0, 9].item()
+    assert aligned == pytest.approx(math.exp(-off), abs=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -246,7 +265,7 @@ def test_edges_are_those_of_the_paper_or_complete() -> None:
     np.testing.assert_array_equal(complete, ~np.eye(9, dtype=bool))
 
 
-@pytest.mark.parametrize(("option", "less"), [("offsets", 2), ("orientation", 4)])
+@pytest.mark.parametrize(("option", "less"), [("offsets", 2), ("orientation", 5)])
 def test_an_option_that_is_off_takes_its_features_away(option: str, less: int) -> None:
     graph = PairGraph(LAYOUT, 2.0, AgentConfig(**{option: False}))
     pairs = random_pairs(LAYOUT, 0)

@@ -1,28 +1,24 @@
-"""Learning from pairs: losses by hand, goldens, what gradients reach, and that it learns."""
+"""Learning from pairs: losses by hand, what gradients reach, and that it learns."""
 
-import json
 from contextlib import closing
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from tangram_agent.graph import Pairs
 from tangram_agent.learner import Learner
+from tangram_agent.pairs import Pairs
 from tangram_agent.policy import Policy
 from tangram_agent.relabelling import ContactBatch, PairBatch
 from tangram_agent.setup import Setup
 from tangram_sim.batch import BatchedEnv
-from tangram_sim.errors import RunError
-from tests.agent.builders import SMALL, random_transitions, setup
+from tests.agent.builders import setup
 from tests.agent.pair_scenes import PERCEPTRON, TWO, seven, transitions
 
 pytestmark = pytest.mark.fast
 
-GOLDEN = Path(__file__).parents[1] / "golden" / "pairs.json"
 TWINS = [{"strategy": "final"}, {"strategy": "near", "position": 0.1, "angle": 0.5}]
 AGENT = {"hindsight": TWINS, "pairs_per_transition": 4}
 UPDATES = 120
@@ -34,24 +30,17 @@ CASES: dict[str, dict[str, Any]] = {
 }
 
 
-def learner_of(made: Setup, seed: int = 0) -> Learner:
-    return Learner(made, seed)
-
-
-def play(learner: Learner, made: Setup, seeds: range, progress: float = 0.25) -> list[Any]:
-    """Updates on transitions and pairs that the seeds draw."""
-    numbers = []
-    for seed in seeds:
-        batch = learner.prepared(transitions(made, 16, seed), np.random.default_rng(seed))
-        numbers.append(learner.update(batch, progress))
-    return numbers
+def updated(learner: Learner, made: Setup) -> Learner:
+    """After one update."""
+    learner.update(learner.prepared(transitions(made, 16, 0), np.random.default_rng(0)), 0.25)
+    return learner
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_the_losses_by_hand(case: str) -> None:
     """Before the first update the acting networks are the learner's own."""
     made = seven(**CASES[case])
-    learner = learner_of(made)
+    learner = Learner(made, 0)
     batch = learner.prepared(transitions(made, 8, 0), np.random.default_rng(0))
     assert isinstance(batch, PairBatch)
     t = {name: torch.from_numpy(np.asarray(c, np.float32)) for name, c in vars(batch).items()}
@@ -87,30 +76,12 @@ def test_the_losses_by_hand(case: str) -> None:
         assert learner.push_loss(batch).item() == pytest.approx(expected, rel=1e-6)
 
 
-def changed(one: dict[str, Any], other: dict[str, Any]) -> set[str]:
-    """The parts of a state in which two differ."""
-    return {name.split(".")[0] for name in one if not np.array_equal(one[name], other[name])}
-
-
-def test_the_actor_step_leaves_the_critic_alone() -> None:
-    made = seven(**CASES["slide"])
-    plain, spoilt = learner_of(made), learner_of(made)
-    with torch.no_grad():
-        for parameter in spoilt.actor.parameters():
-            parameter.mul_(-3.0)
-    play(plain, made, range(2))
-    play(spoilt, made, range(2))
-    parts = changed(plain.state(), spoilt.state())
-    assert "actor" in parts
-    assert not {"critic", "critic_optimiser"} & parts
-
-
 @pytest.mark.parametrize(("case", "moves"), [("mlp", {"head"}), ("slide", {"head", "push_head"})])
 def test_the_critic_learns_what_is_pushed_where_tokens_push(case: str, moves: set[str]) -> None:
     made = seven(**CASES[case])
-    learner = learner_of(made)
+    learner = Learner(made, 0)
     before = learner.state()
-    play(learner, made, range(1))
+    updated(learner, made)
     after = learner.state()
     found = {
         name.split(".")[1]
@@ -121,32 +92,17 @@ def test_the_critic_learns_what_is_pushed_where_tokens_push(case: str, moves: se
 
 
 def test_with_several_tokens_nothing_is_bootstrapped() -> None:
-    learner = learner_of(seven(**CASES["mlp"]))
+    learner = Learner(seven(**CASES["mlp"]), 0)
     assert not learner.bootstraps
     assert set(learner.parts) == {"actor", "critic", "acting"}
 
 
-def test_one_token_learns_the_reward_of_its_transition_and_what_follows() -> None:
-    made = setup(agent={"gamma": 0.9, "readout": "pair"}, actions_per_token=2)
-    learner = learner_of(made)
-    for module in (learner.target_actor, learner.target_critic):
-        for parameter in module.parameters():
-            parameter.mul_(1.5)
-    batch = random_transitions(made, 8, done=None)
-    assert 0 < batch.done.sum() < 8
-    steps = learner.steps(learner.prepared(batch, np.random.default_rng(0)))
-    follow = learner.target_critic(steps.follow, learner.target_actor(steps.follow)[0])
-    y = torch.from_numpy(batch.reward) + 0.9 * follow * (1 - torch.from_numpy(batch.done))
-    loss, q = learner.critic_loss(steps)
-    assert loss.item() == pytest.approx((q - y).square().mean().item(), rel=1e-5)
-
-
 def test_what_plays_is_the_average_of_both_networks() -> None:
     made = seven(AGENT | {"acting_average": 0.5}, PERCEPTRON)
-    learner = learner_of(made)
+    learner = Learner(made, 0)
     learner.updates = 1000  # the average is no longer young
     before = learner.acting_weights(0).tensors
-    play(learner, made, range(1))
+    updated(learner, made)
     after = learner.acting_weights(1).tensors
     own = learner.state()
     assert {name.split(".")[0] for name in after} == {"actor", "critic"}
@@ -154,44 +110,9 @@ def test_what_plays_is_the_average_of_both_networks() -> None:
         np.testing.assert_allclose(average, (before[name] + own[name]) / 2.0, atol=1e-6)
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_a_restored_learner_goes_on_bit_for_bit(case: str) -> None:
-    made = seven(**CASES[case])
-    first, second = learner_of(made), learner_of(made, seed=9)
-    play(first, made, range(2))
-    second.load_state(first.state())
-    assert play(first, made, range(2, 4)) == play(second, made, range(2, 4))
-    assert changed(first.state(), second.state()) == set()
-
-
-def test_the_seed_decides() -> None:
-    made = seven(**CASES["mlp"])
-    one, again, other = (learner_of(made, seed) for seed in (0, 0, 1))
-    assert play(one, made, range(2)) == play(again, made, range(2))
-    assert changed(one.state(), again.state()) == set()
-    play(other, made, range(2))
-    assert {"actor", "critic"} <= changed(one.state(), other.state())
-
-
-@pytest.mark.parametrize(
-    "other",
-    [{"net": SMALL}, {"net": {**PERCEPTRON, "hidden": [8]}}, {"agent": {"readout": "token"}}],
-)
-def test_the_state_of_another_network_is_refused(other: dict[str, Any]) -> None:
-    state = learner_of(seven(**CASES["mlp"])).state()
-    with pytest.raises(RunError, match="weights of another"):
-        Learner(seven(**CASES["mlp"] | other), 0).load_state(state)
-
-
-@pytest.mark.parametrize("net", [SMALL, PERCEPTRON])
-def test_one_network_serves_every_set_of_tokens_with_as_many_corners(net: dict[str, Any]) -> None:
-    state = learner_of(setup(TWO, AGENT, net)).state()
-    learner_of(seven(AGENT, net)).load_state(state)
-
-
 def test_noise_on_the_corners_does_no_harm() -> None:
     made = seven(**CASES["mlp"])
-    learner, batch = learner_of(made), transitions(made, 64)
+    learner, batch = Learner(made, 0), transitions(made, 64)
     rng = np.random.default_rng(0)
     names = ("state", "next_state", "goal")
     noise = {name: 0.2 * rng.standard_normal(batch.state.shape) for name in names}
@@ -218,40 +139,16 @@ def test_it_learns_to_assemble_two_tokens() -> None:
     """From random transitions and hindsight alone; without learning next to nothing is covered."""
     agent = {
         "hindsight": [*TWINS, {"strategy": "near", "position": 0.02, "angle": 0.1}],
-        "actor_lr": 3e-3,
-        "critic_lr": 3e-3,
+        "actor_lr": 5e-3,
+        "critic_lr": 5e-3,
         "reapply": 1,
     }
     net = {"kind": "mlp", "hidden": [64, 64]}
     made = setup(TWO, agent, net, starts="outside", mirrored=0.5)
-    learner = learner_of(made, seed=1)
-    before = coverage(learner, made, 50)
+    learner = Learner(made, seed=1)
+    before = coverage(learner, made, 30)
     for i in range(UPDATES):
-        batch = learner.prepared(transitions(made, 64, i), np.random.default_rng(i))
+        batch = learner.prepared(transitions(made, 48, i), np.random.default_rng(i))
         learner.update(batch, i / UPDATES)
     assert before < 0.2
-    assert coverage(learner, made, 50) > 0.6
-
-
-def golden(made: Setup) -> dict[str, float]:
-    """Losses of the first two updates, and sums over the weights after them."""
-    learner = learner_of(made, seed=1)
-    numbers = play(learner, made, range(2))
-    result = {f"{name}_{i}": v for i, one in enumerate(numbers) for name, v in one.items()}
-    state = learner.state()
-    for part in ("actor", "critic", "acting"):
-        values = [v.astype(np.float64) for k, v in state.items() if k.startswith(f"{part}.")]
-        result[f"{part}_abs_sum"] = float(sum(np.abs(v).sum() for v in values))
-    return result
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_golden_values_of_two_updates(case: str) -> None:
-    """Rewrite them with `python -m tests.agent.test_pair_learning` when a change is meant."""
-    expected = json.loads(GOLDEN.read_text())[case]
-    assert golden(seven(**CASES[case])) == pytest.approx(expected, rel=1e-3, abs=1e-5)
-
-
-if __name__ == "__main__":
-    values = {case: golden(seven(**options)) for case, options in CASES.items()}
-    GOLDEN.write_text(json.dumps(values, indent=1) + "\n")
+    assert coverage(learner, made, 30) > 0.6

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from tangram_agent.graph import Pairs
 from tangram_agent.networks import Networks, initialise
+from tangram_agent.pairs import Pairs
 from tests.agent.builders import SMALL
 from tests.agent.pair_scenes import (
     PERCEPTRON,
@@ -88,23 +88,19 @@ def test_a_token_on_its_other_side_does_what_its_mirror_image_does(kind: str) ->
 
 
 @pytest.mark.parametrize("kind", NETS)
-def test_an_actor_that_says_nothing_leaves_the_token_where_it_is(kind: str) -> None:
-    made, pairs = networks(kind), random_pairs(LAYOUT, 0)
-    for parameter in made.parameters():
+def test_a_token_stays_without_a_word_and_is_shifted_by_an_arena_at_most(kind: str) -> None:
+    pairs = random_pairs(LAYOUT, 0)
+    silent, loud = networks(kind), networks(kind)
+    for parameter in silent.parameters():
         parameter.zero_()
-    np.testing.assert_array_equal(pose_of(made, pairs), pairs.pose)
-    assert not value_of(made, pairs).any()
-
-
-@pytest.mark.parametrize("kind", NETS)
-def test_a_shift_is_as_wide_as_the_arena_at_most(kind: str) -> None:
-    made, pairs = networks(kind), random_pairs(LAYOUT, 0)
-    for parameter in made.parameters():
+    np.testing.assert_array_equal(pose_of(silent, pairs), pairs.pose)
+    assert not value_of(silent, pairs).any()
+    for parameter in loud.parameters():
         parameter.mul_(100.0)
-    velocity, raw = made.actor(pairs)
+    velocity, raw = loud.actor(pairs)
     assert raw.abs().max() > 10.0
     assert velocity.abs().max() <= 1.0
-    assert (pose_of(made, pairs) - pairs.pose)[:, :2].abs().max() <= 2.0 + 1e-6
+    assert (pose_of(loud, pairs) - pairs.pose)[:, :2].abs().max() <= 2.0 + 1e-6
 
 
 @pytest.mark.parametrize("kind", NETS)
@@ -134,48 +130,42 @@ def test_what_is_pushed_depends_on_where_the_token_slides(kind: str) -> None:
 
 @pytest.mark.parametrize(("token", "most"), [(0, math.pi), (5, math.pi / 4), (6, math.pi / 2)])
 def test_a_turn_is_no_longer_than_symmetry_needs(token: int, most: float) -> None:
-    pairs = replace(random_pairs(LAYOUT, 0), token=torch.full((49,), token))
-    pairs = replace(pairs, flipped=torch.zeros(49))
-    made = networks("mlp")
+    own = {"token": torch.full((49,), token), "flipped": torch.zeros(49)}
+    made, pairs = networks("mlp"), replace(random_pairs(LAYOUT, 0), **own)
     outputs = made.actor.head(pairs)
-    found = made.actor(pairs)[0][:, 2] * math.pi
     expected = torch.atan2(outputs[:, 3], outputs[:, 2]) * most / math.pi
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+    np.testing.assert_allclose(made.actor(pairs)[0][:, 2] * math.pi, expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("kind", NETS)
+# Option -> whether actor and critic stay the same.
+OPTIONS: dict[tuple[str, object], tuple[bool, bool]] = {
+    ("egocentric", False): (False, False),
+    ("offsets", False): (False, False),
+    ("orientation", False): (False, False),
+    ("afterstate", False): (True, False),
+    ("squash", "tanh"): (False, True),
+    ("angle_head", "plain"): (False, True),
+}
+
+
 @pytest.mark.parametrize(
-    "option",
+    ("kind", "option", "same"),
     [
-        {"egocentric": False},
-        {"offsets": False},
-        {"orientation": False},
-        {"afterstate": False},
-        {"squash": "tanh"},
-        {"angle_head": "plain"},
+        *((kind, option, same) for kind in NETS for option, same in OPTIONS.items()),
+        ("mha", ("edges", "complete"), (False, False)),
     ],
 )
-def test_every_option_changes_what_pairs_give(kind: str, option: dict[str, Any]) -> None:
+def test_every_option_changes_what_pairs_give(
+    kind: str, option: tuple[str, object], same: tuple[bool, bool]
+) -> None:
     pairs, way = random_pairs(LAYOUT, 0), torch.full((49, 3), 0.1)
-    plain, other = networks(kind), networks(kind, **option)
+    plain, other = networks(kind), networks(kind, **dict([option]))
+    own = dict(plain.named_parameters())
     for name, parameter in other.named_parameters():
-        own = dict(plain.named_parameters())[name]
-        if own.shape == parameter.shape:
-            parameter.copy_(own)
+        if own[name].shape == parameter.shape:
+            parameter.copy_(own[name])
     same_actor = torch.allclose(plain.actor(pairs)[0], other.actor(pairs)[0])
-    same_critic = torch.allclose(plain.critic(pairs, way), other.critic(pairs, way))
-    assert (same_actor, same_critic) == {
-        "afterstate": (True, False),
-        "squash": (False, True),
-        "angle_head": (False, True),
-    }.get(next(iter(option)), (False, False))
-
-
-def test_complete_edges_change_what_attention_gives() -> None:
-    pairs = random_pairs(LAYOUT, 0)
-    assert not torch.allclose(
-        networks("mha").actor(pairs)[0], networks("mha", edges="complete").actor(pairs)[0]
-    )
+    assert (same_actor, torch.allclose(plain.critic(pairs, way), other.critic(pairs, way))) == same
 
 
 @pytest.mark.parametrize("afterstate", [True, False])

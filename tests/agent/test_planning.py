@@ -10,8 +10,8 @@ import torch
 
 from tangram_agent import planning
 from tangram_agent.coverage import covered_share, covering, worths
-from tangram_agent.graph import PairGraph, Pairs
 from tangram_agent.networks import Networks, initialise
+from tangram_agent.pairs import PairGraph, Pairs
 from tangram_agent.planning import Planner
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup

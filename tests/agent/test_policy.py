@@ -1,32 +1,72 @@
-"""Acting and exploring."""
+"""Acting and exploring with either readout of a scene, and weights over the wire."""
+
+from contextlib import closing
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from tangram_agent.learner import Learner
+from tangram_agent.messages import decode_weights
 from tangram_agent.policy import Policy
+from tangram_agent.runs import Run
 from tangram_agent.setup import Setup
-from tangram_agent.types import Weights
-from tangram_sim.errors import RunError
-from tests.agent.builders import PAIR, SCENE, random_transitions, setup
+from tangram_agent.types import Transitions, Weights
+from tangram_sim.actions import chosen_tokens, flips, velocities
+from tangram_sim.batch import BatchedEnv
+from tangram_sim.errors import ConfigError, RunError
+from tests.agent.builders import PAIR, PAPER, SCENE, SMALL, random_transitions, setup
+from tests.agent.messages import broadcast
+from tests.agent.pair_scenes import PERCEPTRON, TWO, seven, transitions
 
 pytestmark = pytest.mark.fast
+
+COUNT = 120
+PARALLELOGRAM = 6
+SLIDE = {"backend": "physics", "motion": "slide"}
+Scene = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def policy_of(made: Setup) -> Policy:
     policy = Policy(made)
-    policy.load(Learner(made, seed=0).acting_weights(7))
+    policy.load(Learner(made, 0).acting_weights(7))
     return policy
 
 
-def test_load_takes_weights_and_version() -> None:
-    made = setup(agent=SCENE)
-    policy = Policy(made)
+def scene_of(batch: Transitions) -> Scene:
+    return batch.state, batch.placed, batch.goal
+
+
+def generators(count: int) -> list[np.random.Generator]:
+    return [np.random.default_rng(i) for i in range(count)]
+
+
+def explored(made: Setup, count: int = COUNT) -> tuple[np.ndarray, np.ndarray]:
+    """Actions in the same scenes, without exploring and with it."""
+    policy, scene = policy_of(made), scene_of(transitions(made, count))
+    return policy.act(*scene), policy.explore(*scene, generators(count))
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        setup(agent=SCENE),
+        seven({}, SMALL),
+        seven({}, PERCEPTRON, **SLIDE),
+    ],
+)
+def test_weights_travel_to_workers(made: Setup) -> None:
+    weights, policy = Learner(made, 0).acting_weights(7), Policy(made)
     assert policy.version == -1
-    weights = Learner(made, seed=0).acting_weights(7)
-    policy.load(weights)
-    assert policy.version == 7
-    assert policy.shapes == {name: value.shape for name, value in weights.tensors.items()}
+    assert {name: tensor.shape for name, tensor in weights.tensors.items()} == policy.shapes
+    epoch, arrived = decode_weights(broadcast(weights, "run"), policy.shapes)
+    policy.load(arrived)
+    assert (epoch, policy.version) == ("run", 7)
+    for name, tensor in policy.weights().tensors.items():
+        np.testing.assert_array_equal(tensor, weights.tensors[name])
+    with pytest.raises(RunError, match="on one side only"):
+        policy.load(Weights(0, {}))
 
 
 def test_weights_are_a_copy() -> None:
@@ -39,21 +79,14 @@ def test_weights_are_a_copy() -> None:
         np.testing.assert_array_equal(weights.tensors[name], value)
 
 
-def test_weights_of_another_network_are_refused() -> None:
-    with pytest.raises(RunError, match="on one side only"):
-        Policy(setup(agent=SCENE)).load(Weights(0, {}))
-
-
 def test_acting_is_the_acting_network_of_the_learner() -> None:
     made = setup(agent=SCENE | {"acting_average": 0.5})
-    learner = Learner(made, seed=0)
+    learner, policy = Learner(made, seed=0), Policy(made)
     batch = random_transitions(made, 8)
     learner.update(batch)
-    policy = Policy(made)
     policy.load(learner.acting_weights(1))
     expected = learner.acting(learner.steps(batch).view)[0].detach().numpy()
-    found = policy.act(batch.state, batch.placed, batch.goal)
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+    np.testing.assert_allclose(policy.act(*scene_of(batch)), expected, atol=1e-6)
 
 
 def test_with_several_tokens_the_next_one_is_named() -> None:
@@ -64,43 +97,178 @@ def test_with_several_tokens_the_next_one_is_named() -> None:
     assert actions[:, 0].tolist() == [-0.5, 0.5]
 
 
-def explore(made: Setup, count: int = 500) -> tuple[np.ndarray, np.ndarray]:
-    policy, batch = policy_of(made), random_transitions(made, count)
-    generators = [np.random.default_rng(i) for i in range(count)]
-    scene = (batch.state, batch.placed, batch.goal)
-    return policy.act(*scene), policy.explore(*scene, generators)
+@pytest.mark.parametrize("flip", [False, True])
+def test_an_action_takes_its_token_to_the_pose_that_was_chosen(flip: bool) -> None:
+    """By the simulation's own reading of actions."""
+    made = seven(allow_flip=flip)
+    count = 40
+    policy, scene = policy_of(made), scene_of(transitions(made, count))
+    actions = policy.act(*scene)
+    exact = [part.astype(np.float64) for part in scene]
+    choice = policy._planner.choose(exact[0], exact[1] > 0, exact[2])  # type: ignore[union-attr]
+    assert actions.shape == (count, 4 + flip)
+    assert actions.dtype == np.float32
+    np.testing.assert_array_equal(chosen_tokens(actions, 7), choice.token)
+    np.testing.assert_array_equal(flips(actions, made.layout, made.sim), choice.flip)
+    assert choice.flip.any() == flip
+    found = made.layout.poses(exact[0])[np.arange(count), choice.token]
+    found += velocities(actions, made.sim)
+    np.testing.assert_allclose(found[:, :2], choice.pose[:, :2], atol=1e-5)
+    np.testing.assert_allclose(np.exp(1j * (found - choice.pose)[:, 2]), 1.0, atol=1e-5)
+    # By the shorter turn: no entry is cut off.
+    assert np.abs(actions).max() <= 1.0
 
 
-def test_gaussian_noise_has_the_spread_that_is_set() -> None:
-    plain, noisy = explore(setup(agent=SCENE | {"noise": 0.05, "uniform_share": 0.0}))
-    inside = np.abs(plain) < 0.8
-    gap = (noisy - plain)[inside]
+def test_refinement_is_for_acting_and_not_for_exploring() -> None:
+    agent = {"refine_steps": 5, "noise": 0.0, "uniform_share": 0.0}
+    made = seven(agent, PERCEPTRON)
+    policy, scene = policy_of(made), scene_of(transitions(made, 8))
+    refined, plain = policy.act(*scene), policy.act(*scene, refine=False)
+    assert not np.allclose(refined, plain, atol=1e-4)
+    np.testing.assert_array_equal(policy.explore(*scene, generators(8)), plain)
+
+
+NOISE = {"noise": 0.05, "uniform_share": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("made", "chosen"),  # how many entries say which token, and whether it is turned over
+    [
+        (setup(agent=SCENE | NOISE), 0),
+        (setup(PAIR, agent=SCENE | NOISE), 1),
+        (seven(NOISE, PERCEPTRON, allow_flip=True), 2),
+    ],
+)
+def test_noise_moves_the_velocity_by_its_spread_and_leaves_the_choice(
+    made: Setup, chosen: int
+) -> None:
+    plain, noisy = explored(made, 500)
+    np.testing.assert_array_equal(noisy[:, :chosen], plain[:, :chosen])
+    inside = np.abs(plain[:, chosen:]) < 0.8
+    gap = (noisy - plain)[:, chosen:][inside]
     assert gap.std() == pytest.approx(0.05, rel=0.1)
     assert abs(gap.mean()) < 0.01
 
 
 def test_a_share_of_actions_is_uniform() -> None:
-    plain, noisy = explore(setup(agent=SCENE | {"noise": 0.0, "uniform_share": 0.3}))
+    plain, noisy = explored(setup(agent=SCENE | {"noise": 0.0, "uniform_share": 0.3}), 500)
     drawn = np.abs(noisy - plain).max(axis=1) > 1e-6
     assert drawn.mean() == pytest.approx(0.3, abs=0.06)
     assert noisy[drawn].std() == pytest.approx(1 / np.sqrt(3), rel=0.1)
 
 
 def test_exploring_stays_in_range_and_keeps_the_choice_of_token() -> None:
-    plain, noisy = explore(setup(PAIR, agent=SCENE | {"noise": 2.0, "uniform_share": 0.5}))
+    plain, noisy = explored(setup(PAIR, agent=SCENE | {"noise": 2.0, "uniform_share": 0.5}))
     assert np.abs(noisy).max() <= 1.0
     np.testing.assert_array_equal(noisy[:, 0], plain[:, 0])
 
 
-def test_the_noise_does_not_depend_on_the_batching() -> None:
-    made = setup(PAIR)
-    policy, batch = policy_of(made), random_transitions(made, 4)
-    together = policy.explore(
-        batch.state, batch.placed, batch.goal, [np.random.default_rng(i) for i in range(4)]
-    )
-    for i in range(4):
-        one = slice(i, i + 1)
-        alone = policy.explore(
-            batch.state[one], batch.placed[one], batch.goal[one], [np.random.default_rng(i)]
-        )
-        np.testing.assert_allclose(alone[0], together[i], atol=1e-6)
+def test_a_share_of_actions_takes_any_token_that_is_left_anywhere() -> None:
+    made = seven({"noise": 0.0, "uniform_share": 1.0}, PERCEPTRON, allow_flip=True)
+    policy, scene = policy_of(made), scene_of(transitions(made, COUNT, placed=0.5))
+    scene[1][:, 0] = 0
+    actions = policy.explore(*scene, generators(COUNT))
+    token = chosen_tokens(actions, 7)
+    assert not scene[1][np.arange(COUNT), token].any()
+    assert set(token) == set(range(7))
+    poses = made.layout.poses(scene[0].astype(np.float64))[np.arange(COUNT), token]
+    end = poses + velocities(actions, made.sim)
+    assert np.abs(end[:, :2]).max() <= 1.0 + 1e-5
+    np.testing.assert_allclose(end[:, :2].std(axis=0), 1.0 / np.sqrt(3.0), rtol=0.1)
+    assert abs(np.exp(1j * end[:, 2]).mean()) < 0.15
+    assert set(actions[:, 1]) == {-1.0, 1.0}
+    turned = flips(actions, made.layout, made.sim)
+    assert 0.2 < turned[token == PARALLELOGRAM].mean() < 0.8
+
+
+def test_where_all_are_placed_exploring_names_the_first() -> None:
+    made = seven({"uniform_share": 1.0}, PERCEPTRON)
+    scene = scene_of(transitions(made, 4, placed=1.1))
+    actions = policy_of(made).explore(*scene, generators(4))
+    assert chosen_tokens(actions, 7).tolist() == [0] * 4
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        setup(PAIR, SCENE),
+        seven({"uniform_share": 0.5}, PERCEPTRON),
+        seven({"uniform_share": 0.5}, PERCEPTRON, allow_flip=True),
+    ],
+)
+def test_exploring_does_not_depend_on_the_batching(made: Setup) -> None:
+    policy, scene = policy_of(made), scene_of(transitions(made, 8))
+    together = policy.explore(*scene, generators(8))
+    for i, generator in enumerate(generators(8)):
+        alone = policy.explore(*(part[i : i + 1] for part in scene), [generator])
+        np.testing.assert_allclose(alone[0], together[i], atol=1e-5)
+
+
+def learns(made: Setup) -> None:
+    learner = Learner(made, 0)
+    learner.update(learner.prepared(transitions(made, 8), np.random.default_rng(0)))
+    assert learner.updates == 1
+
+
+@pytest.mark.parametrize("readout", ["pair", "token"])
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+def test_whole_episodes_of_a_token_with_two_sides(readout: str, noise: float) -> None:
+    """Every readout plays every task, also one whose tokens may be turned over."""
+    agent = {"readout": readout}
+    made = setup(TWO, agent, PERCEPTRON, allow_flip=True, corner_noise=noise)
+    policy = policy_of(made)
+    with closing(BatchedEnv(made.layout, made.sim, made.reward, 4)) as env:
+        env.reset(generators(4))
+        for _ in range(env.horizon):
+            actions = policy.explore(env.seen, env.placed, env.seen_goals, generators(4))
+            assert not env.step(actions.astype(np.float64)).refused.any()
+    learns(made)
+
+
+def test_the_agent_of_the_paper_plays_and_learns_the_game() -> None:
+    made = seven(PAPER, mirrored=0.5)
+    assert policy_of(made).act(*scene_of(transitions(made, 8))).shape == (8, 4)
+    learns(made)
+
+
+def run_of(made: Setup) -> Run:
+    return Run(Path("run"), {}, made, 7, policy_of(made))
+
+
+def test_a_run_plays_on_with_other_settings_of_the_agent() -> None:
+    run = run_of(seven({}, PERCEPTRON))
+    scene = scene_of(transitions(run.setup, 8))
+    other = run.with_settings({"agent": {"refine_steps": 20, "order": "listed"}})
+    assert (other.setup.agent.refine_steps, run.setup.agent.refine_steps) == (20, 0)
+    assert other.policy.version == 7
+    left = [int(np.argmin(flags)) for flags in scene[1]]
+    assert chosen_tokens(other.policy.act(*scene), 7).tolist() == left
+    assert not np.allclose(other.policy.act(*scene), run.policy.act(*scene), atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("section", "name", "value", "reason"),
+    [
+        ("agent", "order", "x", "run with agent.order=x: agent.order must be one of learned,"),
+        ("agent", "order", 1, "wrong config: .*agent.order"),
+        ("agent", "odd", 1, "wrong config: .*odd"),
+        ("agent", "batch_size", 9, "agent.batch_size=9 changes nothing with a trained run, which"),
+        ("sim", "stages", (), "changes nothing with a trained run, which only plays: leave it out"),
+        ("agent", "readout", "token", "agent.readout=token does not fit this run, whose weights"),
+        ("sim", "arena", 3.0, "trained with sim.arena=2: leave it out, or train a run with it"),
+        ("sim", "motion", "slide", "run with sim.motion=slide: .* needs the engine's contacts"),
+    ],
+)
+def test_settings_that_a_trained_run_cannot_play_with_are_refused(
+    section: str, name: str, value: Any, reason: str
+) -> None:
+    with pytest.raises(ConfigError, match=reason):
+        run_of(seven({}, PERCEPTRON)).with_settings({section: {name: value}})
+
+
+def test_settings_of_the_world_are_those_that_are_played_in() -> None:
+    run = run_of(seven({}, PERCEPTRON))
+    other = run.with_settings({"sim": {"allow_flip": True, "corner_noise": 0.01}})
+    assert (other.setup.sim.allow_flip, other.setup.sim.corner_noise) == (True, 0.01)
+    assert other.policy.act(*scene_of(transitions(other.setup, 8))).shape == (8, 5)
+    assert run.with_settings({"sim": {}}) is run

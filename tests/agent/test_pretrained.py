@@ -12,17 +12,17 @@ import yaml
 from tangram_agent import pretrained
 from tangram_agent.learner import Learner
 from tangram_agent.policy import Policy
-from tangram_agent.pretrained import CARD, CONFIG, WEIGHTS, agent_names, is_name
+from tangram_agent.pretrained import CARD, CONFIG, FORMAT, WEIGHTS, agent_names, is_name
 from tangram_agent.runs import load_run
 from tangram_sim.errors import RunError, TangramError
-from tests.agent.builders import SMALL, SQUARE, random_transitions, setup
+from tests.agent.builders import PLAIN, PROPOSAL, SMALL, SQUARE, random_transitions, setup
 
 pytestmark = pytest.mark.fast
 
 MADE = setup()
 TENSORS = Learner(MADE, seed=3).acting_weights(1).tensors
 WORLD = {"tokens": SQUARE, "sim": {"backend": "kinematic"}, "reward": {}}
-SECTIONS = WORLD | {"agent": {}, "net": SMALL}
+SECTIONS = WORLD | {"agent": PLAIN | PROPOSAL, "net": SMALL}
 
 
 def write_agent(folder: Path, **card: object) -> Path:
@@ -30,7 +30,7 @@ def write_agent(folder: Path, **card: object) -> Path:
     (folder / CONFIG).write_text(yaml.safe_dump(SECTIONS))
     data = safetensors.numpy.save(TENSORS)
     (folder / WEIGHTS).write_bytes(data)
-    content = {"format": 1, "updates": 12, "sha256": hashlib.sha256(data).hexdigest()} | card
+    content = {"format": FORMAT, "updates": 12, "sha256": hashlib.sha256(data).hexdigest()} | card
     (folder / CARD).write_text(json.dumps(content))
     return folder
 
@@ -90,9 +90,9 @@ def test_an_unknown_name_lists_those_that_there_are(package: Path) -> None:
         (lambda agent: (agent / CONFIG).write_text("- 1"), "holds no settings"),
         (lambda agent: (agent / CONFIG).write_text("a: [1"), "not valid YAML"),
         (lambda agent: (agent / CARD).write_text("{"), "cannot be read"),
-        (lambda agent: (agent / CARD).write_text("[]"), "not of format 1"),
-        (lambda agent: (agent / CARD).write_text('{"format": 2}'), "not of format 1"),
-        (lambda agent: (agent / CARD).write_text('{"format": 1}'), "does not tell the updates"),
+        (lambda agent: (agent / CARD).write_text("[]"), "not of format 2"),
+        (lambda agent: (agent / CARD).write_text('{"format": 1}'), "not of format 2"),
+        (lambda agent: (agent / CARD).write_text('{"format": 2}'), "does not tell the updates"),
     ],
 )
 def test_a_damaged_agent_is_refused(package: Path, harm: object, reason: str) -> None:

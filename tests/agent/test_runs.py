@@ -12,14 +12,14 @@ from tangram_agent.learner import Learner
 from tangram_agent.policy import Policy
 from tangram_agent.runs import load_run
 from tangram_sim.errors import RunError, TangramError
-from tests.agent.builders import PLAIN, SMALL, SQUARE, random_transitions, setup
+from tests.agent.builders import PLAIN, PROPOSAL, SMALL, SQUARE, random_transitions, setup
 
 pytestmark = pytest.mark.fast
 
 MADE = setup()
 WEIGHTS = "checkpoints/00000020/weights.safetensors"
 WORLD = {"tokens": SQUARE, "sim": {"backend": "kinematic"}, "reward": {}}
-CONFIG: dict[str, Any] = WORLD | {"agent": PLAIN, "net": SMALL}
+CONFIG: dict[str, Any] = WORLD | {"agent": PLAIN | PROPOSAL, "net": SMALL}
 
 
 @pytest.fixture
@@ -73,7 +73,7 @@ def test_a_broken_run_is_refused_in_clear_words(run_dir: Path, harm: Any, reason
     ("section", "content"),
     [
         ("tokens", {"shapes": ["parallelogram"], "scale": 1.0}),
-        ("agent", {"egocentric": False}),
+        ("agent", {"egocentric": False, "reapply": 0}),
         ("net", {**SMALL, "heads": 1}),
     ],
 )

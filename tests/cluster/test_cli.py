@@ -111,6 +111,11 @@ def test_an_own_reward_that_fails_is_told_before_anything_starts(tmp_path: Path,
     assert [path.name for path in tmp_path.iterdir()] == ["own.py"]
 
 
+def test_a_warm_start_from_nowhere_is_refused(tmp_path: Path) -> None:
+    line = refused("tangram-train", "run_dir=x", "warm_start=nowhere", cwd=tmp_path)
+    assert line.startswith(f"tangram-train: warm_start={tmp_path / 'nowhere'} has no checkpoint")
+
+
 # A user's own master.py, worker.py and conf.py, in the current folder and on PYTHONPATH
 
 

@@ -2,7 +2,6 @@
 
 import json
 import re
-import signal
 from pathlib import Path
 
 import pytest
@@ -13,14 +12,10 @@ from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
 from tangram_agent.setup import make_setup
 from tests.cluster.conftest import UPDATES
 from tests.cluster.processes import (
-    LIMIT_S,
-    all_ended,
     pids_of,
     refused,
     run,
     run_here,
-    started,
-    wait_for_file,
 )
 
 # The session's training runs inside the first of these tests.
@@ -29,7 +24,7 @@ pytestmark = pytest.mark.slow
 QUICK = ("sim=kinematic", "service.eval_seconds=1")
 
 
-def test_a_short_training_learns_position_and_angle(trained: Path) -> None:
+def test_a_short_training_learns_position_and_angle_and_leaves_a_whole_run(trained: Path) -> None:
     """The paper's plateau is 0.758 with no angle learned; this is far above after 800 updates."""
     result = json.loads((trained / "result.json").read_text())
     assert result["mean_reward"] > 0.88
@@ -37,30 +32,19 @@ def test_a_short_training_learns_position_and_angle(trained: Path) -> None:
     assert result["position_error_median"] < 0.03
     assert result["mean_reward_camera"] == pytest.approx(result["mean_reward"], abs=0.05)
     assert result["raw_overlap"] == pytest.approx((result["mean_reward"] + 1) / 2, abs=1e-6)
-
-
-def test_the_result_says_what_was_done(trained: Path) -> None:
-    result = json.loads((trained / "result.json").read_text())
-    assert result["updates"] == UPDATES
     assert result["episodes"] >= 10 * UPDATES
-    assert (result["seed"], result["agent"], result["tokens"]) == (0, "tangram", ["square"])
-    assert result["backend"] == "physics"
     assert result["wall_s"] >= result["train_s"] > 0
+    facts = {"updates": UPDATES, "seed": 0, "agent": "tangram", "backend": "physics"}
+    assert result.items() >= (facts | {"tokens": ["square"]}).items()
 
-
-def test_the_run_folder_holds_everything(trained: Path) -> None:
     config = yaml.safe_load((trained / "config.yaml").read_text())
     assert make_setup(config).layout.tokens == 1
-    newest = list_checkpoints(trained / "checkpoints")[-1]
-    checkpoint = load_checkpoint(newest)
+    checkpoint = load_checkpoint(list_checkpoints(trained / "checkpoints")[-1])
     assert checkpoint.updates == UPDATES
     assert set(checkpoint.arrays) == {"weights", "learner", "replay"}
     with Image.open(trained / "test_episodes.png") as picture:
         assert picture.width >= 600
     assert {path.name for path in (trained / "logs").iterdir()} >= {"evaluator.log", "worker-0.log"}
-
-
-def test_no_process_is_left(trained: Path) -> None:
     assert pids_of(trained) == []
 
 
@@ -98,26 +82,6 @@ def test_a_refused_resume_leaves_the_run_as_it_was(trained: Path) -> None:
     assert (trained / "config.yaml").read_bytes() == before
 
 
-def test_a_warm_start_from_nowhere_is_refused(tmp_path: Path) -> None:
-    line = refused("tangram-train", "run_dir=x", *QUICK, "warm_start=nowhere", cwd=tmp_path)
-    assert line.startswith(f"tangram-train: warm_start={tmp_path / 'nowhere'} has no checkpoint")
-
-
-def test_a_signal_ends_a_training_cleanly(tmp_path: Path) -> None:
-    """Twice in a moment is one wish: `timeout` sends it to the process, and to its group."""
-    folder = tmp_path / "run"
-    arguments = (f"run_dir={folder}", *QUICK, "max_updates=100000")
-    with started("tangram-train", *arguments, cwd=tmp_path) as launcher:
-        wait_for_file(folder / "connection.json", launcher)
-        children = pids_of(folder)
-        for _ in range(2):
-            launcher.send_signal(signal.SIGTERM)
-        assert all_ended(children)
-        assert launcher.wait(LIMIT_S) == 0
-    assert list_checkpoints(folder / "checkpoints")
-    assert json.loads((folder / "result.json").read_text())["updates"] < 100_000
-
-
 def test_a_run_begins_with_anothers_networks_once_and_is_extended(trained: Path) -> None:
     """The folder is named as seen from where the command is given, and shapes may differ."""
     folder = trained.parent / "warm"
@@ -137,15 +101,3 @@ def test_a_run_begins_with_anothers_networks_once_and_is_extended(trained: Path)
     assert {"note", "status", "result"} <= {line["event"] for line in lines}
     assert lines[-1].items() >= second.items()
     assert second["episodes"] > first["episodes"]
-
-
-def test_each_job_of_a_multirun_has_a_folder_and_every_agent_trains_the_same_way(
-    tmp_path: Path,
-) -> None:
-    arguments = ("--multirun", "agent=paper,mlp", "run_dir=sweep", "agent.batch_size=16", *QUICK)
-    run("tangram-train", *arguments, "max_updates=20", cwd=tmp_path)
-    results = [json.loads((tmp_path / "sweep" / n / "result.json").read_text()) for n in "01"]
-    assert [(one["agent"], one["updates"], one["parameters"]) for one in results] == [
-        ("paper", 20, 504_324),
-        ("mlp", 20, 13_508),
-    ]

@@ -36,6 +36,7 @@ def test_every_training_composes(budget: str) -> None:
 # What each row of an ablation changes, seen from the first row of its table.
 CHANGES = {
     "tangram": {
+        "tangram_scene": {"agent.readout"},
         "tangram_no_penalty": {"agent.saturation_penalty"},
         "tangram_late_penalty": {"agent.saturation_limit"},
         "tangram_arena_frame": {"agent.egocentric"},

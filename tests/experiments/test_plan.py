@@ -1,6 +1,7 @@
 """Which trainings and tests a study consists of, what it refuses, and the processes it needs."""
 
 import json
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -56,31 +57,17 @@ def study(run_dir: Path, **changes: Any) -> StudyConfig:
     return from_mapping(StudyConfig, content(run_dir, **changes))
 
 
-@pytest.mark.parametrize(
-    ("training", "expected"),
-    [
-        ("square", ["agent=tangram", "a=1", "b=2"]),
-        ("paper", ["agent=paper", "a=1", "b=3", "c=1"]),
-    ],
-)
-def test_the_last_word_on_a_setting_counts(
-    tmp_path: Path, training: str, expected: list[str]
+def test_each_training_is_told_the_last_word_and_comes_once_with_all_its_tests(
+    tmp_path: Path,
 ) -> None:
     config = study(tmp_path)
-    assert config.command(training) == expected
-
-
-def test_trainings_are_wanted_once_and_after_those_that_they_begin_with(tmp_path: Path) -> None:
-    assert study(tmp_path).wanted() == ["paper", "square", "warm"]
-    only = study(tmp_path, experiments={"two": experiment(["warm"], [])})
-    assert only.wanted() == ["square", "warm"]
-
-
-def test_a_training_has_the_tests_of_all_its_experiments(tmp_path: Path) -> None:
-    config = study(tmp_path)
+    assert config.command("square") == ["agent=tangram", "a=1", "b=2"]
+    assert config.command("paper") == ["agent=paper", "a=1", "b=3", "c=1"]
+    assert config.wanted() == ["paper", "square", "warm"]
     assert config.tests_of("square") == ["twice", "noisy"]
     assert config.tests_of("paper") == ["twice"]
     only = study(tmp_path, experiments={"two": experiment(["warm"], ["twice"])})
+    assert only.wanted() == ["square", "warm"]  # what it begins with, before it
     assert only.tests_of("square") == []
 
 
@@ -99,6 +86,15 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ),
     ({"families": {"ours": []}}, "training paper: family 'theirs' is not in the catalogue"),
     ({"trainings": {"square": WARM}, "experiments": {}}, "training square: after 'warm' is not in"),
+    *(
+        ({"budget": {"name": "", "note": "", "test_episodes": 1, "overrides": {}} | change}, text)
+        for change, text in (
+            ({"seeds": []}, "budget.seeds must be different numbers, got"),
+            ({"seeds": [1, 1]}, "budget.seeds must be different numbers, got"),
+            ({"seeds": [0, -1]}, "budget.seeds must be at least 0, got -1"),
+            ({"seeds": [0], "test_episodes": 0}, "budget.test_episodes must be at least 1, got 0"),
+        )
+    ),
 ]
 
 
@@ -108,22 +104,6 @@ def test_what_does_not_exist_is_refused(
 ) -> None:
     with pytest.raises(ConfigError, match=message):
         study(tmp_path, **changes)
-
-
-@pytest.mark.parametrize(
-    ("seeds", "message"),
-    [
-        ([], "must be different numbers, got"),
-        ([1, 1], "must be different numbers, got"),
-        ([0, -1], "must be at least 0, got -1"),
-    ],
-)
-def test_seeds_are_different_and_not_negative(
-    tmp_path: Path, seeds: list[int], message: str
-) -> None:
-    budget = content(tmp_path)["budget"] | {"seeds": seeds}
-    with pytest.raises(ConfigError, match=f"budget.seeds {message}"):
-        study(tmp_path, budget=budget)
 
 
 def test_a_circle_of_warm_starts_is_refused(tmp_path: Path) -> None:
@@ -142,12 +122,8 @@ def test_a_circle_of_warm_starts_is_refused(tmp_path: Path) -> None:
 def test_the_plan_says_everything_that_a_report_needs(tmp_path: Path) -> None:
     plan = plan_content(study(tmp_path), {"command": "tangram-experiment x", "commit": "abc"})
     assert (plan["format"], plan["command"], plan["commit"]) == (2, "tangram-experiment x", "abc")
-    assert plan["budget"] == {
-        "name": "tiny",
-        "note": "Nothing is learned.",
-        "seeds": [0, 1],
-        "test_episodes": 5,
-    }
+    texts = {"name": "tiny", "note": "Nothing is learned."}
+    assert plan["budget"] == {**texts, "seeds": [0, 1], "test_episodes": 5}
     assert list(plan["experiments"]) == ["one", "two"]
     assert plan["trainings"]["warm"] == {
         "label": "warm",
@@ -159,33 +135,37 @@ def test_the_plan_says_everything_that_a_report_needs(tmp_path: Path) -> None:
     assert plan["tests"]["noisy"] == told
 
 
+def joined(folder: Path, earlier: dict[str, Any], **changes: Any) -> dict[str, Any]:
+    """The plan of a study with changes, in a folder whose plan is an earlier one."""
+    path = folder / "plan.json"
+    path.write_text(json.dumps(earlier))
+    return joined_plan(path, plan_content(study(folder, **changes), {"commit": "new"}))
+
+
 def test_a_plan_keeps_what_was_there(tmp_path: Path) -> None:
-    path = tmp_path / "plan.json"
     first = study(tmp_path, experiments={"one": experiment(["paper"], ["twice"])})
-    path.write_text(json.dumps(plan_content(first, {})))
-    second = study(tmp_path, experiments={"two": experiment(["square"], ["noisy"])})
-    joined = joined_plan(path, plan_content(second, {"commit": "new"}))
-    assert joined["commit"] == "new"
-    assert list(joined["experiments"]) == ["one", "two"]
-    assert list(joined["trainings"]) == ["paper", "square"]
-    assert list(joined["tests"]) == ["twice", "noisy"]
+    second = {"two": experiment(["square"], ["noisy"])}
+    found = joined(tmp_path, plan_content(first, {}), experiments=second)
+    assert found["commit"] == "new"
+    assert list(found["experiments"]) == ["one", "two"]
+    assert list(found["trainings"]) == ["paper", "square"]
+    assert list(found["tests"]) == ["twice", "noisy"]
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "message"),
+    ("earlier", "budget", "message"),
     [
-        ("name", "huge", "was made with budget.name=tiny, now it is huge: choose another run_dir"),
-        ("test_episodes", 6, "was made with budget.test_episodes=5, now it is 6"),
+        ({}, {"name": "huge"}, "was made with budget.name=tiny, now it is huge: choose another"),
+        ({}, {"test_episodes": 6}, "was made with budget.test_episodes=5, now it is 6"),
+        ({"format": 1}, {}, "is of format 1, and this version writes 2: choose another run_dir"),
     ],
 )
-def test_another_budget_needs_another_folder(
-    tmp_path: Path, name: str, value: Any, message: str
+def test_another_budget_or_version_needs_another_folder(
+    tmp_path: Path, earlier: dict[str, Any], budget: dict[str, Any], message: str
 ) -> None:
-    path = tmp_path / "plan.json"
-    path.write_text(json.dumps(plan_content(study(tmp_path), {})))
-    budget = content(tmp_path)["budget"] | {name: value}
+    before = plan_content(study(tmp_path), {}) | earlier
     with pytest.raises(ConfigError, match=message):
-        joined_plan(path, plan_content(study(tmp_path, budget=budget), {}))
+        joined(tmp_path, before, budget=content(tmp_path)["budget"] | budget)
 
 
 @pytest.mark.parametrize(
@@ -194,18 +174,9 @@ def test_another_budget_needs_another_folder(
 def test_seeds_may_be_added_and_none_is_forgotten(
     tmp_path: Path, seeds: list[int], expected: list[int]
 ) -> None:
-    path = tmp_path / "plan.json"
-    path.write_text(json.dumps(plan_content(study(tmp_path), {})))
     budget = content(tmp_path)["budget"] | {"seeds": seeds}
-    joined = joined_plan(path, plan_content(study(tmp_path, budget=budget), {}))
-    assert joined["budget"]["seeds"] == expected
-
-
-def test_a_plan_of_another_version_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "plan.json"
-    path.write_text(json.dumps(plan_content(study(tmp_path), {}) | {"format": 1}))
-    with pytest.raises(ConfigError, match="is of format 1, and this version writes 2: choose"):
-        joined_plan(path, plan_content(study(tmp_path), {}))
+    found = joined(tmp_path, plan_content(study(tmp_path), {}), budget=budget)
+    assert found["budget"]["seeds"] == expected
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"budget": 1}'])
@@ -225,9 +196,14 @@ def resolved(config: StudyConfig, **changes: Any) -> dict[str, dict[str, Any]]:
     return {name: {"agent": agent, "max_updates": 3} | changes for name in config.wanted()}
 
 
+@cache
+def _composed(name: str, overrides: tuple[str, ...]) -> dict[str, Any]:
+    return _asked(name, list(overrides))
+
+
 def asked(config: StudyConfig) -> dict[str, dict[str, Any]]:
     """What tests ask for, as tangram-experiment composes it."""
-    return {name: _asked(name, config.test_command(name)) for name in config.tests}
+    return {name: _composed(name, tuple(config.test_command(name))) for name in config.tests}
 
 
 def jobs_of(folder: Path, **changes: Any) -> dict[str, Job]:
@@ -245,50 +221,34 @@ def test_all_trainings_of_a_seed_come_before_the_next_seed(tmp_path: Path) -> No
     ]
 
 
-def test_a_training_is_a_command_that_can_go_on(tmp_path: Path) -> None:
-    job = jobs_of(tmp_path)["paper, seed 1"]
-    run_dir = tmp_path / "trainings" / "paper" / "seed_1"
-    assert job.command == (
-        *("train", f"run_dir='{run_dir}'", "seed=1", "resume=auto"),
-        *("agent=paper", "a=1", "b=3", "c=1"),
-    )
-    assert (job.run_dir, job.leaves, job.needs) == (run_dir, run_dir / "result.json", None)
-    assert job.settings["max_updates"] == 3
-    assert job.log == run_dir / "training.log"
+def test_each_job_is_a_command(tmp_path: Path) -> None:
+    jobs, trainings = jobs_of(tmp_path), tmp_path / "trainings"
+    run_dir = trainings / "warm" / "seed_1"
+    job, source = jobs["warm, seed 1"], trainings / "square" / "seed_1"
+    head = ("train", f"run_dir='{run_dir}'", "seed=1", "resume=auto")
+    assert job.command == (*head, "agent=tangram", "a=1", "b=2", f"warm_start='{source}'")
+    assert (job.run_dir, job.leaves) == (run_dir, run_dir / "result.json")
+    assert (job.log, job.settings["max_updates"]) == (run_dir / "training.log", 3)
+    assert jobs["paper, seed 1"].command[4:] == ("agent=paper", "a=1", "b=3", "c=1")
+    # It waits for what it begins with.
+    assert jobs["paper, seed 1"].needs is None
+    assert job.needs is jobs["square, seed 1"]
+    assert not job.ready
+    end(source / "result.json")
+    assert job.ready
+    for test, setting in (("twice", "sim.actions_per_token=2"), ("noisy", "sim.corner_noise=0.01")):
+        trial, out = jobs[f"warm, seed 1, test {test}"], run_dir / "tests" / f"{test}.json"
+        head = ("eval", f"run_dir='{run_dir}'", f"out='{out}'", "episodes=5")
+        assert trial.command == (*head, setting)
+        assert (trial.needs, trial.leaves, trial.trains) == (job, out, False)
+        assert trial.log == run_dir / "tests.log"
 
 
 def test_trainings_are_told_where_ones_own_presets_lie(tmp_path: Path) -> None:
     config = study(tmp_path)
     jobs = make_jobs(config, resolved(config), asked(config), "/mine")
-    trainings = [job for job in jobs if job.trains]
-    assert {job.command[1] for job in trainings} == {"--config-dir=/mine"}
+    assert {job.command[1] for job in jobs if job.trains} == {"--config-dir=/mine"}
     assert all("--config-dir=/mine" not in job.command for job in jobs_of(tmp_path).values())
-
-
-def test_a_warm_start_waits_for_its_source(tmp_path: Path) -> None:
-    jobs = jobs_of(tmp_path)
-    job, source = jobs["warm, seed 1"], tmp_path / "trainings" / "square" / "seed_1"
-    assert job.command[-1] == f"warm_start='{source}'"
-    assert job.needs is jobs["square, seed 1"]
-    assert not job.ready
-    end(source / "result.json", "max_updates=3")
-    assert job.ready
-
-
-@pytest.mark.parametrize(
-    ("test", "setting"), [("twice", "sim.actions_per_token=2"), ("noisy", "sim.corner_noise=0.01")]
-)
-def test_a_test_follows_its_training(tmp_path: Path, test: str, setting: str) -> None:
-    jobs = jobs_of(tmp_path)
-    job = jobs[f"square, seed 0, test {test}"]
-    run_dir = tmp_path / "trainings" / "square" / "seed_0"
-    out = run_dir / "tests" / f"{test}.json"
-    assert job.command == (
-        *("eval", f"run_dir='{run_dir}'", f"out='{out}'", "episodes=5"),
-        setting,
-    )
-    assert job.needs is jobs["square, seed 0"]
-    assert (job.leaves, job.trains) == (out, False)
 
 
 def end(path: Path, ended_by: str = "max_updates=3", updates: int = 3, scored: Any = 3) -> None:
@@ -326,25 +286,36 @@ def test_what_cannot_be_read_is_not_done(tmp_path: Path, text: str | None) -> No
         assert not job.done
 
 
+RANDOM = {"sim": {"actions_per_token": 2, "arena": 2.0}, "episodes": 5, "updates": 3}
+# Under `puzzles` a test's file has the scores of each.
+FIGURES = {"source": "test", "turns": 8, "updates": 3, "puzzles": [{"name": "cat"}]}
+
+
 @pytest.mark.parametrize(
-    ("changes", "done"),
+    ("told", "changes", "done"),
     [
-        ({}, True),
-        ({"mean_reward": 0.5}, True),
-        ({"sim": {"actions_per_token": 3}}, False),
-        ({"sim": None}, False),
-        ({"episodes": 6}, False),
-        ({"updates": 2}, False),
+        (RANDOM, {}, True),
+        (RANDOM, {"mean_reward": 0.5}, True),
+        (RANDOM, {"sim": {"actions_per_token": 3}}, False),
+        (RANDOM, {"sim": None}, False),
+        (RANDOM, {"episodes": 6}, False),
+        (RANDOM, {"updates": 2}, False),
+        (FIGURES, {}, True),
+        (FIGURES, {"source": "train"}, False),
+        (FIGURES, {"turns": 1}, False),
     ],
 )
 def test_a_test_is_done_when_it_is_that_of_the_final_weights(
-    tmp_path: Path, changes: dict[str, Any], done: bool
+    tmp_path: Path, told: dict[str, Any], changes: dict[str, Any], done: bool
 ) -> None:
-    job = jobs_of(tmp_path)["square, seed 0, test twice"]
+    overrides = ["puzzles=test", "turns=8"] if told is FIGURES else ["sim.actions_per_token=2"]
+    tests = {"it": {"label": "it", "overrides": overrides}}
+    one = {"one": experiment(["square"], ["it"])}
+    job = jobs_of(tmp_path, tests=tests, experiments=one)["square, seed 0, test it"]
+    assert job.command[-len(overrides) :] == tuple(overrides)
     end(job.run_dir / "result.json")
     job.prepare()
     assert not job.done
-    told = {"sim": {"actions_per_token": 2, "arena": 2.0}, "episodes": 5, "updates": 3}
     job.leaves.write_text(json.dumps(told | changes))
     assert job.done is done
 
@@ -377,24 +348,6 @@ def test_other_settings_in_the_same_folder_are_refused(
 
 
 @pytest.mark.parametrize(
-    ("changes", "done"), [({}, True), ({"source": "train"}, False), ({"turns": 1}, False)]
-)
-def test_a_test_of_puzzles_is_known_by_their_source(
-    tmp_path: Path, changes: dict[str, Any], done: bool
-) -> None:
-    """Under `puzzles` its file has the scores of each."""
-    tests = {"figures": {"label": "figures", "overrides": ["puzzles=test", "turns=8"]}}
-    one = {"one": experiment(["square"], ["figures"])}
-    job = jobs_of(tmp_path, tests=tests, experiments=one)["square, seed 0, test figures"]
-    assert job.command[-2:] == ("puzzles=test", "turns=8")
-    end(job.run_dir / "result.json")
-    job.prepare()
-    told = {"source": "test", "turns": 8, "updates": 3, "puzzles": [{"name": "cat"}]}
-    job.leaves.write_text(json.dumps(told | changes))
-    assert job.done is done
-
-
-@pytest.mark.parametrize(
     ("override", "message"),
     [
         ("actions=2", "unknown setting 'actions'"),
@@ -408,8 +361,7 @@ def test_a_test_of_puzzles_is_known_by_their_source(
 def test_a_wrong_test_is_told_before_all_trainings(
     tmp_path: Path, override: str, message: str
 ) -> None:
-    config = study(
-        tmp_path, tests={"odd": {"label": "x", "overrides": override.split()}}, experiments={}
-    )
+    odd = {"odd": {"label": "x", "overrides": override.split()}}
+    config = study(tmp_path, tests=odd, experiments={})
     with pytest.raises(ConfigError, match=f"test odd: {message}"):
         asked(config)

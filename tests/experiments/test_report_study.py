@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from tangram_lab.experiments.report.page import write_report
-from tangram_lab.experiments.report.study import Budget, read_runs
+from tangram_lab.experiments.report.study import Budget, Trial, read_runs
 from tangram_sim.errors import RunError
 from tests.experiments.builders import (
     cells,
@@ -195,6 +195,12 @@ def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
         read_runs(tmp_path)
 
 
+def test_a_test_that_asks_for_no_number() -> None:
+    trial = Trial("noise", ("sim.corner_noise=x",), "noise")
+    with pytest.raises(RunError, match="test noise: sim.corner_noise must be a number, got 'x'"):
+        _ = trial.corner_noise
+
+
 @pytest.mark.parametrize("axis", ["updates", "episodes", "train_s"])
 def test_a_curve_that_goes_back(tmp_path: Path, axis: str) -> None:
     write_study(tmp_path)
@@ -228,9 +234,14 @@ def test_runs_that_differ_in_their_seed_alone_are_one_row(tmp_path: Path) -> Non
     write_sweep(tmp_path)
     study = read_runs(tmp_path)
     assert [one.label for one in study.trainings] == ["paper", "tangram"]
-    assert [len(one.finished) for one in study.trainings] == [3, 3]
     assert study.trainings[1].values("mean_reward") == pytest.approx({0: 0.8, 1: 0.9, 2: 1.0})
     assert study.trainings[0].overrides == ("agent.name=paper",)
+    page, _ = write_report(tmp_path, tmp_path / "report")
+    text = page.read_text()
+    assert [row[0] for row in cells(text, "paper") + cells(text, "tangram")] == ["3 of 3"] * 2
+    assert cells(text, "episodes of every test") == [["100"]]
+    assert "tangram-experiment" not in text
+    assert "Fig. 1" not in text
 
 
 def test_labels_name_what_differs_within_an_agent(tmp_path: Path) -> None:
@@ -240,15 +251,6 @@ def test_labels_name_what_differs_within_an_agent(tmp_path: Path) -> None:
     (tmp_path / "10" / "config.yaml").write_text(yaml.safe_dump(more))
     labels = [one.label for one in read_runs(tmp_path).trainings]
     assert labels == ["paper, agent.noise=0.1", "tangram", "paper, agent.noise=0.2, sim.substeps=4"]
-
-
-def test_a_sweep_becomes_one_table(tmp_path: Path) -> None:
-    write_sweep(tmp_path)
-    page, _ = write_report(tmp_path, tmp_path / "report")
-    text = page.read_text()
-    assert [row[0] for row in cells(text, "paper") + cells(text, "tangram")] == ["3 of 3"] * 2
-    assert "tangram-experiment" not in text
-    assert "Fig. 1" not in text
 
 
 def test_the_same_run_twice_is_refused(tmp_path: Path) -> None:

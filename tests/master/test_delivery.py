@@ -5,7 +5,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from master.delivery import Ledger, Verdict
-from tangram_agent.messages import Ack, Reject
 
 pytestmark = pytest.mark.fast
 
@@ -33,20 +32,6 @@ def test_what_to_do_with_a_batch(
     received: int, held: set[int], sequence: int, verdict: Verdict
 ) -> None:
     assert Ledger(1, received, held=held).judge(sequence, WINDOW) is verdict
-
-
-def test_answers() -> None:
-    ledger = Ledger(1, 5, held={4, 5})
-    assert ledger.answer(Verdict.INSERTED, 2) == Ack(2, duplicate=True)
-    assert ledger.answer(Verdict.HELD, 4) is None
-    assert ledger.answer(Verdict.GAP, 8) == Reject(
-        reason="batch 8: batch 6 must come first", sequence=8, final=False
-    )
-    assert ledger.answer(Verdict.EXCESS, 6) == Reject(
-        reason="batch 6: 2 batches are unacknowledged, the most there may be",
-        sequence=6,
-        final=False,
-    )
 
 
 @pytest.mark.parametrize(

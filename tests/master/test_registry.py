@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from master.registry import Peer, RefusedError, Registry, differing
+from master.registry import Peer, RefusedError, Registry
 from tangram_agent.schema import MAX_COUNT
 from tangram_sim.errors import RunError
 from tests.agent.messages import FINGERPRINTS, hello
@@ -154,20 +154,6 @@ def test_malformed_tables_are_refused(registry: Registry, state: Any, reason: st
     with pytest.raises(RunError) as caught:
         registry.load_state(state, 0.0)
     assert str(caught.value).startswith(reason)
-
-
-@pytest.mark.parametrize(
-    ("theirs", "names"),
-    [
-        ({"tokens": "a", "sim": "b"}, []),
-        ({"tokens": "x", "sim": "b"}, ["tokens"]),
-        ({"tokens": "x", "sim": "x"}, ["sim", "tokens"]),
-        ({"tokens": "a"}, ["sim"]),
-        ({"tokens": "a", "sim": "b", "net": "c"}, ["net"]),
-    ],
-)
-def test_sections_that_differ_are_named(theirs: dict[str, str], names: list[str]) -> None:
-    assert differing({"tokens": "a", "sim": "b"}, theirs) == names
 
 
 def test_batches_of_the_journal_are_new_once(registry: Registry) -> None:

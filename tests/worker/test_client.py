@@ -291,12 +291,16 @@ def test_a_repeated_stop_is_heard_by_who_missed_the_first(master: StandIn) -> No
 def test_scores_and_stats_arrive_and_without_a_master_scores_are_lost_and_counted(
     stage: Stage,
 ) -> None:
-    with make_client(stage.hub.endpoint, role="evaluator") as client:
+    with make_client(stage.hub.endpoint, role="evaluator", index=2) as client:
         client.send_scores(scores())
         assert client.counters["lost_scores"] == 1
         assert served(stage, client.join)
         client.stats["episodes"] = 12.0
         client.send_scores(scores())
         stage.counted("scores")
-        assert isinstance(stage.arrivals[0], ScoresArrived)
+        [arrival] = stage.arrivals
+        assert isinstance(arrival, ScoresArrived)
+        assert (arrival.index, arrival.incarnation) == (2, 1)
+        assert arrival.scores.scalars == scores().scalars
+        np.testing.assert_array_equal(arrival.scores.ends, scores().ends)
         both(stage, client, lambda: stage.hub.peers[0].stats == {"episodes": 12.0})

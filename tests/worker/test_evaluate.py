@@ -157,18 +157,10 @@ def test_settings_of_the_agents_play_are_played_and_written_down(tmp_path: Path,
     assert set(listed["baselines"]) == {"order=size", "order=random", "exact", "random"}
     plain = evaluated(tmp_path, puzzles=two, changes={"agent": {"order": "listed"}})
     assert plain["coverage"] == trained["baselines"]["order=listed"]["coverage"]
+    assert evaluated(tmp_path, puzzles=two, seed=1)["coverage"] != trained["coverage"]
     assert [one["coverage"] for one in plain["puzzles"]] != [
         one["coverage"] for one in listed["puzzles"]
     ]
-
-
-def test_the_same_seed_gives_the_same_scores(tmp_path: Path, two: str) -> None:
-    one, again, other = (evaluated(tmp_path, puzzles=two, seed=seed) for seed in (3, 3, 4))
-    timed = {"seconds", "seconds_per_puzzle", "puzzles", "baselines"}
-    assert {k: v for k, v in one.items() if k not in timed} == {
-        k: v for k, v in again.items() if k not in timed
-    }
-    assert one["coverage"] != other["coverage"]
 
 
 def test_random_targets_of_several_tokens_get_the_same_scores(tmp_path: Path) -> None:

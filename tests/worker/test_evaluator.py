@@ -64,22 +64,6 @@ def test_the_newest_weights_are_scored_on_the_fixed_tests(tokens: dict) -> None:
 
 
 @pytest.mark.cluster
-def test_few_tests_have_few_pictures_and_physics_a_real_camera() -> None:
-    made = setup(pixels=64, backend="physics")
-    service = replace(SERVICE, eval_episodes=3)
-
-    def script(hub: Hub) -> list[ScoresArrived]:
-        hub.publish(weights(made, 1))
-        return collect(hub, bool)
-
-    hub = open_hub(made)
-    arrived, _ = with_master(hub, script, lambda: run_evaluator(config(hub, service), made))
-    assert arrived[0].scores.scalars["episodes"] == 3
-    assert len(arrived[0].scores.starts) == 3
-    assert -1.0 <= arrived[0].scores.scalars["mean_reward_camera"] <= 1.0
-
-
-@pytest.mark.cluster
 def test_a_long_evaluation_keeps_in_touch_and_can_be_stopped() -> None:
     """Alone it would take longer than any wait here."""
     made = setup(pixels=16)

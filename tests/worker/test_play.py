@@ -73,12 +73,6 @@ def test_a_picture_shows_all_episodes(tmp_path: Path) -> None:
     assert max(sizes[2]) < 900
 
 
-def test_another_seed_shows_other_episodes(tmp_path: Path) -> None:
-    plays = [shown(of_square(tmp_path, episodes=2, seed=seed)).played for seed in (0, 0, 1)]
-    np.testing.assert_array_equal(plays[0].starts, plays[1].starts)
-    assert (plays[0].starts != plays[2].starts).all()
-
-
 def test_motion_is_even_and_ends_where_the_episode_did() -> None:
     """A token moved by (0.4, -0.2) and turned by 170 degrees past the cut of the angle."""
     layout = setup().layout
@@ -124,14 +118,6 @@ def test_puzzles_by_name_start_beside_their_figures_and_elsewhere_with_another_s
     for start, goal in zip(starts[0], shows[0].played.goals, strict=True):
         tokens, pieces = outlines(start[None], layout)[0], outlines(goal[None], layout)[0]
         assert not pairs_overlap(np.repeat(tokens, 7, axis=0), np.tile(pieces, (7, 1, 1))).any()
-
-
-@pytest.mark.parametrize(
-    ("names", "titles"), [(None, ["my cat", "my fish"]), (("my_fish",), ["my fish"])]
-)
-def test_puzzles_of_a_file(tmp_path: Path, names: tuple[str] | None, titles: list[str]) -> None:
-    path = write_puzzles(tmp_path / "mine.json", drawn("cat"), drawn("fish"))
-    assert shown(of_game(tmp_path, puzzles=str(path), puzzle=names)).titles == titles
 
 
 def test_unknown_and_too_many_puzzles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -237,18 +223,6 @@ def played_by_two(folder: Path, episodes: int, **second: Any) -> list[tuple[Setu
     config = compared(folder, "first", "second", episodes=episodes)
     runs = [load_run(run) for run in config.run_dirs]
     return [(run.setup, play_episodes(run, config)) for run in runs]
-
-
-def test_every_run_has_a_column(tmp_path: Path) -> None:
-    names = [f"run_{number}" for number in range(4)]
-    for name in names:
-        write_run(tmp_path / name)
-    out = tmp_path / "ends.png"
-    for count in (2, 4):
-        compare_runs(compared(tmp_path, *names[:count], out=str(out), episodes=4))
-        with Image.open(out) as picture:
-            assert picture.format == "PNG"
-            assert 1000 < picture.width < 1300
 
 
 def test_all_have_the_same_starts_and_targets(tmp_path: Path) -> None:

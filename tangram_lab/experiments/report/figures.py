@@ -188,7 +188,7 @@ def sweeps(experiment: Experiment) -> list[Sweep]:
         if test.corner_noise is not None:
             noisy.setdefault(100.0 * test.corner_noise, test)
         if not test.corner_noise and test.actions is not None:
-            several.setdefault(float(test.actions or 1), test)
+            several.setdefault(test.actions or 1.0, test)
     found = (("noise", NOISE, noisy), ("actions", ACTIONS, several))
     return [Sweep(n, label, dict(sorted(o.items()))) for n, label, o in found if len(o) > 1]
 

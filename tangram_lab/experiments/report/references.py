@@ -1,7 +1,7 @@
 """What scores are compared with: policies that learned nothing, and the paper's own numbers."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from tangram_lab.experiments.report.numbers import Measure
@@ -143,5 +143,5 @@ def papers_score(experiment: Experiment, training: Training, trial: Trial) -> fl
     """The paper's mean reward in a test without noise, by its count of actions."""
     if trial.corner_noise or trial.actions is None:
         return None
-    told = papers(experiment, training).get("by_actions", ())
-    return dict(enumerate(told, 1)).get(trial.actions)
+    told: Sequence[float] = papers(experiment, training).get("by_actions", ())
+    return next((value for count, value in enumerate(told, 1) if count == trial.actions), None)

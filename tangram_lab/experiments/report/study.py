@@ -102,21 +102,30 @@ class Trial(TestConfig):
 
     name: str = ""
 
+    def asked(self, setting: str) -> float | None:
+        """A number that it asks of tangram-eval; None as trained.
+
+        Raises:
+            RunError: something else stands there.
+        """
+        told = {text.partition("=")[0]: text.partition("=")[2] for text in self.overrides}
+        try:
+            return float(told[setting]) if setting in told else None
+        except ValueError:
+            raise RunError(
+                f"test {self.name}: {setting} must be a number, got '{told[setting]}': mend "
+                "plan.json"
+            ) from None
+
     @property
-    def actions(self) -> int | None:
-        """For each token; None as trained."""
-        asked = self._asked("sim.actions_per_token")
-        return None if asked is None else int(asked)
+    def actions(self) -> float | None:
+        """For each token."""
+        return self.asked("sim.actions_per_token")
 
     @property
     def corner_noise(self) -> float | None:
-        """Deviation of the noise on the corners that the agent sees, in arenas; None as trained."""
-        asked = self._asked("sim.corner_noise")
-        return None if asked is None else float(asked)
-
-    def _asked(self, name: str) -> str | None:
-        told = (text.partition("=") for text in self.overrides)
-        return {key: value for key, _, value in told}.get(name)
+        """Deviation of the noise on the corners that the agent sees, in arenas."""
+        return self.asked("sim.corner_noise")
 
 
 @dataclass(frozen=True)

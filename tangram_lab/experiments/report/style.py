@@ -3,9 +3,8 @@
 import io
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
@@ -21,14 +20,8 @@ WIDE = 30.0  # most / least of values that need a logarithmic axis
 # Okabe and Ito's colours for all kinds of colour vision, without black and yellow, and two of
 # Paul Tol's.
 COLOURS = (
-    "#0072B2",
-    "#D55E00",
-    "#009E73",
-    "#CC79A7",
-    "#E69F00",
-    "#56B4E9",
-    "#882255",
-    "#999933",
+    *("#0072B2", "#D55E00", "#009E73", "#CC79A7"),
+    *("#E69F00", "#56B4E9", "#882255", "#999933"),
 )
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<")
 DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (5, 1.5, 1.2, 1.5)))
@@ -60,8 +53,7 @@ SETTINGS: dict[Any, Any] = {
 Dash = str | tuple[int, tuple[float, ...]]
 
 
-@dataclass(frozen=True)
-class Look:
+class Look(NamedTuple):
     """How one training looks in every figure."""
 
     colour: str
@@ -86,13 +78,7 @@ def empty_figure(width_in: float, height_in: float) -> Figure:
 def new_figure(
     height_in: float, rows: int, columns: int, sharex: bool = False, sharey: bool = False
 ) -> tuple[Figure, list[Axes]]:
-    """A figure with its panels, row after row.
-
-    Args:
-        height_in: in inches; the width is that of a README.
-        sharex: all panels have one range of x.
-        sharey: all panels have one range of y.
-    """
+    """A figure as wide as a README with its panels, row after row."""
     figure = empty_figure(WIDTH_IN, height_in)
     panels = figure.subplots(rows, columns, sharex=sharex, sharey=sharey, squeeze=False)
     for panel in panels.flat:
@@ -136,18 +122,13 @@ def thousands() -> FuncFormatter:
 
 
 def save(figure: Figure, folder: Path, name: str) -> None:
-    """Write a figure as PNG and SVG; the same data gives the same bytes.
-
-    Args:
-        folder: of the files.
-        name: of the files, without an ending.
+    """Write a figure as `name`.png and .svg; the same data gives the same bytes.
 
     Raises:
         RunError: the files cannot be written.
     """
     # Names of the program and times would change with every machine and run.
-    formats = {"png": ("Software",), "svg": ("Date", "Creator")}
-    for kind, left_out in formats.items():
+    for kind, left_out in {"png": ("Software",), "svg": ("Date", "Creator")}.items():
         data = io.BytesIO()
         figure.savefig(data, format=kind, metadata=dict.fromkeys(left_out))
         write_whole(folder / f"{name}.{kind}", data.getvalue())
