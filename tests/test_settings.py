@@ -61,7 +61,15 @@ MLP = ONE | {"net": {"kind": "mlp", "hidden": [8]}}
 PHYSICS = over(ONE, sim={"backend": "physics"})
 GAUSSIAN = over(SEVERAL, sim={"targets": "gaussian"})
 CROWDED = over(SEVERAL, sim={"arena": 1.2})
-SLIDE = over(SEVERAL, sim={"backend": "physics", "motion": "slide", "arena": 1.4})
+# So crowded that nearly every order pushes something away.
+SLIDE = over(
+    SEVERAL,
+    tokens={
+        "shapes": ["large_triangle", "parallelogram", "square", "medium_triangle"],
+        "scale": 0.6,
+    },
+    sim={"backend": "physics", "motion": "slide", "arena": 1.6},
+)
 SEEN = over(ONE, sim={"pixels": 16, "arena": 1.2})
 CAMERA = over(SEEN, reward={"source": "camera"})
 UNPUNISHED = over(ONE, agent={"saturation_penalty": 0.0})
@@ -185,14 +193,26 @@ def digest(*arrays: Any) -> str:
     return content.hexdigest()
 
 
+class Trace:
+    """The steps of a run, with which many rows compare; it goes on as far as they look."""
+
+    def __init__(self, setup: Setup) -> None:
+        self._rest, self._seen = steps_of(setup), list[str]()
+
+    def __iter__(self) -> Iterator[str]:
+        yield from self._seen
+        for step in self._rest:
+            self._seen.append(step)
+            yield step
+
+
 @cache
-def trace(config: str) -> list[str]:
-    """The steps of the run that a config makes, with which many rows compare."""
-    return list(steps_of(make_setup(ast.literal_eval(config))))
+def trace(config: str) -> Trace:
+    return Trace(make_setup(ast.literal_eval(config)))
 
 
 def differ(base: Config, other: Config) -> bool:
-    """Whether two runs differ; the second one goes on only until it does."""
+    """Whether two runs differ; they go on only until they do."""
     steps = zip_longest(trace(repr(base)), steps_of(make_setup(other)))
     return any(one != two for one, two in steps)
 

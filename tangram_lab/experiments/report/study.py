@@ -113,7 +113,8 @@ class Trial(TestConfig):
             return float(told[setting]) if setting in told else None
         except ValueError:
             raise RunError(
-                f"test {self.name}: {setting} must be a number, got '{told[setting]}': mend plan.json"
+                f"test {self.name}: {setting} must be a number, got '{told[setting]}': mend "
+                "plan.json"
             ) from None
 
     @property
