@@ -88,8 +88,8 @@ class SimConfig(Settings, section="sim"):
     )
     targets: str = setting(
         "uniform",
-        "uniform: pieces apart, anywhere; gaussian: apart, around the arena's centre; connected: edge "
-        "to edge; figures: puzzles of the train split; mixed: uniform or connected by chance",
+        "uniform: pieces apart, anywhere; gaussian: apart, around the arena's centre; connected: "
+        "edge to edge; figures: puzzles of the train split; mixed: uniform or connected by chance",
         choices=TARGETS,
     )
     spread: float = setting(
