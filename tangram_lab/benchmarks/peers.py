@@ -67,7 +67,7 @@ def compare_updates(stage: str, runs: int) -> list[Row]:
 
 
 def _setup() -> Setup:
-    return with_agent(preset("mlp"), batch_size=BATCH)
+    return with_agent(preset("mlp"), batch_size=BATCH, readout="token")
 
 
 def _model() -> Any:

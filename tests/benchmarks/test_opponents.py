@@ -44,8 +44,8 @@ def test_head_by_head_gives_the_same_messages(count: int) -> None:
 def test_the_plain_learner_learns_from_the_same_targets_where_nothing_goes_on() -> None:
     """Only its targets' networks are asked in vain: that is what it is there to cost."""
     setup = with_agent(preset("mlp"), batch_size=32)
-    batch = random_transitions(setup, 32)
     ours, plain = Learner(setup, seed=0), PlainLearner(setup, seed=0)
+    batch = ours.prepared(random_transitions(setup, 32), np.random.default_rng(0))
     for _ in range(3):
         found, expected = plain.update(batch), ours.update(batch)
         assert found == pytest.approx(expected, rel=1e-4)

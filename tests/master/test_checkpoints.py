@@ -167,7 +167,7 @@ def test_every_harm_to_a_file_is_found(tmp_path: Path, file: str, harm: str) -> 
 @pytest.mark.parametrize(
     ("change", "kind", "reason"),
     [
-        ({"format_version": 1}, RunError, "has format 1, this version reads 2: use the version"),
+        ({"format_version": 2}, RunError, "has format 2, this version reads 3: use the version"),
         ({"format_version": None}, CorruptError, "manifest.json has no format_version"),
         ({"updates": 6}, CorruptError, "checksum of manifest.json differs"),
         ({"counters": {}}, CorruptError, "checksum of manifest.json differs"),
