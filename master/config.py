@@ -20,7 +20,7 @@ class MasterConfig(Settings):
     max_updates: int = setting(2000, "after this many updates, 0 for no bound", low=0)
     resume: str = setting(
         "none",
-        "a folder that holds a run is refused, or auto: go on from its newest valid checkpoint",
+        "none: a folder that holds a run is refused; auto: go on from its newest valid checkpoint",
         choices=("none", "auto"),
     )
     warm_start: str | None = setting(None, "folder of a run whose networks this run begins with")

@@ -5,9 +5,11 @@ import platform
 import re
 import shlex
 import subprocess
+import sys
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from shutil import which
 from typing import Any
 
 from rich.console import Console
@@ -36,7 +38,7 @@ PACKAGES = ("tangram-rl", "torch", "numpy", "pyzmq", "pybullet")
 
 
 def make_result(status: RunStatus, trainer: Trainer, seed: int, reason: str) -> dict[str, Any]:
-    """The content of result.json; scores are null where no evaluator was there.
+    """The content of result.json; scores are null where no evaluator sent any.
 
     `scored_updates` tells which weights the scores are of: the final ones if it equals `updates`.
 
@@ -88,12 +90,17 @@ def show_result(console: Console, folder: RunFolder, result: Mapping[str, Any]) 
     if folder.picture.exists():
         paths.append(("picture", str(folder.picture)))
     paths += [
-        ("curves", f"tensorboard --logdir {shlex.quote(str(folder.tensorboard))}"),
-        ("watch it play", f"tangram-play {_run_argument(folder.path)} out=play.gif"),
+        ("curves", f"{_command('tensorboard')} --logdir {shlex.quote(str(folder.tensorboard))}"),
+        ("watch it play", f"{_command('tangram-play')} {_run_argument(folder.path)} out=play.gif"),
     ]
     for name, text in paths:
         # Long paths stay whole, so that they can be copied.
         console.print(f"  {name:<15} {text}", soft_wrap=True, markup=False, highlight=False)
+
+
+def _command(name: str) -> str:
+    """A command of this environment as a shell finds it, which may not have the environment on."""
+    return name if which(name) else shlex.quote(str(Path(sys.executable).with_name(name)))
 
 
 def _run_argument(path: Path) -> str:
@@ -111,7 +118,7 @@ def _rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("position error", _text(result, "position_error_median", "{:.4f}") + " (median)"),
     ]
     if result["scored_updates"] is None:
-        rows = [("scores", "none: no evaluator took part")]
+        rows = [("scores", "none came from an evaluator")]
     elif result["scored_updates"] != result["updates"]:
         rows.append(("scored", f"weights after {result['scored_updates']:,} updates"))
     return [

@@ -81,15 +81,15 @@ class SimConfig(Settings, section="sim"):
     )
     max_overlap: float = setting(
         0.2,
-        "lift: share of a token that may come to lie on others; beyond it is refused",
+        "lift: share of a token that may come to lie on others; a placement beyond it is blocked",
         low=0,
         high=1,
         only={"motion": "lift"},
     )
     targets: str = setting(
         "uniform",
-        "apart from each other, gaussian centres, connected edge to edge, figures (of the train "
-        "split, all seven tans), or mixed (uniform and connected in turns of chance)",
+        "uniform: pieces apart, anywhere; gaussian: apart, around the arena's centre; connected: "
+        "edge to edge; figures: puzzles of the train split; mixed: uniform or connected by chance",
         choices=TARGETS,
     )
     spread: float = setting(

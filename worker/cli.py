@@ -92,8 +92,10 @@ def _play(settings: Plain) -> int:
     from worker.config import PlayConfig, check_compare, check_puzzle
 
     check_compare(settings.get("compare"))  # before a text is taken for a list of letters
-    settings = with_absolute_paths(settings) | {"puzzle": check_puzzle(settings.get("puzzle"))}
-    settings = with_changes(settings)
+    paths = with_absolute_paths(settings)
+    if settings["out"] == PlayConfig.out:
+        paths["out"] = PlayConfig.out  # not given: nothing to refuse beside live=true
+    settings = with_changes(paths | {"puzzle": check_puzzle(settings.get("puzzle"))})
     config = from_mapping(PlayConfig, settings)
     if config.tokens is not None and config.run_dir is not None:
         _check_tokens(config.tokens, config.run_dir)

@@ -69,7 +69,7 @@ class WorkerConfig(Settings):
         )
     )
     role: str = setting(
-        "player", "or evaluator: noise off, fixed tests, sends scores", choices=ROLES
+        "player", "player, or evaluator: plays fixed tests, noise off, sends scores", choices=ROLES
     )
     index: int = setting(
         -1, "number of this worker, -1: the master gives one", low=-1, high=MAX_INDEX

@@ -169,7 +169,7 @@ _ROWS = {
     "share_solved": ("share of targets covered by 0.95 or more", 3),
     "iou": ("intersection over union", 4),
     "wrong": ("pieces under a token of another shape", 2),
-    "blocked": ("placements refused because of other tokens", 2),
+    "blocked": ("placements blocked by other tokens", 2),
     "angle_error_deg_median": ("angle error, median, degrees", 3),
     "angle_error_deg_p90": ("angle error, 90th percentile", 3),
     "position_error_median": ("position error, median, arena units", 4),
@@ -247,7 +247,7 @@ def _limits(setup: Setup, scores: Scores) -> list[str]:
         noise,
         "Each corner must be known by its number: the target's corners come in the token's order.",
         *(["Nothing stops a token at the arena's edge."] if one else several),
-        f"One of ten tests ends below a raw overlap of {scores['raw_overlap_p10']:.3f}.",
+        f"One of ten tests ends below a raw overlap of {scores['raw_overlap_p10']:.4f}.",
     ]
 
 

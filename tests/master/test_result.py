@@ -1,6 +1,7 @@
 """What a run has come to: the final table, and commands that can be pasted."""
 
 import shlex
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ RESULT = dict.fromkeys(SCORES) | {
 @pytest.mark.parametrize(
     ("change", "words", "without"),
     [
-        ({}, ["none: no evaluator took part", "1:01 of training, 1:15 in all"], ["mean reward"]),
+        ({}, ["none came from an evaluator", "1:01 of training, 1:15 in all"], ["mean reward"]),
         (
             SCORED | {"scored_updates": 1234},
             ["0.931 on exact polygons", "- in the camera's", "1.21° (median)", "1,234"],
@@ -55,10 +56,19 @@ def test_the_final_table(
     assert "test_episodes.png" not in text(shown)
 
 
-def test_commands_that_are_shown_can_be_pasted(tmp_path: Path) -> None:
+@pytest.mark.parametrize("active", [True, False])
+def test_commands_that_are_shown_can_be_pasted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, active: bool
+) -> None:
+    """Whether the environment is on or not, as after `make train`."""
+    commands = Path(sys.executable).parent
+    monkeypatch.setenv("PATH", str(commands) if active else str(tmp_path))
     shown, folder = screen(), RunFolder(tmp_path / "it's a=run")
     show_result(shown, folder, RESULT)
     curves, play = (shlex.split(line) for line in text(shown).splitlines()[-2:])
     assert curves[-1] == str(folder.tensorboard)
+    for command in (curves[-3], play[-3]):
+        assert command == Path(command).name if active else Path(command).parent == commands
+        assert (commands / command).exists()
     (parsed,) = OverridesParser.create().parse_overrides([play[-2]])
     assert parsed.value() == str(folder.path)

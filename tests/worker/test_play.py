@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 import worker.film as film_module
+from conf.cli import composed
 from tangram_agent.runs import load_run
 from tangram_agent.setup import Setup
 from tangram_sim.errors import ConfigError, RunError, TangramError
@@ -16,6 +17,7 @@ from tangram_sim.geometry import outlines, pairs_overlap
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.worker.builders import write_run
 from tests.worker.puzzle_files import GAME, SIM, drawn, write_puzzles
+from worker.cli import _play
 from worker.config import PlayConfig
 from worker.film import Show, film_pictures
 from worker.play import (
@@ -209,6 +211,16 @@ def test_no_window_without_a_display(
         monkeypatch.setenv("DISPLAY", display)
     with pytest.raises(TangramError, match="live=true needs a display .*write a film"):
         play_run(of_game(tmp_path, puzzle=("cat",), live=True))
+
+
+def test_a_window_needs_no_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[PlayConfig] = []
+    monkeypatch.setattr("worker.play.play_run", lambda config: shown.append(config) or 0)
+    given = ["run_dir=pretrained/square", "live=true"]
+    assert _play(composed("play", given)) == 0
+    assert [config.live for config in shown] == [True]
+    with pytest.raises(ConfigError, match="out=.*a.gif changes nothing with live=true"):
+        _play(composed("play", [*given, "out=a.gif"]))
 
 
 # Runs side by side
