@@ -145,10 +145,12 @@ def _check(name: str, value: object, what: Declaration) -> None:
 
 
 def check_range(name: str, value: float, low: float, high: float = math.inf) -> None:
-    """Raise ConfigError unless low <= value <= high."""
-    if not low <= value <= high:
+    """Raise ConfigError unless value is a finite number and low <= value <= high."""
+    number = not isinstance(value, bool) and -math.inf < value < math.inf
+    if not (number and low <= value <= high):
         bound = f"at least {low:g}" if math.isinf(high) else f"between {low:g} and {high:g}"
-        raise ConfigError(f"{name} must be {bound}, got {value}")
+        kind, got = ("", value) if number else ("a finite number, ", told(value))
+        raise ConfigError(f"{name} must be {kind}{bound}, got {got}")
 
 
 def check_choice(name: str, value: str, choices: Collection[str]) -> None:

@@ -65,6 +65,7 @@ WRONG = [
     ("tangram-master from_config=nowhere.yaml", "from_config=nowhere.yaml: No such file"),
     ("tangram-worker connect=tcp://127.0.0.1:1 reward.name=own.py:none", "cannot read 'own.py' on"),
     ("tangram-train tokens.shapes=[square,square,square] tokens.scale=2.2", "no room for token"),
+    ("tangram-master tokens.scale=1000", "does not fit into an arena of width 2"),
     ("tangram-worker", "say which master: connect=tcp://host:port"),
     ("tangram-eval", "say which run: run_dir=runs/..."),
     ("tangram-play", "say which run: run_dir=runs/..."),
