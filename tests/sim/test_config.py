@@ -46,6 +46,7 @@ REFUSED = [
     (NoiseConfig, {"kind": "x"}, "^noise.kind must be one of none, gaussian, wide, got 'x'$"),
     (NoiseConfig, {"kind": "wide", "width": -1.0}, "^noise.width must be at least 0, got -1.0$"),
     (NoiseConfig, {"seed": True}, f"^noise.seed must be {FINITE}, between 0 and 9, got true$"),
+    (TopConfig, {"jobs": 10**400}, f"^jobs must be {FINITE}, at least 1, got 1000"),
     (NoiseConfig, {"sizes": (1, True)}, f"^noise.sizes must be {FINITE}, between 1 and 4, got tr"),
     (
         NoiseConfig,
