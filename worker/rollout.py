@@ -84,14 +84,18 @@ class Played:
         cut: dict[str, Any] = {
             name: rows[:count] for name, rows in vars(self).items() if isinstance(rows, np.ndarray)
         }
-        return replace(self, episodes=next(parts(self.episodes, count)), **cut)
+        return replace(self, episodes=_rows(self.episodes, 0, count), **cut)
 
 
 def parts(episodes: Episodes, size: int) -> Iterator[Episodes]:
     """The same episodes, at most `size` at a time, nothing copied."""
-    columns: dict[str, Any] = vars(episodes)
     for first in range(0, episodes.count, size):
-        yield Episodes(**{name: part[first : first + size] for name, part in columns.items()})
+        yield _rows(episodes, first, first + size)
+
+
+def _rows(episodes: Episodes, first: int, end: int) -> Episodes:
+    columns: dict[str, Any] = vars(episodes)
+    return Episodes(**{name: column[first:end] for name, column in columns.items()})
 
 
 def play(
@@ -111,16 +115,17 @@ def play(
             then whatever `choose` draws, so an episode does not depend on those played beside it.
         count: of episodes; the environments that have none left at the end play the first again.
         targets: poses (E, K, 3) and sides (E, K) to assemble instead of targets that are drawn.
-        go_on: asked before each group but the first; if not, fewer episodes are returned.
+        go_on: asked before each action; if not, the episodes that are being played are left out
+            of what is returned.
     """
     whole = -(-count // env.count) * env.count
     played = Played.empty(env, whole)
     for first in range(0, whole, env.count):
-        if first and not go_on():
-            return played.first(first)
         numbers = np.arange(first, first + env.count) % count
         these = None if targets is None else (targets[0][numbers], targets[1][numbers])
-        _play_group(env, choose, [generator(i) for i in numbers.tolist()], these, played, first)
+        generators = [generator(i) for i in numbers.tolist()]
+        if not _play_group(env, choose, generators, these, played, first, go_on):
+            return played.first(first)
     return played.first(count)
 
 
@@ -131,13 +136,16 @@ def _play_group(
     targets: Sides | None,
     played: Played,
     first: int,
-) -> None:
-    """One episode in every environment, into the rows from `first` on."""
+    go_on: Callable[[], bool],
+) -> bool:
+    """One episode in every environment, into the rows from `first` on; False if told to end."""
     rows, seen = slice(first, first + env.count), played.episodes
     env.reset(generators, targets)
     seen.goals[rows], played.goals[rows] = env.seen_goals, env.goals
     began = time.perf_counter()
     for t in range(env.horizon):
+        if not go_on():
+            return False
         _look(env, played, rows, t)
         actions = choose(env.seen, env.placed, env.seen_goals, generators)
         result = env.step(actions.astype(np.float64))
@@ -148,6 +156,7 @@ def _play_group(
     played.overlap[rows] = result.overlap
     if played.camera is not None:
         played.camera[rows] = result.camera_rewards
+    return True
 
 
 def _look(env: BatchedEnv, played: Played, rows: slice, t: int) -> None:

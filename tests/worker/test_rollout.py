@@ -136,10 +136,11 @@ def test_as_many_episodes_as_asked_for_in_any_number_of_environments(camera: boo
     assert (four.camera is None) == (not camera)
 
 
-@pytest.mark.parametrize("groups", [1, 2])
-def test_play_ends_between_groups_when_it_is_told_to(groups: int) -> None:
-    made = setup()
-    answers = iter([True] * (groups - 1) + [False])
+@pytest.mark.parametrize(("asked", "groups"), [(0, 0), (1, 0), (2, 1), (3, 1), (4, 2)])
+def test_play_ends_before_an_action_when_it_is_told_to(asked: int, groups: int) -> None:
+    """What was begun is left out: an episode of two actions is whole after two questions."""
+    made = setup(actions_per_token=2)
+    answers = iter([True] * asked + [False])
     with environment(made, 3) as env:
         rollout = Rollout(env, *IDENTITY)
         episodes = rollout.play(policy(made).explore, 5, lambda: next(answers))
