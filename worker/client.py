@@ -56,7 +56,7 @@ class Client:
     """One process's conversation; made without any I/O, `join` starts it.
 
     Args:
-        connect: host:port with or without tcp://, a connection file, or a run folder that holds one.
+        connect: host:port, a connection file, or a run folder that holds one.
         role: player or evaluator.
         index: wanted within the role, -1 for any.
         fingerprints: section of the settings -> digest, which the master compares.

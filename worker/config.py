@@ -49,9 +49,7 @@ def _refuse(changes: Changes, names: Iterable[str], because: str, remedy: str) -
 
 def _check_connect(value: str) -> None:
     if not value.strip():
-        raise ConfigError(
-            "connect must name the master's endpoint, got '': set connect=HOST:PORT or connect=RUN_DIR"
-        )
+        raise ConfigError("connect must name the master's endpoint, got '': set connect=HOST:PORT")
 
 
 def _check_out(value: str) -> None:

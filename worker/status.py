@@ -62,7 +62,7 @@ def ask_status(
     """The present status of a run.
 
     Args:
-        connect: host:port with or without tcp://, a connection file, or a run folder that holds one.
+        connect: host:port, a connection file, or a run folder that holds one.
         context: of the sockets.
         patience_s: to wait for the answer.
 
