@@ -77,10 +77,14 @@ def _status(settings: Plain) -> int:
 
 
 def _evaluate(settings: Plain) -> int:
+    from tangram_agent.files import check_writable
     from tangram_agent.setup import from_mapping
     from worker.config import EvalConfig
 
     config = from_mapping(EvalConfig, with_changes(with_absolute_paths(settings)))
+    for name, path in (("out", config.out), ("sheet", config.sheet)):
+        if path is not None:
+            check_writable(name, Path(path))
 
     from worker.evaluate import evaluate_run
 
@@ -88,6 +92,7 @@ def _evaluate(settings: Plain) -> int:
 
 
 def _play(settings: Plain) -> int:
+    from tangram_agent.files import check_writable
     from tangram_agent.setup import from_mapping
     from worker.config import PlayConfig, check_compare, check_puzzle
 
@@ -97,6 +102,8 @@ def _play(settings: Plain) -> int:
         paths["out"] = PlayConfig.out  # not given: nothing to refuse beside live=true
     settings = with_changes(paths | {"puzzle": check_puzzle(settings.get("puzzle"))})
     config = from_mapping(PlayConfig, settings)
+    if not config.live:
+        check_writable("out", Path(config.out).absolute())
     if config.tokens is not None and config.run_dir is not None:
         _check_tokens(config.tokens, config.run_dir)
 

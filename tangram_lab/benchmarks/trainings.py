@@ -14,6 +14,7 @@ from typing import Any
 import psutil
 
 from master.children import command
+from tangram_agent.process import Lifeline
 from tangram_sim.errors import TangramError
 
 LOOK_S = 0.3
@@ -21,15 +22,25 @@ PATIENCE_S = 60.0
 
 
 def start_training(folder: Path, *settings: str, name: str = "train") -> "subprocess.Popen[bytes]":
-    """A training in the background, or a `master`; what it says goes to `told` in its folder."""
+    """A training in the background, or a `master`; what it says goes to `told` in its folder.
+
+    A training ends when this process is gone: its lifeline is never cut here.
+    """
     folder.mkdir(parents=True)
+    lifeline, variables = Lifeline(), dict(os.environ)
+    if name == "train":  # a master with a lifeline takes its parent for a launcher
+        variables = lifeline.environment(variables)
     with (folder / "told").open("wb") as told:
-        return subprocess.Popen(
+        process = subprocess.Popen(
             [sys.executable, *command(name), f"run_dir={folder}", *settings],
             stdout=told,
             stderr=told,
+            env=variables,
+            pass_fds=[lifeline.read_end],
             start_new_session=True,
         )
+    lifeline.started()
+    return process
 
 
 def wait_for(path: Path, process: "subprocess.Popen[bytes]") -> None:

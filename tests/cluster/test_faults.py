@@ -229,15 +229,19 @@ def command_line(pid: int) -> bytes:
     return Path(f"/proc/{pid}/cmdline").read_bytes()
 
 
-def test_no_process_is_left_of_a_training_whose_launcher_was_killed(tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    quick = ("sim=kinematic", "net=mlp", "workers=2")
-    with started("tangram-train", f"run_dir={folder}", *quick, cwd=tmp_path) as process:
-        wait_for_file(folder / "connection.json", process)
+@pytest.mark.parametrize("command", ["tangram-train", "tangram-bench"])
+def test_no_process_is_left_of_a_training_whose_parent_was_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    """The launcher of its processes, or the trial that started the launcher."""
+    monkeypatch.setenv("TMPDIR", str(tmp_path))  # where a trial trains
+    itself = command == "tangram-train"
+    quick = (f"run_dir={tmp_path / 'run'}", "sim=kinematic", "net=mlp", "workers=2")
+    with started(command, *(quick if itself else ["soak"]), cwd=tmp_path) as process:
         end = time.monotonic() + LIMIT_S
-        while len(pids_of(folder)) < 5 and time.monotonic() < end:
+        while len(pids_of(tmp_path)) < 5 and time.monotonic() < end:
             time.sleep(0.05)
-        children = [pid for pid in pids_of(folder) if pid != process.pid]
+        children = [pid for pid in pids_of(tmp_path) if pid != process.pid]
         os.kill(process.pid, signal.SIGKILL)
-        assert len(children) == 4
+        assert len(children) == 5 - itself
         assert all_ended(children)
