@@ -46,7 +46,7 @@ def test_import_contracts_catch_every_wrong_arrow(tmp_path: Path) -> None:
         shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("*.pyc"))
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
     wrong = {
-        "tangram_sim/wrong.py": "import torch, pybullet, zmq, omegaconf",
+        "tangram_sim/wrong.py": "import torch, pybullet, zmq, omegaconf, tangram_sim.engine",
         "tangram_agent/wrong.py": "import worker.config, conf.help",
         "master/wrong.py": "import tangram_lab.experiments.plan, tangram_sim.wrong",
     }

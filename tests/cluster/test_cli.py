@@ -66,7 +66,7 @@ WRONG = [
     ("tangram-worker connect=tcp://127.0.0.1:1 reward.name=own.py:none", "cannot read 'own.py' on"),
     ("tangram-train tokens.shapes=[square,square,square] tokens.scale=2.2", "no room for token"),
     ("tangram-master tokens.scale=1000", "does not fit into an arena of width 2"),
-    ("tangram-worker", "say which master: connect=tcp://host:port"),
+    ("tangram-worker", "say which master: connect=host:port"),
     ("tangram-eval", "say which run: run_dir=runs/..."),
     ("tangram-play", "say which run: run_dir=runs/..."),
     ("tangram-eval run_dir=pretrained/square puzzles=test", "puzzle 'trapezoid' has the pieces"),
