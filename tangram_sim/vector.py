@@ -47,6 +47,7 @@ class TangramVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], Any]):
         Raises:
             ConfigError: a setting that cannot work.
         """
+        self.closed = True  # older gymnasium closes even what was refused
         check_render_mode(render_mode, (None, "rgb_array"))
         modes = {AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP}
         if autoreset_mode not in modes | {mode.value for mode in modes}:
@@ -71,6 +72,7 @@ class TangramVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], Any]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._generators = [np.random.default_rng() for _ in range(num_envs)]
         self._over = False  # the next step resets
+        self.closed = False
 
     def reset(
         self,
