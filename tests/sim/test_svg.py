@@ -96,7 +96,7 @@ def test_a_mirroring_transform_turns_the_parallelogram_over() -> None:
 
 def test_pieces_are_read_as_drawing_tools_write_them() -> None:
     """A square as a turned <rect>, nodes within an edge, an outline as a polyline, and skew."""
-    *triangles, square, parallelogram = corners_of("cat")
+    square, *triangles, parallelogram = corners_of("cat")
     side, turn = np.linalg.norm(square[1] - square[0]), square[1] - square[0]
     angle = np.degrees(np.arctan2(turn[1], turn[0]))
     (x, y), sign = square[0], np.sign(np.linalg.det([turn, square[2] - square[1]]))
