@@ -2,7 +2,8 @@
 
 Curves are drawn against updates. Scores of the evaluator stand there three times: against updates
 (`test`), against episodes (`test_by_episodes`) and against seconds of training (`test_by_seconds`).
-For plots without TensorBoard `curve.jsonl` has every evaluation, one JSON object a line.
+All of it is one run in TensorBoard's list; docs/tensorboard.md explains every tag. For plots
+without TensorBoard `curve.jsonl` has every evaluation, one JSON object a line.
 """
 
 import json
@@ -10,12 +11,14 @@ import logging
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 from torch.utils.tensorboard import SummaryWriter
+from torch.utils.tensorboard.summary import hparams
 
 from tangram_agent.files import write_whole
 from tangram_agent.process import Every
@@ -23,6 +26,12 @@ from tangram_sim.arrays import Pixels
 
 FLUSH_S = 30
 RETRY_S = 60.0
+POINT = ("updates", "episodes", "train_s")  # where an evaluation stands
+HPARAMS = (
+    *("seed", "tokens", "agent", "net", "reward", "actions_per_token", "backend"),
+    *("updates", "episodes", "workers", "parameters", "train_s"),
+)
+FINAL = ("mean_reward", "raw_overlap", "angle_error_deg_median", "position_error_median")
 
 log = logging.getLogger(__name__)
 
@@ -64,12 +73,18 @@ class Metrics:
                 process are hidden or dropped, since they happen again.
         """
         self._folder, self._curve = folder, curve
+        kept = [line for line in _lines(curve) if line["updates"] <= updates]
         if curve.exists():
-            kept = [line for line in _lines(curve) if line["updates"] <= updates]
             write_whole(curve, "".join(map(_text, kept)).encode())
         self._broken = False
         self._again = Every(RETRY_S)
-        self._open(updates + 1 if updates else None)
+        purge = updates + 1 if updates else None
+        self._open(purge)
+        # TensorBoard hides the points of every tag from that step on, and does not know that the
+        # steps of some are episodes or seconds: those that stay are written again.
+        for line in kept if purge else ():
+            scores = {name: value for name, value in line.items() if name not in POINT}
+            self._try(partial(self._by_others, scores, *(line[name] for name in POINT[1:]), purge))
 
     def scalars(self, values: Mapping[str, float], step: int) -> None:
         """Points of many curves at one step."""
@@ -84,14 +99,8 @@ class Metrics:
         self, scores: Mapping[str, float], updates: int, episodes: int, seconds: float
     ) -> None:
         """An evaluation of the weights after so many updates, episodes, seconds of training."""
-
-        def write() -> None:
-            for group, step in (("test_by_episodes", episodes), ("test_by_seconds", seconds)):
-                for name, value in scores.items():
-                    self._axes.add_scalar(f"{group}/{name}", value, int(step))
-
         self.scalars({f"test/{name}": value for name, value in scores.items()}, updates)
-        self._try(write)
+        self._try(lambda: self._by_others(scores, episodes, seconds))
         line = {"updates": updates, "episodes": episodes, "train_s": round(seconds, 3), **scores}
         try:
             with self._curve.open("a", encoding="utf-8") as file:
@@ -113,22 +122,36 @@ class Metrics:
         indented = "".join(f"    {line}\n" for line in text.splitlines())
         self._try(lambda: self._writer.add_text("config", indented))
 
-    def hyperparameters(self, resolved: Mapping[str, Any], scores: Mapping[str, float]) -> None:
-        """What runs are compared by in the HPARAMS tab, with the final scores."""
-        metrics = {f"final/{name}": value for name, value in scores.items()}
-        plain = flatten(resolved)
-        self._try(lambda: self._writer.add_hparams(plain, metrics, run_name="final"))
+    def hyperparameters(self, result: Mapping[str, Any]) -> None:
+        """What runs are compared by in the HPARAMS tab, and which curves end in their scores.
+
+        Args:
+            result: of the run, as in result.json.
+        """
+        values = {name: _plain(result[name]) for name in HPARAMS}
+        tags = {f"test/{name}": 0.0 for name in FINAL}
+
+        def write() -> None:
+            # The writer's own add_hparams makes another run in TensorBoard's list.
+            for summary in hparams(values, tags):
+                self._writer.file_writer.add_summary(summary)
+
+        self._try(write)
 
     def close(self) -> None:
         """Write what is left."""
-        for writer in (self._writer, self._axes):
-            self._try(writer.close)
+        self._try(self._writer.close)
 
     def _open(self, purge: int | None) -> None:
         self._writer = SummaryWriter(str(self._folder), purge_step=purge, flush_secs=FLUSH_S)
-        # Purging hides points of every tag in a folder by their step, so curves against episodes
-        # and seconds, which nothing repeats, lie in a folder of their own.
-        self._axes = SummaryWriter(str(self._folder / "axes"), flush_secs=FLUSH_S)
+
+    def _by_others(
+        self, scores: Mapping[str, float], episodes: int, seconds: float, least: int = 0
+    ) -> None:
+        """An evaluation against episodes and seconds, where they are `least` or more."""
+        for group, step in (("test_by_episodes", episodes), ("test_by_seconds", seconds)):
+            for name, value in scores.items() if int(step) >= least else ():
+                self._writer.add_scalar(f"{group}/{name}", value, int(step))
 
     def _try(self, write: Callable[[], object]) -> None:
         """Write, unless the disk did not take anything a short while ago."""
@@ -142,23 +165,14 @@ class Metrics:
         except OSError as error:
             if not self._broken:
                 log.warning("curves cannot be written (%s): a gap is left in them", error.strerror)
-                for writer in (self._writer, self._axes):
-                    with suppress(OSError):
-                        writer.close()
+                with suppress(OSError):
+                    self._writer.close()
             self._broken, self._again = True, Every(RETRY_S)
 
 
-def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, float | str | bool]:
-    """Nested settings as dotted names; sequences become texts."""
-    flat: dict[str, float | str | bool] = {}
-    for name, value in settings.items():
-        if isinstance(value, Mapping):
-            flat |= flatten(value, f"{prefix}{name}.")
-        elif isinstance(value, bool | int | float | str):
-            flat[f"{prefix}{name}"] = value
-        else:
-            flat[f"{prefix}{name}"] = str(value)
-    return flat
+def _plain(value: Any) -> float | str:
+    """As the HPARAMS tab takes it."""
+    return value if isinstance(value, int | float | str) else "+".join(map(str, value))
 
 
 def _text(line: Mapping[str, Any]) -> str:
@@ -173,6 +187,6 @@ def _lines(path: Path) -> list[dict[str, Any]]:
             line = json.loads(text)
         except ValueError:
             continue
-        if isinstance(line, dict) and isinstance(line.get("updates"), int):
+        if isinstance(line, dict) and all(isinstance(line.get(n), int | float) for n in POINT):
             found.append(line)
     return found

@@ -274,9 +274,9 @@ class Reporter:
         """Write the whole config beside the curves."""
         self._metrics.settings(resolved)
 
-    def hyperparameters(self, resolved: Mapping[str, Any]) -> None:
-        """Write what runs are compared by, with the last scores."""
-        self._metrics.hyperparameters(resolved, self._record.scores)
+    def hyperparameters(self, result: Mapping[str, Any]) -> None:
+        """Write what runs are compared by."""
+        self._metrics.hyperparameters(result)
 
     def draw(self, path: Path) -> None:
         """Draw the test episodes of the last evaluation, where there is one with pictures."""

@@ -101,7 +101,7 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
         reason = loop.run()
         result = make_result(loop.finish(launched), loop.guard.trainer, config.seed, reason)
         folder.write_result(result)
-        loop.reporter.hyperparameters(resolved)
+        loop.reporter.hyperparameters(result)
         loop.dismiss(f"the run has ended ({reason})")
         if form == "json":
             log.info("the run has ended (%s)", reason, extra={"event": "result", **result})

@@ -3,7 +3,9 @@
 Tokens are drawn filled over the pale target; whole episodes come as contact sheets or GIFs.
 """
 
+import math
 from collections.abc import Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import BinaryIO
 
@@ -33,6 +35,9 @@ from tangram_sim.strokes import (
 _OPACITY = 0.8  # of a token, so that the target shows through
 _PALETTE_FRAMES = 40  # that a film's colours are taken from
 _GHOST = 0.18  # opacity of a token where it started
+SMALLEST_TEXT = 9  # pixels
+START, WAY, END, GOAL = MARKS = ("start", "way", "end", "target")
+MEANING = ("overlap: covered share", "of the target, 1 is all of it")
 
 
 def draw_scene(
@@ -80,7 +85,7 @@ def episode_sheet(
     columns: int = 4,
     size: int = 240,
 ) -> Image.Image:
-    """One picture for each of E episodes: start, way, end and target, and the overlap below.
+    """One picture for each of E episodes with its overlap below, and one legend for all of them.
 
     Args:
         layout: which corners belong to which token.
@@ -95,7 +100,55 @@ def episode_sheet(
         for start, end, goal in zip(starts, ends, goals, strict=True)
     ]
     captions = [f"overlap  {share:.3f}" for share in overlap_share(ends, goals, layout)]
-    return contact_sheet(scenes, columns, captions)
+    sheet = contact_sheet(scenes, columns, captions)
+    return with_legend(sheet, max(size // 18, SMALLEST_TEXT))
+
+
+def with_legend(sheet: Image.Image, text: int) -> Image.Image:
+    """The sheet, and below it what its shapes and numbers mean, in letters of `text` pixels.
+
+    Words that do not fit beside each other go on in the next line; a sheet that is narrower than
+    the longest of them is widened.
+    """
+    font, gap = ImageFont.load_default(text), text // 2
+    indents = [text + gap] * len(MARKS) + [0] * len(MEANING)
+    words = list(zip((*MARKS, *MEANING), indents, strict=True))
+    lengths = [indent + math.ceil(font.getlength(told)) for told, indent in words]
+    width = max(sheet.width, max(lengths) + 2 * gap)
+    places, left, line = [], gap, 0
+    for length in lengths:
+        if left > gap and left + length > width - gap:
+            left, line = gap, line + 1
+        places.append((left, line))
+        left += length + 2 * gap
+    step = text * 3 // 2
+    whole = Image.new("RGB", (width, sheet.height + (line + 1) * step + gap), PAPER)
+    whole.paste(sheet)
+    draw = ImageDraw.Draw(whole)
+    for (left, line), (told, indent) in zip(places, words, strict=True):
+        middle = sheet.height + line * step + step // 2
+        if indent:
+            whole.paste(_mark(told, text), (left, middle - text // 2))
+        draw.text((left + indent, middle), told, TEXT, font, anchor="lm")
+    return whole
+
+
+def _mark(name: str, side: int) -> Image.Image:
+    """A small square as the pictures show it, or the way."""
+    canvas = Image.new("RGB", (side * SAMPLES, side * SAMPLES), PAPER)
+    low, high, middle = 1.0 * SAMPLES, (side - 2.0) * SAMPLES, side * SAMPLES / 2.0
+    square, colour = [(low, low), (high, low), (high, high), (low, high)], colour_of(0)
+    if name == START:
+        fill(canvas, square, colour, _GHOST)
+    elif name == WAY:
+        draw_dashes(canvas, [(low, middle), (high, middle)], colour, closed=False)
+    elif name == END:
+        fill(canvas, square, colour, _OPACITY)
+        draw_outline(canvas, square, darker(colour), 1.0)
+    else:
+        fill(canvas, square, TARGET, 1.0)
+        draw_dashes(canvas, square, TARGET_LINE)
+    return shown(canvas)
 
 
 def contact_sheet(
@@ -118,7 +171,7 @@ def contact_sheet(
     full = (gap + columns * (width + gap), gap + rows * (height + text + gap))
     sheet = Image.new("RGB", full, PAPER)
     draw = ImageDraw.Draw(sheet)
-    font = ImageFont.load_default(max(width // 18, 9))
+    font = ImageFont.load_default(max(width // 18, SMALLEST_TEXT))
     for i, image in enumerate(images):
         left = gap + (i % columns) * (width + gap)
         top = gap + (i // columns) * (height + text + gap)
@@ -153,6 +206,29 @@ def save_gif(
         loop=0,
         disposal=1,
     )
+
+
+def save_mp4(images: Sequence[Image.Image], target: BinaryIO, milliseconds: int = 400) -> None:
+    """A film in H.264, which every browser and slide shows, every picture for `milliseconds`.
+
+    Raises:
+        ValueError: no pictures.
+        ImportError: PyAV is not installed.
+    """
+    if not images:
+        raise ValueError("a film needs at least one picture")
+    import av  # noqa: PLC0415 - optional
+
+    with av.open(target, "w", format="mp4") as film:
+        stream = film.add_stream("libx264", Fraction(1000, milliseconds), {"crf": "20"})
+        # Players want every colour's sample shared by two by two pixels: sides must be even.
+        stream.width, stream.height = (side + side % 2 for side in images[0].size)
+        stream.pix_fmt = "yuv420p"
+        for image in images:
+            even = Image.new("RGB", (stream.width, stream.height), PAPER)
+            even.paste(image)
+            film.mux(stream.encode(av.VideoFrame.from_image(even)))
+        film.mux(stream.encode())
 
 
 def _draw_starts(

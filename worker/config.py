@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ MAX_EPISODES = 1_000_000
 MAX_SHOWN = 100
 MAX_TURNS = 360
 GAME = "tangram7"  # the agent that plays puzzles unless another is named
-PICTURES = (".gif", ".png")
+PICTURES = (".gif", ".mp4", ".png")
 MIN_COMPARED, MAX_COMPARED = 2, 4
 MAX_SEED = 2**63 - 1
 
@@ -200,7 +201,7 @@ class PlayConfig(Settings):
         only={"compare": None},
     )
     out: str = setting(
-        "play.gif", ".gif for an animation, .png for one picture", only={"live": False}
+        "play.gif", ".gif or .mp4 for an animation, .png for one picture", only={"live": False}
     )
     episodes: int = setting(
         12,
@@ -238,8 +239,13 @@ class PlayConfig(Settings):
         self._check_one_of_both()
         if Path(self.out).suffix not in PICTURES:
             raise ConfigError(
-                f"out must end with {' or '.join(PICTURES)}, got '{self.out}': .gif moves, .png "
-                "shows the ends"
+                f"out must end with {', '.join(PICTURES)}, got '{self.out}': .gif and .mp4 move, "
+                ".png shows the ends"
+            )
+        if Path(self.out).suffix == ".mp4" and find_spec("av") is None:
+            raise ConfigError(
+                f"out={self.out} needs PyAV, which is missing: pip install 'tangram-rl[video]', or "
+                "write a .gif"
             )
         super().__post_init__()
         if self.plays_puzzles:

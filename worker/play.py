@@ -16,7 +16,7 @@ from tangram_agent.files import write_whole
 from tangram_agent.runs import Run, load_run
 from tangram_agent.setup import Setup
 from tangram_sim.arrays import Floats
-from tangram_sim.drawing import episode_sheet, save_gif
+from tangram_sim.drawing import episode_sheet, save_gif, save_mp4
 from tangram_sim.errors import ConfigError, RunError
 from tangram_sim.game_drawing import figure_sheet
 from tangram_sim.kinematics import wrap
@@ -114,7 +114,7 @@ def _frames(show: Show, out: str) -> list[Image.Image]:
 
 
 def save_picture(out: str, frames: Sequence[Image.Image]) -> None:
-    """Write one frame as a PNG or all of them as a GIF, whole or not at all.
+    """Write one frame as a PNG or all of them as a GIF or MP4, whole or not at all.
 
     Raises:
         RunError: `out` is not writable.
@@ -123,7 +123,8 @@ def save_picture(out: str, frames: Sequence[Image.Image]) -> None:
     if Path(out).suffix == ".png":
         frames[-1].save(picture, format="PNG")
     else:
-        save_gif(frames, picture, FRAME_MS)
+        save = save_mp4 if Path(out).suffix == ".mp4" else save_gif
+        save(frames, picture, FRAME_MS)
     write_whole(Path(out), picture.getvalue())
 
 

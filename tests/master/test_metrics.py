@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 from torch.utils.tensorboard import SummaryWriter
 
 from master import metrics as metrics_module
-from master.metrics import Means, Metrics, flatten
+from master.metrics import HPARAMS, Means, Metrics
 from tests.master.builders import FakeHub, arrival, loop, scores, small_setup
 
 pytestmark = pytest.mark.fast
@@ -36,21 +37,22 @@ def test_points_stand_under_their_names_and_steps(tmp_path: Path) -> None:
     metrics.scores({"mean_reward": 0.9}, updates=20, episodes=300, seconds=12.7)
     metrics.picture(np.full((4, 6, 3), 255, np.uint8), 20)
     metrics.settings({"agent": {"noise": 0.1}})
-    metrics.hyperparameters({"agent": {"noise": 0.1}, "seed": 3}, {"mean_reward": 0.9})
+    metrics.hyperparameters(dict.fromkeys(HPARAMS, 1) | {"tokens": ["square", "square"]})
     metrics.close()
     events = read(tmp_path)
     assert points(events, "train/q") == [(10, 0.5), (20, 0.75)]
     assert points(events, "replay/fill") == [(20, 1.0)]
     assert points(events, "test/mean_reward") == [(20, 0.9)]
-    axes = read(tmp_path / "axes")
-    assert points(axes, "test_by_episodes/mean_reward") == [(300, 0.9)]
-    assert points(axes, "test_by_seconds/mean_reward") == [(12, 0.9)]
+    assert points(events, "test_by_episodes/mean_reward") == [(300, 0.9)]
+    assert points(events, "test_by_seconds/mean_reward") == [(12, 0.9)]
     (picture,) = events.Images("test/pictures")
     assert (picture.step, picture.width, picture.height) == (20, 6, 4)
     assert "noise: 0.1" in str(events.Tensors("config/text_summary")[0].tensor_proto)
-    final = read(tmp_path / "final")
-    assert points(final, "final/mean_reward") == [(0, 0.9)]
-    assert "_hparams_/session_start_info" in final.summary_metadata
+    content = events.summary_metadata["_hparams_/session_start_info"].plugin_data.content
+    told = HParamsPluginData.FromString(content).session_start_info.hparams
+    assert set(told) == set(HPARAMS)
+    assert told["tokens"].string_value == "square+square"
+    assert [path.is_file() for path in tmp_path.iterdir()] == [True, True]  # one run in the list
 
 
 def test_points_after_a_checkpoint_are_hidden_when_the_run_goes_on_from_it(
@@ -67,8 +69,11 @@ def test_points_after_a_checkpoint_are_hidden_when_the_run_goes_on_from_it(
                 metrics.scores({"mean_reward": value}, step, 10 * step, step / 10)
         metrics.close()
     assert points(read(tmp_path), "train/q") == [(10, 1.0), (20, 1.0), (30, 2.0)]
-    by_episodes = points(read(tmp_path / "axes"), "test_by_episodes/mean_reward")
-    assert by_episodes == [(100, 1.0), (200, 1.0), (300, 1.0), (300, 2.0)]
+    by_episodes = points(read(tmp_path), "test_by_episodes/mean_reward")
+    assert by_episodes == [(100, 1.0), (200, 1.0), (300, 2.0)]
+    by_seconds = points(read(tmp_path), "test_by_seconds/mean_reward")
+    # What was purged is told by updates: these are fewer, and stay until their steps come again.
+    assert by_seconds == [(1, 1.0), (2, 1.0), (3, 1.0), (3, 2.0)]
 
 
 def test_means_are_weighted_and_begin_anew() -> None:
@@ -78,12 +83,6 @@ def test_means_are_weighted_and_begin_anew() -> None:
     means.add({"reward": 0.0, "age": 2.0}, count=1)
     assert means.take() == {"reward": 0.75, "age": 2.0}
     assert means.take() == {}
-
-
-def test_nested_settings_become_dotted_names() -> None:
-    nested = {"a": {"b": {"c": 1}, "d": [1, 2]}, "e": None, "f": True, "g": "x", "h": 0.5}
-    expected = {"a.b.c": 1, "a.d": "[1, 2]", "e": "None", "f": True, "g": "x", "h": 0.5}
-    assert flatten(nested) == expected
 
 
 def test_a_disk_that_takes_no_curves_leaves_a_gap_and_ends_nothing(
@@ -141,7 +140,7 @@ def test_what_happens_again_is_dropped(tmp_path: Path, updates: int, kept: list[
 
 def test_a_line_cut_short_is_left_out(tmp_path: Path) -> None:
     path = tmp_path / "curve.jsonl"
-    path.write_text('{"updates": 10}\n[3]\n{"updates": "x"}\n{"upda')
+    path.write_text('{"updates": 10, "episodes": 9, "train_s": 1.5}\n[3]\n{"updates": "x"}\n{"upda')
     with closing(Metrics(tmp_path, path, 100)) as metrics:
         metrics.scores({}, 20, 0, 0.0)
     assert [line["updates"] for line in lines(path)] == [10, 20]

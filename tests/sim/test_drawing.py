@@ -4,15 +4,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageDraw
 
-from tangram_sim.drawing import contact_sheet, draw_scene, episode_sheet, save_gif
+from tangram_sim.drawing import contact_sheet, draw_scene, episode_sheet, save_gif, with_legend
 from tangram_sim.game_drawing import Held, captions, draw_game, figure_sheet, tiles
+from tangram_sim.strokes import TARGET
 from tests.sim.builders import SEVEN, layout_of
 
 pytestmark = pytest.mark.fast
 
 SQUARE, PAIR = layout_of("square"), layout_of("square", "square")
+CENTRE, AWAY = (SQUARE.corners(np.array([[x, 0.0, 0.0]])) for x in (0.0, 5.0))
+GHOST = draw_scene(SQUARE, 2.0, AWAY, AWAY, 200, start=CENTRE + [0.05, 0.05])
 
 
 def scene(size: int = 120, active: int | None = None) -> Image.Image:
@@ -107,7 +110,22 @@ def test_an_episode_sheet_says_how_much_is_covered() -> None:
     plain = contact_sheet([draw_scene(SQUARE, 2.0, e, e, 120) for e in ends], columns=2)
     assert sheet.width == plain.width
     assert sheet.height > plain.height  # captions
-    assert np.asarray(sheet.convert("L"))[-16:].min() < 120
+
+
+@pytest.mark.parametrize(("width", "lines"), [(600, 1), (200, 3), (20, 4)])
+def test_a_legend_below_the_sheet_tells_start_way_end_target_and_number(
+    width: int, lines: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words: list[str] = []
+    monkeypatch.setattr(ImageDraw.ImageDraw, "text", lambda *given, **_: words.append(given[2]))
+    sheet = with_legend(Image.new("RGB", (width, 50), "white"), 10)
+    assert words[:4] == ["start", "way", "end", "target"]
+    assert " ".join(words[4:]) == "overlap: covered share of the target, 1 is all of it"
+    assert sheet.height == 50 + 15 * lines + 5
+    assert (sheet.width == width) == (lines < 4)
+    marks = np.asarray(sheet, int)[50:].reshape(-1, 3)
+    for mark in (at(draw_scene(SQUARE, 2.0, CENTRE, AWAY, 200), 0, 0), at(GHOST, 0, 0), TARGET):
+        assert np.abs(marks - mark).max(axis=1).min() < 8  # the paper behind it is not the table's
 
 
 GOAL = PAIR.corners(np.array([[0.2, -0.5, 0.0], [-0.2, -0.5, 0.0]]))

@@ -50,8 +50,8 @@ WRONG = {
     PlayConfig: [
         *OF_A_RUN,
         *[
-            ({"out": out}, "out must end with .gif or .png, got")
-            for out in ("film.mp4", "film", "", "gif", "film.GIF.txt")
+            ({"out": out}, "out must end with .gif, .mp4, .png, got")
+            for out in ("film.webm", "film", "", "gif", "film.GIF.txt")
         ],
         ({"run_dir": None}, "say which run: run_dir=runs/..., or which ones: compare=[runs/a,"),
         ({"run_dir": "a"} | TWO, "run_dir=a changes nothing with compare=[a,b]: leave it out, or"),

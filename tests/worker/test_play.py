@@ -106,6 +106,37 @@ def test_an_animation_has_frames_that_move(
     assert list(tmp_path.glob(".film*")) == []
 
 
+def test_a_film_as_mp4_shows_the_same_for_as_long(tmp_path: Path) -> None:
+    """The GIF keeps a picture that stays as one, for longer."""
+    av = pytest.importorskip("av", reason="pip install '.[video]'")
+    for name in ("film.gif", "film.mp4"):
+        made = of_square(tmp_path, run_of=PAIR, out=str(tmp_path / name), episodes=2)
+        assert play_run(made) == 0
+    with av.open(str(tmp_path / "film.mp4")) as film:
+        stream = film.streams.video[0]
+        assert (stream.codec_context.name, stream.pix_fmt) == ("h264", "yuv420p")
+        shown = [frame.to_ndarray(format="rgb24") for frame in film.decode(stream)]
+        seconds = float(stream.duration * stream.time_base)
+    with Image.open(tmp_path / "film.gif") as gif:
+        lasts, ends = [], []
+        for index in range(gif.n_frames):
+            gif.seek(index)
+            lasts.append(gif.info["duration"])
+            ends.append(np.asarray(gif.convert("RGB")).astype(int))
+    assert seconds == pytest.approx(sum(lasts) / 1000)
+    height, width, _ = ends[0].shape
+    assert [side % 2 for side in shown[0].shape[:2]] == [0, 0]
+    for own, other in ((shown[0], ends[0]), (shown[-1], ends[-1])):
+        assert np.abs(own[:height, :width].astype(int) - other).mean() < 4
+    assert (tmp_path / "film.mp4").stat().st_size < 2 * (tmp_path / "film.gif").stat().st_size
+
+
+def test_without_pyav_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("worker.config.find_spec", lambda _: None)
+    with pytest.raises(ConfigError, match=r"out=a.mp4 needs PyAV, .*: pip install 'tangram-rl.vid"):
+        PlayConfig("run", out="a.mp4")
+
+
 # Puzzles, and random targets of several tokens
 
 
