@@ -84,7 +84,8 @@ class Metrics:
         # steps of some are episodes or seconds: those that stay are written again.
         for line in kept if purge else ():
             scores = {name: value for name, value in line.items() if name not in POINT}
-            self._try(partial(self._by_others, scores, *(line[name] for name in POINT[1:]), purge))
+            point = (line["episodes"], line["train_s"], updates + 1)
+            self._try(partial(self._by_others, scores, *point))
 
     def scalars(self, values: Mapping[str, float], step: int) -> None:
         """Points of many curves at one step."""
@@ -133,8 +134,9 @@ class Metrics:
 
         def write() -> None:
             # The writer's own add_hparams makes another run in TensorBoard's list.
-            for summary in hparams(values, tags):
-                self._writer.file_writer.add_summary(summary)
+            writer: Any = self._writer.file_writer
+            for summary in hparams(values, tags):  # type: ignore[no-untyped-call]
+                writer.add_summary(summary)
 
         self._try(write)
 

@@ -227,7 +227,7 @@ def save_mp4(images: Sequence[Image.Image], target: BinaryIO, milliseconds: int 
         for image in images:
             even = Image.new("RGB", (stream.width, stream.height), PAPER)
             even.paste(image)
-            film.mux(stream.encode(av.VideoFrame.from_image(even)))
+            film.mux(stream.encode(av.VideoFrame.from_ndarray(np.asarray(even))))
         film.mux(stream.encode())
 
 

@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 import yaml
 from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
 from tangram_agent.setup import make_setup
@@ -46,6 +48,31 @@ def test_a_short_training_learns_position_and_angle_and_leaves_a_whole_run(train
         assert picture.width >= 600
     assert {path.name for path in (trained / "logs").iterdir()} >= {"evaluator.log", "worker-0.log"}
     assert pids_of(trained) == []
+
+
+def test_the_page_of_tensorboard_has_every_tag_of_a_run_and_a_run_every_tag_of_the_page(
+    trained: Path,
+) -> None:
+    """Without those that the page says are not always there."""
+    text = (Path(__file__).parents[2] / "docs" / "tensorboard.md").read_text()
+    sometimes = text.partition("**Messages, where it happens.**")[2]
+    rows = [row for row in text.splitlines() if row.startswith("| `")]
+    explained = {tag: row for row in rows for tag in re.findall(r"`([\w/]+)`", row.split("|")[1])}
+    folder = trained / "tensorboard"
+    assert all(path.is_file() for path in folder.iterdir())  # one run in the list
+    events = EventAccumulator(str(folder))
+    events.Reload()
+    tags = {tag for kind in ("scalars", "images") for tag in events.Tags()[kind]}
+    others = {tag for tag in tags if tag.startswith("test_by_")}
+    plain = {tag for tag in tags - others if tag.startswith("test/")} - {"test/pictures"}
+    assert {tag.partition("/")[2] for tag in others} == {tag.partition("/")[2] for tag in plain}
+    assert tags - others <= set(explained)
+    conditions = (*sometimes.splitlines(), *(r for r in rows if "several tokens:" in r))
+    asked = {tag for tag, row in explained.items() if row not in conditions}
+    assert asked - {"test/mean_train_reward"} <= tags
+    content = events.summary_metadata["_hparams_/session_start_info"].plugin_data.content
+    told = HParamsPluginData.FromString(content).session_start_info.hparams
+    assert all(f"`{name}`" in sometimes for name in told)
 
 
 @pytest.mark.parametrize("actions", [None, 5])

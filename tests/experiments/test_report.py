@@ -35,7 +35,7 @@ FIGURES = {
     "table2_actions": (1440, 608),
     "noise_noise": (1440, 608),
     "ablation": (1440, 432),
-    "ablation_seeds": (1440, 344),
+    "ablation_seeds": (1440, 368),
 }
 
 

@@ -11,7 +11,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tangram_lab.experiments.report.figures import looks, sweeps
+from tangram_lab.experiments.report.figures import (
+    PALETTE,
+    agent_and_network,
+    curve_parts,
+    draw_curves,
+    looks,
+    sweeps,
+)
 from tangram_lab.experiments.report.numbers import (
     ANGLE,
     GRID,
@@ -20,13 +27,14 @@ from tangram_lab.experiments.report.numbers import (
     band,
     first_at_least,
     points,
+    rises_early,
     spread,
     thinned,
 )
 from tangram_lab.experiments.report.page import command
 from tangram_lab.experiments.report.references import papers
-from tangram_lab.experiments.report.study import Seed, read_runs
-from tangram_lab.experiments.report.style import COLOURS
+from tangram_lab.experiments.report.study import Seed, Training, read_runs
+from tangram_lab.experiments.report.style import LINES
 from tangram_lab.experiments.report.tables import paired, picture, plain, table
 from tests.experiments.builders import (
     experiment,
@@ -35,6 +43,7 @@ from tests.experiments.builders import (
     result,
     training,
     write_plan,
+    write_run,
     write_study,
 )
 
@@ -51,10 +60,62 @@ def test_every_training_has_one_look_and_neighbours_differ(tmp_path: Path) -> No
     write_plan(tmp_path, plan(experiments, {name: training(name, "x") for name in names}, {}))
     found = looks(read_runs(tmp_path))
     assert set(found) == set(names)
-    assert len({found[name].colour for name in names[8:]}) == 4
-    assert found[names[0]].colour not in {found[name].colour for name in names[9:]}
-    assert len({(one.colour, one.dash) for one in found.values()}) == 12
-    assert {one.colour for one in found.values()} <= set(COLOURS)
+    assert len({found[name].dash for name in names[8:]}) == 4
+    assert found[names[0]].dash not in {found[name].dash for name in names[9:]}
+    assert {one.colour for one in found.values()} == {PALETTE["tangram mha"]}
+
+
+def test_a_colour_is_an_agent_with_its_network() -> None:
+    plain = {"label": "", "after": None, "name": "x"}
+    kinds = [
+        agent_and_network(Training(family=family, overrides=tuple(words.split()), **plain))
+        for family, words in (
+            ("paper", "agent=paper net=mha_small tokens=square"),
+            ("paper", ""),
+            ("paper", "agent=paper net=mlp"),
+            ("mlp_large", "agent=mlp net=mlp_large"),
+            ("matched", "agent=tangram net=mha"),
+            ("start", ""),
+            ("game", "agent.name=tangram net.kind=mlp"),
+        )
+    ]
+    expected = ["paper mha"] * 2 + ["paper mlp"] * 2 + ["tangram mha"] * 2 + ["tangram mlp"]
+    assert kinds == expected
+    assert len(set(PALETTE.values()) & {PALETTE[kind] for kind in expected}) == 4
+
+
+@pytest.mark.parametrize(
+    ("trainings", "lengths"), [(1, [1]), (5, [5]), (6, [3, 3]), (11, [4, 3, 4])]
+)
+def test_no_panel_has_more_than_six_lines(
+    tmp_path: Path, trainings: int, lengths: list[int]
+) -> None:
+    names = [f"t{index}" for index in range(trainings)]
+    content = plan(
+        {"a": experiment("curves", names)}, {n: training(n, "x") for n in names}, {}, (0,)
+    )
+    write_plan(tmp_path, content)
+    for name in names:
+        write_run(tmp_path, name, result(0), learning_curve(0, 0.7))
+    study = read_runs(tmp_path)
+    parts = curve_parts(study, study.experiments[0])
+    assert [len(part) for part in parts] == lengths
+    assert [one.name for part in parts for one in part] == names
+    drawn = [draw_curves(study, study.experiments[0], REWARD, part) for part in parts]
+    for panel in (panel for figure in drawn if figure is not None for panel in figure.axes):
+        assert len(panel.lines) <= LINES
+        assert panel.get_xscale() == "linear"  # half is reached after 8 %
+
+
+def test_an_axis_is_logarithmic_where_curves_rise_early() -> None:
+    """Half of the rise is between the two points."""
+    for at, early in ((5, True), (20, False)):
+        rising = curve((0, -1.0), (at - 1, -0.5), (at, 0.5), (100, 1.0))
+        assert rises_early([rising, curve((0, 0.0), (50, 0.0))], "updates", "mean_reward") is early
+    found = band([curve((0, -1.0), (4, 0.0), (400, 1.0))], "updates", "mean_reward", True)
+    assert found is not None
+    np.testing.assert_allclose(found.x, np.geomspace(4, 400, GRID))
+    assert not rises_early([curve()], "updates", "mean_reward")
 
 
 def test_papers_values_go_to_the_family_only_where_nobody_bears_the_name(tmp_path: Path) -> None:

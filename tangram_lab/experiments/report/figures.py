@@ -4,7 +4,8 @@ Each is None where there is nothing to draw.
 """
 
 import itertools
-from collections.abc import Iterable, Sequence
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ from tangram_lab.experiments.report.numbers import (
     Measure,
     band,
     points,
+    rises_early,
     spread,
 )
 from tangram_lab.experiments.report.references import (
@@ -38,10 +40,12 @@ from tangram_lab.experiments.report.style import (
     DASHES,
     GREY,
     LEVEL,
+    LINES,
     MARKERS,
     PALE,
     Look,
     legend_below,
+    make_logarithmic,
     new_figure,
     thousands,
     widen,
@@ -49,60 +53,99 @@ from tangram_lab.experiments.report.style import (
 
 PER_ROW = 4
 TICKS = 5
+LIMIT = 1.08  # of rewards, with some room
+TITLE_WIDTH = 30  # letters of a small panel's title
 NOISE = "noise on the corners, standard deviation (% of the arena)"
 ACTIONS = "actions in sequence (count)"
+
+
+# Agent and network -> colour, in every figure; others take the next ones.
+PALETTE = {
+    name: COLOURS[index]
+    for index, name in enumerate(("paper mha", "paper mlp", "tangram mha", "tangram mlp"))
+}
 
 
 def looks(study: Study) -> dict[str, Look]:
     """Training -> look, the same in every figure.
 
-    Colours repeat when there are more trainings than colours, but not within one figure of curves
-    if that can be avoided; then the dashes differ. A ranking names its rows, so it can do with
-    colours that are left.
+    A colour is an agent with its network, whatever else a training changes; trainings of one colour
+    differ in markers and dashes, within one figure of curves if that can be avoided.
     """
     groups = [
         {training.name for training in experiment.trainings}
         for experiment in sorted(study.experiments, key=lambda one: one.kind == "ranking")
     ]
-    chosen: dict[str, int] = {}
+    palette, colours = dict(PALETTE), itertools.cycle(COLOURS[len(PALETTE) :])
+    chosen: dict[str, tuple[str, int]] = {}
     for group in groups:
-        for name in (one.name for one in study.trainings if one.name in group):
-            if name not in chosen:
-                near = {o for other in groups if name in other for o in other} & set(chosen)
-                taken = {chosen[other] for other in near}
-                chosen[name] = next(i for i in itertools.count() if i not in taken)
-    return {name: _look(index) for name, index in chosen.items()}
+        for one in (one for one in study.trainings if one.name in group):
+            if one.name not in chosen:
+                near = {o for other in groups if one.name in other for o in other} & set(chosen)
+                colour = palette.get(kind := agent_and_network(one)) or next(colours)
+                palette[kind] = colour
+                taken = {chosen[other][1] for other in near if chosen[other][0] == colour}
+                free = next(i for i in itertools.count() if i not in taken)
+                chosen[one.name] = (colour, free)
+    return {
+        name: Look(colour, MARKERS[index % len(MARKERS)], DASHES[index % len(DASHES)])
+        for name, (colour, index) in chosen.items()
+    }
 
 
-def _look(index: int) -> Look:
-    turn, colour = divmod(index, len(COLOURS))
-    return Look(COLOURS[colour], MARKERS[colour], DASHES[turn % len(DASHES)])
+def agent_and_network(training: Training) -> str:
+    """Such as `paper mlp`: as its settings name them, the defaults where they do not."""
+    settings = dict(text.partition("=")[::2] for text in training.overrides)
+    known = training.family if training.family in ("paper", "mlp") else "tangram"
+    agent = settings.get("agent.name", settings.get("agent", known))
+    network = settings.get("net.kind", settings.get("net", "mlp" if agent == "mlp" else "mha"))
+    return f"{'paper' if agent == 'mlp' else agent} {network.partition('_')[0]}"
+
+
+Part = Sequence[Training]
+
+
+def curve_parts(study: Study, experiment: Experiment) -> list[Part]:
+    """The trainings of each figure of learning curves."""
+    return _parts(experiment, 1 + sum(r.name == POSITION for r in references(study, experiment)))
+
+
+def sweep_parts(study: Study, experiment: Experiment) -> list[Part]:
+    """The trainings of each figure of a sweep."""
+    shown = (POSITION, PERFECT)
+    return _parts(experiment, sum(r.name in shown for r in references(study, experiment)))
+
+
+def _parts(experiment: Experiment, others: int) -> list[Part]:
+    """As few parts as give no panel more than `LINES` lines, `others` in each; alike in length."""
+    known = experiment.trainings
+    count = max(-(-len(known) // max(LINES - others, 1)), 1)
+    ends = [round(len(known) * i / count) for i in range(count + 1)]
+    return [known[first:last] for first, last in itertools.pairwise(ends)]
 
 
 # Learning curves: mean and standard deviation over the seeds
 
 
-def draw_curves(study: Study, experiment: Experiment, measure: Measure) -> Figure | None:
+def draw_curves(
+    study: Study, experiment: Experiment, measure: Measure, part: Part
+) -> Figure | None:
     """Three panels: against episodes, updates and minutes."""
-    known = _with_curves(experiment, measure)
+    known = _with_curves(part, measure)
     if not known:
         return None
     look, axes = looks(study), (EPISODES, UPDATES, MINUTES)
     figure, panels = new_figure(3.9, 1, len(axes), sharey=True)
     for panel, axis in zip(panels, axes, strict=True):
+        early = _rise_early(experiment.trainings, axis, measure)  # alike in each part
         for training in known:
-            if found := _band(training, axis, measure):
+            if found := _band(training, axis, measure, early):
                 count = f"{found.seeds} seed{'s' * (found.seeds > 1)}"
                 low_high = None
                 if found.deviation is not None:
                     low_high = (found.mean - found.deviation, found.mean + found.deviation)
                 x, label = found.x * axis.factor, f"{training.label}, {count}"
                 _draw_line(panel, x, found.mean, low_high, look[training.name], label=label)
-        for training in known if measure is REWARD else ():
-            told = papers(experiment, training).get("mean_reward")
-            if told is not None:
-                label = f"{training.label}, the paper's: {told:.2f}"
-                _draw_level(panel, told, look[training.name].colour, ":", 1.4, label)
         dashes = itertools.cycle(DASHES[1:])
         for policy in references(study, experiment):
             score = policy.score(measure)
@@ -110,20 +153,53 @@ def draw_curves(study: Study, experiment: Experiment, measure: Measure) -> Figur
                 _draw_level(panel, score, GREY, next(dashes), 1.2, f"{policy.label}: {score:.2f}")
         panel.axhline(1.0, color=LEVEL, linewidth=1.0, zorder=1, label="perfect: 1")
         panel.set_xlabel(axis.axis)
-        panel.set_xlim(left=0)
-        panel.xaxis.set_major_formatter(thousands())
-        panel.locator_params(axis="x", nbins=5)
+        _scale_updates(panel, early)
+        if axis is EPISODES and measure is REWARD:
+            _draw_papers(panel, experiment, known, look)
     panels[0].set_ylabel(measure.axis)
+    panels[0].set_ylim(-LIMIT, LIMIT)  # the same in each part
     legend_below(figure, panels[0], 3)
     return figure
 
 
-def _with_curves(experiment: Experiment, measure: Measure) -> list[Training]:
-    return [one for one in experiment.trainings if _band(one, UPDATES, measure)]
+def _draw_papers(
+    panel: Axes, experiment: Experiment, known: Part, look: Mapping[str, Look]
+) -> None:
+    """A diamond where the paper says that it got its mean reward, at the end if it does not."""
+    for training in known:
+        told = papers(experiment, training)
+        if (score := told.get("mean_reward")) is not None:
+            label = f"{training.label}, the paper's: {score:.2f}"
+            style: dict[str, Any] = {"color": look[training.name].colour, "label": label}
+            at = told.get("after", panel.get_xlim()[1])
+            panel.plot(at, score, "D", mfc="white", ms=7, clip_on=False, zorder=4, **style)
 
 
-def _band(training: Training, axis: Measure, measure: Measure) -> Band | None:
-    return band([seed.curve for seed in training.finished], axis.key, measure.key)
+def _scale_updates(panel: Axes, early: bool) -> None:
+    """From 0 on, or logarithmic where the curves rise early."""
+    if early:
+        make_logarithmic(panel, "x")
+        panel.margins(x=0)
+    else:
+        panel.set_xlim(left=0)
+        panel.xaxis.set_major_formatter(thousands())
+        panel.locator_params(axis="x", nbins=5)
+
+
+def _with_curves(trainings: Part, measure: Measure) -> list[Training]:
+    return [one for one in trainings if _band(one, UPDATES, measure)]
+
+
+def _band(
+    training: Training, axis: Measure, measure: Measure, logarithmic: bool = False
+) -> Band | None:
+    curves = [seed.curve for seed in training.finished]
+    return band(curves, axis.key, measure.key, logarithmic)
+
+
+def _rise_early(trainings: Part, axis: Measure, measure: Measure) -> bool:
+    curves = (seed.curve for training in trainings for seed in training.finished)
+    return rises_early(curves, axis.key, measure.key)
 
 
 def _draw_line(panel: Axes, x: Any, y: Any, low_high: Any, look: Look, **style: Any) -> None:
@@ -139,19 +215,27 @@ def _draw_level(panel: Axes, y: float, colour: str, dash: Any, width: float, lab
 def draw_single_seeds(study: Study, experiment: Experiment) -> Figure | None:
     """A small panel for each training: every seed's mean reward against updates.
 
-    The first training, which the others are compared with, stands in grey behind each.
+    The range of the first training, which the others are compared with, stands in grey behind each.
     """
-    known = _with_curves(experiment, REWARD)
+    known = _with_curves(experiment.trainings, REWARD)
     if not known:
         return None
     rows, columns = -(-len(known) // PER_ROW), min(PER_ROW, max(len(known), 3))
-    figure, panels = new_figure(0.55 + 1.6 * rows, rows, columns, sharex=True, sharey=True)
+    figure, panels = new_figure(0.55 + 1.75 * rows, rows, columns, sharex=True, sharey=True)
+    early = _rise_early(known, UPDATES, REWARD)
+    first = _band(known[0], UPDATES, REWARD, early) if known[0] is experiment.trainings[0] else None
     for panel, training in zip(panels, known, strict=False):
-        if training is not known[0] and known[0] is experiment.trainings[0]:
-            _draw_seeds(panel, known[0], PALE, 1.6)
-        _draw_seeds(panel, training, looks(study)[training.name].colour, 1.1)
-        panel.set_title(training.label, loc="left", fontsize=8.5)
+        if training is not known[0] and first is not None:
+            panel.fill_between(first.x, first.least, first.most, color=PALE, linewidth=2.0)
+        for seed in training.finished:
+            x, y = points(seed.curve, UPDATES.key, REWARD.key)
+            panel.plot(x, y, color=looks(study)[training.name].colour, linewidth=1.1)
+        title = "\n".join(textwrap.wrap(training.label, TITLE_WIDTH))
+        panel.set_title(title, loc="left", fontsize=8.5)
         panel.xaxis.set_major_formatter(thousands())
+    if early:
+        make_logarithmic(panels[0], "x")
+        panels[0].set_xlim(left=first.x[0] if first is not None else None)
     for panel in panels[len(known) :]:
         panel.set_visible(False)
     for panel in panels[max(len(known) - columns, 0) : len(known)]:
@@ -159,11 +243,6 @@ def draw_single_seeds(study: Study, experiment: Experiment) -> Figure | None:
     figure.supxlabel(UPDATES.axis, fontsize=9.5, color="#374151")
     figure.supylabel(REWARD.axis, fontsize=9.5, color="#374151")
     return figure
-
-
-def _draw_seeds(panel: Axes, training: Training, colour: str, width: float) -> None:
-    for seed in training.finished:
-        panel.plot(*points(seed.curve, UPDATES.key, REWARD.key), color=colour, linewidth=width)
 
 
 # Tests over a quantity: noise on the corners, or actions in sequence
@@ -193,41 +272,42 @@ def sweeps(experiment: Experiment) -> list[Sweep]:
     return [Sweep(n, label, dict(sorted(o.items()))) for n, label, o in found if len(o) > 1]
 
 
-def draw_sweep(study: Study, experiment: Experiment, sweep: Sweep) -> Figure | None:
+def draw_sweep(study: Study, experiment: Experiment, sweep: Sweep, part: Part) -> Figure | None:
     """Two panels, mean reward and angle error: the median, and least to most."""
-    places = list(sweep.places)
-    known = [
-        one
-        for one in experiment.trainings
-        if any(one.values(REWARD.key, test.name) for test in sweep.places.values())
-    ]
-    if not known:
+    places, tests = list(sweep.places), sweep.places.values()
+    if not any(one.values(REWARD.key, test.name) for one in part for test in tests):
         return None
     look = looks(study)
     figure, panels = new_figure(3.8, 1, 2)
     for panel, measure in zip(panels, (REWARD, ANGLE), strict=True):
-        for training in known:
-            tests = sweep.places.items()
-            pairs = [(x, spread(training.values(measure.key, t.name).values())) for x, t in tests]
+        for training in experiment.trainings:
+            pairs = [
+                (x, spread(training.values(measure.key, t.name).values()))
+                for x, t in sweep.places.items()
+            ]
             found = {x: one for x, one in pairs if one is not None}
-            least, median, most = zip(*found.values(), strict=True) if found else ((), (), ())
-            style: dict[str, Any] = {"marker": look[training.name].marker, "markersize": 5.5}
-            style["label"] = training.label
+            if not found:
+                continue
+            least, median, most = zip(*found.values(), strict=True)
             x = list(found)
-            _draw_line(panel, x, median, (least, most), look[training.name], **style)
-        _draw_others(panel, study, experiment, sweep, measure)
+            panel.update_datalim(np.column_stack([[*x, *x], [*least, *most]]))
+            if training in part:
+                style: dict[str, Any] = {"marker": look[training.name].marker, "markersize": 5.5}
+                style["label"] = training.label
+                _draw_line(panel, x, median, (least, most), look[training.name], **style)
+        _draw_others(panel, study, experiment, sweep, measure, part)
         panel.set_xlabel(sweep.label)
         panel.set_ylabel(measure.axis)
         panel.margins(y=0.08)
         if measure is ANGLE:
-            widen(panel, "y", [y for line in panel.lines for y in np.ravel(line.get_ydata())])
+            widen(panel, "y", [float(panel.dataLim.y0), float(panel.dataLim.y1)])
         panel.set_xticks(places, [f"{at:g}" for at in places])
     legend_below(figure, panels[0])
     return figure
 
 
 def _draw_others(
-    panel: Axes, study: Study, experiment: Experiment, sweep: Sweep, measure: Measure
+    panel: Axes, study: Study, experiment: Experiment, sweep: Sweep, measure: Measure, part: Part
 ) -> None:
     """The paper's, position only (dashed), and perfect, which sees the same noise."""
 
@@ -237,7 +317,7 @@ def _draw_others(
             panel.plot(list(known), list(known.values()), shape, **style)
 
     tests = sweep.places.values()
-    for training in experiment.trainings if measure is REWARD else ():
+    for training in part if measure is REWARD else ():
         told = [papers_score(experiment, training, test) for test in tests]
         colour, label = looks(study)[training.name].colour, f"{training.label}, the paper's"
         draw(told, "D", mfc="white", ms=7, color=colour, label=label)

@@ -11,6 +11,7 @@ from tangram_sim.arrays import Floats
 
 NOTHING = "-"
 GRID = 200  # points of a curve of several seeds
+EARLY = 0.08  # of an axis; what rises there needs a logarithmic one
 KEPT = 60  # points of a curve in data.json
 
 
@@ -93,6 +94,8 @@ class Band(NamedTuple):
     x: Floats  # (G,) rising
     mean: Floats
     deviation: Floats | None
+    least: Floats
+    most: Floats
     seeds: int
 
 
@@ -103,23 +106,41 @@ def points(curve: Sequence[Row], axis: str, key: str) -> tuple[Floats, Floats]:
     return pairs[:, 0], pairs[:, 1]
 
 
-def band(curves: Iterable[Sequence[Row]], axis: str, key: str) -> Band | None:
+def rises_early(curves: Iterable[Sequence[Row]], axis: str, key: str) -> bool:
+    """Whether the median curve has done half of its rise in the first `EARLY` of the axis."""
+    known = [(x, y) for x, y in (points(curve, axis, key) for curve in curves) if len(x)]
+    end = max((x[-1] for x, _ in known), default=0.0)
+    halves = [x[np.argmax(y >= (y[0] + y.max()) / 2)] for x, y in known if y.max() > y[0]]
+    return bool(halves) and bool(np.median(halves) < EARLY * end)
+
+
+def band(
+    curves: Iterable[Sequence[Row]], axis: str, key: str, logarithmic: bool = False
+) -> Band | None:
     """Mean and deviation over the range that all curves cover, by linear interpolation.
 
     Seeds are evaluated at different points, so each is read at G points between the latest first
     and the earliest last evaluation. Curves without a value are left out.
+
+    Args:
+        curves: of the seeds.
+        axis, key: names of x and y.
+        logarithmic: the points are as far apart on a logarithmic axis, from the first above 0.
 
     Returns:
         None if there is no curve, or no range that all of them cover.
     """
     known = [(x, y) for x, y in (points(curve, axis, key) for curve in curves) if len(x)]
     low, high = max((x[0] for x, _ in known), default=0), min((x[-1] for x, _ in known), default=0)
+    if logarithmic:
+        low = max(low, min((x[x > 0].min(initial=high) for x, _ in known), default=0))
     if low >= high:
         return None
-    grid = np.linspace(low, high, GRID)
+    grid = (np.geomspace if logarithmic else np.linspace)(low, high, GRID)
     values = np.stack([np.interp(grid, x, y) for x, y in known])
     deviation = values.std(axis=0, ddof=1) if len(known) > 1 else None
-    return Band(grid, values.mean(axis=0), deviation, len(known))
+    least, most = values.min(axis=0), values.max(axis=0)
+    return Band(grid, values.mean(axis=0), deviation, least, most, len(known))
 
 
 def first_at_least(seed: Seed, level: float) -> float | None:

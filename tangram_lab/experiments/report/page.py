@@ -12,10 +12,12 @@ from matplotlib.figure import Figure
 from tangram_agent.files import write_whole
 from tangram_lab.experiments.pictures import draw_paper_pictures
 from tangram_lab.experiments.report.figures import (
+    curve_parts,
     draw_curves,
     draw_ranking,
     draw_single_seeds,
     draw_sweep,
+    sweep_parts,
     sweeps,
 )
 from tangram_lab.experiments.report.numbers import ANGLE, DENSE, REWARD, thinned
@@ -50,13 +52,17 @@ HOW_TO_READ = (
 )
 BAND = (
     "Mean over the seeds; the band is one standard deviation (n - 1). A curve is drawn over the "
-    "range that all seeds of its training cover."
+    "range that all seeds of its training cover. An axis is logarithmic where curves rise early. A "
+    "colour is an agent with its network, in every figure."
 )
 DOTS = (
     "Final scores: a dot for each seed, a tick at the median; the diamonds are what the "
     "position-only policy scores at the row's task."
 )
-SMALL = "Every seed's test scores while it trains; the first training stands in grey behind each."
+SMALL = (
+    "Every seed's test scores while it trains; the range of the first training stands in grey "
+    "behind each."
+)
 SWEEP = "Median over the seeds; the band goes from the least to the most."
 REACHED = "Episodes are those at the first evaluation in which a seed reached the mean reward."
 
@@ -165,18 +171,20 @@ class Page:
         """Of one reward or of both."""
         lines, both = [], one.kind == "rewards"
         for measure in (REWARD, DENSE) if both else (REWARD,):
-            drawn = draw_curves(self.study, one, measure)
             name, title = one.name + "_dense" * (measure is DENSE), f": {measure.label}" * both
-            lines += self._figure(name, one.title + title, BAND, drawn)
+            for number, part in enumerate(curve_parts(self.study, one), 1):
+                drawn = draw_curves(self.study, one, measure, part)
+                lines += self._figure(_numbered(name, number), one.title + title, BAND, drawn)
             lines += score_table(self.study, one, measure)
         return [*lines, *effort_table(one), REACHED, ""]
 
     def _tests(self, one: Experiment) -> list[str]:
         lines = []
         for sweep in sweeps(one):
-            drawn = draw_sweep(self.study, one, sweep)
             name, title = f"{one.name}_{sweep.name}", f"{one.title}: {sweep.name}"
-            lines += self._figure(name, title, SWEEP, drawn)
+            for number, part in enumerate(sweep_parts(self.study, one), 1):
+                drawn = draw_sweep(self.study, one, sweep, part)
+                lines += self._figure(_numbered(name, number), title, SWEEP, drawn)
         for measure in (REWARD, ANGLE):
             lines += test_table(self.study, one, measure)
         singles = [line for m in (REWARD, ANGLE) for line in single_tests(one, m)]
@@ -189,6 +197,10 @@ class Page:
             *ranking_table(self.study, one),
             *self._figure(f"{one.name}_seeds", f"{one.title}: curves", SMALL, singles),
         ]
+
+
+def _numbered(name: str, number: int) -> str:
+    return name if number == 1 else f"{name}_{number}"
 
 
 def command(study: Study, experiment: Experiment) -> str:

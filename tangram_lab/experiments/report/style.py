@@ -17,6 +17,7 @@ from tangram_agent.files import write_whole
 WIDTH_IN = 9.0  # a README shows it a little smaller than that
 DPI = 160
 WIDE = 30.0  # most / least of values that need a logarithmic axis
+LINES = 6  # of a panel, what they are compared with among them
 # Okabe and Ito's colours for all kinds of colour vision, without black and yellow, and two of
 # Paul Tol's.
 COLOURS = (
@@ -54,7 +55,7 @@ Dash = str | tuple[int, tuple[float, ...]]
 
 
 class Look(NamedTuple):
-    """How one training looks in every figure."""
+    """How one training looks in every figure: the colour is its agent's and network's."""
 
     colour: str
     marker: str
@@ -107,11 +108,16 @@ def legend_below(figure: Figure, panel: Axes, columns: int = 4) -> None:
 def widen(panel: Axes, axis: str, values: Sequence[float]) -> None:
     """A logarithmic axis, x or y, where the values need one; its ticks are plain numbers."""
     if values and min(values) > 0.0 and max(values) / min(values) > WIDE:
-        panel.set(**{f"{axis}scale": "log"})
-        scaled = panel.xaxis if axis == "x" else panel.yaxis
-        scaled.set_major_locator(LogLocator(subs=(1.0, 3.0)))
-        scaled.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        scaled.set_minor_formatter(NullFormatter())
+        make_logarithmic(panel, axis)
+
+
+def make_logarithmic(panel: Axes, axis: str) -> None:
+    """A logarithmic axis, x or y, whose ticks are plain numbers."""
+    panel.set(**{f"{axis}scale": "log"})
+    scaled = panel.xaxis if axis == "x" else panel.yaxis
+    scaled.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+    scaled.set_major_formatter(thousands())
+    scaled.set_minor_formatter(NullFormatter())
 
 
 def thousands() -> FuncFormatter:
