@@ -11,13 +11,7 @@ from typing import Any
 import torch
 
 from master.budget import Budget
-from master.checkpointer import (
-    Checkpointer,
-    Restored,
-    check_resumable,
-    restore_run,
-    warm_start,
-)
+from master.checkpointer import Checkpointer, Restored, restore_run, warm_start
 from master.children import override
 from master.config import MasterConfig
 from master.console import Progress, logging_to, make_progress, sturdy_console
@@ -31,6 +25,7 @@ from master.loop import Loop
 from master.metrics import Metrics
 from master.report import Reporter, StatusCollector
 from master.result import make_result, show_result
+from master.resumable import check_resumable
 from master.rundir import Clock, Record, RunFolder
 from master.security import Keys, is_loopback, needs_keys, run_keys
 from master.signals import StopSignals

@@ -8,13 +8,14 @@ import numpy.typing as npt
 import torch
 
 from master.rate_limiter import LAG_UPDATES, RateLimiter
+from master.resumable import check_same_task
+from tangram_agent.checkpoints import ACTING, SETUP
 from tangram_agent.learner import Learner
 from tangram_agent.relabelling import with_relabelled
 from tangram_agent.replay import ReplayBuffer
-from tangram_agent.runs import ACTING, SETUP
 from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes, Transitions, Weights
-from tangram_sim.errors import ConfigError, RunError
+from tangram_sim.errors import ConfigError
 from tangram_sim.rewards import make_reward
 
 STREAMS = ("replay", "hindsight")
@@ -125,19 +126,6 @@ class Trainer:
         self.episodes = int(counters["episodes"])
         for name, generator in self._generators.items():
             generator.bit_generator.state = counters["generators"][name]
-
-
-def check_same_task(setup: Setup, contents: Mapping[str, Any]) -> None:
-    """Raise RunError unless a run of a setup with these contents can go on with this one.
-
-    The agent's rates may change on the way; what shapes its networks shows when they load.
-    """
-    odd = [name for name in setup.differences(contents) if name != "agent"]
-    if odd:
-        raise RunError(
-            f"the run was made with other settings of {', '.join(odd)}: resume it with its own, "
-            "from_config=RUN_DIR/config.yaml, or choose another run_dir"
-        )
 
 
 def choose_device(wanted: str) -> str:
