@@ -29,10 +29,11 @@ INTERRUPT_STATUS = 130
 CFG_KINDS = ("job", "hydra", "all")
 FLAGS = ("--cfg", *SWEEP)
 OWN_PRESETS = ("--config-dir", "-cd")
+PRESET_GROUPS = (*GROUPS, "experiment", "budget")
 MAKE_RUNS = ("train", "master")  # the commands whose run_dir is made, not read
 MISSING_HINTS = {
     "runs": "say which study: runs=runs/experiments/laptop",
-    "connect": "say which master: connect=tcp://host:port or connect=runs/.../connection.json",
+    "connect": "say which master: connect=host:port or connect=runs/...",
 }
 
 
@@ -64,6 +65,7 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
             )
             return 0
         options = [] if folder is None else [OWN_PRESETS[0], folder]
+        _check_presets(folder)
         sys.argv[1:] = [*options, *hidden(_options_first(arguments), config_name)]
         check_launcher(sys.argv[1:])
         return _run(config_name, task, stored)
@@ -90,7 +92,7 @@ def _own_presets(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
     folder = Path(rest[at[0] + 1]).expanduser().absolute()
     if not folder.is_dir():
         raise ConfigError(f"{OWN_PRESETS[0]}: there is no folder {folder}")
-    for group in (*GROUPS, "experiment", "budget"):
+    for group in PRESET_GROUPS:
         taken = {path.stem for path in (folder / group).glob("*.yaml")} & set(choices(group))
         if taken:
             raise ConfigError(
@@ -98,6 +100,29 @@ def _own_presets(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
                 "tangram-rl: rename it"
             )
     return str(folder), rest[: at[0]] + rest[at[0] + 2 :]
+
+
+def _check_presets(folder: str | None) -> None:
+    """Raise ConfigError for a preset of the user's own that is broken or empty."""
+    if folder is None:
+        return
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    for path in (path for group in PRESET_GROUPS for path in Path(folder, group).glob("*.yaml")):
+        try:
+            content = OmegaConf.to_container(OmegaConf.load(path))
+        except (
+            OSError,
+            ValueError,
+            RecursionError,
+            yaml.YAMLError,
+            OmegaConfBaseException,
+        ) as error:
+            why = " ".join(str(error).split()) or type(error).__name__
+            raise ConfigError(f"preset {path} cannot be read ({why}): mend it") from None
+        if not (content and isinstance(content, dict)):
+            raise ConfigError(f"preset {path} sets nothing: write settings as in name: value")
 
 
 def _split_option(argument: str) -> list[str]:

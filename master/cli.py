@@ -43,6 +43,7 @@ def _master(settings: Plain) -> int:
     from tangram_agent.setup import SECTIONS, from_mapping, make_setup
     from tangram_sim.rewards import check_reward
     from tangram_sim.settings import refuse_ignored
+    from tangram_sim.world import check_room
 
     _make_absolute(settings)
     rest = {name: value for name, value in settings.items() if name not in SECTIONS}
@@ -51,6 +52,7 @@ def _master(settings: Plain) -> int:
         given, alone = f"workers={config.workers}", "service.mode=async in tangram-master"
         refuse_ignored(given, alone, "start them with tangram-worker", 1)
     setup = make_setup(settings)
+    check_room(setup.layout, setup.sim)
     check_reward(setup.reward, setup.layout, setup.sim)
 
     from master.run import run_master

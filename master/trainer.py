@@ -65,6 +65,20 @@ class Trainer:
         """Transitions played that were taken in, without relabelled ones."""
         return self.episodes * self.setup.horizon
 
+    def facts(self) -> dict[str, Any]:
+        """What a result tells of the task and the agent."""
+        setup = self.setup
+        return {
+            "agent": setup.agent.name,
+            "net": setup.net.kind,
+            "tokens": [shape.name for shape in setup.layout.shapes],
+            "actions_per_token": setup.sim.actions_per_token,
+            "reward": setup.reward.name,
+            "backend": setup.sim.backend,
+            "device": str(self.learner.device),
+            "parameters": self.learner.parameters,
+        }
+
     def insert(self, episodes: Episodes) -> None:
         """Take in episodes as they were played, and relabelled."""
         # What is credited piece by piece is relabelled anew for every update.

@@ -66,10 +66,20 @@ class RelabelConfig(Settings, section="agent.hindsight"):
     )
     copies: int = setting(1, "goals of this kind for each transition", low=1, high=64)
     position: float = setting(
-        0.0, "deviation of the goal's shift", low=0, unit="arena units", only={"strategy": "near"}
+        0.0,
+        "deviation of the goal's shift",
+        low=0,
+        high=1e3,
+        unit="arena units",
+        only={"strategy": "near"},
     )
     angle: float = setting(
-        0.0, "deviation of the goal's turn", low=0, unit="rad", only={"strategy": "near"}
+        0.0,
+        "deviation of the goal's turn",
+        low=0,
+        high=100,
+        unit="rad",
+        only={"strategy": "near"},
     )
 
 
@@ -208,7 +218,9 @@ class AgentConfig(Settings, section="agent"):
         0.0, "largest norm of a gradient; 0 is no clipping", low=0, part=LEARNING
     )
     batch_size: int = setting(64, "transitions in one update", low=1, part=LEARNING)
-    replay_capacity: int = setting(200_000, "transitions kept", low=1, part=LEARNING)
+    replay_capacity: int = setting(
+        200_000, "transitions kept", low=1, high=1_000_000_000, part=LEARNING
+    )
     updates_per_transition: float = setting(
         0.1, "updates for each transition played", low=1e-9, high=1e3, part=LEARNING
     )
@@ -298,6 +310,7 @@ class ServiceConfig(Settings, section="service"):
         300.0,
         "a process without progress for so long ends with its stack; 0: never",
         low=0,
+        high=1e6,
         unit="s",
     )
     device: str = setting("auto", "of the learner", choices=("auto", "cpu", "cuda"))

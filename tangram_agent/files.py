@@ -2,8 +2,9 @@
 
 import os
 from pathlib import Path
+from tempfile import TemporaryFile
 
-from tangram_sim.errors import RunError
+from tangram_sim.errors import ConfigError, RunError
 
 PUBLIC = 0o644
 
@@ -19,7 +20,7 @@ def write_whole(path: Path, data: bytes, mode: int = PUBLIC) -> None:
     Raises:
         RunError: the disk is full or the folder cannot be written.
     """
-    aside = path.with_name(f".{path.name}.{os.getpid()}")
+    aside = _aside(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -37,6 +38,30 @@ def write_whole(path: Path, data: bytes, mode: int = PUBLIC) -> None:
         raise RunError(
             f"cannot write {path} ({error.strerror}): make room there or choose another folder"
         ) from None
+
+
+def check_writable(name: str, path: Path) -> None:
+    """Raise ConfigError unless `write_whole` could write a file there; nothing is left behind.
+
+    Args:
+        name: of the setting that names the file.
+        path: the file; folders that are missing would be made.
+    """
+    try:
+        if path.is_dir():
+            raise IsADirectoryError(0, "it is a folder")
+        _aside(path).exists()  # its name may be too long
+        with TemporaryFile(dir=next(folder for folder in path.parents if folder.exists())):
+            pass
+    except OSError as error:
+        raise ConfigError(
+            f"{name}={path} cannot be written ({error.strerror}): name a file in a folder that "
+            "you may write to"
+        ) from None
+
+
+def _aside(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{os.getpid()}")
 
 
 def sync_folder(folder: Path) -> None:

@@ -384,7 +384,9 @@ def _unpacked(header: bytes) -> dict[str, Any]:
             max_ext_len=0,
         )
     except (ValueError, msgpack.UnpackException) as error:
-        raise WireError(f"the header is not msgpack within the limits: {error}") from None
+        deep = isinstance(error, msgpack.StackError)
+        why = str(error) or ("it is nested too deeply" if deep else "a byte begins no value")
+        raise WireError(f"the header is not msgpack within the limits: {why}") from None
     if not isinstance(values, dict):
         raise WireError(f"the header must be a map, got {_shown(values)}")
     return values

@@ -99,7 +99,7 @@ class Setup:
     @property
     def contacts(self) -> bool:
         """Whether tokens push each other out of their places."""
-        return self.layout.tokens > 1 and self.sim.motion == "slide"
+        return self.sim.motion == "slide"
 
     @property
     def action_size(self) -> int:

@@ -16,7 +16,7 @@ import numpy as np
 from tangram_sim.arrays import Bools, Floats, Ints
 from tangram_sim.errors import ConfigError
 from tangram_sim.settings import Settings, declared
-from tangram_sim.shapes import Shape, polygon, tan
+from tangram_sim.shapes import MAX_COORDINATE, Shape, polygon, tan
 
 MAX_TOKENS = 16
 
@@ -33,6 +33,8 @@ class TokensConfig(Settings, section="tokens"):
     scale: float = field(
         metadata=declared(
             "side of the full square that tans are cut from, or factor on a polygon's corners",
+            low=1.0 / MAX_COORDINATE,
+            high=MAX_COORDINATE,
             unit="arena units",
         )
     )
@@ -42,8 +44,7 @@ class TokensConfig(Settings, section="tokens"):
             raise ConfigError(
                 f"tokens.shapes must list 1 to {MAX_TOKENS} shapes, got {len(self.shapes)}"
             )
-        if not (np.isfinite(self.scale) and self.scale > 0):
-            raise ConfigError(f"tokens.scale must be positive, got {self.scale}")
+        super().__post_init__()
 
 
 def make_layout(config: TokensConfig) -> "Layout":

@@ -10,6 +10,7 @@ of a setting is what stands here.
 """
 
 import math
+import sys
 from collections.abc import Collection, Mapping
 from dataclasses import Field, dataclass, field, fields
 from typing import Any, ClassVar, TypeVar, cast
@@ -145,10 +146,13 @@ def _check(name: str, value: object, what: Declaration) -> None:
 
 
 def check_range(name: str, value: float, low: float, high: float = math.inf) -> None:
-    """Raise ConfigError unless low <= value <= high."""
-    if not low <= value <= high:
+    """Raise ConfigError unless value is a finite number and low <= value <= high."""
+    # An integer may be too large for a float, too.
+    number = not isinstance(value, bool) and abs(value) <= sys.float_info.max
+    if not (number and low <= value <= high):
         bound = f"at least {low:g}" if math.isinf(high) else f"between {low:g} and {high:g}"
-        raise ConfigError(f"{name} must be {bound}, got {value}")
+        kind, got = ("", value) if number else ("a finite number, ", told(value))
+        raise ConfigError(f"{name} must be {kind}{bound}, got {got}")
 
 
 def check_choice(name: str, value: str, choices: Collection[str]) -> None:

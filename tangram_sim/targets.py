@@ -18,6 +18,7 @@ from tangram_sim.fitting import kind_of
 from tangram_sim.geometry import outlines
 from tangram_sim.kinematics import wrap
 from tangram_sim.layout import Layout
+from tangram_sim.prisms import thickness
 from tangram_sim.puzzles import library
 from tangram_sim.sampling import sample_batch
 from tangram_sim.settings import refuse_ignored, told
@@ -25,6 +26,7 @@ from tangram_sim.shapes import Shape, mirror_image, tan, turn_onto
 
 Generators = Sequence[np.random.Generator]
 Sides = tuple[Floats, Bools]
+MIN_THICKNESS = 1e-3  # of a token, arenas
 
 
 def sample_targets(
@@ -84,8 +86,8 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
 
     Raises:
         ConfigError: figures of tokens that are not all seven tans or too large for the arena, flips
-            or other sides of tokens that look the same on both, an overlap of one token with
-            others, or a stage that moves more than there are.
+            or other sides of tokens that look the same on both, what one token does to others, a
+            token too thin for the arena, or a stage that moves more than there are.
     """
     if sim.allow_flip and not layout.any_chiral:
         raise ConfigError(
@@ -95,9 +97,11 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
     if sim.mirrored and not layout.any_chiral:
         alike, chiral = "tokens that are their own mirror images", "take a set with a parallelogram"
         refuse_ignored(f"sim.mirrored={told(sim.mirrored)}", alike, chiral, 0.0)
-    if sim.max_overlap != SimConfig.max_overlap and layout.tokens == 1:
-        given = f"sim.max_overlap={told(sim.max_overlap)}"
-        refuse_ignored(given, "one token", "take a set of several", SimConfig.max_overlap)
+    for name in ("max_overlap", "motion"):
+        value, usual = getattr(sim, name), getattr(SimConfig, name)
+        if value != usual and layout.tokens == 1:
+            refuse_ignored(f"sim.{name}={told(value)}", "one token", "take a set of several", usual)
+    _check_thick(layout, sim)
     for stage in sim.stages:
         if stage.tokens > layout.tokens:
             raise ConfigError(
@@ -107,6 +111,18 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
     if any(task.targets == "figures" for task in (sim.task, *sim.stages)):
         _check_full_set(layout)
         _check_figures_fit(layout, sim)
+
+
+def _check_thick(layout: Layout, sim: SimConfig) -> None:
+    """Refuse what is lost in its arena: a slide across takes thousands of steps of the engine."""
+    shape = min(layout.shapes, key=lambda one: thickness(one.corners))
+    thin = thickness(shape.corners)
+    if thin < MIN_THICKNESS * sim.arena:
+        raise ConfigError(
+            f"token '{shape.name}' must be at least {MIN_THICKNESS * sim.arena:g} thick (twice its "
+            f"area by its perimeter) in an arena of width {sim.arena:g}, got {thin:.3g}: raise "
+            "tokens.scale, or lower sim.arena"
+        )
 
 
 def placement(puzzle: Puzzle, layout: Layout) -> Sides:

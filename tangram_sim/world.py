@@ -57,8 +57,20 @@ def check_world(layout: Layout, sim: SimConfig) -> None:
     """Refuse a task that no world could play, without making one.
 
     Raises:
-        SamplingError: a token does not fit into the arena, or not all tokens do.
+        SamplingError: see `check_room`.
         ConfigError: the engine is asked for and not installed, or see `check_targets`.
+    """
+    check_room(layout, sim)
+    if sim.backend == "physics" and find_spec("pybullet") is None:
+        raise _no_engine("no module named 'pybullet'")
+
+
+def check_room(layout: Layout, sim: SimConfig) -> None:
+    """Refuse a task whose tokens have no room, also where nothing is played.
+
+    Raises:
+        SamplingError: a token does not fit into the arena, or not all tokens do.
+        ConfigError: see `check_targets`.
     """
     check_targets(layout, sim)
     done = np.zeros((1, layout.tokens), dtype=np.bool_)
@@ -66,8 +78,6 @@ def check_world(layout: Layout, sim: SimConfig) -> None:
         generators = [np.random.default_rng(0)]
         targets = sample_targets(layout, sim, task, generators)
         sample_starts(layout, sim, targets, done, generators)
-    if sim.backend == "physics" and find_spec("pybullet") is None:
-        raise _no_engine("no module named 'pybullet'")
 
 
 def make_world(layout: Layout, sim: SimConfig) -> World:

@@ -295,7 +295,19 @@ def test_presets_of_ones_own_are_taken(entered: Entered, presets: Path, form: st
     ("name", "content", "message"),
     [
         ("tokens/mine.yaml", "scale: 1\n", "set tokens.shapes=..., it has no default"),
-        ("tokens/mine.yaml", "shapes: [", "while parsing"),
+        ("tokens/mine.yaml", "shapes: [", "/tokens/mine.yaml cannot be read (while parsing"),
+        ("tokens/mine.yaml", "[" * 10_000, "/tokens/mine.yaml cannot be read (maximum recursion"),
+        (
+            "tokens/mine.yaml",
+            "3",
+            "/tokens/mine.yaml cannot be read (Invalid loaded object type: i",
+        ),
+        (
+            "tokens/mine.yaml",
+            "",
+            "/tokens/mine.yaml sets nothing: write settings as in name: value",
+        ),
+        ("tokens/mine.yaml", "[a]", "/tokens/mine.yaml sets nothing"),
         ("tokens/square.yaml", "scale: 1\n", "is called as a preset that comes with tangram-rl"),
     ],
 )

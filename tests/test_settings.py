@@ -278,6 +278,7 @@ def test_every_setting_of_a_command_is_read() -> None:
         (ONE, "sim.substeps", 16, "sim.backend=kinematic"),
         (ONE, "sim.damping", 0.04, "sim.backend=kinematic"),
         (ONE, "sim.max_overlap", 0.1, "one token"),
+        (PHYSICS, "sim.motion", "slide", "one token"),
         (ONE, "sim.mirrored", 0.5, "tokens that are their own mirror images"),
         (SEVERAL, "agent.refine_rate", 0.01, "agent.refine_steps=0"),
         (UNPUNISHED, "agent.saturation_limit", 0.5, "agent.saturation_penalty=0"),

@@ -34,11 +34,11 @@ def play() -> int:
 def _of_the_run(settings: Plain) -> tuple[str, Plain] | None:
     """What the connection file says of the run; nothing where only an address is given."""
     from tangram_agent.process import watch_parent
-    from worker.discovery import await_master
+    from worker.discovery import as_address, await_master
 
     watch_parent()  # already here: a parent may end while the file is waited for
     connect = settings.get("connect")
-    if not isinstance(connect, str) or not connect.strip() or "://" in connect:
+    if not isinstance(connect, str) or not connect.strip() or as_address(connect) is not None:
         return None
     found = await_master(connect, partial(print, file=sys.stderr, flush=True)).settings
     return None if found is None else (f"connect={connect}", dict(found))
@@ -77,10 +77,14 @@ def _status(settings: Plain) -> int:
 
 
 def _evaluate(settings: Plain) -> int:
+    from tangram_agent.files import check_writable
     from tangram_agent.setup import from_mapping
     from worker.config import EvalConfig
 
     config = from_mapping(EvalConfig, with_changes(with_absolute_paths(settings)))
+    for name, path in (("out", config.out), ("sheet", config.sheet)):
+        if path is not None:
+            check_writable(name, Path(path))
 
     from worker.evaluate import evaluate_run
 
@@ -88,6 +92,7 @@ def _evaluate(settings: Plain) -> int:
 
 
 def _play(settings: Plain) -> int:
+    from tangram_agent.files import check_writable
     from tangram_agent.setup import from_mapping
     from worker.config import PlayConfig, check_compare, check_puzzle
 
@@ -97,6 +102,8 @@ def _play(settings: Plain) -> int:
         paths["out"] = PlayConfig.out  # not given: nothing to refuse beside live=true
     settings = with_changes(paths | {"puzzle": check_puzzle(settings.get("puzzle"))})
     config = from_mapping(PlayConfig, settings)
+    if not config.live:
+        check_writable("out", Path(config.out).absolute())
     if config.tokens is not None and config.run_dir is not None:
         _check_tokens(config.tokens, config.run_dir)
 

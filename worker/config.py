@@ -49,9 +49,7 @@ def _refuse(changes: Changes, names: Iterable[str], because: str, remedy: str) -
 
 def _check_connect(value: str) -> None:
     if not value.strip():
-        raise ConfigError(
-            "connect must name the master's endpoint, got '': set connect=tcp://HOST:PORT"
-        )
+        raise ConfigError("connect must name the master's endpoint, got '': set connect=HOST:PORT")
 
 
 def _check_out(value: str) -> None:
@@ -65,7 +63,7 @@ class WorkerConfig(Settings):
 
     connect: str = field(
         metadata=declared(
-            "the run: its folder or its connection.json; or only an address, tcp://host:port"
+            "the run: its folder or its connection.json; or only an address, host:port"
         )
     )
     role: str = setting(
@@ -86,7 +84,7 @@ class StatusConfig(Settings):
     """How a run stands (tangram-status)."""
 
     connect: str = field(
-        metadata=declared("the run: its folder, its connection.json, or tcp://host:port")
+        metadata=declared("the run: its folder, its connection.json, or host:port")
     )
     json: bool = setting(False, "print one JSON object a line instead of a table")
 

@@ -7,7 +7,9 @@ import sys
 import tempfile
 from pathlib import Path
 
+from tangram_agent.files import check_writable
 from tangram_sim.errors import TangramError
+from tangram_sim.settings import check_range
 
 EPILOG = """\
 Options may be written as elsewhere in this project: runs=9 for --runs 9.
@@ -34,6 +36,15 @@ TRIALS = {
     "chaos": ("random faults over a real training", 20.0),
     "fuzz": ("mutated messages against decoder and master", None),
     "soak": ("memory and open files of a long training, drawn", 60.0),
+}
+# Option -> its bounds.
+BOUNDS = {
+    "runs": (1, 10_000),
+    "seeds": (1, 1000),
+    "minutes": (0.01, 1e5),
+    "messages": (1, 10**12),
+    "live": (1, 10**12),
+    "seed": (0, 2**63 - 1),
 }
 
 
@@ -71,10 +82,20 @@ def main() -> int:
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     arguments = _parser().parse_args([_dashed(argument) for argument in sys.argv[1:]])
     try:
+        _check(arguments)
         return _run(arguments)
     except (TangramError, ModuleNotFoundError) as error:
         print(f"tangram-bench: {error}", file=sys.stderr)
         return 2
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    """Raise ConfigError for a number out of its bounds, or a file that cannot be written."""
+    for name, value in vars(arguments).items():
+        if name in BOUNDS:
+            check_range(name, value, *BOUNDS[name])
+    if arguments.out is not None:
+        check_writable("out", arguments.out.absolute())
 
 
 def _dashed(argument: str) -> str:

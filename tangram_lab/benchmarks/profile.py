@@ -29,6 +29,7 @@ def show_profile(out: Path | None) -> None:
     text = "\n".join(parts)
     print(text)
     if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(text)
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from tangram_agent.files import write_whole
-from tangram_sim.errors import RunError
+from tangram_agent.files import check_writable, write_whole
+from tangram_sim.errors import ConfigError, RunError
 from tests.agent.builders import watched_disk
 
 pytestmark = pytest.mark.fast
@@ -46,6 +46,26 @@ def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(RunError, match=r"cannot write .*scores\.json"):
         write_whole(tmp_path / "file" / "scores.json", b"")
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("", "it is a folder"),
+        ("file/scores.json", "Not a directory"),
+        ("file/deeper/scores.json", "Not a directory"),
+        (f"{'x' * 250}.json", "File name too long"),
+        (f"{'x' * 300}/scores.json", "File name too long"),
+    ],
+)
+def test_what_cannot_be_written_is_told_before_anything_is_done(
+    tmp_path: Path, name: str, why: str
+) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match=rf"^out=.* cannot be written \({why}\): name a file in"):
+        check_writable("out", tmp_path / name)
+    check_writable("out", tmp_path / "some" / "folder" / "scores.json")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 @pytest.mark.parametrize("mode", [0o600, 0o644])

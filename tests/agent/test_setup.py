@@ -142,11 +142,7 @@ def test_sizes_follow_from_tokens_and_actions(
 
 @pytest.mark.parametrize(
     ("shapes", "motion", "contacts"),
-    [
-        (["square"], "slide", False),
-        (["square"] * 2, "lift", False),
-        (["square"] * 2, "slide", True),
-    ],
+    [(["square"] * 2, "lift", False), (["square"] * 2, "slide", True)],
 )
 def test_tokens_push_each_other_where_several_slide(
     shapes: list[str], motion: str, contacts: bool

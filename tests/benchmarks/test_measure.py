@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from tangram_lab.benchmarks.cli import main
 from tangram_lab.benchmarks.measure import Bound, compared, rates, single
 
 LABELS = ("stage", "case", "unit")
@@ -58,6 +59,31 @@ def test_a_stage_prints_a_table_and_writes_where_its_numbers_come_from(tmp_path:
     content = json.loads((tmp_path / "replay.json").read_text())
     assert {"command", "commit", "processor", "cores", "versions", "rows"} <= content.keys()
     assert {row["stage"] for row in content["rows"]} == {"replay"}
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        ("wire runs=0", "runs must be between 1 and 10000, got 0"),
+        ("train seeds=0", "seeds must be between 1 and 1000, got 0"),
+        ("soak minutes=inf", "minutes must be a finite number, between 0.01 and 100000, got inf"),
+        ("chaos minutes=0", "minutes must be between 0.01 and 100000, got 0"),
+        ("chaos seed=-1", "seed must be between 0 and"),
+        ("fuzz messages=0", "messages must be between 1 and"),
+        ("fuzz live=0", "live must be between 1 and"),
+        ("sim out=/", "out=/ cannot be written (it is a folder)"),
+    ],
+)
+def test_a_number_out_of_its_bounds_is_refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], line: str, reason: str
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["tangram-bench", *line.split()])
+    monkeypatch.setattr("signal.signal", lambda *_: None)
+    assert main() == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"tangram-bench: {reason}")
+    assert told.count("\n") == 1
 
 
 @pytest.mark.cluster

@@ -86,7 +86,8 @@ def end():
 def told(*_):
     heard.wait(30)  # the reason was sent before the signal
     end()
-signal.signal(signal.SIGTERM, told)
+for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1):
+    signal.signal(number, told)
 (folder / "connection.json").touch()
 while {condition}:
     signal.sigtimedwait([], 0.05)
@@ -119,7 +120,7 @@ def launcher(
     made = Launcher(MasterConfig(str(folder), workers=len(players)), run)
     code = MASTER.format(folder=str(folder), condition=condition, ending=ending)
     if stubborn:
-        code = code.replace("SIGTERM, told", "SIGTERM, signal.SIG_IGN")
+        code = code.replace("number, told", "number, signal.SIG_IGN")
     made._master.arguments = ["-c", code]
     for player, own in zip(made._players, players, strict=True):
         player.arguments = ["-c", own]
@@ -338,7 +339,8 @@ def test_a_signal_ends_the_master_in_order(
     status, told = finish(made, tmp_path)
     signal.signal(number, before)
     assert status == 0
-    assert told == f"{number.name}: the run ends with a checkpoint, again to end at once\n"
+    name = "Ctrl-C (SIGINT)" if number == signal.SIGINT else number.name
+    assert told == f"{name}: the run ends with a checkpoint, again to end at once\n"
 
 
 @pytest.mark.cluster

@@ -32,6 +32,7 @@ class TopConfig(Settings):
     jobs: int = setting(2, "at a time", low=1)
 
 
+FINITE = "a finite number"
 UNUSED = (
     "^noise.width=0.2 changes nothing with noise.kind=none: leave it at 0.1, or set "
     "noise.kind=gaussian or wide$"
@@ -44,7 +45,19 @@ REFUSED = [
     (NoiseConfig, {"seed": 10}, "^noise.seed must be between 0 and 9, got 10$"),
     (NoiseConfig, {"kind": "x"}, "^noise.kind must be one of none, gaussian, wide, got 'x'$"),
     (NoiseConfig, {"kind": "wide", "width": -1.0}, "^noise.width must be at least 0, got -1.0$"),
-    (NoiseConfig, {"kind": "wide", "width": math.nan}, "^noise.width must be at least 0, got nan$"),
+    (NoiseConfig, {"seed": True}, f"^noise.seed must be {FINITE}, between 0 and 9, got true$"),
+    (TopConfig, {"jobs": 10**400}, f"^jobs must be {FINITE}, at least 1, got 1000"),
+    (NoiseConfig, {"sizes": (1, True)}, f"^noise.sizes must be {FINITE}, between 1 and 4, got tr"),
+    (
+        NoiseConfig,
+        {"kind": "wide", "width": math.nan},
+        f"^noise.width must be {FINITE}, at least 0, got nan$",
+    ),
+    (
+        NoiseConfig,
+        {"kind": "wide", "width": math.inf},
+        f"^noise.width must be {FINITE}, at least 0, got inf$",
+    ),
     (NoiseConfig, {"sizes": (1, 5)}, "^noise.sizes must be between 1 and 4, got 5$"),
     (NoiseConfig, {"share": 1.5}, "^noise.share must be between 0 and 1, got 1.5$"),
     (NoiseConfig, {"width": 0.2}, UNUSED),

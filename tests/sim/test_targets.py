@@ -154,6 +154,11 @@ def test_a_narrow_gaussian_widens_until_there_is_room() -> None:
             "allow_flip=true needs a token that is not .* got tokens square: set sim.allow_flip",
         ),
         (
+            layout_of("square", scale=0.01),
+            {},
+            "'square' must be at least 0.002 thick .* got 0.00177",
+        ),
+        (
             GAME,
             {"stages": (StageConfig(), StageConfig(updates=9, tokens=8))},
             r"at most the 7 that there are, got 8 \(in the stage from update 9\); 0 moves all",

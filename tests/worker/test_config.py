@@ -22,7 +22,7 @@ OF_A_RUN = [
 ]
 WRONG = {
     WorkerConfig: [
-        ({"connect": " "}, "set connect=tcp://HOST:PORT"),
+        ({"connect": " "}, "set connect=HOST:PORT"),
         ({"role": "dancer"}, "role must be one of player, evaluator, got 'dancer'"),
         ({"index": -2}, "index must be between -1 and 65535, got -2"),
         ({"index": 65536}, "index must be between -1 and 65535, got 65536"),
