@@ -342,7 +342,7 @@ def test_entry_hands_over_plain_settings(entered: Entered) -> None:
     assert type(settings) is dict
     assert settings == (
         {"run_dir": "x", "episodes": 100, "seed": 3, "turns": 1, "skip_invalid": False}
-        | dict.fromkeys(("out", "puzzles", "sheet"))
+        | dict.fromkeys(("out", "puzzle", "sheet"))
         | {s: dict.fromkeys(own) for s, own in COMMANDS["train"].sections().items() if s in OVER}
     )
 
@@ -407,7 +407,7 @@ SLURM = "hydra/launcher=submitit_slurm"
         ("eval run_dir=x --seed=3", "settings carry no dashes, as in seed=3; --help lists them"),
         ("eval run_dir=x -seed=3", "settings carry no dashes, as in seed=3; --help lists them"),
         (f"eval run_dir=x {SLURM}", "is for the jobs of a sweep: add --multirun"),
-        (f"eval run_dir=x -m {SLURM}", "needs a plugin: pip install 'tangram-rl[slurm]"),
+        (f"eval run_dir=x -m {SLURM}", "needs the extra slurm: .ci/install .venv slurm in"),
     ],
 )
 def test_what_would_be_taken_for_something_else_is_refused(
