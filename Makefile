@@ -50,7 +50,7 @@ bench: .venv/.installed-dev  ## measure speed against what else one could do; op
 	@$(BIN)/tangram-bench all out=docs/results/bench.json $(ARGS)
 
 docs: .venv/.installed-docs  ## make a site of README and docs, in site/
-	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo "the front page is site/index.html; with search: python3 -m http.server -d site"
 
 clean:  ## remove caches and build products; .venv and runs/ stay

@@ -1,8 +1,8 @@
 """What goes into the documentation site: the repository's own pages, each at its own path.
 
 Links between them hold on the site as they do in the repository, and no page is copied. In are the
-pages of mkdocs.yml, all of docs/, and the files that they link to. A page of api/ is named after the
-module whose docstrings it shows.
+pages of mkdocs.yml, all of docs/, and the files that they link to. A page of api/ is named after
+the module whose docstrings it shows.
 """
 
 import re
@@ -20,17 +20,21 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     """The theme's files, and ours by their paths in the repository."""
     ours = [file for file in files if file.src_dir != config.docs_dir]
     named = set(_named(config.nav))
-    pages = {name for name in named if (ROOT / name).is_file()}
-    pages |= {str(page.relative_to(ROOT)) for page in (ROOT / "docs").rglob("*.md")}
-    linked = {name for page in pages for name in _linked(ROOT / page)}
-    for name in sorted({*pages, *linked, *map(str, config.extra_css)}):
-        ours.append(File.generated(config, name, abs_src_path=str(ROOT / name)))
-    for name in sorted(named - pages):
-        if name.startswith("api/"):
-            module = Path(name).stem
-            text = f"# {module}\n\n::: {module}\n"
-            ours.append(File.generated(config, name, content=text))
-    return Files(ours)
+    docs = [*(ROOT / "docs").rglob("*.md"), *(ROOT / "docs").glob("*.css")]
+    kept = {name for name in named if (ROOT / name).is_file()}
+    kept |= {str(path.relative_to(ROOT)) for path in docs}
+    kept |= {name for page in kept for name in _linked(ROOT / page)}
+    modules = {name: Path(name).stem for name in named if name.startswith("api/")}
+    return Files(
+        [
+            *ours,
+            *(File.generated(config, name, abs_src_path=str(ROOT / name)) for name in kept),
+            *(
+                File.generated(config, name, content=f"# {module}\n\n::: {module}\n")
+                for name, module in modules.items()
+            ),
+        ]
+    )
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:

@@ -4,9 +4,10 @@ A comment on the line before a block tells it, and is not seen where the page is
 
     <!-- run: quick -->             runs in the gate, pasted as it stands into an empty folder
     <!-- run: on request -->        the same, but only with python -m tests.blocks
-    <!-- run: on request, in a clone -->    in a fresh clone of this repository
+    <!-- run: on request, in a clone -->    in one clone of this repository, in the page's order
+    <!-- run: on request, in terminals -->  each line beside the ones before; the last when they end
     <!-- run: quick, with runs/square -->   beside the folder of a short training that has ended
-    <!-- run: no, needs Docker -->  never runs, and why
+    <!-- run: never, needs Docker -->       and why
     <!-- file: mine.json -->        lies under this name in each folder that a block runs in
 
 What is printed or drawn is ```text and needs none. A block without a tag is a fault.
@@ -44,8 +45,8 @@ FENCED = re.compile(
     re.MULTILINE,
 )
 TAG = re.compile(
-    r"run: (?P<when>quick|on request)(?P<clone>, in a clone)?(?:, with (?P<run>runs/\w+))?"
-    r"|run: (?P<never>no), \S.*|file: (?P<file>[\w.]+)"
+    r"run: (?P<when>quick|on request)(?:, in (?P<place>a clone|terminals))?"
+    r"(?:, with (?P<run>runs/\w+))?|run: never, \S.*|file: (?P<file>[\w.]+)"
 )
 SHORT = ("max_updates=800", "service.eval_seconds=3")  # a training of some 25 s
 
@@ -88,28 +89,28 @@ def all_blocks() -> tuple[Block, ...]:
     return tuple(block for text, page in named for block in blocks_of(text, page))
 
 
-def blocks_to_run(when: str) -> list[Block]:
-    return [block for block in all_blocks() if block.says("when") == when]
-
-
-def prepare(block: Block, folder: Path, trained: Callable[[], Path]) -> Path:
-    """Fill a folder with what the tags promise; where in it the block runs."""
-    if block.says("clone"):
-        subprocess.run(["git", "clone", "--quiet", ROOT, folder / "clone"], check=True)
-        folder = folder / "clone"
+def prepare(block: Block, folder: Path, made: Callable[[str], Path]) -> Path:
+    """Fill a folder with what the tags promise; where the block runs."""
+    if block.says("place") == "a clone":
+        return made("clone")
     for other in all_blocks():
         if name := other.says("file"):
             (folder / name).write_text(other.code)
     if run := block.says("run"):
-        shutil.copytree(trained(), folder / run)
+        shutil.copytree(made("trained"), folder / run)
     return folder
 
 
 def run(block: Block, folder: Path) -> subprocess.CompletedProcess[str]:
     """In a process of its own; a shell stops at the first line that fails."""
-    shell = ["bash", "-euo", "pipefail", "-c", block.code]
+    code = block.code
+    if block.says("place") == "terminals":
+        *others, last = [line.partition("#")[0].strip() for line in code.splitlines()]
+        started = "".join(f"{line} & started+=($!)\n" for line in others)
+        code = f'{started}for one in "${{started[@]}}"; do wait "$one"; done\n{last}'
+    shell = ["bash", "-euo", "pipefail", "-c", code]
     return subprocess.run(
-        shell if block.language == "bash" else [BIN / "python", "-c", block.code],
+        shell if block.language == "bash" else [BIN / "python", "-c", code],
         cwd=folder,
         env=os.environ | {"PATH": f"{BIN}:{os.environ['PATH']}", "SDL_VIDEODRIVER": "dummy"},
         stdout=subprocess.PIPE,
@@ -120,26 +121,28 @@ def run(block: Block, folder: Path) -> subprocess.CompletedProcess[str]:
 
 
 def main(wanted: list[str]) -> int:
-    can = [*blocks_to_run("quick"), *blocks_to_run("on request")]
-    chosen = [b for b in can if not wanted or {b.name, b.page} & {*wanted}]
-    unknown = {*wanted} - {name for b in can for name in (b.name, b.page)}
+    can = [block for block in all_blocks() if block.says("when")]
+    unknown = {*wanted} - {name for block in can for name in (block.name, block.page)}
     if unknown:
-        print(f"no block that runs: {', '.join(sorted(unknown))}", file=sys.stderr)
+        print(f"no block that can run: {', '.join(sorted(unknown))}", file=sys.stderr)
         return 2
+    chosen = [block for block in can if not wanted or {block.name, block.page} & {*wanted}]
     held = 0
-    with TemporaryDirectory(prefix="blocks-") as folder:
+    with TemporaryDirectory(prefix="blocks-") as scratch:
 
         @cache
-        def trained() -> Path:
-            path = Path(folder) / "trained"
-            subprocess.run([BIN / "tangram-train", f"run_dir={path}", *SHORT], check=True)
+        def made(what: str) -> Path:
+            path = Path(scratch) / what
+            train = [f"{BIN}/tangram-train", f"run_dir={path}", *SHORT]
+            clone = ["git", "clone", "--quiet", str(ROOT), str(path)]
+            subprocess.run(clone if what == "clone" else train, check=True)
             return path
 
         for number, block in enumerate(chosen):
-            place = Path(folder) / str(number)
-            place.mkdir()
+            folder = Path(scratch) / str(number)
+            folder.mkdir()
             start = time.monotonic()
-            done = run(block, prepare(block, place, trained))
+            done = run(block, prepare(block, folder, made))
             took = f"{block.name} ({time.monotonic() - start:.0f} s)"
             held += done.returncode == 0
             if done.returncode == 0:

@@ -7,14 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.blocks import Block, all_blocks, blocks_of, blocks_to_run, prepare, run
+from tests.blocks import Block, all_blocks, blocks_of, prepare, run
 
 pytestmark = pytest.mark.slow
 
 QUICK = [
     # Those that need the session's training run where it is.
     pytest.param(block, id=block.name, marks=[pytest.mark.xdist_group("trained")] * needs)
-    for block in blocks_to_run("quick")
+    for block in all_blocks()
+    if block.says("when") == "quick"
     for needs in (block.says("run") is not None,)
 ]
 
@@ -26,7 +27,7 @@ def test_it_runs_without_a_warning(
     for name in re.findall(r"stable_baselines3|human", block.code):
         module = {"human": "pygame"}.get(name, name)
         pytest.importorskip(module, reason="pip install '.[human,peers]'")
-    folder = prepare(block, tmp_path, lambda: request.getfixturevalue("trained"))
+    folder = prepare(block, tmp_path, request.getfixturevalue)
     if block.language == "bash":
         done = run(block, folder)
         assert done.returncode == 0, done.stdout
@@ -60,9 +61,9 @@ def test_every_block_says_what_becomes_of_it() -> None:
         ("<!-- run: quick -->", "bash", False),
         ("<!-- run: quick -->\n", "bash", True),  # not on the line before
         ("<!-- run: often -->", "bash", True),
-        ("<!-- run: no -->", "bash", True),  # and why?
-        ("<!-- run: no, needs Docker -->", "bash", False),
-        ("<!-- run: on request, in a clone -->", "bash", False),
+        ("<!-- run: never -->", "bash", True),  # and why?
+        ("<!-- run: never, needs Docker -->", "bash", False),
+        ("<!-- run: on request, in terminals -->", "bash", False),
         ("<!-- run: quick, with runs/square -->", "json", True),
         ("<!-- file: mine.json -->", "json", False),
     ],
