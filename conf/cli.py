@@ -360,7 +360,7 @@ def _from_config(settings: Plain) -> tuple[str, Plain] | None:
         content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"{source}: {error.strerror or error}") from None
-    except (yaml.YAMLError, UnicodeDecodeError):
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError):
         raise ConfigError(f"{source} is not a YAML file") from None
     return source, content if isinstance(content, dict) else {}
 

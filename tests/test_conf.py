@@ -182,6 +182,7 @@ def test_choosing_a_group_beside_a_run_config_is_refused(stored: Path, override:
     [
         (None, "No such file"),
         (b"a: [", "not a YAML file"),
+        (b"[" * 10_000, "not a YAML file"),
         (b"\xff\xfe\xfa", "not a YAML file"),
         (b"3", "lacks sim"),
         (b"{agent: {}, net: {}}", "lacks sim, reward, service, tokens"),

@@ -68,7 +68,7 @@ def find_master(connect: str) -> MasterAddress | None:
         return MasterAddress(endpoint, str(content["run_id"]), **keys, settings=settings)
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise RunError(
             f"{path} is no connection file ({error!r}): connect=... takes tcp://host:port, a run "
             f"folder, or the {FILE_NAME} that tangram-master writes into it"

@@ -238,7 +238,7 @@ def joined_plan(path: Path, content: dict[str, Any]) -> dict[str, Any]:
         earlier = json.loads(path.read_text(encoding="utf-8"))
         found = earlier["format"]
         known = {n: dict(earlier[n]) for n in ("budget", "experiments", "trainings", "tests")}
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         raise ConfigError(f"cannot read {path}: remove it, or choose another run_dir") from None
     if found != FORMAT:
         raise ConfigError(

@@ -111,7 +111,7 @@ def _last_evaluation(job: Job) -> dict[str, Any]:
         text = (job.run_dir / "curve.jsonl").read_text(encoding="utf-8")
         last = json.loads(text.splitlines()[-1])
         return last if {"updates", "episodes", "mean_reward"} <= set(last) else {}
-    except (OSError, ValueError, IndexError, TypeError):
+    except (OSError, ValueError, IndexError, TypeError, RecursionError):
         return {}
 
 

@@ -52,6 +52,7 @@ def test_a_file_and_its_folder_are_found(tmp_path: Path) -> None:
         ("{}", "KeyError('endpoint')"),
         ('{"endpoint": "tcp://h:1"}', "KeyError('run_id')"),
         ("\x00", "JSONDecodeError"),
+        ("[" * 100_000, "RecursionError"),
         (
             '{"endpoint": "tcp://h:1", "run_id": "r", "server_key": "short"}',
             "ValueError('server_key,",
