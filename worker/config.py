@@ -9,7 +9,9 @@ from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import MAX_INDEX, ROLES
 from tangram_agent.pretrained import PREFIX, agent_names
 from tangram_sim.errors import ConfigError
-from tangram_sim.settings import Settings, declared, refuse_ignored, setting, told
+from tangram_sim.puzzles import SPLITS
+from tangram_sim.settings import Settings, check_folder, declared, refuse_ignored, setting, told
+from worker.discovery import find_master
 
 Changes = dict[str, dict[str, Any]]  # section -> setting -> value: of a run that was trained
 OF_TARGETS = ("targets", "spread", "mirrored")  # settings of sim that say nothing of a puzzle
@@ -22,11 +24,6 @@ MIN_COMPARED, MAX_COMPARED = 2, 4
 MAX_SEED = 2**63 - 1
 
 
-def _check_run_dir(value: str) -> None:
-    if not value.strip():
-        raise ConfigError("run_dir must name the folder of a run, got '': set run_dir=runs/my_run")
-
-
 def game_run() -> str:
     """The run that plays puzzles unless another is named."""
     return f"{PREFIX}/{GAME}"
@@ -35,7 +32,7 @@ def game_run() -> str:
 def _check_run(run_dir: str | None, puzzles: bool) -> None:
     """Refuse no run where none can be meant."""
     if run_dir is not None:
-        _check_run_dir(run_dir)
+        check_folder("run_dir", run_dir)
     elif not (puzzles and GAME in agent_names()):
         raise ConfigError("say which run: run_dir=runs/...")
 
@@ -51,6 +48,16 @@ def _check_connect(value: str) -> None:
     if not value.strip():
         raise ConfigError(
             "connect must name the master's endpoint, got '': set connect=tcp://HOST:PORT"
+        )
+    if "://" in value:
+        find_master(value)  # no file is read: whether it is an address
+
+
+def _check_puzzles(value: str | None) -> None:
+    if value is not None and not value.strip():
+        raise ConfigError(
+            f"puzzles must name a JSON or SVG file, or {', '.join(SPLITS)}, got '{value}': set "
+            "puzzles=test"
         )
 
 
@@ -143,6 +150,7 @@ class EvalConfig(Settings):
             _check_out(self.out)
         if self.sheet is not None and Path(self.sheet).suffix != ".png":
             raise ConfigError(f"sheet must end with .png, got '{self.sheet}'")
+        _check_puzzles(self.puzzles)
         if self.puzzles is not None:
             _refuse(self.changes, OF_TARGETS, "puzzles", "leave puzzles out")
 
@@ -244,6 +252,7 @@ class PlayConfig(Settings):
                 "shows the ends"
             )
         super().__post_init__()
+        _check_puzzles(self.puzzles)
         if self.plays_puzzles:
             _refuse(self.changes, (*OF_TARGETS, "starts"), "puzzles", "leave puzzles out")
 
@@ -260,7 +269,7 @@ class PlayConfig(Settings):
 
     def _check_one_of_both(self) -> None:
         if self.run_dir is not None:
-            _check_run_dir(self.run_dir)
+            check_folder("run_dir", self.run_dir)
         elif (
             self.compare is None
             and self.tokens is None

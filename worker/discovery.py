@@ -123,6 +123,10 @@ def keys_error(connect: str, endpoint: str) -> str:
 
 def _checked(endpoint: str, source: str) -> str:
     host, _, port = endpoint.removeprefix(SCHEME).rpartition(":")
-    if not (endpoint.startswith(SCHEME) and host and port.isdecimal() and 0 < int(port) < 65536):
-        raise RunError(f"'{endpoint}' (from {source}) is no address: it must be tcp://host:port")
+    named = endpoint.startswith(SCHEME) and host and host.split() == [host]
+    if not (named and port.isdecimal() and 0 < int(port) < 65536):
+        raise RunError(
+            f"'{endpoint}' (from {source}) is no address: it must be tcp://host:port, the port "
+            "from 1 to 65535"
+        )
     return endpoint

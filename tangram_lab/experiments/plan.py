@@ -11,7 +11,14 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from tangram_sim.errors import ConfigError
-from tangram_sim.settings import Settings, check_choice, check_range, declared, setting
+from tangram_sim.settings import (
+    Settings,
+    check_choice,
+    check_folder,
+    check_range,
+    declared,
+    setting,
+)
 
 FORMAT = 2
 Kind = Literal["curves", "complexity", "tests", "rewards", "ranking", "game"]
@@ -125,6 +132,7 @@ class StudyConfig(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_folder("run_dir", self.run_dir)
         for name, experiment in self.experiments.items():
             for kind, wanted in (("trainings", experiment.trainings), ("tests", experiment.tests)):
                 _check_known(f"experiment {name}: {kind}", wanted, getattr(self, kind))

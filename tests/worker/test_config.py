@@ -23,6 +23,11 @@ OF_A_RUN = [
 WRONG = {
     WorkerConfig: [
         ({"connect": " "}, "set connect=tcp://HOST:PORT"),
+        (
+            {"connect": "tcp://h:65536"},
+            "is no address: it must be tcp://host:port, the port from 1",
+        ),
+        ({"connect": "tcp://a b:1"}, "'tcp://a b:1' (from tcp://a b:1) is no address"),
         ({"role": "dancer"}, "role must be one of player, evaluator, got 'dancer'"),
         ({"index": -2}, "index must be between -1 and 65535, got -2"),
         ({"index": 65536}, "index must be between -1 and 65535, got 65536"),
@@ -30,6 +35,7 @@ WRONG = {
     EvalConfig: [
         *OF_A_RUN,
         *[({"out": out}, "out must name a file") for out in ("", "/", ".")],
+        ({"puzzles": " "}, "puzzles must name a JSON or SVG file, or train, test, paper, got ' '"),
         (TESTED | {"turns": 0}, "turns must be between 1 and 360, got 0"),
         (TESTED | {"turns": 361}, "turns must be between 1 and 360, got 361"),
         (TESTED | {"sheet": "ends.gif"}, "sheet must end with .png, got 'ends.gif'"),
@@ -55,6 +61,7 @@ WRONG = {
         ],
         ({"run_dir": None}, "say which run: run_dir=runs/..., or which ones: compare=[runs/a,"),
         ({"run_dir": "a"} | TWO, "run_dir=a changes nothing with compare=[a,b]: leave it out, or"),
+        ({"puzzles": ""}, "puzzles must name a JSON or SVG file, or train, test, paper, got ''"),
         ({"puzzles": "test", "episodes": 5}, "episodes=5 changes nothing with puzzles=test"),
         ({"puzzle": ("cat",), "episodes": 5}, "episodes=5 changes nothing with puzzle=[cat]"),
         ({"live": True, "out": "a.gif"}, "out=a.gif changes nothing with live=true: leave it at"),
