@@ -59,5 +59,5 @@ clean:  ## remove caches and build products; .venv and runs/ stay
 	@touch $@
 
 .venv/.installed-dev: pyproject.toml constraints.txt
-	@.ci/install .venv dev,peers,slurm
+	@.ci/install .venv dev,human,peers,slurm
 	@touch .venv/.installed-run $@

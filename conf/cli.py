@@ -34,7 +34,7 @@ PRESET_GROUPS = (*GROUPS, "experiment", "budget")
 MAKE_RUNS = ("train", "master")  # the commands whose run_dir is made, not read
 MISSING_HINTS = {
     "runs": "say which study: runs=runs/experiments/laptop",
-    "connect": "say which master: connect=tcp://host:port or connect=runs/.../connection.json",
+    "connect": "say which master: connect=host:port or connect=runs/...",
 }
 
 

@@ -183,7 +183,7 @@ tokens, sim, reward, agent and net must be given and be the master's, or it is r
 told what differs.""",
         (
             "tangram-worker connect=runs/shared",
-            "tangram-worker connect=tcp://127.0.0.1:5555 tokens=square service.envs=64",
+            "tangram-worker connect=127.0.0.1:5555 tokens=square service.envs=64",
             "tangram-worker connect=runs/shared/connection.json role=evaluator "
             "service.eval_seconds=30",
         ),
@@ -198,7 +198,7 @@ their weights and the last checkpoint are. It asks the master, from wherever a w
 `watch tangram-status connect=...` asks every two seconds.""",
         (
             "tangram-status connect=runs/my_run",
-            "tangram-status connect=tcp://127.0.0.1:5555",
+            "tangram-status connect=127.0.0.1:5555",
             "tangram-status connect=runs/my_run/connection.json json=true",
         ),
         ("worker.config:StatusConfig",),

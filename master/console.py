@@ -18,12 +18,14 @@ from rich.table import Table
 from rich.text import Text
 
 from tangram_agent.messages import RunStatus
+from tangram_agent.outcome import duration
 from tangram_agent.process import Every, formatter
 
 PANEL_S = 0.5
 LINE_S = 10.0
 PANEL_WIDTH = 76
 TEST = "test/"  # before the names of scores
+PLAYED = "play/reward"  # what the players got lately, exploration included
 
 log = logging.getLogger(__name__)
 
@@ -123,10 +125,19 @@ class Progress(Protocol):
         """Leave the terminal as it was found."""
 
 
-def make_progress(console: Console, title: str, log_format: str = "text") -> Progress:
-    """A live panel where the console is a terminal; lines of the log elsewhere, and for JSON."""
+def make_progress(
+    console: Console, title: str, log_format: str = "text", evaluator: str = ""
+) -> Progress:
+    """A live panel where the console is a terminal; lines of the log elsewhere, and for JSON.
+
+    Args:
+        console: where to.
+        title: of the panel.
+        log_format: text, or json.
+        evaluator: command that starts one, shown while nobody scores; empty if one will come.
+    """
     if console.is_terminal and log_format == "text":
-        return LivePanel(console, title)
+        return LivePanel(console, title, evaluator)
     return StatusLines()
 
 
@@ -149,8 +160,10 @@ class StatusLines:
 class LivePanel:
     """A panel that is drawn again in place; log lines scroll above it."""
 
-    def __init__(self, console: Console, title: str, interval_s: float = PANEL_S) -> None:
-        self._console, self._title = console, title
+    def __init__(
+        self, console: Console, title: str, evaluator: str = "", interval_s: float = PANEL_S
+    ) -> None:
+        self._title, self._evaluator = title, evaluator
         self._due = Every(interval_s, at_once=True)
         self._last: RunStatus | None = None
         self._live = Live(console=console, auto_refresh=False, transient=False)
@@ -169,7 +182,7 @@ class LivePanel:
         self._live.stop()
 
     def _draw(self, status: RunStatus) -> None:
-        self._live.update(status_panel(status, self._title), refresh=True)
+        self._live.update(status_panel(status, self._title, self._evaluator), refresh=True)
 
 
 def status_line(status: RunStatus) -> str:
@@ -189,7 +202,7 @@ def status_line(status: RunStatus) -> str:
     return " | ".join(part for part in parts if part)
 
 
-def status_panel(status: RunStatus, title: str) -> Panel:
+def status_panel(status: RunStatus, title: str, evaluator: str = "") -> Panel:
     """The live panel: how far, how fast, how good, and what is waited for."""
     n = status.numbers
     grid = Table.grid(padding=(0, 3), expand=True)
@@ -199,6 +212,8 @@ def status_panel(status: RunStatus, title: str) -> Panel:
     grid.add_row("episodes", f"{n['episodes']:,.0f}", "updates", f"{n['updates']:,.0f}")
     rates = f"{n['transitions_per_s']:,.0f}", f"{n['updates_per_s']:,.1f}"
     grid.add_row("transitions/s", rates[0], "updates/s", rates[1])
+    if PLAYED in n:
+        grid.add_row("players' reward", f"{n[PLAYED]:.3f}", "", "with exploration")
     grid.add_row(
         "mean reward",
         Text(_score(n, "mean_reward", "{:.3f}"), style="bold green"),
@@ -215,14 +230,9 @@ def status_panel(status: RunStatus, title: str) -> Panel:
     text = f"{helpers} · {status.texts['activity']}"
     foot = Text(text, style="dim", no_wrap=True, overflow="ellipsis")
     body = Group(_bar(n), Text(), grid, Text(), foot)
+    if evaluator and not n["evaluators"]:
+        body.renderables.append(Text(f"no evaluator: start one with {evaluator}", overflow="fold"))
     return Panel(body, title=title, title_align="left", width=PANEL_WIDTH, padding=(1, 2))
-
-
-def duration(seconds: float) -> str:
-    """0:07, 12:34 or 1:02:03."""
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
 def plural(count: float, noun: str) -> str:
@@ -254,7 +264,10 @@ def _scores(n: Mapping[str, float]) -> str:
         ("angle_error_deg_median", "angle {:.2f}°"),
         ("position_error_median", "position {:.4f}"),
     )
-    return ", ".join(text.format(n[TEST + name]) for name, text in known if TEST + name in n)
+    scores = [text.format(n[TEST + name]) for name, text in known if TEST + name in n]
+    if not scores and PLAYED in n:
+        scores = [f"players' reward {n[PLAYED]:.3f}"]
+    return ", ".join(scores)
 
 
 def _score(n: Mapping[str, float], name: str, pattern: str) -> str:

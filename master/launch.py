@@ -9,12 +9,14 @@ from contextlib import AbstractContextManager
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from master.checkpointer import check_resumable
 from master.children import MAX_RESTARTS, Child, command, describe, override
 from master.config import MasterConfig
 from master.console import logging_to, sturdy_console
+from master.result import show_finished
+from master.resumable import check_resumable
 from master.rundir import RunFolder
 from master.signals import SAME_WISH_S, handling, show_cursor
+from tangram_agent.outcome import CTRL_C
 from tangram_agent.process import Every, watch_parent
 
 # While the master starts, its connection file is looked for this often.
@@ -47,13 +49,18 @@ def run_training(config: MasterConfig, resolved: Mapping[str, Any]) -> int:
     folder.prepare(config.resume)
     with folder.lock():
         check_resumable(folder, resolved)
-        folder.logs.mkdir(exist_ok=True)
-        folder.write_config(resolved)
-        # Left by a master that was killed; workers must wait for the new one.
-        folder.connection.unlink(missing_ok=True)
-    console = sturdy_console(sys.stderr)
+        finished = folder.has_finished(config)
+        if not finished:
+            folder.logs.mkdir(exist_ok=True)
+            folder.write_config(resolved)
+            # Left by a master that was killed; workers must wait for the new one.
+            folder.connection.unlink(missing_ok=True)
+    console, form = sturdy_console(sys.stderr), config.service.log_format
     launcher = Launcher(config, folder)
-    with logging_to(console, config.service.log_format, "launcher"), launcher.signals():
+    with logging_to(console, form, "launcher"), launcher.signals():
+        if finished:
+            show_finished(folder, form)
+            return 0
         watch_parent(grace_s=STOP_S + 2.0 * LEAVE_S)  # of an experiment that started it
         try:
             return launcher.run()
@@ -152,7 +159,8 @@ class Launcher:
         if self._signalled_s is None:
             self._signalled_s = now_s
         if self._stop_s is None:
-            self._stop(f"{number.name}: the run ends with a checkpoint, again to end at once")
+            said = CTRL_C.get(number.name, number.name)
+            self._stop(f"{said}: the run ends with a checkpoint, again to end at once", number)
         elif now_s - self._signalled_s >= SAME_WISH_S:
             self._kill_all()
 
@@ -161,10 +169,10 @@ class Launcher:
             child.signal(signal.SIGKILL)
         show_cursor()
 
-    def _stop(self, why: str) -> None:
+    def _stop(self, why: str, number: signal.Signals = signal.SIGTERM) -> None:
         self._say(why)
         self._stop_s = time.monotonic() + STOP_S
-        self._master.signal(signal.SIGTERM)
+        self._master.signal(number)  # the same, so that its result names what ended the run
 
     def _master_comes_back(self, status: int) -> bool:
         """Plan to go on from what a master left that was killed, or hung; workers wait for it."""
@@ -198,9 +206,11 @@ class Launcher:
 
     def _worker_ended(self, child: Child) -> None:
         status = child.clear()
-        ends = self._reached and self._master.alive and not self._folder.connection.exists()
-        if self._stop_s is not None or ends:
-            return  # the master takes leave, and so do its workers
+        if self._reached and not self._folder.connection.exists():
+            child.next_start_s = 0.0  # the master took leave of it; for one that comes back
+            return
+        if self._stop_s is not None:
+            return
         if child.plan_restart(status):
             self._say(
                 f"{child.name} ended with {describe(status)}: it is started again "

@@ -13,7 +13,7 @@ from PIL import Image
 
 from master.budget import Budget, Rates
 from master.checkpointer import Checkpointer
-from master.console import TEST, Progress
+from master.console import PLAYED, TEST, Progress
 from master.delivery import EpisodesArrived
 from master.divergence import DivergenceGuard
 from master.hub import Hub
@@ -40,7 +40,11 @@ log = logging.getLogger(__name__)
 
 
 class StatusCollector:
-    """Puts together how the run stands; whoever shows something of it reads it from there."""
+    """Puts together how the run stands; whoever shows something of it reads it from there.
+
+    Attributes:
+        played: the reward of what was played lately, by its name.
+    """
 
     def __init__(
         self,
@@ -64,6 +68,7 @@ class StatusCollector:
         self._name, self._guard, self._hub, self._budget = name, guard, hub, budget
         self._clock, self._checkpointer = clock, checkpointer
         self._rates = Rates()
+        self.played: dict[str, float] = {}
 
     def mark(self) -> None:
         """Note the counters, from which rates follow; a few times in a second."""
@@ -103,6 +108,7 @@ class StatusCollector:
             "disk_failing": self._checkpointer.failing,
             "scored_updates": record.scored_version,
             **{TEST + name: value for name, value in record.scores.items()},
+            **self.played,
             # Last: where there are more numbers than a status takes, these are left out.
             **{f"hub/{name}": count for name, count in sorted(self._hub.counters.items())},
         }
@@ -212,7 +218,7 @@ class Reporter:
         """Note a batch that went into the replay."""
         episodes = arrival.episodes
         values = {
-            "play/reward": float(np.mean(episodes.rewards[:, -1])),
+            PLAYED: float(np.mean(episodes.rewards[:, -1])),
             "weights/age_updates": float(self._trainer.updates - arrival.weights_version),
         }
         sent = self._published.get(arrival.weights_version)
@@ -249,14 +255,17 @@ class Reporter:
 
     def flush(self, queue: int) -> RunStatus:
         """Tell it now, whatever the time, and return what was told."""
+        played = self._play.take()
+        if PLAYED in played:
+            self._status.played = {PLAYED: played[PLAYED]}
         status = self._status.collect(queue)
         self._progress.show(status)
         for listen in self._listeners:
             listen(status)
         values = {f"train/{name}": value for name, value in self._losses.take().items()}
-        values |= self._play.take()
+        values |= played
         for name, value in status.numbers.items():
-            if not name.startswith(TEST):  # those are written when they come
+            if not name.startswith((TEST, PLAYED)):  # those are written when they come
                 values[name if "/" in name else f"run/{name}"] = value
         self._metrics.scalars(values, self._trainer.updates)
         return status

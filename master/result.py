@@ -1,5 +1,6 @@
 """What a run has come to: result.json and the last words to the user."""
 
+import logging
 import os
 import platform
 import re
@@ -16,12 +17,12 @@ from rich.console import Console
 from rich.table import Table
 
 from master.children import override
-from master.console import TEST, duration
+from master.console import TEST, sturdy_console
 from master.rundir import RunFolder
-from master.trainer import Trainer
 from tangram_agent.messages import RunStatus
+from tangram_agent.outcome import outcome_rows, read_outcome
 
-PLAIN = re.compile(r"run_dir=[\w./-]+")
+PLAIN = re.compile(r"\w+=[\w./-]+")
 ROOT = Path(__file__).resolve().parent.parent
 SCORES = (
     "mean_reward",
@@ -34,21 +35,25 @@ SCORES = (
     "position_error_median",
     "position_error_p90",
 )
+log = logging.getLogger(__name__)
+
 PACKAGES = ("tangram-rl", "torch", "numpy", "pyzmq", "pybullet")
 
 
-def make_result(status: RunStatus, trainer: Trainer, seed: int, reason: str) -> dict[str, Any]:
+def make_result(
+    status: RunStatus, facts: Mapping[str, Any], seed: int, reason: str
+) -> dict[str, Any]:
     """The content of result.json; scores are null where no evaluator sent any.
 
     `scored_updates` tells which weights the scores are of: the final ones if it equals `updates`.
 
     Args:
         status: at the end of the run.
-        trainer: what has learned.
+        facts: of what has learned.
         seed: of the run.
         reason: of its end.
     """
-    setup, n = trainer.setup, status.numbers
+    n = status.numbers
     scored = int(n["scored_updates"])
     return {
         **{name: n.get(TEST + name) for name in SCORES},
@@ -58,15 +63,8 @@ def make_result(status: RunStatus, trainer: Trainer, seed: int, reason: str) -> 
         **{name: round(n[name], 3) for name in ("wall_s", "train_s")},
         "ended_by": reason,
         "seed": seed,
-        "agent": setup.agent.name,
-        "net": setup.net.kind,
-        "tokens": [shape.name for shape in setup.layout.shapes],
-        "actions_per_token": setup.sim.actions_per_token,
-        "reward": setup.reward.name,
-        "backend": setup.sim.backend,
-        "device": str(trainer.learner.device),
+        **facts,
         "workers": int(n["most_players"]),
-        "parameters": trainer.learner.parameters,
         "run_id": status.texts["run_id"],
         "versions": versions(),
         "commit": commit(),
@@ -76,12 +74,21 @@ def make_result(status: RunStatus, trainer: Trainer, seed: int, reason: str) -> 
     }
 
 
-def show_result(console: Console, folder: RunFolder, result: Mapping[str, Any]) -> None:
-    """The final table, and where everything lies."""
+def show_result(
+    console: Console, folder: RunFolder, result: Mapping[str, Any], go_on: str = ""
+) -> None:
+    """The final table, where everything lies, and what to do with it.
+
+    Args:
+        console: where to.
+        folder: of the run.
+        result: content of its result.json.
+        go_on: command that goes on with it; shown where a signal has ended it.
+    """
     table = Table(show_header=False, box=None, padding=(0, 2))
     table.add_column(style="dim", no_wrap=True)
     table.add_column(no_wrap=True)
-    for name, text in _rows(result):
+    for name, text in outcome_rows(result):
         table.add_row(name, text)
     console.print()
     console.print(table)
@@ -89,50 +96,46 @@ def show_result(console: Console, folder: RunFolder, result: Mapping[str, Any]) 
     paths = [("run folder", str(folder.path))]
     if folder.picture.exists():
         paths.append(("picture", str(folder.picture)))
+    curves, where = _installed("tensorboard"), shlex.quote(str(folder.tensorboard))
+    watch = {"run_dir": folder.path, "out": "play.gif"}
     paths += [
-        ("curves", f"{_command('tensorboard')} --logdir {shlex.quote(str(folder.tensorboard))}"),
-        ("watch it play", f"{_command('tangram-play')} {_run_argument(folder.path)} out=play.gif"),
+        ("curves", f"{curves} --logdir {where}"),
+        ("watch it play", command_line("tangram-play", watch)),
     ]
+    if go_on and result["ended_by"].startswith("SIG"):
+        paths.append(("go on", go_on))
     for name, text in paths:
         # Long paths stay whole, so that they can be copied.
         console.print(f"  {name:<15} {text}", soft_wrap=True, markup=False, highlight=False)
 
 
-def _command(name: str) -> str:
+def show_finished(folder: RunFolder, log_format: str) -> None:
+    """The result of a run that was to go on, and has nothing left to do."""
+    result = read_outcome(folder.result)
+    said = f"{folder.path} has finished ({result['ended_by']}): nothing is changed, a higher "
+    said += "bound goes on"
+    if log_format == "json":
+        log.info("%s", said, extra={"event": "result", **result})
+        return
+    console = sturdy_console(sys.stdout)
+    console.print(said, soft_wrap=True, markup=False, highlight=False)
+    show_result(console, folder, result)
+
+
+def command_line(name: str, settings: Mapping[str, object]) -> str:
+    """A command of this installation with settings, to be pasted into a shell."""
+    return " ".join([_installed(name), *(_argument(*pair) for pair in settings.items())])
+
+
+def _installed(name: str) -> str:
     """A command of this environment as a shell finds it, which may not have the environment on."""
     return name if which(name) else shlex.quote(str(Path(sys.executable).with_name(name)))
 
 
-def _run_argument(path: Path) -> str:
-    """What names the run on a command line; quoted for the shell and for the config if needed."""
-    plain = f"run_dir={path}"
-    return plain if PLAIN.fullmatch(plain) else shlex.quote(override("run_dir", str(path)))
-
-
-def _rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
-    rows = [
-        ("mean reward", f"{_text(result, 'mean_reward', '{:.3f}')} on exact polygons"),
-        ("", f"{_text(result, 'mean_reward_camera', '{:.3f}')} in the camera's pictures"),
-        ("raw overlap", _text(result, "raw_overlap", "{:.3f}")),
-        ("angle error", _text(result, "angle_error_deg_median", "{:.2f}°") + " (median)"),
-        ("position error", _text(result, "position_error_median", "{:.4f}") + " (median)"),
-    ]
-    if result["scored_updates"] is None:
-        rows = [("scores", "none came from an evaluator")]
-    elif result["scored_updates"] != result["updates"]:
-        rows.append(("scored", f"weights after {result['scored_updates']:,} updates"))
-    return [
-        *rows,
-        ("episodes", f"{result['episodes']:,}"),
-        ("updates", f"{result['updates']:,}"),
-        ("time", f"{duration(result['train_s'])} of training, {duration(result['wall_s'])} in all"),
-        ("ended by", result["ended_by"]),
-    ]
-
-
-def _text(result: Mapping[str, Any], name: str, pattern: str) -> str:
-    value = result[name]
-    return "-" if value is None else pattern.format(value)
+def _argument(name: str, value: object) -> str:
+    """A setting; quoted for the shell and for the config if needed."""
+    plain = f"{name}={value}"
+    return plain if PLAIN.fullmatch(plain) else shlex.quote(override(name, str(value)))
 
 
 def versions() -> dict[str, str]:

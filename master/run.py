@@ -11,14 +11,7 @@ from typing import Any
 import torch
 
 from master.budget import Budget
-from master.checkpointer import (
-    Checkpointer,
-    Restored,
-    check_resumable,
-    restore_run,
-    warm_start,
-)
-from master.children import override
+from master.checkpointer import Checkpointer, Restored, restore_run, warm_start
 from master.config import MasterConfig
 from master.console import Progress, logging_to, make_progress, sturdy_console
 from master.delivery import EpisodesArrived
@@ -30,7 +23,8 @@ from master.lockstep import Lockstep
 from master.loop import Loop
 from master.metrics import Metrics
 from master.report import Reporter, StatusCollector
-from master.result import make_result, show_result
+from master.result import command_line, make_result, show_finished, show_result
+from master.resumable import check_resumable
 from master.rundir import Clock, Record, RunFolder
 from master.security import Keys, is_loopback, needs_keys, run_keys
 from master.signals import StopSignals
@@ -82,27 +76,46 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
         opened.enter_context(folder.lock())
         signals = opened.enter_context(StopSignals())
         watchdog = opened.enter_context(Watchdog(config.service.watchdog_seconds))
-        if not launched:  # the launcher wrote it, with settings of its own
+        join, evaluator = {"connect": folder.path}, ""
+        if not launched:  # the launcher did it, with settings of its own
             check_resumable(folder, resolved)
+            if folder.has_finished(config):
+                show_finished(folder, form)
+                return 0
             folder.write_config(resolved)
+            evaluator = command_line("tangram-worker", {**join, "role": "evaluator"})
         title = f"tangram · {folder.path.name}"
-        progress = opened.enter_context(closing(make_progress(console, title, form)))
+        progress = make_progress(console, title, form, evaluator)
+        opened.enter_context(closing(progress))
         loop, connection = open_run(config, setup, progress, signals, watchdog, opened)
         loop.reporter.settings(resolved)
         folder.write_connection(connection)
         if not launched:
-            where = override("connect", str(folder.path))
-            log.info("workers join with: tangram-worker %s", where)
+            log.info("workers join with: %s", command_line("tangram-worker", join))
+            log.info("an evaluator scores what is learned: %s", evaluator)
         reason = loop.run()
-        result = make_result(loop.finish(launched), loop.guard.trainer, config.seed, reason)
+        result = make_result(loop.finish(launched), loop.guard.trainer.facts(), config.seed, reason)
         folder.write_result(result)
         loop.reporter.hyperparameters(resolved)
         loop.dismiss(f"the run has ended ({reason})")
         if form == "json":
             log.info("the run has ended (%s)", reason, extra={"event": "result", **result})
     if form != "json":
-        show_result(console, folder, result)
+        show_result(console, folder, result, _go_on(config, folder, launched))
     return 0
+
+
+def _go_on(config: MasterConfig, folder: RunFolder, launched: bool) -> str:
+    """The command that goes on with a run, with all that its folder does not tell."""
+    names = ("seed", "max_hours", "max_episodes", "max_updates", "workers")
+    given = {name: getattr(config, name) for name in names}
+    settings = {
+        "run_dir": folder.path,
+        "from_config": folder.config,
+        "resume": "auto",
+        **{name: value for name, value in given.items() if value != getattr(MasterConfig, name)},
+    }
+    return command_line("tangram-train" if launched else "tangram-master", settings)
 
 
 def _tell_news(line: str) -> None:

@@ -12,9 +12,12 @@ from typing import IO, Any
 import msgspec
 import yaml
 
+from master.config import MasterConfig
 from master.journal import segments
 from tangram_agent.checkpoints import list_checkpoints
 from tangram_agent.files import write_whole
+from tangram_agent.outcome import FILE_NAME as RESULT
+from tangram_agent.outcome import read_outcome
 from tangram_agent.setup import SECTIONS
 from tangram_sim.errors import ConfigError, RunError
 
@@ -51,7 +54,7 @@ class RunFolder:
         self.tensorboard = self.path / "tensorboard"
         self.logs = self.path / "logs"
         self.curve = self.path / "curve.jsonl"
-        self.result = self.path / "result.json"
+        self.result = self.path / RESULT
         self.bad_batch = self.path / "bad_batch.safetensors"
         self.picture = self.path / "test_episodes.png"
 
@@ -78,6 +81,15 @@ class RunFolder:
         curves = self.tensorboard.is_dir() and any(self.tensorboard.iterdir())
         kept = bool(list_checkpoints(self.checkpoints)) or bool(segments(self.journal))
         return self.result.exists() or kept or curves
+
+    def has_finished(self, config: MasterConfig) -> bool:
+        """Whether a bound that this config does not raise has ended the run, scores included."""
+        if config.resume != "auto" or not self.result.exists():
+            return False
+        result = read_outcome(self.result)
+        name, _, reached = result["ended_by"].partition("=")
+        spent = bool(reached) and 0 < getattr(config, name, 0) <= float(reached)
+        return spent and result["scored_updates"] == result["updates"]
 
     def lock(self) -> IO[bytes]:
         """Claim the folder for one process; the claim ends with the process or with `close`.

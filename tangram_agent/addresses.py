@@ -13,7 +13,7 @@ def check_host(name: str, host: str) -> None:
     """Raise ConfigError for a setting that is no host alone, without scheme and port."""
     try:
         if ":" in host:
-            IPv6Address(host)
+            IPv6Address(host.removeprefix("[").removesuffix("]"))
         elif not HOST.fullmatch(host):
             raise ValueError
     except ValueError:

@@ -28,6 +28,9 @@ from tangram_sim.errors import RunError
 
 FORMAT_VERSION = 3
 MANIFEST = "manifest.json"
+CHECKPOINTS = "checkpoints"  # the folder of all of them in that of a run
+ACTING = "weights"  # the file of acting weights
+SETUP = "setup"  # the counter that tells the setup
 _NAME = re.compile(r"(\d{8,})(?:-(\d+))?")
 _TEMPORARY = ".writing-"
 _SET_ASIDE = ".corrupt"

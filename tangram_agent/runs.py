@@ -1,7 +1,8 @@
 """Loading a finished run: its config, its setup and the policy that it learned.
 
-`load_run("runs/my-run").policy.act(corners, placed, goals)` gives actions; docs/inference.md shows
-a whole example. `load_run("pretrained/square")` gives one of the agents that come with the package.
+`load_run("runs/my-run").predict(observation)` gives actions for what gymnasium's environment shows,
+docs/gymnasium.md has whole examples; `policy.act` gives them for corners, see docs/inference.md.
+`load_run("pretrained/square")` gives one of the agents that come with the package.
 """
 
 from collections.abc import Mapping
@@ -10,13 +11,21 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
-from tangram_agent.checkpoints import load_checkpoint, newest_checkpoint
+from tangram_agent.checkpoints import (
+    ACTING,
+    CHECKPOINTS,
+    SETUP,
+    load_checkpoint,
+    newest_checkpoint,
+)
 from tangram_agent.policy import Policy
 from tangram_agent.pretrained import is_agent, is_name, packaged, read_agent
 from tangram_agent.setup import Setup, make_setup
 from tangram_agent.types import Weights
+from tangram_sim.arrays import Floats, Singles
 from tangram_sim.errors import ConfigError, RunError
 from tangram_sim.settings import (
     KEY,
@@ -30,10 +39,7 @@ from tangram_sim.settings import (
 )
 
 CONFIG = "config.yaml"
-CHECKPOINTS = "checkpoints"
-ACTING = "weights"  # the checkpoint's file of acting weights
 POLICY_SECTIONS = ("tokens", "agent", "net")
-SETUP = "setup"  # the checkpoint's counter that tells the setup
 ANOTHER = "train a run with it"
 
 Changes = Mapping[str, Mapping[str, Any]]  # section -> setting -> value
@@ -57,6 +63,55 @@ class Run:
     setup: Setup
     updates: int
     policy: Policy
+
+    def predict(self, observation: Mapping[str, Any]) -> Singles:
+        """What the agent does, noise off: the actions alone, as it keeps nothing in mind.
+
+        Args:
+            observation: of `TangramEnv`, or of `TangramVectorEnv`: each entry with B rows.
+
+        Returns:
+            (A,) in [-1, 1], which `step` takes; (B, A) for B rows.
+
+        Raises:
+            ConfigError: an observation of another form, or of another set of tokens.
+        """
+        shown, layout = self._checked(observation), self.setup.layout
+        corners, goals = (
+            shown[name].reshape(-1, layout.corner_count, 2)
+            for name in ("achieved_goal", "desired_goal")
+        )
+        flags = shown["observation"][..., -layout.tokens :].reshape(-1, layout.tokens)
+        actions = self.policy.act(corners, flags > 0.5, goals)
+        return actions if shown["observation"].ndim > 1 else actions[0]
+
+    def _checked(self, observation: object) -> dict[str, Floats]:
+        """The entries as arrays, all for as many rows."""
+        corners = 2 * self.setup.layout.corner_count
+        wanted = {
+            "observation": corners + self.setup.layout.tokens,
+            "achieved_goal": corners,
+            "desired_goal": corners,
+        }
+        if not isinstance(observation, Mapping) or wanted.keys() - observation.keys():
+            kind = type(observation).__name__
+            given = ", ".join(observation) if isinstance(observation, Mapping) else f"a {kind}"
+            raise ConfigError(
+                f"an observation is a dict of {', '.join(wanted)}, got {given or 'an empty one'}: "
+                "give what reset or step returns first"
+            )
+        shown = {name: np.asarray(observation[name], dtype=np.float64) for name in wanted}
+        rows = shown["observation"].shape[:-1][:1]
+        for name, size in wanted.items():
+            if shown[name].shape != (*rows, size) or 0 in rows:
+                raise ConfigError(
+                    f"observation['{name}'] has shape {shown[name].shape}, and {self.folder} wants "
+                    f"{(*(max(1, row) for row in rows), size)}: make the environment with this "
+                    "agent's tokens"
+                )
+            if not np.isfinite(shown[name]).all():
+                raise ConfigError(f"observation['{name}'] must be finite, got NaN or infinity")
+        return shown
 
     def with_settings(self, changes: Changes) -> "Run":
         """The same weights, played with other settings: `{"agent": {"refine_steps": 20}}`.

@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-import pybullet
 
 from tangram_sim.arrays import Pixels
+from tangram_sim.engine import pybullet
 
 # TinyRenderer draws nothing with an orthographic projection. From this far above, the picture of
 # the arena differs from one by less than a tenth of a pixel at 1024 pixels.

@@ -1,26 +1,17 @@
 """TangramEnv: one tangram world as a gymnasium goal environment."""
 
 from collections.abc import Sequence
-from dataclasses import fields
 from typing import Any
 
 import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from tangram_sim.actions import chosen_tokens
 from tangram_sim.arrays import Floats, Pixels
-from tangram_sim.batch import BatchedEnv, StepResult
-from tangram_sim.config import RewardConfig, SimConfig
-from tangram_sim.drawing import draw_scene
+from tangram_sim.config import RewardConfig
 from tangram_sim.errors import ConfigError
-from tangram_sim.layout import TokensConfig, make_layout
-from tangram_sim.targets import check_targets
-
-Observation = dict[str, Any]  # of float64 vectors
-
-# The square tan has a quarter of the full square's diagonal as its side: this makes it 0.4.
-SQUARE_SCALE = 0.8 * 2.0**0.5
+from tangram_sim.screen import Screen
+from tangram_sim.table import SQUARE_SCALE, Observation, Table
 
 
 class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
@@ -28,8 +19,9 @@ class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
 
     Observations are a dict of float64 vectors: `achieved_goal` and `desired_goal` are the corners
     of the tokens and of the targets, (2V,); `observation` is the tokens' corners and one flag per
-    token that is placed, (2V + K,), with the noise of `sim.corner_noise`. An episode ends after
-    K * actions_per_token steps.
+    token that is placed, (2V + K,), with the noise of `sim.corner_noise`. An episode has
+    K * actions_per_token steps. It is terminated by the last of them if all tokens are placed, and
+    truncated if some are left, as refused actions used up their steps.
 
     Actions are those of `BatchedEnv`, entries in [-1, 1]: which token (with several), flip (with
     `allow_flip`: above 0 turns a token over that is not its own mirror image), then x, y and
@@ -40,7 +32,7 @@ class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
     could not be set down, and `reward_camera` (Eq. 14 from the pictures) with the camera on.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012 - as gymnasium has it
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 2}  # noqa: RUF012 - as gymnasium has it
 
     def __init__(
         self,
@@ -50,6 +42,7 @@ class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         success_overlap: float = 0.95,
         render_mode: str | None = None,
         render_size: int = 240,
+        horizon: int | None = None,
         **sim: Any,
     ) -> None:
         """Make the world.
@@ -59,26 +52,24 @@ class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
             scale: see `TokensConfig`; the default makes the square's side 0.4.
             reward: the name of a reward, or its whole configuration.
             success_overlap: raw overlap from which an episode counts as a success.
-            render_mode: None or rgb_array.
+            render_mode: None, human (a window, with pygame) or rgb_array.
             render_size: side of the rendered picture in pixels.
+            horizon: steps that an episode has. An id has it, as its time limit does not change
+                with other settings: those that would make longer or shorter episodes are refused.
             **sim: the fields of `SimConfig`, such as backend="kinematic".
 
         Raises:
             ConfigError: a setting that cannot work.
         """
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ConfigError(f"render_mode must be None or rgb_array, got '{render_mode}'")
+        check_render_mode(render_mode, (None, "human", "rgb_array"))
         self.render_mode = render_mode
-        self.layout = make_layout(TokensConfig(tuple(shapes), scale))
-        self.sim = _sim_config(sim)
-        check_targets(self.layout, self.sim)
-        config = reward if isinstance(reward, RewardConfig) else RewardConfig(name=reward)
-        self.batch = BatchedEnv(self.layout, self.sim, config)
-        self._success_overlap = success_overlap
-        self._render_size = render_size
-        self._active: int | None = None
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.batch.action_size,), np.float32)
-        self.observation_space = _observation_space(self.batch)
+        human = render_mode == "human"
+        self._screen = Screen("Tangram", self.metadata["render_fps"]) if human else None
+        self._table = Table(1, shapes, scale, reward, success_overlap, render_size, horizon, **sim)
+        self.batch = self._table.batch
+        self.layout, self.sim = self.batch.layout, self.batch.sim
+        self.action_space = self._table.action_space
+        self.observation_space = self._table.observation_space
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -89,19 +80,24 @@ class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
             SamplingError: no layout without overlap was found.
         """
         super().reset(seed=seed, options=options)
-        self.batch.reset([self.np_random])
-        self._active = None
+        self._table.reset([self.np_random])
+        self._show()
         return self._observation(), {}
 
     def step(
         self, action: npt.NDArray[np.float32]
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Play one action of shape (A,)."""
-        actions = np.asarray(action, dtype=np.float64)[None]
-        result = self.batch.step(actions)
-        self._active = int(chosen_tokens(actions, self.layout.tokens)[0])
-        reward = float(result.rewards[0])
-        return self._observation(), reward, result.done, False, self._info(result)
+        result = self._table.step(np.asarray(action, dtype=np.float64)[None])
+        terminated, truncated = self._table.ends(result)
+        self._show()
+        return (
+            self._observation(),
+            float(result.rewards[0]),
+            bool(terminated[0]),
+            bool(truncated[0]),
+            self._table.info(result, 0),
+        )
 
     def compute_reward(self, achieved_goal: Floats, desired_goal: Floats, info: Any) -> Any:  # noqa: ARG002 - goal environments have it
         """The reward of any achieved for any desired goal, as hindsight needs it.
@@ -127,71 +123,25 @@ class TangramEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         return self.layout.state_matrix(batch.seen[0], batch.placed[0], batch.seen_goals[0])
 
     def render(self) -> Pixels | None:
-        """The scene as (size, size, 3), the token that moved last marked; None without a mode."""
-        if self.render_mode is None:
-            return None
-        batch = self.batch
-        image = draw_scene(
-            self.layout,
-            self.sim.arena,
-            batch.corners[0],
-            batch.goals[0],
-            self._render_size,
-            self._active,
-        )
-        return np.asarray(image, dtype=np.uint8)
+        """The scene as (size, size, 3), the token that moved last marked; None but in rgb_array."""
+        return self._table.picture(0) if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
-        """Free the engine."""
+        """Free the engine, and close the window."""
         self.batch.close()
+        if self._screen is not None:
+            self._screen.close()
+
+    def _show(self) -> None:
+        if self._screen is not None:
+            self._screen.show(self._table.picture(0))
 
     def _observation(self) -> Observation:
-        achieved = self.batch.seen[0].ravel()
-        return {
-            "observation": np.concatenate([achieved, self.batch.placed[0]]),
-            "achieved_goal": achieved.copy(),
-            "desired_goal": self.batch.seen_goals[0].flatten(),
-        }
-
-    def _info(self, result: StepResult) -> dict[str, Any]:
-        share = float(result.overlap[0])
-        info: dict[str, Any] = {"overlap": share, "is_success": share >= self._success_overlap}
-        if result.camera_rewards is not None:
-            info["reward_camera"] = float(result.camera_rewards[0])
-        if result.refused[0]:
-            info["refused"] = (
-                f"token {self._active} is placed already: it had its "
-                f"{self.sim.actions_per_token} actions"
-            )
-        if result.blocked[0]:
-            info["blocked"] = (
-                f"token {self._active} would lie on others by {result.covered[0]:.3%} of its area, "
-                f"at most {self.sim.max_overlap:.3%} allowed: set it down where there is room, or "
-                "raise max_overlap"
-            )
-        return info
+        return {name: entry[0] for name, entry in self._table.observations().items()}
 
 
-def _sim_config(settings: dict[str, Any]) -> SimConfig:
-    known = [field.name for field in fields(SimConfig)]
-    unknown = sorted(set(settings) - set(known))
-    if unknown:
-        raise ConfigError(
-            f"unknown setting '{unknown[0]}' of the environment: besides shapes, scale and reward "
-            f"there are {', '.join(known)}"
-        )
-    return SimConfig(**settings)
-
-
-def _observation_space(batch: BatchedEnv) -> gymnasium.spaces.Dict:
-    corners = 2 * batch.layout.corner_count
-    goal = gymnasium.spaces.Box(-batch.bound, batch.bound, (corners,), np.float64)
-    low = np.concatenate([goal.low, np.zeros(batch.layout.tokens)])
-    high = np.concatenate([goal.high, np.ones(batch.layout.tokens)])
-    return gymnasium.spaces.Dict(
-        {
-            "observation": gymnasium.spaces.Box(low, high, dtype=np.float64),
-            "achieved_goal": goal,
-            "desired_goal": gymnasium.spaces.Box(-batch.bound, batch.bound, (corners,), np.float64),
-        }
-    )
+def check_render_mode(given: str | None, modes: Sequence[str | None]) -> None:
+    """Raise ConfigError for a render mode that is none of these."""
+    if given not in modes:
+        *others, last = map(str, modes)
+        raise ConfigError(f"render_mode must be {', '.join(others)} or {last}, got '{given}'")

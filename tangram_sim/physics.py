@@ -1,4 +1,4 @@
-"""Tokens as rigid bodies in PyBullet: the only module, with camera.py, that imports the engine.
+"""Tokens as rigid bodies in PyBullet: the only module, with camera.py, that knows the engine.
 
 The engine always sees an arena of width 2, whatever the arena's unit: its tolerances, its limit of
 100 units a second and the camera are made for bodies of about that size.
@@ -9,11 +9,11 @@ import weakref
 from collections.abc import Sequence
 
 import numpy as np
-import pybullet
 
 from tangram_sim.arrays import Bools, Floats, Pixels
 from tangram_sim.camera import Camera
 from tangram_sim.config import SimConfig
+from tangram_sim.engine import pybullet
 from tangram_sim.errors import TangramError
 from tangram_sim.layout import Layout
 from tangram_sim.pictures import BACKGROUND, TOKEN_GRAY

@@ -1,7 +1,9 @@
 """One puzzle as an SVG drawing of seven polygons, read without trust.
 
-Counted are <polygon> and <path> elements, the latter of straight lines (M, L, H, V, Z); their own
-transforms and those of the groups around them apply. What is defined but not drawn is left out.
+Counted are <polygon>, <polyline>, <rect> and <path> elements, the latter of straight lines (M, L,
+H, V, Z); their own transforms and those of the groups around them apply. Left out are what is
+defined but not drawn, what is hidden, and a <rect> as large as the whole drawing: its background.
+Rounded corners of a <rect> are taken as sharp, and corners within a straight edge as none.
 """
 
 import re
@@ -15,9 +17,19 @@ from tangram_sim.errors import ConfigError
 from tangram_sim.fitting import VARIANTS, fit_piece
 from tangram_sim.shapes import MAX_COORDINATE, polygon_area, tan
 from tangram_sim.sketches import MAX_BYTES, MAX_PIECES, FaultError, Sketch, checked_name
-from tangram_sim.svg_attributes import path_points, polygon_points, transform_matrix
+from tangram_sim.svg_attributes import (
+    length,
+    path_points,
+    polygon_points,
+    rect_points,
+    transform_matrix,
+)
 
 MAX_DEPTH = 50
+_OUTLINES = {"polygon", "polyline", "rect", "path"}
+_RECT = ("x", "y", "width", "height")
+_HIDDEN = re.compile(r"(display\s*:\s*none|visibility\s*:\s*hidden)")
+_STRAIGHT = 1e-6  # of a corner, as a share of the drawing's extent
 _NOT_DRAWN = {"defs", "symbol", "clipPath", "mask", "marker", "pattern", "metadata"}
 
 
@@ -66,10 +78,12 @@ def _kind(outline: Floats) -> str:
 def _root(text: str, name: str) -> ET.Element:
     if len(text) > MAX_BYTES:
         raise ConfigError(f"SVG '{name}' is longer than {MAX_BYTES} characters: simplify it")
-    if re.search(r"<!\s*(doctype|entity)", text, re.IGNORECASE):
-        raise ConfigError(f"SVG '{name}' must have no DOCTYPE and no ENTITY: delete them")
+    if re.search(r"<!\s*(doctype[^>]*\[|entity)", text, re.IGNORECASE):
+        raise ConfigError(
+            f"SVG '{name}' must have no ENTITY and no DOCTYPE with [...]: delete them"
+        )
     try:
-        # Entities are the danger of XML, and none can be defined without a DOCTYPE.
+        # Entities are the danger of XML, and none can be defined without a [...] of DOCTYPE.
         root = ET.fromstring(text)  # noqa: S314
     except (ET.ParseError, ValueError) as error:
         raise ConfigError(f"SVG '{name}' is not XML: {error}") from None
@@ -85,14 +99,17 @@ def _tag(element: ET.Element) -> str:
 def _polygons(root: ET.Element, name: str) -> Iterator[tuple[ET.Element, Floats]]:
     """Drawn polygons in the file's order, each with its motion (3, 3)."""
     waiting, found = [(root, np.eye(3), 0)], 0
+    size = _size(root)
     while waiting:
         element, motion, depth = waiting.pop()
         if depth > MAX_DEPTH:
             raise ConfigError(f"SVG '{name}' nests deeper than {MAX_DEPTH} groups: ungroup it")
-        if _tag(element) in _NOT_DRAWN:
+        if _tag(element) in _NOT_DRAWN or _is_hidden(element):
+            continue
+        if _tag(element) == "rect" and _measures(element) in (size, ("100%", "100%")):
             continue
         motion = motion @ transform_matrix(element.get("transform", ""), f"SVG '{name}'")
-        if _tag(element) in ("polygon", "path"):
+        if _tag(element) in _OUTLINES:
             found += 1
             if found > MAX_PIECES:
                 raise ConfigError(f"SVG '{name}' draws more than {MAX_PIECES} polygons: draw 7")
@@ -100,14 +117,39 @@ def _polygons(root: ET.Element, name: str) -> Iterator[tuple[ET.Element, Floats]
         waiting += [(child, motion, depth + 1) for child in reversed(element)]
 
 
+def _measures(element: ET.Element) -> tuple[str, str]:
+    return element.get("width", ""), element.get("height", "")
+
+
+def _size(root: ET.Element) -> tuple[str, str]:
+    """Width and height of the drawing in its own units, as they are written."""
+    box = re.split(r"[\s,]+", root.get("viewBox", "").strip())
+    return (box[2], box[3]) if len(box) == 4 else _measures(root)
+
+
+def _is_hidden(element: ET.Element) -> bool:
+    names = ("display", "visibility")
+    styles = [element.get("style", ""), *(f"{name}:{element.get(name, '')}" for name in names)]
+    return any(_HIDDEN.search(style) for style in styles)
+
+
 def _outline(element: ET.Element, motion: Floats, where: str) -> Floats:
     """Corners (V, 2) after all transforms, without repetitions."""
-    if _tag(element) == "polygon":
-        points = polygon_points(element.get("points", ""), where)
-    else:
+    if _tag(element) == "rect":
+        points = rect_points(*(length(element.get(n, "0"), f"{where}, {n}") for n in _RECT))
+    elif _tag(element) == "path":
         points = path_points(element.get("d", ""), where)
+    else:
+        points = polygon_points(element.get("points", ""), where)
     points = points @ motion[:2, :2].T + motion[:2, 2]
     if not (np.abs(points) <= MAX_COORDINATE).all():
         raise ConfigError(f"{where} must lie within +-{MAX_COORDINATE:g}: scale it down")
+    if len(points) < 2:
+        return points
+    extent = max(np.ptp(points), 1e-300)
     apart = np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1)
-    return points[apart > 1e-6 * max(np.ptp(points), 1e-300)] if len(points) > 1 else points
+    points = points[apart > _STRAIGHT * extent]
+    before, after = points - np.roll(points, 1, axis=0), np.roll(points, -1, axis=0) - points
+    turns = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    corners: Floats = points[np.abs(turns) > _STRAIGHT * extent**2]
+    return corners

@@ -15,11 +15,18 @@ MAX_NUMBERS = 64  # of one attribute
 MAX_TEXT = 4096  # characters of one attribute
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _TRANSFORM = r"(\w+)\s*\(([^()]*)\)"
-_COUNTS = {"matrix": (6,), "translate": (1, 2), "scale": (1, 2), "rotate": (1, 3)}
+_COUNTS = {
+    "matrix": (6,),
+    "translate": (1, 2),
+    "scale": (1, 2),
+    "rotate": (1, 3),
+    "skewX": (1,),
+    "skewY": (1,),
+}
 
 
 def transform_matrix(text: str, where: str) -> Floats:
-    """The matrix (3, 3) of matrix, translate, scale and rotate, applied from right to left."""
+    """The matrix (3, 3) of transforms, those on the right applied first."""
     motion = np.eye(3)
     _check_length(text, where)
     if re.sub(_TRANSFORM, "", text).strip(", \t\r\n"):
@@ -28,7 +35,7 @@ def transform_matrix(text: str, where: str) -> Floats:
         values = _numbers(inside, f"{where}, transform {kind}")
         if len(values) not in _COUNTS.get(kind, ()):
             raise ConfigError(
-                f"{where}: a transform must be matrix, translate, scale or rotate with its "
+                f"{where}: a transform must be matrix, translate, scale, rotate or skew with its "
                 f"numbers, got {shown(f'{kind}({inside})')}: apply it to the points"
             )
         motion = motion @ _matrix(kind, values)
@@ -43,12 +50,32 @@ def _matrix(kind: str, values: list[float]) -> Floats:
         e, f = (*values, 0.0)[:2]
     elif kind == "scale":
         a, d = values[0], values[-1]
+    elif kind == "skewX":
+        c = np.tan(np.radians(values[0]))
+    elif kind == "skewY":
+        b = np.tan(np.radians(values[0]))
     else:
         angle = np.radians(values[0])
         x, y = values[1:] or (0.0, 0.0)
         a, b, c, d = np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle)
         e, f = x - a * x - c * y, y - b * x - d * y
     return np.array([[a, c, e], [b, d, f], [0.0, 0.0, 1.0]])
+
+
+def length(text: str, where: str) -> float:
+    """One number in the drawing's own units, which may be called px."""
+    _check_length(text, where)
+    values = _numbers(text.strip().removesuffix("px"), where)
+    if len(values) != 1:
+        raise ConfigError(
+            f"{where}: must be one number, got {shown(text)}: write it without a unit"
+        )
+    return values[0]
+
+
+def rect_points(x: float, y: float, width: float, height: float) -> Floats:
+    """Corners (4, 2) of a <rect>."""
+    return np.array([[x, y], [x + width, y], [x + width, y + height], [x, y + height]])
 
 
 def polygon_points(text: str, where: str) -> Floats:

@@ -19,6 +19,24 @@ def test_master_and_registration_never_load_the_engine() -> None:
     assert loaded == "[]"
 
 
+def test_the_launcher_needs_no_torch() -> None:
+    """It would start the master two seconds later, and hold 200 MB for as long as that trains."""
+    needs = "master.launch, tangram_agent.setup, tangram_sim.rewards, tangram_sim.world"
+    assert run_python(f"import sys, {needs}\nprint('torch' in sys.modules)") == "False"
+
+
+def test_learning_needs_no_compiler() -> None:
+    """Its import would take the master more than a second and 70 MB."""
+    told = run_python(
+        "import sys\n"
+        "from tangram_agent.learner import Learner\n"
+        "from tests.agent.builders import SCENE, random_transitions, setup\n"
+        "Learner(setup(agent=SCENE), 0).update(random_transitions(setup(), 4), 0.0)\n"
+        "print('torch._dynamo' in sys.modules)"
+    )
+    assert told == "False"
+
+
 @pytest.mark.parametrize(
     ("marks", "status"),
     [("", 4), ("@pytest.mark.fast", 0), ("@pytest.mark.fast\n@pytest.mark.slow", 4)],

@@ -34,11 +34,11 @@ def play() -> int:
 def _of_the_run(settings: Plain) -> tuple[str, Plain] | None:
     """What the connection file says of the run; nothing where only an address is given."""
     from tangram_agent.process import watch_parent
-    from worker.discovery import await_master
+    from worker.discovery import as_address, await_master
 
     watch_parent()  # already here: a parent may end while the file is waited for
     connect = settings.get("connect")
-    if not isinstance(connect, str) or not connect.strip() or "://" in connect:
+    if not isinstance(connect, str) or not connect.strip() or as_address(connect) is not None:
         return None
     found = await_master(connect, partial(print, file=sys.stderr, flush=True)).settings
     return None if found is None else (f"connect={connect}", dict(found))

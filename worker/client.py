@@ -56,7 +56,7 @@ class Client:
     """One process's conversation; made without any I/O, `join` starts it.
 
     Args:
-        connect: tcp://host:port, a connection file, or a run folder that holds one.
+        connect: host:port, a connection file, or a run folder that holds one.
         role: player or evaluator.
         index: wanted within the role, -1 for any.
         fingerprints: section of the settings -> digest, which the master compares.
@@ -149,6 +149,13 @@ class Client:
         Raises:
             TangramError: no master in time, or it refused; the reason is the master's.
         """
+        patience = self._timing.join_s
+        log.info(
+            "joining %s, for %g s at most",
+            self._connection.place,
+            patience,
+            extra={"event": "joining"},
+        )
         joined = self._wait(lambda: self.joined, "the master", self._timing.join_s)
         if not joined and not self.stopped:
             raise TangramError(self._connection.no_master(self._timing.join_s))
@@ -250,7 +257,7 @@ class Client:
         return self._connection.sockets
 
     def _do_what_is_due(self, sockets: Sockets, now: float) -> None:
-        if self._connection.is_dead(now):
+        if self._connection.is_dead(now, self._welcome is not None):
             self.joined = False
             self._connection.drop()
             self._open()

@@ -11,7 +11,7 @@ from tangram_agent.pretrained import PREFIX, agent_names
 from tangram_sim.errors import ConfigError
 from tangram_sim.puzzles import SPLITS
 from tangram_sim.settings import Settings, check_folder, declared, refuse_ignored, setting, told
-from worker.discovery import find_master
+from worker.discovery import as_address, find_master
 
 Changes = dict[str, dict[str, Any]]  # section -> setting -> value: of a run that was trained
 OF_TARGETS = ("targets", "spread", "mirrored")  # settings of sim that say nothing of a puzzle
@@ -46,11 +46,9 @@ def _refuse(changes: Changes, names: Iterable[str], because: str, remedy: str) -
 
 def _check_connect(value: str) -> None:
     if not value.strip():
-        raise ConfigError(
-            "connect must name the master's endpoint, got '': set connect=tcp://HOST:PORT"
-        )
-    if "://" in value:
-        find_master(value)  # no file is read: whether it is an address
+        raise ConfigError("connect must name the master's endpoint, got '': set connect=HOST:PORT")
+    if as_address(value) is not None:
+        find_master(value)  # no file is read: it only has to be one
 
 
 def _check_puzzles(value: str | None) -> None:
@@ -72,7 +70,7 @@ class WorkerConfig(Settings):
 
     connect: str = field(
         metadata=declared(
-            "the run: its folder or its connection.json; or only an address, tcp://host:port"
+            "the run: its folder or its connection.json; or only an address, host:port"
         )
     )
     role: str = setting(
@@ -93,7 +91,7 @@ class StatusConfig(Settings):
     """How a run stands (tangram-status)."""
 
     connect: str = field(
-        metadata=declared("the run: its folder, its connection.json, or tcp://host:port")
+        metadata=declared("the run: its folder, its connection.json, or host:port")
     )
     json: bool = setting(False, "print one JSON object a line instead of a table")
 

@@ -13,7 +13,14 @@ from zmq.utils.monitor import recv_monitor_message
 from tangram_agent.arrays import MAX_WEIGHTS_BYTES
 from tangram_agent.schema import MAX_HEADER
 from tangram_sim.errors import RunError, TangramError
-from worker.discovery import PATIENCE_S, MasterAddress, find_master, keys_error, no_file_error
+from worker.discovery import (
+    PATIENCE_S,
+    MasterAddress,
+    dns_error,
+    find_master,
+    keys_error,
+    no_file_error,
+)
 
 LINGER_MS = 1000
 # More than any window, so that only heartbeats to a master that is away find no room.
@@ -191,6 +198,7 @@ class Connection:
         self._asked_at: float | None = None
         self._lost_at: float | None = None
         self._reopen_at, self._follow_at = math.inf, 0.0
+        self._unknown_host = ""
 
     @property
     def place(self) -> str:
@@ -211,6 +219,8 @@ class Connection:
             return keys_error(self._connect, self.place)
         if self.address is None:
             return no_file_error(self.place, patience_s)
+        if self._unknown_host:
+            return f"no master was found in {patience_s:g} s: {self._unknown_host}"
         return (
             f"no master answers at {self.place} after {patience_s:g} s: is tangram-master running "
             "there?"
@@ -218,11 +228,19 @@ class Connection:
 
     def open(self) -> bool:
         """Connect to where the master is now; False while that is not known."""
-        self.address = find_master(self._connect)
+        before, self.address = self.address, find_master(self._connect)
         if self.address is None:
             return False
+        if self.address != before or self._unknown_host:
+            self._look_up(self.address.endpoint)
         self.sockets = Sockets(self._context, self.address)
         return True
+
+    def _look_up(self, endpoint: str) -> None:
+        """Warn of a host that DNS does not know, or not yet: ZeroMQ tries again without a word."""
+        before, self._unknown_host = self._unknown_host, dns_error(endpoint)
+        if self._unknown_host and not before:
+            log.warning("%s", self._unknown_host, extra={"event": "unknown_host"})
 
     def drop(self) -> None:
         """Close a connection that brings no answers."""
@@ -257,15 +275,20 @@ class Connection:
             )
         self.keys_refused, self._reopen_at = True, now + self._timing.retry_s
 
-    def is_dead(self, now: float) -> bool:
-        """Whether to try another connection."""
+    def is_dead(self, now: float, joined_before: bool) -> bool:
+        """Whether to try another connection.
+
+        Args:
+            now: monotonic time.
+            joined_before: a master has answered, and its silence is news.
+        """
         silent = self._asked_at is not None and now - self._asked_at > self._timing.silence_s
-        if silent and self._lost_at is None and not self.keys_refused:
+        if silent and joined_before and self._lost_at is None and not self.keys_refused:
             log.warning(
                 "the master at %s has not answered for %g s: tries again for %g s",
                 self.place,
                 self._timing.silence_s,
-                self._timing.lost_s,
+                self._timing.lost_s - self._timing.silence_s,
                 extra={"event": "silent"},
             )
         return silent or now >= self._reopen_at

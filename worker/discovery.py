@@ -2,19 +2,24 @@
 
 import json
 import re
+import socket
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
+from tangram_agent.addresses import host_of
 from tangram_sim.errors import RunError
 
 FILE_NAME = "connection.json"
 # A master may still be starting, or wait in a queue.
 PATIENCE_S = 60.0
 LOOK_S = 0.2
+DNS_S = 2.0
 SCHEME = "tcp://"
+PLAIN_ADDRESS = re.compile(r"[\w.-]+:\d+|\[[0-9a-fA-F:.]+\]:\d+")  # without the scheme
 KEYS = ("server_key", "public_key", "secret_key")
 KEY = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
 
@@ -46,17 +51,30 @@ class MasterAddress:
             raise TypeError("settings must be a map")
 
 
+def as_address(connect: str) -> str | None:
+    """The address that `connect` names, as tcp://host:port; None where it names a file.
+
+    host:port is an address unless a file here is called so.
+    """
+    if "://" in connect:
+        return connect
+    plain = PLAIN_ADDRESS.fullmatch(connect) and not Path(connect).exists()
+    return f"{SCHEME}{connect}" if plain else None
+
+
 def find_master(connect: str) -> MasterAddress | None:
     """The master's address; None while its file is not there.
 
     Args:
-        connect: tcp://host:port, a connection file, or a run folder that holds one.
+        connect: host:port with or without tcp://, a connection file, or a run folder that holds
+            one.
 
     Raises:
         RunError: neither an address nor a readable connection file.
     """
-    if "://" in connect:
-        return MasterAddress(_checked(connect, connect))
+    address = as_address(connect)
+    if address is not None:
+        return MasterAddress(_checked(address, connect))
     path = Path(connect)
     if path.is_dir():
         path /= FILE_NAME
@@ -70,7 +88,7 @@ def find_master(connect: str) -> MasterAddress | None:
         return None
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise RunError(
-            f"{path} is no connection file ({error!r}): connect=... takes tcp://host:port, a run "
+            f"{path} is no connection file ({error!r}): connect=... takes host:port, a run "
             f"folder, or the {FILE_NAME} that tangram-master writes into it"
         ) from None
 
@@ -94,7 +112,7 @@ def await_master(
         if time.monotonic() >= until_s:
             raise RunError(no_file_error(connect, patience_s))
         if not told:
-            tell(f"waits for the connection file {connect}")
+            tell(f"waits for the connection file {connect}, for {patience_s:g} s at most")
             told = True
         time.sleep(LOOK_S)
     return found
@@ -108,9 +126,27 @@ def no_file_error(connect: str, patience_s: float) -> str:
     )
 
 
+def dns_error(endpoint: str, patience_s: float = DNS_S) -> str:
+    """What DNS says against the host of an address, for the user; empty where it has an address."""
+    host, said = host_of(endpoint).strip("[]"), [f"no answer in {patience_s:g} s"]
+
+    def resolve() -> None:
+        try:
+            socket.getaddrinfo(host, None)
+            said[0] = ""
+        except (OSError, UnicodeError) as error:
+            said[0] = str(getattr(error, "strerror", None) or error)
+
+    # In a thread of its own: a name server that is away holds a process for half a minute.
+    asking = Thread(target=resolve, daemon=True)
+    asking.start()
+    asking.join(patience_s)
+    return f"DNS knows no host '{host}' ({said[0]}): check the name in connect=" if said[0] else ""
+
+
 def keys_error(connect: str, endpoint: str) -> str:
     """The error that a handshake fails, for the user, with what `connect` names."""
-    if "://" in connect:
+    if as_address(connect) is not None:
         return (
             f"the master at {endpoint} wants keys, or is none: name its connection file instead, "
             f"connect=RUN_DIR/{FILE_NAME}"

@@ -59,7 +59,6 @@ def joined(config: WorkerConfig, setup: Setup, policy: Policy) -> Iterator[Clien
     )
     client.on_progress = watchdog.progress
     with client, stopped_by_signals(client), watchdog:
-        _log.info("joining %s", config.connect, extra={"event": "joining"})
         if client.join():
             me = client.welcome
             log_as(f"{config.role} {me.index}", service.log_format)

@@ -3,18 +3,21 @@
 import json
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import zmq
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from tangram_agent.messages import WORKER_COLUMNS, AskStatus, RunStatus, decode_from_master
+from tangram_agent.outcome import FILE_NAME, outcome_rows, read_outcome
 from tangram_sim.errors import TangramError, WireError
 from worker.config import StatusConfig
 from worker.connection import Sockets
-from worker.discovery import find_master, keys_error
+from worker.discovery import dns_error, find_master, keys_error
 
 PATIENCE_S = 10.0
 ASK_AGAIN_S = 1.0
@@ -23,22 +26,34 @@ UNKNOWN = -1.0
 
 
 def show_status(config: StatusConfig) -> int:
-    """Print the status.
+    """Print the status, or the result of a run that has finished.
 
     Returns:
         Exit status 0.
 
     Raises:
-        TangramError: no connection file, keys that do not fit, or a master that does not answer.
+        TangramError: neither a connection file nor a result, keys that do not fit, or a master
+            that does not answer.
     """
-    console = Console()
+    console, result = Console(), Path(config.connect) / FILE_NAME
+    if result.is_file() and find_master(config.connect) is None:
+        _print_result(console, read_outcome(result), config)
+        return 0
     with zmq.Context() as context:
         status = ask_status(config.connect, context)
     if config.json:
         console.print(json.dumps(_plain(status)), soft_wrap=True, highlight=False)
     else:
-        _print(console, status)
+        _print(console, status, config.connect)
     return 0
+
+
+def _print_result(console: Console, result: Mapping[str, Any], config: StatusConfig) -> None:
+    if config.json:
+        console.print(json.dumps(result), soft_wrap=True, highlight=False)
+        return
+    console.print(f"run {Path(config.connect).name} has ended", highlight=False, markup=False)
+    _print_rows(console, outcome_rows(result))
 
 
 def ask_status(
@@ -47,7 +62,7 @@ def ask_status(
     """The present status of a run.
 
     Args:
-        connect: tcp://host:port, a connection file, or a run folder that holds one.
+        connect: host:port, a connection file, or a run folder that holds one.
         context: of the sockets.
         patience_s: to wait for the answer.
 
@@ -57,6 +72,9 @@ def ask_status(
     address = find_master(connect)
     if address is None:
         raise TangramError(f"no connection file at {connect}: no master runs there")
+    unknown_host = dns_error(address.endpoint)
+    if unknown_host:
+        raise TangramError(unknown_host)
     sockets = Sockets(context, address)
     try:
         until_s, ask_s = time.monotonic() + patience_s, 0.0
@@ -92,15 +110,34 @@ def _plain(status: RunStatus) -> dict[str, Any]:
     return {**status.texts, **status.numbers, "workers": rows}
 
 
-def _print(console: Console, status: RunStatus) -> None:
+def _print(console: Console, status: RunStatus, connect: str) -> None:
     texts = status.texts
     console.print(f"run {texts.get('run', '?')} ({texts.get('run_id', '?')})", highlight=False)
-    grid = Table.grid(padding=(0, 3))
-    for name, text in _lines(defaultdict(lambda: UNKNOWN, status.numbers), texts):
-        grid.add_row(name, text)
-    console.print(grid, highlight=False)
+    numbers = defaultdict(lambda: UNKNOWN, status.numbers)
+    _print_rows(console, [*_lines(numbers, texts), *_scores(numbers)])
     if len(status.workers):
         console.print(_table(status))
+    if numbers["evaluators"] == 0:  # whole, so that it can be copied
+        console.print(
+            f"tangram-worker connect={connect} role=evaluator", soft_wrap=True, markup=False
+        )
+
+
+def _print_rows(console: Console, rows: Iterable[tuple[str, str]]) -> None:
+    grid = Table.grid(padding=(0, 3))
+    for name, text in rows:
+        grid.add_row(name, Text(text))
+    console.print(grid, highlight=False)
+
+
+def _scores(n: Mapping[str, float]) -> Iterator[tuple[str, str]]:
+    if "play/reward" in n:
+        yield "players' reward", f"{n['play/reward']:.3f}, with exploration"
+    if "test/mean_reward" in n:
+        angle = f"angle error {n['test/angle_error_deg_median']:.2f} deg"
+        yield "last test", f"mean reward {n['test/mean_reward']:.3f}, {angle}"
+    elif n["evaluators"] == 0:
+        yield "last test", "none: no evaluator has joined, the last line starts one"
 
 
 def _lines(n: Mapping[str, float], texts: Mapping[str, str]) -> Iterator[tuple[str, str]]:
@@ -114,9 +151,6 @@ def _lines(n: Mapping[str, float], texts: Mapping[str, str]) -> Iterator[tuple[s
     yield "replay", f"{n['replay']:,.0f} transitions, {share:.0%} of its capacity"
     yield "waiting batches", f"{n['queue']:,.0f}"
     yield "last checkpoint", _age(n["checkpoint_age_s"])
-    if "test/mean_reward" in n:
-        angle = f"angle error {n['test/angle_error_deg_median']:.2f} deg"
-        yield "last test", f"mean reward {n['test/mean_reward']:.3f}, {angle}"
     if n["disk_failing"] > 0:
         yield "disk", "full or broken: nothing is acknowledged"
     if n["undone_updates"] > 0:

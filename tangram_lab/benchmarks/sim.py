@@ -6,7 +6,6 @@ from contextlib import closing
 from typing import Any
 
 import numpy as np
-import pybullet
 
 from tangram_agent.config import ServiceConfig
 from tangram_agent.setup import Setup
@@ -15,6 +14,7 @@ from tangram_lab.benchmarks.setups import preset, several, with_sim
 from tangram_sim.arrays import Floats
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.config import SimConfig
+from tangram_sim.engine import pybullet
 from tangram_sim.layout import Layout
 from tangram_sim.seeding import episode_generator
 

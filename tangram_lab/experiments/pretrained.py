@@ -20,11 +20,11 @@ import safetensors.numpy
 import torch
 import yaml
 
-from tangram_agent.checkpoints import load_checkpoint, newest_checkpoint
+from tangram_agent.checkpoints import ACTING, CHECKPOINTS, load_checkpoint, newest_checkpoint
 from tangram_agent.files import write_whole
 from tangram_agent.policy import Policy
 from tangram_agent.pretrained import CARD, CARD_TEXT, CONFIG, FORMAT, PREFIX, WEIGHTS
-from tangram_agent.runs import ACTING, CHECKPOINTS, Run, load_run
+from tangram_agent.runs import Run, load_run
 from tangram_agent.setup import Setup
 from tangram_sim.errors import ConfigError, RunError, TangramError
 from tangram_sim.targets import has_all_tans

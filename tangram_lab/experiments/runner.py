@@ -22,11 +22,12 @@ from rich.progress import (
 )
 
 from master.children import Child, describe
-from master.console import duration, sturdy_console
+from master.console import sturdy_console
 from master.result import commit, processor, versions
 from master.rundir import RunFolder
 from master.signals import handling
 from tangram_agent.files import write_whole
+from tangram_agent.outcome import duration
 from tangram_lab.experiments.jobs import Job, make_jobs, read_object
 from tangram_lab.experiments.plan import PLAN, StudyConfig, joined_plan, plan_content
 from tangram_sim.errors import ConfigError

@@ -15,10 +15,12 @@ from tangram_agent.setup import Setup
 from tangram_agent.types import Transitions, Weights
 from tangram_sim.actions import chosen_tokens, flips, velocities
 from tangram_sim.batch import BatchedEnv
+from tangram_sim.env import TangramEnv
 from tangram_sim.errors import ConfigError, RunError
+from tangram_sim.vector import TangramVectorEnv
 from tests.agent.builders import PAIR, PAPER, SCENE, SMALL, random_transitions, setup
 from tests.agent.messages import broadcast
-from tests.agent.pair_scenes import PERCEPTRON, TWO, seven, transitions
+from tests.agent.pair_scenes import PERCEPTRON, SEVEN, TWO, seven, transitions
 
 pytestmark = pytest.mark.fast
 
@@ -233,6 +235,62 @@ def test_the_agent_of_the_paper_plays_and_learns_the_game() -> None:
 
 def run_of(made: Setup) -> Run:
     return Run(Path("run"), {}, made, 7, policy_of(made))
+
+
+SHOWN = {"observation": 53, "achieved_goal": 46, "desired_goal": 46}
+
+
+def test_predict_takes_what_the_environments_show() -> None:
+    made = seven({}, PERCEPTRON)
+    run, world = run_of(made), {"backend": "kinematic", **SEVEN}
+    one, several = TangramEnv(**world), TangramVectorEnv(3, **world)
+    observation, _ = one.reset(seed=1)
+    observations, _ = several.reset(seed=0)
+    for _ in range(3):  # with tokens that are placed, too
+        batch = several.batch
+        actions = run.predict(observations)
+        expected = run.policy.act(batch.seen, batch.placed, batch.seen_goals)
+        np.testing.assert_array_equal(actions, expected)
+        alone = run.predict(observation)
+        np.testing.assert_allclose(alone, actions[1], atol=1e-5)
+        assert one.action_space.contains(alone)
+        assert several.action_space.contains(actions)
+        observation, *_ = one.step(actions[1])
+        observations, *_ = several.step(actions)
+
+
+@pytest.mark.parametrize(
+    ("observation", "reason"),
+    [
+        (
+            {name: np.zeros(size - 2) for name, size in SHOWN.items()},
+            "observation.'observation'. has shape .51,., and run wants .53,.: make the environment",
+        ),
+        (
+            {name: np.zeros((2, size)) for name, size in SHOWN.items()}
+            | {"desired_goal": np.zeros(46)},
+            "observation.'desired_goal'. has shape .46,., and run wants .2, 46.: make",
+        ),
+        (
+            {name: np.zeros((2, 2, size)) for name, size in SHOWN.items()},
+            "has shape .2, 2, 53., and run wants .2, 53.",
+        ),
+        (
+            {name: np.zeros((0, size)) for name, size in SHOWN.items()},
+            "has shape .0, 53., and run wants .1, 53.",
+        ),
+        (
+            {name: np.full(size, np.nan) for name, size in SHOWN.items()},
+            "observation.'observation'. must be finite, got NaN or infinity",
+        ),
+        ({"observation": np.zeros(53)}, "of observation, achieved_goal, desired_goal, got observ"),
+        ({}, "got an empty one: give what reset or step returns first"),
+        (({}, {}), "got a tuple: give what reset or step returns first"),
+    ],
+)
+def test_an_observation_of_another_form_is_refused(observation: Any, reason: str) -> None:
+    with pytest.raises(ConfigError, match=reason):
+        run_of(seven({}, PERCEPTRON)).predict(observation)
 
 
 def test_a_run_plays_on_with_other_settings_of_the_agent() -> None:

@@ -78,7 +78,7 @@ WRONG = [
     ("tangram-worker connect=tcp://127.0.0.1:1 reward.name=own.py:none", "cannot read 'own.py' on"),
     ("tangram-train tokens.shapes=[square,square,square] tokens.scale=2.2", "no room for token"),
     ("tangram-master tokens.scale=1000", "does not fit into an arena of width 2"),
-    ("tangram-worker", "say which master: connect=tcp://host:port"),
+    ("tangram-worker", "say which master: connect=host:port"),
     ("tangram-worker connect=tcp://127.0.0.1:99999", "port from 1 to 65535"),
     ("tangram-worker connect=tcp://h:0 role=evaluator", "'tcp://h:0' (from tcp://h:0) is no addr"),
     ("tangram-status connect=tcp://127.0.0.1:65536", "port from 1 to 65535"),

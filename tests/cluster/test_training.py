@@ -82,6 +82,17 @@ def test_a_refused_resume_leaves_the_run_as_it_was(trained: Path) -> None:
     assert (trained / "config.yaml").read_bytes() == before
 
 
+def test_a_finished_run_is_told_and_left_as_it_was(trained: Path) -> None:
+    def state() -> dict[Path, int]:
+        return {path: path.stat().st_mtime_ns for path in trained.rglob("*") if path.is_file()}
+
+    before, bound = state(), f"max_updates={UPDATES}"
+    told = run("tangram-train", f"run_dir={trained}", bound, "resume=auto", cwd=trained.parent)
+    assert f"{trained} has finished ({bound}): nothing is changed, a higher bound goes on" in told
+    assert "angle error" in told
+    assert state() == before
+
+
 def test_a_run_begins_with_anothers_networks_once_and_is_extended(trained: Path) -> None:
     """The folder is named as seen from where the command is given, and shapes may differ."""
     folder = trained.parent / "warm"

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.fast
         ({"run_dir": "a\0b"}, r"got 'a\\x00b': set run_dir=runs/my_run"),
         ({"seed": -1}, "seed must be between 0 and"),
         ({"max_hours": -0.5}, "max_hours must be at least 0, got -0.5"),
-        ({"max_hours": float("nan")}, "max_hours must be at least 0, got nan"),
+        ({"max_hours": float("nan")}, "max_hours must be a finite number, at least 0, got nan"),
         ({"max_episodes": -1}, "max_episodes must be at least 0, got -1"),
         ({"max_updates": -1}, "max_updates must be at least 0, got -1"),
         ({"resume": "maybe"}, "resume must be one of none, auto, got 'maybe'"),

@@ -15,7 +15,6 @@ import pytest
 from master.console import (
     LivePanel,
     StatusLines,
-    duration,
     logging_to,
     make_progress,
     status_line,
@@ -23,6 +22,7 @@ from master.console import (
 )
 from master.counters import Counters
 from tangram_agent.messages import WORKER_COLUMNS, RunStatus
+from tangram_agent.outcome import duration
 from tests.master.builders import screen, text
 
 log = logging.getLogger("master.test")
@@ -76,6 +76,12 @@ def test_durations(seconds: float, shown: str) -> None:
             "1 worker | learning",
             ["no bound: Ctrl-C ends the run", "mean reward", "1 worker, 1 evaluator"],
         ),
+        (
+            replace(FRESH, numbers=FRESH.numbers | {"play/reward": -0.25, "evaluators": 0}),
+            "1:23 | 12,345 episodes | 1,234 updates | 950 transitions/s | 95.1 updates/s | "
+            "players' reward -0.250 | 1 worker | learning",
+            ["players' reward", "-0.250", "no evaluator: start one with tangram-worker connect=r"],
+        ),
     ],
 )
 def test_a_line_and_the_panel_tell_everything(
@@ -83,7 +89,8 @@ def test_a_line_and_the_panel_tell_everything(
 ) -> None:
     assert status_line(status) == line
     shown = screen()
-    shown.print(status_panel(status, "tangram · run"))
+    start = "tangram-worker connect=r role=evaluator"
+    shown.print(status_panel(status, "tangram · run", start))
     assert all(word in text(shown) for word in words)
     assert {len(line) for line in text(shown).splitlines()} == {76}
 

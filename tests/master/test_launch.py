@@ -86,7 +86,8 @@ def end():
 def told(*_):
     heard.wait(30)  # the reason was sent before the signal
     end()
-signal.signal(signal.SIGTERM, told)
+for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1):
+    signal.signal(number, told)
 (folder / "connection.json").touch()
 while {condition}:
     signal.sigtimedwait([], 0.05)
@@ -119,7 +120,7 @@ def launcher(
     made = Launcher(MasterConfig(str(folder), workers=len(players)), run)
     code = MASTER.format(folder=str(folder), condition=condition, ending=ending)
     if stubborn:
-        code = code.replace("SIGTERM, told", "SIGTERM, signal.SIG_IGN")
+        code = code.replace("number, told", "number, signal.SIG_IGN")
     made._master.arguments = ["-c", code]
     for player, own in zip(made._players, players, strict=True):
         player.arguments = ["-c", own]
@@ -248,6 +249,46 @@ print("left in order", flush=True)
 
 
 @pytest.mark.cluster
+def test_workers_that_a_failing_master_sent_home_come_back_with_it(tmp_path: Path) -> None:
+    leaving = f"""
+from pathlib import Path
+import time
+folder = Path({str(tmp_path)!r})
+with open(folder / "joined", "a") as file:
+    file.write("x")
+while (folder / "connection.json").exists():
+    time.sleep(0.01)
+(folder / "left").touch()
+"""
+    ending = """
+if "resume=auto" in sys.argv:
+    end()
+(folder / "connection.json").unlink()
+while not (folder / "left").exists():
+    signal.sigtimedwait([], 0.05)
+signal.sigtimedwait([], 0.3)
+sys.exit(5)
+"""
+    (tmp_path / "joined").touch()
+    times = "(2 if 'resume=auto' in sys.argv else 1)"
+    waits = f"len((folder / 'joined').read_text()) < {times}"
+    made = launcher(tmp_path, ending, waits, players=[leaving])
+    made._master.arguments = [*made._master.arguments, "resume=none"]
+    made._evaluator.next_start_s = None
+    assert finish(made, tmp_path)[0] == 0
+    assert (tmp_path / "joined").read_text() == "xx"
+
+
+@pytest.mark.fast
+def test_a_worker_that_leaves_after_the_master_is_no_failure(tmp_path: Path) -> None:
+    """Its end may be heard of before that of the master."""
+    made = launcher(tmp_path, players=[WORKER])
+    made._reached = True
+    made._worker_ended(made._players[0])
+    assert made._players[0].restarts == 0
+
+
+@pytest.mark.cluster
 def test_workers_start_only_when_the_master_can_be_reached(tmp_path: Path) -> None:
     made = launcher(tmp_path)
     made._master.arguments = ["-c", f"open({str(tmp_path / 'news')!r}, 'w'); raise SystemExit(2)"]
@@ -298,7 +339,8 @@ def test_a_signal_ends_the_master_in_order(
     status, told = finish(made, tmp_path)
     signal.signal(number, before)
     assert status == 0
-    assert told == f"{number.name}: the run ends with a checkpoint, again to end at once\n"
+    name = "Ctrl-C (SIGINT)" if number == signal.SIGINT else number.name
+    assert told == f"{name}: the run ends with a checkpoint, again to end at once\n"
 
 
 @pytest.mark.cluster

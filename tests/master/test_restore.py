@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from master.checkpointer import Restored, check_resumable, restore_run, save_run, warm_start
+from master.checkpointer import Restored, restore_run, save_run, warm_start
 from master.journal import segments
+from master.resumable import check_resumable
 from master.rundir import Record, RunFolder
 from master.trainer import Trainer, choose_device
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint, save_checkpoint

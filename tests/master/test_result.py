@@ -35,20 +35,21 @@ RESULT = dict.fromkeys(SCORES) | {
 @pytest.mark.parametrize(
     ("change", "words", "without"),
     [
-        ({}, ["none came from an evaluator", "1:01 of training, 1:15 in all"], ["mean reward"]),
+        ({}, ["none: no evaluator took part", "1:01 of training, 1:15 in all"], ["mean reward"]),
         (
             SCORED | {"scored_updates": 1234},
             ["0.931 on exact polygons", "- in the camera's", "1.21° (median)", "1,234"],
             ["weights after"],
         ),
-        (SCORED | {"scored_updates": 1000}, ["weights after 1,000 updates"], []),
+        (SCORED | {"scored_updates": 1000}, ["weights after 1,000 updates"], ["go on"]),
+        ({"ended_by": "SIGINT"}, ["Ctrl-C (SIGINT)", "go on           tangram-train r"], []),
     ],
 )
 def test_the_final_table(
     tmp_path: Path, change: dict[str, Any], words: list[str], without: list[str]
 ) -> None:
     shown, folder = screen(), RunFolder(tmp_path / ("deep_" * 30))
-    show_result(shown, folder, RESULT | change)
+    show_result(shown, folder, RESULT | change, "tangram-train r")
     assert all(word in text(shown) for word in words)
     assert not any(word in text(shown) for word in without)
     assert f"tangram-play run_dir={folder.path} out=play.gif" in text(shown)

@@ -14,7 +14,7 @@ from gymnasium.utils.env_checker import check_env
 from tangram_sim.config import RewardConfig
 from tangram_sim.env import TangramEnv
 from tangram_sim.errors import ConfigError
-from tangram_sim.register import ENV_ID, register
+from tangram_sim.register import ENV_ID, KWARGS
 from tests.sim.builders import SEVEN, TRIO
 
 pytestmark = pytest.mark.fast
@@ -42,36 +42,78 @@ PLAYED = [
 ]
 
 
+@pytest.fixture
+def fast_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A display without a screen, and no waiting between pictures."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    monkeypatch.setitem(TangramEnv.metadata, "render_fps", 1000)
+
+
 @pytest.mark.parametrize(
-    "settings", [PLAYED[1], *({"backend": "kinematic"} | one for one in PLAYED)]
+    ("name", "settings"),
+    [
+        *((name, {}) for name in KWARGS),
+        (ENV_ID, PLAYED[1]),
+        *((ENV_ID, {"backend": "kinematic"} | one) for one in PLAYED),
+    ],
 )
-def test_gymnasium_checks_it_without_a_warning(settings: dict[str, Any], made: list[Any]) -> None:
+def test_gymnasium_checks_it_without_a_warning(
+    name: str, settings: dict[str, Any], made: list[Any], fast_window: None
+) -> None:
     if settings.get("motion") == "slide":
         settings = settings | {"backend": "physics"}  # nothing else has contacts
-    env = gymnasium.make(ENV_ID, render_mode="rgb_array", **settings)
+    if settings:
+        settings = settings | {"horizon": None}
+    env = gymnasium.make(name, render_mode="rgb_array", **settings)
     made.append(env)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(env.unwrapped)
 
 
-def test_registration_loads_no_engine() -> None:
+@pytest.mark.parametrize("imports", ["gymnasium, tangram_sim", "tangram_sim, gymnasium"])
+def test_registration_loads_no_engine(imports: str) -> None:
     script = (
-        "import gymnasium, sys, tangram_sim.register as r; r.register(); "
-        "assert 'Tangram-v0' in gymnasium.registry; "
+        f"import sys, {imports}; "
+        "assert {'Tangram-v0', 'Tangram7-v0'} <= set(gymnasium.registry); "
         "assert not {'pybullet', 'tangram_sim.env'} & set(sys.modules); "
         "gymnasium.make('Tangram-v0', backend='kinematic').reset(); "
         "assert 'pybullet' not in sys.modules; "
         "gymnasium.make('Tangram-v0').reset(); "
         "assert 'pybullet' in sys.modules"
     )
+    command = [sys.executable, "-W", "error", "-c", script]
+    done = subprocess.run(command, check=True, timeout=100, capture_output=True)
+    assert done.stdout + done.stderr == b""  # nor does the engine tell when it was built
+
+
+def test_the_package_alone_loads_nothing_and_a_look_for_gymnasium_is_no_import() -> None:
+    script = (
+        "import sys, tangram_sim, importlib.util; importlib.util.find_spec('gymnasium'); "
+        "assert not {'gymnasium', 'numpy', 'torch'} & set(sys.modules); "
+        "import gymnasium; assert 'Tangram-v0' in gymnasium.registry"
+    )
     subprocess.run([sys.executable, "-W", "error", "-c", script], check=True, timeout=100)
 
 
 def test_made_by_module_and_name(made: list[Any]) -> None:
-    register()  # a second time does no harm
-    made.append(gymnasium.make("tangram_sim.register:Tangram-v0", backend="kinematic"))
+    made.append(gymnasium.make("tangram_sim:Tangram-v0", backend="kinematic"))
     assert isinstance(made[0].unwrapped, TangramEnv)
+
+
+@pytest.mark.parametrize("name", KWARGS)
+def test_the_time_limit_of_an_id_is_its_horizon(name: str, made: list[Any]) -> None:
+    made.append(gymnasium.make(name, backend="kinematic"))
+    horizon = made[0].unwrapped.batch.horizon
+    assert gymnasium.spec(name).max_episode_steps == horizon == KWARGS[name]["horizon"]
+    told = "an episode of these settings has .* steps, and the id's time limit is"
+    with pytest.raises(ConfigError, match=told):
+        gymnasium.make(name, actions_per_token=3)
+    longer = {"actions_per_token": 3, "horizon": 3 * horizon, "max_episode_steps": 3 * horizon}
+    made.append(gymnasium.make(name, backend="kinematic", **longer))
+    made[1].reset(seed=0)
+    ends = [any(made[1].step(made[1].action_space.sample())[2:4]) for _ in range(3 * horizon)]
+    assert ends == [False] * (3 * horizon - 1) + [True]
 
 
 def test_a_seed_fixes_whole_episodes_and_those_that_follow(made: list[Any]) -> None:
@@ -85,7 +127,8 @@ def test_a_seed_fixes_whole_episodes_and_those_that_follow(made: list[Any]) -> N
             done = False
             while not done:
                 numbers += [*observation["observation"], *observation["desired_goal"]]
-                observation, reward, done, _, info = env.step(env.action_space.sample())
+                observation, reward, *ends, info = env.step(env.action_space.sample())
+                done = any(ends)
                 numbers += [reward, info["overlap"]]
             observation, _ = env.reset()
         return numbers
@@ -120,10 +163,12 @@ def test_horizon_refusal_and_info() -> None:
     assert (terminated, truncated) == (False, False)
     assert set(info) == {"overlap", "is_success"}
     _, _, terminated, truncated, info = env.step(action)
-    assert (terminated, truncated) == (True, False)
+    assert (terminated, truncated) == (False, True)  # token 1 is left: only the steps ran out
     assert info["refused"] == "token 0 is placed already: it had its 1 actions"
     env.reset()
     assert "refused" not in env.step(action)[-1]
+    _, _, terminated, truncated, _ = env.step(-action)
+    assert (terminated, truncated) == (True, False)  # all are placed
 
 
 def nearly(env: TangramEnv) -> dict[str, Any]:
@@ -159,7 +204,8 @@ def test_compute_reward_is_the_reward_of_the_step(reward: str) -> None:
         env.reset(seed=seed)
         done = False
         while not done:
-            observation, paid, done, _, info = env.step(env.action_space.sample() * 0.3)
+            observation, paid, *ends, info = env.step(env.action_space.sample() * 0.3)
+            done = any(ends)
             achieved.append(observation["achieved_goal"])
             desired.append(observation["desired_goal"])
             rewards.append(paid)
@@ -195,12 +241,46 @@ def test_render() -> None:
     assert kinematic().render() is None
 
 
+def test_human_shows_each_step_in_a_window(fast_window: None) -> None:
+    pygame = pytest.importorskip("pygame", reason="pip install '.[human]'")
+    envs = [kinematic(render_mode=mode, render_size=90) for mode in ("human", "rgb_array")]
+    for play in (
+        lambda env: env.reset(seed=0),
+        lambda env: env.step(np.array([0.3, 0.2, 0.1], dtype=np.float32)),
+    ):
+        for env in envs:
+            play(env)
+        shown = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
+        np.testing.assert_array_equal(shown, envs[1].render())
+    assert envs[0].render() is None
+    for _ in range(2):
+        envs[0].close()
+    assert not pygame.display.get_init()
+
+
+def test_without_pygame_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(ConfigError, match="needs pygame, .*: pip install 'tangram-rl.human.', or"):
+        kinematic(render_mode="human")
+
+
+@pytest.mark.parametrize("driver", ["", "odd"])
+def test_a_window_needs_a_display(driver: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pygame", reason="pip install '.[human]'")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("SDL_VIDEODRIVER", driver)
+    with pytest.raises(ConfigError, match="render_mode=human needs a display .*: log in with one"):
+        kinematic(render_mode="human")
+
+
 @pytest.mark.parametrize(
     ("settings", "reason"),
     [
         ({"shapes": ("hexagon",)}, "unknown shape 'hexagon'"),
         ({"reward": "luck"}, "reward.name must be one of"),
-        ({"render_mode": "human"}, "render_mode must be None or rgb_array, got 'human'"),
+        ({"render_mode": "3d"}, "render_mode must be None, human or rgb_array, got '3d'"),
+        ({"horizon": 2}, "has 1 steps, and the id's time limit is 2: give horizon=1 and max_ep"),
         ({"gravity": 9.81}, "unknown setting 'gravity' of the environment: .* backend, arena"),
         ({"arena": -1.0}, "sim.arena must be"),
         ({"allow_flip": True}, "sim.allow_flip=true needs a token that is not its own mirror"),

@@ -11,7 +11,13 @@ pytestmark = pytest.mark.slow
 def test_stable_baselines3_runs_unchanged() -> None:
     pytest.importorskip("torch").set_num_threads(1)
     sb3 = pytest.importorskip("stable_baselines3", reason="pip install '.[peers]'")
-    env = gymnasium.make(ENV_ID, shapes=["square", "small_triangle"], actions_per_token=2)
+    env = gymnasium.make(
+        ENV_ID,
+        shapes=["square", "small_triangle"],
+        actions_per_token=2,
+        horizon=4,
+        max_episode_steps=4,
+    )
     model = sb3.DDPG(
         "MultiInputPolicy",
         env,

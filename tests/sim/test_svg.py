@@ -18,7 +18,7 @@ from tests.sim.drawings import FIGURES, distance, figure
 
 pytestmark = pytest.mark.fast
 
-FORMS = "a transform must be matrix, translate, scale or rotate with its numbers"
+FORMS = "a transform must be matrix, translate, scale, rotate or skew with its numbers"
 SIZE = 137.0  # of the full square, in the drawing's units
 
 
@@ -94,10 +94,31 @@ def test_a_mirroring_transform_turns_the_parallelogram_over() -> None:
     assert puzzle.pieces[-1] != load_puzzle("cat").pieces[-1]
 
 
+def test_pieces_are_read_as_drawing_tools_write_them() -> None:
+    """A square as a turned <rect>, nodes within an edge, an outline as a polyline, and skew."""
+    square, *triangles, parallelogram = corners_of("cat")
+    side, turn = np.linalg.norm(square[1] - square[0]), square[1] - square[0]
+    angle = np.degrees(np.arctan2(turn[1], turn[0]))
+    (x, y), sign = square[0], np.sign(np.linalg.det([turn, square[2] - square[1]]))
+    rect = (
+        f'<rect x="0" y="{0.0 if sign > 0 else -side}px" rx="1" width="{side}" height="{side}px" '
+        f'transform="translate({x} {y}) rotate({angle})"/>'
+    )
+    first = np.insert(triangles[0], 1, triangles[0][:2].mean(axis=0), axis=0)
+    skew = np.linalg.inv(transform_matrix("skewX(20) skewY(-5)", "it"))[:2, :2]
+    skewed = polygon(parallelogram @ skew.T, 'transform="skewX(20) skewY(-5)"')
+    line = polygon(triangles[1]).replace("polygon", "polyline")
+    rest = [polygon(corners) for corners in triangles[2:]]
+    doctype = '<!DOCTYPE svg PUBLIC "-//W3C//DTD SVG 1.1//EN" "svg11.dtd">'
+    check_drawn(doctype + drawing(polygon(first), line, *rest, rect, skewed), "cat")
+
+
 def test_what_is_not_drawn_or_no_polygon_does_not_count(tmp_path: Path) -> None:
     extra = polygon(np.array([(0, 0), (9, 0), (0, 9)]))
     hidden = f"<defs>{extra}</defs><clipPath>{extra}</clipPath>"
+    hidden += f'<g style="fill:red;display: none">{extra}</g><g visibility="hidden">{extra}</g>'
     named, other = "<title>A cat</title><!-- by hand -->", '<rect width="600" height="400"/>'
+    other += '<rect width="100%" height="100%"/><circle r="9"/>'
     path = tmp_path / "cat.SVG"
     path.write_text(drawing(named, hidden, other, whole("cat")))
     assert [puzzle.name for puzzle in read_puzzles(path).puzzles] == ["cat"]
@@ -107,9 +128,9 @@ def test_what_is_not_drawn_or_no_polygon_does_not_count(tmp_path: Path) -> None:
 
 TRIANGLE = '<polygon points="0,0 1,0 0,1"/>'
 NESTED = "SVG 'it' nests deeper than 50 groups: ungroup it"
-DOCTYPE = "SVG 'it' must have no DOCTYPE and no ENTITY: delete them"
+DOCTYPE = "SVG 'it' must have no ENTITY and no DOCTYPE with [...]: delete them"
 FAR = "SVG 'it', polygon 1 must lie within +-1e+06: scale it down"
-FIVE = '<polygon points="0,0 1,0 1,1 0,1 0,.5"/>'
+FIVE = '<polygon points="0,0 1,0 1,1 0,1 -1,.5"/>'
 
 
 @pytest.mark.parametrize(
@@ -121,7 +142,9 @@ FIVE = '<polygon points="0,0 1,0 1,1 0,1 0,.5"/>'
         ("<svg/>", "puzzle 'it': must draw 7 polygons or paths, got 0"),
         (f"<svg>{TRIANGLE * 6}</svg>", "puzzle 'it': must draw 7 polygons or paths, got 6"),
         (f"<svg>{TRIANGLE * 17}</svg>", "SVG 'it' draws more than 16 polygons: draw 7"),
-        ("<!DOCTYPE svg><svg/>", DOCTYPE),
+        ("<!DOCTYPE svg[]><svg/>", DOCTYPE),
+        ("<svg><!ENTITY a></svg>", DOCTYPE),
+        (f"<svg>{'<rect width=1in />' * 7}</svg>".replace("1in", "'1in'"), "width: numbers cannot"),
         ('<!doctype s [<!ENTITY a "b">]><svg>&a;</svg>', DOCTYPE),
         (f"<svg>{'<g>' * 60}{'</g>' * 60}</svg>", NESTED),
         (f"<svg>{'<g>' * 50_000}{'</g>' * 50_000}</svg>", NESTED),
@@ -129,7 +152,7 @@ FIVE = '<polygon points="0,0 1,0 1,1 0,1 0,.5"/>'
         (f"<svg>{TRIANGLE * 6}{FIVE}</svg>", "piece 7: must have 3 or 4 corners, got 5"),
         (f"<svg>{TRIANGLE * 6}<polygon/></svg>", "piece 7: must have 3 or 4 corners, got 0"),
         (f"<svg>{TRIANGLE.replace('1', '0') * 7}</svg>", "must have 3 or 4 corners, got"),
-        (f"<svg>{TRIANGLE.replace('0,1', '2,0') * 7}</svg>", "its polygons have no area: draw the"),
+        (f"<svg>{TRIANGLE.replace('0,1', '2,0') * 7}</svg>", "must have 3 or 4 corners, got 0"),
         (f"<svg>{TRIANGLE * 7}</svg>", "has 0 large_triangle (must be 2), 7 medium_triangle (mus"),
         (f'<svg><g transform="scale(1e7)">{TRIANGLE}</g></svg>', FAR),
         (f'<svg><g transform="scale(1e300) scale(1e300)">{TRIANGLE}</g></svg>', FAR),
@@ -150,7 +173,7 @@ def test_skip_invalid_returns_the_faults_of_a_drawing() -> None:
 
 def test_a_declared_encoding_cannot_hide_a_doctype(tmp_path: Path) -> None:
     path = tmp_path / "cat.svg"
-    path.write_bytes("<!DOCTYPE svg><svg/>".encode("utf-16"))
+    path.write_bytes("<!DOCTYPE svg[]><svg/>".encode("utf-16"))
     with pytest.raises(ConfigError, match="is not UTF-8: save it as UTF-8"):
         read_puzzles(path)
     path.write_text('<?xml version="1.0" encoding="UTF-7"?>+ADwAIQ-DOCTYPE svg+AD4-<svg/>')
@@ -225,7 +248,8 @@ def test_transforms_move_points(text: str, goal: tuple[float, float]) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("skewX(3)", f"it: {FORMS}"),
+        ("skewX(3 4)", f"it: {FORMS}"),
+        ("shear(3)", f"it: {FORMS}"),
         ("rotate(1 2)", f"it: {FORMS}"),
         ("scale()", f"it: {FORMS}"),
         ("scale(2", "it: transform 'scale(2' cannot be read: check its brackets"),

@@ -266,7 +266,8 @@ def test_a_missing_engine_is_named_also_before_a_world_is_made(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(sys.modules, "pybullet", None)
-    monkeypatch.delitem(sys.modules, "tangram_sim.physics", raising=False)
+    for name in ("engine", "physics"):
+        monkeypatch.delitem(sys.modules, f"tangram_sim.{name}", raising=False)
     with pytest.raises(ConfigError, match=r"set\s+sim\.backend=kinematic"):
         make_world(layout_of("square"), SimConfig())
     monkeypatch.setattr(world_module, "find_spec", lambda name: None)

@@ -160,7 +160,9 @@ def test_a_silent_master_is_told_and_its_return_too(caplog: pytest.LogCaptureFix
             return any(text in record.message for record in caplog.records)
 
         deadline = time.monotonic() + LIMIT_S
-        while not told(f"the master at {endpoint} has not answered for 0.3 s: tries again"):
+        while not told(
+            f"the master at {endpoint} has not answered for 0.3 s: tries again for 35999.7 s"
+        ):
             assert time.monotonic() < deadline
         stage.until(lambda: told(f"the master at {endpoint} answers again"))
 

@@ -1,35 +1,81 @@
 """Where the master is: an address, or the file that it writes."""
 
 import json
+import socket
 from pathlib import Path
+from threading import Event
 
 import pytest
 
 from tangram_sim.errors import RunError
-from worker.discovery import MasterAddress, await_master, find_master
+from worker.discovery import MasterAddress, await_master, dns_error, find_master
 
 pytestmark = pytest.mark.fast
 
 REMEDY = (
-    "connect=... takes tcp://host:port, a run folder, or the connection.json that tangram-master "
+    "connect=... takes host:port, a run folder, or the connection.json that tangram-master "
     "writes into it"
 )
 
 
 def test_an_address_is_taken_as_it_is() -> None:
-    for address in ("tcp://127.0.0.1:5555", "tcp://learner.lan:1", "tcp://[::1]:65535"):
-        assert find_master(address) == MasterAddress(address, "")
+    for address in ("127.0.0.1:5555", "learner.lan:1", "[::1]:65535", "a-b_c:7"):
+        for given in (address, f"tcp://{address}"):
+            assert find_master(given) == MasterAddress(f"tcp://{address}", "")
+
+
+def test_a_file_that_is_called_like_an_address_is_a_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("run:1").write_text(json.dumps({"endpoint": "tcp://h:1", "run_id": "r"}))
+    assert find_master("run:1") == MasterAddress("tcp://h:1", "r")
+    assert find_master("run:2") == MasterAddress("tcp://run:2", "")
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "[::1]"])
+def test_a_host_with_an_address_is_nothing_to_tell(host: str) -> None:
+    assert dns_error(f"tcp://{host}:5555") == ""
+
+
+@pytest.mark.parametrize("answer", ["no", "never"])
+def test_a_host_that_dns_does_not_know_is_told(
+    answer: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = Event()
+
+    def resolve(host: str, _port: None) -> None:
+        assert host == "learner.lan"
+        if answer == "no":
+            raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+        asked.wait(60.0)
+
+    monkeypatch.setattr(socket, "getaddrinfo", resolve)
+    said = {"no": "Name or service not known", "never": "no answer in 0.1 s"}[answer]
+    error = dns_error("tcp://learner.lan:5555", patience_s=60.0 if answer == "no" else 0.1)
+    asked.set()
+    assert error == f"DNS knows no host 'learner.lan' ({said}): check the name in connect="
 
 
 @pytest.mark.parametrize(
     "address",
-    ["udp://h:1", "tcp://h", "tcp://:1", "tcp://h:0", "tcp://h:65536", "tcp://h:x", "tcp://"],
+    [
+        "udp://h:1",
+        "tcp://h",
+        "tcp://:1",
+        "tcp://h:0",
+        "tcp://h:65536",
+        "tcp://h:x",
+        "tcp://",
+        "tcp://a b:1",
+    ],
 )
 def test_a_wrong_address_is_refused(address: str) -> None:
     with pytest.raises(RunError) as caught:
         find_master(address)
     assert str(caught.value) == (
-        f"'{address}' (from {address}) is no address: it must be tcp://host:port"
+        f"'{address}' (from {address}) is no address: it must be tcp://host:port, the port "
+        "from 1 to 65535"
     )
 
 
@@ -89,7 +135,7 @@ def test_a_file_that_comes_late_is_waited_for(tmp_path: Path) -> None:
         path.write_text(json.dumps({"endpoint": "tcp://h:1", "run_id": "r"}))
 
     assert await_master(str(path), tell, 60.0) == MasterAddress("tcp://h:1", "r")
-    assert told == [f"waits for the connection file {path}"]
+    assert told == [f"waits for the connection file {path}, for 60 s at most"]
     path.unlink()
     with pytest.raises(RunError, match=r"no connection file is at .*c.json after 0.1 s"):
         await_master(str(path), lambda _: None, 0.1)

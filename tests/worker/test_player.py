@@ -208,7 +208,7 @@ def test_a_signal_ends_a_player_with_a_goodbye(
     assert {n: signal.getsignal(n) for n in survivable_signals} == survivable_signals
     lines = [line.partition(" ")[2] for line in capfd.readouterr().err.splitlines()]
     assert [line for line in lines if "is behind" not in line] == [
-        f"player: joining {hub.endpoint}",
+        f"player: joining {hub.endpoint}, for 3600 s at most",
         "player 0: joined run run",
         "player 0: waits: no weights yet",
         f"player 0: ends: {number.name}",

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,9 +10,10 @@ import zmq
 
 from master.security import make_keys
 from tangram_agent.messages import RunStatus
-from tangram_sim.errors import TangramError
+from tangram_sim.errors import RunError, TangramError
 from tests.master.dealers import Stage, staged
 from tests.master.test_health import STATUS
+from tests.master.test_result import RESULT
 from tests.worker.conversation import served
 from tests.worker.test_security import write_file
 from worker.config import StatusConfig
@@ -53,8 +55,41 @@ def test_what_a_person_and_a_program_see_also_while_the_run_ends(
     assert (plain["run"], plain["updates"], len(plain["workers"])) == ("r", 7.0, 2)
 
 
+def test_a_finished_run_shows_its_result(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config, path = StatusConfig(str(tmp_path)), tmp_path / "result.json"
+    path.write_text(json.dumps(RESULT))
+    assert show_status(config) == 0
+    shown = capsys.readouterr().out
+    assert shown.startswith(f"run {tmp_path.name} has ended\n")
+    assert re.search(r"ended by +max_updates=1234", shown)
+    assert show_status(StatusConfig(str(tmp_path), json=True)) == 0
+    assert json.loads(capsys.readouterr().out) == RESULT
+    for content in ("", "[]", "{}", json.dumps(RESULT | {"wall_s": "x"}), "[" * 100_000):
+        path.write_text(content)
+        with pytest.raises(RunError, match=r"result\.json is no result of a run"):
+            show_status(config)
+
+
+@pytest.mark.parametrize(("evaluators", "told"), [(0, True), (1, False)])
+def test_a_run_without_an_evaluator_says_how_to_start_one(
+    stage: Stage, tmp_path: Path, capsys: pytest.CaptureFixture[str], evaluators: int, told: bool
+) -> None:
+    numbers = {"updates": 7.0, "evaluators": evaluators, "play/reward": 0.5}
+    stage.hub.tell(replace(STATUS, numbers=numbers))
+    path = str(write_file(tmp_path, stage.hub, None))
+    assert served(stage, lambda: show_status(StatusConfig(path))) == 0
+    shown = capsys.readouterr().out
+    assert re.search("players' reward +0.500, with exploration", shown)
+    assert ("none: no evaluator has joined, the last line starts one" in shown) == told
+    assert shown.endswith(f"\ntangram-worker connect={path} role=evaluator\n") == told
+
+
 def test_nobody_there_is_told(tmp_path: Path) -> None:
     with zmq.Context() as context:
+        with pytest.raises(TangramError, match=r"DNS knows no host 'no\.invalid' \(.+\): check"):
+            ask_status("no.invalid:5555", context)
         with pytest.raises(TangramError, match=r"no connection file at .*: no master runs there"):
             ask_status(str(tmp_path), context)
         with pytest.raises(TangramError, match=r"127\.0\.0\.1:9 has not answered for 0\.2 s"):

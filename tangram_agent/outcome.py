@@ -1,0 +1,61 @@
+"""What a run has come to, in words: the rows that follow from its result.json."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from tangram_sim.errors import RunError
+
+FILE_NAME = "result.json"
+CTRL_C = {"SIGINT": "Ctrl-C (SIGINT)"}
+
+
+def read_outcome(path: Path) -> dict[str, Any]:
+    """The content of a result.json, which has all that `outcome_rows` needs.
+
+    Raises:
+        RunError: it cannot be read, or is none.
+    """
+    try:
+        result = json.loads(path.read_text(encoding="utf-8"))
+        outcome_rows(result)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise RunError(
+            f"{path} is no result of a run ({error!r}): name the folder of a run that has finished"
+        ) from None
+    return dict(result)
+
+
+def outcome_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What people want to know of a result, as names and texts."""
+    rows = [
+        ("mean reward", f"{_text(result, 'mean_reward', '{:.3f}')} on exact polygons"),
+        ("", f"{_text(result, 'mean_reward_camera', '{:.3f}')} in the camera's pictures"),
+        ("raw overlap", _text(result, "raw_overlap", "{:.3f}")),
+        ("angle error", _text(result, "angle_error_deg_median", "{:.2f}°") + " (median)"),
+        ("position error", _text(result, "position_error_median", "{:.4f}") + " (median)"),
+    ]
+    if result["scored_updates"] is None:
+        rows = [("scores", "none: no evaluator took part; tangram-eval scores a finished run")]
+    elif result["scored_updates"] != result["updates"]:
+        rows.append(("scored", f"weights after {result['scored_updates']:,} updates"))
+    return [
+        *rows,
+        ("episodes", f"{result['episodes']:,}"),
+        ("updates", f"{result['updates']:,}"),
+        ("time", f"{duration(result['train_s'])} of training, {duration(result['wall_s'])} in all"),
+        ("ended by", CTRL_C.get(result["ended_by"], result["ended_by"])),
+    ]
+
+
+def duration(seconds: float) -> str:
+    """0:07, 12:34 or 1:02:03."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def _text(result: Mapping[str, Any], name: str, pattern: str) -> str:
+    value = result[name]
+    return "-" if value is None else pattern.format(value)
