@@ -156,7 +156,7 @@ class StudyConfig(Settings):
     def test_command(self, name: str) -> list[str]:
         """Everything that tangram-eval is told; puzzles are as many as there are."""
         overrides = self.tests[name].overrides
-        if any(text.startswith("puzzles=") for text in overrides):
+        if any(text.startswith("puzzle=") for text in overrides):
             return list(overrides)
         return [f"episodes={self.budget.test_episodes}", *overrides]
 
