@@ -414,7 +414,7 @@ SLURM = "hydra/launcher=submitit_slurm"
         ("eval run_dir=x --seed=3", "settings carry no dashes, as in seed=3; --help lists them"),
         ("eval run_dir=x -seed=3", "settings carry no dashes, as in seed=3; --help lists them"),
         (f"eval run_dir=x {SLURM}", "is for the jobs of a sweep: add --multirun"),
-        (f"eval run_dir=x -m {SLURM}", "needs a plugin: pip install 'tangram-rl[slurm]"),
+        (f"eval run_dir=x -m {SLURM}", "needs the extra slurm: .ci/install .venv slurm in"),
     ],
 )
 def test_what_would_be_taken_for_something_else_is_refused(
