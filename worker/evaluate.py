@@ -21,7 +21,7 @@ from tangram_agent.runs import Run, load_run
 from tangram_agent.setup import Setup
 from tangram_sim.game_drawing import figure_sheet
 from worker.baselines import exact_policy, position_policy, random_policy
-from worker.config import EvalConfig
+from worker.config import EvalConfig, source_and_names
 from worker.metrics import assembled, pose_errors, summarise
 from worker.puzzles import Figure, Figures, find_figures, play_figures
 from worker.rollout import Choose, Played
@@ -90,7 +90,7 @@ def evaluate_run(config: EvalConfig) -> int:
     torch.set_num_threads(1)
     began = time.monotonic()
     run = load_run(config.run).with_settings(config.changes)
-    report = (_episodes if config.puzzles is None else _puzzles)(run, config)
+    report = (_episodes if config.puzzle is None else _puzzles)(run, config)
     if config.out is not None:
         report |= {"seconds": time.monotonic() - began}
         write_whole(Path(config.out), (json.dumps(report, indent=1) + "\n").encode())
@@ -138,12 +138,13 @@ def _episodes(run: Run, config: EvalConfig) -> dict[str, Any]:
 
 def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
     """Assemble the puzzles, print the scores and draw the sheet; the file's content."""
-    source, setup = str(config.puzzles), run.setup
-    found = find_figures(source, setup, None, config.turns, config.skip_invalid)
+    source, names = source_and_names(config.puzzle or ())
+    setup = run.setup
+    found = find_figures(source, setup, names, config.turns, config.skip_invalid)
     scores, lines, played = score_puzzles(setup, found.figures, policies(run), config.seed)
     console = Console(highlight=False)
     count = len(found.figures)
-    which = f"{plural(count, 'puzzle')} of {Path(source).name}"
+    which = f"{plural(count, 'puzzle')} of {Path(source or 'the library').name}"
     caption = f"{which}, {_told(setup)}; positions in arena units"
     console.print(scores_table(_title(run), caption, scores))
     console.print(puzzles_table(lines, full=config.out))
@@ -152,7 +153,7 @@ def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
         write_sheet(config.sheet, setup, found, played)
         console.print(f"written: {config.sheet}", markup=False, soft_wrap=True)
     return _report(run, config, scores) | {
-        "source": source,
+        "puzzle": list(config.puzzle or ()),
         "turns": config.turns,
         "skipped": list(found.faults),
         "puzzles": lines,

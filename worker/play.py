@@ -22,7 +22,7 @@ from tangram_sim.errors import ConfigError, RunError
 from tangram_sim.game_drawing import figure_sheet
 from tangram_sim.kinematics import wrap
 from tangram_sim.layout import Layout
-from worker.config import MAX_SHOWN, PlayConfig
+from worker.config import MAX_SHOWN, PlayConfig, source_and_names
 from worker.film import Show, film_pictures, frames_per_action, show_live
 from worker.puzzles import find_figures, play_figures
 from worker.rollout import Played
@@ -68,7 +68,7 @@ def make_show(run: Run, config: PlayConfig) -> Show:
     Raises:
         ConfigError: puzzles that the run cannot play.
     """
-    if config.plays_puzzles:
+    if config.puzzle is not None:
         return puzzle_show(run, config)
     titles = [f"target {i + 1}" for i in range(config.episodes)]
     return Show(run.setup, play_episodes(run, config), titles, "episodes")
@@ -89,7 +89,8 @@ def puzzle_show(run: Run, config: PlayConfig) -> Show:
         ConfigError: puzzles that the run cannot play, or too many of them.
     """
     setup = replace(run.setup, sim=replace(run.setup.sim, starts="outside"))
-    found = find_figures(config.puzzles, setup, config.puzzle)
+    source, names = source_and_names(config.puzzle or ())
+    found = find_figures(source, setup, names, config.turns, config.skip_invalid)
     if len(found.figures) > MAX_SHOWN:
         raise ConfigError(
             f"there are {len(found.figures)} puzzles, at most {MAX_SHOWN} are shown: name some, as "
