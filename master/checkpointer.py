@@ -195,7 +195,7 @@ def restore_run(folder: Path, trainer: Trainer) -> Restored | None:
         return Restored.of(found.counters)
     except RunError as error:
         raise RunError(f"cannot go on from {found.path}: {error}") from None
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise RunError(
             f"cannot go on from {found.path}: its content is not that of a run "
             f"({type(error).__name__}: {error}); start a new run with another run_dir"

@@ -171,7 +171,7 @@ def read_config(path: Path) -> dict[str, Any]:
 def _parse_config(text: str, path: Path) -> dict[str, Any]:
     try:
         content = yaml.safe_load(text)
-    except yaml.YAMLError:
+    except (yaml.YAMLError, RecursionError):
         raise _no_yaml(path) from None
     if not isinstance(content, dict):
         raise RunError(f"{path} holds no settings: it must be a mapping of sections")

@@ -10,7 +10,8 @@ from tangram_agent.messages import MAX_INDEX, ROLES
 from tangram_agent.pretrained import PREFIX, agent_names
 from tangram_sim.errors import ConfigError
 from tangram_sim.puzzles import SPLITS
-from tangram_sim.settings import Settings, declared, refuse_ignored, setting, told
+from tangram_sim.settings import Settings, check_folder, declared, refuse_ignored, setting, told
+from worker.discovery import as_address, find_master
 
 Changes = dict[str, dict[str, Any]]  # section -> setting -> value: of a run that was trained
 OF_TARGETS = ("targets", "spread", "mirrored")  # settings of sim that say nothing of a puzzle
@@ -30,11 +31,6 @@ TURNS_HELP = "each puzzle at so many angles, evenly spread; 1 is as drawn"
 SKIP_HELP = "leave out puzzles that cannot be played"
 
 
-def _check_run_dir(value: str) -> None:
-    if not value.strip():
-        raise ConfigError("run_dir must name the folder of a run, got '': set run_dir=runs/my_run")
-
-
 def game_run() -> str:
     """The run that plays puzzles unless another is named."""
     return f"{PREFIX}/{GAME}"
@@ -43,7 +39,7 @@ def game_run() -> str:
 def _check_run(run_dir: str | None, puzzles: bool) -> None:
     """Refuse no run where none can be meant."""
     if run_dir is not None:
-        _check_run_dir(run_dir)
+        check_folder("run_dir", run_dir)
     elif not (puzzles and GAME in agent_names()):
         raise ConfigError("say which run: run_dir=runs/...")
 
@@ -58,6 +54,8 @@ def _refuse(changes: Changes, names: Iterable[str], because: str, remedy: str) -
 def _check_connect(value: str) -> None:
     if not value.strip():
         raise ConfigError("connect must name the master's endpoint, got '': set connect=HOST:PORT")
+    if as_address(value) is not None:
+        find_master(value)  # no file is read: it only has to be one
 
 
 def _check_out(value: str) -> None:
@@ -259,7 +257,7 @@ class PlayConfig(Settings):
 
     def _check_one_of_both(self) -> None:
         if self.run_dir is not None:
-            _check_run_dir(self.run_dir)
+            check_folder("run_dir", self.run_dir)
         elif (
             self.compare is None
             and self.tokens is None

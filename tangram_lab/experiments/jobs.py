@@ -120,7 +120,7 @@ def read_object(path: Path) -> dict[str, Any]:
     """A JSON object; empty where the file is missing or cannot be read."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return content if isinstance(content, dict) else {}
 

@@ -108,7 +108,7 @@ def _read(run_dir: Path) -> Candidate:
     path = run_dir / RESULT
     try:
         result = json.loads(path.read_bytes())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         raise RunError(f"cannot read {path}: name the folder of a finished run") from None
     if not isinstance(result, dict) or result.get("mean_reward") is None:
         raise RunError(f"{path} holds no mean_reward: train it with an evaluator")

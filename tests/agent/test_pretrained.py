@@ -92,6 +92,7 @@ def test_an_unknown_name_lists_those_that_there_are(package: Path) -> None:
         (lambda agent: (agent / CONFIG).write_text("- 1"), "holds no settings"),
         (lambda agent: (agent / CONFIG).write_text("a: [1"), "not valid YAML"),
         (lambda agent: (agent / CARD).write_text("{"), "cannot be read"),
+        (lambda agent: (agent / CARD).write_text("[" * 100_000), "cannot be read"),
         (lambda agent: (agent / CARD).write_text("[]"), "not of format 2"),
         (lambda agent: (agent / CARD).write_text('{"format": 1}'), "not of format 2"),
         (lambda agent: (agent / CARD).write_text('{"format": 2}'), "does not tell the updates"),

@@ -118,6 +118,7 @@ def test_settings_that_only_one_version_knows_do_not_differ() -> None:
     older = made.contents()
     del older["agent"]["edges"], older["agent"]["hindsight"][0]["angle"], older["reward"]
     assert made.differences(older | {"newer": {}}) == []
+    assert made.differences(3) == ["agent", "net", "reward", "sim", "tokens"]
     older["agent"]["hindsight"][0]["copies"] = 7
     assert made.differences(older) == ["agent"]
     older["agent"]["hindsight"] = []

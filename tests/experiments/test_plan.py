@@ -179,7 +179,7 @@ def test_seeds_may_be_added_and_none_is_forgotten(
     assert found["budget"]["seeds"] == expected
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"budget": 1}'])
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"budget": 1}', "[" * 100_000])
 def test_a_plan_that_cannot_be_read_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "plan.json"
     path.write_text(text)

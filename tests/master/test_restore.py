@@ -142,6 +142,28 @@ def test_a_checkpoint_that_lacks_a_part_is_refused(tmp_path: Path, lost: str) ->
         restore_run(tmp_path, trainer(MADE))
 
 
+@pytest.mark.parametrize(
+    ("forged", "reason"),
+    [
+        ({"setup": 3}, "other settings of net, reward, sim, tokens"),
+        ({"rate_limiter": 3}, "not that of a run .AttributeError"),
+        ({"episodes": 1e400}, "not that of a run .OverflowError"),
+        ({"record": Record().state() | {"loop_s": "x"}}, "Expected `float`, got `str` - at"),
+        (
+            {"record": Record().state() | {"scores": []}},
+            "Expected `object`, got `array`",
+        ),
+    ],
+)
+def test_a_checkpoint_with_a_part_of_another_kind_is_refused(
+    tmp_path: Path, forged: dict[str, Any], reason: str
+) -> None:
+    found = load_checkpoint(save_run(tmp_path, trainer(MADE), REST, keep=1))
+    save_checkpoint(tmp_path, 1, found.arrays, found.counters | forged, keep=1)
+    with pytest.raises(RunError, match=f"cannot go on from .*{reason}"):
+        restore_run(tmp_path, trainer(MADE))
+
+
 def test_a_record_that_lacks_a_field_is_refused() -> None:
     state = Record().state()
     del state["train_s"]
