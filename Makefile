@@ -49,6 +49,7 @@ paper: .venv/.installed-run  ## all figures and tables of the paper: BUDGET=smok
 bench: .venv/.installed-dev  ## measure speed against what else one could do; options go into ARGS="runs=9"
 	@$(BIN)/tangram-bench all out=docs/results/bench.json $(ARGS)
 
+# Not --quiet: mkdocs then counts no warnings, and --strict lets all pass.
 docs: .venv/.installed-docs  ## make a site of README and docs, in site/
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo "the front page is site/index.html; with search: python3 -m http.server -d site"
