@@ -16,6 +16,7 @@ from rich.table import Table
 
 from tangram_agent.config import ORDERS
 from tangram_agent.files import write_whole
+from tangram_agent.outcome import plural
 from tangram_agent.runs import Run, load_run
 from tangram_agent.setup import Setup
 from tangram_sim.game_drawing import figure_sheet
@@ -143,9 +144,8 @@ def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
     scores, lines, played = score_puzzles(setup, found.figures, policies(run), config.seed)
     console = Console(highlight=False)
     count = len(found.figures)
-    where = Path(source or "the library").name
-    puzzles = f"{count:,} puzzle{'s' * (count != 1)} of {where}"
-    caption = f"{puzzles}, {_told(setup)}; positions in arena units"
+    which = f"{plural(count, 'puzzle')} of {Path(source or 'the library').name}"
+    caption = f"{which}, {_told(setup)}; positions in arena units"
     console.print(scores_table(_title(run), caption, scores))
     console.print(puzzles_table(lines, full=config.out))
     print_faults(console, found.faults)
@@ -176,7 +176,7 @@ def _report(run: Run, config: EvalConfig, scores: Mapping[str, Scores]) -> dict[
 
 
 def _title(run: Run) -> str:
-    return f"{run.folder.name} after {run.updates:,} updates"
+    return f"{run.folder.name} after {plural(run.updates, 'update')}"
 
 
 def _told(setup: Setup) -> str:

@@ -13,6 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from rich.console import Console
 
 from tangram_agent.files import write_whole
+from tangram_agent.outcome import plural
 from tangram_agent.runs import Run, load_run
 from tangram_agent.setup import Setup
 from tangram_sim.arrays import Floats
@@ -203,7 +204,7 @@ def compare_runs(config: PlayConfig) -> int:
     save_picture(config.out, with_stills(frames))
     line = "; ".join(f"{label}: {score}" for label, score in zip(labels, scores, strict=True))
     Console(highlight=False).print(
-        f"{config.out}: {config.episodes} episodes; {line}", markup=False, soft_wrap=True
+        f"{config.out}: {plural(config.episodes, 'episode')}; {line}", markup=False, soft_wrap=True
     )
     return 0
 

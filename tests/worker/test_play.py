@@ -304,7 +304,7 @@ def test_two_agents_move_side_by_side(tmp_path: Path, capsys: pytest.CaptureFixt
     write_run(tmp_path / "second", agent=PLAIN_AGENT)
     assert compare_runs(compared(tmp_path, "first", "second", episodes=1)) == 0
     printed = capsys.readouterr().out
-    assert f"{tmp_path / 'both.gif'}: 1 episodes; first: mean raw overlap 0." in printed
+    assert f"{tmp_path / 'both.gif'}: 1 episode; first: mean raw overlap 0." in printed
     assert "; second: mean raw overlap 0." in printed
     with Image.open(tmp_path / "both.gif") as film:
         assert film.n_frames > 5
