@@ -20,6 +20,7 @@ from conf.help import choices, group_help, help_text, setting_names
 from conf.names import hidden, revealed
 from conf.sweep import LAUNCHER, SWEEP, check_launcher, refuse_lost_job
 from tangram_sim.errors import ConfigError, TangramError
+from tangram_sim.settings import CONTROL
 
 # From the settings of a command: where the groups of a run are named, and these; None for nowhere.
 Stored = Callable[[Plain], tuple[str, Plain] | None]
@@ -66,11 +67,13 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
             return 0
         options = [] if folder is None else [OWN_PRESETS[0], folder]
         _check_presets(folder)
-        sys.argv[1:] = [*options, *hidden(_options_first(arguments), config_name)]
+        sys.argv[1:] = [*options, *hidden(_options_first(arguments, config_name), config_name)]
         check_launcher(sys.argv[1:])
         return _run(config_name, task, stored)
     except TangramError as error:
-        print(f"{command}: {error}", file=sys.stderr)
+        # What a user gave may hold line breaks and the terminal's control characters.
+        line = CONTROL.sub(lambda found: ascii(found[0])[1:-1], str(error))
+        print(f"{command}: {line}", file=sys.stderr)
         return USAGE_STATUS
     except KeyboardInterrupt:
         return INTERRUPT_STATUS
@@ -130,7 +133,7 @@ def _split_option(argument: str) -> list[str]:
     return [name, value] if sign and name in OWN_PRESETS else [argument]
 
 
-def _options_first(arguments: Sequence[str]) -> list[str]:
+def _options_first(arguments: Sequence[str], config_name: str) -> list[str]:
     """The arguments in the order that hydra's parser insists on."""
     options: list[str] = []
     overrides: list[str] = []
@@ -152,19 +155,31 @@ def _options_first(arguments: Sequence[str]) -> list[str]:
     if options[-1:] == ["--cfg"]:
         options.append("job")
     for override in overrides:
-        _refuse_several(override)
+        _check_override(override, COMMANDS[config_name].over)
     if len(set(FLAGS) & set(options)) > 1:
         raise ConfigError("--cfg and --multirun do not go together: leave one out")
     return [*options, *overrides]
 
 
-def _refuse_several(override: str) -> None:
-    """Refuse a list of presets: hydra would merge them, so that [square,square] is one square."""
-    group, _, value = override.partition("=")
-    if group not in GROUPS or not value.startswith("["):
-        return
-    remedy = f"; for several tokens write tokens.shapes={value}" if group == "tokens" else ""
-    raise ConfigError(f"{group} takes one preset, got {value}{remedy}")
+def _check_override(override: str, over: Sequence[str]) -> None:
+    """Refuse what hydra would take for something else.
+
+    A list of presets it would merge, so that [square,square] is one square. What is taken away
+    would be as it is by default.
+    """
+    name, _, value = override.lstrip("+~").partition("=")
+    if not name:
+        raise ConfigError(_unreadable(override))
+    if override.startswith("~"):
+        raise ConfigError(f"'{override}': no setting is taken away, write {name}=value instead")
+    if name in over:
+        raise ConfigError(
+            f"{override} chooses a preset, and a trained run has its own {name}: set single "
+            f"values, as --help {name} lists them"
+        )
+    if name in GROUPS and value.startswith("["):
+        remedy = f"; for several tokens write tokens.shapes={value}" if name == "tokens" else ""
+        raise ConfigError(f"{name} takes one preset, got {value}{remedy}")
 
 
 def _run(config_name: str, task: Callable[[Plain], int], stored: Stored | None) -> int:
@@ -194,7 +209,13 @@ def _run(config_name: str, task: Callable[[Plain], int], stored: Stored | None) 
         hydra.main(version_base="1.3", config_path="pkg://conf", config_name=config_name)(job)()
     except TangramError:
         raise
-    except (HydraException, OmegaConfBaseException, ValueError, yaml.YAMLError) as error:
+    except (
+        HydraException,
+        OmegaConfBaseException,
+        ValueError,
+        RecursionError,
+        yaml.YAMLError,
+    ) as error:
         raise ConfigError(_explain(error, config_name)) from error
     except SystemExit:
         if not errors:
@@ -340,7 +361,7 @@ def with_run_config(
         section = key.partition(".")[0]
         if section not in content:
             continue
-        if key == section or override.startswith("~"):
+        if key == section:
             raise ConfigError(
                 f"{source} chooses {section} already: leave out {override}, "
                 f"or set single values as in {section}.name=value"
@@ -360,7 +381,7 @@ def _from_config(settings: Plain) -> tuple[str, Plain] | None:
         content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"{source}: {error.strerror or error}") from None
-    except (yaml.YAMLError, UnicodeDecodeError):
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError):
         raise ConfigError(f"{source} is not a YAML file") from None
     return source, content if isinstance(content, dict) else {}
 
@@ -377,7 +398,11 @@ def _explain(error: Exception, config_name: str) -> str:
         known = error.options or choices(group)
         return f"unknown {group} '{name}': choose from {', '.join(known)}"
     if isinstance(error, OverrideParseException):
-        return f"cannot read '{error.override}': write name=value, and quote texts with '...'"
+        return _unreadable(error.override)
+    if isinstance(error, RecursionError):
+        return "the arguments are nested too deeply: write fewer brackets"
+    if str(error).startswith("Config group override must be"):
+        return "a config group takes the name of a preset, and no number: --help lists them"
     if "Ambiguous value" in str(error):
         return (
             f"{_first_line(error)}: a list is [1,2], a text is '1,2', several runs are --multirun"
@@ -387,6 +412,10 @@ def _explain(error: Exception, config_name: str) -> str:
         name = unknown.group(1) or unknown.group(2)
         return _unknown_setting(name, setting_names(config_name))
     return _first_line(error)
+
+
+def _unreadable(override: object) -> str:
+    return f"cannot read '{override}': write name=value, and quote texts with '...'"
 
 
 def _unknown_setting(name: str, known: Sequence[str]) -> str:

@@ -26,7 +26,10 @@ def check_launcher(arguments: Sequence[str]) -> None:
         raise ConfigError(f"{chosen[-1]} is for the jobs of a sweep: add --multirun")
     name = chosen[-1].partition("=")[2]
     if name.startswith("submitit") and find_spec("submitit") is None:
-        raise ConfigError(f"{chosen[-1]} needs a plugin: pip install 'tangram-rl[slurm]'")
+        raise ConfigError(
+            f"{chosen[-1]} needs the extra slurm: .ci/install .venv slurm in the source tree, "
+            "elsewhere pip install 'tangram-rl[slurm]'"
+        )
     if name == "submitit_slurm" and shutil.which("srun") is None:
         raise ConfigError(f"{chosen[-1]} needs SLURM, and there is no srun on this machine")
 

@@ -16,10 +16,11 @@ from typing import Any
 from master.delivery import EpisodesArrived
 from master.divergence import DivergenceGuard
 from master.hub import Hub
-from master.journal import Journal, JournalError, check_journal, segments
+from master.journal import Journal, JournalError
 from master.rundir import Clock, Record, RunFolder
-from master.trainer import LEARNER, Trainer, check_same_task
+from master.trainer import LEARNER, Trainer
 from tangram_agent.checkpoints import (
+    CHECKPOINTS,
     Checkpoint,
     CorruptError,
     DiskError,
@@ -32,8 +33,6 @@ from tangram_agent.checkpoints import (
 )
 from tangram_agent.config import ServiceConfig
 from tangram_agent.process import Every
-from tangram_agent.runs import CHECKPOINTS, SETUP
-from tangram_agent.setup import make_setup
 from tangram_sim.errors import RunError
 
 MINUTE_S = 60.0
@@ -130,33 +129,6 @@ class Checkpointer:
             log.info("the journal can be written again: batches are taken in")
 
 
-def check_resumable(folder: RunFolder, resolved: Mapping[str, Any]) -> None:
-    """Refuse another task, or a warm start from nowhere, before anything is overwritten.
-
-    Raises:
-        RunError: the newest checkpoint was made with other tokens, sim, reward or net, or there is
-            none, and the journal was, or the run that this one is to begin with has none.
-    """
-    found = list_checkpoints(folder.checkpoints)
-    if not found:
-        if segments(folder.journal):  # it was killed before its first checkpoint
-            check_journal(folder.journal, make_setup(resolved).task_digest())
-        _check_warm_start(resolved.get("warm_start"))
-        return
-    try:
-        counters = load_checkpoint(found[-1], stems=[]).counters
-    except CorruptError:
-        return  # the one before decides, when the run is restored
-    check_same_task(make_setup(resolved), counters.get(SETUP, {}))
-
-
-def _check_warm_start(run_dir: str | None) -> None:
-    if run_dir is not None and not list_checkpoints(Path(run_dir) / CHECKPOINTS):
-        raise RunError(
-            f"warm_start={run_dir} has no checkpoint: name the folder of a run that was trained"
-        )
-
-
 @dataclass(frozen=True)
 class Restored:
     """What a checkpoint holds besides the trainer's state.
@@ -223,7 +195,7 @@ def restore_run(folder: Path, trainer: Trainer) -> Restored | None:
         return Restored.of(found.counters)
     except RunError as error:
         raise RunError(f"cannot go on from {found.path}: {error}") from None
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise RunError(
             f"cannot go on from {found.path}: its content is not that of a run "
             f"({type(error).__name__}: {error}); start a new run with another run_dir"

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 from tangram_agent.config import ServiceConfig
 from tangram_sim.errors import ConfigError
-from tangram_sim.settings import Settings, declared, setting
+from tangram_sim.settings import Settings, check_folder, declared, setting
 
 MAX_WORKERS = 1024
 
@@ -40,5 +40,4 @@ class MasterConfig(Settings):
                 "tangram-master alone waits for workers from elsewhere"
             )
         super().__post_init__()
-        if not self.run_dir.strip():
-            raise ConfigError("run_dir must name a folder, got '': set run_dir=runs/my_run")
+        check_folder("run_dir", self.run_dir)

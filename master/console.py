@@ -18,7 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from tangram_agent.messages import RunStatus
-from tangram_agent.outcome import duration
+from tangram_agent.outcome import duration, plural
 from tangram_agent.process import Every, formatter
 
 PANEL_S = 0.5
@@ -233,11 +233,6 @@ def status_panel(status: RunStatus, title: str, evaluator: str = "") -> Panel:
     if evaluator and not n["evaluators"]:
         body.renderables.append(Text(f"no evaluator: start one with {evaluator}", overflow="fold"))
     return Panel(body, title=title, title_align="left", width=PANEL_WIDTH, padding=(1, 2))
-
-
-def plural(count: float, noun: str) -> str:
-    """1 worker, 2 workers."""
-    return f"{count:,.0f} {noun}" if count == 1 else f"{count:,.0f} {noun}s"
 
 
 def _bar(n: Mapping[str, float]) -> Table:

@@ -187,7 +187,7 @@ class Journal:
 def segments(folder: Path) -> dict[int, Path]:
     """Number -> path of the segments, in order."""
     paths = folder.glob(f"*{SUFFIX}") if folder.is_dir() else ()
-    return {int(path.stem): path for path in sorted(paths) if path.stem.isdecimal()}
+    return dict(sorted((int(path.stem), path) for path in paths if path.stem.isdecimal()))
 
 
 def segment_path(folder: Path, number: int) -> Path:
@@ -250,13 +250,19 @@ def read_journal(
     Raises:
         RunError: another run, task or format.
     """
-    found = segments(folder)
-    for number in range(first, max(found, default=0) + 1):
-        if number not in found:
-            path = segment_path(folder, number)
-            warn(f"{path} is missing: the batches that it held are lost")
+    expected = first
+    for number, path in segments(folder).items():
+        if number < first:
             continue
-        yield from _segment(found[number], run_id, task, spec, warn)
+        if number > expected:
+            warn(_missing(segment_path(folder, expected), number - expected))
+        expected = number + 1
+        yield from _segment(path, run_id, task, spec, warn)
+
+
+def _missing(path: Path, count: int) -> str:
+    more = f" and the {count - 1:,} after it are" if count > 1 else " is"
+    return f"{path}{more} missing: the batches that were in there are lost"
 
 
 def _segment(

@@ -9,11 +9,11 @@ from contextlib import AbstractContextManager
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from master.checkpointer import check_resumable
 from master.children import MAX_RESTARTS, Child, command, describe, override
 from master.config import MasterConfig
 from master.console import logging_to, sturdy_console
 from master.result import show_finished
+from master.resumable import check_resumable
 from master.rundir import RunFolder
 from master.signals import SAME_WISH_S, handling, show_cursor
 from tangram_agent.outcome import CTRL_C
@@ -206,9 +206,11 @@ class Launcher:
 
     def _worker_ended(self, child: Child) -> None:
         status = child.clear()
-        ends = self._reached and self._master.alive and not self._folder.connection.exists()
-        if self._stop_s is not None or ends:
-            return  # the master takes leave, and so do its workers
+        if self._reached and not self._folder.connection.exists():
+            child.next_start_s = 0.0  # the master took leave of it; for one that comes back
+            return
+        if self._stop_s is not None:
+            return
         if child.plan_restart(status):
             self._say(
                 f"{child.name} ended with {describe(status)}: it is started again "

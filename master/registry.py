@@ -246,12 +246,13 @@ def _key(name: str) -> Key:
     return role, int(index)
 
 
-def _ledger(name: str, entry: Mapping[str, int]) -> Ledger:
-    incarnation, sequence = entry.get("incarnation"), entry.get("sequence")
+def _ledger(name: str, entry: object) -> Ledger:
+    found = entry if isinstance(entry, dict) else {}
+    incarnation, sequence = found.get("incarnation"), found.get("sequence")
     for value, low in ((incarnation, 1), (sequence, 0)):
         if type(value) is not int or not low <= value <= MAX_COUNT:
             raise RunError(
                 f"the checkpoint's entry of {name} must hold an incarnation from 1 and a sequence "
-                f"from 0, both to {MAX_COUNT}, got {dict(entry)}"
+                f"from 0, both to {MAX_COUNT}, got {entry!r}"
             )
     return Ledger(int(incarnation or 0), int(sequence or 0))

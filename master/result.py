@@ -19,7 +19,6 @@ from rich.table import Table
 from master.children import override
 from master.console import TEST, sturdy_console
 from master.rundir import RunFolder
-from master.trainer import Trainer
 from tangram_agent.messages import RunStatus
 from tangram_agent.outcome import outcome_rows, read_outcome
 
@@ -41,18 +40,20 @@ log = logging.getLogger(__name__)
 PACKAGES = ("tangram-rl", "torch", "numpy", "pyzmq", "pybullet")
 
 
-def make_result(status: RunStatus, trainer: Trainer, seed: int, reason: str) -> dict[str, Any]:
+def make_result(
+    status: RunStatus, facts: Mapping[str, Any], seed: int, reason: str
+) -> dict[str, Any]:
     """The content of result.json; scores are null where no evaluator sent any.
 
     `scored_updates` tells which weights the scores are of: the final ones if it equals `updates`.
 
     Args:
         status: at the end of the run.
-        trainer: what has learned.
+        facts: of what has learned.
         seed: of the run.
         reason: of its end.
     """
-    setup, n = trainer.setup, status.numbers
+    n = status.numbers
     scored = int(n["scored_updates"])
     return {
         **{name: n.get(TEST + name) for name in SCORES},
@@ -62,15 +63,8 @@ def make_result(status: RunStatus, trainer: Trainer, seed: int, reason: str) -> 
         **{name: round(n[name], 3) for name in ("wall_s", "train_s")},
         "ended_by": reason,
         "seed": seed,
-        "agent": setup.agent.name,
-        "net": setup.net.kind,
-        "tokens": [shape.name for shape in setup.layout.shapes],
-        "actions_per_token": setup.sim.actions_per_token,
-        "reward": setup.reward.name,
-        "backend": setup.sim.backend,
-        "device": str(trainer.learner.device),
+        **facts,
         "workers": int(n["most_players"]),
-        "parameters": trainer.learner.parameters,
         "run_id": status.texts["run_id"],
         "versions": versions(),
         "commit": commit(),

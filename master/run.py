@@ -11,13 +11,7 @@ from typing import Any
 import torch
 
 from master.budget import Budget
-from master.checkpointer import (
-    Checkpointer,
-    Restored,
-    check_resumable,
-    restore_run,
-    warm_start,
-)
+from master.checkpointer import Checkpointer, Restored, restore_run, warm_start
 from master.config import MasterConfig
 from master.console import Progress, logging_to, make_progress, sturdy_console
 from master.delivery import EpisodesArrived
@@ -30,6 +24,7 @@ from master.loop import Loop
 from master.metrics import Metrics
 from master.report import Reporter, StatusCollector
 from master.result import command_line, make_result, show_finished, show_result
+from master.resumable import check_resumable
 from master.rundir import Clock, Record, RunFolder
 from master.security import Keys, is_loopback, needs_keys, run_keys
 from master.signals import StopSignals
@@ -99,7 +94,7 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
             log.info("workers join with: %s", command_line("tangram-worker", join))
             log.info("an evaluator scores what is learned: %s", evaluator)
         reason = loop.run()
-        result = make_result(loop.finish(launched), loop.guard.trainer, config.seed, reason)
+        result = make_result(loop.finish(launched), loop.guard.trainer.facts(), config.seed, reason)
         folder.write_result(result)
         loop.reporter.hyperparameters(result)
         loop.dismiss(f"the run has ended ({reason})")

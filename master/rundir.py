@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import IO, Any
 
+import msgspec
 import yaml
 
 from master.config import MasterConfig
@@ -162,7 +163,7 @@ class Record:
         """The record in a checkpoint.
 
         Raises:
-            RunError: it lacks a field.
+            RunError: it lacks a field, or one is of another type.
         """
         lacking = [f.name for f in fields(Record) if f.name not in state]
         if lacking:
@@ -170,7 +171,13 @@ class Record:
                 f"the checkpoint's record lacks {', '.join(lacking)}: start a new run with "
                 "another run_dir"
             )
-        return Record(**{f.name: state[f.name] for f in fields(Record)})
+        try:
+            return msgspec.convert(dict(state), Record)
+        except msgspec.ValidationError as error:
+            raise RunError(
+                f"the checkpoint's record cannot be read ({error}): start a new run with another "
+                "run_dir"
+            ) from None
 
 
 class Clock:

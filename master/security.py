@@ -54,7 +54,7 @@ def run_keys(path: Path) -> Keys:
         ):
             if zmq.curve_public(secret.encode()).decode() != public:
                 raise ValueError("a public key is not that of its secret key")
-    except (OSError, ValueError, TypeError, AttributeError, zmq.ZMQError) as error:
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError, zmq.ZMQError) as error:
         raise RunError(
             f"{path} does not hold the run's keys ({error}): delete it to make new ones; workers "
             "that run now must then be started again"

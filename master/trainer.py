@@ -8,13 +8,14 @@ import numpy.typing as npt
 import torch
 
 from master.rate_limiter import LAG_UPDATES, RateLimiter
+from master.resumable import check_same_task
+from tangram_agent.checkpoints import ACTING, SETUP
 from tangram_agent.learner import Learner
 from tangram_agent.relabelling import with_relabelled
 from tangram_agent.replay import ReplayBuffer
-from tangram_agent.runs import ACTING, SETUP
 from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes, Transitions, Weights
-from tangram_sim.errors import ConfigError, RunError
+from tangram_sim.errors import ConfigError
 from tangram_sim.rewards import make_reward
 
 STREAMS = ("replay", "hindsight")
@@ -63,6 +64,20 @@ class Trainer:
     def transitions(self) -> int:
         """Transitions played that were taken in, without relabelled ones."""
         return self.episodes * self.setup.horizon
+
+    def facts(self) -> dict[str, Any]:
+        """What a result tells of the task and the agent."""
+        setup = self.setup
+        return {
+            "agent": setup.agent.name,
+            "net": setup.net.kind,
+            "tokens": [shape.name for shape in setup.layout.shapes],
+            "actions_per_token": setup.sim.actions_per_token,
+            "reward": setup.reward.name,
+            "backend": setup.sim.backend,
+            "device": str(self.learner.device),
+            "parameters": self.learner.parameters,
+        }
 
     def insert(self, episodes: Episodes) -> None:
         """Take in episodes as they were played, and relabelled."""
@@ -125,19 +140,6 @@ class Trainer:
         self.episodes = int(counters["episodes"])
         for name, generator in self._generators.items():
             generator.bit_generator.state = counters["generators"][name]
-
-
-def check_same_task(setup: Setup, contents: Mapping[str, Any]) -> None:
-    """Raise RunError unless a run of a setup with these contents can go on with this one.
-
-    The agent's rates may change on the way; what shapes its networks shows when they load.
-    """
-    odd = [name for name in setup.differences(contents) if name != "agent"]
-    if odd:
-        raise RunError(
-            f"the run was made with other settings of {', '.join(odd)}: resume it with its own, "
-            "from_config=RUN_DIR/config.yaml, or choose another run_dir"
-        )
 
 
 def choose_device(wanted: str) -> str:

@@ -65,7 +65,9 @@ trap 'exit 130' INT
 trap 'exit 143' TERM
 
 install_slurm || refuse "cannot install slurm-wlm and munge"
-[[ -x .venv/bin/tangram-master ]] || .ci/install .venv slurm
+# The sweep's plugin is in no environment that only `make train` made.
+.venv/bin/python -c 'import hydra_plugins.hydra_submitit_launcher' 2>/dev/null ||
+    .ci/install .venv slurm || refuse "cannot install the extra slurm into .venv"
 start_cluster || refuse "SLURM does not start: see $(tail -n 5 "$work"/*.out)"
 echo "$(slurmd -V) on Debian $(</etc/debian_version), two nodes on $(nproc) cores"
 

@@ -1,6 +1,26 @@
 """Addresses of sockets, as those on other machines see them."""
 
+import re
+from ipaddress import IPv6Address
+
+from tangram_sim.errors import ConfigError
+
+HOST = re.compile(r"[\w.*-]+")
 WILDCARDS = ("0.0.0.0", "*", "[::]")  # noqa: S104  # replaced, never bound
+
+
+def check_host(name: str, host: str) -> None:
+    """Raise ConfigError for a setting that is no host alone, without scheme and port."""
+    try:
+        if ":" in host:
+            IPv6Address(host.removeprefix("[").removesuffix("]"))
+        elif not HOST.fullmatch(host):
+            raise ValueError
+    except ValueError:
+        raise ConfigError(
+            f"{name} must be an address or a name of a machine, without scheme and port, got "
+            f"'{host}': set {name}=127.0.0.1"
+        ) from None
 
 
 def host_of(address: str) -> str:

@@ -15,8 +15,9 @@ import shutil
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 import safetensors
@@ -27,11 +28,22 @@ from tangram_sim.errors import RunError
 
 FORMAT_VERSION = 3
 MANIFEST = "manifest.json"
+CHECKPOINTS = "checkpoints"  # the folder of all of them in that of a run
+ACTING = "weights"  # the file of acting weights
+SETUP = "setup"  # the counter that tells the setup
 _NAME = re.compile(r"(\d{8,})(?:-(\d+))?")
 _TEMPORARY = ".writing-"
 _SET_ASIDE = ".corrupt"
 
 Tensors = dict[str, npt.NDArray[Any]]
+
+
+class _Manifest(TypedDict):
+    """What a manifest says besides its format and its checksum."""
+
+    updates: Annotated[int, msgspec.Meta(ge=0)]
+    files: dict[str, str]
+    counters: dict[str, Any]
 
 
 class DiskError(RunError):
@@ -202,16 +214,19 @@ def _digest(body: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()
 
 
-def _read_manifest(path: Path) -> dict[str, Any]:
+def _read_manifest(path: Path) -> _Manifest:
     try:
-        manifest = json.loads((path / MANIFEST).read_bytes())
+        content = json.loads((path / MANIFEST).read_bytes())
+        manifest = content if isinstance(content, dict) else {}
+        body = {name: manifest.get(name) for name in _Manifest.__annotations__}
+        digest = _digest(body)
     except FileNotFoundError:
         raise CorruptError(path, f"{MANIFEST} is missing") from None
     except OSError as error:
         raise RunError(f"cannot read checkpoint {path} ({error})") from None
-    except ValueError:
+    except (ValueError, RecursionError):
         raise CorruptError(path, f"{MANIFEST} is not JSON") from None
-    version = manifest.get("format_version") if isinstance(manifest, dict) else None
+    version = manifest.get("format_version")
     if version is None:
         raise CorruptError(path, f"{MANIFEST} has no format_version")
     if version != FORMAT_VERSION:
@@ -219,10 +234,12 @@ def _read_manifest(path: Path) -> dict[str, Any]:
             f"checkpoint {path} has format {version}, this version reads {FORMAT_VERSION}: use "
             "the version of tangram-rl that wrote it, or start a new run"
         )
-    body = {name: manifest.get(name) for name in ("updates", "files", "counters")}
-    if manifest.get("sha256") != _digest(body):
+    if manifest.get("sha256") != digest:
         raise CorruptError(path, f"checksum of {MANIFEST} differs")
-    return body
+    try:
+        return msgspec.convert(body, _Manifest)
+    except msgspec.ValidationError as error:
+        raise CorruptError(path, f"{MANIFEST}: {error}") from None
 
 
 def _read_tensors(path: Path, stem: str, files: Mapping[str, str]) -> Tensors:

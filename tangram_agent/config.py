@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+from tangram_agent.addresses import check_host
 from tangram_agent.process import FORMATS
 from tangram_sim.errors import ConfigError
 from tangram_sim.settings import LEARNING, NETWORK, Settings, declared, setting
@@ -315,3 +316,10 @@ class ServiceConfig(Settings, section="service"):
     )
     device: str = setting("auto", "of the learner", choices=("auto", "cpu", "cuda"))
     threads: int = setting(1, "torch threads of the master", low=1, high=1024)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("bind", "http_bind"):
+            check_host(f"service.{name}", getattr(self, name))
+        if self.host:
+            check_host("service.host", self.host)

@@ -18,6 +18,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from tangram_agent.adam import Adam
 from tangram_agent.config import AgentConfig
 from tangram_agent.networks import VELOCITY, Networks, View, initialise, parameter_count
 from tangram_agent.pairs import Pairs
@@ -124,8 +125,8 @@ class Learner:
         self.playing = networks.playing
         # Kept as lists: walking the modules takes a fifth of a small network's update.
         self._lists = self.parameter_lists()
-        self.actor_optimiser = _adam(self._lists["actor"], self.config.actor_lr)
-        self.critic_optimiser = _adam(self._lists["critic"], self.config.critic_lr)
+        self.actor_optimiser = Adam(self._lists["actor"], self.config.actor_lr)
+        self.critic_optimiser = Adam(self._lists["critic"], self.config.critic_lr)
 
     def parameter_lists(self) -> dict[str, list[Tensor]]:
         """Parameters by the names of `parts`, and those of `playing`."""
@@ -297,8 +298,8 @@ class Learner:
     def _set_learning_rate(self, progress: float) -> None:
         share, low = min(max(progress, 0.0), 1.0), self.config.lr_final
         factor = low + (1.0 - low) * 0.5 * (1.0 + math.cos(math.pi * share))
-        self.actor_optimiser.param_groups[0]["lr"] = self.config.actor_lr * factor
-        self.critic_optimiser.param_groups[0]["lr"] = self.config.critic_lr * factor
+        self.actor_optimiser.rate = self.config.actor_lr * factor
+        self.critic_optimiser.rate = self.config.critic_lr * factor
 
     def _tensor(self, column: Array) -> Tensor:
         return torch.from_numpy(np.asarray(column, np.float32)).to(self.device)
@@ -317,9 +318,9 @@ class Learner:
             for name, value in to_arrays(module).items():
                 state[f"{part}.{name}"] = value
         for part, optimiser in self._optimisers().items():
-            for i, slots in optimiser.state_dict()["state"].items():
-                for name, value in slots.items():
-                    state[f"{part}_optimiser.{i}.{name}"] = value.cpu().numpy().copy()
+            for name, tensors in optimiser.slots.items():
+                for i, tensor in enumerate(tensors):
+                    state[f"{part}_optimiser.{i}.{name}"] = tensor.cpu().numpy().copy()
         return state
 
     def load_state(self, state: dict[str, Array]) -> None:
@@ -332,13 +333,12 @@ class Learner:
             raise RunError("learner state: no counter of updates: not a learner's checkpoint")
         self.load_networks(state)
         for part, optimiser in self._optimisers().items():
-            slots = under(f"{part}_optimiser.", state)
-            content: dict[int, dict[str, Tensor]] = {}
-            for key, value in slots.items():
+            content: dict[str, dict[int, Tensor]] = {}
+            for key, value in under(f"{part}_optimiser.", state).items():
                 i, name = key.split(".", 1)
-                content.setdefault(int(i), {})[name] = torch.from_numpy(np.array(value))
-            groups = optimiser.state_dict()["param_groups"]
-            optimiser.load_state_dict({"state": content, "param_groups": groups})
+                tensor = torch.from_numpy(np.array(value)).to(self.device)
+                content.setdefault(name, {})[int(i)] = tensor
+            optimiser.slots = {n: [one[i] for i in sorted(one)] for n, one in content.items()}
         self.updates = int(state[_COUNTER][0])
 
     def load_networks(self, state: dict[str, Array]) -> None:
@@ -350,16 +350,12 @@ class Learner:
         for part, module in self.parts.items():
             load_arrays(module, under(f"{part}.", state))
 
-    def _optimisers(self) -> dict[str, torch.optim.Adam]:
+    def _optimisers(self) -> dict[str, Adam]:
         return {"actor": self.actor_optimiser, "critic": self.critic_optimiser}
 
 
 def _frozen(module: nn.Module) -> nn.Module:
     return copy.deepcopy(module).requires_grad_(False)
-
-
-def _adam(parameters: list[Tensor], rate: float) -> torch.optim.Adam:
-    return torch.optim.Adam(parameters, lr=rate, fused=True)
 
 
 def _check_finite(updates: int, numbers: dict[str, float]) -> None:

@@ -39,7 +39,7 @@ def outcome_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     if result["scored_updates"] is None:
         rows = [("scores", "none: no evaluator took part; tangram-eval scores a finished run")]
     elif result["scored_updates"] != result["updates"]:
-        rows.append(("scored", f"weights after {result['scored_updates']:,} updates"))
+        rows.append(("scored", f"weights after {plural(result['scored_updates'], 'update')}"))
     return [
         *rows,
         ("episodes", f"{result['episodes']:,}"),
@@ -47,6 +47,11 @@ def outcome_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("time", f"{duration(result['train_s'])} of training, {duration(result['wall_s'])} in all"),
         ("ended by", CTRL_C.get(result["ended_by"], result["ended_by"])),
     ]
+
+
+def plural(count: float, noun: str) -> str:
+    """1 worker, 2 workers."""
+    return f"{count:,.0f} {noun}" if count == 1 else f"{count:,.0f} {noun}s"
 
 
 def duration(seconds: float) -> str:

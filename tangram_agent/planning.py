@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tangram_agent.adam import Adam
 from tangram_agent.coverage import covered_share, covering, worths
 from tangram_agent.networks import Critic, Networks
 from tangram_agent.pairs import PairGraph, Pairs
@@ -232,7 +233,7 @@ class Planner:
         """Poses (B, 3) after gradient steps uphill on what the critic says they cover."""
         with torch.enable_grad():
             moved = pose.clone().requires_grad_(True)
-            optimiser = torch.optim.Adam([moved], lr=self._agent.refine_rate)
+            optimiser = Adam([moved], self._agent.refine_rate)
             for _ in range(self._agent.refine_steps):
                 loss = -self._total(scene, chosen, moved).sum()
                 (moved.grad,) = torch.autograd.grad(loss, [moved])

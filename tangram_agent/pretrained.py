@@ -91,7 +91,7 @@ def read_agent(folder: Traversable, shown: str | Path) -> Agent:
         data = (folder / WEIGHTS).read_bytes()
     except OSError as error:
         raise _damaged(shown, str(error.strerror)) from None
-    except ValueError:
+    except (ValueError, RecursionError):
         raise _damaged(shown, f"{CONFIG} or {CARD} cannot be read") from None
     _check_card(card, data, shown)
     try:

@@ -14,7 +14,13 @@ from typing import Any
 import numpy as np
 import yaml
 
-from tangram_agent.checkpoints import load_checkpoint, newest_checkpoint
+from tangram_agent.checkpoints import (
+    ACTING,
+    CHECKPOINTS,
+    SETUP,
+    load_checkpoint,
+    newest_checkpoint,
+)
 from tangram_agent.policy import Policy
 from tangram_agent.pretrained import is_agent, is_name, packaged, read_agent
 from tangram_agent.setup import Setup, make_setup
@@ -33,10 +39,7 @@ from tangram_sim.settings import (
 )
 
 CONFIG = "config.yaml"
-CHECKPOINTS = "checkpoints"
-ACTING = "weights"  # the checkpoint's file of acting weights
 POLICY_SECTIONS = ("tokens", "agent", "net")
-SETUP = "setup"  # the checkpoint's counter that tells the setup
 ANOTHER = "train a run with it"
 
 Changes = Mapping[str, Mapping[str, Any]]  # section -> setting -> value
@@ -168,7 +171,7 @@ def read_config(path: Path) -> dict[str, Any]:
 def _parse_config(text: str, path: Path) -> dict[str, Any]:
     try:
         content = yaml.safe_load(text)
-    except yaml.YAMLError:
+    except (yaml.YAMLError, RecursionError):
         raise _no_yaml(path) from None
     if not isinstance(content, dict):
         raise RunError(f"{path} holds no settings: it must be a mapping of sections")

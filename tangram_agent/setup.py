@@ -137,14 +137,15 @@ class Setup:
         content: dict[str, Any] = asdict(getattr(self, name))
         return content
 
-    def differences(self, contents: Mapping[str, Any]) -> list[str]:
+    def differences(self, contents: object) -> list[str]:
         """The sections in which another setup, known by its contents, is not this one.
 
         Only settings that both know are compared, so that a run outlives a version with more of
         them: what is new does by default what was done before.
         """
         own = self.contents()
-        return sorted(name for name in own if not _agree(own[name], contents.get(name, own[name])))
+        known = own | contents if isinstance(contents, dict) else {}
+        return sorted(name for name in own if not _agree(own[name], known.get(name)))
 
 
 def _changed(config: RewardConfig | AgentConfig) -> dict[str, Any]:

@@ -10,6 +10,7 @@ of a setting is what stands here.
 """
 
 import math
+import re
 import sys
 from collections.abc import Collection, Mapping
 from dataclasses import Field, dataclass, field, fields
@@ -22,6 +23,10 @@ Metadata = Mapping[str, "Declaration"]
 KEY = "setting"
 # What a setting is a part of: see `Declaration.part`.
 PLAY, NETWORK, LEARNING = "play", "network", "learning"
+MAX_NAME = 255  # bytes, on Linux
+MAX_PATH = 3840  # bytes: Linux takes 4096, and what is made in a folder needs the rest
+MAX_SHOWN = 40
+CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
 @dataclass(frozen=True)
@@ -153,6 +158,19 @@ def check_range(name: str, value: float, low: float, high: float = math.inf) -> 
         bound = f"at least {low:g}" if math.isinf(high) else f"between {low:g} and {high:g}"
         kind, got = ("", value) if number else ("a finite number, ", told(value))
         raise ConfigError(f"{name} must be {kind}{bound}, got {got}")
+
+
+def check_folder(name: str, value: str) -> None:
+    """Raise ConfigError unless the value can name a folder in which more is made."""
+    if not value.strip():
+        raise ConfigError(f"{name} must name a folder, got '{value}': set {name}=runs/my_run")
+    data = value.encode(errors="surrogateescape")
+    if CONTROL.search(value) or len(data) > MAX_PATH or max(map(len, data.split(b"/"))) > MAX_NAME:
+        shown = value if len(value) <= MAX_SHOWN else value[:MAX_SHOWN] + "..."
+        raise ConfigError(
+            f"{name} must be a path of at most {MAX_PATH} bytes, {MAX_NAME} in each name, without "
+            f"line breaks and other control characters, got {shown!r}: set {name}=runs/my_run"
+        )
 
 
 def check_choice(name: str, value: str, choices: Collection[str]) -> None:

@@ -171,7 +171,7 @@ def test_a_command_may_know_other_places_of_a_run_config(stored: Path) -> None:
     assert with_run_config(dict(settings), [], lambda _: None)["agent"]["name"] == "tangram"
 
 
-@pytest.mark.parametrize("override", ["agent=paper", "~agent.noise", "tokens=square"])
+@pytest.mark.parametrize("override", ["agent=paper", "tokens=square"])
 def test_choosing_a_group_beside_a_run_config_is_refused(stored: Path, override: str) -> None:
     with pytest.raises(ConfigError, match="from_config=.* chooses"):
         apply(stored, override)
@@ -182,6 +182,7 @@ def test_choosing_a_group_beside_a_run_config_is_refused(stored: Path, override:
     [
         (None, "No such file"),
         (b"a: [", "not a YAML file"),
+        (b"[" * 10_000, "not a YAML file"),
         (b"\xff\xfe\xfa", "not a YAML file"),
         (b"3", "lacks sim"),
         (b"{agent: {}, net: {}}", "lacks sim, reward, service, tokens"),
@@ -342,7 +343,7 @@ def test_entry_hands_over_plain_settings(entered: Entered) -> None:
     assert type(settings) is dict
     assert settings == (
         {"run_dir": "x", "episodes": 100, "seed": 3, "turns": 1, "skip_invalid": False}
-        | dict.fromkeys(("out", "puzzles", "sheet"))
+        | dict.fromkeys(("out", "puzzle", "sheet"))
         | {s: dict.fromkeys(own) for s, own in COMMANDS["train"].sections().items() if s in OVER}
     )
 
@@ -403,11 +404,17 @@ SLURM = "hydra/launcher=submitit_slurm"
         ("train --config-dir", "--config-dir takes one folder"),
         ("train tokens=mine", "unknown tokens 'mine': choose from hexagon"),
         ("train tokens=[square,square]", "write tokens.shapes=[square,square]"),
+        ("train =3", "cannot read '=3': write name=value"),
+        ("train ~agent.noise", "'~agent.noise': no setting is taken away, write agent.noise=value"),
+        ("train tokens=3", "a config group takes the name of a preset, and no number"),
+        (f"train seed={'[' * 3000}{']' * 3000}", "nested too deeply: write fewer brackets"),
+        ("eval run_dir=x sim=kinematic", "sim=kinematic chooses a preset, and a trained run has"),
+        ("train seed=\x1b[1m", "cannot read 'seed=\\x1b[1m': write name=value"),
         ("train sim=[physics,kinematic]", "sim takes one preset, got [physics,kinematic]"),
         ("eval run_dir=x --seed=3", "settings carry no dashes, as in seed=3; --help lists them"),
         ("eval run_dir=x -seed=3", "settings carry no dashes, as in seed=3; --help lists them"),
         (f"eval run_dir=x {SLURM}", "is for the jobs of a sweep: add --multirun"),
-        (f"eval run_dir=x -m {SLURM}", "needs a plugin: pip install 'tangram-rl[slurm]"),
+        (f"eval run_dir=x -m {SLURM}", "needs the extra slurm: .ci/install .venv slurm in"),
     ],
 )
 def test_what_would_be_taken_for_something_else_is_refused(

@@ -94,14 +94,13 @@ def _evaluate(settings: Plain) -> int:
 def _play(settings: Plain) -> int:
     from tangram_agent.files import check_writable
     from tangram_agent.setup import from_mapping
-    from worker.config import PlayConfig, check_compare, check_puzzle
+    from worker.config import PlayConfig, check_compare
 
     check_compare(settings.get("compare"))  # before a text is taken for a list of letters
     paths = with_absolute_paths(settings)
     if settings["out"] == PlayConfig.out:
         paths["out"] = PlayConfig.out  # not given: nothing to refuse beside live=true
-    settings = with_changes(paths | {"puzzle": check_puzzle(settings.get("puzzle"))})
-    config = from_mapping(PlayConfig, settings)
+    config = from_mapping(PlayConfig, with_changes(paths))
     if not config.live:
         check_writable("out", Path(config.out).absolute())
     if config.tokens is not None and config.run_dir is not None:
@@ -146,15 +145,18 @@ def with_changes(settings: Plain) -> Plain:
 def with_absolute_paths(settings: Plain) -> Plain:
     """Folders and files seen from where the command was started; what is no text is left alone.
 
-    A split of the library stays a name.
+    Puzzles and splits of the library stay names.
     """
     from tangram_sim.puzzles import SPLITS
+    from worker.config import check_puzzle, is_puzzle_source
 
     result = dict(settings)
     for name in ("run_dir", "out", "sheet"):
         result[name] = _absolute(result.get(name), is_run=name == "run_dir")
-    if result.get("puzzles") not in SPLITS:
-        result["puzzles"] = _absolute(result.get("puzzles"), is_run=False)
+    puzzle = check_puzzle(result.get("puzzle"))
+    if puzzle is not None and is_puzzle_source(puzzle[0]) and puzzle[0] not in SPLITS:
+        puzzle = (str(_absolute(puzzle[0], is_run=False)), *puzzle[1:])
+    result["puzzle"] = puzzle
     if isinstance(result.get("compare"), list):
         result["compare"] = [_absolute(run, is_run=True) for run in result["compare"]]
     return {name: value for name, value in result.items() if name in settings}

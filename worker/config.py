@@ -10,7 +10,9 @@ from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import MAX_INDEX, ROLES
 from tangram_agent.pretrained import PREFIX, agent_names
 from tangram_sim.errors import ConfigError
-from tangram_sim.settings import Settings, declared, refuse_ignored, setting, told
+from tangram_sim.puzzles import SPLITS
+from tangram_sim.settings import Settings, check_folder, declared, refuse_ignored, setting, told
+from worker.discovery import as_address, find_master
 
 Changes = dict[str, dict[str, Any]]  # section -> setting -> value: of a run that was trained
 OF_TARGETS = ("targets", "spread", "mirrored")  # settings of sim that say nothing of a puzzle
@@ -21,11 +23,13 @@ GAME = "tangram7"  # the agent that plays puzzles unless another is named
 PICTURES = (".gif", ".mp4", ".png")
 MIN_COMPARED, MAX_COMPARED = 2, 4
 MAX_SEED = 2**63 - 1
-
-
-def _check_run_dir(value: str) -> None:
-    if not value.strip():
-        raise ConfigError("run_dir must name the folder of a run, got '': set run_dir=runs/my_run")
+PUZZLE_FILES = (".json", ".svg")
+PUZZLE_HELP = (
+    "instead of random targets: puzzles by name, as cat or [cat,dog], all of the library's train, "
+    "test or paper, or a JSON or SVG file of your own; [mine.json,cat] is one of a file"
+)
+TURNS_HELP = "each puzzle at so many angles, evenly spread; 1 is as drawn"
+SKIP_HELP = "leave out puzzles that cannot be played"
 
 
 def game_run() -> str:
@@ -36,7 +40,7 @@ def game_run() -> str:
 def _check_run(run_dir: str | None, puzzles: bool) -> None:
     """Refuse no run where none can be meant."""
     if run_dir is not None:
-        _check_run_dir(run_dir)
+        check_folder("run_dir", run_dir)
     elif not (puzzles and GAME in agent_names()):
         raise ConfigError("say which run: run_dir=runs/...")
 
@@ -51,6 +55,8 @@ def _refuse(changes: Changes, names: Iterable[str], because: str, remedy: str) -
 def _check_connect(value: str) -> None:
     if not value.strip():
         raise ConfigError("connect must name the master's endpoint, got '': set connect=HOST:PORT")
+    if as_address(value) is not None:
+        find_master(value)  # no file is read: it only has to be one
 
 
 def _check_out(value: str) -> None:
@@ -103,47 +109,36 @@ class EvalConfig(Settings):
     """
 
     run_dir: str | None = setting(
-        None, "folder of the run, or pretrained/NAME; with puzzles pretrained/tangram7 if not given"
+        None, "folder of the run, or pretrained/NAME; with puzzle= pretrained/tangram7 if not given"
     )
     episodes: int = setting(
         100,
         "test episodes, the same ones for every run",
         low=1,
         high=MAX_EPISODES,
-        only={"puzzles": None},
+        only={"puzzle": None},
     )
     seed: int = setting(
         0, "of the test episodes, and of the starts of puzzles", low=0, high=MAX_SEED
     )
     out: str | None = setting(None, "JSON file for the scores; they are printed anyway")
-    puzzles: str | None = setting(
-        None,
-        "instead of random targets: your JSON or SVG file, or test or train of the library",
-    )
-    turns: int = setting(
-        1,
-        "each puzzle at so many angles, evenly spread; 1 is as drawn",
-        low=1,
-        high=MAX_TURNS,
-        unless={"puzzles": None},
-    )
-    skip_invalid: bool = setting(
-        False, "leave out puzzles that cannot be played", unless={"puzzles": None}
-    )
+    puzzle: tuple[str, ...] | None = setting(None, PUZZLE_HELP)
+    turns: int = setting(1, TURNS_HELP, low=1, high=MAX_TURNS, unless={"puzzle": None})
+    skip_invalid: bool = setting(False, SKIP_HELP, unless={"puzzle": None})
     sheet: str | None = setting(
-        None, "PNG file, a picture of every puzzle's end", unless={"puzzles": None}
+        None, "PNG file, a picture of every puzzle's end", unless={"puzzle": None}
     )
     changes: Changes = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        _check_run(self.run_dir, self.puzzles is not None)
+        _check_run(self.run_dir, self.puzzle is not None)
         super().__post_init__()
         if self.out is not None:
             _check_out(self.out)
         if self.sheet is not None and Path(self.sheet).suffix != ".png":
             raise ConfigError(f"sheet must end with .png, got '{self.sheet}'")
-        if self.puzzles is not None:
-            _refuse(self.changes, OF_TARGETS, "puzzles", "leave puzzles out")
+        if self.puzzle is not None:
+            _refuse(self.changes, OF_TARGETS, "puzzle", "leave puzzle out")
 
     @property
     def run(self) -> str:
@@ -171,7 +166,7 @@ def check_compare(value: object) -> None:
 
 
 def check_puzzle(value: object) -> tuple[str, ...] | None:
-    """The names of puzzles: one or a list of some; None is none.
+    """The names of puzzles, one or a list of some, perhaps behind their file; None is none.
 
     Raises:
         ConfigError: says how to write them.
@@ -182,9 +177,25 @@ def check_puzzle(value: object) -> tuple[str, ...] | None:
     # A puzzle may be called 8.
     if not names or not all(isinstance(one, str | int | float) and str(one) for one in names):
         raise ConfigError(
-            f"puzzle must name puzzles, got {value!r}: set puzzle=cat or puzzle=[cat,dog]"
+            f"puzzle must name puzzles, got {value!r}: set puzzle=cat, puzzle=[cat,dog] or "
+            "puzzle=mine.json"
         )
+    later = [str(one) for one in names[1:] if is_puzzle_source(str(one))]
+    if later:
+        raise ConfigError(f"puzzle takes one file or split, first in its list, got {later[0]}, too")
     return tuple(str(name) for name in names)
+
+
+def is_puzzle_source(name: str) -> bool:
+    """Whether this is no puzzle's name but a file's, or a split of the library."""
+    return name in SPLITS or "/" in name or Path(name).suffix.lower() in PUZZLE_FILES
+
+
+def source_and_names(puzzle: tuple[str, ...]) -> tuple[str | None, tuple[str, ...] | None]:
+    """Where puzzles are, None for all of the library, and which of them are meant, None for all."""
+    if not is_puzzle_source(puzzle[0]):
+        return None, puzzle
+    return puzzle[0], puzzle[1:] or None
 
 
 @dataclass(frozen=True)
@@ -208,7 +219,7 @@ class PlayConfig(Settings):
         "episodes shown side by side",
         low=1,
         high=MAX_SHOWN,
-        only={"puzzle": None, "puzzles": None},
+        only={"puzzle": None},
     )
     seed: int = setting(0, "of the episodes, and of the starts of puzzles", low=0, high=MAX_SEED)
     compare: tuple[str, ...] | None = setting(
@@ -219,16 +230,9 @@ class PlayConfig(Settings):
         "instead of run_dir the agent that comes with tangram-rl for these tokens: square",
         only={"compare": None},
     )
-    puzzle: tuple[str, ...] | None = setting(
-        None,
-        "assemble this puzzle of the library instead of random targets, or several: [cat,dog]",
-        only={"compare": None},
-    )
-    puzzles: str | None = setting(
-        None,
-        "a JSON or SVG file of your own, or train or test: all in it, or those that puzzle names",
-        only={"compare": None},
-    )
+    puzzle: tuple[str, ...] | None = setting(None, PUZZLE_HELP, only={"compare": None})
+    turns: int = setting(1, TURNS_HELP, low=1, high=MAX_TURNS, unless={"puzzle": None})
+    skip_invalid: bool = setting(False, SKIP_HELP, unless={"puzzle": None})
     live: bool = setting(
         False, "play in a window instead of writing a file", only={"compare": None}
     )
@@ -248,13 +252,8 @@ class PlayConfig(Settings):
                 "write a .gif"
             )
         super().__post_init__()
-        if self.plays_puzzles:
-            _refuse(self.changes, (*OF_TARGETS, "starts"), "puzzles", "leave puzzles out")
-
-    @property
-    def plays_puzzles(self) -> bool:
-        """Whether puzzles are to be assembled."""
-        return self.puzzle is not None or self.puzzles is not None
+        if self.puzzle is not None:
+            _refuse(self.changes, (*OF_TARGETS, "starts"), "puzzle", "leave puzzle out")
 
     @property
     def run_dirs(self) -> tuple[str, ...]:
@@ -264,11 +263,11 @@ class PlayConfig(Settings):
 
     def _check_one_of_both(self) -> None:
         if self.run_dir is not None:
-            _check_run_dir(self.run_dir)
+            check_folder("run_dir", self.run_dir)
         elif (
             self.compare is None
             and self.tokens is None
-            and not (self.plays_puzzles and GAME in agent_names())
+            and not (self.puzzle is not None and GAME in agent_names())
         ):
             raise ConfigError(
                 "say which run: run_dir=runs/..., or which ones: compare=[runs/a,runs/b]"

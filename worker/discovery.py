@@ -86,7 +86,7 @@ def find_master(connect: str) -> MasterAddress | None:
         return MasterAddress(endpoint, str(content["run_id"]), **keys, settings=settings)
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise RunError(
             f"{path} is no connection file ({error!r}): connect=... takes host:port, a run "
             f"folder, or the {FILE_NAME} that tangram-master writes into it"
@@ -159,6 +159,10 @@ def keys_error(connect: str, endpoint: str) -> str:
 
 def _checked(endpoint: str, source: str) -> str:
     host, _, port = endpoint.removeprefix(SCHEME).rpartition(":")
-    if not (endpoint.startswith(SCHEME) and host and port.isdecimal() and 0 < int(port) < 65536):
-        raise RunError(f"'{endpoint}' (from {source}) is no address: it must be tcp://host:port")
+    named = endpoint.startswith(SCHEME) and host and host.split() == [host]
+    if not (named and port.isdecimal() and 0 < int(port) < 65536):
+        raise RunError(
+            f"'{endpoint}' (from {source}) is no address: it must be tcp://host:port, the port "
+            "from 1 to 65535"
+        )
     return endpoint

@@ -16,11 +16,12 @@ from rich.table import Table
 
 from tangram_agent.config import ORDERS
 from tangram_agent.files import write_whole
+from tangram_agent.outcome import plural
 from tangram_agent.runs import Run, load_run
 from tangram_agent.setup import Setup
 from tangram_sim.game_drawing import figure_sheet
 from worker.baselines import exact_policy, position_policy, random_policy
-from worker.config import EvalConfig
+from worker.config import EvalConfig, source_and_names
 from worker.metrics import assembled, pose_errors, summarise
 from worker.puzzles import Figure, Figures, find_figures, play_figures
 from worker.rollout import Choose, Played
@@ -89,7 +90,7 @@ def evaluate_run(config: EvalConfig) -> int:
     torch.set_num_threads(1)
     began = time.monotonic()
     run = load_run(config.run).with_settings(config.changes)
-    report = (_episodes if config.puzzles is None else _puzzles)(run, config)
+    report = (_episodes if config.puzzle is None else _puzzles)(run, config)
     if config.out is not None:
         report |= {"seconds": time.monotonic() - began}
         write_whole(Path(config.out), (json.dumps(report, indent=1) + "\n").encode())
@@ -137,12 +138,14 @@ def _episodes(run: Run, config: EvalConfig) -> dict[str, Any]:
 
 def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
     """Assemble the puzzles, print the scores and draw the sheet; the file's content."""
-    source, setup = str(config.puzzles), run.setup
-    found = find_figures(source, setup, None, config.turns, config.skip_invalid)
+    source, names = source_and_names(config.puzzle or ())
+    setup = run.setup
+    found = find_figures(source, setup, names, config.turns, config.skip_invalid)
     scores, lines, played = score_puzzles(setup, found.figures, policies(run), config.seed)
     console = Console(highlight=False)
     count = len(found.figures)
-    caption = f"{count:,} puzzles of {Path(source).name}, {_told(setup)}; positions in arena units"
+    which = f"{plural(count, 'puzzle')} of {Path(source or 'the library').name}"
+    caption = f"{which}, {_told(setup)}; positions in arena units"
     console.print(scores_table(_title(run), caption, scores))
     console.print(puzzles_table(lines, full=config.out))
     print_faults(console, found.faults)
@@ -150,7 +153,7 @@ def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
         write_sheet(config.sheet, setup, found, played)
         console.print(f"written: {config.sheet}", markup=False, soft_wrap=True)
     return _report(run, config, scores) | {
-        "source": source,
+        "puzzle": list(config.puzzle or ()),
         "turns": config.turns,
         "skipped": list(found.faults),
         "puzzles": lines,
@@ -173,7 +176,7 @@ def _report(run: Run, config: EvalConfig, scores: Mapping[str, Scores]) -> dict[
 
 
 def _title(run: Run) -> str:
-    return f"{run.folder.name} after {run.updates:,} updates"
+    return f"{run.folder.name} after {plural(run.updates, 'update')}"
 
 
 def _told(setup: Setup) -> str:

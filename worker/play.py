@@ -13,6 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from rich.console import Console
 
 from tangram_agent.files import write_whole
+from tangram_agent.outcome import plural
 from tangram_agent.runs import Run, load_run
 from tangram_agent.setup import Setup
 from tangram_sim.arrays import Floats
@@ -21,7 +22,7 @@ from tangram_sim.errors import ConfigError, RunError
 from tangram_sim.game_drawing import figure_sheet
 from tangram_sim.kinematics import wrap
 from tangram_sim.layout import Layout
-from worker.config import MAX_SHOWN, PlayConfig
+from worker.config import MAX_SHOWN, PlayConfig, source_and_names
 from worker.film import Show, film_pictures, frames_per_action, show_live
 from worker.puzzles import find_figures, play_figures
 from worker.rollout import Played
@@ -67,7 +68,7 @@ def make_show(run: Run, config: PlayConfig) -> Show:
     Raises:
         ConfigError: puzzles that the run cannot play.
     """
-    if config.plays_puzzles:
+    if config.puzzle is not None:
         return puzzle_show(run, config)
     titles = [f"target {i + 1}" for i in range(config.episodes)]
     return Show(run.setup, play_episodes(run, config), titles, "episodes")
@@ -88,7 +89,8 @@ def puzzle_show(run: Run, config: PlayConfig) -> Show:
         ConfigError: puzzles that the run cannot play, or too many of them.
     """
     setup = replace(run.setup, sim=replace(run.setup.sim, starts="outside"))
-    found = find_figures(config.puzzles, setup, config.puzzle)
+    source, names = source_and_names(config.puzzle or ())
+    found = find_figures(source, setup, names, config.turns, config.skip_invalid)
     if len(found.figures) > MAX_SHOWN:
         raise ConfigError(
             f"there are {len(found.figures)} puzzles, at most {MAX_SHOWN} are shown: name some, as "
@@ -203,7 +205,7 @@ def compare_runs(config: PlayConfig) -> int:
     save_picture(config.out, with_stills(frames))
     line = "; ".join(f"{label}: {score}" for label, score in zip(labels, scores, strict=True))
     Console(highlight=False).print(
-        f"{config.out}: {config.episodes} episodes; {line}", markup=False, soft_wrap=True
+        f"{config.out}: {plural(config.episodes, 'episode')}; {line}", markup=False, soft_wrap=True
     )
     return 0
 

@@ -89,11 +89,11 @@ class PlainLearner(Learner):
                     _take_apart(layer)
         self.target_actor, self.target_critic = map(copy.deepcopy, (self.actor, self.critic))
         self._lists = self.parameter_lists()
-        rates = (self.config.actor_lr, self.config.critic_lr)
-        self.actor_optimiser, self.critic_optimiser = (
-            torch.optim.Adam(part.parameters(), lr=rate, foreach=False)
-            for part, rate in zip((self.actor, self.critic), rates, strict=True)
-        )
+        rates = {"actor": self.config.actor_lr, "critic": self.config.critic_lr}
+        self._plain = {
+            part: torch.optim.Adam(getattr(self, part).parameters(), lr=rate, foreach=False)
+            for part, rate in rates.items()
+        }
 
     def update(self, batch: Any, progress: float = 0.0) -> dict[str, float]:
         """See `Learner`; the targets follow parameter by parameter."""
@@ -106,7 +106,7 @@ class PlainLearner(Learner):
         return losses
 
     def _step(self, part: str, loss: Tensor) -> Tensor:
-        optimiser = self._optimisers()[part]
+        optimiser = self._plain[part]
         optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         norm = nn.utils.clip_grad_norm_(getattr(self, part).parameters(), math.inf)

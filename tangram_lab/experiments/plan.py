@@ -11,7 +11,14 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from tangram_sim.errors import ConfigError
-from tangram_sim.settings import Settings, check_choice, check_range, declared, setting
+from tangram_sim.settings import (
+    Settings,
+    check_choice,
+    check_folder,
+    check_range,
+    declared,
+    setting,
+)
 
 FORMAT = 2
 Kind = Literal["curves", "complexity", "tests", "rewards", "ranking", "game"]
@@ -125,6 +132,7 @@ class StudyConfig(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_folder("run_dir", self.run_dir)
         for name, experiment in self.experiments.items():
             for kind, wanted in (("trainings", experiment.trainings), ("tests", experiment.tests)):
                 _check_known(f"experiment {name}: {kind}", wanted, getattr(self, kind))
@@ -148,7 +156,7 @@ class StudyConfig(Settings):
     def test_command(self, name: str) -> list[str]:
         """Everything that tangram-eval is told; puzzles are as many as there are."""
         overrides = self.tests[name].overrides
-        if any(text.startswith("puzzles=") for text in overrides):
+        if any(text.startswith("puzzle=") for text in overrides):
             return list(overrides)
         return [f"episodes={self.budget.test_episodes}", *overrides]
 
@@ -238,7 +246,7 @@ def joined_plan(path: Path, content: dict[str, Any]) -> dict[str, Any]:
         earlier = json.loads(path.read_text(encoding="utf-8"))
         found = earlier["format"]
         known = {n: dict(earlier[n]) for n in ("budget", "experiments", "trainings", "tests")}
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         raise ConfigError(f"cannot read {path}: remove it, or choose another run_dir") from None
     if found != FORMAT:
         raise ConfigError(

@@ -20,11 +20,11 @@ import safetensors.numpy
 import torch
 import yaml
 
-from tangram_agent.checkpoints import load_checkpoint, newest_checkpoint
+from tangram_agent.checkpoints import ACTING, CHECKPOINTS, load_checkpoint, newest_checkpoint
 from tangram_agent.files import write_whole
 from tangram_agent.policy import Policy
 from tangram_agent.pretrained import CARD, CARD_TEXT, CONFIG, FORMAT, PREFIX, WEIGHTS
-from tangram_agent.runs import ACTING, CHECKPOINTS, Run, load_run
+from tangram_agent.runs import Run, load_run
 from tangram_agent.setup import Setup
 from tangram_sim.errors import ConfigError, RunError, TangramError
 from tangram_sim.targets import has_all_tans
@@ -108,7 +108,7 @@ def _read(run_dir: Path) -> Candidate:
     path = run_dir / RESULT
     try:
         result = json.loads(path.read_bytes())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         raise RunError(f"cannot read {path}: name the folder of a finished run") from None
     if not isinstance(result, dict) or result.get("mean_reward") is None:
         raise RunError(f"{path} holds no mean_reward: train it with an evaluator")

@@ -6,8 +6,10 @@ into four atoms, and in their upright positions all tans whose small triangles h
 1 are unions of atoms.
 """
 
+import argparse
 import json
 import re
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from itertools import product
@@ -115,8 +117,10 @@ _NUMBERS: dict[str, float] = {"": 1.0, "r": 2.0**0.5, "h": 0.5**0.5}
 _DIGITS = 12  # of a coordinate in the files
 
 
-def main() -> None:
-    """Write the files and the sheet; the same version writes the same bytes."""
+def main() -> int:
+    """`python -m tangram_lab.experiments.puzzles`; the same version writes the same bytes."""
+    program = "python -m tangram_lab.experiments.puzzles"
+    argparse.ArgumentParser(prog=program, description=__doc__).parse_args()
     made = {}
     for split, designs in (("train", TRAIN), ("test", TEST), ("paper", PAPER)):
         text = file_text(designs)
@@ -126,6 +130,7 @@ def main() -> None:
         made[split] = puzzles
     picture = sheet([*made["train"], *made["test"]])
     picture.save(ROOT / "docs" / "images" / "puzzles.png", optimize=True)
+    return 0
 
 
 def file_text(designs: Mapping[str, str]) -> str:
@@ -213,4 +218,4 @@ def sheet(puzzles: Sequence[Puzzle], columns: int = 7, size: int = 170) -> Image
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -30,6 +30,7 @@ from tangram_agent.files import write_whole
 from tangram_agent.outcome import duration
 from tangram_lab.experiments.jobs import Job, make_jobs, read_object
 from tangram_lab.experiments.plan import PLAN, StudyConfig, joined_plan, plan_content
+from tangram_sim.errors import ConfigError
 
 
 class StudyProgress:
@@ -112,7 +113,7 @@ def _last_evaluation(job: Job) -> dict[str, Any]:
         text = (job.run_dir / "curve.jsonl").read_text(encoding="utf-8")
         last = json.loads(text.splitlines()[-1])
         return last if {"updates", "episodes", "mean_reward"} <= set(last) else {}
-    except (OSError, ValueError, IndexError, TypeError):
+    except (OSError, ValueError, IndexError, TypeError, RecursionError):
         return {}
 
 
@@ -156,6 +157,10 @@ def run_study(
         ConfigError: the folder holds trainings with other settings or budget, or is in use.
     """
     study, jobs = RunFolder(config.run_dir), make_jobs(config, resolved, asked, presets)
+    if not next(path for path in (study.path, *study.path.parents) if path.exists()).is_dir():
+        raise ConfigError(
+            f"run_dir {study.path} cannot be made (a file is in its way): choose another run_dir"
+        )
     for job in jobs:
         job.check()
     plan = joined_plan(study.path / PLAN, plan_content(config, _source()))

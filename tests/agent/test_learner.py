@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from tangram_agent.adam import Adam
 from tangram_agent.learner import (
     Learner,
     NotFiniteError,
@@ -265,8 +266,23 @@ def test_cosine_decay_of_the_learning_rate(
 ) -> None:
     learner = Learner(setup(agent=SCENE | {"actor_lr": 2e-3} | options), seed=0)
     learner.update(random_transitions(setup(), 4), progress)
-    assert learner.actor_optimiser.param_groups[0]["lr"] == pytest.approx(2e-3 * share)
-    assert learner.critic_optimiser.param_groups[0]["lr"] == pytest.approx(1e-3 * share)
+    assert learner.actor_optimiser.rate == pytest.approx(2e-3 * share)
+    assert learner.critic_optimiser.rate == pytest.approx(1e-3 * share)
+
+
+def test_steps_are_those_of_torch() -> None:
+    generator = torch.Generator().manual_seed(0)
+    start = [torch.randn(shape, generator=generator) for shape in ((3, 2), (5,))]
+    ours, theirs = ([one.clone().requires_grad_() for one in start] for _ in range(2))
+    optimisers = (Adam(ours, 0.1), torch.optim.Adam(theirs, lr=0.1, fused=True))
+    for _ in range(5):
+        for mine, other in zip(ours, theirs, strict=True):
+            mine.grad = torch.randn(mine.shape, generator=generator)
+            other.grad = mine.grad.clone()
+        for optimiser in optimisers:
+            optimiser.step()
+    for mine, other in zip(ours, theirs, strict=True):
+        assert torch.equal(mine, other)
 
 
 def test_gradients_are_clipped_to_the_norm() -> None:

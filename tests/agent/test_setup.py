@@ -118,6 +118,7 @@ def test_settings_that_only_one_version_knows_do_not_differ() -> None:
     older = made.contents()
     del older["agent"]["edges"], older["agent"]["hindsight"][0]["angle"], older["reward"]
     assert made.differences(older | {"newer": {}}) == []
+    assert made.differences(3) == ["agent", "net", "reward", "sim", "tokens"]
     older["agent"]["hindsight"][0]["copies"] = 7
     assert made.differences(older) == ["agent"]
     older["agent"]["hindsight"] = []
@@ -161,6 +162,10 @@ def test_tokens_push_each_other_where_several_slide(
         ("eval_seconds", -1.0, "service.eval_seconds must be at least 0, got -1"),
         ("eval_episodes", 0, "service.eval_episodes must be between 1"),
         ("checkpoint_minutes", 0.0, "service.checkpoint_minutes must be at least 0.001"),
+        ("watchdog_seconds", 1e7, r"service.watchdog_seconds must be between 0 and 1e\+06"),
+        ("bind", "h:1", "service.bind must be an address or a name of a machine, .* got 'h:1'"),
+        ("http_bind", "", "service.http_bind must be an address or a name of a machine"),
+        ("host", "tcp://h", "service.host must be an address or a name of a machine"),
         ("keep_checkpoints", 0, "service.keep_checkpoints must be between 1"),
         ("device", "tpu", "service.device must be one of auto, cpu, cuda, got 'tpu'"),
         ("threads", 0, "service.threads must be between 1"),

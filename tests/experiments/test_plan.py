@@ -179,7 +179,7 @@ def test_seeds_may_be_added_and_none_is_forgotten(
     assert found["budget"]["seeds"] == expected
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"budget": 1}'])
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"budget": 1}', "[" * 100_000])
 def test_a_plan_that_cannot_be_read_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "plan.json"
     path.write_text(text)
@@ -288,7 +288,7 @@ def test_what_cannot_be_read_is_not_done(tmp_path: Path, text: str | None) -> No
 
 RANDOM = {"sim": {"actions_per_token": 2, "arena": 2.0}, "episodes": 5, "updates": 3}
 # Under `puzzles` a test's file has the scores of each.
-FIGURES = {"source": "test", "turns": 8, "updates": 3, "puzzles": [{"name": "cat"}]}
+FIGURES = {"puzzle": ["test"], "turns": 8, "updates": 3, "puzzles": [{"name": "cat"}]}
 
 
 @pytest.mark.parametrize(
@@ -301,14 +301,14 @@ FIGURES = {"source": "test", "turns": 8, "updates": 3, "puzzles": [{"name": "cat
         (RANDOM, {"episodes": 6}, False),
         (RANDOM, {"updates": 2}, False),
         (FIGURES, {}, True),
-        (FIGURES, {"source": "train"}, False),
+        (FIGURES, {"puzzle": ["train"]}, False),
         (FIGURES, {"turns": 1}, False),
     ],
 )
 def test_a_test_is_done_when_it_is_that_of_the_final_weights(
     tmp_path: Path, told: dict[str, Any], changes: dict[str, Any], done: bool
 ) -> None:
-    overrides = ["puzzles=test", "turns=8"] if told is FIGURES else ["sim.actions_per_token=2"]
+    overrides = ["puzzle=test", "turns=8"] if told is FIGURES else ["sim.actions_per_token=2"]
     tests = {"it": {"label": "it", "overrides": overrides}}
     one = {"one": experiment(["square"], ["it"])}
     job = jobs_of(tmp_path, tests=tests, experiments=one)["square, seed 0, test it"]
@@ -353,7 +353,7 @@ def test_other_settings_in_the_same_folder_are_refused(
         ("actions=2", "unknown setting 'actions'"),
         ("sim.actions_per_tokn=2", ".* .did you mean 'sim.actions_per_token'"),
         (
-            "agent.reapply=0 puzzles=test sim.targets=mixed",
+            "agent.reapply=0 puzzle=test sim.targets=mixed",
             "sim.targets=mixed changes nothing with",
         ),
     ],

@@ -1,10 +1,13 @@
 """The script that makes the package's puzzles: what it writes, and designs that are none."""
 
+import sys
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tangram_lab.experiments import puzzles as puzzles_module
 from tangram_lab.experiments.designs import PAPER, TEST, TRAIN
 from tangram_lab.experiments.puzzles import GRID, atoms, figure_pieces, file_text, sheet, tilings
 from tangram_sim.errors import ConfigError
@@ -60,3 +63,15 @@ def test_a_wrong_design_is_refused(design: str, message: str) -> None:
 def test_the_sheet_shows_every_figure() -> None:
     few = library("test")[:3]
     assert sheet(few, columns=3, size=40).width > 3 * 40
+
+
+@pytest.mark.parametrize(("option", "status"), [("--help", 0), ("out=x", 2)])
+def test_help_and_what_is_unknown_write_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str, status: int
+) -> None:
+    monkeypatch.setattr(puzzles_module, "ROOT", tmp_path)
+    monkeypatch.setattr(sys, "argv", ["puzzles", option])
+    with pytest.raises(SystemExit) as ended:
+        puzzles_module.main()
+    assert ended.value.code == status
+    assert list(tmp_path.iterdir()) == []

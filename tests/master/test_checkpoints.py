@@ -1,5 +1,6 @@
 """Checkpoint folders: written whole or not at all, and every changed byte is found."""
 
+import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -183,6 +184,38 @@ def test_a_changed_manifest_is_refused_and_another_format_is_not_taken_for_corru
     with pytest.raises(RunError, match=reason) as caught:
         load_checkpoint(path)
     assert type(caught.value) is kind
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"counters": []}, "Expected `object`, got `array` - at `$.counters`"),
+        ({"counters": None}, "Expected `object`, got `null` - at `$.counters`"),
+        ({"files": 3}, "Expected `object`, got `int` - at `$.files`"),
+        ({"files": {"weights": 3}}, "Expected `str`, got `int` - at `$.files[...]`"),
+        ({"updates": "x"}, "Expected `int`, got `str` - at `$.updates`"),
+        ({"updates": -1}, "Expected `int` >= 0 - at `$.updates`"),
+    ],
+)
+def test_a_forged_manifest_is_corrupt_though_its_checksum_holds(
+    tmp_path: Path, change: dict[str, object], reason: str
+) -> None:
+    path = save(tmp_path)
+    body = {"updates": 5, "files": {}, "counters": {}} | change
+    seal = hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()
+    manifest = {"format_version": 3, "sha256": seal, **body}
+    (path / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(CorruptError) as caught:
+        load_checkpoint(path)
+    assert caught.value.why == f"manifest.json: {reason}"
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"updates":' * 100_000, "[1]", ""])
+def test_what_is_no_manifest_is_corrupt(tmp_path: Path, text: str) -> None:
+    path = save(tmp_path)
+    (path / "manifest.json").write_text(text)
+    with pytest.raises(CorruptError, match=r"manifest.json (is not JSON|has no format_version)"):
+        load_checkpoint(path)
 
 
 def test_a_stem_that_was_never_there(tmp_path: Path) -> None:

@@ -15,7 +15,9 @@ pytestmark = pytest.mark.fast
 @pytest.mark.parametrize(
     ("settings", "reason"),
     [
-        ({"run_dir": " "}, "run_dir must name a folder, got '': set run_dir=runs/my_run"),
+        ({"run_dir": " "}, "run_dir must name a folder, got ' ': set run_dir=runs/my_run"),
+        ({"run_dir": "a\nb"}, r"without line breaks and .* got 'a\\nb': set run_dir=runs/my_run"),
+        ({"run_dir": "a\0b"}, r"got 'a\\x00b': set run_dir=runs/my_run"),
         ({"seed": -1}, "seed must be between 0 and"),
         ({"max_hours": -0.5}, "max_hours must be at least 0, got -0.5"),
         ({"max_hours": float("nan")}, "max_hours must be a finite number, at least 0, got nan"),

@@ -142,17 +142,46 @@ def test_damage_in_the_middle_is_told_as_a_loss(tmp_path: Path) -> None:
     assert f"is damaged at byte {start:,}: the {len(data) - start:,} bytes" in warnings[0]
 
 
-def test_a_missing_segment_is_told_and_the_others_are_read(tmp_path: Path) -> None:
+@given(st.data())
+def test_any_changed_bit_is_told_in_one_line(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    folder = tmp_path_factory.mktemp("journal")
+    kept = journal(folder, MADE)
+    for number in (1, 2, 3):
+        kept.append(arrival(MADE, number, count=1))
+        kept.rotate()
+    path = segments(folder)[2]
+    content = bytearray(path.read_bytes())
+    content[data.draw(st.integers(0, len(content) - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    path.write_bytes(content)
+    warnings: list[str] = []
+    assert sequences(folder, warnings=warnings) == [1, 3]
+    assert len(warnings) == 1
+
+
+def test_missing_segments_are_told_in_one_line_and_the_others_are_read(tmp_path: Path) -> None:
     kept = journal(tmp_path, MADE)
     for number in (1, 2, 3):
         kept.append(arrival(MADE, number))
         kept.rotate()
-    segments(tmp_path)[2].unlink()
+    found = segments(tmp_path)
+    found[2].unlink()
+    found[3].rename(tmp_path / "100000000.log")  # more digits than others, and still the last
+    journal(tmp_path / "stray", MADE).append(arrival(MADE, 4))
+    segments(tmp_path / "stray")[1].rename(tmp_path / "99999999.log")
     warnings: list[str] = []
-    assert sequences(tmp_path, warnings=warnings) == [1, 3]
+    assert sequences(tmp_path, warnings=warnings) == [1, 4, 3]
     assert warnings == [
-        f"{tmp_path / '00000002.log'} is missing: the batches that it held are lost"
+        f"{tmp_path / '00000002.log'} and the 99,999,996 after it are missing: the batches that "
+        "were in there are lost"
     ]
+    (tmp_path / "99999999.log").rename(tmp_path / "00000003.log")
+    warnings.clear()
+    assert sequences(tmp_path, first=2, warnings=warnings) == [4, 3]
+    assert warnings[0] == (
+        f"{tmp_path / '00000002.log'} is missing: the batches that were in there are lost"
+    )
 
 
 @pytest.mark.parametrize("other", [{"run_id": "other"}, {"made": setup(PAIR)}])

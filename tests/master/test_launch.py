@@ -249,6 +249,46 @@ print("left in order", flush=True)
 
 
 @pytest.mark.cluster
+def test_workers_that_a_failing_master_sent_home_come_back_with_it(tmp_path: Path) -> None:
+    leaving = f"""
+from pathlib import Path
+import time
+folder = Path({str(tmp_path)!r})
+with open(folder / "joined", "a") as file:
+    file.write("x")
+while (folder / "connection.json").exists():
+    time.sleep(0.01)
+(folder / "left").touch()
+"""
+    ending = """
+if "resume=auto" in sys.argv:
+    end()
+(folder / "connection.json").unlink()
+while not (folder / "left").exists():
+    signal.sigtimedwait([], 0.05)
+signal.sigtimedwait([], 0.3)
+sys.exit(5)
+"""
+    (tmp_path / "joined").touch()
+    times = "(2 if 'resume=auto' in sys.argv else 1)"
+    waits = f"len((folder / 'joined').read_text()) < {times}"
+    made = launcher(tmp_path, ending, waits, players=[leaving])
+    made._master.arguments = [*made._master.arguments, "resume=none"]
+    made._evaluator.next_start_s = None
+    assert finish(made, tmp_path)[0] == 0
+    assert (tmp_path / "joined").read_text() == "xx"
+
+
+@pytest.mark.fast
+def test_a_worker_that_leaves_after_the_master_is_no_failure(tmp_path: Path) -> None:
+    """Its end may be heard of before that of the master."""
+    made = launcher(tmp_path, players=[WORKER])
+    made._reached = True
+    made._worker_ended(made._players[0])
+    assert made._players[0].restarts == 0
+
+
+@pytest.mark.cluster
 def test_workers_start_only_when_the_master_can_be_reached(tmp_path: Path) -> None:
     made = launcher(tmp_path)
     made._master.arguments = ["-c", f"open({str(tmp_path / 'news')!r}, 'w'); raise SystemExit(2)"]

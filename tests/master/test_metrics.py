@@ -140,7 +140,8 @@ def test_what_happens_again_is_dropped(tmp_path: Path, updates: int, kept: list[
 
 def test_a_line_cut_short_is_left_out(tmp_path: Path) -> None:
     path = tmp_path / "curve.jsonl"
-    path.write_text('{"updates": 10, "episodes": 9, "train_s": 1.5}\n[3]\n{"updates": "x"}\n{"upda')
+    whole = '{"updates": 10, "episodes": 9, "train_s": 1.5}'
+    path.write_text(whole + '\n[3]\n{"updates": "x"}\n' + "[" * 100_000 + '\n{"upda')
     with closing(Metrics(tmp_path, path, 100)) as metrics:
         metrics.scores({}, 20, 0, 0.0)
     assert [line["updates"] for line in lines(path)] == [10, 20]

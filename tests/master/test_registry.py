@@ -144,6 +144,7 @@ ENTRY = "the checkpoint's entry of player/0 must hold an incarnation from 1 and 
     [
         *(({key: {}}, KEY.format(key)) for key in ("player", "spy/1", "player/-1", "player/65536")),
         ({"player/0": {"incarnation": 1}}, ENTRY),
+        ({"player/0": 3}, ENTRY),
         *(
             ({"player/0": {"incarnation": incarnation, "sequence": sequence}}, ENTRY)
             for incarnation, sequence in BAD

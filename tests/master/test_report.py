@@ -88,6 +88,6 @@ def test_a_status_that_cannot_be_told_as_it_is_ends_nothing_and_keeps_the_scores
     status = made.reporter.flush(queue=0)
     assert hub.values("tell") == [status]
     status.encode()
-    result = make_result(status, made.guard.trainer, seed=0, reason="SIGTERM")
+    result = make_result(status, made.guard.trainer.facts(), seed=0, reason="SIGTERM")
     assert (result["raw_overlap"], result["mean_reward"]) == (None, 1e18)
     assert result["position_error_p90"] == 0.5

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from master.checkpointer import Restored, check_resumable, restore_run, save_run, warm_start
+from master.checkpointer import Restored, restore_run, save_run, warm_start
 from master.journal import segments
+from master.resumable import check_resumable
 from master.rundir import Record, RunFolder
 from master.trainer import Trainer, choose_device
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint, save_checkpoint
@@ -138,6 +139,28 @@ def test_a_checkpoint_that_lacks_a_part_is_refused(tmp_path: Path, lost: str) ->
     counters = {name: value for name, value in found.counters.items() if name != lost}
     save_checkpoint(tmp_path, 1, found.arrays, counters, keep=1)
     with pytest.raises(RunError, match=f"not that of a run .KeyError: '{lost}'"):
+        restore_run(tmp_path, trainer(MADE))
+
+
+@pytest.mark.parametrize(
+    ("forged", "reason"),
+    [
+        ({"setup": 3}, "other settings of net, reward, sim, tokens"),
+        ({"rate_limiter": 3}, "not that of a run .AttributeError"),
+        ({"episodes": 1e400}, "not that of a run .OverflowError"),
+        ({"record": Record().state() | {"loop_s": "x"}}, "Expected `float`, got `str` - at"),
+        (
+            {"record": Record().state() | {"scores": []}},
+            "Expected `object`, got `array`",
+        ),
+    ],
+)
+def test_a_checkpoint_with_a_part_of_another_kind_is_refused(
+    tmp_path: Path, forged: dict[str, Any], reason: str
+) -> None:
+    found = load_checkpoint(save_run(tmp_path, trainer(MADE), REST, keep=1))
+    save_checkpoint(tmp_path, 1, found.arrays, found.counters | forged, keep=1)
+    with pytest.raises(RunError, match=f"cannot go on from .*{reason}"):
         restore_run(tmp_path, trainer(MADE))
 
 

@@ -31,6 +31,7 @@ def test_a_run_keeps_its_keys_and_only_the_user_reads_them(tmp_path: Path) -> No
         {"worker_public": make_keys().worker_public},
         {"server_public": 7},
         "",
+        "[" * 100_000,
         "[]",
         "{}",
     ],

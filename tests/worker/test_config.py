@@ -6,12 +6,19 @@ import pytest
 
 from tangram_sim.errors import ConfigError
 from worker.cli import with_absolute_paths, with_changes
-from worker.config import EvalConfig, PlayConfig, WorkerConfig, check_compare, check_puzzle
+from worker.config import (
+    EvalConfig,
+    PlayConfig,
+    WorkerConfig,
+    check_compare,
+    check_puzzle,
+    source_and_names,
+)
 
 pytestmark = pytest.mark.fast
 
 RUN = {"run_dir": "runs/one"}
-TESTED = RUN | {"puzzles": "test"}
+TESTED = RUN | {"puzzle": ("test",)}
 TWO = {"compare": ("a", "b")}
 OF_A_RUN = [
     ({"run_dir": ""}, "set run_dir=runs/my_run"),
@@ -33,9 +40,9 @@ WRONG = {
         (TESTED | {"turns": 0}, "turns must be between 1 and 360, got 0"),
         (TESTED | {"turns": 361}, "turns must be between 1 and 360, got 361"),
         (TESTED | {"sheet": "ends.gif"}, "sheet must end with .png, got 'ends.gif'"),
-        (TESTED | {"episodes": 5}, "episodes=5 changes nothing with puzzles=test: leave it at"),
+        (TESTED | {"episodes": 5}, "episodes=5 changes nothing with puzzle=[test]: leave it at"),
         *[
-            ({name: value}, f"{name}={shown} changes nothing with puzzles=null: leave it")
+            ({name: value}, f"{name}={shown} changes nothing with puzzle=null: leave it")
             for name, value, shown in (
                 ("turns", 2, "2"),
                 ("sheet", "a.png", "a.png"),
@@ -43,7 +50,7 @@ WRONG = {
             )
         ],
         *[
-            (TESTED | {"changes": {"sim": {name: 1}}}, f"sim.{name}=1 changes nothing with puzzles")
+            (TESTED | {"changes": {"sim": {name: 1}}}, f"sim.{name}=1 changes nothing with puzzle:")
             for name in ("targets", "spread", "mirrored")
         ],
     ],
@@ -55,13 +62,14 @@ WRONG = {
         ],
         ({"run_dir": None}, "say which run: run_dir=runs/..., or which ones: compare=[runs/a,"),
         ({"run_dir": "a"} | TWO, "run_dir=a changes nothing with compare=[a,b]: leave it out, or"),
-        ({"puzzles": "test", "episodes": 5}, "episodes=5 changes nothing with puzzles=test"),
+        ({"turns": 2}, "turns=2 changes nothing with puzzle=null"),
+        ({"skip_invalid": True}, "skip_invalid=true changes nothing with puzzle=null"),
         ({"puzzle": ("cat",), "episodes": 5}, "episodes=5 changes nothing with puzzle=[cat]"),
         ({"live": True, "out": "a.gif"}, "out=a.gif changes nothing with live=true: leave it at"),
         *[
             (
                 {"puzzle": ("cat",), "changes": {"sim": {name: 1}}},
-                f"sim.{name}=1 changes nothing with puzzles: leave it out, or leave puzzles out",
+                f"sim.{name}=1 changes nothing with puzzle: leave it out, or leave puzzle out",
             )
             for name in ("targets", "spread", "mirrored", "starts")
         ],
@@ -79,7 +87,6 @@ WRONG = {
             for name, value, shown in (
                 ("tokens", "square", "square"),
                 ("puzzle", ("cat",), "[cat]"),
-                ("puzzles", "test", "test"),
                 ("live", True, "true"),
             )
         ],
@@ -105,15 +112,30 @@ def test_what_is_no_list_of_folders_is_refused(value: object) -> None:
 
 @pytest.mark.parametrize(
     ("value", "names"),
-    [(None, None), ("cat", ("cat",)), (8, ("8",)), (["cat", "dog"], ("cat", "dog"))],
+    [
+        (None, None),
+        ("cat", (None, ("cat",))),
+        (8, (None, ("8",))),
+        (["cat", "dog"], (None, ("cat", "dog"))),
+        ("test", ("test", None)),
+        ("mine.SVG", ("mine.SVG", None)),
+        (["my/own.json", "cat"], ("my/own.json", ("cat",))),
+    ],
 )
-def test_one_puzzle_or_several(value: object, names: tuple[str, ...] | None) -> None:
-    assert check_puzzle(value) == names
+def test_one_puzzle_or_several_perhaps_of_a_file(value: object, names: object) -> None:
+    puzzle = check_puzzle(value)
+    assert (None if puzzle is None else source_and_names(puzzle)) == names
+
+
+@pytest.mark.parametrize("later", ["a.json", "test"])
+def test_puzzles_come_from_one_file(later: str) -> None:
+    with pytest.raises(ConfigError, match=f"one file or split, first in its list, got {later}"):
+        check_puzzle(["cat", later])
 
 
 @pytest.mark.parametrize("value", ["", [], {"a": 1}, [["cat"]]])
 def test_what_names_no_puzzle_is_refused(value: object) -> None:
-    with pytest.raises(ConfigError, match="set puzzle=cat or puzzle=.cat,dog."):
+    with pytest.raises(ConfigError, match="set puzzle=cat, puzzle=.cat,dog. or puzzle=mine.json"):
         check_puzzle(value)
 
 
@@ -123,8 +145,7 @@ def test_what_names_no_puzzle_is_refused(value: object) -> None:
         ({"tokens": "square"}, "pretrained/square"),
         ({"tokens": "square", "run_dir": "a"}, "a"),
         ({"puzzle": ("cat",)}, "pretrained/tangram7"),
-        ({"puzzles": "test"}, "pretrained/tangram7"),
-        ({"puzzles": "test", "tokens": "tangram3"}, "pretrained/tangram3"),
+        ({"puzzle": ("test",), "tokens": "tangram3"}, "pretrained/tangram3"),
     ],
 )
 def test_which_run_is_played(monkeypatch: pytest.MonkeyPatch, settings: dict, run_dir: str) -> None:
@@ -136,12 +157,12 @@ def test_puzzles_are_for_the_agent_of_the_game_if_there_is_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("worker.config.agent_names", lambda: ["square", "tangram7"])
-    assert EvalConfig(puzzles="test").run == "pretrained/tangram7"
-    assert EvalConfig("runs/one", puzzles="test").run == "runs/one"
+    assert EvalConfig(puzzle=("test",)).run == "pretrained/tangram7"
+    assert EvalConfig("runs/one", puzzle=("test",)).run == "runs/one"
     with pytest.raises(ConfigError, match="say which run: run_dir=runs/..."):
         EvalConfig()
     monkeypatch.setattr("worker.config.agent_names", lambda: ["square"])
-    for without in (lambda: EvalConfig(puzzles="test"), lambda: PlayConfig(puzzle=("cat",))):
+    for without in (lambda: EvalConfig(puzzle=("test",)), lambda: PlayConfig(puzzle=("cat",))):
         with pytest.raises(ConfigError, match="say which run"):
             without()
 
@@ -162,8 +183,10 @@ def test_paths_are_seen_from_the_callers_folder(
         ),
         ("out", "pretrained/x.png", f"{tmp_path}/pretrained/x.png"),
         ("sheet", "a.png", f"{tmp_path}/a.png"),
-        ("puzzles", "mine.json", f"{tmp_path}/mine.json"),
-        ("puzzles", "test", "test"),
+        ("puzzle", "mine.json", (f"{tmp_path}/mine.json",)),
+        ("puzzle", ["mine.json", "cat"], (f"{tmp_path}/mine.json", "cat")),
+        ("puzzle", "test", ("test",)),
+        ("puzzle", ["cat", 8], ("cat", "8")),
     ):
         assert with_absolute_paths({name: given}) == {name: seen}
 

@@ -59,13 +59,23 @@ def test_a_host_that_dns_does_not_know_is_told(
 
 @pytest.mark.parametrize(
     "address",
-    ["udp://h:1", "tcp://h", "tcp://:1", "tcp://h:0", "tcp://h:65536", "tcp://h:x", "tcp://"],
+    [
+        "udp://h:1",
+        "tcp://h",
+        "tcp://:1",
+        "tcp://h:0",
+        "tcp://h:65536",
+        "tcp://h:x",
+        "tcp://",
+        "tcp://a b:1",
+    ],
 )
 def test_a_wrong_address_is_refused(address: str) -> None:
     with pytest.raises(RunError) as caught:
         find_master(address)
     assert str(caught.value) == (
-        f"'{address}' (from {address}) is no address: it must be tcp://host:port"
+        f"'{address}' (from {address}) is no address: it must be tcp://host:port, the port "
+        "from 1 to 65535"
     )
 
 
@@ -88,6 +98,7 @@ def test_a_file_and_its_folder_are_found(tmp_path: Path) -> None:
         ("{}", "KeyError('endpoint')"),
         ('{"endpoint": "tcp://h:1"}', "KeyError('run_id')"),
         ("\x00", "JSONDecodeError"),
+        ("[" * 100_000, "RecursionError"),
         (
             '{"endpoint": "tcp://h:1", "run_id": "r", "server_key": "short"}',
             "ValueError('server_key,",

@@ -129,7 +129,7 @@ def two(tmp_path: Path) -> str:
 def test_puzzles_of_a_file_are_scored_together_and_one_by_one(
     tmp_path: Path, two: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    report = evaluated(tmp_path, puzzles=two, turns=2)
+    report = evaluated(tmp_path, puzzle=(two,), turns=2)
     assert set(report) >= MEANS | {"sim", "agent"}
     assert set(report["baselines"]) == ORDERS | {"exact", "random"}
     assert [(one["name"], one["degrees"]) for one in report["puzzles"]] == [
@@ -149,15 +149,15 @@ def test_puzzles_of_a_file_are_scored_together_and_one_by_one(
 
 def test_settings_of_the_agents_play_are_played_and_written_down(tmp_path: Path, two: str) -> None:
     write_run(tmp_path / "run", GAME, sim=SIM, agent={"reapply": 0})
-    trained = evaluated(tmp_path, puzzles=two)
+    trained = evaluated(tmp_path, puzzle=(two,))
     asked = {"order": "listed", "reapply": 1, "refine_steps": 2}
-    listed = evaluated(tmp_path, puzzles=two, changes={"agent": asked})
+    listed = evaluated(tmp_path, puzzle=(two,), changes={"agent": asked})
     assert [trained["agent"][name] for name in asked] == ["learned", 0, 0]
     assert [listed["agent"][name] for name in asked] == ["listed", 1, 2]
     assert set(listed["baselines"]) == {"order=size", "order=random", "exact", "random"}
-    plain = evaluated(tmp_path, puzzles=two, changes={"agent": {"order": "listed"}})
+    plain = evaluated(tmp_path, puzzle=(two,), changes={"agent": {"order": "listed"}})
     assert plain["coverage"] == trained["baselines"]["order=listed"]["coverage"]
-    assert evaluated(tmp_path, puzzles=two, seed=1)["coverage"] != trained["coverage"]
+    assert evaluated(tmp_path, puzzle=(two,), seed=1)["coverage"] != trained["coverage"]
     assert [one["coverage"] for one in plain["puzzles"]] != [
         one["coverage"] for one in listed["puzzles"]
     ]
@@ -179,7 +179,7 @@ def test_a_long_list_is_cut_on_the_screen_only_and_the_sheet_shows_every_puzzle(
 ) -> None:
     monkeypatch.setattr("worker.evaluate.MAX_LINES", 12)
     sheet = tmp_path / "ends.png"
-    report = evaluated(tmp_path, puzzles="test", sheet=str(sheet))
+    report = evaluated(tmp_path, puzzle=("test",), sheet=str(sheet))
     assert len(report["puzzles"]) == 14
     printed = capsys.readouterr().out
     assert printed.count("│ camel") == 1
@@ -194,14 +194,14 @@ def test_puzzles_that_were_left_out_are_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = write_puzzles(tmp_path / "mine.json", drawn("cat"), drawn("fish", [0, 1]))
-    report = evaluated(tmp_path, puzzles=str(path), skip_invalid=True)
+    report = evaluated(tmp_path, puzzle=(str(path),), skip_invalid=True)
     assert len(report["puzzles"]) == len(report["skipped"]) == 1
     assert "left out: puzzle 'my_fish' has the pieces" in capsys.readouterr().out
 
 
 def test_an_agent_without_a_choice_of_order(tmp_path: Path, two: str) -> None:
     write_run(tmp_path / "run", GAME, sim=SIM, agent={"readout": "token"})
-    assert set(evaluated(tmp_path, puzzles=two)["baselines"]) == {"exact", "random"}
+    assert set(evaluated(tmp_path, puzzle=(two,))["baselines"]) == {"exact", "random"}
     reason = "run with agent.order=size: agent.order=size changes nothing with agent.readout=token"
     with pytest.raises(ConfigError, match=reason):
-        evaluated(tmp_path, puzzles=two, changes={"agent": {"order": "size"}})
+        evaluated(tmp_path, puzzle=(two,), changes={"agent": {"order": "size"}})

@@ -162,7 +162,7 @@ def test_unknown_and_too_many_puzzles(tmp_path: Path, monkeypatch: pytest.Monkey
     many = [drawn("cat") | {"name": f"cat_{i}"} for i in range(3)]
     path = write_puzzles(tmp_path / "many.json", *many)
     with pytest.raises(ConfigError, match="there are 3 puzzles, at most 2 .* puzzle=.cat_0"):
-        play_run(of_game(tmp_path, puzzles=str(path), out=str(out)))
+        play_run(of_game(tmp_path, puzzle=(str(path),), out=str(out)))
     assert not out.exists()
 
 
@@ -335,7 +335,7 @@ def test_two_agents_move_side_by_side(tmp_path: Path, capsys: pytest.CaptureFixt
     write_run(tmp_path / "second", agent=PLAIN_AGENT)
     assert compare_runs(compared(tmp_path, "first", "second", episodes=1)) == 0
     printed = capsys.readouterr().out
-    assert f"{tmp_path / 'both.gif'}: 1 episodes; first: mean raw overlap 0." in printed
+    assert f"{tmp_path / 'both.gif'}: 1 episode; first: mean raw overlap 0." in printed
     assert "; second: mean raw overlap 0." in printed
     with Image.open(tmp_path / "both.gif") as film:
         assert film.n_frames > 5

@@ -1,0 +1,49 @@
+"""Adam as torch.optim has it, without the compiler of torch: its import takes 1.4 s and 70 MB."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.optim.adam import adam
+
+BETAS, EPSILON = (0.9, 0.999), 1e-8
+NAMES = ("step", "exp_avg", "exp_avg_sq")
+
+
+class Adam:
+    """Steps of parameters along their gradients.
+
+    Attributes:
+        rate: of the next step.
+        slots: what is kept of every parameter, by the names of torch.optim; empty before a step.
+    """
+
+    def __init__(self, parameters: Sequence[Tensor], rate: float) -> None:
+        self.rate = rate
+        self.slots: dict[str, list[Tensor]] = {}
+        self._parameters = list(parameters)
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """One step along `grad` of each parameter."""
+        if not self.slots:
+            scalars = [parameter.new_zeros(()) for parameter in self._parameters]
+            averages = ([torch.zeros_like(one) for one in self._parameters] for _ in range(2))
+            self.slots = dict(zip(NAMES, (scalars, *averages), strict=True))
+        steps, means, squares = (self.slots[name] for name in NAMES)
+        adam(
+            self._parameters,
+            [parameter.grad for parameter in self._parameters if parameter.grad is not None],
+            means,
+            squares,
+            max_exp_avg_sqs=[],
+            state_steps=steps,
+            fused=True,
+            amsgrad=False,
+            beta1=BETAS[0],
+            beta2=BETAS[1],
+            lr=self.rate,
+            weight_decay=0.0,
+            eps=EPSILON,
+            maximize=False,
+        )
