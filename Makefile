@@ -15,7 +15,7 @@ $(error make knows no $(firstword $(STRAY))=...: settings go into ARGS="...", as
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help train test lint settings format paper bench clean
+.PHONY: help train test lint settings format paper bench docs clean
 
 help:  ## list these commands
 	@sed -nE 's/^([a-z]+):.*## (.*)/  make \1\t\2/p' Makefile | expand -t 16
@@ -49,8 +49,13 @@ paper: .venv/.installed-run  ## all figures and tables of the paper: BUDGET=smok
 bench: .venv/.installed-dev  ## measure speed against what else one could do; options go into ARGS="runs=9"
 	@$(BIN)/tangram-bench all out=docs/results/bench.json $(ARGS)
 
+# Not --quiet: mkdocs then counts no warnings, and --strict lets all pass.
+docs: .venv/.installed-docs  ## make a site of README and docs, in site/
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	@echo "the front page is site/index.html; with search: python3 -m http.server -d site"
+
 clean:  ## remove caches and build products; .venv and runs/ stay
-	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf build dist site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 	find . -name .venv -prune -o -name __pycache__ -type d -exec rm -rf {} +
 
 # A stamp is older than these files only when something new may be needed.
@@ -58,6 +63,10 @@ clean:  ## remove caches and build products; .venv and runs/ stay
 	@.ci/install .venv
 	@touch $@
 
-.venv/.installed-dev: pyproject.toml constraints.txt
-	@.ci/install .venv dev,human,peers,slurm
+.venv/.installed-docs: pyproject.toml constraints.txt
+	@.ci/install .venv docs
 	@touch .venv/.installed-run $@
+
+.venv/.installed-dev: pyproject.toml constraints.txt
+	@.ci/install .venv dev,docs,human,peers,slurm
+	@touch .venv/.installed-run .venv/.installed-docs $@

@@ -1,4 +1,7 @@
-"""What README and docs name exists: files, anchors, settings, and what their commands set."""
+"""What README and docs name exists: files, settings, and what their commands set.
+
+Links and anchors: tests/test_house_slow.py.
+"""
 
 import re
 import shlex
@@ -11,17 +14,13 @@ from conf.commands import COMMANDS
 from conf.help import choices, setting_names
 from tangram_agent.setup import SECTIONS
 from tangram_lab.benchmarks.cli import _parser as bench_parser
+from tests.blocks import PAGES
 
 pytestmark = pytest.mark.fast
 
 ROOT = Path(__file__).parents[1]
-FOLDERS = [p.name for p in ROOT.iterdir() if p.is_dir() and not p.name.startswith(".")]
+FOLDERS = [p.name for p in ROOT.iterdir() if p.is_dir() and p.name[0] != "." and p.name != "site"]
 GENERATED = ("settings.md", "results.md", "bench.md", "game.md")  # of settings or of runs
-PAGES = [
-    ROOT / "README.md",
-    *sorted((ROOT / "docs").rglob("*.md")),
-    ROOT / "tangram_lab" / "benchmarks" / "README.md",
-]
 PRESENT = [page for page in PAGES if page.name not in GENERATED]
 SUFFIXES = ("py", "md", "sh", "sbatch", "def", "yaml", "toml", "txt")
 PRIMARIES = {command.name: name for name, command in COMMANDS.items()}
@@ -33,27 +32,6 @@ def spans(text: str) -> set[str]:
         " ".join(span.split())
         for span in re.findall(r"`([^`]+)`", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
     }
-
-
-def dead_links(page: Path) -> list[str]:
-    """Links to files or headings of this repository that are not there."""
-    dead = []
-    for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
-        place, _, anchor = link.partition("#")
-        target = (page.parent / place).resolve() if place else page
-        if ":" not in place and not (target.exists() and anchor in {"", *anchors(target)}):
-            dead.append(link)
-    return dead
-
-
-def anchors(page: Path) -> set[str]:
-    """What a link may name behind #: headings as they are shown, and ids."""
-    if page.suffix != ".md":
-        return set()
-    text = page.read_text()
-    titles = re.findall(r"^#+ (.*)", text, re.MULTILINE)
-    shown = [re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles]
-    return {*shown, *re.findall(r'id="([^"]+)"', text)}
 
 
 def dead_paths(text: str) -> list[str]:
@@ -108,11 +86,6 @@ def unknown(words: list[str]) -> list[str]:
     return refused
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_links_lead_to_a_file_and_a_heading(page: Path) -> None:
-    assert dead_links(page) == []
-
-
 @pytest.mark.parametrize("page", PRESENT, ids=lambda page: page.name)
 def test_files_and_settings_that_are_named_exist(page: Path) -> None:
     text = page.read_text()
@@ -124,11 +97,8 @@ def test_commands_know_their_settings(page: Path) -> None:
     assert [word for words in commands(page.read_text()) for word in unknown(words)] == []
 
 
-def test_what_is_not_there_is_found(tmp_path: Path) -> None:
-    text = "[a](gone.md) [b](page.md#no) `tests/gone.py` `gone.py` `service.gone=1` `agent.gone`\n"
-    page = tmp_path / "page.md"
-    page.write_text("# Page\n" + text)
-    assert dead_links(page) == ["gone.md", "page.md#no"]
+def test_what_is_not_there_is_found() -> None:
+    text = "`tests/gone.py` `gone.py` `service.gone=1` `agent.gone`\n"
     assert sorted(dead_paths(text)) == ["gone.py", "tests/gone.py"]
     assert sorted(dead_settings(text)) == ["agent.gone", "service.gone"]
     block = "```bash\ntangram-train sim.gone=1 agent=gone agent=paper seed=1  # a comment\n```"

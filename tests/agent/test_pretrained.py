@@ -14,7 +14,9 @@ from tangram_agent.learner import Learner
 from tangram_agent.policy import Policy
 from tangram_agent.pretrained import CARD, CONFIG, FORMAT, WEIGHTS, agent_names, is_name
 from tangram_agent.runs import load_run
+from tangram_sim.env import TangramEnv
 from tangram_sim.errors import RunError, TangramError
+from tangram_sim.register import KWARGS
 from tests.agent.builders import PLAIN, PROPOSAL, SMALL, SQUARE, random_transitions, setup
 
 pytestmark = pytest.mark.fast
@@ -113,3 +115,16 @@ def test_the_packages_own_agents_are_whole_small_and_good(name: str) -> None:
     assert card["scores"]["mean_reward"] > 0.9
     assert len((folder / WEIGHTS).read_bytes()) < 1_000_000
     assert f"# pretrained/{name}\n" in (folder / "card.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("name", "agent"),
+    [("Tangram-v0", "pretrained/square"), ("Tangram7-v0", "pretrained/tangram7")],
+)
+def test_an_id_is_what_its_agent_was_trained_on(name: str, agent: str) -> None:
+    setup = load_run(agent).setup
+    env = TangramEnv(**KWARGS[name])
+    assert env.layout.fingerprint() == setup.layout.fingerprint()
+    assert env.sim == setup.sim
+    assert setup.reward.name == "overlap"
+    env.close()

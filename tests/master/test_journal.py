@@ -142,6 +142,24 @@ def test_damage_in_the_middle_is_told_as_a_loss(tmp_path: Path) -> None:
     assert f"is damaged at byte {start:,}: the {len(data) - start:,} bytes" in warnings[0]
 
 
+@given(st.data())
+def test_any_changed_bit_is_told_in_one_line(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    folder = tmp_path_factory.mktemp("journal")
+    kept = journal(folder, MADE)
+    for number in (1, 2, 3):
+        kept.append(arrival(MADE, number, count=1))
+        kept.rotate()
+    path = segments(folder)[2]
+    content = bytearray(path.read_bytes())
+    content[data.draw(st.integers(0, len(content) - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    path.write_bytes(content)
+    warnings: list[str] = []
+    assert sequences(folder, warnings=warnings) == [1, 3]
+    assert len(warnings) == 1
+
+
 def test_missing_segments_are_told_in_one_line_and_the_others_are_read(tmp_path: Path) -> None:
     kept = journal(tmp_path, MADE)
     for number in (1, 2, 3):

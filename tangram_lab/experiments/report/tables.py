@@ -68,8 +68,8 @@ def details(summary: str, lines: Sequence[str]) -> list[str]:
 
 
 def shell(command: str) -> list[str]:
-    """A command to copy."""
-    return ["```bash", command, "```", ""]
+    """A command to copy; tests/blocks.py runs it on request."""
+    return ["<!-- run: on request -->", "```bash", command, "```", ""]
 
 
 def plain(text: str) -> str:
