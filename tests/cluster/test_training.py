@@ -1,6 +1,7 @@
 """The whole product: real processes, real sockets, PyBullet, and what a run leaves behind."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
