@@ -116,11 +116,11 @@ def with_legend(sheet: Image.Image, text: int) -> Image.Image:
     lengths = [indent + math.ceil(font.getlength(told)) for told, indent in words]
     width = max(sheet.width, max(lengths) + 2 * gap)
     places, left, line = [], gap, 0
-    for length in lengths:
+    for length, indent in zip(lengths, indents, strict=True):
         if left > gap and left + length > width - gap:
             left, line = gap, line + 1
         places.append((left, line))
-        left += length + 2 * gap
+        left += length + (2 * gap if indent else text // 4)
     step = text * 3 // 2
     whole = Image.new("RGB", (width, sheet.height + (line + 1) * step + gap), PAPER)
     whole.paste(sheet)
