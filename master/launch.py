@@ -15,8 +15,7 @@ from master.console import logging_to, sturdy_console
 from master.result import show_finished
 from master.resumable import check_resumable
 from master.rundir import RunFolder
-from master.signals import SAME_WISH_S, handling, show_cursor
-from tangram_agent.outcome import CTRL_C
+from master.signals import SAME_WISH_S, handling, show_cursor, stop_notice
 from tangram_agent.process import Every, watch_parent
 
 # While the master starts, its connection file is looked for this often.
@@ -159,8 +158,7 @@ class Launcher:
         if self._signalled_s is None:
             self._signalled_s = now_s
         if self._stop_s is None:
-            said = CTRL_C.get(number.name, number.name)
-            self._stop(f"{said}: the run ends with a checkpoint, again to end at once", number)
+            self._stop(stop_notice(number.name), number)
         elif now_s - self._signalled_s >= SAME_WISH_S:
             self._kill_all()
 

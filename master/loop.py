@@ -13,7 +13,7 @@ from master.hub import Hub
 from master.lockstep import Lockstep
 from master.report import Reporter
 from master.rundir import Clock, RunFolder
-from master.signals import StopSignals
+from master.signals import StopSignals, stop_notice
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import RunStatus
 from tangram_agent.process import Every, Watchdog
@@ -169,6 +169,8 @@ class Loop:
         Raises:
             RunError: the disk is full.
         """
+        if self.signals.reason is not None and not launched:  # a launcher has said it
+            log.info(stop_notice(self.signals.reason))
         self.guard.check()
         self.publish()
         # Before anything that takes time: what was learned is safe from here on.

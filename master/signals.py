@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, Self
 
+from tangram_agent.outcome import CTRL_C
+
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 # submitit's, near a time limit: all processes of a job get it, and tangram-train leaves it to
 # submitit, which queues the job again; the others must end in order meanwhile.
@@ -36,6 +38,11 @@ def handling(
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def stop_notice(name: str) -> str:
+    """What the user reads when the signal of this name ends a run."""
+    return f"{CTRL_C.get(name, name)}: the run ends with a checkpoint, again to end at once"
 
 
 class StopSignals:

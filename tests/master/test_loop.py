@@ -238,6 +238,33 @@ def test_who_is_waited_for(
     assert (tmp_path / "test_episodes.png").exists() is waits
 
 
+@pytest.mark.parametrize(
+    ("reason", "launched", "said"),
+    [
+        (
+            "SIGINT",
+            False,
+            ["Ctrl-C (SIGINT): the run ends with a checkpoint, again to end at once"],
+        ),
+        ("SIGTERM", False, ["SIGTERM: the run ends with a checkpoint, again to end at once"]),
+        ("SIGINT", True, []),
+        (None, False, []),
+    ],
+)
+def test_a_signal_is_answered_unless_a_launcher_does(
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    reason: str | None,
+    launched: bool,
+    said: list[str],
+) -> None:
+    caplog.set_level("INFO")
+    made = loop(tmp_path, MADE, FakeHub(MADE, [[scores(MADE, 0)]], ["evaluator"]))
+    made.signals.reason = reason
+    made.finish(launched)
+    assert [text for text in caplog.messages if "again to end" in text] == said
+
+
 def test_a_second_wish_to_end_is_not_kept_waiting(tmp_path: Path) -> None:
     hub = FakeHub(MADE, roles=["evaluator"])
     made = loop(tmp_path, MADE, hub)
