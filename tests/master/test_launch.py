@@ -83,7 +83,8 @@ watch_parent(hear)
 def end():
     (folder / "connection.json").unlink()
     sys.exit(0)
-def told(*_):
+def told(number, _):
+    (folder / "signal").write_text(str(int(number)))
     heard.wait(30)  # the reason was sent before the signal
     end()
 for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1):
@@ -339,6 +340,7 @@ def test_a_signal_ends_the_master_in_order(
     status, told = finish(made, tmp_path)
     signal.signal(number, before)
     assert status == 0
+    assert (tmp_path / "signal").read_text() == str(int(number))
     name = "Ctrl-C (SIGINT)" if number == signal.SIGINT else number.name
     assert told == f"{name}: the run ends with a checkpoint, again to end at once\n"
 

@@ -148,6 +148,21 @@ def test_a_waiting_client_says_what_it_waits_for(
         until_said(client, client.wait_for_window, text)
 
 
+def test_a_host_that_dns_does_not_know_is_told_once_and_looked_up_again(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answers = ["no such host", "no such host", ""]
+    monkeypatch.setattr("worker.connection.dns_error", lambda _: answers.pop(0))
+    timing = replace(QUICK, silence_s=0.1, join_s=1.0)
+    with make_client("127.0.0.1:9", timing) as client:
+        deadline = time.monotonic() + LIMIT_S
+        while len(answers) == 3 or (answers and time.monotonic() < deadline):
+            client.poll(0.01)
+            told = client._connection.no_master(1.0)
+            assert ("in 1 s: no such host" in told) == bool(answers)
+    assert caplog.messages.count("no such host") == 1
+
+
 def test_a_silent_master_is_told_and_its_return_too(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     timing = replace(QUICK, silence_s=0.3)
