@@ -15,10 +15,17 @@ from typing import Any
 
 import yaml
 
-from conf.commands import COMMANDS, GROUPS, Plain
+from conf.arguments import (
+    OWN_PRESETS,
+    PRESET_GROUPS,
+    options_first,
+    unreadable,
+    without_own_presets,
+)
+from conf.commands import COMMANDS, Plain
 from conf.help import choices, group_help, help_text, setting_names
 from conf.names import hidden, revealed
-from conf.sweep import LAUNCHER, SWEEP, check_launcher, refuse_lost_job
+from conf.sweep import LAUNCHER, check_launcher, refuse_lost_job
 from tangram_sim.errors import ConfigError, TangramError
 from tangram_sim.settings import CONTROL
 
@@ -27,10 +34,6 @@ Stored = Callable[[Plain], tuple[str, Plain] | None]
 
 USAGE_STATUS = 2
 INTERRUPT_STATUS = 130
-CFG_KINDS = ("job", "hydra", "all")
-FLAGS = ("--cfg", *SWEEP)
-OWN_PRESETS = ("--config-dir", "-cd")
-PRESET_GROUPS = (*GROUPS, "experiment", "budget")
 MAKE_RUNS = ("train", "master")  # the commands whose run_dir is made, not read
 MISSING_HINTS = {
     "runs": "say which study: runs=runs/experiments/laptop",
@@ -56,7 +59,7 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
         print(f"{command} {version('tangram-rl')}")
         return 0
     try:
-        folder, arguments = _own_presets(arguments)
+        folder, arguments = without_own_presets(arguments)
         if {"-h", "--help"} & set(arguments):
             asked = [name for name in arguments if name in COMMANDS[config_name].sections()]
             print(
@@ -67,7 +70,7 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
             return 0
         options = [] if folder is None else [OWN_PRESETS[0], folder]
         _check_presets(folder)
-        sys.argv[1:] = [*options, *hidden(_options_first(arguments, config_name), config_name)]
+        sys.argv[1:] = [*options, *hidden(options_first(arguments, config_name), config_name)]
         check_launcher(sys.argv[1:])
         return _run(config_name, task, stored)
     except TangramError as error:
@@ -77,32 +80,6 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
         return USAGE_STATUS
     except KeyboardInterrupt:
         return INTERRUPT_STATUS
-
-
-def _own_presets(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
-    """The folder of the user's own presets, None if none is named, and the other arguments.
-
-    Raises:
-        ConfigError: no such folder, or a preset that is called as one of ours: hydra would take
-            ours without a word.
-    """
-    rest = [text for argument in arguments for text in _split_option(argument)]
-    at = [number for number, text in enumerate(rest) if text in OWN_PRESETS]
-    if not at:
-        return None, rest
-    if len(at) > 1 or at[0] + 1 == len(rest):
-        raise ConfigError(f"{OWN_PRESETS[0]} takes one folder, as in {OWN_PRESETS[0]} my_presets")
-    folder = Path(rest[at[0] + 1]).expanduser().absolute()
-    if not folder.is_dir():
-        raise ConfigError(f"{OWN_PRESETS[0]}: there is no folder {folder}")
-    for group in PRESET_GROUPS:
-        taken = {path.stem for path in (folder / group).glob("*.yaml")} & set(choices(group))
-        if taken:
-            raise ConfigError(
-                f"{folder}/{group}/{min(taken)}.yaml is called as a preset that comes with "
-                "tangram-rl: rename it"
-            )
-    return str(folder), rest[: at[0]] + rest[at[0] + 2 :]
 
 
 def _check_presets(folder: str | None) -> None:
@@ -126,60 +103,6 @@ def _check_presets(folder: str | None) -> None:
             raise ConfigError(f"preset {path} cannot be read ({why}): mend it") from None
         if not (content and isinstance(content, dict)):
             raise ConfigError(f"preset {path} sets nothing: write settings as in name: value")
-
-
-def _split_option(argument: str) -> list[str]:
-    name, sign, value = argument.partition("=")
-    return [name, value] if sign and name in OWN_PRESETS else [argument]
-
-
-def _options_first(arguments: Sequence[str], config_name: str) -> list[str]:
-    """The arguments in the order that hydra's parser insists on."""
-    options: list[str] = []
-    overrides: list[str] = []
-    for argument in arguments:
-        if options[-1:] == ["--cfg"]:
-            if argument not in CFG_KINDS:
-                raise ConfigError(f"--cfg takes {', '.join(CFG_KINDS)}, got '{argument}'")
-            options.append(argument)
-        elif argument in FLAGS:
-            options.append(argument)
-        elif argument.startswith("-"):
-            name = argument.lstrip("-")
-            raise ConfigError(
-                f"unknown option '{argument}': settings carry no dashes, as in "
-                f"{name if '=' in name else name + '=...'}; --help lists them"
-            )
-        else:
-            overrides.append(argument)
-    if options[-1:] == ["--cfg"]:
-        options.append("job")
-    for override in overrides:
-        _check_override(override, COMMANDS[config_name].over)
-    if len(set(FLAGS) & set(options)) > 1:
-        raise ConfigError("--cfg and --multirun do not go together: leave one out")
-    return [*options, *overrides]
-
-
-def _check_override(override: str, over: Sequence[str]) -> None:
-    """Refuse what hydra would take for something else.
-
-    A list of presets it would merge, so that [square,square] is one square. What is taken away
-    would be as it is by default.
-    """
-    name, _, value = override.lstrip("+~").partition("=")
-    if not name:
-        raise ConfigError(_unreadable(override))
-    if override.startswith("~"):
-        raise ConfigError(f"'{override}': no setting is taken away, write {name}=value instead")
-    if name in over:
-        raise ConfigError(
-            f"{override} chooses a preset, and a trained run has its own {name}: set single "
-            f"values, as --help {name} lists them"
-        )
-    if name in GROUPS and value.startswith("["):
-        remedy = f"; for several tokens write tokens.shapes={value}" if name == "tokens" else ""
-        raise ConfigError(f"{name} takes one preset, got {value}{remedy}")
 
 
 def _run(config_name: str, task: Callable[[Plain], int], stored: Stored | None) -> int:
@@ -398,7 +321,7 @@ def _explain(error: Exception, config_name: str) -> str:
         known = error.options or choices(group)
         return f"unknown {group} '{name}': choose from {', '.join(known)}"
     if isinstance(error, OverrideParseException):
-        return _unreadable(error.override)
+        return unreadable(error.override)
     if isinstance(error, RecursionError):
         return "the arguments are nested too deeply: write fewer brackets"
     if str(error).startswith("Config group override must be"):
@@ -412,10 +335,6 @@ def _explain(error: Exception, config_name: str) -> str:
         name = unknown.group(1) or unknown.group(2)
         return _unknown_setting(name, setting_names(config_name))
     return _first_line(error)
-
-
-def _unreadable(override: object) -> str:
-    return f"cannot read '{override}': write name=value, and quote texts with '...'"
 
 
 def _unknown_setting(name: str, known: Sequence[str]) -> str:

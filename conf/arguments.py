@@ -1,0 +1,103 @@
+"""The arguments of a command before hydra sees them; what it would misread is refused."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from conf.commands import COMMANDS, GROUPS
+from conf.help import choices
+from conf.sweep import SWEEP
+from tangram_sim.errors import ConfigError
+
+CFG_KINDS = ("job", "hydra", "all")
+FLAGS = ("--cfg", *SWEEP)
+OWN_PRESETS = ("--config-dir", "-cd")
+PRESET_GROUPS = (*GROUPS, "experiment", "budget")
+
+
+def without_own_presets(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
+    """The folder of the user's own presets, None if none is named, and the other arguments.
+
+    Raises:
+        ConfigError: no such folder, or a preset that is called as one of ours: hydra would take
+            ours without a word.
+    """
+    rest = [text for argument in arguments for text in _split_option(argument)]
+    at = [number for number, text in enumerate(rest) if text in OWN_PRESETS]
+    if not at:
+        return None, rest
+    if len(at) > 1 or at[0] + 1 == len(rest):
+        raise ConfigError(f"{OWN_PRESETS[0]} takes one folder, as in {OWN_PRESETS[0]} my_presets")
+    folder = Path(rest[at[0] + 1]).expanduser().absolute()
+    if not folder.is_dir():
+        raise ConfigError(f"{OWN_PRESETS[0]}: there is no folder {folder}")
+    for group in PRESET_GROUPS:
+        taken = {path.stem for path in (folder / group).glob("*.yaml")} & set(choices(group))
+        if taken:
+            raise ConfigError(
+                f"{folder}/{group}/{min(taken)}.yaml is called as a preset that comes with "
+                "tangram-rl: rename it"
+            )
+    return str(folder), rest[: at[0]] + rest[at[0] + 2 :]
+
+
+def options_first(arguments: Sequence[str], config_name: str) -> list[str]:
+    """The arguments in the order that hydra's parser insists on.
+
+    Raises:
+        ConfigError: an option or an override that hydra would not take, or would misread.
+    """
+    options: list[str] = []
+    overrides: list[str] = []
+    for argument in arguments:
+        if options[-1:] == ["--cfg"]:
+            if argument not in CFG_KINDS:
+                raise ConfigError(f"--cfg takes {', '.join(CFG_KINDS)}, got '{argument}'")
+            options.append(argument)
+        elif argument in FLAGS:
+            options.append(argument)
+        elif argument.startswith("-"):
+            name = argument.lstrip("-")
+            raise ConfigError(
+                f"unknown option '{argument}': settings carry no dashes, as in "
+                f"{name if '=' in name else name + '=...'}; --help lists them"
+            )
+        else:
+            overrides.append(argument)
+    if options[-1:] == ["--cfg"]:
+        options.append("job")
+    for override in overrides:
+        _check_override(override, COMMANDS[config_name].over)
+    if len(set(FLAGS) & set(options)) > 1:
+        raise ConfigError("--cfg and --multirun do not go together: leave one out")
+    return [*options, *overrides]
+
+
+def _check_override(override: str, over: Sequence[str]) -> None:
+    """Refuse what hydra would take for something else.
+
+    A list of presets it would merge, so that [square,square] is one square. What is taken away
+    would be as it is by default.
+    """
+    name, _, value = override.lstrip("+~").partition("=")
+    if not name:
+        raise ConfigError(unreadable(override))
+    if override.startswith("~"):
+        raise ConfigError(f"'{override}': no setting is taken away, write {name}=value instead")
+    if name in over:
+        raise ConfigError(
+            f"{override} chooses a preset, and a trained run has its own {name}: set single "
+            f"values, as --help {name} lists them"
+        )
+    if name in GROUPS and value.startswith("["):
+        remedy = f"; for several tokens write tokens.shapes={value}" if name == "tokens" else ""
+        raise ConfigError(f"{name} takes one preset, got {value}{remedy}")
+
+
+def unreadable(override: object) -> str:
+    """The error of what is no name=value, for the user."""
+    return f"cannot read '{override}': write name=value, and quote texts with '...'"
+
+
+def _split_option(argument: str) -> list[str]:
+    name, sign, value = argument.partition("=")
+    return [name, value] if sign and name in OWN_PRESETS else [argument]
