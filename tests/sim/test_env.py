@@ -96,6 +96,25 @@ def test_the_package_alone_loads_nothing_and_a_look_for_gymnasium_is_no_import()
     subprocess.run([sys.executable, "-W", "error", "-c", script], check=True, timeout=100)
 
 
+@pytest.mark.parametrize(
+    "first",
+    [
+        "import importlib, tangram_sim; importlib.reload(tangram_sim)",
+        "import sys; sys.modules['gymnasium'] = None; import tangram_sim; "
+        "del sys.modules['gymnasium']",
+        "import tangram_sim, importlib.util; spec = importlib.util.find_spec('gymnasium'); "
+        "import gymnasium; spec.loader.exec_module(gymnasium)",
+    ],
+    ids=["imported anew", "held back", "run again"],
+)
+def test_registered_once_whatever_was_done_before(first: str) -> None:
+    script = (
+        f"{first}; import gymnasium, sys; assert 'Tangram-v0' in gymnasium.registry; "
+        "assert not [one for one in sys.meta_path if type(one).__name__ == '_Finder']"
+    )
+    subprocess.run([sys.executable, "-W", "error", "-c", script], check=True, timeout=100)
+
+
 def test_made_by_module_and_name(made: list[Any]) -> None:
     made.append(gymnasium.make("tangram_sim:Tangram-v0", backend="kinematic"))
     assert isinstance(made[0].unwrapped, TangramEnv)
