@@ -92,8 +92,8 @@ def test_a_run_without_an_evaluator_says_how_to_start_one(
     assert served(stage, lambda: show_status(StatusConfig(path))) == 0
     shown = capsys.readouterr().out
     assert re.search("players' reward +0.500, with exploration", shown)
-    assert ("none: no evaluator has joined, the last line starts one" in shown) == told
-    assert shown.endswith(f"\ntangram-worker connect={path} role=evaluator\n") == told
+    start = f"no evaluator: start one with tangram-worker connect={path} role=evaluator"
+    assert shown.endswith(f"\n{start}\n") == told
 
 
 def test_nobody_there_is_told(tmp_path: Path) -> None:
