@@ -17,7 +17,7 @@ from master.journal import segments
 from tangram_agent.checkpoints import list_checkpoints
 from tangram_agent.files import write_whole
 from tangram_agent.outcome import FILE_NAME as RESULT
-from tangram_agent.outcome import read_outcome
+from tangram_agent.outcome import bound_of, read_outcome
 from tangram_agent.setup import SECTIONS
 from tangram_sim.errors import ConfigError, RunError
 
@@ -87,8 +87,8 @@ class RunFolder:
         if config.resume != "auto" or not self.result.exists():
             return False
         result = read_outcome(self.result)
-        name, _, reached = result["ended_by"].partition("=")
-        spent = bool(reached) and 0 < getattr(config, name, 0) <= float(reached)
+        name, reached = bound_of(result)
+        spent = bool(name) and 0 < getattr(config, name) <= reached
         return spent and result["scored_updates"] == result["updates"]
 
     def lock(self) -> IO[bytes]:
