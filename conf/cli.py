@@ -26,7 +26,6 @@ from tangram_sim.settings import CONTROL
 Stored = Callable[[Plain], tuple[str, Plain] | None]
 
 USAGE_STATUS = 2
-INTERRUPT_STATUS = 130
 CFG_KINDS = ("job", "hydra", "all")
 FLAGS = ("--cfg", *SWEEP)
 OWN_PRESETS = ("--config-dir", "-cd")
@@ -48,7 +47,7 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
 
     Returns:
         The task's status; 2 after a TangramError or a wrong command line, which are told in one
-        line on stderr; 130 after an interrupt.
+        line on stderr.
     """
     command = COMMANDS[config_name].name
     arguments = sys.argv[1:]
@@ -75,8 +74,6 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
         line = CONTROL.sub(lambda found: ascii(found[0])[1:-1], str(error))
         print(f"{command}: {line}", file=sys.stderr)
         return USAGE_STATUS
-    except KeyboardInterrupt:
-        return INTERRUPT_STATUS
 
 
 def _own_presets(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
