@@ -33,7 +33,6 @@ from tangram_sim.settings import CONTROL
 Stored = Callable[[Plain], tuple[str, Plain] | None]
 
 USAGE_STATUS = 2
-INTERRUPT_STATUS = 130
 MAKE_RUNS = ("train", "master")  # the commands whose run_dir is made, not read
 MISSING_HINTS = {
     "runs": "say which study: runs=runs/experiments/laptop",
@@ -51,7 +50,7 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
 
     Returns:
         The task's status; 2 after a TangramError or a wrong command line, which are told in one
-        line on stderr; 130 after an interrupt.
+        line on stderr.
     """
     command = COMMANDS[config_name].name
     arguments = sys.argv[1:]
@@ -78,8 +77,6 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
         line = CONTROL.sub(lambda found: ascii(found[0])[1:-1], str(error))
         print(f"{command}: {line}", file=sys.stderr)
         return USAGE_STATUS
-    except KeyboardInterrupt:
-        return INTERRUPT_STATUS
 
 
 def _check_presets(folder: str | None) -> None:

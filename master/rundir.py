@@ -17,7 +17,7 @@ from master.journal import segments
 from tangram_agent.checkpoints import list_checkpoints
 from tangram_agent.files import write_whole
 from tangram_agent.outcome import FILE_NAME as RESULT
-from tangram_agent.outcome import read_outcome
+from tangram_agent.outcome import bound_of, read_outcome
 from tangram_agent.setup import SECTIONS
 from tangram_sim.errors import ConfigError, RunError
 
@@ -87,8 +87,8 @@ class RunFolder:
         if config.resume != "auto" or not self.result.exists():
             return False
         result = read_outcome(self.result)
-        name, _, reached = result["ended_by"].partition("=")
-        spent = bool(reached) and 0 < getattr(config, name, 0) <= float(reached)
+        name, reached = bound_of(result)
+        spent = bool(name) and 0 < getattr(config, name) <= reached
         return spent and result["scored_updates"] == result["updates"]
 
     def lock(self) -> IO[bytes]:
@@ -112,13 +112,17 @@ class RunFolder:
         """Write the resolved config as plain YAML."""
         write_whole(self.config, yaml.safe_dump(dict(resolved), sort_keys=False).encode())
 
+    def read_config(self) -> dict[str, Any]:
+        """What `write_config` wrote."""
+        return dict(yaml.safe_load(self.config.read_text(encoding="utf-8")))
+
     def write_connection(self, connection: Mapping[str, str]) -> None:
         """Write what a worker needs to take part; only the user may read it.
 
         Args:
             connection: where the master is; the settings of the run are added to it.
         """
-        config = yaml.safe_load(self.config.read_text(encoding="utf-8"))
+        config = self.read_config()
         settings = {name: config[name] for name in SHARED if name in config}
         content = {**connection, "settings": settings}
         write_whole(self.connection, json.dumps(content, indent=1).encode(), PRIVATE)

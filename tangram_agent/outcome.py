@@ -8,11 +8,21 @@ from typing import Any
 from tangram_sim.errors import RunError
 
 FILE_NAME = "result.json"
+BOUNDS = ("max_hours", "max_episodes", "max_updates")
+FAULTS = (
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    OverflowError,
+    RecursionError,
+)
 CTRL_C = {"SIGINT": "Ctrl-C (SIGINT)"}
 
 
 def read_outcome(path: Path) -> dict[str, Any]:
-    """The content of a result.json, which has all that `outcome_rows` needs.
+    """The content of a result.json, which has all that `outcome_rows` and `bound_of` need.
 
     Raises:
         RunError: it cannot be read, or is none.
@@ -20,7 +30,8 @@ def read_outcome(path: Path) -> dict[str, Any]:
     try:
         result = json.loads(path.read_text(encoding="utf-8"))
         outcome_rows(result)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        bound_of(result)
+    except FAULTS as error:
         raise RunError(
             f"{path} is no result of a run ({error!r}): name the folder of a run that has finished"
         ) from None
@@ -47,6 +58,14 @@ def outcome_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("time", f"{duration(result['train_s'])} of training, {duration(result['wall_s'])} in all"),
         ("ended by", CTRL_C.get(result["ended_by"], result["ended_by"])),
     ]
+
+
+def bound_of(result: Mapping[str, Any]) -> tuple[str, float]:
+    """The setting that ended a run and what was reached; none where a signal did."""
+    if not result["ended_by"].isprintable():
+        raise ValueError("ended_by is no plain text")
+    name, _, reached = result["ended_by"].partition("=")
+    return (name, float(reached)) if name in BOUNDS else ("", 0.0)
 
 
 def plural(count: float, noun: str) -> str:

@@ -37,6 +37,7 @@ from tangram_sim.settings import (
     setting_name,
     told,
 )
+from tangram_sim.shapes import MAX_COORDINATE
 
 CONFIG = "config.yaml"
 POLICY_SECTIONS = ("tokens", "agent", "net")
@@ -95,12 +96,19 @@ class Run:
         }
         if not isinstance(observation, Mapping) or wanted.keys() - observation.keys():
             kind = type(observation).__name__
-            given = ", ".join(observation) if isinstance(observation, Mapping) else f"a {kind}"
+            given = (
+                ", ".join(map(str, observation))
+                if isinstance(observation, Mapping)
+                else f"a {kind}"
+            )
             raise ConfigError(
                 f"an observation is a dict of {', '.join(wanted)}, got {given or 'an empty one'}: "
                 "give what reset or step returns first"
             )
-        shown = {name: np.asarray(observation[name], dtype=np.float64) for name in wanted}
+        try:
+            shown = {name: np.asarray(observation[name], dtype=np.float64) for name in wanted}
+        except (TypeError, ValueError) as error:
+            raise ConfigError(f"an observation's entries must be numbers: {error}") from None
         rows = shown["observation"].shape[:-1][:1]
         for name, size in wanted.items():
             if shown[name].shape != (*rows, size) or 0 in rows:
@@ -109,8 +117,11 @@ class Run:
                     f"{(*(max(1, row) for row in rows), size)}: make the environment with this "
                     "agent's tokens"
                 )
-            if not np.isfinite(shown[name]).all():
-                raise ConfigError(f"observation['{name}'] must be finite, got NaN or infinity")
+            if not (np.abs(shown[name]) <= MAX_COORDINATE).all():
+                raise ConfigError(
+                    f"observation['{name}'] must be finite and within +-{MAX_COORDINATE:g}: give "
+                    "what the environment returns"
+                )
         return shown
 
     def with_settings(self, changes: Changes) -> "Run":

@@ -14,6 +14,7 @@ from pathlib import Path
 from types import ModuleType
 
 HOME = Path(__file__).resolve().parents[1]
+INTERRUPT_STATUS = 130
 COMMON_NAMES = frozenset({"conf", "master", "worker"})
 
 
@@ -31,11 +32,14 @@ class OwnPackages:
 
 
 def run(module: str, function: str) -> int:
-    """Run a command out of our packages and return its exit status."""
+    """Run a command out of our packages and return its exit status; 130 after Ctrl-C."""
     sys.meta_path.insert(0, OwnPackages)
-    # Late: what a command needs may only be imported once our packages come first.
-    command: Callable[[], int] = getattr(import_module(module), function)
-    return command()
+    try:
+        # Late: what a command needs may only be imported once our packages come first.
+        command: Callable[[], int] = getattr(import_module(module), function)
+        return command()
+    except KeyboardInterrupt:
+        return INTERRUPT_STATUS
 
 
 master = partial(run, "master.cli", "master")

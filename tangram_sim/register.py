@@ -54,7 +54,7 @@ def register() -> None:
 
 def register_when_loaded() -> None:
     """Register the ids now, or once gymnasium is imported."""
-    if "gymnasium" in sys.modules:
+    if sys.modules.get("gymnasium") is not None:  # None keeps it from being imported
         register()
     else:
         sys.meta_path.insert(0, _Finder())
@@ -63,20 +63,27 @@ def register_when_loaded() -> None:
 class _Finder(MetaPathFinder):
     """Finds gymnasium as the finders behind it do; once it has run, the ids are registered."""
 
+    _looks = False
+
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        if fullname != "gymnasium":
+        if fullname != "gymnasium" or self._looks:
             return None
-        others = [finder for finder in sys.meta_path if finder is not self]
-        found = (finder.find_spec(fullname, path, target) for finder in others)
-        spec = next((one for one in found if one is not None), None)
+        self._looks = True  # another of this kind, as after a reload, asks this one in its turn
+        try:
+            others = [finder for finder in sys.meta_path if finder is not self]
+            found = (finder.find_spec(fullname, path, target) for finder in others)
+            spec = next((one for one in found if one is not None), None)
+        finally:
+            self._looks = False
         if spec is not None and spec.loader is not None:
             run = spec.loader.exec_module
 
             def run_and_register(module: ModuleType) -> None:
                 run(module)
-                sys.meta_path.remove(self)
+                if self in sys.meta_path:
+                    sys.meta_path.remove(self)
                 register()
 
             spec.loader.exec_module = run_and_register  # type: ignore[method-assign]

@@ -14,6 +14,7 @@ import re
 import sys
 from collections.abc import Collection, Mapping
 from dataclasses import Field, dataclass, field, fields
+from numbers import Real
 from typing import Any, ClassVar, TypeVar, cast
 
 from tangram_sim.errors import ConfigError
@@ -150,10 +151,11 @@ def _check(name: str, value: object, what: Declaration) -> None:
             check_range(name, cast("float", one), what.low, what.high)
 
 
-def check_range(name: str, value: float, low: float, high: float = math.inf) -> None:
+def check_range(name: str, value: Any, low: float, high: float = math.inf) -> None:
     """Raise ConfigError unless value is a finite number and low <= value <= high."""
     # An integer may be too large for a float, too.
-    number = not isinstance(value, bool) and abs(value) <= sys.float_info.max
+    number = isinstance(value, Real) and not isinstance(value, bool)
+    number = number and abs(value) <= sys.float_info.max
     if not (number and low <= value <= high):
         bound = f"at least {low:g}" if math.isinf(high) else f"between {low:g} and {high:g}"
         kind, got = ("", value) if number else ("a finite number, ", told(value))

@@ -78,7 +78,7 @@ def _kind(outline: Floats) -> str:
 def _root(text: str, name: str) -> ET.Element:
     if len(text) > MAX_BYTES:
         raise ConfigError(f"SVG '{name}' is longer than {MAX_BYTES} characters: simplify it")
-    if re.search(r"<!\s*(doctype[^>]*\[|entity)", text, re.IGNORECASE):
+    if re.search(r"<!\s*(doctype[^<>]*\[|entity)", text, re.IGNORECASE):
         raise ConfigError(
             f"SVG '{name}' must have no ENTITY and no DOCTYPE with [...]: delete them"
         )

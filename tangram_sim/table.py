@@ -15,10 +15,12 @@ from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.drawing import draw_scene
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import TokensConfig, make_layout
+from tangram_sim.settings import check_range
 from tangram_sim.targets import check_targets
 
 Observation = dict[str, Any]  # of float64 vectors
 
+MAX_SIDE = 4096  # of a picture, pixels
 # The square tan has a quarter of the full square's diagonal as its side: this makes it 0.4.
 SQUARE_SCALE = 0.8 * 2.0**0.5
 
@@ -45,6 +47,8 @@ class Table:
         layout = make_layout(TokensConfig(tuple(shapes), scale))
         config = _sim_config(sim)
         check_targets(layout, config)
+        check_range("success_overlap", success_overlap, 0.0, 1.0)
+        check_range("render_size", render_size, 1, MAX_SIDE)
         steps = steps_of(layout.tokens, config)
         if horizon not in (None, steps):
             raise ConfigError(

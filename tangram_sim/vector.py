@@ -12,6 +12,7 @@ from gymnasium.vector.utils import batch_space
 from tangram_sim.arrays import Bools, Floats, Pixels
 from tangram_sim.env import TangramEnv, check_render_mode
 from tangram_sim.errors import ConfigError
+from tangram_sim.settings import check_range
 from tangram_sim.table import Observation, Table
 
 Stepped = tuple[Observation, Floats, Bools, Bools, dict[str, Any]]
@@ -52,10 +53,9 @@ class TangramVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], Any]):
         modes = {AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP}
         if autoreset_mode not in modes | {mode.value for mode in modes}:
             raise ConfigError(f"autoreset_mode must be NextStep or SameStep, got {autoreset_mode}")
-        if num_envs < 1:
-            raise ConfigError(f"num_envs must be at least 1, got {num_envs}")
-        if max_episode_steps is not None and max_episode_steps < 1:
-            raise ConfigError(f"max_episode_steps must be at least 1, got {max_episode_steps}")
+        check_range("num_envs", num_envs, 1)
+        if max_episode_steps is not None:
+            check_range("max_episode_steps", max_episode_steps, 1)
         self.num_envs = num_envs
         self.render_mode = render_mode
         self._mode = AutoresetMode(autoreset_mode)
@@ -96,9 +96,10 @@ class TangramVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], Any]):
                 "reset_mask leaves environments out, and these are reset together: leave it out, "
                 "or make them with vectorization_mode='sync'"
             )
-        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
-        if seeds is not None and len(seeds) != self.num_envs:
-            raise ConfigError(f"seed must list {self.num_envs} seeds, got {len(seeds)}")
+        seeds: Any = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
+        if seeds is not None and (not isinstance(seeds, Sequence) or len(seeds) != self.num_envs):
+            got = len(seeds) if isinstance(seeds, Sequence) else f"a {type(seeds).__name__}"
+            raise ConfigError(f"seed must be an int or list {self.num_envs} seeds, got {got}")
         for i, own in enumerate(seeds or ()):
             if own is not None:
                 self._generators[i] = gymnasium.utils.seeding.np_random(own)[0]

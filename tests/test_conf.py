@@ -366,7 +366,6 @@ LOWER = "lower agent.replay_capacity, agent.batch_size or service.envs"
     ("raised", "status", "line"),
     [
         (TangramError("port 5 is taken"), 2, "port 5 is taken"),
-        (KeyboardInterrupt(), 130, ""),
         (
             OSError(28, "No space left on device", "/runs/x"),
             2,

@@ -151,7 +151,7 @@ class Client:
         """
         patience = self._timing.join_s
         log.info(
-            "joining %s, for %g s at most",
+            "joins %s, waits %g s at most for its master",
             self._connection.place,
             patience,
             extra={"event": "joining"},

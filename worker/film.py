@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from PIL import Image
 
+from tangram_agent.outcome import plural
 from tangram_agent.setup import Setup
 from tangram_sim.actions import chosen_tokens, flips, velocities
 from tangram_sim.arrays import Bools, Floats, Ints
@@ -40,7 +41,7 @@ class Show:
         setup: the task as it was played.
         played: E episodes.
         titles: what each is called.
-        kind: what all are called.
+        kind: what one is called.
     """
 
     setup: Setup
@@ -51,8 +52,8 @@ class Show:
     def told(self) -> str:
         """What was shown and how well it went, in words."""
         mean = float(self.played.overlap.mean())
-        score = f"covered {mean:.3f}" if self.kind == "puzzles" else f"raw overlap {mean:.3f}"
-        return f"{len(self.titles)} {self.kind}, {score}"
+        score = "coverage" if self.kind == "puzzle" else "raw overlap"
+        return f"{plural(len(self.titles), self.kind)}, {score} {mean:.3f}"
 
 
 def frames_per_action(horizon: int) -> int:

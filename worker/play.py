@@ -71,7 +71,7 @@ def make_show(run: Run, config: PlayConfig) -> Show:
     if config.puzzle is not None:
         return puzzle_show(run, config)
     titles = [f"target {i + 1}" for i in range(config.episodes)]
-    return Show(run.setup, play_episodes(run, config), titles, "episodes")
+    return Show(run.setup, play_episodes(run, config), titles, "episode")
 
 
 def play_episodes(run: Run, config: PlayConfig) -> Played:
@@ -97,7 +97,7 @@ def puzzle_show(run: Run, config: PlayConfig) -> Show:
             f"in puzzle=[{found.figures[0].name}]"
         )
     played = play_figures(setup, found.figures, greedy(run.policy), config.seed)
-    return Show(setup, played, found.titles, "puzzles")
+    return Show(setup, played, found.titles, "puzzle")
 
 
 def end_picture(show: Show) -> Image.Image:

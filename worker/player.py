@@ -30,7 +30,7 @@ def run_player(config: WorkerConfig, setup: Setup) -> int:
         closing(BatchedEnv(setup.layout, setup.sim, setup.reward, config.service.envs)) as env,
         joined(config, setup, policy) as client,
     ):
-        if not _take_first_weights(client, policy, report):
+        if client.stopped or not _take_first_weights(client, policy, report):
             return 0
         me = client.welcome
         if me.lockstep:

@@ -118,9 +118,9 @@ def _print(console: Console, status: RunStatus, connect: str) -> None:
     if len(status.workers):
         console.print(_table(status))
     if numbers["evaluators"] == 0:  # whole, so that it can be copied
-        console.print(
-            f"tangram-worker connect={connect} role=evaluator", soft_wrap=True, markup=False
-        )
+        start = f"tangram-worker connect={connect} role=evaluator"
+        said = f"no evaluator yet (tangram-train starts its own): {start}"
+        console.print(said, soft_wrap=True, markup=False, highlight=False)
 
 
 def _print_rows(console: Console, rows: Iterable[tuple[str, str]]) -> None:
@@ -136,8 +136,6 @@ def _scores(n: Mapping[str, float]) -> Iterator[tuple[str, str]]:
     if "test/mean_reward" in n:
         angle = f"angle error {n['test/angle_error_deg_median']:.2f} deg"
         yield "last test", f"mean reward {n['test/mean_reward']:.3f}, {angle}"
-    elif n["evaluators"] == 0:
-        yield "last test", "none: no evaluator has joined, the last line starts one"
 
 
 def _lines(n: Mapping[str, float], texts: Mapping[str, str]) -> Iterator[tuple[str, str]]:
@@ -160,12 +158,12 @@ def _lines(n: Mapping[str, float], texts: Mapping[str, str]) -> Iterator[tuple[s
 def _time(elapsed_s: float, left_s: float, share: float) -> str:
     text = f"{elapsed_s / MINUTE_S:,.1f} min"
     if share >= 0:
-        text += f", {share:.0%} of the budget"
+        text += f", {share:.0%} done"
     return text + (f", {left_s / MINUTE_S:,.1f} min left" if left_s >= 0 else "")
 
 
 def _age(seconds: float) -> str:
-    return "none by this process" if seconds < 0 else f"{seconds / MINUTE_S:,.1f} min ago"
+    return "none since the master started" if seconds < 0 else f"{seconds / MINUTE_S:,.1f} min ago"
 
 
 def _table(status: RunStatus) -> Table:

@@ -281,8 +281,14 @@ def test_predict_takes_what_the_environments_show() -> None:
         ),
         (
             {name: np.full(size, np.nan) for name, size in SHOWN.items()},
-            "observation.'observation'. must be finite, got NaN or infinity",
+            "observation.'observation'. must be finite and within .-1e.06: give what",
         ),
+        (
+            {name: np.full(size, 1e30) for name, size in SHOWN.items()},
+            "observation.'observation'. must be finite and within .-1e.06: give what",
+        ),
+        (dict.fromkeys(SHOWN, "corners"), "entries must be numbers: could not convert string"),
+        ({1: 2}, "of observation, achieved_goal, desired_goal, got 1: give what"),
         ({"observation": np.zeros(53)}, "of observation, achieved_goal, desired_goal, got observ"),
         ({}, "got an empty one: give what reset or step returns first"),
         (({}, {}), "got a tuple: give what reset or step returns first"),

@@ -4,6 +4,7 @@ import json
 import os
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -21,6 +22,16 @@ SETTING = {
     "tangram-experiment": "jobs: 2",
     "tangram-report": "runs: ???",
 }
+
+
+@pytest.mark.parametrize("place", ["tangram_cli.commands.import_module", "master.cli.entry"])
+def test_ctrl_c_ends_a_command_without_a_word_also_while_it_loads(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], place: str
+) -> None:
+    monkeypatch.setattr(place, Mock(side_effect=KeyboardInterrupt))
+    monkeypatch.setattr(sys, "meta_path", [*sys.meta_path])
+    assert COMMANDS["train"]() == 130
+    assert capsys.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize("command", WITH_HELP)

@@ -96,6 +96,25 @@ def test_the_package_alone_loads_nothing_and_a_look_for_gymnasium_is_no_import()
     subprocess.run([sys.executable, "-W", "error", "-c", script], check=True, timeout=100)
 
 
+@pytest.mark.parametrize(
+    "first",
+    [
+        "import importlib, tangram_sim; importlib.reload(tangram_sim)",
+        "import sys; sys.modules['gymnasium'] = None; import tangram_sim; "
+        "del sys.modules['gymnasium']",
+        "import tangram_sim, importlib.util; spec = importlib.util.find_spec('gymnasium'); "
+        "import gymnasium; spec.loader.exec_module(gymnasium)",
+    ],
+    ids=["imported anew", "held back", "run again"],
+)
+def test_registered_once_whatever_was_done_before(first: str) -> None:
+    script = (
+        f"{first}; import gymnasium, sys; assert 'Tangram-v0' in gymnasium.registry; "
+        "assert not [one for one in sys.meta_path if type(one).__name__ == '_Finder']"
+    )
+    subprocess.run([sys.executable, "-W", "error", "-c", script], check=True, timeout=100)
+
+
 def test_made_by_module_and_name(made: list[Any]) -> None:
     made.append(gymnasium.make("tangram_sim:Tangram-v0", backend="kinematic"))
     assert isinstance(made[0].unwrapped, TangramEnv)
@@ -282,6 +301,10 @@ def test_a_window_needs_a_display(driver: str, monkeypatch: pytest.MonkeyPatch) 
         ({"render_mode": "3d"}, "render_mode must be None, human or rgb_array, got '3d'"),
         ({"horizon": 2}, "has 1 steps, and the id's time limit is 2: give horizon=1 and max_ep"),
         ({"gravity": 9.81}, "unknown setting 'gravity' of the environment: .* backend, arena"),
+        ({"success_overlap": 7}, "success_overlap must be between 0 and 1, got 7"),
+        ({"success_overlap": np.nan}, "success_overlap must be a finite number, .*, got nan"),
+        ({"render_size": 0}, "render_size must be between 1 and 4096, got 0"),
+        ({"scale": "big"}, "tokens.scale must be a finite number, .*, got big"),
         ({"arena": -1.0}, "sim.arena must be"),
         ({"allow_flip": True}, "sim.allow_flip=true needs a token that is not its own mirror"),
         ({"targets": "figures"}, "sim.targets=figures needs all seven tans, got tokens square"),

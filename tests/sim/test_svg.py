@@ -144,6 +144,7 @@ FIVE = '<polygon points="0,0 1,0 1,1 0,1 -1,.5"/>'
         (f"<svg>{TRIANGLE * 17}</svg>", "SVG 'it' draws more than 16 polygons: draw 7"),
         ("<!DOCTYPE svg[]><svg/>", DOCTYPE),
         ("<svg><!ENTITY a></svg>", DOCTYPE),
+        ("<!doctype " * 400_000, "SVG 'it' is not XML: syntax error"),  # in no time
         (f"<svg>{'<rect width=1in />' * 7}</svg>".replace("1in", "'1in'"), "width: numbers cannot"),
         ('<!doctype s [<!ENTITY a "b">]><svg>&a;</svg>', DOCTYPE),
         (f"<svg>{'<g>' * 60}{'</g>' * 60}</svg>", NESTED),

@@ -101,6 +101,7 @@ def test_pictures(made: list[Any]) -> None:
     ("settings", "reason"),
     [
         ({"num_envs": 0}, "num_envs must be at least 1, got 0"),
+        ({"num_envs": "2"}, "num_envs must be a finite number, at least 1, got 2"),
         ({"max_episode_steps": 0}, "max_episode_steps must be at least 1, got 0"),
         ({"autoreset_mode": "Disabled"}, "autoreset_mode must be NextStep or SameStep, got Disab"),
         ({"render_mode": "human"}, "render_mode must be None or rgb_array, got 'human'"),
@@ -116,7 +117,8 @@ def test_refused_settings(settings: dict[str, Any], reason: str) -> None:
 @pytest.mark.parametrize(
     ("given", "reason"),
     [
-        ({"seed": [1]}, "seed must list 3 seeds, got 1"),
+        ({"seed": [1]}, "seed must be an int or list 3 seeds, got 1"),
+        ({"seed": np.arange(3)}, "seed must be an int or list 3 seeds, got a ndarray"),
         ({"options": {"reset_mask": np.array([True, False, True])}}, "reset_mask leaves .* out"),
     ],
 )

@@ -169,7 +169,7 @@ def test_unknown_and_too_many_puzzles(tmp_path: Path, monkeypatch: pytest.Monkey
 @pytest.mark.parametrize(
     ("what", "told"),
     [
-        ({"puzzle": ("cat", "dog")}, "2 puzzles, covered 0."),
+        ({"puzzle": ("cat", "dog")}, "2 puzzles, coverage 0."),
         ({"episodes": 2}, "2 episodes, raw overlap 0."),
     ],
 )
@@ -188,7 +188,9 @@ def test_a_film_has_a_picture_for_each_frame(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(film_module, "MAX_FRAMES", 14)
-    pictures = film_pictures(shown(of_game(tmp_path, puzzle=("cat",), seed=2)))
+    show = shown(of_game(tmp_path, puzzle=("cat",), seed=2))
+    assert show.told().startswith("1 puzzle, coverage 0.")
+    pictures = film_pictures(show)
     assert len(pictures) == 1 + 14 + 1
     assert all((np.asarray(a) != np.asarray(b)).any() for a, b in pairwise(pictures))
 

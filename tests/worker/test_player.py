@@ -208,7 +208,7 @@ def test_a_signal_ends_a_player_with_a_goodbye(
     assert {n: signal.getsignal(n) for n in survivable_signals} == survivable_signals
     lines = [line.partition(" ")[2] for line in capfd.readouterr().err.splitlines()]
     assert [line for line in lines if "is behind" not in line] == [
-        f"player: joining {hub.endpoint}, for 3600 s at most",
+        f"player: joins {hub.endpoint}, waits 3600 s at most for its master",
         "player 0: joined run run",
         "player 0: waits: no weights yet",
         f"player 0: ends: {number.name}",
@@ -216,7 +216,7 @@ def test_a_signal_ends_a_player_with_a_goodbye(
 
 
 def test_a_signal_ends_a_player_that_no_master_answers(
-    survivable_signals: dict[int, object],
+    survivable_signals: dict[int, object], capfd: pytest.CaptureFixture[str]
 ) -> None:
     made = greedy_setup()
     with (
@@ -233,6 +233,7 @@ def test_a_signal_ends_a_player_that_no_master_answers(
 
         heard = pool.submit(wait_for_hello)
         assert run_player(WorkerConfig(endpoint, service=SERVICE), made) == 0
+        assert "no weights yet" not in capfd.readouterr().err
         assert heard.result(LIMIT_S)
 
 

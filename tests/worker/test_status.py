@@ -66,7 +66,17 @@ def test_a_finished_run_shows_its_result(
     assert re.search(r"ended by +max_updates=1234", shown)
     assert show_status(StatusConfig(str(tmp_path), json=True)) == 0
     assert json.loads(capsys.readouterr().out) == RESULT
-    for content in ("", "[]", "{}", json.dumps(RESULT | {"wall_s": "x"}), "[" * 100_000):
+    changes: list[dict[str, object]] = [
+        {"wall_s": "x"},
+        {"wall_s": float("inf")},
+        {"mean_reward": 10**400},
+        {"ended_by": None},
+        {"ended_by": "max_updates=x"},
+        {"ended_by": "\x1b[2J"},
+        {"ended_by": "\ud800"},
+    ]
+    forged = [json.dumps(RESULT | change) for change in changes]
+    for content in ("", "[]", "{}", *forged, "[" * 100_000):
         path.write_text(content)
         with pytest.raises(RunError, match=r"result\.json is no result of a run"):
             show_status(config)
@@ -82,8 +92,9 @@ def test_a_run_without_an_evaluator_says_how_to_start_one(
     assert served(stage, lambda: show_status(StatusConfig(path))) == 0
     shown = capsys.readouterr().out
     assert re.search("players' reward +0.500, with exploration", shown)
-    assert ("none: no evaluator has joined, the last line starts one" in shown) == told
-    assert shown.endswith(f"\ntangram-worker connect={path} role=evaluator\n") == told
+    start = f"tangram-worker connect={path} role=evaluator"
+    said = f"no evaluator yet (tangram-train starts its own): {start}"
+    assert shown.endswith(f"\n{said}\n") == told
 
 
 def test_nobody_there_is_told(tmp_path: Path) -> None:
