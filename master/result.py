@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 from master.children import override
+from master.config import MasterConfig
 from master.console import TEST, sturdy_console
 from master.rundir import RunFolder
 from tangram_agent.messages import RunStatus
@@ -125,6 +126,22 @@ def show_finished(folder: RunFolder, log_format: str) -> None:
 def command_line(name: str, settings: Mapping[str, object]) -> str:
     """A command of this installation with settings, to be pasted into a shell."""
     return " ".join([_installed(name), *(_argument(*pair) for pair in settings.items())])
+
+
+def go_on_command(folder: RunFolder, launched: bool) -> str:
+    """The command that goes on with a run, with all that `from_config` does not take.
+
+    A master that was launched is not told how many workers there are: config.yaml is.
+    """
+    given = folder.read_config()
+    names = ("seed", "max_hours", "max_episodes", "max_updates", "workers")
+    settings = {
+        "run_dir": folder.path,
+        "from_config": folder.config,
+        "resume": "auto",
+        **{name: given[name] for name in names if given[name] != getattr(MasterConfig, name)},
+    }
+    return command_line("tangram-train" if launched else "tangram-master", settings)
 
 
 def _installed(name: str) -> str:

@@ -23,7 +23,7 @@ from master.lockstep import Lockstep
 from master.loop import Loop
 from master.metrics import Metrics
 from master.report import Reporter, StatusCollector
-from master.result import command_line, make_result, show_finished, show_result
+from master.result import command_line, go_on_command, make_result, show_finished, show_result
 from master.resumable import check_resumable
 from master.rundir import Clock, Record, RunFolder
 from master.security import Keys, is_loopback, needs_keys, run_keys
@@ -84,6 +84,7 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
                 return 0
             folder.write_config(resolved)
             evaluator = command_line("tangram-worker", {**join, "role": "evaluator"})
+        go_on = go_on_command(folder, launched)
         title = f"tangram · {folder.path.name}"
         progress = make_progress(console, title, form, evaluator)
         opened.enter_context(closing(progress))
@@ -101,21 +102,8 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
         if form == "json":
             log.info("the run has ended (%s)", reason, extra={"event": "result", **result})
     if form != "json":
-        show_result(console, folder, result, _go_on(config, folder, launched))
+        show_result(console, folder, result, go_on)
     return 0
-
-
-def _go_on(config: MasterConfig, folder: RunFolder, launched: bool) -> str:
-    """The command that goes on with a run, with all that its folder does not tell."""
-    names = ("seed", "max_hours", "max_episodes", "max_updates", "workers")
-    given = {name: getattr(config, name) for name in names}
-    settings = {
-        "run_dir": folder.path,
-        "from_config": folder.config,
-        "resume": "auto",
-        **{name: value for name, value in given.items() if value != getattr(MasterConfig, name)},
-    }
-    return command_line("tangram-train" if launched else "tangram-master", settings)
 
 
 def _tell_news(line: str) -> None:

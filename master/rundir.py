@@ -112,13 +112,17 @@ class RunFolder:
         """Write the resolved config as plain YAML."""
         write_whole(self.config, yaml.safe_dump(dict(resolved), sort_keys=False).encode())
 
+    def read_config(self) -> dict[str, Any]:
+        """What `write_config` wrote."""
+        return dict(yaml.safe_load(self.config.read_text(encoding="utf-8")))
+
     def write_connection(self, connection: Mapping[str, str]) -> None:
         """Write what a worker needs to take part; only the user may read it.
 
         Args:
             connection: where the master is; the settings of the run are added to it.
         """
-        config = yaml.safe_load(self.config.read_text(encoding="utf-8"))
+        config = self.read_config()
         settings = {name: config[name] for name in SHARED if name in config}
         content = {**connection, "settings": settings}
         write_whole(self.connection, json.dumps(content, indent=1).encode(), PRIVATE)

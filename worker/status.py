@@ -118,8 +118,9 @@ def _print(console: Console, status: RunStatus, connect: str) -> None:
     if len(status.workers):
         console.print(_table(status))
     if numbers["evaluators"] == 0:  # whole, so that it can be copied
-        start = f"no evaluator: start one with tangram-worker connect={connect} role=evaluator"
-        console.print(start, soft_wrap=True, markup=False, highlight=False)
+        start = f"tangram-worker connect={connect} role=evaluator"
+        said = f"no evaluator yet (tangram-train starts its own): {start}"
+        console.print(said, soft_wrap=True, markup=False, highlight=False)
 
 
 def _print_rows(console: Console, rows: Iterable[tuple[str, str]]) -> None:

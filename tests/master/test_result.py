@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from master.result import SCORES, show_result
+from master.result import SCORES, go_on_command, show_result
 from master.rundir import RunFolder
 from tests.master.builders import screen, text
 
@@ -55,6 +55,17 @@ def test_the_final_table(
     assert f"tangram-play run_dir={folder.path} out=play.gif" in text(shown)
     assert f"tensorboard --logdir {folder.path}/tensorboard" in text(shown)
     assert "test_episodes.png" not in text(shown)
+
+
+@pytest.mark.parametrize(("launched", "name"), [(True, "tangram-train"), (False, "tangram-master")])
+def test_the_command_that_goes_on_has_as_many_workers_as_before(
+    tmp_path: Path, launched: bool, name: str
+) -> None:
+    folder = RunFolder(tmp_path)
+    bounds = {"max_hours": 0.0, "max_episodes": 0, "max_updates": 2000}
+    folder.write_config({"seed": 3, **bounds, "workers": 2})
+    settings = f"run_dir={tmp_path} from_config={tmp_path}/config.yaml resume=auto seed=3 workers=2"
+    assert go_on_command(folder, launched).endswith(f"{name} {settings}")
 
 
 @pytest.mark.parametrize("active", [True, False])

@@ -92,8 +92,9 @@ def test_a_run_without_an_evaluator_says_how_to_start_one(
     assert served(stage, lambda: show_status(StatusConfig(path))) == 0
     shown = capsys.readouterr().out
     assert re.search("players' reward +0.500, with exploration", shown)
-    start = f"no evaluator: start one with tangram-worker connect={path} role=evaluator"
-    assert shown.endswith(f"\n{start}\n") == told
+    start = f"tangram-worker connect={path} role=evaluator"
+    said = f"no evaluator yet (tangram-train starts its own): {start}"
+    assert shown.endswith(f"\n{said}\n") == told
 
 
 def test_nobody_there_is_told(tmp_path: Path) -> None:
