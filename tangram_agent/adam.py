@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 from torch.optim.adam import adam
 
+from tangram_sim.errors import RunError
+
 BETAS, EPSILON = (0.9, 0.999), 1e-8
 NAMES = ("step", "exp_avg", "exp_avg_sq")
 
@@ -22,6 +24,22 @@ class Adam:
         self.rate = rate
         self.slots: dict[str, list[Tensor]] = {}
         self._parameters = list(parameters)
+
+    def load(self, slots: dict[str, list[Tensor]]) -> None:
+        """Take over what was kept of the same parameters: torch reads beyond the end of others.
+
+        Raises:
+            RunError: it is of other parameters.
+        """
+        forms = [(one.shape, one.dtype) for one in self._parameters]
+        wanted = dict.fromkeys(NAMES, forms) | {"step": [((), kind) for _, kind in forms]}
+        found = {name: [(one.shape, one.dtype) for one in own] for name, own in slots.items()}
+        if slots and found != wanted:
+            raise RunError(
+                "the optimiser's averages are not those of this network: start a new run, "
+                "warm_start=RUN_DIR takes its networks alone"
+            )
+        self.slots = slots
 
     @torch.no_grad()
     def step(self) -> None:

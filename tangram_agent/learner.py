@@ -338,7 +338,7 @@ class Learner:
                 i, name = key.split(".", 1)
                 tensor = torch.from_numpy(np.array(value)).to(self.device)
                 content.setdefault(name, {})[int(i)] = tensor
-            optimiser.slots = {n: [one[i] for i in sorted(one)] for n, one in content.items()}
+            optimiser.load({n: [one[i] for i in sorted(one)] for n, one in content.items()})
         self.updates = int(state[_COUNTER][0])
 
     def load_networks(self, state: dict[str, Array]) -> None:

@@ -33,7 +33,8 @@ def read_outcome(path: Path) -> dict[str, Any]:
         bound_of(result)
     except FAULTS as error:
         raise RunError(
-            f"{path} is no result of a run ({error!r}): name the folder of a run that has finished"
+            f"{path} is no result of a run ({error!r}): name another folder, or "
+            "delete the file, without which resume=auto goes on from the last checkpoint"
         ) from None
     return dict(result)
 

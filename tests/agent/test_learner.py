@@ -324,6 +324,19 @@ def test_weights_of_another_network_are_refused(made: Setup, other: Setup, reaso
         Learner(made, seed=0).load_state({})
 
 
+@pytest.mark.parametrize("name", ["exp_avg", "exp_avg_sq", "step"])
+def test_averages_of_another_optimiser_are_refused(name: str) -> None:
+    made = CASES[next(iter(CASES))]()
+    learner = Learner(made, seed=0)
+    play(learner, made, range(1), 0.1)
+    key = f"actor_optimiser.0.{name}"
+    whole = copied(learner)
+    wrong = {key: np.zeros(5, np.float32)}
+    for state in (whole | wrong, {k: v for k, v in whole.items() if k != key}):
+        with pytest.raises(RunError, match="averages are not those of this network: start a new"):
+            Learner(made, seed=0).load_state(state)
+
+
 @pytest.mark.parametrize(
     ("made", "other"),
     [

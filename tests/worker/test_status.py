@@ -78,7 +78,7 @@ def test_a_finished_run_shows_its_result(
     forged = [json.dumps(RESULT | change) for change in changes]
     for content in ("", "[]", "{}", *forged, "[" * 100_000):
         path.write_text(content)
-        with pytest.raises(RunError, match=r"result\.json is no result of a run"):
+        with pytest.raises(RunError, match=r"result\.json is no result of a run .*, or delete the"):
             show_status(config)
 
 
