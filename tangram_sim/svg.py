@@ -118,7 +118,8 @@ def _polygons(root: ET.Element, name: str) -> Iterator[tuple[ET.Element, Floats]
 
 
 def _measures(element: ET.Element) -> tuple[str, str]:
-    return element.get("width", ""), element.get("height", "")
+    width, height = (element.get(name, "").strip() for name in ("width", "height"))
+    return width.removesuffix("px"), height.removesuffix("px")
 
 
 def _size(root: ET.Element) -> tuple[str, str]:

@@ -19,7 +19,7 @@ PATIENCE_S = 60.0
 LOOK_S = 0.2
 DNS_S = 2.0
 SCHEME = "tcp://"
-PLAIN_ADDRESS = re.compile(r"[\w.-]+:\d+|\[[0-9a-fA-F:.]+\]:\d+")  # without the scheme
+PLAIN_ADDRESS = re.compile(r"[\w.-]{1,249}:\d{1,5}|\[[0-9a-fA-F:.]+\]:\d+")  # without the scheme
 KEYS = ("server_key", "public_key", "secret_key")
 KEY = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
 

@@ -122,6 +122,9 @@ def test_what_is_not_drawn_or_no_polygon_does_not_count(tmp_path: Path) -> None:
     path = tmp_path / "cat.SVG"
     path.write_text(drawing(named, hidden, other, whole("cat")))
     assert [puzzle.name for puzzle in read_puzzles(path).puzzles] == ["cat"]
+    sized = whole("cat").replace('viewBox="0 0 600 400"', 'width="600px" height="400px"')
+    path.write_text(sized.replace("</svg>", '<rect width="600" height="400"/></svg>'))
+    assert [puzzle.name for puzzle in read_puzzles(path).puzzles] == ["cat"]
 
 
 # Refusals
