@@ -68,5 +68,5 @@ clean:  ## remove caches and build products; .venv and runs/ stay
 	@touch .venv/.installed-run $@
 
 .venv/.installed-dev: pyproject.toml constraints.txt
-	@.ci/install .venv dev,docs,human,peers,slurm
+	@.ci/install .venv dev,docs,human,peers,slurm,video
 	@touch .venv/.installed-run .venv/.installed-docs $@

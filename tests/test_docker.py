@@ -1,7 +1,10 @@
 """The images and the compose file, as far as they can be judged without a docker daemon."""
 
+import ast
 import re
+import sys
 import tomllib
+from importlib.metadata import packages_distributions
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +16,12 @@ from conf.cli import composed
 pytestmark = pytest.mark.fast
 
 ROOT = Path(__file__).parents[1]
+OURS = {"conf", "master", "tangram_agent", "tangram_sim", "worker"}
 DOCKER = ROOT / "docker"
 COMPOSE: dict[str, Any] = yaml.safe_load((DOCKER / "docker-compose.yml").read_text())
 # Neither plays nor learns: the gymnasium environment, and the figures of reports.
-LEFT_OUT = {"gymnasium", "matplotlib", "msgspec"}
+LEFT_OUT = {"gymnasium", "matplotlib"}
+EXTRAS = {"av", "PIL"}  # of films and pictures, which no container makes
 
 
 def requirements(name: str) -> set[str]:
@@ -52,6 +57,20 @@ def test_images_have_all_that_the_project_needs_and_nothing_else() -> None:
     assert requirements("worker.txt") | requirements("master.txt") == wanted - LEFT_OUT
     assert "tensorboard" not in requirements("worker.txt")
     assert "pybullet" not in requirements("master.txt")
+
+
+@pytest.mark.parametrize("image", ["master", "worker"])
+def test_what_an_image_imports_is_in_it(image: str) -> None:
+    """Of tangram_sim each image has what it uses: the tests of the house look at that."""
+    distributions, lacking = packages_distributions(), set()
+    for path in (path for name in (image, "tangram_agent") for path in (ROOT / name).glob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [one.name for one in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            for name in {name.partition(".")[0] for name in names} - OURS:
+                known = {one.lower().replace("_", "-") for one in distributions.get(name, [name])}
+                lacking |= set() if known & requirements(f"{image}.txt") else {name}
+    assert lacking - EXTRAS - sys.stdlib_module_names == set()
 
 
 def test_the_targets_are_there() -> None:

@@ -1,5 +1,6 @@
 """The loop around a scripted hub: what is acknowledged, learned, sent, kept, and when it ends."""
 
+import time
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -277,7 +278,9 @@ def test_a_lost_evaluator_is_waited_for_only_so_long(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(loop_module, "SCORES_S", 0.01)
-    made = loop(tmp_path, MADE, FakeHub(MADE, roles=["evaluator"]), {"eval_seconds": 0.0})
+    hub = FakeHub(MADE, roles=["evaluator"])
+    hub.on_poll = lambda: time.sleep(0.001)  # a real one waits, too
+    made = loop(tmp_path, MADE, hub, {"eval_seconds": 0.0})
     made.finish(launched=True)
     assert made.clock.record.scored_version == -1
 
