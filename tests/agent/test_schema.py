@@ -106,7 +106,8 @@ def test_lenient_numbers_never_fail_and_keep_what_fits(values: dict[str, Any]) -
     bound = Numbers(lenient=True)
     fitted = bound.fit(values)
     assert bound.check("here", fitted) == fitted
-    good = {k: v for k, v in values.items() if k in ("a", "b/c") and abs(v) <= MAX_NUMBER}
+    small = {k: v for k, v in values.items() if k in ("a", "b/c") and abs(v) <= MAX_NUMBER}
+    good = {k: float(v) for k, v in small.items()}  # integers above 2^53 are rounded
     assert {k: fitted[k] for k in good} == good or len(fitted) == MAX_ENTRIES
     beyond = bound.fit({"a": INF, "b": -2e18, "c": NAN, "D": 1.0, "e": 10**400})
     assert beyond == {"a": MAX_NUMBER, "b": -MAX_NUMBER, "e": MAX_NUMBER}
