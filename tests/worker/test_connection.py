@@ -156,7 +156,8 @@ def test_a_host_that_dns_does_not_know_is_told_once_and_looked_up_again(
     timing = replace(QUICK, silence_s=0.1, join_s=1.0)
     with make_client("127.0.0.1:9", timing) as client:
         deadline = time.monotonic() + LIMIT_S
-        while len(answers) == 3 or (answers and time.monotonic() < deadline):
+        while answers:
+            assert time.monotonic() < deadline
             client.poll(0.01)
             told = client._connection.no_master(1.0)
             assert ("in 1 s: no such host" in told) == bool(answers)
