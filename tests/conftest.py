@@ -2,6 +2,7 @@
 
 import signal
 
+import hypothesis
 import pytest
 import torch
 
@@ -11,6 +12,12 @@ torch.set_num_threads(1)
 # nohup and some runners have it ignored, which the commands under test would inherit and respect.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# No test is a clock: on a busy machine an example that takes 5 ms may take 300.
+hypothesis.settings.register_profile(
+    "untimed", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+)
+hypothesis.settings.load_profile("untimed")
 
 TIERS = ("fast", "cluster", "slow", "slurm")
 

@@ -25,7 +25,7 @@ from tests.sim.builders import SEVEN, TRIO, layout_of, polygons, random_poses
 pytestmark = pytest.mark.fast
 
 UNIT = [[0, 0], [1, 0], [1, 1], [0, 1]]
-quick = settings(deadline=None, max_examples=60)
+quick = settings(max_examples=60)
 names = st.sampled_from(SHAPE_NAMES)
 poses = st.tuples(*[st.floats(-1.0, 1.0)] * 2, st.floats(-np.pi, np.pi))
 

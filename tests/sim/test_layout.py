@@ -80,7 +80,7 @@ pose = st.tuples(coordinate, coordinate, st.floats(-math.pi, math.pi), st.boolea
 
 
 @given(st.lists(pose, min_size=4, max_size=4))
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_poses_sides_and_corners_round_trip(tokens: list[tuple[float, float, float, bool]]) -> None:
     layout, poses = layout_of(*TRIO, LOPSIDED), np.array([token[:3] for token in tokens])
     sides = np.array([token[3] for token in tokens]) & layout.chiral

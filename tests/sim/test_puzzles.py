@@ -143,7 +143,7 @@ def redrawn(entry: dict, angle: float, shift: Sequence[float], seed: int, noise:
     rng.shuffle(entry["pieces"])
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     name=st.sampled_from(sorted(FIGURES)),
     angle=st.floats(-10.0, 10.0),

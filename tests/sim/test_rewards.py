@@ -101,7 +101,7 @@ def test_dense_is_the_mean_over_tokens_and_blind_to_the_angle() -> None:
 
 
 @given(st.floats(-math.pi, math.pi))
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 def test_pose_counts_a_turn_like_the_shift_that_is_as_visible(angle: float) -> None:
     """A square's corners lie at one radius: a turn by t moves each by 2 r sin(t / 2)."""
     layout = layout_of("square")

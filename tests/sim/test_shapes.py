@@ -115,7 +115,7 @@ def test_refused_polygon(corners: list[list[float]], reason: str) -> None:
 
 
 @given(st.floats(-math.pi, math.pi), st.sampled_from(SHAPE_NAMES))
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 def test_a_turned_polygon_is_the_same_shape(angle: float, name: str) -> None:
     shape: Shape = tan(name)
     turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])

@@ -98,7 +98,7 @@ def test_a_mirrored_layout_is_the_mirror_image() -> None:
 
 
 @given(st.integers(0, 10_000))
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_overlap_is_the_same_in_the_mirror(seed: int) -> None:
     """All of it: that of tokens on either side, and of both sides in one place."""
     states, targets = drawn(2, seed), drawn(2, seed + 1)

@@ -176,7 +176,7 @@ PLACES = st.sampled_from(
 )
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(PLACES, VALUES)
 def test_whatever_stands_in_a_file_is_a_puzzle_or_a_fault(place: str, value: Any) -> None:
     cat = figure("cat")

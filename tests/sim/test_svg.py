@@ -267,7 +267,7 @@ def test_other_transforms_are_refused(text: str, message: str) -> None:
         transform_matrix(text, "it")
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.text("MLHVZmlhvzC0123.,-+e ()translcomix", max_size=30))
 def test_whatever_stands_in_an_attribute_is_read_or_refused(text: str) -> None:
     for read, size in ((path_points, 2), (polygon_points, 2), (transform_matrix, 3)):

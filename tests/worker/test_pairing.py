@@ -14,7 +14,7 @@ pytestmark = pytest.mark.fast
 
 
 @given(st.integers(1, 5), st.integers(0, 2**32 - 1), st.booleans())
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 def test_no_other_order_costs_less(count: int, seed: int, tied: bool) -> None:
     """Two episodes with `count` equal squares and another token, against all orders of both."""
     layout = layout_of(*["square"] * count, "small_triangle", scale=0.3)
