@@ -201,8 +201,8 @@ def with_given_reward(read: Mapping[str, Any], given: Mapping[str, Any]) -> dict
             f"the settings of the run name code, {name} (sha256 {read.get('sha256', 'unknown')}), "
             f"which is not loaded unless you name it: add reward.name={name} if you trust it"
         )
-    # The checksum goes with the file.
-    return {n: value for n, value in read.items() if own or n != "sha256"} | dict(given)
+    without = {} if own or "sha256" not in read else {"sha256": None}
+    return {**read, **without, **given}
 
 
 @dataclass(frozen=True)
