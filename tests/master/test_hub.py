@@ -74,6 +74,7 @@ DIFFERS = "its settings of {0} differ from the master's: start both with the sam
             "this master runs 'run', not 'another': the connection file is stale, take the one of "
             "a master that is running",
         ),
+        (
             {},
             "refused_full",
             f"0 processes take part already, the most that {NO_ROOM.files} open files allow: raise "
