@@ -16,6 +16,7 @@ from master.config import MasterConfig
 from master.console import Progress, logging_to, make_progress, sturdy_console
 from master.delivery import EpisodesArrived
 from master.divergence import DivergenceGuard
+from master.gate import Room
 from master.health import OFF, Health
 from master.hub import Hub, WelcomeInfo
 from master.journal import Journal, Place
@@ -26,7 +27,7 @@ from master.recovery import Reader, journal_run_id
 from master.report import Reporter, StatusCollector
 from master.result import command_line, go_on_command, make_result, show_finished, show_result
 from master.resumable import check_resumable
-from master.rundir import Claim, Clock, Record, RunFolder
+from master.rundir import Claim, Clock, Record, RunFolder, code_of
 from master.security import Keys, is_loopback, needs_keys, run_keys
 from master.signals import StopSignals
 from master.trainer import Trainer, choose_device
@@ -72,16 +73,18 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
         opened.enter_context(logging_to(console, form))
         launched = watch_parent(_tell_news, GRACE_S)
         torch.set_num_threads(config.service.threads)
+        Room.here()  # before anything is written
         folder = RunFolder(config.run_dir)
         folder.prepare(config.resume)
         claim = opened.enter_context(folder.lock())
         signals = opened.enter_context(StopSignals())
         watchdog = opened.enter_context(Watchdog(config.service.watchdog_seconds))
-        join, evaluator = {"connect": folder.path}, ""
+        code, evaluator = code_of(resolved), ""
+        join = {"connect": folder.path, **code}
         if not launched:  # the launcher did it, with settings of its own
             check_resumable(folder, resolved)
             if folder.has_finished(config):
-                show_finished(folder, form)
+                show_finished(folder, form, code)
                 return 0
             folder.write_config(resolved)
             evaluator = command_line("tangram-worker", {**join, "role": "evaluator"})
@@ -103,7 +106,7 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
         if form == "json":
             log.info("the run has ended (%s)", reason, extra={"event": "result", **result})
     if form != "json":
-        show_result(console, folder, result, go_on)
+        show_result(console, folder, result, code, go_on)
     return 0
 
 
@@ -232,7 +235,7 @@ def _open_hub(config: MasterConfig, setup: Setup, run_id: str, keys: Keys | None
         lockstep=service.mode == "lockstep",
     )
     place, patience_s = (service.bind, service.port), service.silence_seconds
-    return Hub(*place, info, patience_s, keys, service.weights_port)
+    return Hub(*place, info, patience_s, keys, service.weights_port, Room.here())
 
 
 def _keys(service: ServiceConfig, folder: RunFolder) -> Keys | None:
