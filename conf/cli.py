@@ -36,7 +36,7 @@ USAGE_STATUS = 2
 MAKE_RUNS = ("train", "master")  # the commands whose run_dir is made, not read
 MISSING_HINTS = {
     "runs": "say which study: runs=runs/experiments/laptop",
-    "connect": "say which master: connect=host:port or connect=runs/...",
+    "connect": "say which run: connect=runs/..., or a copy of its connection.json",
 }
 
 

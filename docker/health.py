@@ -30,7 +30,12 @@ def main() -> str | None:
             urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", None, TIMEOUT_S).close()
         else:
             place = urlsplit(content["endpoint"])
-            socket.create_connection((place.hostname, place.port), TIMEOUT_S).close()
+            if place.scheme == "ipc":
+                with socket.socket(socket.AF_UNIX) as end:
+                    end.settimeout(TIMEOUT_S)
+                    end.connect(place.path)
+            else:
+                socket.create_connection((place.hostname, place.port), TIMEOUT_S).close()
     except OSError as error:  # of urllib, too: 503 is one
         return str(error)
     return None
