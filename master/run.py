@@ -139,7 +139,7 @@ def open_run(
     run_id = rest.record.run_id
     guard = DivergenceGuard(trainer, folder.bad_batch)
     clock, budget = Clock(rest.record), Budget(config, trainer, rest.record)
-    lockstep = Lockstep.of(service, config.workers)
+    lockstep = Lockstep.of(service, config.workers, EpisodeSpec.of(setup))
     if not budget.bounded:
         log.warning(UNBOUNDED)
     keys = _keys(service, folder)

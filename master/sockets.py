@@ -9,7 +9,7 @@ import zmq
 from master.counters import Counters
 from master.security import Authenticator, Keys
 from tangram_agent.addresses import IPC
-from tangram_agent.arrays import MAX_BATCH_BYTES
+from tangram_agent.arrays import MAX_FRAME_BYTES
 from tangram_sim.errors import ConfigError
 
 LINGER_MS = 1000
@@ -91,7 +91,7 @@ class Sockets:
         socket.setsockopt(zmq.LINGER, LINGER_MS)
         socket.setsockopt(zmq.SNDHWM, HIGH_WATER)
         socket.setsockopt(zmq.RCVHWM, HIGH_WATER)
-        socket.setsockopt(zmq.MAXMSGSIZE, MAX_BATCH_BYTES)
+        socket.setsockopt(zmq.MAXMSGSIZE, MAX_FRAME_BYTES)
         socket.setsockopt(zmq.HEARTBEAT_IVL, PING_MS)
         socket.setsockopt(zmq.IPV6, int(":" in bind))
         if kind == zmq.ROUTER:

@@ -304,7 +304,9 @@ class ServiceConfig(Settings, section="service"):
         only={"mode": "async"},
     )
     envs: int = setting(16, "environments that one worker plays at a time", low=1, high=512)
-    batch_episodes: int = setting(32, "episodes in one message", low=1, high=4096)
+    batch_episodes: int = setting(
+        32, "episodes in one message, split where they are too large for it", low=1, high=4096
+    )
     eval_seconds: float = setting(10.0, "least time between two evaluations", low=0, unit="s")
     eval_episodes: int = setting(100, "fixed test episodes of one evaluation", low=1, high=100_000)
     log_format: str = setting(

@@ -187,7 +187,7 @@ def loop(
         folder=run_folder,
         hub=hub,  # type: ignore[arg-type]
         guard=guard,
-        lockstep=Lockstep.of(service, settings.workers),
+        lockstep=Lockstep.of(service, settings.workers, EpisodeSpec.of(made)),
         budget=budget,
         clock=clock,
         checkpointer=checkpointer,

@@ -21,7 +21,7 @@ GARBAGE = [
     [os.urandom(100)],
     [b"\xc1"] * 3,
     [b"\x81\xa1a" * 3000],
-    [bytes(1_000_000)],
+    [bytes(500_000)],
     with_header(hello().encode(), role="spy"),
     with_header(hello().encode(), more=1),
     with_header(hello().encode(), kind="welcome"),
@@ -52,7 +52,7 @@ def test_garbage_is_refused_with_a_reason_and_the_hub_lives_on(
 
 
 def test_a_frame_over_the_limit_never_arrives(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("master.sockets.MAX_BATCH_BYTES", 10_000)
+    monkeypatch.setattr("master.sockets.MAX_FRAME_BYTES", 10_000)
     with staged() as stage:
         large, small = stage.dealer(), stage.dealer()
         large.say([bytes(10_001)])
