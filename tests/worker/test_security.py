@@ -7,6 +7,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ import pytest
 import zmq
 
 from master.hub import Hub
+from master.loop import Loop
 from master.rundir import RunFolder
 from master.security import Keys, make_keys
 from tangram_agent.arrays import EpisodeSpec
@@ -227,18 +229,19 @@ def test_another_user_takes_no_index_and_forges_no_scores(
         assert (stranger.exitcode, hub.peers, arrivals) == (0, [], [])
 
 
-def test_an_impostor_on_a_dead_masters_port_gets_no_batch(tmp_path: Path) -> None:
+def test_an_impostor_on_a_dead_masters_port_gets_no_batch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It has heard the run's id, and says what the master would say."""
+    monkeypatch.setattr(Loop, "dismiss", lambda *_: None)  # who was killed says nothing
     folder, port = RunFolder(tmp_path / "run"), free_port()
     with opened_run(folder.path, bind="127.0.0.1", port=port) as (loop, connection):
         folder.connection.write_text(json.dumps(connection))
         spec = EpisodeSpec.of(MADE)
         given = (str(folder.path), "player", 0, MADE.fingerprints(), spec, None, 4, QUICK)
-        with Client(*given) as client:
-            stage = Stage(loop.hub)
+        with closing(Stage(loop.hub)) as stage, Client(*given) as client:
             assert served(stage, client.join)
-            hub_gone = loop.hub.close
-            hub_gone()
+            loop.hub.close()
             with standing_in(port) as impostor:
                 client.send(random_episodes(MADE, 3), 0)
                 deadline = time.monotonic() + 3.0
