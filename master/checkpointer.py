@@ -9,14 +9,16 @@ the workers keep what they played, and wait.
 import logging
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from master.delivery import EpisodesArrived
 from master.divergence import DivergenceGuard
 from master.hub import Hub
-from master.journal import Journal, JournalError
+from master.journal import Journal, JournalError, Place
 from master.rundir import Clock, Record, RunFolder
 from master.trainer import LEARNER, Trainer
 from tangram_agent.checkpoints import (
@@ -38,7 +40,7 @@ from tangram_sim.errors import RunError
 MINUTE_S = 60.0
 RETRY_S = 1.0
 MAKE_ROOM = "make room there; until then nothing is acknowledged, and workers keep what they played"
-SEGMENT = "journal"
+JOURNAL = "journal"
 
 log = logging.getLogger(__name__)
 
@@ -136,18 +138,18 @@ class Restored:
     Attributes:
         record: what the run had been through.
         hub: the hub's table of what was inserted, so that nothing is inserted twice.
-        segment: of the journal, the first one that the checkpoint does not cover.
+        place: in the journal, None where it is not known.
     """
 
     record: Record
     hub: Mapping[str, Any]
-    segment: int = 1
+    place: Place | None = None
 
     @staticmethod
     def of(counters: Mapping[str, Any]) -> "Restored":
         """From the counters of a checkpoint; RunError if its record is not whole."""
         record = Record.of(counters["record"])
-        return Restored(record, dict(counters["hub"]), int(counters.get(SEGMENT, 1)))
+        return Restored(record, dict(counters["hub"]), _place(counters))
 
 
 def save_run(folder: Path, trainer: Trainer, rest: Restored, keep: int) -> Path:
@@ -163,8 +165,23 @@ def save_run(folder: Path, trainer: Trainer, rest: Restored, keep: int) -> Path:
         DiskError: the folder cannot be written; what was there before is as it was.
     """
     arrays, counters = trainer.state()
-    counters |= {"record": rest.record.state(), "hub": dict(rest.hub), SEGMENT: rest.segment}
+    counters |= {"record": rest.record.state(), "hub": dict(rest.hub)}
+    if rest.place is not None:
+        counters[JOURNAL] = asdict(rest.place)
     return save_checkpoint(folder, trainer.updates, arrays, counters, keep)
+
+
+def _place(counters: Mapping[str, Any]) -> Place | None:
+    """A checkpoint's place in the journal; RunError if it is none."""
+    found = counters.get(JOURNAL)
+    if found is None:
+        return None
+    try:
+        return msgspec.convert({"segment": found} if isinstance(found, int) else found, Place)
+    except msgspec.ValidationError as error:
+        raise RunError(
+            f"its place in the journal cannot be read ({error}): delete it to use the one before"
+        ) from None
 
 
 def first_needed(folder: Path) -> int:
@@ -172,9 +189,10 @@ def first_needed(folder: Path) -> int:
     needed = []
     for path in list_checkpoints(folder):
         try:
-            needed.append(int(load_checkpoint(path, stems=[]).counters.get(SEGMENT, 1)))
-        except (RunError, TypeError, ValueError):
+            place = _place(load_checkpoint(path, stems=[]).counters)
+        except RunError:
             continue  # it cannot be gone on from
+        needed.append((place or Place()).segment)
     return min(needed, default=1)
 
 

@@ -61,9 +61,8 @@ class Lockstep:
         return {i: Go(number, version, first, self._size) for i in missing}
 
     def take(self, arrival: EpisodesArrived) -> None:
-        """A batch has come, in any order; one that nobody asked for stays unacknowledged."""
-        if arrival.index < self._players:
-            self._arrived.setdefault(arrival.index, arrival)
+        """A batch that was ordered has come, in any order of the players."""
+        self._arrived[arrival.index] = arrival
 
     def next(self, episodes: int) -> EpisodesArrived | None:
         """The batch to insert after so many episodes, once all of its round have come."""

@@ -3,7 +3,7 @@
 import logging
 import socket
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,11 @@ from master.delivery import EpisodesArrived
 from master.divergence import DivergenceGuard
 from master.health import OFF, Health
 from master.hub import Hub, WelcomeInfo
-from master.journal import Journal, journal_run_id, read_journal
+from master.journal import Journal, Place
 from master.lockstep import Lockstep
 from master.loop import Loop
 from master.metrics import Metrics
+from master.recovery import Reader, journal_run_id
 from master.report import Reporter, StatusCollector
 from master.result import command_line, go_on_command, make_result, show_finished, show_result
 from master.resumable import check_resumable
@@ -147,11 +148,16 @@ def open_run(
     health = None
     if service.http_port != OFF:
         health = opened.enter_context(closing(Health(service.http_bind, service.http_port)))
-    journal = opened.enter_context(closing(_open_journal(service, setup, folder, run_id)))
     if found is not None:
         hub.load_state(rest.hub)
-    batches = _read_journal(setup, folder, rest)
+    # What was acknowledged after the checkpoint.
+    digest, spec = setup.task_digest(), EpisodeSpec.of(setup)
+    batches = Reader(folder.journal, rest.place, run_id, digest, spec, log.warning)
     _insert_again(batches, hub, guard, budget, lockstep, watchdog)
+    after = Place((rest.place or Place()).segment, batches.number)
+    sync_s = service.journal_sync_seconds
+    journal = Journal(folder.journal, run_id, digest, sync_s, after)
+    opened.enter_context(closing(journal))
     if config.resume == "auto" and (found or trainer.episodes):
         log.info("goes on after %s updates", f"{trainer.updates:,}")
     elif config.resume == "auto":
@@ -224,18 +230,6 @@ def _open_hub(config: MasterConfig, setup: Setup, run_id: str, keys: Keys | None
     bind = listening_place(service.bind, Path(config.run_dir))
     patience_s = service.silence_seconds
     return Hub(bind, service.port, info, patience_s, keys, service.weights_port)
-
-
-def _open_journal(service: ServiceConfig, setup: Setup, folder: RunFolder, run_id: str) -> Journal:
-    sync_s = service.journal_sync_seconds
-    return Journal(folder.journal, run_id, setup.task_digest(), sync_s)
-
-
-def _read_journal(setup: Setup, folder: RunFolder, rest: Restored) -> Iterator[EpisodesArrived]:
-    """What was acknowledged after the checkpoint."""
-    digest, spec = setup.task_digest(), EpisodeSpec.of(setup)
-    run_id = rest.record.run_id
-    return read_journal(folder.journal, rest.segment, run_id, digest, spec, log.warning)
 
 
 def _keys(service: ServiceConfig, folder: RunFolder) -> Keys | None:

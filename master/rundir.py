@@ -15,7 +15,7 @@ import yaml
 from master.config import MasterConfig
 from master.journal import segments
 from tangram_agent.checkpoints import list_checkpoints
-from tangram_agent.files import write_whole
+from tangram_agent.files import PUBLIC, make_folders, write_whole
 from tangram_agent.outcome import FILE_NAME as RESULT
 from tangram_agent.outcome import bound_of, read_outcome
 from tangram_agent.setup import SECTIONS
@@ -70,7 +70,7 @@ class RunFolder:
                 "resume=auto"
             )
         try:
-            self.path.mkdir(parents=True, exist_ok=True)
+            make_folders(self.path)
         except OSError as error:
             raise ConfigError(
                 f"run_dir {self.path} cannot be made ({error.strerror}): choose another run_dir"
@@ -110,7 +110,7 @@ class RunFolder:
 
     def write_config(self, resolved: Mapping[str, Any]) -> None:
         """Write the resolved config as plain YAML."""
-        write_whole(self.config, yaml.safe_dump(dict(resolved), sort_keys=False).encode())
+        self._write(self.config, yaml.safe_dump(dict(resolved), sort_keys=False).encode())
 
     def read_config(self) -> dict[str, Any]:
         """What `write_config` wrote."""
@@ -125,11 +125,14 @@ class RunFolder:
         config = self.read_config()
         settings = {name: config[name] for name in SHARED if name in config}
         content = {**connection, "settings": settings}
-        write_whole(self.connection, json.dumps(content, indent=1).encode(), PRIVATE)
+        self._write(self.connection, json.dumps(content, indent=1).encode(), PRIVATE)
 
     def write_result(self, result: Mapping[str, Any]) -> None:
         """Write the scores of the run."""
-        write_whole(self.result, (json.dumps(dict(result), indent=1) + "\n").encode())
+        self._write(self.result, (json.dumps(dict(result), indent=1) + "\n").encode())
+
+    def _write(self, path: Path, data: bytes, mode: int = PUBLIC) -> None:
+        write_whole(path, data, mode, above=False)  # a folder that was deleted stays so
 
 
 @dataclass

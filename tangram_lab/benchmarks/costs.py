@@ -98,7 +98,7 @@ def _peers(runs: int) -> Iterator[Row]:
 def _registry(count: int) -> Registry:
     registry = Registry({}, 30.0)
     for index in range(count):
-        hello = Hello("player", index, 0, secrets.token_hex(16), 1, {})
+        hello = Hello("player", index, 0, secrets.token_hex(16), 1, {}, "")
         registry.admit(secrets.token_bytes(17), hello, time.monotonic())
     return registry
 

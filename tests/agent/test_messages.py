@@ -85,6 +85,7 @@ BOUNDS: dict[str, dict[str, Bound]] = {
         "process": Text(64, needed=True),
         "first": Between(1, BIG),
         "fingerprints": Texts(64),
+        "run_id": Text(256),
     },
     "want_weights": {"epoch": Text(64), "version": Between(-1, BIG)},
     "heartbeat": {"stats": Numbers(lenient=True)},

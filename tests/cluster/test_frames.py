@@ -89,7 +89,7 @@ def test_a_connection_that_takes_anothers_name_is_not_heard(folder: Path) -> Non
     """ZeroMQ lets peers choose the name of their connection: the first one keeps it."""
     with master(folder) as process, zmq.Context() as context:
         with named(context, folder) as first:
-            hello = Hello("player", 0, 0, "one", 1, setup_of(folder).fingerprints())
+            hello = Hello("player", 0, 0, "one", 1, setup_of(folder).fingerprints(), "")
             first.send_multipart(hello.encode())
             assert isinstance(heard(first), Welcome)
             with named(context, folder) as second:

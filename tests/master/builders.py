@@ -1,6 +1,8 @@
 """Small runs that the tests of the master share: everything real but the sockets."""
 
+import errno
 import io
+import os
 import time
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping
@@ -8,15 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 from rich.console import Console
 
+from master import journal as journal_module
 from master.budget import Budget
 from master.checkpointer import Checkpointer
 from master.config import MasterConfig
 from master.delivery import EpisodesArrived, Ledger, ScoresArrived
 from master.divergence import DivergenceGuard
-from master.journal import Journal
+from master.journal import Journal, Place
 from master.lockstep import Lockstep
 from master.loop import Loop
 from master.metrics import Metrics
@@ -65,11 +69,29 @@ def scores(made: Setup, version: int, reward: float = 0.5) -> ScoresArrived:
 _journals: list[Journal] = []
 
 
-def journal(folder: Path, made: Setup, sync_s: float = 1.0) -> Journal:
-    """A journal of the run `run`."""
-    opened = Journal(folder, "run", made.task_digest(), sync_s)
+def journal(folder: Path, made: Setup, sync_s: float = 1.0, number: int = 0) -> Journal:
+    """A journal of the run `run`, after so many batches."""
+    opened = Journal(folder, "run", made.task_digest(), sync_s, Place(number=number))
     _journals.append(opened)
     return opened
+
+
+class Disk:
+    """Writes journals as long as there is room."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.room = 10**9
+        opened, disk = journal_module.FileIO, self
+
+        class Full(opened):  # type: ignore[misc, valid-type]
+            def write(self, data: memoryview) -> int:
+                if not disk.room:
+                    raise OSError(errno.ENOSPC, "No space left on device")
+                size = min(len(data), disk.room)
+                disk.room -= size
+                return int(os.write(self.fileno(), data[:size]))
+
+        monkeypatch.setattr(journal_module, "FileIO", Full)
 
 
 def close_journals() -> None:

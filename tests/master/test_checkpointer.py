@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 import torch
 
-from master import journal as journal_module
 from master.checkpointer import MAKE_ROOM, restore_run
 from master.journal import JournalError, segments
 from master.trainer import Trainer
 from tangram_agent import checkpoints as checkpoints_module
 from tangram_agent.checkpoints import DiskError, list_checkpoints
 from tangram_agent.process import Every
-from tests.master.builders import FakeHub, arrival, loop, small_setup
+from tests.master.builders import Disk, FakeHub, arrival, loop, small_setup
 
 pytestmark = pytest.mark.fast
 
 MADE = small_setup()
+ROOM = 10**9
 
 
 class Stage:
@@ -30,11 +30,11 @@ class Stage:
         self, folder: Path, patch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
     ) -> None:
         caplog.set_level(logging.INFO)
-        self.full, self._caplog = False, caplog
+        self.disk, self._caplog = Disk(patch), caplog
         self.folder, self.checkpointer = folder, loop(folder, MADE, FakeHub(MADE)).checkpointer
         self.checkpointer._retry = Every(0.0)
-        for writer in (journal_module.Journal, checkpoints_module):
-            patch.setattr(writer, "_write", self._guarded(writer._write))
+        self._write = checkpoints_module._write
+        patch.setattr(checkpoints_module, "_write", self._guarded)
 
     @property
     def told(self) -> list[str]:
@@ -43,13 +43,10 @@ class Stage:
     def keep(self, number: int) -> bool:
         return self.checkpointer.keep(arrival(MADE, number))
 
-    def _guarded(self, write: Any) -> Any:
-        def guarded(*arguments: Any) -> None:
-            if self.full:
-                raise OSError(errno.ENOSPC, "No space left on device")
-            write(*arguments)
-
-        return guarded
+    def _guarded(self, *arguments: Any) -> None:
+        if not self.disk.room:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        self._write(*arguments)
 
 
 @pytest.fixture
@@ -60,17 +57,17 @@ def stage(
 
 
 def test_a_full_disk_is_told_once_and_the_batch_is_kept_when_there_is_room(stage: Stage) -> None:
-    stage.full = True
+    stage.disk.room = 0
     assert [stage.keep(1) for _ in range(3)] == [False] * 3
     where = stage.folder / "journal"
     assert stage.told == [
         f"the journal in {where} cannot be written (No space left on device): {MAKE_ROOM}"
     ]
-    stage.full = False
+    stage.disk.room = ROOM
     assert stage.keep(1)
     assert stage.told[1:] == ["the journal can be written again: batches are taken in"]
     assert stage.keep(2)
-    stage.full = True
+    stage.disk.room = 0
     assert not stage.keep(3)
     assert len(stage.told) == 3
 
@@ -78,17 +75,19 @@ def test_a_full_disk_is_told_once_and_the_batch_is_kept_when_there_is_room(stage
 def test_a_disk_that_does_not_take_a_checkpoint_ends_nothing(stage: Stage) -> None:
     assert stage.keep(1)
     first = stage.checkpointer.save()
+    title = segments(stage.folder / "journal")[2].stat().st_size
     assert stage.keep(2)
-    stage.full = True
+    stage.disk.room = 0
     stage.checkpointer._checkpoint = Every(0.0)
     stage.checkpointer.tick()
     assert len(stage.told) == 1
-    assert stage.told[0].startswith("cannot write a checkpoint to ")
+    assert "cannot be written (No space left on device)" in stage.told[0]
     assert list((stage.folder / "checkpoints").iterdir()) == [first]
-    assert list(segments(stage.folder / "journal")) == [2]
+    stage.disk.room = title  # and for nothing more
     with pytest.raises(DiskError, match="make room there"):
         stage.checkpointer.save()
-    stage.full = False
+    assert list((stage.folder / "checkpoints").iterdir()) == [first]
+    stage.disk.room = ROOM
     stage.checkpointer.tick()
     assert len(list_checkpoints(stage.folder / "checkpoints")) == 2
 
@@ -112,7 +111,7 @@ def test_segments_live_as_long_as_a_checkpoint_needs_them(stage: Stage) -> None:
         assert stage.keep(number)
         stage.checkpointer.save()
         left.append(list(segments(stage.folder / "journal")))
-    assert left == [[], [2], [3], [4]]
+    assert left == [[2], [2, 3], [3, 4], [4, 5]]
 
 
 def test_a_journal_that_cannot_be_synced_is_told(

@@ -58,27 +58,6 @@ def test_a_round_that_was_cut_goes_on_with_those_who_are_missing() -> None:
     assert first.index == 1
 
 
-def test_the_first_of_two_batches_of_an_index_counts() -> None:
-    lockstep = Lockstep(1, SIZE)
-    first = batch(0, sequence=1)
-    lockstep.take(first)
-    lockstep.take(batch(0, sequence=2))
-    assert lockstep.next(0) is first
-
-
-def test_a_player_too_many_holds_nothing_up() -> None:
-    lockstep = Lockstep(2, SIZE)
-    lockstep.ordered = True
-    for index in (2, 7, 0, 1):
-        lockstep.take(batch(index))
-    for episodes, index in ((0, 0), (SIZE, 1)):
-        found = lockstep.next(episodes)
-        assert found is not None
-        assert found.index == index
-        lockstep.inserted(found)
-    assert not lockstep.ordered
-
-
 def test_the_settings_must_fit() -> None:
     spec = EpisodeSpec.of(MADE)
     assert Lockstep.of(ServiceConfig(), 2, spec) is None
