@@ -199,7 +199,8 @@ def _plain(config: Any, stored: Stored | None, config_name: str) -> Plain:
     if in_sweep and isinstance(plain.get("run_dir"), str):
         # The jobs of one sweep start at one time and share their arguments: a folder for each.
         plain["run_dir"] = f"{plain['run_dir']}/{HydraConfig.get().job.num}"
-    return with_run_config(plain, list(HydraConfig.get().overrides.task), stored)
+    overrides = list(HydraConfig.get().overrides.task)
+    return with_named_code(with_run_config(plain, overrides, stored), overrides)
 
 
 def composed(config_name: str, overrides: Sequence[str]) -> Plain:
@@ -277,7 +278,7 @@ def with_run_config(
     content = {name: content[name] for name in sections}
     chosen, result = OmegaConf.create(settings), OmegaConf.create({**settings, **content})
     for override in overrides:
-        key = override.lstrip("+~").partition("=")[0]
+        key = _key(override)
         section = key.partition(".")[0]
         if section not in content:
             continue
@@ -288,6 +289,26 @@ def with_run_config(
             )
         OmegaConf.update(result, key, OmegaConf.select(chosen, key))
     return _mapping(OmegaConf.to_container(result))
+
+
+def with_named_code(settings: Plain, overrides: Sequence[str]) -> Plain:
+    """Refuse code that a run's settings, or a preset, name and the command line does not.
+
+    Raises:
+        ConfigError: says which file, and what to add.
+    """
+    from tangram_sim.config import with_given_reward
+
+    reward = settings.get("reward")
+    if not isinstance(reward, dict):
+        return settings
+    keys = {_key(override) for override in overrides}
+    given = {name: value for name, value in reward.items() if f"reward.{name}" in keys}
+    return settings | {"reward": with_given_reward(reward, given)}
+
+
+def _key(override: str) -> str:
+    return override.lstrip("+~").partition("=")[0]
 
 
 def _from_config(settings: Plain) -> tuple[str, Plain] | None:

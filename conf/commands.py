@@ -38,7 +38,7 @@ STUDY: dict[str, str | list[str]] = {
     "experiment": ["fig4", "table1", "table2", "fig5", "fig6"],
     "budget": "laptop",
 }
-OVER = ("sim", "agent")
+OVER = ("sim", "reward", "agent")
 NEW_RUN = "runs/${now:%Y-%m-%d_%H-%M-%S}"
 
 

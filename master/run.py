@@ -26,7 +26,7 @@ from master.recovery import Reader, journal_run_id
 from master.report import Reporter, StatusCollector
 from master.result import command_line, go_on_command, make_result, show_finished, show_result
 from master.resumable import check_resumable
-from master.rundir import Clock, Record, RunFolder
+from master.rundir import Clock, Record, RunFolder, code_of
 from master.security import Keys, listening_place, needs_keys, run_keys
 from master.signals import StopSignals
 from master.trainer import Trainer, choose_device
@@ -73,12 +73,13 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
         opened.enter_context(folder.lock())
         signals = opened.enter_context(StopSignals())
         watchdog = opened.enter_context(Watchdog(config.service.watchdog_seconds))
-        join, evaluator = {"connect": folder.path}, ""
+        code, evaluator = code_of(resolved), ""
+        join = {"connect": folder.path, **code}
         if not launched:  # the launcher did it, with settings of its own
             check_resumable(folder, resolved)
             listening_place(config.service.bind, folder.path)
             if folder.has_finished(config):
-                show_finished(folder, form)
+                show_finished(folder, form, code)
                 return 0
             folder.write_config(resolved)
             evaluator = command_line("tangram-worker", {**join, "role": "evaluator"})
@@ -100,7 +101,7 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
         if form == "json":
             log.info("the run has ended (%s)", reason, extra={"event": "result", **result})
     if form != "json":
-        show_result(console, folder, result, go_on)
+        show_result(console, folder, result, code, go_on)
     return 0
 
 

@@ -19,11 +19,18 @@ from tangram_agent.files import PUBLIC, make_folders, write_whole
 from tangram_agent.outcome import FILE_NAME as RESULT
 from tangram_agent.outcome import bound_of, read_outcome
 from tangram_agent.setup import SECTIONS
+from tangram_sim.config import own_code
 from tangram_sim.errors import ConfigError, RunError
 
 PRIVATE = 0o600
 # What a worker must know of the config.
 SHARED = (*SECTIONS, "service")
+
+
+def code_of(resolved: Mapping[str, Any]) -> dict[str, str]:
+    """The reward of a run, where it is code, which each of its commands must name itself."""
+    name = resolved.get("reward", {}).get("name", "")
+    return {"reward.name": name} if own_code(name) else {}
 
 
 class RunFolder:

@@ -152,6 +152,7 @@ SHOWS: dict[str, tuple[Config, object]] = {
 # What shows elsewhere, and where.
 ELSEWHERE = {
     "agent.name": "the label of a run in reports",
+    "reward.sha256": "tests/sim/test_rewards.py: another file is refused",
 }
 
 
