@@ -23,7 +23,7 @@ from master.security import Keys, make_keys
 from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.messages import Scores
 from tangram_agent.types import Weights
-from tangram_lab.benchmarks.strangers import NOBODY, knock
+from tangram_lab.benchmarks.intruder import NOBODY, knock
 from tangram_sim.errors import RunError, TangramError
 from tests.agent.builders import random_episodes
 from tests.agent.messages import episodes, hello, weights
