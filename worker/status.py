@@ -152,7 +152,7 @@ def _lines(n: Mapping[str, float], texts: Mapping[str, str]) -> Iterator[tuple[s
     if n["open_to_all"] > 0:
         yield "access", OPEN
     if n["disk_failing"] > 0:
-        yield "disk", "full or broken: nothing is acknowledged"
+        yield "disk", "full, broken or gone: nothing is acknowledged"
     if n["undone_updates"] > 0:
         yield "undone updates", f"{n['undone_updates']:,.0f} were not finite"
 
