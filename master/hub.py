@@ -16,10 +16,11 @@ from typing import Self
 
 from master.counters import Counters
 from master.delivery import Arrival, EpisodesArrived, ScoresArrived, Verdict
+from master.gate import AMPLE, Room
 from master.registry import Peer, RefusedError, Registry
 from master.security import Keys
 from master.sockets import Sockets
-from tangram_agent.arrays import EpisodeSpec, join_frames
+from tangram_agent.arrays import MAX_FRAMES, EpisodeSpec, join_frames
 from tangram_agent.messages import (
     Ack,
     Alive,
@@ -91,6 +92,7 @@ class Hub:
         silence_s: float = 30.0,
         keys: Keys | None = None,
         weights_port: int = 0,
+        room: Room = AMPLE,
     ) -> None:
         """Open the sockets.
 
@@ -101,17 +103,18 @@ class Hub:
             silence_s: after which a peer is forgotten.
             keys: for encrypted sockets, None for plain ones.
             weights_port: of the PUB, 0 for any.
+            room: for those who take part.
         """
         self.epoch = secrets.token_hex(8)
         self._info, self._silence_s = info, silence_s
-        self._registry = Registry(info.fingerprints, silence_s)
+        self._registry = Registry(info.fingerprints, silence_s, room)
         self._weights: list[bytes] | None = None
         self._version = -1
         self._stop_reason: str | None = None
         self._status: list[bytes] | None = None
         self._orders: dict[int, Go] = {}
         self.counters = Counters()
-        self._sockets = Sockets(bind, port, self.counters, keys, weights_port)
+        self._sockets = Sockets(bind, port, self.counters, keys, weights_port, room)
         self.endpoint = self._sockets.endpoint
         self.weights_endpoint = self._sockets.weights_endpoint
 
@@ -213,6 +216,8 @@ class Hub:
         """Read a message and answer it; returns what is new."""
         message: ToMaster | BatchError
         try:
+            if len(frames) > 1 + MAX_FRAMES:
+                raise WireError(f"the message has {len(frames)} frames, at most {1 + MAX_FRAMES}")
             message = decode_from_worker(frames, self._info.spec)
         except ProtocolError as error:
             self._refuse(identity, "refused_protocol", Refused(str(error)))

@@ -16,6 +16,7 @@ from master.config import MasterConfig
 from master.console import Progress, logging_to, make_progress, sturdy_console
 from master.delivery import EpisodesArrived
 from master.divergence import DivergenceGuard
+from master.gate import Room
 from master.health import OFF, Health
 from master.hub import Hub, WelcomeInfo
 from master.journal import Journal, Place
@@ -72,6 +73,7 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
         opened.enter_context(logging_to(console, form))
         launched = watch_parent(_tell_news, GRACE_S)
         torch.set_num_threads(config.service.threads)
+        Room.here()  # before anything is written
         folder = RunFolder(config.run_dir)
         folder.prepare(config.resume)
         opened.enter_context(folder.lock())
@@ -231,7 +233,7 @@ def _open_hub(config: MasterConfig, setup: Setup, run_id: str, keys: Keys | None
         lockstep=service.mode == "lockstep",
     )
     place, patience_s = (service.bind, service.port), service.silence_seconds
-    return Hub(*place, info, patience_s, keys, service.weights_port)
+    return Hub(*place, info, patience_s, keys, service.weights_port, Room.here())
 
 
 def _keys(service: ServiceConfig, folder: RunFolder) -> Keys | None:
