@@ -27,7 +27,7 @@ from master.recovery import Reader, journal_run_id
 from master.report import Reporter, StatusCollector
 from master.result import command_line, go_on_command, make_result, show_finished, show_result
 from master.resumable import check_resumable
-from master.rundir import Clock, Record, RunFolder, code_of
+from master.rundir import Claim, Clock, Record, RunFolder, code_of
 from master.security import Keys, is_loopback, needs_keys, run_keys
 from master.signals import StopSignals
 from master.trainer import Trainer, choose_device
@@ -76,7 +76,7 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
         Room.here()  # before anything is written
         folder = RunFolder(config.run_dir)
         folder.prepare(config.resume)
-        opened.enter_context(folder.lock())
+        claim = opened.enter_context(folder.lock())
         signals = opened.enter_context(StopSignals())
         watchdog = opened.enter_context(Watchdog(config.service.watchdog_seconds))
         code, evaluator = code_of(resolved), ""
@@ -92,7 +92,7 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
         title = f"tangram · {folder.path.name}"
         progress = make_progress(console, title, form, evaluator)
         opened.enter_context(closing(progress))
-        loop, connection = open_run(config, setup, progress, signals, watchdog, opened)
+        loop, connection = open_run(config, setup, claim, progress, signals, watchdog, opened)
         loop.reporter.settings(resolved)
         folder.write_connection(connection)
         if not launched:
@@ -118,6 +118,7 @@ def _tell_news(line: str) -> None:
 def open_run(
     config: MasterConfig,
     setup: Setup,
+    claim: Claim,
     progress: Progress,
     signals: StopSignals,
     watchdog: Watchdog,
@@ -126,8 +127,9 @@ def open_run(
     """Make all that a run consists of, from the newest checkpoint where it is to be resumed.
 
     Args:
-        config: the master's settings; its folder is prepared and locked.
+        config: the master's settings.
         setup: the task and the agent.
+        claim: of the run's folder, which is prepared.
         progress: for the user.
         signals: that end the run.
         watchdog: hears of every batch of the journal, which may take long to read.
@@ -139,7 +141,7 @@ def open_run(
     Raises:
         TangramError: the port or a checkpoint cannot be used, or there is no such device.
     """
-    service, folder = config.service, RunFolder(config.run_dir)
+    service, folder = config.service, claim.run
     trainer = Trainer(setup, config.seed, choose_device(service.device))
     found = _restore(config, folder, trainer)
     rest = found or Restored(_new_record(folder.journal), {})
@@ -168,7 +170,7 @@ def open_run(
         log.info("goes on after %s updates", f"{trainer.updates:,}")
     elif config.resume == "auto":
         log.info("a new run begins")
-    checkpointer = Checkpointer(service, folder, guard, hub, journal, clock)
+    checkpointer = Checkpointer(service, claim, guard, hub, journal, clock)
     metrics = Metrics(folder.tensorboard, folder.curve, trainer.updates)
     opened.enter_context(closing(metrics))
     status = StatusCollector(folder.path.name, guard, hub, budget, clock, checkpointer)

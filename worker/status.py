@@ -150,7 +150,7 @@ def _lines(n: Mapping[str, float], texts: Mapping[str, str]) -> Iterator[tuple[s
     yield "waiting batches", f"{n['queue']:,.0f}"
     yield "last checkpoint", _age(n["checkpoint_age_s"])
     if n["disk_failing"] > 0:
-        yield "disk", "full or broken: nothing is acknowledged"
+        yield "disk", "full, broken or gone: nothing is acknowledged"
     if n["undone_updates"] > 0:
         yield "undone updates", f"{n['undone_updates']:,.0f} were not finite"
 

@@ -123,6 +123,32 @@ def test_two_runs_on_one_machine_do_not_meet(tmp_path: Path) -> None:
         assert_exactly_once(path, group)
 
 
+@pytest.mark.parametrize("how", ["journal deleted", "run deleted", "run moved away"])
+def test_what_is_deleted_under_a_master_loses_nothing(folder: Path, how: str) -> None:
+    """Kill -9 after the first batch that is acknowledged again, then a restart."""
+    away = folder.with_name("away")
+    with ExitStack() as stack:
+        with master(folder, "service.checkpoint_minutes=1000") as process:
+            made = stack.enter_context(players(setup_of(folder), folder, folder))
+            more_acknowledged(made, 5)
+            if how == "journal deleted":
+                shutil.rmtree(folder / "journal")
+            else:
+                folder.rename(away)
+                if how == "run deleted":
+                    shutil.rmtree(away)
+                until(made, lambda: steps_without_answer(made[0]) == 500)
+                assert not folder.exists()  # not made again by accident
+                folder.mkdir() if how == "run deleted" else away.rename(folder)
+            more_acknowledged(made, 1)
+            process.kill()
+            process.wait()
+        with master(folder) as process:
+            more_acknowledged(made, 5)
+            finish(made, process)
+    assert_exactly_once(folder, made)
+
+
 def can_mount() -> bool:
     """Whether this user may have a file system of his own."""
     if shutil.which("unshare") is None:

@@ -61,7 +61,8 @@ def opened_run(
     config = MasterConfig(str(folder), resume=resume, max_updates=0, service=made)
     with ExitStack() as opened:
         watchdog, signals = Watchdog(0.0), StopSignals()
-        yield open_run(config, MADE, ShownProgress(), signals, watchdog, opened)
+        claim = opened.enter_context(RunFolder(folder).lock())
+        yield open_run(config, MADE, claim, ShownProgress(), signals, watchdog, opened)
 
 
 def test_a_run_that_was_killed_before_its_first_checkpoint_goes_on(
