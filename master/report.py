@@ -108,6 +108,7 @@ class StatusCollector:
             "queue": queue,
             "checkpoint_age_s": self._checkpointer.age_s,
             "disk_failing": self._checkpointer.failing,
+            "open_to_all": self._hub.open_to_all,
             "scored_updates": record.scored_version,
             **{TEST + name: value for name, value in record.scores.items()},
             **self.played,

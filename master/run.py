@@ -28,13 +28,13 @@ from master.report import Reporter, StatusCollector
 from master.result import command_line, go_on_command, make_result, show_finished, show_result
 from master.resumable import check_resumable
 from master.rundir import Claim, Clock, Record, RunFolder, code_of
-from master.security import Keys, is_loopback, needs_keys, run_keys
+from master.security import Keys, listening_place, needs_keys, run_keys
 from master.signals import StopSignals
 from master.trainer import Trainer, choose_device
-from tangram_agent.addresses import reachable, with_host
+from tangram_agent.addresses import LOCAL, reachable, with_host
 from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.config import ServiceConfig
-from tangram_agent.messages import WINDOW
+from tangram_agent.messages import OPEN, WINDOW
 from tangram_agent.process import Watchdog, watch_parent
 from tangram_agent.setup import Setup
 
@@ -43,10 +43,6 @@ GRACE_S = 30.0
 UNBOUNDED = (
     "max_hours, max_episodes and max_updates are all 0: only Ctrl-C or SIGTERM ends this run, and "
     "learning rates do not decay"
-)
-PLAIN = (
-    "service.security=plain: whoever reaches this address can read what is sent, and send what he "
-    "likes"
 )
 
 log = logging.getLogger(__name__)
@@ -83,14 +79,14 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
         join = {"connect": folder.path, **code}
         if not launched:  # the launcher did it, with settings of its own
             check_resumable(folder, resolved)
+            listening_place(config.service.bind, folder.path)
             if folder.has_finished(config):
                 show_finished(folder, form, code)
                 return 0
             folder.write_config(resolved)
             evaluator = command_line("tangram-worker", {**join, "role": "evaluator"})
         go_on = go_on_command(folder, launched)
-        title = f"tangram · {folder.path.name}"
-        progress = make_progress(console, title, form, evaluator)
+        progress = make_progress(console, f"tangram · {folder.path.name}", form, evaluator)
         opened.enter_context(closing(progress))
         loop, connection = open_run(config, setup, claim, progress, signals, watchdog, opened)
         loop.reporter.settings(resolved)
@@ -212,6 +208,7 @@ def connection_of(
         "endpoint": announced(hub.endpoint, host),
         "weights_endpoint": announced(hub.weights_endpoint, host),
         "run_id": run_id,
+        "machine": socket.gethostname(),
     }
     if http is not None:
         where["http"] = reachable(http, host)
@@ -234,16 +231,17 @@ def _open_hub(config: MasterConfig, setup: Setup, run_id: str, keys: Keys | None
         window=WINDOW,
         lockstep=service.mode == "lockstep",
     )
-    place, patience_s = (service.bind, service.port), service.silence_seconds
-    return Hub(*place, info, patience_s, keys, service.weights_port, Room.here())
+    bind = listening_place(service.bind, Path(config.run_dir))
+    patience_s = service.silence_seconds
+    return Hub(bind, service.port, info, patience_s, keys, service.weights_port, Room.here())
 
 
 def _keys(service: ServiceConfig, folder: RunFolder) -> Keys | None:
     """Keys where the sockets must be encrypted."""
-    if needs_keys(service.bind, service.security):
+    if needs_keys(service):
         return run_keys(folder.keys)
-    if not is_loopback(service.bind):
-        log.warning(PLAIN)
+    if service.bind != LOCAL:
+        log.warning("%s can read what is sent, and send anything", OPEN)
     return None
 
 

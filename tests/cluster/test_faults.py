@@ -20,6 +20,7 @@ from tangram_sim.errors import TangramError
 from tests.cluster.players import (
     LIMIT_S,
     MASTER,
+    TCP,
     Player,
     assert_exactly_once,
     finish,
@@ -50,7 +51,7 @@ def test_a_network_that_swallows_everything_for_a_while(
 ) -> None:
     """One player behind the proxy, one beside it, who must not notice."""
     with (
-        master(folder) as process,
+        master(folder, *TCP) as process,
         Proxy(port_of(folder)) as proxy,
         players(setup_of(folder), f"tcp://127.0.0.1:{proxy.port}", folder) as made,
     ):
@@ -164,7 +165,7 @@ def test_a_full_disk_stops_the_acknowledgements_and_nothing_is_lost(tmp_path: Pa
     disk.mkdir()
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]
-    settings = [*MASTER, f"service.port={port}", "service.checkpoint_minutes=0.05"]
+    settings = [*MASTER, *TCP, f"service.port={port}", "service.checkpoint_minutes=0.05"]
     words = " ".join(f"'{text}'" for text in [f"run_dir={disk / 'run'}", *settings])
     script = (
         f"mount -t tmpfs -o size=40m none {disk} && {{\n"

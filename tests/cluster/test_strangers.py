@@ -11,7 +11,7 @@ from tangram_lab.benchmarks.strangers import Strangers
 from tests.cluster.players import finish, master, more_acknowledged, players, setup_of, until
 
 pytestmark = pytest.mark.cluster
-KEYS = ("service.bind=127.0.0.1", "service.security=curve")
+KEYS = ("service.bind=127.0.0.1",)
 MIB = 2**20
 
 
