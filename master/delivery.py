@@ -85,12 +85,14 @@ class Ledger:
         received: number of the last batch that was taken or finally refused.
         process: random id of the process, empty where a checkpoint does not know it.
         held: taken, not inserted yet.
+        unused: no batch of this index was ever taken, in this incarnation or before.
     """
 
     incarnation: int
     received: int = 0
     process: str = ""
     held: set[int] = field(default_factory=set)
+    unused: bool = False
 
     @property
     def inserted(self) -> int:
@@ -133,7 +135,7 @@ class Ledger:
 
     def consume(self, sequence: int) -> None:
         """The next batch is refused for good: it counts as done, without an insert."""
-        self.received = sequence
+        self.received, self.unused = sequence, False
 
     def skip_to(self, sequence: int) -> int:
         """Go on at this number; returns how many batches before it were never received."""

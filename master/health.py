@@ -1,10 +1,14 @@
 """HTTP for machines: /metrics in Prometheus' format, and /healthz."""
 
 import json
+import logging
+import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from threading import Thread
+from socket import SHUT_RDWR
+from threading import Lock, Thread
 from typing import Any
 
 from prometheus_client import CollectorRegistry, generate_latest
@@ -12,12 +16,18 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 
 from tangram_agent.messages import WORKER_COLUMNS, RunStatus
+from tangram_agent.process import Every
 from tangram_sim.errors import ConfigError
 
 OFF = -1
 # A loop that has not come round for so long hangs; a checkpoint of a large replay takes seconds.
 STALLED_S = 120.0
 COUNTERS = "hub/"
+MAX_OPEN = 64  # requests at once: each holds a thread and a descriptor
+REQUEST_S = 10.0  # that a client may take from its connection to the end of its answer
+TELL_S = 60.0
+
+log = logging.getLogger(__name__)
 
 
 class Health:
@@ -104,16 +114,53 @@ class Health:
 
 
 class _Server(ThreadingHTTPServer):
+    """Few requests at once, none for long, and what goes wrong with them in one line a minute."""
+
     daemon_threads = True
 
     def __init__(self, address: tuple[str, int], health: Health) -> None:
         self.health = health
+        self._begun: dict[Any, float] = {}  # connection -> when it came
+        self._lost, self._why, self._lock = 0, "", Lock()
+        self._tell = Every(TELL_S, at_once=True)
         super().__init__(address, _Handler)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        if len(self._begun) >= MAX_OPEN:
+            self._lose(client_address, f"{MAX_OPEN} others are open")
+            self.shutdown_request(request)
+            return
+        self._begun[request] = time.monotonic()
+        super().process_request(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        self._begun.pop(request, None)
+        super().shutdown_request(request)
+
+    def service_actions(self) -> None:
+        """Called by the library twice a second: hang up on the slow, and tell what was lost."""
+        latest_s = time.monotonic() - REQUEST_S
+        for request, begun_s in list(self._begun.items()):
+            if begun_s <= latest_s:
+                with suppress(OSError):
+                    request.shutdown(SHUT_RDWR)
+        if self._lost and self._tell.due():
+            with self._lock:
+                lost, self._lost = self._lost, 0
+            told = "HTTP requests without an answer: %d, the last one %s"
+            log.warning(told, lost, self._why, extra={"event": "http", "lost": lost})
+
+    def handle_error(self, _: Any, client_address: Any) -> None:
+        """In place of the library's traceback: most often a client has hung up."""
+        self._lose(client_address, repr(sys.exception()))
+
+    def _lose(self, client_address: Any, why: str) -> None:
+        with self._lock:
+            self._lost, self._why = self._lost + 1, f"from {client_address[0]} ({why})"
 
 
 class _Handler(BaseHTTPRequestHandler):
     server: _Server
-    timeout = 10  # seconds that a client may take to ask
 
     def do_GET(self) -> None:  # the library's name
         code, kind, body = self.server.health.answer(self.path.partition("?")[0])

@@ -16,10 +16,12 @@ from typing import Self
 
 from master.counters import Counters
 from master.delivery import Arrival, EpisodesArrived, ScoresArrived, Verdict
+from master.gate import AMPLE, Room
 from master.registry import Peer, RefusedError, Registry
 from master.security import Keys
 from master.sockets import Sockets
-from tangram_agent.arrays import EpisodeSpec, join_frames
+from tangram_agent.addresses import IPC
+from tangram_agent.arrays import MAX_FRAMES, EpisodeSpec, join_frames
 from tangram_agent.messages import (
     Ack,
     Alive,
@@ -81,6 +83,7 @@ class Hub:
         weights_endpoint: of the PUB socket, as bound.
         epoch: random id of this life of the master.
         counters: traffic and refusals by name.
+        open_to_all: whoever reaches the port may take part.
     """
 
     def __init__(
@@ -91,6 +94,7 @@ class Hub:
         silence_s: float = 30.0,
         keys: Keys | None = None,
         weights_port: int = 0,
+        room: Room = AMPLE,
     ) -> None:
         """Open the sockets.
 
@@ -101,19 +105,21 @@ class Hub:
             silence_s: after which a peer is forgotten.
             keys: for encrypted sockets, None for plain ones.
             weights_port: of the PUB, 0 for any.
+            room: for those who take part.
         """
         self.epoch = secrets.token_hex(8)
         self._info, self._silence_s = info, silence_s
-        self._registry = Registry(info.fingerprints, silence_s)
+        self._registry = Registry(info.fingerprints, silence_s, room)
         self._weights: list[bytes] | None = None
         self._version = -1
         self._stop_reason: str | None = None
         self._status: list[bytes] | None = None
         self._orders: dict[int, Go] = {}
         self.counters = Counters()
-        self._sockets = Sockets(bind, port, self.counters, keys, weights_port)
+        self._sockets = Sockets(bind, port, self.counters, keys, weights_port, room)
         self.endpoint = self._sockets.endpoint
         self.weights_endpoint = self._sockets.weights_endpoint
+        self.open_to_all = keys is None and not self.endpoint.startswith(IPC)
 
     def __enter__(self) -> Self:
         return self
@@ -213,6 +219,8 @@ class Hub:
         """Read a message and answer it; returns what is new."""
         message: ToMaster | BatchError
         try:
+            if len(frames) > 1 + MAX_FRAMES:
+                raise WireError(f"the message has {len(frames)} frames, at most {1 + MAX_FRAMES}")
             message = decode_from_worker(frames, self._info.spec)
         except ProtocolError as error:
             self._refuse(identity, "refused_protocol", Refused(str(error)))
@@ -272,8 +280,13 @@ class Hub:
                 self._send(peer.identity, Alive(self._version))
                 self._remind(peer)
             case WantWeights(epoch, version):
-                if self._weights is not None and (epoch, version) != (self.epoch, self._version):
+                shown = version if epoch == self.epoch else -1
+                if self._weights is None or shown == self._version:
+                    return None
+                if peer.may_have(self._version, shown):
                     self._sockets.send(peer.identity, self._weights)
+                else:
+                    self.counters["weights_asked_again"] += 1
         return None
 
     def _batch(
@@ -281,6 +294,8 @@ class Hub:
     ) -> EpisodesArrived | None:
         """The batch, if it is the next one; else what the worker must know is answered."""
         peer.damaged = 0
+        if self._info.lockstep and not self._is_ordered(peer, batch):
+            return None
         verdict = peer.ledger.take(batch.sequence, self._info.window)
         if verdict is not Verdict.NEW:
             self.counters[verdict.value] += 1
@@ -293,6 +308,27 @@ class Hub:
         self.counters["episodes"] += batch.episodes.count
         self._orders.pop(peer.index, None)
         return EpisodesArrived(peer.role, peer.index, peer.incarnation, batch, frames)
+
+    def _is_ordered(self, peer: Peer, batch: EpisodeBatch) -> bool:
+        """Whether a new batch is what the player was told to play; else it is told again."""
+        if peer.ledger.judge(batch.sequence, self._info.window) is not Verdict.NEW:
+            return True  # it was, when it was new
+        order, told = self._orders.get(peer.index), f"{peer.name}: batch {batch.sequence}"
+        if order is None:
+            # After a restart its order may come soon: it is not refused for good.
+            reason = f"{told}: nothing is ordered of it now"
+            self._refuse(peer.identity, "not_ordered", Reject(reason, batch.sequence, final=False))
+            return False
+        if (batch.episodes.count, batch.weights_version) == (order.episodes, order.version):
+            return True
+        peer.ledger.consume(batch.sequence)
+        reason = (
+            f"{told}: {batch.episodes.count} episodes with weights {batch.weights_version}, "
+            f"ordered were {order.episodes} with weights {order.version}"
+        )
+        self._refuse(peer.identity, "not_ordered", Reject(reason, batch.sequence, final=True))
+        self._remind(peer)
+        return False
 
     def _broken(self, peer: Peer, error: BatchError) -> None:
         """A batch with wrong content: it must not come again, and those after it need not wait."""
@@ -321,6 +357,14 @@ class Hub:
         self._refuse(peer.identity, "rejected", Reject(reason, sequence, final=True))
 
     def _hello(self, identity: bytes, hello: Hello) -> None:
+        run_id = self._info.run_id
+        if hello.run_id not in ("", run_id):
+            reason = (
+                f"this master runs '{run_id}', not '{hello.run_id}': the connection file is stale, "
+                "take the one of a master that is running"
+            )
+            self._refuse(identity, "refused_run", Refused(reason))
+            return
         try:
             peer, older = self._registry.admit(identity, hello, time.monotonic())
         except RefusedError as error:
@@ -330,7 +374,14 @@ class Hub:
             reason = f"{peer.name} was taken over by a newer process"
             self._refuse(older.identity, "superseded", Stop(reason))
         self.counters["welcomed"] += 1
-        self.counters["lost_batches"] = self._registry.lost_batches
+        lost = self._registry.lost_batches - self.counters["lost_batches"]
+        self.counters["lost_batches"] += lost
+        if lost:
+            reason = (
+                f"{lost:,} batches of {peer.name} were acknowledged and are not in the replay: the "
+                "disk has lost them"
+            )
+            self.counters.note("losses", reason)
         self._send(identity, self._welcome(peer))
         self._remind(peer)
 

@@ -8,6 +8,7 @@ inserted says which round it is, so a run that was stopped goes on where it was.
 """
 
 from master.delivery import EpisodesArrived
+from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import Go
 from tangram_sim.errors import ConfigError
@@ -32,11 +33,11 @@ class Lockstep:
         self.ordered = False
 
     @staticmethod
-    def of(service: ServiceConfig, workers: int) -> "Lockstep | None":
+    def of(service: ServiceConfig, workers: int, spec: EpisodeSpec) -> "Lockstep | None":
         """The lockstep of the settings, None in any other mode.
 
         Raises:
-            ConfigError: batches are no whole groups.
+            ConfigError: batches are no whole groups, or too large for one message.
         """
         if service.mode != "lockstep":
             return None
@@ -45,6 +46,7 @@ class Lockstep:
                 f"service.batch_episodes={service.batch_episodes} must be a multiple of "
                 f"service.envs={service.envs} in lockstep: set one of them"
             )
+        spec.check_batch_size(service.batch_episodes)
         return Lockstep(workers, service.batch_episodes)
 
     def begins_round(self, episodes: int) -> bool:
@@ -59,9 +61,8 @@ class Lockstep:
         return {i: Go(number, version, first, self._size) for i in missing}
 
     def take(self, arrival: EpisodesArrived) -> None:
-        """A batch has come, in any order; one that nobody asked for stays unacknowledged."""
-        if arrival.index < self._players:
-            self._arrived.setdefault(arrival.index, arrival)
+        """A batch that was ordered has come, in any order of the players."""
+        self._arrived[arrival.index] = arrival
 
     def next(self, episodes: int) -> EpisodesArrived | None:
         """The batch to insert after so many episodes, once all of its round have come."""

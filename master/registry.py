@@ -1,19 +1,27 @@
 """Who takes part: indices, incarnations and connections; no sockets.
 
 Each role counts its own indices. A new process of an index gets the next incarnation and wins over
-the older one; a process that comes back after the master was restarted keeps what it had.
+the older one; a process that comes back after the master was restarted keeps what it had, unless
+the master has lost it (a disk without power): then it gets the next one, too. No process names one
+that was never given.
 """
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from master.delivery import EpisodesArrived, Ledger
+from master.gate import AMPLE, Room
 from tangram_agent.messages import MAX_INDEX, ROLES, Hello, Refused, Stop
 from tangram_agent.schema import MAX_COUNT
 from tangram_sim.errors import RunError, TangramError
 
-MAX_PEERS = 4096
+CROWDED = 0.9  # share of the room from which on there is a warning
+# One that asks for weights again before it has shown that it got them waits so long, then twice.
+WEIGHTS_AGAIN_S = 10.0
 Key = tuple[str, int]
+
+log = logging.getLogger(__name__)
 
 
 class RefusedError(TangramError):
@@ -44,6 +52,8 @@ class Peer:
         weights_version: that its last batch was played with.
         batches, episodes, transitions: inserted since it joined.
         damaged: messages in a row that were damaged on their way.
+        weights: version that it was sent when it asked, and when it may have more if it does not
+            show that it got them.
     """
 
     role: str
@@ -59,6 +69,20 @@ class Peer:
     episodes: int = 0
     transitions: int = 0
     damaged: int = 0
+    weights: tuple[int, float] = (-1, 0.0)
+    _patience_s: float = WEIGHTS_AGAIN_S
+
+    def may_have(self, version: int, shown: int) -> bool:
+        """Whether to send it weights of a version; it shows which it has.
+
+        What is sent to one that does not read stays in memory here.
+        """
+        sent, due = self.weights
+        if shown != sent and self.last_seen < due:
+            return False
+        self._patience_s = WEIGHTS_AGAIN_S if shown == sent else 2.0 * self._patience_s
+        self.weights = version, self.last_seen + self._patience_s
+        return True
 
     def inserted(self, arrival: EpisodesArrived) -> None:
         """Count a batch of its own."""
@@ -84,13 +108,15 @@ class Registry:
         lost_batches: numbers that a checkpoint had not seen and a worker has no more.
     """
 
-    def __init__(self, fingerprints: Mapping[str, str], grace_s: float) -> None:
+    def __init__(self, fingerprints: Mapping[str, str], grace_s: float, room: Room = AMPLE) -> None:
         """Nobody takes part yet.
 
         Args:
             fingerprints: section of the settings -> digest; a process must have the same.
             grace_s: after a restart, how long indices wait for their workers.
+            room: for peers.
         """
+        self._room, self._crowded = room, False
         self.lost_batches = 0
         self._fingerprints = fingerprints
         self._grace_s, self._reserved_until = grace_s, 0.0
@@ -131,11 +157,11 @@ class Registry:
         if same is not None and same.role == hello.role:
             # A HELLO again, because WELCOME was late or the connection is a new one.
             self._by_identity.pop(same.identity, None)
-            same.identity, same.last_seen = identity, now
+            same.identity, same.last_seen, same.weights = identity, now, (-1, 0.0)
             self._by_identity[identity] = same
             return same, None
-        if len(self._by_key) >= MAX_PEERS:
-            reason = f"{MAX_PEERS} processes take part already, the most there can be"
+        if len(self._by_key) >= self._room.peers:
+            reason = f"{self._room.peers} processes take part already, the most {self._room.bound}"
             raise RefusedError("refused_full", Refused(reason))
         stranger = self._by_identity.get(identity)
         if stranger is not None:
@@ -148,12 +174,15 @@ class Registry:
             self.leave(older)
         peer = Peer(hello.role, index, ledger.incarnation, hello.process, identity, now, ledger)
         self._by_identity[identity] = self._by_key[key] = peer
+        self._warn_early()
         return peer, older
 
     def leave(self, peer: Peer) -> None:
-        """Forget a connection; its ledger stays."""
+        """Forget a connection; its ledger stays, unless no batch of its index was ever taken."""
         self._by_identity.pop(peer.identity, None)
         self._by_key.pop(peer.key, None)
+        if peer.ledger.unused and self._ledgers.get(peer.key) is peer.ledger:
+            del self._ledgers[peer.key]
 
     def drop_silent(self, now: float, silence_s: float) -> list[Peer]:
         """Forget the peers that were not heard of for so long, and return them."""
@@ -189,6 +218,15 @@ class Registry:
         self._reserved_until = now + self._grace_s
         return True
 
+    def _warn_early(self) -> None:
+        """Once, before anybody must be refused."""
+        taken, most = len(self._by_key), self._room.peers
+        if not self._crowded and taken >= CROWDED * most:
+            self._crowded = True
+            fields = {"event": "crowded", "count": taken}
+            text = "%d processes take part, of at most %d %s"
+            log.warning(text, taken, most, self._room.bound, extra=fields)
+
     def _check_settings(self, hello: Hello) -> None:
         odd = differing(self._fingerprints, hello.fingerprints)
         if not odd:
@@ -211,18 +249,18 @@ class Registry:
 
     def _open_ledger(self, key: Key, hello: Hello) -> Ledger:
         last = self._ledgers.get(key)
-        if last is None or hello.incarnation > last.incarnation:
-            # A first one, or the checkpoint is older than this incarnation: go on where it is.
-            ledger = Ledger(max(1, hello.incarnation), hello.first - 1)
-        elif hello.incarnation == 0:
-            if last.incarnation == MAX_COUNT:
+        known = 0 if last is None else last.incarnation
+        if last is None or hello.incarnation == 0 or hello.incarnation > known:
+            if known == MAX_COUNT:
                 reason = f"{key[0]} {key[1]} has no incarnation left: start with another index"
                 raise RefusedError("refused_full", Refused(reason))
-            ledger = Ledger(last.incarnation + 1, hello.first - 1)
-        elif hello.incarnation < last.incarnation or last.process not in ("", hello.process):
+            # Nothing is known of what a new process has sent, nor of a forgotten incarnation.
+            received = hello.first - 1 if hello.incarnation else 0
+            ledger = Ledger(known + 1, received, unused=last is None or last.unused)
+        elif hello.incarnation < known or last.process not in ("", hello.process):
             reason = (
                 f"{key[0]} {key[1]} was taken over by a newer process "
-                f"(incarnation {last.incarnation}, this is {hello.incarnation})"
+                f"(incarnation {known}, this is {hello.incarnation})"
             )
             raise RefusedError("superseded", Stop(reason))
         else:

@@ -25,13 +25,15 @@ from tangram_sim.settings import check_range
 WeightShapes = Mapping[str, tuple[int, ...]]
 
 MAX_EPISODES = 4096
-MAX_BATCH_BYTES = 32 * 2**20
+# Whoever can connect makes the master hold a frame of this size before it has looked at anything.
+MAX_FRAME_BYTES = 512 * 1024
 MAX_WEIGHTS_BYTES = 64 * 2**20
 MAX_REWARD = 1e6
 # Corners and actions are computed in float64; their bounds may be passed by rounding to float32.
 ROUNDING = 1e-6
 LENGTH = struct.Struct("<I")
-MAX_FRAMES = 8  # in one piece of joined data
+MAX_FRAMES = 8  # after a header, or in one piece of joined data
+MAX_BATCH_BYTES = MAX_FRAMES * MAX_FRAME_BYTES
 
 
 @dataclass(frozen=True)
@@ -143,11 +145,11 @@ class EpisodeSpec:
 
     @cached_property
     def max_count(self) -> int:
-        """Most episodes in one message, bounded in number and in bytes."""
-        return min(MAX_EPISODES, MAX_BATCH_BYTES // sum(c.size for c in self.columns(1)))
+        """Most episodes in one message, bounded in number and in the bytes of its frames."""
+        return min(MAX_EPISODES, MAX_FRAME_BYTES // max(c.size for c in self.columns(1)))
 
     def check_batch_size(self, count: int) -> None:
-        """Raise ConfigError if batches of so many episodes cannot be sent."""
+        """Raise ConfigError if so many episodes cannot be sent in one message."""
         if count > self.max_count:
             raise ConfigError(
                 f"{count} episodes of {self.horizon} steps with {self.corners} corners are too "

@@ -54,6 +54,7 @@ WINDOW = 4  # messages of a worker that may be unacknowledged; a full window pau
 MAX_WINDOW = 1024
 MAX_PICTURES = 64
 MAX_ROWS = 4096
+OPEN = "service.auth=off: open to whoever reaches the port"
 
 
 class BatchError(WireError):
@@ -74,6 +75,7 @@ Version = Annotated[int, Between(-1)]  # of weights, -1 for none
 Index = Annotated[int, Between(0, MAX_INDEX)]
 Role = Annotated[str, Text(choices=ROLES)]
 Id = Annotated[str, Text(MAX_ID)]
+RunId = Annotated[str, Text(MAX_RUN_ID)]
 Reason = Annotated[str, Text(cut=True)]
 YesOrNo = Annotated[bool, Flag()]
 
@@ -100,6 +102,7 @@ class Hello(Plain):
         process: random id of the process, the same in each of its HELLOs.
         first: number of the oldest batch that it may still send.
         fingerprints: section of the settings -> digest.
+        run_id: of the run that it wants to take part in, empty where it knows an address only.
     """
 
     kind: ClassVar[str] = "hello"
@@ -109,6 +112,7 @@ class Hello(Plain):
     process: Annotated[str, Text(MAX_ID, needed=True)]
     first: Number
     fingerprints: Annotated[Mapping[str, str], Texts(MAX_ID)]
+    run_id: RunId
 
 
 @dataclass(frozen=True)
@@ -231,7 +235,7 @@ class Welcome(Plain):
 
     kind: ClassVar[str] = "welcome"
     epoch: Id
-    run_id: Annotated[str, Text(MAX_RUN_ID)]
+    run_id: RunId
     seed: Annotated[int, Between(0, MAX_SEED)]  # the user's own, and nothing counts on from it
     index: Index
     incarnation: Number

@@ -97,6 +97,7 @@ class Client:
         self._process = secrets.token_hex(16)
         self._welcome: Welcome | None = None
         self._order: Go | None = None
+        self._again = False
         self._stop_reason = ""
         # The master wants this process to end, and why.
         self._dismissed, self._dismissal = False, ""
@@ -220,13 +221,19 @@ class Client:
         return self.newest.take() if waited else None
 
     def wait_for_order(self, done: Go | None) -> Go | None:
-        """In lockstep: wait for what to play after an order that was done; None if stopped."""
+        """In lockstep: wait for what to play after an order that was done; None if stopped.
+
+        It is the same order again if what was played for it was refused.
+        """
 
         def is_new() -> bool:
             order = self._order
-            return order is not None and (done is None or order.number != done.number)
+            return order is not None and (self._again or order != done)
 
-        return self._order if self._wait(is_new, "its turn") else None
+        if not self._wait(is_new, "its turn"):
+            return None
+        self._again = False
+        return self._order
 
     def close(self) -> None:
         """Say BYE and close; takes a second at most, also when nobody listens."""
@@ -273,6 +280,7 @@ class Client:
 
     def _say_hello(self, sockets: Sockets, now: float) -> None:
         known = self._welcome
+        file = "" if self._connection.address is None else self._connection.address.run_id
         hello = Hello(
             role=self._role,
             index=self._index if known is None else known.index,
@@ -280,6 +288,7 @@ class Client:
             process=self._process,
             first=self.outbox.first,
             fingerprints=self._fingerprints,
+            run_id=file if known is None else known.run_id,
         )
         self._hello_at = now + self._timing.retry_s
         self._ask(sockets, hello, now)
@@ -381,7 +390,7 @@ class Client:
         self.counters["rejected" if reject.final else "out_of_turn"] += 1
         self._warn("rejected", "the master at %s refused a message: %s", reject.reason)
         if reject.final:
-            self.outbox.remove(reject.sequence)
+            self._again = self.outbox.remove(reject.sequence) or self._again
         else:
             self._resend_at = min(self._resend_at, now + self._timing.retry_s)
 

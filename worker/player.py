@@ -3,6 +3,7 @@
 import math
 from contextlib import closing
 
+from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.messages import Go
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
@@ -25,7 +26,8 @@ def run_player(config: WorkerConfig, setup: Setup) -> int:
         TangramError: a setting that cannot work, or a master that refuses or is gone for long.
     """
     policy, report = Policy(setup), Report()
-    size = config.service.batch_episodes
+    # What is too large for a message is split.
+    size = min(config.service.batch_episodes, EpisodeSpec.of(setup).max_count)
     with (
         closing(BatchedEnv(setup.layout, setup.sim, setup.reward, config.service.envs)) as env,
         joined(config, setup, policy) as client,

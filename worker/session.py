@@ -37,7 +37,6 @@ def joined(config: WorkerConfig, setup: Setup, policy: Policy) -> Iterator[Clien
         policy: what the master's weights must fit.
 
     Raises:
-        ConfigError: service.batch_episodes makes messages that are too large.
         TangramError: the master refuses, or does not answer.
     """
     watch_parent()
@@ -46,8 +45,6 @@ def joined(config: WorkerConfig, setup: Setup, policy: Policy) -> Iterator[Clien
     service = config.service
     log_as(config.role, service.log_format)
     spec = EpisodeSpec.of(setup)
-    if config.role == "player":
-        spec.check_batch_size(service.batch_episodes)
     watchdog = Watchdog(service.watchdog_seconds)
     client = Client(
         config.connect,

@@ -50,7 +50,7 @@ def valid_messages(setup: Setup) -> list[list[bytes]]:
     )
     ends = corners[:, 0]
     return [
-        Hello("player", 7, 0, "fuzz", 1, setup.fingerprints()).encode(),
+        Hello("player", 7, 0, "fuzz", 1, setup.fingerprints(), "").encode(),
         EpisodeBatch(1, 0, episodes).encode(spec),
         Scores(3, {"mean_reward": 0.5}, ends, ends, ends).encode(spec),
         WantWeights("epoch", 3).encode(),

@@ -49,8 +49,9 @@ def hello(
     first: int = 1,
     role: str = "player",
     fingerprints: Mapping[str, str] = FINGERPRINTS,
+    run_id: str = "",
 ) -> Hello:
-    return Hello(role, index, incarnation, process, first, fingerprints)
+    return Hello(role, index, incarnation, process, first, fingerprints, run_id)
 
 
 def with_header(frames: list[bytes], **changes: Any) -> list[bytes]:

@@ -13,7 +13,8 @@ from safetensors.numpy import save
 
 from tangram_agent import arrays
 from tangram_agent.arrays import (
-    MAX_BATCH_BYTES,
+    MAX_EPISODES,
+    MAX_FRAME_BYTES,
     MAX_FRAMES,
     MAX_REWARD,
     EpisodeSpec,
@@ -154,16 +155,16 @@ def test_arrays_of_another_task_are_not_sent() -> None:
 
 
 def test_a_batch_holds_a_bounded_number_of_episodes() -> None:
-    long = EpisodeSpec(16, 64, 1600, 4, BOUND)
-    bytes_each = 4 * (1601 * 128 + 1600 * 5 + 128) + 1601 * 16
-    assert long.max_count == MAX_BATCH_BYTES // bytes_each
-    long.check_batch_size(long.max_count)
+    long = EpisodeSpec(16, 64, 100, 4, BOUND)
+    assert long.max_count == MAX_FRAME_BYTES // (4 * 101 * 128) == 10
+    assert EpisodeSpec(1, 3, 1, 3, BOUND).max_count == MAX_EPISODES
+    long.check_batch_size(10)
     message = (
-        "39 episodes of 1600 steps with 64 corners are too many for one message, at most 38: "
+        "11 episodes of 100 steps with 64 corners are too many for one message, at most 10: "
         "lower service.batch_episodes or sim.actions_per_token"
     )
     with pytest.raises(ConfigError, match=f"^{message}$"):
-        long.check_batch_size(long.max_count + 1)
+        long.check_batch_size(11)
     with pytest.raises(ConfigError, match=r"1 episodes of 100000 steps .* at most 0: lower"):
         EpisodeSpec(16, 64, 100_000, 4, BOUND)
 

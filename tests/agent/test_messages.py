@@ -85,6 +85,7 @@ BOUNDS: dict[str, dict[str, Bound]] = {
         "process": Text(64, needed=True),
         "first": Between(1, BIG),
         "fingerprints": Texts(64),
+        "run_id": Text(256),
     },
     "want_weights": {"epoch": Text(64), "version": Between(-1, BIG)},
     "heartbeat": {"stats": Numbers(lenient=True)},
@@ -369,7 +370,7 @@ def test_what_a_receiver_would_refuse_is_not_sent() -> None:
     with pytest.raises(WireError, match=r"ends must have the shape \(2, 7, 2\), got \(1, 7, 2\)"):
         replace(sent, ends=sent.ends[:1]).encode(SPEC)
     none = Episodes(*[array[:0] for array in vars(episodes(1)).values()])
-    with pytest.raises(WireError, match=f"episodes: count {INTEGER} 1 and 4096, got 0"):
+    with pytest.raises(WireError, match=f"episodes: count {INTEGER} 1 and {SPEC.max_count}, got 0"):
         EpisodeBatch(1, 0, none).encode(SPEC)
     with pytest.raises(WireError, match=f"episodes: sequence {INTEGER} 1 and {BIG}, got 0"):
         batch(0).encode(SPEC)

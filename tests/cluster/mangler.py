@@ -7,7 +7,7 @@ from typing import Self
 
 import zmq
 
-from tangram_agent.arrays import MAX_BATCH_BYTES
+from tangram_agent.arrays import MAX_FRAME_BYTES
 from tangram_agent.schema import CHECKSUM
 
 DAMAGE = (
@@ -110,7 +110,7 @@ class Mangler:
             case "random":
                 return [self._dice.randbytes(self._dice.randrange(300)) for _ in range(3)]
             case "oversized":
-                return [header, bytes(MAX_BATCH_BYTES + 1)]
+                return [header, bytes(MAX_FRAME_BYTES + 1)]
             case "without its end":
                 return frames[:-1] or [b""]
             case "cut short":

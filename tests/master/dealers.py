@@ -116,9 +116,11 @@ class Dealer:
 
 
 @contextmanager
-def staged(bind: str = "127.0.0.1", port: int = 0, **hub: Any) -> Iterator[Stage]:
+def staged(
+    bind: str = "127.0.0.1", port: int = 0, info: WelcomeInfo = INFO, **hub: Any
+) -> Iterator[Stage]:
     """A hub on a free port, with nobody connected yet."""
-    with Hub(bind, port, INFO, **hub) as made:
+    with Hub(bind, port, info, **hub) as made:
         stage = Stage(made)
         try:
             yield stage

@@ -1,11 +1,15 @@
 """HTTP for machines: what Prometheus and a health check see."""
 
 import json
+import re
 import socket
+import struct
+import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, suppress
+from functools import partial
 
 import numpy as np
 import pytest
@@ -83,18 +87,64 @@ def test_health_is_lost_when_the_loop_hangs(
     assert json.loads(text)["activity"] == "learning"
 
 
-def test_who_connects_and_asks_nothing_is_hung_up_on(
+def wait_until(done: Callable[[], bool], limit_s: float = 10.0) -> None:
+    until_s = time.monotonic() + limit_s
+    while not done():
+        assert time.monotonic() < until_s, "it does not come"
+        time.sleep(0.02)
+
+
+def port_of(health: Health) -> int:
+    return int(health.url.rpartition(":")[2])
+
+
+def test_who_takes_too_long_to_ask_is_hung_up_on(
     health: Health, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each connection holds a thread, and nothing else bounds their number."""
-    limit_s = health_module._Handler.timeout
-    monkeypatch.setattr(health_module._Handler, "timeout", limit_s / 50)
-    port = int(health.url.rpartition(":")[2])
-    with socket.create_connection(("127.0.0.1", port), timeout=10) as idle:
-        assert idle.recv(1) == b""
+    """Also one that sends a byte every now and then, which no timeout of a socket ends."""
+    monkeypatch.setattr(health_module, "REQUEST_S", 1.0)
+    with socket.create_connection(("127.0.0.1", port_of(health)), timeout=0.2) as slow:
+        began_s, heard = time.monotonic(), b"?"
+        while heard and time.monotonic() - began_s < 10.0:
+            with suppress(TimeoutError, ConnectionError):
+                slow.sendall(b"G")
+                heard = slow.recv(1)
+    assert heard == b""
+
+
+def test_requests_at_once_are_bounded(health: Health, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(health_module, "MAX_OPEN", 3)
+    with ExitStack() as opened:
+        connect = partial(socket.create_connection, ("127.0.0.1", port_of(health)), timeout=10)
+        held = [opened.enter_context(connect()) for _ in range(3)]
+        for _ in range(3):
+            assert opened.enter_context(connect()).recv(1) == b""
+        for one in held:
+            one.sendall(b"GET /healthz HTTP/1.0\r\n\r\n")
+            assert one.recv(12) == b"HTTP/1.0 200"
+    wait_until(lambda: fetch(f"{health.url}/healthz")[0] == 200)
+
+
+def test_requests_that_are_reset_are_one_line(
+    health: Health, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for _ in range(20):
+        with socket.create_connection(("127.0.0.1", port_of(health)), timeout=10) as client:
+            client.sendall(b"GET /met")
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    told = re.compile(
+        r"HTTP requests without an answer: (\d+), the last one from 127\.0\.0\.1 "
+        r"\(ConnectionResetError\(104, 'Connection reset by peer'\)\)"
+    )
+    wait_until(lambda: bool(caplog.messages))
+    [line] = caplog.messages
+    said = told.fullmatch(line)
+    assert said
+    wait_until(lambda: int(said[1]) + health._server._lost == 20)  # of the next line, in a minute
+    assert capfd.readouterr().err == ""
 
 
 def test_a_port_that_is_taken_is_told(health: Health) -> None:
-    port = int(health.url.rpartition(":")[2])
+    port = port_of(health)
     with pytest.raises(ConfigError, match=rf"port {port} \(.*service\.http_port=-1 for none"):
         Health("127.0.0.1", port)

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from master.gate import HANDSHAKES, RESERVE, Room
 from tangram_agent.messages import (
     Ack,
     Alive,
@@ -44,6 +45,7 @@ def test_hello_is_answered_with_all_that_a_worker_needs(stage: Stage) -> None:
     assert hub.counters["welcomed"] == 1
 
 
+NO_ROOM = Room(RESERVE + HANDSHAKES)
 DIFFERS = "its settings of {0} differ from the master's: start both with the same overrides of {0}"
 
 
@@ -66,19 +68,28 @@ DIFFERS = "its settings of {0} differ from the master's: start both with the sam
             f"the other side speaks protocol {PROTOCOL + 1}, this one {PROTOCOL}: install the "
             "same version of tangram on both",
         ),
-        ({}, "refused_full", "0 processes take part already, the most there can be"),
+        (
+            {"run_id": "another"},
+            "refused_run",
+            "this master runs 'run', not 'another': the connection file is stale, take the one of "
+            "a master that is running",
+        ),
+        (
+            {},
+            "refused_full",
+            f"0 processes take part already, the most that {NO_ROOM.files} open files allow: raise "
+            "ulimit -n and start the master again",
+        ),
     ],
 )
 def test_who_does_not_fit_is_told_why(
-    stage: Stage,
-    monkeypatch: pytest.MonkeyPatch,
     changes: dict[str, Any],
     counter: str,
     reason: str,
 ) -> None:
-    monkeypatch.setattr("master.registry.MAX_PEERS", 0)
-    assert stage.dealer().ask(with_header(hello().encode(), **changes)) == Refused(reason)
-    assert (stage.hub.counters[counter], stage.hub.peers) == (1, [])
+    with staged(room=NO_ROOM) as stage:
+        assert stage.dealer().ask(with_header(hello().encode(), **changes)) == Refused(reason)
+        assert (stage.hub.counters[counter], stage.hub.peers) == (1, [])
 
 
 def test_the_newest_process_of_an_index_wins(stage: Stage) -> None:
@@ -122,11 +133,45 @@ def test_the_current_weights_are_sent_to_those_who_lack_them(stage: Stage, playe
     stage.hub.publish(weights(version=2))
     player.say(WantWeights(stage.hub.epoch, 2))
     assert player.beat() == [Alive(2)]
-    for epoch, version in (("", -1), (stage.hub.epoch, 1), ("another life", 2)):
-        player.say(WantWeights(epoch, version))
-        answer = player.hear(SHAPES)
+    for number, (epoch, version) in enumerate([("", -1), (stage.hub.epoch, 1), ("old life", 2)]):
+        dealer = stage.dealer()
+        dealer.join(process=f"late {number}")
+        dealer.say(WantWeights(epoch, version))
+        answer = dealer.hear(SHAPES)
         assert isinstance(answer, WeightsMessage)
         assert (answer.epoch, answer.weights.version) == (stage.hub.epoch, 2)
+
+
+def test_weights_come_again_for_those_who_got_them_and_late_for_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Who asks a hundred times and never reads would keep a hundred copies in memory here."""
+    now = 0.0
+    monkeypatch.setattr("master.hub.time", SimpleNamespace(monotonic=lambda: now))
+    with staged(silence_s=1e6) as stage:
+        dealer, hub = stage.dealer(), stage.hub
+        dealer.join()
+        hub.publish(weights(version=1))
+
+        def asked(shown: int) -> list[int]:
+            """Versions that come when it asks five times."""
+            for _ in range(5):
+                dealer.say(WantWeights(hub.epoch, shown))
+            found = [a for a in dealer.beat() if isinstance(a, WeightsMessage)]
+            return [answer.weights.version for answer in found]
+
+        assert [asked(-1), asked(-1)] == [[1], []]
+        hub.publish(weights(version=2))
+        assert asked(1) == [2]  # it shows that the first ones came
+        assert hub.counters["weights_asked_again"] == 4 + 5 + 4
+        for later, found in ((9.9, []), (10.0, [2]), (29.9, []), (30.0, [2]), (69.9, [])):
+            now = later
+            assert asked(1) == found, later
+        # A new connection of the process: nothing is on its way to it.
+        again = stage.dealer()
+        again.join()
+        again.say(WantWeights(hub.epoch, 1))
+        assert isinstance(again.hear(SHAPES), WeightsMessage)
 
 
 def test_weights_are_broadcast_as_one_frame(stage: Stage) -> None:

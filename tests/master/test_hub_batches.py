@@ -1,15 +1,15 @@
 """Batches and orders: each is handed on once, in order, and never more than a window."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
-from tangram_agent.messages import Ack, Alive, Go, Reject, Stop, Welcome
+from tangram_agent.messages import Ack, Alive, Bye, Go, Reject, Stop, Welcome
 from tangram_agent.types import Episodes
 from tangram_sim.errors import RunError
 from tests.agent.messages import SPEC, batch, hello, with_checksum, with_header
-from tests.master.dealers import WINDOW, Dealer, Stage, staged
+from tests.master.dealers import INFO, WINDOW, Dealer, Stage, staged
 
 pytestmark = pytest.mark.cluster
 
@@ -31,6 +31,40 @@ def test_a_batch_arrives_as_it_was_sent_and_is_acknowledged_after_its_insert_onl
     assert player.beat() == [Ack(1, duplicate=False), Alive(-1)]
     [peer] = stage.hub.peers
     assert (peer.batches, peer.episodes, peer.transitions) == (1, 3, 12)
+
+
+def test_in_lockstep_a_batch_is_what_was_ordered_or_it_is_ordered_again() -> None:
+    with staged(info=replace(INFO, lockstep=True)) as stage:
+        player = stage.dealer()
+        player.join(index=0)
+        # As after a restart: it was played for an order of the master before this one.
+        waits = "player 0: batch 1: nothing is ordered of it now"
+        player.send(1)
+        assert player.hear() == Reject(reason=waits, sequence=1, final=False)
+        order = Go(4, 9, 12, 3)
+        for few in (Go(4, 7, 12, 2), order):  # another number of episodes, other weights
+            stage.hub.order({0: few})
+            assert player.hear() == few
+            player.send(1 if few.episodes == 2 else 2)
+            refused = player.hear()
+            assert isinstance(refused, Reject)
+            assert refused.final
+            assert refused.reason.endswith(
+                f"3 episodes with weights 7, ordered were {few.episodes} with weights {few.version}"
+            )
+            assert player.hear() == few
+        stage.hub.order({0: Go(4, 7, 12, 3)})
+        assert player.hear() == Go(4, 7, 12, 3)
+        player.send(3)
+        stage.counted("batches")
+        # It came, so that nothing more is ordered: a second one waits, the first is known.
+        assert player.ask(batch(4).encode(SPEC)) == Reject(
+            reason="player 0: batch 4: nothing is ordered of it now", sequence=4, final=False
+        )
+        stage.hub.acknowledge(stage.batches()[0])
+        assert player.hear() == Ack(3, duplicate=False)
+        assert player.ask(batch(3).encode(SPEC)) == Ack(3, duplicate=True)
+        assert len(stage.batches()) == 1
 
 
 def test_an_order_is_told_again_until_its_batch_has_come(stage: Stage) -> None:
@@ -131,6 +165,22 @@ def test_a_damaged_batch_is_no_batch_and_who_sends_nothing_else_must_end(
         "6 messages of player 0 in a row were damaged on their way: look at the memory and the "
         "network of its machine"
     )
+
+
+def test_what_the_disk_lost_is_told_when_its_worker_comes_back(
+    stage: Stage, caplog: pytest.LogCaptureFixture
+) -> None:
+    stage.hub.load_state({"player/0": {"incarnation": 1, "sequence": 5}})
+    for first, lost in ((6, 0), (9, 3), (9, 3)):
+        dealer = stage.dealer()
+        dealer.join(index=0, incarnation=1, first=first)
+        assert stage.hub.counters["lost_batches"] == lost
+        dealer.say(Bye("done"))
+        stage.until(lambda: not stage.hub.peers)
+    assert [r.message for r in caplog.records] == [
+        "losses (number 1): 3 batches of player 0 were acknowledged and are not in the replay: the "
+        "disk has lost them"
+    ]
 
 
 def test_after_a_restart_duplicates_are_known_and_the_rest_is_taken(

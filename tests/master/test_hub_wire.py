@@ -1,15 +1,34 @@
 """Garbage, floods, peers that vanish or do not read, and addresses."""
 
+import json
 import os
 import socket
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from master.delivery import EpisodesArrived
 from master.hub import Hub
-from tangram_agent.messages import Greet, Heartbeat, Reject, WantWeights
+from master.report import _workers
+from master.sockets import MAX_COMMAND
+from tangram_agent.arrays import MAX_FRAMES
+from tangram_agent.messages import (
+    AskStatus,
+    Bye,
+    Greet,
+    Heartbeat,
+    Hello,
+    Reject,
+    RunStatus,
+    WantWeights,
+)
+from tangram_agent.schema import Between, Bound, Flag, Numbers, Text
 from tangram_sim.errors import ConfigError
-from tests.agent.messages import SPEC, batch, hello, scores, weights, with_header
+from tests.agent.messages import FINGERPRINTS, SPEC, batch, hello, scores, weights, with_header
 from tests.master.dealers import INFO, WINDOW, Dealer, Stage, staged
 
 pytestmark = pytest.mark.cluster
@@ -21,7 +40,7 @@ GARBAGE = [
     [os.urandom(100)],
     [b"\xc1"] * 3,
     [b"\x81\xa1a" * 3000],
-    [bytes(1_000_000)],
+    [bytes(500_000)],
     with_header(hello().encode(), role="spy"),
     with_header(hello().encode(), more=1),
     with_header(hello().encode(), kind="welcome"),
@@ -52,15 +71,22 @@ def test_garbage_is_refused_with_a_reason_and_the_hub_lives_on(
 
 
 def test_a_frame_over_the_limit_never_arrives(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("master.sockets.MAX_BATCH_BYTES", 10_000)
+    monkeypatch.setattr("master.sockets.MAX_FRAME_BYTES", 10_000)
     with staged() as stage:
         large, small = stage.dealer(), stage.dealer()
-        large.say([bytes(10_001)])
+        large.say([bytes(10_001 + MAX_COMMAND)])
         large.say(Heartbeat({}))
         assert isinstance(small.ask([bytes(10_000)]), Reject)
         # The connection of the large one was cut; it comes again, without its message.
         assert large.ask(Heartbeat({})) == Greet()
         assert stage.hub.counters["malformed"] == 1
+
+
+def test_a_message_of_too_many_frames_is_not_decoded(stage: Stage, player: Dealer) -> None:
+    """Nor are their checksums found."""
+    answer = player.ask([*hello().encode(), *[b""] * MAX_FRAMES, b""])
+    assert isinstance(answer, Reject)
+    assert answer.reason == f"the message has {MAX_FRAMES + 2} frames, at most {MAX_FRAMES + 1}"
 
 
 def test_who_vanished_is_unreachable_and_nobody_waits(stage: Stage, player: Dealer) -> None:
@@ -85,6 +111,7 @@ def test_who_vanished_is_unreachable_and_nobody_waits(stage: Stage, player: Deal
 
 def test_who_does_not_read_loses_answers_and_nobody_waits(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("master.sockets.HIGH_WATER", 2)
+    monkeypatch.setattr("master.registry.Peer.may_have", lambda *_: True)
     with staged() as stage:
         deaf = stage.dealer()
         deaf.join()
@@ -98,6 +125,55 @@ def test_who_does_not_read_loses_answers_and_nobody_waits(monkeypatch: pytest.Mo
             wanted += 1
             stage.counted("heartbeats", wanted)
         assert stage.hub.counters["congested"] > 0
+
+
+# Every field of a peer as its bound allows, extremes first.
+VALUES: dict[type[Bound], Callable[[Any], st.SearchStrategy[Any]]] = {
+    Between: lambda b: st.sampled_from([b.low, b.high]) | st.integers(b.low, b.high),
+    Flag: lambda _: st.booleans(),
+    Text: lambda b: (
+        st.sampled_from(b.choices)
+        if b.choices
+        else st.text(st.characters(codec="utf-8"), min_size=1, max_size=min(b.longest, 12))
+    ),
+    Numbers: lambda _: st.dictionaries(
+        st.sampled_from("abc"), st.sampled_from([1e18, -1e18, 5e-324, 2.0**53])
+    ),
+}
+KINDS = (Hello, Bye, Heartbeat, WantWeights, AskStatus)
+PROCESSES = ("p0", "p1", "p2")
+
+
+@st.composite
+def said(draw: st.DrawFn) -> list[bytes]:
+    """The frames of a message that a reader takes, of a process that may have joined."""
+    cls = draw(st.sampled_from(KINDS))
+    bounds = {n: b for n, b in cls.bounds.items() if n not in ("fingerprints", "run_id")}
+    fields = {name: draw(VALUES[type(bound)](bound)) for name, bound in bounds.items()}
+    if cls is Hello:
+        fields |= {"fingerprints": FINGERPRINTS, "run_id": "run"}
+        fields |= {"process": draw(st.sampled_from(PROCESSES)), "index": draw(st.integers(-1, 1))}
+    return cls(**fields).encode()
+
+
+@settings(max_examples=60)
+@given(st.lists(st.tuples(st.sampled_from(PROCESSES), said() | st.integers(1, 3)), max_size=30))
+def test_nothing_that_peers_may_say_makes_an_answer_or_a_checkpoint_that_cannot_be_told(
+    heard: list[tuple[str, list[bytes] | int]],
+) -> None:
+    """A HELLO of 300 bytes with the incarnation 2^63-1 ended the master."""
+    with Hub("127.0.0.1", 0, INFO) as hub:
+        hub.publish(weights(version=2**53))
+        for name, message in heard:
+            frames = batch(message).encode(SPEC) if isinstance(message, int) else message
+            arrived = hub._receive(name.encode(), frames)
+            if isinstance(arrived, EpisodesArrived):
+                hub.acknowledge(arrived)
+            table = _workers(hub.peers, 2**53)
+            RunStatus(dict(hub.counters), {}, table).encode()
+        with Hub("127.0.0.1", 0, INFO) as again:
+            again.load_state(json.loads(json.dumps(hub.state())))
+            assert again.state() == hub.state()
 
 
 def test_one_poll_takes_a_bounded_number_of_messages(

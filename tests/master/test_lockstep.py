@@ -1,9 +1,12 @@
 """The rounds of lockstep, without sockets."""
 
+from dataclasses import replace
+
 import pytest
 
 from master.delivery import EpisodesArrived
 from master.lockstep import Lockstep
+from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import EpisodeBatch, Go
 from tangram_sim.errors import ConfigError
@@ -55,30 +58,12 @@ def test_a_round_that_was_cut_goes_on_with_those_who_are_missing() -> None:
     assert first.index == 1
 
 
-def test_the_first_of_two_batches_of_an_index_counts() -> None:
-    lockstep = Lockstep(1, SIZE)
-    first = batch(0, sequence=1)
-    lockstep.take(first)
-    lockstep.take(batch(0, sequence=2))
-    assert lockstep.next(0) is first
-
-
-def test_a_player_too_many_holds_nothing_up() -> None:
-    lockstep = Lockstep(2, SIZE)
-    lockstep.ordered = True
-    for index in (2, 7, 0, 1):
-        lockstep.take(batch(index))
-    for episodes, index in ((0, 0), (SIZE, 1)):
-        found = lockstep.next(episodes)
-        assert found is not None
-        assert found.index == index
-        lockstep.inserted(found)
-    assert not lockstep.ordered
-
-
 def test_the_settings_must_fit() -> None:
-    assert Lockstep.of(ServiceConfig(), 2) is None
+    spec = EpisodeSpec.of(MADE)
+    assert Lockstep.of(ServiceConfig(), 2, spec) is None
     step = {"mode": "lockstep", "envs": 4, "batch_episodes": 8}
-    assert Lockstep.of(ServiceConfig(**step), 2) is not None
+    assert Lockstep.of(ServiceConfig(**step), 2, spec) is not None
     with pytest.raises(ConfigError, match=r"must be a multiple of service\.envs=3 in lockstep"):
-        Lockstep.of(ServiceConfig(**(step | {"envs": 3})), 2)
+        Lockstep.of(ServiceConfig(**(step | {"envs": 3})), 2, spec)
+    with pytest.raises(ConfigError, match="too many for one message, at most 4: lower service.b"):
+        Lockstep.of(ServiceConfig(**step), 2, replace(spec, corners=8192))

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from master.gate import DESCRIPTORS, HANDSHAKES, RESERVE, Room
 from master.registry import Peer, RefusedError, Registry
 from tangram_agent.schema import MAX_COUNT
 from tangram_sim.errors import RunError
@@ -37,6 +38,7 @@ def test_any_index_is_the_lowest_that_is_free_within_the_role(registry: Registry
     asked = [("a", -1), ("b", 2), ("c", -1), ("d", -1)]
     assert [admitted(registry, n, index=i).index for n, i in asked] == [0, 2, 1, 3]
     assert admitted(registry, "e", role="evaluator").index == 0
+    registry.peers[2].ledger.take(1, WINDOW)
     registry.leave(registry.peers[2])  # player 1
     fresh = admitted(registry, "f")
     assert (fresh.index, fresh.incarnation) == (1, 2)
@@ -66,9 +68,26 @@ def test_the_newest_process_of_an_index_wins_also_after_a_restart(registry: Regi
 
 def test_two_processes_never_share_an_incarnation(registry: Registry) -> None:
     """Both were given the same by masters that did not know of each other's."""
-    registry.leave(admitted(registry, "a", index=0, incarnation=1))
+    first = admitted(registry, "a", index=0, incarnation=1)
+    first.ledger.take(1, WINDOW)
+    registry.leave(first)
     with pytest.raises(RefusedError, match="taken over"):
         admitted(registry, "b", index=0, incarnation=1)
+
+
+def test_an_index_without_batches_leaves_nothing(registry: Registry) -> None:
+    """A stranger who says HELLO and BYE for each index would fill the memory."""
+    for index in range(9):
+        registry.leave(admitted(registry, f"a{index}", index=index))
+    assert registry.state() == {}
+    assert admitted(registry, "b", index=3).incarnation == 1
+    # Where there was one in an earlier incarnation the number must not come again.
+    used = admitted(registry, "c", index=5)
+    used.ledger.take(1, WINDOW)
+    for name, incarnation in (("d", 2), ("e", 3)):
+        registry.leave(used)
+        used = admitted(registry, name, index=5)
+        assert used.incarnation == incarnation
 
 
 def test_a_hello_again_changes_nothing_but_the_connection(registry: Registry) -> None:
@@ -121,13 +140,21 @@ def test_after_a_restart_indices_wait_for_their_workers_for_a_while(registry: Re
     assert admitted(late, "new", now=100.0 + GRACE_S).index == 0
 
 
-def test_an_incarnation_newer_than_the_checkpoint_goes_on_where_it_is(registry: Registry) -> None:
-    back = admitted(registry, "a", index=2, incarnation=7, first=12)
-    assert (back.incarnation, back.ledger.received, registry.lost_batches) == (7, 11, 0)
+@pytest.mark.parametrize("named", [7, 2**31, MAX_COUNT])
+def test_an_incarnation_that_was_never_given_becomes_the_next(
+    registry: Registry, named: int
+) -> None:
+    """The disk lost it, or somebody made it up: it must not become the last one of its index."""
+    back = admitted(registry, "a", index=2, incarnation=named, first=12)
+    assert (back.incarnation, back.ledger.received, registry.lost_batches) == (1, 11, 0)
+    back.ledger.take(12, WINDOW)
+    assert admitted(registry, "b", index=2).incarnation == 2
+    assert admitted(registry, "c", index=2, incarnation=named, first=MAX_COUNT).incarnation == 3
+    assert admitted(registry, "d", index=2, first=MAX_COUNT).ledger.received == 0  # it sent none
 
 
 def test_incarnations_end_where_messages_could_not_tell_them(registry: Registry) -> None:
-    admitted(registry, "a", index=0, incarnation=MAX_COUNT - 1)
+    registry.load_state({"player/0": {"incarnation": MAX_COUNT - 1, "sequence": 0}}, -GRACE_S)
     assert admitted(registry, "b", index=0).incarnation == MAX_COUNT
     with pytest.raises(RefusedError, match="player 0 has no incarnation left: start with another"):
         admitted(registry, "c", index=0)
@@ -155,6 +182,20 @@ def test_malformed_tables_are_refused(registry: Registry, state: Any, reason: st
     with pytest.raises(RunError) as caught:
         registry.load_state(state, 0.0)
     assert str(caught.value).startswith(reason)
+
+
+def test_the_last_tenth_of_the_room_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    files = RESERVE + HANDSHAKES + 10 * DESCRIPTORS
+    registry = Registry(FINGERPRINTS, GRACE_S, Room(files))
+    told = []
+    for name in "abcdefghij":
+        admitted(registry, name)
+        told.append(len(caplog.messages))
+    assert told == [0] * 8 + [1, 1]
+    bound = f"{files} open files allow: raise ulimit -n and start the master again"
+    assert caplog.messages == [f"9 processes take part, of at most 10 that {bound}"]
+    with pytest.raises(RefusedError, match=f"10 .* already, the most that {bound}"):
+        admitted(registry, "k")
 
 
 def test_batches_of_the_journal_are_new_once(registry: Registry) -> None:

@@ -12,6 +12,7 @@ from master.delivery import ScoresArrived
 from tangram_agent.messages import (
     Ack,
     Alive,
+    Go,
     Greet,
     Hello,
     Refused,
@@ -96,9 +97,21 @@ def test_a_stale_connection_file_is_told(stage: Stage, tmp_path: Path) -> None:
         with pytest.raises(TangramError) as caught:
             served(stage, client.join)
         assert str(caught.value) == (
-            f"the master at {stage.hub.endpoint} runs 'run', not 'an older run': the connection "
-            "file is stale, take the one of a master that is running"
+            f"the master at {stage.hub.endpoint} refused this player: this master runs 'run', not "
+            "'an older run': the connection file is stale, take the one of a master that is running"
         )
+
+
+def test_a_master_of_another_run_gets_nothing(master: StandIn, tmp_path: Path) -> None:
+    """One that took the port of a master that is gone, and says yes to everybody."""
+    write_connection(tmp_path, master.endpoint, "mine")
+    with make_client(tmp_path) as client:
+        hello = master.await_kind(client, Hello)
+        assert isinstance(hello, Hello)
+        assert hello.run_id == "mine"
+        master.say(master.welcome_message())
+        with pytest.raises(TangramError, match="runs 'run', not 'mine': the connection file is st"):
+            master.until(client, lambda: False)
 
 
 def test_an_address_that_zeromq_does_not_take() -> None:
@@ -189,6 +202,27 @@ def test_what_is_refused_for_good_is_not_sent_again(master: StandIn) -> None:
         master.heard.clear()
         master.until(client, lambda: len(numbers(master.heard)) >= 2)
         assert set(numbers(master.heard)) == {2}
+
+
+def test_in_lockstep_what_was_refused_is_played_again(master: StandIn) -> None:
+    order = Go(4, 9, 12, 3)
+    with welcomed(master) as client:
+        master.say(order)
+        assert client.wait_for_order(None) == order
+        assert client.send(episodes(3), 9)
+        master.until(client, lambda: numbers(master.heard) == [1])
+        master.say(Reject(reason="scores are not yours", sequence=0, final=True), order)
+        master.until(client, lambda: client.counters["rejected"] == 1)
+        client.stop("nothing new")  # told again, as with each heartbeat
+        assert client.wait_for_order(order) is None
+    with welcomed(master) as client:
+        master.say(order)
+        assert client.wait_for_order(None) == order
+        assert client.send(episodes(3), 9)
+        master.until(client, lambda: numbers(master.heard)[-1:] == [1])
+        master.say(Reject(reason="player 3: rewards holds nan", sequence=1, final=True))
+        master.until(client, lambda: client.counters["rejected"] == 1)
+        assert client.wait_for_order(order) == order
 
 
 def test_whoever_watches_sees_a_client_at_work(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import Go
 from tangram_agent.process import Lifeline
 from tangram_agent.setup import Setup
-from tangram_sim.errors import ConfigError, TangramError
+from tangram_sim.errors import TangramError
 from tangram_sim.sampling import sample_poses
 from tangram_sim.seeding import episode_generator
 from tests.agent.builders import setup
@@ -270,8 +270,15 @@ def test_a_worker_with_other_settings_is_refused(run: Callable[..., int]) -> Non
         with_master(hub, script, lambda: run(config(hub, role=role), other))
 
 
-def test_messages_that_would_be_too_large_are_refused_at_the_start() -> None:
-    made = setup({"shapes": ["square"] * 16, "scale": 0.1}, actions_per_token=100)
-    service = replace(SERVICE, batch_episodes=4096)
-    with pytest.raises(ConfigError, match="batch_episodes"):
-        run_player(WorkerConfig("tcp://127.0.0.1:9", service=service), made)
+def test_what_is_too_large_for_a_message_is_split(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = greedy_setup()
+    monkeypatch.setattr("tangram_agent.arrays.MAX_EPISODES", 3)
+
+    def script(hub: Hub) -> list[EpisodesArrived]:
+        hub.publish(weights(made, 1))
+        return collect(hub, lambda batches: len(batches) == 2)
+
+    hub = open_hub(made, seed=3)
+    arrived, _ = with_master(hub, script, lambda: run_player(config(hub, index=7), made))
+    assert [batch.episodes.count for batch in arrived[:2]] == [3, 1]
+    assert_episodes(made, arrived[:2], (3, "player", 7, 1), range(4))
