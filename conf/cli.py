@@ -36,7 +36,7 @@ USAGE_STATUS = 2
 MAKE_RUNS = ("train", "master")  # the commands whose run_dir is made, not read
 MISSING_HINTS = {
     "runs": "say which study: runs=runs/experiments/laptop",
-    "connect": "say which master: connect=host:port or connect=runs/...",
+    "connect": "say which run: connect=runs/..., or a copy of its connection.json",
 }
 
 
@@ -86,8 +86,11 @@ def _check_presets(folder: str | None) -> None:
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    for path in (path for group in PRESET_GROUPS for path in Path(folder, group).glob("*.yaml")):
+    from tangram_agent.stored import check_extent
+
+    for path in (path for group in PRESET_GROUPS for path in Path(folder, group).rglob("*.yaml")):
         try:
+            check_extent(path.read_text(encoding="utf-8"), f"preset {path}")
             content = OmegaConf.to_container(OmegaConf.load(path))
         except (
             OSError,
@@ -276,7 +279,11 @@ def with_run_config(
     if lacking:
         raise ConfigError(f"{source} lacks {', '.join(lacking)}: it must come from a run")
     content = {name: content[name] for name in sections}
-    chosen, result = OmegaConf.create(settings), OmegaConf.create({**settings, **content})
+    chosen = OmegaConf.create(settings)
+    try:
+        result = OmegaConf.create({**settings, **content})
+    except RecursionError:
+        raise ConfigError(f"{source} is nested too deeply: it must come from a run") from None
     for override in overrides:
         key = _key(override)
         section = key.partition(".")[0]
@@ -317,13 +324,15 @@ def _from_config(settings: Plain) -> tuple[str, Plain] | None:
         return None
     if not isinstance(path, str):
         raise ConfigError(f"from_config must be the path of a run's config.yaml, got {path!r}")
+    from tangram_agent.stored import load_settings
+
     source = f"from_config={path}"
     try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        content = load_settings(Path(path).read_text(encoding="utf-8"), source)
     except OSError as error:
         raise ConfigError(f"{source}: {error.strerror or error}") from None
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError):
-        raise ConfigError(f"{source} is not a YAML file") from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"{source} is not valid YAML (it is no UTF-8): mend it") from None
     return source, content if isinstance(content, dict) else {}
 
 

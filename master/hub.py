@@ -20,6 +20,7 @@ from master.gate import AMPLE, Room
 from master.registry import Peer, RefusedError, Registry
 from master.security import Keys
 from master.sockets import Sockets
+from tangram_agent.addresses import IPC
 from tangram_agent.arrays import MAX_FRAMES, EpisodeSpec, join_frames
 from tangram_agent.messages import (
     Ack,
@@ -82,6 +83,7 @@ class Hub:
         weights_endpoint: of the PUB socket, as bound.
         epoch: random id of this life of the master.
         counters: traffic and refusals by name.
+        open_to_all: whoever reaches the port may take part.
     """
 
     def __init__(
@@ -117,6 +119,7 @@ class Hub:
         self._sockets = Sockets(bind, port, self.counters, keys, weights_port, room)
         self.endpoint = self._sockets.endpoint
         self.weights_endpoint = self._sockets.weights_endpoint
+        self.open_to_all = keys is None and not self.endpoint.startswith(IPC)
 
     def __enter__(self) -> Self:
         return self

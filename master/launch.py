@@ -15,6 +15,7 @@ from master.console import logging_to, sturdy_console
 from master.result import show_finished
 from master.resumable import check_resumable
 from master.rundir import RunFolder, code_of
+from master.security import listening_place
 from master.signals import SAME_WISH_S, handling, show_cursor, stop_notice
 from tangram_agent.process import Every, watch_parent
 
@@ -48,6 +49,7 @@ def run_training(config: MasterConfig, resolved: Mapping[str, Any]) -> int:
     folder.prepare(config.resume)
     with folder.lock():
         check_resumable(folder, resolved)
+        listening_place(config.service.bind, folder.path)
         finished = folder.has_finished(config)
         if not finished:
             folder.logs.mkdir(exist_ok=True)

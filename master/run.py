@@ -27,14 +27,14 @@ from master.recovery import Reader, journal_run_id
 from master.report import Reporter, StatusCollector
 from master.result import command_line, go_on_command, make_result, show_finished, show_result
 from master.resumable import check_resumable
-from master.rundir import Clock, Record, RunFolder, code_of
-from master.security import Keys, is_loopback, needs_keys, run_keys
+from master.rundir import Claim, Clock, Record, RunFolder, code_of
+from master.security import Keys, listening_place, needs_keys, run_keys
 from master.signals import StopSignals
 from master.trainer import Trainer, choose_device
-from tangram_agent.addresses import reachable, with_host
+from tangram_agent.addresses import LOCAL, reachable, with_host
 from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.config import ServiceConfig
-from tangram_agent.messages import WINDOW
+from tangram_agent.messages import OPEN, WINDOW
 from tangram_agent.process import Watchdog, watch_parent
 from tangram_agent.setup import Setup
 
@@ -43,10 +43,6 @@ GRACE_S = 30.0
 UNBOUNDED = (
     "max_hours, max_episodes and max_updates are all 0: only Ctrl-C or SIGTERM ends this run, and "
     "learning rates do not decay"
-)
-PLAIN = (
-    "service.security=plain: whoever reaches this address can read what is sent, and send what he "
-    "likes"
 )
 
 log = logging.getLogger(__name__)
@@ -76,23 +72,23 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
         Room.here()  # before anything is written
         folder = RunFolder(config.run_dir)
         folder.prepare(config.resume)
-        opened.enter_context(folder.lock())
+        claim = opened.enter_context(folder.lock())
         signals = opened.enter_context(StopSignals())
         watchdog = opened.enter_context(Watchdog(config.service.watchdog_seconds))
         code, evaluator = code_of(resolved), ""
         join = {"connect": folder.path, **code}
         if not launched:  # the launcher did it, with settings of its own
             check_resumable(folder, resolved)
+            listening_place(config.service.bind, folder.path)
             if folder.has_finished(config):
                 show_finished(folder, form, code)
                 return 0
             folder.write_config(resolved)
             evaluator = command_line("tangram-worker", {**join, "role": "evaluator"})
         go_on = go_on_command(folder, launched)
-        title = f"tangram · {folder.path.name}"
-        progress = make_progress(console, title, form, evaluator)
+        progress = make_progress(console, f"tangram · {folder.path.name}", form, evaluator)
         opened.enter_context(closing(progress))
-        loop, connection = open_run(config, setup, progress, signals, watchdog, opened)
+        loop, connection = open_run(config, setup, claim, progress, signals, watchdog, opened)
         loop.reporter.settings(resolved)
         folder.write_connection(connection)
         if not launched:
@@ -118,6 +114,7 @@ def _tell_news(line: str) -> None:
 def open_run(
     config: MasterConfig,
     setup: Setup,
+    claim: Claim,
     progress: Progress,
     signals: StopSignals,
     watchdog: Watchdog,
@@ -126,8 +123,9 @@ def open_run(
     """Make all that a run consists of, from the newest checkpoint where it is to be resumed.
 
     Args:
-        config: the master's settings; its folder is prepared and locked.
+        config: the master's settings.
         setup: the task and the agent.
+        claim: of the run's folder, which is prepared.
         progress: for the user.
         signals: that end the run.
         watchdog: hears of every batch of the journal, which may take long to read.
@@ -139,7 +137,7 @@ def open_run(
     Raises:
         TangramError: the port or a checkpoint cannot be used, or there is no such device.
     """
-    service, folder = config.service, RunFolder(config.run_dir)
+    service, folder = config.service, claim.run
     trainer = Trainer(setup, config.seed, choose_device(service.device))
     found = _restore(config, folder, trainer)
     rest = found or Restored(_new_record(folder.journal), {})
@@ -168,7 +166,7 @@ def open_run(
         log.info("goes on after %s updates", f"{trainer.updates:,}")
     elif config.resume == "auto":
         log.info("a new run begins")
-    checkpointer = Checkpointer(service, folder, guard, hub, journal, clock)
+    checkpointer = Checkpointer(service, claim, guard, hub, journal, clock)
     metrics = Metrics(folder.tensorboard, folder.curve, trainer.updates)
     opened.enter_context(closing(metrics))
     status = StatusCollector(folder.path.name, guard, hub, budget, clock, checkpointer)
@@ -210,6 +208,7 @@ def connection_of(
         "endpoint": announced(hub.endpoint, host),
         "weights_endpoint": announced(hub.weights_endpoint, host),
         "run_id": run_id,
+        "machine": socket.gethostname(),
     }
     if http is not None:
         where["http"] = reachable(http, host)
@@ -232,16 +231,17 @@ def _open_hub(config: MasterConfig, setup: Setup, run_id: str, keys: Keys | None
         window=WINDOW,
         lockstep=service.mode == "lockstep",
     )
-    place, patience_s = (service.bind, service.port), service.silence_seconds
-    return Hub(*place, info, patience_s, keys, service.weights_port, Room.here())
+    bind = listening_place(service.bind, Path(config.run_dir))
+    patience_s = service.silence_seconds
+    return Hub(bind, service.port, info, patience_s, keys, service.weights_port, Room.here())
 
 
 def _keys(service: ServiceConfig, folder: RunFolder) -> Keys | None:
     """Keys where the sockets must be encrypted."""
-    if needs_keys(service.bind, service.security):
+    if needs_keys(service):
         return run_keys(folder.keys)
-    if not is_loopback(service.bind):
-        log.warning(PLAIN)
+    if service.bind != LOCAL:
+        log.warning("%s can read what is sent, and send anything", OPEN)
     return None
 
 

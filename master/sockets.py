@@ -2,12 +2,14 @@
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
 import zmq
 
 from master.counters import Counters
 from master.gate import AMPLE, Gate, Room
 from master.security import Authenticator, Keys
+from tangram_agent.addresses import IPC
 from tangram_agent.arrays import MAX_FRAME_BYTES
 from tangram_sim.errors import ConfigError
 
@@ -85,6 +87,9 @@ class Sockets:
     def close(self) -> None:
         """Close; what is on its way gets a second."""
         self._close(LINGER_MS)
+        for endpoint in (self.endpoint, self.weights_endpoint):
+            if endpoint.startswith(IPC):
+                Path(endpoint.removeprefix(IPC)).unlink(missing_ok=True)
 
     def _close(self, linger_ms: int) -> None:
         if self._gate is not None:
@@ -111,9 +116,15 @@ class Sockets:
         if self._authenticator is not None:
             self._authenticator.guard(socket)
         host = f"[{bind}]" if ":" in bind else bind
+        local = f"{bind}.{'episodes' if kind == zmq.ROUTER else 'weights'}"
         try:
-            socket.bind(f"tcp://{host}:{port or '*'}")
+            socket.bind(local if bind.startswith(IPC) else f"tcp://{host}:{port or '*'}")
         except zmq.ZMQError as error:
+            if bind.startswith(IPC):
+                raise ConfigError(
+                    f"cannot listen at {local} ({error.strerror}): set TMPDIR to a folder of a "
+                    "local disk"
+                ) from None
             if error.errno == zmq.EADDRINUSE:
                 raise ConfigError(
                     f"port {port} of {bind} is in use: choose another with {setting}=..., "

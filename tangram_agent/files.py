@@ -1,6 +1,7 @@
 """Writing a file at once, and for good: a reader sees the old content or the new, never a part."""
 
 import os
+import stat
 from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -84,6 +85,30 @@ def check_writable(name: str, path: Path) -> None:
             f"{name}={path} cannot be written ({error.strerror}): name a file in a folder that "
             "you may write to"
         ) from None
+
+
+def own_folder(path: Path) -> None:
+    """Make a folder that only this user may enter, or see that one is there.
+
+    Raises:
+        RunError: it is another user's, open to others, no folder, or cannot be made.
+    """
+    try:
+        with suppress(FileExistsError):
+            path.mkdir(mode=0o700)
+        found = path.lstat()
+    except OSError as error:
+        raise RunError(
+            f"{path} cannot be made ({error.strerror}): set TMPDIR to a folder that you may write "
+            "to, for the master and its workers"
+        ) from None
+    mine = stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid()
+    if not mine or found.st_mode & 0o077:
+        is_now = f"{stat.filemode(found.st_mode)} of user {found.st_uid}"
+        raise RunError(
+            f"{path} must be a folder that only this user may enter, it is {is_now}: remove it, or "
+            "set TMPDIR to a folder of your own"
+        )
 
 
 def _aside(path: Path) -> Path:

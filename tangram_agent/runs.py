@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from tangram_agent.checkpoints import (
     ACTING,
@@ -24,6 +23,7 @@ from tangram_agent.checkpoints import (
 from tangram_agent.policy import Policy
 from tangram_agent.pretrained import is_agent, is_name, packaged, read_agent
 from tangram_agent.setup import Setup, make_setup
+from tangram_agent.stored import load_settings
 from tangram_agent.types import Weights
 from tangram_sim.arrays import Floats, Singles
 from tangram_sim.config import with_given_reward
@@ -169,29 +169,23 @@ def read_config(path: Path) -> dict[str, Any]:
     """A run's resolved config.
 
     Raises:
-        RunError: the file is missing or not a YAML mapping.
+        RunError: the file is missing or no mapping.
+        ConfigError: it is no YAML, or larger than settings are.
     """
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise RunError(f"cannot read {path} ({error.strerror}): is this a run folder?") from None
     except UnicodeDecodeError:
-        raise _no_yaml(path) from None
+        raise RunError(f"{path} is not valid YAML (it is no UTF-8): mend it") from None
     return _parse_config(text, path)
 
 
 def _parse_config(text: str, path: Path) -> dict[str, Any]:
-    try:
-        content = yaml.safe_load(text)
-    except (yaml.YAMLError, RecursionError):
-        raise _no_yaml(path) from None
+    content = load_settings(text, str(path))
     if not isinstance(content, dict):
         raise RunError(f"{path} holds no settings: it must be a mapping of sections")
     return content
-
-
-def _no_yaml(path: Path) -> RunError:
-    return RunError(f"{path} is not valid YAML: mend it or name another run_dir")
 
 
 def load_run(run_dir: str | Path, checkpoint: str | None = None, reward: str | None = None) -> Run:

@@ -22,9 +22,8 @@ from tests.cluster.players import (
 )
 
 pytestmark = pytest.mark.cluster
-TCP = "service.bind=127.0.0.1"
-KEYS = (TCP, "service.security=curve")
-PLAIN = (TCP, "service.security=plain")
+KEYS = ("service.bind=127.0.0.1",)
+PLAIN = (*KEYS, "service.auth=off")
 MOST_MIB = 64
 
 

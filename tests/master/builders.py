@@ -26,7 +26,7 @@ from master.loop import Loop
 from master.metrics import Metrics
 from master.registry import Peer
 from master.report import Reporter, StatusCollector
-from master.rundir import Clock, Record, RunFolder
+from master.rundir import Claim, Clock, Record, RunFolder
 from master.signals import StopSignals
 from master.trainer import Trainer
 from tangram_agent.arrays import EpisodeSpec
@@ -66,13 +66,13 @@ def scores(made: Setup, version: int, reward: float = 0.5) -> ScoresArrived:
     return ScoresArrived(0, 1, Scores(version, scalars, corners, corners, corners))
 
 
-_journals: list[Journal] = []
+_opened: list[Journal | Claim] = []
 
 
 def journal(folder: Path, made: Setup, sync_s: float = 1.0, number: int = 0) -> Journal:
     """A journal of the run `run`, after so many batches."""
     opened = Journal(folder, "run", made.task_digest(), sync_s, Place(number=number))
-    _journals.append(opened)
+    _opened.append(opened)
     return opened
 
 
@@ -96,8 +96,8 @@ class Disk:
 
 def close_journals() -> None:
     """All that were made here."""
-    while _journals:
-        _journals.pop().close()
+    while _opened:
+        _opened.pop().close()
 
 
 class FakeHub:
@@ -110,6 +110,7 @@ class FakeHub:
     """
 
     endpoint, weights_endpoint = "tcp://127.0.0.1:1", "tcp://127.0.0.1:2"
+    open_to_all = False
 
     def __init__(
         self, made: Setup, script: Iterable[list[Any]] = (), roles: Iterable[str] = ("player",)
@@ -199,7 +200,9 @@ def loop(
     guard = DivergenceGuard(learner, run_folder.bad_batch, limit=3)
     clock, budget = Clock(record), Budget(settings, learner, record)
     kept = journal(run_folder.journal, made)
-    checkpointer = Checkpointer(service, run_folder, guard, hub, kept, clock)  # type: ignore[arg-type]
+    claim = run_folder.lock()
+    _opened.append(claim)
+    checkpointer = Checkpointer(service, claim, guard, hub, kept, clock)  # type: ignore[arg-type]
     status = StatusCollector("run", guard, hub, budget, clock, checkpointer)  # type: ignore[arg-type]
     metrics = Metrics(run_folder.tensorboard, run_folder.curve)
     reporter = Reporter(learner, record, status, ShownProgress(), metrics, [hub.tell])
