@@ -36,7 +36,7 @@ USAGE_STATUS = 2
 MAKE_RUNS = ("train", "master")  # the commands whose run_dir is made, not read
 MISSING_HINTS = {
     "runs": "say which study: runs=runs/experiments/laptop",
-    "connect": "say which master: connect=host:port or connect=runs/...",
+    "connect": "say which run: connect=runs/..., or a copy of its connection.json",
 }
 
 
@@ -86,8 +86,11 @@ def _check_presets(folder: str | None) -> None:
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    for path in (path for group in PRESET_GROUPS for path in Path(folder, group).glob("*.yaml")):
+    from tangram_agent.stored import check_extent
+
+    for path in (path for group in PRESET_GROUPS for path in Path(folder, group).rglob("*.yaml")):
         try:
+            check_extent(path.read_text(encoding="utf-8"), f"preset {path}")
             content = OmegaConf.to_container(OmegaConf.load(path))
         except (
             OSError,
@@ -199,7 +202,8 @@ def _plain(config: Any, stored: Stored | None, config_name: str) -> Plain:
     if in_sweep and isinstance(plain.get("run_dir"), str):
         # The jobs of one sweep start at one time and share their arguments: a folder for each.
         plain["run_dir"] = f"{plain['run_dir']}/{HydraConfig.get().job.num}"
-    return with_run_config(plain, list(HydraConfig.get().overrides.task), stored)
+    overrides = list(HydraConfig.get().overrides.task)
+    return with_named_code(with_run_config(plain, overrides, stored), overrides)
 
 
 def composed(config_name: str, overrides: Sequence[str]) -> Plain:
@@ -275,9 +279,13 @@ def with_run_config(
     if lacking:
         raise ConfigError(f"{source} lacks {', '.join(lacking)}: it must come from a run")
     content = {name: content[name] for name in sections}
-    chosen, result = OmegaConf.create(settings), OmegaConf.create({**settings, **content})
+    chosen = OmegaConf.create(settings)
+    try:
+        result = OmegaConf.create({**settings, **content})
+    except RecursionError:
+        raise ConfigError(f"{source} is nested too deeply: it must come from a run") from None
     for override in overrides:
-        key = override.lstrip("+~").partition("=")[0]
+        key = _key(override)
         section = key.partition(".")[0]
         if section not in content:
             continue
@@ -290,19 +298,41 @@ def with_run_config(
     return _mapping(OmegaConf.to_container(result))
 
 
+def with_named_code(settings: Plain, overrides: Sequence[str]) -> Plain:
+    """Refuse code that a run's settings, or a preset, name and the command line does not.
+
+    Raises:
+        ConfigError: says which file, and what to add.
+    """
+    from tangram_sim.config import with_given_reward
+
+    reward = settings.get("reward")
+    if not isinstance(reward, dict):
+        return settings
+    keys = {_key(override) for override in overrides}
+    given = {name: value for name, value in reward.items() if f"reward.{name}" in keys}
+    return settings | {"reward": with_given_reward(reward, given)}
+
+
+def _key(override: str) -> str:
+    return override.lstrip("+~").partition("=")[0]
+
+
 def _from_config(settings: Plain) -> tuple[str, Plain] | None:
     path = settings.pop("from_config", None)
     if path is None:
         return None
     if not isinstance(path, str):
         raise ConfigError(f"from_config must be the path of a run's config.yaml, got {path!r}")
+    from tangram_agent.stored import load_settings
+
     source = f"from_config={path}"
     try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        content = load_settings(Path(path).read_text(encoding="utf-8"), source)
     except OSError as error:
         raise ConfigError(f"{source}: {error.strerror or error}") from None
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError):
-        raise ConfigError(f"{source} is not a YAML file") from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"{source} is not valid YAML (it is no UTF-8): mend it") from None
     return source, content if isinstance(content, dict) else {}
 
 

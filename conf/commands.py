@@ -38,7 +38,7 @@ STUDY: dict[str, str | list[str]] = {
     "experiment": ["fig4", "table1", "table2", "fig5", "fig6"],
     "budget": "laptop",
 }
-OVER = ("sim", "agent")
+OVER = ("sim", "reward", "agent")
 NEW_RUN = "runs/${now:%Y-%m-%d_%H-%M-%S}"
 
 
@@ -166,8 +166,8 @@ TensorBoard curves, result.json and a picture of test episodes.""",
 Learns. It waits for workers, keeps what they played in a replay buffer, updates the agent
 and broadcasts its weights. Where to join stands in connection.json in the run folder.""",
         (
-            "tangram-master run_dir=runs/shared service.port=5555",
-            "tangram-master run_dir=runs/shared resume=auto service.port=5555",
+            "tangram-master run_dir=runs/shared service.bind=0.0.0.0 service.port=5555",
+            "tangram-master from_config=runs/shared/config.yaml run_dir=runs/shared resume=auto",
             "tangram-master from_config=runs/shared/config.yaml run_dir=runs/again seed=1",
         ),
         ("master.config:MasterConfig", "conf.commands:StoredConfig"),
@@ -178,12 +178,12 @@ and broadcasts its weights. Where to join stands in connection.json in the run f
         "tangram-worker",
         """\
 Plays. It joins a master, plays episodes with the newest weights and sends them. A run's
-folder, or a copy of its connection.json, is all that it needs. With an address alone its
-tokens, sim, reward, agent and net must be given and be the master's, or it is refused and
-told what differs.""",
+folder, or a copy of its connection.json, is all that it needs. An address alone is enough
+where the master has service.auth=off: then tokens, sim, reward, agent and net must be given
+and be the master's, or it is refused and told what differs.""",
         (
             "tangram-worker connect=runs/shared",
-            "tangram-worker connect=127.0.0.1:5555 tokens=square service.envs=64",
+            "tangram-worker connect=mine.json service.envs=64",
             "tangram-worker connect=runs/shared/connection.json role=evaluator "
             "service.eval_seconds=30",
         ),
@@ -198,7 +198,7 @@ their weights and the last checkpoint are. It asks the master, from wherever a w
 `watch tangram-status connect=...` asks every two seconds.""",
         (
             "tangram-status connect=runs/my_run",
-            "tangram-status connect=127.0.0.1:5555",
+            "tangram-status connect=mine.json",
             "tangram-status connect=runs/my_run/connection.json json=true",
         ),
         ("worker.config:StatusConfig",),

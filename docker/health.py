@@ -23,16 +23,23 @@ def main() -> str | None:
     files = [Path(name) for name in sys.argv[2:]] or list(RUNS.glob("*/connection.json"))
     if not files:
         return "no connection file: no master runs"
-    content = json.loads(max(files, key=lambda path: path.stat().st_mtime).read_text())
     try:
+        content = json.loads(max(files, key=lambda path: path.stat().st_mtime).read_text())
         if role == "master":
             port = urlsplit(content["http"]).port
             urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", None, TIMEOUT_S).close()
         else:
             place = urlsplit(content["endpoint"])
-            socket.create_connection((place.hostname, place.port), TIMEOUT_S).close()
+            if place.scheme == "ipc":
+                with socket.socket(socket.AF_UNIX) as end:
+                    end.settimeout(TIMEOUT_S)
+                    end.connect(place.path)
+            else:
+                socket.create_connection((place.hostname, place.port), TIMEOUT_S).close()
     except OSError as error:  # of urllib, too: 503 is one
         return str(error)
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        return f"no connection file of a run ({error!r})"
     return None
 
 

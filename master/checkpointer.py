@@ -9,15 +9,17 @@ the workers keep what they played, and wait.
 import logging
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from master.delivery import EpisodesArrived
 from master.divergence import DivergenceGuard
 from master.hub import Hub
-from master.journal import Journal, JournalError
-from master.rundir import Clock, Record, RunFolder
+from master.journal import Journal, JournalError, Place
+from master.rundir import Claim, Clock, FolderError, Record
 from master.trainer import LEARNER, Trainer
 from tangram_agent.checkpoints import (
     CHECKPOINTS,
@@ -37,8 +39,10 @@ from tangram_sim.errors import RunError
 
 MINUTE_S = 60.0
 RETRY_S = 1.0
-MAKE_ROOM = "make room there; until then nothing is acknowledged, and workers keep what they played"
-SEGMENT = "journal"
+WAIT = "until then nothing is acknowledged, and workers keep what they played"
+MAKE_ROOM = f"make room there; {WAIT}"
+AT_ONCE = "a new segment is begun and a checkpoint written at once, so that nothing is lost"
+JOURNAL = "journal"
 
 log = logging.getLogger(__name__)
 
@@ -53,7 +57,7 @@ class Checkpointer:
     def __init__(
         self,
         service: ServiceConfig,
-        folder: RunFolder,
+        claim: Claim,
         guard: DivergenceGuard,
         hub: Hub,
         journal: Journal,
@@ -63,17 +67,19 @@ class Checkpointer:
 
         Args:
             service: how often, and how many checkpoints are kept.
-            folder: of the run.
+            claim: of the run's folder.
             guard: of the trainer; only what is finite is saved.
             hub: its table of duplicates is saved with the rest.
             journal: open.
             clock: of the run's record.
         """
-        self._folder, self._guard, self._hub, self._journal = folder, guard, hub, journal
-        self._clock = clock
+        self._claim, self._guard, self._hub, self._journal = claim, guard, hub, journal
+        self._folder, self._clock = claim.run.checkpoints, clock
+        self._newest = next(reversed(list_checkpoints(self._folder)), None)
         self._keep_checkpoints = service.keep_checkpoints
         self._checkpoint = Every(service.checkpoint_minutes * MINUTE_S)
         self.failing = False
+        self._look = Every(max(service.journal_sync_seconds, RETRY_S))
         self._saved_s: float | None = None
         self._retry, self._tell = Every(RETRY_S), Every(MINUTE_S, at_once=True)
 
@@ -87,9 +93,10 @@ class Checkpointer:
         if self.failing and not self._retry.due():
             return False
         try:
+            self._keep_safe()
             self._journal.append(arrival)
-        except JournalError as error:
-            self._failed(f"{error}: {MAKE_ROOM}")
+        except (JournalError, FolderError, DiskError) as error:
+            self._failed(error)
             return False
         self._worked()
         return True
@@ -98,30 +105,58 @@ class Checkpointer:
         """Sync the journal and write a checkpoint when it is time; a full disk is told."""
         try:
             self._journal.tick()
+            if self._look.due():
+                self._keep_safe()
             if self._checkpoint.due():
                 self.save()
-        except (JournalError, DiskError) as error:
-            self._failed(str(error))
+        except (JournalError, FolderError, DiskError) as error:
+            self._failed(error)
 
     def save(self) -> Path:
         """Write a checkpoint, and drop the segments of the journal that nobody needs any more.
 
         Raises:
             RunError: the weights are not finite, one time too many.
-            DiskError: the disk does not take it; what was there before is as it was.
+            FolderError: the run folder is gone.
+            JournalError, DiskError: the disk does not take it; what was there before is as it was.
         """
         self._guard.check()
+        self._claim.check()
         rest = Restored(self._clock.read(), self._hub.state(), self._journal.rotate())
-        folder = self._folder.checkpoints
-        path = save_run(folder, self._guard.trainer, rest, self._keep_checkpoints)
-        self._journal.drop_before(first_needed(folder))
+        self._newest = save_run(self._folder, self._guard.trainer, rest, self._keep_checkpoints)
+        self._journal.exposed = False
+        self._journal.drop_before(first_needed(self._folder))
         self._saved_s = time.monotonic()
-        return path
+        return self._newest
 
-    def _failed(self, text: str) -> None:
+    def _keep_safe(self) -> None:
+        """Write a checkpoint at once where what was acknowledged is not on the disk any more.
+
+        Raises:
+            FolderError, JournalError, DiskError: as in `save`.
+        """
+        journal, known = self._journal, self._journal.exposed
+        gone = "was made anew" if self._claim.check() else ""
+        if not journal.in_place():
+            gone = gone or "has lost its newest segment of the journal"
+            journal.abandon()
+        if self._newest is not None and not self._newest.is_dir():
+            gone = gone or "has lost its newest checkpoint"
+        if gone and not known:
+            log.warning("run_dir %s %s: %s", self._claim.run.path, gone, AT_ONCE)
+        journal.exposed = journal.exposed or bool(gone)
+        if journal.exposed:
+            self.save()
+            try:
+                self._claim.run.write_again()
+            except RunError as error:  # who joins later misses it, nobody else
+                log.warning("%s", error)
+
+    def _failed(self, error: RunError) -> None:
         self.failing = True
         if self._tell.due():
-            log.warning(text)
+            remedies = {JournalError: f": {MAKE_ROOM}", FolderError: f"; {WAIT}"}
+            log.warning("%s%s", error, remedies.get(type(error), ""))
 
     def _worked(self) -> None:
         if self.failing:
@@ -136,18 +171,18 @@ class Restored:
     Attributes:
         record: what the run had been through.
         hub: the hub's table of what was inserted, so that nothing is inserted twice.
-        segment: of the journal, the first one that the checkpoint does not cover.
+        place: in the journal, None where it is not known.
     """
 
     record: Record
     hub: Mapping[str, Any]
-    segment: int = 1
+    place: Place | None = None
 
     @staticmethod
     def of(counters: Mapping[str, Any]) -> "Restored":
         """From the counters of a checkpoint; RunError if its record is not whole."""
         record = Record.of(counters["record"])
-        return Restored(record, dict(counters["hub"]), int(counters.get(SEGMENT, 1)))
+        return Restored(record, dict(counters["hub"]), _place(counters))
 
 
 def save_run(folder: Path, trainer: Trainer, rest: Restored, keep: int) -> Path:
@@ -163,8 +198,23 @@ def save_run(folder: Path, trainer: Trainer, rest: Restored, keep: int) -> Path:
         DiskError: the folder cannot be written; what was there before is as it was.
     """
     arrays, counters = trainer.state()
-    counters |= {"record": rest.record.state(), "hub": dict(rest.hub), SEGMENT: rest.segment}
+    counters |= {"record": rest.record.state(), "hub": dict(rest.hub)}
+    if rest.place is not None:
+        counters[JOURNAL] = asdict(rest.place)
     return save_checkpoint(folder, trainer.updates, arrays, counters, keep)
+
+
+def _place(counters: Mapping[str, Any]) -> Place | None:
+    """A checkpoint's place in the journal; RunError if it is none."""
+    found = counters.get(JOURNAL)
+    if found is None:
+        return None
+    try:
+        return msgspec.convert({"segment": found} if isinstance(found, int) else found, Place)
+    except msgspec.ValidationError as error:
+        raise RunError(
+            f"its place in the journal cannot be read ({error}): delete it to use the one before"
+        ) from None
 
 
 def first_needed(folder: Path) -> int:
@@ -172,9 +222,10 @@ def first_needed(folder: Path) -> int:
     needed = []
     for path in list_checkpoints(folder):
         try:
-            needed.append(int(load_checkpoint(path, stems=[]).counters.get(SEGMENT, 1)))
-        except (RunError, TypeError, ValueError):
+            place = _place(load_checkpoint(path, stems=[]).counters)
+        except RunError:
             continue  # it cannot be gone on from
+        needed.append((place or Place()).segment)
     return min(needed, default=1)
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Thread
+from typing import IO
 
 import psutil
 
@@ -61,7 +62,7 @@ class Child:
         """Start a process; `ended` is called with this, in another thread, when it ends."""
         self.next_start_s, self._started_s, self._frozen_s = None, time.monotonic(), 0.0
         self._lifeline = Lifeline()
-        output = None if self.log is None else self.log.open("ab")
+        output = self._output()
         try:
             self._process = subprocess.Popen(
                 [sys.executable, *self.arguments],
@@ -75,7 +76,7 @@ class Child:
             )
         finally:
             self._lifeline.started()
-            if output is not None:
+            if output is not None and not isinstance(output, int):
                 output.close()
         self._be_nice()
         Thread(target=self._wait, args=(self._process, ended), daemon=True).start()
@@ -137,6 +138,13 @@ class Child:
             return ""
         lines = self.log.read_text(encoding="utf-8", errors="replace").splitlines()
         return "\n".join(lines[-TAIL_LINES:])
+
+    def _output(self) -> IO[bytes] | int | None:
+        """Its log; nothing where the disk does not take one: that is no reason to be without it."""
+        try:
+            return None if self.log is None else self.log.open("ab")
+        except OSError:
+            return subprocess.DEVNULL
 
     def _wait(self, process: "subprocess.Popen[bytes]", ended: Callable[["Child"], None]) -> None:
         process.wait()

@@ -17,7 +17,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from tangram_agent.messages import RunStatus
+from tangram_agent.messages import OPEN, RunStatus
 from tangram_agent.outcome import duration, plural
 from tangram_agent.process import Every, formatter
 
@@ -198,6 +198,7 @@ def status_line(status: RunStatus) -> str:
         _scores(n),
         plural(n["players"], "worker"),
         status.texts["activity"],
+        OPEN if n.get("open_to_all") else "",
     ]
     return " | ".join(part for part in parts if part)
 
@@ -230,6 +231,8 @@ def status_panel(status: RunStatus, title: str, evaluator: str = "") -> Panel:
     text = f"{helpers} · {status.texts['activity']}"
     foot = Text(text, style="dim", no_wrap=True, overflow="ellipsis")
     body = Group(_bar(n), Text(), grid, Text(), foot)
+    if n.get("open_to_all"):
+        body.renderables.append(Text(OPEN, style="bold red"))
     if evaluator and not n["evaluators"]:
         body.renderables.append(Text(f"no evaluator: start one with {evaluator}", overflow="fold"))
     return Panel(body, title=title, title_align="left", width=PANEL_WIDTH, padding=(1, 2))

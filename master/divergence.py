@@ -107,7 +107,7 @@ class DivergenceGuard:
 
     def _write_batch(self) -> Path:
         batch = {} if self.trainer.batch is None else vars(self.trainer.batch)
-        write_whole(self._evidence, safetensors.numpy.save(batch))
+        write_whole(self._evidence, safetensors.numpy.save(batch), above=False)
         return self._evidence
 
 

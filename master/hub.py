@@ -16,10 +16,12 @@ from typing import Self
 
 from master.counters import Counters
 from master.delivery import Arrival, EpisodesArrived, ScoresArrived, Verdict
+from master.gate import AMPLE, Room
 from master.registry import Peer, RefusedError, Registry
 from master.security import Keys
 from master.sockets import Sockets
-from tangram_agent.arrays import EpisodeSpec, join_frames
+from tangram_agent.addresses import IPC
+from tangram_agent.arrays import MAX_FRAMES, EpisodeSpec, join_frames
 from tangram_agent.messages import (
     Ack,
     Alive,
@@ -81,6 +83,7 @@ class Hub:
         weights_endpoint: of the PUB socket, as bound.
         epoch: random id of this life of the master.
         counters: traffic and refusals by name.
+        open_to_all: whoever reaches the port may take part.
     """
 
     def __init__(
@@ -91,6 +94,7 @@ class Hub:
         silence_s: float = 30.0,
         keys: Keys | None = None,
         weights_port: int = 0,
+        room: Room = AMPLE,
     ) -> None:
         """Open the sockets.
 
@@ -101,19 +105,21 @@ class Hub:
             silence_s: after which a peer is forgotten.
             keys: for encrypted sockets, None for plain ones.
             weights_port: of the PUB, 0 for any.
+            room: for those who take part.
         """
         self.epoch = secrets.token_hex(8)
         self._info, self._silence_s = info, silence_s
-        self._registry = Registry(info.fingerprints, silence_s)
+        self._registry = Registry(info.fingerprints, silence_s, room)
         self._weights: list[bytes] | None = None
         self._version = -1
         self._stop_reason: str | None = None
         self._status: list[bytes] | None = None
         self._orders: dict[int, Go] = {}
         self.counters = Counters()
-        self._sockets = Sockets(bind, port, self.counters, keys, weights_port)
+        self._sockets = Sockets(bind, port, self.counters, keys, weights_port, room)
         self.endpoint = self._sockets.endpoint
         self.weights_endpoint = self._sockets.weights_endpoint
+        self.open_to_all = keys is None and not self.endpoint.startswith(IPC)
 
     def __enter__(self) -> Self:
         return self
@@ -213,6 +219,8 @@ class Hub:
         """Read a message and answer it; returns what is new."""
         message: ToMaster | BatchError
         try:
+            if len(frames) > 1 + MAX_FRAMES:
+                raise WireError(f"the message has {len(frames)} frames, at most {1 + MAX_FRAMES}")
             message = decode_from_worker(frames, self._info.spec)
         except ProtocolError as error:
             self._refuse(identity, "refused_protocol", Refused(str(error)))

@@ -1,14 +1,18 @@
 """The journal: every batch is on disk before it is acknowledged, so that a kill loses none.
 
-A folder of segments, `00000001.log` and on. A new one begins with each life of the master and with
-each checkpoint, and a checkpoint names the first segment that it does not cover. A restart inserts
-what stands in the segments from there on, in the order of the first time.
+A folder of segments, `00000001.log` and on. A checkpoint begins the next one, and names it as the
+first that it does not cover; a life of the master that goes on appends to the newest. See
+`recovery` for how they are read.
 
-A segment is a row of records: bytes of the body and its CRC-32 (two little-endian u32), then the
-body: a header behind its length (u16), declared and read like those of messages. The header of the
-first record says which run and task the segment is of. That of each other one says who sent the
-batch whose frames follow, joined, just as they came: with their own checksum, which is checked
-again when they are read.
+A segment is a row of records, each a head and a body. The head: a magic, the length of the body,
+the number of the record, and a CRC-32 each of the body and of the head itself. Batches are numbered
+from 1 on, over all segments and lives of a run; a title carries the number of the batch before it.
+The head stays as it is in later formats.
+
+The body: a header behind its length (u16), declared and read like those of messages. The header of
+a title says which run and task what follows is of; each life begins with one, and each segment.
+That of a batch says who sent the batch whose frames follow, joined, just as they came: with their
+own checksum, which is checked again when they are read.
 
 A record goes to the operating system at once, so that it outlives the process; it is synced to the
 disk at an interval, so a machine that loses power may lose what came since.
@@ -17,29 +21,43 @@ disk at an interval, so a machine that loses power may lose what came since.
 import os
 import struct
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, ClassVar
+
+import msgspec
 
 from master.delivery import EpisodesArrived
-from tangram_agent.arrays import MAX_BATCH_BYTES, MAX_FRAMES, EpisodeSpec, join_frames, split_frames
-from tangram_agent.files import sync_folder
-from tangram_agent.messages import Count, EpisodeBatch, Id, Index, Number, Role, decode_from_worker
+from tangram_agent.arrays import join_frames
+from tangram_agent.files import is_same, make_folders, sync_folder
+from tangram_agent.messages import Count, Id, Index, Number, Role
 from tangram_agent.process import Every
-from tangram_agent.schema import MAX_HEADER, Plain, ProtocolError, opened, read
-from tangram_sim.errors import RunError, WireError
+from tangram_agent.schema import MAX_COUNT, Plain
+from tangram_sim.errors import RunError
 
-FORMAT = 2
+FORMAT = 3
 SUFFIX = ".log"
 DIGITS = 8
-HEAD = struct.Struct("<II")
+MAGIC = b"\xf1TJ\n"
+HEAD = struct.Struct("<4sIQII")
 LENGTH = struct.Struct("<H")
-MAX_BODY = LENGTH.size + MAX_HEADER + MAX_BATCH_BYTES + MAX_HEADER + 4 * MAX_FRAMES
-Header = Mapping[str, Any]
-ANOTHER = "choose another run_dir, or delete its folder journal to go on without it"
+CRC = struct.Struct("<I")
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a checkpoint stands in the journal.
+
+    Attributes:
+        segment: the first one that it does not cover.
+        number: of the last batch before that.
+    """
+
+    segment: Annotated[int, msgspec.Meta(ge=1, le=MAX_COUNT)] = 1
+    number: Annotated[int, msgspec.Meta(ge=0, le=MAX_COUNT)] = 0
 
 
 @dataclass(frozen=True)
@@ -77,22 +95,36 @@ class Journal:
 
     Attributes:
         segment: number of the segment that the next batch goes to.
+        number: of the last batch.
+        exposed: what it took since the last checkpoint may be gone: the next one is due at once.
     """
 
-    def __init__(self, folder: Path, run_id: str, task: str, sync_s: float) -> None:
-        """Nothing is written before the first batch.
+    def __init__(
+        self, folder: Path, run_id: str, task: str, sync_s: float, after: Place | None = None
+    ) -> None:
+        """Nothing is written before the first batch, unless a life before this one has.
 
         Args:
-            folder: of the segments, made if it is missing.
+            folder: of the segments, made if it is missing; what it is in must be there.
             run_id: of the run.
             task: digest of what the arrays belong to.
             sync_s: seconds between two syncs, 0 to sync each batch.
+            after: segment that a checkpoint names, and the number of the last batch.
+
+        Raises:
+            JournalError: the segment cannot be gone on with.
         """
         self._folder, self._title = folder, Title(FORMAT, run_id, task)
         self._file: FileIO | None = None
         self._good = 0  # bytes of whole records
+        self._bare = True  # holds nothing but its title
         self._dirty, self._sync = False, Every(sync_s)
-        self.segment = max(segments(folder), default=0) + 1
+        self.exposed = False
+        known = after or Place()
+        self.segment = max([known.segment, *segments(folder)])
+        self.number = known.number
+        if segment_path(folder, self.segment).exists():
+            self._begin()
 
     def append(self, arrival: EpisodesArrived) -> None:
         """Hand a batch to the operating system.
@@ -102,12 +134,10 @@ class Journal:
                 it may have been written after all, a restart drops what it has twice.
         """
         entry = Entry(arrival.role, arrival.index, arrival.incarnation)
-        try:
-            self._write(self._file or self._begin(), _record(entry, arrival.frames))
-        except OSError as error:
-            self._take_back()
-            raise self._broken(error) from None
-        self._dirty = True
+        file = self._file or self._begin()
+        self._write(file, _record(entry, self.number + 1, arrival.frames))
+        self.number += 1
+        self._bare, self._dirty = False, True
         self.tick()
 
     def tick(self) -> None:
@@ -116,26 +146,48 @@ class Journal:
             self.sync()
 
     def sync(self) -> None:
-        """Wait until the disk has it all; JournalError if it does not take it."""
+        """Wait until the disk has it all.
+
+        Raises:
+            JournalError: it does not take it. Nobody knows what it has then, and syncing again
+                would not tell: what follows goes to a new segment.
+        """
         if self._file is not None and self._dirty:
             try:
                 os.fsync(self._file.fileno())
             except OSError as error:
+                self.abandon()
                 raise self._broken(error) from None
             self._dirty = False
 
-    def rotate(self) -> int:
-        """Begin a new segment with the next batch; returns its number."""
-        if self._file is not None:
+    def in_place(self) -> bool:
+        """Whether the open segment still is what lies under its name."""
+        path = segment_path(self._folder, self.segment)
+        return self._file is None or is_same(self._file.fileno(), path)
+
+    def abandon(self) -> None:
+        """Leave the open segment: what it holds may be gone."""
+        self._drop()
+        self.segment += 1
+        self.exposed = True
+
+    def rotate(self) -> Place:
+        """Begin a new segment, unless this one is new; JournalError as in `append`."""
+        if self._file is not None and not self._bare:
             self.close()
             self.segment += 1
-        return self.segment
+        if self._file is None:
+            self._begin()
+        return Place(self.segment, self.number)
 
     def drop_before(self, segment: int) -> None:
-        """Delete the segments below a number, which checkpoints cover."""
-        for number, path in segments(self._folder).items():
-            if number < min(segment, self.segment):
-                path.unlink()
+        """Delete the segments below a number, which checkpoints cover; JournalError if it fails."""
+        try:
+            for number, path in segments(self._folder).items():
+                if number < min(segment, self.segment):
+                    path.unlink(missing_ok=True)
+        except OSError as error:
+            raise self._broken(error) from None
 
     def close(self) -> None:
         """Sync, and close the file."""
@@ -145,40 +197,53 @@ class Journal:
             self._file = None
 
     def _begin(self) -> FileIO:
-        self._folder.mkdir(parents=True, exist_ok=True)
-        # Not "x": a segment that could not be begun for want of room may lie there.
-        self._file = FileIO(segment_path(self._folder, self.segment), "w")
-        # Bytes that are synced into a file without a name would be lost with the power.
-        sync_folder(self._folder)
-        self._good = 0
-        self._write(self._file, _record(self._title, []))
-        return self._file
+        """Open the segment, and write its title for good: a checkpoint may name it."""
+        try:
+            make_folders(self._folder, above=False)
+            # What lies there is kept: of a life before, or of a title without room.
+            file = FileIO(segment_path(self._folder, self.segment), "a")
+            self._good = os.fstat(file.fileno()).st_size
+        except OSError as error:
+            raise self._broken(error) from None
+        self._file, self._bare = file, self._good == 0
+        try:
+            # Bytes that are synced into a file without a name would be lost with the power.
+            sync_folder(self._folder)
+            self._write(file, _record(self._title, self.number, []))
+            os.fsync(file.fileno())
+        except OSError as error:
+            self._drop()
+            raise self._broken(error) from None
+        except JournalError:
+            self._drop()
+            raise
+        return file
 
     def _write(self, file: FileIO, record: bytes) -> None:
+        """Append a record; JournalError if it does not fit, and what was written is taken back."""
         left = memoryview(record)
-        while left:  # a disk that fills up takes a part of it
-            left = left[file.write(left) or 0 :]
+        try:
+            while left:  # a disk that fills up takes a part of it
+                left = left[file.write(left) or 0 :]
+        except OSError as error:
+            self._take_back(file)
+            raise self._broken(error) from None
         self._good += len(record)
 
-    def _take_back(self) -> None:
-        """Cut off a record that was written in part; where that fails, too, go on in a new file."""
-        if self._file is None:
-            return
+    def _take_back(self, file: FileIO) -> None:
+        """Cut off what was written in part; where that fails, too, go on in a new file."""
         try:
-            os.ftruncate(self._file.fileno(), self._good)
-            self._file.seek(self._good)
+            os.ftruncate(file.fileno(), self._good)
         except OSError:
             self._drop()
-            self.segment += 1  # a record that is cut short ends the one before
-        else:
-            if not self._good:
-                self._drop()
+            self.segment += 1
 
     def _drop(self) -> None:
         if self._file is not None:
             with suppress(OSError):
                 self._file.close()
             self._file = None
+        self._dirty = False
 
     def _broken(self, error: OSError) -> JournalError:
         return JournalError(f"the journal in {self._folder} cannot be written ({error.strerror})")
@@ -195,153 +260,12 @@ def segment_path(folder: Path, number: int) -> Path:
     return folder / f"{number:0{DIGITS}d}{SUFFIX}"
 
 
-def _record(header: Title | Entry, frames: Sequence[bytes]) -> bytes:
+def _record(header: Title | Entry, number: int, frames: Sequence[bytes]) -> bytes:
     [packed] = header.encode()
     body = b"".join([LENGTH.pack(len(packed)), packed, join_frames(frames)])
-    return HEAD.pack(len(body), zlib.crc32(body)) + body
+    return _head(len(body), number, zlib.crc32(body)) + body
 
 
-# Reading it back
-
-
-def journal_run_id(folder: Path) -> str | None:
-    """The run that a journal is of; None where there is no journal, or nothing whole in it.
-
-    Raises:
-        RunError: it is of another format.
-    """
-    for path in segments(folder).values():
-        for header, _ in _records(path, lambda _: None):
-            return _title(path, header)[0]
-    return None
-
-
-def check_journal(folder: Path, task: str) -> None:
-    """Raise RunError if there is a journal of another task or format."""
-    for path in segments(folder).values():
-        for header, _ in _records(path, lambda _: None):
-            if _title(path, header)[1] != task:
-                raise _of_another(path)
-            break
-
-
-def _of_another(path: Path) -> RunError:
-    return RunError(f"{path} is of another run, task or version of tangram-rl: {ANOTHER}")
-
-
-def read_journal(
-    folder: Path,
-    first: int,
-    run_id: str,
-    task: str,
-    spec: EpisodeSpec,
-    warn: Callable[[str], None],
-) -> Iterator[EpisodesArrived]:
-    """The batches from a segment on, in the order in which they were added.
-
-    Args:
-        folder: of the segments.
-        first: number of the segment to begin with.
-        run_id: that the segments must be of.
-        task: digest that they must carry.
-        spec: of the arrays.
-        warn: takes lines for the user: a record that was cut short, a segment that is missing.
-
-    Raises:
-        RunError: another run, task or format.
-    """
-    expected = first
-    for number, path in segments(folder).items():
-        if number < first:
-            continue
-        if number > expected:
-            warn(_missing(segment_path(folder, expected), number - expected))
-        expected = number + 1
-        yield from _segment(path, run_id, task, spec, warn)
-
-
-def _missing(path: Path, count: int) -> str:
-    more = f" and the {count - 1:,} after it are" if count > 1 else " is"
-    return f"{path}{more} missing: the batches that were in there are lost"
-
-
-def _segment(
-    path: Path, run_id: str, task: str, spec: EpisodeSpec, warn: Callable[[str], None]
-) -> Iterator[EpisodesArrived]:
-    records = _records(path, warn)
-    for header, _ in records:
-        if _title(path, header) != (run_id, task):
-            raise _of_another(path)
-        break
-    for header, frames in records:
-        try:
-            yield _batch(header, frames, spec)
-        except WireError as error:
-            raise _unreadable(path, error) from None
-
-
-def _records(path: Path, warn: Callable[[str], None]) -> Iterator[tuple[Header, bytes]]:
-    """Header and joined frames of each record, up to one that is not whole."""
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        start = 0
-        while start < size:
-            head = file.read(HEAD.size)
-            length, checksum = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
-            body = file.read(min(length, MAX_BODY))
-            if len(body) != length or length < LENGTH.size or zlib.crc32(body) != checksum:
-                whole = len(head) == HEAD.size and start + HEAD.size + length <= size
-                warn(_damaged(path, start, size) if whole else _cut_short(path, size - start))
-                return
-            start = file.tell()
-            yield _parts(path, body)
-
-
-def _cut_short(path: Path, size: int) -> str:
-    return (
-        f"the last record of {path} is cut short ({size:,} bytes), as a kill leaves it: dropped, "
-        "it was not acknowledged"
-    )
-
-
-def _damaged(path: Path, start: int, size: int) -> str:
-    return (
-        f"{path} is damaged at byte {start:,}: the {size - start:,} bytes from there on "
-        "are lost, with the batches in them"
-    )
-
-
-def _parts(path: Path, body: bytes) -> tuple[Header, bytes]:
-    (length,) = LENGTH.unpack_from(body)
-    split = LENGTH.size + length
-    try:
-        return opened([body[LENGTH.size : split]]), body[split:]
-    except ProtocolError:
-        raise RunError(
-            f"{path} was written by another version of tangram-rl: go on with that, or {ANOTHER}"
-        ) from None
-    except WireError as error:
-        raise _unreadable(path, error) from None
-
-
-def _unreadable(path: Path, error: WireError) -> RunError:
-    return RunError(f"{path} holds what cannot be read ({error}): {ANOTHER}")
-
-
-def _title(path: Path, header: Header) -> tuple[str, str]:
-    """Run id and task of a segment."""
-    if header["kind"] != Title.kind or header.get("format") != FORMAT:
-        raise RunError(f"{path} is no segment of format {FORMAT}: {ANOTHER}")
-    try:
-        title = read(Title, header)
-    except WireError as error:
-        raise RunError(f"{path} is no journal ({error}): {ANOTHER}") from None
-    return title.run_id, title.task
-
-
-def _batch(header: Header, data: bytes, spec: EpisodeSpec) -> EpisodesArrived:
-    entry, frames = read(Entry, header), split_frames(data)
-    batch = decode_from_worker(frames, spec)
-    if not isinstance(batch, EpisodeBatch):
-        raise WireError(f"a message of kind {batch.kind!r}")
-    return EpisodesArrived(entry.role, entry.index, entry.incarnation, batch, frames)
+def _head(length: int, number: int, checksum: int) -> bytes:
+    head = HEAD.pack(MAGIC, length, number, checksum, 0)[: -CRC.size]
+    return head + CRC.pack(zlib.crc32(head))

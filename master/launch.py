@@ -14,7 +14,8 @@ from master.config import MasterConfig
 from master.console import logging_to, sturdy_console
 from master.result import show_finished
 from master.resumable import check_resumable
-from master.rundir import RunFolder
+from master.rundir import RunFolder, code_of
+from master.security import listening_place
 from master.signals import SAME_WISH_S, handling, show_cursor, stop_notice
 from tangram_agent.process import Every, watch_parent
 
@@ -48,6 +49,7 @@ def run_training(config: MasterConfig, resolved: Mapping[str, Any]) -> int:
     folder.prepare(config.resume)
     with folder.lock():
         check_resumable(folder, resolved)
+        listening_place(config.service.bind, folder.path)
         finished = folder.has_finished(config)
         if not finished:
             folder.logs.mkdir(exist_ok=True)
@@ -55,10 +57,11 @@ def run_training(config: MasterConfig, resolved: Mapping[str, Any]) -> int:
             # Left by a master that was killed; workers must wait for the new one.
             folder.connection.unlink(missing_ok=True)
     console, form = sturdy_console(sys.stderr), config.service.log_format
-    launcher = Launcher(config, folder)
+    code = code_of(resolved)
+    launcher = Launcher(config, folder, code)
     with logging_to(console, form, "launcher"), launcher.signals():
         if finished:
-            show_finished(folder, form)
+            show_finished(folder, form, code)
             return 0
         watch_parent(grace_s=STOP_S + 2.0 * LEAVE_S)  # of an experiment that started it
         try:
@@ -70,13 +73,14 @@ def run_training(config: MasterConfig, resolved: Mapping[str, Any]) -> int:
 class Launcher:
     """Starts the children, restarts those that fail, and ends them in order."""
 
-    def __init__(self, config: MasterConfig, folder: RunFolder) -> None:
+    def __init__(self, config: MasterConfig, folder: RunFolder, code: Mapping[str, str]) -> None:
         self._folder = folder
         self._events: SimpleQueue[Child | signal.Signals] = SimpleQueue()
         self._master = Child("master", master_arguments(config, folder))
         self._players = [worker_child(folder, "player", i) for i in range(config.workers)]
         self._evaluator = worker_child(folder, "evaluator", -1)
         for child in (self._master, *self._workers):
+            child.arguments = [*child.arguments, *(override(*own) for own in code.items())]
             child.patience_s = config.service.watchdog_seconds
         self._look = Every(IDLE_S)
         self._stop_s: float | None = None

@@ -3,6 +3,7 @@
 import logging
 import time
 from collections import deque
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 from master.budget import Budget
@@ -183,7 +184,8 @@ class Loop:
         """Tell all peers to end, and wait a moment for them to leave."""
         self._dismissed = True
         # First: it would bring new ones, and a launcher restarts who ends while it is there.
-        self.folder.connection.unlink(missing_ok=True)
+        with suppress(OSError):  # the disk has failed
+            self.folder.connection.unlink()
         until_s = time.monotonic() + LEAVE_S
         self.hub.stop(reason)
         while self.hub.peers and time.monotonic() < until_s:

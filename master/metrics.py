@@ -8,6 +8,7 @@ without TensorBoard `curve.jsonl` has every evaluation, one JSON object a line.
 
 import json
 import logging
+import threading
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -20,7 +21,7 @@ import yaml
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
-from tangram_agent.files import write_whole
+from tangram_agent.files import make_folders, write_whole
 from tangram_agent.process import Every
 from tangram_sim.arrays import Pixels
 
@@ -73,9 +74,10 @@ class Metrics:
                 process are hidden or dropped, since they happen again.
         """
         self._folder, self._curve = folder, curve
+        self._hook, threading.excepthook = threading.excepthook, self._thread_failed
         kept = [line for line in _lines(curve) if line["updates"] <= updates]
         if curve.exists():
-            write_whole(curve, "".join(map(_text, kept)).encode())
+            write_whole(curve, "".join(map(_text, kept)).encode(), above=False)
         self._broken = False
         self._again = Every(RETRY_S)
         purge = updates + 1 if updates else None
@@ -143,8 +145,16 @@ class Metrics:
     def close(self) -> None:
         """Write what is left."""
         self._try(self._writer.close)
+        threading.excepthook = self._hook
+
+    def _thread_failed(self, failure: threading.ExceptHookArgs) -> None:
+        """TensorBoard's thread fails where the disk does, and its next write here tells it."""
+        ours = type(failure.thread).__module__.startswith("tensorboard.")
+        if not (ours and isinstance(failure.exc_value, OSError)):
+            self._hook(failure)
 
     def _open(self, purge: int | None) -> None:
+        make_folders(self._folder, above=False)  # a run folder that was deleted stays so
         self._writer = SummaryWriter(str(self._folder), purge_step=purge, flush_secs=FLUSH_S)
 
     def _by_others(

@@ -6,18 +6,22 @@ the master has lost it (a disk without power): then it gets the next one, too. N
 that was never given.
 """
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from master.delivery import EpisodesArrived, Ledger
+from master.gate import AMPLE, Room
 from tangram_agent.messages import MAX_INDEX, ROLES, Hello, Refused, Stop
 from tangram_agent.schema import MAX_COUNT
 from tangram_sim.errors import RunError, TangramError
 
-MAX_PEERS = 4096
+CROWDED = 0.9  # share of the room from which on there is a warning
 # One that asks for weights again before it has shown that it got them waits so long, then twice.
 WEIGHTS_AGAIN_S = 10.0
 Key = tuple[str, int]
+
+log = logging.getLogger(__name__)
 
 
 class RefusedError(TangramError):
@@ -104,13 +108,15 @@ class Registry:
         lost_batches: numbers that a checkpoint had not seen and a worker has no more.
     """
 
-    def __init__(self, fingerprints: Mapping[str, str], grace_s: float) -> None:
+    def __init__(self, fingerprints: Mapping[str, str], grace_s: float, room: Room = AMPLE) -> None:
         """Nobody takes part yet.
 
         Args:
             fingerprints: section of the settings -> digest; a process must have the same.
             grace_s: after a restart, how long indices wait for their workers.
+            room: for peers.
         """
+        self._room, self._crowded = room, False
         self.lost_batches = 0
         self._fingerprints = fingerprints
         self._grace_s, self._reserved_until = grace_s, 0.0
@@ -154,8 +160,8 @@ class Registry:
             same.identity, same.last_seen, same.weights = identity, now, (-1, 0.0)
             self._by_identity[identity] = same
             return same, None
-        if len(self._by_key) >= MAX_PEERS:
-            reason = f"{MAX_PEERS} processes take part already, the most there can be"
+        if len(self._by_key) >= self._room.peers:
+            reason = f"{self._room.peers} processes take part already, the most {self._room.bound}"
             raise RefusedError("refused_full", Refused(reason))
         stranger = self._by_identity.get(identity)
         if stranger is not None:
@@ -168,6 +174,7 @@ class Registry:
             self.leave(older)
         peer = Peer(hello.role, index, ledger.incarnation, hello.process, identity, now, ledger)
         self._by_identity[identity] = self._by_key[key] = peer
+        self._warn_early()
         return peer, older
 
     def leave(self, peer: Peer) -> None:
@@ -210,6 +217,15 @@ class Registry:
         ledger.consume(sequence)
         self._reserved_until = now + self._grace_s
         return True
+
+    def _warn_early(self) -> None:
+        """Once, before anybody must be refused."""
+        taken, most = len(self._by_key), self._room.peers
+        if not self._crowded and taken >= CROWDED * most:
+            self._crowded = True
+            fields = {"event": "crowded", "count": taken}
+            text = "%d processes take part, of at most %d %s"
+            log.warning(text, taken, most, self._room.bound, extra=fields)
 
     def _check_settings(self, hello: Hello) -> None:
         odd = differing(self._fingerprints, hello.fingerprints)

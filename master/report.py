@@ -5,6 +5,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from master.metrics import Means, Metrics
 from master.registry import Peer
 from master.rundir import Clock, Record
 from master.trainer import Trainer
+from tangram_agent.files import write_whole
 from tangram_agent.messages import WORKER_COLUMNS, RunStatus, Scores
 from tangram_agent.process import Every
 from tangram_agent.setup import Setup
@@ -106,6 +108,7 @@ class StatusCollector:
             "queue": queue,
             "checkpoint_age_s": self._checkpointer.age_s,
             "disk_failing": self._checkpointer.failing,
+            "open_to_all": self._hub.open_to_all,
             "scored_updates": record.scored_version,
             **{TEST + name: value for name, value in record.scores.items()},
             **self.played,
@@ -279,9 +282,15 @@ class Reporter:
         self._metrics.hyperparameters(result)
 
     def draw(self, path: Path) -> None:
-        """Draw the test episodes of the last evaluation, where there is one with pictures."""
+        """Draw the test episodes of the last evaluation, where there is one with pictures.
+
+        Raises:
+            RunError: the disk does not take it.
+        """
         if self._latest is not None and len(self._latest.ends):
-            scores_picture(self._latest, self._trainer.setup, PICTURE_PIXELS).save(path)
+            drawn = BytesIO()
+            scores_picture(self._latest, self._trainer.setup, PICTURE_PIXELS).save(drawn, "PNG")
+            write_whole(path, drawn.getvalue(), above=False)
 
     def _now(self) -> Sent:
         return Sent(time.monotonic(), self._trainer.episodes, self._record.train_s)

@@ -19,11 +19,11 @@ from rich.table import Table
 from master.children import override
 from master.config import MasterConfig
 from master.console import TEST, sturdy_console
-from master.rundir import RunFolder
+from master.rundir import RunFolder, code_of
 from tangram_agent.messages import RunStatus
 from tangram_agent.outcome import outcome_rows, read_outcome
 
-PLAIN = re.compile(r"\w+=[\w./-]+")
+PLAIN = re.compile(r"[\w.]+=[\w./:-]+")
 ROOT = Path(__file__).resolve().parent.parent
 SCORES = (
     "mean_reward",
@@ -76,7 +76,11 @@ def make_result(
 
 
 def show_result(
-    console: Console, folder: RunFolder, result: Mapping[str, Any], go_on: str = ""
+    console: Console,
+    folder: RunFolder,
+    result: Mapping[str, Any],
+    code: Mapping[str, str],
+    go_on: str = "",
 ) -> None:
     """The final table, where everything lies, and what to do with it.
 
@@ -84,6 +88,7 @@ def show_result(
         console: where to.
         folder: of the run.
         result: content of its result.json.
+        code: see `code_of`.
         go_on: command that goes on with it; shown where a signal has ended it.
     """
     table = Table(show_header=False, box=None, padding=(0, 2))
@@ -98,7 +103,7 @@ def show_result(
     if folder.picture.exists():
         paths.append(("picture", str(folder.picture)))
     curves, where = _installed("tensorboard"), shlex.quote(str(folder.tensorboard))
-    watch = {"run_dir": folder.path, "out": "play.gif"}
+    watch = {"run_dir": folder.path, "out": "play.gif", **code}
     paths += [
         ("curves", f"{curves} --logdir {where}"),
         ("watch it play", command_line("tangram-play", watch)),
@@ -110,7 +115,7 @@ def show_result(
         console.print(f"  {name:<15} {text}", soft_wrap=True, markup=False, highlight=False)
 
 
-def show_finished(folder: RunFolder, log_format: str) -> None:
+def show_finished(folder: RunFolder, log_format: str, code: Mapping[str, str]) -> None:
     """The result of a run that was to go on, and has nothing left to do."""
     result = read_outcome(folder.result)
     said = f"{folder.path} has finished ({result['ended_by']}): nothing is changed, a higher "
@@ -120,7 +125,7 @@ def show_finished(folder: RunFolder, log_format: str) -> None:
         return
     console = sturdy_console(sys.stdout)
     console.print(said, soft_wrap=True, markup=False, highlight=False)
-    show_result(console, folder, result)
+    show_result(console, folder, result, code)
 
 
 def command_line(name: str, settings: Mapping[str, object]) -> str:
@@ -140,6 +145,7 @@ def go_on_command(folder: RunFolder, launched: bool) -> str:
         "from_config": folder.config,
         "resume": "auto",
         **{name: given[name] for name in names if given[name] != getattr(MasterConfig, name)},
+        **code_of(given),
     }
     return command_line("tangram-train" if launched else "tangram-master", settings)
 

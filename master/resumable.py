@@ -4,7 +4,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from master.journal import check_journal, segments
+from master.journal import segments
+from master.recovery import check_journal
 from master.rundir import RunFolder
 from tangram_agent.checkpoints import (
     CHECKPOINTS,

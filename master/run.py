@@ -3,7 +3,7 @@
 import logging
 import socket
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
@@ -16,23 +16,25 @@ from master.config import MasterConfig
 from master.console import Progress, logging_to, make_progress, sturdy_console
 from master.delivery import EpisodesArrived
 from master.divergence import DivergenceGuard
+from master.gate import Room
 from master.health import OFF, Health
 from master.hub import Hub, WelcomeInfo
-from master.journal import Journal, journal_run_id, read_journal
+from master.journal import Journal, Place
 from master.lockstep import Lockstep
 from master.loop import Loop
 from master.metrics import Metrics
+from master.recovery import Reader, journal_run_id
 from master.report import Reporter, StatusCollector
 from master.result import command_line, go_on_command, make_result, show_finished, show_result
 from master.resumable import check_resumable
-from master.rundir import Clock, Record, RunFolder
-from master.security import Keys, is_loopback, needs_keys, run_keys
+from master.rundir import Claim, Clock, Record, RunFolder, code_of
+from master.security import Keys, listening_place, needs_keys, run_keys
 from master.signals import StopSignals
 from master.trainer import Trainer, choose_device
-from tangram_agent.addresses import reachable, with_host
+from tangram_agent.addresses import LOCAL, reachable, with_host
 from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.config import ServiceConfig
-from tangram_agent.messages import WINDOW
+from tangram_agent.messages import OPEN, WINDOW
 from tangram_agent.process import Watchdog, watch_parent
 from tangram_agent.setup import Setup
 
@@ -41,10 +43,6 @@ GRACE_S = 30.0
 UNBOUNDED = (
     "max_hours, max_episodes and max_updates are all 0: only Ctrl-C or SIGTERM ends this run, and "
     "learning rates do not decay"
-)
-PLAIN = (
-    "service.security=plain: whoever reaches this address can read what is sent, and send what he "
-    "likes"
 )
 
 log = logging.getLogger(__name__)
@@ -71,24 +69,26 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
         opened.enter_context(logging_to(console, form))
         launched = watch_parent(_tell_news, GRACE_S)
         torch.set_num_threads(config.service.threads)
+        Room.here()  # before anything is written
         folder = RunFolder(config.run_dir)
         folder.prepare(config.resume)
-        opened.enter_context(folder.lock())
+        claim = opened.enter_context(folder.lock())
         signals = opened.enter_context(StopSignals())
         watchdog = opened.enter_context(Watchdog(config.service.watchdog_seconds))
-        join, evaluator = {"connect": folder.path}, ""
+        code, evaluator = code_of(resolved), ""
+        join = {"connect": folder.path, **code}
         if not launched:  # the launcher did it, with settings of its own
             check_resumable(folder, resolved)
+            listening_place(config.service.bind, folder.path)
             if folder.has_finished(config):
-                show_finished(folder, form)
+                show_finished(folder, form, code)
                 return 0
             folder.write_config(resolved)
             evaluator = command_line("tangram-worker", {**join, "role": "evaluator"})
         go_on = go_on_command(folder, launched)
-        title = f"tangram · {folder.path.name}"
-        progress = make_progress(console, title, form, evaluator)
+        progress = make_progress(console, f"tangram · {folder.path.name}", form, evaluator)
         opened.enter_context(closing(progress))
-        loop, connection = open_run(config, setup, progress, signals, watchdog, opened)
+        loop, connection = open_run(config, setup, claim, progress, signals, watchdog, opened)
         loop.reporter.settings(resolved)
         folder.write_connection(connection)
         if not launched:
@@ -102,7 +102,7 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
         if form == "json":
             log.info("the run has ended (%s)", reason, extra={"event": "result", **result})
     if form != "json":
-        show_result(console, folder, result, go_on)
+        show_result(console, folder, result, code, go_on)
     return 0
 
 
@@ -114,6 +114,7 @@ def _tell_news(line: str) -> None:
 def open_run(
     config: MasterConfig,
     setup: Setup,
+    claim: Claim,
     progress: Progress,
     signals: StopSignals,
     watchdog: Watchdog,
@@ -122,8 +123,9 @@ def open_run(
     """Make all that a run consists of, from the newest checkpoint where it is to be resumed.
 
     Args:
-        config: the master's settings; its folder is prepared and locked.
+        config: the master's settings.
         setup: the task and the agent.
+        claim: of the run's folder, which is prepared.
         progress: for the user.
         signals: that end the run.
         watchdog: hears of every batch of the journal, which may take long to read.
@@ -135,7 +137,7 @@ def open_run(
     Raises:
         TangramError: the port or a checkpoint cannot be used, or there is no such device.
     """
-    service, folder = config.service, RunFolder(config.run_dir)
+    service, folder = config.service, claim.run
     trainer = Trainer(setup, config.seed, choose_device(service.device))
     found = _restore(config, folder, trainer)
     rest = found or Restored(_new_record(folder.journal), {})
@@ -150,16 +152,21 @@ def open_run(
     health = None
     if service.http_port != OFF:
         health = opened.enter_context(closing(Health(service.http_bind, service.http_port)))
-    journal = opened.enter_context(closing(_open_journal(service, setup, folder, run_id)))
     if found is not None:
         hub.load_state(rest.hub)
-    batches = _read_journal(setup, folder, rest)
+    # What was acknowledged after the checkpoint.
+    digest, spec = setup.task_digest(), EpisodeSpec.of(setup)
+    batches = Reader(folder.journal, rest.place, run_id, digest, spec, log.warning)
     _insert_again(batches, hub, guard, budget, lockstep, watchdog)
+    after = Place((rest.place or Place()).segment, batches.number)
+    sync_s = service.journal_sync_seconds
+    journal = Journal(folder.journal, run_id, digest, sync_s, after)
+    opened.enter_context(closing(journal))
     if config.resume == "auto" and (found or trainer.episodes):
         log.info("goes on after %s updates", f"{trainer.updates:,}")
     elif config.resume == "auto":
         log.info("a new run begins")
-    checkpointer = Checkpointer(service, folder, guard, hub, journal, clock)
+    checkpointer = Checkpointer(service, claim, guard, hub, journal, clock)
     metrics = Metrics(folder.tensorboard, folder.curve, trainer.updates)
     opened.enter_context(closing(metrics))
     status = StatusCollector(folder.path.name, guard, hub, budget, clock, checkpointer)
@@ -201,6 +208,7 @@ def connection_of(
         "endpoint": announced(hub.endpoint, host),
         "weights_endpoint": announced(hub.weights_endpoint, host),
         "run_id": run_id,
+        "machine": socket.gethostname(),
     }
     if http is not None:
         where["http"] = reachable(http, host)
@@ -223,28 +231,17 @@ def _open_hub(config: MasterConfig, setup: Setup, run_id: str, keys: Keys | None
         window=WINDOW,
         lockstep=service.mode == "lockstep",
     )
-    place, patience_s = (service.bind, service.port), service.silence_seconds
-    return Hub(*place, info, patience_s, keys, service.weights_port)
-
-
-def _open_journal(service: ServiceConfig, setup: Setup, folder: RunFolder, run_id: str) -> Journal:
-    sync_s = service.journal_sync_seconds
-    return Journal(folder.journal, run_id, setup.task_digest(), sync_s)
-
-
-def _read_journal(setup: Setup, folder: RunFolder, rest: Restored) -> Iterator[EpisodesArrived]:
-    """What was acknowledged after the checkpoint."""
-    digest, spec = setup.task_digest(), EpisodeSpec.of(setup)
-    run_id = rest.record.run_id
-    return read_journal(folder.journal, rest.segment, run_id, digest, spec, log.warning)
+    bind = listening_place(service.bind, Path(config.run_dir))
+    patience_s = service.silence_seconds
+    return Hub(bind, service.port, info, patience_s, keys, service.weights_port, Room.here())
 
 
 def _keys(service: ServiceConfig, folder: RunFolder) -> Keys | None:
     """Keys where the sockets must be encrypted."""
-    if needs_keys(service.bind, service.security):
+    if needs_keys(service):
         return run_keys(folder.keys)
-    if not is_loopback(service.bind):
-        log.warning(PLAIN)
+    if service.bind != LOCAL:
+        log.warning("%s can read what is sent, and send anything", OPEN)
     return None
 
 

@@ -2,12 +2,13 @@
 
 import fcntl
 import json
+import os
 import secrets
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Self
 
 import msgspec
 import yaml
@@ -15,15 +16,23 @@ import yaml
 from master.config import MasterConfig
 from master.journal import segments
 from tangram_agent.checkpoints import list_checkpoints
-from tangram_agent.files import write_whole
+from tangram_agent.files import PUBLIC, is_same, make_folders, write_whole
 from tangram_agent.outcome import FILE_NAME as RESULT
 from tangram_agent.outcome import bound_of, read_outcome
 from tangram_agent.setup import SECTIONS
+from tangram_sim.config import own_code
 from tangram_sim.errors import ConfigError, RunError
 
 PRIVATE = 0o600
+LOCK = ".lock"
 # What a worker must know of the config.
 SHARED = (*SECTIONS, "service")
+
+
+def code_of(resolved: Mapping[str, Any]) -> dict[str, str]:
+    """The reward of a run, where it is code, which each of its commands must name itself."""
+    name = resolved.get("reward", {}).get("name", "")
+    return {"reward.name": name} if own_code(name) else {}
 
 
 class RunFolder:
@@ -57,6 +66,7 @@ class RunFolder:
         self.result = self.path / RESULT
         self.bad_batch = self.path / "bad_batch.safetensors"
         self.picture = self.path / "test_episodes.png"
+        self._written: dict[Path, tuple[bytes, int]] = {}
 
     def prepare(self, resume: str) -> None:
         """Make the folder.
@@ -70,7 +80,7 @@ class RunFolder:
                 "resume=auto"
             )
         try:
-            self.path.mkdir(parents=True, exist_ok=True)
+            make_folders(self.path)
         except OSError as error:
             raise ConfigError(
                 f"run_dir {self.path} cannot be made ({error.strerror}): choose another run_dir"
@@ -79,8 +89,12 @@ class RunFolder:
     def holds_run(self) -> bool:
         """Whether a run has left something here that a new one would mix with."""
         curves = self.tensorboard.is_dir() and any(self.tensorboard.iterdir())
+        return curves or self.holds_more()
+
+    def holds_more(self) -> bool:
+        """Whether that is more than curves, which a master may draw where its folder was."""
         kept = bool(list_checkpoints(self.checkpoints)) or bool(segments(self.journal))
-        return self.result.exists() or kept or curves
+        return self.result.exists() or kept
 
     def has_finished(self, config: MasterConfig) -> bool:
         """Whether a bound that this config does not raise has ended the run, scores included."""
@@ -91,30 +105,29 @@ class RunFolder:
         spent = bool(name) and 0 < getattr(config, name) <= reached
         return spent and result["scored_updates"] == result["updates"]
 
-    def lock(self) -> IO[bytes]:
+    def lock(self) -> "Claim":
         """Claim the folder for one process; the claim ends with the process or with `close`.
 
         Raises:
             ConfigError: another process works here.
         """
-        claim = (self.path / ".lock").open("ab")
-        try:
-            fcntl.flock(claim, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            claim.close()
-            raise ConfigError(
-                f"run_dir {self.path} is in use by another process: choose another run_dir, or "
-                "stop that one first"
-            ) from None
-        return claim
+        return Claim(self)
+
+    def write_again(self) -> None:
+        """Write what is missing of what was written, or read, here: the folder is a new one."""
+        for path, (data, mode) in self._written.items():
+            if not path.exists():
+                write_whole(path, data, mode, above=False)
 
     def write_config(self, resolved: Mapping[str, Any]) -> None:
         """Write the resolved config as plain YAML."""
-        write_whole(self.config, yaml.safe_dump(dict(resolved), sort_keys=False).encode())
+        self._write(self.config, yaml.safe_dump(dict(resolved), sort_keys=False).encode())
 
     def read_config(self) -> dict[str, Any]:
         """What `write_config` wrote."""
-        return dict(yaml.safe_load(self.config.read_text(encoding="utf-8")))
+        data = self.config.read_bytes()
+        self._written[self.config] = data, PUBLIC
+        return dict(yaml.safe_load(data))
 
     def write_connection(self, connection: Mapping[str, str]) -> None:
         """Write what a worker needs to take part; only the user may read it.
@@ -125,11 +138,85 @@ class RunFolder:
         config = self.read_config()
         settings = {name: config[name] for name in SHARED if name in config}
         content = {**connection, "settings": settings}
-        write_whole(self.connection, json.dumps(content, indent=1).encode(), PRIVATE)
+        self._write(self.connection, json.dumps(content, indent=1).encode(), PRIVATE)
 
     def write_result(self, result: Mapping[str, Any]) -> None:
         """Write the scores of the run."""
-        write_whole(self.result, (json.dumps(dict(result), indent=1) + "\n").encode())
+        self._write(self.result, (json.dumps(dict(result), indent=1) + "\n").encode())
+
+    def _write(self, path: Path, data: bytes, mode: int = PUBLIC) -> None:
+        write_whole(path, data, mode, above=False)  # a folder that was deleted stays so
+        self._written[path] = data, mode
+
+
+class FolderError(RunError):
+    """The run folder is gone, or is another one now: nothing may be acknowledged."""
+
+
+class Claim:
+    """A run folder in which no other process works, as long as it is the one that was claimed.
+
+    Attributes:
+        run: the folder.
+    """
+
+    def __init__(self, run: RunFolder) -> None:
+        """Claim a folder; ConfigError if another process works there."""
+        self.run = run
+        self._take()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def check(self) -> bool:
+        """Claim the folder anew if its lock was deleted, or if it is new and empty.
+
+        Returns:
+            Whether that was necessary.
+
+        Raises:
+            FolderError: it is gone, or another run's, or another process works there.
+        """
+        path = self.run.path
+        if is_same(self._lock.fileno(), path / LOCK):
+            return False
+        back = "put it back, or make an empty folder there"
+        try:
+            if not path.is_dir():
+                raise FolderError(f"run_dir {path} is gone: {back}")
+            if not is_same(self._folder, path) and self.run.holds_more():
+                raise FolderError(f"run_dir {path} is another folder now, with a run in it: {back}")
+            before = self._lock, self._folder
+            self._take()
+        except (OSError, ConfigError) as error:
+            why = error.strerror if isinstance(error, OSError) else "another process works there"
+            raise FolderError(f"run_dir {path} cannot be claimed anew ({why}): {back}") from None
+        self._release(*before)
+        return True
+
+    def close(self) -> None:
+        """Give the folder back."""
+        self._release(self._lock, self._folder)
+
+    def _take(self) -> None:
+        lock = (self.run.path / LOCK).open("ab")
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            lock.close()
+            raise ConfigError(
+                f"run_dir {self.run.path} is in use by another process: choose another run_dir, or "
+                "stop that one first"
+            ) from None
+        # Open, so that no folder which is made later has the same number.
+        self._lock, self._folder = lock, os.open(self.run.path, os.O_RDONLY)
+
+    def _release(self, lock: IO[bytes], folder: int) -> None:
+        lock.close()
+        os.close(folder)
 
 
 @dataclass

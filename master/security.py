@@ -4,8 +4,10 @@ A run has the server's pair of keys, and one pair that all of its workers share.
 as the run, so that a worker may come back after the master was restarted.
 """
 
-import ipaddress
+import hashlib
 import json
+import os
+import tempfile
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -13,11 +15,14 @@ import zmq
 from zmq.auth.thread import ThreadAuthenticator
 
 from master.counters import Counters
-from tangram_agent.files import write_whole
+from tangram_agent.addresses import IPC, LOCAL
+from tangram_agent.config import ServiceConfig
+from tangram_agent.files import own_folder, write_whole
 from tangram_sim.errors import ConfigError, RunError
 
 PRIVATE = 0o600
 DOMAIN = "tangram"
+MAX_SOCKET_PATH = 107  # bytes, of Linux
 
 
 @dataclass(frozen=True)
@@ -62,27 +67,46 @@ def run_keys(path: Path) -> Keys:
     return keys
 
 
-def needs_keys(bind: str, security: str) -> bool:
-    """Whether the sockets must be encrypted: `auto` spares only loopback addresses.
+def needs_keys(service: ServiceConfig) -> bool:
+    """Whether who takes part must show a key: always, but on the sockets of one user.
 
     Raises:
-        ConfigError: they must be, and this ZeroMQ cannot.
+        ConfigError: this ZeroMQ knows no keys.
     """
-    wanted = security == "curve" or (security == "auto" and not is_loopback(bind))
+    wanted = service.bind != LOCAL and service.auth == "on"
     if wanted and not zmq.has("curve"):
         raise ConfigError(
-            "this ZeroMQ was built without CURVE: install pyzmq from its wheel, listen on "
-            "service.bind=127.0.0.1, or set service.security=plain in a network that you trust"
+            "this ZeroMQ was built without CURVE: install pyzmq from its wheel, or leave "
+            f"service.bind at {LOCAL}"
         )
     return wanted
 
 
-def is_loopback(bind: str) -> bool:
-    """Whether nobody outside this machine can reach an address."""
-    try:
-        return bind == "localhost" or ipaddress.ip_address(bind).is_loopback
-    except ValueError:
-        return False  # the name of a host or an interface
+def listening_place(bind: str, run: Path) -> str:
+    """The address to listen on; for unix sockets the beginning of their paths.
+
+    They lie in a folder that only this user may enter, and not in the run's, whose file system may
+    be shared and whose path too long. A run has the same ones in each of its lives.
+
+    Args:
+        bind: as it was set.
+        run: folder of the run, which is there.
+
+    Raises:
+        TangramError: the folder of the sockets cannot be used.
+    """
+    if bind != LOCAL:
+        return bind
+    folder, found = Path(tempfile.gettempdir()) / f"tangram-{os.geteuid()}", run.stat()
+    own_folder(folder)
+    name = hashlib.sha256(f"{run.resolve()} {found.st_dev} {found.st_ino}".encode()).hexdigest()
+    place = f"{folder}/{name[:12]}"
+    if len(os.fsencode(f"{place}.episodes")) > MAX_SOCKET_PATH:
+        raise ConfigError(
+            f"{folder} is too long for sockets, whose paths have {MAX_SOCKET_PATH} bytes at most: "
+            "set TMPDIR to a shorter one, such as /tmp"
+        )
+    return IPC + place
 
 
 class Authenticator:

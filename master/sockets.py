@@ -2,17 +2,26 @@
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
 import zmq
 
 from master.counters import Counters
+from master.gate import AMPLE, Gate, Room
 from master.security import Authenticator, Keys
+from tangram_agent.addresses import IPC
 from tangram_agent.arrays import MAX_FRAME_BYTES
 from tangram_sim.errors import ConfigError
 
 LINGER_MS = 1000
 # Messages queued for each peer and direction; what a peer has no room for it must ask for again.
 HIGH_WATER = 64
+# A handshake takes milliseconds, seconds on a busy machine.
+HANDSHAKE_MS = 10_000
+# Connections that wait to be accepted, of many workers that start at once.
+BACKLOG = 1024
+# Of a subscription or a step of a handshake; more than encryption adds to a frame.
+MAX_COMMAND = 1024
 # ZMTP pings find connections that died without a word.
 PING_MS = 5000
 
@@ -32,9 +41,11 @@ class Sockets:
         counters: Counters,
         keys: Keys | None = None,
         weights_port: int = 0,
+        room: Room = AMPLE,
     ) -> None:
         self._counters = counters
         self._context = zmq.Context()
+        self._gate: Gate | None = None
         self._authenticator = Authenticator(self._context, keys, counters) if keys else None
         try:
             self._router = self._open(zmq.ROUTER, bind, port, "service.port")
@@ -44,6 +55,7 @@ class Sockets:
             raise
         self.endpoint = self._router.getsockopt_string(zmq.LAST_ENDPOINT)
         self.weights_endpoint = self._pub.getsockopt_string(zmq.LAST_ENDPOINT)
+        self._gate = Gate((self._router, self._pub), room, keys is not None, counters)
 
     def wait(self, timeout_s: float) -> bool:
         """Whether a message came within this time."""
@@ -75,8 +87,14 @@ class Sockets:
     def close(self) -> None:
         """Close; what is on its way gets a second."""
         self._close(LINGER_MS)
+        for endpoint in (self.endpoint, self.weights_endpoint):
+            if endpoint.startswith(IPC):
+                Path(endpoint.removeprefix(IPC)).unlink(missing_ok=True)
 
     def _close(self, linger_ms: int) -> None:
+        if self._gate is not None:
+            self._gate.close()
+            self._gate = None
         if self._authenticator is not None:
             self._authenticator.close()
         self._context.destroy(linger=linger_ms)
@@ -86,7 +104,10 @@ class Sockets:
         socket.setsockopt(zmq.LINGER, LINGER_MS)
         socket.setsockopt(zmq.SNDHWM, HIGH_WATER)
         socket.setsockopt(zmq.RCVHWM, HIGH_WATER)
-        socket.setsockopt(zmq.MAXMSGSIZE, MAX_FRAME_BYTES)
+        socket.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
+        socket.setsockopt(zmq.BACKLOG, BACKLOG)
+        most = MAX_COMMAND + (MAX_FRAME_BYTES if kind == zmq.ROUTER else 0)
+        socket.setsockopt(zmq.MAXMSGSIZE, most)
         socket.setsockopt(zmq.HEARTBEAT_IVL, PING_MS)
         socket.setsockopt(zmq.IPV6, int(":" in bind))
         if kind == zmq.ROUTER:
@@ -95,9 +116,15 @@ class Sockets:
         if self._authenticator is not None:
             self._authenticator.guard(socket)
         host = f"[{bind}]" if ":" in bind else bind
+        local = f"{bind}.{'episodes' if kind == zmq.ROUTER else 'weights'}"
         try:
-            socket.bind(f"tcp://{host}:{port or '*'}")
+            socket.bind(local if bind.startswith(IPC) else f"tcp://{host}:{port or '*'}")
         except zmq.ZMQError as error:
+            if bind.startswith(IPC):
+                raise ConfigError(
+                    f"cannot listen at {local} ({error.strerror}): set TMPDIR to a folder of a "
+                    "local disk"
+                ) from None
             if error.errno == zmq.EADDRINUSE:
                 raise ConfigError(
                     f"port {port} of {bind} is in use: choose another with {setting}=..., "

@@ -10,6 +10,7 @@ export PROJECT RUN_DIR RUN_WITH
 export PATH="$PROJECT/.venv/bin:$PATH"
 
 master=  # process of the srun that runs the master
+code=()  # a reward of one's own: code, which each process is told by name
 warned=  # 1 once the time limit is near
 
 say() {
@@ -42,6 +43,14 @@ begin_run() {
     trap warn_master USR1
 }
 
+# What workers must be told, too, of the settings of a master: code_of SETTING...
+code_of() {
+    local setting
+    for setting in "$@"; do
+        [[ $setting != reward.name=* ]] || code+=("$setting")
+    done
+}
+
 # The master as a step of its own: start_master [OPTION OF SRUN...] -- [SETTING...]
 start_master() {
     local -a options=()
@@ -50,6 +59,7 @@ start_master() {
         shift
     done
     shift
+    code_of "$@"
     srun --exact --nodes=1 --ntasks=1 "${options[@]}" --open-mode=append \
         --output="$RUN_DIR/logs/master.%j.log" "$PROJECT/slurm/master.sh" "$@" &
     master=$!
@@ -69,7 +79,7 @@ start_worker() {
     # --gres=none: the master's step keeps the job's GPU.
     srun --exact --nodes=1 --ntasks=1 --cpus-per-task=1 --gres=none "${options[@]}" \
         --job-name="$name" --open-mode=append --output="$RUN_DIR/logs/$name.%j.%t.log" \
-        "$PROJECT/slurm/worker.sh" "$@" &
+        "$PROJECT/slurm/worker.sh" "$@" "${code[@]}" &
 }
 
 warn_master() {

@@ -5,6 +5,8 @@ from ipaddress import IPv6Address
 
 from tangram_sim.errors import ConfigError
 
+LOCAL = "local"  # of service.bind: unix sockets instead of an address
+IPC = "ipc://"
 HOST = re.compile(r"[\w.*-]+")
 WILDCARDS = ("0.0.0.0", "*", "[::]")  # noqa: S104  # replaced, never bound
 

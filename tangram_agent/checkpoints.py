@@ -23,7 +23,7 @@ import numpy.typing as npt
 import safetensors
 import safetensors.numpy
 
-from tangram_agent.files import sync_folder
+from tangram_agent.files import make_folders, sync_folder
 from tangram_sim.errors import RunError
 
 FORMAT_VERSION = 3
@@ -90,7 +90,7 @@ def save_checkpoint(
     """Write a checkpoint and drop all but the newest `keep`.
 
     Args:
-        folder: holds all checkpoints of a run; made if it is missing.
+        folder: holds all checkpoints of a run; made if it is missing, in a folder that is there.
         arrays: file stem -> tensor name -> array.
         counters: JSON values.
 
@@ -99,7 +99,7 @@ def save_checkpoint(
     """
     aside = folder / f"{_TEMPORARY}{updates:08d}"
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folders(folder, above=False)
         _drop_temporary(folder)
         aside.mkdir()
         _write_content(aside, updates, arrays, counters)
@@ -156,7 +156,9 @@ def set_aside(path: Path) -> Path:
     target = path.with_name(path.name + _SET_ASIDE)
     if target.exists():
         shutil.rmtree(target)
-    return path.rename(target)
+    path.rename(target)
+    sync_folder(path.parent)
+    return target
 
 
 def was_set_aside(folder: Path) -> bool:

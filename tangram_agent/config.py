@@ -2,13 +2,14 @@
 
 from dataclasses import dataclass, field
 
-from tangram_agent.addresses import check_host
+from tangram_agent.addresses import LOCAL, check_host
 from tangram_agent.process import FORMATS
 from tangram_sim.errors import ConfigError
 from tangram_sim.settings import LEARNING, NETWORK, Settings, declared, setting
 
 ORDERS = ("learned", "listed", "size", "random")
 STRATEGIES = ("final", "future", "near")
+ON_SOCKETS: dict[str, object] = {"bind": LOCAL}
 
 
 @dataclass(frozen=True)
@@ -261,22 +262,33 @@ class AgentConfig(Settings, section="agent"):
 class ServiceConfig(Settings, section="service"):
     """How the processes work together; the same values serve master and workers."""
 
-    bind: str = setting("127.0.0.1", "address that the master listens on")
-    port: int = setting(0, "of the master's ROUTER socket, 0 for any free one", low=0, high=65535)
-    weights_port: int = setting(0, "of its PUB socket, 0 for any free one", low=0, high=65535)
+    bind: str = setting(
+        LOCAL,
+        "address that the master listens on; local: unix sockets, for processes of the same user "
+        "on its machine",
+    )
+    port: int = setting(
+        0, "of the master's ROUTER socket, 0 for any free one", low=0, high=65535, unless=ON_SOCKETS
+    )
+    weights_port: int = setting(
+        0, "of its PUB socket, 0 for any free one", low=0, high=65535, unless=ON_SOCKETS
+    )
     host: str = setting(
         "",
         "name that workers find the master under; empty: bind, or this machine's name for 0.0.0.0",
+        unless=ON_SOCKETS,
     )
     mode: str = setting(
         "async",
         "nobody waits for anybody, or lockstep: slower, and the same seed gives the same weights",
         choices=("async", "lockstep"),
     )
-    security: str = setting(
-        "auto",
-        "encrypted by the connection file's keys, plain, or auto: curve but on loopback",
-        choices=("auto", "curve", "plain"),
+    auth: str = setting(
+        "on",
+        "workers need the connection file's keys; off, for tests: whoever reaches the port takes "
+        "part, unencrypted",
+        choices=("on", "off"),
+        unless=ON_SOCKETS,
     )
     http_bind: str = setting(
         "127.0.0.1", "address of the master's /metrics and /healthz", unless={"http_port": -1}

@@ -1,6 +1,8 @@
 """Writing a file at once, and for good: a reader sees the old content or the new, never a part."""
 
 import os
+import stat
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryFile
 
@@ -9,20 +11,22 @@ from tangram_sim.errors import ConfigError, RunError
 PUBLIC = 0o644
 
 
-def write_whole(path: Path, data: bytes, mode: int = PUBLIC) -> None:
+def write_whole(path: Path, data: bytes, mode: int = PUBLIC, above: bool = True) -> None:
     """Replace a file, or make it and its folders; nothing is left behind when that fails.
 
     Args:
         path: the file.
         data: its whole content.
         mode: its permissions.
+        above: make the folders that are missing.
 
     Raises:
         RunError: the disk is full or the folder cannot be written.
     """
     aside = _aside(path)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        if above:
+            make_folders(path.parent)
         try:
             aside.unlink(missing_ok=True)
             handle = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
@@ -38,6 +42,29 @@ def write_whole(path: Path, data: bytes, mode: int = PUBLIC) -> None:
         raise RunError(
             f"cannot write {path} ({error.strerror}): make room there or choose another folder"
         ) from None
+
+
+def make_folders(folder: Path, above: bool = True) -> None:
+    """Make a folder where it is missing, with its name on the disk.
+
+    Args:
+        folder: the folder.
+        above: make those above it, too, where they are missing.
+
+    Raises:
+        OSError: it cannot be made, or a file is in the way.
+    """
+    try:
+        folder.mkdir(exist_ok=True)
+    except FileNotFoundError:
+        if not above or folder == folder.parent:
+            raise
+        make_folders(folder.parent)
+        folder.mkdir(exist_ok=True)
+    # Also where it is there: a kill may have come before the sync. One that may not be read was
+    # made by somebody else.
+    with suppress(PermissionError):
+        sync_folder(folder.parent)
 
 
 def check_writable(name: str, path: Path) -> None:
@@ -60,6 +87,30 @@ def check_writable(name: str, path: Path) -> None:
         ) from None
 
 
+def own_folder(path: Path) -> None:
+    """Make a folder that only this user may enter, or see that one is there.
+
+    Raises:
+        RunError: it is another user's, open to others, no folder, or cannot be made.
+    """
+    try:
+        with suppress(FileExistsError):
+            path.mkdir(mode=0o700)
+        found = path.lstat()
+    except OSError as error:
+        raise RunError(
+            f"{path} cannot be made ({error.strerror}): set TMPDIR to a folder that you may write "
+            "to, for the master and its workers"
+        ) from None
+    mine = stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid()
+    if not mine or found.st_mode & 0o077:
+        is_now = f"{stat.filemode(found.st_mode)} of user {found.st_uid}"
+        raise RunError(
+            f"{path} must be a folder that only this user may enter, it is {is_now}: remove it, or "
+            "set TMPDIR to a folder of your own"
+        )
+
+
 def _aside(path: Path) -> Path:
     return path.with_name(f".{path.name}.{os.getpid()}")
 
@@ -75,3 +126,11 @@ def sync_folder(folder: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+def is_same(handle: int, path: Path) -> bool:
+    """Whether an open file, or folder, still is what lies under its name."""
+    try:
+        return os.path.samestat(os.fstat(handle), path.stat())
+    except OSError:
+        return False

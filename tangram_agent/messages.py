@@ -54,6 +54,7 @@ WINDOW = 4  # messages of a worker that may be unacknowledged; a full window pau
 MAX_WINDOW = 1024
 MAX_PICTURES = 64
 MAX_ROWS = 4096
+OPEN = "service.auth=off: open to whoever reaches the port"
 
 
 class BatchError(WireError):

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from tangram_agent.checkpoints import (
     ACTING,
@@ -24,8 +23,10 @@ from tangram_agent.checkpoints import (
 from tangram_agent.policy import Policy
 from tangram_agent.pretrained import is_agent, is_name, packaged, read_agent
 from tangram_agent.setup import Setup, make_setup
+from tangram_agent.stored import load_settings
 from tangram_agent.types import Weights
 from tangram_sim.arrays import Floats, Singles
+from tangram_sim.config import with_given_reward
 from tangram_sim.errors import ConfigError, RunError
 from tangram_sim.settings import (
     KEY,
@@ -168,43 +169,39 @@ def read_config(path: Path) -> dict[str, Any]:
     """A run's resolved config.
 
     Raises:
-        RunError: the file is missing or not a YAML mapping.
+        RunError: the file is missing or no mapping.
+        ConfigError: it is no YAML, or larger than settings are.
     """
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise RunError(f"cannot read {path} ({error.strerror}): is this a run folder?") from None
     except UnicodeDecodeError:
-        raise _no_yaml(path) from None
+        raise RunError(f"{path} is not valid YAML (it is no UTF-8): mend it") from None
     return _parse_config(text, path)
 
 
 def _parse_config(text: str, path: Path) -> dict[str, Any]:
-    try:
-        content = yaml.safe_load(text)
-    except (yaml.YAMLError, RecursionError):
-        raise _no_yaml(path) from None
+    content = load_settings(text, str(path))
     if not isinstance(content, dict):
         raise RunError(f"{path} holds no settings: it must be a mapping of sections")
     return content
 
 
-def _no_yaml(path: Path) -> RunError:
-    return RunError(f"{path} is not valid YAML: mend it or name another run_dir")
-
-
-def load_run(run_dir: str | Path, checkpoint: str | None = None) -> Run:
+def load_run(run_dir: str | Path, checkpoint: str | None = None, reward: str | None = None) -> Run:
     """A run with the weights of its newest checkpoint, or of the one that is named.
 
     Args:
         run_dir: the run folder, or `pretrained/<name>` for an agent that comes with the package;
             a folder of that name wins.
         checkpoint: name of a folder under `checkpoints`, such as 00004000.
+        reward: `reward.name` in place of the run's. A run that was trained with code of somebody's
+            own must be told it again, or `overlap`: its files alone have no code loaded.
 
     Raises:
         RunError: the folder, its config or the checkpoint is missing or corrupt, or the weights
             do not fit the config.
-        ConfigError: the config is not one that this version can use.
+        ConfigError: the config is not one that this version can use, or names code.
     """
     folder = Path(run_dir)
     source: Traversable = folder
@@ -213,20 +210,38 @@ def load_run(run_dir: str | Path, checkpoint: str | None = None) -> Run:
             raise RunError(f"no run folder {folder}: give the folder that tangram-train printed")
         source = packaged(folder)
     if is_agent(source):
-        return _agent_run(source, folder, checkpoint)
-    return _trained_run(folder, checkpoint)
+        return _agent_run(source, folder, checkpoint, reward)
+    return _trained_run(folder, checkpoint, reward)
 
 
-def _agent_run(source: Traversable, folder: Path, checkpoint: str | None) -> Run:
+def load_changed(run_dir: str | Path, changes: Changes) -> Run:
+    """A run, played with other settings; a reward that is code must be among them.
+
+    Raises:
+        TangramError: see `load_run` and `Run.with_settings`.
+    """
+    return load_run(run_dir, reward=changes.get("reward", {}).get("name")).with_settings(changes)
+
+
+def _agent_run(
+    source: Traversable, folder: Path, checkpoint: str | None, reward: str | None
+) -> Run:
     if checkpoint is not None:
         raise RunError(f"{folder} has no checkpoint {checkpoint}: leave the checkpoint out")
     agent = read_agent(source, folder)
-    config = _parse_config(agent.config, folder / CONFIG)
+    config = _with_reward(_parse_config(agent.config, folder / CONFIG), reward)
     return _make_run(folder, config, make_setup(config), agent.weights)
 
 
-def _trained_run(folder: Path, checkpoint: str | None) -> Run:
-    config = read_config(folder / CONFIG)
+def _with_reward(config: dict[str, Any], name: str | None) -> dict[str, Any]:
+    own = config.get("reward")
+    if not isinstance(own, dict):
+        return config
+    return config | {"reward": with_given_reward(own, {} if name is None else {"name": name})}
+
+
+def _trained_run(folder: Path, checkpoint: str | None, reward: str | None) -> Run:
+    config = _with_reward(read_config(folder / CONFIG), reward)
     checkpoints = folder / CHECKPOINTS
     path = checkpoints / checkpoint if checkpoint else newest_checkpoint(checkpoints)
     # First, as it tells a run of another version by its format.

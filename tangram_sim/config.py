@@ -1,11 +1,13 @@
 """Settings of the simulated world and of the reward."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import MAX_TOKENS
-from tangram_sim.settings import LEARNING, NETWORK, Settings, setting
+from tangram_sim.settings import LEARNING, NETWORK, Settings, refuse_ignored, setting
 
 BACKENDS = ("physics", "kinematic")
 REWARDS = ("overlap", "dense", "pose")
@@ -177,6 +179,32 @@ class SimConfig(Settings, section="sim"):
             )
 
 
+def own_code(name: str) -> tuple[Path, str] | None:
+    """File and function where a reward is code of the user's own."""
+    path, _, function = name.rpartition(":")
+    code = path.endswith(".py") and function.isidentifier()
+    return (Path(path).expanduser(), function) if code else None
+
+
+def with_given_reward(read: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of a reward that were read from a file, and over them those of a command line.
+
+    A file may come from anybody: it can name code, but only a command line has it loaded.
+
+    Raises:
+        ConfigError: the file names code, and the command line names no reward.
+    """
+    name = given.get("name", read.get("name"))
+    own = isinstance(name, str) and own_code(name) is not None
+    if own and "name" not in given:
+        raise ConfigError(
+            f"the settings of the run name code, {name} (sha256 {read.get('sha256', 'unknown')}), "
+            f"which is not loaded unless you name it: add reward.name={name} if you trust it"
+        )
+    without = {} if own or "sha256" not in read else {"sha256": None}
+    return {**read, **without, **given}
+
+
 @dataclass(frozen=True)
 class RewardConfig(Settings, section="reward"):
     """What an action is worth."""
@@ -198,10 +226,12 @@ class RewardConfig(Settings, section="reward"):
         high=1e9,
         only={"name": ("dense", "pose")},
     )
+    sha256: str | None = setting(
+        None, "of your own file, as a run writes it down: a file with another content is refused"
+    )
 
     def __post_init__(self) -> None:
-        path, _, function = self.name.rpartition(":")
-        if self.name not in REWARDS and not (path.endswith(".py") and function.isidentifier()):
+        if self.name not in REWARDS and self.own is None:
             raise ConfigError(
                 f"reward.name must be one of {', '.join(REWARDS)} or path/to/file.py:function, "
                 f"got '{self.name}'"
@@ -212,11 +242,10 @@ class RewardConfig(Settings, section="reward"):
                 f"reward.source=camera measures Eq. 14 only, got reward.name={self.name}: "
                 "set reward.source=polygon"
             )
+        if self.sha256 is not None and self.own is None:
+            refuse_ignored("reward.sha256", f"reward.name={self.name}", "name a file of your own")
 
     @property
     def own(self) -> tuple[Path, str] | None:
         """File and function of a reward of the user's own."""
-        if self.name in REWARDS:
-            return None
-        path, _, function = self.name.rpartition(":")
-        return Path(path).expanduser(), function
+        return own_code(self.name)

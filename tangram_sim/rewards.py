@@ -44,7 +44,7 @@ def make_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> RewardF
         exact = make_reward(config, layout, replace(sim, corner_noise=0.0))
         return lambda achieved, desired: exact(_fitted(achieved, layout), _fitted(desired, layout))
     if config.own is not None:
-        function = _load(config.name, *config.own)
+        function = _load(config, *config.own)
         return lambda achieved, desired: _checked(config.name, function, achieved, desired, layout)
     if config.name == "overlap":
         return lambda achieved, desired: overlap(achieved, desired, layout)
@@ -173,32 +173,47 @@ def reward_identity(config: RewardConfig) -> dict[str, Any]:
         ConfigError: the user's file cannot be read.
     """
     content = asdict(config)
+    del content["sha256"]
     if config.own is not None:
         path, function = config.own
-        digest = hashlib.sha256(_source(config.name, path)).hexdigest()[:16]
+        digest = hashlib.sha256(_source(config, path)).hexdigest()[:16]
         content["name"] = f"{digest}:{function}"
     return content
 
 
-def absolute_name(name: str) -> str:
-    """The name of a reward so that it holds in any folder."""
-    path, colon, function = name.rpartition(":")
-    return f"{Path(path).expanduser().absolute()}{colon}{function}" if colon else name
+def pinned(config: RewardConfig) -> RewardConfig:
+    """The reward so that it holds in any folder, and for no other content of a user's file.
+
+    Raises:
+        ConfigError: the user's file cannot be read, or is not the one that was written down.
+    """
+    if config.own is None:
+        return config
+    path, function = config.own
+    digest = hashlib.sha256(_source(config, path)).hexdigest()
+    return replace(config, name=f"{path.absolute()}:{function}", sha256=digest)
 
 
-def _source(name: str, path: Path) -> bytes:
+def _source(config: RewardConfig, path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        source = path.read_bytes()
     except OSError as error:
         raise ConfigError(
-            f"reward.name={name}: cannot read '{path}' on this machine "
+            f"reward.name={config.name}: cannot read '{path}' on this machine "
             f"({error.strerror or error}): put a copy there, or say where it lies with "
             "reward.name=path/to/file.py:function"
         ) from None
+    found = hashlib.sha256(source).hexdigest()
+    if config.sha256 not in (None, found):
+        raise ConfigError(
+            f"reward.name={config.name}: '{path}' has sha256 {found}, and the settings of the run "
+            f"want {config.sha256}: name the file that it began with, or set reward.sha256={found}"
+        )
+    return source
 
 
-def _load(name: str, path: Path, attribute: str) -> UserReward:
-    source = _source(name, path)
+def _load(config: RewardConfig, path: Path, attribute: str) -> UserReward:
+    name, source = config.name, _source(config, path)
     # Registered as an import would, since dataclasses look their module up. A user's file is not
     # found by this name, and two files with one name do not meet.
     module = ModuleType(f"_tangram_reward_{hashlib.sha256(source).hexdigest()[:16]}")

@@ -113,7 +113,7 @@ def refuse_ignored(given: str, because: str, remedy: str, default: object = None
         remedy: besides leaving the setting out.
         default: of the setting, which a preset may have changed.
     """
-    left = "out" if default is None else f"at {told(default)}"
+    left = "out" if default in (None, "") else f"at {told(default)}"
     raise ConfigError(f"{given} changes nothing with {because}: leave it {left}, or {remedy}")
 
 

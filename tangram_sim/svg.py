@@ -26,6 +26,7 @@ from tangram_sim.svg_attributes import (
 )
 
 MAX_DEPTH = 50
+MAX_TAGS = 20_000
 _OUTLINES = {"polygon", "polyline", "rect", "path"}
 _RECT = ("x", "y", "width", "height")
 _HIDDEN = re.compile(r"(display\s*:\s*none|visibility\s*:\s*hidden)")
@@ -78,6 +79,8 @@ def _kind(outline: Floats) -> str:
 def _root(text: str, name: str) -> ET.Element:
     if len(text) > MAX_BYTES:
         raise ConfigError(f"SVG '{name}' is longer than {MAX_BYTES} characters: simplify it")
+    if text.count("<") > MAX_TAGS:
+        raise ConfigError(f"SVG '{name}' has more than {MAX_TAGS} tags: draw 7 polygons only")
     if re.search(r"<!\s*(doctype[^<>]*\[|entity)", text, re.IGNORECASE):
         raise ConfigError(
             f"SVG '{name}' must have no ENTITY and no DOCTYPE with [...]: delete them"

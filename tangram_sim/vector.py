@@ -15,6 +15,7 @@ from tangram_sim.errors import ConfigError
 from tangram_sim.settings import check_range
 from tangram_sim.table import Observation, Table
 
+MAX_ENVS = 4096
 Stepped = tuple[Observation, Floats, Bools, Bools, dict[str, Any]]
 
 
@@ -53,7 +54,7 @@ class TangramVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], Any]):
         modes = {AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP}
         if autoreset_mode not in modes | {mode.value for mode in modes}:
             raise ConfigError(f"autoreset_mode must be NextStep or SameStep, got {autoreset_mode}")
-        check_range("num_envs", num_envs, 1)
+        check_range("num_envs", num_envs, 1, MAX_ENVS)
         if max_episode_steps is not None:
             check_range("max_episode_steps", max_episode_steps, 1)
         self.num_envs = num_envs

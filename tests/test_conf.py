@@ -166,6 +166,11 @@ def test_a_command_may_know_other_places_of_a_run_config(stored: Path) -> None:
     assert (made["agent"]["name"], made["service"]["envs"], "seed" in made) == ("mlp", 7, False)
     with pytest.raises(ConfigError, match="runs/shared chooses tokens already: leave out tokens=x"):
         apply_stored(["tokens=x"])
+    deep: list[Any] = []
+    for _ in range(900):
+        deep = [deep]
+    with pytest.raises(ConfigError, match="runs/shared is nested too deeply: it must come from a"):
+        apply_stored([], content | {"sim": {"stages": deep}})
     with pytest.raises(ConfigError, match="runs/shared lacks net: it must come from a run"):
         apply_stored([], {name: value for name, value in content.items() if name != "net"})
     assert with_run_config(dict(settings), [], lambda _: None)["agent"]["name"] == "tangram"
@@ -177,13 +182,20 @@ def test_choosing_a_group_beside_a_run_config_is_refused(stored: Path, override:
         apply(stored, override)
 
 
+# A thousand million values, if they were written out; by << they are.
+LAUGHS = b"a0: &a0 {b: 1}\n" + b"".join(
+    b"a%d: &a%d {<<: [%s]}\n" % (i, i, b", ".join([b"*a%d" % (i - 1)] * 9)) for i in range(1, 10)
+)
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
         (None, "No such file"),
-        (b"a: [", "not a YAML file"),
-        (b"[" * 10_000, "not a YAML file"),
-        (b"\xff\xfe\xfa", "not a YAML file"),
+        (b"a: [", "is not valid YAML \\(while parsing"),
+        (b"[" * 10_000, "is no file of settings: it must have .* and 20 levels"),
+        (LAUGHS, "is no file of settings: .* 10000 values with what aliases repeat"),
+        (b"\xff\xfe\xfa", "is not valid YAML \\(it is no UTF-8"),
         (b"3", "lacks sim"),
         (b"{agent: {}, net: {}}", "lacks sim, reward, service, tokens"),
     ],
@@ -239,7 +251,7 @@ def test_help_of_what_is_laid_over_a_run_has_what_it_may_be_played_with(group: s
     names = [line.partition(":")[0] for line in group_help("eval", group).splitlines()[2:]]
     kinds = {own.name: own.metadata[KEY].part for own in declared_fields(load(GROUPS[group]))}
     assert names == [f"{group}.{name}" for name, part in kinds.items() if part == PLAY]
-    refused = {"sim": "sim.arena", "agent": "agent.batch_size"}[group]
+    refused = {"sim": "sim.arena", "agent": "agent.batch_size"}.get(group)
     assert refused not in names
 
 
@@ -297,7 +309,10 @@ def test_presets_of_ones_own_are_taken(entered: Entered, presets: Path, form: st
     [
         ("tokens/mine.yaml", "scale: 1\n", "set tokens.shapes=..., it has no default"),
         ("tokens/mine.yaml", "shapes: [", "/tokens/mine.yaml cannot be read (while parsing"),
-        ("tokens/mine.yaml", "[" * 10_000, "/tokens/mine.yaml cannot be read (maximum recursion"),
+        ("tokens/mine.yaml", "[" * 10_000, "/tokens/mine.yaml is no file of settings: it must"),
+        ("tokens/mine.yaml", LAUGHS.decode(), "/tokens/mine.yaml is no file of settings: it must"),
+        ("tokens/mine.yaml", "&a [*a]", "/tokens/mine.yaml is no file of settings: it must"),
+        ("tokens/mine.yaml", "x" * 100_001, "it must have at most 100000 characters"),
         (
             "tokens/mine.yaml",
             "3",

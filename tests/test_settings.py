@@ -152,6 +152,7 @@ SHOWS: dict[str, tuple[Config, object]] = {
 # What shows elsewhere, and where.
 ELSEWHERE = {
     "agent.name": "the label of a run in reports",
+    "reward.sha256": "tests/sim/test_rewards.py: another file is refused",
 }
 
 
@@ -303,11 +304,15 @@ def test_a_setting_without_effect_is_refused(
     [
         ({"http_bind": "::1", "http_port": -1}, "http_bind", "http_port=-1"),
         ({"publish_seconds": 1.0, "mode": "lockstep"}, "publish_seconds", "mode=lockstep"),
+        ({"port": 5555}, "port", "bind=local"),
+        ({"weights_port": 5556}, "weights_port", "bind=local"),
+        ({"host": "learner"}, "host", "bind=local"),
+        ({"auth": "off"}, "auth", "bind=local"),
     ],
 )
 def test_a_setting_of_the_service_without_effect_is_refused(
     given: dict[str, Any], name: str, because: str
 ) -> None:
-    reason = f"^service.{name}=.* changes nothing with service.{because}: leave it at"
+    reason = f"^service.{name}=.* changes nothing with service.{because}: leave it "
     with pytest.raises(TangramError, match=reason):
         ServiceConfig(**given)

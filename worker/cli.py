@@ -104,7 +104,7 @@ def _play(settings: Plain) -> int:
     if not config.live:
         check_writable("out", Path(config.out).absolute())
     if config.tokens is not None and config.run_dir is not None:
-        _check_tokens(config.tokens, config.run_dir)
+        _check_tokens(config.tokens, config.run_dir, config.changes)
 
     if config.compare is not None:
         from worker.play import compare_runs
@@ -115,9 +115,9 @@ def _play(settings: Plain) -> int:
     return play_run(config)
 
 
-def _check_tokens(name: str, run_dir: str) -> None:
+def _check_tokens(name: str, run_dir: str, changes: Plain) -> None:
     """Refuse a run that moves other tokens than those of a preset."""
-    from tangram_agent.runs import load_run
+    from tangram_agent.runs import load_changed
     from tangram_agent.setup import from_mapping
     from tangram_sim.errors import ConfigError
     from tangram_sim.layout import TokensConfig, make_layout
@@ -125,7 +125,7 @@ def _check_tokens(name: str, run_dir: str) -> None:
     preset = make_layout(
         from_mapping(TokensConfig, composed("worker", [f"tokens={name}"])["tokens"])
     )
-    moved = load_run(run_dir).setup.layout
+    moved = load_changed(run_dir, changes).setup.layout
     if moved.fingerprint() != preset.fingerprint():
         shapes = ", ".join(shape.name for shape in moved.shapes)
         raise ConfigError(

@@ -70,7 +70,7 @@ class WorkerConfig(Settings):
 
     connect: str = field(
         metadata=declared(
-            "the run: its folder or its connection.json; or only an address, host:port"
+            "the run: its folder or its connection.json; host:port with service.auth=off only"
         )
     )
     role: str = setting(
@@ -91,7 +91,9 @@ class StatusConfig(Settings):
     """How a run stands (tangram-status)."""
 
     connect: str = field(
-        metadata=declared("the run: its folder, its connection.json, or host:port")
+        metadata=declared(
+            "the run: its folder or its connection.json; host:port with service.auth=off only"
+        )
     )
     json: bool = setting(False, "print one JSON object a line instead of a table")
 

@@ -10,7 +10,8 @@ from pathlib import Path
 from threading import Thread
 from typing import Any
 
-from tangram_agent.addresses import host_of
+from tangram_agent.addresses import IPC, host_of
+from tangram_agent.files import own_folder
 from tangram_sim.errors import RunError
 
 FILE_NAME = "connection.json"
@@ -80,7 +81,11 @@ def find_master(connect: str) -> MasterAddress | None:
         path /= FILE_NAME
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        endpoint = _checked(str(content["endpoint"]), str(path))
+        endpoint = str(content["endpoint"])
+        if endpoint.startswith(f"{IPC}/"):
+            _check_own(endpoint.removeprefix(IPC), str(content["machine"]), path)
+        else:
+            _checked(endpoint, str(path))
         keys = {name: str(content.get(name, "")) for name in KEYS}
         settings = content.get("settings")
         return MasterAddress(endpoint, str(content["run_id"]), **keys, settings=settings)
@@ -128,6 +133,8 @@ def no_file_error(connect: str, patience_s: float) -> str:
 
 def dns_error(endpoint: str, patience_s: float = DNS_S) -> str:
     """What DNS says against the host of an address, for the user; empty where it has an address."""
+    if endpoint.startswith(IPC):
+        return ""
     host, said = host_of(endpoint).strip("[]"), [f"no answer in {patience_s:g} s"]
 
     def resolve() -> None:
@@ -155,6 +162,16 @@ def keys_error(connect: str, endpoint: str) -> str:
         f"wrong or stale connection file: what answers at {endpoint} does not take the keys of "
         f"{connect}; take the file of a master that is running"
     )
+
+
+def _check_own(place: str, machine: str, source: Path) -> None:
+    """Raise RunError where the master listens on another machine, or perhaps another user does."""
+    if machine != socket.gethostname() and not Path(place).exists():
+        raise RunError(
+            f"{source}: this master listens on its own machine, {machine}, only: start it there "
+            "with service.bind=0.0.0.0, or start this there"
+        )
+    own_folder(Path(place).parent)
 
 
 def _checked(endpoint: str, source: str) -> str:

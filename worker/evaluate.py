@@ -17,7 +17,7 @@ from rich.table import Table
 from tangram_agent.config import ORDERS
 from tangram_agent.files import write_whole
 from tangram_agent.outcome import plural
-from tangram_agent.runs import Run, load_run
+from tangram_agent.runs import Run, load_changed
 from tangram_agent.setup import Setup
 from tangram_sim.game_drawing import figure_sheet
 from worker.baselines import exact_policy, position_policy, random_policy
@@ -89,7 +89,7 @@ def evaluate_run(config: EvalConfig) -> int:
     """
     torch.set_num_threads(1)
     began = time.monotonic()
-    run = load_run(config.run).with_settings(config.changes)
+    run = load_changed(config.run, config.changes)
     report = (_episodes if config.puzzle is None else _puzzles)(run, config)
     if config.out is not None:
         report |= {"seconds": time.monotonic() - began}

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from tangram_agent.files import write_whole
 from tangram_agent.outcome import plural
-from tangram_agent.runs import Run, load_run
+from tangram_agent.runs import Run, load_changed
 from tangram_agent.setup import Setup
 from tangram_sim.arrays import Floats
 from tangram_sim.drawing import episode_sheet, save_gif, save_mp4
@@ -53,7 +53,7 @@ def play_run(config: PlayConfig) -> int:
     """
     torch.set_num_threads(1)
     (run_dir,) = config.run_dirs
-    show = make_show(load_run(run_dir).with_settings(config.changes), config)
+    show = make_show(load_changed(run_dir, config.changes), config)
     if config.live:
         show_live(show)
         return 0
@@ -192,7 +192,7 @@ def compare_runs(config: PlayConfig) -> int:
             first, or `out` is not writable.
     """
     torch.set_num_threads(1)
-    runs = [load_run(run_dir).with_settings(config.changes) for run_dir in config.run_dirs]
+    runs = [load_changed(run_dir, config.changes) for run_dir in config.run_dirs]
     check_same_task(runs)
     shown = [(run.setup, play_episodes(run, config)) for run in runs]
     labels = distinct_names([run.folder for run in runs])

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from tangram_agent.messages import WORKER_COLUMNS, AskStatus, RunStatus, decode_from_master
+from tangram_agent.messages import OPEN, WORKER_COLUMNS, AskStatus, RunStatus, decode_from_master
 from tangram_agent.outcome import FILE_NAME, outcome_rows, read_outcome
 from tangram_sim.errors import TangramError, WireError
 from worker.config import StatusConfig
@@ -149,8 +149,10 @@ def _lines(n: Mapping[str, float], texts: Mapping[str, str]) -> Iterator[tuple[s
     yield "replay", f"{n['replay']:,.0f} transitions, {share:.0%} of its capacity"
     yield "waiting batches", f"{n['queue']:,.0f}"
     yield "last checkpoint", _age(n["checkpoint_age_s"])
+    if n["open_to_all"] > 0:
+        yield "access", OPEN
     if n["disk_failing"] > 0:
-        yield "disk", "full or broken: nothing is acknowledged"
+        yield "disk", "full, broken or gone: nothing is acknowledged"
     if n["undone_updates"] > 0:
         yield "undone updates", f"{n['undone_updates']:,.0f} were not finite"
 

@@ -22,7 +22,11 @@ read -ra master_options <<<"$MASTER_OPTIONS"
 read -ra worker_options <<<"$WORKER_OPTIONS"
 
 master=$(sbatch --parsable "${master_options[@]}" "$PROJECT/slurm/elastic/master.sbatch" "$@")
+code=() # a reward of one's own: code, which workers must be told, too
+for setting in "$@"; do
+    [[ $setting != reward.name=* ]] || code+=("$setting")
+done
 workers=$(sbatch --parsable --dependency="after:$master" --array="0-$WORKERS" \
-    "${worker_options[@]}" "$PROJECT/slurm/elastic/workers.sbatch")
+    "${worker_options[@]}" "$PROJECT/slurm/elastic/workers.sbatch" "${code[@]}")
 echo "master: job $master, evaluator and workers: job $workers, run folder: $RUN_DIR"
 echo "see how it stands with: tangram-status connect=$RUN_DIR"

@@ -154,6 +154,7 @@ SETTINGS = (
     "service.eval_seconds=20",
     "service.checkpoint_minutes=0.5",
 )
+TCP = ("service.bind=127.0.0.1", "service.auth=off")  # the proxy and garbage come to a port
 PAUSE_S = (1.0, 5.0)  # between the recovery from one fault and the next
 FROZEN_S = (3.0, 15.0)
 CUT_S = (5.0, 20.0)
@@ -293,7 +294,7 @@ def run_chaos(minutes: float, seed: int, out: Path | None, folder: Path) -> int:
     disturbed, straight = folder / "disturbed", folder / "straight"
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = int(probe.getsockname()[1])
-    bounds = (f"seed={seed}", f"service.port={port}", "max_updates=0", *SETTINGS)
+    bounds = (f"seed={seed}", *TCP, f"service.port={port}", "max_updates=0", *SETTINGS)
     launcher = start_training(disturbed, *bounds)
     wait_for(disturbed / "connection.json", launcher)
     setup = make_setup(yaml.safe_load((disturbed / "config.yaml").read_text()))

@@ -16,13 +16,13 @@ from master.trainer import Trainer
 from tangram_agent.messages import Hello
 from tangram_lab.benchmarks.measure import Row, single
 from tangram_lab.benchmarks.setups import played, preset
-from tangram_lab.benchmarks.wire import Case, connected
+from tangram_lab.benchmarks.wire import UNIX, Case, connected
 
 STAGE, UNIT = "scaling", "us of CPU"
 BATCH, MESSAGES = 32, 500
 PEERS = (100, 1000)
 POLLS = 200
-CASE = Case("1 token, 32 in a batch, plain", 1, BATCH, "plain")
+CASE = Case("1 token, 32 in a batch, unix", 1, BATCH, UNIX)
 
 
 class Spent:

@@ -1,9 +1,9 @@
 """The way from worker to master: a Client and a Hub, against bare ROUTER-DEALER sockets.
 
-Both carry the same frames between two processes, with as many unacknowledged, over TCP on this
-machine. What is counted are the transitions that the master's end takes. Ours are checked on both
-ends, decoded, entered into the table of duplicates and acknowledged; the bare ones are received,
-and answered with as many bytes.
+Both carry the same frames between two processes, with as many unacknowledged, over a unix socket or
+over TCP on this machine. What is counted are the transitions that the master's end takes. Ours are
+checked on both ends, decoded, entered into the table of duplicates and acknowledged; the bare ones
+are received, and answered with as many bytes.
 """
 
 import json
@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from socket import gethostname
 from typing import Any
 
 import zmq
@@ -20,6 +21,7 @@ import zmq
 from master.delivery import EpisodesArrived
 from master.hub import Hub, WelcomeInfo
 from master.security import Keys, make_keys
+from tangram_agent.addresses import IPC
 from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.messages import WINDOW, Ack, EpisodeBatch
 from tangram_agent.setup import Setup
@@ -37,7 +39,7 @@ SPAN_S = 1.0
 BARE_MESSAGES = 16  # between two looks at the clock
 PATIENCE_S = 20.0
 SEQUENCE = 1000  # of the bare batches: its header is as long as most
-PLAIN = "plain"
+UNIX, PLAIN, CURVE = "unix", "plain", "curve"
 
 
 @dataclass(frozen=True)
@@ -48,26 +50,27 @@ class Case:
         text: for the row.
         tans: tokens of an episode, 1 or 7.
         batch: episodes in a message.
-        security: plain or curve.
+        way: a unix socket, TCP, or TCP with keys.
     """
 
     text: str
     tans: int
     batch: int
-    security: str
+    way: str
 
     @property
     def keys(self) -> Keys | None:
         """For encrypted sockets."""
-        return None if self.security == PLAIN else make_keys()
+        return make_keys() if self.way == CURVE else None
 
 
-LARGE = Case("1 token, 256 in a batch, plain", 1, 256, PLAIN)
+LARGE = Case("1 token, 256 in a batch, unix", 1, 256, UNIX)
 CASES = (
     LARGE,
-    Case("1 token, 256 in a batch, curve", 1, 256, "curve"),
-    Case("1 token, 32 in a batch, plain", 1, 32, PLAIN),
-    Case("7 tokens, 32 in a batch, plain", 7, 32, PLAIN),
+    Case("1 token, 256 in a batch, plain", 1, 256, PLAIN),
+    Case("1 token, 256 in a batch, curve", 1, 256, CURVE),
+    Case("1 token, 32 in a batch, unix", 1, 32, UNIX),
+    Case("7 tokens, 32 in a batch, unix", 7, 32, UNIX),
 )
 
 
@@ -116,7 +119,10 @@ def connected(case: Case, setup: Setup, episodes: Episodes, workers: int = 1) ->
     """A Hub that a process sends to, as one worker or as several."""
     keys, spec = case.keys, EpisodeSpec.of(setup)
     info = WelcomeInfo("bench", 0, setup.fingerprints(), spec, WINDOW)
-    with Hub("127.0.0.1", 0, info, keys=keys) as hub, tempfile.TemporaryDirectory() as folder:
+    with ExitStack() as stack:
+        folder = stack.enter_context(tempfile.TemporaryDirectory())
+        bind = f"{IPC}{folder}/hub" if case.way == UNIX else "127.0.0.1"
+        hub = stack.enter_context(Hub(bind, 0, info, keys=keys))
         connect = Path(folder) / "connection.json"
         connect.write_text(json.dumps(_connection(hub, keys)))
         with child(send_batches, str(connect), setup, episodes, workers):
@@ -148,7 +154,7 @@ def send_batches(connect: str, setup: Setup, episodes: Episodes, workers: int) -
 
 
 def _connection(hub: Hub, keys: Keys | None) -> dict[str, str]:
-    where = {"endpoint": hub.endpoint, "run_id": "bench"}
+    where = {"endpoint": hub.endpoint, "run_id": "bench", "machine": gethostname()}
     if keys is None:
         return where
     return where | {
@@ -166,13 +172,18 @@ def bare(case: Case, setup: Setup, episodes: Episodes) -> Iterator[Work]:
     """A ROUTER here that takes and answers what a DEALER in another process sends."""
     frames = EpisodeBatch(SEQUENCE, 0, episodes).encode(EpisodeSpec.of(setup))
     ack, keys = Ack(SEQUENCE, duplicate=False).encode()[0], case.keys
-    with zmq.Context() as context, context.socket(zmq.ROUTER) as router:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        zmq.Context() as context,
+        context.socket(zmq.ROUTER) as router,
+    ):
         router.setsockopt(zmq.RCVTIMEO, round(PATIENCE_S * 1000))
         if keys is not None:
             router.setsockopt(zmq.CURVE_SERVER, 1)
             router.setsockopt(zmq.CURVE_SECRETKEY, keys.server_secret.encode())
-        port = router.bind_to_random_port("tcp://127.0.0.1")
-        with child(send_frames, port, frames, keys):
+        router.bind(f"{IPC}{folder}/bare" if case.way == UNIX else "tcp://127.0.0.1:*")
+        endpoint = router.getsockopt_string(zmq.LAST_ENDPOINT)
+        with child(send_frames, endpoint, frames, keys):
             yield lambda: _take_frames(router, ack) * episodes.transitions
 
 
@@ -182,7 +193,7 @@ def _take_frames(router: "zmq.Socket[bytes]", ack: bytes) -> int:
     return BARE_MESSAGES
 
 
-def send_frames(port: int, frames: list[bytes], keys: Keys | None) -> None:
+def send_frames(endpoint: str, frames: list[bytes], keys: Keys | None) -> None:
     """Send the same frames for ever, and wait for an answer when a window of them is on its way."""
     with zmq.Context() as context, context.socket(zmq.DEALER) as dealer:
         dealer.setsockopt(zmq.LINGER, 0)
@@ -191,7 +202,7 @@ def send_frames(port: int, frames: list[bytes], keys: Keys | None) -> None:
             dealer.setsockopt(zmq.CURVE_SERVERKEY, keys.server_public.encode())
             dealer.setsockopt(zmq.CURVE_PUBLICKEY, keys.worker_public.encode())
             dealer.setsockopt(zmq.CURVE_SECRETKEY, keys.worker_secret.encode())
-        dealer.connect(f"tcp://127.0.0.1:{port}")
+        dealer.connect(endpoint)
         for _ in range(WINDOW - 1):
             dealer.send_multipart(frames)
         while True:

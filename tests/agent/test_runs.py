@@ -10,8 +10,9 @@ import yaml
 from tangram_agent.checkpoints import save_checkpoint
 from tangram_agent.learner import Learner
 from tangram_agent.policy import Policy
-from tangram_agent.runs import load_run
-from tangram_sim.errors import RunError, TangramError
+from tangram_agent.runs import load_changed, load_run
+from tangram_sim.config import RewardConfig
+from tangram_sim.errors import ConfigError, RunError, TangramError
 from tests.agent.builders import PLAIN, PROPOSAL, SMALL, SQUARE, random_transitions, setup
 
 pytestmark = pytest.mark.fast
@@ -56,7 +57,7 @@ def spoil(path: Path) -> None:
         (lambda run: run.rename(run.with_name("elsewhere")), "no run folder"),
         (lambda run: (run / "config.yaml").unlink(), "is this a run folder"),
         (lambda run: (run / "config.yaml").write_text("a: [1"), "not valid YAML"),
-        (lambda run: (run / "config.yaml").write_text("[" * 9999), "not valid YAML"),
+        (lambda run: (run / "config.yaml").write_text("[" * 9999), "is no file of sett"),
         (lambda run: (run / "config.yaml").write_text("- 1"), "holds no settings"),
         (lambda run: (run / "config.yaml").write_text("tokens: {}"), "no section sim"),
         (lambda run: (run / "checkpoints").rename(run / "gone"), "no checkpoint in"),
@@ -91,6 +92,21 @@ def test_a_run_may_be_played_in_another_world(run_dir: Path) -> None:
     config = CONFIG | {"sim": {"backend": "physics"}, "reward": {"name": "dense"}}
     (run_dir / "config.yaml").write_text(yaml.safe_dump(config))
     assert load_run(run_dir).setup.sim.backend == "physics"
+
+
+def test_a_run_folder_has_no_code_loaded_that_was_not_named(run_dir: Path) -> None:
+    own = run_dir / "own.py"
+    own.write_text("def near(achieved, desired, layout): return [0.0] * len(achieved)")
+    config = CONFIG | {"reward": {"name": f"{own}:near", "sha256": "0" * 64}}
+    (run_dir / "config.yaml").write_text(yaml.safe_dump(config))
+    with pytest.raises(ConfigError, match=rf"name code, {own}:near \(sha256 0{{64}}\)"):
+        load_run(run_dir)
+    with pytest.raises(ConfigError, match=f"has sha256 .* want {'0' * 64}"):
+        load_run(run_dir, reward=f"{own}:near")
+    assert load_changed(run_dir, {"reward": {"name": "overlap"}}).setup.reward == RewardConfig()
+    config["reward"] = {"name": f"{own}:near"}
+    (run_dir / "config.yaml").write_text(yaml.safe_dump(config))
+    assert load_run(run_dir, reward=f"{own}:near").setup.reward.own == (own, "near")
 
 
 def test_weights_of_another_net_are_refused(tmp_path: Path) -> None:

@@ -173,7 +173,7 @@ def test_tokens_push_each_other_where_several_slide(
 )
 def test_wrong_service_settings_are_refused(name: str, value: object, reason: str) -> None:
     with pytest.raises(ConfigError, match=reason):
-        from_mapping(ServiceConfig, {name: value})
+        from_mapping(ServiceConfig, {"bind": "::1", name: value})
 
 
 def test_stages_are_read_from_mappings() -> None:

@@ -31,6 +31,7 @@ MASTER = (
     "agent.batch_size=16",
     "agent.replay_capacity=2000000",  # nothing makes room for anything
 )
+TCP = ("service.bind=127.0.0.1", "service.auth=off")  # for those who know its address alone
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """The commands, started from another folder: their help, and what they refuse."""
 
+import hashlib
 import json
 import os
 import sys
@@ -7,7 +8,9 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
+import yaml
 
+from conf.cli import composed
 from tangram_cli.commands import COMMANDS, COMMON_NAMES
 from tests.cluster.processes import BIN, ended, here, refused
 
@@ -84,12 +87,16 @@ WRONG = [
     ("tangram-train service.bind=", "without scheme and port, got '': set service.bind=127.0.0.1"),
     ("tangram-master service.bind=127.0.0.1:99999", "service.bind must be an address or a name of"),
     ("tangram-master service.port=99999", "service.port must be between 0 and 65535, got 99999"),
+    (
+        "tangram-train service.port=5555",
+        "service.port=5555 changes nothing with service.bind=",
+    ),
     ("tangram-master +sim.colour=1", 'can not match "colour"'),
     ("tangram-master from_config=nowhere.yaml", "from_config=nowhere.yaml: No such file"),
     ("tangram-worker connect=tcp://127.0.0.1:1 reward.name=own.py:none", "cannot read 'own.py' on"),
     ("tangram-train tokens.shapes=[square,square,square] tokens.scale=2.2", "no room for token"),
     ("tangram-master tokens.scale=1000", "does not fit into an arena of width 2"),
-    ("tangram-worker", "say which master: connect=host:port"),
+    ("tangram-worker", "say which run: connect=runs/..., or a"),
     ("tangram-worker connect=tcp://127.0.0.1:99999", "port from 1 to 65535"),
     ("tangram-worker connect=tcp://h:0 role=evaluator", "'tcp://h:0' (from tcp://h:0) is no addr"),
     ("tangram-status connect=tcp://127.0.0.1:65536", "port from 1 to 65535"),
@@ -139,6 +146,54 @@ def test_an_own_reward_that_fails_is_told_before_anything_starts(tmp_path: Path,
     told = refused(*line.split(), "reward.name=own.py:near", cwd=tmp_path)
     assert "own.py:near failed: ZeroDivisionError" in told
     assert [path.name for path in tmp_path.iterdir()] == ["own.py"]
+
+
+MARKS = """
+from pathlib import Path
+Path(__file__).with_name("loaded").touch()
+def near(achieved, desired, layout): return -abs(achieved - desired).mean(axis=(1, 2))
+"""
+READ = [
+    "tangram-worker connect=run",
+    "tangram-worker connect=run/connection.json role=evaluator",
+    "tangram-worker connect=tcp://127.0.0.1:1 from_config=run/config.yaml",
+    "tangram-train from_config=run/config.yaml",
+    "tangram-master from_config=run/config.yaml run_dir=run resume=auto",
+    "tangram-eval run_dir=run",
+    "tangram-play run_dir=run",
+    "tangram-play compare=[run,pretrained/square]",
+    "tangram-play run_dir=run tokens=square",
+    "tangram-train --config-dir presets reward=mine",
+]
+
+
+@pytest.mark.parametrize("folder", [".", "{}"])
+@pytest.mark.parametrize("line", READ)
+def test_code_is_loaded_only_if_the_command_line_names_it(
+    tmp_path: Path, line: str, folder: str
+) -> None:
+    """Not from the working folder either, where a file may lie that somebody else has named."""
+    name, digest = f"{folder.format(tmp_path)}/own.py:near", "0" * 64
+    (tmp_path / "own.py").write_text(MARKS)
+    settings = composed("train", []) | {"reward": {"name": name, "sha256": digest}}
+    connection = {"endpoint": "tcp://127.0.0.1:1", "run_id": "a" * 16, "settings": settings}
+    for place, content in (
+        ("run/config.yaml", yaml.safe_dump(settings)),
+        ("run/connection.json", json.dumps(connection)),
+        ("presets/reward/mine.yaml", yaml.safe_dump(settings["reward"])),
+    ):
+        path = tmp_path / place
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(content)
+    before = sorted(tmp_path.rglob("*"))
+    told = refused(*line.split(), cwd=tmp_path)
+    assert f"name code, {name} (sha256 {digest}), which is not loaded unless you name it: " in told
+    assert told.endswith(f"add reward.name={name} if you trust it")
+    told = refused(*line.split(), f"reward.name={name}", cwd=tmp_path)
+    found = hashlib.sha256(MARKS.encode()).hexdigest()
+    other = f"has sha256 {found}, and the settings of the run want {digest}"
+    assert (other in told) != ("no checkpoint in" in told)  # which eval and play look for first
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_a_warm_start_from_nowhere_is_refused(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from tangram_sim.errors import TangramError
 from tests.cluster.players import (
     LIMIT_S,
     MASTER,
+    TCP,
     Player,
     assert_exactly_once,
     finish,
@@ -50,7 +51,7 @@ def test_a_network_that_swallows_everything_for_a_while(
 ) -> None:
     """One player behind the proxy, one beside it, who must not notice."""
     with (
-        master(folder) as process,
+        master(folder, *TCP) as process,
         Proxy(port_of(folder)) as proxy,
         players(setup_of(folder), f"tcp://127.0.0.1:{proxy.port}", folder) as made,
     ):
@@ -123,6 +124,32 @@ def test_two_runs_on_one_machine_do_not_meet(tmp_path: Path) -> None:
         assert_exactly_once(path, group)
 
 
+@pytest.mark.parametrize("how", ["journal deleted", "run deleted", "run moved away"])
+def test_what_is_deleted_under_a_master_loses_nothing(folder: Path, how: str) -> None:
+    """Kill -9 after the first batch that is acknowledged again, then a restart."""
+    away = folder.with_name("away")
+    with ExitStack() as stack:
+        with master(folder, "service.checkpoint_minutes=1000") as process:
+            made = stack.enter_context(players(setup_of(folder), folder, folder))
+            more_acknowledged(made, 5)
+            if how == "journal deleted":
+                shutil.rmtree(folder / "journal")
+            else:
+                folder.rename(away)
+                if how == "run deleted":
+                    shutil.rmtree(away)
+                until(made, lambda: steps_without_answer(made[0]) == 500)
+                assert not folder.exists()  # not made again by accident
+                folder.mkdir() if how == "run deleted" else away.rename(folder)
+            more_acknowledged(made, 1)
+            process.kill()
+            process.wait()
+        with master(folder) as process:
+            more_acknowledged(made, 5)
+            finish(made, process)
+    assert_exactly_once(folder, made)
+
+
 def can_mount() -> bool:
     """Whether this user may have a file system of his own."""
     if shutil.which("unshare") is None:
@@ -138,7 +165,7 @@ def test_a_full_disk_stops_the_acknowledgements_and_nothing_is_lost(tmp_path: Pa
     disk.mkdir()
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]
-    settings = [*MASTER, f"service.port={port}", "service.checkpoint_minutes=0.05"]
+    settings = [*MASTER, *TCP, f"service.port={port}", "service.checkpoint_minutes=0.05"]
     words = " ".join(f"'{text}'" for text in [f"run_dir={disk / 'run'}", *settings])
     script = (
         f"mount -t tmpfs -o size=40m none {disk} && {{\n"

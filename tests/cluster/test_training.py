@@ -91,6 +91,23 @@ def test_eval_repeats_the_scores_of_the_run_and_applies_several_actions(
         assert scores["mean_reward"] > 0.8
 
 
+def test_a_reward_of_ones_own_is_named_by_every_process_and_command(tmp_path: Path) -> None:
+    """From a file that the processes know by its whole path, and by its content."""
+    (tmp_path / "own.py").write_text(
+        "def near(achieved, desired, layout): return -abs(achieved - desired).mean(axis=(1, 2))"
+    )
+    code = f"reward.name={tmp_path}/own.py:near"
+    arguments = ("run_dir=own", "max_updates=3", "reward.name=own.py:near", *QUICK)
+    assert code in run("tangram-train", *arguments, cwd=tmp_path)  # with what shows it at play
+    assert json.loads((tmp_path / "own/result.json").read_text())["updates"] == 3
+    assert f"add {code} if" in refused("tangram-eval", "run_dir=own", "episodes=1", cwd=tmp_path)
+    for given in (code, "reward.name=overlap"):
+        run_here("tangram-eval", "run_dir=own", "episodes=1", given, cwd=tmp_path)
+    more = ("from_config=own/config.yaml", "run_dir=own", "resume=auto", "max_updates=4", code)
+    run("tangram-train", *more, cwd=tmp_path)
+    assert json.loads((tmp_path / "own/result.json").read_text())["updates"] == 4
+
+
 def test_a_refused_resume_leaves_the_run_as_it_was(trained: Path) -> None:
     before = (trained / "config.yaml").read_bytes()
     arguments = (f"run_dir={trained}", "resume=auto", "tokens=parallelogram")

@@ -1,6 +1,8 @@
 """Small runs that the tests of the master share: everything real but the sockets."""
 
+import errno
 import io
+import os
 import time
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping
@@ -8,21 +10,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 from rich.console import Console
 
+from master import journal as journal_module
 from master.budget import Budget
 from master.checkpointer import Checkpointer
 from master.config import MasterConfig
 from master.delivery import EpisodesArrived, Ledger, ScoresArrived
 from master.divergence import DivergenceGuard
-from master.journal import Journal
+from master.journal import Journal, Place
 from master.lockstep import Lockstep
 from master.loop import Loop
 from master.metrics import Metrics
 from master.registry import Peer
 from master.report import Reporter, StatusCollector
-from master.rundir import Clock, Record, RunFolder
+from master.rundir import Claim, Clock, Record, RunFolder
 from master.signals import StopSignals
 from master.trainer import Trainer
 from tangram_agent.arrays import EpisodeSpec
@@ -62,20 +66,38 @@ def scores(made: Setup, version: int, reward: float = 0.5) -> ScoresArrived:
     return ScoresArrived(0, 1, Scores(version, scalars, corners, corners, corners))
 
 
-_journals: list[Journal] = []
+_opened: list[Journal | Claim] = []
 
 
-def journal(folder: Path, made: Setup, sync_s: float = 1.0) -> Journal:
-    """A journal of the run `run`."""
-    opened = Journal(folder, "run", made.task_digest(), sync_s)
-    _journals.append(opened)
+def journal(folder: Path, made: Setup, sync_s: float = 1.0, number: int = 0) -> Journal:
+    """A journal of the run `run`, after so many batches."""
+    opened = Journal(folder, "run", made.task_digest(), sync_s, Place(number=number))
+    _opened.append(opened)
     return opened
+
+
+class Disk:
+    """Writes journals as long as there is room."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.room = 10**9
+        opened, disk = journal_module.FileIO, self
+
+        class Full(opened):  # type: ignore[misc, valid-type]
+            def write(self, data: memoryview) -> int:
+                if not disk.room:
+                    raise OSError(errno.ENOSPC, "No space left on device")
+                size = min(len(data), disk.room)
+                disk.room -= size
+                return int(os.write(self.fileno(), data[:size]))
+
+        monkeypatch.setattr(journal_module, "FileIO", Full)
 
 
 def close_journals() -> None:
     """All that were made here."""
-    while _journals:
-        _journals.pop().close()
+    while _opened:
+        _opened.pop().close()
 
 
 class FakeHub:
@@ -88,6 +110,7 @@ class FakeHub:
     """
 
     endpoint, weights_endpoint = "tcp://127.0.0.1:1", "tcp://127.0.0.1:2"
+    open_to_all = False
 
     def __init__(
         self, made: Setup, script: Iterable[list[Any]] = (), roles: Iterable[str] = ("player",)
@@ -177,7 +200,9 @@ def loop(
     guard = DivergenceGuard(learner, run_folder.bad_batch, limit=3)
     clock, budget = Clock(record), Budget(settings, learner, record)
     kept = journal(run_folder.journal, made)
-    checkpointer = Checkpointer(service, run_folder, guard, hub, kept, clock)  # type: ignore[arg-type]
+    claim = run_folder.lock()
+    _opened.append(claim)
+    checkpointer = Checkpointer(service, claim, guard, hub, kept, clock)  # type: ignore[arg-type]
     status = StatusCollector("run", guard, hub, budget, clock, checkpointer)  # type: ignore[arg-type]
     metrics = Metrics(run_folder.tensorboard, run_folder.curve)
     reporter = Reporter(learner, record, status, ShownProgress(), metrics, [hub.tell])

@@ -2,6 +2,8 @@
 
 import errno
 import logging
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,18 +11,22 @@ import numpy as np
 import pytest
 import torch
 
-from master import journal as journal_module
-from master.checkpointer import MAKE_ROOM, restore_run
+from master.checkpointer import AT_ONCE, MAKE_ROOM, WAIT, restore_run
 from master.journal import JournalError, segments
+from master.recovery import Reader
+from master.rundir import RunFolder
 from master.trainer import Trainer
 from tangram_agent import checkpoints as checkpoints_module
+from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.checkpoints import DiskError, list_checkpoints
 from tangram_agent.process import Every
-from tests.master.builders import FakeHub, arrival, loop, small_setup
+from tangram_sim.errors import ConfigError, RunError
+from tests.master.builders import Disk, FakeHub, arrival, loop, small_setup
 
 pytestmark = pytest.mark.fast
 
 MADE = small_setup()
+ROOM = 10**9
 
 
 class Stage:
@@ -30,11 +36,13 @@ class Stage:
         self, folder: Path, patch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
     ) -> None:
         caplog.set_level(logging.INFO)
-        self.full, self._caplog = False, caplog
-        self.folder, self.checkpointer = folder, loop(folder, MADE, FakeHub(MADE)).checkpointer
+        self.disk, self._caplog = Disk(patch), caplog
+        self.folder = folder / "run"
+        self.folder.mkdir()
+        self.checkpointer = loop(self.folder, MADE, FakeHub(MADE)).checkpointer
         self.checkpointer._retry = Every(0.0)
-        for writer in (journal_module.Journal, checkpoints_module):
-            patch.setattr(writer, "_write", self._guarded(writer._write))
+        self._write = checkpoints_module._write
+        patch.setattr(checkpoints_module, "_write", self._guarded)
 
     @property
     def told(self) -> list[str]:
@@ -43,13 +51,10 @@ class Stage:
     def keep(self, number: int) -> bool:
         return self.checkpointer.keep(arrival(MADE, number))
 
-    def _guarded(self, write: Any) -> Any:
-        def guarded(*arguments: Any) -> None:
-            if self.full:
-                raise OSError(errno.ENOSPC, "No space left on device")
-            write(*arguments)
-
-        return guarded
+    def _guarded(self, *arguments: Any) -> None:
+        if not self.disk.room:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        self._write(*arguments)
 
 
 @pytest.fixture
@@ -60,17 +65,17 @@ def stage(
 
 
 def test_a_full_disk_is_told_once_and_the_batch_is_kept_when_there_is_room(stage: Stage) -> None:
-    stage.full = True
+    stage.disk.room = 0
     assert [stage.keep(1) for _ in range(3)] == [False] * 3
     where = stage.folder / "journal"
     assert stage.told == [
         f"the journal in {where} cannot be written (No space left on device): {MAKE_ROOM}"
     ]
-    stage.full = False
+    stage.disk.room = ROOM
     assert stage.keep(1)
     assert stage.told[1:] == ["the journal can be written again: batches are taken in"]
     assert stage.keep(2)
-    stage.full = True
+    stage.disk.room = 0
     assert not stage.keep(3)
     assert len(stage.told) == 3
 
@@ -78,17 +83,19 @@ def test_a_full_disk_is_told_once_and_the_batch_is_kept_when_there_is_room(stage
 def test_a_disk_that_does_not_take_a_checkpoint_ends_nothing(stage: Stage) -> None:
     assert stage.keep(1)
     first = stage.checkpointer.save()
+    title = segments(stage.folder / "journal")[2].stat().st_size
     assert stage.keep(2)
-    stage.full = True
+    stage.disk.room = 0
     stage.checkpointer._checkpoint = Every(0.0)
     stage.checkpointer.tick()
     assert len(stage.told) == 1
-    assert stage.told[0].startswith("cannot write a checkpoint to ")
+    assert "cannot be written (No space left on device)" in stage.told[0]
     assert list((stage.folder / "checkpoints").iterdir()) == [first]
-    assert list(segments(stage.folder / "journal")) == [2]
+    stage.disk.room = title  # and for nothing more
     with pytest.raises(DiskError, match="make room there"):
         stage.checkpointer.save()
-    stage.full = False
+    assert list((stage.folder / "checkpoints").iterdir()) == [first]
+    stage.disk.room = ROOM
     stage.checkpointer.tick()
     assert len(list_checkpoints(stage.folder / "checkpoints")) == 2
 
@@ -112,7 +119,7 @@ def test_segments_live_as_long_as_a_checkpoint_needs_them(stage: Stage) -> None:
         assert stage.keep(number)
         stage.checkpointer.save()
         left.append(list(segments(stage.folder / "journal")))
-    assert left == [[], [2], [3], [4]]
+    assert left == [[2], [2, 3], [3, 4], [4, 5]]
 
 
 def test_a_journal_that_cannot_be_synced_is_told(
@@ -125,4 +132,152 @@ def test_a_journal_that_cannot_be_synced_is_told(
 
     monkeypatch.setattr(stage.checkpointer._journal, "tick", fail)
     stage.checkpointer.tick()
-    assert stage.told == ["the journal cannot be written"]
+    assert stage.told == [f"the journal cannot be written: {MAKE_ROOM}"]
+
+
+def inserted(stage: Stage) -> tuple[int, list[int]]:
+    """Where a restart would begin, and the batches that it would insert then."""
+    found = restore_run(stage.folder / "checkpoints", Trainer(MADE, 0, "cpu", 64))
+    place, spec = found.place if found else None, EpisodeSpec.of(MADE)
+    journal = stage.folder / "journal"
+    batches = Reader(journal, place, "run", MADE.task_digest(), spec, pytest.fail)
+    return place.number if place else 0, [one.sequence for one in batches]
+
+
+def emptied(folder: Path) -> None:
+    for path in folder.iterdir():
+        if path.name != ".lock":
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+def made_anew(folder: Path) -> None:
+    shutil.rmtree(folder)
+    folder.mkdir()
+
+
+def copied(folder: Path) -> None:
+    shutil.copytree(folder, folder.with_name("copy"))
+    shutil.rmtree(folder)
+    folder.with_name("copy").rename(folder)
+
+
+LOST: dict[str, tuple[Callable[[Path], object], str]] = {
+    "a segment": (
+        lambda folder: segments(folder / "journal")[2].unlink(),
+        "has lost its newest segment of the journal",
+    ),
+    "the journal": (
+        lambda folder: shutil.rmtree(folder / "journal"),
+        "has lost its newest segment of the journal",
+    ),
+    "the checkpoint": (
+        lambda folder: shutil.rmtree(folder / "checkpoints"),
+        "has lost its newest checkpoint",
+    ),
+    "all but the lock": (emptied, "has lost its newest segment of the journal"),
+    "the lock": (lambda folder: (folder / ".lock").unlink(), "was made anew"),
+    "the folder, made anew": (made_anew, "was made anew"),
+}
+
+
+@pytest.mark.parametrize("lost", LOST)
+@pytest.mark.parametrize("looks", ["at the next batch", "at the next sync"])
+def test_what_is_deleted_under_a_master_is_told_and_written_anew_at_once(
+    stage: Stage, lost: str, looks: str
+) -> None:
+    """Acknowledgements went on into files without names, and a second master began beside it."""
+    assert stage.keep(1)
+    stage.checkpointer.save()
+    assert stage.keep(2)
+    lose, told = LOST[lost]
+    lose(stage.folder)
+    if looks == "at the next batch":
+        assert stage.keep(3)
+        after = (2, [3])
+    else:
+        stage.checkpointer._look = Every(0.0)
+        stage.checkpointer.tick()
+        after = (2, [])
+    assert stage.told == [f"run_dir {stage.folder} {told}: {AT_ONCE}"]
+    assert inserted(stage) == after
+    with pytest.raises(ConfigError, match="in use by another process"):
+        RunFolder(stage.folder).lock()
+    assert (stage.folder / "config.yaml").exists()
+    assert stage.keep(4)
+    assert len(stage.told) == 1
+
+
+GONE: dict[str, tuple[Callable[[Path], object], str]] = {
+    "deleted": (shutil.rmtree, "is gone"),
+    "moved": (lambda folder: folder.rename(folder.with_name("away")), "is gone"),
+    "another one": (copied, "is another folder now, with a run in it"),
+}
+
+
+@pytest.mark.parametrize("gone", GONE)
+def test_nothing_is_acknowledged_while_the_run_folder_is_gone(stage: Stage, gone: str) -> None:
+    assert stage.keep(1)
+    stage.checkpointer.save()
+    lose, told = GONE[gone]
+    lose(stage.folder)
+    there = stage.folder.exists()
+    stage.checkpointer._look = stage.checkpointer._checkpoint = Every(0.0)
+    for _ in range(3):
+        assert not stage.keep(2)
+        stage.checkpointer.tick()
+    with pytest.raises(RunError, match=f"^run_dir {stage.folder} {told}: put it back, or make an"):
+        stage.checkpointer.save()
+    back = "put it back, or make an empty folder there"
+    assert stage.told == [f"run_dir {stage.folder} {told}: {back}; {WAIT}"]
+    assert stage.checkpointer.failing
+    assert stage.folder.exists() == there  # not made again by accident
+    if there:
+        shutil.rmtree(stage.folder)
+    away = stage.folder.with_name("away")
+    away.rename(stage.folder) if away.exists() else stage.folder.mkdir()
+    assert stage.keep(2)
+    assert not stage.checkpointer.failing
+    assert stage.told[-1] == "the journal can be written again: batches are taken in"
+    assert len(stage.told) == (2 if gone == "moved" else 3)
+    assert inserted(stage) == (1, [2])
+
+
+def test_a_second_master_in_a_folder_that_was_made_anew_keeps_it(stage: Stage) -> None:
+    assert stage.keep(1)
+    made_anew(stage.folder)
+    with RunFolder(stage.folder).lock():
+        assert not stage.keep(2)
+        assert "cannot be claimed anew (another process works there)" in stage.told[0]
+        assert [path.name for path in stage.folder.iterdir()] == [".lock"]
+    assert stage.keep(2)
+
+
+def test_a_checkpoint_that_is_due_at_once_stays_so_until_it_is_written(stage: Stage) -> None:
+    assert stage.keep(1)
+    shutil.rmtree(stage.folder / "journal")
+    stage.disk.room = 0
+    for _ in range(2):
+        assert not stage.keep(2)
+    assert len(stage.told) == 2  # what is gone, and that the disk is full
+    stage.disk.room = ROOM
+    assert stage.keep(2)
+    assert inserted(stage) == (1, [2])
+
+
+def test_after_a_sync_that_failed_nothing_depends_on_what_it_was_to_sync(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The next sync of the same file may succeed without what this one has lost."""
+
+    def fail(_: int) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    assert stage.keep(1)
+    stage.checkpointer._journal._sync = Every(0.0)
+    with monkeypatch.context() as patch:
+        patch.setattr("os.fsync", fail)
+        stage.checkpointer.tick()
+    assert "cannot be written (Input/output error)" in stage.told[0]
+    segments(stage.folder / "journal")[1].unlink()
+    assert stage.keep(2)
+    assert inserted(stage) == (1, [2])

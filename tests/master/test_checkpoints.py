@@ -50,7 +50,7 @@ def names(folder: Path) -> list[str]:
 
 
 def test_what_is_read_is_what_was_written(tmp_path: Path) -> None:
-    path = save(tmp_path / "deep" / "checkpoints")
+    path = save(tmp_path / "checkpoints")
     found = load_checkpoint(path)
     assert (found.path, found.updates, found.counters) == (path, 5, READ_BACK)
     assert set(found.arrays) == set(ARRAYS)
@@ -121,8 +121,9 @@ def test_all_bytes_and_names_are_on_the_disk_in_the_order_that_a_power_cut_asks_
     path = save(tmp_path)
     content = {file.stat().st_ino for file in path.iterdir()}
     assert len(content) == 3
-    assert set(events[:3]) == content
-    assert events[3:] == [path.stat().st_ino, "renamed", tmp_path.stat().st_ino]
+    assert events[0] == tmp_path.parent.stat().st_ino
+    assert set(events[1:4]) == content
+    assert events[4:] == [path.stat().st_ino, "renamed", tmp_path.stat().st_ino]
 
 
 def test_a_half_written_folder_is_no_checkpoint(tmp_path: Path) -> None:
@@ -233,11 +234,19 @@ def test_a_folder_without_a_checkpoint_and_one_that_cannot_be_written_are_told(
         folder.mkdir(exist_ok=True)
     folder.rmdir()
     folder.write_text("a file is in the way")
-    with pytest.raises(RunError, match=r"cannot write a checkpoint to .*: make room there"):
-        save(folder)
+    for in_the_way in (folder, tmp_path / "deleted" / "checkpoints"):
+        with pytest.raises(RunError, match=r"cannot write a checkpoint to .*: make room there"):
+            save(in_the_way)
+        folder.unlink(missing_ok=True)
+    assert list(tmp_path.iterdir()) == []  # what was deleted is not made again by accident
 
 
-def test_a_corrupt_one_is_set_aside_and_no_longer_counts(tmp_path: Path) -> None:
+def test_a_corrupt_one_is_set_aside_for_good_and_no_longer_counts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for _ in range(2):
         assert set_aside(save(tmp_path)).name == "00000005.corrupt"
     assert names(tmp_path) == []
+    path, events = save(tmp_path), watched_disk(monkeypatch)
+    set_aside(path)
+    assert events == ["renamed", tmp_path.stat().st_ino]

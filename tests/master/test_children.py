@@ -80,6 +80,12 @@ def test_a_child_has_its_own_session_niceness_thread_and_log(
         assert made.clear() == 7
         assert [json.loads(line) for line in made.tail().splitlines()] == [[True, "1"]] * lives
     assert not made.alive
+    (tmp_path / "log").unlink()
+    (tmp_path / "log").mkdir()  # as where the run folder is gone: no reason to be without it
+    made.start(ended.put)
+    assert ended.get(timeout=LIMIT_S) is made
+    assert made.clear() == 7
+    (tmp_path / "log").rmdir()
 
     polite = Child("polite", ["-c", "import signal; signal.pause()"], tmp_path / "log", nice=3)
     polite.start(ended.put)

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from master.gate import HANDSHAKES, RESERVE, Room
 from tangram_agent.messages import (
     Ack,
     Alive,
@@ -44,6 +45,7 @@ def test_hello_is_answered_with_all_that_a_worker_needs(stage: Stage) -> None:
     assert hub.counters["welcomed"] == 1
 
 
+NO_ROOM = Room(RESERVE + HANDSHAKES)
 DIFFERS = "its settings of {0} differ from the master's: start both with the same overrides of {0}"
 
 
@@ -72,19 +74,22 @@ DIFFERS = "its settings of {0} differ from the master's: start both with the sam
             "this master runs 'run', not 'another': the connection file is stale, take the one of "
             "a master that is running",
         ),
-        ({}, "refused_full", "0 processes take part already, the most there can be"),
+        (
+            {},
+            "refused_full",
+            f"0 processes take part already, the most that {NO_ROOM.files} open files allow: raise "
+            "ulimit -n and start the master again",
+        ),
     ],
 )
 def test_who_does_not_fit_is_told_why(
-    stage: Stage,
-    monkeypatch: pytest.MonkeyPatch,
     changes: dict[str, Any],
     counter: str,
     reason: str,
 ) -> None:
-    monkeypatch.setattr("master.registry.MAX_PEERS", 0)
-    assert stage.dealer().ask(with_header(hello().encode(), **changes)) == Refused(reason)
-    assert (stage.hub.counters[counter], stage.hub.peers) == (1, [])
+    with staged(room=NO_ROOM) as stage:
+        assert stage.dealer().ask(with_header(hello().encode(), **changes)) == Refused(reason)
+        assert (stage.hub.counters[counter], stage.hub.peers) == (1, [])
 
 
 def test_the_newest_process_of_an_index_wins(stage: Stage) -> None:

@@ -14,6 +14,8 @@ from hypothesis import strategies as st
 from master.delivery import EpisodesArrived
 from master.hub import Hub
 from master.report import _workers
+from master.sockets import MAX_COMMAND
+from tangram_agent.arrays import MAX_FRAMES
 from tangram_agent.messages import (
     AskStatus,
     Bye,
@@ -72,12 +74,19 @@ def test_a_frame_over_the_limit_never_arrives(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr("master.sockets.MAX_FRAME_BYTES", 10_000)
     with staged() as stage:
         large, small = stage.dealer(), stage.dealer()
-        large.say([bytes(10_001)])
+        large.say([bytes(10_001 + MAX_COMMAND)])
         large.say(Heartbeat({}))
         assert isinstance(small.ask([bytes(10_000)]), Reject)
         # The connection of the large one was cut; it comes again, without its message.
         assert large.ask(Heartbeat({})) == Greet()
         assert stage.hub.counters["malformed"] == 1
+
+
+def test_a_message_of_too_many_frames_is_not_decoded(stage: Stage, player: Dealer) -> None:
+    """Nor are their checksums found."""
+    answer = player.ask([*hello().encode(), *[b""] * MAX_FRAMES, b""])
+    assert isinstance(answer, Reject)
+    assert answer.reason == f"the message has {MAX_FRAMES + 2} frames, at most {MAX_FRAMES + 1}"
 
 
 def test_who_vanished_is_unreachable_and_nobody_waits(stage: Stage, player: Dealer) -> None:

@@ -3,7 +3,6 @@
 import errno
 import os
 import zlib
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +14,14 @@ from hypothesis import strategies as st
 
 from master import journal as journal_module
 from master.delivery import EpisodesArrived
-from master.journal import FORMAT, HEAD, JournalError, Title, journal_run_id, read_journal, segments
-from tangram_agent.arrays import EpisodeSpec
+from master.journal import FORMAT, HEAD, MAGIC, JournalError, Place, Title, segments
+from master.recovery import Reader, journal_run_id
+from tangram_agent.arrays import EpisodeSpec, join_frames
+from tangram_agent.schema import opened, seal
 from tangram_agent.setup import Setup
 from tangram_sim.errors import RunError
 from tests.agent.builders import PAIR, setup, watched_disk
-from tests.master.builders import arrival, close_journals, journal, small_setup
+from tests.master.builders import Disk, arrival, close_journals, journal, small_setup
 
 pytestmark = pytest.mark.fast
 
@@ -30,13 +31,19 @@ MADE = small_setup()
 def read(
     folder: Path,
     warnings: list[str] | None = None,
-    first: int = 1,
+    after: Place | None = None,
     run_id: str = "run",
     made: Setup = MADE,
 ) -> list[EpisodesArrived]:
     warn = pytest.fail if warnings is None else warnings.append
-    spec = EpisodeSpec.of(made)
-    return list(read_journal(folder, first, run_id, made.task_digest(), spec, warn))
+    return list(Reader(folder, after, run_id, made.task_digest(), EpisodeSpec.of(made), warn))
+
+
+def read_all(folder: Path, warnings: list[str]) -> Reader:
+    """A reader at its end."""
+    reader = Reader(folder, None, "run", MADE.task_digest(), EpisodeSpec.of(MADE), warnings.append)
+    list(reader)
+    return reader
 
 
 def sequences(folder: Path, **more: Any) -> list[int]:
@@ -81,28 +88,29 @@ def test_batches_are_with_the_operating_system_at_once_and_synced_on_their_inter
         kept.append(arrival(MADE, number))
         sizes.append(segments(tmp_path)[1].stat().st_size)
     assert sizes == sorted(set(sizes))
-    folder, file = (path.stat().st_ino for path in (tmp_path, *tmp_path.iterdir()))
-    assert done == [folder, *[file] * syncs]
+    paths = (tmp_path.parent, tmp_path, *tmp_path.iterdir())
+    above, folder, file = (path.stat().st_ino for path in paths)
+    assert done == [above, folder, file, *[file] * syncs]  # a title at once
     kept.close()
-    assert done == [folder, *[file] * max(syncs, 1)]
+    assert done == [above, folder, file, *[file] * max(syncs, 1)]
 
 
-def test_every_life_and_every_checkpoint_begins_a_segment_and_covered_ones_are_dropped(
+def test_every_checkpoint_begins_a_segment_every_life_goes_on_and_covered_ones_are_dropped(
     tmp_path: Path,
 ) -> None:
     journal(tmp_path, MADE).append(arrival(MADE, 1))
-    kept = journal(tmp_path, MADE)
+    kept = journal(tmp_path, MADE, number=1)
     kept.append(arrival(MADE, 2))
-    assert [kept.rotate() for _ in range(2)] == [3, 3]  # nothing came in between
+    assert [kept.rotate() for _ in range(2)] == 2 * [Place(2, 2)]  # nothing came in between
+    assert list(segments(tmp_path)) == [1, 2]  # there before the checkpoint that names it
     kept.append(arrival(MADE, 3))
-    assert list(segments(tmp_path)) == [1, 2, 3]
-    assert [sequences(tmp_path, first=n) for n in (1, 3, 4)] == [[1, 2, 3], [3], []]
+    assert [sequences(tmp_path, after=Place(*n)) for n in ((1, 0), (2, 2))] == [[1, 2, 3], [3]]
     kept.drop_before(2)
-    assert list(segments(tmp_path)) == [2, 3]
+    assert list(segments(tmp_path)) == [2]
     kept.drop_before(99)  # never the current one
-    assert list(segments(tmp_path)) == [3]
+    assert list(segments(tmp_path)) == [2]
     kept.append(arrival(MADE, 4))
-    assert sequences(tmp_path, first=3) == [3, 4]
+    assert sequences(tmp_path, after=Place(2, 2)) == [3, 4]
 
 
 @given(st.data())
@@ -127,61 +135,177 @@ def test_wherever_a_kill_cuts_whole_batches_come_back(
     assert all("cut short" in line and "it was not acknowledged" in line for line in warnings)
 
 
-def test_damage_in_the_middle_is_told_as_a_loss(tmp_path: Path) -> None:
-    kept = journal(tmp_path, MADE)
-    kept.append(arrival(MADE, 1))
-    start = segments(tmp_path)[1].stat().st_size
-    for number in (2, 3):
-        kept.append(arrival(MADE, number))
-    data = bytearray(segments(tmp_path)[1].read_bytes())
-    data[start + HEAD.size + 40] ^= 1
-    segments(tmp_path)[1].write_bytes(data)
+def test_a_life_that_goes_on_behind_a_torn_record_loses_nothing(tmp_path: Path) -> None:
+    """Wherever the kill came, also twice; what the first life left is not touched."""
+    written = journal(tmp_path, MADE)
+    for number in (1, 2):
+        written.append(arrival(MADE, number, count=1))
+    path = segments(tmp_path)[1]
+    whole = path.read_bytes()
+    second = len(record_at(whole, 2))
+    for left in (1, HEAD.size - 1, HEAD.size, HEAD.size + 9, second - 1):
+        path.write_bytes(whole[: len(whole) - second + left])
+        for number, sequence in ((1, 3), (2, 4)):
+            warnings: list[str] = []
+            reader = read_all(tmp_path, warnings)
+            before = path.read_bytes()
+            kept = journal(tmp_path, MADE, number=reader.number)
+            assert kept.number == number
+            kept.append(arrival(MADE, sequence, count=1))
+            assert path.read_bytes().startswith(before)
+        assert sequences(tmp_path, warnings=warnings) == [1, 3, 4]
+        assert len(warnings) == 2  # the second life told it, and this one
+        assert all("is cut short" in line and "not acknowledged" in line for line in warnings)
+
+
+def record_at(content: bytes, number: int) -> bytes:
+    """The record of a batch, of those whose heads are whole."""
+    at = -1
+    while (at := content.find(MAGIC, at + 1)) >= 0:
+        _, length, found, *_ = HEAD.unpack_from(content, at)
+        record = content[at : at + HEAD.size + length]
+        if found == number and b"episodes" in record:
+            return record
+    raise AssertionError(f"there is no record {number}")
+
+
+def damaged(folder: Path, number: int, byte: int) -> int:
+    """Three batches in each of two segments, one bit of a record changed; its first byte."""
+    kept = journal(folder, MADE)
+    for sequence in range(1, 7):
+        kept.append(arrival(MADE, sequence))
+        if sequence == 3:
+            kept.rotate()
+    path = segments(folder)[1 if number <= 3 else 2]
+    content = path.read_bytes()
+    start = content.index(record_at(content, number))
+    flipped = bytes([content[start + byte] ^ 1])
+    path.write_bytes(content[: start + byte] + flipped + content[start + byte + 1 :])
+    return start
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize("byte", [0, 4, 7, 8, 16, 20, HEAD.size, HEAD.size + 40])
+def test_damage_anywhere_in_a_record_costs_that_record_and_is_told_with_its_number(
+    tmp_path: Path, number: int, byte: int
+) -> None:
+    """A flipped bit of a length made all that followed look like a torn record."""
+    start = damaged(tmp_path, number, byte)
     warnings: list[str] = []
-    assert sequences(tmp_path, warnings=warnings) == [1]
-    assert len(warnings) == 1
-    assert f"is damaged at byte {start:,}: the {len(data) - start:,} bytes" in warnings[0]
+    assert sequences(tmp_path, warnings=warnings) == [n for n in range(1, 7) if n != number]
+    path = segments(tmp_path)[1 if number <= 3 else 2]
+    assert warnings == [f"{path} is damaged at byte {start:,}: 1 batch is lost"]
+
+
+@pytest.mark.parametrize(
+    ("byte", "told"),
+    [
+        (HEAD.size + 40, "1 batch is lost"),
+        (5, "the batches that were in there are lost, and nobody knows how many"),
+    ],
+)
+def test_damage_at_the_end_is_no_torn_record_in_any_later_life(
+    tmp_path: Path, byte: int, told: str
+) -> None:
+    start = damaged(tmp_path, 6, byte)
+    path = segments(tmp_path)[2]
+    for life in range(3):
+        warnings: list[str] = []
+        reader = read_all(tmp_path, warnings)
+        assert warnings == [f"{path} is damaged at byte {start:,}: {told}"]
+        kept = journal(tmp_path, MADE, number=reader.number)
+        kept.append(arrival(MADE, 7 + life))
+    assert sequences(tmp_path, warnings=warnings) == [1, 2, 3, 4, 5, 7, 8, 9]
 
 
 @given(st.data())
-def test_any_changed_bit_is_told_in_one_line(
+def test_any_changed_bit_is_told_in_one_line_and_costs_one_batch_at_most(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
     folder = tmp_path_factory.mktemp("journal")
     kept = journal(folder, MADE)
-    for number in (1, 2, 3):
+    for number in (1, 2, 3, 4):
         kept.append(arrival(MADE, number, count=1))
-        kept.rotate()
+        if number != 2:
+            kept.rotate()
     path = segments(folder)[2]
     content = bytearray(path.read_bytes())
     content[data.draw(st.integers(0, len(content) - 1))] ^= 1 << data.draw(st.integers(0, 7))
     path.write_bytes(content)
     warnings: list[str] = []
-    assert sequences(folder, warnings=warnings) == [1, 3]
+    assert sequences(folder, warnings=warnings) in ([1, 3, 4], [1, 2, 4], [1, 2, 3, 4])
     assert len(warnings) == 1
+
+
+def test_garbage_in_place_of_a_segment_is_a_loss(tmp_path: Path) -> None:
+    """Told with its number where later segments know it; with nothing else the run goes on."""
+    kept = journal(tmp_path, MADE)
+    for number in (1, 2, 3):
+        kept.append(arrival(MADE, number))
+        if number != 1:
+            kept.rotate()
+    found, warnings = segments(tmp_path), list[str]()
+    found[1].write_bytes(b"garbage" * 1000)
+    assert sequences(tmp_path, warnings=warnings) == [3]
+    assert warnings == [f"{found[1]} is damaged at byte 0: 2 batches are lost"]
+    for path in segments(tmp_path).values():
+        path.write_bytes(b"\0" * 100)
+    warnings.clear()
+    assert sequences(tmp_path, warnings=warnings) == []
+    assert len(warnings) == 1
+    assert "damaged at byte 0: the batches that were in there are lost, and nob" in warnings[0]
+    assert journal_run_id(tmp_path) is None
+    journal(tmp_path, MADE).append(arrival(MADE, 4))
+    assert sequences(tmp_path, warnings=warnings) == [4]
 
 
 def test_missing_segments_are_told_in_one_line_and_the_others_are_read(tmp_path: Path) -> None:
     kept = journal(tmp_path, MADE)
-    for number in (1, 2, 3):
+    for number in (1, 2, 3, 4):
         kept.append(arrival(MADE, number))
         kept.rotate()
-    found = segments(tmp_path)
+    found, warnings = segments(tmp_path), list[str]()
     found[2].unlink()
-    found[3].rename(tmp_path / "100000000.log")  # more digits than others, and still the last
-    journal(tmp_path / "stray", MADE).append(arrival(MADE, 4))
-    segments(tmp_path / "stray")[1].rename(tmp_path / "99999999.log")
-    warnings: list[str] = []
-    assert sequences(tmp_path, warnings=warnings) == [1, 4, 3]
-    assert warnings == [
-        f"{tmp_path / '00000002.log'} and the 99,999,996 after it are missing: the batches that "
-        "were in there are lost"
-    ]
-    (tmp_path / "99999999.log").rename(tmp_path / "00000003.log")
+    found[3].unlink()
+    found[4].rename(tmp_path / "100000000.log")  # more digits than others, and still the last
+    found[5].unlink()
+    assert sequences(tmp_path, warnings=warnings) == [1, 4]
+    assert warnings == [f"{found[2]} and the 99,999,997 after it are missing: 2 batches are lost"]
+    (tmp_path / "100000000.log").rename(found[3])
     warnings.clear()
-    assert sequences(tmp_path, first=2, warnings=warnings) == [4, 3]
-    assert warnings[0] == (
-        f"{tmp_path / '00000002.log'} is missing: the batches that were in there are lost"
-    )
+    assert sequences(tmp_path, warnings=warnings, after=Place(2, 1)) == [4]
+    assert warnings == [f"{found[2]} is missing: 2 batches are lost"]
+
+
+def test_a_newest_segment_that_is_missing_is_a_loss_where_a_checkpoint_names_it(
+    tmp_path: Path,
+) -> None:
+    kept = journal(tmp_path, MADE)
+    kept.append(arrival(MADE, 1))
+    place = kept.rotate()
+    warnings: list[str] = []
+    assert sequences(tmp_path, after=place) == []
+    segments(tmp_path)[2].unlink()
+    assert sequences(tmp_path, warnings=warnings, after=place) == []
+    assert warnings == [
+        f"{tmp_path / '00000002.log'} is missing: the batches that were in there are lost, and "
+        "nobody knows how many"
+    ]
+
+
+def test_records_that_are_gone_without_a_trace_are_missed(tmp_path: Path) -> None:
+    """Cut off where a record ends: the next title knows."""
+    kept = journal(tmp_path, MADE)
+    kept.append(arrival(MADE, 1))
+    size = segments(tmp_path)[1].stat().st_size
+    kept.append(arrival(MADE, 2))
+    kept.rotate()
+    kept.append(arrival(MADE, 3))
+    os.truncate(segments(tmp_path)[1], size)
+    warnings: list[str] = []
+    assert sequences(tmp_path, warnings=warnings) == [1, 3]
+    where = segments(tmp_path)[2]
+    assert warnings == [f"{where}: what came before byte 0 is missing: 1 batch is lost"]
 
 
 @pytest.mark.parametrize("other", [{"run_id": "other"}, {"made": setup(PAIR)}])
@@ -191,60 +315,86 @@ def test_another_run_or_task_is_refused(tmp_path: Path, other: dict[str, Any]) -
         read(tmp_path, **other)
 
 
-def record(header: bytes, rest: bytes = b"") -> bytes:
-    """A whole record as far as its checksum tells."""
+def record(header: bytes, rest: bytes = b"", number: int = 0) -> bytes:
+    """A whole record as far as its checksums tell."""
     body = len(header).to_bytes(2, "little") + header + rest
-    return HEAD.pack(len(body), zlib.crc32(body)) + body
+    head = HEAD.pack(MAGIC, len(body), number, zlib.crc32(body), 0)[:-4]
+    return head + zlib.crc32(head).to_bytes(4, "little") + body
 
 
-def test_what_is_no_journal_and_one_of_another_version_or_format_are_refused(
-    tmp_path: Path,
-) -> None:
+def test_one_of_another_version_or_format_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "00000001.log"
-    before = {"v": 2, "kind": "segment", "format": 1, "run_id": "run", "task": MADE.task_digest()}
+    before = {"v": 2, "kind": "segment", "format": 3, "run_id": "run", "task": MADE.task_digest()}
     path.write_bytes(record(msgpack.packb(before)))
     with pytest.raises(RunError, match=r"was written by another version of tangram-rl: go on with"):
         journal_run_id(tmp_path)
     [later] = Title(FORMAT + 1, "run", MADE.task_digest()).encode()
-    journal(tmp_path / "whole", MADE).append(arrival(MADE, 1))
-    whole = segments(tmp_path / "whole")[1].read_bytes()
-    untitled = whole[HEAD.size + HEAD.unpack_from(whole)[0] :]
-    for content in (record(later), untitled):
-        path.write_bytes(content)
-        with pytest.raises(RunError, match=r"is no segment of format 2: choose another run_dir"):
-            read(tmp_path)
-
-
-def test_the_frames_are_kept_as_they_came_and_their_checksum_is_checked(tmp_path: Path) -> None:
-    """What was damaged before it was written, or by whoever wrote the record anew."""
-    one, kept = arrival(MADE, 1), journal(tmp_path, MADE)
-    kept.append(one)
-    content = segments(tmp_path)[1].read_bytes()
-    assert all(frame in content for frame in one.frames)
-    assert list(read(tmp_path)[0].frames) == list(one.frames)
-    bad = [*one.frames[:-1], bytes([one.frames[-1][0] ^ 1]) + one.frames[-1][1:]]
-    kept.append(replace(one, frames=bad))
-    reason = r"holds what cannot be read \(the message is damaged: its ch"
-    with pytest.raises(RunError, match=reason):
+    path.write_bytes(record(later))
+    with pytest.raises(RunError, match=r"is no segment of format 3: choose another run_dir"):
+        read(tmp_path)
+    body = b"\x05\x00title"
+    path.write_bytes(
+        len(body).to_bytes(4, "little") + zlib.crc32(body).to_bytes(4, "little") + body
+    )
+    with pytest.raises(RunError, match=r"is of an older version of tangram-rl: choose another"):
         read(tmp_path)
 
 
-class Disk:
-    """Writes as long as there is room; stands in for os-level writes of a file."""
+FORGED: dict[str, tuple[dict[str, Any], str]] = {
+    "2^63-1": ({"incarnation": 2**63 - 1}, "batch: incarnation must be an integer between 1 and"),
+    "2^53+1": ({"incarnation": 2**53 + 1}, "batch: incarnation must be an integer between 1 and"),
+    "negative": ({"incarnation": -1}, "batch: incarnation must be an integer between 1 and"),
+    "bool": ({"incarnation": True}, "batch: incarnation must be an integer between 1 and"),
+    "sequence": ({"sequence": 2**53 + 1}, "episodes: sequence must be an integer between 1 and"),
+    "negative sequence": ({"sequence": -1}, "episodes: sequence must be an integer between 1 and"),
+    "index": ({"index": 2**16}, "batch: index must be an integer between 0 and 65535"),
+    "role": ({"role": "judge"}, "batch: role must be one of player, evaluator, got 'judge'"),
+    "kind": ({"kind": "bye"}, "expected batch, got a message of kind 'bye'"),
+    "damage": ({"damage": 1}, "the message is damaged: its checksum is"),
+    "number": ({"number": 2**64 - 1}, "it says that it is batch 18,446,744,073,709,551,615"),
+    "empty": ({"empty": 1}, "the header is not msgpack within the limits"),
+}
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.room = 10**9
-        opened, disk = journal_module.FileIO, self
 
-        class Full(opened):  # type: ignore[misc, valid-type]
-            def write(self, data: memoryview) -> int:
-                if not disk.room:
-                    raise OSError(errno.ENOSPC, "No space left on device")
-                size = min(len(data), disk.room)
-                disk.room -= size
-                return int(os.write(self.fileno(), data[:size]))
+@pytest.mark.parametrize("name", FORGED)
+def test_a_forged_record_is_left_out_and_no_reason_to_throw_the_others_away(
+    tmp_path: Path, name: str
+) -> None:
+    """Its checksums hold, and what it says is out of bounds."""
+    change, reason = FORGED[name]
+    kept, one = journal(tmp_path, MADE), arrival(MADE, 2)
+    kept.append(arrival(MADE, 1))
+    start = segments(tmp_path)[1].stat().st_size
+    frames = list(one.frames)
+    if "sequence" in change:
+        header = opened(frames)
+        fields = {n: v for n, v in header.items() if n != "kind"}
+        frames = seal(header["kind"], fields | change, frames[1:])
+    if "damage" in change:
+        frames[-1] = bytes([frames[-1][0] ^ 1]) + frames[-1][1:]
+    entry = {"kind": "batch", "role": "player", "index": 0, "incarnation": 1} | {
+        n: v for n, v in change.items() if n in ("kind", "role", "index", "incarnation")
+    }
+    [packed] = seal(str(entry.pop("kind")), entry, [])
+    data = b"" if "empty" in change else join_frames(frames)
+    number = change.get("number", 2)
+    with segments(tmp_path)[1].open("ab") as file:
+        file.write(record(b"" if "empty" in change else packed, data, number))
+    kept.number = 2
+    kept.append(arrival(MADE, 3))
+    warnings: list[str] = []
+    assert sequences(tmp_path, warnings=warnings) == [1, 3]
+    assert len(warnings) == 1
+    assert f"00000001.log is damaged at byte {start:,} ({reason}" in warnings[0]
+    assert warnings[0].endswith("): 1 batch is lost")
 
-        monkeypatch.setattr(journal_module, "FileIO", Full)
+
+def test_the_frames_are_kept_as_they_came(tmp_path: Path) -> None:
+    one = arrival(MADE, 1)
+    journal(tmp_path, MADE).append(one)
+    content = segments(tmp_path)[1].read_bytes()
+    assert all(frame in content for frame in one.frames)
+    assert list(read(tmp_path)[0].frames) == list(one.frames)
 
 
 @pytest.fixture

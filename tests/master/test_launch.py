@@ -118,7 +118,7 @@ def launcher(
     """A launcher whose children run the given code."""
     run = RunFolder(folder)
     run.logs.mkdir()
-    made = Launcher(MasterConfig(str(folder), workers=len(players)), run)
+    made = Launcher(MasterConfig(str(folder), workers=len(players)), run, {})
     code = MASTER.format(folder=str(folder), condition=condition, ending=ending)
     if stubborn:
         code = code.replace("number, told", "number, signal.SIG_IGN")

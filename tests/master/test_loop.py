@@ -1,5 +1,6 @@
 """The loop around a scripted hub: what is acknowledged, learned, sent, kept, and when it ends."""
 
+import shutil
 import time
 from contextlib import closing
 from dataclasses import replace
@@ -12,6 +13,7 @@ import torch
 from PIL import Image
 
 from master import loop as loop_module
+from master import metrics as metrics_module
 from master.delivery import EpisodesArrived
 from master.result import make_result
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
@@ -214,6 +216,31 @@ def test_the_final_weights_are_waited_for_and_reported(tmp_path: Path) -> None:
     with Image.open(tmp_path / "test_episodes.png") as picture:
         assert picture.width > picture.height
     assert load_checkpoint(list_checkpoints(tmp_path / "checkpoints")[-1]).updates == 4
+
+
+def test_a_run_whose_folder_is_gone_ends_with_one_line_and_makes_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither scores nor curves, the picture or the result make it anew by accident."""
+    monkeypatch.setattr(metrics_module, "RETRY_S", 0.0)
+    folder = tmp_path / "run"
+    folder.mkdir()
+    made = loop(folder, MADE, FakeHub(MADE, batches(2)), max_updates=4)
+    made.run()
+    shutil.rmtree(folder)
+    for _ in range(2):
+        made.reporter.scored(scores(MADE, 4).scores)
+        made.reporter.flush(0)
+        made.reporter._metrics._try(made.reporter._metrics._writer.flush)
+    with pytest.raises(RunError, match=r"^run_dir .*/run is gone: put it back, or make an empty"):
+        made.finish(launched=False)
+    with pytest.raises(RunError, match=r"cannot write .*/test_episodes.png \(No such file or dir"):
+        made.reporter.draw(made.folder.picture)
+    with pytest.raises(RunError, match=r"cannot write .*/result.json \(No such file or directory"):
+        made.folder.write_result({})
+    made.dismiss("the end")
+    made.reporter._metrics.close()
+    assert not folder.exists()
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from master.gate import DESCRIPTORS, HANDSHAKES, RESERVE, Room
 from master.registry import Peer, RefusedError, Registry
 from tangram_agent.schema import MAX_COUNT
 from tangram_sim.errors import RunError
@@ -181,6 +182,20 @@ def test_malformed_tables_are_refused(registry: Registry, state: Any, reason: st
     with pytest.raises(RunError) as caught:
         registry.load_state(state, 0.0)
     assert str(caught.value).startswith(reason)
+
+
+def test_the_last_tenth_of_the_room_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    files = RESERVE + HANDSHAKES + 10 * DESCRIPTORS
+    registry = Registry(FINGERPRINTS, GRACE_S, Room(files))
+    told = []
+    for name in "abcdefghij":
+        admitted(registry, name)
+        told.append(len(caplog.messages))
+    assert told == [0] * 8 + [1, 1]
+    bound = f"{files} open files allow: raise ulimit -n and start the master again"
+    assert caplog.messages == [f"9 processes take part, of at most 10 that {bound}"]
+    with pytest.raises(RefusedError, match=f"10 .* already, the most that {bound}"):
+        admitted(registry, "k")
 
 
 def test_batches_of_the_journal_are_new_once(registry: Registry) -> None:

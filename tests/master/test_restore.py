@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from master.checkpointer import Restored, restore_run, save_run, warm_start
-from master.journal import segments
+from master.journal import Place, segments
 from master.resumable import check_resumable
 from master.rundir import Record, RunFolder
 from master.trainer import Trainer, choose_device
@@ -54,7 +54,7 @@ def test_a_run_goes_on_as_if_it_had_never_stopped(
     play_on(straight, rounds)
     play_on(stopped, rounds)
     record = Record(loop_s=12.5, scores={"mean_reward": 0.5}, scored_version=4, workers=3)
-    rest = Restored(record, HUB, segment=7)
+    rest = Restored(record, HUB, Place(7, 12))
     save_run(tmp_path, stopped, rest, keep=1)
     assert restore_run(tmp_path, resumed) == rest
     assert caplog.messages == []
@@ -153,6 +153,12 @@ def test_a_checkpoint_that_lacks_a_part_is_refused(tmp_path: Path, lost: str) ->
             {"record": Record().state() | {"scores": []}},
             "Expected `object`, got `array`",
         ),
+        ({"journal": {"segment": 2**63 - 1}}, "its place in the journal .*<= 9007199254740992"),
+        (
+            {"journal": -1},
+            "its place in the journal cannot be read .* delete it to use",
+        ),
+        ({"journal": {"number": True}}, "its place in the journal .*Expected `int`, got `bool`"),
     ],
 )
 def test_a_checkpoint_with_a_part_of_another_kind_is_refused(

@@ -49,7 +49,7 @@ def test_the_final_table(
     tmp_path: Path, change: dict[str, Any], words: list[str], without: list[str]
 ) -> None:
     shown, folder = screen(), RunFolder(tmp_path / ("deep_" * 30))
-    show_result(shown, folder, RESULT | change, "tangram-train r")
+    show_result(shown, folder, RESULT | change, {}, "tangram-train r")
     assert all(word in text(shown) for word in words)
     assert not any(word in text(shown) for word in without)
     assert f"tangram-play run_dir={folder.path} out=play.gif" in text(shown)
@@ -58,14 +58,16 @@ def test_the_final_table(
 
 
 @pytest.mark.parametrize(("launched", "name"), [(True, "tangram-train"), (False, "tangram-master")])
-def test_the_command_that_goes_on_has_as_many_workers_as_before(
+def test_the_command_that_goes_on_has_the_workers_and_the_code_of_before(
     tmp_path: Path, launched: bool, name: str
 ) -> None:
     folder = RunFolder(tmp_path)
     bounds = {"max_hours": 0.0, "max_episodes": 0, "max_updates": 2000}
-    folder.write_config({"seed": 3, **bounds, "workers": 2})
+    reward = {"reward": {"name": "/a/own.py:near"}}
+    folder.write_config({"seed": 3, **bounds, "workers": 2, **reward})
     settings = f"run_dir={tmp_path} from_config={tmp_path}/config.yaml resume=auto seed=3 workers=2"
-    assert go_on_command(folder, launched).endswith(f"{name} {settings}")
+    own = "reward.name=/a/own.py:near"
+    assert go_on_command(folder, launched).endswith(f"{name} {settings} {own}")
 
 
 @pytest.mark.parametrize("active", [True, False])
@@ -76,7 +78,7 @@ def test_commands_that_are_shown_can_be_pasted(
     commands = Path(sys.executable).parent
     monkeypatch.setenv("PATH", str(commands) if active else str(tmp_path))
     shown, folder = screen(), RunFolder(tmp_path / "it's a=run")
-    show_result(shown, folder, RESULT)
+    show_result(shown, folder, RESULT, {})
     curves, play = (shlex.split(line) for line in text(shown).splitlines()[-2:])
     assert curves[-1] == str(folder.tensorboard)
     for command in (curves[-3], play[-3]):

@@ -13,10 +13,11 @@ from master.checkpointer import Restored, save_run
 from master.config import MasterConfig
 from master.journal import segments
 from master.loop import Loop
-from master.run import PLAIN, UNBOUNDED, open_run
+from master.run import UNBOUNDED, open_run
 from master.rundir import Record, RunFolder
 from master.signals import StopSignals
 from tangram_agent.config import ServiceConfig
+from tangram_agent.messages import OPEN
 from tangram_agent.process import Watchdog
 from tangram_sim.errors import ConfigError, RunError
 from tests.master.builders import (
@@ -61,7 +62,8 @@ def opened_run(
     config = MasterConfig(str(folder), resume=resume, max_updates=0, service=made)
     with ExitStack() as opened:
         watchdog, signals = Watchdog(0.0), StopSignals()
-        yield open_run(config, MADE, ShownProgress(), signals, watchdog, opened)
+        claim = opened.enter_context(RunFolder(folder).lock())
+        yield open_run(config, MADE, claim, ShownProgress(), signals, watchdog, opened)
 
 
 def test_a_run_that_was_killed_before_its_first_checkpoint_goes_on(
@@ -74,7 +76,8 @@ def test_a_run_that_was_killed_before_its_first_checkpoint_goes_on(
         assert made.clock.record.run_id == "run"
         assert made.guard.trainer.episodes == 3 * BATCH
         assert made.hub.state() == {"player/0": {"incarnation": 1, "sequence": 3}}
-        assert made.checkpointer._journal.segment == 2
+        kept = made.checkpointer._journal
+        assert (kept.segment, kept.number) == (1, 4)
     assert "12 episodes come back from the journal" in told()
     assert "goes on after 0 updates" in told()
 
@@ -126,10 +129,11 @@ def test_a_journal_of_another_run_and_a_new_run_in_its_folder_are_refused(tmp_pa
         pass
 
 
-def test_outside_of_loopback_the_connection_carries_keys(tmp_path: Path, told: Told) -> None:
+@pytest.mark.parametrize("bind", [EVERYWHERE, "127.0.0.1"])
+def test_over_tcp_the_connection_carries_keys(tmp_path: Path, told: Told, bind: str) -> None:
     names, found = ("server_key", "public_key", "secret_key"), []
     for _ in range(2):
-        with opened_run(tmp_path, bind=EVERYWHERE) as (_, connection):
+        with opened_run(tmp_path, bind=bind) as (_, connection):
             found.append([connection[name] for name in names])
     assert found[0] == found[1]
     assert all(len(key) == 40 for key in found[0])
@@ -166,7 +170,7 @@ def test_both_ports_can_be_fixed_and_the_wrong_one_is_named(tmp_path: Path) -> N
         socket.create_server(("127.0.0.1", 0)) as two,
     ):
         ports = {"port": one.getsockname()[1], "weights_port": two.getsockname()[1]}
-    with opened_run(tmp_path / "a", **ports) as (made, _):
+    with opened_run(tmp_path / "a", bind="127.0.0.1", **ports) as (made, _):
         found = (made.hub.endpoint, made.hub.weights_endpoint)
         assert [int(endpoint.rpartition(":")[2]) for endpoint in found] == list(ports.values())
         for name, port in ports.items():
@@ -175,16 +179,32 @@ def test_both_ports_can_be_fixed_and_the_wrong_one_is_named(tmp_path: Path) -> N
             )
             with (
                 pytest.raises(ConfigError, match=remedy),
-                opened_run(tmp_path / name, **{name: port}),
+                opened_run(tmp_path / name, bind="127.0.0.1", **{name: port}),
             ):
                 pass
 
 
-@pytest.mark.parametrize(("bind", "warned"), [(EVERYWHERE, True), ("127.0.0.1", False)])
-def test_plain_transport_is_warned_of_where_others_reach_it(
-    tmp_path: Path, told: Told, bind: str, warned: bool
-) -> None:
-    with opened_run(tmp_path, bind=bind, security="plain") as (_, connection):
-        assert set(connection) == {"endpoint", "weights_endpoint", "run_id"}
-    assert (PLAIN in told()) is warned
+def test_a_run_that_is_open_to_all_says_so(tmp_path: Path, told: Told) -> None:
+    with opened_run(tmp_path, bind="127.0.0.1", auth="off") as (made, connection):
+        assert made.reporter.flush(0).numbers["open_to_all"] == 1.0
+    assert set(connection) == {"endpoint", "weights_endpoint", "run_id", "machine"}
+    assert any(line.startswith(OPEN) for line in told())
     assert not (tmp_path / "keys.json").exists()
+
+
+def test_on_one_machine_sockets_of_the_user_alone_are_the_same_in_each_life(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sockets, found = tmp_path / "t", []
+    sockets.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(sockets))
+    for _ in range(2):
+        with opened_run(tmp_path / "run") as (made, connection):
+            assert made.reporter.flush(0).numbers["open_to_all"] == 0.0
+            found.append(connection["endpoint"])
+            path = Path(connection["endpoint"].removeprefix("ipc://"))
+            assert path.is_socket()
+            assert path.parent.stat().st_mode & 0o777 == 0o700
+        assert list(path.parent.iterdir()) == []
+    assert found[0] == found[1]
+    assert not (tmp_path / "run" / "keys.json").exists()

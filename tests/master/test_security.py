@@ -1,14 +1,18 @@
 """Keys of a run: made once, kept for the user alone, checked when read."""
 
 import json
+import os
+import re
 import stat
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
-from master.security import Keys, is_loopback, make_keys, needs_keys, run_keys
-from tangram_sim.errors import RunError
+from master.security import Keys, listening_place, make_keys, needs_keys, run_keys
+from tangram_agent.config import ServiceConfig
+from tangram_sim.errors import ConfigError, RunError
 
 pytestmark = pytest.mark.fast
 
@@ -44,16 +48,44 @@ def test_a_file_that_holds_something_else_is_refused(tmp_path: Path, change: obj
         run_keys(path)
 
 
-LOOPBACK = ("127.0.0.1", "127.9.9.9", "localhost", "::1")
-REACHABLE = ("0.0.0.0", "10.0.0.1", "::", "*", "eth0", "node7.cluster")  # noqa: S104
+@pytest.mark.parametrize("bind", ["127.0.0.1", "localhost", "::1", "0.0.0.0", "node7"])  # noqa: S104
+def test_every_address_takes_keys_unless_it_is_opened_by_name(bind: str) -> None:
+    assert needs_keys(ServiceConfig(bind=bind))
+    assert not needs_keys(ServiceConfig(bind=bind, auth="off"))
+    assert not needs_keys(ServiceConfig())
 
 
-@pytest.mark.parametrize("bind", [*LOOPBACK, *REACHABLE])
-def test_everything_but_loopback_is_encrypted_unless_it_is_asked_for_by_name(bind: str) -> None:
-    assert is_loopback(bind) is (bind in LOOPBACK)
-    assert needs_keys(bind, "auto") is (bind in REACHABLE)
-    assert needs_keys(bind, "curve") is True
-    assert needs_keys(bind, "plain") is False
+@pytest.mark.parametrize(
+    ("make", "reason"),
+    [
+        (lambda path: path.mkdir(mode=0o750), "it is drwxr-x--- of user {uid}: remove it, or set"),
+        (lambda path: path.write_text(""), "it is -rw"),
+        (lambda path: path.symlink_to("/"), "it is lrwxrwxrwx of user"),
+        (lambda path: (path.mkdir(mode=0o700), os.chown(path, 7, 7)), "drwx------ of user 7: rem"),
+        (lambda path: path.parent.rmdir(), "cannot be made (No such file or directory): set TMPD"),
+    ],
+)
+def test_a_folder_of_sockets_that_others_may_change_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Callable[[Path], object], reason: str
+) -> None:
+    if "user 7" in reason and os.geteuid():
+        pytest.skip("only root can give a folder away")
+    folder = tmp_path / "t" / f"tangram-{os.geteuid()}"
+    folder.parent.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(folder.parent))
+    make(folder)
+    with pytest.raises(RunError, match=re.escape(reason.format(uid=os.geteuid()))):
+        listening_place("local", tmp_path)
+
+
+def test_a_folder_too_deep_for_sockets_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    deep = tmp_path / ("x" * 80)
+    deep.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(deep))
+    with pytest.raises(ConfigError, match=r"have 107 bytes at most: set TMPDIR to a shorter one"):
+        listening_place("local", tmp_path)
 
 
 def test_secrets_are_not_shown() -> None:

@@ -1,7 +1,10 @@
 """Rewards against tables, against brute force, and the user's own."""
 
+import hashlib
 import math
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,10 +18,10 @@ from tangram_sim.pictures import BACKGROUND, TOKEN_GRAY, token_pixels
 from tangram_sim.rewards import (
     RewardFn,
     TargetPictures,
-    absolute_name,
     check_reward,
     closeness,
     make_reward,
+    pinned,
     reward_identity,
 )
 from tangram_sim.sampling import sample_batch
@@ -254,10 +257,28 @@ def test_a_file_of_the_users_own_holds_in_every_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("HOME", "/home/me")
-    given = ("a/own.py:near", "~/own.py:near", "/own.py:near", "dense")
-    told = [f"{tmp_path}/a/own.py:near", "/home/me/own.py:near", "/own.py:near", "dense"]
-    assert [absolute_name(name) for name in given] == told
+    monkeypatch.setenv("HOME", str(tmp_path))
+    Path("own.py").write_text(OWN)
+    digest = hashlib.sha256(OWN.encode()).hexdigest()
+    for name in ("own.py:near", "~/own.py:near", f"{tmp_path}/own.py:near"):
+        assert pinned(RewardConfig(name)) == RewardConfig(f"{tmp_path}/own.py:near", sha256=digest)
+    assert pinned(RewardConfig("dense")) == RewardConfig("dense")
+
+
+@pytest.mark.usefixtures("own")
+@pytest.mark.parametrize(
+    "use",
+    [pinned, reward_identity, lambda reward: check_reward(reward, layout_of("square"), SIM)],
+)
+def test_another_file_than_the_one_that_was_written_down_is_refused(
+    use: Callable[[RewardConfig], Any],
+) -> None:
+    ours = pinned(RewardConfig("own.py:near"))
+    use(ours)
+    Path("own.py").write_text("raise SystemExit")
+    found = hashlib.sha256(b"raise SystemExit").hexdigest()
+    with pytest.raises(ConfigError, match=rf"has sha256 {found}, and .* want {ours.sha256}: name"):
+        use(ours)
 
 
 def test_files_with_one_name_are_different_rewards(tmp_path: Path) -> None:

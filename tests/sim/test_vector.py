@@ -100,8 +100,9 @@ def test_pictures(made: list[Any]) -> None:
 @pytest.mark.parametrize(
     ("settings", "reason"),
     [
-        ({"num_envs": 0}, "num_envs must be at least 1, got 0"),
-        ({"num_envs": "2"}, "num_envs must be a finite number, at least 1, got 2"),
+        ({"num_envs": 0}, "num_envs must be between 1 and 4096, got 0"),
+        ({"num_envs": 10**7}, "num_envs must be between 1 and 4096, got 10000000"),
+        ({"num_envs": "2"}, "num_envs must be a finite number, between 1 and 4096, got 2"),
         ({"max_episode_steps": 0}, "max_episode_steps must be at least 1, got 0"),
         ({"autoreset_mode": "Disabled"}, "autoreset_mode must be NextStep or SameStep, got Disab"),
         ({"render_mode": "human"}, "render_mode must be None or rgb_array, got 'human'"),

@@ -92,10 +92,12 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def write_connection(folder: Path, endpoint: str, run_id: str = "run") -> None:
+def write_connection(folder: Path, endpoint: str, run_id: str = "run", machine: str = "") -> Path:
+    """As a master writes it, of this machine unless another is named."""
     aside = folder / "aside"
-    aside.write_text(json.dumps({"endpoint": endpoint, "run_id": run_id}))
-    aside.replace(folder / "connection.json")
+    content = {"endpoint": endpoint, "run_id": run_id, "machine": machine or socket.gethostname()}
+    aside.write_text(json.dumps(content))
+    return aside.replace(folder / "connection.json")
 
 
 def numbers(heard: list[ToMaster]) -> list[int]:
@@ -112,10 +114,10 @@ class StandIn:
         identity: of the connection that was heard last.
     """
 
-    def __init__(self, context: zmq.Context[zmq.Socket[bytes]]) -> None:
+    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], port: int | str = "*") -> None:
         self._router, self._pub = context.socket(zmq.ROUTER), context.socket(zmq.PUB)
-        for one in (self._router, self._pub):
-            one.bind("tcp://127.0.0.1:*")
+        for one, its_port in ((self._router, port), (self._pub, "*")):
+            one.bind(f"tcp://127.0.0.1:{its_port}")
         self.endpoint = self._router.getsockopt_string(zmq.LAST_ENDPOINT)
         self.heard: list[ToMaster] = []
         self.stats: Mapping[str, float] = {}
@@ -191,11 +193,11 @@ class StandIn:
 
 
 @contextmanager
-def standing_in() -> Iterator[StandIn]:
+def standing_in(port: int | str = "*") -> Iterator[StandIn]:
     """A stand-in that nobody has connected to."""
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     try:
-        yield StandIn(context)
+        yield StandIn(context, port)
     finally:
         context.destroy(linger=0)
 

@@ -1,21 +1,45 @@
 """Encrypted sockets: who has the run's connection file is let in, and nobody else."""
 
 import json
+import os
 import socket
+import tempfile
+import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import zmq
 
 from master.hub import Hub
+from master.loop import Loop
+from master.rundir import RunFolder
 from master.security import Keys, make_keys
+from tangram_agent.arrays import EpisodeSpec
+from tangram_agent.messages import Scores
 from tangram_agent.types import Weights
-from tangram_sim.errors import TangramError
+from tangram_lab.benchmarks.intruder import NOBODY, knock
+from tangram_sim.errors import RunError, TangramError
+from tests.agent.builders import random_episodes
 from tests.agent.messages import episodes, hello, weights
 from tests.master.dealers import INFO, Stage, staged
-from tests.worker.conversation import QUICK, both, free_port, make_client, served
+from tests.master.test_run import MADE, opened_run
+from tests.worker.conversation import (
+    QUICK,
+    both,
+    free_port,
+    make_client,
+    served,
+    standing_in,
+    write_connection,
+)
+from worker.client import Client
+from worker.discovery import find_master
 
 pytestmark = pytest.mark.cluster
 
@@ -171,3 +195,84 @@ def test_a_connection_that_is_lost_in_the_handshake_is_no_wrong_key(
             assert future.result()
             assert client.counters["handshakes_failed"] == 0
     assert "wrong or stale" not in caplog.text
+
+
+# Strangers: another user of this machine, and one without a key; on the default settings, too
+
+BINDS = [{}, {"bind": "127.0.0.1"}]
+
+
+@pytest.fixture
+def open_tmp(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A TMPDIR that everybody may enter and write to, as /tmp is; pytest's own is closed."""
+    with tempfile.TemporaryDirectory(dir="/tmp") as folder:
+        Path(folder).chmod(0o1777)
+        monkeypatch.setattr("tempfile.tempdir", folder)
+        yield Path(folder)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+@pytest.mark.parametrize("service", BINDS, ids=str)
+@pytest.mark.parametrize("role", ["player", "evaluator"])
+def test_another_user_takes_no_index_and_forges_no_scores(
+    open_tmp: Path, service: dict[str, str], role: str
+) -> None:
+    """It knows all that a worker says, and where."""
+    with opened_run(open_tmp / "run", **service) as (loop, connection):
+        hub, fingerprints, spec = loop.hub, MADE.fingerprints(), EpisodeSpec.of(MADE)
+        none = np.zeros((0, spec.corners, 2), np.float32)
+        question = hello(role=role, process="nobody", fingerprints=fingerprints, index=0)
+        forged = Scores(7, {"mean_reward": 0.999}, *3 * [none]).encode(spec)
+        stranger, arrivals = knock(connection["endpoint"], [question.encode(), forged]), list[Any]()
+        while stranger.is_alive():
+            arrivals += hub.poll(0.05)
+        assert (stranger.exitcode, hub.peers, arrivals) == (0, [], [])
+
+
+def test_an_impostor_on_a_dead_masters_port_gets_no_batch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It has heard the run's id, and says what the master would say."""
+    monkeypatch.setattr(Loop, "dismiss", lambda *_: None)  # who was killed says nothing
+    folder, port = RunFolder(tmp_path / "run"), free_port()
+    with opened_run(folder.path, bind="127.0.0.1", port=port) as (loop, connection):
+        folder.connection.write_text(json.dumps(connection))
+        spec = EpisodeSpec.of(MADE)
+        given = (str(folder.path), "player", 0, MADE.fingerprints(), spec, None, 4, QUICK)
+        with closing(Stage(loop.hub)) as stage, Client(*given) as client:
+            assert served(stage, client.join)
+            loop.hub.close()
+            with standing_in(port) as impostor:
+                client.send(random_episodes(MADE, 3), 0)
+                deadline = time.monotonic() + 3.0
+                while time.monotonic() < deadline:
+                    client.poll(0.005)
+                    impostor.listen()
+                    if impostor.heard:
+                        impostor.say(impostor.welcome_message(run_id=connection["run_id"]))
+                assert (impostor.heard, client.acknowledged) == ([], 0)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+def test_another_user_cannot_stand_where_the_sockets_were(open_tmp: Path) -> None:
+    """Not in the folder, which stays when the master has ended, and not in its place."""
+    with opened_run(open_tmp / "run") as (_, connection):
+        place = Path(connection["endpoint"].removeprefix("ipc://"))
+    path = write_connection(open_tmp, f"ipc://{place}")
+    assert place.parent.stat().st_mode & 0o777 == 0o700
+    place.parent.rmdir()
+    place.parent.mkdir(mode=0o755)
+    os.chown(place.parent, NOBODY, NOBODY)
+    with pytest.raises(RunError, match=r"only this user may enter, it is drwxr-xr-x of user 65534"):
+        find_master(str(path))
+
+
+def test_a_worker_on_another_machine_is_told_where_the_master_listens(tmp_path: Path) -> None:
+    path = write_connection(tmp_path, f"ipc://{tmp_path}/t/hub", machine="learner")
+    with pytest.raises(RunError) as caught:
+        find_master(str(path))
+    assert str(caught.value) == (
+        f"{path}: this master listens on its own machine, learner, only: start it there with "
+        "service.bind=0.0.0.0, or start this there"
+    )
+    assert not (tmp_path / "t").exists()
