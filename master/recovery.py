@@ -27,7 +27,6 @@ from master.journal import (
     segments,
 )
 from tangram_agent.arrays import MAX_BATCH_BYTES, MAX_FRAMES, EpisodeSpec, split_frames
-from tangram_agent.files import sync_folder
 from tangram_agent.messages import EpisodeBatch, decode_from_worker
 from tangram_agent.schema import MAX_HEADER, ProtocolError, opened, read
 from tangram_sim.errors import RunError, WireError
@@ -73,7 +72,8 @@ def _of_another(path: Path) -> RunError:
 class Reader:
     """The batches from a place on, in the order in which they were added.
 
-    What is read is synced, since its senders will be told that it was inserted before.
+    What is read is synced first, since its senders will be told that it was inserted before: the
+    life that wrote it may have been killed before its sync.
 
     Attributes:
         number: of the last batch that was found, or known to be lost.
@@ -119,8 +119,6 @@ class Reader:
                 yield from self._segment(path)
             if self._named and not found:
                 self._lost(_missing(segment_path(self._folder, expected), 1))
-            if found:
-                sync_folder(self._folder)
         except OSError as error:
             raise RunError(
                 f"the journal in {self._folder} cannot be read ({error.strerror}): mend the disk, "

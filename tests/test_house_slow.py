@@ -1,15 +1,22 @@
 """Rules of the house that start other processes to be seen: tiers of tests, no engine, the site."""
 
+import hashlib
+import json
+import os
 import re
 import shutil
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
+from zipfile import ZipFile
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from tests.blocks import PAGES
-from tests.test_house import ROOT, run, run_python
+from tests.test_house import ROOT, locked, run, run_python
 
 pytestmark = pytest.mark.slow
 
@@ -52,6 +59,85 @@ def test_each_test_carries_one_tier(tmp_path: Path, marks: str, status: int) -> 
     assert result.returncode == status, result.stdout + result.stderr
     if status:
         assert "test_it.py::test_it must carry exactly one of the markers" in result.stderr
+
+
+# What is installed
+
+
+def made_wheel(folder: Path, name: str) -> str:
+    """The line of a lock file of a package that has nothing in it."""
+    path, about = folder / f"{name}-99-py3-none-any.whl", f"{name}-99.dist-info"
+    with ZipFile(path, "w") as wheel:
+        wheel.writestr(f"{about}/METADATA", f"Metadata-Version: 2.1\nName: {name}\nVersion: 99\n")
+        wheel.writestr(f"{about}/WHEEL", "Wheel-Version: 1.0\nTag: py3-none-any\n")
+        wheel.writestr(f"{about}/RECORD", "")
+    return f"{name}==99 \\\n    --hash=sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}\n"
+
+
+@pytest.mark.parametrize(
+    ("extras", "changed", "told"),
+    [
+        ("", None, "installing into"),
+        ("more", None, "installing into"),
+        ("", "pip", "DO NOT MATCH THE HASHES"),
+        ("", "setuptools", "DO NOT MATCH THE HASHES"),
+        ("", "run", "DO NOT MATCH THE HASHES"),
+        ("more", "extra", "DO NOT MATCH THE HASHES"),
+        ("more", "nothing", "must have their versions pinned"),
+        ("more,mroe", None, "install: there is no extra mroe; there are more"),
+    ],
+)
+def test_install_refuses_a_file_with_another_hash(
+    tmp_path: Path, extras: str, changed: str | None, told: str
+) -> None:
+    """The script itself, with wheels made here and no index; pip only says what it would do."""
+    lock = {name: made_wheel(tmp_path, name) for name in ("pip", "setuptools", "run", "extra")}
+    if changed == "nothing":
+        del lock["extra"]
+    elif changed:
+        digit = lock[changed][-2]
+        lock[changed] = lock[changed][:-2] + ("0" if digit != "0" else "1") + "\n"
+    (tmp_path / "lock.txt").write_text("".join(lock.values()))
+    (tmp_path / "pyproject.toml").write_text(
+        '[project]\nname = "it"\nversion = "1"\ndependencies = ["run"]\n'
+        '[project.optional-dependencies]\nmore = ["extra"]\n[tool.setuptools]\npackages = []\n'
+    )
+    python = tmp_path / ".venv" / "bin" / "python"
+    python.parent.mkdir(parents=True)
+    python.write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
+    python.chmod(0o755)
+    options = ("DRY_RUN", "IGNORE_INSTALLED", "NO_INDEX")
+    environment = {name: text for name, text in os.environ.items() if name[:4] != "PIP_"}
+    environment |= {f"PIP_{name}": "1" for name in options}
+    environment |= {"PIP_FIND_LINKS": str(tmp_path), "PIP_CONFIG_FILE": os.devnull}
+    result = subprocess.run(
+        [ROOT / ".ci" / "install", ".venv", extras],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert told in result.stdout + result.stderr
+    assert (result.returncode == 0) == told.startswith("installing"), result.stderr
+
+
+def test_the_bill_of_materials_has_the_lock(tmp_path: Path) -> None:
+    """Valid CycloneDX, as its maker checks, of an environment with all extras."""
+    for module in ("mkdocs", "submitit"):
+        pytest.importorskip(module, reason="pip install '.[docs,slurm]'")
+    recipe = run(["make", "--dry-run", "sbom"]).stdout.splitlines()
+    command = next(line for line in recipe if "cyclonedx-py" in line)
+    assert "--no-validate" not in command
+    result = run(command.replace("sbom.json", str(tmp_path / "sbom.json")).split())
+    assert result.returncode == 0, result.stderr
+    content = json.loads((tmp_path / "sbom.json").read_text())
+    assert content["bomFormat"] == "CycloneDX"
+    has = {canonicalize_name(one["name"]): one["version"] for one in content["components"]}
+    cuda = () if not version("torch").endswith("+cpu") else ("nvidia-", "cuda-", "triton")
+    pins = (Requirement(pin) for pin in locked() if not pin.startswith(cuda))
+    for pin in (pin for pin in pins if pin.marker is None or pin.marker.evaluate()):
+        assert pin.specifier.contains(has[pin.name]), pin
 
 
 # The documentation site
