@@ -15,7 +15,7 @@ $(error make knows no $(firstword $(STRAY))=...: settings go into ARGS="...", as
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help train test lint settings format paper bench docs clean
+.PHONY: help train test lint settings format paper bench docs lock sbom clean
 
 help:  ## list these commands
 	@sed -nE 's/^([a-z]+):.*## (.*)/  make \1\t\2/p' Makefile | expand -t 16
@@ -54,19 +54,27 @@ docs: .venv/.installed-docs  ## make a site of README and docs, in site/
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo "the front page is site/index.html; with search: python3 -m http.server -d site"
 
+lock:  ## write lock.txt and constraints.txt anew, from constraints.txt and pyproject.toml
+	@[ -x $(BIN)/uv ] || .ci/install .venv dev
+	@$(BIN)/python .ci/lock.py
+
+sbom: .venv/.installed-dev  ## list what is installed in sbom.json (CycloneDX)
+	@$(BIN)/cyclonedx-py environment --pyproject pyproject.toml --short-PURLs --output-file sbom.json $(BIN)/python
+	@echo "all packages of $(BIN), with versions and licences: sbom.json"
+
 clean:  ## remove caches and build products; .venv and runs/ stay
-	rm -rf build dist site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf build dist site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache sbom.json
 	find . -name .venv -prune -o -name __pycache__ -type d -exec rm -rf {} +
 
 # A stamp is older than these files only when something new may be needed.
-.venv/.installed-run: pyproject.toml constraints.txt
+.venv/.installed-run: pyproject.toml lock.txt
 	@.ci/install .venv
 	@touch $@
 
-.venv/.installed-docs: pyproject.toml constraints.txt
+.venv/.installed-docs: pyproject.toml lock.txt
 	@.ci/install .venv docs
 	@touch .venv/.installed-run $@
 
-.venv/.installed-dev: pyproject.toml constraints.txt
+.venv/.installed-dev: pyproject.toml lock.txt
 	@.ci/install .venv dev,docs,human,peers,slurm,video
 	@touch .venv/.installed-run .venv/.installed-docs $@

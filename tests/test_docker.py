@@ -80,6 +80,26 @@ def test_the_targets_are_there() -> None:
     assert built == {"worker", "master-cpu", "master-gpu"}
 
 
+@pytest.mark.parametrize("name", ["Dockerfile", "apptainer.def"])
+def test_images_take_nothing_without_a_hash(name: str) -> None:
+    text = (DOCKER / name).read_text().replace("\\\n", "")
+    installs = re.findall(r"pip install (.*)", text)
+    assert len(installs) >= 3
+    for one in installs:
+        assert "--require-hashes" in one or "--no-deps --no-build-isolation ." in one
+
+
+@pytest.mark.parametrize("service", COMPOSE["services"])
+def test_a_service_has_no_rights_and_writes_to_its_volume_only(service: str) -> None:
+    about = COMPOSE["services"][service]
+    assert about["cap_drop"] == ["ALL"]
+    assert about["security_opt"] == ["no-new-privileges:true"]
+    assert about["read_only"] is True
+    assert (about["volumes"], about["tmpfs"]) == (["runs:/runs"], ["/tmp:size=256m"])
+    assert about["pids_limit"] == 512
+    assert not about.keys() & {"cap_add", "privileged", "network_mode", "pid"}
+
+
 def test_nothing_runs_as_root() -> None:
     text = (DOCKER / "Dockerfile").read_text()
     stages = re.split(r"^FROM ", text, flags=re.MULTILINE)[1:]

@@ -1,13 +1,17 @@
 """The rules of the house: arrows, packaging, tiers of tests."""
 
+import re
 import shutil
 import subprocess
 import sys
 import tomllib
 from importlib.metadata import EntryPoint
+from itertools import chain
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from tangram_cli.commands import COMMANDS
 
@@ -71,7 +75,18 @@ def test_command_lines_load_nothing_heavy() -> None:
 
 @pytest.mark.parametrize(
     "command",
-    ["master", "train", "worker", "status", "eval", "play", "experiment", "report", "bench"],
+    [
+        "master",
+        "train",
+        "keys",
+        "worker",
+        "status",
+        "eval",
+        "play",
+        "experiment",
+        "report",
+        "bench",
+    ],
 )
 def test_console_scripts_come_through_the_door(command: str) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -87,14 +102,30 @@ def test_every_package_is_installed() -> None:
     assert found == set(tools["setuptools"]["packages"])
 
 
-def test_constraints_pin_every_requirement() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    extras = project["optional-dependencies"]
-    wanted = [*project["dependencies"], *(name for extra in extras.values() for name in extra)]
+def locked() -> dict[str, list[str]]:
+    """`name==version`, with its marker where it has one -> hashes."""
+    lines = (ROOT / "lock.txt").read_text().replace("\\\n", "").splitlines()
+    parts = (re.split(r"\s+--hash=", line) for line in lines if not line.startswith("#"))
+    return {pin: hashes for pin, *hashes in parts}
+
+
+def test_the_lock_has_all_that_is_required_each_file_by_its_hash() -> None:
+    """Of the project, of its extras, of what builds it, and of the images."""
+    pins = locked()
+    for pin, hashes in pins.items():
+        assert hashes, f"{pin} has no hash"
+        assert all(re.fullmatch("sha256:[0-9a-f]{64}", one) for one in hashes), pin
     lines = (ROOT / "constraints.txt").read_text().splitlines()
-    pinned = {line.partition("==")[0].lower().replace("_", "-") for line in lines if "==" in line}
-    names = {text.partition(";")[0].partition(">=")[0].strip().lower() for text in wanted}
-    assert names <= pinned
+    assert [line for line in lines if not line.startswith("#")] == list(pins), "make lock"
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    project = settings["project"]
+    lists = [path.read_text().splitlines() for path in (ROOT / "docker").glob("*.txt")]
+    extras = project["optional-dependencies"].values()
+    wanted = [*project["dependencies"], *settings["build-system"]["requires"], *chain(*extras)]
+    wanted += [line for line in chain(*lists) if line[:1].isalpha()]
+    versions = dict(pin.partition(" ;")[0].split("==") for pin in pins)
+    for one in map(Requirement, wanted):
+        assert one.specifier.contains(versions[canonicalize_name(one.name)]), f"{one}: make lock"
 
 
 def test_every_file_of_conf_is_package_data() -> None:

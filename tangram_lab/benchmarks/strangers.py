@@ -7,9 +7,37 @@ from typing import Self
 from urllib.parse import urlsplit
 
 # ZMTP 3.1 (https://rfc.zeromq.org/spec/37): signature, version, mechanism, not as a server.
-GREETING = b"\xff" + bytes(8) + b"\x7f" + b"\x03\x01" + b"CURVE".ljust(20, b"\0") + bytes(32)
-LARGE_COMMAND = b"\x06"
+SIGNATURE = b"\xff" + bytes(8) + b"\x7f" + b"\x03\x01"
+CURVE, NULL = (SIGNATURE + name.ljust(20, b"\0") + bytes(32) for name in (b"CURVE", b"NULL"))
+READY = b"\x04\x19\x05READY" + b"\x0bSocket-Type" + b"\0\0\0\x03SUB"
+LARGE, LARGE_COMMAND = b"\x02", b"\x06"
+SIZE = struct.Struct(">Q")
 AT_ONCE = 16  # connections that are opened between two looks at the others
+
+
+def connection(endpoint: str) -> socket.socket:
+    """Of a stranger."""
+    if endpoint.startswith("ipc://"):
+        one = socket.socket(socket.AF_UNIX)
+        one.connect(endpoint.removeprefix("ipc://"))
+        return one
+    place = urlsplit(endpoint)
+    return socket.create_connection((place.hostname or "", place.port or 0))
+
+
+def subscribe(endpoint: str, size: int) -> bool:
+    """Subscribe to a topic so long, on a socket that takes no keys; False if that is not taken."""
+    with connection(endpoint) as one:
+        try:
+            one.sendall(NULL + READY + LARGE + SIZE.pack(1 + size) + b"\x01" + bytes(size))
+            one.settimeout(1.0)
+            while one.recv(4096):
+                pass
+        except TimeoutError:
+            return True
+        except ConnectionError:
+            pass
+        return False
 
 
 class Strangers:
@@ -28,10 +56,9 @@ class Strangers:
             count: connections at a time.
             size: of a frame that each sends but for its last byte, 0 for silence.
         """
-        place = urlsplit(endpoint)
-        self._address, self._count = (place.hostname or "", place.port or 0), count
-        frame = LARGE_COMMAND + struct.pack(">Q", size) + bytes(size - 1) if size else b""
-        self._words = GREETING + frame if size else b""
+        self._endpoint, self._count = endpoint, count
+        frame = LARGE_COMMAND + SIZE.pack(size) + bytes(size - 1) if size else b""
+        self._words = CURVE + frame if size else b""
         self._selector = selectors.DefaultSelector()
         self.opened = self.ended = 0
 
@@ -61,7 +88,7 @@ class Strangers:
                 self._drop(key)
 
     def _connect(self) -> None:
-        one = socket.create_connection(self._address)
+        one = connection(self._endpoint)
         one.setblocking(False)
         both = selectors.EVENT_READ | selectors.EVENT_WRITE
         self._selector.register(one, both, memoryview(self._words))
