@@ -32,7 +32,9 @@ from master.config import MasterConfig
 from master.loop import Loop
 from master.run import open_run
 from master.rundir import RunFolder
+from master.security import Holder
 from master.signals import StopSignals
+from master.sockets import Received
 from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.config import ServiceConfig
 from tangram_agent.process import Watchdog
@@ -88,8 +90,11 @@ class Sockets:
     def wait(self, _timeout_s: float) -> bool:
         return bool(self.arriving)
 
-    def receive(self) -> tuple[bytes, list[bytes]] | None:
-        return self.arriving.popleft() if self.arriving else None
+    def receive(self) -> Received | None:
+        return Received(*self.arriving.popleft(), Holder(), "") if self.arriving else None
+
+    def revoked(self) -> list[Holder]:
+        return []
 
     def send(self, identity: bytes, frames: Sequence[bytes]) -> None:
         if identity in self.wires:
