@@ -36,6 +36,7 @@ USAGE_STATUS = 2
 MAKE_RUNS = ("train", "master")  # the commands whose run_dir is made, not read
 MISSING_HINTS = {
     "runs": "say which study: runs=runs/experiments/laptop",
+    "run_dir": "say which run: run_dir=runs/...",
     "connect": "say which run: connect=runs/..., or a copy of its connection.json",
 }
 

@@ -203,6 +203,20 @@ their weights and the last checkpoint are. It asks the master, from wherever a w
         ),
         ("worker.config:StatusConfig",),
     ),
+    "keys": Command(
+        "tangram-keys",
+        """\
+Says who has a key to a run whose master listens on an address, makes a key for somebody
+else, and takes it back, all while the run goes on. The new key lies in a connection file
+of its own, which is all that the other one needs. Who joined, left and was refused stands
+in audit.jsonl in the run folder.""",
+        (
+            "tangram-keys run_dir=runs/shared",
+            "tangram-keys run_dir=runs/shared add=alice role=player out=alice.json",
+            "tangram-keys run_dir=runs/shared revoke=alice",
+        ),
+        ("master.config:KeysConfig",),
+    ),
     "eval": Command(
         "tangram-eval",
         """\

@@ -1,4 +1,4 @@
-"""The commands tangram-train and tangram-master.
+"""The commands tangram-train, tangram-master and tangram-keys.
 
 Everything heavy is imported after the config was composed, so --help and wrong input are instant.
 """
@@ -22,6 +22,23 @@ def train() -> int:
 def master() -> int:
     """tangram-master: the one process that learns."""
     return entry("master", _master)
+
+
+def keys() -> int:
+    """tangram-keys: who else may take part."""
+    return entry("keys", _keys)
+
+
+def _keys(settings: Plain) -> int:
+    from master.config import KeysConfig
+    from tangram_agent.setup import from_mapping
+
+    config = from_mapping(KeysConfig, settings)
+
+    from master.giving import change_keys
+
+    print("\n".join(change_keys(config)))
+    return 0
 
 
 def _train(settings: Plain) -> int:

@@ -3,10 +3,28 @@
 from dataclasses import dataclass, field
 
 from tangram_agent.config import ServiceConfig
+from tangram_agent.messages import ROLES
 from tangram_sim.errors import ConfigError
 from tangram_sim.settings import Settings, check_folder, declared, setting
 
 MAX_WORKERS = 1024
+
+
+@dataclass(frozen=True)
+class KeysConfig(Settings):
+    """Who else may take part in a run (tangram-keys)."""
+
+    run_dir: str = field(metadata=declared("folder of the run"))
+    add: str | None = setting(None, "make a key for somebody of this name", only={"revoke": None})
+    revoke: str | None = setting(None, "take the key of this name back")
+    role: str = setting("player", "that a new key is for", choices=ROLES, unless={"add": None})
+    out: str | None = setting(
+        None, "connection file with a new key alone; NAME.json if not given", unless={"add": None}
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_folder("run_dir", self.run_dir)
 
 
 @dataclass(frozen=True)

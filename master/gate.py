@@ -120,6 +120,13 @@ class Gate:
         self._thread = Thread(target=self._watch, name="gate", daemon=True)
         self._thread.start()
 
+    def end_all(self, endpoint: str) -> None:
+        """End all connections of a socket; those who may come connect again."""
+        for descriptor in list(self._open):
+            with suppress(OSError), _connection(descriptor) as found:
+                if _door(_named(found.getsockname())) == _door(endpoint):
+                    found.shutdown(socket.SHUT_RDWR)
+
     def close(self) -> None:
         """End the thread, before the sockets are closed."""
         for one in self._sockets:

@@ -14,12 +14,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
 
+from master.audit import Audit
 from master.counters import Counters
 from master.delivery import Arrival, EpisodesArrived, ScoresArrived, Verdict
 from master.gate import AMPLE, Room
 from master.registry import Peer, RefusedError, Registry
-from master.security import Keys
-from master.sockets import Sockets
+from master.security import Holder, Keys
+from master.sockets import Received, Sockets
 from tangram_agent.addresses import IPC
 from tangram_agent.arrays import MAX_FRAMES, EpisodeSpec, join_frames
 from tangram_agent.messages import (
@@ -95,6 +96,7 @@ class Hub:
         keys: Keys | None = None,
         weights_port: int = 0,
         room: Room = AMPLE,
+        audit: Audit | None = None,
     ) -> None:
         """Open the sockets.
 
@@ -106,6 +108,7 @@ class Hub:
             keys: for encrypted sockets, None for plain ones.
             weights_port: of the PUB, 0 for any.
             room: for those who take part.
+            audit: of who joins, leaves and is refused.
         """
         self.epoch = secrets.token_hex(8)
         self._info, self._silence_s = info, silence_s
@@ -116,7 +119,9 @@ class Hub:
         self._status: list[bytes] | None = None
         self._orders: dict[int, Go] = {}
         self.counters = Counters()
-        self._sockets = Sockets(bind, port, self.counters, keys, weights_port, room)
+        self._audit, self._caller = audit or Audit(), Holder()
+        self._address = ""
+        self._sockets = Sockets(bind, port, self.counters, keys, weights_port, room, audit)
         self.endpoint = self._sockets.endpoint
         self.weights_endpoint = self._sockets.weights_endpoint
         self.open_to_all = keys is None and not self.endpoint.startswith(IPC)
@@ -144,13 +149,18 @@ class Hub:
                 received = self._sockets.receive()
                 if received is None:
                     break
-                arrival = self._receive(*received)
+                arrival = self._heard(received)
                 if arrival is not None:
                     arrivals.append(arrival)
             else:  # more is waiting, perhaps from those who seem silent
                 return arrivals
+        for holder in self._sockets.revoked():
+            for peer in [one for one in self.peers if one.holder == holder.name]:
+                self._revoked(peer.identity, holder.name)
         for peer in self._registry.drop_silent(time.monotonic(), self._silence_s):
-            self.counters.note("lost_peers", f"{peer.name} was silent for {self._silence_s:g} s")
+            reason = f"{peer.name} was silent for {self._silence_s:g} s"
+            self.counters.note("lost_peers", reason)
+            self._tell_of("lost", peer, reason)
         return arrivals
 
     def acknowledge(self, arrival: EpisodesArrived) -> None:
@@ -215,6 +225,23 @@ class Hub:
         """Close the sockets; answers that are on their way get a second."""
         self._sockets.close()
 
+    def _heard(self, received: Received) -> Arrival | None:
+        """Read a message, if its sender still has a key; returns what is new."""
+        identity, frames, holder, self._address = received
+        if holder is None:
+            peer = self._registry.find(identity)
+            self._revoked(identity, "" if peer is None else peer.holder)
+            return None
+        self._caller = holder
+        return self._receive(identity, frames)
+
+    def _revoked(self, identity: bytes, name: str) -> None:
+        peer, reason = self._registry.find(identity), f"the key {name} was revoked"
+        if peer is not None:
+            self._registry.leave(peer)
+            self._tell_of("refused", peer, reason)
+        self._refuse(identity, "revoked", Stop(reason))
+
     def _receive(self, identity: bytes, frames: Sequence[bytes]) -> Arrival | None:
         """Read a message and answer it; returns what is new."""
         message: ToMaster | BatchError
@@ -239,6 +266,8 @@ class Hub:
     ) -> Arrival | None:
         """Those who need not take part, and those who may not any more."""
         peer = self._registry.find(identity)
+        if peer is not None and peer.holder != self._caller.name:
+            peer = None  # the name of a connection is no proof
         if isinstance(message, AskStatus):
             if self._status is not None:
                 self._sockets.send(identity, self._status)
@@ -246,6 +275,7 @@ class Hub:
             self.counters["byes"] += 1
             if peer is not None:
                 self._registry.leave(peer)
+                self._tell_of("left", peer, message.reason)
         elif self._stop_reason is not None:
             # Batches, too, right and wrong ones: none is taken, so none may be refused for good.
             self._send(identity, Stop(self._stop_reason))
@@ -363,16 +393,24 @@ class Hub:
                 f"this master runs '{run_id}', not '{hello.run_id}': the connection file is stale, "
                 "take the one of a master that is running"
             )
-            self._refuse(identity, "refused_run", Refused(reason))
+            self._refuse_hello(identity, hello, "refused_run", Refused(reason))
+            return
+        reason = self._not_with_this_key(hello)
+        if reason:
+            self._refuse_hello(identity, hello, "refused_keys", Refused(reason))
             return
         try:
             peer, older = self._registry.admit(identity, hello, time.monotonic())
         except RefusedError as error:
-            self._refuse(identity, error.counter, error.answer)
+            self._refuse_hello(identity, hello, error.counter, error.answer)
             return
         if older is not None:
             reason = f"{peer.name} was taken over by a newer process"
+            self._tell_of("superseded", older, reason)
             self._refuse(older.identity, "superseded", Stop(reason))
+        before, peer.address, peer.holder = peer.address, self._address, self._caller.name
+        if before is None:
+            self._tell_of("joined", peer)
         self.counters["welcomed"] += 1
         lost = self._registry.lost_batches - self.counters["lost_batches"]
         self.counters["lost_batches"] += lost
@@ -384,6 +422,30 @@ class Hub:
             self.counters.note("losses", reason)
         self._send(identity, self._welcome(peer))
         self._remind(peer)
+
+    def _not_with_this_key(self, hello: Hello) -> str:
+        """Why a key does not let a process take part as it wants to; empty if it does."""
+        name, role = self._caller.name, self._caller.role
+        if role not in ("", hello.role):
+            return f"the key '{name}' is one for role={role}, not for role={hello.role}"
+        there = self._registry.at((hello.role, hello.index))
+        if there is not None and there.holder != name:
+            return f"{there.name} takes part with another key: leave index out, or choose another"
+        return ""
+
+    def _refuse_hello(
+        self, identity: bytes, hello: Hello, counter: str, answer: Refused | Stop
+    ) -> None:
+        who = {"role": hello.role, "index": hello.index, "process": hello.process}
+        where = {"key": self._caller.name, "address": self._address, "reason": answer.reason}
+        self._audit.note("refused", **who, **where)
+        self._refuse(identity, counter, answer)
+
+    def _tell_of(self, event: str, peer: Peer, reason: str = "") -> None:
+        """One line of the audit."""
+        who = {"role": peer.role, "index": peer.index, "incarnation": peer.incarnation}
+        where = {"process": peer.process, "key": peer.holder, "address": peer.address}
+        self._audit.note(event, **who, **where, **({"reason": reason} if reason else {}))
 
     def _welcome(self, peer: Peer) -> Welcome:
         return Welcome(

@@ -52,6 +52,8 @@ class Peer:
         weights_version: that its last batch was played with.
         batches, episodes, transitions: inserted since it joined.
         damaged: messages in a row that were damaged on their way.
+        holder: name of the key that it joined with, empty where there are none.
+        address: where it is; None before it has joined.
         weights: version that it was sent when it asked, and when it may have more if it does not
             show that it got them.
     """
@@ -69,6 +71,8 @@ class Peer:
     episodes: int = 0
     transitions: int = 0
     damaged: int = 0
+    holder: str = ""
+    address: str | None = None
     weights: tuple[int, float] = (-1, 0.0)
     _patience_s: float = WEIGHTS_AGAIN_S
 

@@ -5,11 +5,13 @@ import socket
 import sys
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack, closing
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from master.audit import Audit
 from master.budget import Budget
 from master.checkpointer import Checkpointer, Restored, restore_run, warm_start
 from master.config import MasterConfig
@@ -119,7 +121,7 @@ def open_run(
     signals: StopSignals,
     watchdog: Watchdog,
     opened: ExitStack,
-) -> tuple[Loop, dict[str, str]]:
+) -> tuple[Loop, dict[str, Any]]:
     """Make all that a run consists of, from the newest checkpoint where it is to be resumed.
 
     Args:
@@ -192,7 +194,7 @@ def open_run(
 
 def connection_of(
     service: ServiceConfig, hub: Hub, run_id: str, http: str | None, keys: Keys | None
-) -> dict[str, str]:
+) -> dict[str, Any]:
     """What a worker needs to find this master, and to be let in.
 
     Args:
@@ -204,7 +206,7 @@ def connection_of(
     """
     host = service.host or socket.gethostname()
     announced = with_host if service.host else reachable
-    where = {
+    where: dict[str, Any] = {
         "endpoint": announced(hub.endpoint, host),
         "weights_endpoint": announced(hub.weights_endpoint, host),
         "run_id": run_id,
@@ -214,11 +216,8 @@ def connection_of(
         where["http"] = reachable(http, host)
     if keys is None:
         return where
-    return where | {
-        "server_key": keys.server_public,
-        "public_key": keys.worker_public,
-        "secret_key": keys.worker_secret,
-    }
+    own = {role: asdict(pair) for role, pair in keys.own().items()}
+    return where | {"server_key": keys.server.public, "keys": own}
 
 
 def _open_hub(config: MasterConfig, setup: Setup, run_id: str, keys: Keys | None) -> Hub:
@@ -232,8 +231,8 @@ def _open_hub(config: MasterConfig, setup: Setup, run_id: str, keys: Keys | None
         lockstep=service.mode == "lockstep",
     )
     bind = listening_place(service.bind, Path(config.run_dir))
-    patience_s = service.silence_seconds
-    return Hub(bind, service.port, info, patience_s, keys, service.weights_port, Room.here())
+    patience_s, audit = service.silence_seconds, Audit(RunFolder(config.run_dir).audit)
+    return Hub(bind, service.port, info, patience_s, keys, service.weights_port, Room.here(), audit)
 
 
 def _keys(service: ServiceConfig, folder: RunFolder) -> Keys | None:

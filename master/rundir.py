@@ -48,6 +48,7 @@ class RunFolder:
         tensorboard: folder of the curves.
         logs: folder of the output of workers and evaluator.
         curve: the scores of every evaluation.
+        audit: who joined, left and was refused.
         result: the scores of the final weights.
         bad_batch: what the learner could not learn from, where that ended the run.
         picture: the test episodes, played with the final weights.
@@ -63,6 +64,7 @@ class RunFolder:
         self.tensorboard = self.path / "tensorboard"
         self.logs = self.path / "logs"
         self.curve = self.path / "curve.jsonl"
+        self.audit = self.path / "audit.jsonl"
         self.result = self.path / RESULT
         self.bad_batch = self.path / "bad_batch.safetensors"
         self.picture = self.path / "test_episodes.png"
@@ -129,7 +131,7 @@ class RunFolder:
         self._written[self.config] = data, PUBLIC
         return dict(yaml.safe_load(data))
 
-    def write_connection(self, connection: Mapping[str, str]) -> None:
+    def write_connection(self, connection: Mapping[str, Any]) -> None:
         """Write what a worker needs to take part; only the user may read it.
 
         Args:

@@ -1,44 +1,116 @@
 """Who may connect at all: CURVE encryption, its keys, and ZeroMQ's authentication (ZAP).
 
-A run has the server's pair of keys, and one pair that all of its workers share. They live as long
-as the run, so that a worker may come back after the master was restarted.
+A run has the server's pair of keys, one for each role that its own workers share, and those that
+tangram-keys made for others. They live as long as the run, so that a worker may come back after the
+master was restarted.
 """
 
 import hashlib
 import json
+import logging
 import os
+import re
+import struct
 import tempfile
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import zmq
 from zmq.auth.thread import ThreadAuthenticator
+from zmq.utils import z85
 
+from master.audit import Audit
 from master.counters import Counters
 from tangram_agent.addresses import IPC, LOCAL
 from tangram_agent.config import ServiceConfig
 from tangram_agent.files import own_folder, write_whole
+from tangram_agent.messages import ROLES
+from tangram_agent.process import Every
 from tangram_sim.errors import ConfigError, RunError
 
 PRIVATE = 0o600
 DOMAIN = "tangram"
 MAX_SOCKET_PATH = 107  # bytes, of Linux
+NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,63}")  # of a key
+KEY_BYTES = 32
+LOOK_S = 1.0  # between two looks at the file of keys
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Pair:
+    """CURVE keys, 40 characters of Z85 each; the secret one is never shown."""
+
+    public: str
+    secret: str = field(repr=False)
+
+
+@dataclass(frozen=True)
+class Given:
+    """A key that was made for somebody, who alone has its secret half.
+
+    Attributes:
+        role: that it may take part in.
+        public: the other half.
+    """
+
+    role: str
+    public: str
 
 
 @dataclass(frozen=True)
 class Keys:
-    """Two pairs of CURVE keys, 40 characters of Z85 each; the secret ones are never shown."""
+    """The keys of a run.
 
-    server_public: str
-    server_secret: str = field(repr=False)
-    worker_public: str
-    worker_secret: str = field(repr=False)
+    Attributes:
+        server: of the master.
+        player, evaluator: of the run's own workers, by role.
+        given: name -> key, of those that tangram-keys made.
+        path: where they are kept; changes there are followed.
+    """
+
+    server: Pair
+    player: Pair
+    evaluator: Pair
+    given: Mapping[str, Given] = field(default_factory=dict)
+    path: Path | None = field(default=None, compare=False)
+
+    def own(self) -> dict[str, Pair]:
+        """Role -> the pair of the run's own workers."""
+        return {role: getattr(self, role) for role in ROLES}
+
+    def content(self) -> dict[str, Any]:
+        """As the file holds them."""
+        return {name: value for name, value in asdict(self).items() if name != "path"}
+
+
+@dataclass(frozen=True)
+class Holder:
+    """Who has a key: a name, and the role it is for; empty for any, where there are no keys."""
+
+    name: str = ""
+    role: str = ""
+
+
+def make_pair() -> Pair:
+    """A fresh one."""
+    return Pair(*(key.decode("ascii") for key in zmq.curve_keypair()))
 
 
 def make_keys() -> Keys:
     """Fresh keys."""
-    pairs = [*zmq.curve_keypair(), *zmq.curve_keypair()]
-    return Keys(*(key.decode("ascii") for key in pairs))
+    return Keys(make_pair(), make_pair(), make_pair())
+
+
+def holders(keys: Keys) -> dict[str, Holder]:
+    """Public key -> who has it."""
+    own = {pair.public: Holder(role, role) for role, pair in keys.own().items()}
+    return own | {one.public: Holder(name, one.role) for name, one in keys.given.items()}
 
 
 def run_keys(path: Path) -> Keys:
@@ -48,23 +120,46 @@ def run_keys(path: Path) -> Keys:
         RunError: the file is there and holds something else.
     """
     if not path.exists():
-        keys = make_keys()
-        write_whole(path, json.dumps(asdict(keys), indent=1).encode(), PRIVATE)
-        return keys
+        write_keys(path, make_keys())
+    return read_keys(path)
+
+
+def read_keys(path: Path) -> Keys:
+    """The keys in a file; RunError if it holds something else."""
     try:
-        keys = Keys(**json.loads(path.read_text(encoding="utf-8")))
-        for secret, public in (
-            (keys.server_secret, keys.server_public),
-            (keys.worker_secret, keys.worker_public),
-        ):
-            if zmq.curve_public(secret.encode()).decode() != public:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        keys = msgspec.convert(content, Keys)
+        if keys.content() != content:
+            raise ValueError("it holds more")
+        for pair in (keys.server, *keys.own().values()):
+            if zmq.curve_public(pair.secret.encode()).decode() != pair.public:
                 raise ValueError("a public key is not that of its secret key")
-    except (OSError, ValueError, TypeError, AttributeError, RecursionError, zmq.ZMQError) as error:
+        for name, one in keys.given.items():
+            if not NAME.fullmatch(name) or name in ROLES or one.role not in ROLES:
+                raise ValueError(f"'{name}' is no name, or its role is unknown")
+            if len(z85.decode(one.public)) != KEY_BYTES:
+                raise ValueError(f"the key of {name} is none")
+    except (
+        OSError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        RecursionError,
+        struct.error,
+        KeyError,
+        msgspec.MsgspecError,
+        zmq.ZMQError,
+    ) as error:
         raise RunError(
             f"{path} does not hold the run's keys ({error}): delete it to make new ones; workers "
             "that run now must then be started again"
         ) from None
-    return keys
+    return replace(keys, path=path)
+
+
+def write_keys(path: Path, keys: Keys) -> None:
+    """Keep keys in a file that only the user may read."""
+    write_whole(path, json.dumps(keys.content(), indent=1).encode(), PRIVATE)
 
 
 def needs_keys(service: ServiceConfig) -> bool:
@@ -113,9 +208,15 @@ class Authenticator:
     """Encrypts sockets of a context, and turns away those with another key."""
 
     def __init__(
-        self, context: zmq.Context[zmq.Socket[bytes]], keys: Keys, counters: Counters
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        keys: Keys,
+        counters: Counters,
+        audit: Audit,
     ) -> None:
-        self._keys, self._counters = keys, counters
+        self._keys, self._counters, self._audit = keys, counters, audit
+        self._holders, self._former = holders(keys), dict[str, Holder]()
+        self._stamp, self._look = self._stamped(), Every(LOOK_S)
         self._thread = ThreadAuthenticator(context)
         self._thread.start()
         self._thread.configure_curve_callback(domain=DOMAIN, credentials_provider=self)
@@ -123,16 +224,47 @@ class Authenticator:
     def guard(self, socket: zmq.Socket[bytes]) -> None:
         """Encrypt a socket that is not bound yet."""
         socket.setsockopt(zmq.CURVE_SERVER, 1)
-        socket.setsockopt(zmq.CURVE_SECRETKEY, self._keys.server_secret.encode())
+        socket.setsockopt(zmq.CURVE_SECRETKEY, self._keys.server.secret.encode())
         socket.setsockopt_string(zmq.ZAP_DOMAIN, DOMAIN)
 
     def callback(self, _domain: str, key: bytes) -> bool:
         """Whether a key (Z85) may connect; called by the thread."""
-        allowed = key == self._keys.worker_public.encode()
+        public = key.decode("ascii")
+        allowed = public in self._holders
         if not allowed:
-            self._counters.note("refused_keys", "a worker with the key of another run")
+            former = self._former.get(public, Holder()).name
+            self._counters.note("refused_keys", "a worker with the key of another run, or a former")
+            self._audit.note("refused", key=former or public, reason="no key of this run")
         return allowed
+
+    def holder(self, public: str) -> Holder | None:
+        """Who has a key, None if it was revoked."""
+        return self._holders.get(public)
+
+    def revoked(self) -> list[Holder]:
+        """Look at the file, once in a second, and return those whose keys are no longer there."""
+        if not self._look.due() or (stamp := self._stamped()) in (None, self._stamp):
+            return []
+        self._stamp = stamp
+        try:
+            found = holders(read_keys(self._keys.path or Path()))
+        except RunError as error:
+            log.warning("%s; those of before stay valid", error)
+            return []
+        gone = {key: one for key, one in self._holders.items() if key not in found}
+        for key in found.keys() - self._holders.keys():
+            log.info("the key '%s' may take part from now on", found[key].name)
+        self._former |= gone
+        self._holders = found
+        return list(gone.values())
 
     def close(self) -> None:
         """End the thread, before the context is destroyed."""
         self._thread.stop()
+
+    def _stamped(self) -> tuple[int, int] | None:
+        """What changes with the file; None where there is none."""
+        with suppress(OSError):
+            found = (self._keys.path or Path()).stat()
+            return found.st_mtime_ns, found.st_ino
+        return None

@@ -3,12 +3,14 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import zmq
 
+from master.audit import Audit
 from master.counters import Counters
 from master.gate import AMPLE, Gate, Room
-from master.security import Authenticator, Keys
+from master.security import Authenticator, Holder, Keys
 from tangram_agent.addresses import IPC
 from tangram_agent.arrays import MAX_FRAME_BYTES
 from tangram_sim.errors import ConfigError
@@ -24,6 +26,22 @@ BACKLOG = 1024
 MAX_COMMAND = 1024
 # ZMTP pings find connections that died without a word.
 PING_MS = 5000
+
+
+class Received(NamedTuple):
+    """A message, and who it is from.
+
+    Attributes:
+        identity: of the connection.
+        frames: of the message.
+        holder: of the key that the connection showed, None if that was revoked since.
+        address: of the other side; of a unix socket it has user, group and process.
+    """
+
+    identity: bytes
+    frames: Sequence[bytes]
+    holder: Holder | None
+    address: str
 
 
 class Sockets:
@@ -42,11 +60,14 @@ class Sockets:
         keys: Keys | None = None,
         weights_port: int = 0,
         room: Room = AMPLE,
+        audit: Audit | None = None,
     ) -> None:
         self._counters = counters
         self._context = zmq.Context()
         self._gate: Gate | None = None
-        self._authenticator = Authenticator(self._context, keys, counters) if keys else None
+        self._authenticator: Authenticator | None = None
+        if keys is not None:
+            self._authenticator = Authenticator(self._context, keys, counters, audit or Audit())
         try:
             self._router = self._open(zmq.ROUTER, bind, port, "service.port")
             self._pub = self._open(zmq.PUB, bind, weights_port, "service.weights_port")
@@ -61,13 +82,25 @@ class Sockets:
         """Whether a message came within this time."""
         return bool(self._router.poll(math.ceil(max(0.0, timeout_s) * 1000)))
 
-    def receive(self) -> tuple[bytes, Sequence[bytes]] | None:
-        """The identity and the frames of the next message, None if there is none."""
+    def receive(self) -> Received | None:
+        """The next message, None if there is none."""
         try:
-            identity, *frames = self._router.recv_multipart(zmq.NOBLOCK)
+            first = self._router.recv(zmq.NOBLOCK, copy=False)
         except zmq.Again:
             return None
-        return identity, frames
+        frames = self._router.recv_multipart(zmq.NOBLOCK)
+        holder: Holder | None = Holder()
+        if self._authenticator is not None:
+            holder = self._authenticator.holder(str(first.get("User-Id")))
+        return Received(first.bytes, frames, holder, str(first.get("Peer-Address")))
+
+    def revoked(self) -> list[Holder]:
+        """Those whose keys were revoked since; none of them gets weights any more."""
+        gone = [] if self._authenticator is None else self._authenticator.revoked()
+        if gone and self._gate is not None:
+            # A PUB knows no subscribers: all must show their keys again.
+            self._gate.end_all(self.weights_endpoint)
+        return gone
 
     def send(self, identity: bytes, frames: Sequence[bytes]) -> None:
         """Send to a peer; if it is gone or does not read, count that and drop the message."""

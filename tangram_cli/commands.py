@@ -44,6 +44,7 @@ def run(module: str, function: str) -> int:
 
 master = partial(run, "master.cli", "master")
 train = partial(run, "master.cli", "train")
+keys = partial(run, "master.cli", "keys")
 worker = partial(run, "worker.cli", "worker")
 status = partial(run, "worker.cli", "status")
 evaluate = partial(run, "worker.cli", "evaluate")
@@ -55,6 +56,7 @@ bench = partial(run, "tangram_lab.benchmarks.cli", "main")
 COMMANDS: dict[str, Callable[[], int]] = {
     "master": master,
     "train": train,
+    "keys": keys,
     "worker": worker,
     "status": status,
     "eval": evaluate,

@@ -75,7 +75,18 @@ def test_command_lines_load_nothing_heavy() -> None:
 
 @pytest.mark.parametrize(
     "command",
-    ["master", "train", "worker", "status", "eval", "play", "experiment", "report", "bench"],
+    [
+        "master",
+        "train",
+        "keys",
+        "worker",
+        "status",
+        "eval",
+        "play",
+        "experiment",
+        "report",
+        "bench",
+    ],
 )
 def test_console_scripts_come_through_the_door(command: str) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

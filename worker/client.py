@@ -91,7 +91,7 @@ class Client:
         self.joined = False
         self.on_progress: Callable[[], None] = lambda: None
         self._timing = timing or Timing()
-        self._connection = Connection(connect, self._timing, self.counters)
+        self._connection = Connection(connect, self._timing, self.counters, role)
         self._role, self._index, self._fingerprints = role, index, fingerprints
         self._spec, self._shapes, self._window = spec, shapes, window
         self._process = secrets.token_hex(16)

@@ -68,8 +68,12 @@ class Sockets:
     believes alive.
     """
 
-    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], address: MasterAddress) -> None:
+    def __init__(
+        self, context: zmq.Context[zmq.Socket[bytes]], address: MasterAddress, role: str = ""
+    ) -> None:
+        """Connect with the key of a role, or with any; RunError if there is none for it."""
         self._context, self._address = context, address
+        self._key = _key_of(address, role)
         self._sub: zmq.Socket[bytes] | None = None
         self._weights_endpoint = ""
         self._doubts = 0
@@ -162,10 +166,11 @@ class Sockets:
         socket.setsockopt(zmq.HEARTBEAT_IVL, PING_MS)
         socket.setsockopt(zmq.RECONNECT_IVL, RECONNECT_MS)
         socket.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MAX_MS)
-        if self._address.server_key:
+        if self._key is not None:
+            public, secret = self._key
             socket.setsockopt(zmq.CURVE_SERVERKEY, self._address.server_key.encode())
-            socket.setsockopt(zmq.CURVE_PUBLICKEY, self._address.public_key.encode())
-            socket.setsockopt(zmq.CURVE_SECRETKEY, self._address.secret_key.encode())
+            socket.setsockopt(zmq.CURVE_PUBLICKEY, public.encode())
+            socket.setsockopt(zmq.CURVE_SECRETKEY, secret.encode())
         self._poller.register(socket, zmq.POLLIN)
         return socket
 
@@ -179,6 +184,19 @@ class Sockets:
             ) from None
 
 
+def _key_of(address: MasterAddress, role: str) -> tuple[str, str] | None:
+    """The key to show; None where none is wanted."""
+    if not address.keys:
+        return None
+    if role and role not in address.keys:
+        there = " and ".join(address.keys)
+        raise RunError(
+            f"the connection file of {address.endpoint} has a key for role={there} only: start "
+            f"with that, or ask for one for role={role} (tangram-keys)"
+        )
+    return address.keys[role] if role else next(iter(address.keys.values()))
+
+
 class Connection:
     """One pair of sockets at a time; the next one may have another address.
 
@@ -188,11 +206,14 @@ class Connection:
         keys_refused: the last handshake failed, because keys do not fit.
     """
 
-    def __init__(self, connect: str, timing: Timing, counters: Counter[str]) -> None:
+    def __init__(
+        self, connect: str, timing: Timing, counters: Counter[str], role: str = ""
+    ) -> None:
         self.sockets: Sockets | None = None
         self.address: MasterAddress | None = None
         self.keys_refused = False
         self._connect, self._timing, self._counters = connect, timing, counters
+        self._role = role
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         # Since when an answer is due on this connection, and on all since the last answer.
         self._asked_at: float | None = None
@@ -233,7 +254,7 @@ class Connection:
             return False
         if self.address != before or self._unknown_host:
             self._look_up(self.address.endpoint)
-        self.sockets = Sockets(self._context, self.address)
+        self.sockets = Sockets(self._context, self.address, self._role)
         return True
 
     def _look_up(self, endpoint: str) -> None:

@@ -21,7 +21,6 @@ LOOK_S = 0.2
 DNS_S = 2.0
 SCHEME = "tcp://"
 PLAIN_ADDRESS = re.compile(r"[\w.-]{1,249}:\d{1,5}|\[[0-9a-fA-F:.]+\]:\d+")  # without the scheme
-KEYS = ("server_key", "public_key", "secret_key")
 KEY = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
 
 
@@ -33,21 +32,21 @@ class MasterAddress:
         endpoint: of its ROUTER socket.
         run_id: that it must have, empty where any will do.
         server_key: the master's public CURVE key, empty where nothing is encrypted.
-        public_key, secret_key: the pair of the run's workers.
+        keys: role -> public and secret key, of those that may take part in it.
         settings: section -> those of the run; None where only an address is known.
     """
 
     endpoint: str
     run_id: str = ""
     server_key: str = ""
-    public_key: str = ""
-    secret_key: str = field(default="", repr=False)
+    keys: Mapping[str, tuple[str, str]] = field(default_factory=dict, repr=False)
     settings: Mapping[str, Any] | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        keys = (self.server_key, self.public_key, self.secret_key)
-        if any(keys) and not all(KEY.fullmatch(key) for key in keys):
-            raise ValueError("server_key, public_key and secret_key must be 40 characters of Z85")
+        keys = [self.server_key, *(key for pair in self.keys.values() for key in pair)]
+        wanted = self.server_key or self.keys
+        if wanted and not (self.keys and all(KEY.fullmatch(key) for key in keys)):
+            raise ValueError("server_key and keys must be 40 characters of Z85 each")
         if not isinstance(self.settings, Mapping | None):
             raise TypeError("settings must be a map")
 
@@ -86,12 +85,20 @@ def find_master(connect: str) -> MasterAddress | None:
             _check_own(endpoint.removeprefix(IPC), str(content["machine"]), path)
         else:
             _checked(endpoint, str(path))
-        keys = {name: str(content.get(name, "")) for name in KEYS}
-        settings = content.get("settings")
-        return MasterAddress(endpoint, str(content["run_id"]), **keys, settings=settings)
+        found = content.get("keys", {}).items()
+        keys = {str(role): (str(one["public"]), str(one["secret"])) for role, one in found}
+        known = (endpoint, str(content["run_id"]), str(content.get("server_key", "")), keys)
+        return MasterAddress(*known, content.get("settings"))
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        RecursionError,
+    ) as error:
         raise RunError(
             f"{path} is no connection file ({error!r}): connect=... takes host:port, a run "
             f"folder, or the {FILE_NAME} that tangram-master writes into it"
@@ -156,11 +163,11 @@ def keys_error(connect: str, endpoint: str) -> str:
     if as_address(connect) is not None:
         return (
             f"the master at {endpoint} wants keys, or is none: name its connection file instead, "
-            f"connect=RUN_DIR/{FILE_NAME}"
+            f"connect=RUN_DIR/{FILE_NAME}, or one that tangram-keys made"
         )
     return (
         f"wrong or stale connection file: what answers at {endpoint} does not take the keys of "
-        f"{connect}; take the file of a master that is running"
+        f"{connect}, of another run or revoked; take the file of a master that is running"
     )
 
 

@@ -11,7 +11,7 @@ import multiprocessing
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from socket import gethostname
 from typing import Any
@@ -153,15 +153,11 @@ def send_batches(connect: str, setup: Setup, episodes: Episodes, workers: int) -
             pass
 
 
-def _connection(hub: Hub, keys: Keys | None) -> dict[str, str]:
+def _connection(hub: Hub, keys: Keys | None) -> dict[str, Any]:
     where = {"endpoint": hub.endpoint, "run_id": "bench", "machine": gethostname()}
     if keys is None:
         return where
-    return where | {
-        "server_key": keys.server_public,
-        "public_key": keys.worker_public,
-        "secret_key": keys.worker_secret,
-    }
+    return where | {"server_key": keys.server.public, "keys": {"player": asdict(keys.player)}}
 
 
 # Theirs
@@ -180,7 +176,7 @@ def bare(case: Case, setup: Setup, episodes: Episodes) -> Iterator[Work]:
         router.setsockopt(zmq.RCVTIMEO, round(PATIENCE_S * 1000))
         if keys is not None:
             router.setsockopt(zmq.CURVE_SERVER, 1)
-            router.setsockopt(zmq.CURVE_SECRETKEY, keys.server_secret.encode())
+            router.setsockopt(zmq.CURVE_SECRETKEY, keys.server.secret.encode())
         router.bind(f"{IPC}{folder}/bare" if case.way == UNIX else "tcp://127.0.0.1:*")
         endpoint = router.getsockopt_string(zmq.LAST_ENDPOINT)
         with child(send_frames, endpoint, frames, keys):
@@ -199,9 +195,9 @@ def send_frames(endpoint: str, frames: list[bytes], keys: Keys | None) -> None:
         dealer.setsockopt(zmq.LINGER, 0)
         dealer.setsockopt(zmq.RCVTIMEO, round(PATIENCE_S * 1000))
         if keys is not None:
-            dealer.setsockopt(zmq.CURVE_SERVERKEY, keys.server_public.encode())
-            dealer.setsockopt(zmq.CURVE_PUBLICKEY, keys.worker_public.encode())
-            dealer.setsockopt(zmq.CURVE_SECRETKEY, keys.worker_secret.encode())
+            dealer.setsockopt(zmq.CURVE_SERVERKEY, keys.server.public.encode())
+            dealer.setsockopt(zmq.CURVE_PUBLICKEY, keys.player.public.encode())
+            dealer.setsockopt(zmq.CURVE_SECRETKEY, keys.player.secret.encode())
         dealer.connect(endpoint)
         for _ in range(WINDOW - 1):
             dealer.send_multipart(frames)

@@ -18,10 +18,18 @@ pytestmark = pytest.mark.cluster
 
 ROOT = Path(__file__).parents[2]
 TRAINING = ("tangram-train", "tangram-master", "tangram-worker")
-WITH_HELP = (*TRAINING, "tangram-eval", "tangram-play", "tangram-experiment", "tangram-report")
+WITH_HELP = (
+    *TRAINING,
+    "tangram-keys",
+    "tangram-eval",
+    "tangram-play",
+    "tangram-experiment",
+    "tangram-report",
+)
 # One of the settings that a command's help explains.
 SETTING = {
     "tangram-worker": "role: player",
+    "tangram-keys": "add: null",
     "tangram-experiment": "jobs: 2",
     "tangram-report": "runs: ???",
 }

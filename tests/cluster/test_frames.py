@@ -125,7 +125,7 @@ def test_strangers_with_stale_or_foreign_keys_are_turned_away(tmp_path: Path) ->
             finish([], second)
         mine = json.loads((one / "connection.json").read_text())
         stale = tmp_path / "stale.json"
-        stale.write_text(json.dumps(mine | {n: keys[n] for n in ("public_key", "secret_key")}))
+        stale.write_text(json.dumps(mine | {"keys": keys["keys"]}))
         with players(setup_of(one), one) as made:
             more_acknowledged(made, 3)
             line = f"wrong or stale connection file: what answers at {mine['endpoint']} does not"

@@ -7,10 +7,22 @@ import stat
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from master.security import Keys, listening_place, make_keys, needs_keys, run_keys
+from master.audit import Audit
+from master.config import KeysConfig
+from master.giving import change_keys
+from master.security import (
+    Given,
+    Pair,
+    listening_place,
+    make_keys,
+    make_pair,
+    needs_keys,
+    run_keys,
+)
 from tangram_agent.config import ServiceConfig
 from tangram_sim.errors import ConfigError, RunError
 
@@ -23,17 +35,22 @@ def test_a_run_keeps_its_keys_and_only_the_user_reads_them(tmp_path: Path) -> No
     assert run_keys(path) == made
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     assert run_keys(tmp_path / "other.json") != made
-    assert len(set(asdict(made).values())) == 4
+    pairs = (made.server, *made.own().values())
+    assert len({key for pair in pairs for key in asdict(pair).values()}) == 6
 
 
 @pytest.mark.parametrize(
     "change",
     [
         {"more": 1},
-        {"server_secret": "x" * 40},
-        {"worker_secret": "short"},
-        {"worker_public": make_keys().worker_public},
-        {"server_public": 7},
+        {"server": asdict(make_pair()) | {"secret": "x" * 40}},
+        {"player": asdict(make_pair()) | {"secret": "short"}},
+        {"evaluator": asdict(make_pair()) | {"public": make_pair().public}},
+        {"server": {"public": 7, "secret": 7}},
+        {"given": {"alice": {"role": "master", "public": make_pair().public}}},
+        {"given": {"alice": {"role": "player", "public": "short"}}},
+        {"given": {"player": {"role": "player", "public": make_pair().public}}},
+        {"given": {"a/b": {"role": "player", "public": make_pair().public}}},
         "",
         "[" * 100_000,
         "[]",
@@ -43,7 +60,7 @@ def test_a_run_keeps_its_keys_and_only_the_user_reads_them(tmp_path: Path) -> No
 def test_a_file_that_holds_something_else_is_refused(tmp_path: Path, change: object) -> None:
     path = tmp_path / "keys.json"
     whole = isinstance(change, str)
-    path.write_text(str(change) if whole else json.dumps(asdict(make_keys()) | dict(change)))
+    path.write_text(str(change) if whole else json.dumps(make_keys().content() | dict(change)))
     with pytest.raises(RunError, match=r"keys\.json does not hold the run's keys .*: delete it"):
         run_keys(path)
 
@@ -89,5 +106,76 @@ def test_a_folder_too_deep_for_sockets_is_refused(
 
 
 def test_secrets_are_not_shown() -> None:
-    keys = Keys("a", "SECRET", "b", "SECRET")
-    assert "SECRET" not in repr(keys)
+    assert "SECRET" not in repr(Pair("a", "SECRET"))
+
+
+# tangram-keys
+
+
+def keys_of(folder: Path, **settings: Any) -> list[str]:
+    return change_keys(KeysConfig(str(folder), **settings))
+
+
+def test_keys_are_given_listed_and_taken_back(tmp_path: Path) -> None:
+    out, file = tmp_path / "alice.json", tmp_path / "keys.json"
+    own = ["player: role=player, of the run itself", "evaluator: role=evaluator, of the run itself"]
+    with pytest.raises(RunError, match=r"has no keys: they are made when its master first listens"):
+        keys_of(tmp_path)
+    made = run_keys(file)
+    assert keys_of(tmp_path) == own
+    with pytest.raises(RunError, match=r"no master of .* listens on an address with keys: start"):
+        keys_of(tmp_path, add="alice")
+    where = {"endpoint": "tcp://h:1", "run_id": "r", "server_key": made.server.public}
+    connection = where | {"keys": {"player": asdict(made.player)}, "settings": {}}
+    (tmp_path / "connection.json").write_text(json.dumps(connection))
+    told = f"{out} lets alice take part as evaluator: hand it on by a private way"
+    assert keys_of(tmp_path, add="alice", role="evaluator", out=str(out)) == [told]
+    assert keys_of(tmp_path) == [*own, "alice: role=evaluator"]
+    content = json.loads(out.read_text())
+    assert stat.S_IMODE(out.stat().st_mode) == 0o600
+    assert made.player.secret not in out.read_text()
+    assert content["keys"]["evaluator"]["secret"] not in file.read_text()
+    public = content["keys"]["evaluator"]["public"]
+    assert run_keys(file).given == {"alice": Given("evaluator", public)}
+    for settings, reason in (
+        ({"add": "alice"}, "there is a key of alice: revoke it first, or choose another name"),
+        ({"add": "player"}, "there is a key of player: revoke"),
+        ({"add": "a/b"}, "add must be a name of at most 64 letters, .* got 'a/b': set add=alice"),
+        ({"add": "bob", "out": str(out)}, "alice.json is there already: name another file"),
+        ({"revoke": "bob"}, r"revoke must name a key that was made here \(alice\), got 'bob'"),
+        ({"revoke": "alice", "add": "bob"}, "add=bob changes nothing with revoke=alice: leave it"),
+        ({"out": "x"}, "out=x changes nothing with add=null: leave it out"),
+        ({"role": "evaluator"}, "role=evaluator changes nothing with add=null"),
+    ):
+        with pytest.raises(ConfigError, match=reason):
+            keys_of(tmp_path, **settings)
+    assert keys_of(tmp_path, revoke="alice") == ["alice may take part no longer"]
+    assert run_keys(file) == made
+    log = [json.loads(line) for line in (tmp_path / "audit.jsonl").read_text().splitlines()]
+    assert [(line["event"], line["key"]) for line in log] == [
+        ("key added", "alice"),
+        ("key revoked", "alice"),
+    ]
+
+
+def test_the_audit_is_bounded_and_counts_what_it_leaves_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("master.audit.BURST", {"refused": 2})
+    log = Audit(tmp_path / "audit.jsonl")
+    for number in range(5):
+        log.note("refused", reason="x" * 1000, number=number)
+    log.note("joined")
+    monkeypatch.setattr("master.audit.REFILL_S", {"refused": 1e-9})
+    monkeypatch.setattr("master.audit.MAX_BYTES", 10)
+    log.note("refused")
+    old = (tmp_path / "audit.jsonl.old").read_text().splitlines()
+    assert [json.loads(line)["event"] for line in old] == ["refused", "refused", "joined"]
+    assert max(map(len, old)) < 400
+    [last] = (tmp_path / "audit.jsonl").read_text().splitlines()
+    assert json.loads(last)["left_out"] == 3
+    lost = Audit(tmp_path / "nowhere" / "audit.jsonl")
+    for _ in range(2):
+        lost.note("joined")
+    assert len(caplog.messages) == 1
+    assert "a line of the audit is missing" in caplog.text

@@ -101,8 +101,11 @@ def test_a_file_and_its_folder_are_found(tmp_path: Path) -> None:
         ("[" * 100_000, "RecursionError"),
         (
             '{"endpoint": "tcp://h:1", "run_id": "r", "server_key": "short"}',
-            "ValueError('server_key,",
+            "ValueError('server_key and",
         ),
+        ('{"endpoint": "tcp://h:1", "run_id": "r", "keys": []}', "AttributeError("),
+        ('{"endpoint": "tcp://h:1", "run_id": "r", "keys": {"player": {}}}', "KeyError('public')"),
+        ("7", "TypeError("),
     ],
 )
 def test_a_file_that_is_no_connection_file(tmp_path: Path, content: str, reason: str) -> None:

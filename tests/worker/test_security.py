@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,21 @@ import numpy as np
 import pytest
 import zmq
 
+from master.audit import Audit
 from master.hub import Hub
 from master.loop import Loop
 from master.rundir import RunFolder
-from master.security import Keys, make_keys
+from master.security import Given, Keys, Pair, make_keys, make_pair, read_keys, write_keys
 from tangram_agent.arrays import EpisodeSpec
-from tangram_agent.messages import Scores
+from tangram_agent.messages import (
+    Greet,
+    Heartbeat,
+    Refused,
+    Scores,
+    Stop,
+    Welcome,
+    decode_from_master,
+)
 from tangram_agent.types import Weights
 from tangram_lab.benchmarks.intruder import NOBODY, knock
 from tangram_sim.errors import RunError, TangramError
@@ -54,13 +63,10 @@ def unlingering(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def write_file(folder: Path, hub: Hub, keys: Keys | None, run_id: str = "run") -> Path:
     """What a master with these keys would write."""
-    content = {"endpoint": hub.endpoint, "run_id": run_id}
+    content: dict[str, Any] = {"endpoint": hub.endpoint, "run_id": run_id}
     if keys is not None:
-        content |= {
-            "server_key": keys.server_public,
-            "public_key": keys.worker_public,
-            "secret_key": keys.worker_secret,
-        }
+        own = {role: asdict(pair) for role, pair in keys.own().items()}
+        content |= {"server_key": keys.server.public, "keys": own}
     path = folder / "connection.json"
     path.write_text(json.dumps(content))
     return path
@@ -103,10 +109,8 @@ def test_other_keys_are_turned_away_and_the_worker_names_its_file(
 ) -> None:
     keys, other = make_keys(), make_keys()
     given: Keys | None = {
-        "server": replace(keys, server_public=other.server_public),
-        "worker": replace(
-            keys, worker_public=other.worker_public, worker_secret=other.worker_secret
-        ),
+        "server": replace(keys, server=other.server),
+        "worker": replace(keys, player=other.player),
         "none": None,
     }.get(wrong, other)
     with staged(keys=None if wrong == "of a plain master" else keys) as stage:
@@ -114,7 +118,8 @@ def test_other_keys_are_turned_away_and_the_worker_names_its_file(
         reason = turned_away(stage, path)
         assert reason == (
             f"wrong or stale connection file: what answers at {stage.hub.endpoint} does not take "
-            f"the keys of {path}; take the file of a master that is running"
+            f"the keys of {path}, of another run or revoked; take the file of a master that is "
+            "running"
         )
         assert stage.hub.counters["refused_keys"] >= (wrong == "worker")
         assert stage.hub.peers == []
@@ -144,7 +149,7 @@ def test_a_master_that_gets_the_right_keys_is_joined_without_waiting_for_silence
 ) -> None:
     """ZeroMQ itself never connects again after it was refused."""
     keys, other, port = make_keys(), make_keys(), free_port()
-    others = replace(keys, worker_public=other.worker_public, worker_secret=other.worker_secret)
+    others = replace(keys, player=other.player)
     with staged(port=port, keys=others) as stage:
         path = write_file(tmp_path, stage.hub, keys)
         with make_client(path) as client:
@@ -276,3 +281,114 @@ def test_a_worker_on_another_machine_is_told_where_the_master_listens(tmp_path: 
         "service.bind=0.0.0.0, or start this there"
     )
     assert not (tmp_path / "t").exists()
+
+
+# Keys of one role, of one person, and for a while
+
+
+def raw(stage: Stage, keys: Keys, pair: Pair, name: bytes = b"", kind: int = zmq.DEALER) -> Any:
+    """A connection with a key, and perhaps with a name of its own; or a subscription."""
+    end, hub = stage._open(kind), stage.hub
+    end.setsockopt(zmq.LINGER, 0)
+    if name:
+        end.setsockopt(zmq.IDENTITY, name)
+    if kind == zmq.SUB:
+        end.setsockopt(zmq.SUBSCRIBE, b"")
+    end.setsockopt(zmq.CURVE_SERVERKEY, keys.server.public.encode())
+    end.setsockopt(zmq.CURVE_PUBLICKEY, pair.public.encode())
+    end.setsockopt(zmq.CURVE_SECRETKEY, pair.secret.encode())
+    end.connect(hub.endpoint if kind == zmq.DEALER else hub.weights_endpoint)
+    return end
+
+
+def asked(stage: Stage, end: Any, message: Any) -> Any:
+    end.send_multipart(message.encode())
+    stage.until(lambda: end.poll(0))
+    return decode_from_master(end.recv_multipart(), None)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    """Of the keys of a run."""
+    path = tmp_path / "keys.json"
+    write_keys(path, make_keys())
+    return path
+
+
+def give(file: Path, name: str, role: str = "player") -> Pair:
+    pair, keys = make_pair(), read_keys(file)
+    write_keys(file, replace(keys, given={**keys.given, name: Given(role, pair.public)}))
+    return pair
+
+
+def lines(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_a_key_is_for_one_role_and_for_its_own_indices(tmp_path: Path, file: Path) -> None:
+    alice, bob, log = give(file, "alice"), give(file, "bob"), tmp_path / "audit.jsonl"
+    keys = read_keys(file)
+    with staged(keys=keys, audit=Audit(log)) as stage:
+        one, other = raw(stage, keys, alice, b"the same"), raw(stage, keys, bob)
+        answer = asked(stage, one, hello(role="evaluator"))
+        assert answer == Refused("the key 'alice' is one for role=player, not for role=evaluator")
+        assert isinstance(asked(stage, one, hello(index=3)), Welcome)
+        answer = asked(stage, other, hello(index=3, process="p2"))
+        assert isinstance(answer, Refused)
+        assert answer.reason.startswith("player 3 takes part with another key: leave index out")
+        assert isinstance(asked(stage, other, hello(process="p2")), Welcome)
+        # The name of a connection is free once it is gone; what it had joined as is not.
+        one.close()
+        heir = raw(stage, keys, bob, b"the same")
+        assert asked(stage, heir, Heartbeat({})) == Greet()
+    found = lines(log)
+    assert [(line["event"], line["key"]) for line in found] == [
+        ("refused", "alice"),
+        ("joined", "alice"),
+        ("refused", "bob"),
+        ("joined", "bob"),
+    ]
+    assert found[1] == {
+        "time": found[1]["time"],
+        "event": "joined",
+        "role": "player",
+        "index": 3,
+        "incarnation": 1,
+        "process": "p1",
+        "key": "alice",
+        "address": "127.0.0.1",
+    }
+
+
+def test_a_revoked_key_ends_its_process_at_once_and_the_others_lose_nothing(
+    tmp_path: Path, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("master.security.LOOK_S", 0.05)
+    bob = give(file, "bob")
+    keys = read_keys(file)
+    with staged(keys=keys, audit=Audit(tmp_path / "audit.jsonl")) as stage:
+        path = write_file(tmp_path, stage.hub, keys)
+        beside, end = raw(stage, keys, bob, kind=zmq.SUB), raw(stage, keys, bob)
+        with make_client(path) as client:
+            assert served(stage, client.join)
+            assert isinstance(asked(stage, end, hello(process="bob")), Welcome)
+
+            def publish() -> None:
+                stage.hub.publish(weights(version=stage.hub.counters["published"] + 1))
+
+            stage.until(lambda: publish() or beside.poll(10))
+            write_keys(file, replace(keys, given={}))
+            stage.until(lambda: end.poll(0))
+            told = decode_from_master(end.recv_multipart(), None)
+            assert told == Stop("the key bob was revoked")
+            assert [peer.holder for peer in stage.hub.peers] == ["player"]
+            assert isinstance(asked(stage, end, Heartbeat({})), Stop)
+            while beside.poll(100):  # what was on its way
+                beside.recv()
+            client.newest_weights()
+            client.send(episodes(), 0)
+            both(stage, client, lambda: publish() or client.newest_weights())
+            stage.until(stage.batches)
+            assert client.counters["reconnects"] == 0
+            assert not beside.poll(500)
+    assert {"event": "refused", "key": "bob"}.items() <= lines(tmp_path / "audit.jsonl")[-1].items()

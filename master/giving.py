@@ -1,0 +1,102 @@
+"""tangram-keys: keys for others, made and revoked while a run goes on."""
+
+import fcntl
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from master.audit import write_line
+from master.config import KeysConfig
+from master.rundir import RunFolder
+from master.security import NAME, PRIVATE, Given, Keys, holders, make_pair, read_keys, write_keys
+from tangram_agent.files import write_whole
+from tangram_agent.messages import ROLES
+from tangram_sim.errors import ConfigError, RunError
+
+TCP = "tcp://"
+
+
+def change_keys(config: KeysConfig) -> list[str]:
+    """Make a key, revoke one, or neither.
+
+    Returns:
+        Lines for the user; without a change who has keys.
+
+    Raises:
+        TangramError: nothing was changed.
+    """
+    folder = RunFolder(config.run_dir)
+    if not folder.keys.exists():
+        raise RunError(
+            f"{folder.path} has no keys: they are made when its master first listens on an "
+            "address, as with service.bind=0.0.0.0; on unix sockets none are needed"
+        )
+    with _alone(folder):
+        keys = read_keys(folder.keys)
+        if config.add is not None:
+            return [_add(config, folder, keys, config.add)]
+        if config.revoke is not None:
+            return [_revoke(folder, keys, config.revoke)]
+    own = set(ROLES)
+    return [
+        f"{one.name}: role={one.role}{', of the run itself' if one.name in own else ''}"
+        for one in holders(keys).values()
+    ]
+
+
+def _add(config: KeysConfig, folder: RunFolder, keys: Keys, name: str) -> str:
+    out = Path(config.out or f"{name}.json").absolute()
+    if name in ROLES or name in keys.given:
+        raise ConfigError(f"there is a key of {name}: revoke it first, or choose another name")
+    if not NAME.fullmatch(name):
+        raise ConfigError(
+            f"add must be a name of at most 64 letters, digits, dots, dashes and underscores, got "
+            f"'{name}': set add=alice"
+        )
+    if out.exists():
+        raise ConfigError(f"out={out} is there already: name another file")
+    connection, pair = _connection(folder), make_pair()
+    given = {**keys.given, name: Given(config.role, pair.public)}
+    mine = connection | {"keys": {config.role: asdict(pair)}}
+    write_whole(out, json.dumps(mine, indent=1).encode(), PRIVATE)
+    write_keys(folder.keys, replace(keys, given=given))
+    write_line(folder.audit, "key added", key=name, role=config.role)
+    return f"{out} lets {name} take part as {config.role}: hand it on by a private way"
+
+
+def _revoke(folder: RunFolder, keys: Keys, name: str) -> str:
+    if name not in keys.given:
+        known = ", ".join(keys.given) or "none"
+        raise ConfigError(f"revoke must name a key that was made here ({known}), got '{name}'")
+    given = {one: key for one, key in keys.given.items() if one != name}
+    write_keys(folder.keys, replace(keys, given=given))
+    write_line(folder.audit, "key revoked", key=name)
+    return f"{name} may take part no longer"
+
+
+def _connection(folder: RunFolder) -> dict[str, Any]:
+    try:
+        content = json.loads(folder.connection.read_text(encoding="utf-8"))
+        if str(content["endpoint"]).startswith(TCP) and "server_key" in content:
+            return dict(content)
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        pass
+    raise RunError(
+        f"no master of {folder.path} listens on an address with keys: start it, as with "
+        "service.bind=0.0.0.0; a connection file names its address"
+    )
+
+
+@contextmanager
+def _alone(folder: RunFolder) -> Iterator[None]:
+    """Two commands at a time would lose a change."""
+    handle = os.open(folder.path, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
