@@ -85,9 +85,9 @@ class Door:
         made = self.context.socket(kind)
         self._made.append(made)  # it lives until all are closed
         if self.keys is not None:
-            made.curve_serverkey = self.keys.server_public.encode()
-            made.curve_publickey = self.keys.worker_public.encode()
-            made.curve_secretkey = self.keys.worker_secret.encode()
+            made.curve_serverkey = self.keys.server.public.encode()
+            made.curve_publickey = self.keys.player.public.encode()
+            made.curve_secretkey = self.keys.player.secret.encode()
         return made
 
     def until(self, done: Callable[[], Any], limit_s: float = LIMIT_S) -> None:
