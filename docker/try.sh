@@ -160,6 +160,7 @@ for target in worker master-cpu test; do
     held "the image $target is built" build "$target"
 done
 held "the worker has no TensorBoard" lacks tangram-worker tensorboard
+held "the worker has no CUDA" lacks tangram-worker triton
 held "the worker has PyBullet" has tangram-worker pybullet
 held "the master has no PyBullet" lacks tangram-master-cpu pybullet
 held "the master has TensorBoard" has tangram-master-cpu tensorboard

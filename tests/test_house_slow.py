@@ -64,14 +64,46 @@ def test_each_test_carries_one_tier(tmp_path: Path, marks: str, status: int) -> 
 # What is installed
 
 
-def made_wheel(folder: Path, name: str) -> str:
+def made_wheel(folder: Path, name: str, version: str = "99") -> str:
     """The line of a lock file of a package that has nothing in it."""
-    path, about = folder / f"{name}-99-py3-none-any.whl", f"{name}-99.dist-info"
+    path, about = folder / f"{name}-{version}-py3-none-any.whl", f"{name}-{version}.dist-info"
     with ZipFile(path, "w") as wheel:
-        wheel.writestr(f"{about}/METADATA", f"Metadata-Version: 2.1\nName: {name}\nVersion: 99\n")
+        wheel.writestr(
+            f"{about}/METADATA", f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n"
+        )
         wheel.writestr(f"{about}/WHEEL", "Wheel-Version: 1.0\nTag: py3-none-any\n")
         wheel.writestr(f"{about}/RECORD", "")
-    return f"{name}==99 \\\n    --hash=sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}\n"
+    return (
+        f"{name}=={version} \\\n    --hash=sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}\n"
+    )
+
+
+def try_install(
+    folder: Path, lock: str, extras: str, needs: str = "run"
+) -> subprocess.CompletedProcess[str]:
+    """The script itself, with wheels made here and no index; pip only says what it would do."""
+    (folder / "lock.txt").write_text(lock)
+    (folder / "pyproject.toml").write_text(
+        f'[project]\nname = "it"\nversion = "1"\ndependencies = ["{needs}"]\n'
+        '[project.optional-dependencies]\nmore = ["extra"]\n[tool.setuptools]\npackages = []\n'
+    )
+    python = folder / ".venv" / "bin" / "python"
+    python.parent.mkdir(parents=True)
+    python.write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
+    python.chmod(0o755)
+    options = ("DRY_RUN", "IGNORE_INSTALLED", "NO_INDEX")
+    environment = {name: text for name, text in os.environ.items() if name[:4] != "PIP_"}
+    environment |= {f"PIP_{name}": "1" for name in options}
+    environment |= {"PIP_CONFIG_FILE": os.devnull, "PIP_LOG": str(folder / "log")}
+    environment["PIP_FIND_LINKS"] = f"{folder} {folder / 'page.html'}"
+    return subprocess.run(
+        [ROOT / ".ci" / "install", ".venv", extras],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
 
 
 @pytest.mark.parametrize(
@@ -90,36 +122,30 @@ def made_wheel(folder: Path, name: str) -> str:
 def test_install_refuses_a_file_with_another_hash(
     tmp_path: Path, extras: str, changed: str | None, told: str
 ) -> None:
-    """The script itself, with wheels made here and no index; pip only says what it would do."""
     lock = {name: made_wheel(tmp_path, name) for name in ("pip", "setuptools", "run", "extra")}
     if changed == "nothing":
         del lock["extra"]
     elif changed:
         digit = lock[changed][-2]
         lock[changed] = lock[changed][:-2] + ("0" if digit != "0" else "1") + "\n"
-    (tmp_path / "lock.txt").write_text("".join(lock.values()))
-    (tmp_path / "pyproject.toml").write_text(
-        '[project]\nname = "it"\nversion = "1"\ndependencies = ["run"]\n'
-        '[project.optional-dependencies]\nmore = ["extra"]\n[tool.setuptools]\npackages = []\n'
-    )
-    python = tmp_path / ".venv" / "bin" / "python"
-    python.parent.mkdir(parents=True)
-    python.write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
-    python.chmod(0o755)
-    options = ("DRY_RUN", "IGNORE_INSTALLED", "NO_INDEX")
-    environment = {name: text for name, text in os.environ.items() if name[:4] != "PIP_"}
-    environment |= {f"PIP_{name}": "1" for name in options}
-    environment |= {"PIP_FIND_LINKS": str(tmp_path), "PIP_CONFIG_FILE": os.devnull}
-    result = subprocess.run(
-        [ROOT / ".ci" / "install", ".venv", extras],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    result = try_install(tmp_path, "".join(lock.values()), extras)
     assert told in result.stdout + result.stderr
     assert (result.returncode == 0) == told.startswith("installing"), result.stderr
+
+
+@pytest.mark.parametrize("offered", [True, False])
+def test_install_takes_the_cpu_build_where_it_is_offered(tmp_path: Path, offered: bool) -> None:
+    """Of the build whose hash an index tells pip thinks more, which is the one with CUDA."""
+    lock = "".join(made_wheel(tmp_path, name) for name in ("pip", "setuptools", "torch"))
+    wheel, digest = "torch-99-py3-none-any.whl", lock.rpartition(":")[2].strip()
+    (tmp_path / "page.html").write_text(f'<a href="{wheel}#sha256={digest}">{wheel}</a>')
+    cpu = made_wheel(tmp_path, "torch", "99+cpu").partition("\n")[2]
+    if not offered:
+        (tmp_path / "torch-99+cpu-py3-none-any.whl").unlink()
+    result = try_install(tmp_path, f"{lock[:-1]} \\\n{cpu}", "", needs="torch")
+    assert result.returncode == 0, result.stderr
+    taken = re.findall(r"Would install (torch-\S+)", (tmp_path / "log").read_text())
+    assert taken[-1] == ("torch-99+cpu" if offered else "torch-99")
 
 
 def test_the_bill_of_materials_has_the_lock(tmp_path: Path) -> None:

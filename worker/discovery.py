@@ -163,11 +163,11 @@ def keys_error(connect: str, endpoint: str) -> str:
     if as_address(connect) is not None:
         return (
             f"the master at {endpoint} wants keys, or is none: name its connection file instead, "
-            f"connect=RUN_DIR/{FILE_NAME}"
+            f"connect=RUN_DIR/{FILE_NAME}, or one that tangram-keys made"
         )
     return (
         f"wrong or stale connection file: what answers at {endpoint} does not take the keys of "
-        f"{connect}; take the file of a master that is running"
+        f"{connect}, of another run or revoked; take the file of a master that is running"
     )
 
 

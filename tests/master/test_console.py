@@ -21,7 +21,7 @@ from master.console import (
     status_panel,
 )
 from master.counters import Counters
-from tangram_agent.messages import WORKER_COLUMNS, RunStatus
+from tangram_agent.messages import OPEN, WORKER_COLUMNS, RunStatus
 from tangram_agent.outcome import duration
 from tests.master.builders import screen, text
 
@@ -75,6 +75,12 @@ def test_durations(seconds: float, shown: str) -> None:
             "1:23 | 12,345 episodes | 1,234 updates | 950 transitions/s | 95.1 updates/s | "
             "1 worker | learning",
             ["no bound: Ctrl-C ends the run", "mean reward", "1 worker, 1 evaluator"],
+        ),
+        (
+            replace(FRESH, numbers=FRESH.numbers | {"open_to_all": 1.0}),
+            "1:23 | 12,345 episodes | 1,234 updates | 950 transitions/s | 95.1 updates/s | "
+            f"1 worker | learning | {OPEN}",
+            [OPEN],
         ),
         (
             replace(FRESH, numbers=FRESH.numbers | {"play/reward": -0.25, "evaluators": 0}),

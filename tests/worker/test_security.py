@@ -118,7 +118,8 @@ def test_other_keys_are_turned_away_and_the_worker_names_its_file(
         reason = turned_away(stage, path)
         assert reason == (
             f"wrong or stale connection file: what answers at {stage.hub.endpoint} does not take "
-            f"the keys of {path}; take the file of a master that is running"
+            f"the keys of {path}, of another run or revoked; take the file of a master that is "
+            "running"
         )
         assert stage.hub.counters["refused_keys"] >= (wrong == "worker")
         assert stage.hub.peers == []

@@ -86,12 +86,13 @@ def test_a_finished_run_shows_its_result(
 def test_a_run_without_an_evaluator_says_how_to_start_one(
     stage: Stage, tmp_path: Path, capsys: pytest.CaptureFixture[str], evaluators: int, told: bool
 ) -> None:
-    numbers = {"updates": 7.0, "evaluators": evaluators, "play/reward": 0.5}
+    numbers = {"updates": 7.0, "evaluators": evaluators, "play/reward": 0.5, "open_to_all": 1.0}
     stage.hub.tell(replace(STATUS, numbers=numbers))
     path = str(write_file(tmp_path, stage.hub, None))
     assert served(stage, lambda: show_status(StatusConfig(path))) == 0
     shown = capsys.readouterr().out
     assert re.search("players' reward +0.500, with exploration", shown)
+    assert re.search("access +service.auth=off: open to whoever reaches the port", shown)
     start = f"tangram-worker connect={path} role=evaluator"
     said = f"no evaluator yet (tangram-train starts its own): {start}"
     assert shown.endswith(f"\n{said}\n") == told
