@@ -19,6 +19,7 @@ examples:
   tangram-bench wire runs=9 out=wire.json   more runs, and a file with machine, versions, commit
   tangram-bench all out=bench.json          everything, most of an hour on two cores (make bench)
   tangram-bench chaos minutes=20 seed=1     random faults over a real training
+  tangram-bench attack out=attack.json      every attack that is known, on real trainings
 """
 RATES = {
     "sim": "the simulation, against a bare PyBullet loop",
@@ -34,6 +35,7 @@ RATES = {
 }
 TRIALS = {
     "chaos": ("random faults over a real training", 20.0),
+    "attack": ("every attack that is known, on trainings that run; what held", None),
     "fuzz": ("mutated messages against decoder and master", None),
     "soak": ("memory and open files of a long training, drawn", 60.0),
 }
@@ -68,10 +70,11 @@ def _parser() -> argparse.ArgumentParser:
         one = kinds.add_parser(name, help=text, description=text)
         if minutes is not None:
             one.add_argument("--minutes", type=float, default=minutes, help=f"({minutes:g})")
-        else:
+        elif name == "fuzz":
             one.add_argument("--messages", type=int, default=1_000_000, help="for the decoder")
             one.add_argument("--live", type=int, default=100_000, help="for a live master")
-        one.add_argument("--seed", type=int, default=0, help="of everything random (0)")
+        if name != "attack":
+            one.add_argument("--seed", type=int, default=0, help="of everything random (0)")
         one.add_argument("--out", type=Path, help="JSON file of the results")
     return parser
 
@@ -108,11 +111,14 @@ def _run(arguments: argparse.Namespace) -> int:
         from tangram_lab.benchmarks.stages import run_stages
 
         return run_stages(arguments)
+    from tangram_lab.benchmarks.attack import run_attack
     from tangram_lab.benchmarks.chaos import run_chaos
     from tangram_lab.benchmarks.fuzz_wire import run_fuzz
     from tangram_lab.benchmarks.soak import run_soak
 
     with tempfile.TemporaryDirectory(prefix="tangram-") as folder:
+        if arguments.kind == "attack":
+            return run_attack(arguments.out, Path(folder))
         if arguments.kind == "chaos":
             return run_chaos(arguments.minutes, arguments.seed, arguments.out, Path(folder))
         if arguments.kind == "soak":

@@ -6,19 +6,26 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
+from threading import Event, Thread
 from typing import Any
 
 import psutil
+import yaml
+import zmq
 
-from master.children import command
+from master.children import command, override
 from tangram_agent.process import Lifeline
+from tangram_agent.setup import Setup, make_setup
 from tangram_sim.errors import TangramError
+from worker.status import ask_status
 
 LOOK_S = 0.3
 PATIENCE_S = 60.0
+MIB = 2**20
 
 
 def start_training(folder: Path, *settings: str, name: str = "train") -> "subprocess.Popen[bytes]":
@@ -32,7 +39,7 @@ def start_training(folder: Path, *settings: str, name: str = "train") -> "subpro
         variables = lifeline.environment(variables)
     with (folder / "told").open("wb") as told:
         process = subprocess.Popen(
-            [sys.executable, *command(name), f"run_dir={folder}", *settings],
+            [sys.executable, *command(name), override("run_dir", str(folder)), *settings],
             stdout=told,
             stderr=told,
             env=variables,
@@ -80,3 +87,76 @@ def result_of(folder: Path) -> dict[str, Any]:
     content = json.loads((folder / "result.json").read_text())
     assert isinstance(content, dict)
     return content
+
+
+@dataclass
+class Watched:
+    """A training that is looked at from outside.
+
+    Attributes:
+        folder: of the run.
+        launcher: tangram-train, or a master alone.
+        context: of the sockets that ask it.
+    """
+
+    folder: Path
+    launcher: "subprocess.Popen[bytes]"
+    context: "zmq.Context[zmq.Socket[bytes]]"
+
+    @property
+    def where(self) -> dict[str, Any]:
+        """What its connection file says."""
+        content: dict[str, Any] = json.loads((self.folder / "connection.json").read_text())
+        return content
+
+    @property
+    def setup(self) -> Setup:
+        """Its task."""
+        return make_setup(yaml.safe_load((self.folder / "config.yaml").read_text()))
+
+    @property
+    def master(self) -> psutil.Process:
+        """The process that learns."""
+        found = [p for p, line in processes_of(self.folder).items() if "tangram_cli master" in line]
+        if not found:
+            raise TangramError("no master runs")
+        return found[0]
+
+    def numbers(self) -> Mapping[str, float]:
+        """Those of its status; TangramError where it does not answer."""
+        return ask_status(str(self.folder), self.context, 5.0).numbers
+
+    def goes_on(self, more: float = 1.0, name: str = "episodes") -> bool:
+        """Whether so many more of something come in time."""
+        until_s, goal = time.monotonic() + PATIENCE_S, float("inf")
+        while time.monotonic() < until_s:
+            with suppress(TangramError):
+                value = self.numbers()[name]
+                goal = min(goal, value + more)
+                if value >= goal:
+                    return True
+            time.sleep(LOOK_S)
+        return False
+
+    def told(self) -> str:
+        """All lines of launcher and master."""
+        return (self.folder / "told").read_text(errors="replace")
+
+    @contextmanager
+    def cost(self) -> Iterator[list[float]]:
+        """The most MiB that the master has grown by, as the one entry of a list."""
+        process, most, ends = self.master, [0.0], Event()
+        before = process.memory_info().rss / MIB
+
+        def look() -> None:
+            with suppress(psutil.Error):
+                while not ends.wait(0.02):
+                    most[0] = max(most[0], process.memory_info().rss / MIB - before)
+
+        watch = Thread(target=look, daemon=True)
+        watch.start()
+        try:
+            yield most
+        finally:
+            ends.set()
+            watch.join()
