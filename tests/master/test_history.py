@@ -52,7 +52,7 @@ AT_ONCE = Timing(retry_s=0.0, resend_s=0.0, heartbeat_s=1000.0)
 FIRST_TAG = 2.0  # rewards of hindsight twins are at most 1
 WORKERS, ON_THE_WAY = 3, 12
 CHANCE = st.integers(0, 2**16)
-EXAMPLES = int(os.environ.get("TANGRAM_HISTORIES", "8"))
+EXAMPLES = int(os.environ.get("TANGRAM_HISTORIES", "15"))
 
 
 class Wire:
@@ -220,7 +220,11 @@ class Histories(RuleBasedStateMachine):
 
     @rule(chance=CHANCE)
     def saves(self, chance: int) -> None:
+        """Also with batches that have come and are not inserted, and often with an end."""
+        self.lives(lambda loop: loop.receive(0.0), chance)
         self.lives(lambda loop: loop.checkpointer.save(), chance)
+        if chance % 3 == 0:
+            self.restart(power=False)
 
     @rule(how=st.sampled_from(["now", "while it writes", "power", "power soon"]), chance=CHANCE)
     def is_killed(self, how: str, chance: int) -> None:
@@ -250,7 +254,7 @@ class Histories(RuleBasedStateMachine):
                 worker.does(worker.client.poll)
                 sent, worker.wire.sent = worker.wire.sent, []
                 self.sockets.arriving.extend((worker.identity, frames) for frames in sent)
-                self.work(chance, insert=chance % 4 > 0)
+                self.work(chance, insert=chance % 3 > 0)
                 worker.does(worker.client.poll)
 
     @rule(index=st.integers(-1, 1))
