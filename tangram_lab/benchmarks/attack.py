@@ -263,16 +263,17 @@ def folder_away(target: Target) -> Seen:
 
 
 def full_disk(target: Target) -> Seen:
-    master, said = target.master, target.told().count("nothing is acknowledged")
+    master = target.master
     before = master.rlimit(psutil.RLIMIT_FSIZE)
-    master.rlimit(psutil.RLIMIT_FSIZE, (1, before[1]))
-    until_s, told = time.monotonic() + 15.0, False
-    while not told and time.monotonic() < until_s:
-        time.sleep(0.2)
-        told = target.told().count("nothing is acknowledged") > said
+    master.rlimit(psutil.RLIMIT_FSIZE, (1, before[1]))  # what it says has no room either
+    until_s, taken, stands = time.monotonic() + 15.0, -1.0, False
+    while not stands and time.monotonic() < until_s:
+        stands, taken = target.numbers()["episodes"] == taken, target.numbers()["episodes"]
+        time.sleep(3.0)
     master.rlimit(psutil.RLIMIT_FSIZE, before)
     held = target.goes_on(10.0) and target.master.pid == master.pid
-    return told and held, f"told: {told}; with room again it goes on: {held}"
+    told = "batches are taken in" in target.told()
+    return stands and held, f"it stands: {stands}; with room again it goes on: {held}; told: {told}"
 
 
 def frozen(target: Target) -> Seen:
@@ -290,7 +291,7 @@ OWN: list[Attack] = [
     ("2", "the largest numbers, then kill -9", "1 kill", killed_after_huge_numbers),
     ("8", "the journal unlinked, then kill -9", "1 kill", killed_after_unlink),
     ("8", "the run folder taken away", "3 s", folder_away),
-    ("held", "a full disk", "until it is told", full_disk),
+    ("held", "a full disk", "until it stands", full_disk),
     ("held", "SIGSTOP", "8 s", frozen),
 ]
 
