@@ -38,7 +38,7 @@ Attack = tuple[str, str, str, Callable[[Any], Seen]]  # row, what, how much, and
 ON_A_PORT = ("service.bind=127.0.0.1", "service.log_format=json")
 OPEN_FILES = 1024  # that a master may begin with
 NOISE = 0.02  # of the mean reward, between two trainings of so many updates
-UPDATES = 2000  # before the attacks begin, and at least in all
+UPDATES = 500  # before the attacks begin
 BATCHES = 40
 TASK: dict[str, Any] = {"tokens": {"shapes": ["square"], "scale": 1.0}} | {
     name: {} for name in ("sim", "reward", "agent", "net")
@@ -344,11 +344,11 @@ def run_attack(out: Path | None, folder: Path) -> int:
     """
     begun = time.monotonic()
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    rows = list(tried(FILES, folder))
     live, own, straight = folder / "live", folder / "a=run of ü", folder / "straight"
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(OPEN_FILES, hard), hard))
     with training(live, "max_updates=0", *ON_A_PORT, *SETTINGS) as target:
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+        rows = list(tried(FILES, folder))
         target.goes_on(UPDATES, "updates")
         rows += tried(LIVE, target)
     resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
