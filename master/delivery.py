@@ -26,6 +26,7 @@ class EpisodesArrived:
         role, index, incarnation: of its sender.
         batch: as it was read.
         frames: as they came, for the journal.
+        process: random id of its sender.
     """
 
     role: str
@@ -33,6 +34,7 @@ class EpisodesArrived:
     incarnation: int
     batch: EpisodeBatch
     frames: Sequence[bytes]
+    process: str = ""
 
     @property
     def sequence(self) -> int:
@@ -83,7 +85,8 @@ class Ledger:
     Attributes:
         incarnation: whose batches these are.
         received: number of the last batch that was taken or finally refused.
-        process: random id of the process, empty where a checkpoint does not know it.
+        process: random id of the process, empty where it is not known. Two may name one
+            incarnation: what was given before a kill and had no batch is given again after it.
         held: taken, not inserted yet.
         unused: no batch of this index was ever taken, in this incarnation or before.
     """

@@ -9,6 +9,7 @@ import os
 import resource
 import socket
 import struct
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -19,9 +20,11 @@ import zmq
 from master.counters import Counters
 from tangram_sim.errors import ConfigError
 
-# Connections that have shown no key, at a time. The oldest makes room: a handshake takes
-# milliseconds, so it is idle. A worker that is hit on a busy machine comes again by itself.
+# Connections that have shown no key, at a time. For one more the oldest is ended: a handshake takes
+# milliseconds, so it is idle. While others show keys, so long after each, the newest is: then it is
+# one of many workers. A worker that is hit comes again by itself.
 HANDSHAKES = 32
+MOVING_S = 0.1
 MAX_PEERS = 4096
 DESCRIPTORS = 2  # of each worker
 RESERVE = 192  # descriptors for files, HTTP and ZeroMQ itself
@@ -32,7 +35,12 @@ LET_IN = 250
 SENT = struct.Struct("=QQ")  # tcpi_bytes_sent and tcpi_bytes_retrans of Linux' struct tcp_info,
 SENT_AT = 200  # which stand here
 EVENT = struct.Struct("=HI")
-EVENTS = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED | zmq.EVENT_MONITOR_STOPPED
+EVENTS = (
+    zmq.EVENT_ACCEPTED
+    | zmq.EVENT_DISCONNECTED
+    | zmq.EVENT_HANDSHAKE_SUCCEEDED
+    | zmq.EVENT_MONITOR_STOPPED
+)
 
 
 @dataclass(frozen=True)
@@ -105,7 +113,7 @@ class Gate:
         """
         self._sockets, self._room, self._counters = sockets, room, counters
         self._encrypted = encrypted
-        self._open = set[int]()
+        self._open, self._moved = set[int](), 0.0
         self._waiting = dict[int, str]()  # descriptor -> address, in the order they came
         self._doors = {_door(s.getsockopt_string(zmq.LAST_ENDPOINT)) for s in sockets}
         self._monitors = [s.get_monitor_socket(EVENTS) for s in sockets]
@@ -137,11 +145,13 @@ class Gate:
                 event, descriptor = EVENT.unpack(monitor.recv_multipart()[0])
                 if event == zmq.EVENT_MONITOR_STOPPED:
                     left -= 1
-                    continue
-                self._open.discard(descriptor)
-                self._waiting.pop(descriptor, None)
-                if event == zmq.EVENT_ACCEPTED:
-                    self._accepted(descriptor)
+                elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED:  # whose is not told
+                    self._moved = time.monotonic()
+                else:
+                    self._open.discard(descriptor)
+                    self._waiting.pop(descriptor, None)
+                    if event == zmq.EVENT_ACCEPTED:
+                        self._accepted(descriptor)
 
     def _accepted(self, descriptor: int) -> None:
         self._open.add(descriptor)
@@ -152,8 +162,18 @@ class Gate:
             reason = f"{self._room.connections} are open already, the most {self._room.bound}"
             self._end(descriptor, "refused_connections", reason)
         while self._encrypted and len(self._waiting) > HANDSHAKES:
-            reason = f"more than {HANDSHAKES} show no key, this one for the longest time"
-            self._end(next(iter(self._waiting)), "refused_handshakes", reason)
+            self._make_room()
+
+    def _make_room(self) -> None:
+        """Strike out one that has shown its key meanwhile, or end one."""
+        first, last = next(iter(self._waiting)), next(reversed(self._waiting))
+        with suppress(OSError), _connection(first) as found:
+            if _let_in(found):
+                del self._waiting[first]
+                return
+        workers = time.monotonic() - self._moved < MOVING_S
+        reason = f"more than {HANDSHAKES} show no key"
+        self._end(last if workers else first, "refused_handshakes", reason)
 
     def _end(self, descriptor: int, counter: str, reason: str) -> None:
         """End a connection, unless it is another one by now, or has shown a key."""
@@ -184,5 +204,7 @@ def _connection(descriptor: int) -> socket.socket:
 def _let_in(connection: socket.socket) -> bool:
     """Whether the master has taken the key of an encrypted connection."""
     info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, SENT_AT + SENT.size)
+    if len(info) < SENT_AT + SENT.size:
+        return True  # Linux before 4.19 does not tell
     sent, again = SENT.unpack_from(info, SENT_AT)
     return int(sent - again) >= LET_IN

@@ -204,11 +204,11 @@ class Hub:
         for peer in self.peers:
             self._send(peer.identity, Stop(reason))
 
-    def state(self) -> dict[str, dict[str, int]]:
+    def state(self) -> dict[str, dict[str, int | str]]:
         """The table of duplicates, for a checkpoint."""
         return self._registry.state()
 
-    def load_state(self, state: Mapping[str, Mapping[str, int]]) -> None:
+    def load_state(self, state: Mapping[str, Mapping[str, int | str]]) -> None:
         """Take the table of duplicates of a checkpoint, before the first poll.
 
         Raises:
@@ -219,7 +219,8 @@ class Hub:
     def recover(self, arrival: EpisodesArrived) -> bool:
         """Note a batch of the journal, before the first poll; False if it was inserted before."""
         key = (arrival.role, arrival.index)
-        return self._registry.recover(key, arrival.incarnation, arrival.sequence, time.monotonic())
+        sent = (arrival.incarnation, arrival.sequence)
+        return self._registry.recover(key, *sent, time.monotonic(), arrival.process)
 
     def close(self) -> None:
         """Close the sockets; answers that are on their way get a second."""
@@ -337,7 +338,7 @@ class Hub:
         self.counters["batches"] += 1
         self.counters["episodes"] += batch.episodes.count
         self._orders.pop(peer.index, None)
-        return EpisodesArrived(peer.role, peer.index, peer.incarnation, batch, frames)
+        return EpisodesArrived(peer.role, peer.index, peer.incarnation, batch, frames, peer.process)
 
     def _is_ordered(self, peer: Peer, batch: EpisodeBatch) -> bool:
         """Whether a new batch is what the player was told to play; else it is told again."""

@@ -84,6 +84,7 @@ class Entry(Plain):
     role: Role
     index: Index
     incarnation: Number
+    process: Id
 
 
 class JournalError(RunError):
@@ -133,7 +134,7 @@ class Journal:
             JournalError: the disk is full or broken. What was written of it is taken back; where
                 it may have been written after all, a restart drops what it has twice.
         """
-        entry = Entry(arrival.role, arrival.index, arrival.incarnation)
+        entry = Entry(arrival.role, arrival.index, arrival.incarnation, arrival.process)
         file = self._file or self._begin()
         self._write(file, _record(entry, self.number + 1, arrival.frames))
         self.number += 1

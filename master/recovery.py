@@ -321,7 +321,7 @@ def _batch(body: bytes, spec: EpisodeSpec) -> EpisodesArrived:
     batch = decode_from_worker(frames, spec)
     if not isinstance(batch, EpisodeBatch):
         raise WireError(f"a message of kind {batch.kind!r}")
-    return EpisodesArrived(entry.role, entry.index, entry.incarnation, batch, frames)
+    return EpisodesArrived(entry.role, entry.index, entry.incarnation, batch, frames, entry.process)
 
 
 def _parts(body: bytes) -> tuple[Mapping[str, Any], bytes]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from master.delivery import EpisodesArrived, Ledger
 from master.gate import AMPLE, Room
-from tangram_agent.messages import MAX_INDEX, ROLES, Hello, Refused, Stop
+from tangram_agent.messages import MAX_ID, MAX_INDEX, ROLES, Hello, Refused, Stop
 from tangram_agent.schema import MAX_COUNT
 from tangram_sim.errors import RunError, TangramError
 
@@ -195,14 +195,18 @@ class Registry:
             self.leave(peer)
         return silent
 
-    def state(self) -> dict[str, dict[str, int]]:
-        """Last incarnation and last inserted batch of each index, for a checkpoint."""
+    def state(self) -> dict[str, dict[str, int | str]]:
+        """Last incarnation, its process and its last inserted batch, of each index."""
         return {
-            f"{role}/{index}": {"incarnation": ledger.incarnation, "sequence": ledger.inserted}
+            f"{role}/{index}": {
+                "incarnation": ledger.incarnation,
+                "sequence": ledger.inserted,
+                **({"process": ledger.process} if ledger.process else {}),
+            }
             for (role, index), ledger in sorted(self._ledgers.items())
         }
 
-    def load_state(self, state: Mapping[str, Mapping[str, int]], now: float) -> None:
+    def load_state(self, state: Mapping[str, Mapping[str, int | str]], now: float) -> None:
         """Take the ledgers of a checkpoint; their indices wait for their workers for a while.
 
         Raises:
@@ -211,11 +215,13 @@ class Registry:
         self._ledgers = {_key(name): _ledger(name, entry) for name, entry in state.items()}
         self._reserved_until = now + self._grace_s
 
-    def recover(self, key: Key, incarnation: int, sequence: int, now: float) -> bool:
+    def recover(
+        self, key: Key, incarnation: int, sequence: int, now: float, process: str = ""
+    ) -> bool:
         """Note a batch of the journal as inserted; False if the table has it already."""
         ledger = self._ledgers.get(key)
         if ledger is None or incarnation > ledger.incarnation:
-            ledger = self._ledgers[key] = Ledger(incarnation)
+            ledger = self._ledgers[key] = Ledger(incarnation, process=process)
         if incarnation < ledger.incarnation or sequence <= ledger.received:
             return False
         ledger.consume(sequence)
@@ -297,4 +303,6 @@ def _ledger(name: str, entry: object) -> Ledger:
                 f"the checkpoint's entry of {name} must hold an incarnation from 1 and a sequence "
                 f"from 0, both to {MAX_COUNT}, got {entry!r}"
             )
-    return Ledger(int(incarnation or 0), int(sequence or 0))
+    process = found.get("process")
+    known = process if isinstance(process, str) and len(process) <= MAX_ID else ""
+    return Ledger(int(incarnation or 0), int(sequence or 0), known)

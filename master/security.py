@@ -10,8 +10,10 @@ import json
 import logging
 import os
 import re
+import socket
 import struct
 import tempfile
+import time
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
@@ -37,6 +39,7 @@ DOMAIN = "tangram"
 MAX_SOCKET_PATH = 107  # bytes, of Linux
 NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,63}")  # of a key
 KEY_BYTES = 32
+STALE_S = 24 * 3600.0  # of a socket that nobody listens on
 LOOK_S = 1.0  # between two looks at the file of keys
 
 log = logging.getLogger(__name__)
@@ -194,6 +197,7 @@ def listening_place(bind: str, run: Path) -> str:
         return bind
     folder, found = Path(tempfile.gettempdir()) / f"tangram-{os.geteuid()}", run.stat()
     own_folder(folder)
+    _sweep(folder)
     name = hashlib.sha256(f"{run.resolve()} {found.st_dev} {found.st_ino}".encode()).hexdigest()
     place = f"{folder}/{name[:12]}"
     if len(os.fsencode(f"{place}.episodes")) > MAX_SOCKET_PATH:
@@ -202,6 +206,19 @@ def listening_place(bind: str, run: Path) -> str:
             "set TMPDIR to a shorter one, such as /tmp"
         )
     return IPC + place
+
+
+def _sweep(folder: Path) -> None:
+    """Remove sockets that masters left which were killed and never came back."""
+    for path in folder.iterdir():
+        with suppress(OSError), socket.socket(socket.AF_UNIX) as end:
+            if time.time() - path.stat().st_mtime < STALE_S:
+                continue
+            try:
+                end.setblocking(False)
+                end.connect(os.fspath(path))
+            except ConnectionRefusedError:
+                path.unlink()
 
 
 class Authenticator:
@@ -221,11 +238,11 @@ class Authenticator:
         self._thread.start()
         self._thread.configure_curve_callback(domain=DOMAIN, credentials_provider=self)
 
-    def guard(self, socket: zmq.Socket[bytes]) -> None:
+    def guard(self, end: zmq.Socket[bytes]) -> None:
         """Encrypt a socket that is not bound yet."""
-        socket.setsockopt(zmq.CURVE_SERVER, 1)
-        socket.setsockopt(zmq.CURVE_SECRETKEY, self._keys.server.secret.encode())
-        socket.setsockopt_string(zmq.ZAP_DOMAIN, DOMAIN)
+        end.setsockopt(zmq.CURVE_SERVER, 1)
+        end.setsockopt(zmq.CURVE_SECRETKEY, self._keys.server.secret.encode())
+        end.setsockopt_string(zmq.ZAP_DOMAIN, DOMAIN)
 
     def callback(self, _domain: str, key: bytes) -> bool:
         """Whether a key (Z85) may connect; called by the thread."""

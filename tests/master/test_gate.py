@@ -5,8 +5,8 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from tempfile import TemporaryDirectory
 from typing import Any
-from urllib.parse import urlsplit
 
 import pytest
 import zmq
@@ -16,6 +16,7 @@ from master.gate import AMPLE, DESCRIPTORS, HANDSHAKES, MAX_PEERS, MOST_FILES, R
 from master.security import Keys, make_keys
 from master.sockets import MAX_COMMAND, Sockets
 from tangram_agent.arrays import MAX_FRAME_BYTES
+from tangram_lab.benchmarks.strangers import connection
 from tangram_sim.errors import ConfigError
 
 LIMIT_S = 100.0
@@ -60,18 +61,16 @@ def test_no_room_for_a_single_worker_is_refused(monkeypatch: pytest.MonkeyPatch)
 class Door:
     """Sockets that a test connects to; what comes is answered."""
 
-    def __init__(self, keys: Keys | None, room: Room) -> None:
+    def __init__(self, keys: Keys | None, room: Room, bind: str) -> None:
         self.counters, self.keys = Counters(), keys
-        self.sockets = Sockets("127.0.0.1", 0, self.counters, keys, room=room)
+        self.sockets = Sockets(bind, 0, self.counters, keys, room=room)
         self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._strangers: list[socket.socket] = []
         self._made: list[zmq.Socket[bytes]] = []
 
     def stranger(self) -> socket.socket:
         """A connection that says nothing."""
-        place = urlsplit(self.sockets.endpoint)
-        address = place.hostname or "", place.port or 0
-        self._strangers.append(socket.create_connection(address, LIMIT_S))
+        self._strangers.append(connection(self.sockets.endpoint))
         return self._strangers[-1]
 
     def dealer(self, question: bytes = b"question") -> "zmq.Socket[bytes]":
@@ -86,9 +85,9 @@ class Door:
         made = self.context.socket(kind)
         self._made.append(made)  # it lives until all are closed
         if self.keys is not None:
-            made.curve_serverkey = self.keys.server_public.encode()
-            made.curve_publickey = self.keys.worker_public.encode()
-            made.curve_secretkey = self.keys.worker_secret.encode()
+            made.curve_serverkey = self.keys.server.public.encode()
+            made.curve_publickey = self.keys.player.public.encode()
+            made.curve_secretkey = self.keys.player.secret.encode()
         return made
 
     def until(self, done: Callable[[], Any], limit_s: float = LIMIT_S) -> None:
@@ -110,8 +109,8 @@ class Door:
 
 
 @contextmanager
-def door(keys: Keys | None, room: Room = AMPLE) -> Iterator[Door]:
-    made = Door(keys, room)
+def door(keys: Keys | None, room: Room = AMPLE, bind: str = "127.0.0.1") -> Iterator[Door]:
+    made = Door(keys, room, bind)
     try:
         yield made
     finally:
@@ -135,6 +134,7 @@ def ended(stranger: socket.socket) -> bool:
 def test_of_too_many_without_a_key_the_oldest_goes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever has shown one stays, older or not, and others still get in."""
     monkeypatch.setattr("master.gate.HANDSHAKES", 3)
+    monkeypatch.setattr("master.gate.MOVING_S", 0.0)
     with door(make_keys()) as made:
         first = made.dealer()
         made.answered(first)
@@ -148,6 +148,20 @@ def test_of_too_many_without_a_key_the_oldest_goes(monkeypatch: pytest.MonkeyPat
         first.send(b"question")
         made.answered(first, second)
         assert made.counters["refused_handshakes"] == 4
+
+
+@pytest.mark.cluster
+def test_where_keys_are_shown_one_after_the_other_the_newest_goes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Else workers that start together would end each other before any has shown its key."""
+    monkeypatch.setattr("master.gate.HANDSHAKES", 3)
+    monkeypatch.setattr("master.gate.MOVING_S", 3600.0)
+    with door(make_keys()) as made:
+        made.answered(made.dealer())
+        strangers = [made.stranger() for _ in range(6)]
+        made.until(lambda: all(ended(s) for s in strangers[3:]))
+        assert not any(ended(s) for s in strangers[:3])
 
 
 @pytest.mark.cluster
@@ -184,9 +198,15 @@ def test_a_handshake_has_little_time(monkeypatch: pytest.MonkeyPatch) -> None:
         assert not made.counters["refused_handshakes"]
 
 
+@pytest.fixture(params=["tcp", "unix"])
+def bind(request: pytest.FixtureRequest) -> Iterator[str]:
+    with TemporaryDirectory(dir="/tmp") as folder:  # paths of sockets are short
+        yield "127.0.0.1" if request.param == "tcp" else f"ipc://{folder}/run"
+
+
 @pytest.mark.cluster
-def test_one_connection_too_many_is_ended_and_the_others_stay() -> None:
-    with door(None, Room(RESERVE + 3)) as made:
+def test_one_connection_too_many_is_ended_and_the_others_stay(bind: str) -> None:
+    with door(None, Room(RESERVE + 3), bind) as made:
         first = made.dealer()
         made.answered(first)
         strangers = [made.stranger(), made.stranger()]

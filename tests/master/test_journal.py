@@ -372,7 +372,7 @@ def test_a_forged_record_is_left_out_and_no_reason_to_throw_the_others_away(
         frames = seal(header["kind"], fields | change, frames[1:])
     if "damage" in change:
         frames[-1] = bytes([frames[-1][0] ^ 1]) + frames[-1][1:]
-    entry = {"kind": "batch", "role": "player", "index": 0, "incarnation": 1} | {
+    entry = {"kind": "batch", "role": "player", "index": 0, "incarnation": 1, "process": "p"} | {
         n: v for n, v in change.items() if n in ("kind", "role", "index", "incarnation")
     }
     [packed] = seal(str(entry.pop("kind")), entry, [])

@@ -120,8 +120,8 @@ def test_a_checkpoint_keeps_incarnations_and_inserted_batches(registry: Registry
     peer.ledger.held -= {1, 3}
     admitted(registry, "e", role="evaluator")
     assert registry.state() == {
-        "evaluator/0": {"incarnation": 1, "sequence": 0},
-        "player/4": {"incarnation": 1, "sequence": 1},
+        "evaluator/0": {"incarnation": 1, "sequence": 0, "process": "e"},
+        "player/4": {"incarnation": 1, "sequence": 1, "process": "a"},
     }
     # The worker comes back and sends again what the checkpoint has not; of what it has not either
     # nothing is waited for.
@@ -218,4 +218,24 @@ def test_batches_of_the_journal_are_new_once(registry: Registry) -> None:
     # They wait for their workers like those of a checkpoint.
     assert admitted(registry, "a", now=1.0).index == 2
     again = admitted(registry, "b", now=1.0, index=1, incarnation=1, first=2)
+    assert (again.incarnation, again.ledger.inserted) == (1, 1)
+
+
+@pytest.mark.parametrize("kept", ["in the journal", "in a checkpoint"])
+def test_after_a_restart_an_incarnation_belongs_to_the_process_that_used_it(
+    registry: Registry, kept: str
+) -> None:
+    """It was given twice: before a kill to one that sent nothing yet, after it to another.
+
+    The first one's batches would have been acknowledged as those of the second.
+    """
+    if kept == "in the journal":
+        registry.recover(("player", 0), 1, 1, 0.0, "second")
+    else:
+        entry = {"incarnation": 1, "sequence": 1, "process": "second"}
+        registry.load_state({"player/0": entry}, 0.0)
+        assert registry.state() == {"player/0": entry}
+    with pytest.raises(RefusedError, match="player 0 was taken over by a newer process"):
+        admitted(registry, "first", index=0, incarnation=1)
+    again = admitted(registry, "second", index=0, incarnation=1)
     assert (again.incarnation, again.ledger.inserted) == (1, 1)
