@@ -240,14 +240,17 @@ def killed_after_huge_numbers(target: Target) -> Seen:
 
 
 def killed_after_unlink(target: Target) -> Seen:
-    folder = target.folder / "journal"
-    for path in segments(folder).values():
+    journal, points = target.folder / "journal", target.folder / "checkpoints"
+    for path in segments(journal).values():
         path.unlink(missing_ok=True)
-    until_s = time.monotonic() + 10.0
-    while not segments(folder) and time.monotonic() < until_s:
+    # What was acknowledged before is in the next checkpoint; one may have been on its way.
+    newest, until_s = {list_checkpoints(points)[-1].name}, time.monotonic() + 20.0
+    while len(newest) < 3 and time.monotonic() < until_s:
+        newest.add(list_checkpoints(points)[-1].name)
         time.sleep(0.05)
-    begun, held = bool(segments(folder)), killed(target)
-    return begun and held, f"a new segment: {begun}; killed then, it goes on: {held}"
+    begun, held = bool(segments(journal)), killed(target)
+    held = held and len(newest) == 3
+    return begun and held, f"a new segment: {begun}; killed after a checkpoint, it goes on: {held}"
 
 
 def folder_away(target: Target) -> Seen:
