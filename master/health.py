@@ -117,6 +117,7 @@ class _Server(ThreadingHTTPServer):
     """Few requests at once, none for long, and what goes wrong with them in one line a minute."""
 
     daemon_threads = True
+    request_queue_size = MAX_OPEN
 
     def __init__(self, address: tuple[str, int], health: Health) -> None:
         self.health = health

@@ -38,7 +38,7 @@ Attack = tuple[str, str, str, Callable[[Any], Seen]]  # row, what, how much, and
 ON_A_PORT = ("service.bind=127.0.0.1", "service.log_format=json")
 OPEN_FILES = 1024  # that a master may begin with
 NOISE = 0.02  # of the mean reward, between two trainings of so many updates
-UPDATES = 2000  # before the attacks begin, and at least in all
+UPDATES = 500  # before the attacks begin
 BATCHES = 40
 TASK: dict[str, Any] = {"tokens": {"shapes": ["square"], "scale": 1.0}} | {
     name: {} for name in ("sim", "reward", "agent", "net")
@@ -240,14 +240,17 @@ def killed_after_huge_numbers(target: Target) -> Seen:
 
 
 def killed_after_unlink(target: Target) -> Seen:
-    folder = target.folder / "journal"
-    for path in segments(folder).values():
+    journal, points = target.folder / "journal", target.folder / "checkpoints"
+    for path in segments(journal).values():
         path.unlink(missing_ok=True)
-    until_s = time.monotonic() + 10.0
-    while not segments(folder) and time.monotonic() < until_s:
+    # What was acknowledged before is in the next checkpoint; one may have been on its way.
+    newest, until_s = {list_checkpoints(points)[-1].name}, time.monotonic() + 20.0
+    while len(newest) < 3 and time.monotonic() < until_s:
+        newest.add(list_checkpoints(points)[-1].name)
         time.sleep(0.05)
-    begun, held = bool(segments(folder)), killed(target)
-    return begun and held, f"a new segment: {begun}; killed then, it goes on: {held}"
+    begun, held = bool(segments(journal)), killed(target)
+    held = held and len(newest) == 3
+    return begun and held, f"a new segment: {begun}; killed after a checkpoint, it goes on: {held}"
 
 
 def folder_away(target: Target) -> Seen:
@@ -263,16 +266,17 @@ def folder_away(target: Target) -> Seen:
 
 
 def full_disk(target: Target) -> Seen:
-    master, said = target.master, target.told().count("nothing is acknowledged")
+    master = target.master
     before = master.rlimit(psutil.RLIMIT_FSIZE)
-    master.rlimit(psutil.RLIMIT_FSIZE, (1, before[1]))
-    until_s, told = time.monotonic() + 15.0, False
-    while not told and time.monotonic() < until_s:
-        time.sleep(0.2)
-        told = target.told().count("nothing is acknowledged") > said
+    master.rlimit(psutil.RLIMIT_FSIZE, (1, before[1]))  # what it says has no room either
+    until_s, taken, stands = time.monotonic() + 15.0, -1.0, False
+    while not stands and time.monotonic() < until_s:
+        stands, taken = target.numbers()["episodes"] == taken, target.numbers()["episodes"]
+        time.sleep(3.0)
     master.rlimit(psutil.RLIMIT_FSIZE, before)
     held = target.goes_on(10.0) and target.master.pid == master.pid
-    return told and held, f"told: {told}; with room again it goes on: {held}"
+    told = "batches are taken in" in target.told()
+    return stands and held, f"it stands: {stands}; with room again it goes on: {held}; told: {told}"
 
 
 def frozen(target: Target) -> Seen:
@@ -290,7 +294,7 @@ OWN: list[Attack] = [
     ("2", "the largest numbers, then kill -9", "1 kill", killed_after_huge_numbers),
     ("8", "the journal unlinked, then kill -9", "1 kill", killed_after_unlink),
     ("8", "the run folder taken away", "3 s", folder_away),
-    ("held", "a full disk", "until it is told", full_disk),
+    ("held", "a full disk", "until it stands", full_disk),
     ("held", "SIGSTOP", "8 s", frozen),
 ]
 
@@ -343,11 +347,11 @@ def run_attack(out: Path | None, folder: Path) -> int:
     """
     begun = time.monotonic()
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    rows = list(tried(FILES, folder))
     live, own, straight = folder / "live", folder / "a=run of ü", folder / "straight"
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(OPEN_FILES, hard), hard))
     with training(live, "max_updates=0", *ON_A_PORT, *SETTINGS) as target:
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+        rows = list(tried(FILES, folder))
         target.goes_on(UPDATES, "updates")
         rows += tried(LIVE, target)
     resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))

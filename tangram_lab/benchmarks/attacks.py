@@ -312,12 +312,26 @@ def garbage(target: Target) -> Seen:
 # HTTP
 
 
+@contextmanager
+def askers(target: Target, count: int, words: bytes) -> Iterator[list[socket.socket]]:
+    """So many connections at once to where HTTP is spoken, which have said these words."""
+    with ExitStack() as opened:
+        asking = [opened.enter_context(socket.socket()) for _ in range(count)]
+        for one in asking:
+            one.setblocking(False)
+            one.connect_ex(target.port("http"))
+        time.sleep(2.0)
+        for one in asking:
+            with suppress(OSError):
+                one.sendall(words)
+        yield asking
+
+
 def reset_requests(target: Target) -> Seen:
-    for _ in range(100):
-        with socket.create_connection(target.port("http")) as one:
-            one.sendall(b"GET /metrics")
+    with askers(target, 100, b"GET /metrics") as asking:
+        for one in asking:
             one.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-    time.sleep(1.0)
+    time.sleep(2.0)
     count = target.told().count("Traceback")
     counted = "HTTP requests without an answer" in target.told()
     return counted and not count, f"{count} tracebacks, {'counted' if counted else 'not a word'}"
@@ -325,11 +339,7 @@ def reset_requests(target: Target) -> Seen:
 
 def slow_requests(target: Target) -> Seen:
     threads = target.master.num_threads()
-    with ExitStack() as opened:
-        for _ in range(600):
-            one = opened.enter_context(socket.create_connection(target.port("http"), 5.0))
-            with suppress(OSError):
-                one.sendall(b"GET /")
+    with askers(target, 600, b"GET /"):
         more = target.master.num_threads() - threads
     until_s, answer = time.monotonic() + 15.0, b""
     while b"200" not in answer and time.monotonic() < until_s:
