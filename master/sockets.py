@@ -91,8 +91,8 @@ class Sockets:
         frames = self._router.recv_multipart(zmq.NOBLOCK)
         holder: Holder | None = Holder()
         if self._authenticator is not None:
-            holder = self._authenticator.holder(str(first.get("User-Id")))
-        return Received(first.bytes, frames, holder, str(first.get("Peer-Address")))
+            holder = self._authenticator.holder(_told(first, "User-Id"))
+        return Received(first.bytes, frames, holder, _told(first, "Peer-Address"))
 
     def revoked(self) -> list[Holder]:
         """Those whose keys were revoked since; none of them gets weights any more."""
@@ -168,3 +168,14 @@ class Sockets:
                 f"address of this machine, such as 127.0.0.1, and {setting} to one you may use"
             ) from None
         return socket
+
+
+def _told(frame: zmq.Frame, name: str) -> str:
+    """What ZeroMQ knows of a frame's sender; empty where that is nothing.
+
+    Bytes that are no ZeroMQ at all are taken for its first version, which tells nothing.
+    """
+    try:
+        return str(frame.get(name))
+    except zmq.ZMQError:
+        return ""

@@ -2,7 +2,8 @@
 
 Array frames carry neither shape nor dtype: both follow from the number of rows and from the task
 that sender and receiver agreed on in HELLO. What arrives is checked for its exact size, and every
-value for its bounds; decoding copies nothing, so the arrays are read-only.
+value for its bounds; the arrays are read-only. A large array is cut into several frames; decoding
+copies no other.
 """
 
 import math
@@ -10,6 +11,7 @@ import struct
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -26,14 +28,14 @@ WeightShapes = Mapping[str, tuple[int, ...]]
 
 MAX_EPISODES = 4096
 # Whoever can connect makes the master hold a frame of this size before it has looked at anything.
-MAX_FRAME_BYTES = 512 * 1024
+MAX_FRAME_BYTES = 32 * 1024
+MAX_BATCH_BYTES = 2 * 2**20
 MAX_WEIGHTS_BYTES = 64 * 2**20
 MAX_REWARD = 1e6
 # Corners and actions are computed in float64; their bounds may be passed by rounding to float32.
 ROUNDING = 1e-6
 LENGTH = struct.Struct("<I")
-MAX_FRAMES = 8  # after a header, or in one piece of joined data
-MAX_BATCH_BYTES = MAX_FRAMES * MAX_FRAME_BYTES
+MAX_FRAMES = MAX_BATCH_BYTES // MAX_FRAME_BYTES + 8  # of a message; one for each array is not full
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,11 @@ class Column:
     def size(self) -> int:
         """Bytes."""
         return math.prod(self.shape) * np.dtype(self.dtype).itemsize
+
+    @cached_property
+    def frames(self) -> int:
+        """That it takes."""
+        return max(1, math.ceil(self.size / MAX_FRAME_BYTES))
 
     @cached_property
     def native(self) -> np.dtype[Any]:
@@ -145,8 +152,8 @@ class EpisodeSpec:
 
     @cached_property
     def max_count(self) -> int:
-        """Most episodes in one message, bounded in number and in the bytes of its frames."""
-        return min(MAX_EPISODES, MAX_FRAME_BYTES // max(c.size for c in self.columns(1)))
+        """Most episodes in one message, bounded in number and in bytes."""
+        return min(MAX_EPISODES, MAX_BATCH_BYTES // sum(c.size for c in self.columns(1)))
 
     def check_batch_size(self, count: int) -> None:
         """Raise ConfigError if so many episodes cannot be sent in one message."""
@@ -184,12 +191,19 @@ def _columns(spec: EpisodeSpec, count: int) -> tuple[Column, ...]:
 def encode_columns(
     arrays: Mapping[str, npt.NDArray[Any]], columns: Sequence[Column]
 ) -> list[bytes]:
-    """One raw frame per column, from arrays by name.
+    """Raw frames of arrays by name, column by column; large ones are cut.
 
     Raises:
         WireError: an array that a receiver would refuse.
     """
-    return [column.encode(arrays[column.name]) for column in columns]
+    whole = [column.encode(arrays[column.name]) for column in columns]
+    if all(column.frames == 1 for column in columns):
+        return whole
+    return [
+        data[i * MAX_FRAME_BYTES : (i + 1) * MAX_FRAME_BYTES]
+        for data, column in zip(whole, columns, strict=True)
+        for i in range(column.frames)
+    ]
 
 
 def decode_columns(
@@ -200,8 +214,12 @@ def decode_columns(
     Raises:
         WireError: another number of frames, or a frame that breaks its column.
     """
-    if len(frames) != len(columns):
-        raise WireError(f"there must be {len(columns)} array frames, got {len(frames)}")
+    count = sum(column.frames for column in columns)
+    if len(frames) != count:
+        raise WireError(f"there must be {count} array frames, got {len(frames)}")
+    if count > len(columns):
+        rest = iter(frames)
+        frames = [b"".join(islice(rest, column.frames)) for column in columns]
     return {c.name: c.decode(f) for c, f in zip(columns, frames, strict=True)}
 
 

@@ -13,6 +13,7 @@ from safetensors.numpy import save
 
 from tangram_agent import arrays
 from tangram_agent.arrays import (
+    MAX_BATCH_BYTES,
     MAX_EPISODES,
     MAX_FRAME_BYTES,
     MAX_FRAMES,
@@ -154,17 +155,37 @@ def test_arrays_of_another_task_are_not_sent() -> None:
         encode_episodes(replace(sent, rewards=sent.rewards[:, :3]), SPEC)
 
 
+def test_large_arrays_are_cut_and_put_together_again() -> None:
+    large = EpisodeSpec(7, 28, 50, 5, BOUND)
+    rng = np.random.default_rng(0)
+    for count in (1, 2, 3, large.max_count):
+        arrays = {
+            c.name: rng.uniform(c.low, c.high, c.shape).astype(c.native)
+            for c in large.columns(count)
+        }
+        sent = Episodes(**arrays)
+        frames = encode_episodes(sent, large)
+        assert max(map(len, frames)) <= MAX_FRAME_BYTES
+        assert len(frames) <= MAX_FRAMES
+        assert [len(f) for f in frames[: count // 3]] == [MAX_FRAME_BYTES] * (count // 3)
+        assert same(decode_episodes(frames, count, large), sent)
+        for wrong in (frames[1:], [*frames, b""], [frames[0][:-1], *frames[1:]]):
+            with pytest.raises(WireError):
+                decode_episodes(wrong, count, large)
+
+
 def test_a_batch_holds_a_bounded_number_of_episodes() -> None:
-    long = EpisodeSpec(16, 64, 100, 4, BOUND)
-    assert long.max_count == MAX_FRAME_BYTES // (4 * 101 * 128) == 10
+    long = EpisodeSpec(16, 64, 500, 4, BOUND)
+    each = 4 * (501 * 128 + 500 * 5 + 128) + 501 * 16
+    assert long.max_count == MAX_BATCH_BYTES // each == 7
     assert EpisodeSpec(1, 3, 1, 3, BOUND).max_count == MAX_EPISODES
-    long.check_batch_size(10)
+    long.check_batch_size(7)
     message = (
-        "11 episodes of 100 steps with 64 corners are too many for one message, at most 10: "
+        "8 episodes of 500 steps with 64 corners are too many for one message, at most 7: "
         "lower service.batch_episodes or sim.actions_per_token"
     )
     with pytest.raises(ConfigError, match=f"^{message}$"):
-        long.check_batch_size(11)
+        long.check_batch_size(8)
     with pytest.raises(ConfigError, match=r"1 episodes of 100000 steps .* at most 0: lower"):
         EpisodeSpec(16, 64, 100_000, 4, BOUND)
 
@@ -284,5 +305,5 @@ def test_joined_frames_come_back_and_none_that_is_cut_short(frames: list[bytes])
 
 
 def test_joined_frames_are_bounded_in_number() -> None:
-    with pytest.raises(WireError, match="there may be 8 joined frames, got more"):
+    with pytest.raises(WireError, match=f"there may be {MAX_FRAMES} joined frames, got more"):
         split_frames(join_frames([b""] * (MAX_FRAMES + 1)))

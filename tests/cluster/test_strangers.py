@@ -25,7 +25,7 @@ pytestmark = pytest.mark.cluster
 KEYS = ("service.bind=127.0.0.1",)
 PLAIN = (*KEYS, "service.auth=off")
 # 50 where there is little else to do; without bounds 30 of them cost 940, a topic 1,700.
-MOST_MIB = 192
+MOST_MIB = 64
 
 
 class Trained:

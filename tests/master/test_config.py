@@ -34,6 +34,6 @@ def test_wrong_settings_are_refused(settings: dict[str, Any], reason: str) -> No
 
 
 def test_settings_come_from_a_plain_mapping() -> None:
-    given = {"run_dir": "runs/x", "max_hours": 2, "workers": 2, "service": {"port": 5555}}
-    expected = MasterConfig("runs/x", max_hours=2.0, workers=2, service=ServiceConfig(port=5555))
+    given = {"run_dir": "runs/x", "max_hours": 2, "workers": 2, "service": {"envs": 3}}
+    expected = MasterConfig("runs/x", max_hours=2.0, workers=2, service=ServiceConfig(envs=3))
     assert from_mapping(MasterConfig, given) == expected

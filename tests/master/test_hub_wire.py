@@ -40,7 +40,7 @@ GARBAGE = [
     [os.urandom(100)],
     [b"\xc1"] * 3,
     [b"\x81\xa1a" * 3000],
-    [bytes(500_000)],
+    [bytes(32_000)],
     with_header(hello().encode(), role="spy"),
     with_header(hello().encode(), more=1),
     with_header(hello().encode(), kind="welcome"),

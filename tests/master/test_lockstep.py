@@ -65,5 +65,5 @@ def test_the_settings_must_fit() -> None:
     assert Lockstep.of(ServiceConfig(**step), 2, spec) is not None
     with pytest.raises(ConfigError, match=r"must be a multiple of service\.envs=3 in lockstep"):
         Lockstep.of(ServiceConfig(**(step | {"envs": 3})), 2, spec)
-    with pytest.raises(ConfigError, match="too many for one message, at most 4: lower service.b"):
-        Lockstep.of(ServiceConfig(**step), 2, replace(spec, corners=8192))
+    with pytest.raises(ConfigError, match="too many for one message, at most 1: lower service.b"):
+        Lockstep.of(ServiceConfig(**step), 2, replace(spec, corners=65536))
