@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -62,7 +63,12 @@ def write_line(path: Path, event: str, **fields: Any) -> None:
     try:
         if path.exists() and path.stat().st_size > MAX_BYTES:
             path.replace(path.with_name(f"{path.name}.old"))
-        with path.open("a", encoding="utf-8") as file:
+        # Whoever knows the id of a process could name it.
+        with open(path, "a", encoding="utf-8", opener=_private) as file:
             file.write(line + "\n")
     except OSError as error:
         raise TangramError(f"{path} cannot be written ({error.strerror})") from None
+
+
+def _private(path: str, flags: int) -> int:
+    return os.open(path, flags, 0o600)

@@ -429,9 +429,12 @@ class Hub:
         name, role = self._caller.name, self._caller.role
         if role not in ("", hello.role):
             return f"the key '{name}' is one for role={role}, not for role={hello.role}"
-        there = self._registry.at((hello.role, hello.index))
-        if there is not None and there.holder != name:
-            return f"{there.name} takes part with another key: leave index out, or choose another"
+        for peer in self.peers:
+            its = peer.process == hello.process or peer.key == (hello.role, hello.index)
+            if its and peer.holder != name:
+                return (
+                    f"{peer.name} takes part with another key: leave index out, or choose another"
+                )
         return ""
 
     def _refuse_hello(

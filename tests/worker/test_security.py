@@ -336,6 +336,7 @@ def test_a_key_is_for_one_role_and_for_its_own_indices(tmp_path: Path, file: Pat
         answer = asked(stage, other, hello(index=3, process="p2"))
         assert isinstance(answer, Refused)
         assert answer.reason.startswith("player 3 takes part with another key: leave index out")
+        assert isinstance(asked(stage, other, hello(process="p1")), Refused)  # nor its process
         assert isinstance(asked(stage, other, hello(process="p2")), Welcome)
         # The name of a connection is free once it is gone; what it had joined as is not.
         one.close()
@@ -346,8 +347,10 @@ def test_a_key_is_for_one_role_and_for_its_own_indices(tmp_path: Path, file: Pat
         ("refused", "alice"),
         ("joined", "alice"),
         ("refused", "bob"),
+        ("refused", "bob"),
         ("joined", "bob"),
     ]
+    assert log.stat().st_mode & 0o077 == 0
     assert found[1] == {
         "time": found[1]["time"],
         "event": "joined",
