@@ -82,9 +82,9 @@ class Peer:
         What is sent to one that does not read stays in memory here.
         """
         sent, due = self.weights
-        if shown != sent and self.last_seen < due:
+        if shown < sent and self.last_seen < due:
             return False
-        self._patience_s = WEIGHTS_AGAIN_S if shown == sent else 2.0 * self._patience_s
+        self._patience_s = WEIGHTS_AGAIN_S if shown >= sent else 2.0 * self._patience_s
         self.weights = version, self.last_seen + self._patience_s
         return True
 
