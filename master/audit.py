@@ -2,11 +2,11 @@
 
 import json
 import logging
-import os
 import time
 from pathlib import Path
 from typing import Any
 
+from tangram_agent.files import private
 from tangram_sim.errors import TangramError
 
 # Lines of one event: so many at once, then one in so many seconds. The rest is counted.
@@ -64,11 +64,7 @@ def write_line(path: Path, event: str, **fields: Any) -> None:
         if path.exists() and path.stat().st_size > MAX_BYTES:
             path.replace(path.with_name(f"{path.name}.old"))
         # Whoever knows the id of a process could name it.
-        with open(path, "a", encoding="utf-8", opener=_private) as file:
+        with open(path, "a", encoding="utf-8", opener=private) as file:
             file.write(line + "\n")
     except OSError as error:
         raise TangramError(f"{path} cannot be written ({error.strerror})") from None
-
-
-def _private(path: str, flags: int) -> int:
-    return os.open(path, flags, 0o600)

@@ -2,7 +2,6 @@
 
 import fcntl
 import json
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
@@ -13,7 +12,7 @@ from master.audit import write_line
 from master.config import KeysConfig
 from master.rundir import RunFolder
 from master.security import NAME, PRIVATE, Given, Keys, holders, make_pair, read_keys, write_keys
-from tangram_agent.files import write_whole
+from tangram_agent.files import private, write_whole
 from tangram_agent.messages import ROLES
 from tangram_sim.errors import ConfigError, RunError
 
@@ -94,9 +93,6 @@ def _connection(folder: RunFolder) -> dict[str, Any]:
 @contextmanager
 def _alone(folder: RunFolder) -> Iterator[None]:
     """Two commands at a time would lose a change."""
-    handle = os.open(folder.path, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
+    with open(folder.path / ".keys.lock", "ab", opener=private) as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
         yield
-    finally:
-        os.close(handle)

@@ -10,6 +10,7 @@ journalled and inserted, and the unacknowledged batches of one peer are bounded 
 
 import secrets
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
@@ -24,6 +25,7 @@ from master.sockets import Received, Sockets
 from tangram_agent.addresses import IPC
 from tangram_agent.arrays import MAX_FRAMES, EpisodeSpec, join_frames
 from tangram_agent.messages import (
+    ROLES,
     Ack,
     Alive,
     AskStatus,
@@ -53,6 +55,8 @@ from tangram_sim.errors import WireError
 MAX_DRAIN = 256
 # Damaged messages of one peer without an intact batch between them: then it must end.
 MAX_DAMAGED = 100
+# Peers that have left and whose batches still wait.
+SPARE_PEERS = 64
 
 
 @dataclass(frozen=True)
@@ -118,6 +122,7 @@ class Hub:
         self._stop_reason: str | None = None
         self._status: list[bytes] | None = None
         self._orders: dict[int, Go] = {}
+        self._waiting = Counter[tuple[str, int]]()  # for their insert, of all processes of an index
         self.counters = Counters()
         self._audit, self._caller = audit or Audit(), Holder()
         self._address = ""
@@ -144,6 +149,9 @@ class Hub:
             New batches and scores, in the order of their arrival.
         """
         arrivals: list[Arrival] = []
+        for holder in self._sockets.revoked():  # first: a flood must not keep anybody in
+            for peer in [one for one in self.peers if one.holder == holder.name]:
+                self._revoked(peer.identity, holder.name)
         if self._sockets.wait(timeout_s):
             for _ in range(MAX_DRAIN):
                 received = self._sockets.receive()
@@ -154,9 +162,6 @@ class Hub:
                     arrivals.append(arrival)
             else:  # more is waiting, perhaps from those who seem silent
                 return arrivals
-        for holder in self._sockets.revoked():
-            for peer in [one for one in self.peers if one.holder == holder.name]:
-                self._revoked(peer.identity, holder.name)
         for peer in self._registry.drop_silent(time.monotonic(), self._silence_s):
             reason = f"{peer.name} was silent for {self._silence_s:g} s"
             self.counters.note("lost_peers", reason)
@@ -166,6 +171,7 @@ class Hub:
     def acknowledge(self, arrival: EpisodesArrived) -> None:
         """Tell the worker that its batch is safe; once for each arrival, after its insert."""
         key = (arrival.role, arrival.index)
+        self._waiting[key] = max(0, self._waiting[key] - 1)
         ledger = self._registry.ledger(key, arrival.incarnation)
         if ledger is None or not ledger.release(arrival.sequence):
             return  # a newer process has the index, or this was told before
@@ -327,7 +333,7 @@ class Hub:
         peer.damaged = 0
         if self._info.lockstep and not self._is_ordered(peer, batch):
             return None
-        verdict = peer.ledger.take(batch.sequence, self._info.window)
+        verdict = peer.ledger.take(batch.sequence, self._room_for(peer))
         if verdict is not Verdict.NEW:
             self.counters[verdict.value] += 1
             answer = peer.ledger.answer(verdict, batch.sequence)
@@ -338,7 +344,15 @@ class Hub:
         self.counters["batches"] += 1
         self.counters["episodes"] += batch.episodes.count
         self._orders.pop(peer.index, None)
+        self._waiting[peer.key] += 1
         return EpisodesArrived(peer.role, peer.index, peer.incarnation, batch, frames, peer.process)
+
+    def _room_for(self, peer: Peer) -> int:
+        """How many batches of a process may wait; those of processes before it count, too."""
+        window = self._info.window
+        if self._waiting.total() >= window * (len(self.peers) + SPARE_PEERS):
+            return 0
+        return window - self._waiting[peer.key] + len(peer.ledger.held)
 
     def _is_ordered(self, peer: Peer, batch: EpisodeBatch) -> bool:
         """Whether a new batch is what the player was told to play; else it is told again."""
@@ -417,8 +431,8 @@ class Hub:
         self.counters["lost_batches"] += lost
         if lost:
             reason = (
-                f"{lost:,} batches of {peer.name} were acknowledged and are not in the replay: the "
-                "disk has lost them"
+                f"{peer.name} says that {lost:,} of its batches were acknowledged which are not in "
+                "the replay: the disk has lost them, if it is right"
             )
             self.counters.note("losses", reason)
         self._send(identity, self._welcome(peer))
@@ -431,7 +445,8 @@ class Hub:
             return f"the key '{name}' is one for role={role}, not for role={hello.role}"
         for peer in self.peers:
             its = peer.process == hello.process or peer.key == (hello.role, hello.index)
-            if its and peer.holder != name:
+            # What the run starts itself has its place: a key that was given away gets another.
+            if its and peer.holder != name and name not in ROLES:
                 return (
                     f"{peer.name} takes part with another key: leave index out, or choose another"
                 )

@@ -127,6 +127,7 @@ class Registry:
         self._by_identity: dict[bytes, Peer] = {}
         self._by_key: dict[Key, Peer] = {}
         self._ledgers: dict[Key, Ledger] = {}
+        self._recovered = dict[tuple[Key, int], int]()  # last batch of each incarnation
 
     @property
     def peers(self) -> list[Peer]:
@@ -161,7 +162,7 @@ class Registry:
         if same is not None and same.role == hello.role:
             # A HELLO again, because WELCOME was late or the connection is a new one.
             self._by_identity.pop(same.identity, None)
-            same.identity, same.last_seen, same.weights = identity, now, (-1, 0.0)
+            same.identity, same.last_seen = identity, now
             self._by_identity[identity] = same
             return same, None
         if len(self._by_key) >= self._room.peers:
@@ -222,9 +223,14 @@ class Registry:
         ledger = self._ledgers.get(key)
         if ledger is None or incarnation > ledger.incarnation:
             ledger = self._ledgers[key] = Ledger(incarnation, process=process)
-        if incarnation < ledger.incarnation or sequence <= ledger.received:
+        known = self._recovered.get((key, incarnation), 0)
+        # A process that was taken over may have had a batch here that was not inserted yet, so that
+        # the checkpoint has it not: what is read here was journalled after it.
+        if sequence <= (known if incarnation < ledger.incarnation else ledger.received):
             return False
-        ledger.consume(sequence)
+        self._recovered[key, incarnation] = sequence
+        if incarnation == ledger.incarnation:
+            ledger.consume(sequence)
         self._reserved_until = now + self._grace_s
         return True
 

@@ -16,7 +16,7 @@ import yaml
 from master.config import MasterConfig
 from master.journal import segments
 from tangram_agent.checkpoints import list_checkpoints
-from tangram_agent.files import PUBLIC, is_same, make_folders, write_whole
+from tangram_agent.files import PUBLIC, is_same, make_folders, private, write_whole
 from tangram_agent.outcome import FILE_NAME as RESULT
 from tangram_agent.outcome import bound_of, read_outcome
 from tangram_agent.setup import SECTIONS
@@ -204,7 +204,8 @@ class Claim:
         self._release(self._lock, self._folder)
 
     def _take(self) -> None:
-        lock = (self.run.path / LOCK).open("ab")
+        # Whoever can open it can lock it.
+        lock = open(self.run.path / LOCK, "ab", opener=private)  # noqa: SIM115
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -67,6 +67,13 @@ def make_folders(folder: Path, above: bool = True) -> None:
         sync_folder(folder.parent)
 
 
+def private(path: str, flags: int) -> int:
+    """Opener of a file that only this user may open, also where it was made otherwise."""
+    handle = os.open(path, flags, 0o600)
+    os.fchmod(handle, 0o600)
+    return handle
+
+
 def check_writable(name: str, path: Path) -> None:
     """Raise ConfigError unless `write_whole` could write a file there; nothing is left behind.
 

@@ -167,6 +167,24 @@ def test_a_damaged_batch_is_no_batch_and_who_sends_nothing_else_must_end(
     )
 
 
+def test_batches_that_wait_are_bounded_over_all_processes_of_an_index(stage: Stage) -> None:
+    """Each HELLO of a new process began a new window, and memory had no bound."""
+    for number in range(4):
+        dealer = stage.dealer()
+        dealer.join(index=0, process=f"p{number}")
+        dealer.send(1)
+        if number < WINDOW:
+            stage.counted("batches", number + 1)
+        else:
+            answer = dealer.hear()
+            assert isinstance(answer, Reject)
+            assert not answer.final
+    assert len(stage.batches()) == WINDOW
+    stage.hub.acknowledge(stage.batches()[0])  # of a process that was taken over
+    dealer.send(1)
+    stage.counted("batches", WINDOW + 1)
+
+
 def test_what_the_disk_lost_is_told_when_its_worker_comes_back(
     stage: Stage, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -178,8 +196,8 @@ def test_what_the_disk_lost_is_told_when_its_worker_comes_back(
         dealer.say(Bye("done"))
         stage.until(lambda: not stage.hub.peers)
     assert [r.message for r in caplog.records] == [
-        "losses (number 1): 3 batches of player 0 were acknowledged and are not in the replay: the "
-        "disk has lost them"
+        "losses (number 1): player 0 says that 3 of its batches were acknowledged which are not in "
+        "the replay: the disk has lost them, if it is right"
     ]
 
 

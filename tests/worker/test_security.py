@@ -342,6 +342,9 @@ def test_a_key_is_for_one_role_and_for_its_own_indices(tmp_path: Path, file: Pat
         one.close()
         heir = raw(stage, keys, bob, b"the same")
         assert asked(stage, heir, Heartbeat({})) == Greet()
+        # The run's own workers have their places.
+        mine = raw(stage, keys, keys.player)
+        assert isinstance(asked(stage, mine, hello(index=3, process="p3")), Welcome)
     found = lines(log)
     assert [(line["event"], line["key"]) for line in found] == [
         ("refused", "alice"),
@@ -349,6 +352,8 @@ def test_a_key_is_for_one_role_and_for_its_own_indices(tmp_path: Path, file: Pat
         ("refused", "bob"),
         ("refused", "bob"),
         ("joined", "bob"),
+        ("superseded", "alice"),
+        ("joined", "player"),
     ]
     assert log.stat().st_mode & 0o077 == 0
     assert found[1] == {
