@@ -33,7 +33,7 @@ from master.rundir import Claim, Clock, Record, RunFolder, code_of
 from master.security import Keys, listening_place, needs_keys, run_keys, write_keys
 from master.signals import StopSignals
 from master.trainer import Trainer, choose_device
-from tangram_agent.addresses import LOCAL, reachable, with_host
+from tangram_agent.addresses import LOCAL, dns_error, reachable, with_host
 from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import OPEN, WINDOW
@@ -208,6 +208,8 @@ def connection_of(
     """
     host = service.host or socket.gethostname()
     announced = with_host if service.host else reachable
+    if service.host and (unknown := dns_error(with_host(hub.endpoint, host))):
+        log.warning("service.host: %s here: workers must know it", unknown)
     where: dict[str, Any] = {
         "endpoint": announced(hub.endpoint, host),
         "weights_endpoint": announced(hub.weights_endpoint, host),

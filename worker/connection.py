@@ -16,8 +16,8 @@ from tangram_sim.errors import RunError, TangramError
 from worker.discovery import (
     PATIENCE_S,
     MasterAddress,
-    dns_error,
     find_master,
+    host_error,
     keys_error,
     no_file_error,
 )
@@ -259,7 +259,7 @@ class Connection:
 
     def _look_up(self, endpoint: str) -> None:
         """Warn of a host that DNS does not know, or not yet: ZeroMQ tries again without a word."""
-        before, self._unknown_host = self._unknown_host, dns_error(endpoint)
+        before, self._unknown_host = self._unknown_host, host_error(endpoint, self._connect)
         if self._unknown_host and not before:
             log.warning("%s", self._unknown_host, extra={"event": "unknown_host"})
 

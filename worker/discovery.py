@@ -7,10 +7,9 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
-from tangram_agent.addresses import IPC, host_of
+from tangram_agent.addresses import IPC, dns_error
 from tangram_agent.files import own_folder
 from tangram_agent.outcome import FILE_NAME as RESULT
 from tangram_sim.errors import RunError
@@ -19,7 +18,6 @@ FILE_NAME = "connection.json"
 # A master may still be starting, or wait in a queue.
 PATIENCE_S = 60.0
 LOOK_S = 0.2
-DNS_S = 2.0
 SCHEME = "tcp://"
 PLAIN_ADDRESS = re.compile(r"[\w.-]{1,249}:\d{1,5}|\[[0-9a-fA-F:.]+\]:\d+")  # without the scheme
 KEY = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
@@ -142,24 +140,15 @@ def no_file_error(connect: str, patience_s: float) -> str:
     )
 
 
-def dns_error(endpoint: str, patience_s: float = DNS_S) -> str:
-    """What DNS says against the host of an address, for the user; empty where it has an address."""
-    if endpoint.startswith(IPC):
-        return ""
-    host, said = host_of(endpoint).strip("[]"), [f"no answer in {patience_s:g} s"]
-
-    def resolve() -> None:
-        try:
-            socket.getaddrinfo(host, None)
-            said[0] = ""
-        except (OSError, UnicodeError) as error:
-            said[0] = str(getattr(error, "strerror", None) or error)
-
-    # In a thread of its own: a name server that is away holds a process for half a minute.
-    asking = Thread(target=resolve, daemon=True)
-    asking.start()
-    asking.join(patience_s)
-    return f"DNS knows no host '{host}' ({said[0]}): check the name in connect=" if said[0] else ""
+def host_error(endpoint: str, connect: str) -> str:
+    """What DNS says against the host of the master, for the user; empty where it knows it."""
+    said = dns_error(endpoint)
+    if not said or as_address(connect) is not None:
+        return said and f"{said}: check the name in connect="
+    return (
+        f"{said}: it is the master's service.host and stands in {connect}; start the master with a "
+        "name or an address that this machine knows"
+    )
 
 
 def keys_error(connect: str, endpoint: str) -> str:

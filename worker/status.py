@@ -19,7 +19,7 @@ from tangram_sim.config import own_code
 from tangram_sim.errors import TangramError, WireError
 from worker.config import StatusConfig
 from worker.connection import Sockets
-from worker.discovery import dns_error, find_master, keys_error
+from worker.discovery import find_master, host_error, keys_error
 
 PATIENCE_S = 10.0
 ASK_AGAIN_S = 1.0
@@ -78,7 +78,7 @@ def ask_status(
     address = find_master(connect)
     if address is None:
         raise TangramError(f"no connection file at {connect}: no master runs there")
-    unknown_host = dns_error(address.endpoint)
+    unknown_host = host_error(address.endpoint, connect)
     if unknown_host:
         raise TangramError(unknown_host)
     sockets = Sockets(context, address)

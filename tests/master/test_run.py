@@ -155,8 +155,13 @@ def test_over_tcp_the_connection_carries_keys(tmp_path: Path, told: Told, bind: 
     ],
 )
 def test_the_connection_names_a_host_that_others_reach(
-    tmp_path: Path, settings: dict[str, str], host: str
+    tmp_path: Path,
+    settings: dict[str, str],
+    host: str,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
+    monkeypatch.setattr("master.run.dns_error", "no such host".__add__)
     with opened_run(tmp_path, http_bind=settings["bind"], http_port=0, **settings) as (
         made,
         connection,
@@ -164,6 +169,8 @@ def test_the_connection_names_a_host_that_others_reach(
         ports = [int(made.hub.endpoint.rpartition(":")[2])]
         ports.append(int(made.hub.weights_endpoint.rpartition(":")[2]))
     assert connection["endpoint"] == f"tcp://{host}:{ports[0]}"
+    said = f"service.host: no such host{connection['endpoint']} here: workers must know it"
+    assert (said in caplog.messages) == ("host" in settings)
     assert connection["weights_endpoint"] == f"tcp://{host}:{ports[1]}"
     http_host = host if settings["bind"] == EVERYWHERE else "127.0.0.1"
     assert connection["http"].startswith(f"http://{http_host}:")

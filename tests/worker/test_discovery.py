@@ -7,8 +7,9 @@ from threading import Event
 
 import pytest
 
+from tangram_agent.addresses import dns_error
 from tangram_sim.errors import RunError
-from worker.discovery import MasterAddress, await_master, dns_error, find_master
+from worker.discovery import MasterAddress, await_master, find_master, host_error
 
 pytestmark = pytest.mark.fast
 
@@ -54,7 +55,18 @@ def test_a_host_that_dns_does_not_know_is_told(
     said = {"no": "Name or service not known", "never": "no answer in 0.1 s"}[answer]
     error = dns_error("tcp://learner.lan:5555", patience_s=60.0 if answer == "no" else 0.1)
     asked.set()
-    assert error == f"DNS knows no host 'learner.lan' ({said}): check the name in connect="
+    assert error == f"DNS knows no host 'learner.lan' ({said})"
+
+
+def test_a_host_that_is_unknown_says_where_its_name_comes_from(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("worker.discovery.dns_error", lambda _: "no such host")
+    endpoint = "tcp://learner.lan:1"
+    assert host_error(endpoint, "learner.lan:1") == "no such host: check the name in connect="
+    assert host_error(endpoint, "runs/zz").startswith(
+        "no such host: it is the master's service.host and stands in runs/zz; start the master with"
+    )
 
 
 @pytest.mark.parametrize(
