@@ -30,7 +30,7 @@ from master.report import Reporter, StatusCollector
 from master.result import command_line, go_on_command, make_result, show_finished, show_result
 from master.resumable import check_resumable
 from master.rundir import Claim, Clock, Record, RunFolder, code_of
-from master.security import Keys, listening_place, needs_keys, run_keys
+from master.security import Keys, listening_place, needs_keys, run_keys, write_keys
 from master.signals import StopSignals
 from master.trainer import Trainer, choose_device
 from tangram_agent.addresses import LOCAL, reachable, with_host
@@ -151,6 +151,8 @@ def open_run(
         log.warning(UNBOUNDED)
     keys = _keys(service, folder)
     hub = opened.enter_context(_open_hub(config, setup, run_id, keys))
+    if keys is not None:
+        folder.again[folder.keys] = lambda: write_keys(folder.keys, hub.keys or keys)
     health = None
     if service.http_port != OFF:
         health = opened.enter_context(closing(Health(service.http_bind, service.http_port)))

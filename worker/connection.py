@@ -191,8 +191,8 @@ def _key_of(address: MasterAddress, role: str) -> tuple[str, str] | None:
     if role and role not in address.keys:
         there = " and ".join(address.keys)
         raise RunError(
-            f"the connection file of {address.endpoint} has a key for role={there} only: start "
-            f"with that, or ask for one for role={role} (tangram-keys)"
+            f"the connection file of {address.endpoint} has a key for role={there} only: add "
+            f"role={there}, or ask for one for role={role} (tangram-keys)"
         )
     return address.keys[role] if role else next(iter(address.keys.values()))
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from tangram_agent.addresses import IPC, host_of
 from tangram_agent.files import own_folder
+from tangram_agent.outcome import FILE_NAME as RESULT
 from tangram_sim.errors import RunError
 
 FILE_NAME = "connection.json"
@@ -48,7 +49,7 @@ class MasterAddress:
         if wanted and not (self.keys and all(KEY.fullmatch(key) for key in keys)):
             raise ValueError("server_key and keys must be 40 characters of Z85 each")
         if not isinstance(self.settings, Mapping | None):
-            raise TypeError("settings must be a map")
+            raise ValueError("settings must be a map")
 
 
 def as_address(connect: str) -> str | None:
@@ -100,7 +101,7 @@ def find_master(connect: str) -> MasterAddress | None:
         RecursionError,
     ) as error:
         raise RunError(
-            f"{path} is no connection file ({error!r}): connect=... takes host:port, a run "
+            f"{path} is no connection file ({_why(error)}): connect=... takes host:port, a run "
             f"folder, or the {FILE_NAME} that tangram-master writes into it"
         ) from None
 
@@ -124,7 +125,10 @@ def await_master(
         if time.monotonic() >= until_s:
             raise RunError(no_file_error(connect, patience_s))
         if not told:
-            tell(f"waits for the connection file {connect}, for {patience_s:g} s at most")
+            ended = (Path(connect) / RESULT).is_file()
+            note = f"run {Path(connect).name} has ended, unless its master goes on with it: "
+            wait = f"waits for the connection file {connect}, for {patience_s:g} s at most"
+            tell(note * ended + wait)
             told = True
         time.sleep(LOOK_S)
     return found
@@ -169,6 +173,20 @@ def keys_error(connect: str, endpoint: str) -> str:
         f"wrong or stale connection file: what answers at {endpoint} does not take the keys of "
         f"{connect}, of another run or revoked; take the file of a master that is running"
     )
+
+
+def _why(error: Exception) -> str:
+    """What is wrong with a file, for the user."""
+    match error:
+        case json.JSONDecodeError() | UnicodeDecodeError():
+            return "it is not JSON"
+        case RecursionError():
+            return "it is nested too deeply"
+        case KeyError():
+            return f"it has no {error.args[0]}"
+        case TypeError() | AttributeError():
+            return "its content is another one"
+    return str(getattr(error, "strerror", None) or error)
 
 
 def _check_own(place: str, machine: str, source: Path) -> None:

@@ -1,9 +1,12 @@
 """Opening a run: what a master that was killed left behind, and what workers are told."""
 
 import logging
+import shutil
 import socket
+import stat
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +18,11 @@ from master.journal import segments
 from master.loop import Loop
 from master.run import UNBOUNDED, open_run
 from master.rundir import Record, RunFolder
+from master.security import Given, make_pair, read_keys, write_keys
 from master.signals import StopSignals
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import OPEN
-from tangram_agent.process import Watchdog
+from tangram_agent.process import Every, Watchdog
 from tangram_sim.errors import ConfigError, RunError
 from tests.master.builders import (
     ShownProgress,
@@ -209,3 +213,21 @@ def test_on_one_machine_sockets_of_the_user_alone_are_the_same_in_each_life(
         assert list(path.parent.iterdir()) == []
     assert found[0] == found[1]
     assert not (tmp_path / "run" / "keys.json").exists()
+
+
+def test_keys_that_were_given_meanwhile_come_back_with_a_folder_that_was_made_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("master.security.LOOK_S", 0.0)
+    folder = RunFolder(tmp_path / "run")
+    with opened_run(folder.path, bind="127.0.0.1") as (made, _):
+        given = {"alice": Given("player", make_pair().public)}
+        keys = replace(read_keys(folder.keys), given=given)
+        write_keys(folder.keys, keys)
+        made.hub.poll(0.0)
+        shutil.rmtree(folder.path)
+        folder.path.mkdir()
+        made.checkpointer._look = Every(0.0)
+        made.checkpointer.tick()
+        assert read_keys(folder.keys) == keys
+        assert stat.S_IMODE(folder.keys.stat().st_mode) == 0o600
