@@ -35,7 +35,7 @@ class Received(NamedTuple):
         identity: of the connection.
         frames: of the message.
         holder: of the key that the connection showed, which may be revoked since.
-        address: of the other side; of a unix socket it has user, group and process.
+        address: of the other side; of a unix socket `local` and the id of its process.
     """
 
     identity: bytes
@@ -97,7 +97,10 @@ class Sockets:
         holder = Holder()
         if self._authenticator is not None:
             holder = self._authenticator.holder(_told(first, "User-Id"))
-        return Received(first.bytes, frames, holder, _told(first, "Peer-Address"))
+        address = _told(first, "Peer-Address")
+        if address and self.endpoint.startswith(IPC):  # host:user:group:process
+            address = f"local, pid {address.rpartition(':')[2]}"
+        return Received(first.bytes, frames, holder, address)
 
     def revoked(self) -> list[Holder]:
         """Those whose keys were revoked since; none of them gets weights any more."""
