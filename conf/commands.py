@@ -183,7 +183,7 @@ where the master has service.auth=off: then tokens, sim, reward, agent and net m
 and be the master's, or it is refused and told what differs.""",
         (
             "tangram-worker connect=runs/shared",
-            "tangram-worker connect=mine.json service.envs=64",
+            "tangram-worker connect=learner.json service.envs=64",
             "tangram-worker connect=runs/shared/connection.json role=evaluator "
             "service.eval_seconds=30",
         ),
@@ -198,7 +198,7 @@ their weights and the last checkpoint are. It asks the master, from wherever a w
 `watch tangram-status connect=...` asks every two seconds.""",
         (
             "tangram-status connect=runs/my_run",
-            "tangram-status connect=mine.json",
+            "tangram-status connect=learner.json",
             "tangram-status connect=runs/my_run/connection.json json=true",
         ),
         ("worker.config:StatusConfig",),
@@ -207,13 +207,14 @@ their weights and the last checkpoint are. It asks the master, from wherever a w
         "tangram-keys",
         """\
 Says who has a key to a run whose master listens on an address, makes a key for somebody
-else, and takes it back, all while the run goes on. The new key lies in a connection file
-of its own, which is all that the other one needs. Who joined, left and was refused stands
-in audit.jsonl in the run folder.""",
+else, and takes it back, all while the run goes on. The master must have started on an
+address before, as with service.bind=0.0.0.0. The new key lies in a connection file of its
+own, which is all that the other one needs. Who joined, left and was refused stands in
+audit.jsonl in the run folder.""",
         (
-            "tangram-keys run_dir=runs/shared",
-            "tangram-keys run_dir=runs/shared add=alice role=player out=alice.json",
-            "tangram-keys run_dir=runs/shared revoke=alice",
+            "tangram-keys run_dir=runs/shared    # who has keys; changes nothing",
+            "tangram-keys run_dir=runs/shared add=alice role=evaluator    # makes alice.json",
+            "tangram-keys run_dir=runs/shared revoke=alice    # ends alice's process, too",
         ),
         ("master.config:KeysConfig",),
     ),

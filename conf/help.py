@@ -24,10 +24,11 @@ def help_text(config_name: str, folder: str | None = None) -> str:
         folder: of the user's own presets.
     """
     command = COMMANDS[config_name]
+    choice = " | group=choice" if command.groups else ""
     inside = ["  --help sim   the settings of a group"] if command.sections() else []
     return "\n".join(
         [
-            f"{command.name} [setting=value | group=choice] ...",
+            f"{command.name} [setting=value{choice}] ...",
             "",
             command.about,
             *_groups_text(command, folder),

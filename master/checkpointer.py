@@ -41,6 +41,7 @@ MINUTE_S = 60.0
 RETRY_S = 1.0
 WAIT = "until then nothing is acknowledged, and workers keep what they played"
 MAKE_ROOM = f"make room there; {WAIT}"
+PUT_BACK = f"put it back, or make an empty folder there; {WAIT}"
 AT_ONCE = "a new segment is begun and a checkpoint written at once, so that nothing is lost"
 JOURNAL = "journal"
 
@@ -52,6 +53,7 @@ class Checkpointer:
 
     Attributes:
         failing: the disk takes nothing more.
+        homeless: because the run folder is gone, or another one.
     """
 
     def __init__(
@@ -78,7 +80,7 @@ class Checkpointer:
         self._newest = next(reversed(list_checkpoints(self._folder)), None)
         self._keep_checkpoints = service.keep_checkpoints
         self._checkpoint = Every(service.checkpoint_minutes * MINUTE_S)
-        self.failing = False
+        self.failing = self.homeless = False
         self._look = Every(max(service.journal_sync_seconds, RETRY_S))
         self._saved_s: float | None = None
         self._retry, self._tell = Every(RETRY_S), Every(MINUTE_S, at_once=True)
@@ -137,6 +139,7 @@ class Checkpointer:
         """
         journal, known = self._journal, self._journal.exposed
         gone = "was made anew" if self._claim.check() else ""
+        self.homeless = False
         if not journal.in_place():
             gone = gone or "has lost its newest segment of the journal"
             journal.abandon()
@@ -153,9 +156,9 @@ class Checkpointer:
                 log.warning("%s", error)
 
     def _failed(self, error: RunError) -> None:
-        self.failing = True
+        self.failing, self.homeless = True, isinstance(error, FolderError)
         if self._tell.due():
-            remedies = {JournalError: f": {MAKE_ROOM}", FolderError: f"; {WAIT}"}
+            remedies = {JournalError: f": {MAKE_ROOM}", FolderError: f": {PUT_BACK}"}
             log.warning("%s%s", error, remedies.get(type(error), ""))
 
     def _worked(self) -> None:

@@ -142,6 +142,11 @@ class Hub:
         """Processes that take part, by role and index."""
         return self._registry.peers
 
+    @property
+    def keys(self) -> Keys | None:
+        """As their file has them by now; None on plain sockets."""
+        return self._sockets.keys
+
     def poll(self, timeout_s: float) -> list[Arrival]:
         """Wait for a message, then take and answer what is there.
 
@@ -235,9 +240,8 @@ class Hub:
     def _heard(self, received: Received) -> Arrival | None:
         """Read a message, if its sender still has a key; returns what is new."""
         identity, frames, holder, self._address = received
-        if holder is None:
-            peer = self._registry.find(identity)
-            self._revoked(identity, "" if peer is None else peer.holder)
+        if holder.revoked:
+            self._revoked(identity, holder.name)
             return None
         self._caller = holder
         return self._receive(identity, frames)

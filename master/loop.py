@@ -13,11 +13,12 @@ from master.divergence import DivergenceGuard
 from master.hub import Hub
 from master.lockstep import Lockstep
 from master.report import Reporter
-from master.rundir import Clock, RunFolder
+from master.rundir import Clock, FolderError, RunFolder
 from master.signals import StopSignals, stop_notice
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import RunStatus
 from tangram_agent.process import Every, Watchdog
+from tangram_sim.errors import RunError
 
 # Between two looks at the sockets: learning goes on for so long, or idleness lasts.
 LEARN_S = 0.05
@@ -175,7 +176,13 @@ class Loop:
         self.guard.check()
         self.publish()
         # Before anything that takes time: what was learned is safe from here on.
-        self.checkpointer.save()
+        try:
+            self.checkpointer.save()
+        except FolderError as error:
+            raise RunError(
+                f"{error}: the run ended without a checkpoint, and what it learned since the last "
+                "one is lost; a copy of the folder goes on from there with resume=auto"
+            ) from None
         self._wait_for_scores(launched)
         self.reporter.draw(self.folder.picture)
         return self.reporter.flush(len(self._arrived))

@@ -118,9 +118,12 @@ class StatusCollector:
         texts = {
             "run": self._name,
             "run_id": record.run_id,
-            "activity": activity(trainer, players),
+            "activity": HOMELESS if self._checkpointer.homeless else activity(trainer, players),
         }
         return RunStatus(numbers, texts, _workers(peers, trainer.updates))
+
+
+HOMELESS = "waiting for the run folder, which is gone or another one"
 
 
 def activity(trainer: Trainer, players: int) -> str:

@@ -30,10 +30,10 @@ from master.report import Reporter, StatusCollector
 from master.result import command_line, go_on_command, make_result, show_finished, show_result
 from master.resumable import check_resumable
 from master.rundir import Claim, Clock, Record, RunFolder, code_of
-from master.security import Keys, listening_place, needs_keys, run_keys
+from master.security import Keys, listening_place, needs_keys, run_keys, write_keys
 from master.signals import StopSignals
 from master.trainer import Trainer, choose_device
-from tangram_agent.addresses import LOCAL, reachable, with_host
+from tangram_agent.addresses import LOCAL, dns_error, reachable, with_host
 from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import OPEN, WINDOW
@@ -151,6 +151,8 @@ def open_run(
         log.warning(UNBOUNDED)
     keys = _keys(service, folder)
     hub = opened.enter_context(_open_hub(config, setup, run_id, keys))
+    if keys is not None:
+        folder.again[folder.keys] = lambda: write_keys(folder.keys, hub.keys or keys)
     health = None
     if service.http_port != OFF:
         health = opened.enter_context(closing(Health(service.http_bind, service.http_port)))
@@ -206,6 +208,8 @@ def connection_of(
     """
     host = service.host or socket.gethostname()
     announced = with_host if service.host else reachable
+    if service.host and (unknown := dns_error(with_host(hub.endpoint, host))):
+        log.warning("service.host: %s here: workers must know it", unknown)
     where: dict[str, Any] = {
         "endpoint": announced(hub.endpoint, host),
         "weights_endpoint": announced(hub.weights_endpoint, host),

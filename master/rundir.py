@@ -5,8 +5,9 @@ import json
 import os
 import secrets
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from typing import IO, Any, Self
 
@@ -52,6 +53,7 @@ class RunFolder:
         result: the scores of the final weights.
         bad_batch: what the learner could not learn from, where that ended the run.
         picture: the test episodes, played with the final weights.
+        again: path -> writes it again where the folder was made anew.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -68,7 +70,7 @@ class RunFolder:
         self.result = self.path / RESULT
         self.bad_batch = self.path / "bad_batch.safetensors"
         self.picture = self.path / "test_episodes.png"
-        self._written: dict[Path, tuple[bytes, int]] = {}
+        self.again: dict[Path, Callable[[], object]] = {}
 
     def prepare(self, resume: str) -> None:
         """Make the folder.
@@ -117,9 +119,9 @@ class RunFolder:
 
     def write_again(self) -> None:
         """Write what is missing of what was written, or read, here: the folder is a new one."""
-        for path, (data, mode) in self._written.items():
+        for path, write in self.again.items():
             if not path.exists():
-                write_whole(path, data, mode, above=False)
+                write()
 
     def write_config(self, resolved: Mapping[str, Any]) -> None:
         """Write the resolved config as plain YAML."""
@@ -128,7 +130,7 @@ class RunFolder:
     def read_config(self) -> dict[str, Any]:
         """What `write_config` wrote."""
         data = self.config.read_bytes()
-        self._written[self.config] = data, PUBLIC
+        self.again[self.config] = partial(write_whole, self.config, data, above=False)
         return dict(yaml.safe_load(data))
 
     def write_connection(self, connection: Mapping[str, Any]) -> None:
@@ -147,8 +149,9 @@ class RunFolder:
         self._write(self.result, (json.dumps(dict(result), indent=1) + "\n").encode())
 
     def _write(self, path: Path, data: bytes, mode: int = PUBLIC) -> None:
-        write_whole(path, data, mode, above=False)  # a folder that was deleted stays so
-        self._written[path] = data, mode
+        write = partial(write_whole, path, data, mode, above=False)
+        write()  # not above: a folder that was deleted stays so
+        self.again[path] = write
 
 
 class FolderError(RunError):
@@ -185,17 +188,16 @@ class Claim:
         path = self.run.path
         if is_same(self._lock.fileno(), path / LOCK):
             return False
-        back = "put it back, or make an empty folder there"
         try:
             if not path.is_dir():
-                raise FolderError(f"run_dir {path} is gone: {back}")
+                raise FolderError(f"run_dir {path} is gone")
             if not is_same(self._folder, path) and self.run.holds_more():
-                raise FolderError(f"run_dir {path} is another folder now, with a run in it: {back}")
+                raise FolderError(f"run_dir {path} is another folder now, with a run in it")
             before = self._lock, self._folder
             self._take()
         except (OSError, ConfigError) as error:
             why = error.strerror if isinstance(error, OSError) else "another process works there"
-            raise FolderError(f"run_dir {path} cannot be claimed anew ({why}): {back}") from None
+            raise FolderError(f"run_dir {path} cannot be claimed anew ({why})") from None
         self._release(*before)
         return True
 

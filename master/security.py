@@ -94,10 +94,17 @@ class Keys:
 
 @dataclass(frozen=True)
 class Holder:
-    """Who has a key: a name, and the role it is for; empty for any, where there are no keys."""
+    """Who has a key.
+
+    Attributes:
+        name: empty where there are no keys.
+        role: it is for; empty for any, where there are no keys.
+        revoked: it was valid before.
+    """
 
     name: str = ""
     role: str = ""
+    revoked: bool = False
 
 
 def make_pair() -> Pair:
@@ -221,8 +228,22 @@ def _sweep(folder: Path) -> None:
                 path.unlink()
 
 
+class _Asked(ThreadAuthenticator):
+    """Knows the address of whoever shows a key, which the callback is not told."""
+
+    address = ""
+
+    async def handle_zap_message(self, msg: list[bytes]) -> None:
+        self.address = b"".join(msg[3:4]).decode(errors="replace")
+        await super().handle_zap_message(msg)
+
+
 class Authenticator:
-    """Encrypts sockets of a context, and turns away those with another key."""
+    """Encrypts sockets of a context, and turns away those with another key.
+
+    Attributes:
+        keys: as their file has them by now.
+    """
 
     def __init__(
         self,
@@ -231,17 +252,17 @@ class Authenticator:
         counters: Counters,
         audit: Audit,
     ) -> None:
-        self._keys, self._counters, self._audit = keys, counters, audit
+        self.keys, self._counters, self._audit = keys, counters, audit
         self._holders, self._former = holders(keys), dict[str, Holder]()
         self._stamp, self._look = self._stamped(), Every(LOOK_S)
-        self._thread = ThreadAuthenticator(context)
+        self._thread = _Asked(context)
         self._thread.start()
         self._thread.configure_curve_callback(domain=DOMAIN, credentials_provider=self)
 
     def guard(self, end: zmq.Socket[bytes]) -> None:
         """Encrypt a socket that is not bound yet."""
         end.setsockopt(zmq.CURVE_SERVER, 1)
-        end.setsockopt(zmq.CURVE_SECRETKEY, self._keys.server.secret.encode())
+        end.setsockopt(zmq.CURVE_SECRETKEY, self.keys.server.secret.encode())
         end.setsockopt_string(zmq.ZAP_DOMAIN, DOMAIN)
 
     def callback(self, _domain: str, key: bytes) -> bool:
@@ -249,14 +270,16 @@ class Authenticator:
         public = key.decode("ascii")
         allowed = public in self._holders
         if not allowed:
-            former = self._former.get(public, Holder()).name
+            former = self._former.get(public)
             self._counters.note("refused_keys", "a worker with the key of another run, or a former")
-            self._audit.note("refused", key=former or public, reason="no key of this run")
+            reason = "no key of this run" if former is None else "revoked"
+            name, address = "" if former is None else former.name, self._thread.address
+            self._audit.note("refused", key=name, public=public, address=address, reason=reason)
         return allowed
 
-    def holder(self, public: str) -> Holder | None:
-        """Who has a key, None if it was revoked."""
-        return self._holders.get(public)
+    def holder(self, public: str) -> Holder:
+        """Who has, or had, a key."""
+        return self._holders.get(public) or self._former.get(public) or Holder(revoked=True)
 
     def revoked(self) -> list[Holder]:
         """Look at the file, once in a second, and return those whose keys are no longer there."""
@@ -264,14 +287,15 @@ class Authenticator:
             return []
         self._stamp = stamp
         try:
-            found = holders(read_keys(self._keys.path or Path()))
+            keys = read_keys(self.keys.path or Path())
         except RunError as error:
             log.warning("%s; those of before stay valid", error)
             return []
+        self.keys, found = keys, holders(keys)
         gone = {key: one for key, one in self._holders.items() if key not in found}
         for key in found.keys() - self._holders.keys():
             log.info("the key '%s' may take part from now on", found[key].name)
-        self._former |= gone
+        self._former |= {key: replace(one, revoked=True) for key, one in gone.items()}
         self._holders = found
         return list(gone.values())
 
@@ -282,6 +306,6 @@ class Authenticator:
     def _stamped(self) -> tuple[int, int] | None:
         """What changes with the file; None where there is none."""
         with suppress(OSError):
-            found = (self._keys.path or Path()).stat()
+            found = (self.keys.path or Path()).stat()
             return found.st_mtime_ns, found.st_ino
         return None

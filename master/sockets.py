@@ -34,13 +34,13 @@ class Received(NamedTuple):
     Attributes:
         identity: of the connection.
         frames: of the message.
-        holder: of the key that the connection showed, None if that was revoked since.
-        address: of the other side; of a unix socket it has user, group and process.
+        holder: of the key that the connection showed, which may be revoked since.
+        address: of the other side; of a unix socket `local` and the id of its process.
     """
 
     identity: bytes
     frames: Sequence[bytes]
-    holder: Holder | None
+    holder: Holder
     address: str
 
 
@@ -78,6 +78,11 @@ class Sockets:
         self.weights_endpoint = self._pub.getsockopt_string(zmq.LAST_ENDPOINT)
         self._gate = Gate((self._router, self._pub), room, keys is not None, counters)
 
+    @property
+    def keys(self) -> Keys | None:
+        """As their file has them by now; None on plain sockets."""
+        return None if self._authenticator is None else self._authenticator.keys
+
     def wait(self, timeout_s: float) -> bool:
         """Whether a message came within this time."""
         return bool(self._router.poll(math.ceil(max(0.0, timeout_s) * 1000)))
@@ -89,10 +94,13 @@ class Sockets:
         except zmq.Again:
             return None
         frames = self._router.recv_multipart(zmq.NOBLOCK)
-        holder: Holder | None = Holder()
+        holder = Holder()
         if self._authenticator is not None:
             holder = self._authenticator.holder(_told(first, "User-Id"))
-        return Received(first.bytes, frames, holder, _told(first, "Peer-Address"))
+        address = _told(first, "Peer-Address")
+        if address and self.endpoint.startswith(IPC):  # host:user:group:process
+            address = f"local, pid {address.rpartition(':')[2]}"
+        return Received(first.bytes, frames, holder, address)
 
     def revoked(self) -> list[Holder]:
         """Those whose keys were revoked since; none of them gets weights any more."""

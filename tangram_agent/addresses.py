@@ -1,10 +1,13 @@
 """Addresses of sockets, as those on other machines see them."""
 
 import re
+import socket
 from ipaddress import IPv6Address
+from threading import Thread
 
 from tangram_sim.errors import ConfigError
 
+DNS_S = 2.0  # to wait for its answer
 LOCAL = "local"  # of service.bind: unix sockets instead of an address
 IPC = "ipc://"
 HOST = re.compile(r"[\w.*-]+")
@@ -40,6 +43,26 @@ def with_host(address: str, host: str) -> str:
     scheme, _, port = _split(address)
     bracketed = f"[{host}]" if ":" in host and not host.startswith("[") else host
     return f"{scheme}://{bracketed}:{port}"
+
+
+def dns_error(endpoint: str, patience_s: float = DNS_S) -> str:
+    """What DNS says against the host of an address, for the user; empty where it has an address."""
+    if endpoint.startswith(IPC):
+        return ""
+    host, said = host_of(endpoint).strip("[]"), [f"no answer in {patience_s:g} s"]
+
+    def resolve() -> None:
+        try:
+            socket.getaddrinfo(host, None)
+            said[0] = ""
+        except (OSError, UnicodeError) as error:
+            said[0] = str(getattr(error, "strerror", None) or error)
+
+    # In a thread of its own: a name server that is away holds a process for half a minute.
+    asking = Thread(target=resolve, daemon=True)
+    asking.start()
+    asking.join(patience_s)
+    return f"DNS knows no host '{host}' ({said[0]})" if said[0] else ""
 
 
 def _split(address: str) -> tuple[str, str, str]:

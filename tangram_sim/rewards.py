@@ -207,7 +207,8 @@ def _source(config: RewardConfig, path: Path) -> bytes:
     if config.sha256 not in (None, found):
         raise ConfigError(
             f"reward.name={config.name}: '{path}' has sha256 {found}, and the settings of the run "
-            f"want {config.sha256}: name the file that it began with, or set reward.sha256={found}"
+            f"want {config.sha256}: name the file that it began with; only a new run may set "
+            f"reward.sha256={found}"
         )
     return source
 

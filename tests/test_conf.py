@@ -1,5 +1,6 @@
 """Presets, overrides, help, and the entry of every command."""
 
+import shlex
 import sys
 from collections.abc import Callable
 from importlib.resources import files
@@ -228,10 +229,14 @@ def test_tokens_of_a_command_without_groups_are_a_name(given: str, name: str | N
 def test_help_explains_every_setting_and_its_examples_compose(primary: str) -> None:
     text = help_text(primary)
     lines = text.splitlines()
+    assert ("group=choice" in lines[0]) == bool(COMMANDS[primary].groups)
     for own in COMMANDS[primary].fields():
         (line,) = [line for line in lines if line.startswith(f"  {own.name}: ")]
         assert len(line.partition("  # ")[2]) > 5
-    examples = [line.split() for line in text.partition("Examples:")[2].strip().splitlines()]
+    examples = [
+        shlex.split(line, comments=True)
+        for line in text.partition("Examples:")[2].strip().splitlines()
+    ]
     assert len(examples) == 3
     for command, *overrides in examples:
         assert command == text.split()[0]

@@ -100,6 +100,12 @@ def test_a_service_has_no_rights_and_writes_to_its_volume_only(service: str) -> 
     assert not about.keys() & {"cap_add", "privileged", "network_mode", "pid"}
 
 
+def test_connection_files_stay_out_of_images_and_commits() -> None:
+    """tangram-keys leaves them in the current folder, often that of a clone, and they have keys."""
+    assert "*.json" in (ROOT / ".dockerignore").read_text().splitlines()
+    assert "/*.json" in (ROOT / ".gitignore").read_text().splitlines()
+
+
 def test_nothing_runs_as_root() -> None:
     text = (DOCKER / "Dockerfile").read_text()
     stages = re.split(r"^FROM ", text, flags=re.MULTILINE)[1:]

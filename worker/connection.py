@@ -16,8 +16,8 @@ from tangram_sim.errors import RunError, TangramError
 from worker.discovery import (
     PATIENCE_S,
     MasterAddress,
-    dns_error,
     find_master,
+    host_error,
     keys_error,
     no_file_error,
 )
@@ -191,8 +191,8 @@ def _key_of(address: MasterAddress, role: str) -> tuple[str, str] | None:
     if role and role not in address.keys:
         there = " and ".join(address.keys)
         raise RunError(
-            f"the connection file of {address.endpoint} has a key for role={there} only: start "
-            f"with that, or ask for one for role={role} (tangram-keys)"
+            f"the connection file of {address.endpoint} has a key for role={there} only: add "
+            f"role={there}, or ask for one for role={role} (tangram-keys)"
         )
     return address.keys[role] if role else next(iter(address.keys.values()))
 
@@ -259,7 +259,7 @@ class Connection:
 
     def _look_up(self, endpoint: str) -> None:
         """Warn of a host that DNS does not know, or not yet: ZeroMQ tries again without a word."""
-        before, self._unknown_host = self._unknown_host, dns_error(endpoint)
+        before, self._unknown_host = self._unknown_host, host_error(endpoint, self._connect)
         if self._unknown_host and not before:
             log.warning("%s", self._unknown_host, extra={"event": "unknown_host"})
 

@@ -7,18 +7,17 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
-from tangram_agent.addresses import IPC, host_of
+from tangram_agent.addresses import IPC, dns_error
 from tangram_agent.files import own_folder
+from tangram_agent.outcome import FILE_NAME as RESULT
 from tangram_sim.errors import RunError
 
 FILE_NAME = "connection.json"
 # A master may still be starting, or wait in a queue.
 PATIENCE_S = 60.0
 LOOK_S = 0.2
-DNS_S = 2.0
 SCHEME = "tcp://"
 PLAIN_ADDRESS = re.compile(r"[\w.-]{1,249}:\d{1,5}|\[[0-9a-fA-F:.]+\]:\d+")  # without the scheme
 KEY = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
@@ -48,7 +47,7 @@ class MasterAddress:
         if wanted and not (self.keys and all(KEY.fullmatch(key) for key in keys)):
             raise ValueError("server_key and keys must be 40 characters of Z85 each")
         if not isinstance(self.settings, Mapping | None):
-            raise TypeError("settings must be a map")
+            raise ValueError("settings must be a map")
 
 
 def as_address(connect: str) -> str | None:
@@ -100,7 +99,7 @@ def find_master(connect: str) -> MasterAddress | None:
         RecursionError,
     ) as error:
         raise RunError(
-            f"{path} is no connection file ({error!r}): connect=... takes host:port, a run "
+            f"{path} is no connection file ({_why(error)}): connect=... takes host:port, a run "
             f"folder, or the {FILE_NAME} that tangram-master writes into it"
         ) from None
 
@@ -124,7 +123,10 @@ def await_master(
         if time.monotonic() >= until_s:
             raise RunError(no_file_error(connect, patience_s))
         if not told:
-            tell(f"waits for the connection file {connect}, for {patience_s:g} s at most")
+            ended = (Path(connect) / RESULT).is_file()
+            note = f"run {Path(connect).name} has ended, unless its master goes on with it: "
+            wait = f"waits for the connection file {connect}, for {patience_s:g} s at most"
+            tell(note * ended + wait)
             told = True
         time.sleep(LOOK_S)
     return found
@@ -138,24 +140,15 @@ def no_file_error(connect: str, patience_s: float) -> str:
     )
 
 
-def dns_error(endpoint: str, patience_s: float = DNS_S) -> str:
-    """What DNS says against the host of an address, for the user; empty where it has an address."""
-    if endpoint.startswith(IPC):
-        return ""
-    host, said = host_of(endpoint).strip("[]"), [f"no answer in {patience_s:g} s"]
-
-    def resolve() -> None:
-        try:
-            socket.getaddrinfo(host, None)
-            said[0] = ""
-        except (OSError, UnicodeError) as error:
-            said[0] = str(getattr(error, "strerror", None) or error)
-
-    # In a thread of its own: a name server that is away holds a process for half a minute.
-    asking = Thread(target=resolve, daemon=True)
-    asking.start()
-    asking.join(patience_s)
-    return f"DNS knows no host '{host}' ({said[0]}): check the name in connect=" if said[0] else ""
+def host_error(endpoint: str, connect: str) -> str:
+    """What DNS says against the host of the master, for the user; empty where it knows it."""
+    said = dns_error(endpoint)
+    if not said or as_address(connect) is not None:
+        return said and f"{said}: check the name in connect="
+    return (
+        f"{said}: it is the master's service.host and stands in {connect}; start the master with a "
+        "name or an address that this machine knows"
+    )
 
 
 def keys_error(connect: str, endpoint: str) -> str:
@@ -169,6 +162,20 @@ def keys_error(connect: str, endpoint: str) -> str:
         f"wrong or stale connection file: what answers at {endpoint} does not take the keys of "
         f"{connect}, of another run or revoked; take the file of a master that is running"
     )
+
+
+def _why(error: Exception) -> str:
+    """What is wrong with a file, for the user."""
+    match error:
+        case json.JSONDecodeError() | UnicodeDecodeError():
+            return "it is not JSON"
+        case RecursionError():
+            return "it is nested too deeply"
+        case KeyError():
+            return f"it has no {error.args[0]}"
+        case TypeError() | AttributeError():
+            return "its content is another one"
+    return str(getattr(error, "strerror", None) or error)
 
 
 def _check_own(place: str, machine: str, source: Path) -> None:

@@ -5,6 +5,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import zmq
@@ -14,15 +15,20 @@ from rich.text import Text
 
 from tangram_agent.messages import OPEN, WORKER_COLUMNS, AskStatus, RunStatus, decode_from_master
 from tangram_agent.outcome import FILE_NAME, outcome_rows, read_outcome
+from tangram_sim.config import own_code
 from tangram_sim.errors import TangramError, WireError
 from worker.config import StatusConfig
 from worker.connection import Sockets
-from worker.discovery import dns_error, find_master, keys_error
+from worker.discovery import find_master, host_error, keys_error
 
 PATIENCE_S = 10.0
 ASK_AGAIN_S = 1.0
 MINUTE_S = 60.0
 UNKNOWN = -1.0
+REFUSED = {
+    "refused_keys": ("refused keys", "with no key for this run and role: see audit.jsonl"),
+    "refused_handshakes": ("ended handshakes", "connections that showed no key"),
+}
 
 
 def show_status(config: StatusConfig) -> int:
@@ -72,7 +78,7 @@ def ask_status(
     address = find_master(connect)
     if address is None:
         raise TangramError(f"no connection file at {connect}: no master runs there")
-    unknown_host = dns_error(address.endpoint)
+    unknown_host = host_error(address.endpoint, connect)
     if unknown_host:
         raise TangramError(unknown_host)
     sockets = Sockets(context, address)
@@ -118,9 +124,19 @@ def _print(console: Console, status: RunStatus, connect: str) -> None:
     if len(status.workers):
         console.print(_table(status))
     if numbers["evaluators"] == 0:  # whole, so that it can be copied
-        start = f"tangram-worker connect={connect} role=evaluator"
-        said = f"no evaluator yet (tangram-train starts its own): {start}"
+        said = f"no evaluator yet (tangram-train starts its own): {_evaluator(connect)}"
         console.print(said, soft_wrap=True, markup=False, highlight=False)
+
+
+def _evaluator(connect: str) -> str:
+    """How to start one, with what this connection file is good for."""
+    address = find_master(connect)
+    if address is not None and address.keys and "evaluator" not in address.keys:
+        return f"{connect} has no key for one, tangram-keys makes it (add=NAME role=evaluator)"
+    reward = {} if address is None else dict((address.settings or {}).get("reward", {}))
+    own = own_code(str(reward.get("name", "")))
+    named = f" {quote('reward.name=' + reward['name'])}" if own else ""
+    return f"tangram-worker connect={connect} role=evaluator{named}"
 
 
 def _print_rows(console: Console, rows: Iterable[tuple[str, str]]) -> None:
@@ -153,6 +169,9 @@ def _lines(n: Mapping[str, float], texts: Mapping[str, str]) -> Iterator[tuple[s
         yield "access", OPEN
     if n["disk_failing"] > 0:
         yield "disk", "full, broken or gone: nothing is acknowledged"
+    for name, (row, who) in REFUSED.items():
+        if n[f"hub/{name}"] > 0:
+            yield row, f"{n[f'hub/{name}']:,.0f} {who}"
     if n["undone_updates"] > 0:
         yield "undone updates", f"{n['undone_updates']:,.0f} were not finite"
 

@@ -1,5 +1,6 @@
 """Connections beyond a bound are ended, those of others never."""
 
+import os
 import resource
 import socket
 import time
@@ -218,6 +219,17 @@ def test_one_connection_too_many_is_ended_and_the_others_stay(bind: str) -> None
         assert made.counters["refused_connections"] == 1
         strangers.pop().close()  # which makes room
         made.answered(made.dealer())
+
+
+@pytest.mark.cluster
+def test_it_is_told_from_where_a_message_came(bind: str) -> None:
+    with door(None, bind=bind) as made:
+        made.dealer()
+        assert made.sockets.wait(LIMIT_S)
+        received = made.sockets.receive()
+        assert received is not None
+        unix = bind.startswith("ipc")
+        assert received.address == (f"local, pid {os.getpid()}" if unix else "127.0.0.1")
 
 
 @pytest.mark.cluster

@@ -232,7 +232,7 @@ def test_a_run_whose_folder_is_gone_ends_with_one_line_and_makes_none(
         made.reporter.scored(scores(MADE, 4).scores)
         made.reporter.flush(0)
         made.reporter._metrics._try(made.reporter._metrics._writer.flush)
-    with pytest.raises(RunError, match=r"^run_dir .*/run is gone: put it back, or make an empty"):
+    with pytest.raises(RunError, match=r"^run_dir .*/run is gone: the run ended without a check"):
         made.finish(launched=False)
     with pytest.raises(RunError, match=r"cannot write .*/test_episodes.png \(No such file or dir"):
         made.reporter.draw(made.folder.picture)

@@ -74,6 +74,9 @@ def test_what_is_waited_for(
     made.guard.trainer.rate_limiter.updated(updates)
     made.reporter.tick(0)
     assert shown(made)[-1].texts["activity"] == words
+    made.checkpointer.homeless = True
+    said = "waiting for the run folder, which is gone or another one"
+    assert made.reporter.flush(0).texts["activity"] == said
 
 
 def test_a_status_that_cannot_be_told_as_it_is_ends_nothing_and_keeps_the_scores(

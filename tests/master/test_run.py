@@ -1,9 +1,12 @@
 """Opening a run: what a master that was killed left behind, and what workers are told."""
 
 import logging
+import shutil
 import socket
+import stat
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +18,11 @@ from master.journal import segments
 from master.loop import Loop
 from master.run import UNBOUNDED, open_run
 from master.rundir import Record, RunFolder
+from master.security import Given, make_pair, read_keys, write_keys
 from master.signals import StopSignals
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import OPEN
-from tangram_agent.process import Watchdog
+from tangram_agent.process import Every, Watchdog
 from tangram_sim.errors import ConfigError, RunError
 from tests.master.builders import (
     ShownProgress,
@@ -151,8 +155,13 @@ def test_over_tcp_the_connection_carries_keys(tmp_path: Path, told: Told, bind: 
     ],
 )
 def test_the_connection_names_a_host_that_others_reach(
-    tmp_path: Path, settings: dict[str, str], host: str
+    tmp_path: Path,
+    settings: dict[str, str],
+    host: str,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
+    monkeypatch.setattr("master.run.dns_error", "no such host".__add__)
     with opened_run(tmp_path, http_bind=settings["bind"], http_port=0, **settings) as (
         made,
         connection,
@@ -160,6 +169,8 @@ def test_the_connection_names_a_host_that_others_reach(
         ports = [int(made.hub.endpoint.rpartition(":")[2])]
         ports.append(int(made.hub.weights_endpoint.rpartition(":")[2]))
     assert connection["endpoint"] == f"tcp://{host}:{ports[0]}"
+    said = f"service.host: no such host{connection['endpoint']} here: workers must know it"
+    assert (said in caplog.messages) == ("host" in settings)
     assert connection["weights_endpoint"] == f"tcp://{host}:{ports[1]}"
     http_host = host if settings["bind"] == EVERYWHERE else "127.0.0.1"
     assert connection["http"].startswith(f"http://{http_host}:")
@@ -209,3 +220,21 @@ def test_on_one_machine_sockets_of_the_user_alone_are_the_same_in_each_life(
         assert list(path.parent.iterdir()) == []
     assert found[0] == found[1]
     assert not (tmp_path / "run" / "keys.json").exists()
+
+
+def test_keys_that_were_given_meanwhile_come_back_with_a_folder_that_was_made_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("master.security.LOOK_S", 0.0)
+    folder = RunFolder(tmp_path / "run")
+    with opened_run(folder.path, bind="127.0.0.1") as (made, _):
+        given = {"alice": Given("player", make_pair().public)}
+        keys = replace(read_keys(folder.keys), given=given)
+        write_keys(folder.keys, keys)
+        made.hub.poll(0.0)
+        shutil.rmtree(folder.path)
+        folder.path.mkdir()
+        made.checkpointer._look = Every(0.0)
+        made.checkpointer.tick()
+        assert read_keys(folder.keys) == keys
+        assert stat.S_IMODE(folder.keys.stat().st_mode) == 0o600

@@ -15,7 +15,8 @@ import pytest
 
 from master.audit import Audit
 from master.config import KeysConfig
-from master.giving import change_keys
+from master.giving import NEEDLESS, STALE, change_keys
+from master.rundir import RunFolder
 from master.security import (
     Given,
     Pair,
@@ -137,11 +138,27 @@ def keys_of(folder: Path, **settings: Any) -> list[str]:
     return change_keys(KeysConfig(str(folder), **settings))
 
 
+def test_a_run_without_keys_says_why(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path / "run")
+    folder.path.mkdir()
+
+    def told(given: Path) -> str:
+        with pytest.raises(RunError) as caught:
+            keys_of(given)
+        return str(caught.value)
+
+    where = "run_dir= takes the folder of a run, as in runs/my_run"
+    assert told(folder.path) == f"there is no run at {folder.path}: {where}"
+    folder.config.touch()
+    assert told(folder.config) == f"run_dir={folder.config} is a file: {where}"
+    assert "has no keys: they are made when its master first listens" in told(folder.path)
+    folder.result.touch()
+    assert told(folder.path) == "run run has ended, and nobody needed a key"
+
+
 def test_keys_are_given_listed_and_taken_back(tmp_path: Path) -> None:
     out, file = tmp_path / "alice.json", tmp_path / "keys.json"
     own = ["player: role=player, of the run itself", "evaluator: role=evaluator, of the run itself"]
-    with pytest.raises(RunError, match=r"has no keys: they are made when its master first listens"):
-        keys_of(tmp_path)
     made = run_keys(file)
     assert keys_of(tmp_path) == own
     with pytest.raises(RunError, match=r"no master of .* listens on an address with keys: start"):
@@ -149,7 +166,8 @@ def test_keys_are_given_listed_and_taken_back(tmp_path: Path) -> None:
     where = {"endpoint": "tcp://h:1", "run_id": "r", "server_key": made.server.public}
     connection = where | {"keys": {"player": asdict(made.player)}, "settings": {}}
     (tmp_path / "connection.json").write_text(json.dumps(connection))
-    told = f"{out} lets alice take part as evaluator: hand it on by a private way"
+    line = "tangram-worker connect=alice.json role=evaluator"
+    told = f"{out} lets alice take part as evaluator ({line}): hand it on by a private way"
     assert keys_of(tmp_path, add="alice", role="evaluator", out=str(out)) == [told]
     assert keys_of(tmp_path) == [*own, "alice: role=evaluator"]
     content = json.loads(out.read_text())
@@ -177,6 +195,20 @@ def test_keys_are_given_listed_and_taken_back(tmp_path: Path) -> None:
         ("key added", "alice"),
         ("key revoked", "alice"),
     ]
+
+
+def test_keys_that_are_needless_or_will_be_stale_are_told(tmp_path: Path) -> None:
+    made, out = run_keys(tmp_path / "keys.json"), tmp_path / "a.json"
+    file = tmp_path / "connection.json"
+    plain = {"endpoint": "tcp://h:1", "run_id": "r", "settings": {"service": {"port": 0}}}
+    file.write_text(json.dumps(plain))
+    assert keys_of(tmp_path)[-1] == NEEDLESS
+    file.write_text(json.dumps(plain | {"server_key": made.server.public}))
+    assert NEEDLESS not in keys_of(tmp_path)
+    assert keys_of(tmp_path, add="alice", out=str(out))[1:] == [STALE]
+    keys_of(tmp_path, revoke="alice")
+    with pytest.raises(ConfigError, match=r"is there already: delete it \(its key is none of this"):
+        keys_of(tmp_path, add="alice", out=str(out))
 
 
 def test_the_audit_is_bounded_and_counts_what_it_leaves_out(

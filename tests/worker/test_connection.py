@@ -152,7 +152,7 @@ def test_a_host_that_dns_does_not_know_is_told_once_and_looked_up_again(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     answers = ["no such host", "no such host", ""]
-    monkeypatch.setattr("worker.connection.dns_error", lambda _: answers.pop(0))
+    monkeypatch.setattr("worker.connection.host_error", lambda *_: answers.pop(0))
     timing = replace(QUICK, silence_s=0.1, join_s=1.0)
     with make_client("127.0.0.1:9", timing) as client:
         deadline = time.monotonic() + LIMIT_S

@@ -7,8 +7,9 @@ from threading import Event
 
 import pytest
 
+from tangram_agent.addresses import dns_error
 from tangram_sim.errors import RunError
-from worker.discovery import MasterAddress, await_master, dns_error, find_master
+from worker.discovery import MasterAddress, await_master, find_master, host_error
 
 pytestmark = pytest.mark.fast
 
@@ -54,7 +55,18 @@ def test_a_host_that_dns_does_not_know_is_told(
     said = {"no": "Name or service not known", "never": "no answer in 0.1 s"}[answer]
     error = dns_error("tcp://learner.lan:5555", patience_s=60.0 if answer == "no" else 0.1)
     asked.set()
-    assert error == f"DNS knows no host 'learner.lan' ({said}): check the name in connect="
+    assert error == f"DNS knows no host 'learner.lan' ({said})"
+
+
+def test_a_host_that_is_unknown_says_where_its_name_comes_from(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("worker.discovery.dns_error", lambda _: "no such host")
+    endpoint = "tcp://learner.lan:1"
+    assert host_error(endpoint, "learner.lan:1") == "no such host: check the name in connect="
+    assert host_error(endpoint, "runs/zz").startswith(
+        "no such host: it is the master's service.host and stands in runs/zz; start the master with"
+    )
 
 
 @pytest.mark.parametrize(
@@ -92,20 +104,20 @@ def test_a_file_and_its_folder_are_found(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        ("", "JSONDecodeError"),
-        ("{", "JSONDecodeError"),
-        ("[]", "TypeError"),
-        ("{}", "KeyError('endpoint')"),
-        ('{"endpoint": "tcp://h:1"}', "KeyError('run_id')"),
-        ("\x00", "JSONDecodeError"),
-        ("[" * 100_000, "RecursionError"),
+        ("", "it is not JSON)"),
+        ("{", "it is not JSON)"),
+        ("[]", "its content is another one)"),
+        ("{}", "it has no endpoint)"),
+        ('{"endpoint": "tcp://h:1"}', "it has no run_id)"),
+        ("\x00", "it is not JSON)"),
+        ("[" * 100_000, "it is nested too deeply)"),
         (
             '{"endpoint": "tcp://h:1", "run_id": "r", "server_key": "short"}',
-            "ValueError('server_key and",
+            "server_key and keys must",
         ),
-        ('{"endpoint": "tcp://h:1", "run_id": "r", "keys": []}', "AttributeError("),
-        ('{"endpoint": "tcp://h:1", "run_id": "r", "keys": {"player": {}}}', "KeyError('public')"),
-        ("7", "TypeError("),
+        ('{"endpoint": "tcp://h:1", "run_id": "r", "keys": []}', "its content is another"),
+        ('{"endpoint": "tcp://h:1", "run_id": "r", "keys": {"player": {}}}', "it has no public)"),
+        ("7", "its content is another one)"),
     ],
 )
 def test_a_file_that_is_no_connection_file(tmp_path: Path, content: str, reason: str) -> None:
@@ -142,6 +154,17 @@ def test_a_file_that_comes_late_is_waited_for(tmp_path: Path) -> None:
     path.unlink()
     with pytest.raises(RunError, match=r"no connection file is at .*c.json after 0.1 s"):
         await_master(str(path), lambda _: None, 0.1)
+
+
+def test_a_run_that_has_ended_is_told_before_it_is_waited_for(tmp_path: Path) -> None:
+    (tmp_path / "result.json").touch()
+    told: list[str] = []
+    with pytest.raises(RunError, match="no connection file is at"):
+        await_master(str(tmp_path), told.append, 0.1)
+    assert told == [
+        f"run {tmp_path.name} has ended, unless its master goes on with it: waits for the "
+        f"connection file {tmp_path}, for 0.1 s at most"
+    ]
 
 
 def test_an_address_in_a_file_is_checked(tmp_path: Path) -> None:

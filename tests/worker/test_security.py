@@ -48,7 +48,8 @@ from tests.worker.conversation import (
     write_connection,
 )
 from worker.client import Client
-from worker.discovery import find_master
+from worker.connection import Sockets
+from worker.discovery import MasterAddress, find_master
 
 pytestmark = pytest.mark.cluster
 
@@ -113,7 +114,8 @@ def test_other_keys_are_turned_away_and_the_worker_names_its_file(
         "worker": replace(keys, player=other.player),
         "none": None,
     }.get(wrong, other)
-    with staged(keys=None if wrong == "of a plain master" else keys) as stage:
+    log = Audit(tmp_path / "audit.jsonl")
+    with staged(keys=None if wrong == "of a plain master" else keys, audit=log) as stage:
         path = write_file(tmp_path, stage.hub, given)
         reason = turned_away(stage, path)
         assert reason == (
@@ -122,9 +124,23 @@ def test_other_keys_are_turned_away_and_the_worker_names_its_file(
             "running"
         )
         assert stage.hub.counters["refused_keys"] >= (wrong == "worker")
+        if wrong == "worker":
+            unknown = {"event": "refused", "key": "", "public": other.player.public}
+            where = {"address": "127.0.0.1", "reason": "no key of this run"}
+            assert (unknown | where).items() <= lines(tmp_path / "audit.jsonl")[0].items()
         assert stage.hub.peers == []
     # It was told at once, too, not only when the patience was over.
     assert [r.message for r in caplog.records if r.name == "worker.connection"] == [reason]
+
+
+def test_a_file_of_another_role_says_what_to_add() -> None:
+    key = "k" * 40
+    given = MasterAddress("tcp://h:1", "r", key, {"evaluator": (key, key)})
+    with (
+        zmq.Context() as context,
+        pytest.raises(RunError, match="only: add role=evaluator"),
+    ):
+        Sockets(context, given, "player")
 
 
 def test_an_address_alone_is_not_enough() -> None:
@@ -390,7 +406,7 @@ def test_a_revoked_key_ends_its_process_at_once_and_the_others_lose_nothing(
             told = decode_from_master(end.recv_multipart(), None)
             assert told == Stop("the key bob was revoked")
             assert [peer.holder for peer in stage.hub.peers] == ["player"]
-            assert isinstance(asked(stage, end, Heartbeat({})), Stop)
+            assert asked(stage, end, Heartbeat({})) == told
             while beside.poll(100):  # what was on its way
                 beside.recv()
             client.newest_weights()
@@ -399,4 +415,5 @@ def test_a_revoked_key_ends_its_process_at_once_and_the_others_lose_nothing(
             stage.until(stage.batches)
             assert client.counters["reconnects"] == 0
             assert not beside.poll(500)
-    assert {"event": "refused", "key": "bob"}.items() <= lines(tmp_path / "audit.jsonl")[-1].items()
+    again = {"event": "refused", "key": "bob", "address": "127.0.0.1", "reason": "revoked"}
+    assert again.items() <= lines(tmp_path / "audit.jsonl")[-1].items()

@@ -2,13 +2,14 @@
 
 import json
 import re
-from dataclasses import replace
+from collections import defaultdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
 import zmq
 
-from master.security import make_keys
+from master.security import make_keys, make_pair
 from tangram_agent.messages import RunStatus
 from tangram_sim.errors import RunError, TangramError
 from tests.master.dealers import Stage, staged
@@ -17,7 +18,7 @@ from tests.master.test_result import RESULT
 from tests.worker.conversation import served
 from tests.worker.test_security import write_file
 from worker.config import StatusConfig
-from worker.status import ask_status, show_status
+from worker.status import _evaluator, _lines, ask_status, show_status
 
 pytestmark = pytest.mark.cluster
 
@@ -96,6 +97,27 @@ def test_a_run_without_an_evaluator_says_how_to_start_one(
     start = f"tangram-worker connect={path} role=evaluator"
     said = f"no evaluator yet (tangram-train starts its own): {start}"
     assert shown.endswith(f"\n{said}\n") == told
+
+
+def test_the_line_that_starts_an_evaluator_works_as_it_is(tmp_path: Path) -> None:
+    path, content = tmp_path / "c.json", {"endpoint": "tcp://h:1", "run_id": "r"}
+    mine = content | {"settings": {"reward": {"name": "/my own.py:near"}}}
+    path.write_text(json.dumps(mine))
+    start = f"tangram-worker connect={path} role=evaluator"
+    assert _evaluator(str(path)) == f"{start} 'reward.name=/my own.py:near'"
+    assert _evaluator("h:1") == "tangram-worker connect=h:1 role=evaluator"
+    pair, server = asdict(make_pair()), make_pair().public
+    path.write_text(json.dumps(content | {"server_key": server, "keys": {"player": pair}}))
+    said = f"{path} has no key for one, tangram-keys makes it (add=NAME role=evaluator)"
+    assert _evaluator(str(path)) == said
+
+
+def test_who_was_refused_is_shown_where_anybody_was() -> None:
+    numbers = defaultdict(float, {"hub/refused_keys": 3.0, "hub/refused_handshakes": 1000.0})
+    shown = dict(_lines(numbers, {}))
+    assert shown["refused keys"] == "3 with no key for this run and role: see audit.jsonl"
+    assert shown["ended handshakes"] == "1,000 connections that showed no key"
+    assert not {"refused keys", "ended handshakes"} & set(dict(_lines(defaultdict(float), {})))
 
 
 def test_nobody_there_is_told(tmp_path: Path) -> None:
