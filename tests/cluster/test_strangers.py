@@ -24,7 +24,7 @@ from tests.cluster.players import (
 pytestmark = pytest.mark.cluster
 KEYS = ("service.bind=127.0.0.1",)
 PLAIN = (*KEYS, "service.auth=off")
-# 50 where there is little else to do; without bounds 30 of them cost 940, a topic 1,700.
+# 16 where there is little else to do; without bounds 30 of them cost 940, a topic 1,700.
 MOST_MIB = 64
 
 
