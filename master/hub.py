@@ -176,7 +176,9 @@ class Hub:
     def acknowledge(self, arrival: EpisodesArrived) -> None:
         """Tell the worker that its batch is safe; once for each arrival, after its insert."""
         key = (arrival.role, arrival.index)
-        self._waiting[key] = max(0, self._waiting[key] - 1)
+        self._waiting[key] -= 1
+        if self._waiting[key] <= 0:
+            del self._waiting[key]  # their sum is taken for each batch
         ledger = self._registry.ledger(key, arrival.incarnation)
         if ledger is None or not ledger.release(arrival.sequence):
             return  # a newer process has the index, or this was told before

@@ -12,6 +12,7 @@ from master.gate import Room
 from tangram_agent.arrays import MAX_FRAME_BYTES
 from tangram_lab.benchmarks.strangers import Strangers, subscribe
 from tests.cluster.players import (
+    TCP,
     Player,
     finish,
     master,
@@ -23,7 +24,6 @@ from tests.cluster.players import (
 
 pytestmark = pytest.mark.cluster
 KEYS = ("service.bind=127.0.0.1",)
-PLAIN = (*KEYS, "service.auth=off")
 # 16 where there is little else to do; without bounds 30 of them cost 940, a topic 1,700.
 MOST_MIB = 64
 
@@ -102,7 +102,7 @@ def test_3300_who_say_nothing_take_no_descriptors(folder: Path) -> None:
 
 
 def test_a_topic_of_16_mib_costs_nothing(folder: Path) -> None:
-    with trained(folder, *PLAIN) as run:
+    with trained(folder, *TCP) as run:
         before = run.resident()
         assert not subscribe(run.where["weights_endpoint"], 16 * 2**20)
         assert run.resident() - before <= MOST_MIB

@@ -92,6 +92,15 @@ def test_who_does_not_fit_is_told_why(
         assert (stage.hub.counters[counter], stage.hub.peers) == (1, [])
 
 
+def test_what_a_peer_sends_forges_no_line_of_the_log(
+    stage: Stage, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert isinstance(stage.dealer().ask(hello(run_id="x\nFORGED \x1b[2J")), Refused)
+    [line] = caplog.messages
+    assert line.isprintable()
+    assert "x\\nFORGED \\x1b[2J" in line
+
+
 def test_the_newest_process_of_an_index_wins(stage: Stage) -> None:
     old, new = stage.dealer(), stage.dealer()
     old.join(index=0, process="old")
@@ -167,9 +176,11 @@ def test_weights_come_again_for_those_who_got_them_and_late_for_others(
         for later, found in ((9.9, []), (10.0, [2]), (29.9, []), (30.0, [2]), (69.9, [])):
             now = later
             assert asked(1) == found, later
-        stage.dealer().join()  # nor does HELLO make it sooner
-        now = 69.9
+        dealer = stage.dealer()
+        dealer.join()  # the same process: HELLO does not make it sooner
         assert asked(1) == []
+        now = 70.0
+        assert asked(1) == [2]
 
 
 def test_weights_are_broadcast_as_one_frame(stage: Stage) -> None:

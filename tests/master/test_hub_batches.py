@@ -185,6 +185,28 @@ def test_batches_that_wait_are_bounded_over_all_processes_of_an_index(stage: Sta
     stage.counted("batches", WINDOW + 1)
 
 
+def test_batches_that_wait_are_bounded_over_those_who_have_left(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Index after index would fill the memory, a window each."""
+    monkeypatch.setattr("master.hub.SPARE_PEERS", 0)
+    left, late = stage.dealer(), stage.dealer()
+    left.join(process="left")
+    left.send(*range(1, WINDOW + 1))
+    left.say(Bye("done"))
+    stage.until(lambda: not stage.hub.peers)
+    late.join(process="late", index=5)
+    answer = late.ask(batch(1).encode(SPEC))
+    assert isinstance(answer, Reject)
+    assert not answer.final
+    stage.hub.acknowledge(stage.batches()[0])
+    late.send(1)
+    stage.counted("batches", WINDOW + 1)
+    for arrival in stage.batches():
+        stage.hub.acknowledge(arrival)
+    assert not stage.hub._waiting
+
+
 def test_what_the_disk_lost_is_told_when_its_worker_comes_back(
     stage: Stage, caplog: pytest.LogCaptureFixture
 ) -> None:

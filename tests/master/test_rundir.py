@@ -56,6 +56,12 @@ def test_only_one_master_works_in_a_folder(tmp_path: Path) -> None:
     RunFolder(tmp_path).lock().close()
 
 
+def test_nobody_else_can_lock_a_folder(tmp_path: Path) -> None:
+    (tmp_path / ".lock").touch(0o644)  # of an older version
+    with RunFolder(tmp_path).lock():
+        assert stat.S_IMODE((tmp_path / ".lock").stat().st_mode) == 0o600
+
+
 def test_what_is_written_is_read_back_and_only_the_user_may_read_the_connection(
     tmp_path: Path,
 ) -> None:

@@ -402,7 +402,18 @@ def test_a_revoked_key_ends_its_process_at_once_and_the_others_lose_nothing(
 
             stage.until(lambda: publish() or beside.poll(10))
             write_keys(file, replace(keys, given={}))
-            stage.until(lambda: end.poll(0))
+            # While somebody says more than one poll takes.
+            loud = raw(stage, keys, keys.player)
+            assert asked(stage, loud, Heartbeat({})) == Greet()
+            with monkeypatch.context() as flooded:
+                flooded.setattr("master.hub.MAX_DRAIN", 1)
+
+                def shouted() -> int:
+                    for _ in range(5):
+                        loud.send_multipart(Heartbeat({}).encode(), zmq.NOBLOCK)
+                    return int(end.poll(0))
+
+                stage.until(shouted)
             told = decode_from_master(end.recv_multipart(), None)
             assert told == Stop("the key bob was revoked")
             assert [peer.holder for peer in stage.hub.peers] == ["player"]
