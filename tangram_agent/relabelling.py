@@ -97,8 +97,6 @@ def _goals(
 
 def _transitions(episodes: Episodes, goals: Singles, rewards: Singles) -> Transitions:
     count, steps = episodes.count, episodes.steps
-    done = np.zeros((count, steps), dtype=np.uint8)
-    done[:, -1] = 1
     size = count * steps
     return Transitions(
         state=episodes.corners[:, :-1].reshape(size, *episodes.corners.shape[2:]),
@@ -107,7 +105,7 @@ def _transitions(episodes: Episodes, goals: Singles, rewards: Singles) -> Transi
         reward=rewards,
         next_state=episodes.corners[:, 1:].reshape(size, *episodes.corners.shape[2:]),
         next_placed=episodes.placed[:, 1:].reshape(size, -1),
-        done=done.reshape(size),
+        done=episodes.placed[:, 1:].all(axis=-1).astype(np.uint8).reshape(size),
         goal=goals,
     )
 

@@ -58,7 +58,7 @@ class Transitions:
         placed, next_placed: (B, K) uint8.
         action: (B, A) float32.
         reward: (B,) float32.
-        done: (B,) uint8, 1 where next_state is terminal.
+        done: (B,) uint8, 1 where next_state is terminal; a time limit is not.
         goal: (B, V, 2) float32 target corners.
     """
 

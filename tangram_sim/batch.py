@@ -57,8 +57,10 @@ class BatchedEnv:
     An action is (x, y, angular velocity) in [-1, 1], with one entry before them that names the
     token if there are several, and with `sim.allow_flip` one more between, above 0 where the token
     is to be turned over before it moves (see `actions.flips`). A token that had its
-    `actions_per_token` actions is placed. An action that names a placed token is refused: it moves
-    nothing, but uses up its step. One that would set a lifted token down on others by more than
+    `actions_per_token` actions is placed, and once all are the episode is over for good. A lone
+    token that has several actions is never placed: a time limit ends its episode, and it could as
+    well go on. An action that names a placed token is refused: it moves nothing, but uses up its
+    step. One that would set a lifted token down on others by more than
     `sim.max_overlap` of its area moves nothing either, and is one of the token's actions.
 
     Attributes:
@@ -89,6 +91,7 @@ class BatchedEnv:
         self.action_size = action_size(layout.tokens, sim)
         self.bound = corner_bound(layout.tokens, sim)
         self.task = sim.task
+        self._ends_by_placing = layout.tokens > 1 or sim.actions_per_token == 1
         self._worlds = [make_world(layout, sim) for _ in range(count)]
         self._targets: TargetPictures | None = None
         self._moves: Ints = np.zeros((count, layout.tokens), dtype=np.int64)
@@ -101,7 +104,7 @@ class BatchedEnv:
     @property
     def placed(self) -> Bools:
         """(B, K), see the class."""
-        placed: Bools = self._moves >= self.sim.actions_per_token
+        placed: Bools = (self._moves >= self.sim.actions_per_token) & self._ends_by_placing
         return placed
 
     def reset(

@@ -51,7 +51,7 @@ class SimConfig(Settings, section="sim"):
         2.0, "side of the square arena", low=1e-3, high=1e3, unit="as the tokens", part=NETWORK
     )
     actions_per_token: int = setting(
-        1, "actions after which a token counts as placed", low=1, high=100
+        1, "actions that each token has", low=1, high=100
     )
     substeps: int = setting(
         8,

@@ -1,5 +1,7 @@
 """Tables: a trajectory in, the exact transitions out."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -51,6 +53,14 @@ def rows(batch: Transitions) -> list[tuple[object, ...]]:
         )
         for i in range(batch.count)
     ]
+
+
+def test_only_where_all_tokens_are_placed_does_nothing_follow() -> None:
+    played = flatten(replace(EPISODE, placed=np.zeros((1, 4, 1), np.uint8)))
+    assert played.done.tolist() == [0, 0, 0]  # a time limit
+    assert flatten(EPISODE).done.tolist() == [0, 0, 1]
+    two = np.array([[[0, 0], [1, 0], [1, 1], [1, 1]]], np.uint8)
+    assert flatten(replace(EPISODE, placed=two)).done.tolist() == [0, 1, 1]
 
 
 PLAYED = [

@@ -190,6 +190,23 @@ def test_horizon_refusal_and_info() -> None:
     assert (terminated, truncated) == (True, False)  # all are placed
 
 
+@pytest.mark.parametrize("shapes", [("square",), ("square", "small_triangle")])
+@pytest.mark.parametrize("actions", [1, 2])
+def test_a_lone_token_of_several_actions_ends_by_a_time_limit(
+    shapes: tuple[str, ...], actions: int
+) -> None:
+    env = kinematic(shapes=shapes, actions_per_token=actions)
+    env.reset(seed=0)
+    named = np.repeat(np.linspace(-1.0, 1.0, len(shapes)), actions)
+    ends = [
+        env.step(np.array([*[token] * (len(shapes) > 1), 0, 0, 0], dtype=np.float32))[2:4]
+        for token in named
+    ]
+    limit = len(shapes) == 1 and actions > 1  # it could go on: it is not placed
+    assert ends == [(False, False)] * (len(named) - 1) + [(not limit, limit)]
+    assert not limit or not env.batch.placed.any()
+
+
 def nearly(env: TangramEnv) -> dict[str, Any]:
     """What is told of an action that misses about 6 % of the square, its reward included."""
     env.reset(seed=0)
