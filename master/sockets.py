@@ -24,8 +24,10 @@ HANDSHAKE_MS = 10_000
 BACKLOG = 1024
 # Of a subscription or a step of a handshake; more than encryption adds to a frame.
 MAX_COMMAND = 1024
-# ZMTP pings find connections that died without a word.
-PING_MS = 5000
+# TCP finds connections that died without a word. ZMTP's own pings end the process that sends them:
+# for one that has been reset while its queue was full, an assertion of ZeroMQ's fails
+# (https://github.com/zeromq/libzmq/issues/4364).
+DEAD_S, PROBE_S = 30, 5
 
 
 class Received(NamedTuple):
@@ -149,7 +151,11 @@ class Sockets:
         socket.setsockopt(zmq.BACKLOG, BACKLOG)
         most = MAX_COMMAND + (MAX_FRAME_BYTES if kind == zmq.ROUTER else 0)
         socket.setsockopt(zmq.MAXMSGSIZE, most)
-        socket.setsockopt(zmq.HEARTBEAT_IVL, PING_MS)
+        socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
+        socket.setsockopt(zmq.TCP_KEEPALIVE_IDLE, PROBE_S)
+        socket.setsockopt(zmq.TCP_KEEPALIVE_INTVL, PROBE_S)
+        socket.setsockopt(zmq.TCP_KEEPALIVE_CNT, DEAD_S // PROBE_S - 1)
+        socket.setsockopt(zmq.TCP_MAXRT, DEAD_S * 1000)  # of what is sent
         socket.setsockopt(zmq.IPV6, int(":" in bind))
         if kind == zmq.ROUTER:
             # Else answers to those who are gone vanish without a word.
