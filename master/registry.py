@@ -19,6 +19,8 @@ from tangram_sim.errors import RunError, TangramError
 CROWDED = 0.9  # share of the room from which on there is a warning
 # One that asks for weights again before it has shown that it got them waits so long, then twice.
 WEIGHTS_AGAIN_S = 10.0
+# Answers about the run: so many in this time over all who ask, and one for each connection.
+STATUS_ANSWERS, STATUS_AGAIN_S = 64, 0.5
 Key = tuple[str, int]
 
 log = logging.getLogger(__name__)
@@ -286,6 +288,22 @@ class Registry:
         ledger.process = hello.process
         self._ledgers[key] = ledger
         return ledger
+
+
+class Askers:
+    """Those who were told how the run stands a moment ago; they need not take part."""
+
+    def __init__(self) -> None:
+        self._told = dict[bytes, float]()  # connection -> when, oldest first
+
+    def may_have(self, identity: bytes, now: float) -> bool:
+        """Whether to tell a connection now; what it does not read stays in memory here."""
+        while self._told and now - next(iter(self._told.values())) >= STATUS_AGAIN_S:
+            del self._told[next(iter(self._told))]
+        if identity in self._told or len(self._told) >= STATUS_ANSWERS:
+            return False
+        self._told[identity] = now
+        return True
 
 
 def differing(ours: Mapping[str, str], theirs: Mapping[str, str]) -> list[str]:

@@ -13,6 +13,8 @@ from master.gate import AMPLE, Gate, Room
 from master.security import Authenticator, Holder, Keys
 from tangram_agent.addresses import IPC
 from tangram_agent.arrays import MAX_FRAME_BYTES
+from tangram_agent.messages import Greet, Refused, Reject, Stop
+from tangram_agent.schema import Plain
 from tangram_sim.errors import ConfigError
 
 LINGER_MS = 1000
@@ -122,6 +124,17 @@ class Sockets:
             if error.errno != zmq.EHOSTUNREACH:
                 raise
             self._counters["unreachable"] += 1
+
+    def answer(self, identity: bytes, answer: Plain) -> None:
+        """Send a message to a peer; see `send`."""
+        self.send(identity, answer.encode())
+
+    def refuse(
+        self, identity: bytes, counter: str, answer: Reject | Refused | Stop | Greet
+    ) -> None:
+        """Send a reason, count it and tell it."""
+        self._counters.note(counter, getattr(answer, "reason", "a connection without HELLO"))
+        self.answer(identity, answer)
 
     def publish(self, frame: bytes) -> None:
         """Send to all subscribers that have room."""

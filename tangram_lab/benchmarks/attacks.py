@@ -17,7 +17,8 @@ from urllib.parse import urlsplit
 import numpy as np
 import zmq
 
-from master.hub import Hub, WelcomeInfo
+from master.admission import WelcomeInfo
+from master.hub import Hub
 from tangram_agent.arrays import MAX_FRAME_BYTES, EpisodeSpec
 from tangram_agent.messages import EpisodeBatch, Heartbeat, Hello, Scores, WantWeights
 from tangram_agent.schema import MAX_COUNT, seal
