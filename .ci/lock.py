@@ -19,8 +19,8 @@ TITLE = "# Exact versions that the tests ran with. Written by make lock: .ci/loc
 # `name==version`, with a marker where it has one -> hashes.
 Pins = dict[str, list[str]]
 
-# Building a package to look at it would run what no hash vouches for yet. antlr4-python3-runtime, of
-# hydra, comes as source only.
+# Building a package to look at it would run what no hash vouches for yet. hydra's
+# antlr4-python3-runtime comes as source only.
 ARGUMENTS = """pip compile pyproject.toml --all-extras --universal --python-version=3.11
     --constraints=constraints.txt --generate-hashes --no-annotate --no-header --quiet
     --only-binary=:all: --no-binary=antlr4-python3-runtime

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from master.delivery import EpisodesArrived, Ledger
 from master.gate import AMPLE, Room
-from tangram_agent.messages import MAX_ID, MAX_INDEX, ROLES, Hello, Refused, Stop
+from tangram_agent.messages import MAX_ID, MAX_INDEX, ROLES, TAKEN_OVER, Hello, Refused, Stop
 from tangram_agent.schema import MAX_COUNT
 from tangram_sim.errors import RunError, TangramError
 
@@ -275,8 +275,7 @@ class Registry:
             ledger = Ledger(known + 1, received, unused=last is None or last.unused)
         elif hello.incarnation < known or last.process not in ("", hello.process):
             reason = (
-                f"{key[0]} {key[1]} was taken over by a newer process "
-                f"(incarnation {known}, this is {hello.incarnation})"
+                f"{key[0]} {key[1]} {TAKEN_OVER} (incarnation {known}, this is {hello.incarnation})"
             )
             raise RefusedError("superseded", Stop(reason))
         else:
