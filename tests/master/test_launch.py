@@ -319,13 +319,13 @@ def test_a_worker_that_dies_or_stays_stopped_is_started_again(
 
 
 @pytest.mark.cluster
-@pytest.mark.parametrize("mode", ["free", "lockstep"])
+@pytest.mark.parametrize("mode", ["async", "lockstep"])
 def test_a_worker_whose_index_was_taken_is_no_failure_and_takes_part_in_no_contest(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str
 ) -> None:
     """However often; in lockstep it must have its index, and takes it back after a while."""
     monkeypatch.setattr(launch_module, "TAKE_BACK_S", 0.01)
-    times = MAX_RESTARTS + 1 if mode == "lockstep" else 1
+    times = MAX_RESTARTS + 1
     player = f"""
 import sys
 from pathlib import Path
