@@ -248,9 +248,15 @@ class Registry:
         if not odd:
             return
         listed = ", ".join(odd)
+        ours, theirs = self._fingerprints, hello.fingerprints
+        digests = (
+            f"{n}: the worker has {theirs.get(n, 'none')}, the master {ours.get(n, 'none')}"
+            for n in odd
+        )
         reason = (
-            f"its settings of {listed} differ from the master's: start both with the same "
-            f"overrides of {listed}"
+            f"its settings of {listed} differ from the master's ({'; '.join(digests)}): leave them "
+            "out, for connect=RUN_DIR brings the master's, or start both with the same overrides "
+            f"of {listed}"
         )
         counter = "refused_tokens" if "tokens" in odd else "refused_settings"
         raise RefusedError(counter, Refused(reason))
