@@ -148,9 +148,11 @@ def test_install_takes_the_cpu_build_where_it_is_offered(tmp_path: Path, offered
     if offered != "wheel":
         (tmp_path / "torch-99+cpu-py3-none-any.whl").unlink()
     if offered == "source":
-        code = f"open({str(tmp_path / 'ran')!r}, 'w')\nraise SystemExit(1)\n".encode()
+        builder = '[build-system]\nrequires = []\nbuild-backend = "own"\nbackend-path = ["."]\n'
+        code = f"open({str(tmp_path / 'ran')!r}, 'w')\n"
         with tarfile.open(tmp_path / "torch-99+cpu.tar.gz", "w:gz") as source:
-            for name, data in (("setup.py", code), ("PKG-INFO", b"Name: torch\n")):
+            for name, text in (("pyproject.toml", builder), ("own.py", code)):
+                data = text.encode()
                 about = tarfile.TarInfo(f"torch-99+cpu/{name}")
                 about.size = len(data)
                 source.addfile(about, BytesIO(data))
