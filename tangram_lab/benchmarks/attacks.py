@@ -38,7 +38,7 @@ from worker.discovery import find_master
 
 Seen = tuple[bool, str]
 ROOM_MIB = 64.0  # that the memory of a master may grow by under any attack
-ROOM_FILES = 100  # the same of its open files, under strangers
+ROOM_FILES = 300  # the same of its open files, under strangers
 OPEN_FILES = 1024  # that a master may begin with
 ENDS_S = 60.0
 LOOK_S = 0.1

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
@@ -122,7 +123,7 @@ class Watched:
         content: dict[str, Any] = json.loads((self.folder / "connection.json").read_text())
         return content
 
-    @property
+    @cached_property
     def setup(self) -> Setup:
         """Its task."""
         return make_setup(yaml.safe_load((self.folder / "config.yaml").read_text()))
