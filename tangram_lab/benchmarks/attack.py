@@ -47,7 +47,7 @@ Attack = tuple[str, str, str, Callable[[Any], Seen]]  # row, what, how much, and
 OFTEN = "service.checkpoint_minutes=0.05"
 ON_A_PORT = ("service.bind=127.0.0.1", "service.log_format=json")
 NOISE = 0.02  # of the mean reward, between two trainings of so many updates
-UPDATES = 500  # before the attacks begin
+UPDATES = 200  # before the attacks begin
 BATCHES = 40
 TASK: dict[str, Any] = {"tokens": {"shapes": ["square"], "scale": 1.0}} | {
     name: {} for name in ("sim", "reward", "agent", "net")
