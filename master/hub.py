@@ -26,6 +26,7 @@ from tangram_agent.addresses import IPC
 from tangram_agent.arrays import MAX_FRAMES, EpisodeSpec, join_frames
 from tangram_agent.messages import (
     ROLES,
+    TAKEN_OVER,
     Ack,
     Alive,
     AskStatus,
@@ -154,6 +155,7 @@ class Hub:
             New batches and scores, in the order of their arrival.
         """
         arrivals: list[Arrival] = []
+        self._sockets.listen_again()
         for holder in self._sockets.revoked():  # first: a flood must not keep anybody in
             for peer in [one for one in self.peers if one.holder == holder.name]:
                 self._revoked(peer.identity, holder.name)
@@ -426,7 +428,7 @@ class Hub:
             self._refuse_hello(identity, hello, error.counter, error.answer)
             return
         if older is not None:
-            reason = f"{peer.name} was taken over by a newer process"
+            reason = f"{peer.name} {TAKEN_OVER}"
             self._tell_of("superseded", older, reason)
             self._refuse(older.identity, "superseded", Stop(reason))
         before, peer.address, peer.holder = peer.address, self._address, self._caller.name

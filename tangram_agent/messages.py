@@ -54,6 +54,7 @@ WINDOW = 4  # messages of a worker that may be unacknowledged; a full window pau
 MAX_WINDOW = 1024
 MAX_PICTURES = 64
 MAX_ROWS = 4096
+TAKEN_OVER = "was taken over by a newer process"  # tangram-train reads it in a worker's log
 OPEN = "service.auth=off: open to whoever reaches the port"
 
 
