@@ -14,7 +14,7 @@ from master.registry import Peer, RefusedError, Registry
 from master.security import Holder
 from master.sockets import Sockets
 from tangram_agent.arrays import EpisodeSpec
-from tangram_agent.messages import ROLES, Hello, Refused, Stop, Welcome
+from tangram_agent.messages import ROLES, TAKEN_OVER, Hello, Refused, Stop, Welcome
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Admission:
             self._sockets.refuse(identity, error.counter, error.answer)
             return None
         if older is not None:
-            reason = f"{peer.name} was taken over by a newer process"
+            reason = f"{peer.name} {TAKEN_OVER}"
             self._tell_of("superseded", older, reason)
             self._sockets.refuse(older.identity, "superseded", Stop(reason))
         before, peer.address, peer.holder = peer.address, address, caller.name

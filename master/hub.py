@@ -130,6 +130,7 @@ class Hub:
             New batches and scores, in the order of their arrival.
         """
         arrivals: list[Arrival] = []
+        self._sockets.listen_again()
         self._admission.drop_revoked()  # first: a flood must not keep anybody in
         if self._sockets.wait(timeout_s):
             for _ in range(MAX_DRAIN):

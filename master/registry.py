@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from master.delivery import EpisodesArrived, Ledger
 from master.gate import AMPLE, Room
-from tangram_agent.messages import MAX_ID, MAX_INDEX, ROLES, Hello, Refused, Stop
+from tangram_agent.messages import MAX_ID, MAX_INDEX, ROLES, TAKEN_OVER, Hello, Refused, Stop
 from tangram_agent.schema import MAX_COUNT
 from tangram_sim.errors import RunError, TangramError
 
@@ -250,9 +250,15 @@ class Registry:
         if not odd:
             return
         listed = ", ".join(odd)
+        ours, theirs = self._fingerprints, hello.fingerprints
+        digests = (
+            f"{n}: the worker has {theirs.get(n, 'none')}, the master {ours.get(n, 'none')}"
+            for n in odd
+        )
         reason = (
-            f"its settings of {listed} differ from the master's: start both with the same "
-            f"overrides of {listed}"
+            f"its settings of {listed} differ from the master's ({'; '.join(digests)}): leave them "
+            "out, for connect=RUN_DIR brings the master's, or start both with the same overrides "
+            f"of {listed}"
         )
         counter = "refused_tokens" if "tokens" in odd else "refused_settings"
         raise RefusedError(counter, Refused(reason))
@@ -277,8 +283,7 @@ class Registry:
             ledger = Ledger(known + 1, received, unused=last is None or last.unused)
         elif hello.incarnation < known or last.process not in ("", hello.process):
             reason = (
-                f"{key[0]} {key[1]} was taken over by a newer process "
-                f"(incarnation {known}, this is {hello.incarnation})"
+                f"{key[0]} {key[1]} {TAKEN_OVER} (incarnation {known}, this is {hello.incarnation})"
             )
             raise RefusedError("superseded", Stop(reason))
         else:

@@ -77,6 +77,7 @@ SCORE_NAMES = (
     "episodes",
     "seconds",
 )
+TAKEN_OVER = "was taken over by a newer process"  # tangram-train reads it in a worker's log
 OPEN = "service.auth=off: open to whoever reaches the port"
 
 

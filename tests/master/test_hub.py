@@ -52,7 +52,10 @@ def test_hello_is_answered_with_all_that_a_worker_needs(stage: Stage) -> None:
 
 
 NO_ROOM = Room(RESERVE + HANDSHAKES)
-DIFFERS = "its settings of {0} differ from the master's: start both with the same overrides of {0}"
+DIFFERS = (
+    "its settings of {0} differ from the master's ({1}): leave them out, for connect=RUN_DIR "
+    "brings the master's, or start both with the same overrides of {0}"
+)
 
 
 @pytest.mark.parametrize(
@@ -61,12 +64,18 @@ DIFFERS = "its settings of {0} differ from the master's: start both with the sam
         (
             {"fingerprints": FINGERPRINTS | {"tokens": "other"}},
             "refused_tokens",
-            DIFFERS.format("tokens"),
+            DIFFERS.format(
+                "tokens", f"tokens: the worker has other, the master {FINGERPRINTS['tokens']}"
+            ),
         ),
         (
             {"fingerprints": {"tokens": FINGERPRINTS["tokens"], "net": "more"}},
             "refused_settings",
-            DIFFERS.format("net, sim"),
+            DIFFERS.format(
+                "net, sim",
+                "net: the worker has more, the master none; "
+                f"sim: the worker has none, the master {FINGERPRINTS['sim']}",
+            ),
         ),
         (
             {"v": PROTOCOL + 1},

@@ -1,18 +1,23 @@
 """The master's sockets as a stranger sees them."""
 
+import shutil
 import socket
 import struct
 import subprocess
 import sys
+import tempfile
 import time
-from tempfile import TemporaryDirectory
+from pathlib import Path
 
 import pytest
 
+from master import sockets as sockets_module
 from master.counters import Counters
 from master.gate import _connection
 from master.sockets import DEAD_S, PROBE_S, Sockets
 from tangram_agent.addresses import IPC
+from tests.agent.messages import weights
+from tests.master.dealers import staged
 
 pytestmark = pytest.mark.cluster
 
@@ -81,7 +86,7 @@ for one in made:
 def test_who_is_gone_while_its_queue_is_full_ends_nobody() -> None:
     """ZeroMQ aborts the process that pings such a connection."""
     with (
-        TemporaryDirectory(dir="/tmp") as folder,  # paths of sockets are short
+        tempfile.TemporaryDirectory(dir="/tmp") as folder,  # paths of sockets are short
         subprocess.Popen(
             [sys.executable, "-c", BUSY, f"ipc://{folder}/m"],
             stdin=subprocess.PIPE,
@@ -97,3 +102,37 @@ def test_who_is_gone_while_its_queue_is_full_ends_nobody() -> None:
                 peer.sendall(b"\0\x01x" * 1000)
         process.stdin.close()
         assert process.wait(60) == 0
+
+
+@pytest.mark.parametrize("what", ["files", "folder", "folder taken"])
+def test_who_comes_after_the_sockets_were_cleaned_away_joins(
+    monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    """It is told, and who was there before stays."""
+    monkeypatch.setattr(sockets_module, "LOOK_S", 0.0)
+    with tempfile.TemporaryDirectory() as short:  # a socket's path must be
+        folder = Path(short) / "t"
+        folder.mkdir(mode=0o700)
+        with staged(f"ipc://{folder}/run") as stage:
+            before = stage.dealer()
+            before.join()
+            shutil.rmtree(folder)
+            if what == "files":
+                folder.mkdir(mode=0o700)
+            elif what == "folder taken":
+                folder.touch()
+                stage.until(lambda: stage.hub.counters["removed_sockets"] >= 2)
+                folder.unlink()
+            stage.until(lambda: len(list(folder.glob("run.*"))) == 2)
+            assert stage.dealer().join(process="p2").index == 1
+            news = stage.subscriber()
+
+            def heard() -> int:
+                stage.hub.publish(weights(version=stage.hub.counters["published"] + 1))
+                return int(news.poll(10))
+
+            stage.until(heard)
+            assert before.join().index == 0
+            if what != "folder taken":
+                assert stage.hub.counters["removed_sockets"] == 2
+        assert list(folder.iterdir()) == []
