@@ -11,6 +11,7 @@ from master.rate_limiter import LAG_UPDATES, RateLimiter
 from master.resumable import check_same_task
 from tangram_agent.checkpoints import ACTING, SETUP
 from tangram_agent.learner import Learner
+from tangram_agent.motion import Motions, motions_of
 from tangram_agent.relabelling import with_relabelled
 from tangram_agent.replay import ReplayBuffer
 from tangram_agent.setup import Setup
@@ -18,7 +19,8 @@ from tangram_agent.types import Episodes, Transitions, Weights
 from tangram_sim.errors import ConfigError
 from tangram_sim.rewards import make_reward
 
-STREAMS = ("replay", "hindsight")
+STREAMS = ("replay", "hindsight", "motion")
+SEEN_MOTIONS = 256  # transitions of whole episodes that the motion model sees in an update
 LEARNER = "learner"  # the checkpoint's file of networks and optimisers
 
 Arrays = dict[str, dict[str, npt.NDArray[Any]]]
@@ -52,7 +54,9 @@ class Trainer:
         self.episodes = 0
         self.batch: Transitions | None = None
         self._generators = {
-            name: np.random.default_rng([seed, stream]) for stream, name in enumerate(STREAMS)
+            name: np.random.default_rng([seed, stream])
+            for stream, name in enumerate(STREAMS)
+            if name != "motion" or setup.learns_motion
         }
 
     @property
@@ -94,9 +98,18 @@ class Trainer:
         """One update, at the used share of the budget; returns its losses."""
         self.batch = self.replay.sample(self.setup.agent.batch_size, self._generators["replay"])
         prepared = self.learner.prepared(self.batch, self._generators["hindsight"])
-        losses = self.learner.update(prepared, share)
+        losses = self.learner.update(prepared, share, self._motions())
         self.rate_limiter.updated()
         return losses
+
+    def _motions(self) -> Motions | None:
+        """What whole episodes of the replay tell of the motion, where it is learned."""
+        if not self.setup.learns_motion:
+            return None
+        steps = self.setup.horizon
+        count = max(1, SEEN_MOTIONS // steps)
+        past, ends = self.replay.sample_episodes(count, steps, self._generators["motion"])
+        return motions_of(past, ends.astype(np.float64), self.setup.layout, self.setup.sim)
 
     def go_back(self, state: dict[str, npt.NDArray[Any]]) -> None:
         """Take the learner back to a state of its own; the updates since are due again."""

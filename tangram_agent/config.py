@@ -108,6 +108,15 @@ class AgentConfig(Settings, section="agent"):
     afterstate: bool = setting(
         True, "the critic sees the graph as the action would leave it", part=NETWORK
     )
+    motion: str = setting(
+        "learned",
+        "what a command comes to: learned from the replay, and watched in each episode; or the "
+        "exact rigid motion, which makes the agent model-based",
+        choices=("learned", "exact"),
+        only={"readout": "pair"},
+        unless={"afterstate": False},
+        part=NETWORK,
+    )
     angle_head: str = setting(
         "kfold",
         "one output, or two with angle = atan2 / k",

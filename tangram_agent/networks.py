@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from tangram_agent.attention import GraphEncoder
 from tangram_agent.config import AgentConfig, NetConfig
 from tangram_agent.graph import Graph
+from tangram_agent.motion import MotionModel
 from tangram_agent.pairs import PairGraph, Pairs
 from tangram_agent.scenes import SceneGraph, Scenes
 from tangram_agent.setup import Setup
@@ -209,12 +210,13 @@ class Networks(nn.Module):
         contacts = setup.pairs and setup.contacts
         self.actor = Actor(graph, setup.agent, setup.net)
         self.critic = Critic(graph, setup.agent, setup.net, contacts)
+        self.motion = MotionModel() if setup.learns_motion else None
         # Of pairs the critic chooses among what the actor proposes: both play.
         self._both_play = setup.pairs
 
     @property
     def playing(self) -> nn.Module:
-        """What a worker needs: the actor, and the critic where it chooses."""
+        """What a worker needs: the actor, or all networks where the critic chooses."""
         return self if self._both_play else self.actor
 
 

@@ -16,10 +16,13 @@ from torch import Tensor
 
 from tangram_agent.adam import Adam
 from tangram_agent.coverage import covered_share, covering, worths
+from tangram_agent.motion import Belief, motions_of
 from tangram_agent.networks import Critic, Networks
 from tangram_agent.pairs import PairGraph, Pairs
 from tangram_agent.setup import Setup
-from tangram_sim.arrays import Bools, Floats, Ints
+from tangram_agent.types import Past
+from tangram_sim.actions import velocities_of
+from tangram_sim.arrays import Bools, Floats, Ints, Singles
 from tangram_sim.layout import Layout
 
 _SHORT_LIST = 8  # proposals of an environment that are valued for all pieces
@@ -118,14 +121,14 @@ class Choice:
     Attributes:
         token: (B,) which token.
         flip: (B,) whether it is turned over.
-        start: (B, 3) where it lies.
-        pose: (B, 3) where it goes.
+        pose: (B, 3) where it is to go.
+        velocity: (B, 3) in [-1, 1], the command that takes it there.
     """
 
     token: Ints
     flip: Bools
-    start: Floats
     pose: Floats
+    velocity: Singles
 
 
 class Planner:
@@ -133,11 +136,19 @@ class Planner:
 
     def __init__(self, networks: Networks, setup: Setup) -> None:
         self._networks, self._layout, self._agent = networks, setup.layout, setup.agent
+        self._motion, self._sim = networks.motion, setup.sim
         self._graph = PairGraph(setup.layout, setup.sim.arena, setup.agent)
         self._contacts = setup.contacts
         self._turns_over = setup.layout.chiral & setup.sim.allow_flip
 
-    def choose(self, corners: Floats, placed: Bools, goals: Floats, refine: bool = True) -> Choice:
+    def choose(
+        self,
+        corners: Floats,
+        placed: Bools,
+        goals: Floats,
+        refine: bool = True,
+        past: Past | None = None,
+    ) -> Choice:
         """What to play; where all tokens are placed, some action of the first one.
 
         Args:
@@ -145,22 +156,57 @@ class Planner:
             placed: (B, K) which tokens are placed.
             goals: (B, V, 2) of the target.
             refine: take the gradient steps that the agent is configured for.
+            past: what was seen of these episodes before, if anything.
         """
-        start = self._layout.poses(corners)
-        scene = self._scene(corners, start, goals)
+        scene = self._scene(corners, self._layout.poses(corners), goals)
         with torch.no_grad():
+            belief = self._belief(corners, past)
             candidates, pose = self._short_list(scene, self._open(placed, goals))
-            best = self._best(scene, candidates, pose)
-        chosen, pose = candidates.at(best), pose[best]
+            velocity, reached = self._reached(scene, candidates, pose, belief)
+            best = self._best(scene, candidates, reached)
+        chosen, pose, velocity = candidates.at(best), pose[best], velocity[best]
         if refine and self._agent.refine_steps:
             pose = self._refined(scene, chosen, pose)
-        token = chosen.token.numpy()
+            with torch.no_grad():
+                velocity, _ = self._reached(scene, chosen, pose, belief)
         return Choice(
-            token=token,
+            token=chosen.token.numpy(),
             flip=chosen.flip.numpy() > 0.5,
-            start=start[np.arange(len(token)), token],
             pose=pose.numpy().astype(np.float64),
+            velocity=velocity.numpy(),
         )
+
+    def velocity_to(self, pose: Floats, wanted: Floats) -> Singles:
+        """Commands (B, 3) that take tokens from poses (B, 3) to others, in worlds not yet seen."""
+        way = torch.from_numpy(velocities_of(wanted - pose, self._sim).astype(np.float32))
+        with torch.no_grad():
+            prior = None if self._motion is None else self._motion.prior(len(way))
+            return self._command(way, prior).numpy()
+
+    def _belief(self, corners: Floats, past: Past | None) -> Belief | None:
+        """What is believed of the motion in each environment; None: it is taken to be exact."""
+        if self._motion is None:
+            return None
+        if past is None:
+            return self._motion.prior(len(corners))
+        return self._motion.belief(motions_of(past, corners, self._layout, self._sim))
+
+    def _command(self, way: Tensor, belief: Belief | None) -> Tensor:
+        if self._motion is None or belief is None:
+            return way.clamp(-1.0, 1.0)
+        return self._motion.command(belief, way)
+
+    def _reached(
+        self, scene: Scene, candidates: Candidates, pose: Tensor, belief: Belief | None
+    ) -> tuple[Tensor, Tensor]:
+        """Commands (M, 3) that take tokens to poses (M, 3), and the poses that they come to."""
+        pairs = scene.pairs(candidates)
+        way = self._graph.way(pairs, pose)
+        if self._motion is None or belief is None:
+            return way.clamp(-1.0, 1.0), pose
+        own = belief.at(candidates.row)
+        command = self._motion.command(own, way)
+        return command, self._graph.moved(pairs, self._motion.predict(own, command)[0]).pose
 
     def _scene(self, corners: Floats, start: Floats, goals: Floats) -> Scene:
         layout = self._layout

@@ -13,9 +13,9 @@ from tangram_agent.networks import Networks
 from tangram_agent.planning import Planner
 from tangram_agent.scenes import Scenes, next_token
 from tangram_agent.setup import Setup
-from tangram_agent.types import Weights
+from tangram_agent.types import Past, Weights
 from tangram_agent.weights import load_arrays, to_arrays
-from tangram_sim.actions import make_actions, velocities_of
+from tangram_sim.actions import make_actions
 from tangram_sim.arrays import Floats, Singles
 
 Flags = npt.NDArray[np.bool_] | npt.NDArray[np.uint8]
@@ -61,6 +61,7 @@ class Policy:
         placed: Flags,
         goals: Floats | Singles,
         refine: bool = True,
+        past: Past | None = None,
     ) -> Singles:
         """Actions (B, A) in [-1, 1], noise off.
 
@@ -69,6 +70,8 @@ class Policy:
             placed: (B, K) which tokens are placed.
             goals: (B, V, 2) corners of the targets.
             refine: take the steps of `agent.refine_steps`, where the agent has such.
+            past: what was seen of these episodes before, if anything: an agent that learns what a
+                command comes to corrects itself by it.
         """
         if self._planner is None:
             token, velocity = self._velocity(corners, placed, goals)
@@ -76,9 +79,9 @@ class Policy:
         else:
             exact = np.asarray(corners, np.float64)
             wanted = np.asarray(goals, np.float64)
-            choice = self._planner.choose(exact, np.asarray(placed, np.bool_), wanted, refine)
-            token, flip = choice.token, choice.flip
-            velocity = self._velocity_to(choice.start, choice.pose)
+            flags = np.asarray(placed, np.bool_)
+            choice = self._planner.choose(exact, flags, wanted, refine, past)
+            token, flip, velocity = choice.token, choice.flip, choice.velocity
         return make_actions(token, velocity, flip, self.tokens, self.sim)
 
     def _velocity(
@@ -92,23 +95,19 @@ class Policy:
             velocity, _ = self._network(scenes)
         return token.numpy(), velocity.numpy()
 
-    def _velocity_to(self, pose: Floats, wanted: Floats) -> Singles:
-        """Velocities (B, 3) in [-1, 1] from poses (B, 3) to others, as far as one reaches."""
-        velocity: Singles = velocities_of(wanted - pose, self.sim).astype(np.float32)
-        return np.clip(velocity, -1.0, 1.0)
-
     def explore(
         self,
         corners: Floats | Singles,
         placed: Flags,
         goals: Floats | Singles,
         generators: Sequence[np.random.Generator],
+        past: Past | None = None,
     ) -> Singles:
         """Actions (B, A) with Gaussian noise, a share of them drawn uniformly.
 
         Each environment has its own generator, so the noise does not depend on the batching.
         """
-        actions = self.act(corners, placed, goals, refine=False)
+        actions = self.act(corners, placed, goals, refine=False, past=past)
         for i, (action, generator) in enumerate(zip(actions, generators, strict=True)):
             velocity = action[-3:]
             if generator.random() < self.config.uniform_share:
@@ -116,15 +115,19 @@ class Policy:
                     velocity[:] = generator.uniform(-1.0, 1.0, 3)
                 else:
                     here = self.layout.poses(np.asarray(corners[i], np.float64))
-                    action[:] = self._anything(here, np.asarray(placed)[i], generator)
+                    open_to = np.asarray(placed)[i]
+                    action[:] = self._anything(self._planner, here, open_to, generator)
             else:
                 velocity += self.config.noise * generator.standard_normal(3)
         return np.clip(actions, -1.0, 1.0)
 
-    def _anything(self, here: Floats, placed: Flags, generator: np.random.Generator) -> Singles:
+    def _anything(
+        self, planner: Planner, here: Floats, placed: Flags, generator: np.random.Generator
+    ) -> Singles:
         """An action (A,): any token that is left goes to any pose in the arena, on any side.
 
         Args:
+            planner: knows the way there.
             here: (K, 3) poses of the tokens.
             placed: (K,) which are placed; where all are, the first one is named.
             generator: draws it.
@@ -134,7 +137,7 @@ class Policy:
         reach = (self.sim.arena / 2.0, self.sim.arena / 2.0, np.pi)
         wanted = generator.uniform(-1.0, 1.0, 3) * reach
         flip = self.sim.allow_flip and generator.choice((-1.0, 1.0)) > 0.0
-        velocity = self._velocity_to(here[None, token], wanted[None])
+        velocity = planner.velocity_to(here[None, token], wanted[None])
         named, turned = np.array([token]), np.array([flip])
         action: Singles = make_actions(named, velocity, turned, self.tokens, self.sim)[0]
         return action

@@ -3,7 +3,8 @@
 import numpy as np
 import numpy.typing as npt
 
-from tangram_agent.types import Transitions
+from tangram_agent.types import Past, Transitions
+from tangram_sim.arrays import Singles
 from tangram_sim.errors import RunError
 
 Array = npt.NDArray[np.generic]
@@ -62,6 +63,26 @@ class ReplayBuffer:
             raise ValueError("cannot sample from an empty replay buffer")
         rows = generator.integers(len(self), size=size)
         return Transitions(**{name: column[rows] for name, column in self._columns.items()})  # type: ignore[arg-type]
+
+    def sample_episodes(
+        self, count: int, steps: int, generator: np.random.Generator
+    ) -> tuple[Past, Singles]:
+        """Episodes of so many steps, drawn uniformly with replacement: their past and their ends.
+
+        Raises:
+            ValueError: none is whole.
+        """
+        # Rows are added episode by episode, so each begins at a multiple of its steps.
+        first, end = -(-(self.added - len(self)) // steps), self.added // steps
+        if first >= end:
+            raise ValueError(f"the replay buffer holds no whole episode of {steps} steps")
+        begin = generator.integers(first, end, size=count) * steps
+        rows = (begin[:, None] + np.arange(steps)) % self.capacity
+        state, action, following = (
+            self._columns[name] for name in ("state", "action", "next_state")
+        )
+        past = Past(state[rows].astype(np.float32), action[rows].astype(np.float32))
+        return past, following[rows[:, -1]].astype(np.float32)
 
     def check_valid(self) -> None:
         """Raise RunError unless every kept number is finite and every flag is 0 or 1."""

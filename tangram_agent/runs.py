@@ -185,6 +185,9 @@ def _parse_config(text: str, path: Path) -> dict[str, Any]:
     content = load_settings(text, str(path))
     if not isinstance(content, dict):
         raise RunError(f"{path} holds no settings: it must be a mapping of sections")
+    agent = content.get("agent")
+    if isinstance(agent, dict) and agent.get("readout") == "pair" and agent.get("afterstate"):
+        agent.setdefault("motion", "exact")  # trained before there was a choice
     return content
 
 

@@ -43,6 +43,11 @@ class Setup:
         """
         check_targets(self.layout, self.sim)
         agent, one = self.agent, self.layout.tokens == 1
+        if agent.replay_capacity < self.horizon:
+            raise ConfigError(
+                f"agent.replay_capacity must hold an episode, {self.horizon} actions, "
+                f"got {agent.replay_capacity}"
+            )
         if self.net.kind == "mlp":
             self._refuse(("edges",), "net.kind=mlp", "set net.kind=mha")
         if one:
@@ -95,6 +100,12 @@ class Setup:
     def bootstraps(self) -> bool:
         """Whether the critic's target counts what follows an action (Eq. 5)."""
         return self.agent.gamma > 0.0 and self.horizon > 1
+
+    @property
+    def learns_motion(self) -> bool:
+        """Whether the agent learns what a command comes to: with a critic that sees afterstates."""
+        agent = self.agent
+        return self.pairs and agent.afterstate and agent.motion == "learned"
 
     @property
     def contacts(self) -> bool:

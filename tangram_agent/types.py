@@ -50,6 +50,19 @@ class Episodes:
 
 
 @dataclass(frozen=True, eq=False)
+class Past:
+    """What was seen and done in B episodes before now, T actions in each.
+
+    Attributes:
+        corners: (B, T, V, 2) of the tokens before each action.
+        actions: (B, T, A).
+    """
+
+    corners: Singles
+    actions: Singles
+
+
+@dataclass(frozen=True, eq=False)
 class Transitions:
     """A flat batch of (s, a, r, s', d, g).
 

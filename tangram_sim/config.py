@@ -50,9 +50,7 @@ class SimConfig(Settings, section="sim"):
     arena: float = setting(
         2.0, "side of the square arena", low=1e-3, high=1e3, unit="as the tokens", part=NETWORK
     )
-    actions_per_token: int = setting(
-        1, "actions that each token has", low=1, high=100
-    )
+    actions_per_token: int = setting(1, "actions that each token has", low=1, high=100)
     substeps: int = setting(
         8,
         "least simulation steps in one action of one second; with fewer than 4 a lifted token "

@@ -5,6 +5,7 @@ Legend: B environments, K tokens, V corners, A entries of an action.
 
 import numpy as np
 
+from tangram_agent.types import Past
 from tangram_sim.actions import action_size, make_actions, velocities_of
 from tangram_sim.arrays import Bools, Floats, Ints, Singles
 from tangram_sim.config import SimConfig
@@ -22,7 +23,9 @@ def random_policy(layout: Layout, sim: SimConfig) -> Choose:
     """
     size = action_size(layout.tokens, sim)
 
-    def choose(corners: Floats, placed: Bools, _goals: Floats, generators: Generators) -> Singles:
+    def choose(
+        corners: Floats, placed: Bools, _goals: Floats, generators: Generators, _past: Past
+    ) -> Singles:
         drawn = np.array([generator.uniform(-1.0, 1.0, size) for generator in generators])
         if layout.tokens == 1:
             return drawn.astype(np.float32)
@@ -41,7 +44,9 @@ def position_policy(layout: Layout, sim: SimConfig) -> Choose:
     A square moved so overlaps by 0.8825 on average: that is the plateau of the paper's Table II.
     """
 
-    def choose(corners: Floats, placed: Bools, goals: Floats, _generators: Generators) -> Singles:
+    def choose(
+        corners: Floats, placed: Bools, goals: Floats, _generators: Generators, _past: Past
+    ) -> Singles:
         token = np.argmin(placed, axis=1)
         way = (layout.poses(goals) - layout.poses(corners))[np.arange(len(token)), token]
         way[:, 2] = 0.0
@@ -58,7 +63,9 @@ def exact_policy(layout: Layout, sim: SimConfig) -> Choose:
     a circle, float32 actions, and the engine's arithmetic.
     """
 
-    def choose(corners: Floats, placed: Bools, goals: Floats, _generators: Generators) -> Singles:
+    def choose(
+        corners: Floats, placed: Bools, goals: Floats, _generators: Generators, _past: Past
+    ) -> Singles:
         pairing = paired(layout, corners, goals)
         token = _freest(layout, corners, placed, goals, pairing)
         rows = np.arange(len(token))

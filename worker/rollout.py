@@ -11,15 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from tangram_agent.types import Episodes
+from tangram_agent.types import Episodes, Past
 from tangram_sim.arrays import Bools, Floats, Singles
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.seeding import episode_generator
 from tangram_sim.targets import Sides
 
 Generators = Sequence[np.random.Generator]
-# (corners (B, V, 2), placed (B, K), goals (B, V, 2), one generator each) -> actions (B, A)
-Choose = Callable[[Floats, Bools, Floats, Generators], Singles]
+# (corners (B, V, 2), placed (B, K), goals (B, V, 2), one generator each, what was seen and done
+# before) -> actions (B, A)
+Choose = Callable[[Floats, Bools, Floats, Generators, Past], Singles]
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +148,8 @@ def _play_group(
         if not go_on():
             return False
         _look(env, played, rows, t)
-        actions = choose(env.seen, env.placed, env.seen_goals, generators)
+        past = Past(seen.corners[rows, :t], seen.actions[rows, :t])
+        actions = choose(env.seen, env.placed, env.seen_goals, generators, past)
         result = env.step(actions.astype(np.float64))
         seen.actions[rows, t], seen.rewards[rows, t] = actions, result.rewards
         played.refused[rows, t], played.blocked[rows, t] = result.refused, result.blocked

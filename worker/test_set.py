@@ -7,6 +7,7 @@ import numpy as np
 
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
+from tangram_agent.types import Past
 from tangram_sim.arrays import Bools, Floats, Singles
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.seeding import episode_generator
@@ -17,8 +18,10 @@ from worker.rollout import Choose, Generators, Played, play
 def greedy(policy: Policy) -> Choose:
     """The policy without exploration noise."""
 
-    def choose(corners: Floats, placed: Bools, goals: Floats, _generators: Generators) -> Singles:
-        return policy.act(corners, placed, goals)
+    def choose(
+        corners: Floats, placed: Bools, goals: Floats, _generators: Generators, past: Past
+    ) -> Singles:
+        return policy.act(corners, placed, goals, past=past)
 
     return choose
 

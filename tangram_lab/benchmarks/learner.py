@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from tangram_agent.attention import EncoderLayer
 from tangram_agent.learner import Learner, Steps, critic_target
+from tangram_agent.motion import Motions
 from tangram_agent.setup import Setup
 from tangram_lab.benchmarks.measure import Bound, Row, Work, compare
 from tangram_lab.benchmarks.peers import compare_updates
@@ -95,9 +96,11 @@ class PlainLearner(Learner):
             for part, rate in rates.items()
         }
 
-    def update(self, batch: Any, progress: float = 0.0) -> dict[str, float]:
+    def update(
+        self, batch: Any, progress: float = 0.0, motions: Motions | None = None
+    ) -> dict[str, float]:
         """See `Learner`; the targets follow parameter by parameter."""
-        losses = super().update(batch, progress)
+        losses = super().update(batch, progress, motions)
         pairs = ((self.target_actor, self.actor), (self.target_critic, self.critic))
         with torch.no_grad():
             for target, source in pairs:
@@ -105,7 +108,7 @@ class PlainLearner(Learner):
                     old.mul_(self.config.polyak).add_(new, alpha=1.0 - self.config.polyak)
         return losses
 
-    def _step(self, part: str, loss: Tensor) -> Tensor:
+    def _step(self, part: str, loss: Tensor, clip: float = 0.0) -> Tensor:  # noqa: ARG002
         optimiser = self._plain[part]
         optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]

@@ -14,7 +14,7 @@ from tangram_agent.policy import Policy
 from tangram_agent.relabelling import with_relabelled
 from tangram_agent.replay import ReplayBuffer
 from tangram_agent.setup import Setup
-from tangram_agent.types import Episodes, Transitions
+from tangram_agent.types import Episodes, Past, Transitions
 from tangram_lab.benchmarks.measure import Bound, Row, Work, compare
 from tangram_lab.benchmarks.sb3 import Rival, label, make_envs, make_model, observation
 from tangram_lab.benchmarks.setups import preset, with_agent, with_sim
@@ -103,7 +103,9 @@ def _rollout(setup: Setup) -> Rollout:
     return Rollout(env, 0, "bench", 0, 0)
 
 
-def _random(_corners: Floats, _placed: Bools, _goals: Floats, generators: Generators) -> Singles:
+def _random(
+    _corners: Floats, _placed: Bools, _goals: Floats, generators: Generators, _past: Past
+) -> Singles:
     return generators[0].uniform(-1.0, 1.0, (len(generators), 3)).astype(np.float32)
 
 

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from tangram_agent.types import Past
 from tangram_lab.benchmarks.setups import preset
 from tangram_sim.arrays import Bools, Floats, Singles
 from tangram_sim.batch import BatchedEnv
@@ -206,7 +207,9 @@ def _exam(model: Any) -> Callable[[], float]:
     setup = preset()
     env = BatchedEnv(setup.layout, setup.sim, setup.reward, AT_ONCE)
 
-    def choose(corners: Floats, placed: Bools, goals: Floats, _: Generators) -> Singles:
+    def choose(
+        corners: Floats, placed: Bools, goals: Floats, _: Generators, _past: Past
+    ) -> Singles:
         actions: Singles = model.predict(observation(corners, placed, goals), deterministic=True)[0]
         return actions
 

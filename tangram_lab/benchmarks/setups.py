@@ -11,7 +11,7 @@ import yaml
 
 import conf
 from tangram_agent.setup import SECTIONS, Setup, make_setup
-from tangram_agent.types import Episodes
+from tangram_agent.types import Episodes, Past
 from tangram_sim.arrays import Bools, Floats, Singles
 from tangram_sim.assembly import COUNTS
 from tangram_sim.batch import BatchedEnv
@@ -71,7 +71,11 @@ def played(setup: Setup, count: int) -> Episodes:
     """Episodes of random actions, without an engine; `count` is a multiple of ENVS."""
 
     def choose(
-        _corners: Floats, _placed: Bools, _goals: Floats, generators: Sequence[np.random.Generator]
+        _corners: Floats,
+        _placed: Bools,
+        _goals: Floats,
+        generators: Sequence[np.random.Generator],
+        _past: Past,
     ) -> Singles:
         rows = [generator.uniform(-1.0, 1.0, setup.action_size) for generator in generators]
         return np.array(rows, np.float32)

@@ -20,6 +20,7 @@ from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Polygon, Rectang
 from tangram_agent.attention import GraphEncoder
 from tangram_agent.config import NetConfig
 from tangram_agent.networks import initialise
+from tangram_agent.types import Past
 from tangram_lab.experiments.report.style import (
     COLOURS,
     GREY,
@@ -336,7 +337,10 @@ def take_shots(backend: str = "physics") -> Shots:
     policy = position_policy(layout, sim)
     placed = np.zeros((1, 1), dtype=np.bool_)
     corners, goals = layout.corners(start)[None], layout.corners(target)[None]
-    action = policy(corners, placed, goals, [generator])
+    nothing = Past(
+        np.zeros((1, 0, *corners.shape[1:]), np.float32), np.zeros((1, 0, 3), np.float32)
+    )
+    action = policy(corners, placed, goals, [generator], nothing)
     with closing(make_world(layout, sim)) as world:
         world.place(target)
         wanted = world.picture()

@@ -26,9 +26,10 @@ PAPER = {
     "acting_average": 0.0,
     "lr_final": 1.0,
 }
-# One relabelled goal, and on pairs one proposal: what most tests need.
+# One relabelled goal, and on pairs one proposal of exact motion: what most tests need.
 PLAIN: dict[str, Any] = {"hindsight": [{"strategy": "final"}]}
 PROPOSAL = {"reapply": 0}
+EXACT = {"motion": "exact"}
 SCENE = {"readout": "token"}  # ours, on whole scenes
 SMALL = {"width": 16, "layers": 2, "heads": 2, "feed_forward": 32}
 
@@ -41,12 +42,14 @@ def setup(
 ) -> Setup:
     """A setup on the kinematic backend with a small network."""
     given = PLAIN | (agent or {})
+    if given.get("readout") != "token":
+        given = PROPOSAL | (EXACT if given.get("afterstate", True) else {}) | given
     return make_setup(
         {
             "tokens": tokens,
             "sim": {"backend": "kinematic", **sim},
             "reward": {},
-            "agent": given if given.get("readout") == "token" else PROPOSAL | given,
+            "agent": given,
             "net": net,
         }
     )

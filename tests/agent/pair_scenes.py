@@ -117,6 +117,7 @@ class PerfectNetworks:
     critic: PerfectCritic
 
     graph: PairGraph
+    motion = None
 
     def actor(self, pairs: Pairs) -> tuple[Tensor, Tensor]:
         """The way to the piece's own pose."""

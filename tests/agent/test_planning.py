@@ -15,6 +15,7 @@ from tangram_agent.pairs import PairGraph, Pairs
 from tangram_agent.planning import Planner
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
+from tangram_sim.actions import velocities_of
 from tangram_sim.batch import BatchedEnv
 from tests.agent.builders import SMALL, setup
 from tests.agent.pair_scenes import (
@@ -119,8 +120,8 @@ def test_the_best_of_all_is_played(
         _, pose, token, turned = max(every, key=lambda one: one[0])
         assert (choice.token[row], choice.flip[row]) == (token, turned)
         np.testing.assert_allclose(choice.pose[row], pose, atol=1e-5)
-        start = made.layout.poses(corners[row])[token]
-        np.testing.assert_allclose(choice.start[row], start)
+        way = velocities_of((pose - made.layout.poses(corners[row])[token])[None], made.sim)[0]
+        np.testing.assert_allclose(choice.velocity[row], way.clip(-1.0, 1.0), atol=1e-5)
 
 
 @pytest.mark.parametrize("sim", [{}, {"allow_flip": True}, SLIDE])

@@ -10,7 +10,7 @@ import pytest
 
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
-from tangram_agent.types import Episodes
+from tangram_agent.types import Episodes, Past
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.geometry import overlap_share
 from tangram_sim.sampling import sample_poses
@@ -35,9 +35,18 @@ def naive_episode(made: Setup, acting: Policy, rng: np.random.Generator) -> dict
     pose = sample_poses(layout, sim, rng).copy()
     moves = np.zeros(layout.tokens, int)
     corners, placed, actions, rewards = [layout.corners(pose)], [moves >= 1], [], []
+
+    def is_placed(moves: np.ndarray) -> np.ndarray:
+        limited = layout.tokens == 1 and sim.actions_per_token > 1
+        return (moves >= sim.actions_per_token) & (not limited)
+
     for _ in range(made.horizon):
-        flags = moves >= sim.actions_per_token
-        action = acting.explore(corners[-1][None], flags[None], goal[None], [rng])[0]
+        flags = is_placed(moves)
+        past = Past(
+            np.array(corners[:-1], np.float32).reshape(1, -1, layout.corner_count, 2),
+            np.array(actions, np.float32).reshape(1, -1, made.action_size),
+        )
+        action = acting.explore(corners[-1][None], flags[None], goal[None], [rng], past)[0]
         token = 0
         if layout.tokens > 1:
             token = min(int((action[0] + 1.0) / 2.0 * layout.tokens), layout.tokens - 1)
@@ -45,7 +54,7 @@ def naive_episode(made: Setup, acting: Policy, rng: np.random.Generator) -> dict
             pose[token] += action[-3:] * np.array([sim.arena, sim.arena, np.pi])
             moves[token] += 1
         corners.append(layout.corners(pose))
-        placed.append(moves >= sim.actions_per_token)
+        placed.append(is_placed(moves))
         actions.append(action)
         rewards.append(2.0 * overlap_share(corners[-1][None], goal[None], layout)[0] - 1.0)
     return {
@@ -151,7 +160,7 @@ def test_the_policy_sees_noise_and_that_is_what_travels() -> None:
     made = setup(corner_noise=0.02)
     seen: list[np.ndarray] = []
 
-    def choose(corners: np.ndarray, _placed: object, goals: np.ndarray, _generators: object) -> Any:
+    def choose(corners: np.ndarray, _placed: object, goals: np.ndarray, *_: object) -> Any:
         seen.extend([corners.copy(), goals.copy()])
         return np.zeros((4, 3), np.float32)
 
