@@ -19,8 +19,11 @@ TITLE = "# Exact versions that the tests ran with. Written by make lock: .ci/loc
 # `name==version`, with a marker where it has one -> hashes.
 Pins = dict[str, list[str]]
 
+# Building a package to look at it would run what no hash vouches for yet. hydra's
+# antlr4-python3-runtime comes as source only.
 ARGUMENTS = """pip compile pyproject.toml --all-extras --universal --python-version=3.11
     --constraints=constraints.txt --generate-hashes --no-annotate --no-header --quiet
+    --only-binary=:all: --no-binary=antlr4-python3-runtime
     --no-emit-package=cffi --no-emit-package=pycparser"""  # these two: PyPy only
 
 
@@ -40,6 +43,7 @@ def resolved() -> Pins:
 def cpu_build(torch: str) -> list[str]:
     """The hash of torch's CPU build, which is not in the usual index, where pip is offered one."""
     options = "--dry-run --ignore-installed --no-deps --no-cache-dir --quiet --report -"
+    options += " --only-binary=:all:"
     command = [sys.executable, "-m", "pip", "install", *options.split(), f"{torch}+cpu"]
     told = subprocess.run(command, check=False, capture_output=True, text=True).stdout
     found = json.loads(told)["install"] if told else []

@@ -132,12 +132,12 @@ class Child:
         if self._process is not None:
             self._process.send_signal(number)
 
-    def tail(self) -> str:
+    def tail(self, count: int = TAIL_LINES) -> str:
         """The last lines of its log."""
         if self.log is None or not self.log.exists():
             return ""
         lines = self.log.read_text(encoding="utf-8", errors="replace").splitlines()
-        return "\n".join(lines[-TAIL_LINES:])
+        return "\n".join(lines[-count:])
 
     def _output(self) -> IO[bytes] | int | None:
         """Its log; nothing where the disk does not take one: that is no reason to be without it."""

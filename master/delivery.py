@@ -10,12 +10,18 @@ again, and a broken worker must not send it for ever. A message that was damaged
 neither: nothing in it is believed, its number least of all, and what was meant comes again.
 """
 
+from collections import Counter, OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 
 from tangram_agent.messages import Ack, EpisodeBatch, Reject, Scores
 from tangram_agent.types import Episodes
+
+REMEMBERED_VERSIONS = 4096
+# Peers that have left and whose batches still wait.
+SPARE_PEERS = 64
+MAX_EVALUATORS = 16  # that score the same weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,3 +151,56 @@ class Ledger:
         missing = max(0, sequence - 1 - self.received)
         self.received += missing
         return missing
+
+
+class Waiting:
+    """Batches that wait for their insert, of all processes that have an index one after another."""
+
+    def __init__(self, window: int) -> None:
+        """None yet.
+
+        Args:
+            window: most of one index.
+        """
+        self._window, self._of = window, Counter[tuple[str, int]]()
+
+    def add(self, key: tuple[str, int]) -> None:
+        """One more of an index."""
+        self._of[key] += 1
+
+    def done(self, key: tuple[str, int]) -> None:
+        """One less."""
+        self._of[key] -= 1
+        if self._of[key] <= 0:
+            del self._of[key]  # their sum is taken for each batch
+
+    def room(self, key: tuple[str, int], ledger: Ledger, peers: int) -> int:
+        """How many of a process may be held, while so many peers take part."""
+        if self._of.total() >= self._window * (peers + SPARE_PEERS):
+            return 0
+        return self._window - self._of[key] + len(ledger.held)
+
+
+class Exams:
+    """Which weights were published in this life of the master, and who has scored them."""
+
+    def __init__(self) -> None:
+        self._scored = OrderedDict[int, set[int]]()  # version -> indices
+
+    def published(self, version: int) -> None:
+        """From now on these may be scored, once by each evaluator."""
+        self._scored.setdefault(version, set())
+        while len(self._scored) > REMEMBERED_VERSIONS:
+            self._scored.popitem(last=False)
+
+    def take(self, version: int, index: int) -> str:
+        """Note that an evaluator scored these weights; why that is too much, or empty."""
+        scored = self._scored.get(version)
+        if scored is None:
+            return f"weights {version} are none of the last {REMEMBERED_VERSIONS:,} of this master"
+        if index in scored:
+            return f"it has scored weights {version} before"
+        if len(scored) >= MAX_EVALUATORS:
+            return f"{MAX_EVALUATORS} evaluators have scored weights {version}, the most that may"
+        scored.add(index)
+        return ""

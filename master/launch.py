@@ -17,6 +17,7 @@ from master.resumable import check_resumable
 from master.rundir import RunFolder, code_of
 from master.security import listening_place
 from master.signals import SAME_WISH_S, handling, show_cursor, stop_notice
+from tangram_agent.messages import TAKEN_OVER
 from tangram_agent.process import Every, watch_parent
 
 # While the master starts, its connection file is looked for this often.
@@ -26,6 +27,7 @@ IDLE_S = 1.0
 STOP_S = 120.0
 LEAVE_S = 8.0
 FAILED_STATUS = 1
+TAKE_BACK_S = 30.0
 PLAYER_NICE = 5
 EVALUATOR_NICE = 10
 
@@ -74,7 +76,7 @@ class Launcher:
     """Starts the children, restarts those that fail, and ends them in order."""
 
     def __init__(self, config: MasterConfig, folder: RunFolder, code: Mapping[str, str]) -> None:
-        self._folder = folder
+        self._folder, self._in_step = folder, config.service.mode == "lockstep"
         self._events: SimpleQueue[Child | signal.Signals] = SimpleQueue()
         self._master = Child("master", master_arguments(config, folder))
         self._players = [worker_child(folder, "player", i) for i in range(config.workers)]
@@ -213,16 +215,31 @@ class Launcher:
             return
         if self._stop_s is not None:
             return
-        if child.plan_restart(status):
+        if status == 0 and TAKEN_OVER in child.tail(1):
+            self._make_way(child)
+        elif child.plan_restart(status):
             self._say(
                 f"{child.name} ended with {describe(status)}: it is started again "
                 f"({child.restarts} of {MAX_RESTARTS}); see {child.log}"
             )
+        else:
+            self._say(f"{child.name} ended with {describe(status)}: given up\n{child.tail()}")
+            if not any(c.alive or c.next_start_s is not None for c in self._players):
+                self._failed = True
+                self._stop("no worker is left: the run ends")
+
+    def _make_way(self, child: Child) -> None:
+        """Somebody started a worker with the index of one: that is no failure, and no contest."""
+        lost = f"{child.name} lost its index to a worker that was started with the same"
+        if self._in_step:  # whose rounds are of these indices
+            child.next_start_s = time.monotonic() + TAKE_BACK_S
+            self._say(f"{lost}: it takes it back in {TAKE_BACK_S:g} s; start others without index=")
             return
-        self._say(f"{child.name} ended with {describe(status)}: given up\n{child.tail()}")
-        if not any(c.alive or c.next_start_s is not None for c in self._players):
-            self._failed = True
-            self._stop("no worker is left: the run ends")
+        child.next_start_s = time.monotonic()
+        child.arguments = [
+            "index=-1" if text.startswith("index=") else text for text in child.arguments
+        ]
+        self._say(f"{lost}: it goes on with one that is free")
 
     def _say(self, text: str) -> None:
         """Show a line through the master, which owns the terminal while it runs."""

@@ -26,13 +26,12 @@ from master.journal import (
     segment_path,
     segments,
 )
-from tangram_agent.arrays import MAX_BATCH_BYTES, MAX_FRAMES, EpisodeSpec, split_frames
+from tangram_agent.arrays import EpisodeSpec, split_frames
 from tangram_agent.messages import EpisodeBatch, decode_from_worker
-from tangram_agent.schema import MAX_HEADER, ProtocolError, opened, read
+from tangram_agent.schema import ProtocolError, opened, read
 from tangram_sim.errors import RunError, WireError
 
 OLD_HEAD = struct.Struct("<II")  # of formats 1 and 2: length and CRC of the body
-MAX_BODY = LENGTH.size + MAX_HEADER + MAX_BATCH_BYTES + MAX_HEADER + 4 * MAX_FRAMES
 CHUNK = 2**20
 MAX_GAP = 2**32  # a number further on than this was forged
 ANOTHER = "choose another run_dir, or delete its folder journal to go on without it"
@@ -153,26 +152,29 @@ class Reader:
         """Something is missing; how much shows when the next whole record is found."""
         last = self._trouble
         if last is None:
-            self._trouble = _Trouble(where, number, torn)
+            self._trouble = _Trouble(where, number, torn, number > 0)
         else:
             torn = last.torn if last.torn and torn else ""
-            self._trouble = _Trouble(last.where, max(last.number, number), torn)
+            self._trouble = _Trouble(last.where, max(last.number, number), torn, number > 0)
 
     def _reached(self, number: int, path: Path, start: int, another_life: bool) -> None:
         """So many batches came before this byte."""
         trouble, missing = self._trouble, number - self.number
+        # A life counts on from what it could read of the one before.
+        counted = another_life and start > 0
         if missing > 0:
             where = f"{path}: what came before byte {start:,} is missing"
-            self._warn(f"{where if trouble is None else trouble.where}: {_batches(missing)} lost")
+            least = counted and trouble is not None and not trouble.whole
+            told = _batches(missing, least)
+            self._warn(f"{where if trouble is None else trouble.where}: {told} lost")
         elif trouble is not None:
-            # A life counts on from what it could read of the one before.
-            self._tell(trouble, "" if another_life and start else "no batch is lost")
+            self._tell(trouble, "" if counted else "no batch is lost")
         self._trouble, self.number = None, max(self.number, number)
 
     def _end(self) -> None:
         if self._trouble is not None:
             missing = self._trouble.number - self.number
-            known = f"{_batches(missing)} lost" if missing > 0 else ""
+            known = f"{_batches(missing, not self._trouble.whole)} lost" if missing > 0 else ""
             self._tell(self._trouble, known)
             self.number += max(0, missing)
 
@@ -188,11 +190,13 @@ class _Trouble(NamedTuple):
         where: it is, for people.
         number: of the last batch that is known to have been in there, 0 for none.
         torn: what is said instead where nothing was lost: a kill has left it so.
+        whole: it ends with a record whose head is whole, so that no later batch was in there.
     """
 
     where: str
     number: int
     torn: str
+    whole: bool
 
 
 class _Found(NamedTuple):
@@ -225,8 +229,9 @@ def _scan(path: Path) -> Iterator[_Found]:
             file.seek(start)
             head = _read_head(file.read(HEAD.size))
             length, number, checksum = head or (0, 0, 0)
-            body = file.read(min(length, MAX_BODY))
             end = start + HEAD.size + length
+            # Not asked for where it cannot be: room for it is taken first, 4 GiB of a forged head.
+            body = file.read(length) if end <= size else b""
             if head is not None and len(body) == length and zlib.crc32(body) == checksum:
                 yield _Found(start, end, number, body, torn=False)
             elif head is not None:
@@ -234,7 +239,7 @@ def _scan(path: Path) -> Iterator[_Found]:
                 whole = end <= (end := min(end, _next_head(file, start + 1, size)))
                 yield _Found(start, end, number if whole else 0, None, not whole)
             else:
-                if not start and _is_old(file):
+                if not start and _is_old(file, size):
                     raise RunError(f"{path} is of an older version of tangram-rl: {ANOTHER}")
                 end = _next_head(file, start + 1, size)
                 yield _Found(start, end, 0, None, end - start < HEAD.size)
@@ -267,12 +272,12 @@ def _next_head(file: BinaryIO, start: int, size: int) -> int:
     return size
 
 
-def _is_old(file: BinaryIO) -> bool:
+def _is_old(file: BinaryIO, size: int) -> bool:
     """Whether a file begins with a record of format 1 or 2."""
     file.seek(0)
     head = file.read(OLD_HEAD.size)
     length, checksum = OLD_HEAD.unpack(head) if len(head) == OLD_HEAD.size else (0, 0)
-    body = file.read(min(length, MAX_BODY))
+    body = file.read(min(length, size))
     return bool(body) and len(body) == length and zlib.crc32(body) == checksum
 
 
@@ -288,8 +293,9 @@ def _cut_short(path: Path, found: _Found) -> str:
     )
 
 
-def _batches(count: int) -> str:
-    return f"{count:,} batches are" if count > 1 else "1 batch is"
+def _batches(count: int, least: bool) -> str:
+    told = f"{count:,} batches are" if count > 1 else "1 batch is"
+    return f"at least {told}" if least else told
 
 
 def _title(path: Path, found: _Found) -> Title | None:

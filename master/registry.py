@@ -12,13 +12,15 @@ from dataclasses import dataclass, field
 
 from master.delivery import EpisodesArrived, Ledger
 from master.gate import AMPLE, Room
-from tangram_agent.messages import MAX_ID, MAX_INDEX, ROLES, Hello, Refused, Stop
+from tangram_agent.messages import MAX_ID, MAX_INDEX, ROLES, TAKEN_OVER, Hello, Refused, Stop
 from tangram_agent.schema import MAX_COUNT
 from tangram_sim.errors import RunError, TangramError
 
 CROWDED = 0.9  # share of the room from which on there is a warning
 # One that asks for weights again before it has shown that it got them waits so long, then twice.
 WEIGHTS_AGAIN_S = 10.0
+# Answers about the run: so many in this time over all who ask, and one for each connection.
+STATUS_ANSWERS, STATUS_AGAIN_S = 64, 0.5
 Key = tuple[str, int]
 
 log = logging.getLogger(__name__)
@@ -248,9 +250,15 @@ class Registry:
         if not odd:
             return
         listed = ", ".join(odd)
+        ours, theirs = self._fingerprints, hello.fingerprints
+        digests = (
+            f"{n}: the worker has {theirs.get(n, 'none')}, the master {ours.get(n, 'none')}"
+            for n in odd
+        )
         reason = (
-            f"its settings of {listed} differ from the master's: start both with the same "
-            f"overrides of {listed}"
+            f"its settings of {listed} differ from the master's ({'; '.join(digests)}): leave them "
+            "out, for connect=RUN_DIR brings the master's, or start both with the same overrides "
+            f"of {listed}"
         )
         counter = "refused_tokens" if "tokens" in odd else "refused_settings"
         raise RefusedError(counter, Refused(reason))
@@ -275,8 +283,7 @@ class Registry:
             ledger = Ledger(known + 1, received, unused=last is None or last.unused)
         elif hello.incarnation < known or last.process not in ("", hello.process):
             reason = (
-                f"{key[0]} {key[1]} was taken over by a newer process "
-                f"(incarnation {known}, this is {hello.incarnation})"
+                f"{key[0]} {key[1]} {TAKEN_OVER} (incarnation {known}, this is {hello.incarnation})"
             )
             raise RefusedError("superseded", Stop(reason))
         else:
@@ -286,6 +293,22 @@ class Registry:
         ledger.process = hello.process
         self._ledgers[key] = ledger
         return ledger
+
+
+class Askers:
+    """Those who were told how the run stands a moment ago; they need not take part."""
+
+    def __init__(self) -> None:
+        self._told = dict[bytes, float]()  # connection -> when, oldest first
+
+    def may_have(self, identity: bytes, now: float) -> bool:
+        """Whether to tell a connection now; what it does not read stays in memory here."""
+        while self._told and now - next(iter(self._told.values())) >= STATUS_AGAIN_S:
+            del self._told[next(iter(self._told))]
+        if identity in self._told or len(self._told) >= STATUS_ANSWERS:
+            return False
+        self._told[identity] = now
+        return True
 
 
 def differing(ours: Mapping[str, str], theirs: Mapping[str, str]) -> list[str]:

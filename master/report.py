@@ -15,7 +15,7 @@ from PIL import Image
 from master.budget import Budget, Rates
 from master.checkpointer import Checkpointer
 from master.console import PLAYED, TEST, Progress
-from master.delivery import EpisodesArrived
+from master.delivery import REMEMBERED_VERSIONS, EpisodesArrived
 from master.divergence import DivergenceGuard
 from master.hub import Hub
 from master.metrics import Means, Metrics
@@ -30,7 +30,6 @@ from tangram_sim.arrays import Floats
 from tangram_sim.drawing import episode_sheet
 
 UNKNOWN = -1.0
-REMEMBERED_VERSIONS = 4096
 PICTURE_COLUMNS = 4
 CURVE_PIXELS, PICTURE_PIXELS = 120, 240
 PICTURE_S = 30.0

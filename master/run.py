@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from master.admission import WelcomeInfo
 from master.audit import Audit
 from master.budget import Budget
 from master.checkpointer import Checkpointer, Restored, restore_run, warm_start
@@ -20,7 +21,7 @@ from master.delivery import EpisodesArrived
 from master.divergence import DivergenceGuard
 from master.gate import Room
 from master.health import OFF, Health
-from master.hub import Hub, WelcomeInfo
+from master.hub import Hub
 from master.journal import Journal, Place
 from master.lockstep import Lockstep
 from master.loop import Loop

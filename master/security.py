@@ -203,6 +203,11 @@ def listening_place(bind: str, run: Path) -> str:
     if bind != LOCAL:
         return bind
     folder, found = Path(tempfile.gettempdir()) / f"tangram-{os.geteuid()}", run.stat()
+    if not str(folder).isprintable():
+        raise ConfigError(
+            f"{os.fsencode(folder)!r} cannot hold sockets, whose paths are printable UTF-8: set "
+            "TMPDIR to another folder, such as /tmp"
+        )
     own_folder(folder)
     _sweep(folder)
     name = hashlib.sha256(f"{run.resolve()} {found.st_dev} {found.st_ino}".encode()).hexdigest()

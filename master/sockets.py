@@ -13,7 +13,11 @@ from master.gate import AMPLE, Gate, Room
 from master.security import Authenticator, Holder, Keys
 from tangram_agent.addresses import IPC
 from tangram_agent.arrays import MAX_FRAME_BYTES
-from tangram_sim.errors import ConfigError
+from tangram_agent.files import own_folder
+from tangram_agent.messages import Greet, Refused, Reject, Stop
+from tangram_agent.process import Every
+from tangram_agent.schema import Plain
+from tangram_sim.errors import ConfigError, RunError
 
 LINGER_MS = 1000
 # Messages queued for each peer and direction; what a peer has no room for it must ask for again.
@@ -24,8 +28,11 @@ HANDSHAKE_MS = 10_000
 BACKLOG = 1024
 # Of a subscription or a step of a handshake; more than encryption adds to a frame.
 MAX_COMMAND = 1024
-# ZMTP pings find connections that died without a word.
-PING_MS = 5000
+# TCP finds connections that died without a word. ZMTP's own pings end the process that sends them:
+# for one that has been reset while its queue was full, an assertion of ZeroMQ's fails
+# (https://github.com/zeromq/libzmq/issues/4364).
+DEAD_S, PROBE_S = 30, 5
+LOOK_S = 1.0  # between two looks at the files of unix sockets
 
 
 class Received(NamedTuple):
@@ -77,11 +84,36 @@ class Sockets:
         self.endpoint = self._router.getsockopt_string(zmq.LAST_ENDPOINT)
         self.weights_endpoint = self._pub.getsockopt_string(zmq.LAST_ENDPOINT)
         self._gate = Gate((self._router, self._pub), room, keys is not None, counters)
+        self._look = Every(LOOK_S)
 
     @property
     def keys(self) -> Keys | None:
         """As their file has them by now; None on plain sockets."""
         return None if self._authenticator is None else self._authenticator.keys
+
+    def listen_again(self) -> None:
+        """Look, once in a second, whether a cleaner of TMPDIR took the files of unix sockets away.
+
+        Nobody could join any more. What is connected stays, and so does the socket without a name.
+        """
+        if not (self.endpoint.startswith(IPC) and self._look.due()):
+            return
+        ends = {self.endpoint: self._router, self.weights_endpoint: self._pub}
+        for endpoint, end in ends.items():
+            path = Path(endpoint.removeprefix(IPC))
+            if path.exists():
+                continue
+            try:
+                own_folder(path.parent)
+                end.bind(endpoint)
+                done = "it is made anew"
+            except (RunError, zmq.ZMQError) as error:
+                done = f"nobody can join before it is made anew, which fails ({error})"
+            self._counters.note(
+                "removed_sockets",
+                f"{path} was removed: {done}; keep what cleans {path.parent.parent} away from "
+                f"{path.parent}, or set TMPDIR to another folder",
+            )
 
     def wait(self, timeout_s: float) -> bool:
         """Whether a message came within this time."""
@@ -121,6 +153,17 @@ class Sockets:
                 raise
             self._counters["unreachable"] += 1
 
+    def answer(self, identity: bytes, answer: Plain) -> None:
+        """Send a message to a peer; see `send`."""
+        self.send(identity, answer.encode())
+
+    def refuse(
+        self, identity: bytes, counter: str, answer: Reject | Refused | Stop | Greet
+    ) -> None:
+        """Send a reason, count it and tell it."""
+        self._counters.note(counter, getattr(answer, "reason", "a connection without HELLO"))
+        self.answer(identity, answer)
+
     def publish(self, frame: bytes) -> None:
         """Send to all subscribers that have room."""
         self._pub.send(frame, zmq.NOBLOCK)
@@ -149,7 +192,11 @@ class Sockets:
         socket.setsockopt(zmq.BACKLOG, BACKLOG)
         most = MAX_COMMAND + (MAX_FRAME_BYTES if kind == zmq.ROUTER else 0)
         socket.setsockopt(zmq.MAXMSGSIZE, most)
-        socket.setsockopt(zmq.HEARTBEAT_IVL, PING_MS)
+        socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
+        socket.setsockopt(zmq.TCP_KEEPALIVE_IDLE, PROBE_S)
+        socket.setsockopt(zmq.TCP_KEEPALIVE_INTVL, PROBE_S)
+        socket.setsockopt(zmq.TCP_KEEPALIVE_CNT, DEAD_S // PROBE_S - 1)
+        socket.setsockopt(zmq.TCP_MAXRT, DEAD_S * 1000)  # of what is sent
         socket.setsockopt(zmq.IPV6, int(":" in bind))
         if kind == zmq.ROUTER:
             # Else answers to those who are gone vanish without a word.

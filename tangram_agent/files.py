@@ -103,12 +103,22 @@ def own_folder(path: Path) -> None:
     try:
         with suppress(FileExistsError):
             path.mkdir(mode=0o700)
-        found = path.lstat()
+        check_own(path)
     except OSError as error:
         raise RunError(
             f"{path} cannot be made ({error.strerror}): set TMPDIR to a folder that you may write "
             "to, for the master and its workers"
         ) from None
+
+
+def check_own(path: Path) -> None:
+    """See that a folder is one that only this user may enter.
+
+    Raises:
+        RunError: it is another user's, open to others, or no folder.
+        OSError: it is not there, or cannot be looked at.
+    """
+    found = path.lstat()
     mine = stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid()
     if not mine or found.st_mode & 0o077:
         is_now = f"{stat.filemode(found.st_mode)} of user {found.st_uid}"

@@ -54,6 +54,30 @@ WINDOW = 4  # messages of a worker that may be unacknowledged; a full window pau
 MAX_WINDOW = 1024
 MAX_PICTURES = 64
 MAX_ROWS = 4096
+# What an evaluator may report; see `worker.metrics`.
+SCORE_NAMES = (
+    "mean_reward",
+    "mean_reward_dense",
+    "mean_reward_camera",
+    "mean_train_reward",
+    "raw_overlap",
+    "raw_overlap_p10",
+    "angle_error_deg_median",
+    "angle_error_deg_p90",
+    "position_error_median",
+    "position_error_p90",
+    "coverage",
+    "iou",
+    "share_solved",
+    "wrong",
+    "doubly_used",
+    "refused",
+    "blocked",
+    "actions_used",
+    "episodes",
+    "seconds",
+)
+TAKEN_OVER = "was taken over by a newer process"  # tangram-train reads it in a worker's log
 OPEN = "service.auth=off: open to whoever reaches the port"
 
 
@@ -196,13 +220,13 @@ class Scores(OfTask):
 
     Attributes:
         weights_version: of the weights that were tested.
-        scalars: name -> value, at most 64.
+        scalars: name -> value.
         starts, ends, goals: (n, V, 2) float32 corners of n <= 64 test episodes, for pictures.
     """
 
     kind: ClassVar[str] = "scores"
     weights_version: Version
-    scalars: Annotated[Mapping[str, float], Numbers()]
+    scalars: Annotated[Mapping[str, float], Numbers(names=SCORE_NAMES)]
     starts: Singles
     ends: Singles
     goals: Singles

@@ -7,7 +7,9 @@ import re
 import shutil
 import subprocess
 import sys
+import tarfile
 from importlib.metadata import version
+from io import BytesIO
 from pathlib import Path
 from zipfile import ZipFile
 
@@ -133,19 +135,32 @@ def test_install_refuses_a_file_with_another_hash(
     assert (result.returncode == 0) == told.startswith("installing"), result.stderr
 
 
-@pytest.mark.parametrize("offered", [True, False])
-def test_install_takes_the_cpu_build_where_it_is_offered(tmp_path: Path, offered: bool) -> None:
-    """Of the build whose hash an index tells pip thinks more, which is the one with CUDA."""
+@pytest.mark.parametrize("offered", ["wheel", "source", "not"])
+def test_install_takes_the_cpu_build_where_it_is_offered(tmp_path: Path, offered: str) -> None:
+    """Of the build whose hash an index tells pip thinks more, which is the one with CUDA.
+
+    To look whether it is there pip has no hash: a source, which names itself by its code, is none.
+    """
     lock = "".join(made_wheel(tmp_path, name) for name in ("pip", "setuptools", "torch"))
     wheel, digest = "torch-99-py3-none-any.whl", lock.rpartition(":")[2].strip()
     (tmp_path / "page.html").write_text(f'<a href="{wheel}#sha256={digest}">{wheel}</a>')
     cpu = made_wheel(tmp_path, "torch", "99+cpu").partition("\n")[2]
-    if not offered:
+    if offered != "wheel":
         (tmp_path / "torch-99+cpu-py3-none-any.whl").unlink()
+    if offered == "source":
+        builder = '[build-system]\nrequires = []\nbuild-backend = "own"\nbackend-path = ["."]\n'
+        code = f"open({str(tmp_path / 'ran')!r}, 'w')\n"
+        with tarfile.open(tmp_path / "torch-99+cpu.tar.gz", "w:gz") as source:
+            for name, text in (("pyproject.toml", builder), ("own.py", code)):
+                data = text.encode()
+                about = tarfile.TarInfo(f"torch-99+cpu/{name}")
+                about.size = len(data)
+                source.addfile(about, BytesIO(data))
     result = try_install(tmp_path, f"{lock[:-1]} \\\n{cpu}", "", needs="torch")
     assert result.returncode == 0, result.stderr
     taken = re.findall(r"Would install (torch-\S+)", (tmp_path / "log").read_text())
-    assert taken[-1] == ("torch-99+cpu" if offered else "torch-99")
+    assert taken[-1] == ("torch-99+cpu" if offered == "wheel" else "torch-99")
+    assert not (tmp_path / "ran").exists()
 
 
 def test_the_bill_of_materials_has_the_lock(tmp_path: Path) -> None:

@@ -3,14 +3,17 @@
 import json
 import re
 import socket
+import struct
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from zmq.utils import z85
+
 from tangram_agent.addresses import IPC, dns_error
-from tangram_agent.files import own_folder
+from tangram_agent.files import check_own
 from tangram_agent.outcome import FILE_NAME as RESULT
 from tangram_sim.errors import RunError
 
@@ -20,7 +23,7 @@ PATIENCE_S = 60.0
 LOOK_S = 0.2
 SCHEME = "tcp://"
 PLAIN_ADDRESS = re.compile(r"[\w.-]{1,249}:\d{1,5}|\[[0-9a-fA-F:.]+\]:\d+")  # without the scheme
-KEY = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
+KEY_BYTES = 32
 
 
 @dataclass(frozen=True)
@@ -42,10 +45,13 @@ class MasterAddress:
     settings: Mapping[str, Any] | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        keys = [self.server_key, *(key for pair in self.keys.values() for key in pair)]
-        wanted = self.server_key or self.keys
-        if wanted and not (self.keys and all(KEY.fullmatch(key) for key in keys)):
-            raise ValueError("server_key and keys must be 40 characters of Z85 each")
+        if self.server_key or self.keys:
+            _check_key("server_key", self.server_key)
+            for role, (public, secret) in self.keys.items():
+                _check_key(f"keys.{role}.public", public)
+                _check_key(f"keys.{role}.secret", secret)
+            if not self.keys:
+                raise ValueError("it has a server_key, and no keys")
         if not isinstance(self.settings, Mapping | None):
             raise ValueError("settings must be a map")
 
@@ -62,7 +68,7 @@ def as_address(connect: str) -> str | None:
 
 
 def find_master(connect: str) -> MasterAddress | None:
-    """The master's address; None while its file is not there.
+    """The master's address; None while its file, or the folder of its sockets, is not there.
 
     Args:
         connect: host:port with or without tcp://, a connection file, or a run folder that holds
@@ -79,14 +85,15 @@ def find_master(connect: str) -> MasterAddress | None:
         path /= FILE_NAME
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        endpoint = str(content["endpoint"])
+        endpoint, run_id = str(content["endpoint"]), str(content["run_id"])
+        f"{endpoint}{run_id}".encode()  # half a character is no text
         if endpoint.startswith(f"{IPC}/"):
-            _check_own(endpoint.removeprefix(IPC), str(content["machine"]), path)
+            _check_local(endpoint, str(content["machine"]), path)
         else:
             _checked(endpoint, str(path))
         found = content.get("keys", {}).items()
         keys = {str(role): (str(one["public"]), str(one["secret"])) for role, one in found}
-        known = (endpoint, str(content["run_id"]), str(content.get("server_key", "")), keys)
+        known = (endpoint, run_id, str(content.get("server_key", "")), keys)
         return MasterAddress(*known, content.get("settings"))
     except FileNotFoundError:
         return None
@@ -135,8 +142,8 @@ def await_master(
 def no_file_error(connect: str, patience_s: float) -> str:
     """The error that there is no connection file, for the user."""
     return (
-        f"no connection file is at {connect} after {patience_s:g} s: is tangram-master running "
-        "there?"
+        f"no connection file is at {connect} after {patience_s:g} s, or none whose sockets are "
+        "there: is tangram-master running there?"
     )
 
 
@@ -178,19 +185,37 @@ def _why(error: Exception) -> str:
     return str(getattr(error, "strerror", None) or error)
 
 
-def _check_own(place: str, machine: str, source: Path) -> None:
-    """Raise RunError where the master listens on another machine, or perhaps another user does."""
+def _check_key(name: str, key: str) -> None:
+    """Raise ValueError, without what may be a secret, for what ZeroMQ takes for no key."""
+    try:
+        whole = len(z85.decode(key)) == KEY_BYTES
+    except (ValueError, KeyError, struct.error):
+        whole = False
+    if not whole:
+        raise ValueError(f"{name} must be a key, 40 characters of Z85")
+
+
+def _check_local(endpoint: str, machine: str, source: Path) -> None:
+    """Look, and change nothing, whether only this user can listen there.
+
+    Raises:
+        RunError: the master listens on another machine, or perhaps another user does.
+        FileNotFoundError: the folder is not there; another user could make it.
+    """
+    place = endpoint.removeprefix(IPC)
+    if ".." in Path(place).parts:
+        raise ValueError(f"its endpoint '{endpoint}' must be a path without '..'")
     if machine != socket.gethostname() and not Path(place).exists():
         raise RunError(
             f"{source}: this master listens on its own machine, {machine}, only: start it there "
             "with service.bind=0.0.0.0, or start this there"
         )
-    own_folder(Path(place).parent)
+    check_own(Path(place).parent)
 
 
 def _checked(endpoint: str, source: str) -> str:
     host, _, port = endpoint.removeprefix(SCHEME).rpartition(":")
-    named = endpoint.startswith(SCHEME) and host and host.split() == [host]
+    named = endpoint.startswith(SCHEME) and host.isprintable() and host.split() == [host]
     if not (named and port.isdecimal() and 0 < int(port) < 65536):
         raise RunError(
             f"'{endpoint}' (from {source}) is no address: it must be tcp://host:port, the port "

@@ -24,8 +24,17 @@ from master.recovery import Reader
 from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint, save_checkpoint
 from tangram_agent.messages import EpisodeBatch
+from tangram_agent.schema import MAX_COUNT
 from tangram_agent.setup import Setup, make_setup
-from tangram_lab.benchmarks.attacks import ENDS_S, LIVE, Seen, Target, episodes_of, training
+from tangram_lab.benchmarks.attacks import (
+    ENDS_S,
+    LIVE,
+    OPEN_FILES,
+    Seen,
+    Target,
+    episodes_of,
+    training,
+)
 from tangram_lab.benchmarks.chaos import SETTINGS, Witness, compare
 from tangram_lab.benchmarks.intruder import NOBODY, knock
 from tangram_lab.benchmarks.measure import show, write
@@ -35,10 +44,10 @@ from tangram_sim.puzzles import parse_puzzles, parse_svg_puzzle
 from worker.client import Client
 
 Attack = tuple[str, str, str, Callable[[Any], Seen]]  # row, what, how much, and what does it
+OFTEN = "service.checkpoint_minutes=0.05"
 ON_A_PORT = ("service.bind=127.0.0.1", "service.log_format=json")
-OPEN_FILES = 1024  # that a master may begin with
 NOISE = 0.02  # of the mean reward, between two trainings of so many updates
-UPDATES = 500  # before the attacks begin
+UPDATES = 200  # before the attacks begin
 BATCHES = 40
 TASK: dict[str, Any] = {"tokens": {"shapes": ["square"], "scale": 1.0}} | {
     name: {} for name in ("sim", "reward", "agent", "net")
@@ -220,7 +229,9 @@ def second_master(target: Target) -> Seen:
 
 
 def killed(target: Target) -> bool:
-    """Whether a training goes on after its master was killed."""
+    """Whether a training goes on after its master was killed, with batches in the journal alone."""
+    target.checkpoint()
+    target.goes_on(20.0)
     master = target.master
     master.kill()
     until_s = time.monotonic() + ENDS_S
@@ -233,24 +244,25 @@ def killed(target: Target) -> bool:
 
 
 def killed_after_huge_numbers(target: Target) -> Seen:
-    huge = 2**63 - 1
-    target.ask(target.hello(incarnation=huge), target.hello(first=huge))
+    """With a batch, so that the numbers would be in journal and checkpoint."""
+    setup = target.setup
+    batch = EpisodeBatch(1, 0, episodes_of(setup, 1)).encode(EpisodeSpec.of(setup))
+    for huge in (2**63 - 1, MAX_COUNT):
+        target.ask(target.hello(incarnation=huge), batch)
+        target.ask(target.hello(incarnation=1, first=huge, index=3001, process="other"))
     held = killed(target)
     return held, "it goes on" if held else "it does not come back"
 
 
 def killed_after_unlink(target: Target) -> Seen:
-    journal, points = target.folder / "journal", target.folder / "checkpoints"
+    """Just after a checkpoint, so that it is not the next one that begins another segment."""
+    journal = target.folder / "journal"
+    target.checkpoint()
     for path in segments(journal).values():
         path.unlink(missing_ok=True)
-    # What was acknowledged before is in the next checkpoint; one may have been on its way.
-    newest, until_s = {list_checkpoints(points)[-1].name}, time.monotonic() + 20.0
-    while len(newest) < 3 and time.monotonic() < until_s:
-        newest.add(list_checkpoints(points)[-1].name)
-        time.sleep(0.05)
-    begun, held = bool(segments(journal)), killed(target)
-    held = held and len(newest) == 3
-    return begun and held, f"a new segment: {begun}; killed after a checkpoint, it goes on: {held}"
+    target.goes_on(20.0)
+    told, held = "has lost its newest segment" in target.told(), killed(target)
+    return told and held, f"told: {told}; killed after a checkpoint, it goes on: {held}"
 
 
 def folder_away(target: Target) -> Seen:
@@ -261,8 +273,9 @@ def folder_away(target: Target) -> Seen:
     stopped = not target.folder.exists()
     if stopped:
         away.rename(target.folder)
-    held = stopped and target.goes_on(10.0)
-    return held, f"made again by accident: {not stopped}; goes on when it is back: {held}"
+    held, told = stopped and target.goes_on(10.0), f"{target.folder} is gone" in target.told()
+    seen = f"made again by accident: {not stopped}; told: {told}; goes on when it is back: {held}"
+    return held and told, seen
 
 
 def full_disk(target: Target) -> Seen:
@@ -349,7 +362,7 @@ def run_attack(out: Path | None, folder: Path) -> int:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     live, own, straight = folder / "live", folder / "a=run of ü", folder / "straight"
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(OPEN_FILES, hard), hard))
-    with training(live, "max_updates=0", *ON_A_PORT, *SETTINGS) as target:
+    with training(live, "max_updates=0", *ON_A_PORT, *SETTINGS, OFTEN) as target:
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
         rows = list(tried(FILES, folder))
         target.goes_on(UPDATES, "updates")
@@ -381,15 +394,27 @@ def run_attack(out: Path | None, folder: Path) -> int:
 
 def harmed(folder: Path) -> list[dict[str, Any]]:
     """What was done to a training of its own, with an independent witness; the folder is odd."""
-    with training(folder, "max_updates=0", *SETTINGS, "service.checkpoint_minutes=0.05") as target:
-        witness = Witness(str(folder), target.setup)
+    with training(folder, "max_updates=0", *SETTINGS, OFTEN) as target:
+        witness, rows = Witness(str(folder), target.setup), list[dict[str, Any]]()
         witness.start()
         target.goes_on(100.0)
-        rows = list(tried(OWN, target))
+        after = 0  # so many it was acknowledged to
+        for attack in OWN:
+            rows += tried([attack], target)
+            after += acknowledged_again(witness)
         witness.stop()
         witness.join(ENDS_S)
     counts = compare(folder, witness)
-    held = not (counts["lost"] or counts["doubled"] or witness.error) and counts["acknowledged"] > 0
+    held = not (counts["lost"] or counts["doubled"] or witness.error) and after == len(OWN)
     seen = ", ".join(f"{n} {counts[n]:,}" for n in ("acknowledged", "lost", "doubled"))
+    seen += f"; acknowledged again after {after} of {len(OWN)}"
     what = "held: kill -9 with a witness, in an odd folder"
     return [*rows, {"attack": what, "tried": "2 kills", "held": held, "seen": seen}]
+
+
+def acknowledged_again(witness: Witness) -> bool:
+    """Whether more of what a witness plays is acknowledged from now on."""
+    before, until_s = witness.acknowledged, time.monotonic() + ENDS_S
+    while witness.acknowledged == before and witness.is_alive() and time.monotonic() < until_s:
+        time.sleep(0.1)
+    return witness.acknowledged > before

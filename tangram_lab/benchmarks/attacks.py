@@ -5,24 +5,30 @@ Everything goes to 127.0.0.1 or to unix sockets of this machine, bounded in coun
 
 import json
 import random
+import re
 import socket
 import struct
 import time
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
+import psutil
 import zmq
 
-from master.hub import Hub, WelcomeInfo
+from master.admission import WelcomeInfo
+from master.hub import Hub
 from tangram_agent.arrays import MAX_FRAME_BYTES, EpisodeSpec
+from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
 from tangram_agent.messages import EpisodeBatch, Heartbeat, Hello, Scores, WantWeights
-from tangram_agent.schema import MAX_COUNT, seal
+from tangram_agent.schema import MAX_COUNT, opened, seal
 from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes
+from tangram_lab.benchmarks.chaos import Witness
 from tangram_lab.benchmarks.fuzz_wire import fuzzed, resealed, valid_messages
 from tangram_lab.benchmarks.strangers import Strangers, subscribe
 from tangram_lab.benchmarks.trainings import MIB, Watched, start_training, wait_for
@@ -33,6 +39,8 @@ from worker.discovery import find_master
 
 Seen = tuple[bool, str]
 ROOM_MIB = 64.0  # that the memory of a master may grow by under any attack
+ROOM_FILES = 300  # the same of its open files, under strangers
+OPEN_FILES = 1024  # that a master may begin with
 ENDS_S = 60.0
 LOOK_S = 0.1
 HOST = "127.0.0.1"
@@ -41,14 +49,21 @@ HOST = "127.0.0.1"
 class Target(Watched):
     """A training under attack."""
 
+    @property
+    def points(self) -> Path:
+        """The folder of its checkpoints."""
+        return self.folder / "checkpoints"
+
     @contextmanager
     def peer(self, kind: int = zmq.DEALER, role: str = "player", **options: int) -> Iterator[Any]:
-        """A socket with the keys of a role; of no role, without."""
+        """A socket with the keys of a role; of an unknown role, with new ones; of none, without."""
         where, address = self.where, find_master(str(self.folder))
         with self.context.socket(kind) as one:
             one.setsockopt(zmq.LINGER, 0)
-            if address is not None and role in address.keys:
-                public, secret = address.keys[role]
+            one.setsockopt(zmq.SNDTIMEO, 5000)  # it may be gone
+            if address is not None and address.keys and role:
+                made = (key.decode() for key in zmq.curve_keypair())
+                public, secret = address.keys.get(role, made)
                 one.setsockopt(zmq.CURVE_SERVERKEY, address.server_key.encode())
                 one.setsockopt(zmq.CURVE_PUBLICKEY, public.encode())
                 one.setsockopt(zmq.CURVE_SECRETKEY, secret.encode())
@@ -57,15 +72,14 @@ class Target(Watched):
             one.connect(where["endpoint" if kind == zmq.DEALER else "weights_endpoint"])
             yield one
 
-    def ask(self, *messages: list[bytes], role: str = "player") -> int:
-        """How many answers a new connection gets to these messages."""
-        answers = 0
+    def ask(self, *messages: list[bytes], role: str = "player") -> Counter[str]:
+        """The kinds of the answers that a new connection gets to these messages."""
+        answers = Counter[str]()
         with self.peer(role=role) as one:
             for frames in messages:
                 one.send_multipart(frames)
-            while answers < len(messages) and one.poll(2000):
-                one.recv_multipart()
-                answers += 1
+            while answers.total() < len(messages) and one.poll(2000):
+                answers[opened(one.recv_multipart())["kind"]] += 1
         return answers
 
     def port(self, name: str) -> tuple[str, int]:
@@ -84,8 +98,38 @@ class Target(Watched):
         with self.cost() as most:
             deed()
         same = self.goes_on() and self.master.pid == pid
-        seen = f"+{most[0]:.0f} of {room_mib:g} MiB, the master {'goes on' if same else 'is gone'}"
-        return same and most[0] <= room_mib, seen
+        seen = f"+{most.mib:.0f} of {room_mib:g} MiB, the master {'goes on' if same else 'is gone'}"
+        return same and most.mib <= room_mib, seen
+
+    def newest(self) -> str:
+        """Name of the newest checkpoint, empty before the first."""
+        return next((one.name for one in reversed(list_checkpoints(self.points))), "")
+
+    def checkpoint(self) -> Mapping[str, Any]:
+        """The counters of a checkpoint that begins from now on."""
+        seen, until_s = {self.newest()}, time.monotonic() + ENDS_S
+        while len(seen) < 3 and time.monotonic() < until_s:  # one may be on its way
+            seen.add(self.newest())
+            time.sleep(LOOK_S / 2)
+        return load_checkpoint(self.points / self.newest(), []).counters
+
+    def besieged(self, strangers: Strangers, seconds: float) -> Seen:
+        """Whether strangers cost little, and a worker that joins meanwhile is acknowledged."""
+        worker, master = Witness(str(self.folder), self.setup), self.master
+        with self.cost() as most:
+            lasting(seconds / 2, strangers.push)
+            worker.start()
+            lasting(seconds / 2, strangers.push)
+            until_s = time.monotonic() + ENDS_S / 2
+            while not worker.acknowledged and time.monotonic() < until_s:
+                lasting(LOOK_S, strangers.push)
+        worker.stop()
+        worker.join(ENDS_S)
+        same = self.goes_on() and self.master.pid == master.pid
+        few = most.mib <= ROOM_MIB and most.files <= ROOM_FILES
+        seen = f"+{most.mib:.0f} of {ROOM_MIB:g} MiB, +{most.files} of {ROOM_FILES} files, "
+        seen += f"a worker joins meanwhile: {worker.acknowledged > 0}"
+        return same and few and worker.acknowledged > 0, seen
 
 
 @contextmanager
@@ -126,12 +170,17 @@ def episodes_of(setup: Setup, count: int) -> Episodes:
 
 
 def huge_incarnations(target: Target) -> Seen:
-    huge = 2**63 - 1
+    """And then the next process of the same index: the number after the largest."""
+
+    def join() -> None:
+        for huge in (2**63 - 1, MAX_COUNT):
+            target.ask(target.hello(incarnation=huge))
+            target.ask(target.hello(process="next"))
+            target.ask(target.hello(process="third"), bye, target.hello(incarnation=1, first=huge))
+            target.ask(target.hello(index=3001, process="other", first=huge))
+
     bye = seal("bye", {"reason": "x"}, [])
-    target.ask(target.hello(incarnation=huge), target.hello(incarnation=MAX_COUNT))
-    target.ask(target.hello(), bye, target.hello(incarnation=1, first=MAX_COUNT))
-    target.ask(target.hello(index=3001, first=huge), target.hello(index=3002, first=MAX_COUNT))
-    return target.cheap(lambda: None)
+    return target.cheap(join)
 
 
 def large_topic(target: Target) -> Seen:
@@ -143,9 +192,9 @@ def large_topic(target: Target) -> Seen:
     def topics() -> None:
         subscribe(target.where["weights_endpoint"], 16 * MIB)
         with ExitStack() as opened:
-            for _ in range(64):
+            for number in range(64):  # those that are equal would be kept once
                 one = opened.enter_context(target.peer(zmq.SUB))
-                one.setsockopt(zmq.SUBSCRIBE, b"x" * 32 * 1024)
+                one.setsockopt(zmq.SUBSCRIBE, bytes([number]) * 32 * 1024)
             time.sleep(2.0)
 
     return target.cheap(topics, 16.0)
@@ -153,27 +202,33 @@ def large_topic(target: Target) -> Seen:
 
 def unread_weights(target: Target) -> Seen:
     def want() -> None:
-        with target.peer(RCVHWM=1, RCVBUF=4096) as one:
-            one.send_multipart(target.hello(index=3010))
-            for _ in range(1000):
-                one.send_multipart(WantWeights("x", -1).encode())
-            time.sleep(2.0)
+        with ExitStack() as opened:
+            for number in range(50):
+                one = opened.enter_context(target.peer(RCVHWM=1, RCVBUF=4096))
+                hello = target.hello(index=3100 + number, process=f"unread {number}")
+                for message in [hello] + [WantWeights("x", -1).encode()] * 60:
+                    one.send_multipart(message)
+            time.sleep(4.0)
 
     return target.cheap(want, 32.0)
 
 
 def many_incarnations(target: Target) -> Seen:
+    """Of one index, and of as many; nobody has sent a batch, so a checkpoint has none of them."""
+
     def join() -> None:
         with target.peer() as one:
-            for number in range(4096):
-                one.send_multipart(hellos[number % 2])
+            for number in range(8192):
+                index = 10_000 + max(0, number - 4096)
+                one.send_multipart(target.hello(index=index, process=f"one {number}"))
                 while one.poll(0):
                     one.recv_multipart()
                 if number % 64 == 0:
                     time.sleep(LOOK_S / 10)
 
-    hellos = [target.hello(index=3020, process=name) for name in ("one", "other")]
-    return target.cheap(join, 16.0)
+    held, seen = target.cheap(join, 16.0)
+    known = len(target.checkpoint()["hub"])
+    return held and known < 1000, f"{known:,} are kept, {seen}"
 
 
 def million_frames(target: Target) -> Seen:
@@ -187,14 +242,21 @@ def million_frames(target: Target) -> Seen:
 
 def identities(target: Target) -> Seen:
     def connect() -> None:
-        with ExitStack() as opened:
-            made = [opened.enter_context(target.peer()) for _ in range(500)]
+        with ExitStack() as stack:
+            made = [stack.enter_context(target.peer()) for _ in range(500)]
             for number, one in enumerate(made):
                 hello = target.hello(index=4000 + number, process=f"p{number}")
                 one.send_multipart(hello if number < 300 else Heartbeat({}).encode())
-            time.sleep(1.0)
+            until_s = time.monotonic() + 10.0
+            while answers.total() < len(made) and time.monotonic() < until_s:
+                for one in made:
+                    while one.poll(0):
+                        answers[opened(one.recv_multipart())["kind"]] += 1
 
-    return target.cheap(connect)
+    answers = Counter[str]()
+    held, seen = target.cheap(connect)
+    welcome, greet = answers["welcome"], answers["greet"]
+    return held and (welcome, greet) == (300, 200), f"{welcome} let in, {greet} asked who, {seen}"
 
 
 def forged_messages(target: Target) -> Seen:
@@ -212,8 +274,7 @@ def forged_messages(target: Target) -> Seen:
 
 def invalid_utf8(target: Target) -> Seen:
     forged = target.hello()[0].replace(b"attacker", b"\xff\xfe\xc0\x80bad!")
-    target.ask(resealed([forged]), [b"\xff" * 300], [b"\x00"])
-    return target.cheap(lambda: None)
+    return target.cheap(lambda: target.ask(resealed([forged]), [b"\xff" * 300], [b"\x00"]))
 
 
 def deaf_subscribers(target: Target) -> Seen:
@@ -228,17 +289,22 @@ def deaf_subscribers(target: Target) -> Seen:
 
 
 def degenerate_batches(target: Target) -> Seen:
-    setup, spec = target.setup, EpisodeSpec.of(target.setup)
-    header, *frames = EpisodeBatch(1, 0, episodes_of(setup, 4)).encode(spec)
-    sent = []
+    """Each is the next one of its sender, so that it would be taken if it were right."""
+    spec, episodes = EpisodeSpec.of(target.setup), episodes_of(target.setup, 4)
+    frames = EpisodeBatch(1, 0, episodes).encode(spec)[1:]
+    wrong = [[], frames[1:], [*frames, b""], [b"", *frames[1:]]]
     for place, frame in enumerate(frames):
         for value in (np.nan, np.inf, 1e30):
             row = np.full(len(frame) // 4, value, np.float32).tobytes()[: len(frame)]
-            sent.append([header, *frames[:place], row, *frames[place + 1 :]])
-    sent += [[header], [header, *frames[1:]], [header, *frames, b""], [header, b"", *frames[1:]]]
-    answers = target.ask(target.hello(index=3030), *map(resealed, sent))
-    held, seen = target.cheap(lambda: None)
-    return held and answers > len(sent), f"{answers - 1} of {len(sent)} answered; {seen}"
+            wrong.append([*frames[:place], row, *frames[place + 1 :]])
+    headers = (EpisodeBatch(n, 0, episodes).encode(spec)[0] for n in range(1, 1 + len(wrong)))
+    sent = [resealed([header, *rest]) for header, rest in zip(headers, wrong, strict=True)]
+    answers = Counter[str]()
+    held, seen = target.cheap(
+        lambda: answers.update(target.ask(target.hello(index=3030, process="odd"), *sent))
+    )
+    refused = answers["reject"]
+    return held and refused == len(sent), f"{refused} of {len(sent)} refused, {seen}"
 
 
 # Those who have none
@@ -251,14 +317,15 @@ def large_frames(target: Target) -> Seen:
 
 def thousand_strangers(target: Target) -> Seen:
     with Strangers(target.where["endpoint"], 1000, MAX_FRAME_BYTES) as strangers:
-        return target.cheap(lambda: lasting(5.0, strangers.push))
+        return target.besieged(strangers, 5.0)
 
 
 def idle_connections(target: Target) -> Seen:
+    """By a master that began with few files, and took more."""
+    soft, hard = target.master.rlimit(psutil.RLIMIT_NOFILE)
     with Strangers(target.where["endpoint"], 3300) as strangers:
-        lasting(4.0, strangers.push)
-        held = target.goes_on(100.0)
-        return held, f"{strangers.connected:,} connected, the run {'goes on' if held else 'stands'}"
+        held, seen = target.besieged(strangers, 4.0)
+    return held and soft > min(OPEN_FILES, hard - 1), f"of {soft:,} files it may open {seen}"
 
 
 def uninvited(target: Target, role: str = "") -> Seen:
@@ -266,10 +333,15 @@ def uninvited(target: Target, role: str = "") -> Seen:
     corners = np.zeros((1, setup.layout.corner_count, 2), np.float32)
     forged = Scores(1, {"mean_reward": 0.999}, corners, corners, corners).encode(spec)
     evaluator = target.hello(role="evaluator", index=0)
-    answers = target.ask(evaluator, forged, Heartbeat({}).encode(), role=role)
-    score = target.numbers().get("test/mean_reward", 0.0)
-    held = (role or not answers) and abs(score - 0.999) > 1e-9 and target.goes_on()
-    return bool(held), f"{answers} answers, mean reward {score:.3f}"
+    said = (evaluator, forged, Heartbeat({}).encode())
+    roles = [role] if role else ["", "unknown"]
+    answers = sum((target.ask(*said, role=one) for one in roles), Counter[str]())
+    time.sleep(2.0)
+    curve = target.folder / "curve.jsonl"
+    told = curve.read_text() if curve.exists() else ""
+    forgeries = len(re.findall(r"\b0\.999\b", told))
+    held = (role or not answers) and not forgeries and target.goes_on()
+    return bool(held), f"{answers.total()} answers, {forgeries} forged scores"
 
 
 def player_as_evaluator(target: Target) -> Seen:
@@ -341,28 +413,28 @@ def slow_requests(target: Target) -> Seen:
     threads = target.master.num_threads()
     with askers(target, 600, b"GET /"):
         more = target.master.num_threads() - threads
-    until_s, answer = time.monotonic() + 15.0, b""
-    while b"200" not in answer and time.monotonic() < until_s:
-        with suppress(OSError), socket.create_connection(target.port("http"), 5.0) as one:
-            one.sendall(b"GET /healthz HTTP/1.0\r\n\r\n")
-            answer = one.recv(100)
+        until_s, answer = time.monotonic() + 15.0, b""
+        while b"200" not in answer and time.monotonic() < until_s:
+            with suppress(OSError), socket.create_connection(target.port("http"), 5.0) as one:
+                one.sendall(b"GET /healthz HTTP/1.0\r\n\r\n")
+                answer = one.recv(100)
     held = more <= 100 and b"200" in answer and target.goes_on()
     return held, f"{more} threads more; then {answer[:15]!r}"
 
 
 LIVE: list[tuple[str, str, str, Callable[[Target], Seen]]] = [
-    ("1", "HELLO, BYE and HELLO with the largest numbers", "6 messages", huge_incarnations),
-    ("3", "frames before the handshake", "30 of 31 MiB", large_frames),
+    # First: what others leave behind would be room for it. The largest one is the last.
     ("3", "strangers with all that they may say", "1,000 at a time, 5 s", thousand_strangers),
+    ("1", "HELLO, BYE and HELLO with the largest numbers", "12 messages", huge_incarnations),
+    ("3", "frames before the handshake", "30 of 31 MiB", large_frames),
     ("4", "a topic on the weights socket", "16 MiB and 64 of 32 KiB", large_topic),
-    ("5", "an evaluator's scores without keys", "3 messages", uninvited),
+    ("5", "an evaluator's scores without a key of the run", "6 messages", uninvited),
     ("5", "an evaluator's scores with a player's key", "3 messages", player_as_evaluator),
     ("5", "an impostor with the run's name", "1 for 4 s", impostor),
     ("9", "idle connections", "3,300 for 4 s", idle_connections),
     ("10", "HTTP requests that are reset", "100", reset_requests),
-    ("12", "requests for weights, never read", "1,000", unread_weights),
-    ("12", "incarnations", "4,096", many_incarnations),
-    ("held", "a message of many frames", "1,000,000", million_frames),
+    ("12", "requests for weights, never read", "60 each of 50 workers", unread_weights),
+    ("12", "incarnations", "8,192", many_incarnations),
     ("held", "identities; workers at once", "500; 300", identities),
     ("held", "garbage on three ports", "1 MB/s, 3 s", garbage),
     ("held", "forged headers and messages", "5,000", forged_messages),
@@ -370,4 +442,5 @@ LIVE: list[tuple[str, str, str, Callable[[Target], Seen]]] = [
     ("held", "slow HTTP clients", "600", slow_requests),
     ("held", "texts that are no UTF-8", "3 messages", invalid_utf8),
     ("held", "degenerate batches", "19", degenerate_batches),
+    ("held", "a message of many frames", "1,000,000", million_frames),
 ]

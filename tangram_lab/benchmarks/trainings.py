@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
@@ -90,6 +91,19 @@ def result_of(folder: Path) -> dict[str, Any]:
 
 
 @dataclass
+class Growth:
+    """The most that a process has grown by.
+
+    Attributes:
+        mib: of memory.
+        files: that it has open.
+    """
+
+    mib: float = 0.0
+    files: int = 0
+
+
+@dataclass
 class Watched:
     """A training that is looked at from outside.
 
@@ -109,7 +123,7 @@ class Watched:
         content: dict[str, Any] = json.loads((self.folder / "connection.json").read_text())
         return content
 
-    @property
+    @cached_property
     def setup(self) -> Setup:
         """Its task."""
         return make_setup(yaml.safe_load((self.folder / "config.yaml").read_text()))
@@ -143,15 +157,16 @@ class Watched:
         return (self.folder / "told").read_text(errors="replace")
 
     @contextmanager
-    def cost(self) -> Iterator[list[float]]:
-        """The most MiB that the master has grown by, as the one entry of a list."""
-        process, most, ends = self.master, [0.0], Event()
-        before = process.memory_info().rss / MIB
+    def cost(self) -> Iterator[Growth]:
+        """What the master grows by."""
+        process, most, ends = self.master, Growth(), Event()
+        mib, files = process.memory_info().rss / MIB, process.num_fds()
 
         def look() -> None:
             with suppress(psutil.Error):
                 while not ends.wait(0.02):
-                    most[0] = max(most[0], process.memory_info().rss / MIB - before)
+                    most.mib = max(most.mib, process.memory_info().rss / MIB - mib)
+                    most.files = max(most.files, process.num_fds() - files)
 
         watch = Thread(target=look, daemon=True)
         watch.start()

@@ -18,8 +18,9 @@ from typing import Any
 
 import zmq
 
+from master.admission import WelcomeInfo
 from master.delivery import EpisodesArrived
-from master.hub import Hub, WelcomeInfo
+from master.hub import Hub
 from master.security import Keys, make_keys
 from tangram_agent.addresses import IPC
 from tangram_agent.arrays import EpisodeSpec

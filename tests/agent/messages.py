@@ -39,7 +39,7 @@ def broadcast(sent: Weights, epoch: str = "e") -> bytes:
 
 def scores(count: int = 2) -> Scores:
     corners = np.zeros((count, SPEC.corners, 2), np.float32)
-    return Scores(7, {"mean_reward": 0.25, "raw/overlap": 0.5}, corners, corners + 1, corners - 1)
+    return Scores(7, {"mean_reward": 0.25, "raw_overlap": 0.5}, corners, corners + 1, corners - 1)
 
 
 def hello(

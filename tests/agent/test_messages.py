@@ -15,6 +15,7 @@ from tangram_agent.messages import (
     MAX_PICTURES,
     MAX_ROWS,
     ROLES,
+    SCORE_NAMES,
     WORKER_COLUMNS,
     Ack,
     Alive,
@@ -92,7 +93,7 @@ BOUNDS: dict[str, dict[str, Bound]] = {
     "bye": REASON,
     "ask_status": {},
     "episodes": {"sequence": Between(1, BIG), "weights_version": Between(-1, BIG)},
-    "scores": {"weights_version": Between(-1, BIG), "scalars": Numbers()},
+    "scores": {"weights_version": Between(-1, BIG), "scalars": Numbers(names=SCORE_NAMES)},
     "welcome": {
         "epoch": Text(64),
         "run_id": Text(256),
@@ -214,8 +215,9 @@ def values_of(bound: Bound) -> st.SearchStrategy[Any]:
             letters = st.characters(exclude_categories=() if cut else ["Cs"])
             text = st.text(letters, min_size=int(needed), max_size=min(longest, 200))
             return st.sampled_from(sorted(choices)) if choices else text
-        case Numbers():
-            return st.dictionaries(words, st.floats(-1e18, 1e18), max_size=5)
+        case Numbers(names=names):
+            keys = st.sampled_from(names) if names else words
+            return st.dictionaries(keys, st.floats(-1e18, 1e18), max_size=5)
         case Texts():
             return st.dictionaries(words, st.text("é9", min_size=1, max_size=16), max_size=5)
     raise AssertionError(bound)
@@ -243,7 +245,7 @@ def test_batches_come_back_as_they_were_sent(
         np.testing.assert_array_equal(vars(received.episodes)[name], array)
 
 
-@given(st.integers(0, MAX_PICTURES), values_of(Numbers()), st.integers(-1, BIG))
+@given(st.integers(0, MAX_PICTURES), values_of(Numbers(names=SCORE_NAMES)), st.integers(-1, BIG))
 def test_scores_come_back_as_they_were_sent(
     count: int, scalars: dict[str, float], version: int
 ) -> None:
@@ -365,8 +367,8 @@ def test_what_a_receiver_would_refuse_is_not_sent() -> None:
     sent = scores()
     with pytest.raises(WireError, match=f"scores: count {INTEGER} 0 and 64, got 65"):
         scores(65).encode(SPEC)
-    with pytest.raises(WireError, match=r"scores: scalars.a must be a finite number, got nan"):
-        replace(sent, scalars={"a": NAN}).encode(SPEC)
+    with pytest.raises(WireError, match=r"scores: scalars.iou must be a finite number, got nan"):
+        replace(sent, scalars={"iou": NAN}).encode(SPEC)
     with pytest.raises(WireError, match=r"ends must have the shape \(2, 7, 2\), got \(1, 7, 2\)"):
         replace(sent, ends=sent.ends[:1]).encode(SPEC)
     none = Episodes(*[array[:0] for array in vars(episodes(1)).values()])

@@ -1,13 +1,40 @@
 """The attacks that need no training; the others run by `tangram-bench attack`."""
 
 import json
+import subprocess
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from threading import Timer
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
+import zmq
 
-from tangram_lab.benchmarks import attack
-from tangram_lab.benchmarks.attack import FILES, LOCKSTEP, OWN, Attack, tried
-from tangram_lab.benchmarks.attacks import LIVE
+from tangram_agent.setup import make_setup
+from tangram_lab.benchmarks import attack, attacks
+from tangram_lab.benchmarks.attack import (
+    FILES,
+    LOCKSTEP,
+    OWN,
+    TASK,
+    Attack,
+    acknowledged_again,
+    tried,
+)
+from tangram_lab.benchmarks.attacks import (
+    LIVE,
+    Seen,
+    Target,
+    degenerate_batches,
+    player_as_evaluator,
+    thousand_strangers,
+    uninvited,
+)
+from tangram_lab.benchmarks.chaos import Witness
+from tangram_lab.benchmarks.trainings import Growth
 
 pytestmark = pytest.mark.slow
 
@@ -35,3 +62,95 @@ def test_all_rows_are_tried() -> None:
     """Row 4 and others twice, in several ways."""
     rows = {one[0] for one in (*LIVE, *FILES, *OWN, *LOCKSTEP)}
     assert rows == {"held", *map(str, range(1, 14))}
+
+
+class Standing(Target):
+    """A training that goes on, and answers and grows as it is told to."""
+
+    answers: Counter[str]
+    growth = Growth()
+    master = cast(Any, SimpleNamespace(pid=1))
+    where = {"endpoint": "tcp://127.0.0.1:1", "run_id": "x"}  # noqa: RUF012
+    setup = make_setup(TASK)
+
+    def ask(self, *_messages: list[bytes], role: str = "player") -> Counter[str]:
+        return self.answers
+
+    def goes_on(self, more: float = 1.0, name: str = "episodes") -> bool:
+        return True
+
+    @contextmanager
+    def cost(self) -> Iterator[Growth]:
+        yield self.growth
+
+
+@pytest.fixture
+def standing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Standing:
+    monkeypatch.setattr(attacks, "lasting", lambda *_: None)
+    monkeypatch.setattr("time.sleep", lambda _: None)
+    monkeypatch.setattr(attacks, "ENDS_S", 0.0)
+    monkeypatch.setattr(attacks, "Strangers", lambda *_: nullcontext(SimpleNamespace(push=None)))
+    return Standing(tmp_path, cast("subprocess.Popen[bytes]", None), zmq.Context.instance())
+
+
+def forged(standing: Standing, strike: Callable[[Target], Seen]) -> bool:
+    (standing.folder / "curve.jsonl").write_text('{"updates": 3, "mean_reward": 0.999}\n')
+    return strike(standing)[0]
+
+
+@pytest.mark.parametrize(
+    ("strike", "answers", "held"),
+    [
+        (degenerate_batches, {"welcome": 1, "reject": 19}, True),
+        (degenerate_batches, {"welcome": 1, "reject": 18, "ack": 1}, False),
+        (uninvited, {}, True),
+        (uninvited, {"welcome": 1}, False),
+        (player_as_evaluator, {"refused": 1}, True),
+        (lambda target: (forged(target, uninvited), ""), {}, False),
+        (lambda target: (forged(target, player_as_evaluator), ""), {"refused": 1}, False),
+    ],
+)
+def test_an_answer_is_not_enough(
+    standing: Standing, strike: Callable[[Target], Seen], answers: dict[str, int], held: bool
+) -> None:
+    standing.answers = Counter(answers)
+    assert strike(standing)[0] == held
+
+
+@pytest.mark.parametrize(
+    ("growth", "acknowledged", "held"),
+    [
+        (Growth(10.0, 40), 1, True),
+        (Growth(80.0, 40), 1, False),
+        (Growth(10.0, 1003), 1, False),
+        (Growth(10.0, 40), 0, False),
+    ],
+)
+def test_strangers_take_little_memory_few_files_and_nobodys_turn(
+    standing: Standing,
+    monkeypatch: pytest.MonkeyPatch,
+    growth: Growth,
+    acknowledged: int,
+    held: bool,
+) -> None:
+    """1,003 files were seen with the bound on handshakes taken away."""
+    worker = SimpleNamespace(acknowledged=acknowledged)
+    worker.start = worker.stop = worker.join = lambda *_: None
+    monkeypatch.setattr(attacks, "Witness", lambda *_: worker)
+    standing.growth = growth
+    assert thousand_strangers(standing)[0] == held
+    assert LIVE[0][3] is thousand_strangers  # others would have raised what it begins at
+
+
+def test_a_witness_must_be_acknowledged_again(
+    standing: Standing, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(attack, "ENDS_S", 0.5)
+    witness = Witness("nobody", standing.setup)
+    monkeypatch.setattr(witness, "is_alive", lambda: True)
+    witness.acknowledged = 5
+    assert not acknowledged_again(witness)
+    more = Timer(0.1, setattr, [witness, "acknowledged", 6])
+    more.start()
+    assert acknowledged_again(witness)
+    more.join()

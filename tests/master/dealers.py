@@ -7,8 +7,9 @@ from typing import Any
 
 import zmq
 
+from master.admission import WelcomeInfo
 from master.delivery import Arrival, EpisodesArrived
-from master.hub import Hub, WelcomeInfo
+from master.hub import Hub
 from tangram_agent.arrays import WeightShapes
 from tangram_agent.messages import Heartbeat, Reject, ToWorker, Welcome, decode_from_master
 from tangram_agent.schema import Plain

@@ -205,6 +205,7 @@ def test_what_is_deleted_under_a_master_is_told_and_written_anew_at_once(
     assert (stage.folder / "config.yaml").exists()
     assert stage.keep(4)
     assert len(stage.told) == 1
+    assert inserted(stage) == (2, [*after[1], 4])  # one checkpoint was enough
 
 
 GONE: dict[str, tuple[Callable[[Path], object], str]] = {

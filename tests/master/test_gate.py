@@ -13,7 +13,17 @@ import pytest
 import zmq
 
 from master.counters import Counters
-from master.gate import AMPLE, DESCRIPTORS, HANDSHAKES, MAX_PEERS, MOST_FILES, RESERVE, Room
+from master.gate import (
+    AMPLE,
+    DESCRIPTORS,
+    HANDSHAKES,
+    LET_IN,
+    MAX_PEERS,
+    MOST_FILES,
+    RESERVE,
+    Room,
+    _let_in,
+)
 from master.security import Keys, make_keys
 from master.sockets import MAX_COMMAND, Sockets
 from tangram_agent.arrays import MAX_FRAME_BYTES
@@ -149,6 +159,22 @@ def test_of_too_many_without_a_key_the_oldest_goes(monkeypatch: pytest.MonkeyPat
         first.send(b"question")
         made.answered(first, second)
         assert made.counters["refused_handshakes"] == 4
+
+
+@pytest.mark.cluster
+def test_a_welcome_or_an_error_before_the_key_lets_nobody_in() -> None:
+    """Else 32 that stopped there would keep all others out."""
+    with (
+        socket.create_server(("127.0.0.1", 0)) as server,
+        socket.create_connection(server.getsockname()),
+        server.accept()[0] as made,
+    ):
+        found, total = dict[int, bool](), 0
+        for more in (64, 170, 12, 4):  # greeting, WELCOME, an error or instead of it READY
+            made.sendall(bytes(more))
+            total += more
+            found[total] = _let_in(made)
+    assert found == {64: False, 234: False, 246: False, LET_IN: True}
 
 
 @pytest.mark.cluster

@@ -28,7 +28,9 @@ from hypothesis.stateful import (
 from master import hub as hub_module
 from master import journal as journal_module
 from master import run as run_module
+from master import sockets as sockets_module
 from master.config import MasterConfig
+from master.counters import Counters
 from master.loop import Loop
 from master.run import open_run
 from master.rundir import RunFolder
@@ -77,15 +79,16 @@ class Wire:
             yield self.answers.popleft()
 
 
-class Sockets:
+class Sockets(sockets_module.Sockets):
     """In place of the master's: takes what is delivered, and answers at once."""
 
     endpoint, weights_endpoint = "tcp://127.0.0.1:1", "tcp://127.0.0.1:2"
 
     def __init__(self, *_: object, **__: object) -> None:
+        self._counters, self._authenticator = Counters(), None
         self.arriving = deque[tuple[bytes, list[bytes]]]()
         self.wires: dict[bytes, Wire] = {}
-        self.publish = self.close = lambda *_: None
+        self.publish = self.close = lambda *_: None  # type: ignore[method-assign]
 
     def wait(self, _timeout_s: float) -> bool:
         return bool(self.arriving)

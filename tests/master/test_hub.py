@@ -1,19 +1,25 @@
 """The hub with peers that keep the rules and peers that do not, on real sockets."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from master.gate import HANDSHAKES, RESERVE, Room
+from master.registry import STATUS_AGAIN_S
 from tangram_agent.messages import (
+    WORKER_COLUMNS,
     Ack,
     Alive,
+    AskStatus,
     Bye,
     Greet,
     Heartbeat,
     Refused,
     Reject,
+    RunStatus,
     Stop,
     WantWeights,
     WeightsMessage,
@@ -46,7 +52,10 @@ def test_hello_is_answered_with_all_that_a_worker_needs(stage: Stage) -> None:
 
 
 NO_ROOM = Room(RESERVE + HANDSHAKES)
-DIFFERS = "its settings of {0} differ from the master's: start both with the same overrides of {0}"
+DIFFERS = (
+    "its settings of {0} differ from the master's ({1}): leave them out, for connect=RUN_DIR "
+    "brings the master's, or start both with the same overrides of {0}"
+)
 
 
 @pytest.mark.parametrize(
@@ -55,12 +64,18 @@ DIFFERS = "its settings of {0} differ from the master's: start both with the sam
         (
             {"fingerprints": FINGERPRINTS | {"tokens": "other"}},
             "refused_tokens",
-            DIFFERS.format("tokens"),
+            DIFFERS.format(
+                "tokens", f"tokens: the worker has other, the master {FINGERPRINTS['tokens']}"
+            ),
         ),
         (
             {"fingerprints": {"tokens": FINGERPRINTS["tokens"], "net": "more"}},
             "refused_settings",
-            DIFFERS.format("net, sim"),
+            DIFFERS.format(
+                "net, sim",
+                "net: the worker has more, the master none; "
+                f"sim: the worker has none, the master {FINGERPRINTS['sim']}",
+            ),
         ),
         (
             {"v": PROTOCOL + 1},
@@ -216,6 +231,60 @@ def test_each_role_sends_its_own_kind_only(
     dealer.join(role=role, index=2)
     assert dealer.ask(frames) == Reject(reason=reason, sequence=number, final=True)
     assert (stage.arrivals, stage.hub.counters["rejected"]) == ([], 1)
+
+
+def test_scores_are_taken_once_for_each_of_the_published_weights(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An evaluator that sent as many as it liked filled the disk."""
+    monkeypatch.setattr("master.delivery.MAX_EVALUATORS", 2)
+    monkeypatch.setattr("master.delivery.REMEMBERED_VERSIONS", 2)
+    dealers = [stage.dealer() for _ in range(3)]
+    for number, dealer in enumerate(dealers):
+        dealer.join(role="evaluator", process=f"p{number}")
+    unknown = "weights {} are none of the last 2 of this master"
+    for published, index, version, reason in (
+        (6, 0, 7, unknown.format(7)),
+        (7, 0, 7, ""),
+        (7, 0, 7, "it has scored weights 7 before"),
+        (7, 1, 7, ""),
+        (7, 2, 7, "2 evaluators have scored weights 7, the most that may"),
+        (8, 0, 8, ""),
+        (8, 0, 6, unknown.format(6)),
+    ):
+        stage.hub.publish(weights(published))
+        dealers[index].say(replace(scores(), weights_version=version).encode(SPEC))
+        answer = dealers[index].ask(Heartbeat({}))
+        if reason:
+            assert answer == Reject(f"evaluator {index}: {reason}", sequence=0, final=True)
+            answer = dealers[index].hear()
+        assert answer == Alive(published)
+    assert len(stage.arrivals) == stage.hub.counters["scores"] == 3
+    assert stage.hub.counters["excess_scores"] == 4
+
+
+def test_how_the_run_stands_is_told_at_a_bounded_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever asked without an end and read nothing kept all the answers in memory here."""
+    now = 0.0
+    monkeypatch.setattr("master.hub.time", SimpleNamespace(monotonic=lambda: now))
+    monkeypatch.setattr("master.registry.STATUS_ANSWERS", 2)
+    with staged() as stage:
+        stage.hub.tell(RunStatus({}, {"run_id": "run"}, np.zeros((0, len(WORKER_COLUMNS)))))
+        dealers = [stage.dealer() for _ in range(3)]
+        for later, found in (
+            (0.0, [1, 1, 0]),
+            (STATUS_AGAIN_S - 0.01, [0, 0, 0]),
+            (STATUS_AGAIN_S, [1, 1, 0]),
+        ):
+            now = later
+            for dealer, answers in zip(dealers, found, strict=True):
+                for _ in range(3):
+                    dealer.say(AskStatus())
+                heard = [dealer.ask(Heartbeat({}))]
+                while heard[-1] != Greet():  # who asks need not take part
+                    heard.append(dealer.hear())
+                assert len(heard) == answers + 1, later
+        assert stage.hub.counters["status_asked_again"] == 27 - 4
 
 
 def test_silence_and_bye_free_the_index_and_whoever_says_something_is_not_silent(

@@ -189,7 +189,7 @@ def test_batches_that_wait_are_bounded_over_those_who_have_left(
     stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Index after index would fill the memory, a window each."""
-    monkeypatch.setattr("master.hub.SPARE_PEERS", 0)
+    monkeypatch.setattr("master.delivery.SPARE_PEERS", 0)
     left, late = stage.dealer(), stage.dealer()
     left.join(process="left")
     left.send(*range(1, WINDOW + 1))
@@ -204,7 +204,7 @@ def test_batches_that_wait_are_bounded_over_those_who_have_left(
     stage.counted("batches", WINDOW + 1)
     for arrival in stage.batches():
         stage.hub.acknowledge(arrival)
-    assert not stage.hub._waiting
+    assert not stage.hub._waiting._of
 
 
 def test_what_the_disk_lost_is_told_when_its_worker_comes_back(

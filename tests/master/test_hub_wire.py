@@ -99,7 +99,7 @@ def test_who_vanished_is_unreachable_and_nobody_waits(stage: Stage, player: Deal
 
     def unreachable() -> int:
         # The ROUTER learns of it some time; until then it accepts answers.
-        stage.hub._send(identity, Greet())
+        stage.hub._sockets.answer(identity, Greet())
         return stage.hub.counters["unreachable"]
 
     stage.until(unreachable)

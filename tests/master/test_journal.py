@@ -2,6 +2,7 @@
 
 import errno
 import os
+import tracemalloc
 import zlib
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from hypothesis import strategies as st
 
 from master import journal as journal_module
 from master.delivery import EpisodesArrived
-from master.journal import FORMAT, HEAD, MAGIC, JournalError, Place, Title, segments
+from master.journal import FORMAT, HEAD, MAGIC, JournalError, Place, Title, _head, segments
 from master.recovery import Reader, journal_run_id
 from tangram_agent.arrays import EpisodeSpec, join_frames
 from tangram_agent.schema import opened, seal
@@ -216,6 +217,75 @@ def test_damage_at_the_end_is_no_torn_record_in_any_later_life(
         kept = journal(tmp_path, MADE, number=reader.number)
         kept.append(arrival(MADE, 7 + life))
     assert sequences(tmp_path, warnings=warnings) == [1, 2, 3, 4, 5, 7, 8, 9]
+
+
+def starts(content: bytes) -> list[int]:
+    """Where the title and each batch of a segment begin, and its end, as it was written."""
+    at = [0]
+    while at[-1] < len(content):
+        at.append(at[-1] + HEAD.size + HEAD.unpack_from(content, at[-1])[1])
+    return at
+
+
+@pytest.mark.parametrize("later", [False, True], ids=["at the end", "before another life"])
+@pytest.mark.parametrize(
+    ("hits", "told"),
+    [
+        ("body 6", "1 batch is lost"),
+        ("body 5, body 6", "2 batches are lost"),
+        ("head 4, head 5, body 6", "3 batches are lost"),
+        ("body 4, body 5, head 6", "at least 2 batches are lost"),
+        ("body 4, head 5, head 6", "at least 1 batch is lost"),
+        ("body 4, zeros 5", "at least 2 batches are lost"),
+        ("zeros 4", "at least 1 batch is lost"),
+        ("body 5, cut 6", "at least 1 batch is lost"),
+        ("head 4, cut 5", "the batches that were in there are lost, and nobody knows how many"),
+        ("head 4, head 5, head 6", "the batches that were in there are lost, and nobody knows how"),
+    ],
+)
+def test_of_a_damaged_end_no_more_is_claimed_than_is_known(
+    tmp_path: Path, hits: str, told: str, later: bool
+) -> None:
+    """Who is told too low a number believes that the rest is there."""
+    kept = journal(tmp_path, MADE)
+    for number in range(1, 7):
+        kept.append(arrival(MADE, number))
+    close_journals()
+    content = bytearray(segments(tmp_path)[1].read_bytes())
+    at, whole = starts(content), [1, 2, 3, 4, 5, 6]
+    for hit in hits.split(", "):
+        kind, number = hit[:-2], int(hit[-1])
+        body = at[number] + HEAD.size + 9
+        if kind == "cut":
+            del content[body:]
+        elif kind == "zeros":
+            content[body:] = bytes(len(content) - body)
+        else:
+            content[body if kind == "body" else at[number] + 5] ^= 1
+        last = 6 if kind in ("cut", "zeros") else number
+        whole = [n for n in whole if not number <= n <= last]
+    segments(tmp_path)[1].write_bytes(content)
+    damaged = at[len(whole) + 1]
+    for _ in range(1 + later):
+        warnings: list[str] = []
+        reader = read_all(tmp_path, warnings)
+        [line] = warnings
+        assert line.startswith(f"{segments(tmp_path)[1]} is damaged at byte {damaged:,}: {told}")
+        assert sequences(tmp_path, warnings=[]) == whole
+        if later and 7 not in whole:
+            journal(tmp_path, MADE, number=reader.number).append(arrival(MADE, 7))
+            whole.append(7)
+
+
+def test_a_forged_length_makes_nobody_take_room_for_it(tmp_path: Path) -> None:
+    journal(tmp_path, MADE).append(arrival(MADE, 1))
+    with segments(tmp_path)[1].open("ab") as file:
+        file.write(_head(2**32 - 1, 2, 0))
+    tracemalloc.start()
+    assert sequences(tmp_path, warnings=[]) == [1]
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 2**26
 
 
 @given(st.data())

@@ -319,6 +319,39 @@ def test_a_worker_that_dies_or_stays_stopped_is_started_again(
 
 
 @pytest.mark.cluster
+@pytest.mark.parametrize("mode", ["async", "lockstep"])
+def test_a_worker_whose_index_was_taken_is_no_failure_and_takes_part_in_no_contest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str
+) -> None:
+    """However often; in lockstep it must have its index, and takes it back after a while."""
+    monkeypatch.setattr(launch_module, "TAKE_BACK_S", 0.01)
+    times = MAX_RESTARTS + 1
+    player = f"""
+import sys
+from pathlib import Path
+folder = Path({str(tmp_path)!r})
+lives = len(list(folder.glob("life*")))
+(folder / f"life {{lives}} {{sys.argv[1]}}").touch()
+if lives < {times}:
+    print("12:00:00 player 0: ends: player 0 was taken over by a newer process")
+    raise SystemExit(0)
+{WORKER}"""
+    made = launcher(tmp_path, condition=f"not list(folder.glob('life {times}*'))", players=[player])
+    made._players[0].arguments = ["-c", player, "index=0"]
+    made._in_step = mode == "lockstep"
+    status, told = finish(made, tmp_path)
+    assert status == 0
+    remedy = {
+        "async": "it goes on with one that is free",
+        "lockstep": "it takes it back in 0.01 s; start others without index=",
+    }[mode]
+    lost = "worker 0 lost its index to a worker that was started with the same"
+    assert told.splitlines() == times * [f"{lost}: {remedy}"]
+    last = "index=0" if mode == "lockstep" else "index=-1"
+    assert (tmp_path / f"life {times} {last}").exists()
+
+
+@pytest.mark.cluster
 def test_when_no_worker_can_be_kept_the_run_ends_with_the_reason(tmp_path: Path) -> None:
     players = ["raise SystemExit('wrong tokens')", "print('bad input'); raise SystemExit(2)"]
     status, told = finish(launcher(tmp_path, players=players), tmp_path)

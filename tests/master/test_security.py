@@ -127,6 +127,19 @@ def test_a_folder_too_deep_for_sockets_is_refused(
         listening_place("local", tmp_path)
 
 
+def test_a_folder_whose_name_is_no_text_is_refused_before_anything_is_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    odd = tmp_path / "a\udcff"  # as Python has the byte 255
+    odd.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(odd))
+    with pytest.raises(
+        ConfigError, match=r"a\\xff/tangram-.*' cannot hold sockets, whose .*: set TM"
+    ):
+        listening_place("local", tmp_path)
+    assert list(odd.iterdir()) == []
+
+
 def test_secrets_are_not_shown() -> None:
     assert "SECRET" not in repr(Pair("a", "SECRET"))
 

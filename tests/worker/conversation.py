@@ -16,8 +16,9 @@ from typing import Any, TypeVar
 
 import zmq
 
+from master.admission import WelcomeInfo
 from master.delivery import Arrival
-from master.hub import Hub, WelcomeInfo
+from master.hub import Hub
 from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.messages import (
     EpisodeBatch,

@@ -1,9 +1,11 @@
 """Where the master is: an address, or the file that it writes."""
 
 import json
+import re
 import socket
 from pathlib import Path
 from threading import Event
+from typing import Any
 
 import pytest
 
@@ -17,6 +19,14 @@ REMEDY = (
     "connect=... takes host:port, a run folder, or the connection.json that tangram-master "
     "writes into it"
 )
+
+
+KEY = "k" * 40
+
+
+def written(**more: Any) -> str:
+    """A connection file."""
+    return json.dumps({"endpoint": "tcp://h:1", "run_id": "r"} | more)
 
 
 def test_an_address_is_taken_as_it_is() -> None:
@@ -80,6 +90,7 @@ def test_a_host_that_is_unknown_says_where_its_name_comes_from(
         "tcp://h:x",
         "tcp://",
         "tcp://a b:1",
+        "tcp://a\udcff:1",
     ],
 )
 def test_a_wrong_address_is_refused(address: str) -> None:
@@ -111,13 +122,28 @@ def test_a_file_and_its_folder_are_found(tmp_path: Path) -> None:
         ('{"endpoint": "tcp://h:1"}', "it has no run_id)"),
         ("\x00", "it is not JSON)"),
         ("[" * 100_000, "it is nested too deeply)"),
-        (
-            '{"endpoint": "tcp://h:1", "run_id": "r", "server_key": "short"}',
-            "server_key and keys must",
-        ),
-        ('{"endpoint": "tcp://h:1", "run_id": "r", "keys": []}', "its content is another"),
-        ('{"endpoint": "tcp://h:1", "run_id": "r", "keys": {"player": {}}}', "it has no public)"),
         ("7", "its content is another one)"),
+        (written(server_key="short"), "server_key must be a key, 40 characters of Z85)"),
+        (written(server_key=KEY), "it has a server_key, and no keys)"),
+        (written(keys={"player": {"public": KEY, "secret": KEY}}), "server_key must be a key,"),
+        (written(keys=[]), "its content is another"),
+        (written(keys={"player": {}}), "it has no public)"),
+        *(
+            (
+                written(server_key=KEY, keys={"player": {"public": KEY, "secret": KEY} | wrong}),
+                f"keys.player.{next(iter(wrong))} must be a key, 40 characters of Z85)",
+            )
+            for wrong in (
+                {"public": "%" * 40},  # characters of Z85, of more than 32 bits
+                {"secret": "~" * 40},
+                {"secret": "ä" * 40},
+                {"secret": KEY[5:]},
+                {"secret": KEY + "\n"},
+                {"secret": 7},
+            )
+        ),
+        (written(endpoint="ipc:///tmp/\udcff/x"), "'utf-8' codec can't encode"),
+        (written(run_id="\udcff"), "'utf-8' codec can't encode"),
     ],
 )
 def test_a_file_that_is_no_connection_file(tmp_path: Path, content: str, reason: str) -> None:
@@ -172,3 +198,20 @@ def test_an_address_in_a_file_is_checked(tmp_path: Path) -> None:
     path.write_text('{"endpoint": "ipc://x", "run_id": "r"}')
     with pytest.raises(RunError, match=r"'ipc://x' \(from .*c.json\) is no address"):
         find_master(str(path))
+
+
+@pytest.mark.parametrize("place", ["t/../x/y", "x/y"])
+def test_who_reads_a_file_makes_no_folder(tmp_path: Path, place: str) -> None:
+    """Where the folder of the sockets is missing, the master is waited for as without its file."""
+    (tmp_path / "t").mkdir(mode=0o700)
+    path, endpoint = tmp_path / "c.json", f"ipc://{tmp_path}/{place}"
+    path.write_text(written(endpoint=endpoint, machine=socket.gethostname()))
+    if ".." in place:
+        reason = f"{path} is no connection file (its endpoint '{endpoint}' must be a path without "
+        with pytest.raises(RunError, match=re.escape(f"{reason}'..')")):
+            find_master(str(path))
+    else:
+        assert find_master(str(path)) is None
+        with pytest.raises(RunError, match="or none whose sockets are there: is tangram-master"):
+            await_master(str(path), lambda _: None, 0.1)
+    assert not (tmp_path / "x").exists()
