@@ -95,8 +95,7 @@ class PhysicsWorld:
         self._carry(token, self._command(velocity), flip, _LIFTED)
         landing = np.array(self._pose(token))
         self._flipped[token] ^= flip
-        for other, pose in enumerate(poses):
-            self._put(other, *pose)
+        self._put_all(poses)
         landing[:2] /= self._unit
         return landing
 
@@ -142,8 +141,7 @@ class PhysicsWorld:
         self._carry(token, command, flip, _LIFTED)
         # While one is carried the rest of a settled overlap would make others creep.
         poses[token] = self._pose(token)
-        for other, pose in enumerate(poses):
-            self._put(other, *pose)
+        self._put_all(poses)
         self._settle()
 
     def _carry(self, token: int, command: _Command, flip: bool, height: float) -> None:
@@ -286,6 +284,10 @@ class PhysicsWorld:
             (cos, sin, 0.0, 0.0) if self._flipped[token] else (0.0, 0.0, sin, cos),
             physicsClientId=self._client,
         )
+
+    def _put_all(self, poses: Sequence[tuple[float, float, float]]) -> None:
+        for other, pose in enumerate(poses):
+            self._put(other, *pose)
 
     def _pose(self, token: int) -> tuple[float, float, float]:
         """Position in engine units, and the angle in (-pi, pi]."""
