@@ -42,6 +42,7 @@ class Actuation:
         drift: (B,).
         damping: (B,).
         pending: with `sim.delay` what the next step carries out; None: nothing.
+        carried: what the last step carried out, as it was commanded; None before the first.
     """
 
     def __init__(self, sim: SimConfig, count: int) -> None:
@@ -53,10 +54,11 @@ class Actuation:
         self.drift: Floats = np.full(count, sim.drift)
         self.damping: Floats = np.full(count, sim.damping)
         self.pending: Command | None = None
+        self.carried: Command | None = None
 
     def begin(self, generators: Sequence[np.random.Generator]) -> None:
         """Draw what varies, for one episode each; what does not draws nothing."""
-        sim, self._generators, self.pending = self._sim, generators, None
+        sim, self._generators, self.pending, self.carried = self._sim, generators, None, None
         if sim.gain_spread > 1.0:
             self.gain = np.array(sim.gain) * sim.gain_spread ** self._uniform(3)
         if sim.bias_spread:
@@ -71,6 +73,7 @@ class Actuation:
         """What this step carries out of what it was told, or of what the one before was."""
         if self._sim.delay:
             command, self.pending = self.pending or _nothing(command), command
+        self.carried = command
         noise: Floats = np.zeros_like(command.velocity)
         if self._sim.action_noise:
             drawn = np.stack([generator.standard_normal(3) for generator in self._generators])

@@ -25,13 +25,13 @@ from worker.baselines import (
     Player,
     Told,
     exact_policy,
-    oracle_policy,
     playing,
     position_policy,
     random_policy,
 )
 from worker.config import EvalConfig, source_and_names
 from worker.metrics import assembled, pose_errors, summarise
+from worker.oracle import oracle_policy
 from worker.puzzles import Figure, Figures, find_figures, play_figures
 from worker.rollout import Played
 from worker.test_set import FixedTests, greedy
@@ -39,6 +39,7 @@ from worker.test_set import FixedTests, greedy
 AT_ONCE = 32
 MAX_PICTURES = 100  # on a sheet
 RUN = "this run"
+MAX_PADDED = 6  # policies in a table
 MAX_LINES = 40  # of puzzles and of faults on the screen
 
 Scores = dict[str, Any]  # numbers, and `coverage_each` of the episodes of several tokens
@@ -87,8 +88,9 @@ def evaluate_run(config: EvalConfig) -> int:
 
     Policies that learned nothing play the same episodes, to compare with: `exact` moves every
     token exactly onto its target, `position only` one token onto its centre and never turns it,
-    `random` is chance; in a world that moves tokens otherwise than actions say `oracle` knows it.
-    A run that learned which token is next also plays fixed orders.
+    `random` is chance. Where a world moves tokens otherwise than actions say, or several noisy
+    looks at them can be put together, `oracle` knows that world and its noise. A run that learned
+    which token is next also plays fixed orders.
 
     Returns:
         Exit status 0.
@@ -118,7 +120,7 @@ def policies(run: Run) -> dict[str, Player]:
         other = run.with_settings({"agent": {"order": name}})
         result[f"order={name}"] = greedy(other.policy)
     result["exact"] = exact_policy(layout, sim)
-    if sim.inexact:
+    if sim.inexact or (sim.corner_noise and run.setup.horizon > 1):
         result["oracle"] = Told(oracle_policy)
     if layout.tokens == 1:
         result["position only"] = position_policy(layout, sim)
@@ -266,7 +268,8 @@ def _one_by_one(setup: Setup, figures: Sequence[Figure], played: Played) -> list
 
 def scores_table(title: str, caption: str, scores: Mapping[str, Scores]) -> Table:
     """One column for each policy, one row for each score."""
-    table = Table(title=title, caption=caption)
+    # More than six fit into 80 columns without the blanks.
+    table = Table(title=title, caption=caption, padding=(0, int(len(scores) <= MAX_PADDED)))
     table.add_column("", no_wrap=True)
     for name in scores:
         table.add_column(

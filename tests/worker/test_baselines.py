@@ -12,7 +12,8 @@ import pytest
 from tangram_sim.kinematics import wrap
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.sim.builders import SEVEN
-from worker.baselines import Told, exact_policy, oracle_policy, playing, random_policy
+from worker.baselines import Told, exact_policy, playing, random_policy
+from worker.oracle import oracle_policy
 from worker.test_set import FixedTests
 
 pytestmark = pytest.mark.fast
@@ -62,6 +63,21 @@ def test_the_oracle_ends_on_its_target_in_every_world(
     assert oracle["angle_error_deg_p90"] < 1e-2
     short = formula["position_error_p90"] / 1e-3 / made.sim.arena
     assert max(short, formula["angle_error_deg_p90"] / 0.5) > 1.0
+
+
+@pytest.mark.parametrize("sim", [{}, {"delay": True}, {"gain_spread": 1.25, "action_noise": 5e-4}])
+@pytest.mark.parametrize("tokens", [SQUARE, PAIR], ids=["one", "two"])
+def test_the_oracle_puts_noisy_looks_together(tokens: dict, sim: dict[str, Any]) -> None:
+    """The look at the target is one: its noise is left, and of eight looks at a token a third."""
+    made = setup(tokens, corner_noise=0.01, actions_per_token=8, starts="outside", **sim)
+    found = []
+    with closing(FixedTests(made, 60, 20)) as tests:
+        for player in (Told(oracle_policy), exact_policy(made.layout, made.sim)):
+            played = tests.play(playing(player, tests.env))
+            # From where the target is seen: what no policy can know is no matter here.
+            ends, goals = made.layout.poses(played.ends), made.layout.poses(played.episodes.goals)
+            found.append(np.median(np.abs(ends - goals)[..., :2]))
+    assert found[0] < 0.7 * found[1]
 
 
 @pytest.mark.parametrize("sim", [{}, {"delay": True}, {"allow_flip": True}])
