@@ -31,7 +31,7 @@ _STILL = 1e-6  # an action that moves no more was refused or blocked
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """What is believed of the motion in B worlds.
+    """What is believed of the motion in B worlds, in float64: it begins far from sure.
 
     Attributes:
         mean: (B, 3, F) of K.
@@ -99,15 +99,16 @@ class MotionModel(nn.Module):
         return self.log_noise.exp() + _LEAST_NOISE
 
     def features(self, command: Tensor) -> Tensor:
-        """Phi (..., F) of commands (..., 3)."""
+        """Phi (..., F) of commands (..., 3), in float64."""
         length = command[..., :2].norm(dim=-1, keepdim=True)
         learned = torch.tanh(self.learned(torch.tanh(self.hidden(2.0 * command))))
-        return torch.cat([command, length, torch.ones_like(length), learned], dim=-1)
+        given = torch.cat([command, length, torch.ones_like(length)], dim=-1)
+        return torch.cat([given, learned], dim=-1).double()
 
     def prior(self, count: int) -> Belief:
         """What is believed of so many worlds before anything is seen of them."""
-        covariance = torch.diag_embed(self.log_variance.exp())
-        return Belief(self.mean.expand(count, -1, -1), covariance.expand(count, -1, -1, -1))
+        mean, covariance = self.mean.double(), torch.diag_embed(self.log_variance.double().exp())
+        return Belief(mean.expand(count, -1, -1), covariance.expand(count, -1, -1, -1))
 
     def belief(self, motions: Motions) -> Belief:
         """What is believed after motions were seen."""
@@ -120,7 +121,7 @@ class MotionModel(nn.Module):
     def predict(self, belief: Belief, command: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and deviation (B, 3) of what commands (B, 3) come to."""
         mean, spread = _predict(belief, self.features(command))
-        return mean, spread.sqrt() * self.noise
+        return mean.float(), (spread.sqrt() * self.noise).float()
 
     def loss(self, motions: Motions) -> tuple[Tensor, Tensor]:
         """Mean negative log likelihood of each motion given those before it in its episode.
@@ -134,13 +135,14 @@ class MotionModel(nn.Module):
             variance = spread * noise.square()
             loss = (wrong.square() / variance + variance.log()).sum(dim=-1)
             losses.append(0.5 * (loss * motions.moved[:, t]).mean())
-        return torch.stack(losses).mean(), wrong.detach().square().mean().sqrt()
+        error = wrong.detach().square().mean().sqrt()
+        return torch.stack(losses).mean().float(), error.float()
 
     def command(self, belief: Belief, way: Tensor) -> Tensor:
         """(B, 3) in [-1, 1], what comes to ways (B, 3), or as near to them as can be."""
         command = way.clamp(-1.0, 1.0)
         for _ in range(_SEARCH_STEPS):
-            missing = _shortest(way - _predict(belief, self.features(command))[0])
+            missing = _shortest(way - _predict(belief, self.features(command))[0]).float()
             better = (command + missing).clamp(-1.0, 1.0)
             done = bool((better - command).abs().max() < _NEAR_ENOUGH)
             command = better

@@ -129,6 +129,7 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "agent.orientation": (ONE, False),
     "agent.edges": (ONE, "complete"),
     "agent.afterstate": (ONE, False),
+    "agent.motion": (ONE, "exact"),
     "agent.angle_head": (ONE, "plain"),
     "agent.squash": (ONE, "tanh"),
     "agent.saturation_penalty": (over(ONE, agent={"saturation_limit": 0.0}), 9.0),

@@ -43,7 +43,11 @@ def random_policy(layout: Layout, sim: SimConfig) -> Choose:
     size = action_size(layout.tokens, sim)
 
     def choose(
-        corners: Floats, placed: Bools, _goals: Floats, generators: Generators, _past: Past
+        corners: Floats,
+        placed: Bools,
+        _goals: Floats,
+        generators: Generators,
+        _past: Past | None = None,
     ) -> Singles:
         drawn = np.array([generator.uniform(-1.0, 1.0, size) for generator in generators])
         if layout.tokens == 1:
@@ -64,7 +68,11 @@ def position_policy(layout: Layout, sim: SimConfig) -> Choose:
     """
 
     def choose(
-        corners: Floats, placed: Bools, goals: Floats, _generators: Generators, _past: Past
+        corners: Floats,
+        placed: Bools,
+        goals: Floats,
+        _generators: Generators,
+        _past: Past | None = None,
     ) -> Singles:
         token = np.argmin(placed, axis=1)
         way = (layout.poses(goals) - layout.poses(corners))[np.arange(len(token)), token]
@@ -83,7 +91,11 @@ def exact_policy(layout: Layout, sim: SimConfig) -> Choose:
     """
 
     def choose(
-        corners: Floats, placed: Bools, goals: Floats, _generators: Generators, _past: Past
+        corners: Floats,
+        placed: Bools,
+        goals: Floats,
+        _generators: Generators,
+        _past: Past | None = None,
     ) -> Singles:
         pairing = paired(layout, corners, goals)
         token = freest(layout, corners, placed, goals, pairing)

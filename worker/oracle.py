@@ -39,7 +39,11 @@ def oracle_policy(env: BatchedEnv) -> Choose:
     tracker = _Filter(env, engine)
 
     def choose(
-        corners: Floats, placed: Bools, goals: Floats, _generators: Generators, _past: Past
+        corners: Floats,
+        placed: Bools,
+        goals: Floats,
+        _generators: Generators,
+        _past: Past | None = None,
     ) -> Singles:
         poses, sides = tracker.follow(corners), layout.flipped(corners)
         if world.pending is not None:  # that comes first

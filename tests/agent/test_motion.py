@@ -1,0 +1,188 @@
+"""The motion model: exact at first, right after it has seen, and never surer than it may be."""
+
+import numpy as np
+import pytest
+import torch
+
+from tangram_agent.adam import Adam
+from tangram_agent.learner import Learner
+from tangram_agent.motion import MotionModel, Motions, motions_of
+from tangram_agent.policy import Policy
+from tangram_agent.replay import ReplayBuffer
+from tangram_agent.types import Past, Transitions
+from tangram_sim.errors import ConfigError
+from tangram_sim.layout import TokensConfig, make_layout
+from tests.agent.builders import PAIR, SQUARE, random_episodes, setup
+
+pytestmark = pytest.mark.fast
+
+LEARNED = {"motion": "learned"}
+SCALE = np.array([2.0, 2.0, np.pi])
+
+
+def commands(count: int, seed: int = 0) -> torch.Tensor:
+    return torch.from_numpy(np.random.default_rng(seed).uniform(-1, 1, (count, 3))).float()
+
+
+def seen(ways: torch.Tensor, told: torch.Tensor) -> Motions:
+    """Motions of one episode (T, 3)."""
+    return Motions(told[None], ways[None], torch.ones(1, len(told)))
+
+
+def at_first() -> MotionModel:
+    """As sure of the exact motion as a deviation of 0.3, with little noise."""
+    model = MotionModel()
+    with torch.no_grad():
+        model.log_noise.fill_(np.log(1e-3))
+        model.log_variance.fill_(np.log((0.3 / 1e-3) ** 2))
+    return model.requires_grad_(False)
+
+
+def test_before_anything_is_learned_the_motion_is_exact() -> None:
+    model, told = MotionModel(), commands(64)
+    belief = model.prior(64)
+    torch.testing.assert_close(model.predict(belief, told)[0], told)
+    torch.testing.assert_close(model.command(belief, told), told)
+    far = torch.tensor([[2.0, -3.0, 0.5]])
+    torch.testing.assert_close(model.command(model.prior(1), far), far.clamp(-1.0, 1.0))
+
+
+def test_a_belief_equals_the_regression_in_closed_form() -> None:
+    torch.manual_seed(0)
+    model, told = at_first(), commands(7)
+    ways = 0.8 * told + 0.05 * torch.randn(7, 3)
+    belief = model.belief(seen(ways, told))
+    phi = model.features(told)
+    for row in range(3):
+        precision = torch.diag(1.0 / model.log_variance[row].exp().double())
+        covariance = torch.linalg.inv(precision + phi.T @ phi)
+        mean = covariance @ (precision @ model.mean[row].double() + phi.T @ ways[:, row].double())
+        torch.testing.assert_close(belief.mean[0, row], mean)
+        spread = torch.einsum("bf,fg,bg->b", phi, covariance, phi)
+        found = torch.einsum("bf,fg,bg->b", phi, belief.covariance[0, row], phi)
+        torch.testing.assert_close(found, spread)
+
+
+@pytest.mark.parametrize("moved", [0.0, 1.0])
+def test_what_did_not_move_tells_nothing(moved: float) -> None:
+    model, told = at_first(), commands(3)
+    motions = Motions(told[None], torch.zeros(1, 3, 3), torch.full((1, 3), moved))
+    same = torch.equal(model.belief(motions).mean, model.prior(1).mean)
+    assert same == (moved == 0.0)
+
+
+def test_it_grows_surer_where_it_has_seen_and_finds_the_command() -> None:
+    """A world with a gain and a bias of each axis, from four actions."""
+    model, told = at_first(), commands(4)
+    gain, bias = torch.tensor([0.8, 1.2, 0.9]), torch.tensor([0.03, -0.02, 0.05])
+    before = model.predict(model.prior(4), told)[1]
+    belief = model.belief(seen(gain * told + bias, told))
+    after = model.predict(belief.at(torch.zeros(4, dtype=torch.int64)), told)[1]
+    assert (after < 0.1 * before).all()
+    wanted = torch.tensor([[0.1, -0.2, 0.15]])
+    command = model.command(belief, wanted)
+    torch.testing.assert_close(gain * command + bias, wanted, atol=0.02, rtol=0.0)
+
+
+def test_turns_are_compared_by_the_shorter_way() -> None:
+    model = at_first()
+    told = torch.tensor([[0.0, 0.0, 0.99]])
+    belief = model.belief(seen(torch.tensor([[0.0, 0.0, -0.99]]), told))
+    expected = model.predict(belief, told)[0][0, 2]
+    assert expected == pytest.approx(1.01, abs=1e-3)  # it went 0.02 further, not back
+
+
+def test_learning_finds_a_world_that_turns_too_little() -> None:
+    """A turn that saturates, as one step of the engine has it."""
+    torch.manual_seed(0)
+    model = MotionModel()
+    parameters = list(model.parameters())
+    optimiser, rng = Adam(parameters, 1e-2), np.random.default_rng(0)
+
+    def world(told: torch.Tensor) -> torch.Tensor:
+        return torch.cat([0.9 * told[..., :2], 0.6 * torch.sin(1.5 * told[..., 2:])], dim=-1)
+
+    for _ in range(300):
+        told = torch.from_numpy(rng.uniform(-1, 1, (64, 1, 3))).float()
+        loss, error = model.loss(Motions(told, world(told), torch.ones(64, 1)))
+        for parameter, gradient in zip(
+            parameters, torch.autograd.grad(loss, parameters), strict=True
+        ):
+            parameter.grad = gradient
+        optimiser.step()
+    assert error < 0.02
+    wanted = torch.tensor([[0.3, 0.2, 0.5]])
+    with torch.no_grad():
+        reached = world(model.command(model.prior(1), wanted))
+    torch.testing.assert_close(reached, wanted, atol=0.03, rtol=0.0)
+
+
+@pytest.mark.parametrize("tokens", [SQUARE, PAIR])
+def test_motions_are_those_of_the_token_that_each_action_named(tokens: dict) -> None:
+    made = setup(tokens, actions_per_token=2)
+    layout = made.layout
+    poses = np.zeros((1, 3, layout.tokens, 3))
+    poses[0, :, -1] = [[0.1, 0.2, 3.0], [0.3, 0.1, -3.0], [0.3, 0.1, -3.0]]
+    corners = layout.corners(poses)
+    named = [1.0] if layout.tokens > 1 else []
+    actions = np.array([[[*named, 0.1, 0.2, 0.3], [*named, 0.0, 0.0, 0.4]]], np.float32)
+    motions = motions_of(
+        Past(corners[:, :2].astype(np.float32), actions), corners[:, 2], layout, made.sim
+    )
+    turned = (2.0 * np.pi - 6.0) / np.pi
+    np.testing.assert_allclose(motions.way[0, 0], [0.1, -0.05, turned], atol=1e-5)
+    np.testing.assert_allclose(motions.command[0], actions[0, :, -3:])
+    assert motions.moved.tolist() == [[1.0, 0.0]]
+
+
+@pytest.mark.parametrize("capacity", [7, 12, 100])
+def test_the_replay_gives_whole_episodes(capacity: int) -> None:
+    made = setup(actions_per_token=3)
+    buffer = ReplayBuffer(capacity, made.layout.corner_count, 1, 3)
+    for first in range(0, 18, 6):
+        number = np.arange(first, first + 6, dtype=np.float32)
+        points = np.broadcast_to(number[:, None, None], (6, 4, 2))
+        flags, action = np.zeros((6, 1), np.uint8), np.repeat(number[:, None], 3, axis=1)
+        buffer.add(
+            Transitions(points, flags, action, number, points + 1.0, flags, flags[:, 0], points)
+        )
+    past, ends = buffer.sample_episodes(50, 3, np.random.default_rng(0))
+    first = past.actions[:, 0, 0]
+    assert set(first) == {float(n) for n in range(0, 18, 3) if n >= 18 - capacity}
+    np.testing.assert_array_equal(past.actions[..., 0], first[:, None] + np.arange(3))
+    np.testing.assert_array_equal(past.corners[:, :, 0, 0], past.actions[..., 0])
+    np.testing.assert_array_equal(ends[:, 0, 0], first + 3.0)
+
+
+def test_a_replay_that_cannot_hold_an_episode_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"must hold an episode, 9 actions, got 8"):
+        setup(agent={"replay_capacity": 8, "batch_size": 4}, actions_per_token=9)
+
+
+def test_an_agent_corrects_itself_by_what_it_has_seen() -> None:
+    """In a world that goes half as far as it is told: the second command is longer."""
+    made = setup(agent=LEARNED, actions_per_token=2)
+    learner = Learner(made, 0)
+    with torch.no_grad():
+        for part in (learner.motion, learner.acting.motion):  # type: ignore[union-attr]
+            part.load_state_dict(at_first().state_dict())  # type: ignore[union-attr,operator]
+    policy = Policy(made)
+    policy.load(learner.acting_weights(1))
+    episodes = random_episodes(made, 5)
+    start, goals, placed = episodes.corners[:, 0], episodes.goals, episodes.placed[:, 0]
+    first = policy.act(start, placed, goals)
+    poses = made.layout.poses(start.astype(np.float64))
+    poses[:, 0] += 0.5 * first * SCALE
+    now = made.layout.corners(poses).astype(np.float32)
+    past = Past(start[:, None], first[:, None])
+    blind, told = policy.act(now, placed, goals), policy.act(now, placed, goals, past=past)
+    short = np.abs(blind) < 0.5
+    assert short.sum() > 5
+    assert (np.abs(told) > np.abs(blind))[short].mean() > 0.8
+
+
+def test_pieces_of_a_layout_do_not_matter_to_the_motion() -> None:
+    """The model knows commands only, so every token of a set teaches it."""
+    layout = make_layout(TokensConfig(tuple(PAIR["shapes"]), PAIR["scale"]))
+    assert layout.tokens == 2
+    assert MotionModel().features(commands(4)).shape == (4, 21)
