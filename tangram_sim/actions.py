@@ -5,6 +5,7 @@ Legend: B actions of A entries each, K tokens.
 
 import numpy as np
 
+from tangram_sim.actuation import full_scale, reach
 from tangram_sim.arrays import Bools, Floats, Ints, Singles
 from tangram_sim.config import SimConfig
 from tangram_sim.kinematics import wrap
@@ -27,13 +28,18 @@ def horizon(tokens: int, sim: SimConfig) -> int:
 def corner_bound(tokens: int, sim: SimConfig) -> float:
     """The largest |coordinate| that a corner can reach in an episode, arena units.
 
-    A start lies inside the arena, and each action moves a token by at most the arena's width in x
-    and in y; turning keeps a corner within the start's margin for every angle. A token that slides
-    may push another as far as it goes itself, in each action of the episode; one that settles moves
-    others by less than an arena. What an agent sees may lie further out by the noise's bound.
+    A start lies inside the arena, and each action moves a token in x and in y by at most what it
+    can be told, which is the arena's width unless the world says otherwise; turning keeps a corner
+    within the start's margin for every angle. A token that slides may push another as far as it
+    goes itself, in each action of the episode; one that settles moves others by less than an arena,
+    wherever it was set down. What an agent sees may lie further out by the noise's bound.
     """
     pushes = 0 if tokens == 1 else horizon(tokens, sim) if sim.motion == "slide" else 1
-    return (sim.arena * (0.5 + sim.actions_per_token + pushes) + noise_bound(sim)) * _ROUNDING
+    way = float(reach(sim)[:2].max())
+    # One that only turns pushes others by less than an arena, too.
+    push = max(way, 1.0) if sim.motion == "slide" else 1.0
+    moved = sim.actions_per_token * way + pushes * push
+    return (sim.arena * (0.5 + moved) + noise_bound(sim)) * _ROUNDING
 
 
 def chosen_tokens(actions: Floats, tokens: int) -> Ints:
@@ -49,8 +55,7 @@ def velocities(actions: Floats, sim: SimConfig) -> Floats:
 
     So one action can reach every pose of the arena from every other.
     """
-    scale = np.array([sim.arena, sim.arena, np.pi])
-    scaled: Floats = np.asarray(actions, dtype=np.float64)[:, -3:] * scale
+    scaled: Floats = np.asarray(actions, dtype=np.float64)[:, -3:] * full_scale(sim)
     return scaled
 
 
@@ -71,7 +76,7 @@ def velocities_of(ways: Floats, sim: SimConfig) -> Floats:
     The inverse of `velocities`; a shift beyond the arena's width gives entries beyond [-1, 1].
     """
     shortest = np.column_stack([ways[:, :2], wrap(ways[:, 2])])
-    velocity: Floats = shortest / (sim.arena, sim.arena, np.pi)
+    velocity: Floats = shortest / full_scale(sim)
     return velocity
 
 

@@ -17,6 +17,7 @@ from tangram_sim.actions import (
     horizon,
     velocities,
 )
+from tangram_sim.actuation import Actuation, Command
 from tangram_sim.arrays import Bools, Floats, Ints
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.geometry import outlines, overlap_share, shared_area
@@ -37,6 +38,8 @@ class StepResult:
         camera_rewards: (B,) Eq. 14 from the pictures, or None with the camera off.
         refused: (B,) where the action named a placed token: nothing moved.
         blocked: (B,) where a lifted token could not be set down on others: nothing moved.
+        tokens: (B,) which token moved, or would have: with `sim.delay` the one that was named a
+            step before.
         covered: (B,) share of its area by which a lifted token was, or would have been, set down on
             others; 0 for one that slides.
         done: whether the episodes are over, all at once.
@@ -47,6 +50,7 @@ class StepResult:
     camera_rewards: Floats | None
     refused: Bools
     blocked: Bools
+    tokens: Ints
     covered: Floats
     done: bool
 
@@ -59,7 +63,8 @@ class BatchedEnv:
     is to be turned over before it moves (see `actions.flips`). A token that had its
     `actions_per_token` actions is placed. An action that names a placed token is refused: it moves
     nothing, but uses up its step. One that would set a lifted token down on others by more than
-    `sim.max_overlap` of its area moves nothing either, and is one of the token's actions.
+    `sim.max_overlap` of its area moves nothing either, and is one of the token's actions. What is
+    made of an action before a token moves is told in actuation.py.
 
     Attributes:
         count: B.
@@ -71,6 +76,7 @@ class BatchedEnv:
         corners: (B, V, 2) of the tokens.
         placed: (B, K) which tokens are placed.
         goals: (B, V, 2) corners of the targets.
+        actuation: the world that each episode has drawn.
         seen: `corners` as an agent sees them, new noise at every step if there is any.
         seen_goals: `goals` as an agent sees them, with one noise for the whole episode.
     """
@@ -90,6 +96,7 @@ class BatchedEnv:
         self.bound = corner_bound(layout.tokens, sim)
         self.task = sim.task
         self._worlds = [make_world(layout, sim) for _ in range(count)]
+        self.actuation = Actuation(sim, count)
         self._targets: TargetPictures | None = None
         self._moves: Ints = np.zeros((count, layout.tokens), dtype=np.int64)
         self.steps_done = self.horizon  # no episode yet
@@ -128,6 +135,10 @@ class BatchedEnv:
         self._generators = generators
         self.seen_goals = see(self.goals, self.sim, generators)
         self._look()
+        self.actuation.begin(generators)
+        if self.sim.damping_spread:
+            for world, damping in zip(self._worlds, self.actuation.damping, strict=True):
+                world.damp(float(damping))
         self.steps_done = 0
 
     def _done(self, generators: Sequence[np.random.Generator]) -> Bools:
@@ -155,25 +166,40 @@ class BatchedEnv:
         refused = self.placed[np.arange(self.count), tokens]
         self._moves[np.flatnonzero(~refused), tokens[~refused]] += 1
         velocity, flip = velocities(actions, self.sim), flips(actions, self.layout, self.sim)
-        covered = self._covered(tokens, velocity, flip)
-        blocked = (covered > self.sim.max_overlap) & ~refused
-        camera = self._move(tokens, velocity, flip, refused | blocked)
+        command = self.actuation.carry_out(Command(tokens, velocity, flip, refused))
+        covered = self._covered(command)
+        blocked = (covered > self.sim.max_overlap) & ~command.idle
+        camera = self._move(command, command.idle | blocked)
         self.steps_done += 1
-        return self._result(refused, blocked, covered, camera)
+        share = overlap_share(self.corners, self.goals, self.layout)
+        return StepResult(
+            rewards=self._rewards(share, camera),
+            overlap=share,
+            camera_rewards=camera,
+            refused=refused,
+            blocked=blocked,
+            tokens=command.tokens,
+            covered=covered,
+            done=self.steps_done == self.horizon,
+        )
 
     def close(self) -> None:
         """Close all worlds; calling it twice does no harm."""
         for world in self._worlds:
             world.close()
 
-    def _covered(self, tokens: Ints, velocity: Floats, flip: Bools) -> Floats:
+    def _covered(self, command: Command) -> Floats:
         """(B,) share of its area by which each lifted token would be set down on others."""
-        layout, rows = self.layout, np.arange(self.count)
+        layout, rows, tokens = self.layout, np.arange(self.count), command.tokens
         if layout.tokens == 1 or self.sim.motion != "lift":
             return np.zeros(self.count)
         poses, sides = self._poses.copy(), self._flipped.copy()
-        poses[rows, tokens] += velocity
-        sides[rows, tokens] ^= flip
+        if self.sim.falls_short:
+            told = zip(self._worlds, tokens.tolist(), command.velocity, command.flip, strict=True)
+            poses[rows, tokens] = [world.landing(*one) for world, *one in told]
+        else:
+            poses[rows, tokens] += command.velocity
+        sides[rows, tokens] ^= command.flip
         pieces = outlines(layout.corners(poses, sides), layout)
         own = np.repeat(pieces[rows, tokens], layout.tokens, axis=0)
         common = shared_area(own, pieces.reshape(own.shape)).reshape(self.count, -1)
@@ -193,36 +219,24 @@ class BatchedEnv:
         if self.sim.pixels:
             self._targets = TargetPictures(np.stack(pictures))
 
-    def _move(self, tokens: Ints, velocity: Floats, flip: Bools, idle: Bools) -> Floats | None:
+    def _move(self, command: Command, idle: Bools) -> Floats | None:
         """Move in every world and look at it; (B,) Eq. 14 of the pictures with the camera on."""
         pictures = []
         for b, world in enumerate(self._worlds):
             if not idle[b]:
-                world.move(int(tokens[b]), velocity[b], bool(flip[b]))
+                world.move(int(command.tokens[b]), command.velocity[b], bool(command.flip[b]))
             if self.sim.pixels:
                 pictures.append(world.picture())
         self._look()
         return None if self._targets is None else self._targets.rewards(np.stack(pictures))
 
-    def _result(
-        self, refused: Bools, blocked: Bools, covered: Floats, camera: Floats | None
-    ) -> StepResult:
-        share = overlap_share(self.corners, self.goals, self.layout)
+    def _rewards(self, share: Floats, camera: Floats | None) -> Floats:
+        """(B,) of the configured reward, with the raw overlap and Eq. 14 of the pictures."""
         if camera is not None and self._reward.source == "camera":
-            rewards = camera
-        elif self._reward.name == "overlap":
-            rewards = scaled_overlap(share)  # what reward_fn gives, without doing it twice
-        else:
-            rewards = self.reward_fn(self.corners, self.goals)
-        return StepResult(
-            rewards=rewards,
-            overlap=share,
-            camera_rewards=camera,
-            refused=refused,
-            blocked=blocked,
-            covered=covered,
-            done=self.steps_done == self.horizon,
-        )
+            return camera
+        if self._reward.name == "overlap":
+            return scaled_overlap(share)  # what reward_fn gives, without doing it twice
+        return self.reward_fn(self.corners, self.goals)
 
     def _checked(self, actions: Floats) -> Floats:
         actions = np.asarray(actions, dtype=np.float64)

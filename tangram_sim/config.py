@@ -7,7 +7,7 @@ from typing import Any
 
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import MAX_TOKENS
-from tangram_sim.settings import LEARNING, NETWORK, Settings, refuse_ignored, setting
+from tangram_sim.settings import LEARNING, NETWORK, Settings, refuse_ignored, setting, told
 
 BACKENDS = ("physics", "kinematic")
 REWARDS = ("overlap", "dense", "pose")
@@ -18,6 +18,13 @@ EXACT_SUBSTEPS = 4
 MIN_PIXELS = 16
 # A fifth of the arena is a whole token: nothing is left to see beyond.
 MAX_CORNER_NOISE = 0.2
+# What an action says is told a token otherwise by at most this much; see SimConfig.
+MAX_GAIN, MAX_BIAS, MAX_ACTION_NOISE = 2.0, 1.0, 0.2
+# Without another of these a token goes exactly where an action takes it, but for noise.
+UNKNOWN = (
+    *("gain", "gain_spread", "bias", "bias_spread", "drift", "drift_spread", "delay"),
+    *("damping", "damping_spread"),
+)
 MOTIONS = ("lift", "slide")
 STARTS = ("anywhere", "outside")
 TARGETS = ("uniform", "gaussian", "connected", "figures", "mixed")
@@ -63,11 +70,77 @@ class SimConfig(Settings, section="sim"):
     )
     damping: float = setting(
         0.0,
-        "linear and angular; above 0 a token stops short of where it is told to go; Bullet's own "
-        "default is 0.04",
+        "linear and angular; above 0 a lifted token stops short of where it is told to go; "
+        "Bullet's own default is 0.04",
         low=0,
         high=1,
-        only={"backend": "physics"},
+        only={"backend": "physics", "motion": "lift"},
+    )
+    damping_spread: float = setting(
+        0.0,
+        "each episode draws its damping between damping and so much more",
+        low=0,
+        high=1,
+        only={"backend": "physics", "motion": "lift"},
+    )
+    friction: float = setting(
+        0.2,
+        "of the edges of tokens that slide along each other; the engine multiplies both",
+        low=0,
+        high=10,
+        only={"motion": "slide"},
+    )
+    gain: tuple[float, ...] = setting(
+        (1.0, 1.0, 1.0),
+        "of x, y and turn: a token is told so many times what an action says",
+        low=0.1,
+        high=MAX_GAIN,
+    )
+    gain_spread: float = setting(
+        1.0,
+        "each episode draws each gain between gain / gain_spread and gain * gain_spread, "
+        "uniform in the logarithm",
+        low=1,
+        high=MAX_GAIN,
+    )
+    bias: tuple[float, ...] = setting(
+        (0.0, 0.0, 0.0),
+        "of x, y and turn: added to what a token is told",
+        low=-MAX_BIAS,
+        high=MAX_BIAS,
+        unit="full scales",
+    )
+    bias_spread: float = setting(
+        0.0,
+        "each episode draws each bias at most so far from bias",
+        low=0,
+        high=MAX_BIAS,
+        unit="full scales",
+    )
+    drift: float = setting(
+        0.0,
+        "turn that goes along with a shift of one full scale, whatever its direction",
+        low=-1,
+        high=1,
+        unit="half turns",
+    )
+    drift_spread: float = setting(
+        0.0,
+        "each episode draws its drift at most so far from drift",
+        low=0,
+        high=1,
+        unit="half turns",
+    )
+    action_noise: float = setting(
+        0.0,
+        "deviation of the Gaussian noise on x, y and turn of every action as it is carried out",
+        low=0,
+        high=MAX_ACTION_NOISE,
+        unit="full scales",
+    )
+    delay: bool = setting(
+        False,
+        "an action is carried out one step late: the first moves nothing, the last has no effect",
     )
     corner_noise: float = setting(
         0.0,
@@ -150,8 +223,30 @@ class SimConfig(Settings, section="sim"):
         """What is played in a stage."""
         return self.stages[stage - 1] if stage else self.task
 
+    @property
+    def inexact(self) -> dict[str, object]:
+        """The settings by which a token that is alone does not go where an action takes it.
+
+        Noise is not among them: nobody could know it.
+        """
+        few = self.backend == "physics" and self.motion == "lift" and self.substeps < EXACT_SUBSTEPS
+        values = {name: getattr(self, name) for name in ("substeps",) * few + UNKNOWN}
+        return {name: v for name, v in values.items() if v != getattr(SimConfig, name)}
+
+    @property
+    def falls_short(self) -> bool:
+        """Whether the engine itself takes a token less far than it is told."""
+        return not self.inexact.keys().isdisjoint(("substeps", "damping", "damping_spread"))
+
     def __post_init__(self) -> None:
         self._check_stages()
+        for name in ("gain", "bias"):
+            value = getattr(self, name)
+            if not isinstance(value, tuple) or len(value) != 3:
+                raise ConfigError(
+                    f"sim.{name} must be three numbers, of x, y and turn, as in "
+                    f"sim.{name}={told(getattr(SimConfig, name))}, got {told(value)}"
+                )
         super().__post_init__()
         if self.motion == "slide" and self.backend == "kinematic":
             raise ConfigError(

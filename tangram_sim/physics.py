@@ -30,7 +30,6 @@ _LIFTED = 3.0 * _WALL
 # smaller by it on every side, so that pieces that only touch leave each other alone.
 _MARGIN = 1e-4
 _UPRIGHT = 1e4  # inertia about x and y, far more than a token's: none tips over
-_FRICTION = 0.2  # between the edges of tokens
 _GRIP = 1e3  # mass of the token that is pushed along the table, as a multiple of its own
 _STRIDE = 0.02  # longest way of any of its points in one step
 _THIN = 0.5  # the same as a share of the thinnest token's thickness, which is not to be jumped over
@@ -57,7 +56,7 @@ class PhysicsWorld:
                 "close environments, or use fewer of them"
             )
         self._finalizer = weakref.finalize(self, pybullet.disconnect, self._client)
-        self._substeps, self._damping = sim.substeps, sim.damping
+        self._substeps, self._friction = sim.substeps, sim.friction
         self._slides, self._alone = sim.motion == "slide", layout.tokens == 1
         self._radius = (layout.radii * self._unit).tolist()
         thin = min(thickness(shape.corners) for shape in layout.shapes) * self._unit
@@ -67,6 +66,8 @@ class PhysicsWorld:
         self._masses = [self._mass(body) for body in self._bodies]
         for token in range(layout.tokens):
             self._weigh(token, 1.0)
+        # Bullet damps by 0.04 unless told otherwise: tokens would stop short.
+        self.damp(sim.damping)
         self._play_at_once()
         if sim.pixels:
             self._camera = Camera(self._client, sim.pixels, ENGINE_ARENA, _HALF_HEIGHT)
@@ -82,12 +83,32 @@ class PhysicsWorld:
     def move(self, token: int, velocity: Floats, flip: bool = False) -> None:
         """See `World.move`."""
         # Every body rests between calls: `place` relies on the stop at the end.
-        x, y, angular = np.asarray(velocity, dtype=np.float64).tolist()
-        command = x * self._unit, y * self._unit, angular
+        command = self._command(velocity)
         if self._slides and not self._alone:
             self._slide(token, command)
         else:
             self._lift(token, command, flip)
+
+    def landing(self, token: int, velocity: Floats, flip: bool = False) -> Floats:
+        """See `World.landing`."""
+        poses = [self._pose(other) for other in range(len(self._bodies))]
+        self._carry(token, self._command(velocity), flip, _LIFTED)
+        landing = np.array(self._pose(token))
+        self._flipped[token] ^= flip
+        self._put_all(poses)
+        landing[:2] /= self._unit
+        return landing
+
+    def damp(self, damping: float) -> None:
+        """See `World.damp`."""
+        for body in self._bodies:
+            pybullet.changeDynamics(
+                body,
+                -1,
+                linearDamping=damping,
+                angularDamping=damping,
+                physicsClientId=self._client,
+            )
 
     def poses(self) -> Floats:
         """See `World.poses`."""
@@ -107,6 +128,10 @@ class PhysicsWorld:
         """See `World.close`."""
         self._finalizer()
 
+    def _command(self, velocity: Floats) -> _Command:
+        x, y, angular = np.asarray(velocity, dtype=np.float64).tolist()
+        return x * self._unit, y * self._unit, angular
+
     def _lift(self, token: int, command: _Command, flip: bool) -> None:
         """Carry a token above the others, set it down, and push apart what then overlaps."""
         if self._alone:
@@ -116,8 +141,7 @@ class PhysicsWorld:
         self._carry(token, command, flip, _LIFTED)
         # While one is carried the rest of a settled overlap would make others creep.
         poses[token] = self._pose(token)
-        for other, pose in enumerate(poses):
-            self._put(other, *pose)
+        self._put_all(poses)
         self._settle()
 
     def _carry(self, token: int, command: _Command, flip: bool, height: float) -> None:
@@ -219,14 +243,11 @@ class PhysicsWorld:
         )
         mass = shape.area * self._unit**2
         body: int = pybullet.createMultiBody(mass, collision, visual, physicsClientId=self._client)
-        # Bullet damps by 0.04 unless told otherwise: tokens would stop short.
         pybullet.changeDynamics(
             body,
             -1,
-            linearDamping=self._damping,
-            angularDamping=self._damping,
             collisionMargin=margin,
-            lateralFriction=_FRICTION,
+            lateralFriction=self._friction,
             physicsClientId=self._client,
         )
         if self._alone:
@@ -263,6 +284,10 @@ class PhysicsWorld:
             (cos, sin, 0.0, 0.0) if self._flipped[token] else (0.0, 0.0, sin, cos),
             physicsClientId=self._client,
         )
+
+    def _put_all(self, poses: Sequence[tuple[float, float, float]]) -> None:
+        for other, pose in enumerate(poses):
+            self._put(other, *pose)
 
     def _pose(self, token: int) -> tuple[float, float, float]:
         """Position in engine units, and the angle in (-pi, pi]."""

@@ -60,6 +60,7 @@ class Table:
         self.batch = BatchedEnv(layout, config, paid, count)
         self._success_overlap = success_overlap
         self._render_size = render_size
+        self._named: Ints = np.zeros(count, dtype=np.int64)
         self._moved: Ints | None = None
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.batch.action_size,), np.float32)
         self.observation_space = _observation_space(self.batch)
@@ -72,7 +73,8 @@ class Table:
     def step(self, actions: Floats) -> StepResult:
         """Play one action (A,) in every environment."""
         result = self.batch.step(actions)
-        self._moved = chosen_tokens(actions, self.batch.layout.tokens)
+        self._named = chosen_tokens(actions, self.batch.layout.tokens)
+        self._moved = result.tokens
         return result
 
     def ends(self, result: StepResult) -> tuple[Bools, Bools]:
@@ -93,20 +95,20 @@ class Table:
     def info(self, result: StepResult, row: int) -> dict[str, Any]:
         """What is told of one environment's step."""
         sim = self.batch.sim
-        token = None if self._moved is None else int(self._moved[row])
         share = float(result.overlap[row])
         info: dict[str, Any] = {"overlap": share, "is_success": share >= self._success_overlap}
         if result.camera_rewards is not None:
             info["reward_camera"] = float(result.camera_rewards[row])
         if result.refused[row]:
             info["refused"] = (
-                f"token {token} is placed already: it had its {sim.actions_per_token} actions"
+                f"token {self._named[row]} is placed already: it had its "
+                f"{sim.actions_per_token} actions"
             )
         if result.blocked[row]:
             info["blocked"] = (
-                f"token {token} would lie on others by {result.covered[row]:.3%} of its area, "
-                f"at most {sim.max_overlap:.3%} allowed: set it down where there is room, or "
-                "raise max_overlap"
+                f"token {result.tokens[row]} would lie on others by {result.covered[row]:.3%} of "
+                f"its area, at most {sim.max_overlap:.3%} allowed: set it down where there is "
+                "room, or raise max_overlap"
             )
         return info
 

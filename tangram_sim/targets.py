@@ -4,11 +4,14 @@ Legend: B environments, K tokens. A layout is poses (B, K, 3) and sides (B, K): 
 their other side.
 """
 
+import math
 from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
 
+from tangram_sim.actions import horizon
+from tangram_sim.actuation import reach
 from tangram_sim.arrays import Bools, Floats
 from tangram_sim.assembly import COUNTS, Puzzle, PuzzleRules
 from tangram_sim.config import SimConfig, StageConfig
@@ -18,7 +21,7 @@ from tangram_sim.fitting import kind_of
 from tangram_sim.geometry import outlines
 from tangram_sim.kinematics import wrap
 from tangram_sim.layout import Layout
-from tangram_sim.prisms import thickness
+from tangram_sim.prisms import ENGINE_ARENA, thickness
 from tangram_sim.puzzles import library
 from tangram_sim.sampling import sample_batch
 from tangram_sim.settings import refuse_ignored, told
@@ -87,7 +90,8 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
     Raises:
         ConfigError: figures of tokens that are not all seven tans or too large for the arena, flips
             or other sides of tokens that look the same on both, what one token does to others, a
-            token too thin for the arena, or a stage that moves more than there are.
+            token too thin for the arena, a world in which none could move, or a stage that moves
+            more than there are.
     """
     if sim.allow_flip and not layout.any_chiral:
         raise ConfigError(
@@ -102,6 +106,7 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
         if value != usual and layout.tokens == 1:
             refuse_ignored(f"sim.{name}={told(value)}", "one token", "take a set of several", usual)
     _check_thick(layout, sim)
+    _check_world(layout, sim)
     for stage in sim.stages:
         if stage.tokens > layout.tokens:
             raise ConfigError(
@@ -111,6 +116,25 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
     if any(task.targets == "figures" for task in (sim.task, *sim.stages)):
         _check_full_set(layout)
         _check_figures_fit(layout, sim)
+
+
+def _check_world(layout: Layout, sim: SimConfig) -> None:
+    if sim.delay and horizon(layout.tokens, sim) == 1:
+        raise ConfigError(
+            "sim.delay=true moves nothing in an episode of one action: raise "
+            "sim.actions_per_token to at least 2, or set sim.delay=false"
+        )
+    # In one step the engine takes damping * (1 + speed) of a speed, and more than all of it would
+    # throw a token back.
+    x, y, turn = reach(sim)
+    fastest = max(ENGINE_ARENA * math.hypot(x, y), math.pi * turn)
+    damping = sim.damping + sim.damping_spread
+    if damping * (1.0 + fastest) > sim.substeps:
+        raise ConfigError(
+            f"sim.substeps must be at least {math.ceil(damping * (1.0 + fastest))} with a damping "
+            f"of {damping:g}, got {sim.substeps}: the engine would throw fast tokens back; raise "
+            "it, or lower sim.damping or sim.damping_spread"
+        )
 
 
 def _check_thick(layout: Layout, sim: SimConfig) -> None:

@@ -3,15 +3,34 @@
 Legend: B environments, K tokens, V corners, A entries of an action.
 """
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import numpy as np
 
 from tangram_sim.actions import action_size, make_actions, velocities_of
 from tangram_sim.arrays import Bools, Floats, Ints, Singles
+from tangram_sim.batch import BatchedEnv
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry import outlines, shared_areas
 from tangram_sim.layout import Layout
 from worker.pairing import Pairing, paired
 from worker.rollout import Choose, Generators
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """A policy that is told the world: it is made for the environments in which it plays."""
+
+    of: Callable[[BatchedEnv], Choose]
+
+
+Player = Choose | Told
+
+
+def playing(player: Player, env: BatchedEnv) -> Choose:
+    """The policy, told the world if it asks for that."""
+    return player.of(env) if isinstance(player, Told) else player
 
 
 def random_policy(layout: Layout, sim: SimConfig) -> Choose:
@@ -60,7 +79,7 @@ def exact_policy(layout: Layout, sim: SimConfig) -> Choose:
 
     def choose(corners: Floats, placed: Bools, goals: Floats, _generators: Generators) -> Singles:
         pairing = paired(layout, corners, goals)
-        token = _freest(layout, corners, placed, goals, pairing)
+        token = freest(layout, corners, placed, goals, pairing)
         rows = np.arange(len(token))
         way, flip = pairing.way[rows, token], pairing.other_side[rows, token]
         return _actions(sim, layout, token, way, flip)
@@ -74,9 +93,7 @@ def _any_left(placed: Bools, generator: np.random.Generator) -> int:
     return int(generator.choice(left if len(left) else len(placed)))
 
 
-def _freest(
-    layout: Layout, corners: Floats, placed: Bools, goals: Floats, pairing: Pairing
-) -> Ints:
+def freest(layout: Layout, corners: Floats, placed: Bools, goals: Floats, pairing: Pairing) -> Ints:
     """(B,) the token left whose place the others cover least; the first of several."""
     rows, every = np.arange(len(corners))[:, None], np.arange(layout.tokens)
     places = outlines(goals, layout)[rows, pairing.target]

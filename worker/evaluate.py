@@ -20,16 +20,26 @@ from tangram_agent.outcome import plural
 from tangram_agent.runs import Run, load_changed
 from tangram_agent.setup import Setup
 from tangram_sim.game_drawing import figure_sheet
-from worker.baselines import exact_policy, position_policy, random_policy
+from tangram_sim.settings import told
+from worker.baselines import (
+    Player,
+    Told,
+    exact_policy,
+    playing,
+    position_policy,
+    random_policy,
+)
 from worker.config import EvalConfig, source_and_names
 from worker.metrics import assembled, pose_errors, summarise
+from worker.oracle import oracle_policy
 from worker.puzzles import Figure, Figures, find_figures, play_figures
-from worker.rollout import Choose, Played
+from worker.rollout import Played
 from worker.test_set import FixedTests, greedy
 
 AT_ONCE = 32
 MAX_PICTURES = 100  # on a sheet
 RUN = "this run"
+MAX_PADDED = 6  # policies in a table
 MAX_LINES = 40  # of puzzles and of faults on the screen
 
 Scores = dict[str, Any]  # numbers, and `coverage_each` of the episodes of several tokens
@@ -78,7 +88,9 @@ def evaluate_run(config: EvalConfig) -> int:
 
     Policies that learned nothing play the same episodes, to compare with: `exact` moves every
     token exactly onto its target, `position only` one token onto its centre and never turns it,
-    `random` is chance. A run that learned which token is next also plays fixed orders.
+    `random` is chance. Where a world moves tokens otherwise than actions say, or several noisy
+    looks at them can be put together, `oracle` knows that world and its noise. A run that learned
+    which token is next also plays fixed orders.
 
     Returns:
         Exit status 0.
@@ -98,31 +110,33 @@ def evaluate_run(config: EvalConfig) -> int:
     return 0
 
 
-def policies(run: Run) -> dict[str, Choose]:
+def policies(run: Run) -> dict[str, Player]:
     """The run, and those to compare it with, by their names in tables and files."""
     layout, sim = run.setup.layout, run.setup.sim
     fixed = [order for order in ORDERS if order not in ("learned", run.setup.agent.order)]
     fixed = fixed if run.setup.pairs and layout.tokens > 1 else []
-    result = {RUN: greedy(run.policy)}
+    result: dict[str, Player] = {RUN: greedy(run.policy)}
     for name in fixed:
         other = run.with_settings({"agent": {"order": name}})
         result[f"order={name}"] = greedy(other.policy)
     result["exact"] = exact_policy(layout, sim)
+    if sim.inexact or (sim.corner_noise and run.setup.horizon > 1):
+        result["oracle"] = Told(oracle_policy)
     if layout.tokens == 1:
         result["position only"] = position_policy(layout, sim)
     return result | {"random": random_policy(layout, sim)}
 
 
 def score_policies(
-    setup: Setup, players: Mapping[str, Choose], config: EvalConfig
+    setup: Setup, players: Mapping[str, Player], config: EvalConfig
 ) -> dict[str, Scores]:
     """Scores of each policy, on the same episodes."""
     with closing(FixedTests(setup, config.episodes, AT_ONCE, seed=config.seed)) as tests:
-        return {name: _scored(tests, choose) for name, choose in players.items()}
+        return {name: _scored(tests, player) for name, player in players.items()}
 
 
-def _scored(tests: FixedTests, choose: Choose) -> Scores:
-    played = tests.play(choose)
+def _scored(tests: FixedTests, player: Player) -> Scores:
+    played = tests.play(playing(player, tests.env))
     scores: Scores = dict(tests.scores(played))
     return scores | (of_several(played) if tests.setup.layout.tokens > 1 else {})
 
@@ -189,11 +203,14 @@ def _told(setup: Setup) -> str:
         f"corners with noise {noise:g}" if noise else "exact corners",
         sim.backend if setup.layout.tokens == 1 else f"{sim.backend}, {sim.motion}",
     ]
+    parts += [f"{name} {told(value)}" for name, value in sim.inexact.items()]
+    if sim.action_noise:
+        parts.append(f"actions with noise {sim.action_noise:g}")
     return ", ".join(parts)
 
 
 def score_puzzles(
-    setup: Setup, figures: Sequence[Figure], players: Mapping[str, Choose], seed: int
+    setup: Setup, figures: Sequence[Figure], players: Mapping[str, Player], seed: int
 ) -> tuple[dict[str, Scores], list[dict[str, Any]], Played]:
     """Scores of each policy on the same starts; those of the run also one by one.
 
@@ -202,8 +219,8 @@ def score_puzzles(
         played them.
     """
     scores, played = dict[str, Scores](), dict[str, Played]()
-    for name, choose in players.items():
-        played[name] = play_figures(setup, figures, choose, seed)
+    for name, player in players.items():
+        played[name] = play_figures(setup, figures, player, seed)
         means = summarise(setup.layout, setup.sim, played[name], own_reward=False)
         scores[name] = means | of_several(played[name])
     return scores, _one_by_one(setup, figures, played[RUN]), played[RUN]
@@ -251,7 +268,8 @@ def _one_by_one(setup: Setup, figures: Sequence[Figure], played: Played) -> list
 
 def scores_table(title: str, caption: str, scores: Mapping[str, Scores]) -> Table:
     """One column for each policy, one row for each score."""
-    table = Table(title=title, caption=caption)
+    # More than six fit into 80 columns without the blanks.
+    table = Table(title=title, caption=caption, padding=(0, int(len(scores) <= MAX_PADDED)))
     table.add_column("", no_wrap=True)
     for name in scores:
         table.add_column(

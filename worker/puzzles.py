@@ -19,7 +19,8 @@ from tangram_sim.errors import ConfigError
 from tangram_sim.puzzles import SPLITS, PuzzleFile, library, read_puzzles
 from tangram_sim.seeding import episode_generator
 from tangram_sim.targets import placement, turned_figure
-from worker.rollout import Choose, Played, play
+from worker.baselines import Player, playing
+from worker.rollout import Played, play
 
 AT_ONCE = 32
 _ROUNDING = 1e-9
@@ -100,7 +101,7 @@ def find_figures(
     return Figures(tuple(figures), tuple(faults))
 
 
-def play_figures(setup: Setup, figures: Sequence[Figure], choose: Choose, seed: int) -> Played:
+def play_figures(setup: Setup, figures: Sequence[Figure], player: Player, seed: int) -> Played:
     """Assemble E figures, one episode each; where the tokens start is decided by seed and figure.
 
     Raises:
@@ -110,7 +111,8 @@ def play_figures(setup: Setup, figures: Sequence[Figure], choose: Choose, seed: 
     targets = (np.stack([f.poses for f in figures]), np.stack([f.flipped for f in figures]))
     at_once = min(AT_ONCE, len(figures))
     with closing(BatchedEnv(setup.layout, sim, RewardConfig(), at_once)) as env:
-        return play(env, choose, lambda i: _generator(figures[i], seed), len(figures), targets)
+        choose, count = playing(player, env), len(figures)
+        return play(env, choose, lambda i: _generator(figures[i], seed), count, targets)
 
 
 def _generator(figure: Figure, seed: int) -> np.random.Generator:

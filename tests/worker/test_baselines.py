@@ -4,6 +4,7 @@ And chance, which plays by the rules.
 """
 
 from contextlib import closing
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ import pytest
 from tangram_sim.kinematics import wrap
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.sim.builders import SEVEN
-from worker.baselines import exact_policy, random_policy
+from worker.baselines import Told, exact_policy, playing, random_policy
+from worker.oracle import oracle_policy
 from worker.test_set import FixedTests
 
 pytestmark = pytest.mark.fast
@@ -30,6 +32,65 @@ def test_the_exact_policy_scores_one(backend: str, tokens: dict, actions: int) -
     assert scores["raw_overlap_p10"] > 0.9999
     assert scores["position_error_p90"] < 1e-4
     assert scores["angle_error_deg_p90"] < 1e-2
+
+
+# Worlds that are not plain, and so few actions in them that the formula repeated does not arrive.
+WORLDS: list[tuple[dict[str, Any], int]] = [
+    ({"gain": (0.8, 1.25, 0.9)}, 2),
+    ({"bias": (0.05, -0.03, 0.04)}, 2),
+    ({"drift": 0.2}, 1),
+    ({"gain_spread": 1.25, "bias_spread": 0.05, "drift_spread": 0.1}, 2),
+    ({"delay": True}, 3),
+    ({"delay": True, "gain_spread": 1.25, "bias_spread": 0.05, "drift_spread": 0.1}, 4),
+    ({"backend": "physics", "damping": 0.1}, 2),
+    ({"backend": "physics", "damping_spread": 0.1}, 2),
+    ({"backend": "physics", "damping": 0.04, "substeps": 1}, 2),
+    ({"backend": "physics", "damping_spread": 0.1, "substeps": 1, "gain_spread": 1.25}, 3),
+    ({"backend": "physics", "damping": 0.04, "arena": 5.0, "delay": True, "bias_spread": 0.1}, 3),
+]
+
+
+@pytest.mark.parametrize(("sim", "actions"), WORLDS)
+@pytest.mark.parametrize("shape", ["square", "parallelogram", "large_triangle"])
+def test_the_oracle_ends_on_its_target_in_every_world(
+    sim: dict[str, Any], actions: int, shape: str
+) -> None:
+    made = setup({"shapes": [shape], "scale": 0.8}, **sim, actions_per_token=actions)
+    with closing(FixedTests(made, 16, 8)) as tests:
+        oracle = tests.scores(tests.play(playing(Told(oracle_policy), tests.env)))
+        formula = tests.scores(tests.play(exact_policy(made.layout, made.sim)))
+    assert oracle["position_error_p90"] < 1e-5 * made.sim.arena
+    assert oracle["angle_error_deg_p90"] < 1e-2
+    short = formula["position_error_p90"] / 1e-3 / made.sim.arena
+    assert max(short, formula["angle_error_deg_p90"] / 0.5) > 1.0
+
+
+@pytest.mark.parametrize("sim", [{}, {"delay": True}, {"gain_spread": 1.25, "action_noise": 5e-4}])
+@pytest.mark.parametrize("tokens", [SQUARE, PAIR], ids=["one", "two"])
+def test_the_oracle_puts_noisy_looks_together(tokens: dict, sim: dict[str, Any]) -> None:
+    """The look at the target is one: its noise is left, and of eight looks at a token a third."""
+    made = setup(tokens, corner_noise=0.01, actions_per_token=8, starts="outside", **sim)
+    found = []
+    with closing(FixedTests(made, 60, 20)) as tests:
+        for player in (Told(oracle_policy), exact_policy(made.layout, made.sim)):
+            played = tests.play(playing(player, tests.env))
+            # From where the target is seen: what no policy can know is no matter here.
+            ends, goals = made.layout.poses(played.ends), made.layout.poses(played.episodes.goals)
+            found.append(np.median(np.abs(ends - goals)[..., :2]))
+    assert found[0] < 0.7 * found[1]
+
+
+@pytest.mark.parametrize("sim", [{}, {"delay": True}, {"allow_flip": True}])
+def test_the_oracle_plays_several_tokens(sim: dict[str, Any]) -> None:
+    sim = sim | {"backend": "physics", "starts": "outside", "arena": 3.0}
+    varies = {"gain_spread": 1.2, "bias_spread": 0.02, "damping_spread": 0.1, "substeps": 1}
+    tokens = {"shapes": ["square", "parallelogram"], "scale": 0.6}
+    made = setup(tokens, **sim, **varies, actions_per_token=3)
+    with closing(FixedTests(made, 8, 8)) as tests:
+        oracle = tests.scores(tests.play(playing(Told(oracle_policy), tests.env)))
+        formula = tests.scores(tests.play(exact_policy(made.layout, made.sim)))
+    assert oracle["coverage"] > 0.999
+    assert formula["coverage"] < oracle["coverage"] - 0.01
 
 
 @pytest.mark.parametrize("shape", SHAPES)

@@ -80,6 +80,22 @@ def test_settings_of_the_world_are_played_and_written_down(tmp_path: Path) -> No
     assert report["actions_used"] == 8
 
 
+def test_in_another_world_there_is_an_oracle(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    world = {"gain": [0.8, 1.0, 1.25], "bias_spread": 0.05, "action_noise": 0.001}
+    for tokens, puzzle in ((PAIR, None), (GAME, ("train",))):
+        folder = tmp_path / str(puzzle)
+        more = {"episodes": 2} if puzzle is None else {"puzzle": puzzle}
+        changes = {"sim": world | {"actions_per_token": 2}}
+        baselines = evaluated(folder, tokens, changes=changes, **more)["baselines"]
+        assert baselines["oracle"]["coverage"] > baselines["exact"]["coverage"]
+        told = "gain [0.8,1,1.25], bias_spread 0.05, actions with noise 0.001"
+        assert told in " ".join(capsys.readouterr().out.split())
+        if puzzle is None:
+            assert evaluated(folder, tokens, **more)["baselines"].keys().isdisjoint({"oracle"})
+
+
 USES: dict[str, Callable[[str, str], int]] = {
     "eval": lambda run, out: evaluate_run(EvalConfig(run, out=out)),
     "play": lambda run, out: play_run(PlayConfig(run, out=out)),
