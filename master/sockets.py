@@ -11,7 +11,7 @@ from master.audit import Audit
 from master.counters import Counters
 from master.gate import AMPLE, Gate, Room
 from master.security import Authenticator, Holder, Keys
-from tangram_agent.addresses import IPC
+from tangram_agent.addresses import IPC, KEEPALIVE
 from tangram_agent.arrays import MAX_FRAME_BYTES
 from tangram_agent.files import own_folder
 from tangram_agent.messages import Greet, Refused, Reject, Stop
@@ -28,10 +28,6 @@ HANDSHAKE_MS = 10_000
 BACKLOG = 1024
 # Of a subscription or a step of a handshake; more than encryption adds to a frame.
 MAX_COMMAND = 1024
-# TCP finds connections that died without a word. ZMTP's own pings end the process that sends them:
-# for one that has been reset while its queue was full, an assertion of ZeroMQ's fails
-# (https://github.com/zeromq/libzmq/issues/4364).
-DEAD_S, PROBE_S = 30, 5
 LOOK_S = 1.0  # between two looks at the files of unix sockets
 
 
@@ -192,11 +188,8 @@ class Sockets:
         socket.setsockopt(zmq.BACKLOG, BACKLOG)
         most = MAX_COMMAND + (MAX_FRAME_BYTES if kind == zmq.ROUTER else 0)
         socket.setsockopt(zmq.MAXMSGSIZE, most)
-        socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
-        socket.setsockopt(zmq.TCP_KEEPALIVE_IDLE, PROBE_S)
-        socket.setsockopt(zmq.TCP_KEEPALIVE_INTVL, PROBE_S)
-        socket.setsockopt(zmq.TCP_KEEPALIVE_CNT, DEAD_S // PROBE_S - 1)
-        socket.setsockopt(zmq.TCP_MAXRT, DEAD_S * 1000)  # of what is sent
+        for name, value in KEEPALIVE.items():
+            socket.setsockopt(getattr(zmq, name), value)
         socket.setsockopt(zmq.IPV6, int(":" in bind))
         if kind == zmq.ROUTER:
             # Else answers to those who are gone vanish without a word.

@@ -12,6 +12,17 @@ LOCAL = "local"  # of service.bind: unix sockets instead of an address
 IPC = "ipc://"
 HOST = re.compile(r"[\w.*-]+")
 WILDCARDS = ("0.0.0.0", "*", "[::]")  # noqa: S104  # replaced, never bound
+# TCP finds connections that died without a word. ZMTP's own pings end the process that sends them:
+# for one that has been reset while its queue was full, an assertion of ZeroMQ's fails
+# (https://github.com/zeromq/libzmq/issues/4364).
+DEAD_S, PROBE_S = 30, 5
+KEEPALIVE = {  # options of ZeroMQ
+    "TCP_KEEPALIVE": 1,
+    "TCP_KEEPALIVE_IDLE": PROBE_S,
+    "TCP_KEEPALIVE_INTVL": PROBE_S,
+    "TCP_KEEPALIVE_CNT": DEAD_S // PROBE_S - 1,
+    "TCP_MAXRT": DEAD_S * 1000,  # of what is sent
+}
 
 
 def check_host(name: str, host: str) -> None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
+from tangram_agent.addresses import KEEPALIVE
 from tangram_agent.arrays import MAX_WEIGHTS_BYTES
 from tangram_agent.schema import MAX_HEADER
 from tangram_sim.errors import RunError, TangramError
@@ -25,8 +26,6 @@ from worker.discovery import (
 LINGER_MS = 1000
 # More than any window, so that only heartbeats to a master that is away find no room.
 HIGH_WATER = 2048
-# ZMTP pings find connections that died without a word.
-PING_MS = 5000
 RECONNECT_MS = 100
 RECONNECT_MAX_MS = 2000
 SURE = 8  # handshakes in a row that failed without a reason: some fail when many come at once
@@ -163,7 +162,8 @@ class Sockets:
         socket.setsockopt(zmq.SNDHWM, HIGH_WATER)
         socket.setsockopt(zmq.RCVHWM, HIGH_WATER)
         socket.setsockopt(zmq.MAXMSGSIZE, MAX_WEIGHTS_BYTES + MAX_HEADER)
-        socket.setsockopt(zmq.HEARTBEAT_IVL, PING_MS)
+        for name, value in KEEPALIVE.items():
+            socket.setsockopt(getattr(zmq, name), value)
         socket.setsockopt(zmq.RECONNECT_IVL, RECONNECT_MS)
         socket.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MAX_MS)
         if self._key is not None:

@@ -14,8 +14,8 @@ import pytest
 from master import sockets as sockets_module
 from master.counters import Counters
 from master.gate import _connection
-from master.sockets import DEAD_S, PROBE_S, Sockets
-from tangram_agent.addresses import IPC
+from master.sockets import Sockets
+from tangram_agent.addresses import DEAD_S, IPC, PROBE_S
 from tests.agent.messages import weights
 from tests.master.dealers import staged
 

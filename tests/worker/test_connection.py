@@ -8,7 +8,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import zmq
 
+from tangram_agent.addresses import KEEPALIVE
 from tangram_agent.messages import Alive, Greet, Hello
 from tangram_sim.errors import TangramError
 from tests.agent.messages import SHAPES, episodes, weights
@@ -75,6 +77,17 @@ def test_a_connection_that_does_not_answer_is_made_anew(master: StandIn) -> None
         again = master.await_kind(client, Hello)
         assert (again.index, again.incarnation, again.first) == (3, 2, 1)
         assert master.identity != first
+
+
+def test_connections_that_died_without_a_word_are_found_without_pings(master: StandIn) -> None:
+    """A master's weights would come no more; ZeroMQ's pings may end the process that sends them."""
+    with welcomed(master) as client:
+        sockets = client._connection.sockets
+        assert sockets is not None
+        for one in (sockets._dealer, sockets._sub):
+            assert one is not None
+            found = {name: one.getsockopt(getattr(zmq, name)) for name in KEEPALIVE}
+            assert (found, one.getsockopt(zmq.HEARTBEAT_IVL)) == (KEEPALIVE, 0)
 
 
 def test_a_lost_master_is_given_up_in_the_end(master: StandIn) -> None:
