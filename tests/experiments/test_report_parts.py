@@ -32,7 +32,7 @@ from tangram_lab.experiments.report.numbers import (
     thinned,
 )
 from tangram_lab.experiments.report.page import command
-from tangram_lab.experiments.report.references import papers
+from tangram_lab.experiments.report.references import falls_short, papers
 from tangram_lab.experiments.report.study import Seed, Training, read_runs
 from tangram_lab.experiments.report.style import LINES
 from tangram_lab.experiments.report.tables import paired, picture, plain, table
@@ -271,3 +271,21 @@ def test_learning_curves_are_thinned_to_sixty_points() -> None:
 )
 def test_numbers_as_people_read_them(found: object, expected: object) -> None:
     assert found == expected
+
+
+@pytest.mark.parametrize(
+    ("override", "short"),
+    [
+        ("sim.damping=0.04", True),
+        ("sim.damping=0.0", False),
+        ("sim.substeps=1", True),
+        ("sim.substeps=4", False),
+        ("sim.gain=[0.8,1,1]", True),
+        ("sim.gain=[1,1,1]", False),
+        ("sim.delay=true", True),
+        ("sim=bullet_defaults", True),
+        ("sim.arena=3", False),
+    ],
+)
+def test_in_which_worlds_the_exact_hand_is_no_oracle(override: str, short: bool) -> None:
+    assert falls_short(override) == short

@@ -4,9 +4,11 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import yaml
+
 from tangram_lab.experiments.report.numbers import Measure
 from tangram_lab.experiments.report.study import Experiment, Row, Study, Training, Trial
-from tangram_sim.config import EXACT_SUBSTEPS
+from tangram_sim.config import EXACT_SUBSTEPS, UNKNOWN, SimConfig
 
 # Name in the files of tests -> name in the report.
 POSITION, PERFECT, RANDOM = "position only", "perfect", "random"
@@ -73,7 +75,7 @@ def _all(study: Study, experiment: Experiment) -> Iterator[Reference]:
     shapes = [one.tokens for one in firsts.values()]
     for key, name in NAMES.items():
         for task, one in firsts.items():
-            if not any(map(_falls_short, task)):
+            if not any(map(falls_short, task)):
                 label = one.tokens if shapes.count(one.tokens) == 1 else one.label
                 yield Reference(name, label * (len(shapes) > 1), _scores(study, key, task))
 
@@ -91,11 +93,14 @@ def _scores(study: Study, key: str, task: Task) -> dict[str, Row]:
     return found
 
 
-def _falls_short(override: str) -> bool:
+def falls_short(override: str) -> bool:
     """Whether tokens fall short of what they are told, so that no policy here is an oracle."""
     name, _, value = override.partition("=")
     few = name == "sim.substeps" and int(value) < EXACT_SUBSTEPS
-    return few or (name == "sim.damping" and float(value) > 0.0)
+    usual = {f"sim.{one}": getattr(SimConfig, one) for one in UNKNOWN}
+    given = yaml.safe_load(value)
+    given = tuple(given) if isinstance(given, list) else given
+    return few or override == "sim=bullet_defaults" or given != usual.get(name, given)
 
 
 def task_of(training: Training) -> Task:
@@ -103,7 +108,7 @@ def task_of(training: Training) -> Task:
     settings = sorted(
         text
         for text in training.overrides
-        if text.startswith(("tokens.", "sim.")) and text.partition("=")[0] not in APART
+        if text.startswith(("tokens.", "sim.", "sim=")) and text.partition("=")[0] not in APART
     )
     return (training.tokens, *settings)
 
