@@ -56,13 +56,15 @@ def _worker(settings: Plain) -> int:
     check_world(setup.layout, setup.sim)  # before anything is connected
     check_reward(setup.reward, setup.layout, setup.sim)
 
+    from worker.session import keep_part
+
     if config.role == "evaluator":
         from worker.evaluator import run_evaluator
 
-        return run_evaluator(config, setup)
+        return keep_part(run_evaluator, config, setup)
     from worker.player import run_player
 
-    return run_player(config, setup)
+    return keep_part(run_player, config, setup)
 
 
 def _status(settings: Plain) -> int:

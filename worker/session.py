@@ -12,9 +12,11 @@ from typing import TextIO
 import torch
 
 from tangram_agent.arrays import EpisodeSpec
+from tangram_agent.messages import TAKEN_OVER
 from tangram_agent.policy import Policy
 from tangram_agent.process import Watchdog, formatter, watch_parent
 from tangram_agent.setup import Setup
+from tangram_sim.errors import TangramError
 from worker.client import Client
 from worker.config import WorkerConfig
 
@@ -22,6 +24,10 @@ SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1, signal.SIGUSR2)
 REPORT_S = 30.0
 
 _log = logging.getLogger(__name__)
+
+
+class IndexTakenError(TangramError):
+    """The index that the master gave to this process, which asked for any, is another's now."""
 
 
 @contextmanager
@@ -38,6 +44,7 @@ def joined(config: WorkerConfig, setup: Setup, policy: Policy) -> Iterator[Clien
 
     Raises:
         TangramError: the master refuses, or does not answer.
+        IndexTakenError: another process asked for the index that this one was given.
     """
     watch_parent()
     # Several workers share one machine: more threads each would only get in each other's way.
@@ -62,7 +69,26 @@ def joined(config: WorkerConfig, setup: Setup, policy: Policy) -> Iterator[Clien
             fields = {"event": "joined", "run_id": me.run_id, "incarnation": me.incarnation}
             _log.info("joined run %s", me.run_id, extra=fields)
         yield client
+        if config.index < 0 and TAKEN_OVER in client.stop_reason:
+            raise IndexTakenError(client.stop_reason)
         _log.info("ends: %s", client.stop_reason, extra={"event": "ended"})
+
+
+def keep_part(run: Callable[[WorkerConfig, Setup], int], config: WorkerConfig, setup: Setup) -> int:
+    """Run a player or an evaluator, and again when another process takes the index it was given.
+
+    Returns:
+        Exit status 0.
+
+    Raises:
+        TangramError: as `run`.
+    """
+    while True:
+        try:
+            return run(config, setup)
+        except IndexTakenError as error:
+            fields = {"event": "index_taken"}
+            _log.info("%s: it goes on with an index that is free", error, extra=fields)
 
 
 @contextmanager

@@ -16,6 +16,7 @@ import zmq
 
 from master.delivery import EpisodesArrived
 from master.hub import Hub
+from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import Go
 from tangram_agent.process import Lifeline
@@ -26,9 +27,11 @@ from tangram_sim.seeding import episode_generator
 from tests.agent.builders import setup
 from tests.worker.builders import policy, weights, write_run
 from tests.worker.conversation import LIMIT_S, QUICK, collect, open_hub, with_master
+from worker.client import Client
 from worker.config import WorkerConfig
 from worker.evaluator import run_evaluator
 from worker.player import run_player
+from worker.session import keep_part
 
 pytestmark = pytest.mark.cluster
 
@@ -213,6 +216,32 @@ def test_a_signal_ends_a_player_with_a_goodbye(
         "player 0: waits: no weights yet",
         f"player 0: ends: {number.name}",
     ]
+
+
+@pytest.mark.parametrize("index", [-1, 0], ids=["given", "asked for"])
+def test_a_player_whose_index_is_taken_goes_on_if_it_asked_for_none(
+    capfd: pytest.CaptureFixture[str], index: int
+) -> None:
+    """One that is started by hand may be there before the run's own workers, which ask for 0."""
+    made = greedy_setup()
+
+    def script(hub: Hub) -> list[int]:
+        hub.publish(weights(made, 1))
+        [first, *_] = collect(hub, bool)
+        with Client(hub.endpoint, "player", 0, made.fingerprints(), EpisodeSpec.of(made)) as taker:
+            collect(hub, lambda _: taker.poll() or taker.joined)
+            if index >= 0:
+                return [first.index]
+            [again, *_] = collect(hub, bool)
+        return [first.index, again.index]
+
+    hub = open_hub(made)
+    found, status = with_master(
+        hub, script, lambda: keep_part(run_player, config(hub, index=index), made)
+    )
+    assert (found, status) == ([0] if index >= 0 else [0, 1], 0)
+    taken = "player 0: player 0 was taken over by a newer process: it goes on with an index that is"
+    assert (taken in capfd.readouterr().err) == (index < 0)
 
 
 def test_a_signal_ends_a_player_that_no_master_answers(
