@@ -28,8 +28,7 @@ PAPER = {
 }
 # One relabelled goal, and on pairs one proposal of exact motion: what most tests need.
 PLAIN: dict[str, Any] = {"hindsight": [{"strategy": "final"}]}
-PROPOSAL = {"reapply": 0}
-EXACT = {"motion": "exact"}
+PROPOSAL = {"reapply": 0, "motion": "exact"}
 SCENE = {"readout": "token"}  # ours, on whole scenes
 SMALL = {"width": 16, "layers": 2, "heads": 2, "feed_forward": 32}
 
@@ -43,7 +42,8 @@ def setup(
     """A setup on the kinematic backend with a small network."""
     given = PLAIN | (agent or {})
     if given.get("readout") != "token":
-        given = PROPOSAL | (EXACT if given.get("afterstate", True) else {}) | given
+        learned = {} if given.get("afterstate", True) else {"motion": "learned"}
+        given = PROPOSAL | learned | given
     return make_setup(
         {
             "tokens": tokens,

@@ -332,6 +332,7 @@ def test_scores_and_stats_arrive_and_without_a_master_scores_are_lost_and_counte
         assert client.counters["lost_scores"] == 1
         assert served(stage, client.join)
         client.stats["episodes"] = 12.0
+        stage.hub.publish(weights(scores().weights_version))
         client.send_scores(scores())
         stage.counted("scores")
         [arrival] = stage.arrivals
