@@ -370,6 +370,10 @@ class Learner:
         Raises:
             RunError: tensors are missing or have other shapes.
         """
+        if self.motion is not None and not under("motion.", state):
+            raise RunError(
+                "the checkpoint has no model of motion: set agent.motion=exact, as it was trained"
+            )
         for part, module in self.parts.items():
             load_arrays(module, under(f"{part}.", state))
 

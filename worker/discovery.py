@@ -216,7 +216,7 @@ def _check_local(endpoint: str, machine: str, source: Path) -> None:
 def _checked(endpoint: str, source: str) -> str:
     host, _, port = endpoint.removeprefix(SCHEME).rpartition(":")
     named = endpoint.startswith(SCHEME) and host.isprintable() and host.split() == [host]
-    if not (named and port.isdecimal() and 0 < int(port) < 65536):
+    if not (named and port.isascii() and port.isdecimal() and 0 < int(port) < 65536):
         raise RunError(
             f"'{endpoint}' (from {source}) is no address: it must be tcp://host:port, the port "
             "from 1 to 65535"

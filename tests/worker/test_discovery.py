@@ -90,6 +90,7 @@ def test_a_host_that_is_unknown_says_where_its_name_comes_from(
         "tcp://h:x",
         "tcp://",
         "tcp://a b:1",
+        "tcp://h:١٢",
         "tcp://a\udcff:1",
     ],
 )
