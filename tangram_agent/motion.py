@@ -26,6 +26,8 @@ _HIDDEN, _LEARNED = 64, 16
 _GIVEN = 5  # features that are not learned: the command, its shift's length, and 1
 _NOISE, _LEAST_NOISE = 0.02, 1e-4  # deviation of a way at the start, and at least
 _SEARCH_STEPS, _NEAR_ENOUGH = 30, 1e-5
+_SHORT = 0.01  # share of a half turn
+_SLOPES = 0.1, 10.0  # of what a command comes to, as the search takes them
 _STILL = 1e-6  # an action that moves no more was refused or blocked
 
 
@@ -126,7 +128,7 @@ class MotionModel(nn.Module):
     def loss(self, motions: Motions) -> tuple[Tensor, Tensor]:
         """Mean negative log likelihood of each motion given those before it in its episode.
 
-        Beside it the root of the mean squared error of the last ones.
+        Beside it the root of the mean squared error of the last ones, of those that moved.
         """
         belief, losses = self.prior(len(motions.command)), []
         phi, noise = self.features(motions.command), self.noise
@@ -135,20 +137,42 @@ class MotionModel(nn.Module):
             variance = spread * noise.square()
             loss = (wrong.square() / variance + variance.log()).sum(dim=-1)
             losses.append(0.5 * (loss * motions.moved[:, t]).mean())
-        error = wrong.detach().square().mean().sqrt()
-        return torch.stack(losses).mean().float(), error.float()
+        moved = motions.moved[:, -1:]
+        error = (wrong.detach().square() * moved).sum() / (3.0 * moved.sum()).clamp(min=1.0)
+        return torch.stack(losses).mean().float(), error.sqrt().float()
 
     def command(self, belief: Belief, way: Tensor) -> Tensor:
-        """(B, 3) in [-1, 1], what comes to ways (B, 3), or as near to them as can be."""
-        command = way.clamp(-1.0, 1.0)
-        for _ in range(_SEARCH_STEPS):
-            missing = _shortest(way - _predict(belief, self.features(command))[0]).float()
-            better = (command + missing).clamp(-1.0, 1.0)
-            done = bool((better - command).abs().max() < _NEAR_ENOUGH)
-            command = better
-            if done:
-                break
+        """(B, 3) in [-1, 1], the nearest that was found to come to ways (B, 3).
+
+        Where a turn falls short, the other way round is tried, too.
+        """
+        command, missing = self._search(belief, way, way.clamp(-1.0, 1.0))
+        if bool((missing[:, 2].abs() > _SHORT).any()):
+            back = torch.cat([command[:, :2], -command[:, 2:].sign()], dim=-1)
+            other, less = self._search(belief, way, back)
+            nearer = less.norm(dim=-1) < missing.norm(dim=-1) - _NEAR_ENOUGH
+            command = torch.where(nearer[:, None], other, command)
         return command
+
+    def _search(self, belief: Belief, way: Tensor, command: Tensor) -> tuple[Tensor, Tensor]:
+        """Commands (B, 3) from these on, and what their ways miss, by secants of each axis."""
+        missing = self._missing(belief, way, command)
+        slope = torch.ones_like(way)
+        for _ in range(_SEARCH_STEPS):
+            tried = (command + missing / slope).clamp(-1.0, 1.0)
+            step = tried - command
+            if bool(step.abs().max() < _NEAR_ENOUGH):
+                break
+            rest = self._missing(belief, way, tried)
+            secant = torch.where(step.abs() < _NEAR_ENOUGH, slope, (missing - rest) / step)
+            better = rest.norm(dim=-1, keepdim=True) < missing.norm(dim=-1, keepdim=True)
+            slope = torch.where(better, secant, torch.maximum(secant, 1.5 * slope)).clamp(*_SLOPES)
+            command = torch.where(better, tried, command)
+            missing = torch.where(better, rest, missing)
+        return command, missing
+
+    def _missing(self, belief: Belief, way: Tensor, command: Tensor) -> Tensor:
+        return _shortest(way - _predict(belief, self.features(command))[0]).float()
 
     def _told(
         self, belief: Belief, phi: Tensor, motions: Motions, t: int

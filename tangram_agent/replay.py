@@ -4,7 +4,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tangram_agent.types import Past, Transitions
-from tangram_sim.arrays import Singles
+from tangram_sim.arrays import Ints, Singles
 from tangram_sim.errors import RunError
 
 Array = npt.NDArray[np.generic]
@@ -29,6 +29,7 @@ class ReplayBuffer:
             action_size: A.
         """
         self.capacity, self.added = capacity, 0
+        self._first = 0  # number of the first row that was ever kept here
         points, flags = (capacity, corners, 2), (capacity, tokens)
         self._columns: dict[str, Array] = {
             "state": np.zeros(points, np.float32),
@@ -42,7 +43,12 @@ class ReplayBuffer:
         }
 
     def __len__(self) -> int:
-        return min(self.added, self.capacity)
+        return min(self.added - self._first, self.capacity)
+
+    def _slots(self) -> Ints:
+        """Where the kept rows lie, the oldest first."""
+        kept = len(self)
+        return (self.added - kept + np.arange(kept)) % self.capacity
 
     def add(self, batch: Transitions) -> None:
         """Append a batch; the oldest transitions make room."""
@@ -61,7 +67,8 @@ class ReplayBuffer:
         """
         if not len(self):
             raise ValueError("cannot sample from an empty replay buffer")
-        rows = generator.integers(len(self), size=size)
+        oldest = self.added - len(self)
+        rows = (oldest + generator.integers(len(self), size=size)) % self.capacity
         return Transitions(**{name: column[rows] for name, column in self._columns.items()})  # type: ignore[arg-type]
 
     def sample_episodes(
@@ -86,9 +93,9 @@ class ReplayBuffer:
 
     def check_valid(self) -> None:
         """Raise RunError unless every kept number is finite and every flag is 0 or 1."""
-        kept = len(self)
+        slots = self._slots()
         for name, column in self._columns.items():
-            part = column[:kept]
+            part = column[slots]
             if part.dtype == np.uint8:
                 if not np.isin(part, (0, 1)).all():
                     raise RunError(f"replay buffer: '{name}' holds flags other than 0 and 1")
@@ -96,9 +103,15 @@ class ReplayBuffer:
                 raise RunError(f"replay buffer: '{name}' holds numbers that are not finite")
 
     def state(self) -> dict[str, Array]:
-        """The kept transitions and the counter, as arrays for a checkpoint (views, not copies)."""
+        """The kept transitions and the counter, as arrays for a checkpoint (mostly views).
+
+        Row n that was ever added lies at n modulo the number of those kept.
+        """
         kept = len(self)
-        columns = {name: column[:kept] for name, column in self._columns.items()}
+        rows: slice | Ints = slice(kept)
+        if kept < self.capacity and self._first:  # a full ring that was given more room
+            rows = np.roll(self._slots(), self.added % kept)
+        columns = {name: column[rows] for name, column in self._columns.items()}
         return columns | {_COUNTERS: np.array([self.added], np.int64)}
 
     def load_state(self, state: dict[str, Array]) -> None:
@@ -121,8 +134,8 @@ class ReplayBuffer:
                 )
         # Oldest first: the state's own ring was full if it held fewer than were ever added.
         order = np.roll(np.arange(kept), -(added % kept) if added > kept else 0)[-self.capacity :]
-        self.added = added
-        slots = (added - len(order) + np.arange(len(order))) % self.capacity
+        self.added, self._first = added, added - len(order)
+        slots = self._slots()
         for name, column in self._columns.items():
             column[slots] = state[name][order]
         self.check_valid()

@@ -24,7 +24,7 @@ from tangram_agent.policy import Policy
 from tangram_agent.pretrained import is_agent, is_name, packaged, read_agent
 from tangram_agent.setup import Setup, make_setup
 from tangram_agent.stored import load_settings
-from tangram_agent.types import Weights
+from tangram_agent.types import Past, Weights
 from tangram_sim.arrays import Floats, Singles
 from tangram_sim.config import with_given_reward
 from tangram_sim.errors import ConfigError, RunError
@@ -66,11 +66,13 @@ class Run:
     updates: int
     policy: Policy
 
-    def predict(self, observation: Mapping[str, Any]) -> Singles:
+    def predict(self, observation: Mapping[str, Any], past: Past | None = None) -> Singles:
         """What the agent does, noise off: the actions alone, as it keeps nothing in mind.
 
         Args:
             observation: of `TangramEnv`, or of `TangramVectorEnv`: each entry with B rows.
+            past: of these B episodes, by which an agent that learned the motion corrects itself;
+                without it, it plays by what is usual.
 
         Returns:
             (A,) in [-1, 1], which `step` takes; (B, A) for B rows.
@@ -84,7 +86,7 @@ class Run:
             for name in ("achieved_goal", "desired_goal")
         )
         flags = shown["observation"][..., -layout.tokens :].reshape(-1, layout.tokens)
-        actions = self.policy.act(corners, flags > 0.5, goals)
+        actions = self.policy.act(corners, flags > 0.5, goals, past=past)
         return actions if shown["observation"].ndim > 1 else actions[0]
 
     def _checked(self, observation: object) -> dict[str, Floats]:

@@ -152,7 +152,8 @@ class Setup:
         """The sections in which another setup, known by its contents, is not this one.
 
         Only settings that both know are compared, so that a run outlives a version with more of
-        them: what is new does by default what was done before.
+        them: what is new does by default what was done before. But for agent.motion: a learner
+        refuses a checkpoint that has no model of motion.
         """
         own = self.contents()
         known = own | contents if isinstance(contents, dict) else {}

@@ -84,6 +84,28 @@ def test_it_grows_surer_where_it_has_seen_and_finds_the_command() -> None:
     torch.testing.assert_close(gain * command + bias, wanted, atol=0.02, rtol=0.0)
 
 
+@pytest.mark.parametrize("gain", [0.5, 1.9, 2.0, 3.0])
+@pytest.mark.parametrize("bias", [0.0, 0.3])
+def test_the_command_is_found_whatever_the_gain(gain: float, bias: float) -> None:
+    model = at_first()
+    model.mean[:, :3] *= gain
+    model.mean[:, 4] = bias
+    wanted = bias + 0.9 * gain * commands(50) * torch.tensor([1.0, 1.0, 0.3])
+    belief = model.prior(50)
+    found = model.predict(belief, model.command(belief, wanted))[0]
+    off = (found - wanted).abs()
+    off[:, 2] = torch.remainder(off[:, 2] + 1.0, 2.0) - 1.0
+    assert off.abs().max() < 1e-3
+
+
+def test_a_turn_that_falls_short_is_made_the_other_way_round() -> None:
+    model = at_first()
+    model.mean[2, 4] = 0.5  # it turns a quarter further, whatever it is told
+    belief, wanted = model.prior(1), torch.tensor([[0.0, 0.0, -0.9]])
+    command = model.command(belief, wanted)
+    assert command[0, 2] == pytest.approx(0.6, abs=1e-3)  # to 1.1, which is -0.9
+
+
 def test_turns_are_compared_by_the_shorter_way() -> None:
     model = at_first()
     told = torch.tensor([[0.0, 0.0, 0.99]])
