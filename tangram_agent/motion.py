@@ -117,7 +117,7 @@ class MotionModel(nn.Module):
         belief = self.prior(len(motions.command))
         phi = self.features(motions.command)
         for t in range(phi.shape[1]):
-            belief, _, _ = self._told(belief, phi[:, t], motions, t)
+            belief = _told(belief, phi[:, t], motions, t, *_expected(belief, phi[:, t], motions, t))
         return belief
 
     def predict(self, belief: Belief, command: Tensor) -> tuple[Tensor, Tensor]:
@@ -132,11 +132,14 @@ class MotionModel(nn.Module):
         """
         belief, losses = self.prior(len(motions.command)), []
         phi, noise = self.features(motions.command), self.noise
-        for t in range(phi.shape[1]):
-            belief, wrong, spread = self._told(belief, phi[:, t], motions, t)
+        last = phi.shape[1] - 1
+        for t in range(last + 1):
+            wrong, spread = _expected(belief, phi[:, t], motions, t)
             variance = spread * noise.square()
             loss = (wrong.square() / variance + variance.log()).sum(dim=-1)
             losses.append(0.5 * (loss * motions.moved[:, t]).mean())
+            if t < last:
+                belief = _told(belief, phi[:, t], motions, t, wrong, spread)
         moved = motions.moved[:, -1:]
         error = (wrong.detach().square() * moved).sum() / (3.0 * moved.sum()).clamp(min=1.0)
         return torch.stack(losses).mean().float(), error.sqrt().float()
@@ -174,22 +177,26 @@ class MotionModel(nn.Module):
     def _missing(self, belief: Belief, way: Tensor, command: Tensor) -> Tensor:
         return _shortest(way - _predict(belief, self.features(command))[0]).float()
 
-    def _told(
-        self, belief: Belief, phi: Tensor, motions: Motions, t: int
-    ) -> tuple[Belief, Tensor, Tensor]:
-        """The belief after motion t, by how much it was wrong before (B, 3), and its spread.
 
-        The spread is the variance of what it expected, in units of the noise's.
-        """
-        mean, spread = _predict(belief, phi)
-        wrong = _shortest(motions.way[:, t] - mean)
-        along = torch.einsum("bdfg,bg->bdf", belief.covariance, phi)
-        gain = motions.moved[:, t, None, None] * along / spread[..., None]
-        told = Belief(
-            belief.mean + gain * wrong[..., None],
-            belief.covariance - gain[..., :, None] * along[..., None, :],
-        )
-        return told, wrong, spread
+def _expected(belief: Belief, phi: Tensor, motions: Motions, t: int) -> tuple[Tensor, Tensor]:
+    """By how much motion t is not what is expected (B, 3), and the variance of that.
+
+    The variance is in units of the noise's.
+    """
+    mean, spread = _predict(belief, phi)
+    return _shortest(motions.way[:, t] - mean), spread
+
+
+def _told(
+    belief: Belief, phi: Tensor, motions: Motions, t: int, wrong: Tensor, spread: Tensor
+) -> Belief:
+    """The belief after motion t, which was so wrong, with such a spread."""
+    along = torch.einsum("bdfg,bg->bdf", belief.covariance, phi)
+    gain = motions.moved[:, t, None, None] * along / spread[..., None]
+    return Belief(
+        belief.mean + gain * wrong[..., None],
+        belief.covariance - gain[..., :, None] * along[..., None, :],
+    )
 
 
 def _predict(belief: Belief, phi: Tensor) -> tuple[Tensor, Tensor]:

@@ -50,6 +50,13 @@ class ReplayBuffer:
         kept = len(self)
         return (self.added - kept + np.arange(kept)) % self.capacity
 
+    def _rows(self) -> slice | Ints:
+        """Where they lie, row n that was ever added at n modulo the number of those kept."""
+        kept = len(self)
+        if kept < self.capacity and self._first:  # a full ring that was given more room
+            return np.roll(self._slots(), self.added % kept)
+        return slice(kept)
+
     def add(self, batch: Transitions) -> None:
         """Append a batch; the oldest transitions make room."""
         kept = min(batch.count, self.capacity)
@@ -93,9 +100,9 @@ class ReplayBuffer:
 
     def check_valid(self) -> None:
         """Raise RunError unless every kept number is finite and every flag is 0 or 1."""
-        slots = self._slots()
+        rows = self._rows()
         for name, column in self._columns.items():
-            part = column[slots]
+            part = column[rows]
             if part.dtype == np.uint8:
                 if not np.isin(part, (0, 1)).all():
                     raise RunError(f"replay buffer: '{name}' holds flags other than 0 and 1")
@@ -107,10 +114,7 @@ class ReplayBuffer:
 
         Row n that was ever added lies at n modulo the number of those kept.
         """
-        kept = len(self)
-        rows: slice | Ints = slice(kept)
-        if kept < self.capacity and self._first:  # a full ring that was given more room
-            rows = np.roll(self._slots(), self.added % kept)
+        rows = self._rows()
         columns = {name: column[rows] for name, column in self._columns.items()}
         return columns | {_COUNTERS: np.array([self.added], np.int64)}
 

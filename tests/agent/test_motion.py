@@ -11,7 +11,6 @@ from tangram_agent.policy import Policy
 from tangram_agent.replay import ReplayBuffer
 from tangram_agent.types import Past, Transitions
 from tangram_sim.errors import ConfigError
-from tangram_sim.layout import TokensConfig, make_layout
 from tests.agent.builders import PAIR, SQUARE, random_episodes, setup
 
 pytestmark = pytest.mark.fast
@@ -201,10 +200,3 @@ def test_an_agent_corrects_itself_by_what_it_has_seen() -> None:
     short = np.abs(blind) < 0.5
     assert short.sum() > 5
     assert (np.abs(told) > np.abs(blind))[short].mean() > 0.8
-
-
-def test_pieces_of_a_layout_do_not_matter_to_the_motion() -> None:
-    """The model knows commands only, so every token of a set teaches it."""
-    layout = make_layout(TokensConfig(tuple(PAIR["shapes"]), PAIR["scale"]))
-    assert layout.tokens == 2
-    assert MotionModel().features(commands(4)).shape == (4, 21)
