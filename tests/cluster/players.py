@@ -114,6 +114,12 @@ def more_acknowledged(players: list[Player], batches: int) -> None:
     until(players, lambda: all(p.acknowledged >= w for p, w in zip(players, wanted, strict=True)))
 
 
+def later_acknowledged(players: list[Player]) -> None:
+    """Play until each has an acknowledgement of a batch that it has not sent yet."""
+    sent = [player.sent for player in players]
+    until(players, lambda: all(p.acknowledged > n for p, n in zip(players, sent, strict=True)))
+
+
 def setup_of(folder: Path) -> Setup:
     return make_setup(yaml.safe_load((folder / "config.yaml").read_text()))
 
