@@ -31,6 +31,8 @@ from tangram_lab.benchmarks.target import (
 from tangram_sim.errors import TangramError
 from worker.client import Client
 
+LEARNS_LITTLE = "agent.updates_per_transition=0.1"  # nobody asks for its score
+
 
 def sockets_of_others(target: Target) -> Seen:
     place = Path(target.where["endpoint"].removeprefix("ipc://"))
@@ -160,7 +162,7 @@ def harmed(folder: Path) -> Rows:
 
 def witnessed(folder: Path) -> Rows:
     """What was done to a training of its own, with an independent witness; the folder is odd."""
-    with training(folder, "max_updates=0", *OURS, OFTEN) as target:
+    with training(folder, "max_updates=0", *OURS, LEARNS_LITTLE, OFTEN) as target:
         witness, rows = Witness(str(folder), target.setup), Rows()
         witness.start()
         target.goes_on(100.0)
