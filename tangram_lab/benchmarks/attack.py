@@ -1,50 +1,46 @@
-"""Every attack of the security review, on trainings that run; what held, and what was seen."""
+"""Every attack of the security review, on files and trainings; what held, and what was seen."""
 
 import json
 import os
 import resource
 import shutil
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, suppress
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing, contextmanager, suppress
+from multiprocessing import active_children, get_context
 from pathlib import Path
-from threading import Timer
 from typing import Any
 from unittest import mock
 
 import numpy as np
-import psutil
+import zmq
 
-from master.children import command, override
 from master.delivery import EpisodesArrived
 from master.journal import MAGIC, Journal, segments
 from master.recovery import Reader
 from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint, save_checkpoint
 from tangram_agent.messages import EpisodeBatch
-from tangram_agent.schema import MAX_COUNT
 from tangram_agent.setup import Setup, make_setup
-from tangram_lab.benchmarks.attacks import (
-    ENDS_S,
-    LIVE,
-    OPEN_FILES,
-    Seen,
-    Target,
-    episodes_of,
-    training,
-)
-from tangram_lab.benchmarks.chaos import SETTINGS, Witness, compare
-from tangram_lab.benchmarks.intruder import NOBODY, knock
+from tangram_lab.benchmarks.attacks import BESIEGED, LIVE, OPEN_FILES
+from tangram_lab.benchmarks.harms import harmed
 from tangram_lab.benchmarks.measure import show, write
-from tangram_lab.benchmarks.trainings import MIB, result_of, start_training
+from tangram_lab.benchmarks.target import (
+    OFTEN,
+    OURS,
+    Attack,
+    Seen,
+    episodes_of,
+    one_line,
+    training,
+    tried,
+)
+from tangram_lab.benchmarks.trainings import LOOK_S, MIB, Watched, result_of, start_training
 from tangram_sim.errors import RunError, TangramError
 from tangram_sim.puzzles import parse_puzzles, parse_svg_puzzle
-from worker.client import Client
 
-Attack = tuple[str, str, str, Callable[[Any], Seen]]  # row, what, how much, and what does it
-OFTEN = "service.checkpoint_minutes=0.05"
 ON_A_PORT = ("service.bind=127.0.0.1", "service.log_format=json")
 NOISE = 0.02  # of the mean reward, between two trainings of so many updates
 UPDATES = 200  # before the attacks begin
@@ -52,21 +48,6 @@ BATCHES = 40
 TASK: dict[str, Any] = {"tokens": {"shapes": ["square"], "scale": 1.0}} | {
     name: {} for name in ("sim", "reward", "agent", "net")
 }
-
-
-def one_line(*arguments: str, cwd: Path) -> Seen:
-    """Whether a command refuses in one line, with status 2."""
-    done = subprocess.run(
-        [sys.executable, *command(arguments[0]), *arguments[1:]],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        timeout=ENDS_S,
-        check=False,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
-    )
-    lines = done.stderr.strip().splitlines()
-    return (done.returncode, len(lines)) == (2, 1), f"{len(lines)} lines: {' '.join(lines)[-90:]}"
 
 
 # Files
@@ -210,142 +191,31 @@ FILES: list[Attack] = [
 ]
 
 
-# Trainings that are harmed
-
-
-def sockets_of_others(target: Target) -> Seen:
-    place = Path(target.where["endpoint"].removeprefix("ipc://"))
-    private = place.is_socket() and not place.parent.stat().st_mode & 0o077
-    stranger = knock(target.where["endpoint"], [target.hello(index=0)], NOBODY)
-    stranger.join(10.0)
-    answers = stranger.exitcode if os.geteuid() == 0 else 0
-    return private and answers == 0, f"{place.parent}: private {private}, {answers} answers"
-
-
-def second_master(target: Target) -> Seen:
-    arguments = (override("run_dir", str(target.folder)), "resume=auto", *SETTINGS[1:])
-    held, seen = one_line("master", *arguments, cwd=target.folder.parent)
-    return held and "in use" in seen and target.goes_on(), seen
-
-
-def killed(target: Target) -> bool:
-    """Whether a training goes on after its master was killed, with batches in the journal alone."""
-    target.checkpoint()
-    target.goes_on(20.0)
-    master = target.master
-    master.kill()
-    until_s = time.monotonic() + ENDS_S
-    while time.monotonic() < until_s:
-        with suppress(TangramError, psutil.Error):
-            if target.master.pid != master.pid and target.goes_on(10.0):
-                return True
-        time.sleep(0.2)
-    return False
-
-
-def killed_after_huge_numbers(target: Target) -> Seen:
-    """With a batch, so that the numbers would be in journal and checkpoint."""
-    setup = target.setup
-    batch = EpisodeBatch(1, 0, episodes_of(setup, 1)).encode(EpisodeSpec.of(setup))
-    for huge in (2**63 - 1, MAX_COUNT):
-        target.ask(target.hello(incarnation=huge), batch)
-        target.ask(target.hello(incarnation=1, first=huge, index=3001, process="other"))
-    held = killed(target)
-    return held, "it goes on" if held else "it does not come back"
-
-
-def killed_after_unlink(target: Target) -> Seen:
-    """Just after a checkpoint, so that it is not the next one that begins another segment."""
-    journal = target.folder / "journal"
-    target.checkpoint()
-    for path in segments(journal).values():
-        path.unlink(missing_ok=True)
-    target.goes_on(20.0)
-    told, held = "has lost its newest segment" in target.told(), killed(target)
-    return told and held, f"told: {told}; killed after a checkpoint, it goes on: {held}"
-
-
-def folder_away(target: Target) -> Seen:
-    target.goes_on()
-    away = target.folder.with_name("away")
-    target.folder.rename(away)
-    time.sleep(3.0)
-    stopped = not target.folder.exists()
-    if stopped:
-        away.rename(target.folder)
-    held, told = stopped and target.goes_on(10.0), f"{target.folder} is gone" in target.told()
-    seen = f"made again by accident: {not stopped}; told: {told}; goes on when it is back: {held}"
-    return held and told, seen
-
-
-def full_disk(target: Target) -> Seen:
-    master = target.master
-    before = master.rlimit(psutil.RLIMIT_FSIZE)
-    master.rlimit(psutil.RLIMIT_FSIZE, (1, before[1]))  # what it says has no room either
-    until_s, taken, stands = time.monotonic() + 15.0, -1.0, False
-    while not stands and time.monotonic() < until_s:
-        stands, taken = target.numbers()["episodes"] == taken, target.numbers()["episodes"]
-        time.sleep(3.0)
-    master.rlimit(psutil.RLIMIT_FSIZE, before)
-    held = target.goes_on(10.0) and target.master.pid == master.pid
-    told = "batches are taken in" in target.told()
-    return stands and held, f"it stands: {stands}; with room again it goes on: {held}; told: {told}"
-
-
-def frozen(target: Target) -> Seen:
-    master = target.master
-    master.suspend()
-    time.sleep(8.0)
-    master.resume()
-    held = target.goes_on(10.0) and target.master.pid == master.pid
-    return held, "it goes on" if held else "it does not go on"
-
-
-OWN: list[Attack] = [
-    ("5", "another user at the sockets", "1", sockets_of_others),
-    ("held", "two masters on one folder", "1", second_master),
-    ("2", "the largest numbers, then kill -9", "1 kill", killed_after_huge_numbers),
-    ("8", "the journal unlinked, then kill -9", "1 kill", killed_after_unlink),
-    ("8", "the run folder taken away", "3 s", folder_away),
-    ("held", "a full disk", "until it stands", full_disk),
-    ("held", "SIGSTOP", "8 s", frozen),
-]
-
-
-def wrong_batch_in_lockstep(target: Target) -> Seen:
-    setup = target.setup
-    spec, rounds = EpisodeSpec.of(setup), 0
-    with Client(str(target.folder), "player", 0, setup.fingerprints(), spec) as client:
-        late = Timer(20.0, client.stop, ["it takes too long"])
-        late.start()
-        client.join()
-        order = client.wait_for_order(None)
-        if order is not None and client.send(episodes_of(setup, 2), order.version):
-            while rounds < 3 and (order := client.wait_for_order(order)) is not None:
-                client.send(episodes_of(setup, order.episodes), order.version)
-                rounds += 1
-        late.cancel()
-    return rounds == 3, f"{rounds} of 3 rounds after it"
-
-
-LOCKSTEP: list[Attack] = [("6", "another batch than was ordered", "1", wrong_batch_in_lockstep)]
-
-
 # All of them
 
 
-def tried(attacks: Iterable[Attack], target: Any) -> Iterator[dict[str, Any]]:
-    """Each attack with its outcome, as a row; an attack that fails has not held."""
-    for row, what, count, strike in attacks:
-        begun = time.monotonic()
+@contextmanager
+def beside() -> Iterator[ProcessPoolExecutor]:
+    """A process for what may be done meanwhile; it is gone after the block."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         try:
-            held, seen = strike(target)
-        except Exception as error:  # noqa: BLE001  # a training that is gone answers with anything
-            held, seen = False, repr(error)
-        took = time.monotonic() - begun
-        said = "held" if held else "NOT HELD"
-        print(f"{row:>4} {what}: {said} ({took:.1f} s), {seen}", flush=True)
-        yield {"attack": f"{row}: {what}", "tried": count, "held": held, "seen": seen}
+            yield pool
+        finally:
+            for process in active_children():
+                process.terminate()
+
+
+def end_after(updates: int, folder: Path, launcher: "subprocess.Popen[bytes]") -> None:
+    """End a training in order when it has done so many updates."""
+    with zmq.Context() as context:
+        watched = Watched(folder, launcher, context)
+        while launcher.poll() is None:
+            with suppress(TangramError):
+                if watched.numbers()["updates"] >= updates:
+                    launcher.terminate()
+                    break
+            time.sleep(LOOK_S)
+    launcher.wait()
 
 
 def run_attack(out: Path | None, folder: Path) -> int:
@@ -360,29 +230,31 @@ def run_attack(out: Path | None, folder: Path) -> int:
     """
     begun = time.monotonic()
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    live, own, straight = folder / "live", folder / "a=run of ü", folder / "straight"
-    resource.setrlimit(resource.RLIMIT_NOFILE, (min(OPEN_FILES, hard), hard))
-    with training(live, "max_updates=0", *ON_A_PORT, *SETTINGS, OFTEN) as target:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-        rows = list(tried(FILES, folder))
-        target.goes_on(UPDATES, "updates")
-        rows += tried(LIVE, target)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-    result = result_of(live)
-    undisturbed = start_training(straight, f"max_updates={result['updates']}", *SETTINGS)
-    rows += harmed(own)
-    lockstep = ("service.mode=lockstep", "workers=1", "max_updates=0", "sim=kinematic")
-    with training(folder / "lockstep", *lockstep, name="master") as target:
-        rows += tried(LOCKSTEP, target)
-    undisturbed.wait()
-    scores = {"attacked": result["mean_reward"], "undisturbed": result_of(straight)["mean_reward"]}
+    live, straight = folder / "live", folder / "straight"
+    with beside() as pool:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (min(OPEN_FILES, hard), hard))
+        with training(live, "max_updates=0", *ON_A_PORT, *OURS, OFTEN) as target:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+            rows = list(tried(FILES, folder))
+            target.goes_on(UPDATES, "updates")
+            rows += tried(BESIEGED, target)
+            meanwhile = pool.submit(harmed, folder)
+            undisturbed = start_training(straight, "max_updates=0", *OURS)
+            rows += tried(LIVE, target)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+        result = result_of(live)
+        rows += meanwhile.result()
+        end_after(result["updates"], straight, undisturbed)
+    other = result_of(straight)
+    scores = {"attacked": result["mean_reward"], "undisturbed": other["mean_reward"]}
     no_worse = scores["attacked"] >= scores["undisturbed"] - NOISE
     rows.append(
         {
             "attack": "the score of the training",
             "tried": f"{result['updates']:,} updates",
             "held": no_worse,
-            "seen": f"{scores['attacked']:.4f}, undisturbed {scores['undisturbed']:.4f}",
+            "seen": f"{scores['attacked']:.4f}, undisturbed {scores['undisturbed']:.4f} "
+            f"after {other['updates']:,}",
         }
     )
     show("attacks", [row | {"held": "yes" if row["held"] else "NO"} for row in rows])
@@ -390,31 +262,3 @@ def run_attack(out: Path | None, folder: Path) -> int:
     print(f"tried {len(rows)}, held {held}, in {took:.0f} s")
     write(out, {"rows": rows, "tried": len(rows), "held": held, "seconds": took, **scores})
     return int(held < len(rows))
-
-
-def harmed(folder: Path) -> list[dict[str, Any]]:
-    """What was done to a training of its own, with an independent witness; the folder is odd."""
-    with training(folder, "max_updates=0", *SETTINGS, OFTEN) as target:
-        witness, rows = Witness(str(folder), target.setup), list[dict[str, Any]]()
-        witness.start()
-        target.goes_on(100.0)
-        after = 0  # so many it was acknowledged to
-        for attack in OWN:
-            rows += tried([attack], target)
-            after += acknowledged_again(witness)
-        witness.stop()
-        witness.join(ENDS_S)
-    counts = compare(folder, witness)
-    held = not (counts["lost"] or counts["doubled"] or witness.error) and after == len(OWN)
-    seen = ", ".join(f"{n} {counts[n]:,}" for n in ("acknowledged", "lost", "doubled"))
-    seen += f"; acknowledged again after {after} of {len(OWN)}"
-    what = "held: kill -9 with a witness, in an odd folder"
-    return [*rows, {"attack": what, "tried": "2 kills", "held": held, "seen": seen}]
-
-
-def acknowledged_again(witness: Witness) -> bool:
-    """Whether more of what a witness plays is acknowledged from now on."""
-    before, until_s = witness.acknowledged, time.monotonic() + ENDS_S
-    while witness.acknowledged == before and witness.is_alive() and time.monotonic() < until_s:
-        time.sleep(0.1)
-    return witness.acknowledged > before

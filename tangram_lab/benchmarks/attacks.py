@@ -10,11 +10,8 @@ import socket
 import struct
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from pathlib import Path
-from typing import Any
-from urllib.parse import urlsplit
 
 import numpy as np
 import psutil
@@ -23,128 +20,28 @@ import zmq
 from master.admission import WelcomeInfo
 from master.hub import Hub
 from tangram_agent.arrays import MAX_FRAME_BYTES, EpisodeSpec
-from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
-from tangram_agent.messages import EpisodeBatch, Heartbeat, Hello, Scores, WantWeights
+from tangram_agent.messages import EpisodeBatch, Heartbeat, Scores, WantWeights
 from tangram_agent.schema import MAX_COUNT, opened, seal
-from tangram_agent.setup import Setup
-from tangram_agent.types import Episodes
 from tangram_lab.benchmarks.chaos import Witness
 from tangram_lab.benchmarks.fuzz_wire import fuzzed, resealed, valid_messages
 from tangram_lab.benchmarks.strangers import Strangers, subscribe
-from tangram_lab.benchmarks.trainings import MIB, Watched, start_training, wait_for
+from tangram_lab.benchmarks.target import (
+    ENDS_S,
+    HOST,
+    LOOK_S,
+    ROOM_MIB,
+    Attack,
+    Seen,
+    Target,
+    episodes_of,
+)
+from tangram_lab.benchmarks.trainings import MIB
 from tangram_sim.errors import TangramError
 from worker.client import Client
 from worker.connection import Timing
-from worker.discovery import find_master
 
-Seen = tuple[bool, str]
-ROOM_MIB = 64.0  # that the memory of a master may grow by under any attack
 ROOM_FILES = 300  # the same of its open files, under strangers
 OPEN_FILES = 1024  # that a master may begin with
-ENDS_S = 60.0
-LOOK_S = 0.1
-HOST = "127.0.0.1"
-
-
-class Target(Watched):
-    """A training under attack."""
-
-    @property
-    def points(self) -> Path:
-        """The folder of its checkpoints."""
-        return self.folder / "checkpoints"
-
-    @contextmanager
-    def peer(self, kind: int = zmq.DEALER, role: str = "player", **options: int) -> Iterator[Any]:
-        """A socket with the keys of a role; of an unknown role, with new ones; of none, without."""
-        where, address = self.where, find_master(str(self.folder))
-        with self.context.socket(kind) as one:
-            one.setsockopt(zmq.LINGER, 0)
-            one.setsockopt(zmq.SNDTIMEO, 5000)  # it may be gone
-            if address is not None and address.keys and role:
-                made = (key.decode() for key in zmq.curve_keypair())
-                public, secret = address.keys.get(role, made)
-                one.setsockopt(zmq.CURVE_SERVERKEY, address.server_key.encode())
-                one.setsockopt(zmq.CURVE_PUBLICKEY, public.encode())
-                one.setsockopt(zmq.CURVE_SECRETKEY, secret.encode())
-            for name, value in options.items():
-                one.setsockopt(getattr(zmq, name), value)
-            one.connect(where["endpoint" if kind == zmq.DEALER else "weights_endpoint"])
-            yield one
-
-    def ask(self, *messages: list[bytes], role: str = "player") -> Counter[str]:
-        """The kinds of the answers that a new connection gets to these messages."""
-        answers = Counter[str]()
-        with self.peer(role=role) as one:
-            for frames in messages:
-                one.send_multipart(frames)
-            while answers.total() < len(messages) and one.poll(2000):
-                answers[opened(one.recv_multipart())["kind"]] += 1
-        return answers
-
-    def port(self, name: str) -> tuple[str, int]:
-        """Where something listens, as its connection file has it."""
-        return HOST, urlsplit(self.where[name]).port or 0
-
-    def hello(self, **fields: object) -> list[bytes]:
-        """A HELLO of a player, with fields that no worker would send."""
-        own: dict[str, object] = {"role": "player", "index": 3000, "incarnation": 0}
-        own |= {"process": "attacker", "first": 1, "fingerprints": self.setup.fingerprints()}
-        return seal(Hello.kind, {**own, "run_id": self.where["run_id"], **fields}, [])
-
-    def cheap(self, deed: Callable[[], object], room_mib: float = ROOM_MIB) -> Seen:
-        """Whether a deed costs little memory, and the same master goes on."""
-        pid = self.master.pid
-        with self.cost() as most:
-            deed()
-        same = self.goes_on() and self.master.pid == pid
-        seen = f"+{most.mib:.0f} of {room_mib:g} MiB, the master {'goes on' if same else 'is gone'}"
-        return same and most.mib <= room_mib, seen
-
-    def newest(self) -> str:
-        """Name of the newest checkpoint, empty before the first."""
-        return next((one.name for one in reversed(list_checkpoints(self.points))), "")
-
-    def checkpoint(self) -> Mapping[str, Any]:
-        """The counters of a checkpoint that begins from now on."""
-        seen, until_s = {self.newest()}, time.monotonic() + ENDS_S
-        while len(seen) < 3 and time.monotonic() < until_s:  # one may be on its way
-            seen.add(self.newest())
-            time.sleep(LOOK_S / 2)
-        return load_checkpoint(self.points / self.newest(), []).counters
-
-    def besieged(self, strangers: Strangers, seconds: float) -> Seen:
-        """Whether strangers cost little, and a worker that joins meanwhile is acknowledged."""
-        worker, master = Witness(str(self.folder), self.setup), self.master
-        with self.cost() as most:
-            lasting(seconds / 2, strangers.push)
-            worker.start()
-            lasting(seconds / 2, strangers.push)
-            until_s = time.monotonic() + ENDS_S / 2
-            while not worker.acknowledged and time.monotonic() < until_s:
-                lasting(LOOK_S, strangers.push)
-        worker.stop()
-        worker.join(ENDS_S)
-        same = self.goes_on() and self.master.pid == master.pid
-        few = most.mib <= ROOM_MIB and most.files <= ROOM_FILES
-        seen = f"+{most.mib:.0f} of {ROOM_MIB:g} MiB, +{most.files} of {ROOM_FILES} files, "
-        seen += f"a worker joins meanwhile: {worker.acknowledged > 0}"
-        return same and few and worker.acknowledged > 0, seen
-
-
-@contextmanager
-def training(folder: Path, *settings: str, name: str = "train") -> Iterator[Target]:
-    """A training until the end of the block, which ends it in order."""
-    launcher = start_training(folder, *settings, name=name)
-    try:
-        wait_for(folder / "connection.json", launcher)
-        with zmq.Context() as context:
-            context.set(zmq.MAX_SOCKETS, 4096)
-            yield Target(folder, launcher, context)
-            launcher.terminate()
-            launcher.wait(ENDS_S)
-    finally:
-        launcher.kill()
 
 
 def lasting(seconds: float, step: Callable[[], object], pause_s: float = 0.001) -> None:
@@ -153,17 +50,6 @@ def lasting(seconds: float, step: Callable[[], object], pause_s: float = 0.001) 
     while time.monotonic() < until_s:
         step()
         time.sleep(pause_s)
-
-
-def episodes_of(setup: Setup, count: int) -> Episodes:
-    """Episodes of the right shapes; nobody has played them."""
-    dice = np.random.default_rng(0)
-    return Episodes(
-        **{
-            one.name: dice.uniform(0.0, 0.4, one.shape).astype(one.dtype)
-            for one in EpisodeSpec.of(setup).columns(count)
-        }
-    )
 
 
 # Those who have the keys
@@ -176,7 +62,8 @@ def huge_incarnations(target: Target) -> Seen:
         for huge in (2**63 - 1, MAX_COUNT):
             target.ask(target.hello(incarnation=huge))
             target.ask(target.hello(process="next"))
-            target.ask(target.hello(process="third"), bye, target.hello(incarnation=1, first=huge))
+            again = target.hello(incarnation=1, first=huge)
+            target.ask(target.hello(process="third"), bye, again, unanswered=1)
             target.ask(target.hello(index=3001, process="other", first=huge))
 
     bye = seal("bye", {"reason": "x"}, [])
@@ -232,12 +119,16 @@ def many_incarnations(target: Target) -> Seen:
 
 
 def million_frames(target: Target) -> Seen:
+    """It is refused when all of it has come, which takes seconds."""
+    refused: list[int] = []
+
     def send() -> None:
         with target.peer() as one:
             one.send_multipart([b"x"] * 1_000_000)
-            time.sleep(1.0)
+            refused.append(one.poll(ENDS_S * 1000))
 
-    return target.cheap(send, 512.0)
+    held, seen = target.cheap(send, 512.0)
+    return held and any(refused), seen
 
 
 def identities(target: Target) -> Seen:
@@ -310,6 +201,25 @@ def degenerate_batches(target: Target) -> Seen:
 # Those who have none
 
 
+def besieged(target: Target, strangers: Strangers, seconds: float) -> Seen:
+    """Whether strangers cost little, and a worker that joins meanwhile is acknowledged."""
+    worker, master = Witness(str(target.folder), target.setup), target.master
+    with target.cost() as most:
+        lasting(seconds / 2, strangers.push)
+        worker.start()
+        lasting(seconds / 2, strangers.push)
+        until_s = time.monotonic() + ENDS_S / 2
+        while not worker.acknowledged and time.monotonic() < until_s:
+            lasting(LOOK_S, strangers.push)
+    worker.stop()
+    worker.join(ENDS_S)
+    same = target.goes_on() and target.master.pid == master.pid
+    few = most.mib <= ROOM_MIB and most.files <= ROOM_FILES
+    seen = f"+{most.mib:.0f} of {ROOM_MIB:g} MiB, +{most.files} of {ROOM_FILES} files, "
+    seen += f"a worker joins meanwhile: {worker.acknowledged > 0}"
+    return same and few and worker.acknowledged > 0, seen
+
+
 def large_frames(target: Target) -> Seen:
     with Strangers(target.where["endpoint"], 30, 31 * MIB) as strangers:
         return target.cheap(lambda: lasting(3.0, strangers.push))
@@ -317,14 +227,14 @@ def large_frames(target: Target) -> Seen:
 
 def thousand_strangers(target: Target) -> Seen:
     with Strangers(target.where["endpoint"], 1000, MAX_FRAME_BYTES) as strangers:
-        return target.besieged(strangers, 5.0)
+        return besieged(target, strangers, 5.0)
 
 
 def idle_connections(target: Target) -> Seen:
     """By a master that began with few files, and took more."""
     soft, hard = target.master.rlimit(psutil.RLIMIT_NOFILE)
     with Strangers(target.where["endpoint"], 3300) as strangers:
-        held, seen = target.besieged(strangers, 4.0)
+        held, seen = besieged(target, strangers, 4.0)
     return held and soft > min(OPEN_FILES, hard - 1), f"of {soft:,} files it may open {seen}"
 
 
@@ -336,11 +246,11 @@ def uninvited(target: Target, role: str = "") -> Seen:
     said = (evaluator, forged, Heartbeat({}).encode())
     roles = [role] if role else ["", "unknown"]
     answers = sum((target.ask(*said, role=one) for one in roles), Counter[str]())
-    time.sleep(2.0)
+    goes_on = target.goes_on()  # what was said has been looked at, and written
     curve = target.folder / "curve.jsonl"
     told = curve.read_text() if curve.exists() else ""
     forgeries = len(re.findall(r"\b0\.999\b", told))
-    held = (role or not answers) and not forgeries and target.goes_on()
+    held = (role or not answers) and not forgeries and goes_on
     return bool(held), f"{answers.total()} answers, {forgeries} forged scores"
 
 
@@ -422,16 +332,19 @@ def slow_requests(target: Target) -> Seen:
     return held, f"{more} threads more; then {answer[:15]!r}"
 
 
-LIVE: list[tuple[str, str, str, Callable[[Target], Seen]]] = [
-    # First: what others leave behind would be room for it. The largest one is the last.
+# First: what others leave behind would be room for it. And with nothing else at work: a worker
+# joins in the time that strangers leave to the master.
+BESIEGED: list[Attack] = [
     ("3", "strangers with all that they may say", "1,000 at a time, 5 s", thousand_strangers),
+    ("9", "idle connections", "3,300 for 4 s", idle_connections),
+]
+LIVE: list[Attack] = [  # the largest one is the last
     ("1", "HELLO, BYE and HELLO with the largest numbers", "12 messages", huge_incarnations),
     ("3", "frames before the handshake", "30 of 31 MiB", large_frames),
     ("4", "a topic on the weights socket", "16 MiB and 64 of 32 KiB", large_topic),
     ("5", "an evaluator's scores without a key of the run", "6 messages", uninvited),
     ("5", "an evaluator's scores with a player's key", "3 messages", player_as_evaluator),
     ("5", "an impostor with the run's name", "1 for 4 s", impostor),
-    ("9", "idle connections", "3,300 for 4 s", idle_connections),
     ("10", "HTTP requests that are reset", "100", reset_requests),
     ("12", "requests for weights, never read", "60 each of 50 workers", unread_weights),
     ("12", "incarnations", "8,192", many_incarnations),

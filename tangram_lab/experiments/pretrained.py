@@ -242,8 +242,15 @@ def _limits(setup: Setup, scores: Scores) -> list[str]:
         }[sim.motion],
         "The target's pieces must be known, each by its corners: a silhouette is not enough.",
     ]
+    motion = {
+        "exact": "Model-based: it takes every motion to be exact, and in a world that does not do "
+        "what it is told it is no better than the formula.",
+        "learned": "What a command comes to was learned in this world: in others it watches its "
+        "first actions and goes on from there.",
+    }
     return [
         f"{pieces}, in an arena of this width: another task needs another training.",
+        motion[setup.agent.motion],
         noise,
         "Each corner must be known by its number: the target's corners come in the token's order.",
         *(["Nothing stops a token at the arena's edge."] if one else several),

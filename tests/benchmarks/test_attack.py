@@ -2,9 +2,11 @@
 
 import json
 import subprocess
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from multiprocessing import active_children
 from pathlib import Path
 from threading import Timer
 from types import SimpleNamespace
@@ -14,26 +16,19 @@ import pytest
 import zmq
 
 from tangram_agent.setup import make_setup
-from tangram_lab.benchmarks import attack, attacks
-from tangram_lab.benchmarks.attack import (
-    FILES,
-    LOCKSTEP,
-    OWN,
-    TASK,
-    Attack,
-    acknowledged_again,
-    tried,
-)
+from tangram_lab.benchmarks import attack, attacks, harms
+from tangram_lab.benchmarks.attack import FILES, TASK, beside
 from tangram_lab.benchmarks.attacks import (
+    BESIEGED,
     LIVE,
-    Seen,
-    Target,
     degenerate_batches,
     player_as_evaluator,
     thousand_strangers,
     uninvited,
 )
 from tangram_lab.benchmarks.chaos import Witness
+from tangram_lab.benchmarks.harms import LOCKSTEP, OWN, acknowledged_again
+from tangram_lab.benchmarks.target import Attack, Seen, Target, tried
 from tangram_lab.benchmarks.trainings import Growth
 
 pytestmark = pytest.mark.slow
@@ -58,9 +53,16 @@ def test_an_attack_that_fails_has_not_held(tmp_path: Path, monkeypatch: pytest.M
     assert rows[1]["seen"] == "ConnectionError('gone')"
 
 
+def test_what_is_done_beside_ends_with_an_attack_that_is_stopped() -> None:
+    with pytest.raises(KeyboardInterrupt), beside() as pool:  # noqa: PT012
+        pool.submit(time.sleep, 600.0)
+        raise KeyboardInterrupt
+    assert not active_children()
+
+
 def test_all_rows_are_tried() -> None:
     """Row 4 and others twice, in several ways."""
-    rows = {one[0] for one in (*LIVE, *FILES, *OWN, *LOCKSTEP)}
+    rows = {one[0] for one in (*BESIEGED, *LIVE, *FILES, *OWN, *LOCKSTEP)}
     assert rows == {"held", *map(str, range(1, 14))}
 
 
@@ -139,13 +141,13 @@ def test_strangers_take_little_memory_few_files_and_nobodys_turn(
     monkeypatch.setattr(attacks, "Witness", lambda *_: worker)
     standing.growth = growth
     assert thousand_strangers(standing)[0] == held
-    assert LIVE[0][3] is thousand_strangers  # others would have raised what it begins at
+    assert BESIEGED[0][3] is thousand_strangers  # others would have raised what it begins at
 
 
 def test_a_witness_must_be_acknowledged_again(
     standing: Standing, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(attack, "ENDS_S", 0.5)
+    monkeypatch.setattr(harms, "ENDS_S", 0.5)
     witness = Witness("nobody", standing.setup)
     monkeypatch.setattr(witness, "is_alive", lambda: True)
     witness.acknowledged = 5

@@ -180,6 +180,21 @@ def test_settings_of_the_agents_play_are_played_and_written_down(tmp_path: Path,
     ]
 
 
+def test_a_look_ahead_stands_beside_the_same_agent_without_and_a_formula_with(
+    tmp_path: Path,
+) -> None:
+    sim = SIM | {"backend": "physics", "motion": "slide"}
+    write_run(tmp_path / "run", GAME, sim=sim, agent={"reapply": 0})
+    ahead = {"agent": {"lookahead": "engine", "beam": 1}}
+    report = evaluated(tmp_path, episodes=2, changes=ahead)
+    compared = report["baselines"]
+    assert set(compared) == {"lookahead=none", "exact+lookahead", "exact", "random"}
+    alone = evaluated(tmp_path, episodes=2)
+    assert compared["lookahead=none"]["coverage_each"] == alone["coverage_each"]
+    assert compared["exact+lookahead"]["coverage"] > compared["exact"]["coverage"]
+    assert report["ms_per_decision"] > compared["lookahead=none"]["ms_per_decision"] > 0.0
+
+
 def test_random_targets_of_several_tokens_get_the_same_scores(tmp_path: Path) -> None:
     report = evaluated(tmp_path, episodes=3)
     assert set(report) >= MEANS | {"mean_reward", "mean_reward_camera", "episodes"}
