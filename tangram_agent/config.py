@@ -150,7 +150,7 @@ class AgentConfig(Settings, section="agent"):
         "learned",
         "which token is next: that of the best value, the first as listed, the largest, or any",
         choices=ORDERS,
-        only={"readout": "pair"},
+        only={"readout": "pair", "lookahead": "none"},
     )
     reapply: int = setting(
         2,
@@ -164,7 +164,7 @@ class AgentConfig(Settings, section="agent"):
         "gradient steps uphill on the critic before a pose is played, exploration off",
         low=0,
         high=10_000,
-        only={"readout": "pair"},
+        only={"readout": "pair", "lookahead": "none"},
     )
     refine_rate: float = setting(
         0.004,
@@ -188,7 +188,21 @@ class AgentConfig(Settings, section="agent"):
         "several tokens that slide: weight of what later ones push away of what is set down now",
         low=0,
         high=1,
+        only={"readout": "pair", "lookahead": "none"},
+    )
+    lookahead: str = setting(
+        "none",
+        "several tokens that slide, exploration off: plan orders, places and ways of two legs by "
+        "trying them in a world of its own, the engine: planning with the simulator",
+        choices=("none", "engine"),
         only={"readout": "pair"},
+    )
+    beam: int = setting(
+        4,
+        "scenes of each depth that a look ahead follows",
+        low=1,
+        high=1000,
+        unless={"lookahead": "none"},
     )
     gamma: float = setting(
         0.0,

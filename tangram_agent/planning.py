@@ -9,6 +9,7 @@ row), N meetings of a token with another.
 
 import zlib
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -16,6 +17,8 @@ from torch import Tensor
 
 from tangram_agent.adam import Adam
 from tangram_agent.coverage import covered_share, covering, worths
+from tangram_agent.guide import NetworkGuide
+from tangram_agent.lookahead import Lookahead
 from tangram_agent.motion import Belief, motions_of
 from tangram_agent.networks import Critic, Networks
 from tangram_agent.pairs import PairGraph, Pairs
@@ -24,6 +27,7 @@ from tangram_agent.types import Past
 from tangram_sim.actions import velocities_of
 from tangram_sim.arrays import Bools, Floats, Ints, Singles
 from tangram_sim.layout import Layout
+from tangram_sim.world import make_world
 
 _SHORT_LIST = 8  # proposals of an environment that are valued for all pieces
 
@@ -140,6 +144,13 @@ class Planner:
         self._graph = PairGraph(setup.layout, setup.sim.arena, setup.agent)
         self._contacts = setup.contacts
         self._turns_over = setup.layout.chiral & setup.sim.allow_flip
+        self._guide = NetworkGuide(networks, setup)
+
+    @cached_property
+    def _lookahead(self) -> Lookahead:
+        """Made when it is first asked for: its world loads the engine."""
+        sim, beam = replace(self._sim, pixels=0), self._agent.beam
+        return Lookahead(self._layout, sim, self._guide, make_world(self._layout, sim), beam)
 
     def choose(
         self,
@@ -155,12 +166,16 @@ class Planner:
             corners: (B, V, 2) of the tokens.
             placed: (B, K) which tokens are placed.
             goals: (B, V, 2) of the target.
-            refine: take the gradient steps that the agent is configured for.
+            refine: look ahead, or take the gradient steps, as the agent is configured.
             past: what was seen of these episodes before, if anything.
         """
-        scene = self._scene(corners, self._layout.poses(corners), goals)
+        if refine and self._agent.lookahead != "none":
+            return self._planned(corners, placed, goals, past)
         with torch.no_grad():
             belief = self._belief(corners, past)
+            if self._motion is not None and belief is not None and past is not None:
+                corners = self._motion.ahead(belief, corners, past, self._layout, self._sim)
+            scene = self._scene(corners, self._layout.poses(corners), goals)
             candidates, pose = self._short_list(scene, self._open(placed, goals))
             velocity, reached = self._reached(scene, candidates, pose, belief)
             best = self._best(scene, candidates, reached)
@@ -175,6 +190,15 @@ class Planner:
             pose=pose.numpy().astype(np.float64),
             velocity=velocity.numpy(),
         )
+
+    def _planned(self, corners: Floats, placed: Bools, goals: Floats, past: Past | None) -> Choice:
+        """What a look ahead finds."""
+        token, pose = self._lookahead.choose(corners, placed, goals, past)
+        here = self._layout.poses(corners)[np.arange(len(token)), token]
+        with torch.no_grad():
+            way = _tensor(velocities_of(pose - here, self._sim))
+            velocity = self._command(way, self._belief(corners, past)).numpy()
+        return Choice(token, np.zeros(len(token), dtype=np.bool_), pose, velocity)
 
     def velocity_to(self, pose: Floats, wanted: Floats) -> Singles:
         """Commands (B, 3) that take tokens from poses (B, 3) to others, in worlds not yet seen."""

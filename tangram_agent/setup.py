@@ -21,7 +21,8 @@ from tangram_sim.targets import check_targets
 Settings = TypeVar("Settings")
 
 # Settings of the agent that have no effect but on pairs of several tokens.
-_SEVERAL_ONLY = ("order", "pairs_per_transition", "push_weight")
+_SEVERAL_ONLY = ("order", "pairs_per_transition", "push_weight", "lookahead")
+MAX_PLANNED = 8  # tokens: a look ahead finds the best order over all their subsets
 SECTIONS = ("tokens", "sim", "reward", "agent", "net")
 
 
@@ -54,7 +55,13 @@ class Setup:
             self._refuse(_SEVERAL_ONLY, "one token", "take a set of several")
         if not self.contacts:
             slide = "set sim.motion=slide"
-            self._refuse(("push_weight",), "tokens that do not push each other", slide)
+            apart = ("push_weight", "lookahead")
+            self._refuse(apart, "tokens that do not push each other", slide)
+        if agent.lookahead != "none" and self.layout.tokens > MAX_PLANNED:
+            raise ConfigError(
+                f"agent.lookahead={agent.lookahead} plans for at most {MAX_PLANNED} tokens, got "
+                f"{self.layout.tokens}: set agent.lookahead=none, or take fewer tokens"
+            )
         if self.credits_pieces:
             several = f"{self.layout.tokens} tokens on pairs"
             whole = "set agent.readout=token, which values the whole scene"

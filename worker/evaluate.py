@@ -14,7 +14,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from tangram_agent.config import ORDERS
+from tangram_agent.config import ORDERS, AgentConfig
 from tangram_agent.files import write_whole
 from tangram_agent.outcome import plural
 from tangram_agent.runs import Run, load_changed
@@ -30,10 +30,12 @@ from worker.baselines import (
     random_policy,
 )
 from worker.config import EvalConfig, source_and_names
+from worker.fitted import fitted_policy
 from worker.metrics import assembled, pose_errors, summarise
 from worker.oracle import oracle_policy
 from worker.puzzles import Figure, Figures, find_figures, play_figures
 from worker.rollout import Played
+from worker.sweeping import sweeping_policy
 from worker.test_set import FixedTests, greedy
 
 AT_ONCE = 32
@@ -79,6 +81,7 @@ _SEVERAL = {
     "blocked": ("blocked by others", 2),
     "actions_used": ("actions", 2),
     "seconds_per_puzzle": ("seconds", 3),
+    "ms_per_decision": ("ms for each action", 1),
 }
 _COUNTS = ("wrong", "doubly_used", "refused", "blocked", "actions_used")
 
@@ -89,7 +92,8 @@ def evaluate_run(config: EvalConfig) -> int:
     Policies that learned nothing play the same episodes, to compare with: `exact` moves every
     token exactly onto its target, `position only` one token onto its centre and never turns it,
     `random` is chance. Where a world moves tokens otherwise than actions say, or several noisy
-    looks at them can be put together, `oracle` knows that world and its noise. A run that learned
+    looks at them can be put together, `fitted` is `exact` by a model of motion that has seen some
+    random commands, and `oracle` knows that world and its noise. A run that learned
     which token is next also plays fixed orders.
 
     Returns:
@@ -114,14 +118,19 @@ def policies(run: Run) -> dict[str, Player]:
     """The run, and those to compare it with, by their names in tables and files."""
     layout, sim = run.setup.layout, run.setup.sim
     fixed = [order for order in ORDERS if order not in ("learned", run.setup.agent.order)]
-    fixed = fixed if run.setup.pairs and layout.tokens > 1 else []
+    ahead = run.setup.agent.lookahead != "none"
+    fixed = fixed if run.setup.pairs and layout.tokens > 1 and not ahead else []
     result: dict[str, Player] = {RUN: greedy(run.policy)}
     for name in fixed:
         other = run.with_settings({"agent": {"order": name}})
         result[f"order={name}"] = greedy(other.policy)
+    if ahead:
+        alone = {"lookahead": "none", "beam": AgentConfig.beam}
+        result["lookahead=none"] = greedy(run.with_settings({"agent": alone}).policy)
+        result["exact+lookahead"] = sweeping_policy(layout, sim, run.setup.agent.beam)
     result["exact"] = exact_policy(layout, sim)
     if sim.inexact or (sim.corner_noise and run.setup.horizon > 1):
-        result["oracle"] = Told(oracle_policy)
+        result |= {"fitted": Told(fitted_policy), "oracle": Told(oracle_policy)}
     if layout.tokens == 1:
         result["position only"] = position_policy(layout, sim)
     return result | {"random": random_policy(layout, sim)}
@@ -228,8 +237,10 @@ def score_puzzles(
 
 def of_several(played: Played) -> Scores:
     """What only evaluations tell: time, and every coverage, for tests on pairs of episodes."""
+    seconds = float(np.mean(played.seconds))
     return {
-        "seconds_per_puzzle": float(np.mean(played.seconds)),
+        "seconds_per_puzzle": seconds,
+        "ms_per_decision": 1e3 * seconds / played.refused.shape[1],
         "coverage_each": np.round(played.overlap, 6).tolist(),
     }
 

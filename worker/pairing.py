@@ -41,7 +41,7 @@ def paired(layout: Layout, corners: Floats, goals: Floats) -> Pairing:
         goals: (E, V, 2) of the target.
     """
     turns = _turns(layout)
-    ways = _all_ways(layout, corners, goals, turns)
+    ways = all_ways(layout, corners, goals)
     sides = layout.flipped(corners)[:, :, None] != layout.flipped(goals)[:, None, :]
     cost = np.linalg.norm(ways[..., :2], axis=-1) + layout.radii[:, None] * np.abs(ways[..., 2])
     cost += sides * (cost.sum(axis=(1, 2), keepdims=True) + 1.0)
@@ -76,8 +76,9 @@ def _groups(turns: Floats) -> list[Ints]:
     return [group for group in groups if len(group) > 1]
 
 
-def _all_ways(layout: Layout, corners: Floats, goals: Floats, turns: Floats) -> Floats:
+def all_ways(layout: Layout, corners: Floats, goals: Floats) -> Floats:
     """(E, K, K, 3) from every token to every piece, the turn modulo the symmetry."""
+    turns = _turns(layout)
     ways: Floats = layout.poses(goals)[:, None] - layout.poses(corners)[:, :, None]
     # A body on its other side is turned the other way.
     turn = np.where(layout.flipped(goals)[:, None], -1.0, 1.0) * np.nan_to_num(turns)

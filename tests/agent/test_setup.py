@@ -57,6 +57,11 @@ def changed(section: str, **values: Any) -> dict[str, dict[str, Any]]:
         (changed("agent", readout="x"), "agent.readout must be one of pair, token, got 'x'"),
         (changed("agent", order="x"), "agent.order must be one of learned, listed, size, random"),
         (changed("agent", reapply=-1), "agent.reapply must be between 0 and 100, got -1"),
+        (changed("agent", lookahead="x"), "agent.lookahead must be one of none, engine, got 'x'"),
+        (
+            changed("agent", lookahead="engine", beam=0),
+            "agent.beam must be between 1 and 1000, got 0",
+        ),
         (changed("agent", refine_steps=-1), "agent.refine_steps must be between 0 and 10000"),
         (changed("agent", refine_rate=0), "agent.refine_rate must be between 1e-09 and 1, got 0"),
         (changed("agent", pairs_per_transition=0), "pairs_per_transition must be between 1 and"),
@@ -206,6 +211,11 @@ FUTURE = [{"strategy": "future"}]
         (SEVERAL, {"agent": {"hindsight": FUTURE}}, "strategy=future changes nothing"),
         (SEVERAL, {"agent": {"push_weight": 0.5}}, "agent.push_weight=0.5 .* sim.motion=slide"),
         (SEVERAL, {"agent": {"readout": "token", "order": "size"}}, "agent.order=size changes"),
+        (
+            {"shapes": ["square"] * 9, "scale": 0.3},
+            {"agent": {"lookahead": "engine"}, "sim": {"motion": "slide"}},
+            "lookahead=engine plans for at most 8 tokens, got 9: set agent.lookahead=none, or take",
+        ),
         (ONE, {"agent": {"order": "size"}}, "agent.order=size changes nothing with one token"),
         (ONE, {"agent": {"pairs_per_transition": 2}}, "changes nothing with one token"),
         (ONE, {"agent": {"readout": "token", "reapply": 0}}, "agent.reapply=0 changes nothing"),

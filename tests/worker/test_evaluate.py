@@ -89,7 +89,8 @@ def test_in_another_world_there_is_an_oracle(
         more = {"episodes": 2} if puzzle is None else {"puzzle": puzzle}
         changes = {"sim": world | {"actions_per_token": 2}}
         baselines = evaluated(folder, tokens, changes=changes, **more)["baselines"]
-        assert baselines["oracle"]["coverage"] > baselines["exact"]["coverage"]
+        for told_more in ("fitted", "oracle"):
+            assert baselines[told_more]["coverage"] > baselines["exact"]["coverage"]
         told = "gain [0.8,1,1.25], bias_spread 0.05, actions with noise 0.001"
         assert told in " ".join(capsys.readouterr().out.split())
         if puzzle is None:
@@ -177,6 +178,21 @@ def test_settings_of_the_agents_play_are_played_and_written_down(tmp_path: Path,
     assert [one["coverage"] for one in plain["puzzles"]] != [
         one["coverage"] for one in listed["puzzles"]
     ]
+
+
+def test_a_look_ahead_stands_beside_the_same_agent_without_and_a_formula_with(
+    tmp_path: Path,
+) -> None:
+    sim = SIM | {"backend": "physics", "motion": "slide"}
+    write_run(tmp_path / "run", GAME, sim=sim, agent={"reapply": 0})
+    ahead = {"agent": {"lookahead": "engine", "beam": 1}}
+    report = evaluated(tmp_path, episodes=2, changes=ahead)
+    compared = report["baselines"]
+    assert set(compared) == {"lookahead=none", "exact+lookahead", "exact", "random"}
+    alone = evaluated(tmp_path, episodes=2)
+    assert compared["lookahead=none"]["coverage_each"] == alone["coverage_each"]
+    assert compared["exact+lookahead"]["coverage"] > compared["exact"]["coverage"]
+    assert report["ms_per_decision"] > compared["lookahead=none"]["ms_per_decision"] > 0.0
 
 
 def test_random_targets_of_several_tokens_get_the_same_scores(tmp_path: Path) -> None:

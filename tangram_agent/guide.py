@@ -1,0 +1,76 @@
+"""The networks as the guide of a look ahead: the actor's places, the critic's values and pushes.
+
+Legend: K tokens, M options.
+"""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tangram_agent.lookahead import Places, Table
+from tangram_agent.networks import Networks
+from tangram_agent.pairs import PairGraph, Pairs
+from tangram_agent.setup import Setup
+from tangram_sim.arrays import Bools, Floats, Ints
+
+_WORTH = 0.5  # value from which on a place is proposed,
+_PIECES = 3  # and for at most so many pieces for each token
+_NOISE = 0.03  # shares that are predicted for tokens which stay where they are
+
+
+class NetworkGuide:
+    """See `tangram_agent.lookahead.Guide`."""
+
+    def __init__(self, networks: Networks, setup: Setup) -> None:
+        self._networks, self._reapply = networks, setup.agent.reapply
+        self._graph = PairGraph(setup.layout, setup.sim.arena, setup.agent)
+
+    @torch.no_grad()
+    def places(self, table: Table, left: Bools, covered: Floats) -> Places:
+        """The actor's poses for the pieces that its critic likes best, token by token."""
+        token, piece = np.nonzero(left[:, None] & (covered < 1.0))
+        pairs = self._pairs(table, token, table.poses[token], piece, covered[piece])
+        pose = self._proposed(pairs)
+        for _ in range(self._reapply):
+            pose = self._proposed(pairs.at(pose))
+        way = self._graph.way(pairs, pose)
+        value = self._networks.critic(pairs, way, pairs.at(pose)).numpy().astype(np.float64)
+        ranks = np.array([(value[token == i] > v).sum() for i, v in zip(token, value, strict=True)])
+        kept = (ranks == 0) | ((ranks < _PIECES) & (value >= _WORTH))
+        poses = pose.numpy().astype(np.float64)
+        return Places(token[kept], piece[kept], poses[kept], np.clip(value[kept], 0.0, 1.0))
+
+    @torch.no_grad()
+    def pushed(self, table: Table, token: Ints, start: Floats, end: Floats) -> Floats:
+        """What the critic's second head says of a token of the piece's shape that lies there."""
+        count = len(table.goal)
+        index, piece = (
+            np.repeat(np.arange(len(token)), count),
+            np.tile(np.arange(count), len(token)),
+        )
+        none = np.zeros(len(piece))
+        pairs = self._pairs(table, token[index], start[index], piece, none)
+        share = self._networks.critic.pushed(pairs, _tensor(end[index])).numpy()
+        share = share.reshape(len(token), count).astype(np.float64)
+        return np.where(share > _NOISE, np.minimum(share, 1.0), 0.0)
+
+    def _proposed(self, pairs: Pairs) -> Tensor:
+        velocity, _ = self._networks.actor(pairs)
+        return self._graph.moved(pairs, velocity).pose
+
+    def _pairs(
+        self, table: Table, token: Ints, pose: Floats, piece: Ints, covered: Floats
+    ) -> Pairs:
+        return Pairs(
+            pose=_tensor(pose),
+            flipped=_tensor(table.flipped[token]),
+            token=torch.from_numpy(token),
+            goal=_tensor(table.goal[piece]),
+            goal_flipped=_tensor(table.goal_flipped[piece]),
+            piece=torch.from_numpy(piece),
+            covered=_tensor(covered),
+        )
+
+
+def _tensor(array: Floats | Bools) -> Tensor:
+    return torch.from_numpy(np.array(array, np.float32))

@@ -1,0 +1,403 @@
+"""Looking ahead where tokens push each other: a beam over orders, places and ways of two legs.
+
+A guide proposes: where tokens may go, and what a token that slides there pushes away of pieces
+that lie in place. A world says what an action really comes to, neighbours of neighbours included.
+A node is a scene as some actions have left it. What is left to do there is valued by the best order
+of all tokens left, as the guide sees it, found exactly over sets of tokens and pieces.
+
+Legend: K tokens, M options. Shares and losses are of the area of the whole target.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Protocol
+
+import numpy as np
+
+from tangram_agent.types import Past
+from tangram_sim.actions import chosen_tokens, velocities_of
+from tangram_sim.actuation import full_scale
+from tangram_sim.arrays import Bools, Floats, Ints
+from tangram_sim.config import SimConfig
+from tangram_sim.geometry import outlines, shared_areas
+from tangram_sim.kinematics import wrap
+from tangram_sim.layout import Layout
+
+_DONE = 0.99  # share of a piece that is as good as all of it
+_TRIED = 6  # options of a node that the world is asked for
+_ALIKE = 3  # of them, at most so many of one token and one piece
+_STOPS = 8  # directions in which a way of two legs may come to its piece,
+_AWAY = (0.8, 1.6)  # and from how far, in radii of the largest token
+_PERFECT = 0.999  # share of the target beyond which nothing better is looked for
+_LEG = 1e-4  # what an action more must bring at least
+_SAME = 1e-3  # a scene is what was foreseen: arena units and radians
+_LOST = 3e-3  # predicted losses below that are the guide's noise
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """A scene and its target.
+
+    Attributes:
+        poses: (K, 3) of the tokens.
+        flipped: (K,) which lie on their other side.
+        goal: (K, 3) poses of the pieces.
+        goal_flipped: (K,) their sides.
+    """
+
+    poses: Floats
+    flipped: Bools
+    goal: Floats
+    goal_flipped: Bools
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """M places that tokens may take.
+
+    Attributes:
+        token: (M,) which token.
+        piece: (M,) for which piece.
+        pose: (M, 3) where it is to lie.
+        value: (M,) area that it covers there of the piece, over the larger of both areas.
+    """
+
+    token: Ints
+    piece: Ints
+    pose: Floats
+    value: Floats
+
+
+class Guide(Protocol):
+    """Who proposes."""
+
+    def places(self, table: Table, left: Bools, covered: Floats) -> Places:
+        """Where tokens that are left (K,) may go; covered (K,) shares of pieces are taken."""
+
+    def pushed(self, table: Table, token: Ints, start: Floats, end: Floats) -> Floats:
+        """(M, K) share of every piece's area that is pushed away where its own token lies there.
+
+        Args:
+            table: the scene.
+            token: (M,) which slide
+            start: from poses (M, 3)
+            end: to poses (M, 3).
+        """
+
+
+class Foresight(Protocol):
+    """A world of its own to try actions in; see `tangram_sim.world.World`."""
+
+    def place(self, poses: Floats, flipped: Bools | None = None) -> None:
+        """Put every token at its pose (K, 3), on its side (K,)."""
+
+    def move(self, token: int, velocity: Floats, flip: bool = False) -> None:
+        """Move one token by a shift and a turn (3,)."""
+
+    def poses(self) -> Floats:
+        """(K, 3) as the tokens lie."""
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One action of a plan.
+
+    Attributes:
+        before: (K, 3) poses at which it is meant to be played.
+        token: which token moves; None: nothing more is to be done.
+        pose: (3,) where it goes.
+    """
+
+    before: Floats
+    token: int | None
+    pose: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class _Options:
+    """M ways to places.
+
+    Attributes:
+        token: (M,) which token.
+        piece: (M,) for which piece.
+        legs: (M,) actions that it takes; 0: the token stays where it lies.
+        stops: (M, 2, 3) poses that it takes in turn; the last one twice where it is one leg.
+        gain: (M,) what it covers there.
+        loss: (M, K) what it pushes away of each piece, if that is in place.
+    """
+
+    token: Ints
+    piece: Ints
+    legs: Ints
+    stops: Floats
+    gain: Floats
+    loss: Floats
+
+    def at(self, index: Ints) -> "_Options":
+        return _Options(*(part[index] for part in vars(self).values()))
+
+    def __add__(self, other: "_Options") -> "_Options":
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return _Options(*(np.concatenate(pair) for pair in pairs))
+
+
+@dataclass(frozen=True, eq=False)
+class _Node:
+    """What some actions came to.
+
+    Attributes:
+        table: the scene.
+        actions: (K,) that each token has left.
+        steps: how it was reached.
+        covered: share of the target that is covered.
+        promise: the share that may come to be.
+        best: the most promising options, each a token and the poses (L, 3) that it takes in turn.
+    """
+
+    table: Table
+    actions: Ints
+    steps: tuple[Step, ...]
+    covered: float
+    promise: float
+    best: list[tuple[int, Floats]]
+
+
+class Lookahead:
+    """Plans from what is seen, and keeps to a plan while the world does what it foresaw."""
+
+    def __init__(
+        self, layout: Layout, sim: SimConfig, guide: Guide, world: Foresight, beam: int
+    ) -> None:
+        """Make one.
+
+        Args:
+            layout: of few tokens, see `setup.MAX_PLANNED`.
+            sim: the world that is played in.
+            guide: who proposes.
+            world: what actions are tried in.
+            beam: nodes of each depth that are followed.
+        """
+        self._layout, self._sim, self._guide = layout, sim, guide
+        self._world, self._beam = world, beam
+        self._share: Floats = layout.areas / layout.areas.sum()
+        masks = np.arange(1 << layout.tokens)
+        self._taken = (masks[:, None] >> np.arange(layout.tokens)) & 1  # (2^K, K)
+        self._plans: dict[bytes, tuple[Step, ...]] = {}
+        # What a way pushes away of pieces in place is the same in every node of a plan.
+        self._pushed: dict[bytes, Floats] = {}
+
+    def choose(
+        self, corners: Floats, placed: Bools, goals: Floats, past: Past | None
+    ) -> tuple[Ints, Floats]:
+        """Which token (B,) goes to which pose (B, 3); one that stays where nothing is to be done.
+
+        Args:
+            corners: (B, V, 2) of the tokens.
+            placed: (B, K) which tokens are placed.
+            goals: (B, V, 2) of the target.
+            past: what was done in these episodes before; None: nothing.
+        """
+        layout, poses = self._layout, self._layout.poses(corners)
+        tables = [
+            Table(*rows)
+            for rows in zip(
+                poses,
+                layout.flipped(corners),
+                layout.poses(goals),
+                layout.flipped(goals),
+                strict=True,
+            )
+        ]
+        left = np.where(placed, 0, self._sim.actions_per_token)
+        if past is not None:
+            for b, actions in enumerate(past.actions):
+                named = chosen_tokens(actions, layout.tokens)
+                left[b] = np.maximum(left[b] - np.bincount(named, minlength=layout.tokens), 0)
+        tokens = np.argmin(placed, axis=1)
+        wanted = poses[np.arange(len(tokens)), tokens]
+        for b, step in enumerate(self._steps(tables, left)):
+            if step.token is not None:
+                tokens[b], wanted[b] = step.token, step.pose
+        return tokens, wanted
+
+    def _steps(self, tables: Sequence[Table], actions: Ints) -> list[Step]:
+        """The next action in every scene, each token having so many left, (B, K)."""
+        kept, steps = dict[bytes, tuple[Step, ...]](), list[Step]()
+        for table, left in zip(tables, actions, strict=True):
+            key = table.goal.tobytes()
+            plan = self._plans.get(key, ())
+            if not (plan and self._foreseen(plan[0], table)):
+                plan = self._plan(table, left)
+            steps.append(plan[0])
+            kept[key] = plan[1:] or plan  # the last one does nothing
+        self._plans = kept
+        return steps
+
+    def _foreseen(self, step: Step, table: Table) -> bool:
+        off = table.poses - step.before
+        off[:, 2] = wrap(off[:, 2])
+        return bool(np.abs(off).max() <= _SAME)
+
+    def _plan(self, table: Table, actions: Ints) -> tuple[Step, ...]:
+        self._pushed.clear()
+        best = self._node(table, actions, ())
+        beam = [best]
+        while beam and best.covered < _PERFECT:
+            found = [child for node in beam for child in self._children(node)]
+            best = max([best, *found], key=lambda node: node.covered - _LEG * len(node.steps))
+            beam = self._kept(found, best)
+        return (*best.steps, Step(best.table.poses, None, np.zeros(3)))
+
+    def _kept(self, nodes: Iterable[_Node], best: _Node) -> list[_Node]:
+        """The most promising nodes, those that are alike once."""
+        kept = dict[bytes, _Node]()
+        for node in sorted(nodes, key=lambda node: -node.promise):
+            if node.best and node.promise > best.covered + _LEG and len(kept) < self._beam:
+                kept.setdefault(node.table.poses.round(2).tobytes() + node.actions.tobytes(), node)
+        return list(kept.values())
+
+    def _children(self, node: _Node) -> Iterator[_Node]:
+        for token, stops in node.best:
+            poses, steps = node.table.poses, node.steps
+            self._world.place(poses, node.table.flipped)
+            for stop in stops:
+                steps = (*steps, Step(poses, token, stop))
+                share = velocities_of((stop - poses[token])[None], self._sim)[0]
+                self._world.move(token, np.clip(share, -1.0, 1.0) * full_scale(self._sim))
+                poses = self._world.poses()
+            actions = node.actions.copy()
+            actions[token] -= len(stops)
+            yield self._node(replace(node.table, poses=poses), actions, steps)
+
+    def _node(self, table: Table, actions: Ints, steps: tuple[Step, ...]) -> _Node:
+        areas = self._layout.areas
+        shared = shared_areas(self._outlines(table.poses, table.flipped), self._goals(table))[0]
+        # Rounding must not decide between ways that are equally good.
+        now = round(float(self._share @ np.minimum(shared.sum(axis=0) / areas, 1.0)), 6)
+        lies = shared / np.maximum(areas[:, None], areas)
+        fits = lies >= _DONE
+        left = (actions > 0) & ~fits.any(axis=1)
+        covered = np.minimum((shared * ~left[:, None]).sum(axis=0) / areas, 1.0)
+        if not left.any():
+            return _Node(table, actions, steps, now, now, [])
+        options = self._options(table, actions, left, covered, lies)
+        base = float(self._share @ covered)
+        taken = covered > _DONE
+        promise, totals = self._promises(options, left, taken)
+        best = self._most_promising(options, totals)
+        return _Node(table, actions, steps, now, base + promise, best)
+
+    def _options(
+        self, table: Table, actions: Ints, left: Bools, covered: Floats, lies: Floats
+    ) -> _Options:
+        """Every token left, straight or by two legs to places, or where it lies."""
+        places, areas = self._guide.places(table, left, covered), self._layout.areas
+        larger = np.maximum(areas[places.token], areas[places.piece]) / areas[places.piece]
+        gain = np.minimum(places.value * larger, 1.0 - covered[places.piece])
+        # A token that a turn maps onto itself may lie in several ways.
+        turns = self._layout.symmetries[places.token]
+        index = np.repeat(np.arange(len(turns)), turns)
+        number = np.concatenate([np.arange(count) for count in turns])
+        pose = places.pose[index]
+        pose[:, 2] += 2.0 * np.pi * number / turns[index]
+        token, piece = places.token[index], places.piece[index]
+        straight = _Options(
+            token=token,
+            piece=piece,
+            legs=np.ones(len(token), dtype=np.int64),
+            stops=np.stack([pose, pose], axis=1),
+            gain=gain[index] * self._share[piece],
+            loss=self._losses(table, token, piece, table.poses[token], pose),
+        )
+        around = self._around(table, straight, actions)
+        return straight + around + self._staying(table, left, covered, lies)
+
+    def _around(self, table: Table, straight: _Options, actions: Ints) -> _Options:
+        """Ways of two legs where the straight one costs: turn on the first one, then shift."""
+        costs = (straight.loss.sum(axis=1) > 0.0) & (actions[straight.token] > 1)
+        costly = straight.at(np.flatnonzero(costs))
+        angle = 2.0 * np.pi * np.arange(_STOPS) / _STOPS
+        circle = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(_STOPS)])
+        away = np.concatenate([circle * far * self._layout.radii.max() for far in _AWAY])
+        around = costly.at(np.repeat(np.arange(len(costly.token)), len(away)))
+        around.stops[:, 0] += np.tile(away, (len(costly.token), 1))
+        inside = (np.abs(around.stops[:, 0, :2]) <= self._sim.arena / 2.0).all(axis=1)
+        around = around.at(np.flatnonzero(inside))
+        token, piece, stops = around.token, around.piece, around.stops
+        first = self._losses(table, token, piece, table.poses[token], stops[:, 0])
+        second = self._losses(table, token, piece, stops[:, 0], stops[:, 1])
+        loss = np.maximum(first, second)
+        return replace(around, legs=around.legs + 1, gain=around.gain - _LEG, loss=loss)
+
+    def _staying(self, table: Table, left: Bools, covered: Floats, lies: Floats) -> _Options:
+        """Tokens left that cover a part of a piece where they lie."""
+        token, piece = np.nonzero(lies * left[:, None] > 0.0)
+        pose = table.poses[token]
+        return _Options(
+            token=token,
+            piece=piece,
+            legs=np.zeros(len(token), dtype=np.int64),
+            stops=np.stack([pose, pose], axis=1),
+            gain=np.minimum(lies[token, piece], 1.0 - covered[piece]) * self._share[piece],
+            loss=np.zeros((len(token), len(left))),
+        )
+
+    def _losses(self, table: Table, token: Ints, piece: Ints, start: Floats, end: Floats) -> Floats:
+        if not len(token):
+            return np.zeros((0, self._layout.tokens))
+        ways = np.column_stack([token, start, end]).round(6)
+        keys = [way.tobytes() for way in ways]
+        new = [m for m, key in enumerate(keys) if key not in self._pushed]
+        if new:
+            rows = self._guide.pushed(table, token[new], start[new], end[new])
+            self._pushed.update(zip([keys[m] for m in new], rows, strict=True))
+        pushed = np.stack([self._pushed[key] for key in keys])
+        pushed[np.arange(len(token)), piece] = 0.0
+        return np.where(pushed > _LOST, pushed, 0.0) * self._share
+
+    def _promises(self, options: _Options, left: Bools, taken: Bools) -> tuple[float, Floats]:
+        """What the best order of all tokens left adds, and the best after each option, (M,)."""
+        net = options.gain[:, None] - options.loss @ self._taken.T  # (M, 2^K)
+        pairs = dict[tuple[int, int], Floats]()
+        for m, pair in enumerate(zip(options.token.tolist(), options.piece.tolist(), strict=True)):
+            pairs[pair] = np.maximum(pairs[pair], net[m]) if pair in pairs else net[m]
+        moves = [(1 << i, 1 << j, row.tolist()) for (i, j), row in pairs.items()]
+
+        @cache
+        def rest(tokens: int, pieces: int) -> float:
+            most = 0.0
+            for token, piece, row in moves:
+                if tokens & token and not pieces & piece:
+                    most = max(most, row[pieces] + rest(tokens ^ token, pieces | piece))
+            return most
+
+        tokens, pieces = _mask(left), _mask(taken)
+        after = [
+            net[m, pieces] + rest(tokens ^ (1 << i), pieces | (1 << j))
+            for m, (i, j) in enumerate(
+                zip(options.token.tolist(), options.piece.tolist(), strict=True)
+            )
+        ]
+        after_or_never = np.where((options.legs > 0) & ~taken[options.piece], after, -np.inf)
+        return rest(tokens, pieces), after_or_never
+
+    def _most_promising(self, options: _Options, totals: Floats) -> list[tuple[int, Floats]]:
+        best, alike = list[tuple[int, Floats]](), dict[tuple[int, int], int]()
+        for m in np.argsort(-totals, kind="stable").tolist():
+            pair = int(options.token[m]), int(options.piece[m])
+            if totals[m] > -np.inf and alike.get(pair, 0) < _ALIKE and len(best) < _TRIED:
+                alike[pair] = alike.get(pair, 0) + 1
+                best.append((pair[0], options.stops[m, 2 - options.legs[m] :]))
+        return best
+
+    def _outlines(self, poses: Floats, flipped: Bools) -> Floats:
+        return outlines(self._layout.corners(poses, flipped)[None], self._layout)
+
+    def _goals(self, table: Table) -> Floats:
+        return self._outlines(table.goal, table.goal_flipped)
+
+
+def _mask(flags: Bools) -> int:
+    """Flags (K,) as the bits of a number."""
+    return int(flags @ (1 << np.arange(len(flags))))

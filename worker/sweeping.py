@@ -1,0 +1,101 @@
+"""The guide that learned nothing: exact places, and what lies in the way of a sweep.
+
+Legend: K tokens, M ways, S moments of each.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from tangram_agent.lookahead import Lookahead, Places, Table
+from tangram_agent.types import Past
+from tangram_sim.actions import make_actions, velocities_of
+from tangram_sim.arrays import Bools, Complex, Floats, Ints, Singles
+from tangram_sim.config import SimConfig
+from tangram_sim.geometry import outlines, outlines_at
+from tangram_sim.kinematics import wrap
+from tangram_sim.layout import Layout
+from tangram_sim.world import make_world
+from worker.pairing import alike, all_ways
+from worker.rollout import Choose, Generators
+
+_MOMENTS = 24
+_NO_EDGE = 1e-9  # length, of corners that are repeated
+_PUSHED = 1.5  # depth of a meeting, in roots of the area, by which all of a piece is pushed away
+
+
+def sweeping_policy(layout: Layout, sim: SimConfig, beam: int) -> Choose:
+    """A look ahead in the engine that nothing learned guides, see `Lookahead`."""
+    own = replace(sim, pixels=0)
+    lookahead = Lookahead(layout, own, SweepGuide(layout), make_world(layout, own), beam)
+
+    def choose(
+        corners: Floats, placed: Bools, goals: Floats, _generators: Generators, past: Past
+    ) -> Singles:
+        token, pose = lookahead.choose(corners, placed, goals, past)
+        here = layout.poses(corners)[np.arange(len(token)), token]
+        straight = np.zeros(len(token), dtype=np.bool_)
+        velocity = velocities_of(pose - here, sim)
+        return make_actions(token, velocity, straight, layout.tokens, sim)
+
+    return choose
+
+
+class SweepGuide:
+    """See `tangram_agent.lookahead.Guide`."""
+
+    def __init__(self, layout: Layout) -> None:
+        self._layout = layout
+        self._same = alike(layout)
+        self._body = layout.body[layout.padded_corners]
+
+    def places(self, table: Table, left: Bools, covered: Floats) -> Places:
+        """Every token exactly on every piece of its shape that is not taken."""
+        layout = self._layout
+        corners = layout.corners(np.stack([table.poses, table.goal]), table.flipped)
+        goals = layout.corners(table.goal, table.goal_flipped)
+        ways = all_ways(layout, corners[:1], goals[None])[0]
+        same = self._same & (table.flipped[:, None] == table.goal_flipped)
+        token, piece = np.nonzero(same & left[:, None] & (covered < 1.0))
+        pose = table.poses[token] + ways[token, piece]
+        return Places(token, piece, pose, np.ones(len(token)))
+
+    def pushed(self, table: Table, token: Ints, start: Floats, end: Floats) -> Floats:
+        """By how deep the token comes into the piece on its way."""
+        layout = self._layout
+        way = end - start
+        way[:, 2] = wrap(way[:, 2])
+        moment = np.arange(1, _MOMENTS + 1) / _MOMENTS
+        path = start[:, None] + moment[:, None] * way[:, None]  # (M, S, 3)
+        apart = np.linalg.norm(path[:, :, None, :2] - table.goal[:, :2], axis=-1)
+        near = layout.radii[token][:, None, None] + layout.radii
+        m, s, piece = np.nonzero(apart < near)
+        one = outlines_at(self._body[token[m]], path[m, s], table.flipped[token[m]])
+        pieces = outlines(layout.corners(table.goal, table.goal_flipped)[None], layout)[0]
+        depth = np.zeros(apart.shape)
+        depth[m, s, piece] = _depth(one, pieces[piece])
+        share: Floats = np.clip(depth.max(axis=1) / np.sqrt(layout.areas) * _PUSHED, 0.0, 1.0)
+        return share
+
+
+def _depth(first: Floats, second: Floats) -> Floats:
+    """(N,) the shortest way by which convex polygons (N, C, 2) come apart; 0 where they are."""
+    # Corner by corner: numpy is several times slower along short axes.
+    one, other = (list((p[..., 0] + 1j * p[..., 1]).T.copy()) for p in (first, second))
+    depth = np.full(len(first), np.inf)
+    for polygon in (one, other):
+        for corner, following in zip(polygon, polygon[1:] + polygon[:1], strict=True):
+            edge = following - corner
+            length = np.abs(edge)
+            normal = (edge / np.maximum(length, _NO_EDGE)).conj()
+            low, high = _extent(one, normal)
+            other_low, other_high = _extent(other, normal)
+            gap = np.minimum(high - other_low, other_high - low)
+            depth = np.minimum(depth, np.where(length > _NO_EDGE, gap, np.inf))
+    return np.asarray(np.maximum(depth, 0.0))
+
+
+def _extent(corners: list[Complex], normal: Complex) -> tuple[Floats, Floats]:
+    """(N,) lowest and highest of corners across an edge of direction `normal`, conjugated."""
+    across = [(normal * corner).imag for corner in corners]
+    return np.minimum.reduce(across), np.maximum.reduce(across)
