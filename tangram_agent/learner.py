@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from tangram_agent.adam import Adam
 from tangram_agent.config import AgentConfig
-from tangram_agent.motion import MotionModel, Motions
+from tangram_agent.motion import Fit, Motions
 from tangram_agent.networks import VELOCITY, Networks, View, initialise, parameter_count
 from tangram_agent.pairs import Pairs
 from tangram_agent.relabelling import (
@@ -42,7 +42,6 @@ from tangram_sim.errors import RunError
 Array = npt.NDArray[Any]
 Batch = Transitions | PairBatch
 _COUNTER = "updates"
-_MOTION_RATE, _MOTION_CLIP = 1e-2, 1.0  # of the motion model's learning
 
 
 def critic_target(reward: Tensor, done: Tensor, next_value: Tensor, gamma: float) -> Tensor:
@@ -125,8 +124,6 @@ class Learner:
         initialise(self.critic, generator)
         self.parameters = parameter_count(self.actor, self.critic)
         self.motion = networks.motion
-        if self.motion is not None:
-            initialise(self.motion, generator)
         networks.to(self.device)
         self.acting = _frozen(networks.playing)
         self.parts: dict[str, nn.Module] = {"actor": self.actor, "critic": self.critic}
@@ -141,8 +138,7 @@ class Learner:
         self._lists = self.parameter_lists()
         self.actor_optimiser = Adam(self._lists["actor"], self.config.actor_lr)
         self.critic_optimiser = Adam(self._lists["critic"], self.config.critic_lr)
-        if self.motion is not None:
-            self.motion_optimiser = Adam(self._lists["motion"], _MOTION_RATE)
+        self._fit = None if self.motion is None else Fit(self.motion)
 
     def parameter_lists(self) -> dict[str, list[Tensor]]:
         """Parameters by the names of `parts`, and those of `playing`."""
@@ -172,8 +168,8 @@ class Learner:
 
         Returns:
             critic_loss, actor_loss, q (mean value of the batch's actions), saturation, and the
-            norms of the gradients, critic_gradient and actor_gradient; with motions motion_loss,
-            motion_error (shares of full scale) and motion_gradient.
+            norms of the gradients, critic_gradient and actor_gradient; with motions also
+            motion_error and motion_noise (shares of full scale).
 
         Raises:
             NotFiniteError: one of these is not finite. The update does not count, and the networks
@@ -192,8 +188,8 @@ class Learner:
         if isinstance(batch, ContactBatch):
             loss = loss + self.push_loss(batch)
         values = self._critic_step(loss, q) | self._actor_step(steps, features)
-        if self.motion is not None and motions is not None:
-            values |= self._motion_step(self.motion, motions.to(self.device))
+        if self._fit is not None and motions is not None:
+            values |= self._fit.step(motions.to(self.device))
         self._follow()
         # One wait for the device, after everything has been asked of it.
         numbers = dict(zip(values, torch.stack(list(values.values())).tolist(), strict=True))
@@ -331,22 +327,16 @@ class Learner:
             "actor_gradient": norm,
         }
 
-    def _motion_step(self, model: MotionModel, motions: Motions) -> dict[str, Tensor]:
-        loss, error = model.loss(motions)
-        norm = self._step("motion", loss, _MOTION_CLIP)
-        return {"motion_loss": loss.detach(), "motion_error": error, "motion_gradient": norm}
-
-    def _step(self, part: str, loss: Tensor, clip: float = 0.0) -> Tensor:
+    def _step(self, part: str, loss: Tensor) -> Tensor:
         """One step of one network, whatever else the loss depends on; its gradient's norm."""
         parameters = self._lists[part]
         gradients = torch.autograd.grad(loss, parameters)
         norm = nn.utils.get_total_norm(gradients)
         for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
-        clip = clip or self.config.grad_clip
-        if clip > 0.0:
-            nn.utils.clip_grads_with_norm_(parameters, clip, norm)
-        self._optimisers()[part].step()
+        if self.config.grad_clip > 0.0:
+            nn.utils.clip_grads_with_norm_(parameters, self.config.grad_clip, norm)
+        (self.actor_optimiser if part == "actor" else self.critic_optimiser).step()
         return norm
 
     def _set_learning_rate(self, progress: float) -> None:
@@ -354,8 +344,6 @@ class Learner:
         factor = low + (1.0 - low) * 0.5 * (1.0 + math.cos(math.pi * share))
         self.actor_optimiser.rate = self.config.actor_lr * factor
         self.critic_optimiser.rate = self.config.critic_lr * factor
-        if self.motion is not None:
-            self.motion_optimiser.rate = _MOTION_RATE * factor
 
     def _tensor(self, column: Array) -> Tensor:
         return torch.from_numpy(np.asarray(column, np.float32)).to(self.device)
@@ -410,9 +398,9 @@ class Learner:
         for part, module in self.parts.items():
             load_arrays(module, under(f"{part}.", state))
 
-    def _optimisers(self) -> dict[str, Adam]:
-        optimisers = {"actor": self.actor_optimiser, "critic": self.critic_optimiser}
-        return optimisers if self.motion is None else optimisers | {"motion": self.motion_optimiser}
+    def _optimisers(self) -> dict[str, Adam | Fit]:
+        fit = {} if self._fit is None else {"motion": self._fit}
+        return {"actor": self.actor_optimiser, "critic": self.critic_optimiser, **fit}
 
 
 def _frozen(module: nn.Module) -> nn.Module:
