@@ -20,10 +20,17 @@ from torch import Tensor, nn
 
 from tangram_agent.adam import Adam
 from tangram_agent.config import AgentConfig
-from tangram_agent.motion import MotionModel, Motions
+from tangram_agent.motion import Fit, Motions
 from tangram_agent.networks import VELOCITY, Networks, View, initialise, parameter_count
 from tangram_agent.pairs import Pairs
-from tangram_agent.relabelling import ContactBatch, PairBatch, make_pairs, with_contacts
+from tangram_agent.relabelling import (
+    ContactBatch,
+    PairBatch,
+    SceneBatch,
+    make_pairs,
+    with_contacts,
+    with_scenes,
+)
 from tangram_agent.scenes import Scenes, next_token
 from tangram_agent.setup import Setup
 from tangram_agent.types import Transitions, Weights
@@ -35,7 +42,6 @@ from tangram_sim.errors import RunError
 Array = npt.NDArray[Any]
 Batch = Transitions | PairBatch
 _COUNTER = "updates"
-_MOTION_RATE, _MOTION_CLIP = 1e-2, 1.0  # of the motion model's learning
 
 
 def critic_target(reward: Tensor, done: Tensor, next_value: Tensor, gamma: float) -> Tensor:
@@ -118,8 +124,6 @@ class Learner:
         initialise(self.critic, generator)
         self.parameters = parameter_count(self.actor, self.critic)
         self.motion = networks.motion
-        if self.motion is not None:
-            initialise(self.motion, generator)
         networks.to(self.device)
         self.acting = _frozen(networks.playing)
         self.parts: dict[str, nn.Module] = {"actor": self.actor, "critic": self.critic}
@@ -134,8 +138,7 @@ class Learner:
         self._lists = self.parameter_lists()
         self.actor_optimiser = Adam(self._lists["actor"], self.config.actor_lr)
         self.critic_optimiser = Adam(self._lists["critic"], self.config.critic_lr)
-        if self.motion is not None:
-            self.motion_optimiser = Adam(self._lists["motion"], _MOTION_RATE)
+        self._fit = None if self.motion is None else Fit(self.motion)
 
     def parameter_lists(self) -> dict[str, list[Tensor]]:
         """Parameters by the names of `parts`, and those of `playing`."""
@@ -147,6 +150,8 @@ class Learner:
         if not self._setup.pairs:
             return batch
         pairs = make_pairs(batch, self._setup, generator)
+        if self._setup.credits_scenes:
+            return with_scenes(pairs, batch, self._layout, generator)
         return (
             with_contacts(pairs, batch, self._layout, generator) if self._setup.contacts else pairs
         )
@@ -163,8 +168,8 @@ class Learner:
 
         Returns:
             critic_loss, actor_loss, q (mean value of the batch's actions), saturation, and the
-            norms of the gradients, critic_gradient and actor_gradient; with motions motion_loss,
-            motion_error (shares of full scale) and motion_gradient.
+            norms of the gradients, critic_gradient and actor_gradient; with motions also
+            motion_error and motion_noise (shares of full scale).
 
         Raises:
             NotFiniteError: one of these is not finite. The update does not count, and the networks
@@ -176,10 +181,15 @@ class Learner:
         features = None
         if not self.config.afterstate and steps.start is steps.view:
             features = self.actor.head.see(steps.view)
-        pushes = self.push_loss(batch) if isinstance(batch, ContactBatch) else None
-        values = self._critic_step(steps, features, pushes) | self._actor_step(steps, features)
-        if self.motion is not None and motions is not None:
-            values |= self._motion_step(self.motion, motions.to(self.device))
+        if isinstance(batch, SceneBatch):
+            loss, q = self.scene_loss(batch)
+        else:
+            loss, q = self.critic_loss(steps, features)
+        if isinstance(batch, ContactBatch):
+            loss = loss + self.push_loss(batch)
+        values = self._critic_step(loss, q) | self._actor_step(steps, features)
+        if self._fit is not None and motions is not None:
+            values |= self._fit.step(motions.to(self.device))
         self._follow()
         # One wait for the device, after everything has been asked of it.
         numbers = dict(zip(values, torch.stack(list(values.values())).tolist(), strict=True))
@@ -262,6 +272,30 @@ class Learner:
         share = self.critic.pushed(meeting, self._tensor(batch.after))
         return (share - self._tensor(batch.pushed)).square().mean()
 
+    def scene_loss(self, batch: SceneBatch) -> tuple[Tensor, Tensor]:
+        """Mean squared error of the reward as a sum over all pairs of a scene, and the sums (B,).
+
+        As in value decomposition networks (Sunehag et al. 2018): nobody says which pair earned it.
+        """
+        count, tokens = batch.poses.shape[:2]
+        token, piece = (part.reshape(-1) for part in np.indices((tokens, tokens)))
+        pairs = Pairs(
+            pose=self._tensor(batch.poses[:, token].reshape(-1, 3)),
+            flipped=self._tensor(batch.flips[:, token].reshape(-1)),
+            token=self._index(np.tile(token, count)),
+            goal=self._tensor(batch.goals[:, piece].reshape(-1, 3)),
+            goal_flipped=self._tensor(batch.goal_flips[:, piece].reshape(-1)),
+            piece=self._index(np.tile(piece, count)),
+            covered=torch.zeros(count * tokens * tokens, device=self.device),
+        )
+        still = torch.zeros(len(pairs.pose), VELOCITY, device=self.device)
+        values = self.critic(pairs, still, pairs).view(count, -1)
+        areas = self._layout.areas
+        weights = self._tensor(np.maximum(areas[token], areas[piece]) / areas.sum())
+        share = values @ weights
+        error = 2.0 * share - 1.0 - self._tensor(batch.returned)
+        return error.square().mean(), share
+
     def _target(self, steps: Steps) -> Tensor:
         """Eq. 5; the target networks are not asked where no transition goes on."""
         if not self.bootstraps or bool(steps.done.all()):
@@ -279,12 +313,7 @@ class Learner:
         rho = average_so_far(config.acting_average, self.updates)
         polyak_update(lists["acting"], lists["playing"], rho)
 
-    def _critic_step(
-        self, steps: Steps, features: Tensor | None, pushes: Tensor | None
-    ) -> dict[str, Tensor]:
-        loss, q = self.critic_loss(steps, features)
-        if pushes is not None:
-            loss = loss + pushes
+    def _critic_step(self, loss: Tensor, q: Tensor) -> dict[str, Tensor]:
         norm = self._step("critic", loss)
         return {"critic_loss": loss.detach(), "q": q.detach().mean(), "critic_gradient": norm}
 
@@ -298,22 +327,16 @@ class Learner:
             "actor_gradient": norm,
         }
 
-    def _motion_step(self, model: MotionModel, motions: Motions) -> dict[str, Tensor]:
-        loss, error = model.loss(motions)
-        norm = self._step("motion", loss, _MOTION_CLIP)
-        return {"motion_loss": loss.detach(), "motion_error": error, "motion_gradient": norm}
-
-    def _step(self, part: str, loss: Tensor, clip: float = 0.0) -> Tensor:
+    def _step(self, part: str, loss: Tensor) -> Tensor:
         """One step of one network, whatever else the loss depends on; its gradient's norm."""
         parameters = self._lists[part]
         gradients = torch.autograd.grad(loss, parameters)
         norm = nn.utils.get_total_norm(gradients)
         for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
-        clip = clip or self.config.grad_clip
-        if clip > 0.0:
-            nn.utils.clip_grads_with_norm_(parameters, clip, norm)
-        self._optimisers()[part].step()
+        if self.config.grad_clip > 0.0:
+            nn.utils.clip_grads_with_norm_(parameters, self.config.grad_clip, norm)
+        (self.actor_optimiser if part == "actor" else self.critic_optimiser).step()
         return norm
 
     def _set_learning_rate(self, progress: float) -> None:
@@ -321,8 +344,6 @@ class Learner:
         factor = low + (1.0 - low) * 0.5 * (1.0 + math.cos(math.pi * share))
         self.actor_optimiser.rate = self.config.actor_lr * factor
         self.critic_optimiser.rate = self.config.critic_lr * factor
-        if self.motion is not None:
-            self.motion_optimiser.rate = _MOTION_RATE * factor
 
     def _tensor(self, column: Array) -> Tensor:
         return torch.from_numpy(np.asarray(column, np.float32)).to(self.device)
@@ -377,9 +398,9 @@ class Learner:
         for part, module in self.parts.items():
             load_arrays(module, under(f"{part}.", state))
 
-    def _optimisers(self) -> dict[str, Adam]:
-        optimisers = {"actor": self.actor_optimiser, "critic": self.critic_optimiser}
-        return optimisers if self.motion is None else optimisers | {"motion": self.motion_optimiser}
+    def _optimisers(self) -> dict[str, Adam | Fit]:
+        fit = {} if self._fit is None else {"motion": self._fit}
+        return {"actor": self.actor_optimiser, "critic": self.critic_optimiser, **fit}
 
 
 def _frozen(module: nn.Module) -> nn.Module:

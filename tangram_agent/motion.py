@@ -1,10 +1,11 @@
 """What a command comes to: a model of motion, learned from the replay and corrected in play.
 
 A command c (x, y and turn, shares of full scale) moves a token by a way d, in the same units. The
-model is a Bayesian linear regression on features, d = K phi(c) + noise. Features and prior are
-learned from whole episodes (ALPaCA: Harrison, Sharma and Pavone 2018), so before the first action
-of an episode it knows what is usual, and every action that is seen tells it more of the world at
-hand. It starts as the exact rigid motion, d = c, and knows how sure it is.
+model is a Bayesian linear regression on given features, d = K phi(c) + noise. What entries of K
+are usual, how much they differ between episodes, and the noise are fitted to whole episodes in
+closed form; every action that is seen tells the model more of the world at hand. It starts as the
+exact rigid motion, d = c, and knows how sure it is. Where actions come late (`sim.delay`) it knows
+so much, and takes the command before for the cause.
 
 Legend: B episodes, T actions of each, F features; a command and a way have 3 entries.
 """
@@ -17,14 +18,16 @@ import torch
 from torch import Tensor, nn
 
 from tangram_agent.types import Past
-from tangram_sim.actions import chosen_tokens, velocities_of
+from tangram_sim.actions import chosen_tokens, flips, velocities, velocities_of
 from tangram_sim.arrays import Floats
 from tangram_sim.config import SimConfig
+from tangram_sim.errors import RunError
 from tangram_sim.layout import Layout
 
-_HIDDEN, _LEARNED = 64, 16
-_GIVEN = 5  # features that are not learned: the command, its shift's length, and 1
-_NOISE, _LEAST_NOISE = 0.02, 1e-4  # deviation of a way at the start, and at least
+_FEATURES = 26
+_SPREAD, _NOISE = 0.1, 0.02  # deviations of entries of K and of a way, at the start
+_LEAST = 1e-4  # deviation of a way
+_KEPT = 0.998  # of what was seen before, with each update
 _SEARCH_STEPS, _NEAR_ENOUGH = 30, 1e-5
 _SHORT = 0.01  # share of a half turn
 _SLOPES = 0.1, 10.0  # of what a command comes to, as the search takes them
@@ -33,11 +36,11 @@ _STILL = 1e-6  # an action that moves no more was refused or blocked
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """What is believed of the motion in B worlds, in float64: it begins far from sure.
+    """What is believed of the motion in B worlds, in float64.
 
     Attributes:
         mean: (B, 3, F) of K.
-        covariance: (B, 3, F, F) of the rows of K, in units of the noise's variance.
+        covariance: (B, 3, F, F) of the rows of K.
     """
 
     mean: Tensor
@@ -54,7 +57,7 @@ class Motions:
 
     Attributes:
         command: (B, T, 3).
-        way: (B, T, 3) of the token that each action named, by the shorter turn.
+        way: (B, T, 3) of the token that it named, by the shorter turn.
         moved: (B, T) 1 where it moved; an action that was refused or blocked tells nothing.
     """
 
@@ -72,40 +75,71 @@ def motions_of(past: Past, now: Floats, layout: Layout, sim: SimConfig) -> Motio
     corners = np.concatenate([past.corners, now[:, None]], axis=1).astype(np.float64)
     poses = layout.poses(corners)
     count, steps, size = past.actions.shape
-    actions = past.actions.reshape(count * steps, size).astype(np.float64)
+    if sim.delay:  # nothing is carried out in the first step, and what is told last not at all
+        poses, steps = poses[:, 1:], max(steps - 1, 0)
+    actions = past.actions[:, :steps].reshape(count * steps, size).astype(np.float64)
     token = chosen_tokens(actions, layout.tokens).reshape(count, steps, 1, 1)
     before, after = (
         np.take_along_axis(part, token, axis=2)[:, :, 0] for part in (poses[:, :-1], poses[:, 1:])
     )
     way = velocities_of((after - before).reshape(-1, 3), sim).reshape(count, steps, 3)
-    moved = np.abs(way).max(axis=-1) > _STILL
+    moved = np.abs(way).max(axis=-1, initial=0.0) > _STILL
     command = actions[:, -3:].reshape(count, steps, 3)
-    return Motions(*(torch.from_numpy(part.astype(np.float32)) for part in (command, way, moved)))
+    return Motions(*(torch.from_numpy(part.astype(np.float64)) for part in (command, way, moved)))
+
+
+def features(command: Tensor) -> Tensor:
+    """Phi (..., F) of commands (..., 3), in float64.
+
+    A shift that is shortened by its length, a turn by its angle, and what a bias makes of that.
+    """
+    command = command.double()
+    shift, x, y, turn = command[..., :2], command[..., :1], command[..., 1:2], command[..., 2:]
+    length, angle = shift.norm(dim=-1, keepdim=True), turn.abs()
+    unit = shift / (length + 1e-3)
+    of_shift = [length, length * shift, length**2 * shift, x * x, x * y, y * y, unit, x * unit]
+    of_turn = [
+        angle * turn,
+        turn**2,
+        turn**3,
+        angle * turn**3,
+        turn**4,
+        turn**5,
+        angle * turn**5,
+        turn**7,
+        angle * turn**7,
+    ]
+    parts = [command, torch.ones_like(length), *of_shift, *of_turn, length * turn]
+    return torch.cat(parts, dim=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """Motions of B episodes beside what is usual.
+
+    Attributes:
+        phi: (B, T, F), 0 where nothing moved.
+        off: (B, 3, T) how far the way is from the usual one.
+        along: (B, 3, T, F) covariance of ways and entries of K.
+        inverse: (B, 3, T, T) of the covariance of the ways.
+    """
+
+    phi: Tensor
+    off: Tensor
+    along: Tensor
+    inverse: Tensor
 
 
 class MotionModel(nn.Module):
-    """The prior of K, the features, and the noise."""
+    """What entries of K are usual, how much they differ between episodes, and the noise."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.hidden = nn.Linear(3, _HIDDEN)
-        self.learned = nn.Linear(_HIDDEN, _LEARNED)
-        exact = torch.eye(3, _GIVEN + _LEARNED)
+        exact = torch.eye(3, _FEATURES)
         self.mean = nn.Parameter(exact)
-        self.log_variance = nn.Parameter(torch.zeros_like(exact))
-        self.log_noise = nn.Parameter(torch.full((3,), math.log(_NOISE)))
-
-    @property
-    def noise(self) -> Tensor:
-        """(3,) deviation of a way that nothing explains."""
-        return self.log_noise.exp() + _LEAST_NOISE
-
-    def features(self, command: Tensor) -> Tensor:
-        """Phi (..., F) of commands (..., 3), in float64."""
-        length = command[..., :2].norm(dim=-1, keepdim=True)
-        learned = torch.tanh(self.learned(torch.tanh(self.hidden(2.0 * command))))
-        given = torch.cat([command, length, torch.ones_like(length)], dim=-1)
-        return torch.cat([given, learned], dim=-1).double()
+        self.log_variance = nn.Parameter(torch.full_like(exact, 2.0 * math.log(_SPREAD)))
+        self.log_noise = nn.Parameter(torch.full((3,), 2.0 * math.log(_NOISE)))
+        self.requires_grad_(False)
 
     def prior(self, count: int) -> Belief:
         """What is believed of so many worlds before anything is seen of them."""
@@ -114,35 +148,42 @@ class MotionModel(nn.Module):
 
     def belief(self, motions: Motions) -> Belief:
         """What is believed after motions were seen."""
-        belief = self.prior(len(motions.command))
-        phi = self.features(motions.command)
-        for t in range(phi.shape[1]):
-            belief = _told(belief, phi[:, t], motions, t, *_expected(belief, phi[:, t], motions, t))
-        return belief
+        seen, prior = self.beside_usual(motions), self.prior(len(motions.command))
+        gain = seen.inverse @ seen.along
+        return Belief(
+            prior.mean + (gain * seen.off[..., None]).sum(dim=2),
+            prior.covariance - seen.along.mT @ gain,
+        )
+
+    def beside_usual(self, motions: Motions) -> _Seen:
+        """What was seen, beside what was to be expected."""
+        moved = motions.moved[..., None]
+        phi = features(motions.command) * moved
+        off = _shortest(motions.way - phi @ self.mean.double().mT) * moved
+        along = phi[:, None] * self.log_variance.double().exp()[:, None]
+        noise = torch.diag_embed(self.log_noise.double().exp()[:, None].expand(3, phi.shape[1]))
+        return _Seen(phi, off.mT, along, torch.linalg.inv(along @ phi[:, None].mT + noise))
 
     def predict(self, belief: Belief, command: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and deviation (B, 3) of what commands (B, 3) come to."""
-        mean, spread = _predict(belief, self.features(command))
-        return mean.float(), (spread.sqrt() * self.noise).float()
+        phi = features(command)
+        spread = torch.einsum("bf,bdfg,bg->bd", phi, belief.covariance, phi)
+        deviation = (spread + self.log_noise.double().exp()).sqrt()
+        return torch.einsum("bdf,bf->bd", belief.mean, phi).float(), deviation.float()
 
-    def loss(self, motions: Motions) -> tuple[Tensor, Tensor]:
-        """Mean negative log likelihood of each motion given those before it in its episode.
-
-        Beside it the root of the mean squared error of the last ones, of those that moved.
-        """
-        belief, losses = self.prior(len(motions.command)), []
-        phi, noise = self.features(motions.command), self.noise
-        last = phi.shape[1] - 1
-        for t in range(last + 1):
-            wrong, spread = _expected(belief, phi[:, t], motions, t)
-            variance = spread * noise.square()
-            loss = (wrong.square() / variance + variance.log()).sum(dim=-1)
-            losses.append(0.5 * (loss * motions.moved[:, t]).mean())
-            if t < last:
-                belief = _told(belief, phi[:, t], motions, t, wrong, spread)
-        moved = motions.moved[:, -1:]
-        error = (wrong.detach().square() * moved).sum() / (3.0 * moved.sum()).clamp(min=1.0)
-        return torch.stack(losses).mean().float(), error.sqrt().float()
+    def ahead(
+        self, belief: Belief, corners: Floats, past: Past, layout: Layout, sim: SimConfig
+    ) -> Floats:
+        """Corners (B, V, 2) once what was told last, and comes late, is carried out."""
+        if not sim.delay or not past.actions.shape[1]:
+            return corners
+        last = past.actions[:, -1].astype(np.float64)
+        token, rows = chosen_tokens(last, layout.tokens), np.arange(len(last))
+        poses, sides = layout.poses(corners), layout.flipped(corners)
+        sides[rows, token] ^= flips(last, layout, sim)
+        way, _ = self.predict(belief, torch.from_numpy(last[:, -3:]))
+        poses[rows, token] += velocities(way.numpy(), sim)
+        return layout.corners(poses, sides)
 
     def command(self, belief: Belief, way: Tensor) -> Tensor:
         """(B, 3) in [-1, 1], the nearest that was found to come to ways (B, 3).
@@ -175,34 +216,76 @@ class MotionModel(nn.Module):
         return command, missing
 
     def _missing(self, belief: Belief, way: Tensor, command: Tensor) -> Tensor:
-        return _shortest(way - _predict(belief, self.features(command))[0]).float()
+        return _shortest(way - torch.einsum("bdf,bf->bd", belief.mean, features(command))).float()
 
 
-def _expected(belief: Belief, phi: Tensor, motions: Motions, t: int) -> tuple[Tensor, Tensor]:
-    """By how much motion t is not what is expected (B, 3), and the variance of that.
+class Fit:
+    """Fits a model to episodes, in closed form, where a network takes steps of its optimiser.
 
-    The variance is in units of the noise's.
+    The usual K is that of generalised least squares over the motions seen, older ones counting
+    less. Each variance is multiplied by the root of what the errors hold it responsible for over
+    what they would if it were right: the likelihood grows without a rate (MM, Zhou et al. 2019).
+
+    Attributes:
+        slots: sums of squares and products of each axis; empty before a step.
     """
-    mean, spread = _predict(belief, phi)
-    return _shortest(motions.way[:, t] - mean), spread
+
+    def __init__(self, model: MotionModel) -> None:
+        self.slots: dict[str, list[Tensor]] = {}
+        self._model = model
+
+    def load(self, slots: dict[str, list[Tensor]]) -> None:
+        """Take over the sums of the same model.
+
+        Raises:
+            RunError: they are of another one.
+        """
+        size = _FEATURES
+        wanted = {"squares": [(size, size)] * 3, "products": [(size,)] * 3}
+        found = {name: [tuple(one.shape) for one in own] for name, own in slots.items()}
+        if slots and found != wanted:
+            raise RunError(
+                "the sums of the motion model are not those of this version: start a new run"
+            )
+        self.slots = slots
+
+    @torch.no_grad()
+    def step(self, motions: Motions) -> dict[str, Tensor]:
+        """Fit to more motions; their error (shares of full scale) and the noise that is seen.
+
+        The error is that of each episode's last action, those before it being known.
+        """
+        model, seen = self._model, self._model.beside_usual(motions)
+        usual = model.mean.double()
+        squares = torch.einsum("btf,bdtu,bug->dfg", seen.phi, seen.inverse, seen.phi)
+        blame = torch.einsum("bdtu,bdu->bdt", seen.inverse, seen.off)
+        lacks = torch.einsum("btf,bdt->bdf", seen.phi, blame)
+        products = lacks.sum(dim=0) + torch.einsum("dfg,dg->df", squares, usual)
+        self._add("squares", squares)
+        self._add("products", products)
+        total, right = (torch.stack(self.slots[name]) for name in ("squares", "products"))
+        one = torch.eye(total.shape[-1], dtype=total.dtype, device=total.device)
+        model.mean.copy_(torch.linalg.solve(total + one, right + one[:3]))
+        alone = squares.diagonal(dim1=1, dim2=2)
+        model.log_variance.add_(0.5 * (_log(lacks.square().sum(dim=0)) - _log(alone)))
+        moved = motions.moved[:, None]
+        own = (seen.inverse.diagonal(dim1=2, dim2=3) * moved).sum(dim=(0, 2))
+        model.log_noise.add_(0.5 * (_log(blame.square().sum(dim=(0, 2))) - _log(own)))
+        model.log_noise.clamp_(min=2.0 * math.log(_LEAST))
+        last = (blame[..., -1] / seen.inverse[..., -1, -1]).square() * moved[..., -1]
+        error = (last.sum() / (3.0 * moved[..., -1].sum()).clamp(min=1.0)).sqrt()
+        return {
+            "motion_error": error.float(),
+            "motion_noise": model.log_noise.exp().mean().sqrt(),
+        }
+
+    def _add(self, name: str, more: Tensor) -> None:
+        before = self.slots.get(name, [torch.zeros_like(one) for one in more])
+        self.slots[name] = [_KEPT * old + one for old, one in zip(before, more, strict=True)]
 
 
-def _told(
-    belief: Belief, phi: Tensor, motions: Motions, t: int, wrong: Tensor, spread: Tensor
-) -> Belief:
-    """The belief after motion t, which was so wrong, with such a spread."""
-    along = torch.einsum("bdfg,bg->bdf", belief.covariance, phi)
-    gain = motions.moved[:, t, None, None] * along / spread[..., None]
-    return Belief(
-        belief.mean + gain * wrong[..., None],
-        belief.covariance - gain[..., :, None] * along[..., None, :],
-    )
-
-
-def _predict(belief: Belief, phi: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean (B, 3) of ways with features (B, F), and their variance in units of the noise's."""
-    mean = torch.einsum("bdf,bf->bd", belief.mean, phi)
-    return mean, 1.0 + torch.einsum("bf,bdfg,bg->bd", phi, belief.covariance, phi)
+def _log(value: Tensor) -> Tensor:
+    return (value + 1e-12).log()
 
 
 def _shortest(way: Tensor) -> Tensor:

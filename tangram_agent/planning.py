@@ -171,9 +171,11 @@ class Planner:
         """
         if refine and self._agent.lookahead != "none":
             return self._planned(corners, placed, goals, past)
-        scene = self._scene(corners, self._layout.poses(corners), goals)
         with torch.no_grad():
             belief = self._belief(corners, past)
+            if self._motion is not None and belief is not None and past is not None:
+                corners = self._motion.ahead(belief, corners, past, self._layout, self._sim)
+            scene = self._scene(corners, self._layout.poses(corners), goals)
             candidates, pose = self._short_list(scene, self._open(placed, goals))
             velocity, reached = self._reached(scene, candidates, pose, belief)
             best = self._best(scene, candidates, reached)

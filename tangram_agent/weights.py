@@ -21,7 +21,10 @@ def load_arrays(module: nn.Module, arrays: dict[str, Array]) -> None:
     own = dict(module.named_parameters())
     if set(own) != set(arrays):
         odd = min(set(own) ^ set(arrays))
-        raise RunError(f"weights of another network: '{odd}' is on one side only")
+        raise RunError(
+            f"weights of another network: '{odd}' is on one side only: start a new run, or use the "
+            "version that they were trained with"
+        )
     with torch.no_grad():
         for name, parameter in own.items():
             if tuple(parameter.shape) != arrays[name].shape:

@@ -30,6 +30,7 @@ from worker.baselines import (
     random_policy,
 )
 from worker.config import EvalConfig, source_and_names
+from worker.fitted import fitted_policy
 from worker.metrics import assembled, pose_errors, summarise
 from worker.oracle import oracle_policy
 from worker.puzzles import Figure, Figures, find_figures, play_figures
@@ -91,7 +92,8 @@ def evaluate_run(config: EvalConfig) -> int:
     Policies that learned nothing play the same episodes, to compare with: `exact` moves every
     token exactly onto its target, `position only` one token onto its centre and never turns it,
     `random` is chance. Where a world moves tokens otherwise than actions say, or several noisy
-    looks at them can be put together, `oracle` knows that world and its noise. A run that learned
+    looks at them can be put together, `fitted` is `exact` by a model of motion that has seen some
+    random commands, and `oracle` knows that world and its noise. A run that learned
     which token is next also plays fixed orders.
 
     Returns:
@@ -128,7 +130,7 @@ def policies(run: Run) -> dict[str, Player]:
         result["exact+lookahead"] = sweeping_policy(layout, sim, run.setup.agent.beam)
     result["exact"] = exact_policy(layout, sim)
     if sim.inexact or (sim.corner_noise and run.setup.horizon > 1):
-        result["oracle"] = Told(oracle_policy)
+        result |= {"fitted": Told(fitted_policy), "oracle": Told(oracle_policy)}
     if layout.tokens == 1:
         result["position only"] = position_policy(layout, sim)
     return result | {"random": random_policy(layout, sim)}

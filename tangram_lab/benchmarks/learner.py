@@ -108,7 +108,7 @@ class PlainLearner(Learner):
                     old.mul_(self.config.polyak).add_(new, alpha=1.0 - self.config.polyak)
         return losses
 
-    def _step(self, part: str, loss: Tensor, clip: float = 0.0) -> Tensor:  # noqa: ARG002
+    def _step(self, part: str, loss: Tensor) -> Tensor:
         optimiser = self._plain[part]
         optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]

@@ -13,6 +13,7 @@ from tangram_sim.kinematics import wrap
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.sim.builders import SEVEN
 from worker.baselines import Told, exact_policy, playing, random_policy
+from worker.fitted import fitted_policy
 from worker.oracle import oracle_policy
 from worker.test_set import FixedTests
 
@@ -63,6 +64,14 @@ def test_the_oracle_ends_on_its_target_in_every_world(
     assert oracle["angle_error_deg_p90"] < 1e-2
     short = formula["position_error_p90"] / 1e-3 / made.sim.arena
     assert max(short, formula["angle_error_deg_p90"] / 0.5) > 1.0
+
+
+@pytest.mark.parametrize(("sim", "actions"), [WORLDS[i] for i in (0, 1, 2, 4)])
+def test_a_fitted_model_of_motion_serves_the_formula(sim: dict[str, Any], actions: int) -> None:
+    made = setup(SQUARE, **sim, actions_per_token=actions)
+    with closing(FixedTests(made, 16, 8)) as tests:
+        fitted = tests.scores(tests.play(playing(Told(fitted_policy), tests.env)))
+    assert fitted["mean_reward"] > 0.995
 
 
 @pytest.mark.parametrize("sim", [{}, {"delay": True}, {"gain_spread": 1.25, "action_noise": 5e-4}])
