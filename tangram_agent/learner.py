@@ -334,8 +334,9 @@ class Learner:
         norm = nn.utils.get_total_norm(gradients)
         for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
-        if self.config.grad_clip > 0.0:
-            nn.utils.clip_grads_with_norm_(parameters, self.config.grad_clip, norm)
+        clip = self.config.grad_clip
+        if clip > 0.0:
+            nn.utils.clip_grads_with_norm_(parameters, clip, norm)
         (self.actor_optimiser if part == "actor" else self.critic_optimiser).step()
         return norm
 

@@ -41,7 +41,7 @@ from worker.test_set import FixedTests, greedy
 AT_ONCE = 32
 MAX_PICTURES = 100  # on a sheet
 RUN = "this run"
-MAX_PADDED = 6  # policies in a table
+MAX_PADDED = 5  # policies in a table
 MAX_LINES = 40  # of puzzles and of faults on the screen
 
 Scores = dict[str, Any]  # numbers, and `coverage_each` of the episodes of several tokens
@@ -279,7 +279,7 @@ def _one_by_one(setup: Setup, figures: Sequence[Figure], played: Played) -> list
 
 def scores_table(title: str, caption: str, scores: Mapping[str, Scores]) -> Table:
     """One column for each policy, one row for each score."""
-    # More than six fit into 80 columns without the blanks.
+    # More than five fit into 80 columns without the blanks.
     table = Table(title=title, caption=caption, padding=(0, int(len(scores) <= MAX_PADDED)))
     table.add_column("", no_wrap=True)
     for name in scores:

@@ -67,8 +67,9 @@ def test_a_belief_equals_the_regression_in_closed_form() -> None:
 def test_what_did_not_move_tells_nothing(moved: float) -> None:
     model, told = at_first(), commands(3)
     motions = Motions(told[None], torch.zeros(1, 3, 3), torch.full((1, 3), moved))
-    same = torch.equal(model.belief(motions).mean, model.prior(1).mean)
-    assert same == (moved == 0.0)
+    after, before = model.belief(motions), model.prior(1)
+    for found, usual in zip(vars(after).values(), vars(before).values(), strict=True):
+        assert torch.equal(found, usual) == (moved == 0.0)
 
 
 def test_it_grows_surer_where_it_has_seen_and_finds_the_command() -> None:

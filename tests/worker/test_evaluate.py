@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from rich.console import Console
 
 from tangram_sim.errors import ConfigError, RunError
 from tests.agent.builders import PAIR, SQUARE
 from tests.worker.builders import write_run
 from tests.worker.puzzle_files import GAME, SIM, drawn, write_puzzles
 from worker.config import EvalConfig, PlayConfig
-from worker.evaluate import evaluate_run
+from worker.evaluate import RUN, evaluate_run, scores_table
 from worker.play import play_run
 
 pytestmark = pytest.mark.fast
@@ -95,6 +96,15 @@ def test_in_another_world_there_is_an_oracle(
         assert told in " ".join(capsys.readouterr().out.split())
         if puzzle is None:
             assert evaluated(folder, tokens, **more)["baselines"].keys().isdisjoint({"oracle"})
+
+
+def test_all_policies_of_one_token_fit_into_80_columns(capsys: pytest.CaptureFixture[str]) -> None:
+    scores = {"mean_reward": -0.987, "position_error_p90": 1.2345, "angle_error_deg_p90": 180.0}
+    names = RUN, "exact", "fitted", "oracle", "position only", "random"
+    Console(width=80).print(scores_table("run", "", dict.fromkeys(names, scores)))
+    printed = capsys.readouterr().out
+    assert "…" not in printed
+    assert printed.count("1.2345") == len(names)
 
 
 USES: dict[str, Callable[[str, str], int]] = {
