@@ -175,6 +175,15 @@ class AgentConfig(Settings, section="agent"):
         only={"readout": "pair"},
         unless={"refine_steps": 0},
     )
+    credit: str = setting(
+        "piece",
+        "several tokens: what the critic of pairs learns from: piece, labels for each pair, from "
+        "the exact geometry; or reward, what the environment returns, as a sum over all pairs",
+        choices=("piece", "reward"),
+        only={"readout": "pair"},
+        unless={"afterstate": False},
+        part=NETWORK,
+    )
     pairs_per_transition: int = setting(
         8,
         "several tokens: pairs that a transition gives in one update",

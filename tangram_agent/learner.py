@@ -23,7 +23,14 @@ from tangram_agent.config import AgentConfig
 from tangram_agent.motion import Fit, Motions
 from tangram_agent.networks import VELOCITY, Networks, View, initialise, parameter_count
 from tangram_agent.pairs import Pairs
-from tangram_agent.relabelling import ContactBatch, PairBatch, make_pairs, with_contacts
+from tangram_agent.relabelling import (
+    ContactBatch,
+    PairBatch,
+    SceneBatch,
+    make_pairs,
+    with_contacts,
+    with_scenes,
+)
 from tangram_agent.scenes import Scenes, next_token
 from tangram_agent.setup import Setup
 from tangram_agent.types import Transitions, Weights
@@ -143,6 +150,8 @@ class Learner:
         if not self._setup.pairs:
             return batch
         pairs = make_pairs(batch, self._setup, generator)
+        if self._setup.credits_scenes:
+            return with_scenes(pairs, batch, self._layout, generator)
         return (
             with_contacts(pairs, batch, self._layout, generator) if self._setup.contacts else pairs
         )
@@ -172,8 +181,13 @@ class Learner:
         features = None
         if not self.config.afterstate and steps.start is steps.view:
             features = self.actor.head.see(steps.view)
-        pushes = self.push_loss(batch) if isinstance(batch, ContactBatch) else None
-        values = self._critic_step(steps, features, pushes) | self._actor_step(steps, features)
+        if isinstance(batch, SceneBatch):
+            loss, q = self.scene_loss(batch)
+        else:
+            loss, q = self.critic_loss(steps, features)
+        if isinstance(batch, ContactBatch):
+            loss = loss + self.push_loss(batch)
+        values = self._critic_step(loss, q) | self._actor_step(steps, features)
         if self._fit is not None and motions is not None:
             values |= self._fit.step(motions.to(self.device))
         self._follow()
@@ -258,6 +272,30 @@ class Learner:
         share = self.critic.pushed(meeting, self._tensor(batch.after))
         return (share - self._tensor(batch.pushed)).square().mean()
 
+    def scene_loss(self, batch: SceneBatch) -> tuple[Tensor, Tensor]:
+        """Mean squared error of the reward as a sum over all pairs of a scene, and the sums (B,).
+
+        As in value decomposition networks (Sunehag et al. 2018): nobody says which pair earned it.
+        """
+        count, tokens = batch.poses.shape[:2]
+        token, piece = (part.reshape(-1) for part in np.indices((tokens, tokens)))
+        pairs = Pairs(
+            pose=self._tensor(batch.poses[:, token].reshape(-1, 3)),
+            flipped=self._tensor(batch.flips[:, token].reshape(-1)),
+            token=self._index(np.tile(token, count)),
+            goal=self._tensor(batch.goals[:, piece].reshape(-1, 3)),
+            goal_flipped=self._tensor(batch.goal_flips[:, piece].reshape(-1)),
+            piece=self._index(np.tile(piece, count)),
+            covered=torch.zeros(count * tokens * tokens, device=self.device),
+        )
+        still = torch.zeros(len(pairs.pose), VELOCITY, device=self.device)
+        values = self.critic(pairs, still, pairs).view(count, -1)
+        areas = self._layout.areas
+        weights = self._tensor(np.maximum(areas[token], areas[piece]) / areas.sum())
+        share = values @ weights
+        error = 2.0 * share - 1.0 - self._tensor(batch.returned)
+        return error.square().mean(), share
+
     def _target(self, steps: Steps) -> Tensor:
         """Eq. 5; the target networks are not asked where no transition goes on."""
         if not self.bootstraps or bool(steps.done.all()):
@@ -275,12 +313,7 @@ class Learner:
         rho = average_so_far(config.acting_average, self.updates)
         polyak_update(lists["acting"], lists["playing"], rho)
 
-    def _critic_step(
-        self, steps: Steps, features: Tensor | None, pushes: Tensor | None
-    ) -> dict[str, Tensor]:
-        loss, q = self.critic_loss(steps, features)
-        if pushes is not None:
-            loss = loss + pushes
+    def _critic_step(self, loss: Tensor, q: Tensor) -> dict[str, Tensor]:
         norm = self._step("critic", loss)
         return {"critic_loss": loss.detach(), "q": q.detach().mean(), "critic_gradient": norm}
 

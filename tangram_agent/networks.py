@@ -158,6 +158,7 @@ class Critic(nn.Module):
     ) -> None:
         super().__init__()
         self.graph, self.afterstate = graph, agent.afterstate
+        self._of_the_rest = agent.credit == "reward"
         action = 0 if agent.afterstate else VELOCITY
         # The paper's value is read off the whole graph; a pair's also at its token.
         at_base = isinstance(graph, PairGraph)
@@ -181,9 +182,14 @@ class Critic(nn.Module):
         """
         if self.afterstate:
             moved = self.graph.moved(view, velocity) if after is None else after
-            return self._value(self.head(moved))
-        seen = self.graph.as_seen(view, velocity)
-        return self._value(self.head(view, action=seen, features=features))
+            value = self._value(self.head(moved))
+        else:
+            seen = self.graph.as_seen(view, velocity)
+            value = self._value(self.head(view, action=seen, features=features))
+        if self._of_the_rest and isinstance(view, Pairs):
+            # What is covered cannot be covered anew, which scenes of disjoint tokens do not teach.
+            value = value * (1.0 - view.covered)
+        return value
 
     def _value(self, outputs: Tensor) -> Tensor:
         return outputs.squeeze(-1)

@@ -167,6 +167,23 @@ class ContactBatch(PairBatch):
     pushed: Floats
 
 
+@dataclass(frozen=True, eq=False)
+class SceneBatch(PairBatch):
+    """Pairs for the actor, and the whole scenes that the environment rewarded for the critic.
+
+    Attributes:
+        poses, goals: (B, K, 3) of all tokens after the action, and of the target's pieces.
+        flips, goal_flips: (B, K) on which sides.
+        returned: (B,) the environment's reward.
+    """
+
+    poses: Floats
+    flips: Bools
+    goals: Floats
+    goal_flips: Bools
+    returned: Singles
+
+
 def make_pairs(batch: Transitions, setup: Setup, generator: np.random.Generator) -> PairBatch:
     """Pairs of a batch of transitions.
 
@@ -176,16 +193,19 @@ def make_pairs(batch: Transitions, setup: Setup, generator: np.random.Generator)
     goals that were played, the rest with those of hindsight: as many parts as there are copies.
     """
     layout, agent = setup.layout, setup.agent
-    each = agent.pairs_per_transition if setup.credits_pieces else 1
+    several = layout.tokens > 1
+    each = agent.pairs_per_transition if several else 1
     rows = np.repeat(np.arange(batch.count), each)
     token = chosen_tokens(batch.action.astype(np.float64), layout.tokens)[rows]
     before = lying(batch.state, layout, rows, token)
     after = lying(batch.next_state, layout, rows, token)
-    if setup.credits_pieces:
+    if several:
         strategy = _strategies(agent, len(rows), generator)
         piece, covered = _played(batch, layout, rows, token, generator)
         _Relabelled(agent, layout, generator).replace(piece, covered, after, strategy)
-        reward, done = newly_covered(after, piece, covered, layout), np.ones(len(rows), np.uint8)
+        reward, done = np.zeros(len(rows)), np.ones(len(rows), np.uint8)
+        if setup.credits_pieces:
+            reward = newly_covered(after, piece, covered, layout)
     else:
         piece, covered = lying(batch.goal, layout, rows, token), np.zeros(len(rows))
         # Most goals are where the token came to lie: else it would know them by its own turn.
@@ -224,6 +244,25 @@ def with_contacts(
         other_pose=before.pose,
         other_flipped=before.flipped,
         pushed=pushed_share(before, after, layout),
+    )
+
+
+def with_scenes(
+    pairs: PairBatch, batch: Transitions, layout: Layout, generator: np.random.Generator
+) -> SceneBatch:
+    """The same pairs, with the scenes of their batch as the actions left them."""
+    after, goal = batch.next_state.astype(np.float64), batch.goal.astype(np.float64)
+    goals = layout.poses(goal)
+    # As in `make_pairs`: a goal of hindsight has the token's own turn, and others look the same.
+    every = np.broadcast_to(np.arange(layout.tokens), goals.shape[:2])
+    goals[..., 2] += _alike(every, layout, generator)
+    return SceneBatch(
+        **vars(pairs),
+        poses=layout.poses(after),
+        flips=layout.flipped(after),
+        goals=goals,
+        goal_flips=layout.flipped(goal),
+        returned=batch.reward,
     )
 
 

@@ -21,7 +21,7 @@ from tangram_sim.targets import check_targets
 Settings = TypeVar("Settings")
 
 # Settings of the agent that have no effect but on pairs of several tokens.
-_SEVERAL_ONLY = ("order", "pairs_per_transition", "push_weight", "lookahead")
+_SEVERAL_ONLY = ("order", "credit", "pairs_per_transition", "push_weight", "lookahead")
 MAX_PLANNED = 8  # tokens: a look ahead finds the best order over all their subsets
 SECTIONS = ("tokens", "sim", "reward", "agent", "net")
 
@@ -62,15 +62,30 @@ class Setup:
                 f"agent.lookahead={agent.lookahead} plans for at most {MAX_PLANNED} tokens, got "
                 f"{self.layout.tokens}: set agent.lookahead=none, or take fewer tokens"
             )
+        if self.pairs and not one:
+            self._check_credit(f"{self.layout.tokens} tokens on pairs")
+
+    def _check_credit(self, several: str) -> None:
+        """Refuse what several tokens on pairs cannot use, or cannot learn."""
+        agent, whole = self.agent, "set agent.readout=token, which values the whole scene"
+        if agent.gamma > 0.0:
+            refuse_ignored(f"agent.gamma={told(agent.gamma)}", several, whole)
         if self.credits_pieces:
-            several = f"{self.layout.tokens} tokens on pairs"
-            whole = "set agent.readout=token, which values the whole scene"
+            learn = "set agent.credit=reward, which learns what the environment returns"
             for name, value in _changed(self.reward).items():
-                refuse_ignored(f"reward.{name}={told(value)}", several, whole)
-            if agent.gamma > 0.0:
-                refuse_ignored(f"agent.gamma={told(agent.gamma)}", several, whole)
+                refuse_ignored(f"reward.{name}={told(value)}", several, learn)
             if any(relabel.strategy == "future" for relabel in agent.hindsight):
                 refuse_ignored("agent.hindsight.strategy=future", several, "use final")
+        elif self.reward.name != "overlap":
+            raise ConfigError(
+                f"reward.name={self.reward.name} is no sum over tokens and pieces, as which "
+                f"agent.credit=reward learns it: {whole}"
+            )
+        elif self.contacts:
+            raise ConfigError(
+                "agent.credit=reward does not learn what sliding tokens push away: set "
+                "sim.motion=lift, or agent.credit=piece"
+            )
 
     def _refuse(self, names: Iterable[str], because: str, remedy: str) -> None:
         """Refuse settings of the agent that are not the default."""
@@ -101,7 +116,12 @@ class Setup:
 
         Else it learns the environment's reward.
         """
-        return self.pairs and self.layout.tokens > 1
+        return self.pairs and self.layout.tokens > 1 and self.agent.credit == "piece"
+
+    @property
+    def credits_scenes(self) -> bool:
+        """Whether the critic of pairs learns the reward of scenes, as a sum over all pairs."""
+        return self.pairs and self.layout.tokens > 1 and self.agent.credit == "reward"
 
     @property
     def bootstraps(self) -> bool:

@@ -8,9 +8,11 @@ import shutil
 import subprocess
 import sys
 import tarfile
+from contextlib import nullcontext
 from importlib.metadata import version
 from io import BytesIO
 from pathlib import Path
+from unittest import mock
 from zipfile import ZipFile
 
 import pytest
@@ -18,6 +20,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from tests.blocks import PAGES
+from tests.conftest import pytest_collection_modifyitems
 from tests.test_house import ROOT, locked, run, run_python
 
 pytestmark = pytest.mark.slow
@@ -51,16 +54,13 @@ def test_learning_needs_no_compiler() -> None:
 
 
 @pytest.mark.parametrize(
-    ("marks", "status"),
-    [("", 4), ("@pytest.mark.fast", 0), ("@pytest.mark.fast\n@pytest.mark.slow", 4)],
+    ("tiers", "has"), [([], "none"), (["fast"], None), (["fast", "slow"], "fast, slow")]
 )
-def test_each_test_carries_one_tier(tmp_path: Path, marks: str, status: int) -> None:
-    (tmp_path / "test_it.py").write_text(f"import pytest\n\n{marks}\ndef test_it(): pass\n")
-    options = ["-p", "tests.conftest", "-p", "no:cacheprovider", "-c", "pyproject.toml"]
-    result = run([sys.executable, "-m", "pytest", *options, f"--rootdir={tmp_path}", str(tmp_path)])
-    assert result.returncode == status, result.stdout + result.stderr
-    if status:
-        assert "test_it.py::test_it must carry exactly one of the markers" in result.stderr
+def test_each_test_carries_one_tier(tiers: list[str], has: str | None) -> None:
+    item = mock.Mock(nodeid="it", fixturenames=(), get_closest_marker=set(tiers).__contains__)
+    told = f"it must carry exactly one of the markers .*, has {has}$"
+    with nullcontext() if has is None else pytest.raises(pytest.UsageError, match=told):
+        pytest_collection_modifyitems([item])
 
 
 # What is installed

@@ -140,6 +140,7 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "agent.reapply": (SEVERAL, 0),
     "agent.refine_steps": (REFINED, 2),
     "agent.refine_rate": (REFINED, 0.02),
+    "agent.credit": (SEVERAL, "reward"),
     "agent.pairs_per_transition": (SEVERAL, 2),
     "agent.gamma": (PAPER, 0.5),
     "agent.push_weight": (SLIDE, 0.0),

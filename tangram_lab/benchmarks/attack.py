@@ -4,11 +4,13 @@ import json
 import os
 import resource
 import shutil
+import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any
@@ -34,10 +36,11 @@ from tangram_lab.benchmarks.target import (
     Seen,
     episodes_of,
     one_line,
+    started,
     training,
     tried,
 )
-from tangram_lab.benchmarks.trainings import LOOK_S, MIB, Watched, result_of, start_training
+from tangram_lab.benchmarks.trainings import LOOK_S, MIB, Watched, result_of
 from tangram_sim.errors import RunError, TangramError
 from tangram_sim.puzzles import parse_puzzles, parse_svg_puzzle
 
@@ -194,10 +197,15 @@ FILES: list[Attack] = [
 # All of them
 
 
+def ends_in_order() -> None:
+    """From now on SIGTERM ends what this process has started, as Ctrl-C does."""
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+
+
 @contextmanager
 def beside() -> Iterator[ProcessPoolExecutor]:
     """A process for what may be done meanwhile; it is gone after the block."""
-    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+    with ProcessPoolExecutor(1, get_context("spawn"), ends_in_order) as pool:
         try:
             yield pool
         finally:
@@ -205,17 +213,14 @@ def beside() -> Iterator[ProcessPoolExecutor]:
                 process.terminate()
 
 
-def end_after(updates: int, folder: Path, launcher: "subprocess.Popen[bytes]") -> None:
-    """End a training in order when it has done so many updates."""
+def wait_for_updates(most: int, folder: Path, launcher: "subprocess.Popen[bytes]") -> None:
+    """Wait until a training has done so many, or ended."""
     with zmq.Context() as context:
-        watched = Watched(folder, launcher, context)
-        while launcher.poll() is None:
-            with suppress(TangramError):
-                if watched.numbers()["updates"] >= updates:
-                    launcher.terminate()
-                    break
+        watched, updates = Watched(folder, launcher, context), 0.0
+        while updates < most and launcher.poll() is None:
             time.sleep(LOOK_S)
-    launcher.wait()
+            with suppress(TangramError):
+                updates = watched.numbers()["updates"]
 
 
 def run_attack(out: Path | None, folder: Path) -> int:
@@ -231,7 +236,7 @@ def run_attack(out: Path | None, folder: Path) -> int:
     begun = time.monotonic()
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     live, straight = folder / "live", folder / "straight"
-    with beside() as pool:
+    with beside() as pool, ExitStack() as others:
         resource.setrlimit(resource.RLIMIT_NOFILE, (min(OPEN_FILES, hard), hard))
         with training(live, "max_updates=0", *ON_A_PORT, *OURS, OFTEN) as target:
             resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
@@ -239,12 +244,12 @@ def run_attack(out: Path | None, folder: Path) -> int:
             target.goes_on(UPDATES, "updates")
             rows += tried(BESIEGED, target)
             meanwhile = pool.submit(harmed, folder)
-            undisturbed = start_training(straight, "max_updates=0", *OURS)
+            undisturbed = others.enter_context(started(straight, "max_updates=0", *OURS))
             rows += tried(LIVE, target)
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
         result = result_of(live)
         rows += meanwhile.result()
-        end_after(result["updates"], straight, undisturbed)
+        wait_for_updates(result["updates"], straight, undisturbed)
     other = result_of(straight)
     scores = {"attacked": result["mean_reward"], "undisturbed": other["mean_reward"]}
     no_worse = scores["attacked"] >= scores["undisturbed"] - NOISE

@@ -108,18 +108,25 @@ class Target(Watched):
 
 
 @contextmanager
-def training(folder: Path, *settings: str, name: str = "train") -> Iterator[Target]:
+def started(
+    folder: Path, *settings: str, name: str = "train"
+) -> Iterator["subprocess.Popen[bytes]"]:
     """A training until the end of the block, which ends it in order."""
     launcher = start_training(folder, *settings, name=name)
     try:
-        wait_for(folder / "connection.json", launcher)
-        with zmq.Context() as context:
-            context.set(zmq.MAX_SOCKETS, 4096)
-            yield Target(folder, launcher, context)
-            launcher.terminate()
-            launcher.wait(ENDS_S)
+        yield launcher
     finally:
-        launcher.kill()
+        launcher.terminate()
+        launcher.wait(ENDS_S)
+
+
+@contextmanager
+def training(folder: Path, *settings: str, name: str = "train") -> Iterator[Target]:
+    """The same, once it can be reached."""
+    with started(folder, *settings, name=name) as launcher, zmq.Context() as context:
+        wait_for(folder / "connection.json", launcher)
+        context.set(zmq.MAX_SOCKETS, 4096)
+        yield Target(folder, launcher, context)
 
 
 def episodes_of(setup: Setup, count: int) -> Episodes:

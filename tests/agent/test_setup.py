@@ -199,6 +199,7 @@ def test_stages_are_read_from_mappings() -> None:
 SEVERAL = {"shapes": ["square", "square"]}
 ONE = {"shapes": ["square"]}
 FUTURE = [{"strategy": "future"}]
+REWARD = {"credit": "reward"}
 
 
 @pytest.mark.parametrize(
@@ -206,8 +207,12 @@ FUTURE = [{"strategy": "future"}]
     [
         (SEVERAL, {"reward": {"name": "dense"}}, "reward.name=dense changes nothing with 2 tokens"),
         (SEVERAL, {"reward": {"source": "camera"}}, "reward.source=camera changes nothing"),
-        (SEVERAL, {"reward": {"name": "pose"}}, "set agent.readout=token, which values the whole"),
-        (SEVERAL, {"agent": {"gamma": 0.9}}, "agent.gamma=0.9 changes nothing with 2 tokens"),
+        (SEVERAL, {"reward": {"name": "pose"}}, "set agent.credit=reward, which learns what"),
+        (SEVERAL, {"agent": {"gamma": 0.9}}, "agent.gamma=0.9 .*readout=token, which values the"),
+        (SEVERAL, {"agent": REWARD, "reward": {"name": "pose"}}, "reward.name=pose is no sum over"),
+        (SEVERAL, {"agent": REWARD, "sim": {"motion": "slide"}}, "set sim.motion=lift, or agent"),
+        (SEVERAL, {"agent": REWARD | {"afterstate": False}}, "agent.credit=reward changes nothing"),
+        (ONE, {"agent": REWARD}, "agent.credit=reward changes nothing with one token"),
         (SEVERAL, {"agent": {"hindsight": FUTURE}}, "strategy=future changes nothing"),
         (SEVERAL, {"agent": {"push_weight": 0.5}}, "agent.push_weight=0.5 .* sim.motion=slide"),
         (SEVERAL, {"agent": {"readout": "token", "order": "size"}}, "agent.order=size changes"),
