@@ -26,11 +26,13 @@ from tangram_sim.layout import Layout
 
 _FEATURES = 26
 _SPREAD, _NOISE = 0.1, 0.02  # deviations of entries of K and of a way, at the start
-_LEAST = 1e-4  # deviation of a way
+_LEAST = 1e-4  # deviation of a way, and of an entry of K: another world may differ more
+_BOUNDS = -40.0, 40.0  # logarithms that are believed of weights which came from elsewhere
 _KEPT = 0.998  # of what was seen before, with each update
 _SEARCH_STEPS, _NEAR_ENOUGH = 30, 1e-5
 _SHORT = 0.01  # share of a half turn
 _SLOPES = 0.1, 10.0  # of what a command comes to, as the search takes them
+_NOISE_DEVIATIONS = 8.0  # of a corner's noise that are no motion
 _STILL = 1e-6  # an action that moves no more was refused or blocked
 
 
@@ -83,8 +85,10 @@ def motions_of(past: Past, now: Floats, layout: Layout, sim: SimConfig) -> Motio
         np.take_along_axis(part, token, axis=2)[:, :, 0] for part in (poses[:, :-1], poses[:, 1:])
     )
     way = velocities_of((after - before).reshape(-1, 3), sim).reshape(count, steps, 3)
-    moved = np.abs(way).max(axis=-1, initial=0.0) > _STILL
-    command = actions[:, -3:].reshape(count, steps, 3)
+    # Seen with noise, what was blocked or refused seems to have moved; a lone token never is.
+    still = _STILL + (_NOISE_DEVIATIONS * sim.corner_noise if layout.tokens > 1 else 0.0)
+    moved = np.abs(way).max(axis=-1, initial=0.0) > still
+    command = actions[:, -3:].reshape(count, steps, 3).clip(-1.0, 1.0)
     return Motions(*(torch.from_numpy(part.astype(np.float64)) for part in (command, way, moved)))
 
 
@@ -141,9 +145,19 @@ class MotionModel(nn.Module):
         self.log_noise = nn.Parameter(torch.full((3,), 2.0 * math.log(_NOISE)))
         self.requires_grad_(False)
 
+    @property
+    def variance(self) -> Tensor:
+        """(3, F) of entries of K between episodes."""
+        return self.log_variance.double().clamp(*_BOUNDS).exp()
+
+    @property
+    def noise(self) -> Tensor:
+        """(3,) variance of a way that nothing explains."""
+        return self.log_noise.double().clamp(*_BOUNDS).exp()
+
     def prior(self, count: int) -> Belief:
         """What is believed of so many worlds before anything is seen of them."""
-        mean, covariance = self.mean.double(), torch.diag_embed(self.log_variance.double().exp())
+        mean, covariance = self.mean.double(), torch.diag_embed(self.variance)
         return Belief(mean.expand(count, -1, -1), covariance.expand(count, -1, -1, -1))
 
     def belief(self, motions: Motions) -> Belief:
@@ -160,15 +174,15 @@ class MotionModel(nn.Module):
         moved = motions.moved[..., None]
         phi = features(motions.command) * moved
         off = _shortest(motions.way - phi @ self.mean.double().mT) * moved
-        along = phi[:, None] * self.log_variance.double().exp()[:, None]
-        noise = torch.diag_embed(self.log_noise.double().exp()[:, None].expand(3, phi.shape[1]))
+        along = phi[:, None] * self.variance[:, None]
+        noise = torch.diag_embed(self.noise[:, None].expand(3, phi.shape[1]))
         return _Seen(phi, off.mT, along, torch.linalg.inv(along @ phi[:, None].mT + noise))
 
     def predict(self, belief: Belief, command: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and deviation (B, 3) of what commands (B, 3) come to."""
         phi = features(command)
         spread = torch.einsum("bf,bdfg,bg->bd", phi, belief.covariance, phi)
-        deviation = (spread + self.log_noise.double().exp()).sqrt()
+        deviation = (spread + self.noise).sqrt()
         return torch.einsum("bdf,bf->bd", belief.mean, phi).float(), deviation.float()
 
     def ahead(
@@ -271,7 +285,8 @@ class Fit:
         moved = motions.moved[:, None]
         own = (seen.inverse.diagonal(dim1=2, dim2=3) * moved).sum(dim=(0, 2))
         model.log_noise.add_(0.5 * (_log(blame.square().sum(dim=(0, 2))) - _log(own)))
-        model.log_noise.clamp_(min=2.0 * math.log(_LEAST))
+        for learned in (model.log_noise, model.log_variance):
+            learned.clamp_(min=2.0 * math.log(_LEAST))
         last = (blame[..., -1] / seen.inverse[..., -1, -1]).square() * moved[..., -1]
         error = (last.sum() / (3.0 * moved[..., -1].sum()).clamp(min=1.0)).sqrt()
         return {

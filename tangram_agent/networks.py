@@ -7,6 +7,7 @@ that it came from. A critic values a view and a velocity (M, 3).
 """
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
@@ -180,16 +181,15 @@ class Critic(nn.Module):
             after: what it came to, where that is known better than by the exact motion.
             features: of the view, as for `Head`; an afterstate critic makes its own.
         """
-        if self.afterstate:
-            moved = self.graph.moved(view, velocity) if after is None else after
-            value = self._value(self.head(moved))
-        else:
+        if not self.afterstate:
             seen = self.graph.as_seen(view, velocity)
-            value = self._value(self.head(view, action=seen, features=features))
-        if self._of_the_rest and isinstance(view, Pairs):
-            # What is covered cannot be covered anew, which scenes of disjoint tokens do not teach.
-            value = value * (1.0 - view.covered)
-        return value
+            return self._value(self.head(view, action=seen, features=features))
+        moved = self.graph.moved(view, velocity) if after is None else after
+        if not self._of_the_rest or not isinstance(moved, Pairs):
+            return self._value(self.head(moved))
+        # What is covered cannot be covered anew, which scenes of disjoint tokens do not teach.
+        bare = replace(moved, covered=torch.zeros_like(moved.covered))
+        return self._value(self.head(bare)) * (1.0 - moved.covered)
 
     def _value(self, outputs: Tensor) -> Tensor:
         return outputs.squeeze(-1)

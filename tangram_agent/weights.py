@@ -10,13 +10,14 @@ from torch import nn
 from tangram_sim.errors import RunError
 
 Array = npt.NDArray[Any]
+MOST = 1e6  # of a parameter's magnitude; what is learned stays far below
 
 
 def load_arrays(module: nn.Module, arrays: dict[str, Array]) -> None:
     """Copy named arrays into a module's parameters.
 
     Raises:
-        RunError: names or shapes differ; says which first.
+        RunError: names or shapes differ, or numbers are none; says which first.
     """
     own = dict(module.named_parameters())
     if set(own) != set(arrays):
@@ -32,6 +33,11 @@ def load_arrays(module: nn.Module, arrays: dict[str, Array]) -> None:
                     f"weights of another layout: '{name}' is {arrays[name].shape}, "
                     f"this setup needs {tuple(parameter.shape)}: start with the run's own tokens, "
                     "agent and net"
+                )
+            if not np.abs(arrays[name]).max(initial=0.0) <= MOST:  # nor is a NaN
+                raise RunError(
+                    f"damaged weights: '{name}' must hold finite numbers up to {MOST:g}: take them "
+                    "from another checkpoint"
                 )
             parameter.copy_(torch.from_numpy(np.array(arrays[name])))
 

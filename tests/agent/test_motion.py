@@ -11,6 +11,7 @@ from tangram_agent.motion import Fit, MotionModel, Motions, features, motions_of
 from tangram_agent.policy import Policy
 from tangram_agent.replay import ReplayBuffer
 from tangram_agent.types import Past, Transitions
+from tangram_agent.weights import load_arrays, to_arrays
 from tangram_sim.errors import ConfigError, RunError
 from tests.agent.builders import PAIR, SQUARE, random_episodes, setup
 
@@ -251,3 +252,44 @@ def test_with_a_delay_it_plays_for_where_the_action_before_will_have_taken_the_t
     there = made.layout.corners(poses)
     late = policy.act(start, placed, goals, past=Past(start[:, None], first[:, None]))
     np.testing.assert_allclose(late, policy.act(there, placed, goals), atol=1e-5)
+
+
+def test_with_noise_what_was_blocked_has_not_moved() -> None:
+    """A lone token is never blocked: there the smallest way counts."""
+    for tokens, counts in ((PAIR, False), (SQUARE, True)):
+        made = setup(tokens, corner_noise=0.01)
+        rng = np.random.default_rng(0)
+        shape = 8, 1, made.layout.corner_count, 2
+        before = made.layout.corners(rng.uniform(-0.5, 0.5, (8, made.layout.tokens, 3)))[:, None]
+        noise = 0.01 * made.sim.arena * rng.standard_normal((2, *shape))
+        actions = rng.uniform(-1.2, 1.2, (8, 1, made.action_size)).astype(np.float32)
+        past = Past((before + noise[0]).astype(np.float32), actions)
+        seen_of = motions_of(past, (before + noise[1])[:, 0], made.layout, made.sim)
+        assert bool(seen_of.moved.any()) == counts
+        assert seen_of.command.abs().max() == 1.0  # as far as it is carried out
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 3e38, 1e7])
+def test_damaged_weights_are_refused(value: float) -> None:
+    model = MotionModel()
+    arrays = to_arrays(model)
+    arrays["mean"][0, 0] = value
+    with pytest.raises(RunError, match="damaged weights: 'mean' must hold finite numbers"):
+        load_arrays(model, arrays)
+
+
+def test_whatever_variances_are_told_commands_are_finite() -> None:
+    model, told = MotionModel(), commands(4)
+    for variance, noise in ((800.0, 0.02), (-1e5, -1e5), (1e5, 1e5)):
+        model.log_variance.fill_(variance)
+        model.log_noise.fill_(noise)
+        belief = model.belief(seen(told, told)).at(torch.zeros(4, dtype=torch.int64))
+        assert model.command(belief, told).isfinite().all()
+
+
+def test_what_a_world_never_varied_may_still_be_learned_in_another() -> None:
+    model = MotionModel()
+    fit, told = Fit(model), commands(64)
+    for _ in range(300):
+        fit.step(seen(told, told))
+    assert model.variance.min() >= 1e-4**2 * 0.99
