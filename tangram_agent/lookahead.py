@@ -221,6 +221,10 @@ class Lookahead:
                 tokens[b], wanted[b] = step.token, step.pose
         return tokens, wanted
 
+    def forget(self) -> None:
+        """Drop the plans: what guided them is another one now."""
+        self._plans.clear()
+
     def _steps(self, tables: Sequence[Table], actions: Ints) -> list[Step]:
         """The next action in every scene, each token having so many left, (B, K)."""
         kept, steps = dict[bytes, tuple[Step, ...]](), list[Step]()
@@ -298,7 +302,7 @@ class Lookahead:
         # A token that a turn maps onto itself may lie in several ways.
         turns = self._layout.symmetries[places.token]
         index = np.repeat(np.arange(len(turns)), turns)
-        number = np.concatenate([np.arange(count) for count in turns])
+        number = np.arange(len(index)) - (turns.cumsum() - turns)[index]
         pose = places.pose[index]
         pose[:, 2] += 2.0 * np.pi * number / turns[index]
         token, piece = places.token[index], places.piece[index]

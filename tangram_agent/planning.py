@@ -152,6 +152,11 @@ class Planner:
         sim, beam = replace(self._sim, pixels=0), self._agent.beam
         return Lookahead(self._layout, sim, self._guide, make_world(self._layout, sim), beam)
 
+    def forget(self) -> None:
+        """Drop what was planned with other weights."""
+        if "_lookahead" in vars(self):
+            self._lookahead.forget()
+
     def choose(
         self,
         corners: Floats,

@@ -50,6 +50,8 @@ class Policy:
         """
         load_arrays(self._network, weights.tensors)
         self.version = weights.version
+        if self._planner is not None:
+            self._planner.forget()
 
     def weights(self) -> Weights:
         """A copy of the weights that are loaded."""

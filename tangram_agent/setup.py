@@ -62,6 +62,11 @@ class Setup:
                 f"agent.lookahead={agent.lookahead} plans for at most {MAX_PLANNED} tokens, got "
                 f"{self.layout.tokens}: set agent.lookahead=none, or take fewer tokens"
             )
+        if agent.lookahead != "none" and self.sim.delay:
+            raise ConfigError(
+                f"agent.lookahead={agent.lookahead} plans for actions that do not come late: "
+                "set sim.delay=false, or agent.lookahead=none"
+            )
         if self.pairs and not one:
             self._check_credit(f"{self.layout.tokens} tokens on pairs")
 

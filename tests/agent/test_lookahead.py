@@ -201,3 +201,23 @@ def test_what_is_in_the_way_is_seen_by_its_depth() -> None:
     pushed = guide.pushed(table, np.array([1, 1]), start, end)
     assert pushed[0, 0] == 1.0  # through the middle of the square's place
     assert not pushed[1].any()
+
+
+def test_a_token_that_seems_to_lie_on_its_other_side_goes_nowhere() -> None:
+    """As noise on the corners may show it: no piece is its own then."""
+    made = setup({"shapes": ["square", "parallelogram"], "scale": 0.6}, {}, PERCEPTRON, **SLIDE)
+    layout, poses = made.layout, np.array([[(0.0, 0, 0), (0.7, 0, 0)]])
+    seen = layout.corners(poses + [0.0, 0.1, 0.0], np.array([[False, True]]))
+    none = Past(np.zeros((1, 0, 0, 2), np.float32), np.zeros((1, 0, 4), np.float32))
+    choose = sweeping_policy(layout, made.sim, 2)
+    action = choose(seen, np.array([[True, False]]), layout.corners(poses), [], none)
+    assert np.isfinite(action).all()
+
+
+def test_other_weights_begin_with_no_plans() -> None:
+    policy = Policy(two())
+    planner = policy._planner
+    assert planner is not None
+    planner._lookahead._plans[b"somewhere"] = ()
+    policy.load(policy.weights())
+    assert not planner._lookahead._plans

@@ -167,7 +167,10 @@ def test_sums_of_another_model_are_refused() -> None:
     whole = Fit(MotionModel())
     whole.step(seen(commands(3), commands(3)))
     for name in whole.slots:
-        wrong = whole.slots | {name: [one[1:] for one in whole.slots[name]]}
+        for made in (lambda one: one[1:], lambda one: one * float("nan")):
+            with pytest.raises(RunError, match="not those of this version"):
+                Fit(MotionModel()).load(whole.slots | {name: list(map(made, whole.slots[name]))})
+        wrong = whole.slots | {"squares": [-one for one in whole.slots["squares"]]}
         with pytest.raises(RunError, match="not those of this version: start a new run"):
             Fit(MotionModel()).load(wrong)
 

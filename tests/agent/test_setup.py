@@ -221,6 +221,11 @@ REWARD = {"credit": "reward"}
             {"agent": {"lookahead": "engine"}, "sim": {"motion": "slide"}},
             "lookahead=engine plans for at most 8 tokens, got 9: set agent.lookahead=none, or take",
         ),
+        (
+            SEVERAL,
+            {"agent": {"lookahead": "engine"}, "sim": {"motion": "slide", "delay": True}},
+            "lookahead=engine plans for actions that do not come late: set sim.delay=false",
+        ),
         (ONE, {"agent": {"order": "size"}}, "agent.order=size changes nothing with one token"),
         (ONE, {"agent": {"pairs_per_transition": 2}}, "changes nothing with one token"),
         (ONE, {"agent": {"readout": "token", "reapply": 0}}, "agent.reapply=0 changes nothing"),
