@@ -25,7 +25,11 @@ def preset(agent: str = "tangram", tokens: str = "square") -> Setup:
 
     def group(name: str, choice: str) -> dict[str, Any]:
         content = yaml.safe_load((folder / name / f"{choice}.yaml").read_text())
-        return {key: value for key, value in content.items() if key != "defaults"}
+        own = {key: value for key, value in content.items() if key != "defaults"}
+        bases = (base for base in content.get("defaults", []) if isinstance(base, str))
+        for base in bases:
+            own = own if base == "_self_" else group(name, base) | own
+        return own
 
     agent_file = yaml.safe_load((folder / "agent" / f"{agent}.yaml").read_text())
     (net,) = (

@@ -1,6 +1,7 @@
 """What the project is compared with must do the same work, or the comparison is worth nothing."""
 
 from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -39,6 +40,12 @@ def test_head_by_head_gives_the_same_messages(count: int) -> None:
     nodes, edges = torch.randn(3, count, 64), torch.rand(count, count) > 0.3
     edges.fill_diagonal_(fill_value=True)
     torch.testing.assert_close(apart(nodes, edges), joint(nodes, edges), atol=1e-5, rtol=1e-4)
+
+
+def test_a_preset_has_what_it_inherits() -> None:
+    mlp, paper = preset("mlp"), preset("paper")
+    assert mlp.agent == replace(paper.agent, name="mlp")
+    assert (mlp.net.kind, paper.net.kind) == ("mlp", "mha")
 
 
 def test_the_plain_learner_learns_from_the_same_targets_where_nothing_goes_on() -> None:
