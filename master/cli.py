@@ -79,11 +79,21 @@ def _master(settings: Plain) -> int:
 
 
 def _task(settings: Plain) -> "Setup":
-    """The task; its reward is written into the settings so that it holds for other processes."""
+    """The task; its reward is written into the settings so that it holds for other processes.
+
+    Raises:
+        ConfigError: it cannot be trained.
+    """
     from tangram_agent.setup import make_setup
+    from tangram_sim.errors import ConfigError
     from tangram_sim.rewards import check_reward, pinned
 
     setup = make_setup(settings)
+    if setup.agent.lookahead != "none":
+        raise ConfigError(
+            f"agent.lookahead={setup.agent.lookahead} is for play, an evaluator would be silent "
+            "for minutes: leave it out, and give it to tangram-eval or tangram-play"
+        )
     setup = replace(setup, reward=pinned(setup.reward))
     check_reward(setup.reward, setup.layout, setup.sim)
     settings["reward"] = asdict(setup.reward)

@@ -69,6 +69,10 @@ WRONG = [
     ("tangram-train sed=1", "unknown setting 'sed' (did you mean 'seed'?)"),
     ("tangram-train noise=1", "unknown setting 'noise' (did you mean 'agent.noise'?)"),
     ("tangram-train agent.gama=0", "unknown setting 'agent.gama' (did you mean 'agent.gamma'?)"),
+    (
+        "tangram-train tokens=tangram2 sim.motion=slide agent.lookahead=engine",
+        "agent.lookahead=engine is for play, an evaluator would be silent for minutes: leave it",
+    ),
     ("tangram-train +~zzz", "cannot read '+~zzz'"),
     ("tangram-train zzz=1", "unknown setting 'zzz' (--help and --cfg job list them)"),
     ("tangram-train --seed=1", "unknown option '--seed=1': settings carry no dashes, as in seed=1"),
