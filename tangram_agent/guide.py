@@ -30,9 +30,9 @@ class NetworkGuide:
         """The actor's poses for the pieces that its critic likes best, token by token."""
         token, piece = np.nonzero(left[:, None] & (covered < 1.0))
         pairs = self._pairs(table, token, table.poses[token], piece, covered[piece])
-        pose = self._proposed(pairs)
+        pose = self.proposed(pairs)
         for _ in range(self._reapply):
-            pose = self._proposed(pairs.at(pose))
+            pose = self.proposed(pairs.at(pose))
         way = self._graph.way(pairs, pose)
         value = self._networks.critic(pairs, way, pairs.at(pose)).numpy().astype(np.float64)
         ranks = np.array([(value[token == i] > v).sum() for i, v in zip(token, value, strict=True)])
@@ -50,11 +50,12 @@ class NetworkGuide:
         )
         none = np.zeros(len(piece))
         pairs = self._pairs(table, token[index], start[index], piece, none)
-        share = self._networks.critic.pushed(pairs, _tensor(end[index])).numpy()
+        share = self._networks.critic.pushed(pairs, as_tensor(end[index])).numpy()
         share = share.reshape(len(token), count).astype(np.float64)
         return np.where(share > _NOISE, np.minimum(share, 1.0), 0.0)
 
-    def _proposed(self, pairs: Pairs) -> Tensor:
+    def proposed(self, pairs: Pairs) -> Tensor:
+        """Poses (M, 3) that the actor gives to the tokens of pairs."""
         velocity, _ = self._networks.actor(pairs)
         return self._graph.moved(pairs, velocity).pose
 
@@ -62,15 +63,16 @@ class NetworkGuide:
         self, table: Table, token: Ints, pose: Floats, piece: Ints, covered: Floats
     ) -> Pairs:
         return Pairs(
-            pose=_tensor(pose),
-            flipped=_tensor(table.flipped[token]),
+            pose=as_tensor(pose),
+            flipped=as_tensor(table.flipped[token]),
             token=torch.from_numpy(token),
-            goal=_tensor(table.goal[piece]),
-            goal_flipped=_tensor(table.goal_flipped[piece]),
+            goal=as_tensor(table.goal[piece]),
+            goal_flipped=as_tensor(table.goal_flipped[piece]),
             piece=torch.from_numpy(piece),
-            covered=_tensor(covered),
+            covered=as_tensor(covered),
         )
 
 
-def _tensor(array: Floats | Bools) -> Tensor:
+def as_tensor(array: Floats | Bools) -> Tensor:
+    """A copy in single precision."""
     return torch.from_numpy(np.array(array, np.float32))

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from tangram_agent.adam import Adam
 from tangram_agent.coverage import covered_share, covering, worths
-from tangram_agent.guide import NetworkGuide
+from tangram_agent.guide import NetworkGuide, as_tensor
 from tangram_agent.lookahead import Lookahead
 from tangram_agent.motion import Belief, motions_of
 from tangram_agent.networks import Critic, Networks
@@ -201,7 +201,7 @@ class Planner:
         token, pose = self._lookahead.choose(corners, placed, goals, past)
         here = self._layout.poses(corners)[np.arange(len(token)), token]
         with torch.no_grad():
-            way = _tensor(velocities_of(pose - here, self._sim))
+            way = as_tensor(velocities_of(pose - here, self._sim))
             velocity = self._command(way, self._belief(corners, past)).numpy()
         return Choice(token, np.zeros(len(token), dtype=np.bool_), pose, velocity)
 
@@ -241,12 +241,12 @@ class Planner:
         layout = self._layout
         covered = covering(corners, goals, layout)
         return Scene(
-            pose=_tensor(start),
-            flipped=_tensor(layout.flipped(corners)),
-            goal=_tensor(layout.poses(goals)),
-            goal_flipped=_tensor(layout.flipped(goals)),
-            covered=_tensor(covered_share(covered, layout)),
-            worth=_tensor(worths(covered, layout)),
+            pose=as_tensor(start),
+            flipped=as_tensor(layout.flipped(corners)),
+            goal=as_tensor(layout.poses(goals)),
+            goal_flipped=as_tensor(layout.flipped(goals)),
+            covered=as_tensor(covered_share(covered, layout)),
+            worth=as_tensor(worths(covered, layout)),
         )
 
     def _open(self, placed: Bools, goals: Floats) -> Bools:
@@ -269,18 +269,13 @@ class Planner:
         row, token, flip, piece = map(torch.from_numpy, np.nonzero(every))
         candidates = Candidates(row, token, flip.float(), piece)
         pairs = scene.pairs(candidates)
-        pose = self._proposed(pairs)
+        pose = self._guide.proposed(pairs)
         best = candidates.best(self._valued(pairs, pose), _SHORT_LIST)
         candidates, pose = candidates.at(best), pose[best]
         pairs = scene.pairs(candidates)
         for _ in range(self._agent.reapply):
-            pose = self._proposed(pairs.at(pose))
+            pose = self._guide.proposed(pairs.at(pose))
         return candidates, pose
-
-    def _proposed(self, pairs: Pairs) -> Tensor:
-        """Poses (M, 3) that the actor gives to the tokens of pairs."""
-        velocity, _ = self._networks.actor(pairs)
-        return self._graph.moved(pairs, velocity).pose
 
     def _valued(self, pairs: Pairs, pose: Tensor) -> Tensor:
         """Values (M,) of moving the tokens of pairs to poses (M, 3)."""
@@ -394,7 +389,3 @@ def _ranks(order: str, layout: Layout, goals: Floats) -> Floats:
         seeds = [zlib.crc32(np.asarray(goal, np.float32).tobytes()) for goal in goals]
         return np.stack([np.random.default_rng(seed).permutation(count) for seed in seeds])
     return np.broadcast_to(np.arange(count), (len(goals), count))
-
-
-def _tensor(array: Floats | Bools) -> Tensor:
-    return torch.from_numpy(np.array(array, np.float32))

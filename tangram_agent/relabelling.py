@@ -130,7 +130,8 @@ class PairBatch:
         piece: (M,) its index.
         covered: (M,) share of the piece that was covered before the action.
         reward: (M,) what the action is worth: with several tokens what the token covers newly of
-            the piece, over the larger of both areas, with one the environment's reward.
+            the piece, over the larger of both areas, or 0 where whole scenes teach that; with one
+            the environment's reward.
         done: (M,) 1 where nothing follows.
     """
 
