@@ -58,6 +58,11 @@ class Child:
         """Whether a process runs here."""
         return self._process is not None and self._process.poll() is None
 
+    @property
+    def kept(self) -> bool:
+        """Whether a process is here, if only its end that nobody cleared, or is planned."""
+        return self._process is not None or self.next_start_s is not None
+
     def start(self, ended: Callable[["Child"], None]) -> None:
         """Start a process; `ended` is called with this, in another thread, when it ends."""
         self.next_start_s, self._started_s, self._frozen_s = None, time.monotonic(), 0.0

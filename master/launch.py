@@ -224,7 +224,7 @@ class Launcher:
             )
         else:
             self._say(f"{child.name} ended with {describe(status)}: given up\n{child.tail()}")
-            if not any(c.alive or c.next_start_s is not None for c in self._players):
+            if not any(player.kept for player in self._players):
                 self._failed = True
                 self._stop("no worker is left: the run ends")
 

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from queue import SimpleQueue
 
 import pytest
 
@@ -287,6 +288,21 @@ def test_a_worker_that_leaves_after_the_master_is_no_failure(tmp_path: Path) -> 
     made._reached = True
     made._worker_ended(made._players[0])
     assert made._players[0].restarts == 0
+
+
+@pytest.mark.cluster
+def test_a_worker_whose_end_was_not_heard_of_yet_is_not_given_up(tmp_path: Path) -> None:
+    """Two that end at one time are told of one after the other."""
+    first, second = "raise SystemExit(1)", "raise SystemExit(2)"
+    made = launcher(tmp_path, players=[first, second])
+    ends: SimpleQueue[Child] = SimpleQueue()
+    for player in made._players:
+        player.start(ends.put)
+    assert {ends.get(timeout=LIMIT_S), ends.get(timeout=LIMIT_S)} == set(made._players)
+    made._worker_ended(made._players[1])
+    assert not made._failed
+    made._worker_ended(made._players[0])
+    assert made._players[0].restarts == 1
 
 
 @pytest.mark.cluster
