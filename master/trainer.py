@@ -88,9 +88,11 @@ class Trainer:
         # What is credited piece by piece is relabelled anew for every update.
         relabels = () if self.setup.credits_pieces else self.setup.agent.hindsight
         generator = self._generators["hindsight"]
-        self.replay.add(
-            with_relabelled(episodes, relabels, self.setup.layout, self.reward, generator)
-        )
+        seen = episodes.seen_whole()
+        if seen.count:
+            self.replay.add(
+                with_relabelled(seen, relabels, self.setup.layout, self.reward, generator)
+            )
         self.rate_limiter.inserted(episodes.transitions)
         self.episodes += episodes.count
 

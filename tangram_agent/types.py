@@ -25,6 +25,9 @@ class Episodes:
         actions: (E, T, A) float32 in [-1, 1].
         rewards: (E, T) float32 of the goal that was played.
         goals: (E, V, 2) float32, target corners.
+        missing: (E, T + 1, K) uint8, 1 where a token was not found in a picture; None where
+            pictures are not what is observed.
+        goals_missing: (E, K) uint8, the same of the target's pieces.
     """
 
     corners: Singles
@@ -32,6 +35,21 @@ class Episodes:
     actions: Singles
     rewards: Singles
     goals: Singles
+    missing: Flags | None = None
+    goals_missing: Flags | None = None
+
+    def seen_whole(self) -> "Episodes":
+        """Those in which nothing was missing."""
+        if self.missing is None or self.goals_missing is None:
+            return self
+        whole = ~(self.missing.any(axis=(1, 2)) | self.goals_missing.any(axis=1))
+        return Episodes(
+            corners=self.corners[whole],
+            placed=self.placed[whole],
+            actions=self.actions[whole],
+            rewards=self.rewards[whole],
+            goals=self.goals[whole],
+        )
 
     @property
     def count(self) -> int:

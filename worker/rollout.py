@@ -69,6 +69,12 @@ class Played:
             rewards=np.empty((count, steps), np.float32),
             goals=np.empty((count, corners, 2), np.float32),
         )
+        if env.sight is not None:
+            seen = replace(
+                seen,
+                missing=np.empty((count, steps + 1, tokens), np.uint8),
+                goals_missing=np.empty((count, tokens), np.uint8),
+            )
         return Played(
             episodes=seen,
             corners=np.empty((count, steps + 1, corners, 2)),
@@ -96,7 +102,10 @@ def parts(episodes: Episodes, size: int) -> Iterator[Episodes]:
 
 def _rows(episodes: Episodes, first: int, end: int) -> Episodes:
     columns: dict[str, Any] = vars(episodes)
-    return Episodes(**{name: column[first:end] for name, column in columns.items()})
+    rows: dict[str, Any] = {
+        name: None if column is None else column[first:end] for name, column in columns.items()
+    }
+    return Episodes(**rows)
 
 
 def play(
@@ -143,13 +152,15 @@ def _play_group(
     rows, seen = slice(first, first + env.count), played.episodes
     env.reset(generators, targets)
     seen.goals[rows], played.goals[rows] = env.seen_goals, env.goals
+    if env.sight is not None and seen.goals_missing is not None:
+        seen.goals_missing[rows] = env.sight.goals_missing
     began = time.perf_counter()
     for t in range(env.horizon):
         if not go_on():
             return False
         _look(env, played, rows, t)
         past = Past(seen.corners[rows, :t], seen.actions[rows, :t])
-        actions = choose(env.seen, env.placed, env.seen_goals, generators, past)
+        actions = choose(env.seen, env.closed, env.seen_goals, generators, past)
         result = env.step(actions.astype(np.float64))
         seen.actions[rows, t], seen.rewards[rows, t] = actions, result.rewards
         played.refused[rows, t], played.blocked[rows, t] = result.refused, result.blocked
@@ -164,6 +175,8 @@ def _play_group(
 def _look(env: BatchedEnv, played: Played, rows: slice, t: int) -> None:
     played.corners[rows, t], played.episodes.corners[rows, t] = env.corners, env.seen
     played.episodes.placed[rows, t] = env.placed
+    if env.sight is not None and played.episodes.missing is not None:
+        played.episodes.missing[rows, t] = env.sight.missing
 
 
 class Rollout:

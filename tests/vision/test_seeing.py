@@ -34,7 +34,7 @@ def errors(layout: Layout, poses: Floats, flipped: Any, seen: Seen) -> Floats:
     for name in set(names):
         own = [k for k in range(layout.tokens) if names[k] == name]
         tries = [
-            [_error(layout, poses, flipped, seen, *pair) for pair in zip(own, order)]
+            [_error(layout, poses, flipped, seen, *pair) for pair in zip(own, order, strict=True)]
             for order in permutations(own)
         ]
         best[name] = min(tries, key=lambda one: sum(distance for distance, _ in one))
@@ -115,7 +115,7 @@ def test_tokens_that_touch_are_seen(names: tuple[str, ...]) -> None:
 
 
 def test_what_has_two_explanations_is_doubtful() -> None:
-    """Two small triangles that make a square: along which of its diagonals they meet, none tells."""
+    """Two small triangles make a square: along which diagonal they meet, no picture tells."""
     layout = layout_of("small_triangle", "small_triangle", scale=0.6)
     other = layout_of("square", scale=0.6)
     picture = grey(other.corners(np.array([[0.1, 0.2, 0.5]])), other, 128)
