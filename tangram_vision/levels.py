@@ -18,24 +18,28 @@ _CLEAR = cv2.getStructuringElement(cv2.MORPH_RECT, (7, 7))
 
 def coverage(picture: Pixels) -> Singles | None:
     """(P, P) of a picture (P, P); None if nothing is to be seen on it."""
-    low, high = (float(level) for level in cv2.minMaxLoc(picture)[:2])
+    low, high = (float(level) for level in cv2.minMaxLoc(cv2.blur(picture, (3, 3)))[:2])
     if high - low < MIN_CONTRAST:
         return None
-    _, dark_or_not = cv2.threshold(picture, 0, 255, cv2.THRESH_BINARY_INV | cv2.THRESH_OTSU)
-    mask = np.asarray(dark_or_not, np.uint8)
-    mean = float(cv2.mean(picture, mask)[0])
-    if cv2.mean(picture, cv2.bitwise_not(mask))[0] - mean < MIN_CONTRAST:
+    middle = (low + high) / 2.0
+    border = np.concatenate([picture[0], picture[-1], picture[:, 0], picture[:, -1]])
+    if np.count_nonzero(border < middle) > border.size / 2:  # a dark ground
+        picture, middle = 255 - picture, 255.0 - middle
+    shade, inside = _lit(picture, picture < middle)
+    if 1.0 - shade[inside].mean() < MIN_CONTRAST / 255.0:
         return None
-    border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
-    if np.count_nonzero(border) > border.size / 2:  # a dark ground
-        picture, mask = 255 - picture, 255 - mask
-    ground = cv2.dilate(mask, _CLEAR) == 0
-    light = _light(picture, ground)
-    shade = picture.astype(np.float32) / light
-    inside = cv2.erode(mask, _CLEAR) > 0
-    dark = float(np.median(shade[inside if inside.any() else mask > 0]))
-    covered: Singles = (1.0 - shade) / np.float32(1.0 - dark)
+    # What is a token's is known better once light is even.
+    shade, inside = _lit(picture, shade < (1.0 + np.median(shade[inside])) / 2.0)
+    covered: Singles = (1.0 - shade) / np.float32(1.0 - np.median(shade[inside]))
     return covered
+
+
+def _lit(picture: Pixels, tokens: Bools) -> tuple[Singles, Bools]:
+    """(P, P) levels over those of lit ground, and where surely tokens are (P, P)."""
+    mask = tokens.astype(np.uint8)
+    shade: Singles = picture.astype(np.float32) / _light(picture, cv2.dilate(mask, _CLEAR) == 0)
+    inside = cv2.erode(mask, _CLEAR) > 0
+    return shade, inside if inside.any() else tokens
 
 
 def _light(picture: Pixels, ground: Bools) -> Singles | np.float32:
@@ -51,4 +55,4 @@ def _light(picture: Pixels, ground: Bools) -> Singles | np.float32:
     plane = np.linalg.solve(design.T @ design, design.T @ levels)
     side = np.arange(len(picture), dtype=np.float32)
     lit: Singles = (plane[0] + plane[1] * side + plane[2] * side[:, None]).astype(np.float32)
-    return lit
+    return np.maximum(lit, 1.0)
