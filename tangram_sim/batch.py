@@ -131,6 +131,8 @@ class BatchedEnv:
         observed = eye if sim.observe == "pictures" else None
         self.sight = None if observed is None else Sight(layout, observed, count)
         self._targets: TargetPictures | None = None
+        self._late = np.zeros(count, np.int64), np.zeros(count)  # what was told a step before
+        self._pictures: Pixels = np.zeros((count, 0, 0), np.uint8)  # after the last step
         self._moves: Ints = np.zeros((count, layout.tokens), dtype=np.int64)
         self.steps_done = self.horizon  # no episode yet
         self.corners: Floats = np.zeros((count, layout.corner_count, 2))
@@ -174,6 +176,7 @@ class BatchedEnv:
         starts = sample_starts(self.layout, self.sim, targets, done, generators)
         self._moves[:] = self.sim.actions_per_token * done
         self._generators = generators
+        self._late = np.zeros(self.count, np.int64), np.zeros(self.count)
         self._begin(targets, starts)
         if self.sight is None:
             self.seen_goals = see(self.goals, self.sim, generators)
@@ -215,7 +218,12 @@ class BatchedEnv:
         command = self.actuation.carry_out(Command(tokens, velocity, flip, refused))
         covered = self._covered(command)
         blocked = (covered > self.sim.max_overlap) & ~command.idle
-        camera = self._move(command, command.idle | blocked, named)
+        camera = self._move(command, command.idle | blocked)
+        if self.sight is not None:
+            told = named, np.where(refused, 0.0, velocity[:, 2])
+            self.sight.follow(self._pictures, *(self._late if self.sim.delay else told))
+            self._late = told
+        self._look()
         self.steps_done += 1
         share = overlap_share(self.corners, self.goals, self.layout)
         return StepResult(
@@ -275,18 +283,18 @@ class BatchedEnv:
         """(P, P) of an environment, as the camera has it now."""
         return self._lens.taken(b, self._worlds[b].picture(), self._generators[b])
 
-    def _move(self, command: Command, idle: Bools, named: Ints) -> Floats | None:
-        """Move in every world and look at it; (B,) Eq. 14 of the pictures with the camera on."""
+    def _move(self, command: Command, idle: Bools) -> Floats | None:
+        """Move in every world; (B,) Eq. 14 of the pictures with the camera on."""
         pictures = []
         for b, world in enumerate(self._worlds):
             if not idle[b]:
                 world.move(int(command.tokens[b]), command.velocity[b], bool(command.flip[b]))
             if self.sim.pixels:
                 pictures.append(self._picture(b))
-        if self.sight is not None:
-            self.sight.follow(np.stack(pictures), named.tolist())
-        self._look()
-        return None if self._targets is None else self._targets.rewards(np.stack(pictures))
+        if self._targets is None:
+            return None
+        self._pictures = np.stack(pictures)
+        return self._targets.rewards(self._pictures)
 
     def _rewards(self, share: Floats, camera: Floats | None) -> Floats:
         """(B,) of the configured reward, with the raw overlap and Eq. 14 of the pictures."""

@@ -1,7 +1,9 @@
 """What an agent sees where pictures are its only source: tokens as they were found, and which not.
 
 What is found has no name: of tokens that look alike, each is taken for the one that lay nearest
-when the agent looked last. So an agent's tokens need not be the world's, see `Sight.hands`.
+when the agent looked last. So an agent's tokens need not be the world's, see `Sight.hands`. Nor is
+it seen how far a token turned that looks alike after a part of a turn: it is taken to have turned
+about as it was told.
 
 Legend: B environments, K tokens, V corners, P pixels along a side of a picture.
 """
@@ -15,18 +17,22 @@ import numpy as np
 from tangram_sim.arrays import Bools, Floats, Ints, Pixels
 from tangram_sim.layout import Layout
 
+_STILL = 0.03  # radians, and share of a token's radius, up to which nothing moved
+
 
 @dataclass(frozen=True, eq=False)
 class Look:
     """What one picture shows.
 
     Attributes:
-        corners: (V, 2) of the tokens, alike ones in any order.
-        known: (K,) those that lie somewhere as far as is known; the corners of others say nothing.
+        poses: (K, 3) x, y and angle of the tokens, alike ones in any order.
+        flipped: (K,) which lie on their other side.
+        known: (K,) those that lie somewhere as far as is known; the poses of others say nothing.
         sure: (K,) those that surely lie there.
     """
 
-    corners: Floats
+    poses: Floats
+    flipped: Bools
     known: Bools
     sure: Bools
 
@@ -55,32 +61,38 @@ class Sight:
             np.array([token for token, own in enumerate(names) if own == name])
             for name in dict.fromkeys(names)
         ]
-        middle = layout.corners(np.zeros((layout.tokens, 3)))
-        self.corners: Floats = np.repeat(middle[None], count, axis=0)
+        self._poses: Floats = np.zeros((count, layout.tokens, 3))
+        self._flipped: Bools = np.zeros((count, layout.tokens), np.bool_)
         self.missing: Bools = np.ones((count, layout.tokens), np.bool_)
-        self.goals: Floats = self.corners.copy()
-        self.goals_missing: Bools = self.missing.copy()
-        self._middle = middle
+        self.corners: Floats = layout.corners(self._poses)
+        self.goals, self.goals_missing = self.corners, self.missing
 
     def begin(self, targets: Pixels, states: Pixels) -> None:
         """Look at pictures (B, P, P) of targets and starts."""
-        # What the world holds is a copy of this: a row is never changed in place.
-        self.corners, self.missing = self.corners.copy(), self.missing.copy()
-        self.goals, self.goals_missing = self.corners.copy(), self.missing.copy()
-        for b, (target, state) in enumerate(zip(targets, states, strict=True)):
-            self.corners[b], self.missing[b] = self._middle, True
-            self._take(b, self._eye(state), moved=None)
-            wanted = self._eye(target)
-            gone = ~(wanted.known & wanted.sure)
-            corner_gone = gone[self._layout.token_of_corner]
-            self.goals[b] = np.where(corner_gone[:, None], self.corners[b], wanted.corners)
-            self.goals_missing[b] = gone
+        self._poses[:], self._flipped[:], self.missing = 0.0, False, np.ones_like(self.missing)
+        count = len(self._poses)
+        self.follow(states, np.zeros(count, np.int64), np.zeros(count))
+        poses, flipped, gone = self._poses.copy(), self._flipped.copy(), np.ones_like(self.missing)
+        for b, target in enumerate(targets):
+            look = self._eye(target)
+            found = look.known & look.sure
+            poses[b, found], flipped[b, found] = look.poses[found], look.flipped[found]
+            gone[b] = ~found
+        self.goals, self.goals_missing = self._layout.corners(poses, flipped), gone
 
-    def follow(self, states: Pixels, moved: Sequence[int]) -> None:
-        """Look at pictures (B, P, P) after tokens (B,) have moved, as the agent names them."""
-        self.corners, self.missing = self.corners.copy(), self.missing.copy()
-        for b, (state, token) in enumerate(zip(states, moved, strict=True)):
-            self._take(b, self._eye(state), token)
+    def follow(self, states: Pixels, moved: Ints, turns: Floats) -> None:
+        """Look at pictures (B, P, P) after tokens have moved.
+
+        Args:
+            states: the pictures.
+            moved: (B,) tokens, as the agent names them.
+            turns: (B,) by which they were told to turn, radians.
+        """
+        # What was given away before stays as it is.
+        self.missing = self.missing.copy()
+        for b, (state, token) in enumerate(zip(states, moved.tolist(), strict=True)):
+            self._take(b, self._eye(state), token, float(turns[b]))
+        self.corners = self._layout.corners(self._poses, self._flipped)
 
     def hands(self, tokens: Ints, corners: Floats) -> Ints:
         """(B,) which tokens of the world lie where the agent sees tokens (B,): those it would grab.
@@ -89,33 +101,41 @@ class Sight:
             tokens: as the agent names them.
             corners: (B, V, 2) as they are.
         """
-        found = tokens.copy()
-        seen, true = self._layout.bases(self.corners), self._layout.bases(corners)
+        found, true = tokens.copy(), self._layout.bases(corners)
         for b, token in enumerate(tokens.tolist()):
             alike = next(own for own in self._alike if token in own)
             if len(alike) > 1:
-                here, there = seen[b, alike], true[b, alike]
-                first = [i for i, missing in enumerate(self.missing[b, alike]) if not missing]
-                of = _nearest(here, there, first)
+                sure = np.flatnonzero(~self.missing[b, alike]).tolist()
+                of = _nearest(self._poses[b, alike, :2], true[b, alike], sure)
                 found[b] = alike[of[int(np.flatnonzero(alike == token)[0])]]
         return found
 
-    def _take(self, b: int, look: Look, moved: int | None) -> None:
-        """Take over what was seen of an environment."""
-        layout = self._layout
-        before, now = layout.bases(self.corners[b]), layout.bases(look.corners)
-        corners, missing = self.corners[b].copy(), np.ones(layout.tokens, np.bool_)
+    def _take(self, b: int, look: Look, moved: int, turn: float) -> None:
+        """Take over what was seen of an environment, after a token was told to turn."""
+        missing = np.ones_like(self.missing[b])
         for alike in self._alike:
             shown = alike[look.known[alike]]
             # Those that did not move say which one did.
             still = [i for i, one in enumerate(alike) if one != moved and not self.missing[b, one]]
-            of = _nearest(before[alike], now[shown], still)
+            of = _nearest(self._poses[b, alike, :2], look.poses[shown, :2], still)
             for i, token in enumerate(alike.tolist()):
                 if of[i] < len(shown):
                     one = int(shown[of[i]])
-                    corners[layout.corners_of(token)] = look.corners[layout.corners_of(one)]
+                    told = turn if token == moved else 0.0
+                    self._poses[b, token] = self._near(b, token, look.poses[one], told)
+                    self._flipped[b, token] = look.flipped[one]
                     missing[token] = not look.sure[one]
-        self.corners[b], self.missing[b] = corners, missing
+        self.missing[b] = missing
+
+    def _near(self, b: int, token: int, pose: Floats, told: float) -> Floats:
+        """A pose (3,) of a token at that of the turns that look alike which it made."""
+        before, step = self._poses[b, token], 2.0 * np.pi / self._layout.symmetries[token]
+        way = pose - before
+        stayed = way[2] - step * np.round(way[2] / step)
+        # What looks as before did not move, whatever it was told.
+        if np.hypot(*way[:2]) > _STILL * self._layout.radii[token] or abs(stayed) > _STILL:
+            stayed = way[2] - step * np.round((way[2] - told) / step)
+        return np.array([*pose[:2], before[2] + stayed])
 
 
 def _nearest(places: Floats, others: Floats, first: Sequence[int]) -> list[int]:

@@ -34,7 +34,6 @@ def make_eye(setup: Setup) -> Eye | None:
 
     def look(picture: Pixels) -> Look:
         seen = see(picture, layout, arena)
-        corners = layout.corners(seen.poses, seen.flipped)
-        return Look(corners, np.asarray(seen.confidence > 0.0), seen.found)
+        return Look(seen.poses, seen.flipped, np.asarray(seen.confidence > 0.0), seen.found)
 
     return look
