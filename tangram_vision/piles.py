@@ -8,6 +8,7 @@ are fitted to all pixels, and what pixels still differ judges.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import cv2
 import numpy as np
@@ -114,7 +115,8 @@ class _Search:
         for kind, pose in single:
             now = _without(left, self._kinds[kind].shape)
             yield from self._rest(others, now, (*laid, kind), np.vstack([poses, pose]))
-        if not single and len(laid) + len(blobs) < MOST and self._sums(area, left):
+        most = MOST - len(laid) - len(blobs) + 1
+        if not single and most > 1 and self._sums(area, left, most):
             for kind, pose in self._corners(part, area, left, len(laid)):
                 here = ramps([self._kinds[kind]], pose[None], rest.shape[0])[0]
                 now = _without(left, self._kinds[kind].shape)
@@ -137,15 +139,16 @@ class _Search:
     def _is_area(self, area: float, kind: int, times: float = 1.0) -> bool:
         return abs(area - self._kinds[kind].area) < times * _AREA * self._kinds[kind].perimeter
 
-    def _sums(self, area: float, left: tuple[int, ...]) -> bool:
-        """Whether an area may be that of two tokens that are left, or more."""
+    def _sums(self, area: float, left: tuple[int, ...], most: int) -> bool:
+        """Whether an area may be that of two tokens that are left, or of a few more."""
         areas = {kind.shape: kind.area for kind in self._kinds}
-        sizes = [areas[shape] for shape, count in enumerate(left) for _ in range(count)]
-        sums = {0.0}
-        for size in sizes:
-            sums |= {one + size for one in sums}
+        sizes = [areas[shape] for shape, count in enumerate(left) for _ in range(min(count, most))]
         slack = 3.0 * _AREA * max(kind.perimeter for kind in self._kinds)
-        return any(abs(one - area) < slack for one in sums)
+        return any(
+            abs(sum(some) - area) < slack
+            for count in range(2, most + 1)
+            for some in combinations(sizes, count)
+        )
 
     def _corners(
         self, part: Singles, area: float, left: tuple[int, ...], depth: int
