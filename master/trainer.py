@@ -93,7 +93,8 @@ class Trainer:
             self.replay.add(
                 with_relabelled(seen, relabels, self.setup.layout, self.reward, generator)
             )
-        self.rate_limiter.inserted(episodes.transitions)
+        # The pace is that of what can be learned from.
+        self.rate_limiter.inserted(seen.transitions)
         self.episodes += episodes.count
 
     def update(self, share: float) -> dict[str, float]:

@@ -20,6 +20,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from tangram_agent.setup import Setup
+from tangram_agent.types import AWAY
 from tangram_sim.arrays import Singles
 from tangram_sim.errors import ConfigError, WireError
 from tangram_sim.settings import check_range
@@ -187,7 +188,7 @@ def _columns(spec: EpisodeSpec, count: int) -> tuple[Column, ...]:
     e, t, v, k = count, spec.horizon, spec.corners, spec.tokens
     reach, one = spec.bound * (1 + ROUNDING), 1 + ROUNDING
     missing = (
-        Column("missing", "u1", (e, t + 1, k), 0, 1),
+        Column("missing", "u1", (e, t + 1, k), 0, AWAY),
         Column("goals_missing", "u1", (e, k), 0, 1),
     )
     return (

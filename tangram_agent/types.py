@@ -13,6 +13,7 @@ import numpy.typing as npt
 from tangram_sim.arrays import Singles
 
 Flags = npt.NDArray[np.uint8]
+AWAY = 2  # of `Episodes.missing`
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,8 +26,8 @@ class Episodes:
         actions: (E, T, A) float32 in [-1, 1].
         rewards: (E, T) float32 of the goal that was played.
         goals: (E, V, 2) float32, target corners.
-        missing: (E, T + 1, K) uint8, 1 where a token was not found in a picture; None where
-            pictures are not what is observed.
+        missing: (E, T + 1, K) uint8, 1 where a token was not found in a picture, `AWAY` where it
+            should have left that; None where pictures are not what is observed.
         goals_missing: (E, K) uint8, the same of the target's pieces.
     """
 
@@ -39,10 +40,16 @@ class Episodes:
     goals_missing: Flags | None = None
 
     def seen_whole(self) -> "Episodes":
-        """Those in which nothing was missing."""
+        """Those in which nothing was missing; of several tokens some may have left the picture.
+
+        Where those lie is only known by what they were told, but to lose an episode of many actions
+        for one that left is worse.
+        """
         if self.missing is None or self.goals_missing is None:
             return self
-        whole = ~(self.missing.any(axis=(1, 2)) | self.goals_missing.any(axis=1))
+        several = self.missing.shape[2] > 1
+        gone = (self.missing > 0) & ((self.missing != AWAY) | (not several))
+        whole = ~(gone.any(axis=(1, 2)) | self.goals_missing.any(axis=1))
         return Episodes(
             corners=self.corners[whole],
             placed=self.placed[whole],

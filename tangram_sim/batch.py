@@ -129,9 +129,9 @@ class BatchedEnv:
         self.actuation = Actuation(sim, count)
         self._lens = Lens(sim)
         observed = eye if sim.observe == "pictures" else None
-        self.sight = None if observed is None else Sight(layout, observed, count)
+        self.sight = None if observed is None else Sight(layout, observed, count, sim.arena)
         self._targets: TargetPictures | None = None
-        self._late = np.zeros(count, np.int64), np.zeros(count)  # what was told a step before
+        self._late = np.zeros(count, np.int64), np.zeros((count, 3))  # what was told a step before
         self._pictures: Pixels = np.zeros((count, 0, 0), np.uint8)  # after the last step
         self._moves: Ints = np.zeros((count, layout.tokens), dtype=np.int64)
         self.steps_done = self.horizon  # no episode yet
@@ -176,7 +176,7 @@ class BatchedEnv:
         starts = sample_starts(self.layout, self.sim, targets, done, generators)
         self._moves[:] = self.sim.actions_per_token * done
         self._generators = generators
-        self._late = np.zeros(self.count, np.int64), np.zeros(self.count)
+        self._late = np.zeros(self.count, np.int64), np.zeros((self.count, 3))
         self._begin(targets, starts)
         if self.sight is None:
             self.seen_goals = see(self.goals, self.sim, generators)
@@ -220,7 +220,7 @@ class BatchedEnv:
         blocked = (covered > self.sim.max_overlap) & ~command.idle
         camera = self._move(command, command.idle | blocked)
         if self.sight is not None:
-            told = named, np.where(refused, 0.0, velocity[:, 2])
+            told = named, np.where(refused[:, None], 0.0, velocity)
             self.sight.follow(self._pictures, *(self._late if self.sim.delay else told))
             self._late = told
         self._look()

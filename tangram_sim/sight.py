@@ -47,15 +47,16 @@ class Sight:
     """What is seen of B environments.
 
     Attributes:
-        corners: (B, V, 2) of the tokens; of one that is missing where it lay last, or in the middle
-            of the arena.
+        corners: (B, V, 2) of the tokens; of one that is missing where it lay last, or was told to
+            go, and before it was ever found in the middle of the arena.
         missing: (B, K) tokens that are not found, or not surely.
+        away: (B, K) those of them that should have left the picture by what they were told.
         goals: (B, V, 2) of the target; a piece that is missing lies where its token began.
         goals_missing: (B, K) pieces of the target, alike.
     """
 
-    def __init__(self, layout: Layout, eye: Eye, count: int) -> None:
-        self._layout, self._eye = layout, eye
+    def __init__(self, layout: Layout, eye: Eye, count: int, arena: float) -> None:
+        self._layout, self._eye, self._half = layout, eye, arena / 2.0
         names = [shape.name for shape in layout.shapes]
         self._alike = [
             np.array([token for token, own in enumerate(names) if own == name])
@@ -64,6 +65,7 @@ class Sight:
         self._poses: Floats = np.zeros((count, layout.tokens, 3))
         self._flipped: Bools = np.zeros((count, layout.tokens), np.bool_)
         self.missing: Bools = np.ones((count, layout.tokens), np.bool_)
+        self.away: Bools = np.zeros_like(self.missing)
         self.corners: Floats = layout.corners(self._poses)
         self.goals, self.goals_missing = self.corners, self.missing
 
@@ -71,7 +73,7 @@ class Sight:
         """Look at pictures (B, P, P) of targets and starts."""
         self._poses[:], self._flipped[:], self.missing = 0.0, False, np.ones_like(self.missing)
         count = len(self._poses)
-        self.follow(states, np.zeros(count, np.int64), np.zeros(count))
+        self.follow(states, np.zeros(count, np.int64), np.zeros((count, 3)))
         poses, flipped, gone = self._poses.copy(), self._flipped.copy(), np.ones_like(self.missing)
         for b, target in enumerate(targets):
             look = self._eye(target)
@@ -80,19 +82,22 @@ class Sight:
             gone[b] = ~found
         self.goals, self.goals_missing = self._layout.corners(poses, flipped), gone
 
-    def follow(self, states: Pixels, moved: Ints, turns: Floats) -> None:
+    def follow(self, states: Pixels, moved: Ints, ways: Floats) -> None:
         """Look at pictures (B, P, P) after tokens have moved.
 
         Args:
             states: the pictures.
             moved: (B,) tokens, as the agent names them.
-            turns: (B,) by which they were told to turn, radians.
+            ways: (B, 3) that they were told to go: x, y and turn.
         """
         # What was given away before stays as it is.
         self.missing = self.missing.copy()
         for b, (state, token) in enumerate(zip(states, moved.tolist(), strict=True)):
-            self._take(b, self._eye(state), token, float(turns[b]))
+            self._take(b, self._eye(state), token, ways[b])
         self.corners = self._layout.corners(self._poses, self._flipped)
+        beyond = np.abs(self.corners).max(axis=2) > self._half
+        out = np.logical_or.reduceat(beyond, self._layout.starts[:-1], axis=1)
+        self.away = self.missing & out
 
     def hands(self, tokens: Ints, corners: Floats) -> Ints:
         """(B,) which tokens of the world lie where the agent sees tokens (B,): those it would grab.
@@ -110,8 +115,8 @@ class Sight:
                 found[b] = alike[of[int(np.flatnonzero(alike == token)[0])]]
         return found
 
-    def _take(self, b: int, look: Look, moved: int, turn: float) -> None:
-        """Take over what was seen of an environment, after a token was told to turn."""
+    def _take(self, b: int, look: Look, moved: int, way: Floats) -> None:
+        """Take over what was seen of an environment, after a token was told to go a way (3,)."""
         missing = np.ones_like(self.missing[b])
         for alike in self._alike:
             shown = alike[look.known[alike]]
@@ -121,10 +126,12 @@ class Sight:
             for i, token in enumerate(alike.tolist()):
                 if of[i] < len(shown):
                     one = int(shown[of[i]])
-                    told = turn if token == moved else 0.0
+                    told = float(way[2]) if token == moved else 0.0
                     self._poses[b, token] = self._near(b, token, look.poses[one], told)
                     self._flipped[b, token] = look.flipped[one]
                     missing[token] = not look.sure[one]
+                elif token == moved:
+                    self._poses[b, token] += way
         self.missing[b] = missing
 
     def _near(self, b: int, token: int, pose: Floats, told: float) -> Floats:

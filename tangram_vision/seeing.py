@@ -28,7 +28,7 @@ _ROUGH = 0.7  # pixels that the edges of a token may be off, in the mean
 _AREA = 0.35  # pixels along its perimeter by which its area may be wrong
 _DIFFERS = 0.08  # share of a pile that may be explained wrongly
 _ALIKE = 0.01  # so little more explains a pile as well
-_TRIES = 24  # piles that are searched for one picture
+_TRIES = 8  # piles that are searched for one picture
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +107,8 @@ class _Puzzle:
         singles = self._singles()
         left = Counter({kind.shape: len(kind.tokens) for kind in self.kinds})
         # Blobs that look like one token first: they cost nothing.
-        order = sorted(range(len(self.blobs)), key=lambda blob: (blob not in singles, -blob))
+        whole = np.flatnonzero(~self.blobs.cut).tolist()
+        order = sorted(whole, key=lambda blob: (blob not in singles, -blob))
         best: list[_Explained] = []
         for found in self._whole(order, singles, left, []):
             if len(found) > len(best):
@@ -141,7 +142,7 @@ class _Puzzle:
         single = singles.get(blob)
         if single is not None and left[self.kinds[single.laid.kinds[0]].shape]:
             yield single
-        if left.total() > 1 and not self.blobs.cut[blob]:
+        if left.total() > 1:
             yield from self._piles(blob, left)
 
     def _piles(self, blob: int, left: Counter[int]) -> list[_Explained]:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from tangram_agent.types import Episodes, Past
+from tangram_agent.types import AWAY, Episodes, Past
 from tangram_sim.arrays import Bools, Floats, Singles
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.seeding import episode_generator
@@ -176,7 +176,8 @@ def _look(env: BatchedEnv, played: Played, rows: slice, t: int) -> None:
     played.corners[rows, t], played.episodes.corners[rows, t] = env.corners, env.seen
     played.episodes.placed[rows, t] = env.placed
     if env.sight is not None and played.episodes.missing is not None:
-        played.episodes.missing[rows, t] = env.sight.missing
+        sight = env.sight
+        played.episodes.missing[rows, t] = np.where(sight.away, AWAY, sight.missing)
 
 
 class Rollout:

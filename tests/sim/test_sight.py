@@ -26,7 +26,7 @@ def look(poses: Iterable[tuple[float, float, float] | None], doubtful: int | Non
 
 def sight(*looks: Look) -> Sight:
     shown = iter(looks)
-    return Sight(LAYOUT, lambda _picture: next(shown), 1)
+    return Sight(LAYOUT, lambda _picture: next(shown), 1, 2.0)
 
 
 def places(corners: Floats) -> list[list[float]]:
@@ -37,7 +37,7 @@ def test_a_token_that_moved_keeps_its_name_whatever_the_order_of_what_is_found()
     moved = [START[0], (0.45, -0.45, 0.0), START[2]]  # the second token, beside the third
     seen = sight(look(START), look(GOAL), look([moved[0], moved[2], moved[1]]))
     seen.begin(PICTURES, PICTURES)
-    seen.follow(PICTURES, np.array([1]), np.zeros(1))
+    seen.follow(PICTURES, np.array([1]), np.zeros((1, 3)))
     assert places(seen.corners[0]) == [[x, y] for x, y, _ in moved]
     assert not seen.missing.any()
 
@@ -46,12 +46,20 @@ def test_what_is_missing_lies_where_it_lay_and_is_found_again() -> None:
     seen = sight(look(START), look(GOAL), look([None, *START[1:]]), look(START))
     seen.begin(PICTURES, PICTURES)
     before = seen.corners
-    seen.follow(PICTURES, np.array([0]), np.zeros(1))
+    seen.follow(PICTURES, np.array([0]), np.zeros((1, 3)))
     assert places(seen.corners[0]) == places(before[0])
     assert seen.missing.tolist() == [[True, False, False]]
     assert seen.corners is not before
-    seen.follow(PICTURES, np.array([0]), np.zeros(1))
+    seen.follow(PICTURES, np.array([0]), np.zeros((1, 3)))
     assert not seen.missing.any()
+
+
+def test_what_left_the_picture_lies_where_it_was_told_to_go() -> None:
+    seen = sight(look(START), look(GOAL), look([None, *START[1:]]))
+    seen.begin(PICTURES, PICTURES)
+    seen.follow(PICTURES, np.array([0]), np.array([[0.8, 0.0, 0.1]]))
+    assert places(seen.corners)[0][0] == [1.3, 0.5]
+    assert seen.away.tolist() == seen.missing.tolist() == [[True, False, False]]
 
 
 def test_what_is_doubtful_has_a_place_and_counts_as_missing() -> None:
@@ -83,6 +91,6 @@ def test_a_square_turned_about_as_it_was_told(told: float) -> None:
     seen = sight(look(START), look(GOAL), look([turned, *START[1:]]))
     seen.begin(PICTURES, PICTURES)
     before = LAYOUT.poses(seen.corners)[0, 0, 2]
-    seen.follow(PICTURES, np.array([0]), np.array([told]))
+    seen.follow(PICTURES, np.array([0]), np.array([[0.0, 0.0, told]]))
     turn = LAYOUT.poses(seen.corners)[0, 0, 2] - before
     assert np.angle(np.exp(1j * (turn - told))) == pytest.approx(0.05)
