@@ -14,12 +14,12 @@ import cv2
 import numpy as np
 
 from tangram_sim.arrays import Complex, Floats, Ints, Singles
+from tangram_sim.targets import MAX_PILE
 from tangram_vision.blobs import find_blobs, likeness
 from tangram_vision.edges import NARROW, WIDE, Outlines
 from tangram_vision.kinds import Kind
 from tangram_vision.ramps import fitted, ramps, unlike
 
-MOST = 3  # tokens in one pile
 _TRIED = 48  # corner fits that are refined
 _BEAM = (10, 6, 4)  # of those followed, by the number of tokens laid before
 _LEAVES = 8  # whole arrangements that are compared
@@ -105,7 +105,7 @@ class _Search:
         if not len(blobs):
             yield laid, poses
             return
-        if len(laid) + len(blobs) > MOST:
+        if len(laid) + len(blobs) > MAX_PILE:
             return
         # The smallest part is explained first: it is mostly one token.
         part = blobs.cover[blobs.base[-1] :][: len(rest)]
@@ -115,7 +115,7 @@ class _Search:
         for kind, pose in single:
             now = _without(left, self._kinds[kind].shape)
             yield from self._rest(others, now, (*laid, kind), np.vstack([poses, pose]))
-        most = MOST - len(laid) - len(blobs) + 1
+        most = MAX_PILE - len(laid) - len(blobs) + 1
         if not single and most > 1 and self._sums(area, left, most):
             for kind, pose in self._corners(part, area, left, len(laid)):
                 here = ramps([self._kinds[kind]], pose[None], rest.shape[0])[0]
