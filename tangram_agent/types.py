@@ -6,6 +6,7 @@ Goals and states are corners in the order of `tangram_sim.layout.Layout`.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -38,6 +39,11 @@ class Episodes:
     goals: Singles
     missing: Flags | None = None
     goals_missing: Flags | None = None
+
+    @property
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """Those that there are, by name."""
+        return {name: array for name, array in vars(self).items() if array is not None}
 
     def seen_whole(self) -> "Episodes":
         """Those in which nothing was missing; of several tokens some may have left the picture.

@@ -101,10 +101,7 @@ def parts(episodes: Episodes, size: int) -> Iterator[Episodes]:
 
 
 def _rows(episodes: Episodes, first: int, end: int) -> Episodes:
-    columns: dict[str, Any] = vars(episodes)
-    rows: dict[str, Any] = {
-        name: None if column is None else column[first:end] for name, column in columns.items()
-    }
+    rows = {name: array[first:end] for name, array in episodes.arrays.items()}
     return Episodes(**rows)
 
 

@@ -96,7 +96,7 @@ def test_weights_change_between_batches_only_and_batches_tell_which() -> None:
     for batch in arrived:
         acting = policy(made, batch.weights_version % 5)
         # Copies: what arrives is read-only, and torch warns of that.
-        played = {name: column.copy() for name, column in vars(batch.episodes).items()}
+        played = {name: column.copy() for name, column in batch.episodes.arrays.items()}
         for t in range(3):
             expected = acting.act(played["corners"][:, t], played["placed"][:, t], played["goals"])
             np.testing.assert_allclose(played["actions"][:, t], expected, atol=1e-4)
