@@ -13,6 +13,8 @@ from tangram_sim.arrays import Bools, Floats, Pixels, Singles
 MIN_CONTRAST = 40  # levels between ground and tokens; less is taken for noise
 _EVEN = 1.0  # levels of deviation up to which the ground is taken to be lit evenly
 _SPARSE = 3  # every so many rows and columns tell the light
+_FEW = 12  # pixels that are enough to tell the level of tokens
+_DEEP = 0.02
 _CLEAR = cv2.getStructuringElement(cv2.MORPH_RECT, (7, 7))
 
 
@@ -39,7 +41,11 @@ def _lit(picture: Pixels, tokens: Bools) -> tuple[Singles, Bools]:
     mask = tokens.astype(np.uint8)
     shade: Singles = picture.astype(np.float32) / _light(picture, cv2.dilate(mask, _CLEAR) == 0)
     inside = cv2.erode(mask, _CLEAR) > 0
-    return shade, inside if inside.any() else tokens
+    if np.count_nonzero(inside) >= _FEW:
+        return shade, inside
+    # So small that a blur reaches its middle: there it is darkest.
+    smooth = cv2.blur(shade, (3, 3))
+    return shade, tokens & (smooth <= smooth[tokens].min() + _DEEP)
 
 
 def _light(picture: Pixels, ground: Bools) -> Singles | np.float32:

@@ -10,6 +10,7 @@ from tangram_sim.arrays import Floats, Pixels
 from tangram_sim.config import SimConfig
 from tangram_sim.connected import sample_connected
 from tangram_sim.layout import Layout
+from tangram_sim.lens import Lens
 from tangram_sim.pictures import rasterise
 from tangram_sim.sampling import sample_batch
 from tangram_vision.seeing import Seen, see
@@ -163,3 +164,16 @@ def test_what_is_not_to_be_seen_is_missing(shown: str) -> None:
     seen = see(pictures[shown], layout, ARENA)
     assert not seen.found.any()
     assert seen.confidence[0] == 0.0
+
+
+def test_a_small_token_that_is_blurred_is_as_large_as_it_is() -> None:
+    """The blur reaches its middle, from which its level is told."""
+    layout, rng = layout_of("small_triangle", scale=0.6), np.random.default_rng(6)
+    lens = Lens(SimConfig(pixels=128, picture_blur=1.0))
+    for _ in range(6):
+        poses, flipped = scene(layout, rng, 0.0)
+        lens.begin([rng])
+        picture = lens.taken(0, grey(layout.corners(poses), layout, 128), rng)
+        [[distance, turn]] = errors(layout, poses, flipped, see(picture, layout, ARENA))
+        assert distance < 0.002
+        assert turn < 0.6
