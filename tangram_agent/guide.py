@@ -7,6 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tangram_agent.contacts import Contacts
+from tangram_agent.coverage import Lying
 from tangram_agent.lookahead import Places, Table
 from tangram_agent.networks import Networks
 from tangram_agent.pairs import PairGraph, Pairs
@@ -21,8 +23,8 @@ _NOISE = 0.03  # shares that are predicted for tokens which stay where they are
 class NetworkGuide:
     """See `tangram_agent.lookahead.Guide`."""
 
-    def __init__(self, networks: Networks, setup: Setup) -> None:
-        self._networks, self._reapply = networks, setup.agent.reapply
+    def __init__(self, networks: Networks, setup: Setup, contacts: Contacts | None = None) -> None:
+        self._networks, self._reapply, self._contacts = networks, setup.agent.reapply, contacts
         self._graph = PairGraph(setup.layout, setup.sim.arena, setup.agent)
 
     @torch.no_grad()
@@ -42,7 +44,15 @@ class NetworkGuide:
 
     @torch.no_grad()
     def pushed(self, table: Table, token: Ints, start: Floats, end: Floats) -> Floats:
-        """What the critic's second head says of a token of the piece's shape that lies there."""
+        """What becomes of a token of the piece's shape that lies there.
+
+        By the model of contacts, or where none is at hand by the critic's second head.
+        """
+        if self._contacts is not None:
+            kinds = self._contacts.kinds
+            movers = Lying(kinds[token], start, table.flipped[token])
+            pieces = Lying(kinds, table.goal, table.goal_flipped)
+            return self._contacts.pushed(movers, end, pieces)
         count = len(table.goal)
         index, piece = (
             np.repeat(np.arange(len(token)), count),

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from tangram_agent.adam import Adam
+from tangram_agent.contacts import ContactWorld, known_contacts
 from tangram_agent.coverage import covered_share, covering, worths
 from tangram_agent.guide import NetworkGuide, as_tensor
 from tangram_agent.lookahead import Lookahead
@@ -144,13 +145,16 @@ class Planner:
         self._graph = PairGraph(setup.layout, setup.sim.arena, setup.agent)
         self._contacts = setup.contacts
         self._turns_over = setup.layout.chiral & setup.sim.allow_flip
-        self._guide = NetworkGuide(networks, setup)
+        self._known = known_contacts(setup)
+        self._guide = NetworkGuide(networks, setup, self._known)
 
     @cached_property
     def _lookahead(self) -> Lookahead:
-        """Made when it is first asked for: its world loads the engine."""
-        sim, beam = replace(self._sim, pixels=0), self._agent.beam
-        return Lookahead(self._layout, sim, self._guide, make_world(self._layout, sim), beam)
+        """Made when it is first asked for: its world may load the engine."""
+        sim, known = replace(self._sim, pixels=0), self._known
+        learned = known is not None and self._agent.lookahead == "learned"
+        world = ContactWorld(known) if learned else make_world(self._layout, sim)
+        return Lookahead(self._layout, sim, self._guide, world, self._agent.beam)
 
     def forget(self) -> None:
         """Drop what was planned with other weights."""

@@ -10,9 +10,9 @@ import numpy as np
 from tangram_agent.lookahead import Lookahead, Places, Table
 from tangram_agent.types import Past
 from tangram_sim.actions import make_actions, velocities_of
-from tangram_sim.arrays import Bools, Complex, Floats, Ints, Singles
+from tangram_sim.arrays import Bools, Floats, Ints, Singles
 from tangram_sim.config import SimConfig
-from tangram_sim.geometry import outlines, outlines_at
+from tangram_sim.geometry import outlines, outlines_at, separations
 from tangram_sim.kinematics import wrap
 from tangram_sim.layout import Layout
 from tangram_sim.world import make_world
@@ -20,7 +20,6 @@ from worker.pairing import alike, all_ways
 from worker.rollout import Choose, Generators
 
 _MOMENTS = 24
-_NO_EDGE = 1e-9  # length, of corners that are repeated
 _PUSHED = 1.5  # depth of a meeting, in roots of the area, by which all of a piece is pushed away
 
 
@@ -73,29 +72,6 @@ class SweepGuide:
         one = outlines_at(self._body[token[m]], path[m, s], table.flipped[token[m]])
         pieces = outlines(layout.corners(table.goal, table.goal_flipped)[None], layout)[0]
         depth = np.zeros(apart.shape)
-        depth[m, s, piece] = _depth(one, pieces[piece])
+        depth[m, s, piece] = separations(one, pieces[piece])[0]
         share: Floats = np.clip(depth.max(axis=1) / np.sqrt(layout.areas) * _PUSHED, 0.0, 1.0)
         return share
-
-
-def _depth(first: Floats, second: Floats) -> Floats:
-    """(N,) the shortest way by which convex polygons (N, C, 2) come apart; 0 where they are."""
-    # Corner by corner: numpy is several times slower along short axes.
-    one, other = (list((p[..., 0] + 1j * p[..., 1]).T.copy()) for p in (first, second))
-    depth = np.full(len(first), np.inf)
-    for polygon in (one, other):
-        for corner, following in zip(polygon, polygon[1:] + polygon[:1], strict=True):
-            edge = following - corner
-            length = np.abs(edge)
-            normal = (edge / np.maximum(length, _NO_EDGE)).conj()
-            low, high = _extent(one, normal)
-            other_low, other_high = _extent(other, normal)
-            gap = np.minimum(high - other_low, other_high - low)
-            depth = np.minimum(depth, np.where(length > _NO_EDGE, gap, np.inf))
-    return np.asarray(np.maximum(depth, 0.0))
-
-
-def _extent(corners: list[Complex], normal: Complex) -> tuple[Floats, Floats]:
-    """(N,) lowest and highest of corners across an edge of direction `normal`, conjugated."""
-    across = [(normal * corner).imag for corner in corners]
-    return np.minimum.reduce(across), np.maximum.reduce(across)

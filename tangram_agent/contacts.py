@@ -1,0 +1,301 @@
+"""What a token that slides does to others, learned from short pushes in the engine.
+
+A network sees two tokens: one goes a short way and comes to lie on the other. It tells how that one
+is shifted and turned. A longer way is many short ones, and what is pushed pushes others in turn.
+No engine is needed here: `tangram_lab.experiments.contacts` played the pushes in it.
+
+Legend: N tokens that move, each with another one; M ways, S short pushes of each; K tokens.
+Indices of tokens that lie somewhere are places in `TOKENS`.
+"""
+
+from dataclasses import replace
+from importlib.resources.abc import Traversable
+
+import numpy as np
+import torch
+from torch import nn
+
+from tangram_agent.coverage import Lying
+from tangram_agent.networks import perceptron
+from tangram_agent.pretrained import CONTACTS, PACKAGED, PREFIX, read_agent
+from tangram_agent.setup import Setup
+from tangram_agent.stored import load_settings
+from tangram_agent.weights import load_arrays
+from tangram_sim.arrays import Bools, Complex, Floats, Ints, Singles
+from tangram_sim.config import SimConfig
+from tangram_sim.errors import ConfigError, RunError
+from tangram_sim.geometry import separations, shared_area
+from tangram_sim.kinematics import wrap
+from tangram_sim.layout import Layout, TokensConfig, make_layout
+from tangram_sim.settings import told
+from tangram_sim.shapes import Shape
+
+TOKENS = TokensConfig(
+    ("large_triangle", "medium_triangle", "small_triangle", "square", "parallelogram"), 0.6
+)
+LAYOUT = make_layout(TOKENS)
+SIM = SimConfig(motion="slide")
+WORLD = ("arena", "friction", "substeps")  # settings that a push depends on
+PUSH = 0.04  # longest way of any point of a token in one push, arena units
+SCALE = np.array([0.02, 0.02, 0.06])  # of what the network tells: shift, and turn
+HIDDEN = (128, 128, 128)
+_TOUCH = 1e-5  # depth from which on tokens push each other
+_SHARP = 2e-3  # so much less deep a corner counts for a third
+_ROUNDS = 3  # a token pushes another one, that a third, and that a fourth
+_REMEDY = "set agent.lookahead=engine"
+
+
+def network() -> nn.Sequential:
+    """The layers, without weights."""
+    still = Lying(np.zeros(1, np.int64), np.zeros((1, 3)), np.zeros(1, np.bool_))
+    return perceptron(features(still, np.zeros((1, 3)), still).shape[1], HIDDEN, 3)
+
+
+def features(movers: Lying, way: Floats, others: Lying) -> Singles:
+    """(N, F): tokens that others come onto by ways (N, 3), as these see them at first."""
+    kinds, first = np.eye(len(TOKENS.shapes)), movers.pose
+    ahead = np.exp(-1j * first[:, 2])
+    ends, corners = (
+        _complex(lying.outlines(LAYOUT)) for lying in (replace(movers, pose=first + way), others)
+    )
+    depth, out = separations(_points(ends), _points(corners))
+    centre = _complex(others.pose[:, :2])
+    # Where they touch: corners of the one that are deepest in the other, and the other way round.
+    touching = _deepest(ends, out) - centre, _deepest(corners, -out) - centre
+    turn = np.exp(1j * others.pose[:, 2]) * ahead
+    seen = [
+        (centre - _complex(first[:, :2])) * ahead / 0.3,
+        turn,
+        *((corners - _complex(first[:, :2])[:, None]) * ahead[:, None] / 0.3).T,
+        _complex(way[:, :2]) * ahead / 0.03,
+        out * ahead,
+        out * ahead * depth / 0.02,
+        *(point * ahead / 0.2 for point in touching),
+    ]
+    plain = [movers.flipped, others.flipped, way[:, 2] / 0.1, depth / 0.02]
+    parts = np.column_stack([*(part.real for part in seen), *(part.imag for part in seen), *plain])
+    return np.hstack([kinds[movers.index], kinds[others.index], parts]).astype(np.float32)
+
+
+class Contacts:
+    """The model that comes with the package, for the tokens of one layout.
+
+    Attributes:
+        kinds: (K,) their places in `TOKENS`.
+    """
+
+    def __init__(self, kinds: Ints, folder: Traversable = PACKAGED / CONTACTS) -> None:
+        """Read it.
+
+        Raises:
+            RunError: a file is missing or damaged, or of another version.
+        """
+        self.kinds = kinds
+        shown = f"{PREFIX}/{CONTACTS}"
+        agent = read_agent(folder, shown)
+        if load_settings(agent.config, shown) != world():
+            raise RunError(f"{shown} was learned by another version: install tangram-rl again")
+        self._network = network().requires_grad_(False)
+        load_arrays(self._network, agent.weights.tensors)
+
+    def shifts(self, movers: Lying, way: Floats, others: Lying) -> Floats:
+        """(N, 3) shift and turn of tokens that others come onto by ways (N, 3) of one push."""
+        rows = torch.from_numpy(features(movers, way, others))
+        return _turned(self._network(rows).numpy() * SCALE, movers.pose[:, 2])
+
+    def pushed(self, movers: Lying, end: Floats, pieces: Lying) -> Floats:
+        """(M, K) share of pieces (K,) in place that tokens on ways to poses (M, 3) push away."""
+        way, count = end - movers.pose, len(pieces.index)
+        way[:, 2] = wrap(way[:, 2])
+        path = _path(movers, way)
+        places = path[:, 1:, None], movers.index[:, None, None], pieces.pose, pieces.index
+        m, s, k = np.nonzero(_near(*places))
+        meet = _meet(replace(_at(movers, m), pose=path[m, s + 1]), _at(pieces, k))
+        # The first of its pushes by which each token comes onto a piece.
+        pair, first = np.unique(m[meet] * count + k[meet], return_index=True)
+        m, k, step = pair // count, pair % count, s[meet][first]
+        mover, lies, home = _at(movers, m), _at(pieces, k), _at(pieces, k)
+        going = np.arange(len(pair))
+        while len(going):
+            start, to = path[m[going], step[going]], path[m[going], step[going] + 1]
+            rows = np.flatnonzero(_meet(replace(_at(mover, going), pose=to), _at(lies, going)))
+            hit = going[rows]
+            begin = replace(_at(mover, hit), pose=start[rows])
+            lies.pose[hit] += self.shifts(begin, (to - start)[rows], _at(lies, hit))
+            step[going] += 1
+            off = np.hypot(*(lies.pose - home.pose)[going, :2].T) / LAYOUT.radii[lies.index[going]]
+            going = going[(off < 1.0) & (step[going] + 1 < path.shape[1])]
+        stays = shared_area(lies.outlines(LAYOUT), home.outlines(LAYOUT))
+        share = np.zeros((len(end), count))
+        share[m, k] = np.clip(1.0 - stays / LAYOUT.areas[lies.index], 0.0, 1.0)
+        return share
+
+
+class ContactWorld:
+    """See `tangram_agent.lookahead.Foresight`: what the model foresees, without an engine."""
+
+    def __init__(self, contacts: Contacts) -> None:
+        self._contacts, count = contacts, len(contacts.kinds)
+        none = np.zeros(count, dtype=np.bool_)
+        self._lying = Lying(contacts.kinds, np.zeros((count, 3)), none)
+
+    def place(self, poses: Floats, flipped: Bools | None = None) -> None:
+        """See `Foresight.place`."""
+        sides = np.zeros(len(poses), dtype=np.bool_) if flipped is None else flipped
+        self._lying = Lying(self._lying.index, np.array(poses, np.float64), sides)
+
+    def move(self, token: int, velocity: Floats, flip: bool = False) -> None:  # noqa: ARG002 - what slides stays on its side
+        """See `Foresight.move`."""
+        pose = self._lying.pose
+        path = _path(_at(self._lying, np.array([token])), np.asarray(velocity)[None])[0]
+        step = self._first(token, path, 1)
+        while step < len(path):
+            pose[token] = path[step]
+            met = self._push(token, path[step - 1])
+            step = step + 1 if met else self._first(token, path, step + 1)
+        pose[token] = path[-1]
+
+    def poses(self) -> Floats:
+        """See `Foresight.poses`."""
+        poses = self._lying.pose.copy()
+        poses[:, 2] = wrap(poses[:, 2])
+        return poses
+
+    def _first(self, token: int, path: Floats, step: int) -> int:
+        """The first step of a path, from one on, that comes onto another token; its end if none."""
+        every, kind = self._lying, self._lying.index
+        near = _near(path[step:, None], kind[[token]], every.pose, kind)
+        near[:, token] = False
+        s, other = np.nonzero(near)
+        there = replace(_at(every, np.full(len(s), token)), pose=path[step + s])
+        return step + int(s[_meet(there, _at(every, other))].min(initial=len(path) - step))
+
+    def _push(self, token: int, before: Floats) -> bool:
+        """Shift what a token came onto from a pose (3,), what that comes onto, and so on."""
+        every, moved, start = self._lying, np.array([token]), before[None]
+        left = np.arange(len(every.index)) != token
+        for number in range(_ROUNDS):
+            rest = np.flatnonzero(left)
+            by, other = np.repeat(np.arange(len(moved)), len(rest)), np.tile(rest, len(moved))
+            meet = _meet(_at(every, moved[by]), _at(every, other))
+            other, first = np.unique(other[meet], return_index=True)
+            if not len(other):
+                return number > 0
+            by = by[meet][first]
+            begin = replace(_at(every, moved[by]), pose=start[by])
+            way, start = every.pose[moved[by]] - start[by], every.pose[other]
+            every.pose[other] += self._contacts.shifts(begin, way, _at(every, other))
+            moved, left[other] = other, False
+        return True
+
+
+def kinds_of(layout: Layout, sim: SimConfig) -> Ints:
+    """(K,) places of a layout's tokens in `TOKENS`.
+
+    Raises:
+        ConfigError: the model knows nothing of such tokens, or of such a world.
+    """
+    known = "agent.lookahead=learned was learned with"
+    for name in WORLD:
+        wanted, given = getattr(SIM, name), getattr(sim, name)
+        if given != wanted:
+            raise ConfigError(f"{known} sim.{name}={told(wanted)}, got {told(given)}: {_REMEDY}")
+    kinds = [_kind(shape) for shape in layout.shapes]
+    if -1 in kinds:
+        raise ConfigError(
+            f"{known} the tans at tokens.scale={TOKENS.scale:g}, got another "
+            f"{layout.shapes[kinds.index(-1)].name}: {_REMEDY}"
+        )
+    return np.array(kinds)
+
+
+def known_contacts(setup: Setup) -> Contacts | None:
+    """What is known of contacts, where an agent looks ahead.
+
+    Raises:
+        ConfigError: it looks ahead by nothing else, and was learned in another world.
+        RunError: see `Contacts`.
+    """
+    if setup.agent.lookahead == "none":
+        return None
+    try:
+        return Contacts(kinds_of(setup.layout, setup.sim))
+    except ConfigError:
+        if setup.agent.lookahead == "learned":
+            raise
+        return None
+
+
+def _kind(shape: Shape) -> int:
+    same = [
+        len(own.corners) == len(shape.corners) and np.allclose(own.corners, shape.corners)
+        for own in LAYOUT.shapes
+    ]
+    return same.index(True) if any(same) else -1
+
+
+def world() -> dict[str, object]:
+    """What the model is learned in, for its config.yaml."""
+    return {
+        "tokens": {"shapes": list(TOKENS.shapes), "scale": TOKENS.scale},
+        "sim": {name: getattr(SIM, name) for name in WORLD},
+        "push": PUSH,
+    }
+
+
+def seen(movers: Lying, moved: Floats) -> Floats:
+    """Shifts and turns (N, 3) as tokens see them at first."""
+    return _turned(moved, -movers.pose[:, 2])
+
+
+def _turned(moved: Floats, angle: Floats) -> Floats:
+    """Shifts and turns (N, 3), in axes that are turned by angles (N,)."""
+    shift = _complex(moved[:, :2]) * np.exp(1j * angle)
+    return np.column_stack([shift.real, shift.imag, moved[:, 2]])
+
+
+def _meet(one: Lying, other: Lying) -> Bools:
+    """(N,) whether tokens overlap."""
+    meet = _near(one.pose, one.index, other.pose, other.index)
+    rows = np.flatnonzero(meet)
+    first, second = (_at(lying, rows).outlines(LAYOUT) for lying in (one, other))
+    meet[rows] = separations(first, second)[0] > _TOUCH
+    return meet
+
+
+def _near(pose: Floats, index: Ints, others: Floats, other: Ints) -> Bools:
+    """(...,) whether tokens at poses (..., 3) may touch others, by their radii."""
+    off = (pose - others)[..., :2]
+    return np.asarray((off**2).sum(axis=-1) < (LAYOUT.radii[index] + LAYOUT.radii[other]) ** 2)
+
+
+def _path(movers: Lying, way: Floats) -> Floats:
+    """(M, S + 1, 3) where tokens are after 0 to S pushes; shorter ways end before."""
+    longest = np.hypot(way[:, 0], way[:, 1]) + np.abs(way[:, 2]) * LAYOUT.radii[movers.index]
+    pushes = np.maximum(np.ceil(longest / PUSH), 1.0)
+    share = np.minimum(np.arange(pushes.max(initial=0.0) + 1.0) / pushes[:, None], 1.0)
+    path: Floats = movers.pose[:, None] + share[..., None] * way[:, None]
+    return path
+
+
+def _deepest(corners: Complex, direction: Complex) -> Complex:
+    """(N,) the corner of (N, C) that is farthest along a direction (N,); between those alike."""
+    far = (corners * direction.conj()[:, None]).real
+    weight = np.exp((far - far.max(axis=1, keepdims=True)) / _SHARP)
+    point: Complex = (weight * corners).sum(axis=1) / weight.sum(axis=1)
+    return point
+
+
+def _complex(points: Floats) -> Complex:
+    """Points (..., 2) as x + iy."""
+    numbers: Complex = points[..., 0] + 1j * points[..., 1]
+    return numbers
+
+
+def _points(numbers: Complex) -> Floats:
+    return np.stack([numbers.real, numbers.imag], axis=-1)
+
+
+def _at(lying: Lying, rows: Ints) -> Lying:
+    """Copies of some of them."""
+    return Lying(lying.index[rows], lying.pose[rows], lying.flipped[rows])
