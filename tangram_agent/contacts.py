@@ -8,7 +8,7 @@ Legend: N tokens that move, each with another one; M ways, S short pushes of eac
 Indices of tokens that lie somewhere are places in `TOKENS`.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.resources.abc import Traversable
 
 import numpy as np
@@ -16,6 +16,7 @@ import torch
 from torch import nn
 
 from tangram_agent.coverage import Lying
+from tangram_agent.foresight import Table
 from tangram_agent.networks import perceptron
 from tangram_agent.pretrained import CONTACTS, PACKAGED, PREFIX, read_agent
 from tangram_agent.setup import Setup
@@ -107,86 +108,116 @@ class Contacts:
         """(M, K) share of pieces (K,) in place that tokens on ways to poses (M, 3) push away."""
         way, count = end - movers.pose, len(pieces.index)
         way[:, 2] = wrap(way[:, 2])
-        path = _path(movers, way)
-        places = path[:, 1:, None], movers.index[:, None, None], pieces.pose, pieces.index
-        m, s, k = np.nonzero(_near(*places))
-        meet = _meet(replace(_at(movers, m), pose=path[m, s + 1]), _at(pieces, k))
+        path, last = _path(movers, way)
+        near = _near(path[:, :, None], movers.index[:, None, None], pieces.pose, pieces.index)
+        m, s, k = np.nonzero(near & _between(1, last, path)[..., None])
+        meet = _meet(replace(_at(movers, m), pose=path[m, s]), _at(pieces, k))
         # The first of its pushes by which each token comes onto a piece.
         pair, first = np.unique(m[meet] * count + k[meet], return_index=True)
         m, k, step = pair // count, pair % count, s[meet][first]
         mover, lies, home = _at(movers, m), _at(pieces, k), _at(pieces, k)
         going = np.arange(len(pair))
         while len(going):
-            start, to = path[m[going], step[going]], path[m[going], step[going] + 1]
+            start, to = path[m[going], step[going] - 1], path[m[going], step[going]]
             rows = np.flatnonzero(_meet(replace(_at(mover, going), pose=to), _at(lies, going)))
             hit = going[rows]
             begin = replace(_at(mover, hit), pose=start[rows])
             lies.pose[hit] += self.shifts(begin, (to - start)[rows], _at(lies, hit))
             step[going] += 1
             off = np.hypot(*(lies.pose - home.pose)[going, :2].T) / LAYOUT.radii[lies.index[going]]
-            going = going[(off < 1.0) & (step[going] + 1 < path.shape[1])]
+            going = going[(off < 1.0) & (step[going] <= last[m[going]])]
         stays = shared_area(lies.outlines(LAYOUT), home.outlines(LAYOUT))
         share = np.zeros((len(end), count))
         share[m, k] = np.clip(1.0 - stays / LAYOUT.areas[lies.index], 0.0, 1.0)
         return share
 
 
-class ContactWorld:
-    """See `tangram_agent.lookahead.Foresight`: what the model foresees, without an engine."""
+class ContactWorlds:
+    """See `tangram_agent.foresight.Foresight`: what the model foresees, without an engine."""
 
     def __init__(self, contacts: Contacts) -> None:
-        self._contacts, count = contacts, len(contacts.kinds)
-        none = np.zeros(count, dtype=np.bool_)
-        self._lying = Lying(contacts.kinds, np.zeros((count, 3)), none)
+        self._contacts = contacts
 
-    def place(self, poses: Floats, flipped: Bools | None = None) -> None:
-        """See `Foresight.place`."""
-        sides = np.zeros(len(poses), dtype=np.bool_) if flipped is None else flipped
-        self._lying = Lying(self._lying.index, np.array(poses, np.float64), sides)
+    def slid(self, table: Table, token: Ints, way: Floats) -> Floats:
+        """See `Foresight.slid`."""
+        scenes = _Scenes(self._contacts.kinds, table.poses.copy(), table.flipped)
+        rows = np.arange(len(token))
+        path, last = _path(scenes.at(rows, token), way)
+        step = self._first(scenes, rows, token, path, _between(1, last, path))
+        while len(rows := np.flatnonzero(step <= last)):
+            scenes.pose[rows, token[rows]] = path[rows, step[rows]]
+            met = self._push(scenes, rows, token[rows], path[rows, step[rows] - 1])
+            step[rows] += 1
+            off = rows[~met]
+            steps = _between(step[off], last[off], path)
+            step[off] = self._first(scenes, off, token[off], path[off], steps)
+        ends = scenes.pose
+        ends[np.arange(len(token)), token] = path[:, -1]
+        ends[..., 2] = wrap(ends[..., 2])
+        return ends
 
-    def move(self, token: int, velocity: Floats, flip: bool = False) -> None:  # noqa: ARG002 - what slides stays on its side
-        """See `Foresight.move`."""
-        pose = self._lying.pose
-        path = _path(_at(self._lying, np.array([token])), np.asarray(velocity)[None])[0]
-        step = self._first(token, path, 1)
-        while step < len(path):
-            pose[token] = path[step]
-            met = self._push(token, path[step - 1])
-            step = step + 1 if met else self._first(token, path, step + 1)
-        pose[token] = path[-1]
+    def _first(
+        self, scenes: "_Scenes", rows: Ints, token: Ints, path: Floats, steps: Bools
+    ) -> Ints:
+        """The first of steps (N, S) of paths (N, S, 3) that meets a token; S where none does."""
+        kinds = scenes.kinds
+        near = _near(path[:, :, None], kinds[token][:, None, None], scenes.pose[rows, None], kinds)
+        near &= steps[..., None]
+        near[np.arange(len(rows)), :, token] = False
+        n, s, other = np.nonzero(near)
+        there = replace(scenes.at(rows[n], token[n]), pose=path[n, s])
+        meet = _meet(there, scenes.at(rows[n], other))
+        first = np.full(len(rows), path.shape[1])
+        np.minimum.at(first, n[meet], s[meet])
+        return first
 
-    def poses(self) -> Floats:
-        """See `Foresight.poses`."""
-        poses = self._lying.pose.copy()
-        poses[:, 2] = wrap(poses[:, 2])
-        return poses
+    def _push(self, scenes: "_Scenes", rows: Ints, token: Ints, start: Floats) -> Bools:
+        """Shift what tokens (N,) came onto from poses (N, 3), what that comes onto, and so on.
 
-    def _first(self, token: int, path: Floats, step: int) -> int:
-        """The first step of a path, from one on, that comes onto another token; its end if none."""
-        every, kind = self._lying, self._lying.index
-        near = _near(path[step:, None], kind[[token]], every.pose, kind)
-        near[:, token] = False
-        s, other = np.nonzero(near)
-        there = replace(_at(every, np.full(len(s), token)), pose=path[step + s])
-        return step + int(s[_meet(there, _at(every, other))].min(initial=len(path) - step))
-
-    def _push(self, token: int, before: Floats) -> bool:
-        """Shift what a token came onto from a pose (3,), what that comes onto, and so on."""
-        every, moved, start = self._lying, np.array([token]), before[None]
-        left = np.arange(len(every.index)) != token
+        Returns:
+            (N,) whether there was any.
+        """
+        first, count = rows, len(scenes.kinds)
+        met = np.zeros(len(scenes.pose), dtype=np.bool_)
+        left = np.ones(scenes.pose.shape[:2], dtype=np.bool_)
         for number in range(_ROUNDS):
-            rest = np.flatnonzero(left)
-            by, other = np.repeat(np.arange(len(moved)), len(rest)), np.tile(rest, len(moved))
-            meet = _meet(_at(every, moved[by]), _at(every, other))
-            other, first = np.unique(other[meet], return_index=True)
-            if not len(other):
-                return number > 0
-            by = by[meet][first]
-            begin = replace(_at(every, moved[by]), pose=start[by])
-            way, start = every.pose[moved[by]] - start[by], every.pose[other]
-            every.pose[other] += self._contacts.shifts(begin, way, _at(every, other))
-            moved, left[other] = other, False
-        return True
+            left[rows, token] = False
+            by, other = np.nonzero(left[rows])
+            meet = _meet(scenes.at(rows[by], token[by]), scenes.at(rows[by], other))
+            by, other = by[meet], other[meet]
+            # By the first one alone where several tokens come onto one.
+            _, once = np.unique(rows[by] * count + other, return_index=True)
+            by, other = by[once], other[once]
+            if number == 0:
+                met[rows[by]] = True
+            if not len(by):
+                break
+            moved = scenes.at(rows[by], token[by])
+            way = moved.pose - start[by]
+            lying = scenes.at(rows[by], other)
+            shift = self._contacts.shifts(replace(moved, pose=start[by]), way, lying)
+            rows, token, start = rows[by], other, lying.pose
+            scenes.pose[rows, token] += shift
+        return met[first]
+
+
+@dataclass(frozen=True, eq=False)
+class _Scenes:
+    """B scenes of the same tokens.
+
+    Attributes:
+        kinds: (K,) of the tokens.
+        pose: (B, K, 3).
+        flipped: (K,).
+    """
+
+    kinds: Ints
+    pose: Floats
+    flipped: Bools
+
+    def at(self, rows: Ints, token: Ints) -> Lying:
+        """Copies of some tokens."""
+        return Lying(self.kinds[token], self.pose[rows, token], self.flipped[token])
 
 
 def kinds_of(layout: Layout, sim: SimConfig) -> Ints:
@@ -269,13 +300,19 @@ def _near(pose: Floats, index: Ints, others: Floats, other: Ints) -> Bools:
     return np.asarray((off**2).sum(axis=-1) < (LAYOUT.radii[index] + LAYOUT.radii[other]) ** 2)
 
 
-def _path(movers: Lying, way: Floats) -> Floats:
-    """(M, S + 1, 3) where tokens are after 0 to S pushes; shorter ways end before."""
+def _path(movers: Lying, way: Floats) -> tuple[Floats, Ints]:
+    """(M, S + 1, 3) where tokens are after 0 to S pushes, and (M,) the number of pushes of each."""
     longest = np.hypot(way[:, 0], way[:, 1]) + np.abs(way[:, 2]) * LAYOUT.radii[movers.index]
     pushes = np.maximum(np.ceil(longest / PUSH), 1.0)
     share = np.minimum(np.arange(pushes.max(initial=0.0) + 1.0) / pushes[:, None], 1.0)
     path: Floats = movers.pose[:, None] + share[..., None] * way[:, None]
-    return path
+    return path, pushes.astype(np.int64)
+
+
+def _between(first: Ints | int, last: Ints, path: Floats) -> Bools:
+    """(M, S + 1) steps of paths from first ones to last ones, both (M,)."""
+    step = np.arange(path.shape[1])
+    return np.asarray((step >= np.reshape(first, (-1, 1))) & (step <= last[:, None]))
 
 
 def _deepest(corners: Complex, direction: Complex) -> Complex:

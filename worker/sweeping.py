@@ -3,11 +3,10 @@
 Legend: K tokens, M ways, S moments of each.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
-from tangram_agent.lookahead import Lookahead, Places, Table
+from tangram_agent.foresight import EngineWorlds, Places, Table
+from tangram_agent.lookahead import Lookahead
 from tangram_agent.types import Past
 from tangram_sim.actions import make_actions, velocities_of
 from tangram_sim.arrays import Bools, Floats, Ints, Singles
@@ -15,7 +14,6 @@ from tangram_sim.config import SimConfig
 from tangram_sim.geometry import outlines, outlines_at, separations
 from tangram_sim.kinematics import wrap
 from tangram_sim.layout import Layout
-from tangram_sim.world import make_world
 from worker.pairing import alike, all_ways
 from worker.rollout import Choose, Generators
 
@@ -25,8 +23,7 @@ _PUSHED = 1.5  # depth of a meeting, in roots of the area, by which all of a pie
 
 def sweeping_policy(layout: Layout, sim: SimConfig, beam: int) -> Choose:
     """A look ahead in the engine that nothing learned guides, see `Lookahead`."""
-    own = replace(sim, pixels=0)
-    lookahead = Lookahead(layout, own, SweepGuide(layout), make_world(layout, own), beam)
+    lookahead = Lookahead(layout, sim, SweepGuide(layout), EngineWorlds(layout, sim), beam)
 
     def choose(
         corners: Floats, placed: Bools, goals: Floats, _generators: Generators, past: Past
@@ -41,7 +38,7 @@ def sweeping_policy(layout: Layout, sim: SimConfig, beam: int) -> Choose:
 
 
 class SweepGuide:
-    """See `tangram_agent.lookahead.Guide`."""
+    """See `tangram_agent.foresight.Guide`."""
 
     def __init__(self, layout: Layout) -> None:
         self._layout = layout
@@ -51,13 +48,13 @@ class SweepGuide:
     def places(self, table: Table, left: Bools, covered: Floats) -> Places:
         """Every token exactly on every piece of its shape that is not taken."""
         layout = self._layout
-        corners = layout.corners(np.stack([table.poses, table.goal]), table.flipped)
-        goals = layout.corners(table.goal, table.goal_flipped)
-        ways = all_ways(layout, corners[:1], goals[None])[0]
+        corners = layout.corners(table.poses, table.flipped)
+        goals = layout.corners(table.goal[None], table.goal_flipped)
+        ways = all_ways(layout, corners, goals)
         same = self._same & (table.flipped[:, None] == table.goal_flipped)
-        token, piece = np.nonzero(same & left[:, None] & (covered < 1.0))
-        pose = table.poses[token] + ways[token, piece]
-        return Places(token, piece, pose, np.ones(len(token)))
+        row, token, piece = np.nonzero(same & left[:, :, None] & (covered < 1.0)[:, None])
+        pose = table.poses[row, token] + ways[row, token, piece]
+        return Places(row, token, piece, pose, np.ones(len(token)))
 
     def pushed(self, table: Table, token: Ints, start: Floats, end: Floats) -> Floats:
         """By how deep the token comes into the piece on its way."""

@@ -25,14 +25,25 @@ from torch import Tensor, nn
 
 from master.result import commit, versions
 from tangram_agent.adam import Adam
-from tangram_agent.contacts import LAYOUT, PUSH, SCALE, SIM, TOKENS, features, network, seen, world
+from tangram_agent.contacts import (
+    LAYOUT,
+    PUSH,
+    SCALE,
+    SIM,
+    TOKENS,
+    WORLD,
+    features,
+    network,
+    seen,
+    world,
+)
 from tangram_agent.coverage import Lying
 from tangram_agent.files import write_whole
 from tangram_agent.networks import initialise
 from tangram_agent.pretrained import CARD, CARD_TEXT, CONFIG, CONTACTS, FORMAT, PREFIX, WEIGHTS
 from tangram_agent.weights import to_arrays
 from tangram_lab.experiments.pretrained import PACKAGE
-from tangram_sim.arrays import Floats
+from tangram_sim.arrays import Floats, Singles
 from tangram_sim.errors import TangramError
 from tangram_sim.geometry import separations
 from tangram_sim.kinematics import wrap
@@ -153,13 +164,13 @@ def make(pushes: int = PUSHES, updates: int = UPDATES) -> tuple[nn.Sequential, d
 
 def _learnable(parts: list[Pushes]) -> tuple[Tensor, Tensor]:
     """Features and what came of them, where a token would come to lie on the other."""
-    rows, wanted = list[Floats](), list[Floats]()
+    rows, wanted = list[Singles](), list[Singles]()
     for movers, way, others, moved in parts:
         ends = replace(movers, pose=movers.pose + way).outlines(LAYOUT)
         touch = separations(ends, others.outlines(LAYOUT))[0] > 0.0
         rows.append(features(movers, way, others)[touch])
-        wanted.append((seen(movers, moved) / SCALE)[touch])
-    return tuple(torch.from_numpy(np.concatenate(x).astype(np.float32)) for x in (rows, wanted))
+        wanted.append((seen(movers, moved) / SCALE)[touch].astype(np.float32))
+    return torch.from_numpy(np.concatenate(rows)), torch.from_numpy(np.concatenate(wanted))
 
 
 def _median_shift(moved: Floats) -> float:
@@ -193,7 +204,7 @@ def publish(folder: Path, pushes: int = PUSHES, updates: int = UPDATES) -> dict[
 
 
 def _card_text(card: dict[str, Any]) -> str:
-    sim = ", ".join(f"sim.{name}={value:g}" for name, value in world()["sim"].items())
+    sim = ", ".join(f"sim.{name}={getattr(SIM, name):g}" for name in WORLD)
     return f"""\
 # {PREFIX}/{CONTACTS}
 
