@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from importlib.resources.abc import Traversable
 
 import numpy as np
-import torch
 from torch import nn
 
 from tangram_agent.coverage import Lying
@@ -37,11 +36,13 @@ TOKENS = TokensConfig(
 LAYOUT = make_layout(TOKENS)
 SIM = SimConfig(motion="slide")
 WORLD = ("arena", "friction", "substeps")  # settings that a push depends on
-PUSH = 0.04  # longest way of any point of a token in one push, arena units
+PUSH = 0.06  # longest way of any point of a token in one push, arena units
 SCALE = np.array([0.02, 0.02, 0.06])  # of what the network tells: shift, and turn
 HIDDEN = (128, 128, 128)
 _TOUCH = 1e-5  # depth from which on tokens push each other
 _SHARP = 2e-3  # so much less deep a corner counts for a third
+_GONE = 0.6  # radii: a piece that was pushed so far is lost
+_MISSES = 2  # pushes without a touch after which a way has left a piece behind
 _ROUNDS = 3  # a token pushes another one, that a third, and that a fourth
 _REMEDY = "set agent.lookahead=engine"
 
@@ -96,13 +97,22 @@ class Contacts:
         agent = read_agent(folder, shown)
         if load_settings(agent.config, shown) != world():
             raise RunError(f"{shown} was learned by another version: install tangram-rl again")
-        self._network = network().requires_grad_(False)
-        load_arrays(self._network, agent.weights.tensors)
+        layers = network()
+        load_arrays(layers, agent.weights.tensors)
+        # Torch takes several times as long for a few rows.
+        self._layers = [
+            (layer.weight.detach().numpy().T, layer.bias.detach().numpy())
+            for layer in layers
+            if isinstance(layer, nn.Linear)
+        ]
 
     def shifts(self, movers: Lying, way: Floats, others: Lying) -> Floats:
         """(N, 3) shift and turn of tokens that others come onto by ways (N, 3) of one push."""
-        rows = torch.from_numpy(features(movers, way, others))
-        return _turned(self._network(rows).numpy() * SCALE, movers.pose[:, 2])
+        rows = features(movers, way, others)
+        for weight, bias in self._layers[:-1]:
+            rows = np.maximum(rows @ weight + bias, 0.0)
+        weight, bias = self._layers[-1]
+        return _turned((rows @ weight + bias) * SCALE, movers.pose[:, 2])
 
     def pushed(self, movers: Lying, end: Floats, pieces: Lying) -> Floats:
         """(M, K) share of pieces (K,) in place that tokens on ways to poses (M, 3) push away."""
@@ -116,7 +126,8 @@ class Contacts:
         pair, first = np.unique(m[meet] * count + k[meet], return_index=True)
         m, k, step = pair // count, pair % count, s[meet][first]
         mover, lies, home = _at(movers, m), _at(pieces, k), _at(pieces, k)
-        going = np.arange(len(pair))
+        going, missed = np.arange(len(pair)), np.zeros(len(pair), np.int64)
+        far = np.zeros(len(pair))
         while len(going):
             start, to = path[m[going], step[going] - 1], path[m[going], step[going]]
             rows = np.flatnonzero(_meet(replace(_at(mover, going), pose=to), _at(lies, going)))
@@ -124,11 +135,15 @@ class Contacts:
             begin = replace(_at(mover, hit), pose=start[rows])
             lies.pose[hit] += self.shifts(begin, (to - start)[rows], _at(lies, hit))
             step[going] += 1
-            off = np.hypot(*(lies.pose - home.pose)[going, :2].T) / LAYOUT.radii[lies.index[going]]
-            going = going[(off < 1.0) & (step[going] <= last[m[going]])]
+            missed[going] += 1
+            missed[hit] = 0
+            far[hit] = np.hypot(*(lies.pose - home.pose)[hit, :2].T) / LAYOUT.radii[lies.index[hit]]
+            ends = (far >= _GONE) | (missed >= _MISSES) | (step > last[m])
+            going = going[~ends[going]]
         stays = shared_area(lies.outlines(LAYOUT), home.outlines(LAYOUT))
         share = np.zeros((len(end), count))
-        share[m, k] = np.clip(1.0 - stays / LAYOUT.areas[lies.index], 0.0, 1.0)
+        lost = np.clip(1.0 - stays / LAYOUT.areas[lies.index], 0.0, 1.0)
+        share[m, k] = np.where(far < _GONE, lost, 1.0)
         return share
 
 

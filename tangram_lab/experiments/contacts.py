@@ -50,7 +50,7 @@ from tangram_sim.kinematics import wrap
 from tangram_sim.layout import TokensConfig, make_layout
 from tangram_sim.world import make_world
 
-PUSHES, UPDATES, BATCH, RATE = 30_000, 6_000, 512, 2e-3
+PUSHES, UPDATES, BATCH, RATE = 60_000, 10_000, 512, 2e-3
 TESTED = 0.05  # share of the pushes that nothing is learned from
 _HALVINGS = 14  # until tokens touch
 _TOUCHING = 1e-4  # so far apart are tokens that touch

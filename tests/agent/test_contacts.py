@@ -92,7 +92,7 @@ def test_what_a_way_pushes_off_a_piece_is_foreseen() -> None:
     pieces = Lying(np.array([3, 0]), np.array([(0.0, 0.0, 0.0), (0.6, 0.5, 0.0)]), none)
     ends = np.array([(0.3, 0.0, 0.0), (-0.7, 0.6, 0.0)])
     pushed = contacts.pushed(movers, ends, pieces)
-    assert pushed[0, 0] > 0.8
+    assert pushed[0, 0] == 1.0
     assert not pushed[0, 1]
     assert not pushed[1].any()
     part = contacts.pushed(movers, np.array([(-0.18, 0.0, 0.0)] * 2), pieces)
