@@ -11,6 +11,7 @@ Legend: B scenes, K tokens, M options. Shares and losses are of the area of the 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,7 +30,8 @@ _TRIED = 6  # options of a node that the world is asked for
 _ALIKE = 3  # of them, at most so many of one token and one piece
 _STOPS = 8  # directions in which a way of two legs may come to its piece,
 _AWAY = (0.8, 1.6)  # and from how far, in radii of the largest token
-_PERFECT = 0.999  # share of the target beyond which nothing better is looked for
+_PERFECT = 0.999  # share of the target beyond which nothing better is looked for,
+_ENOUGH = 0.98  # and beyond which that is not done again at the next action
 _LEG = 1e-4  # what an action more must bring at least
 _SAME = 1e-3  # a scene is what was foreseen: arena units and radians
 _LOST = 3e-3  # predicted losses below that are the guide's noise
@@ -48,6 +50,13 @@ class Step:
     before: Floats
     token: int | None
     pose: Floats
+
+
+class _Plan(NamedTuple):
+    """What is to be played, and the share of the target that is covered then."""
+
+    covered: float
+    steps: tuple[Step, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +130,7 @@ class Lookahead:
         self._share: Floats = layout.areas / layout.areas.sum()
         masks = np.arange(1 << layout.tokens)
         self._taken = (masks[:, None] >> np.arange(layout.tokens)) & 1  # (2^K, K)
-        self._plans: dict[bytes, tuple[Step, ...]] = {}
+        self._plans: dict[bytes, _Plan] = {}
         # What a way pushes away of pieces in place is the same in every node of a plan.
         self._pushed: dict[bytes, Floats] = {}
 
@@ -165,14 +174,19 @@ class Lookahead:
 
     def _steps(self, tables: Sequence[Table], actions: Ints) -> list[Step]:
         """The next action in every scene, each token having so many left, (B, K)."""
-        kept, steps = dict[bytes, tuple[Step, ...]](), list[Step]()
+        kept, steps = dict[bytes, _Plan](), list[Step]()
         for table, left in zip(tables, actions, strict=True):
             key = table.goal.tobytes()
-            plan = self._plans.get(key, ())
-            if not (plan and self._foreseen(plan[0], table)):
-                plan = self._plan(table, left)
-            steps.append(plan[0])
-            kept[key] = plan[1:] or plan  # the last one does nothing
+            plan = self._plans.get(key)
+            if plan is not None and not self._foreseen(plan.steps[0], table):
+                plan = None
+            # With fewer tokens left a plan costs less, and sees farther.
+            if plan is None or plan.covered < _ENOUGH:
+                found = self._plan(table, left)
+                plan = found if plan is None or found.covered > plan.covered else plan
+            first, *rest = plan.steps
+            steps.append(first)
+            kept[key] = _Plan(plan.covered, tuple(rest) or plan.steps)  # the last one does nothing
         self._plans = kept
         return steps
 
@@ -181,7 +195,7 @@ class Lookahead:
         off[:, 2] = wrap(off[:, 2])
         return bool(np.abs(off).max() <= _SAME)
 
-    def _plan(self, table: Table, actions: Ints) -> tuple[Step, ...]:
+    def _plan(self, table: Table, actions: Ints) -> _Plan:
         self._pushed.clear()
         [best] = self._nodes(replace(table, poses=table.poses[None]), actions[None], [()])
         beam = [best]
@@ -189,7 +203,7 @@ class Lookahead:
             found = self._children(table, beam)
             best = max([best, *found], key=lambda node: node.covered - _LEG * len(node.steps))
             beam = self._kept(found, best)
-        return (*best.steps, Step(best.poses, None, np.zeros(3)))
+        return _Plan(best.covered, (*best.steps, Step(best.poses, None, np.zeros(3))))
 
     def _kept(self, nodes: Iterable[_Node], best: _Node) -> list[_Node]:
         """The most promising nodes, those that are alike once."""

@@ -127,6 +127,7 @@ def policies(run: Run) -> dict[str, Player]:
     if ahead:
         alone = {"lookahead": "none", "beam": AgentConfig.beam}
         result["lookahead=none"] = greedy(run.with_settings({"agent": alone}).policy)
+    if run.setup.agent.lookahead == "engine":
         result["exact+lookahead"] = sweeping_policy(layout, sim, run.setup.agent.beam)
     result["exact"] = exact_policy(layout, sim)
     if sim.inexact or (sim.corner_noise and run.setup.horizon > 1):
