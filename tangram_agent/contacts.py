@@ -119,8 +119,10 @@ class Contacts:
         way, count = end - movers.pose, len(pieces.index)
         way[:, 2] = wrap(way[:, 2])
         path, last = _path(movers, way)
-        near = _near(path[:, :, None], movers.index[:, None, None], pieces.pose, pieces.index)
-        m, s, k = np.nonzero(near & _between(1, last, path)[..., None])
+        m, k = np.nonzero(_passing(movers, way, pieces))
+        places = path[m], movers.index[m, None], pieces.pose[k][:, None], pieces.index[k, None]
+        n, s = np.nonzero(_near(*places) & _between(1, last[m], path))
+        m, k = m[n], k[n]
         meet = _meet(replace(_at(movers, m), pose=path[m, s]), _at(pieces, k))
         # The first of its pushes by which each token comes onto a piece.
         pair, first = np.unique(m[meet] * count + k[meet], return_index=True)
@@ -313,6 +315,16 @@ def _near(pose: Floats, index: Ints, others: Floats, other: Ints) -> Bools:
     """(...,) whether tokens at poses (..., 3) may touch others, by their radii."""
     off = (pose - others)[..., :2]
     return np.asarray((off**2).sum(axis=-1) < (LAYOUT.radii[index] + LAYOUT.radii[other]) ** 2)
+
+
+def _passing(movers: Lying, way: Floats, pieces: Lying) -> Bools:
+    """(M, K) whether a token that goes a way (M, 3) comes near a piece, (K,), anywhere on it."""
+    along, to = _complex(way)[:, None], _complex(pieces.pose) - _complex(movers.pose)[:, None]
+    share = (to * along.conj()).real / np.maximum(np.abs(along) ** 2, _TOUCH**2)
+    off = np.abs(to - np.clip(share, 0.0, 1.0) * along)
+    return np.asarray(
+        off < LAYOUT.radii[movers.index][:, None] + LAYOUT.radii[pieces.index] + _TOUCH
+    )
 
 
 def _path(movers: Lying, way: Floats) -> tuple[Floats, Ints]:

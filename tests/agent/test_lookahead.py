@@ -145,6 +145,21 @@ def test_it_keeps_to_its_plan_while_the_world_does_what_was_foreseen() -> None:
     assert world.moves > tried
 
 
+def test_a_plan_that_leaves_a_part_is_made_again_at_the_next_action() -> None:
+    made = two()
+    layout, world = made.layout, Watched(made.layout, made.sim)
+    ahead = Lookahead(layout, made.sim, SweepGuide(layout), world, 1)
+    starts, goals = (layout.corners(np.array([poses], np.float64)) for poses in CROSSED)
+    moved, _ = ahead.choose(starts, np.zeros((1, 2), np.bool_), goals, None)
+    [first], tried = ahead._plans.values(), world.moves
+    assert first.covered < 0.98
+    placed = np.arange(2) == moved
+    ahead.choose(layout.corners(first.steps[0].before[None]), placed[None], goals, None)
+    [second] = ahead._plans.values()
+    assert world.moves > tried
+    assert second.covered >= first.covered
+
+
 def test_a_broader_beam_tries_more(monkeypatch: pytest.MonkeyPatch) -> None:
     worlds = list[Watched]()
 
