@@ -23,9 +23,9 @@ help:  ## list these commands
 train: .venv/.installed-run  ## train an agent on this machine; settings go into ARGS="seed=1 tokens=parallelogram"
 	@$(BIN)/tangram-train $(ARGS)
 
-# Ends with pytest's own summary line. Two tests at a time: most tests of real processes wait.
+# Ends with pytest's own summary line. Three tests at a time, on two cores too: those of real processes wait a lot.
 test: lint  ## lint, then all tests, a short training through real processes included
-	@$(BIN)/python -m pytest --numprocesses=2 --dist=loadgroup $(ARGS)
+	@$(BIN)/python -m pytest --numprocesses=3 --dist=loadgroup $(ARGS)
 
 lint: .venv/.installed-dev  ## ruff, mypy, import-linter, hadolint and shellcheck; changes nothing
 	$(BIN)/ruff check .

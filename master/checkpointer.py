@@ -259,14 +259,15 @@ def restore_run(folder: Path, trainer: Trainer) -> Restored | None:
 def warm_start(run_dir: Path, trainer: Trainer) -> None:
     """Give the trainer the networks of another run, with fresh optimisers and an empty replay.
 
-    The other run may have had other tokens, where the networks do not depend on them (net=mha).
+    The other run may have had other tokens, where the networks do not depend on them (net=mha), and
+    another world: what a command comes to is learned anew.
 
     Raises:
         RunError: there is no whole checkpoint, or its networks have other shapes.
     """
     try:
         content = load_checkpoint(newest_checkpoint(run_dir / CHECKPOINTS), [LEARNER])
-        trainer.learner.load_networks(content.arrays[LEARNER])
+        trainer.learner.begin_with(content.arrays[LEARNER])
     except RunError as error:
         raise RunError(f"warm_start={run_dir}: {error}") from None
     log.info("begins with the networks of %s after %s updates", run_dir, f"{content.updates:,}")

@@ -22,8 +22,9 @@ def check_resumable(folder: RunFolder, resolved: Mapping[str, Any]) -> None:
     """Refuse another task, or a warm start from nowhere, before anything is overwritten.
 
     Raises:
-        RunError: the newest checkpoint was made with other tokens, sim, reward or net, or there is
-            none, and the journal was, or the run that this one is to begin with has none.
+        RunError: the newest checkpoint was made with other tokens, sim, reward or net, or by an
+            agent whose networks mean something else, or there is none, and the journal was, or the
+            run that this one is to begin with has none.
     """
     found = list_checkpoints(folder.checkpoints)
     if not found:
@@ -48,9 +49,10 @@ def _check_warm_start(run_dir: str | None) -> None:
 def check_same_task(setup: Setup, contents: Mapping[str, Any]) -> None:
     """Raise RunError unless a run of a setup with these contents can go on with this one.
 
-    The agent's rates may change on the way; what shapes its networks shows when they load.
+    The agent's rates may change on the way, but not what its networks see, give and learn from.
     """
     odd = [name for name in setup.differences(contents) if name != "agent"]
+    odd += setup.meant_otherwise(contents)
     if odd:
         raise RunError(
             f"the run was made with other settings of {', '.join(odd)}: resume it with its own, "

@@ -202,8 +202,9 @@ class AgentConfig(Settings, section="agent"):
     lookahead: str = setting(
         "none",
         "several tokens that slide, exploration off: plan orders, places and ways of two legs by "
-        "trying them in a world of its own, the engine: planning with the simulator",
-        choices=("none", "engine"),
+        "trying them in a world of its own: the engine, which is planning with the simulator, or a "
+        "model of contacts that was learned from the engine's short pushes",
+        choices=("none", "engine", "learned"),
         only={"readout": "pair"},
     )
     beam: int = setting(

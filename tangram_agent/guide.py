@@ -7,7 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tangram_agent.lookahead import Places, Table
+from tangram_agent.contacts import Contacts
+from tangram_agent.coverage import Lying
+from tangram_agent.foresight import Places, Table
 from tangram_agent.networks import Networks
 from tangram_agent.pairs import PairGraph, Pairs
 from tangram_agent.setup import Setup
@@ -19,30 +21,41 @@ _NOISE = 0.03  # shares that are predicted for tokens which stay where they are
 
 
 class NetworkGuide:
-    """See `tangram_agent.lookahead.Guide`."""
+    """See `tangram_agent.foresight.Guide`."""
 
-    def __init__(self, networks: Networks, setup: Setup) -> None:
-        self._networks, self._reapply = networks, setup.agent.reapply
+    def __init__(self, networks: Networks, setup: Setup, contacts: Contacts | None = None) -> None:
+        self._networks, self._reapply, self._contacts = networks, setup.agent.reapply, contacts
         self._graph = PairGraph(setup.layout, setup.sim.arena, setup.agent)
 
     @torch.no_grad()
     def places(self, table: Table, left: Bools, covered: Floats) -> Places:
         """The actor's poses for the pieces that its critic likes best, token by token."""
-        token, piece = np.nonzero(left[:, None] & (covered < 1.0))
-        pairs = self._pairs(table, token, table.poses[token], piece, covered[piece])
+        row, token, piece = np.nonzero(left[:, :, None] & (covered < 1.0)[:, None])
+        start, taken = table.poses[row, token], covered[row, piece]
+        pairs = self._pairs(table, token, start, piece, taken)
         pose = self.proposed(pairs)
         for _ in range(self._reapply):
             pose = self.proposed(pairs.at(pose))
         way = self._graph.way(pairs, pose)
         value = self._networks.critic(pairs, way, pairs.at(pose)).numpy().astype(np.float64)
-        ranks = np.array([(value[token == i] > v).sum() for i, v in zip(token, value, strict=True)])
+        own = row * left.shape[1] + token
+        ranks = ((own == own[:, None]) & (value > value[:, None])).sum(axis=1)
         kept = (ranks == 0) | ((ranks < _PIECES) & (value >= _WORTH))
         poses = pose.numpy().astype(np.float64)
-        return Places(token[kept], piece[kept], poses[kept], np.clip(value[kept], 0.0, 1.0))
+        chosen = row[kept], token[kept], piece[kept]
+        return Places(*chosen, poses[kept], np.clip(value[kept], 0.0, 1.0))
 
     @torch.no_grad()
     def pushed(self, table: Table, token: Ints, start: Floats, end: Floats) -> Floats:
-        """What the critic's second head says of a token of the piece's shape that lies there."""
+        """What becomes of a token of the piece's shape that lies there.
+
+        By the model of contacts, or where none is at hand by the critic's second head.
+        """
+        if self._contacts is not None:
+            kinds = self._contacts.kinds
+            movers = Lying(kinds[token], start, table.flipped[token])
+            pieces = Lying(kinds, table.goal, table.goal_flipped)
+            return self._contacts.pushed(movers, end, pieces)
         count = len(table.goal)
         index, piece = (
             np.repeat(np.arange(len(token)), count),

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from tangram_agent.adam import Adam
 from tangram_agent.config import AgentConfig
-from tangram_agent.motion import Fit, Motions
+from tangram_agent.motion import Fit, MotionModel, Motions
 from tangram_agent.networks import VELOCITY, Networks, View, initialise, parameter_count
 from tangram_agent.pairs import Pairs
 from tangram_agent.relabelling import (
@@ -398,6 +398,17 @@ class Learner:
             )
         for part, module in self.parts.items():
             load_arrays(module, under(f"{part}.", state))
+
+    def begin_with(self, state: dict[str, Array]) -> None:
+        """Take over the networks of a state; the motion is learned anew: its world may be another.
+
+        Raises:
+            RunError: tensors are missing or have other shapes.
+        """
+        self.load_networks(state)
+        if self.motion is not None:
+            for model in (self.motion, self.acting.get_submodule("motion")):
+                model.load_state_dict(MotionModel().state_dict())
 
     def _optimisers(self) -> dict[str, Adam | Fit]:
         fit = {} if self._fit is None else {"motion": self._fit}

@@ -5,16 +5,17 @@ that lie in place. A world says what an action really comes to, neighbours of ne
 A node is a scene as some actions have left it. What is left to do there is valued by the best order
 of all tokens left, as the guide sees it, found exactly over sets of tokens and pieces.
 
-Legend: K tokens, M options. Shares and losses are of the area of the whole target.
+Legend: B scenes, K tokens, M options. Shares and losses are of the area of the whole target.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
 
+from tangram_agent.foresight import Foresight, Guide, Table
 from tangram_agent.types import Past
 from tangram_sim.actions import chosen_tokens, velocities_of
 from tangram_sim.actuation import full_scale
@@ -29,74 +30,11 @@ _TRIED = 6  # options of a node that the world is asked for
 _ALIKE = 3  # of them, at most so many of one token and one piece
 _STOPS = 8  # directions in which a way of two legs may come to its piece,
 _AWAY = (0.8, 1.6)  # and from how far, in radii of the largest token
-_PERFECT = 0.999  # share of the target beyond which nothing better is looked for
+_PERFECT = 0.999  # share of the target beyond which nothing better is looked for,
+_ENOUGH = 0.98  # and beyond which that is not done again at the next action
 _LEG = 1e-4  # what an action more must bring at least
 _SAME = 1e-3  # a scene is what was foreseen: arena units and radians
 _LOST = 3e-3  # predicted losses below that are the guide's noise
-
-
-@dataclass(frozen=True, eq=False)
-class Table:
-    """A scene and its target.
-
-    Attributes:
-        poses: (K, 3) of the tokens.
-        flipped: (K,) which lie on their other side.
-        goal: (K, 3) poses of the pieces.
-        goal_flipped: (K,) their sides.
-    """
-
-    poses: Floats
-    flipped: Bools
-    goal: Floats
-    goal_flipped: Bools
-
-
-@dataclass(frozen=True, eq=False)
-class Places:
-    """M places that tokens may take.
-
-    Attributes:
-        token: (M,) which token.
-        piece: (M,) for which piece.
-        pose: (M, 3) where it is to lie.
-        value: (M,) area that it covers there of the piece, over the larger of both areas.
-    """
-
-    token: Ints
-    piece: Ints
-    pose: Floats
-    value: Floats
-
-
-class Guide(Protocol):
-    """Who proposes."""
-
-    def places(self, table: Table, left: Bools, covered: Floats) -> Places:
-        """Where tokens that are left (K,) may go; covered (K,) shares of pieces are taken."""
-
-    def pushed(self, table: Table, token: Ints, start: Floats, end: Floats) -> Floats:
-        """(M, K) share of every piece's area that is pushed away where its own token lies there.
-
-        Args:
-            table: the scene.
-            token: (M,) which slide
-            start: from poses (M, 3)
-            end: to poses (M, 3).
-        """
-
-
-class Foresight(Protocol):
-    """A world of its own to try actions in; see `tangram_sim.world.World`."""
-
-    def place(self, poses: Floats, flipped: Bools | None = None) -> None:
-        """Put every token at its pose (K, 3), on its side (K,)."""
-
-    def move(self, token: int, velocity: Floats, flip: bool = False) -> None:
-        """Move one token by a shift and a turn (3,)."""
-
-    def poses(self) -> Floats:
-        """(K, 3) as the tokens lie."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,11 +52,19 @@ class Step:
     pose: Floats
 
 
+class _Plan(NamedTuple):
+    """What is to be played, and the share of the target that is covered then."""
+
+    covered: float
+    steps: tuple[Step, ...]
+
+
 @dataclass(frozen=True, eq=False)
 class _Options:
     """M ways to places.
 
     Attributes:
+        row: (M,) in which scene.
         token: (M,) which token.
         piece: (M,) for which piece.
         legs: (M,) actions that it takes; 0: the token stays where it lies.
@@ -127,6 +73,7 @@ class _Options:
         loss: (M, K) what it pushes away of each piece, if that is in place.
     """
 
+    row: Ints
     token: Ints
     piece: Ints
     legs: Ints
@@ -147,7 +94,7 @@ class _Node:
     """What some actions came to.
 
     Attributes:
-        table: the scene.
+        poses: (K, 3) of the tokens.
         actions: (K,) that each token has left.
         steps: how it was reached.
         covered: share of the target that is covered.
@@ -155,7 +102,7 @@ class _Node:
         best: the most promising options, each a token and the poses (L, 3) that it takes in turn.
     """
 
-    table: Table
+    poses: Floats
     actions: Ints
     steps: tuple[Step, ...]
     covered: float
@@ -183,7 +130,7 @@ class Lookahead:
         self._share: Floats = layout.areas / layout.areas.sum()
         masks = np.arange(1 << layout.tokens)
         self._taken = (masks[:, None] >> np.arange(layout.tokens)) & 1  # (2^K, K)
-        self._plans: dict[bytes, tuple[Step, ...]] = {}
+        self._plans: dict[bytes, _Plan] = {}
         # What a way pushes away of pieces in place is the same in every node of a plan.
         self._pushed: dict[bytes, Floats] = {}
 
@@ -227,14 +174,19 @@ class Lookahead:
 
     def _steps(self, tables: Sequence[Table], actions: Ints) -> list[Step]:
         """The next action in every scene, each token having so many left, (B, K)."""
-        kept, steps = dict[bytes, tuple[Step, ...]](), list[Step]()
+        kept, steps = dict[bytes, _Plan](), list[Step]()
         for table, left in zip(tables, actions, strict=True):
             key = table.goal.tobytes()
-            plan = self._plans.get(key, ())
-            if not (plan and self._foreseen(plan[0], table)):
-                plan = self._plan(table, left)
-            steps.append(plan[0])
-            kept[key] = plan[1:] or plan  # the last one does nothing
+            plan = self._plans.get(key)
+            if plan is not None and not self._foreseen(plan.steps[0], table):
+                plan = None
+            # With fewer tokens left a plan costs less, and sees farther.
+            if plan is None or plan.covered < _ENOUGH:
+                found = self._plan(table, left)
+                plan = found if plan is None or found.covered > plan.covered else plan
+            first, *rest = plan.steps
+            steps.append(first)
+            kept[key] = _Plan(plan.covered, tuple(rest) or plan.steps)  # the last one does nothing
         self._plans = kept
         return steps
 
@@ -243,54 +195,64 @@ class Lookahead:
         off[:, 2] = wrap(off[:, 2])
         return bool(np.abs(off).max() <= _SAME)
 
-    def _plan(self, table: Table, actions: Ints) -> tuple[Step, ...]:
+    def _plan(self, table: Table, actions: Ints) -> _Plan:
         self._pushed.clear()
-        best = self._node(table, actions, ())
+        [best] = self._nodes(replace(table, poses=table.poses[None]), actions[None], [()])
         beam = [best]
         while beam and best.covered < _PERFECT:
-            found = [child for node in beam for child in self._children(node)]
+            found = self._children(table, beam)
             best = max([best, *found], key=lambda node: node.covered - _LEG * len(node.steps))
             beam = self._kept(found, best)
-        return (*best.steps, Step(best.table.poses, None, np.zeros(3)))
+        return _Plan(best.covered, (*best.steps, Step(best.poses, None, np.zeros(3))))
 
     def _kept(self, nodes: Iterable[_Node], best: _Node) -> list[_Node]:
         """The most promising nodes, those that are alike once."""
         kept = dict[bytes, _Node]()
         for node in sorted(nodes, key=lambda node: -node.promise):
             if node.best and node.promise > best.covered + _LEG and len(kept) < self._beam:
-                kept.setdefault(node.table.poses.round(2).tobytes() + node.actions.tobytes(), node)
+                kept.setdefault(node.poses.round(2).tobytes() + node.actions.tobytes(), node)
         return list(kept.values())
 
-    def _children(self, node: _Node) -> Iterator[_Node]:
-        for token, stops in node.best:
-            poses, steps = node.table.poses, node.steps
-            self._world.place(poses, node.table.flipped)
-            for stop in stops:
-                steps = (*steps, Step(poses, token, stop))
-                share = velocities_of((stop - poses[token])[None], self._sim)[0]
-                self._world.move(token, np.clip(share, -1.0, 1.0) * full_scale(self._sim))
-                poses = self._world.poses()
-            actions = node.actions.copy()
-            actions[token] -= len(stops)
-            yield self._node(replace(node.table, poses=poses), actions, steps)
+    def _children(self, table: Table, nodes: Sequence[_Node]) -> list[_Node]:
+        """What the most promising options come to."""
+        tried = [(node, token, stops) for node in nodes for token, stops in node.best]
+        if not tried:
+            return []
+        token = np.array([moving for _, moving, _ in tried])
+        poses, actions = (
+            np.stack([getattr(node, name) for node, _, _ in tried]) for name in ("poses", "actions")
+        )
+        steps = [node.steps for node, _, _ in tried]
+        for leg in range(2):
+            rows = np.array([b for b, (_, _, stops) in enumerate(tried) if leg < len(stops)], int)
+            if len(rows):
+                stop = np.stack([tried[b][2][leg] for b in rows])
+                for b, pose in zip(rows.tolist(), stop, strict=True):
+                    steps[b] = (*steps[b], Step(poses[b].copy(), int(token[b]), pose))
+                share = velocities_of(stop - poses[rows, token[rows]], self._sim)
+                way = np.clip(share, -1.0, 1.0) * full_scale(self._sim)
+                scenes = replace(table, poses=poses[rows])
+                poses[rows] = self._world.slid(scenes, token[rows], way)
+                actions[rows, token[rows]] -= 1
+        return self._nodes(replace(table, poses=poses), actions, steps)
 
-    def _node(self, table: Table, actions: Ints, steps: tuple[Step, ...]) -> _Node:
+    def _nodes(self, table: Table, actions: Ints, steps: Sequence[tuple[Step, ...]]) -> list[_Node]:
         areas = self._layout.areas
-        shared = shared_areas(self._outlines(table.poses, table.flipped), self._goals(table))[0]
+        shared = shared_areas(self._outlines(table.poses, table.flipped), self._goals(table))
         # Rounding must not decide between ways that are equally good.
-        now = round(float(self._share @ np.minimum(shared.sum(axis=0) / areas, 1.0)), 6)
+        now = (np.minimum(shared.sum(axis=1) / areas, 1.0) @ self._share).round(6)
         lies = shared / np.maximum(areas[:, None], areas)
-        fits = lies >= _DONE
-        left = (actions > 0) & ~fits.any(axis=1)
-        covered = np.minimum((shared * ~left[:, None]).sum(axis=0) / areas, 1.0)
-        if not left.any():
-            return _Node(table, actions, steps, now, now, [])
+        left = (actions > 0) & ~(lies >= _DONE).any(axis=2)
+        covered = np.minimum((shared * ~left[..., None]).sum(axis=1) / areas, 1.0)
         options = self._options(table, actions, left, covered, lies)
-        base = float(self._share @ covered)
-        taken = covered > _DONE
-        promise, totals = self._promises(options, left, taken)
-        best = self._most_promising(options, totals)
-        return _Node(table, actions, steps, now, base + promise, best)
+        base, taken, nodes = covered @ self._share, covered > _DONE, list[_Node]()
+        for b, poses in enumerate(table.poses):
+            own = options.at(np.flatnonzero(options.row == b))
+            promise, totals = self._promises(own, left[b], taken[b])
+            best = self._most_promising(own, totals)
+            promised = float(base[b]) + promise
+            nodes.append(_Node(poses, actions[b], steps[b], float(now[b]), promised, best))
+        return nodes
 
     def _options(
         self, table: Table, actions: Ints, left: Bools, covered: Floats, lies: Floats
@@ -298,28 +260,30 @@ class Lookahead:
         """Every token left, straight or by two legs to places, or where it lies."""
         places, areas = self._guide.places(table, left, covered), self._layout.areas
         larger = np.maximum(areas[places.token], areas[places.piece]) / areas[places.piece]
-        gain = np.minimum(places.value * larger, 1.0 - covered[places.piece])
+        gain = np.minimum(places.value * larger, 1.0 - covered[places.row, places.piece])
         # A token that a turn maps onto itself may lie in several ways.
         turns = self._layout.symmetries[places.token]
         index = np.repeat(np.arange(len(turns)), turns)
         number = np.arange(len(index)) - (turns.cumsum() - turns)[index]
         pose = places.pose[index]
         pose[:, 2] += 2.0 * np.pi * number / turns[index]
-        token, piece = places.token[index], places.piece[index]
+        row, token, piece = (part[index] for part in (places.row, places.token, places.piece))
         straight = _Options(
+            row=row,
             token=token,
             piece=piece,
             legs=np.ones(len(token), dtype=np.int64),
             stops=np.stack([pose, pose], axis=1),
             gain=gain[index] * self._share[piece],
-            loss=self._losses(table, token, piece, table.poses[token], pose),
+            loss=self._losses(table, token, piece, table.poses[row, token], pose),
         )
-        around = self._around(table, straight, actions)
+        # Of ways round to turns that look alike one is enough.
+        around = self._around(table, straight.at(np.flatnonzero(number == 0)), actions)
         return straight + around + self._staying(table, left, covered, lies)
 
     def _around(self, table: Table, straight: _Options, actions: Ints) -> _Options:
         """Ways of two legs where the straight one costs: turn on the first one, then shift."""
-        costs = (straight.loss.sum(axis=1) > 0.0) & (actions[straight.token] > 1)
+        costs = (straight.loss.sum(axis=1) > 0.0) & (actions[straight.row, straight.token] > 1)
         costly = straight.at(np.flatnonzero(costs))
         angle = 2.0 * np.pi * np.arange(_STOPS) / _STOPS
         circle = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(_STOPS)])
@@ -329,36 +293,41 @@ class Lookahead:
         inside = (np.abs(around.stops[:, 0, :2]) <= self._sim.arena / 2.0).all(axis=1)
         around = around.at(np.flatnonzero(inside))
         token, piece, stops = around.token, around.piece, around.stops
-        first = self._losses(table, token, piece, table.poses[token], stops[:, 0])
-        second = self._losses(table, token, piece, stops[:, 0], stops[:, 1])
-        loss = np.maximum(first, second)
+        # Both legs together: what is asked of a guide takes about as long for many ways.
+        starts = np.concatenate([table.poses[around.row, token], stops[:, 0]])
+        ends = np.concatenate([stops[:, 0], stops[:, 1]])
+        legs = self._losses(table, np.tile(token, 2), np.tile(piece, 2), starts, ends)
+        loss = np.maximum(*np.split(legs, 2))
         return replace(around, legs=around.legs + 1, gain=around.gain - _LEG, loss=loss)
 
     def _staying(self, table: Table, left: Bools, covered: Floats, lies: Floats) -> _Options:
         """Tokens left that cover a part of a piece where they lie."""
-        token, piece = np.nonzero(lies * left[:, None] > 0.0)
-        pose = table.poses[token]
+        row, token, piece = np.nonzero(lies * left[..., None] > 0.0)
+        pose = table.poses[row, token]
+        gain = np.minimum(lies[row, token, piece], 1.0 - covered[row, piece])
         return _Options(
+            row=row,
             token=token,
             piece=piece,
             legs=np.zeros(len(token), dtype=np.int64),
             stops=np.stack([pose, pose], axis=1),
-            gain=np.minimum(lies[token, piece], 1.0 - covered[piece]) * self._share[piece],
-            loss=np.zeros((len(token), len(left))),
+            gain=gain * self._share[piece],
+            loss=np.zeros((len(token), self._layout.tokens)),
         )
 
     def _losses(self, table: Table, token: Ints, piece: Ints, start: Floats, end: Floats) -> Floats:
         if not len(token):
             return np.zeros((0, self._layout.tokens))
-        ways = np.column_stack([token, start, end]).round(6)
+        ways = np.column_stack([token, start, end]).round(3)
         keys = [way.tobytes() for way in ways]
-        new = [m for m, key in enumerate(keys) if key not in self._pushed]
+        new = {key: m for m, key in enumerate(keys) if key not in self._pushed}
         if new:
-            rows = self._guide.pushed(table, token[new], start[new], end[new])
-            self._pushed.update(zip([keys[m] for m in new], rows, strict=True))
-        pushed = np.stack([self._pushed[key] for key in keys])
-        pushed[np.arange(len(token)), piece] = 0.0
-        return np.where(pushed > _LOST, pushed, 0.0) * self._share
+            rows = list(new.values())
+            pushed = self._guide.pushed(table, token[rows], start[rows], end[rows])
+            self._pushed.update(zip(new, pushed, strict=True))
+        known = np.stack([self._pushed[key] for key in keys])
+        known[np.arange(len(token)), piece] = 0.0
+        return np.where(known > _LOST, known, 0.0) * self._share
 
     def _promises(self, options: _Options, left: Bools, taken: Bools) -> tuple[float, Floats]:
         """What the best order of all tokens left adds, and the best after each option, (M,)."""
@@ -396,10 +365,10 @@ class Lookahead:
         return best
 
     def _outlines(self, poses: Floats, flipped: Bools) -> Floats:
-        return outlines(self._layout.corners(poses, flipped)[None], self._layout)
+        return outlines(self._layout.corners(poses, flipped), self._layout)
 
     def _goals(self, table: Table) -> Floats:
-        return self._outlines(table.goal, table.goal_flipped)
+        return self._outlines(table.goal[None], table.goal_flipped)
 
 
 def _mask(flags: Bools) -> int:

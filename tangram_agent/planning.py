@@ -16,7 +16,9 @@ import torch
 from torch import Tensor
 
 from tangram_agent.adam import Adam
+from tangram_agent.contacts import ContactWorlds, known_contacts
 from tangram_agent.coverage import covered_share, covering, worths
+from tangram_agent.foresight import EngineWorlds, Foresight
 from tangram_agent.guide import NetworkGuide, as_tensor
 from tangram_agent.lookahead import Lookahead
 from tangram_agent.motion import Belief, motions_of
@@ -27,7 +29,6 @@ from tangram_agent.types import Past
 from tangram_sim.actions import velocities_of
 from tangram_sim.arrays import Bools, Floats, Ints, Singles
 from tangram_sim.layout import Layout
-from tangram_sim.world import make_world
 
 _SHORT_LIST = 8  # proposals of an environment that are valued for all pieces
 
@@ -144,13 +145,19 @@ class Planner:
         self._graph = PairGraph(setup.layout, setup.sim.arena, setup.agent)
         self._contacts = setup.contacts
         self._turns_over = setup.layout.chiral & setup.sim.allow_flip
-        self._guide = NetworkGuide(networks, setup)
+        self._known = known_contacts(setup)
+        self._guide = NetworkGuide(networks, setup, self._known)
 
     @cached_property
     def _lookahead(self) -> Lookahead:
-        """Made when it is first asked for: its world loads the engine."""
-        sim, beam = replace(self._sim, pixels=0), self._agent.beam
-        return Lookahead(self._layout, sim, self._guide, make_world(self._layout, sim), beam)
+        """Made when it is first asked for: its world may load the engine."""
+        layout, sim, known = self._layout, self._sim, self._known
+        world: Foresight
+        if known is None or self._agent.lookahead == "engine":
+            world = EngineWorlds(layout, sim)
+        else:
+            world = ContactWorlds(known)
+        return Lookahead(layout, sim, self._guide, world, self._agent.beam)
 
     def forget(self) -> None:
         """Drop what was planned with other weights."""

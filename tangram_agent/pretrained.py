@@ -24,6 +24,7 @@ CONFIG = "config.yaml"
 WEIGHTS = "weights.safetensors"
 CARD = "card.json"
 CARD_TEXT = "card.md"
+CONTACTS = "contacts"  # no agent, but a model that agents look ahead by; see contacts.py
 FORMAT = 2
 PACKAGED: Traversable = files("tangram_agent") / PREFIX
 
@@ -47,7 +48,8 @@ def agent_names() -> list[str]:
     """The agents that come with the package."""
     if not PACKAGED.is_dir():
         return []
-    return sorted(entry.name for entry in PACKAGED.iterdir() if is_agent(entry))
+    names = (entry.name for entry in PACKAGED.iterdir() if is_agent(entry))
+    return sorted(name for name in names if name != CONTACTS)
 
 
 def is_agent(folder: Traversable) -> bool:
@@ -114,4 +116,4 @@ def _check_card(card: object, data: bytes, shown: str | Path) -> None:
 
 
 def _damaged(shown: str | Path, why: str) -> RunError:
-    return RunError(f"the agent {shown} is damaged ({why}): install tangram-rl again")
+    return RunError(f"{shown} is damaged ({why}): install tangram-rl again")

@@ -145,6 +145,13 @@ class Run:
             setup = make_setup(config)
         except ConfigError as error:
             raise ConfigError(f"{self.folder} with {', '.join(given)}: {error}") from None
+        if setup.pairs and setup.contacts != self.setup.contacts:
+            learned = "learned" if self.setup.contacts else "never learned"
+            raise ConfigError(
+                f"sim.motion={setup.sim.motion} does not fit {self.folder}, which was trained with "
+                f"sim.motion={self.setup.sim.motion} and {learned} what tokens push away: leave it "
+                f"out, or {ANOTHER}"
+            )
         policy = Policy(setup)
         policy.load(self.policy.weights())
         return replace(self, setup=setup, policy=policy)

@@ -15,7 +15,7 @@ from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import Layout, TokensConfig, make_layout
 from tangram_sim.rewards import reward_identity
-from tangram_sim.settings import refuse_ignored, told
+from tangram_sim.settings import KEY, NETWORK, declared_fields, refuse_ignored, told
 from tangram_sim.targets import check_targets
 
 Settings = TypeVar("Settings")
@@ -190,6 +190,18 @@ class Setup:
         own = self.contents()
         known = own | contents if isinstance(contents, dict) else {}
         return sorted(name for name in own if not _agree(own[name], known.get(name)))
+
+    def meant_otherwise(self, contents: object) -> list[str]:
+        """The agent's settings by which networks of another setup are not networks of this one.
+
+        They may have the same shapes: what they see, give and learn from is another thing.
+        """
+        agent = contents.get("agent") if isinstance(contents, dict) else None
+        own = self.contents()["agent"]
+        known = own | agent if isinstance(agent, dict) else own
+        parts = {one.name: one.metadata[KEY].part for one in declared_fields(AgentConfig)}
+        names = [name for name in own if parts[name] == NETWORK]
+        return [f"agent.{name}" for name in names if own[name] != known[name]]
 
 
 def _changed(config: RewardConfig | AgentConfig) -> dict[str, Any]:

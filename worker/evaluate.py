@@ -83,6 +83,7 @@ _SEVERAL = {
     "actions_used": ("actions", 2),
     "seconds_per_puzzle": ("seconds", 3),
     "ms_per_decision": ("ms for each action", 1),
+    "ms_slowest": ("CPU ms of the slowest", 0),
 }
 _COUNTS = ("wrong", "doubly_used", "refused", "blocked", "actions_used")
 
@@ -128,6 +129,7 @@ def policies(run: Run) -> dict[str, Player]:
     if ahead:
         alone = {"lookahead": "none", "beam": AgentConfig.beam}
         result["lookahead=none"] = greedy(run.with_settings({"agent": alone}).policy)
+    if run.setup.agent.lookahead == "engine":
         result["exact+lookahead"] = sweeping_policy(layout, sim, run.setup.agent.beam)
     result["exact"] = exact_policy(layout, sim)
     if sim.inexact or (sim.corner_noise and run.setup.horizon > 1):
@@ -140,14 +142,17 @@ def policies(run: Run) -> dict[str, Player]:
 def score_policies(
     setup: Setup, players: Mapping[str, Player], config: EvalConfig
 ) -> dict[str, Scores]:
-    """Scores of each policy, on the same episodes."""
-    with closing(FixedTests(setup, config.episodes, AT_ONCE, seed=config.seed)) as tests:
+    """Scores of each policy, on the same episodes; what looks ahead plays one by one."""
+    at_once = AT_ONCE if setup.agent.lookahead == "none" else 1
+    with closing(FixedTests(setup, config.episodes, at_once, seed=config.seed)) as tests:
         return {name: _scored(tests, player) for name, player in players.items()}
 
 
 def _scored(tests: FixedTests, player: Player) -> Scores:
     played = tests.play(playing(player, tests.env))
     scores: Scores = dict(tests.scores(played))
+    if tests.env.count == 1:
+        scores["ms_slowest"] = 1e3 * float(played.slowest.max())
     return scores | (of_several(played) if tests.setup.layout.tokens > 1 else {})
 
 

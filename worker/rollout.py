@@ -36,6 +36,7 @@ class Played:
         blocked: (E, T) where a token could not be set down on others.
         seconds: (E,) wall time of choosing and moving, an equal share for each of those that were
             played together.
+        slowest: (E,) processor time of their slowest choice, in seconds.
         camera: (E,) Eq. 14 of the pictures after the last step; None without a camera.
     """
 
@@ -46,6 +47,7 @@ class Played:
     refused: Bools
     blocked: Bools
     seconds: Floats
+    slowest: Floats
     camera: Floats | None
 
     @property
@@ -83,6 +85,7 @@ class Played:
             refused=np.empty((count, steps), np.bool_),
             blocked=np.empty((count, steps), np.bool_),
             seconds=np.empty(count),
+            slowest=np.zeros(count),
             camera=np.empty(count) if env.sim.pixels else None,
         )
 
@@ -157,7 +160,10 @@ def _play_group(
             return False
         _look(env, played, rows, t)
         past = Past(seen.corners[rows, :t], seen.actions[rows, :t])
+        asked = time.process_time()
         actions = choose(env.seen, env.closed, env.seen_goals, generators, past)
+        spent = time.process_time() - asked
+        played.slowest[rows] = np.maximum(played.slowest[rows], spent)
         result = env.step(actions.astype(np.float64))
         seen.actions[rows, t], seen.rewards[rows, t] = actions, result.rewards
         played.refused[rows, t], played.blocked[rows, t] = result.refused, result.blocked

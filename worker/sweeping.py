@@ -3,31 +3,27 @@
 Legend: K tokens, M ways, S moments of each.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
-from tangram_agent.lookahead import Lookahead, Places, Table
+from tangram_agent.foresight import EngineWorlds, Places, Table
+from tangram_agent.lookahead import Lookahead
 from tangram_agent.types import Past
 from tangram_sim.actions import make_actions, velocities_of
-from tangram_sim.arrays import Bools, Complex, Floats, Ints, Singles
+from tangram_sim.arrays import Bools, Floats, Ints, Singles
 from tangram_sim.config import SimConfig
-from tangram_sim.geometry import outlines, outlines_at
+from tangram_sim.geometry import outlines, outlines_at, separations
 from tangram_sim.kinematics import wrap
 from tangram_sim.layout import Layout
-from tangram_sim.world import make_world
 from worker.pairing import alike, all_ways
 from worker.rollout import Choose, Generators
 
 _MOMENTS = 24
-_NO_EDGE = 1e-9  # length, of corners that are repeated
 _PUSHED = 1.5  # depth of a meeting, in roots of the area, by which all of a piece is pushed away
 
 
 def sweeping_policy(layout: Layout, sim: SimConfig, beam: int) -> Choose:
     """A look ahead in the engine that nothing learned guides, see `Lookahead`."""
-    own = replace(sim, pixels=0)
-    lookahead = Lookahead(layout, own, SweepGuide(layout), make_world(layout, own), beam)
+    lookahead = Lookahead(layout, sim, SweepGuide(layout), EngineWorlds(layout, sim), beam)
 
     def choose(
         corners: Floats, placed: Bools, goals: Floats, _generators: Generators, past: Past
@@ -42,7 +38,7 @@ def sweeping_policy(layout: Layout, sim: SimConfig, beam: int) -> Choose:
 
 
 class SweepGuide:
-    """See `tangram_agent.lookahead.Guide`."""
+    """See `tangram_agent.foresight.Guide`."""
 
     def __init__(self, layout: Layout) -> None:
         self._layout = layout
@@ -52,13 +48,13 @@ class SweepGuide:
     def places(self, table: Table, left: Bools, covered: Floats) -> Places:
         """Every token exactly on every piece of its shape that is not taken."""
         layout = self._layout
-        corners = layout.corners(np.stack([table.poses, table.goal]), table.flipped)
-        goals = layout.corners(table.goal, table.goal_flipped)
-        ways = all_ways(layout, corners[:1], goals[None])[0]
+        corners = layout.corners(table.poses, table.flipped)
+        goals = layout.corners(table.goal[None], table.goal_flipped)
+        ways = all_ways(layout, corners, goals)
         same = self._same & (table.flipped[:, None] == table.goal_flipped)
-        token, piece = np.nonzero(same & left[:, None] & (covered < 1.0))
-        pose = table.poses[token] + ways[token, piece]
-        return Places(token, piece, pose, np.ones(len(token)))
+        row, token, piece = np.nonzero(same & left[:, :, None] & (covered < 1.0)[:, None])
+        pose = table.poses[row, token] + ways[row, token, piece]
+        return Places(row, token, piece, pose, np.ones(len(token)))
 
     def pushed(self, table: Table, token: Ints, start: Floats, end: Floats) -> Floats:
         """By how deep the token comes into the piece on its way."""
@@ -73,29 +69,6 @@ class SweepGuide:
         one = outlines_at(self._body[token[m]], path[m, s], table.flipped[token[m]])
         pieces = outlines(layout.corners(table.goal, table.goal_flipped)[None], layout)[0]
         depth = np.zeros(apart.shape)
-        depth[m, s, piece] = _depth(one, pieces[piece])
+        depth[m, s, piece] = separations(one, pieces[piece])[0]
         share: Floats = np.clip(depth.max(axis=1) / np.sqrt(layout.areas) * _PUSHED, 0.0, 1.0)
         return share
-
-
-def _depth(first: Floats, second: Floats) -> Floats:
-    """(N,) the shortest way by which convex polygons (N, C, 2) come apart; 0 where they are."""
-    # Corner by corner: numpy is several times slower along short axes.
-    one, other = (list((p[..., 0] + 1j * p[..., 1]).T.copy()) for p in (first, second))
-    depth = np.full(len(first), np.inf)
-    for polygon in (one, other):
-        for corner, following in zip(polygon, polygon[1:] + polygon[:1], strict=True):
-            edge = following - corner
-            length = np.abs(edge)
-            normal = (edge / np.maximum(length, _NO_EDGE)).conj()
-            low, high = _extent(one, normal)
-            other_low, other_high = _extent(other, normal)
-            gap = np.minimum(high - other_low, other_high - low)
-            depth = np.minimum(depth, np.where(length > _NO_EDGE, gap, np.inf))
-    return np.asarray(np.maximum(depth, 0.0))
-
-
-def _extent(corners: list[Complex], normal: Complex) -> tuple[Floats, Floats]:
-    """(N,) lowest and highest of corners across an edge of direction `normal`, conjugated."""
-    across = [(normal * corner).imag for corner in corners]
-    return np.minimum.reduce(across), np.maximum.reduce(across)

@@ -21,7 +21,7 @@ from tangram_sim.settings import (
 )
 
 FORMAT = 2
-Kind = Literal["curves", "complexity", "tests", "rewards", "ranking", "game"]
+Kind = Literal["curves", "complexity", "tests", "rewards", "ranking", "game", "worlds"]
 KINDS: tuple[str, ...] = get_args(Kind)
 PLAN = "plan.json"
 

@@ -27,6 +27,7 @@ from tangram_agent.pretrained import CARD, CARD_TEXT, CONFIG, FORMAT, PREFIX, WE
 from tangram_agent.runs import Run, load_run
 from tangram_agent.setup import Setup
 from tangram_sim.errors import ConfigError, RunError, TangramError
+from tangram_sim.settings import told
 from tangram_sim.targets import has_all_tans
 from worker.config import EvalConfig
 from worker.evaluate import RUN, policies, score_policies, score_puzzles
@@ -190,7 +191,8 @@ def make_card(
     """
     setup, result = chosen.run.setup, chosen.result
     acting = sum(math.prod(shape) for shape in Policy(setup).shapes.values())
-    source = f"simulated by this project ({setup.sim.backend}), random starts and targets"
+    world = "".join(f", {name} {told(value)}" for name, value in setup.sim.inexact.items())
+    source = f"simulated by this project ({setup.sim.backend}{world}), random starts and targets"
     each = ("seed", "train_s", "episodes", *_ROWS)
     return {
         "format": FORMAT,

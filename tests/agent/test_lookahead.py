@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from tangram_agent import planning
-from tangram_agent.lookahead import Lookahead, Table
+from tangram_agent.foresight import EngineWorlds, Table
+from tangram_agent.lookahead import Lookahead
 from tangram_agent.networks import Networks
 from tangram_agent.pairs import PairGraph
 from tangram_agent.planning import Planner
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
 from tangram_agent.types import Past
-from tangram_sim.arrays import Bools, Floats
+from tangram_sim.arrays import Bools, Floats, Ints
 from tangram_sim.batch import BatchedEnv
-from tangram_sim.world import World, make_world
 from tests.agent.builders import setup
 from tests.agent.pair_scenes import PERCEPTRON, PerfectCritic, PerfectNetworks, seven
 from worker.baselines import exact_policy
@@ -116,20 +116,19 @@ def test_a_token_that_was_pushed_is_put_back_while_it_has_actions() -> None:
     np.testing.assert_array_equal(choose(corners, spent, goals, [], second), [[-0.5, 0, 0, 0]])
 
 
-class Watched:
-    """A world that counts the actions that are tried in it."""
+class Watched(EngineWorlds):
+    """Counts the actions that are tried."""
 
-    def __init__(self, world: World) -> None:
-        self.place, self.poses, self._move, self.moves = world.place, world.poses, world.move, 0
+    moves = 0
 
-    def move(self, token: int, velocity: Floats, flip: bool = False) -> None:
-        self.moves += 1
-        self._move(token, velocity, flip)
+    def slid(self, table: Table, token: Ints, way: Floats) -> Floats:
+        self.moves += len(token)
+        return super().slid(table, token, way)
 
 
 def test_it_keeps_to_its_plan_while_the_world_does_what_was_foreseen() -> None:
     made = two()
-    layout, world = made.layout, Watched(make_world(made.layout, made.sim))
+    layout, world = made.layout, Watched(made.layout, made.sim)
     ahead = Lookahead(layout, made.sim, SweepGuide(layout), world, 2)
     goals, placed = layout.corners(np.array([GOALS], np.float64)), np.array([[False, False]])
 
@@ -146,14 +145,29 @@ def test_it_keeps_to_its_plan_while_the_world_does_what_was_foreseen() -> None:
     assert world.moves > tried
 
 
+def test_a_plan_that_leaves_a_part_is_made_again_at_the_next_action() -> None:
+    made = two()
+    layout, world = made.layout, Watched(made.layout, made.sim)
+    ahead = Lookahead(layout, made.sim, SweepGuide(layout), world, 1)
+    starts, goals = (layout.corners(np.array([poses], np.float64)) for poses in CROSSED)
+    moved, _ = ahead.choose(starts, np.zeros((1, 2), np.bool_), goals, None)
+    [first], tried = ahead._plans.values(), world.moves
+    assert first.covered < 0.98
+    placed = np.arange(2) == moved
+    ahead.choose(layout.corners(first.steps[0].before[None]), placed[None], goals, None)
+    [second] = ahead._plans.values()
+    assert world.moves > tried
+    assert second.covered >= first.covered
+
+
 def test_a_broader_beam_tries_more(monkeypatch: pytest.MonkeyPatch) -> None:
     worlds = list[Watched]()
 
     def watched(*given: Any) -> Watched:
-        worlds.append(Watched(make_world(*given)))
+        worlds.append(Watched(*given))
         return worlds[-1]
 
-    monkeypatch.setattr(planning, "make_world", watched)
+    monkeypatch.setattr(planning, "EngineWorlds", watched)
     goals, starts = np.zeros((2, 7, 3))
     goals[:, 0], goals[:, 1] = np.linspace(-0.9, 0.9, 7), 0.3
     starts[:, 0], starts[:, 1] = goals[::-1, 0], -0.3

@@ -57,7 +57,7 @@ def changed(section: str, **values: Any) -> dict[str, dict[str, Any]]:
         (changed("agent", readout="x"), "agent.readout must be one of pair, token, got 'x'"),
         (changed("agent", order="x"), "agent.order must be one of learned, listed, size, random"),
         (changed("agent", reapply=-1), "agent.reapply must be between 0 and 100, got -1"),
-        (changed("agent", lookahead="x"), "agent.lookahead must be one of none, engine, got 'x'"),
+        (changed("agent", lookahead="x"), "agent.lookahead must be one of none, engine, learned"),
         (
             changed("agent", lookahead="engine", beam=0),
             "agent.beam must be between 1 and 1000, got 0",

@@ -22,6 +22,7 @@ from worker.connection import Timing
 EPISODES = 3  # in each batch
 FIRST_TAG = 2.0  # rewards of hindsight twins are at most 1
 QUICK = Timing(retry_s=0.2, heartbeat_s=0.2, resend_s=1.0, silence_s=1.5)
+PATIENT = replace(QUICK, silence_s=30.0)  # a master on a busy machine may be silent for seconds
 MASTER = (
     "resume=auto",
     "sim=kinematic",
@@ -50,13 +51,18 @@ class Player:
     """A worker whose batches can be told apart in the replay, by their rewards."""
 
     def __init__(
-        self, connect: str | Path, index: int, setup: Setup, tag_index: int | None = None
+        self,
+        connect: str | Path,
+        index: int,
+        setup: Setup,
+        tag_index: int | None = None,
+        timing: Timing = QUICK,
     ) -> None:
         self._setup, self.index = setup, index
         self._first_tag = FIRST_TAG + 100_000.0 * (index if tag_index is None else tag_index)
         spec = EpisodeSpec.of(setup)
         self.client = Client(
-            str(connect), "player", index, setup.fingerprints(), spec, None, 4, QUICK
+            str(connect), "player", index, setup.fingerprints(), spec, None, 4, timing
         )
         self.sent = 0
 
@@ -125,10 +131,14 @@ def setup_of(folder: Path) -> Setup:
 
 
 @contextmanager
-def players(setup: Setup, *connects: str | Path) -> Iterator[list[Player]]:
-    """Players that have joined."""
+def players(
+    setup: Setup, *connects: str | Path, beside: str | Path | None = None
+) -> Iterator[list[Player]]:
+    """Players that have joined; the last one, `beside`, must not notice what befalls the others."""
     with ExitStack() as stack:
         made = [Player(connect, i, setup) for i, connect in enumerate(connects)]
+        if beside is not None:
+            made.append(Player(beside, len(made), setup, timing=PATIENT))
         for player in made:
             stack.enter_context(player.client)
             assert player.client.join()

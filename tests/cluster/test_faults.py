@@ -54,7 +54,7 @@ def test_a_network_that_swallows_everything_for_a_while(
     with (
         master(folder, *TCP) as process,
         Proxy(port_of(folder)) as proxy,
-        players(setup_of(folder), f"tcp://127.0.0.1:{proxy.port}", folder) as made,
+        players(setup_of(folder), f"tcp://127.0.0.1:{proxy.port}", beside=folder) as made,
     ):
         more_acknowledged(made, 5)
         proxy.cut(*directions)
@@ -226,7 +226,7 @@ def test_a_worker_that_is_killed_while_it_plays_comes_back(tmp_path: Path) -> No
     """Real workers with the engine; episodes of theirs that never arrived are all that is lost."""
     folder = tmp_path / "run"
     settings = (
-        *("workers=2", "agent.learning_starts=100", "agent.replay_capacity=100000"),
+        *("workers=2", "agent.learning_starts=100", "agent.replay_capacity=2000000"),
         *("agent.updates_per_transition=0.02", "max_updates=100000"),
     )
     with (

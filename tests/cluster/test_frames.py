@@ -50,7 +50,7 @@ def test_repeated_swapped_and_damaged_messages_change_nothing(folder: Path, seed
     with (
         master(folder) as process,
         Mangler(endpoint_of(folder), seed) as mangler,
-        players(setup_of(folder), f"tcp://127.0.0.1:{mangler.port}", folder) as made,
+        players(setup_of(folder), f"tcp://127.0.0.1:{mangler.port}", beside=folder) as made,
     ):
         wanted = {(kind, way) for kind in KINDS for way in ("up", "down")}
         wanted -= {("a bit of an array", "down")}  # nobody asked for weights

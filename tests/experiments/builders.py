@@ -161,6 +161,8 @@ EXPERIMENTS = {
     "ablation": experiment("ranking", ["ours", "paper", "mlp", "triangle", "inexact"]),
     "game": experiment("game", ["seven"], tests=["random", "actions_1"]),
     "one_test": experiment("game", ["seven"], tests=["actions_1"]),
+    "worlds": experiment("worlds", ["seven"], tests=["random"]),
+    "changed": experiment("worlds", ["ours"], tests=["noise_0", "noise_010"]),
     "untested": experiment("tests", ["triangle"], tests=TWO),
     "no_curve": experiment("curves", ["inexact"]),
     "later": experiment("curves", ["later"]),

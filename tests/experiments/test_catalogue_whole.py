@@ -18,6 +18,8 @@ AGENTS = {
     "mlp_large": "mlp",
     "game": "tangram",
     "game_paper": "paper",
+    "game_reward": "tangram",
+    "worlds": "tangram",
 }
 
 

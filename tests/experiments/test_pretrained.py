@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from tangram_agent.runs import load_run
-from tangram_lab.experiments.pretrained import main, publish
+from tangram_lab.experiments.pretrained import Candidate, main, make_card, publish
 from tangram_sim.errors import ConfigError, RunError
 from tests.agent.builders import random_transitions, setup
 from tests.worker.builders import write_run
@@ -107,6 +107,13 @@ def test_an_agent_is_its_run_and_its_card_tells_everything(tmp_path: Path) -> No
         content = path.read_bytes()
         assert str(tmp_path).encode() not in content
         assert b"a_secret_host" not in content
+
+
+def test_a_card_tells_the_world_that_it_was_trained_in(tmp_path: Path) -> None:
+    write_run(tmp_path, sim={"backend": "kinematic", "gain": [0.8, 1, 1]})
+    seed = Candidate(load_run(tmp_path), SEED_0)
+    card = make_card("square", seed, [seed], {"this run": {"raw_overlap_p10": 0.9}})
+    assert card["data"]["source"].startswith("simulated by this project (kinematic, gain [0.8,1")
 
 
 def test_an_agent_is_evaluated_like_a_run(tmp_path: Path) -> None:

@@ -35,6 +35,7 @@ FIGURES = {
     "table2_actions": (1440, 608),
     "noise_noise": (1440, 608),
     "ablation": (1440, 432),
+    "changed": (1440, 528),
     "ablation_seeds": (1440, 368),
 }
 

@@ -14,8 +14,10 @@ from hypothesis import strategies as st
 from tangram_lab.experiments.report.figures import (
     PALETTE,
     agent_and_network,
+    changed_worlds,
     curve_parts,
     draw_curves,
+    draw_worlds,
     looks,
     sweeps,
 )
@@ -35,12 +37,14 @@ from tangram_lab.experiments.report.page import command
 from tangram_lab.experiments.report.references import falls_short, papers
 from tangram_lab.experiments.report.study import Seed, Training, read_runs
 from tangram_lab.experiments.report.style import LINES
-from tangram_lab.experiments.report.tables import paired, picture, plain, table
+from tangram_lab.experiments.report.tables import paired, picture, plain, table, worlds_table
 from tests.experiments.builders import (
+    cells,
     experiment,
     learning_curve,
     plan,
     result,
+    scores,
     training,
     write_plan,
     write_run,
@@ -127,6 +131,35 @@ def test_papers_values_go_to_the_family_only_where_nobody_bears_the_name(tmp_pat
     found = [[papers(o, t) for t in o.trainings] for o in read_runs(tmp_path).experiments]
     told = {"mean_reward": 0.70, "after": 19_000}
     assert found == [[told, {}], [told], [{}]]
+
+
+def test_worlds_stand_beside_the_formula_and_the_oracle(tmp_path: Path) -> None:
+    """One thing is changed in each panel; where nothing is to be known the formula knows all."""
+    names = {"plain": "", "noisy": "sim.action_noise=0.1", "far": "sim.gain=[2,2,2]"}
+    tests = {name: {"label": name, "overrides": text.split()} for name, text in names.items()}
+    tests["both"] = {"label": "", "overrides": ["sim.gain=[2,2,2]", "sim.damping=0.1"]}
+    one = experiment("worlds", ["agent"], tests=[*tests])
+    write_plan(tmp_path, plan({"a": one}, {"agent": training("ours", "x")}, tests, (0, 1)))
+    for seed, final in enumerate((0.9, 0.8)):
+        known = {"exact": {"mean_reward": 0.5}, "oracle": {"mean_reward": 1.0}}
+        found = {"plain": scores(final), "far": scores(final - 0.1, known)}
+        write_run(tmp_path, "agent", result(seed), [], found | {"noisy": scores(0.3)})
+    study = read_runs(tmp_path)
+    (read,) = study.experiments
+    found = {n: {at: t.name for at, t in o.items()} for n, o in changed_worlds(read).items()}
+    assert found == {
+        "sim.action_noise": {0.0: "plain", 0.1: "noisy"},
+        "sim.gain": {1.0: "plain", 2.0: "far"},
+    }
+    rows = [row[2:] for row in cells("\n".join(worlds_table(read)), "ours")]
+    assert rows[0] == ["0.8500 (0.8000 to 0.9000)", "1.0000", "-", "-"]
+    assert rows[2] == ["0.7500 (0.7000 to 0.8000)", "0.5000", "-", "1.0000"]
+    drawn = draw_worlds(study, read)
+    assert drawn is not None
+    lines = [{one.get_label(): [*one.get_ydata()] for one in axes.lines} for axes in drawn.axes]
+    assert [panel["formula"] for panel in lines] == [[1.0, 1.0], [1.0, 0.5]]
+    assert [panel["oracle"] for panel in lines] == [[1.0, 1.0], [1.0, 1.0]]
+    np.testing.assert_allclose(lines[1]["ours"], [0.85, 0.75])
 
 
 def test_sweeps_over_noise_and_actions(tmp_path: Path) -> None:

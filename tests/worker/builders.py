@@ -68,6 +68,7 @@ def ended(layout: Layout, corners: Floats, goals: Floats, **more: Any) -> Played
         "refused": np.zeros((count, steps), np.bool_),
         "blocked": np.zeros((count, steps), np.bool_),
         "seconds": np.ones(count),
+        "slowest": np.ones(count),
         "camera": None,
     }
     travels = Episodes(**{name: more.get(name, column) for name, column in seen.items()})

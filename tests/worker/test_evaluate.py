@@ -206,6 +206,11 @@ def test_a_look_ahead_stands_beside_the_same_agent_without_and_a_formula_with(
         whole = 1e3 * one["seconds_per_puzzle"] / report["actions_used"]
         assert one["ms_per_decision"] == pytest.approx(whole)
         assert whole > 0.0
+        assert one["ms_slowest"] > 0.0
+    assert "ms_slowest" not in alone
+    learned = {"agent": {"lookahead": "learned", "beam": 1}}
+    report = evaluated(tmp_path, episodes=1, changes=learned)
+    assert set(report["baselines"]) == {"lookahead=none", "exact", "random"}
 
 
 def test_random_targets_of_several_tokens_get_the_same_scores(tmp_path: Path) -> None:

@@ -50,6 +50,7 @@ from tangram_lab.experiments.report.style import (
     thousands,
     widen,
 )
+from tangram_lab.experiments.report.tables import COMPARED, FORMULA, ORACLE
 
 PER_ROW = 4
 TICKS = 5
@@ -57,6 +58,13 @@ LIMIT = 1.08  # of rewards, with some room
 TITLE_WIDTH = 30  # letters of a small panel's title
 NOISE = "noise on the corners, standard deviation (% of the arena)"
 ACTIONS = "actions in sequence (count)"
+# What is changed of a plain world -> label of an axis.
+CHANGED = {
+    "sim.damping": "damping",
+    "sim.action_noise": "noise on actions, standard deviation (full scales)",
+    "sim.corner_noise": "noise on corners, standard deviation (arenas)",
+    "sim.gain": "gain of x, y and turn",
+}
 
 
 # Agent and network -> colour, in every figure; others take the next ones.
@@ -327,6 +335,76 @@ def _draw_others(
             draw(told, "--", linewidth=1.2, color=GREY, label=policy.label)
         elif policy.name == PERFECT and measure is REWARD:
             draw(told, "-", linewidth=1.0, color=LEVEL, label=policy.label)
+
+
+# Worlds that differ from a plain one in one thing
+
+
+def changed_worlds(experiment: Experiment) -> dict[str, dict[float, Trial]]:
+    """Setting -> its values -> tests that ask for it and for no other, from the plain one on."""
+    found: dict[str, dict[float, Trial]] = {}
+    plain: list[Trial] = []
+    for test in experiment.tests:
+        asked = {name: at for name in CHANGED if (at := test.asked(name)) is not None}
+        if not asked:
+            plain.append(test)
+        elif len(asked) == 1:
+            ((name, at),) = asked.items()
+            found.setdefault(name, {})[at] = test
+    for name, places in found.items():
+        if plain:
+            places.setdefault(float(name == "sim.gain"), plain[0])
+    return {name: dict(sorted(one.items())) for name, one in found.items() if len(one) > 1}
+
+
+def draw_worlds(study: Study, experiment: Experiment) -> Figure | None:
+    """A panel for each thing that is changed: mean reward, the median and least to most."""
+    found, look = changed_worlds(experiment), looks(study)
+    known = [
+        one
+        for one in experiment.trainings
+        if any(one.values(REWARD.key, t.name) for ts in found.values() for t in ts.values())
+    ]
+    if not known:
+        return None
+    rows = -(-len(found) // 2)
+    figure, panels = new_figure(0.7 + 2.6 * rows, rows, min(len(found), 2), sharey=True)
+    for panel, (setting, places) in zip(panels, found.items(), strict=False):
+        for name, shape in ((ORACLE, "-"), ("fitted", ":"), (FORMULA, "--")):
+            told = _compared(known, places, name)
+            style: dict[str, Any] = {"color": LEVEL if name == ORACLE else GREY, "linewidth": 1.4}
+            panel.plot(list(told), list(told.values()), shape, label=COMPARED[name], **style)
+        for number, one in enumerate(known):
+            pairs = [
+                (x, spread(one.values(REWARD.key, t.name).values())) for x, t in places.items()
+            ]
+            own = {x: values for x, values in pairs if values is not None}
+            if own:
+                least, median, most = zip(*own.values(), strict=True)
+                line = look[one.name]._replace(colour=COLOURS[number % len(COLOURS)])
+                style = {"marker": line.marker, "markersize": 4.5, "label": one.label}
+                _draw_line(panel, list(own), median, (least, most), line, **style)
+        panel.set_xlabel(CHANGED[setting])
+    for panel in panels[len(found) :]:
+        panel.set_visible(False)
+    for panel in panels[::2]:
+        panel.set_ylabel(REWARD.axis)
+    legend_below(figure, panels[0], 3)
+    return figure
+
+
+def _compared(known: Part, places: Mapping[float, Trial], policy: str) -> dict[float, float]:
+    """Place -> what a policy scores there; where a world does as it is told, by the formula."""
+    result: dict[float, float] = {}
+    for at, test in places.items():
+        for name in (policy, FORMULA):
+            values = [
+                v for one in known for v in one.compared(name, REWARD.key, test.name).values()
+            ]
+            if values:
+                result[at] = values[0]
+                break
+    return result
 
 
 # Rankings: final scores, training by training

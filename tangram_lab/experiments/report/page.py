@@ -17,6 +17,7 @@ from tangram_lab.experiments.report.figures import (
     draw_ranking,
     draw_single_seeds,
     draw_sweep,
+    draw_worlds,
     sweep_parts,
     sweeps,
 )
@@ -38,6 +39,7 @@ from tangram_lab.experiments.report.tables import (
     single_tests,
     table,
     test_table,
+    worlds_table,
 )
 from tangram_sim.errors import RunError
 
@@ -64,6 +66,10 @@ SMALL = (
     "behind each."
 )
 SWEEP = "Median over the seeds; the band goes from the least to the most."
+WORLDS = (
+    "Median over the seeds; the band goes from the least to the most. Where a world does as it is "
+    "told, but for noise on actions, nothing is left to know: the other two lie on the formula."
+)
 REACHED = "Episodes are those at the first evaluation in which a seed reached the mean reward."
 
 
@@ -147,10 +153,11 @@ class Page:
                 "tests": self._tests,
                 "ranking": self._ranking,
                 "game": lambda one: [*assembly_table(one), *order_table(one)],
+                "worlds": self._worlds,
             }
             lines += kinds[experiment.kind](experiment)
             left_out = lacking(self.study, experiment)
-            if left_out and experiment.kind not in ("complexity", "game"):
+            if left_out and experiment.kind not in ("complexity", "game", "worlds"):
                 told = plain("; ".join(left_out))
                 lines += [f"Left out, since no test has their scores: {told}.", ""]
         gaps = [f"- {plain(gap)}" for one in experiment.trainings for gap in _gaps(experiment, one)]
@@ -197,6 +204,12 @@ class Page:
             *ranking_table(self.study, one),
             *self._figure(f"{one.name}_seeds", f"{one.title}: curves", SMALL, singles),
         ]
+
+    def _worlds(self, one: Experiment) -> list[str]:
+        """A picture and a long table, or a short one where nothing is changed step by step."""
+        lines = self._figure(one.name, one.title, WORLDS, draw_worlds(self.study, one))
+        rows = worlds_table(one)
+        return lines + (details("Every test", rows) if lines else rows)
 
 
 def _numbered(name: str, number: int) -> str:

@@ -90,6 +90,12 @@ class Training(TrainingConfig):
             return self.each(lambda seed: seed.result.get(key))
         return self.each(lambda seed: seed.tests.get(test, {}).get(key))
 
+    def compared(self, policy: str, key: str, test: str) -> dict[int, float]:
+        """Seed -> what a policy that its test compares it with scored, where there is one."""
+        return self.each(
+            lambda seed: seed.tests.get(test, {}).get("baselines", {}).get(policy, {}).get(key)
+        )
+
     def each(self, number: Callable[[Seed], float | None]) -> dict[int, float]:
         """Seed -> what a function makes of it, where it makes a number."""
         pairs = ((seed.number, number(seed)) for seed in self.finished)
@@ -103,14 +109,15 @@ class Trial(TestConfig):
     name: str = ""
 
     def asked(self, setting: str) -> float | None:
-        """A number that it asks of tangram-eval; None as trained.
+        """A number that it asks of tangram-eval, of a list the first; None as trained.
 
         Raises:
             RunError: something else stands there.
         """
         told = {text.partition("=")[0]: text.partition("=")[2] for text in self.overrides}
         try:
-            return float(told[setting]) if setting in told else None
+            first = told[setting].strip("[]").partition(",")[0] if setting in told else None
+            return None if first is None else float(first)
         except ValueError:
             raise RunError(
                 f"test {self.name}: {setting} must be a number, got '{told[setting]}': mend "

@@ -48,6 +48,12 @@ ORDER_NOTE = (
 NORMAL = 1.96
 
 
+# In worlds whose motion is not known: name of a policy in the files of tests -> in tables.
+FORMULA, ORACLE = "exact", "oracle"
+COMPARED = {FORMULA: "formula", "fitted": "fitted", ORACLE: ORACLE}
+PRECISE = REWARD._replace(pattern="{:.4f}")
+
+
 # Markdown
 
 
@@ -298,3 +304,28 @@ def paired(values: Sequence[float] | Floats) -> str:
     mean = float(np.mean(values))
     half = NORMAL * float(np.std(values, ddof=1)) / math.sqrt(len(values))
     return f"{mean:+.4f} ({mean - half:+.4f} to {mean + half:+.4f})"
+
+
+# Worlds whose motion is not known
+
+
+def worlds_table(experiment: Experiment) -> list[str]:
+    """Every training in every test, beside the policies that tangram-eval compares it with."""
+    one_test = len(experiment.tests) == 1
+    head = ["training", *([] if one_test else ["test"]), "seeds", f"agent, {SPREAD}"]
+    rows = []
+    for one in experiment.trainings:
+        for test in experiment.tests:
+            several = one.values(COVERAGE.key, test.name)
+            measure = COVERAGE if several else PRECISE
+            own = several or one.values(measure.key, test.name)
+            policies = (one.compared(name, measure.key, test.name) for name in COMPARED)
+            rows.append(
+                [
+                    f"{one.label}{', coverage' * bool(several)}",
+                    *([] if one_test else [test.label]),
+                    str(len(own)),
+                    *map(measure.show_spread, (own, *policies)),
+                ]
+            )
+    return table([*head, *COMPARED.values()], rows)
