@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tangram_agent import planning
+from tangram_agent import contacts
 from tangram_agent.contacts import Contacts, ContactWorlds, known_contacts
 from tangram_agent.coverage import Lying
 from tangram_agent.foresight import EngineWorlds, Table
@@ -104,7 +104,7 @@ def test_a_plan_is_the_same_each_time_and_needs_no_engine(monkeypatch: pytest.Mo
     with closing(BatchedEnv(made.layout, made.sim, made.reward)) as env:
         env.reset([np.random.default_rng(3)])
         corners, placed, goals = env.corners, env.placed, env.goals
-    monkeypatch.setattr(planning, "EngineWorlds", None)
+    monkeypatch.setattr(contacts, "EngineWorlds", None)
     first, second = Policy(made), Policy(made)
     second.load(first.weights())
     actions = [policy.act(corners, placed, goals) for policy in (first, second)]
