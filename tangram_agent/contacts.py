@@ -246,7 +246,7 @@ def kinds_of(layout: Layout, sim: SimConfig) -> Ints:
     known = "agent.lookahead=learned was learned with"
     for name in WORLD:
         wanted, given = getattr(SIM, name), getattr(sim, name)
-        if given != wanted:
+        if told(given) != told(wanted):
             raise ConfigError(f"{known} sim.{name}={told(wanted)}, got {told(given)}: {_REMEDY}")
     kinds = [_kind(shape) for shape in layout.shapes]
     if -1 in kinds:

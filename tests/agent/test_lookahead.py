@@ -6,7 +6,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from tangram_agent import planning
+from tangram_agent import contacts
 from tangram_agent.foresight import EngineWorlds, Table
 from tangram_agent.lookahead import Lookahead
 from tangram_agent.networks import Networks
@@ -172,7 +172,7 @@ def test_a_broader_beam_tries_more(monkeypatch: pytest.MonkeyPatch) -> None:
         worlds.append(Watched(*given))
         return worlds[-1]
 
-    monkeypatch.setattr(planning, "EngineWorlds", watched)
+    monkeypatch.setattr(contacts, "EngineWorlds", watched)
     goals, starts = np.zeros((2, 7, 3))
     goals[:, 0], goals[:, 1] = np.linspace(-0.9, 0.9, 7), 0.3
     starts[:, 0], starts[:, 1] = goals[::-1, 0], -0.3
