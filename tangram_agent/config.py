@@ -211,7 +211,7 @@ class AgentConfig(Settings, section="agent"):
         4,
         "scenes of each depth that a look ahead follows",
         low=1,
-        high=1000,
+        high=32,
         unless={"lookahead": "none"},
     )
     gamma: float = setting(

@@ -15,7 +15,7 @@ import numpy as np
 from torch import nn
 
 from tangram_agent.coverage import Lying
-from tangram_agent.foresight import Table
+from tangram_agent.foresight import EngineWorlds, Foresight, Table
 from tangram_agent.networks import perceptron
 from tangram_agent.pretrained import CONTACTS, PACKAGED, PREFIX, read_agent
 from tangram_agent.setup import Setup
@@ -246,7 +246,7 @@ def kinds_of(layout: Layout, sim: SimConfig) -> Ints:
     known = "agent.lookahead=learned was learned with"
     for name in WORLD:
         wanted, given = getattr(SIM, name), getattr(sim, name)
-        if given != wanted:
+        if told(given) != told(wanted):
             raise ConfigError(f"{known} sim.{name}={told(wanted)}, got {told(given)}: {_REMEDY}")
     kinds = [_kind(shape) for shape in layout.shapes]
     if -1 in kinds:
@@ -272,6 +272,13 @@ def known_contacts(setup: Setup) -> Contacts | None:
         if setup.agent.lookahead == "learned":
             raise
         return None
+
+
+def foreseen(setup: Setup, known: Contacts | None) -> Foresight:
+    """The worlds in which a look ahead tries actions."""
+    if setup.agent.lookahead == "engine" or known is None:
+        return EngineWorlds(setup.layout, setup.sim)
+    return ContactWorlds(known)
 
 
 def _kind(shape: Shape) -> int:

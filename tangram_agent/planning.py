@@ -16,9 +16,8 @@ import torch
 from torch import Tensor
 
 from tangram_agent.adam import Adam
-from tangram_agent.contacts import ContactWorlds, known_contacts
+from tangram_agent.contacts import foreseen, known_contacts
 from tangram_agent.coverage import covered_share, covering, worths
-from tangram_agent.foresight import EngineWorlds, Foresight
 from tangram_agent.guide import NetworkGuide, as_tensor
 from tangram_agent.lookahead import Lookahead
 from tangram_agent.motion import Belief, motions_of
@@ -140,7 +139,8 @@ class Planner:
     """Chooses token, side and pose."""
 
     def __init__(self, networks: Networks, setup: Setup) -> None:
-        self._networks, self._layout, self._agent = networks, setup.layout, setup.agent
+        self._setup, self._networks = setup, networks
+        self._layout, self._agent = setup.layout, setup.agent
         self._motion, self._sim = networks.motion, setup.sim
         self._graph = PairGraph(setup.layout, setup.sim.arena, setup.agent)
         self._contacts = setup.contacts
@@ -151,13 +151,8 @@ class Planner:
     @cached_property
     def _lookahead(self) -> Lookahead:
         """Made when it is first asked for: its world may load the engine."""
-        layout, sim, known = self._layout, self._sim, self._known
-        world: Foresight
-        if known is None or self._agent.lookahead == "engine":
-            world = EngineWorlds(layout, sim)
-        else:
-            world = ContactWorlds(known)
-        return Lookahead(layout, sim, self._guide, world, self._agent.beam)
+        world = foreseen(self._setup, self._known)
+        return Lookahead(self._layout, self._sim, self._guide, world, self._agent.beam)
 
     def forget(self) -> None:
         """Drop what was planned with other weights."""

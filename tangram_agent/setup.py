@@ -54,7 +54,7 @@ class Setup:
         if one:
             self._refuse(_SEVERAL_ONLY, "one token", "take a set of several")
         if not self.contacts:
-            slide = "set sim.motion=slide"
+            slide = "train with sim.motion=slide"
             apart = ("push_weight", "lookahead")
             self._refuse(apart, "tokens that do not push each other", slide)
         if agent.lookahead != "none" and self.layout.tokens > MAX_PLANNED:

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from tangram_agent.config import ORDERS, AgentConfig
+from tangram_agent.contacts import foreseen, known_contacts
 from tangram_agent.files import write_whole
 from tangram_agent.outcome import plural
 from tangram_agent.runs import Run, load_changed
@@ -129,8 +130,8 @@ def policies(run: Run) -> dict[str, Player]:
     if ahead:
         alone = {"lookahead": "none", "beam": AgentConfig.beam}
         result["lookahead=none"] = greedy(run.with_settings({"agent": alone}).policy)
-    if run.setup.agent.lookahead == "engine":
-        result["exact+lookahead"] = sweeping_policy(layout, sim, run.setup.agent.beam)
+        world = foreseen(run.setup, known_contacts(run.setup))
+        result["exact+lookahead"] = sweeping_policy(layout, sim, world, run.setup.agent.beam)
     result["exact"] = exact_policy(layout, sim)
     if sim.inexact or (sim.corner_noise and run.setup.horizon > 1):
         result |= {"fitted": Told(fitted_policy), "oracle": Told(oracle_policy)}

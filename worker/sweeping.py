@@ -5,7 +5,7 @@ Legend: K tokens, M ways, S moments of each.
 
 import numpy as np
 
-from tangram_agent.foresight import EngineWorlds, Places, Table
+from tangram_agent.foresight import Foresight, Places, Table
 from tangram_agent.lookahead import Lookahead
 from tangram_agent.types import Past
 from tangram_sim.actions import make_actions, velocities_of
@@ -21,9 +21,9 @@ _MOMENTS = 24
 _PUSHED = 1.5  # depth of a meeting, in roots of the area, by which all of a piece is pushed away
 
 
-def sweeping_policy(layout: Layout, sim: SimConfig, beam: int) -> Choose:
-    """A look ahead in the engine that nothing learned guides, see `Lookahead`."""
-    lookahead = Lookahead(layout, sim, SweepGuide(layout), EngineWorlds(layout, sim), beam)
+def sweeping_policy(layout: Layout, sim: SimConfig, world: Foresight, beam: int) -> Choose:
+    """A look ahead that nothing learned guides, see `Lookahead`."""
+    lookahead = Lookahead(layout, sim, SweepGuide(layout), world, beam)
 
     def choose(
         corners: Floats, placed: Bools, goals: Floats, _generators: Generators, past: Past

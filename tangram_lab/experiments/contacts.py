@@ -48,6 +48,7 @@ from tangram_sim.errors import TangramError
 from tangram_sim.geometry import separations
 from tangram_sim.kinematics import wrap
 from tangram_sim.layout import TokensConfig, make_layout
+from tangram_sim.settings import check_range
 from tangram_sim.world import make_world
 
 PUSHES, UPDATES, BATCH, RATE = 60_000, 10_000, 512, 2e-3
@@ -231,6 +232,8 @@ def main() -> int:
     given = parser.parse_args()
     torch.set_num_threads(1)
     try:
+        check_range("--pushes", given.pushes, 100)
+        check_range("--updates", given.updates, 1)
         card = publish(given.out, given.pushes, given.updates)
     except TangramError as error:
         sys.stderr.write(f"contacts: {error}\n")

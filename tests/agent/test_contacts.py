@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tangram_agent import planning
+from tangram_agent import contacts
 from tangram_agent.contacts import Contacts, ContactWorlds, known_contacts
 from tangram_agent.coverage import Lying
 from tangram_agent.foresight import EngineWorlds, Table
 from tangram_agent.policy import Policy
 from tangram_agent.pretrained import CARD, CONFIG, CONTACTS, PACKAGED, WEIGHTS, agent_names
 from tangram_agent.setup import Setup
-from tangram_lab.experiments.contacts import play, publish
+from tangram_lab.experiments.contacts import main, play, publish
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.errors import ConfigError, RunError
 from tangram_sim.kinematics import wrap
@@ -104,7 +104,7 @@ def test_a_plan_is_the_same_each_time_and_needs_no_engine(monkeypatch: pytest.Mo
     with closing(BatchedEnv(made.layout, made.sim, made.reward)) as env:
         env.reset([np.random.default_rng(3)])
         corners, placed, goals = env.corners, env.placed, env.goals
-    monkeypatch.setattr(planning, "EngineWorlds", None)
+    monkeypatch.setattr(contacts, "EngineWorlds", None)
     first, second = Policy(made), Policy(made)
     second.load(first.weights())
     actions = [policy.act(corners, placed, goals) for policy in (first, second)]
@@ -166,3 +166,12 @@ def test_it_is_made_by_one_command_and_is_no_agent(tmp_path: Path) -> None:
     assert "No agent" in (tmp_path / "model" / "card.md").read_text()
     assert Contacts(np.arange(5), tmp_path / "model").kinds.shape == (5,)
     assert CONTACTS not in agent_names()
+
+
+@pytest.mark.parametrize("given", ["--pushes=24", "--pushes=-5", "--updates=0"])
+def test_a_model_of_nothing_is_not_made(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], given: str
+) -> None:
+    monkeypatch.setattr("sys.argv", ["contacts", given])
+    assert main() == 2
+    assert capsys.readouterr().err.startswith(f"contacts: {given.partition('=')[0]} must be at le")

@@ -6,7 +6,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from tangram_agent import planning
+from tangram_agent import contacts
 from tangram_agent.foresight import EngineWorlds, Table
 from tangram_agent.lookahead import Lookahead
 from tangram_agent.networks import Networks
@@ -83,7 +83,7 @@ def test_the_order_that_pushes_nothing_away_is_found() -> None:
     made = two()
     assert played(made, exact_policy(made.layout, made.sim), STARTS, GOALS)[0] == [0, 1]
     for choose in (
-        sweeping_policy(made.layout, made.sim, 1),
+        sweeping_policy(made.layout, made.sim, EngineWorlds(made.layout, made.sim), 1),
         as_choose(perfect(made, [[0, 0], [1, 0]]), made),
         as_choose(perfect(made), made),  # a guide that knows nothing: the engine tells
     ):
@@ -95,7 +95,12 @@ def test_the_order_that_pushes_nothing_away_is_found() -> None:
 def test_with_two_actions_a_token_goes_round_what_is_in_its_way() -> None:
     one, both = (two(actions_per_token=count) for count in (1, 2))
     covered = [
-        played(made, sweeping_policy(made.layout, made.sim, 4), *CROSSED)[1] for made in (one, both)
+        played(
+            made,
+            sweeping_policy(made.layout, made.sim, EngineWorlds(made.layout, made.sim), 4),
+            *CROSSED,
+        )[1]
+        for made in (one, both)
     ]
     assert covered[0] < 0.9
     assert covered[1] == pytest.approx(1.0, abs=1e-3)
@@ -104,7 +109,7 @@ def test_with_two_actions_a_token_goes_round_what_is_in_its_way() -> None:
 def test_a_token_that_was_pushed_is_put_back_while_it_has_actions() -> None:
     made = two(actions_per_token=2)
     layout, moved = made.layout, np.array([[[0.1, 0.0, 0.3], [0.7, 0.0, 0.0]]])
-    choose = sweeping_policy(layout, made.sim, 1)
+    choose = sweeping_policy(layout, made.sim, EngineWorlds(layout, made.sim), 1)
     corners, goals = layout.corners(moved), layout.corners(np.array([GOALS], np.float64))
     spent = np.array([[False, True]])
     first, second = (
@@ -167,7 +172,7 @@ def test_a_broader_beam_tries_more(monkeypatch: pytest.MonkeyPatch) -> None:
         worlds.append(Watched(*given))
         return worlds[-1]
 
-    monkeypatch.setattr(planning, "EngineWorlds", watched)
+    monkeypatch.setattr(contacts, "EngineWorlds", watched)
     goals, starts = np.zeros((2, 7, 3))
     goals[:, 0], goals[:, 1] = np.linspace(-0.9, 0.9, 7), 0.3
     starts[:, 0], starts[:, 1] = goals[::-1, 0], -0.3
@@ -185,7 +190,7 @@ def test_planning_leaves_the_world_that_is_played_as_it_is() -> None:
     made = seven({"lookahead": "engine", "beam": 1}, PERCEPTRON, starts="outside", **SLIDE)
     ends = []
     for rounds in (0, 1, 2):
-        choose = sweeping_policy(made.layout, made.sim, 1)
+        choose = sweeping_policy(made.layout, made.sim, EngineWorlds(made.layout, made.sim), 1)
         with closing(BatchedEnv(made.layout, made.sim, made.reward)) as env:
             env.reset([np.random.default_rng(3)])
             none = Past(np.zeros((1, 0, 0, 2), np.float32), np.zeros((1, 0, 4), np.float32))
@@ -223,7 +228,7 @@ def test_a_token_that_seems_to_lie_on_its_other_side_goes_nowhere() -> None:
     layout, poses = made.layout, np.array([[(0.0, 0, 0), (0.7, 0, 0)]])
     seen = layout.corners(poses + [0.0, 0.1, 0.0], np.array([[False, True]]))
     none = Past(np.zeros((1, 0, 0, 2), np.float32), np.zeros((1, 0, 4), np.float32))
-    choose = sweeping_policy(layout, made.sim, 2)
+    choose = sweeping_policy(layout, made.sim, EngineWorlds(layout, made.sim), 2)
     action = choose(seen, np.array([[True, False]]), layout.corners(poses), [], none)
     assert np.isfinite(action).all()
 

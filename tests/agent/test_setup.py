@@ -60,7 +60,7 @@ def changed(section: str, **values: Any) -> dict[str, dict[str, Any]]:
         (changed("agent", lookahead="x"), "agent.lookahead must be one of none, engine, learned"),
         (
             changed("agent", lookahead="engine", beam=0),
-            "agent.beam must be between 1 and 1000, got 0",
+            "agent.beam must be between 1 and 32, got 0",
         ),
         (changed("agent", refine_steps=-1), "agent.refine_steps must be between 0 and 10000"),
         (changed("agent", refine_rate=0), "agent.refine_rate must be between 1e-09 and 1, got 0"),

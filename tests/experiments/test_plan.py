@@ -78,7 +78,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"experiments": {"x": experiment(["square"], ["x"])}}, "use twice, noisy"),
     (
         {"experiments": {"x": experiment(["square"], []) | {"kind": "pie"}}},
-        "kind must be one of curves, complexity, tests, rewards, ranking, game, got 'pie'",
+        "kind must be one of curves, complexity, tests, rewards, ranking, game, worlds, got 'pie'",
     ),
     (
         {"experiments": {"x": experiment(["square"], []) | {"labels": {"paper": "x"}}}},

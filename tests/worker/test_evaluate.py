@@ -209,8 +209,11 @@ def test_a_look_ahead_stands_beside_the_same_agent_without_and_a_formula_with(
         assert one["ms_slowest"] > 0.0
     assert "ms_slowest" not in alone
     learned = {"agent": {"lookahead": "learned", "beam": 1}}
-    report = evaluated(tmp_path, episodes=1, changes=learned)
-    assert set(report["baselines"]) == {"lookahead=none", "exact", "random"}
+    report = evaluated(tmp_path, episodes=2, changes=learned)
+    assert set(report["baselines"]) == set(compared)
+    found = report["baselines"]["exact+lookahead"]
+    assert found["coverage"] > compared["exact"]["coverage"]
+    assert found["coverage_each"] != compared["exact+lookahead"]["coverage_each"]
 
 
 def test_random_targets_of_several_tokens_get_the_same_scores(tmp_path: Path) -> None:
