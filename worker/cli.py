@@ -153,7 +153,7 @@ def with_absolute_paths(settings: Plain) -> Plain:
     from worker.config import check_puzzle, is_puzzle_source
 
     result = dict(settings)
-    for name in ("run_dir", "out", "sheet"):
+    for name in ("run_dir", "out", "sheet", "target"):
         result[name] = _absolute(result.get(name), is_run=name == "run_dir")
     puzzle = check_puzzle(result.get("puzzle"))
     if puzzle is not None and is_puzzle_source(puzzle[0]) and puzzle[0] not in SPLITS:

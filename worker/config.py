@@ -221,7 +221,7 @@ class PlayConfig(Settings):
         "episodes shown side by side",
         low=1,
         high=MAX_SHOWN,
-        only={"puzzle": None},
+        only={"puzzle": None, "target": None},
     )
     seed: int = setting(0, "of the episodes, and of the starts of puzzles", low=0, high=MAX_SEED)
     compare: tuple[str, ...] | None = setting(
@@ -233,6 +233,12 @@ class PlayConfig(Settings):
         only={"compare": None},
     )
     puzzle: tuple[str, ...] | None = setting(None, PUZZLE_HELP, only={"compare": None})
+    target: str | None = setting(
+        None,
+        "instead of random targets: a photograph of the run's tokens, PNG or JPEG, dark on light "
+        "ground or the reverse, at most three touching",
+        only={"compare": None, "puzzle": None},
+    )
     turns: int = setting(1, TURNS_HELP, low=1, high=MAX_TURNS, unless={"puzzle": None})
     skip_invalid: bool = setting(False, SKIP_HELP, unless={"puzzle": None})
     live: bool = setting(
@@ -256,6 +262,8 @@ class PlayConfig(Settings):
         super().__post_init__()
         if self.puzzle is not None:
             _refuse(self.changes, (*OF_TARGETS, "starts"), "puzzle", "leave puzzle out")
+        if self.target is not None:
+            _refuse(self.changes, OF_TARGETS, "target", "leave target out")
 
     @property
     def run_dirs(self) -> tuple[str, ...]:
@@ -269,7 +277,7 @@ class PlayConfig(Settings):
         elif (
             self.compare is None
             and self.tokens is None
-            and not (self.puzzle is not None and GAME in agent_names())
+            and not ((self.puzzle or self.target) is not None and GAME in agent_names())
         ):
             raise ConfigError(
                 "say which run: run_dir=runs/..., or which ones: compare=[runs/a,runs/b]"

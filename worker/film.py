@@ -42,17 +42,19 @@ class Show:
         played: E episodes.
         titles: what each is called.
         kind: what one is called.
+        seen: a picture of where the target comes from, if from one.
     """
 
     setup: Setup
     played: Played
     titles: list[str]
     kind: str
+    seen: Image.Image | None = None
 
     def told(self) -> str:
         """What was shown and how well it went, in words."""
         mean = float(self.played.overlap.mean())
-        score = "coverage" if self.kind == "puzzle" else "raw overlap"
+        score = "raw overlap" if self.kind == "episode" else "coverage"
         return f"{plural(len(self.titles), self.kind)}, {score} {mean:.3f}"
 
 

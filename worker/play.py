@@ -19,11 +19,12 @@ from tangram_agent.setup import Setup
 from tangram_sim.arrays import Floats
 from tangram_sim.drawing import episode_sheet, save_gif, save_mp4
 from tangram_sim.errors import ConfigError, RunError
-from tangram_sim.game_drawing import figure_sheet
+from tangram_sim.game_drawing import figure_sheet, tiles
 from tangram_sim.kinematics import wrap
 from tangram_sim.layout import Layout
 from worker.config import MAX_SHOWN, PlayConfig, source_and_names
-from worker.film import Show, film_pictures, frames_per_action, show_live
+from worker.film import WIDTH, Show, film_pictures, frames_per_action, show_live
+from worker.photographs import draw_photograph, read_photograph
 from worker.puzzles import find_figures, play_figures
 from worker.rollout import Played
 from worker.test_set import FixedTests, greedy
@@ -31,6 +32,7 @@ from worker.test_set import FixedTests, greedy
 AT_ONCE = 32
 FRAME_MS = 50
 STILL_START, STILL_END = 10, 30  # frames
+SEEN = 30  # frames of what was seen before a film
 SHEET = 720  # pixels across, about
 MIN_TILE, MAX_TILE = 64, 240
 COMPARED = 1080  # pixels across, about, of all runs together
@@ -41,7 +43,7 @@ PAPER, TEXT, FAINT, RULE = (250, 250, 247), (31, 41, 55), (107, 114, 128), (214,
 
 
 def play_run(config: PlayConfig) -> int:
-    """Play puzzles or random episodes of a run, noise off, and draw them side by side.
+    """Play puzzles, a photograph or random episodes, noise off, and draw them side by side.
 
     Returns:
         Exit status 0.
@@ -66,10 +68,12 @@ def make_show(run: Run, config: PlayConfig) -> Show:
     """What the settings name, played by a run.
 
     Raises:
-        ConfigError: puzzles that the run cannot play.
+        ConfigError: puzzles or a photograph that the run cannot play.
     """
     if config.puzzle is not None:
         return puzzle_show(run, config)
+    if config.target is not None:
+        return photograph_show(run, config, config.target)
     titles = [f"target {i + 1}" for i in range(config.episodes)]
     return Show(run.setup, play_episodes(run, config), titles, "episode")
 
@@ -100,6 +104,19 @@ def puzzle_show(run: Run, config: PlayConfig) -> Show:
     return Show(setup, played, found.titles, "puzzle")
 
 
+def photograph_show(run: Run, config: PlayConfig, target: str) -> Show:
+    """What a photograph shows, with the tokens anywhere at first.
+
+    Raises:
+        ConfigError: a photograph that does not show the run's tokens.
+    """
+    photograph = read_photograph(target, run.setup)
+    figure, player = photograph.figure, greedy(run.policy)
+    played = play_figures(run.setup, [figure], player, config.seed, touching=False)
+    seen = draw_photograph(photograph, run.setup.layout, tiles(1, WIDTH)[1])
+    return Show(run.setup, played, [figure.title], "photograph", seen)
+
+
 def end_picture(show: Show) -> Image.Image:
     """The ends of all episodes."""
     layout, arena, played = show.setup.layout, show.setup.sim.arena, show.played
@@ -110,6 +127,10 @@ def _frames(show: Show, out: str) -> list[Image.Image]:
     """One picture of the ends, or the film."""
     setup, played = show.setup, show.played
     still = Path(out).suffix == ".png"
+    if show.seen is not None:
+        if still:
+            return [side_by_side([show.seen, end_picture(show)])]
+        return [show.seen] * SEEN + with_stills(film_pictures(show))
     if setup.layout.tokens > 1:
         return [end_picture(show)] if still else with_stills(film_pictures(show))
     return [draw_sheet(setup, played, played.ends)] if still else draw_motion(setup, played)

@@ -20,6 +20,7 @@ from tangram_sim.puzzles import SPLITS, PuzzleFile, library, read_puzzles
 from tangram_sim.seeding import episode_generator
 from tangram_sim.targets import placement, turned_figure
 from worker.baselines import Player, playing
+from worker.looking import make_eye
 from worker.rollout import Played, play
 
 AT_ONCE = 32
@@ -101,22 +102,34 @@ def find_figures(
     return Figures(tuple(figures), tuple(faults))
 
 
-def play_figures(setup: Setup, figures: Sequence[Figure], player: Player, seed: int) -> Played:
+def play_figures(
+    setup: Setup, figures: Sequence[Figure], player: Player, seed: int, touching: bool = True
+) -> Played:
     """Assemble E figures, one episode each; where the tokens start is decided by seed and figure.
 
+    Args:
+        setup: whose tokens are moved.
+        figures: E.
+        player: moves them.
+        seed: of the starts.
+        touching: whether their pieces touch, so that no picture tells them apart.
+
     Raises:
+        ConfigError: pictures are to be observed, and pieces touch.
         SamplingError: the tokens find no room to start.
     """
-    if setup.sim.observe == "pictures":
+    looks = setup.sim.observe == "pictures"
+    if looks and touching:
         raise ConfigError(
             "sim.observe=pictures cannot tell the pieces of a puzzle apart, which touch: set "
             "sim.observe=corners"
         )
     # Without a camera nothing disturbs its pictures either.
-    sim = replace(setup.sim, **{name: getattr(SimConfig, name) for name in CAMERA})
+    without = {} if looks else {name: getattr(SimConfig, name) for name in CAMERA}
+    sim = replace(setup.sim, **without)
     targets = (np.stack([f.poses for f in figures]), np.stack([f.flipped for f in figures]))
     at_once = min(AT_ONCE, len(figures))
-    with closing(BatchedEnv(setup.layout, sim, RewardConfig(), at_once)) as env:
+    with closing(BatchedEnv(setup.layout, sim, RewardConfig(), at_once, make_eye(setup))) as env:
         choose, count = playing(player, env), len(figures)
         return play(env, choose, lambda i: _generator(figures[i], seed), count, targets)
 

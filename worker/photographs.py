@@ -1,0 +1,82 @@
+"""A photograph as what a run is to assemble: its tokens are found, outlined and played."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from tangram_agent.setup import Setup
+from tangram_sim.arrays import Floats
+from tangram_sim.drawing import contact_sheet
+from tangram_sim.errors import ConfigError
+from tangram_sim.layout import Layout
+from tangram_sim.strokes import PAPER, SAMPLES, Point, colour_of, draw_outline, shown
+from tangram_sim.targets import turned_figure
+from worker.puzzles import Figure
+
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """What a photograph shows.
+
+    Attributes:
+        picture: in colour, upright.
+        outlines: (V, 2) corners of the tokens, pixels of the picture, y down.
+        figure: the tokens in the middle of a run's arena.
+    """
+
+    picture: Image.Image
+    outlines: Floats
+    figure: Figure
+
+
+def read_photograph(target: str, setup: Setup) -> Photograph:
+    """What a file shows of a run's tokens.
+
+    Raises:
+        ConfigError: says what was found instead, or that OpenCV is not installed.
+    """
+    try:
+        # Only here: other targets need no OpenCV.
+        from tangram_vision.photos import find_tokens  # noqa: PLC0415
+        from tangram_vision.picture_files import read_picture  # noqa: PLC0415
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"target needs OpenCV ({error}): install opencv-python-headless, or leave target out"
+        ) from error
+    source, layout = f"target={target}", setup.layout
+    picture = read_picture(Path(target), source)
+    found = find_tokens(picture, layout, source)
+    poses = turned_figure(layout, (found.poses, found.flipped), 0.0)
+    _check_inside(source, setup, layout.corners(poses, found.flipped))
+    outlines = layout.corners(found.poses, found.flipped) * (found.unit, -found.unit)
+    return Photograph(picture, outlines, Figure(Path(target).stem, 0.0, poses, found.flipped))
+
+
+def draw_photograph(photograph: Photograph, layout: Layout, size: int) -> Image.Image:
+    """The photograph with the outlines of what was seen, and how much that was below."""
+    picture = photograph.picture
+    share = size * SAMPLES / max(picture.size)
+    width, height = (round(side * share) for side in picture.size)
+    left, top = (size * SAMPLES - width) // 2, (size * SAMPLES - height) // 2
+    canvas = Image.new("RGB", (size * SAMPLES, size * SAMPLES), PAPER)
+    canvas.paste(picture.resize((width, height), Image.Resampling.BILINEAR), (left, top))
+    for k in range(layout.tokens):
+        own = photograph.outlines[layout.corners_of(k)] * share + (left, top)
+        points: list[Point] = [(float(x), float(y)) for x, y in own]
+        draw_outline(canvas, points, PAPER, 3.0)
+        draw_outline(canvas, points, colour_of(k), 2.0)
+    seen = f"{layout.tokens} tokens" if layout.tokens > 1 else layout.shapes[0].name
+    return contact_sheet([shown(canvas)], 1, [f"seen: {seen.replace('_', ' ')}"])
+
+
+def _check_inside(source: str, setup: Setup, corners: Floats) -> None:
+    reach = float(np.abs(corners).max())
+    if reach > setup.sim.arena / 2.0 + _ROUNDING:
+        raise ConfigError(
+            f"{source} shows tokens that reach {reach:.3g} from their middle at the run's scale, "
+            f"and its arena only {setup.sim.arena / 2.0:.3g}: lay them nearer together"
+        )
