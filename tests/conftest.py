@@ -1,6 +1,8 @@
 """Rules that hold for every test."""
 
+import os
 import signal
+import sys
 
 import hypothesis
 import pytest
@@ -8,6 +10,10 @@ import torch
 
 # The sizes are small: a second thread costs more than it brings, the more so on a busy machine.
 torch.set_num_threads(1)
+
+# Where compiled modules are not kept, each of the hundreds of processes compiles them anew.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 # nohup and some runners have it ignored, which the commands under test would inherit and respect.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
