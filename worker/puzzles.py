@@ -20,9 +20,8 @@ from tangram_sim.puzzles import SPLITS, PuzzleFile, library, read_puzzles
 from tangram_sim.seeding import episode_generator
 from tangram_sim.targets import placement, turned_figure
 from worker.baselines import Player, playing
-from worker.rollout import Played, play
+from worker.rollout import Played, at_once, play
 
-AT_ONCE = 32
 _ROUNDING = 1e-9
 
 
@@ -115,8 +114,8 @@ def play_figures(setup: Setup, figures: Sequence[Figure], player: Player, seed: 
     # Without a camera nothing disturbs its pictures either.
     sim = replace(setup.sim, **{name: getattr(SimConfig, name) for name in CAMERA})
     targets = (np.stack([f.poses for f in figures]), np.stack([f.flipped for f in figures]))
-    at_once = min(AT_ONCE, len(figures))
-    with closing(BatchedEnv(setup.layout, sim, RewardConfig(), at_once)) as env:
+    envs = min(at_once(setup), len(figures))
+    with closing(BatchedEnv(setup.layout, sim, RewardConfig(), envs)) as env:
         choose, count = playing(player, env), len(figures)
         return play(env, choose, lambda i: _generator(figures[i], seed), count, targets)
 
