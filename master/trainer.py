@@ -88,10 +88,13 @@ class Trainer:
         # What is credited piece by piece is relabelled anew for every update.
         relabels = () if self.setup.credits_pieces else self.setup.agent.hindsight
         generator = self._generators["hindsight"]
-        self.replay.add(
-            with_relabelled(episodes, relabels, self.setup.layout, self.reward, generator)
-        )
-        self.rate_limiter.inserted(episodes.transitions)
+        seen = episodes.seen_whole()
+        if seen.count:
+            self.replay.add(
+                with_relabelled(seen, relabels, self.setup.layout, self.reward, generator)
+            )
+        # The pace is that of what can be learned from.
+        self.rate_limiter.inserted(seen.transitions)
         self.episodes += episodes.count
 
     def update(self, share: float) -> dict[str, float]:

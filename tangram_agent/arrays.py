@@ -20,6 +20,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from tangram_agent.setup import Setup
+from tangram_agent.types import AWAY
 from tangram_sim.arrays import Singles
 from tangram_sim.errors import ConfigError, WireError
 from tangram_sim.settings import check_range
@@ -128,6 +129,7 @@ class EpisodeSpec:
         horizon: T, steps of every episode.
         action_size: A.
         bound: largest |coordinate| that a corner can reach.
+        observed: whether pictures are what is observed: then some of it can be missing.
     """
 
     tokens: int
@@ -135,6 +137,7 @@ class EpisodeSpec:
     horizon: int
     action_size: int
     bound: float
+    observed: bool = False
 
     def __post_init__(self) -> None:
         for name in ("tokens", "corners", "horizon", "action_size"):
@@ -147,7 +150,12 @@ class EpisodeSpec:
         """The spec of a run's task."""
         layout = setup.layout
         return EpisodeSpec(
-            layout.tokens, layout.corner_count, setup.horizon, setup.action_size, setup.bound
+            layout.tokens,
+            layout.corner_count,
+            setup.horizon,
+            setup.action_size,
+            setup.bound,
+            setup.sim.observe == "pictures",
         )
 
     @cached_property
@@ -179,12 +187,17 @@ class EpisodeSpec:
 def _columns(spec: EpisodeSpec, count: int) -> tuple[Column, ...]:
     e, t, v, k = count, spec.horizon, spec.corners, spec.tokens
     reach, one = spec.bound * (1 + ROUNDING), 1 + ROUNDING
+    missing = (
+        Column("missing", "u1", (e, t + 1, k), 0, AWAY),
+        Column("goals_missing", "u1", (e, k), 0, 1),
+    )
     return (
         Column("corners", "<f4", (e, t + 1, v, 2), -reach, reach),
         Column("placed", "u1", (e, t + 1, k), 0, 1),
         Column("actions", "<f4", (e, t, spec.action_size), -one, one),
         Column("rewards", "<f4", (e, t), -MAX_REWARD, MAX_REWARD),
         Column("goals", "<f4", (e, v, 2), -reach, reach),
+        *(missing if spec.observed else ()),
     )
 
 

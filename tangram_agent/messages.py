@@ -198,7 +198,7 @@ class EpisodeBatch(OfTask):
 
     def arrays(self) -> Mapping[str, Any]:
         """The fields of the episodes."""
-        return vars(self.episodes)
+        return self.episodes.arrays
 
     @classmethod
     def refused(cls, header: Mapping[str, Any], error: WireError) -> WireError:

@@ -6,6 +6,7 @@ Goals and states are corners in the order of `tangram_sim.layout.Layout`.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +14,7 @@ import numpy.typing as npt
 from tangram_sim.arrays import Singles
 
 Flags = npt.NDArray[np.uint8]
+AWAY = 2  # of `Episodes.missing`
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +27,9 @@ class Episodes:
         actions: (E, T, A) float32 in [-1, 1].
         rewards: (E, T) float32 of the goal that was played.
         goals: (E, V, 2) float32, target corners.
+        missing: (E, T + 1, K) uint8, 1 where a token was not found in a picture, `AWAY` where it
+            should have left that; None where pictures are not what is observed.
+        goals_missing: (E, K) uint8, the same of the target's pieces.
     """
 
     corners: Singles
@@ -32,6 +37,32 @@ class Episodes:
     actions: Singles
     rewards: Singles
     goals: Singles
+    missing: Flags | None = None
+    goals_missing: Flags | None = None
+
+    @property
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """Those that there are, by name."""
+        return {name: array for name, array in vars(self).items() if array is not None}
+
+    def seen_whole(self) -> "Episodes":
+        """Those in which nothing was missing; of several tokens some may have left the picture.
+
+        Where those lie is only known by what they were told, but to lose an episode of many actions
+        for one that left is worse.
+        """
+        if self.missing is None or self.goals_missing is None:
+            return self
+        several = self.missing.shape[2] > 1
+        gone = (self.missing > 0) & ((self.missing != AWAY) | (not several))
+        whole = ~(gone.any(axis=(1, 2)) | self.goals_missing.any(axis=1))
+        return Episodes(
+            corners=self.corners[whole],
+            placed=self.placed[whole],
+            actions=self.actions[whole],
+            rewards=self.rewards[whole],
+            goals=self.goals[whole],
+        )
 
     @property
     def count(self) -> int:

@@ -18,12 +18,15 @@ from tangram_sim.actions import (
     velocities,
 )
 from tangram_sim.actuation import Actuation, Command
-from tangram_sim.arrays import Bools, Floats, Ints
+from tangram_sim.arrays import Bools, Floats, Ints, Pixels
 from tangram_sim.config import RewardConfig, SimConfig
+from tangram_sim.errors import ConfigError
 from tangram_sim.geometry import outlines, overlap_share, shared_area
 from tangram_sim.layout import Layout
+from tangram_sim.lens import Lens
 from tangram_sim.observation_noise import see
 from tangram_sim.rewards import TargetPictures, make_reward, scaled_overlap
+from tangram_sim.sight import Eye, Sight
 from tangram_sim.targets import Sides, sample_starts, sample_targets
 from tangram_sim.world import make_world
 
@@ -79,15 +82,39 @@ class BatchedEnv:
         placed: (B, K) which tokens are placed.
         goals: (B, V, 2) corners of the targets.
         actuation: the world that each episode has drawn.
-        seen: `corners` as an agent sees them, new noise at every step if there is any.
+        seen: `corners` as an agent sees them, new noise at every step if there is any, or as they
+            are found in pictures.
         seen_goals: `goals` as an agent sees them, with one noise for the whole episode.
+        sight: what is found in pictures, where these are the agent's only source, else None.
     """
 
     def __init__(
-        self, layout: Layout, sim: SimConfig, reward: RewardConfig, count: int = 1
+        self,
+        layout: Layout,
+        sim: SimConfig,
+        reward: RewardConfig,
+        count: int = 1,
+        eye: Eye | None = None,
     ) -> None:
+        """Open `count` worlds.
+
+        Args:
+            layout: the tokens.
+            sim: the world.
+            reward: what an action is worth.
+            count: B.
+            eye: finds tokens in pictures, for `sim.observe=pictures`.
+
+        Raises:
+            ConfigError: pictures are to be observed, and there is no eye.
+        """
         if count < 1:
             raise ValueError(f"count must be at least 1, got {count}")
+        if sim.observe == "pictures" and eye is None:
+            raise ConfigError(
+                "sim.observe=pictures is for tangram-train, tangram-worker and tangram-eval, which "
+                "look at pictures: set sim.observe=corners"
+            )
         self.layout = layout
         self.sim = sim
         self._reward = reward
@@ -100,7 +127,12 @@ class BatchedEnv:
         self._ends_by_placing = layout.tokens > 1 or sim.actions_per_token == 1
         self._worlds = [make_world(layout, sim) for _ in range(count)]
         self.actuation = Actuation(sim, count)
+        self._lens = Lens(sim)
+        observed = eye if sim.observe == "pictures" else None
+        self.sight = None if observed is None else Sight(layout, observed, count, sim.arena)
         self._targets: TargetPictures | None = None
+        self._late = np.zeros(count, np.int64), np.zeros((count, 3))  # what was told a step before
+        self._pictures: Pixels = np.zeros((count, 0, 0), np.uint8)  # after the last step
         self._moves: Ints = np.zeros((count, layout.tokens), dtype=np.int64)
         self.steps_done = self.horizon  # no episode yet
         self.corners: Floats = np.zeros((count, layout.corner_count, 2))
@@ -113,6 +145,15 @@ class BatchedEnv:
         """(B, K), see the class."""
         placed: Bools = (self._moves >= self.sim.actions_per_token) & self._ends_by_placing
         return placed
+
+    @property
+    def closed(self) -> Bools:
+        """(B, K) tokens that no action should name: placed, or not seen while others are."""
+        placed = self.placed
+        if self.sight is None:
+            return placed
+        either = placed | self.sight.missing
+        return np.where(either.all(axis=1, keepdims=True), placed, either)
 
     def reset(
         self, generators: Sequence[np.random.Generator], targets: Sides | None = None
@@ -134,9 +175,13 @@ class BatchedEnv:
         done = self._done(generators)
         starts = sample_starts(self.layout, self.sim, targets, done, generators)
         self._moves[:] = self.sim.actions_per_token * done
-        self._begin(targets, starts)
         self._generators = generators
-        self.seen_goals = see(self.goals, self.sim, generators)
+        self._late = np.zeros(self.count, np.int64), np.zeros((self.count, 3))
+        self._begin(targets, starts)
+        if self.sight is None:
+            self.seen_goals = see(self.goals, self.sim, generators)
+        else:
+            self.seen_goals = self.sight.goals
         self._look()
         self.actuation.begin(generators)
         if self.sim.damping_spread:
@@ -165,14 +210,20 @@ class BatchedEnv:
         if self.steps_done >= self.horizon:
             raise RuntimeError(f"the episode of {self.horizon} steps is over: call reset first")
         actions = self._checked(actions)
-        tokens = chosen_tokens(actions, self.layout.tokens)
-        refused = self.placed[np.arange(self.count), tokens]
-        self._moves[np.flatnonzero(~refused), tokens[~refused]] += 1
+        named = chosen_tokens(actions, self.layout.tokens)
+        refused = self.placed[np.arange(self.count), named]
+        self._moves[np.flatnonzero(~refused), named[~refused]] += 1
+        tokens = named if self.sight is None else self.sight.hands(named, self.corners)
         velocity, flip = velocities(actions, self.sim), flips(actions, self.layout, self.sim)
         command = self.actuation.carry_out(Command(tokens, velocity, flip, refused))
         covered = self._covered(command)
         blocked = (covered > self.sim.max_overlap) & ~command.idle
         camera = self._move(command, command.idle | blocked)
+        if self.sight is not None:
+            told = named, np.where(refused[:, None], 0.0, velocity)
+            self.sight.follow(self._pictures, *(self._late if self.sim.delay else told))
+            self._late = told
+        self._look()
         self.steps_done += 1
         share = overlap_share(self.corners, self.goals, self.layout)
         return StepResult(
@@ -214,29 +265,44 @@ class BatchedEnv:
         """Photograph the targets and put the tokens at their starts."""
         # World after world, here and in `_move`: the engine's memory of each fills the cache.
         pictures = []
+        views = self._lens.begin(self._generators)
         for b, world in enumerate(self._worlds):
+            if self._lens.moves:
+                world.aim(views[b].x, views[b].y, views[b].turn)
             if self.sim.pixels:
                 world.place(targets[0][b], targets[1][b])
-                pictures.append(world.picture())
+                pictures.append(self._picture(b))
             world.place(starts[0][b], starts[1][b])
         if self.sim.pixels:
             self._targets = TargetPictures(np.stack(pictures))
+        if self.sight is not None:
+            states = [self._picture(b) for b in range(self.count)]
+            self.sight.begin(np.stack(pictures), np.stack(states))
+
+    def _picture(self, b: int) -> Pixels:
+        """(P, P) of an environment, as the camera has it now."""
+        return self._lens.taken(b, self._worlds[b].picture(), self._generators[b])
 
     def _move(self, command: Command, idle: Bools) -> Floats | None:
-        """Move in every world and look at it; (B,) Eq. 14 of the pictures with the camera on."""
+        """Move in every world; (B,) Eq. 14 of the pictures with the camera on."""
         pictures = []
         for b, world in enumerate(self._worlds):
             if not idle[b]:
                 world.move(int(command.tokens[b]), command.velocity[b], bool(command.flip[b]))
             if self.sim.pixels:
-                pictures.append(world.picture())
-        self._look()
-        return None if self._targets is None else self._targets.rewards(np.stack(pictures))
+                pictures.append(self._picture(b))
+        if self._targets is None:
+            return None
+        self._pictures = np.stack(pictures)
+        return self._targets.rewards(self._pictures)
 
     def _rewards(self, share: Floats, camera: Floats | None) -> Floats:
         """(B,) of the configured reward, with the raw overlap and Eq. 14 of the pictures."""
-        if camera is not None and self._reward.source == "camera":
+        observed = self._reward.source == "camera" or self.sight is not None
+        if camera is not None and observed and self._reward.name == "overlap":
             return camera
+        if self.sight is not None:
+            return self.reward_fn(self.seen, self.seen_goals)
         if self._reward.name == "overlap":
             return scaled_overlap(share)  # what reward_fn gives, without doing it twice
         return self.reward_fn(self.corners, self.goals)
@@ -255,4 +321,7 @@ class BatchedEnv:
         self._poses = np.stack([world.poses() for world in self._worlds])
         self._flipped = np.stack([world.flipped() for world in self._worlds])
         self.corners = self.layout.corners(self._poses, self._flipped)
-        self.seen = see(self.corners, self.sim, self._generators)
+        if self.sight is None:
+            self.seen = see(self.corners, self.sim, self._generators)
+        else:
+            self.seen = self.sight.corners

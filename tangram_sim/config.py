@@ -16,6 +16,14 @@ SOURCES = ("polygon", "camera")
 # needs four.
 EXACT_SUBSTEPS = 4
 MIN_PIXELS = 16
+PICTURES = ("binary", "grey")
+OBSERVED = ("corners", "pictures")
+# The settings of the camera.
+CAMERA = (
+    *("pixels", "picture", "picture_noise", "picture_blur"),
+    *("light_gradient", "camera_turn", "camera_shift"),
+)
+NO_PICTURES: dict[str, object] = {"pixels": 0}
 # A fifth of the arena is a whole token: nothing is left to see beyond.
 MAX_CORNER_NOISE = 0.2
 # What an action says is told a token otherwise by at most this much; see SimConfig.
@@ -147,6 +155,12 @@ class SimConfig(Settings, section="sim"):
         high=MAX_CORNER_NOISE,
         unit="arenas",
     )
+    observe: str = setting(
+        "corners",
+        "what agents see: corners as they are, or what is found in the camera's pictures; then "
+        "Eq. 14 is measured on pictures, too, and scores are exact polygons all the same",
+        choices=OBSERVED,
+    )
     motion: str = setting(
         "lift",
         "carried above the others and set down, or pushed along the table and others with it",
@@ -196,7 +210,53 @@ class SimConfig(Settings, section="sim"):
         "evaluators, which report Eq. 14 by them",
         low=0,
         high=1024,
-        part=LEARNING,
+    )
+    picture: str = setting(
+        "binary",
+        "what the camera takes: binary shows at each pixel what is at its centre; grey is averaged "
+        "from a larger picture, as a real camera does",
+        choices=PICTURES,
+        unless=NO_PICTURES,
+    )
+    picture_noise: float = setting(
+        0.0,
+        "deviation of the Gaussian noise on each pixel",
+        low=0,
+        high=64,
+        unit="of 255 levels",
+        unless=NO_PICTURES,
+    )
+    picture_blur: float = setting(
+        0.0,
+        "deviation of the Gaussian that pictures are blurred with",
+        low=0,
+        high=8,
+        unit="pixels",
+        unless=NO_PICTURES,
+    )
+    light_gradient: float = setting(
+        0.0,
+        "share by which light falls off across a picture, in a direction that each episode draws",
+        low=0,
+        high=0.5,
+        unless=NO_PICTURES,
+    )
+    camera_turn: float = setting(
+        0.0,
+        "the camera is turned by so much, either way as each episode draws; targets and tokens are "
+        "seen by the same camera",
+        low=0,
+        high=45,
+        unit="degrees",
+        unless=NO_PICTURES,
+    )
+    camera_shift: float = setting(
+        0.0,
+        "the camera is shifted by so much, in a direction that each episode draws",
+        low=0,
+        high=64,
+        unit="pixels",
+        unless=NO_PICTURES,
     )
 
     @property
@@ -258,6 +318,18 @@ class SimConfig(Settings, section="sim"):
             )
         if 0 < self.pixels < MIN_PIXELS:
             raise ConfigError(f"sim.pixels must be 0 or at least {MIN_PIXELS}, got {self.pixels}")
+        if self.observe == "pictures":
+            self._check_observed()
+
+    def _check_observed(self) -> None:
+        if not self.pixels:
+            raise ConfigError(
+                "sim.observe=pictures needs pictures, got sim.pixels=0: set sim.pixels=128"
+            )
+        if self.corner_noise:
+            given = f"sim.corner_noise={told(self.corner_noise)}"
+            remedy = "set sim.picture_noise"
+            refuse_ignored(given, "sim.observe=pictures", remedy, SimConfig.corner_noise)
 
     def _check_stages(self) -> None:
         entries: tuple[object, ...] = tuple(self.stages)

@@ -16,7 +16,7 @@ from tangram_sim.config import SimConfig
 from tangram_sim.engine import pybullet
 from tangram_sim.errors import TangramError
 from tangram_sim.layout import Layout
-from tangram_sim.pictures import BACKGROUND, TOKEN_GRAY
+from tangram_sim.pictures import BACKGROUND, TOKEN_GRAY, averaged, taken_pixels
 from tangram_sim.prisms import ENGINE_ARENA, inset, prism, thickness
 from tangram_sim.shapes import Shape
 from tangram_sim.window import Window
@@ -70,7 +70,8 @@ class PhysicsWorld:
         self.damp(sim.damping)
         self._play_at_once()
         if sim.pixels:
-            self._camera = Camera(self._client, sim.pixels, ENGINE_ARENA, _HALF_HEIGHT)
+            self._pixels = sim.pixels
+            self._camera = Camera(self._client, taken_pixels(sim), ENGINE_ARENA, _HALF_HEIGHT)
 
     def place(self, poses: Floats, flipped: Bools | None = None) -> None:
         """See `World.place`."""
@@ -120,9 +121,13 @@ class PhysicsWorld:
         """See `World.flipped`."""
         return self._flipped.copy()
 
+    def aim(self, x: float, y: float, turn: float) -> None:
+        """See `World.aim`."""
+        self._camera.aim(x * self._unit, y * self._unit, turn)
+
     def picture(self) -> Pixels:
         """See `World.picture`."""
-        return self._camera.picture()
+        return averaged(self._camera.picture(), self._pixels)
 
     def close(self) -> None:
         """See `World.close`."""

@@ -7,16 +7,34 @@ arena / 2, y = arena / 2 - (row + 1/2) * arena / P: rows run down, as in every i
 import numpy as np
 
 from tangram_sim.arrays import Bools, Floats, Pixels
+from tangram_sim.config import SimConfig
 from tangram_sim.layout import Layout
 
 BACKGROUND = 255
 TOKEN_GRAY = 80
+_MIDDLE = (BACKGROUND + TOKEN_GRAY) // 2
+_FINER = 4  # a grey picture is averaged from one with so many times the pixels along a side
 
 
 def token_pixels(picture: Pixels) -> Bools:
-    """(P, P), where a picture shows a token: px = 1 of Eq. 14."""
-    mask: Bools = np.not_equal(picture, BACKGROUND)
+    """(P, P), where a picture shows a token, by more than half: px = 1 of Eq. 14."""
+    mask: Bools = np.less(picture, _MIDDLE)
     return mask
+
+
+def taken_pixels(sim: SimConfig) -> int:
+    """The side of the picture that is taken before it is averaged."""
+    return sim.pixels * (_FINER if sim.picture == "grey" else 1)
+
+
+def averaged(picture: Pixels, pixels: int) -> Pixels:
+    """A picture with so many pixels along its side, each the mean of those that it stands for."""
+    times = len(picture) // pixels
+    if times == 1:
+        return picture
+    parts = picture.reshape(pixels, times, pixels, times)
+    mean: Pixels = np.round(parts.mean(axis=(1, 3))).astype(np.uint8)
+    return mean
 
 
 def rasterise(corners: Floats, layout: Layout, arena: float, pixels: int) -> Pixels:

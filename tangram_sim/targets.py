@@ -29,6 +29,7 @@ from tangram_sim.shapes import Shape, mirror_image, tan, turn_onto
 
 Generators = Sequence[np.random.Generator]
 Sides = tuple[Floats, Bools]
+MAX_PILE = 3  # tokens that touch and can be found in a picture: more are searched for too long
 MIN_THICKNESS = 1e-3  # of a token, arenas
 
 
@@ -113,6 +114,15 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
                 f"sim.stages: tokens must be at most the {layout.tokens} that there are, got "
                 f"{stage.tokens} (in the stage from update {stage.updates}); 0 moves all"
             )
+    together = [
+        t for t in (sim.task, *sim.stages) if t.targets in ("connected", "figures", "mixed")
+    ]
+    if sim.observe == "pictures" and together and layout.tokens > MAX_PILE:
+        raise ConfigError(
+            f"sim.observe=pictures tells at most {MAX_PILE} tokens that touch from each other, got "
+            f"{layout.tokens} in sim.targets={together[0].targets}: set sim.targets=uniform, or "
+            "sim.observe=corners"
+        )
     if any(task.targets == "figures" for task in (sim.task, *sim.stages)):
         _check_full_set(layout)
         _check_figures_fit(layout, sim)

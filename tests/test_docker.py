@@ -16,7 +16,7 @@ from conf.cli import composed
 pytestmark = pytest.mark.fast
 
 ROOT = Path(__file__).parents[1]
-OURS = {"conf", "master", "tangram_agent", "tangram_sim", "worker"}
+OURS = {"conf", "master", "tangram_agent", "tangram_sim", "tangram_vision", "worker"}
 DOCKER = ROOT / "docker"
 COMPOSE: dict[str, Any] = yaml.safe_load((DOCKER / "docker-compose.yml").read_text())
 # Neither plays nor learns: the gymnasium environment, and the figures of reports.

@@ -18,7 +18,7 @@ from tangram_cli.commands import COMMANDS
 pytestmark = pytest.mark.fast
 
 ROOT = Path(__file__).parents[1]
-OURS = ("tangram_agent", "tangram_cli", "tangram_lab", "tangram_sim")
+OURS = ("tangram_agent", "tangram_cli", "tangram_lab", "tangram_sim", "tangram_vision")
 PACKAGES = ("conf", "master", "worker", *OURS)
 
 
@@ -50,8 +50,8 @@ def test_import_contracts_catch_every_wrong_arrow(tmp_path: Path) -> None:
         shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("*.pyc"))
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
     wrong = {
-        "tangram_sim/wrong.py": "import torch, pybullet, zmq, omegaconf, tangram_sim.engine",
-        "tangram_agent/wrong.py": "import worker.config, conf.help",
+        "tangram_sim/wrong.py": "import torch, pybullet, cv2, zmq, omegaconf, tangram_sim.engine",
+        "tangram_agent/wrong.py": "import worker.config, conf.help, tangram_vision.seeing",
         "master/wrong.py": "import tangram_lab.experiments.plan, tangram_sim.wrong",
     }
     for path, code in wrong.items():

@@ -18,9 +18,9 @@ from master.trainer import Trainer
 from tangram_agent.config import ServiceConfig
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup, make_setup
-from tangram_sim.batch import BatchedEnv
 from tangram_sim.errors import TangramError
 from tangram_sim.settings import declared_fields
+from worker.looking import environments
 from worker.rollout import Rollout
 
 pytestmark = pytest.mark.fast
@@ -82,6 +82,15 @@ NEAR_ONE = over(ONE, agent={"hindsight": [NEAR]})
 STAGE = {"updates": 2, "tokens": 1, "targets": "gaussian", "spread": 0.2}
 STAGES = over(SEVERAL, sim={"stages": [STAGE]})
 
+DISTURBED: dict[str, object] = {
+    "picture": "grey",
+    "picture_noise": 8.0,
+    "picture_blur": 1.0,
+    "light_gradient": 0.2,
+    "camera_turn": 1.0,
+    "camera_shift": 2.0,
+}
+
 # Setting -> a run in which it has an effect, and another value.
 SHOWS: dict[str, tuple[Config, object]] = {
     "tokens.shapes": (ONE, ["square"]),
@@ -111,6 +120,13 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "sim.allow_flip": (SEVERAL, True),
     "sim.stages": (SEVERAL, [STAGE]),
     "sim.pixels": (CAMERA, 32),
+    "sim.picture": (CAMERA, "grey"),
+    "sim.picture_noise": (CAMERA, 64.0),
+    "sim.picture_blur": (CAMERA, 2.0),
+    "sim.light_gradient": (CAMERA, 0.5),
+    "sim.camera_turn": (CAMERA, 20.0),
+    "sim.camera_shift": (CAMERA, 3.0),
+    "sim.observe": (SEEN, "pictures"),
     "sim.stages.updates": (STAGES, 100),
     "sim.stages.tokens": (STAGES, 2),
     "sim.stages.targets": (over(STAGES, sim={"stages": [STAGE | {"spread": 0.2}]}), "connected"),
@@ -183,7 +199,7 @@ def changed(base: Config, name: str, value: object) -> Config:
 def steps_of(setup: Setup) -> Iterator[str]:
     """Digests of a short seeded run: of what is played, of what is learned, and so on."""
     trainer, policy = Trainer(setup, 0, "cpu"), Policy(setup)
-    with closing(BatchedEnv(setup.layout, setup.sim, setup.reward, ENVS)) as env:
+    with closing(environments(setup, ENVS)) as env:
         policy.load(trainer.weights())
         env.reset([np.random.default_rng(i) for i in range(ENVS)])
         yield digest(policy.act(env.seen, env.placed, env.seen_goals))
@@ -313,6 +329,8 @@ def test_every_setting_of_a_command_is_read() -> None:
         (FINAL_TWICE, "agent.hindsight.position", 0.1, "agent.hindsight.strategy=final"),
         (FINAL_TWICE, "agent.hindsight.angle", 0.1, "agent.hindsight.strategy=final"),
         (ONE, "sim.spread", 0.1, "sim.targets=uniform"),
+        *((ONE, f"sim.{name}", value, "sim.pixels=0") for name, value in DISTURBED.items()),
+        (over(SEEN, sim={"observe": "pictures"}), "sim.corner_noise", 0.01, "sim.observe=pictures"),
         (SLIDE, "sim.max_overlap", 0.1, "sim.motion=slide"),
         (ONE, "reward.sharpness", 10.0, "reward.name=overlap"),
     ],

@@ -19,6 +19,7 @@ from tangram_agent.files import write_whole
 from tangram_agent.outcome import plural
 from tangram_agent.runs import Run, load_changed
 from tangram_agent.setup import Setup
+from tangram_sim.config import SimConfig
 from tangram_sim.game_drawing import figure_sheet
 from tangram_sim.settings import told
 from worker.baselines import (
@@ -205,17 +206,23 @@ def _title(run: Run) -> str:
 def _told(setup: Setup) -> str:
     """The settings of the test, in words."""
     sim = setup.sim
-    noise = sim.corner_noise
     parts = [
         f"{sim.actions_per_token} action{'s' * (sim.actions_per_token > 1)} a token",
         "exploration off",
-        f"corners with noise {noise:g}" if noise else "exact corners",
+        _observed(sim),
         sim.backend if setup.layout.tokens == 1 else f"{sim.backend}, {sim.motion}",
     ]
     parts += [f"{name} {told(value)}" for name, value in sim.inexact.items()]
     if sim.action_noise:
         parts.append(f"actions with noise {sim.action_noise:g}")
     return ", ".join(parts)
+
+
+def _observed(sim: SimConfig) -> str:
+    """What agents see, in words."""
+    if sim.observe == "pictures":
+        return f"{sim.picture} pictures of {sim.pixels} px"
+    return f"corners with noise {sim.corner_noise:g}" if sim.corner_noise else "exact corners"
 
 
 def score_puzzles(

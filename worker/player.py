@@ -8,10 +8,10 @@ from tangram_agent.messages import Go
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes
-from tangram_sim.batch import BatchedEnv
 from tangram_sim.errors import TangramError
 from worker.client import Client
 from worker.config import WorkerConfig
+from worker.looking import environments
 from worker.rollout import Rollout, parts
 from worker.session import Report, joined
 
@@ -29,7 +29,7 @@ def run_player(config: WorkerConfig, setup: Setup) -> int:
     # What is too large for a message is split.
     size = min(config.service.batch_episodes, EpisodeSpec.of(setup).max_count)
     with (
-        closing(BatchedEnv(setup.layout, setup.sim, setup.reward, config.service.envs)) as env,
+        closing(environments(setup, config.service.envs)) as env,
         joined(config, setup, policy) as client,
     ):
         if client.stopped or not _take_first_weights(client, policy, report):

@@ -14,7 +14,7 @@ from tangram_agent.setup import Setup
 from tangram_sim.arrays import Bools, Floats
 from tangram_sim.assembly import Puzzle, PuzzleRules
 from tangram_sim.batch import BatchedEnv
-from tangram_sim.config import RewardConfig
+from tangram_sim.config import CAMERA, RewardConfig, SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.puzzles import SPLITS, PuzzleFile, library, read_puzzles
 from tangram_sim.seeding import episode_generator
@@ -106,7 +106,13 @@ def play_figures(setup: Setup, figures: Sequence[Figure], player: Player, seed: 
     Raises:
         SamplingError: the tokens find no room to start.
     """
-    sim = replace(setup.sim, pixels=0)
+    if setup.sim.observe == "pictures":
+        raise ConfigError(
+            "sim.observe=pictures cannot tell the pieces of a puzzle apart, which touch: set "
+            "sim.observe=corners"
+        )
+    # Without a camera nothing disturbs its pictures either.
+    sim = replace(setup.sim, **{name: getattr(SimConfig, name) for name in CAMERA})
     targets = (np.stack([f.poses for f in figures]), np.stack([f.flipped for f in figures]))
     envs = min(at_once(setup), len(figures))
     with closing(BatchedEnv(setup.layout, sim, RewardConfig(), envs)) as env:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from tangram_agent.setup import Setup
-from tangram_agent.types import Episodes, Past
+from tangram_agent.types import AWAY, Episodes, Past
 from tangram_sim.arrays import Bools, Floats, Singles
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.seeding import episode_generator
@@ -74,6 +74,12 @@ class Played:
             rewards=np.empty((count, steps), np.float32),
             goals=np.empty((count, corners, 2), np.float32),
         )
+        if env.sight is not None:
+            seen = replace(
+                seen,
+                missing=np.empty((count, steps + 1, tokens), np.uint8),
+                goals_missing=np.empty((count, tokens), np.uint8),
+            )
         return Played(
             episodes=seen,
             corners=np.empty((count, steps + 1, corners, 2)),
@@ -101,8 +107,8 @@ def parts(episodes: Episodes, size: int) -> Iterator[Episodes]:
 
 
 def _rows(episodes: Episodes, first: int, end: int) -> Episodes:
-    columns: dict[str, Any] = vars(episodes)
-    return Episodes(**{name: column[first:end] for name, column in columns.items()})
+    rows = {name: array[first:end] for name, array in episodes.arrays.items()}
+    return Episodes(**rows)
 
 
 def at_once(setup: Setup) -> int:
@@ -157,6 +163,8 @@ def _play_group(
     rows, seen = slice(first, first + env.count), played.episodes
     env.reset(generators, targets)
     seen.goals[rows], played.goals[rows] = env.seen_goals, env.goals
+    if env.sight is not None and seen.goals_missing is not None:
+        seen.goals_missing[rows] = env.sight.goals_missing
     began = time.perf_counter()
     for t in range(env.horizon):
         if not go_on():
@@ -164,7 +172,7 @@ def _play_group(
         _look(env, played, rows, t)
         past = Past(seen.corners[rows, :t], seen.actions[rows, :t])
         asked = time.process_time()
-        actions = choose(env.seen, env.placed, env.seen_goals, generators, past)
+        actions = choose(env.seen, env.closed, env.seen_goals, generators, past)
         spent = time.process_time() - asked
         played.slowest[rows] = np.maximum(played.slowest[rows], spent)
         result = env.step(actions.astype(np.float64))
@@ -181,6 +189,9 @@ def _play_group(
 def _look(env: BatchedEnv, played: Played, rows: slice, t: int) -> None:
     played.corners[rows, t], played.episodes.corners[rows, t] = env.corners, env.seen
     played.episodes.placed[rows, t] = env.placed
+    if env.sight is not None and played.episodes.missing is not None:
+        sight = env.sight
+        played.episodes.missing[rows, t] = np.where(sight.away, AWAY, sight.missing)
 
 
 class Rollout:

@@ -9,8 +9,8 @@ from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
 from tangram_agent.types import Past
 from tangram_sim.arrays import Bools, Floats, Singles
-from tangram_sim.batch import BatchedEnv
 from tangram_sim.seeding import episode_generator
+from worker.looking import environments
 from worker.metrics import summarise
 from worker.rollout import Choose, Generators, Played, play
 
@@ -50,7 +50,7 @@ class FixedTests:
         self.setup = replace(setup, sim=replace(setup.sim, pixels=setup.sim.pixels or PIXELS))
         self._episodes = episodes
         self._set = (seed, role, 0, 0)
-        self.env = BatchedEnv(setup.layout, self.setup.sim, setup.reward, min(at_once, episodes))
+        self.env = environments(self.setup, min(at_once, episodes))
 
     def play(self, choose: Choose, go_on: Callable[[], bool] = lambda: True) -> Played:
         """All episodes, fewer if `go_on` says so; see `rollout.play`."""

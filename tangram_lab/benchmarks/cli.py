@@ -37,6 +37,7 @@ TRIALS = {
     "chaos": ("random faults over a real training", 20.0),
     "attack": ("every attack that is known, on trainings that run; what held", None),
     "fuzz": ("mutated messages against decoder and master", None),
+    "seeing": ("tokens found in pictures: how exactly, how surely, how fast", None),
     "soak": ("memory and open files of a long training, drawn", 60.0),
 }
 # Option -> its bounds.
@@ -46,6 +47,7 @@ BOUNDS = {
     "minutes": (0.01, 1e5),
     "messages": (1, 10**12),
     "live": (1, 10**12),
+    "scenes": (1, 10**6),
     "seed": (0, 2**63 - 1),
 }
 
@@ -73,6 +75,8 @@ def _parser() -> argparse.ArgumentParser:
         elif name == "fuzz":
             one.add_argument("--messages", type=int, default=1_000_000, help="for the decoder")
             one.add_argument("--live", type=int, default=100_000, help="for a live master")
+        elif name == "seeing":
+            one.add_argument("--scenes", type=int, default=200, help="of each kind (200)")
         if name != "attack":
             one.add_argument("--seed", type=int, default=0, help="of everything random (0)")
         one.add_argument("--out", type=Path, help="JSON file of the results")
@@ -114,8 +118,11 @@ def _run(arguments: argparse.Namespace) -> int:
     from tangram_lab.benchmarks.attack import run_attack
     from tangram_lab.benchmarks.chaos import run_chaos
     from tangram_lab.benchmarks.fuzz_wire import run_fuzz
+    from tangram_lab.benchmarks.seeing import run_seeing
     from tangram_lab.benchmarks.soak import run_soak
 
+    if arguments.kind == "seeing":
+        return run_seeing(arguments.scenes, arguments.seed, arguments.out)
     with tempfile.TemporaryDirectory(prefix="tangram-") as folder:
         if arguments.kind == "attack":
             return run_attack(arguments.out, Path(folder))

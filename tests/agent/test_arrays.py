@@ -81,7 +81,7 @@ def test_frames_are_raw_little_endian_bytes_in_the_order_of_the_fields() -> None
 
 def test_decoding_copies_nothing() -> None:
     frames = encode_episodes(episodes(2), SPEC)
-    for array, frame in zip(vars(decode_episodes(frames, 2, SPEC)).values(), frames, strict=True):
+    for array, frame in zip(decode_episodes(frames, 2, SPEC).arrays.values(), frames, strict=True):
         assert np.shares_memory(array, np.frombuffer(frame, np.uint8))
         assert not array.flags.writeable
 

@@ -241,7 +241,7 @@ def test_batches_come_back_as_they_were_sent(
     received = decode_from_worker(sent.encode(SPEC), SPEC)
     assert isinstance(received, EpisodeBatch)
     assert (received.sequence, received.weights_version) == (sequence, version)
-    for name, array in vars(sent.episodes).items():
+    for name, array in sent.episodes.arrays.items():
         np.testing.assert_array_equal(vars(received.episodes)[name], array)
 
 
@@ -371,7 +371,7 @@ def test_what_a_receiver_would_refuse_is_not_sent() -> None:
         replace(sent, scalars={"iou": NAN}).encode(SPEC)
     with pytest.raises(WireError, match=r"ends must have the shape \(2, 7, 2\), got \(1, 7, 2\)"):
         replace(sent, ends=sent.ends[:1]).encode(SPEC)
-    none = Episodes(*[array[:0] for array in vars(episodes(1)).values()])
+    none = Episodes(*[array[:0] for array in episodes(1).arrays.values()])
     with pytest.raises(WireError, match=f"episodes: count {INTEGER} 1 and {SPEC.max_count}, got 0"):
         EpisodeBatch(1, 0, none).encode(SPEC)
     with pytest.raises(WireError, match=f"episodes: sequence {INTEGER} 1 and {BIG}, got 0"):

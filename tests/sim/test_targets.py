@@ -149,6 +149,11 @@ def test_a_narrow_gaussian_widens_until_there_is_room() -> None:
             r"an arena of width 2\.48 for tokens.scale=0.8, got 2: raise sim.arena, or lower",
         ),
         (
+            GAME,
+            {"targets": "mixed", "observe": "pictures", "pixels": 64},
+            "pictures tells at most 3 tokens .* got 7 in sim.targets=mixed: set sim.targets",
+        ),
+        (
             layout_of("square"),
             {"allow_flip": True},
             "allow_flip=true needs a token that is not .* got tokens square: set sim.allow_flip",

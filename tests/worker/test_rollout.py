@@ -77,7 +77,7 @@ def rolled_out(made: Setup, envs: int, count: int) -> Episodes:
         rollout, acting = Rollout(env, *IDENTITY), policy(made)
         played = [rollout.play(acting.explore, groups) for groups in (1, count // envs - 1)]
         assert rollout.episode == count
-    return Episodes(**{n: np.concatenate([vars(p)[n] for p in played]) for n in vars(played[0])})
+    return Episodes(**{n: np.concatenate([vars(p)[n] for p in played]) for n in played[0].arrays})
 
 
 @pytest.mark.parametrize(("tokens", "actions"), [(SQUARE, 1), (SQUARE, 3), (PAIR, 2)])
@@ -89,7 +89,7 @@ def test_episodes_equal_a_naive_loop_however_they_are_batched(tokens: dict, acti
     naive = [naive_episode(made, acting, episode_generator(*IDENTITY, n)) for n in range(16)]
     for envs in (1, 4, 8):
         episodes = rolled_out(made, envs, 16)
-        assert {name: column.dtype.name for name, column in vars(episodes).items()} == {
+        assert {name: column.dtype.name for name, column in episodes.arrays.items()} == {
             **dict.fromkeys(("corners", "actions", "rewards", "goals"), "float32"),
             "placed": "uint8",
         }
@@ -117,7 +117,7 @@ def test_physics_plays_what_kinematics_plays() -> None:
     kinematic = setup(agent=CURIOUS)
     physics = replace(kinematic, sim=replace(kinematic.sim, backend="physics"))
     one, two = rolled_out(kinematic, 4, 8), rolled_out(physics, 4, 8)
-    for name, column in vars(one).items():
+    for name, column in one.arrays.items():
         np.testing.assert_allclose(vars(two)[name], column, atol=1e-2, err_msg=name)
 
 
@@ -126,7 +126,7 @@ def test_messages_are_parts_of_the_record_in_order(size: int, counts: list[int])
     episodes = rolled_out(setup(), envs=4, count=12)
     found = list(parts(episodes, size))
     assert [part.count for part in found] == counts
-    for name, column in vars(episodes).items():
+    for name, column in episodes.arrays.items():
         pieces = [vars(part)[name] for part in found]
         np.testing.assert_array_equal(np.concatenate(pieces), column)
         assert all(np.shares_memory(piece, column) for piece in pieces)  # nothing is copied

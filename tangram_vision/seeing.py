@@ -1,0 +1,208 @@
+"""One picture -> where each token of a known set lies, on which side, and how sure that is.
+
+Blobs that look like one token are fitted at once; the others are searched for tokens that touch.
+All tokens are known, so what explains one blob leaves less for the others: the first explanation of
+all is taken. Tokens that look alike come in any order.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from tangram_sim.arrays import Bools, Complex, Floats, Ints, Pixels
+from tangram_sim.layout import Layout
+from tangram_vision.blobs import Blobs, find_blobs, likeness
+from tangram_vision.edges import refined
+from tangram_vision.kinds import Kind, kinds_of
+from tangram_vision.levels import coverage
+from tangram_vision.piles import Laid, arrangements
+from tangram_vision.samples import binary, settled
+
+SURE = 0.5  # confidence from which a token counts as seen
+_DOUBTFUL = 0.4  # of tokens that could as well lie otherwise
+_SMALLEST = 0.4  # of the smallest token: less is dirt
+_CLOSE = 0.15  # moments nearer than this to the nearest are compared by their edges
+_ROUGH = 0.7  # pixels that the edges of a token may be off, in the mean
+_AREA = 0.35  # pixels along its perimeter by which its area may be wrong
+_DIFFERS = 0.08  # share of a pile that may be explained wrongly
+_ALIKE = 0.01  # so little more explains a pile as well
+_TRIES = 8  # piles that are searched for one picture
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What was seen of K tokens.
+
+    Attributes:
+        poses: (K, 3) x, y (arena units) and angle; 0 where a token is missing.
+        flipped: (K,) which lie on their other side.
+        confidence: (K,) in [0, 1]; 0 where a token is missing.
+        blobs: connected areas that were found.
+    """
+
+    poses: Floats
+    flipped: Bools
+    confidence: Floats
+    blobs: int
+
+    @property
+    def found(self) -> Bools:
+        """(K,) tokens that are seen well enough."""
+        return np.asarray(self.confidence >= SURE)
+
+
+@dataclass(frozen=True, eq=False)
+class _Explained:
+    """What one blob is.
+
+    Attributes:
+        laid: its tokens.
+        sure: of all of them.
+        doubtful: whether they could as well lie otherwise.
+    """
+
+    laid: Laid
+    sure: float
+    doubtful: bool = False
+
+
+def see(picture: Pixels, layout: Layout, arena: float) -> Seen:
+    """What a picture (P, P) of an arena shows of a layout's tokens."""
+    pixels = len(picture)
+    kinds = kinds_of(layout, arena, pixels)
+    cover = coverage(picture)
+    poses, flipped = np.zeros((layout.tokens, 3)), np.zeros(layout.tokens, np.bool_)
+    confidence, count = np.zeros(layout.tokens), 0
+    if cover is not None:
+        blobs = find_blobs(cover, _SMALLEST * min(kind.area for kind in kinds))
+        count = len(blobs)
+        left = {kind.shape: list(kind.tokens) for kind in kinds}
+        for one in _Puzzle(blobs, kinds, sharp=binary(cover)).explained():
+            for number, pose in zip(one.laid.kinds, one.laid.poses, strict=True):
+                token = left[kinds[number].shape].pop(0)
+                poses[token], flipped[token] = pose, kinds[number].flipped
+                confidence[token] = _DOUBTFUL if one.doubtful else one.sure
+    unit, seen = arena / pixels, confidence > 0.0
+    poses[seen, :2] = (poses[seen, :2] + (-pixels / 2.0, pixels / 2.0)) * unit
+    poses[:, 2] = np.angle(np.exp(1j * poses[:, 2]))
+    return Seen(poses, flipped, confidence, count)
+
+
+@dataclass
+class _Puzzle:
+    """The blobs of a picture, to be explained together."""
+
+    blobs: Blobs
+    kinds: Sequence[Kind]
+    sharp: bool
+    _known: dict[tuple[int, tuple[int, ...]], list[_Explained]] = field(default_factory=dict)
+    _tries: int = 0
+
+    def explained(self) -> list[_Explained]:
+        """What the blobs are, as many as can be explained with the tokens that there are."""
+        if not len(self.blobs):
+            return []
+        singles = self._singles()
+        left = Counter({kind.shape: len(kind.tokens) for kind in self.kinds})
+        # Blobs that look like one token first: they cost nothing.
+        whole = np.flatnonzero(~self.blobs.cut).tolist()
+        order = sorted(whole, key=lambda blob: (blob not in singles, -blob))
+        best: list[_Explained] = []
+        for found in self._whole(order, singles, left, []):
+            if len(found) > len(best):
+                best = found
+            if len(best) == len(order) or self._tries >= _TRIES:
+                break
+        return best
+
+    def _whole(
+        self,
+        order: Sequence[int],
+        singles: dict[int, _Explained],
+        left: Counter[int],
+        found: list[_Explained],
+    ) -> Iterator[list[_Explained]]:
+        """Explanations of all blobs from some on; those of fewer where there is none."""
+        if not order:
+            yield found
+            return
+        blob, rest = order[0], order[1:]
+        for one in self._options(blob, singles, left):
+            used = Counter(self.kinds[number].shape for number in one.laid.kinds)
+            yield from self._whole(rest, singles, left - used, [*found, one])
+        # It stays unexplained, or waits for tokens that others do not need.
+        yield from self._whole(rest, singles, left, found)
+
+    def _options(
+        self, blob: int, singles: dict[int, _Explained], left: Counter[int]
+    ) -> Iterator[_Explained]:
+        """What a blob may be with the tokens that are left, the simplest first."""
+        single = singles.get(blob)
+        if single is not None and left[self.kinds[single.laid.kinds[0]].shape]:
+            yield single
+        if left.total() > 1:
+            yield from self._piles(blob, left)
+
+    def _piles(self, blob: int, left: Counter[int]) -> list[_Explained]:
+        """The pile's best arrangement with each of a few sets of tokens."""
+        counts = tuple(left[shape] for shape in range(1 + max(k.shape for k in self.kinds)))
+        key = (blob, counts)
+        if key in self._known or self._tries >= _TRIES:
+            return self._known.get(key, [])
+        side = self.blobs.cover.shape[1]
+        cover = self.blobs.cover[self.blobs.base[blob] :][:side]
+        self._tries += 1
+        found = [one for one in arrangements(cover, self.kinds, counts) if one.differs < _DIFFERS]
+        sets: dict[tuple[int, ...], list[Laid]] = {}
+        for one in found:
+            sets.setdefault(tuple(sorted(self.kinds[k].shape for k in one.kinds)), []).append(one)
+        options = [
+            _Explained(
+                best[0],
+                1.0 - 0.5 * best[0].differs / _DIFFERS,
+                len(best) > 1 and best[1].differs < best[0].differs + _ALIKE,
+            )
+            for best in sets.values()
+        ]
+        self._known[key] = options
+        return options
+
+    def _singles(self) -> dict[int, _Explained]:
+        """The blobs that look like one token."""
+        blobs, kinds = self.blobs, self.kinds
+        far, turn = likeness(blobs.moments, kinds)
+        area = np.array([kind.area for kind in kinds])
+        slack = _AREA * np.array([kind.perimeter for kind in kinds])
+        fits = (np.abs(blobs.area[:, None] - area) < slack) & ~blobs.cut[:, None]
+        far = np.where(fits, far, np.inf)
+        near = far < np.minimum(far.min(axis=1, keepdims=True) + _CLOSE, 1.0)
+        blob, kind = np.nonzero(near)
+        if not len(blob):
+            return {}
+        rough = np.column_stack([_plane(blobs.centre[blob]), turn[blob, kind]])
+        shapes = [kinds[k] for k in kind.tolist()]
+        poses, spread = refined(shapes, rough, blobs.cover, blobs.base[blob])
+        best = _least(blob, spread)
+        best = best[spread[best] < _ROUGH]
+        if self.sharp and len(best):
+            own = [shapes[row] for row in best.tolist()]
+            poses[best] = settled(own, poses[best], blobs.cover, blobs.base[blob[best]])
+        return {
+            int(blob[row]): _Explained(
+                Laid((int(kind[row]),), poses[row : row + 1], 0.0),
+                float(1.0 - 0.5 * (spread[row] / _ROUGH) ** 2),
+            )
+            for row in best.tolist()
+        }
+
+
+def _plane(z: Complex) -> Floats:
+    return np.column_stack([z.real, z.imag])
+
+
+def _least(group: Ints, value: Floats) -> Ints:
+    """The row of the least value in each group."""
+    order = np.lexsort((value, group))
+    return order[np.unique(group[order], return_index=True)[1]]

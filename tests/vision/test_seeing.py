@@ -1,0 +1,179 @@
+"""What pictures show of tokens: one, several, in piles, under bad light, and what they do not."""
+
+from itertools import permutations
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tangram_sim.arrays import Floats, Pixels
+from tangram_sim.config import SimConfig
+from tangram_sim.connected import sample_connected
+from tangram_sim.layout import Layout
+from tangram_sim.lens import Lens
+from tangram_sim.pictures import rasterise
+from tangram_sim.sampling import sample_batch
+from tangram_vision.seeing import Seen, see
+from tests.sim.builders import LOPSIDED, SEVEN, layout_of, pieces
+
+pytestmark = pytest.mark.fast
+
+ARENA = 2.0
+TANS = sorted(set(SEVEN))
+
+
+def grey(corners: Floats, layout: Layout, pixels: int, times: int = 4) -> Pixels:
+    large = rasterise(corners, layout, ARENA, pixels * times)
+    mean = large.reshape(pixels, times, pixels, times).mean(axis=(1, 3))
+    return np.round(mean).astype(np.uint8)
+
+
+def errors(layout: Layout, poses: Floats, flipped: Any, seen: Seen) -> Floats:
+    """(K, 2) distance and degrees of each token from where it was seen, alike ones in any order."""
+    names = [shape.name for shape in layout.shapes]
+    best: dict[str, list[tuple[float, float]]] = {}
+    for name in set(names):
+        own = [k for k in range(layout.tokens) if names[k] == name]
+        tries = [
+            [_error(layout, poses, flipped, seen, *pair) for pair in zip(own, order, strict=True)]
+            for order in permutations(own)
+        ]
+        best[name] = min(tries, key=lambda one: sum(distance for distance, _ in one))
+    return np.array([best[name].pop(0) for name in names])
+
+
+def _error(
+    layout: Layout, poses: Floats, flipped: Any, seen: Seen, token: int, as_token: int
+) -> tuple[float, float]:
+    if not seen.found[as_token] or seen.flipped[as_token] != flipped[token]:
+        return np.inf, np.inf
+    turn = np.pi / layout.symmetries[token]
+    off = seen.poses[as_token] - poses[token]
+    return float(np.hypot(*off[:2])), float(np.degrees(abs((off[2] + turn) % (2 * turn) - turn)))
+
+
+def scene(layout: Layout, rng: np.random.Generator, gap: float) -> tuple[Floats, Any]:
+    """Poses and sides of tokens that lie so far apart, arena units."""
+    while True:
+        flipped = (rng.random(layout.tokens) < 0.5) & layout.chiral
+        poses = sample_batch(layout, SimConfig(), [rng], flipped[None])[0]
+        own = pieces(layout, poses, flipped)
+        if all(one.distance(two) >= gap for i, one in enumerate(own) for two in own[:i]):
+            return poses, flipped
+
+
+@pytest.mark.parametrize("shape", [*TANS, LOPSIDED], ids=str)
+@pytest.mark.parametrize(
+    ("pixels", "mean", "near", "degrees"),
+    [(128, True, 0.003, 0.6), (128, False, 0.006, 2.0), (64, True, 0.006, 3.0)],
+)
+def test_one_token_is_seen(
+    shape: Any, pixels: int, mean: bool, near: float, degrees: float
+) -> None:
+    scale = 0.6 if isinstance(shape, str) else 0.12
+    layout, rng = layout_of(shape, scale=scale), np.random.default_rng(0)
+    for _ in range(6):
+        poses, flipped = scene(layout, rng, 0.0)
+        corners = layout.corners(poses, flipped)
+        draw = grey if mean else lambda *what: rasterise(what[0], what[1], ARENA, what[2])
+        [[distance, turn]] = errors(
+            layout, poses, flipped, see(draw(corners, layout, pixels), layout, ARENA)
+        )
+        assert distance < near
+        assert turn < degrees
+
+
+def test_seven_tokens_two_pixels_apart_are_seen() -> None:
+    layout, rng = layout_of(*SEVEN, scale=0.6), np.random.default_rng(1)
+    for _ in range(5):
+        poses, flipped = scene(layout, rng, 2 * ARENA / 128)
+        seen = see(grey(layout.corners(poses, flipped), layout, 128), layout, ARENA)
+        assert seen.blobs == 7
+        assert (errors(layout, poses, flipped, seen) < (0.01, 2.0)).all()
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("square", "large_triangle"),
+        ("parallelogram", "square"),
+        ("large_triangle", "square", "small_triangle"),
+    ],
+)
+def test_tokens_that_touch_are_seen(names: tuple[str, ...]) -> None:
+    layout, rng = layout_of(*names, scale=0.6), np.random.default_rng(2)
+    every = []
+    for _ in range(4):
+        poses = sample_connected(layout, SimConfig(), rng)
+        sides = np.zeros(layout.tokens, np.bool_)
+        seen = see(grey(layout.corners(poses), layout, 128), layout, ARENA)
+        assert seen.blobs == 1
+        off = errors(layout, poses, sides, seen)
+        # What could as well lie otherwise is told with low confidence.
+        every.append((off < (0.01, 2.0)).all() or not seen.found.all())
+        assert np.isinf(off).any() or (off < (0.01, 2.0)).all()
+    assert all(every)
+
+
+def test_what_has_two_explanations_is_doubtful() -> None:
+    """Two small triangles make a square: along which diagonal they meet, no picture tells."""
+    layout = layout_of("small_triangle", "small_triangle", scale=0.6)
+    other = layout_of("square", scale=0.6)
+    picture = grey(other.corners(np.array([[0.1, 0.2, 0.5]])), other, 128)
+    seen = see(picture, layout, ARENA)
+    assert (seen.confidence > 0.0).all()
+    assert not seen.found.any()
+
+
+def disturbed(picture: Pixels, rng: np.random.Generator) -> Pixels:
+    side = np.arange(len(picture)) / len(picture)
+    lit = picture * (1.0 - 0.2 * side) + rng.normal(0.0, 8.0, picture.shape)
+    return np.clip(np.round(lit), 0, 255).astype(np.uint8)
+
+
+def test_noise_and_uneven_light_cost_little() -> None:
+    layout, rng = layout_of("square", scale=0.6), np.random.default_rng(3)
+    for _ in range(5):
+        poses, flipped = scene(layout, rng, 0.0)
+        picture = disturbed(grey(layout.corners(poses), layout, 128), rng)
+        [[distance, turn]] = errors(layout, poses, flipped, see(picture, layout, ARENA))
+        assert distance < 0.003
+        assert turn < 2.0
+
+
+def test_light_tokens_on_dark_ground_are_seen() -> None:
+    layout, rng = layout_of("parallelogram", scale=0.6), np.random.default_rng(4)
+    poses, flipped = scene(layout, rng, 0.0)
+    picture = 255 - grey(layout.corners(poses, flipped), layout, 128)
+    [[distance, turn]] = errors(layout, poses, flipped, see(picture, layout, ARENA))
+    assert distance < 0.003
+    assert turn < 1.0
+
+
+@pytest.mark.parametrize("shown", ["nothing", "noise", "half of it", "another shape"])
+def test_what_is_not_to_be_seen_is_missing(shown: str) -> None:
+    layout, rng = layout_of("square", scale=0.6), np.random.default_rng(5)
+    pictures = {
+        "nothing": np.full((64, 64), 255, np.uint8),
+        "noise": rng.normal(128, 8, (64, 64)).astype(np.uint8),
+        "half of it": grey(layout.corners(np.array([[1.0, 0.0, 0.3]])), layout, 64),
+        "another shape": grey(
+            (other := layout_of("large_triangle", scale=0.6)).corners(np.zeros((1, 3))), other, 64
+        ),
+    }
+    seen = see(pictures[shown], layout, ARENA)
+    assert not seen.found.any()
+    assert seen.confidence[0] == 0.0
+
+
+def test_a_small_token_that_is_blurred_is_as_large_as_it_is() -> None:
+    """The blur reaches its middle, from which its level is told."""
+    layout, rng = layout_of("small_triangle", scale=0.6), np.random.default_rng(6)
+    lens = Lens(SimConfig(pixels=128, picture_blur=1.0))
+    for _ in range(6):
+        poses, flipped = scene(layout, rng, 0.0)
+        lens.begin([rng])
+        picture = lens.taken(0, grey(layout.corners(poses), layout, 128), rng)
+        [[distance, turn]] = errors(layout, poses, flipped, see(picture, layout, ARENA))
+        assert distance < 0.002
+        assert turn < 0.6

@@ -1,0 +1,39 @@
+"""How a worker looks at pictures, where these are what its agent observes."""
+
+import numpy as np
+
+from tangram_agent.setup import Setup
+from tangram_sim.arrays import Pixels
+from tangram_sim.batch import BatchedEnv
+from tangram_sim.errors import ConfigError
+from tangram_sim.sight import Eye, Look
+
+
+def environments(setup: Setup, count: int) -> BatchedEnv:
+    """So many environments of a run, to be closed by whoever asked."""
+    return BatchedEnv(setup.layout, setup.sim, setup.reward, count, make_eye(setup))
+
+
+def make_eye(setup: Setup) -> Eye | None:
+    """What finds the tokens of a run in pictures; None where corners are observed.
+
+    Raises:
+        ConfigError: OpenCV is not installed.
+    """
+    if setup.sim.observe != "pictures":
+        return None
+    try:
+        # Only here: most workers look at nothing, and its import takes time and memory.
+        from tangram_vision.seeing import see  # noqa: PLC0415
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"sim.observe=pictures needs OpenCV ({error}): install opencv-python-headless, or set "
+            "sim.observe=corners"
+        ) from error
+    layout, arena = setup.layout, setup.sim.arena
+
+    def look(picture: Pixels) -> Look:
+        seen = see(picture, layout, arena)
+        return Look(seen.poses, seen.flipped, np.asarray(seen.confidence > 0.0), seen.found)
+
+    return look
