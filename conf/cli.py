@@ -81,8 +81,13 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
 
 
 def tell(line: str) -> None:
-    """Show who waits at a terminal what takes its time: torch alone takes seconds to load."""
-    if sys.stderr.isatty():
+    """Show who waits at a terminal what takes its time: torch alone takes seconds to load.
+
+    Not from a child, which shares the terminal with the process that started it.
+    """
+    from tangram_agent.process import VARIABLE
+
+    if sys.stderr.isatty() and VARIABLE not in os.environ:
         print(line, file=sys.stderr, flush=True)
 
 

@@ -11,6 +11,7 @@ from PIL import Image
 import worker.film as film_module
 from conf.cli import composed
 from tangram_agent.lookahead import Lookahead
+from tangram_agent.process import VARIABLE
 from tangram_agent.runs import load_changed, load_run
 from tangram_agent.setup import Setup
 from tangram_sim.arrays import Floats, Ints
@@ -278,6 +279,9 @@ def test_a_window_needs_no_out(
     monkeypatch.setattr("sys.stderr.isatty", lambda: True)
     assert _play(composed("play", given)) == 0
     assert capsys.readouterr().err == "loads and plays pretrained/square\n"
+    monkeypatch.setenv(VARIABLE, "3")  # a child's
+    assert _play(composed("play", given)) == 0
+    assert capsys.readouterr().err == ""
 
 
 # Runs side by side
