@@ -264,7 +264,9 @@ def test_no_window_without_a_display(
         play_run(of_game(tmp_path, puzzle=("cat",), live=True))
 
 
-def test_a_window_needs_no_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_window_needs_no_out(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     shown: list[PlayConfig] = []
     monkeypatch.setattr("worker.play.play_run", lambda config: shown.append(config) or 0)
     given = ["run_dir=pretrained/square", "live=true"]
@@ -272,6 +274,10 @@ def test_a_window_needs_no_out(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [config.live for config in shown] == [True]
     with pytest.raises(ConfigError, match="out=.*a.gif changes nothing with live=true"):
         _play(composed("play", [*given, "out=a.gif"]))
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    assert _play(composed("play", given)) == 0
+    assert capsys.readouterr().err == "loads and plays pretrained/square\n"
 
 
 # Runs side by side
