@@ -114,7 +114,7 @@ def _rows(episodes: Episodes, first: int, end: int) -> Episodes:
 def at_once(setup: Setup) -> int:
     """Most episodes to play at a time where they are shown or scored.
 
-    One of an agent that looks ahead: the plans of many take gigabytes, and save a tenth of the time.
+    One of an agent that looks ahead: plans of many take gigabytes, and save a tenth of the time.
     """
     return AT_ONCE if setup.agent.lookahead == "none" else 1
 
