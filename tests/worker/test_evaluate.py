@@ -87,8 +87,8 @@ def test_in_another_world_there_is_an_oracle(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     world = {"gain": [0.8, 1.0, 1.25], "bias_spread": 0.05, "action_noise": 0.001}
-    for tokens, puzzle in ((PAIR, None), (GAME, ("train",))):
-        folder = tmp_path / str(puzzle)
+    for tokens, puzzle in ((PAIR, None), (GAME, ("cat", "boat"))):
+        folder = tmp_path / str(puzzle is None)
         more = {"episodes": 2} if puzzle is None else {"puzzle": puzzle}
         changes = {"sim": world | {"actions_per_token": 2}}
         baselines = evaluated(folder, tokens, changes=changes, **more)["baselines"]
