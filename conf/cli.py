@@ -80,6 +80,17 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
         return USAGE_STATUS
 
 
+def tell(line: str) -> None:
+    """Show who waits at a terminal what takes its time: torch alone takes seconds to load.
+
+    Not from a child, which shares the terminal with the process that started it.
+    """
+    from tangram_agent.process import VARIABLE
+
+    if sys.stderr.isatty() and VARIABLE not in os.environ:
+        print(line, file=sys.stderr, flush=True)
+
+
 def _check_presets(folder: str | None) -> None:
     """Raise ConfigError for a preset of the user's own that is broken or empty."""
     if folder is None:

@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from conf.cli import entry
+from conf.cli import entry, tell
 from conf.commands import Plain
 
 if TYPE_CHECKING:
@@ -52,6 +52,7 @@ def _train(settings: Plain) -> int:
     # The children check it again; a wrong task is refused before any of them starts.
     setup = _task(settings)
     check_world(setup.layout, setup.sim)
+    tell(f"starts in {config.run_dir}")
 
     from master.launch import run_training
 
@@ -72,6 +73,7 @@ def _master(settings: Plain) -> int:
         refuse_ignored(given, alone, "start them with tangram-worker", 1)
     setup = _task(settings)
     check_room(setup.layout, setup.sim)
+    tell(f"starts in {config.run_dir}")
 
     from master.run import run_master
 

@@ -264,13 +264,22 @@ def decode_tensors(frame: bytes, shapes: WeightShapes | None) -> dict[str, Singl
     """
     if len(frame) > MAX_WEIGHTS_BYTES:
         raise WireError(f"weights: {len(frame)} bytes, at most {MAX_WEIGHTS_BYTES}")
-    try:
-        tensors = load(frame)
-    # KeyError: a dtype that numpy has not; ValueError: a shape beyond its limits.
-    except (SafetensorError, KeyError, ValueError) as error:
-        raise WireError(f"weights: not safetensors: {error}") from None
+    tensors = load_tensors(frame, "weights")
     _check_tensors(tensors, shapes)
     return tensors
+
+
+def load_tensors(data: bytes, name: str) -> dict[str, npt.NDArray[Any]]:
+    """The tensors in data of safetensors, whoever wrote it.
+
+    Raises:
+        WireError: it is none; begins with the name.
+    """
+    try:
+        return load(data)
+    # KeyError: a dtype that numpy has not; ValueError: a shape beyond its limits.
+    except (SafetensorError, KeyError, ValueError) as error:
+        raise WireError(f"{name}: not safetensors: {error}") from None
 
 
 def _check_tensors(tensors: dict[str, npt.NDArray[Any]], shapes: WeightShapes | None) -> None:

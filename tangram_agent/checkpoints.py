@@ -20,11 +20,11 @@ from typing import Annotated, Any, TypedDict
 import msgspec
 import numpy as np
 import numpy.typing as npt
-import safetensors
 import safetensors.numpy
 
+from tangram_agent.arrays import load_tensors
 from tangram_agent.files import make_folders, sync_folder
-from tangram_sim.errors import RunError
+from tangram_sim.errors import RunError, WireError
 
 FORMAT_VERSION = 3
 MANIFEST = "manifest.json"
@@ -257,6 +257,6 @@ def _read_tensors(path: Path, stem: str, files: Mapping[str, str]) -> Tensors:
     if hashlib.sha256(data).hexdigest() != files[stem]:
         raise CorruptError(path, f"checksum of {name} differs")
     try:
-        return safetensors.numpy.load(data)
-    except safetensors.SafetensorError as error:
-        raise CorruptError(path, f"{name}: {error}") from None
+        return load_tensors(data, name)
+    except WireError as error:
+        raise CorruptError(path, str(error)) from None

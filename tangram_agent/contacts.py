@@ -95,10 +95,14 @@ class Contacts:
         self.kinds = kinds
         shown = f"{PREFIX}/{CONTACTS}"
         agent = read_agent(folder, shown)
+        other = RunError(f"{shown} was learned by another version: install tangram-rl again")
         if load_settings(agent.config, shown) != world():
-            raise RunError(f"{shown} was learned by another version: install tangram-rl again")
+            raise other
         layers = network()
-        load_arrays(layers, agent.weights.tensors)
+        try:
+            load_arrays(layers, agent.weights.tensors)
+        except RunError:
+            raise other from None
         # Torch takes several times as long for a few rows.
         self._layers = [
             (layer.weight.detach().numpy().T, layer.bias.detach().numpy())

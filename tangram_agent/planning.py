@@ -18,6 +18,7 @@ from torch import Tensor
 from tangram_agent.adam import Adam
 from tangram_agent.contacts import foreseen, known_contacts
 from tangram_agent.coverage import covered_share, covering, worths
+from tangram_agent.foresight import Foresight
 from tangram_agent.guide import NetworkGuide, as_tensor
 from tangram_agent.lookahead import Lookahead
 from tangram_agent.motion import Belief, motions_of
@@ -151,8 +152,11 @@ class Planner:
     @cached_property
     def _lookahead(self) -> Lookahead:
         """Made when it is first asked for: its world may load the engine."""
-        world = foreseen(self._setup, self._known)
-        return Lookahead(self._layout, self._sim, self._guide, world, self._agent.beam)
+        return Lookahead(self._layout, self._sim, self._guide, self.world(), self._agent.beam)
+
+    def world(self) -> Foresight:
+        """A new one to look ahead in."""
+        return foreseen(self._setup, self._known)
 
     def forget(self) -> None:
         """Drop what was planned with other weights."""

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from tangram_agent.foresight import Foresight
 from tangram_agent.networks import Networks
 from tangram_agent.planning import Planner
 from tangram_agent.scenes import Scenes, next_token
@@ -56,6 +57,12 @@ class Policy:
     def weights(self) -> Weights:
         """A copy of the weights that are loaded."""
         return Weights(self.version, to_arrays(self._network))
+
+    def foresight(self) -> Foresight | None:
+        """A world to try actions in, where the agent looks ahead."""
+        if self._planner is None or self.config.lookahead == "none":
+            return None
+        return self._planner.world()
 
     def act(
         self,

@@ -13,11 +13,9 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
-import safetensors
-import safetensors.numpy
-
+from tangram_agent.arrays import decode_tensors
 from tangram_agent.types import Weights
-from tangram_sim.errors import RunError
+from tangram_sim.errors import RunError, WireError
 
 PREFIX = "pretrained"
 CONFIG = "config.yaml"
@@ -73,7 +71,12 @@ def packaged(run_dir: str | Path) -> Traversable:
     names = agent_names()
     if name not in names:
         known = ", ".join(f"{PREFIX}/{one}" for one in names) or "none come with this version"
-        raise RunError(f"no pretrained agent '{name}': choose from {known}")
+        what = (
+            f"{run_dir} is no agent but a model of contacts, for agent.lookahead=learned"
+            if name == CONTACTS
+            else f"no pretrained agent '{name}'"
+        )
+        raise RunError(f"{what}: choose from {known}")
     return PACKAGED / name
 
 
@@ -97,9 +100,9 @@ def read_agent(folder: Traversable, shown: str | Path) -> Agent:
         raise _damaged(shown, f"{CONFIG} or {CARD} cannot be read") from None
     _check_card(card, data, shown)
     try:
-        tensors = safetensors.numpy.load(data)
-    except safetensors.SafetensorError as error:
-        raise _damaged(shown, f"{WEIGHTS}: {error}") from None
+        tensors = decode_tensors(data, None)
+    except WireError as error:
+        raise _damaged(shown, str(error)) from None
     return Agent(config, card, Weights(card["updates"], tensors))
 
 

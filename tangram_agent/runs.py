@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from tangram_agent.checkpoints import (
     load_checkpoint,
     newest_checkpoint,
 )
-from tangram_agent.policy import Policy
 from tangram_agent.pretrained import is_agent, is_name, packaged, read_agent
 from tangram_agent.setup import Setup, make_setup
 from tangram_agent.stored import load_settings
@@ -40,11 +39,28 @@ from tangram_sim.settings import (
 )
 from tangram_sim.shapes import MAX_COORDINATE
 
+if TYPE_CHECKING:
+    from tangram_agent.policy import Policy
+
 CONFIG = "config.yaml"
 POLICY_SECTIONS = ("tokens", "agent", "net")
 ANOTHER = "train a run with it"
 
 Changes = Mapping[str, Mapping[str, Any]]  # section -> setting -> value
+
+
+class Stored(NamedTuple):
+    """What is read of a run, before its policy is made; see `Run`."""
+
+    folder: Path
+    config: dict[str, Any]
+    setup: Setup
+    weights: Weights
+
+    def made(self) -> "Run":
+        """The run with its policy."""
+        policy = _policy(self.setup, self.weights)
+        return Run(self.folder, self.config, self.setup, self.weights.version, policy)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +80,7 @@ class Run:
     config: dict[str, Any]
     setup: Setup
     updates: int
-    policy: Policy
+    policy: "Policy"
 
     def predict(self, observation: Mapping[str, Any], past: Past | None = None) -> Singles:
         """What the agent does, noise off: the actions alone, as it keeps nothing in mind.
@@ -134,27 +150,33 @@ class Run:
             ConfigError: a setting that the weights were trained for or that was for learning only,
                 or a value that this run cannot be played with.
         """
-        given = [f"{s}.{name}={told(v)}" for s, own in changes.items() for name, v in own.items()]
-        if not given:
+        setup = _changed(self.folder, self.setup, changes)
+        if setup is self.setup:
             return self
-        config = asdict(self.setup)
-        for section, values in changes.items():
-            _check_playable(getattr(self.setup, section), values)
-            config[section] |= values
-        try:
-            setup = make_setup(config)
-        except ConfigError as error:
-            raise ConfigError(f"{self.folder} with {', '.join(given)}: {error}") from None
-        if setup.pairs and setup.contacts != self.setup.contacts:
-            learned = "learned" if self.setup.contacts else "never learned"
-            raise ConfigError(
-                f"sim.motion={setup.sim.motion} does not fit {self.folder}, which was trained with "
-                f"sim.motion={self.setup.sim.motion} and {learned} what tokens push away: leave it "
-                f"out, or {ANOTHER}"
-            )
-        policy = Policy(setup)
-        policy.load(self.policy.weights())
-        return replace(self, setup=setup, policy=policy)
+        return replace(self, setup=setup, policy=_policy(setup, self.policy.weights()))
+
+
+def _changed(folder: Path, trained: Setup, changes: Changes) -> Setup:
+    """See `Run.with_settings`."""
+    given = [f"{s}.{name}={told(v)}" for s, own in changes.items() for name, v in own.items()]
+    if not given:
+        return trained
+    config = asdict(trained)
+    for section, values in changes.items():
+        _check_playable(getattr(trained, section), values)
+        config[section] |= values
+    try:
+        setup = make_setup(config)
+    except ConfigError as error:
+        raise ConfigError(f"{folder} with {', '.join(given)}: {error}") from None
+    if setup.pairs and setup.contacts != trained.contacts:
+        learned = "learned" if trained.contacts else "never learned"
+        raise ConfigError(
+            f"sim.motion={setup.sim.motion} does not fit {folder}, which was trained with "
+            f"sim.motion={trained.sim.motion} and {learned} what tokens push away: leave it out, "
+            f"or {ANOTHER}"
+        )
+    return setup
 
 
 def _check_playable(trained: Settings, values: Mapping[str, Any]) -> None:
@@ -215,15 +237,34 @@ def load_run(run_dir: str | Path, checkpoint: str | None = None, reward: str | N
             do not fit the config.
         ConfigError: the config is not one that this version can use, or names code.
     """
-    folder = Path(run_dir)
+    return _read(Path(run_dir), checkpoint, reward).made()
+
+
+def _policy(setup: Setup, weights: Weights) -> "Policy":
+    # Late: torch takes seconds, and what is read before may be refused.
+    from tangram_agent.policy import Policy  # noqa: PLC0415
+
+    policy = Policy(setup)
+    policy.load(weights)
+    return policy
+
+
+def _read(folder: Path, checkpoint: str | None, reward: str | None) -> Stored:
+    """See `load_run`."""
     source: Traversable = folder
     if not folder.is_dir():
         if not is_name(folder):
             raise RunError(f"no run folder {folder}: give the folder that tangram-train printed")
         source = packaged(folder)
     if is_agent(source):
-        return _agent_run(source, folder, checkpoint, reward)
-    return _trained_run(folder, checkpoint, reward)
+        return _agent(source, folder, checkpoint, reward)
+    return _trained(folder, checkpoint, reward)
+
+
+def read_changed(run_dir: str | Path, changes: Changes) -> Stored:
+    """A run to play with other settings, read without torch; see `load_changed`."""
+    stored = _read(Path(run_dir), None, changes.get("reward", {}).get("name"))
+    return stored._replace(setup=_changed(stored.folder, stored.setup, changes))
 
 
 def load_changed(run_dir: str | Path, changes: Changes) -> Run:
@@ -232,17 +273,15 @@ def load_changed(run_dir: str | Path, changes: Changes) -> Run:
     Raises:
         TangramError: see `load_run` and `Run.with_settings`.
     """
-    return load_run(run_dir, reward=changes.get("reward", {}).get("name")).with_settings(changes)
+    return read_changed(run_dir, changes).made()
 
 
-def _agent_run(
-    source: Traversable, folder: Path, checkpoint: str | None, reward: str | None
-) -> Run:
+def _agent(source: Traversable, folder: Path, checkpoint: str | None, reward: str | None) -> Stored:
     if checkpoint is not None:
         raise RunError(f"{folder} has no checkpoint {checkpoint}: leave the checkpoint out")
     agent = read_agent(source, folder)
     config = _with_reward(_parse_config(agent.config, folder / CONFIG), reward)
-    return _make_run(folder, config, make_setup(config), agent.weights)
+    return Stored(folder, config, make_setup(config), agent.weights)
 
 
 def _with_reward(config: dict[str, Any], name: str | None) -> dict[str, Any]:
@@ -252,7 +291,7 @@ def _with_reward(config: dict[str, Any], name: str | None) -> dict[str, Any]:
     return config | {"reward": with_given_reward(own, {} if name is None else {"name": name})}
 
 
-def _trained_run(folder: Path, checkpoint: str | None, reward: str | None) -> Run:
+def _trained(folder: Path, checkpoint: str | None, reward: str | None) -> Stored:
     config = _with_reward(read_config(folder / CONFIG), reward)
     checkpoints = folder / CHECKPOINTS
     path = checkpoints / checkpoint if checkpoint else newest_checkpoint(checkpoints)
@@ -267,10 +306,4 @@ def _trained_run(folder: Path, checkpoint: str | None, reward: str | None) -> Ru
             f"{folder / CONFIG} is not what {path.name} was trained with: its {', '.join(odd)} "
             "differ; restore the run's own config.yaml"
         )
-    return _make_run(folder, config, setup, Weights(content.updates, content.arrays[ACTING]))
-
-
-def _make_run(folder: Path, config: dict[str, Any], setup: Setup, weights: Weights) -> Run:
-    policy = Policy(setup)
-    policy.load(weights)
-    return Run(folder, config, setup, weights.version, policy)
+    return Stored(folder, config, setup, Weights(content.updates, content.arrays[ACTING]))

@@ -41,6 +41,20 @@ def test_the_launcher_needs_no_torch() -> None:
     assert run_python(f"import sys, {needs}\nprint('torch' in sys.modules)") == "False"
 
 
+@pytest.mark.parametrize(
+    "line", ["eval episodes=3 sim.damping=3", "play sim.gain=0", "play puzzle=nowhere.json"]
+)
+def test_what_cannot_be_played_is_refused_without_torch(line: str) -> None:
+    given = [*line.split(), "run_dir=pretrained/tangram7"]
+    told = run_python(
+        "import sys\n"
+        "from worker.cli import evaluate, play\n"
+        f"command, *sys.argv[1:] = {given}\n"
+        "print({'eval': evaluate, 'play': play}[command](), 'torch' in sys.modules)"
+    )
+    assert told == "2 False"
+
+
 def test_learning_needs_no_compiler() -> None:
     """Its import would take the master more than a second and 70 MB."""
     told = run_python(

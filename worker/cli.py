@@ -4,11 +4,17 @@ Everything heavy is imported after the config was composed, so --help and wrong 
 """
 
 import sys
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from conf.cli import composed, entry
+from conf.cli import composed, entry, tell
 from conf.commands import Plain
+
+if TYPE_CHECKING:
+    from tangram_sim.layout import Layout
+    from worker.config import EvalConfig, PlayConfig
 
 
 def worker() -> int:
@@ -87,6 +93,8 @@ def _evaluate(settings: Plain) -> int:
     for name, path in (("out", config.out), ("sheet", config.sheet)):
         if path is not None:
             check_writable(name, Path(path))
+    _check_played([config.run], config)
+    tell(f"loads and plays {config.run}")
 
     from worker.evaluate import evaluate_run
 
@@ -105,8 +113,10 @@ def _play(settings: Plain) -> int:
     config = from_mapping(PlayConfig, with_changes(paths))
     if not config.live:
         check_writable("out", Path(config.out).absolute())
+    layouts = _check_played(config.run_dirs, config)
     if config.tokens is not None and config.run_dir is not None:
-        _check_tokens(config.tokens, config.run_dir, config.changes)
+        _check_tokens(config.tokens, config.run_dir, layouts[0])
+    tell(f"loads and plays {', '.join(config.run_dirs)}")
 
     if config.compare is not None:
         from worker.play import compare_runs
@@ -117,9 +127,22 @@ def _play(settings: Plain) -> int:
     return play_run(config)
 
 
-def _check_tokens(name: str, run_dir: str, changes: Plain) -> None:
+def _check_played(run_dirs: Sequence[str], config: "EvalConfig | PlayConfig") -> list["Layout"]:
+    """Refuse what cannot be played before torch is loaded; returns what the runs move."""
+    from tangram_agent.runs import read_changed
+
+    setups = [read_changed(run_dir, config.changes).setup for run_dir in run_dirs]
+    if config.puzzle is not None:
+        from worker.config import source_and_names
+        from worker.puzzles import find_figures
+
+        source, names = source_and_names(config.puzzle)
+        find_figures(source, setups[0], names, skip_invalid=config.skip_invalid)
+    return [setup.layout for setup in setups]
+
+
+def _check_tokens(name: str, run_dir: str, moved: "Layout") -> None:
     """Refuse a run that moves other tokens than those of a preset."""
-    from tangram_agent.runs import load_changed
     from tangram_agent.setup import from_mapping
     from tangram_sim.errors import ConfigError
     from tangram_sim.layout import TokensConfig, make_layout
@@ -127,7 +150,6 @@ def _check_tokens(name: str, run_dir: str, changes: Plain) -> None:
     preset = make_layout(
         from_mapping(TokensConfig, composed("worker", [f"tokens={name}"])["tokens"])
     )
-    moved = load_changed(run_dir, changes).setup.layout
     if moved.fingerprint() != preset.fingerprint():
         shapes = ", ".join(shape.name for shape in moved.shapes)
         raise ConfigError(

@@ -15,7 +15,6 @@ from rich.console import Console
 from rich.table import Table
 
 from tangram_agent.config import ORDERS, AgentConfig
-from tangram_agent.contacts import foreseen, known_contacts
 from tangram_agent.files import write_whole
 from tangram_agent.outcome import plural
 from tangram_agent.runs import Run, load_changed
@@ -36,11 +35,10 @@ from worker.fitted import fitted_policy
 from worker.metrics import assembled, pose_errors, summarise
 from worker.oracle import oracle_policy
 from worker.puzzles import Figure, Figures, find_figures, play_figures
-from worker.rollout import Played
+from worker.rollout import Played, at_once
 from worker.sweeping import sweeping_policy
 from worker.test_set import FixedTests, greedy
 
-AT_ONCE = 32
 MAX_PICTURES = 100  # on a sheet
 RUN = "this run"
 MAX_PADDED = 5  # policies in a table
@@ -121,16 +119,15 @@ def policies(run: Run) -> dict[str, Player]:
     """The run, and those to compare it with, by their names in tables and files."""
     layout, sim = run.setup.layout, run.setup.sim
     fixed = [order for order in ORDERS if order not in ("learned", run.setup.agent.order)]
-    ahead = run.setup.agent.lookahead != "none"
-    fixed = fixed if run.setup.pairs and layout.tokens > 1 and not ahead else []
+    world = run.policy.foresight()
+    fixed = fixed if run.setup.pairs and layout.tokens > 1 and world is None else []
     result: dict[str, Player] = {RUN: greedy(run.policy)}
     for name in fixed:
         other = run.with_settings({"agent": {"order": name}})
         result[f"order={name}"] = greedy(other.policy)
-    if ahead:
+    if world is not None:
         alone = {"lookahead": "none", "beam": AgentConfig.beam}
         result["lookahead=none"] = greedy(run.with_settings({"agent": alone}).policy)
-        world = foreseen(run.setup, known_contacts(run.setup))
         result["exact+lookahead"] = sweeping_policy(layout, sim, world, run.setup.agent.beam)
     result["exact"] = exact_policy(layout, sim)
     if sim.inexact or (sim.corner_noise and run.setup.horizon > 1):
@@ -143,18 +140,15 @@ def policies(run: Run) -> dict[str, Player]:
 def score_policies(
     setup: Setup, players: Mapping[str, Player], config: EvalConfig
 ) -> dict[str, Scores]:
-    """Scores of each policy, on the same episodes; what looks ahead plays one by one."""
-    at_once = AT_ONCE if setup.agent.lookahead == "none" else 1
-    with closing(FixedTests(setup, config.episodes, at_once, seed=config.seed)) as tests:
+    """Scores of each policy, on the same episodes."""
+    with closing(FixedTests(setup, config.episodes, at_once(setup), seed=config.seed)) as tests:
         return {name: _scored(tests, player) for name, player in players.items()}
 
 
 def _scored(tests: FixedTests, player: Player) -> Scores:
     played = tests.play(playing(player, tests.env))
     scores: Scores = dict(tests.scores(played))
-    if tests.env.count == 1:
-        scores["ms_slowest"] = 1e3 * float(played.slowest.max())
-    return scores | (of_several(played) if tests.setup.layout.tokens > 1 else {})
+    return scores | (of_several(tests.setup, played) if tests.setup.layout.tokens > 1 else {})
 
 
 def _episodes(run: Run, config: EvalConfig) -> dict[str, Any]:
@@ -244,18 +238,21 @@ def score_puzzles(
     for name, player in players.items():
         played[name] = play_figures(setup, figures, player, seed)
         means = summarise(setup.layout, setup.sim, played[name], own_reward=False)
-        scores[name] = means | of_several(played[name])
+        scores[name] = means | of_several(setup, played[name])
     return scores, _one_by_one(setup, figures, played[RUN]), played[RUN]
 
 
-def of_several(played: Played) -> Scores:
+def of_several(setup: Setup, played: Played) -> Scores:
     """What only evaluations tell: time, and every coverage, for tests on pairs of episodes."""
     seconds = float(np.mean(played.seconds))
-    return {
+    scores: Scores = {
         "seconds_per_puzzle": seconds,
         "ms_per_decision": 1e3 * seconds / played.refused.shape[1],
         "coverage_each": np.round(played.overlap, 6).tolist(),
     }
+    if at_once(setup) == 1:
+        scores["ms_slowest"] = 1e3 * float(played.slowest.max())
+    return scores
 
 
 def write_sheet(path: str, setup: Setup, found: Figures, played: Played) -> None:

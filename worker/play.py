@@ -26,10 +26,9 @@ from worker.config import MAX_SHOWN, PlayConfig, source_and_names
 from worker.film import WIDTH, Show, film_pictures, frames_per_action, show_live
 from worker.photographs import draw_photograph, read_photograph
 from worker.puzzles import find_figures, play_figures
-from worker.rollout import Played
+from worker.rollout import Played, at_once
 from worker.test_set import FixedTests, greedy
 
-AT_ONCE = 32
 FRAME_MS = 50
 STILL_START, STILL_END = 10, 30  # frames
 SEEN = 30  # frames of what was seen before a film
@@ -81,7 +80,7 @@ def make_show(run: Run, config: PlayConfig) -> Show:
 def play_episodes(run: Run, config: PlayConfig) -> Played:
     """The episodes that the settings name, played by a run."""
     with closing(
-        FixedTests(run.setup, config.episodes, AT_ONCE, role="play", seed=config.seed)
+        FixedTests(run.setup, config.episodes, at_once(run.setup), role="play", seed=config.seed)
     ) as tests:
         return tests.play(greedy(run.policy))
 

@@ -21,9 +21,8 @@ from tangram_sim.seeding import episode_generator
 from tangram_sim.targets import placement, turned_figure
 from worker.baselines import Player, playing
 from worker.looking import make_eye
-from worker.rollout import Played, play
+from worker.rollout import Played, at_once, play
 
-AT_ONCE = 32
 _ROUNDING = 1e-9
 
 
@@ -128,8 +127,8 @@ def play_figures(
     without = {} if looks else {name: getattr(SimConfig, name) for name in CAMERA}
     sim = replace(setup.sim, **without)
     targets = (np.stack([f.poses for f in figures]), np.stack([f.flipped for f in figures]))
-    at_once = min(AT_ONCE, len(figures))
-    with closing(BatchedEnv(setup.layout, sim, RewardConfig(), at_once, make_eye(setup))) as env:
+    envs, eye = min(at_once(setup), len(figures)), make_eye(setup)
+    with closing(BatchedEnv(setup.layout, sim, RewardConfig(), envs, eye)) as env:
         choose, count = playing(player, env), len(figures)
         return play(env, choose, lambda i: _generator(figures[i], seed), count, targets)
 

@@ -14,7 +14,8 @@ from rich.table import Table
 from rich.text import Text
 
 from tangram_agent.messages import OPEN, WORKER_COLUMNS, AskStatus, RunStatus, decode_from_master
-from tangram_agent.outcome import FILE_NAME, outcome_rows, read_outcome
+from tangram_agent.outcome import FILE_NAME, duration, outcome_rows, read_outcome
+from tangram_agent.runs import CONFIG
 from tangram_sim.config import own_code
 from tangram_sim.errors import TangramError, WireError
 from worker.config import StatusConfig
@@ -77,7 +78,7 @@ def ask_status(
     """
     address = find_master(connect)
     if address is None:
-        raise TangramError(f"no connection file at {connect}: no master runs there")
+        raise TangramError(f"no connection file at {connect}: {_nobody(Path(connect) / CONFIG)}")
     unknown_host = host_error(address.endpoint, connect)
     if unknown_host:
         raise TangramError(unknown_host)
@@ -101,6 +102,14 @@ def ask_status(
         f"the master at {address.endpoint} has not answered for {patience_s:g} s: is it still "
         "running?"
     )
+
+
+def _nobody(config: Path) -> str:
+    """Why no master can be asked; each writes its config when it starts."""
+    if not config.is_file():
+        return "no master runs there"
+    ago = duration(max(0.0, time.time() - config.stat().st_mtime))
+    return f"its master was started {ago} ago and is still starting, or failed to: ask again"
 
 
 def _read(frames: list[bytes]) -> RunStatus | None:

@@ -37,6 +37,7 @@ TRIALS = {
     "chaos": ("random faults over a real training", 20.0),
     "attack": ("every attack that is known, on trainings that run; what held", None),
     "fuzz": ("mutated messages against decoder and master", None),
+    "pixels": ("DDPG on pixels, no tokens looked for: how far it gets", 60.0),
     "seeing": ("tokens found in pictures: how exactly, how surely, how fast", None),
     "soak": ("memory and open files of a long training, drawn", 60.0),
 }
@@ -118,11 +119,14 @@ def _run(arguments: argparse.Namespace) -> int:
     from tangram_lab.benchmarks.attack import run_attack
     from tangram_lab.benchmarks.chaos import run_chaos
     from tangram_lab.benchmarks.fuzz_wire import run_fuzz
+    from tangram_lab.benchmarks.pixels import run_pixels
     from tangram_lab.benchmarks.seeing import run_seeing
     from tangram_lab.benchmarks.soak import run_soak
 
     if arguments.kind == "seeing":
         return run_seeing(arguments.scenes, arguments.seed, arguments.out)
+    if arguments.kind == "pixels":
+        return run_pixels(arguments.minutes, arguments.seed, arguments.out)
     with tempfile.TemporaryDirectory(prefix="tangram-") as folder:
         if arguments.kind == "attack":
             return run_attack(arguments.out, Path(folder))

@@ -38,7 +38,7 @@ from tangram_agent.contacts import (
     world,
 )
 from tangram_agent.coverage import Lying
-from tangram_agent.files import write_whole
+from tangram_agent.files import check_writable, write_whole
 from tangram_agent.networks import initialise
 from tangram_agent.pretrained import CARD, CARD_TEXT, CONFIG, CONTACTS, FORMAT, PREFIX, WEIGHTS
 from tangram_agent.weights import to_arrays
@@ -183,7 +183,12 @@ def _median_turn(moved: Floats) -> float:
 
 
 def publish(folder: Path, pushes: int = PUSHES, updates: int = UPDATES) -> dict[str, Any]:
-    """Make the model and write its folder; the card says what it is."""
+    """Make the model and write its folder; the card says what it is.
+
+    Raises:
+        TangramError: the folder cannot be written, which is seen first.
+    """
+    check_writable("--out", folder.absolute() / CARD)
     layers, told = make(pushes, updates)
     weights: bytes = safetensors.numpy.save(dict(sorted(to_arrays(layers).items())))
     card = {

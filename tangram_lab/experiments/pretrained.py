@@ -21,7 +21,7 @@ import torch
 import yaml
 
 from tangram_agent.checkpoints import ACTING, CHECKPOINTS, load_checkpoint, newest_checkpoint
-from tangram_agent.files import write_whole
+from tangram_agent.files import check_writable, write_whole
 from tangram_agent.policy import Policy
 from tangram_agent.pretrained import CARD, CARD_TEXT, CONFIG, FORMAT, PREFIX, WEIGHTS
 from tangram_agent.runs import Run, load_run
@@ -67,10 +67,11 @@ def publish(
 
     Raises:
         RunError: a run is not finished, not of the same setup, or its weights are too large.
-        ConfigError: a name that cannot be one.
+        ConfigError: a name that cannot be one, or a folder that cannot be written.
     """
     if not (name.isascii() and name.isidentifier() and name == name.lower()):
         raise ConfigError(f"name must be small letters, digits and _, got '{name}'")
+    check_writable("--out", (target / name / CARD).absolute())
     seeds = sorted((_read(path) for path in run_dirs), key=lambda one: int(one.result["seed"]))
     _check_one_setup(seeds)
     chosen = median(seeds)

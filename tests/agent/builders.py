@@ -1,5 +1,7 @@
 """Small setups, layouts and episodes that the tests of the agent share."""
 
+import hashlib
+import json
 import os
 from pathlib import Path
 from typing import Any
@@ -7,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tangram_agent.pretrained import CARD, WEIGHTS
 from tangram_agent.setup import Setup, make_setup
 from tangram_agent.types import Episodes, Transitions
 
@@ -53,6 +56,25 @@ def setup(
             "net": net,
         }
     )
+
+
+def one_tensor(dtype: str, shape: list[int], data: bytes = bytes(4)) -> bytes:
+    """A file of safetensors with one, of four bytes that are said to be this."""
+    described = {"a": {"dtype": dtype, "shape": shape, "data_offsets": [0, 4]}}
+    header = json.dumps(described).encode()
+    return len(header).to_bytes(8, "little") + header + data
+
+
+def with_weights(agent: Path, data: bytes) -> None:
+    """Weights that were not the agent's, as its card has it they are."""
+    card = json.loads((agent / CARD).read_text()) | {"sha256": hashlib.sha256(data).hexdigest()}
+    (agent / CARD).write_text(json.dumps(card))
+    (agent / WEIGHTS).write_bytes(data)
+
+
+BFLOAT = one_tensor("BF16", [2])  # which numpy has not
+ZERO = one_tensor("F32", [1])
+NAN = one_tensor("F32", [1], b"\xff" * 4)
 
 
 def random_episodes(made: Setup, count: int, seed: int = 0) -> Episodes:

@@ -28,7 +28,7 @@ from tangram_agent.arrays import (
 )
 from tangram_agent.types import Episodes
 from tangram_sim.errors import ConfigError, WireError
-from tests.agent.builders import PAIR, setup
+from tests.agent.builders import BFLOAT, PAIR, one_tensor, setup
 from tests.agent.messages import BOUND, SHAPES, SPEC, episodes, weights
 
 pytestmark = pytest.mark.fast
@@ -228,12 +228,6 @@ DATA = save({name: np.zeros(shape, np.float32) for name, shape in SHAPES.items()
 HUGE_HEADER = (10**15).to_bytes(8, "little") + b"{}"
 
 
-def entry(text: bytes) -> bytes:
-    """One tensor `a` of four bytes, described like this."""
-    described = b'{"a":{%s,"data_offsets":[0,4]}}' % text
-    return len(described).to_bytes(8, "little") + described + bytes(4)
-
-
 @pytest.mark.parametrize(
     ("frame", "reason"),
     [
@@ -248,8 +242,8 @@ def entry(text: bytes) -> bytes:
         (tensor_frame(scale=np.zeros((), np.float64)), "'scale' must be float32, got flo"),
         (tensor_frame(scale=np.array(NAN, np.float32)), "'scale' is not finite"),
         (tensor_frame(scale=np.array(INF, np.float32)), "'scale' is not finite"),
-        (entry(b'"dtype":"BF16","shape":[2]'), "not safetensors: 'BF16'"),
-        (entry(b'"dtype":"F32","shape":%s' % str([1] * 70).encode()), "not safetensors: maximum "),
+        (BFLOAT, "not safetensors: 'BF16'"),
+        (one_tensor("F32", [1] * 70), "not safetensors: maximum "),
     ],
 )
 def test_wrong_tensors_are_refused(frame: bytes, reason: str) -> None:

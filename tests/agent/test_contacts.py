@@ -20,7 +20,7 @@ from tangram_lab.experiments.contacts import main, play, publish
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.errors import ConfigError, RunError
 from tangram_sim.kinematics import wrap
-from tests.agent.builders import setup
+from tests.agent.builders import NAN, ZERO, setup, with_weights
 from tests.agent.pair_scenes import PERCEPTRON, SEVEN, TWO, seven
 
 pytestmark = pytest.mark.fast
@@ -149,6 +149,8 @@ def test_what_it_was_not_learned_for_is_refused(
         (lambda model: (model / CARD).write_text("{"), "cannot be read"),
         (lambda model: (model / CONFIG).write_text("push: 1"), "learned by another version: inst"),
         (lambda model: (model / CONFIG).write_text("a: [1"), "not valid YAML"),
+        (lambda model: with_weights(model, NAN), "'a' is not finite.: install tangram-rl again"),
+        (lambda model: with_weights(model, ZERO), "learned by another version: install tangram"),
     ],
 )
 def test_a_damaged_model_is_refused(tmp_path: Path, harm: Any, reason: str) -> None:
@@ -168,10 +170,19 @@ def test_it_is_made_by_one_command_and_is_no_agent(tmp_path: Path) -> None:
     assert CONTACTS not in agent_names()
 
 
-@pytest.mark.parametrize("given", ["--pushes=24", "--pushes=-5", "--updates=0"])
-def test_a_model_of_nothing_is_not_made(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], given: str
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [
+        ("--pushes=24", "--pushes must be at least 100"),
+        ("--pushes=-5", "--pushes must be at least 100"),
+        ("--updates=0", "--updates must be at least 1"),
+        (f"--out={__file__}", f"--out={__file__}/card.json cannot be written"),
+    ],
+)
+def test_a_model_of_nothing_or_for_nowhere_is_not_made(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], given: str, reason: str
 ) -> None:
+    monkeypatch.setattr("tangram_lab.experiments.contacts.make", None)
     monkeypatch.setattr("sys.argv", ["contacts", given])
     assert main() == 2
-    assert capsys.readouterr().err.startswith(f"contacts: {given.partition('=')[0]} must be at le")
+    assert capsys.readouterr().err.startswith(f"contacts: {reason}")

@@ -17,7 +17,17 @@ from tangram_agent.runs import load_run
 from tangram_sim.env import TangramEnv
 from tangram_sim.errors import RunError, TangramError
 from tangram_sim.register import KWARGS
-from tests.agent.builders import PLAIN, PROPOSAL, SMALL, SQUARE, random_transitions, setup
+from tests.agent.builders import (
+    BFLOAT,
+    NAN,
+    PLAIN,
+    PROPOSAL,
+    SMALL,
+    SQUARE,
+    random_transitions,
+    setup,
+    with_weights,
+)
 
 pytestmark = pytest.mark.fast
 
@@ -79,6 +89,9 @@ def test_an_unknown_name_lists_those_that_there_are(package: Path) -> None:
     known = "no pretrained agent 'cat': choose from pretrained/other, pretrained/square"
     with pytest.raises(RunError, match=known):
         load_run("pretrained/cat")
+    contacts = "pretrained/contacts is no agent but a model of contacts, for agent.lookahead=l"
+    with pytest.raises(RunError, match=contacts):
+        load_run("pretrained/contacts")
     with pytest.raises(RunError, match="has no checkpoint 00000010"):
         load_run("pretrained/square", "00000010")
 
@@ -96,6 +109,8 @@ def test_an_unknown_name_lists_those_that_there_are(package: Path) -> None:
         (lambda agent: (agent / CARD).write_text("[]"), "not of format 2"),
         (lambda agent: (agent / CARD).write_text('{"format": 1}'), "not of format 2"),
         (lambda agent: (agent / CARD).write_text('{"format": 2}'), "does not tell the updates"),
+        (lambda agent: with_weights(agent, BFLOAT), "not safetensors: 'BF16'"),
+        (lambda agent: with_weights(agent, NAN), "'a' is not finite"),
     ],
 )
 def test_a_damaged_agent_is_refused(package: Path, harm: object, reason: str) -> None:

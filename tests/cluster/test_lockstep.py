@@ -16,7 +16,7 @@ from worker.status import ask_status
 
 pytestmark = pytest.mark.cluster
 
-UPDATES = 250
+UPDATES = 160
 STEP = (
     "service.mode=lockstep",
     "workers=2",
@@ -63,12 +63,9 @@ def assert_same(one: Path, other: Path) -> None:
     assert ours.counters["rate_limiter"] == pytest.approx(theirs.counters["rate_limiter"])
 
 
-def test_the_same_numbers_come_twice(straight: Path, tmp_path: Path) -> None:
-    run("tangram-train", f"run_dir={tmp_path / 'again'}", *STEP, cwd=tmp_path)
-    assert_same(tmp_path / "again", straight)
-
-
-def test_a_stop_in_the_middle_changes_nothing(straight: Path, tmp_path: Path) -> None:
+def test_the_same_numbers_come_twice_and_a_stop_in_the_middle_changes_nothing(
+    straight: Path, tmp_path: Path
+) -> None:
     folder = tmp_path / "stopped"
     with started("tangram-train", f"run_dir={folder}", *STEP, cwd=tmp_path) as process:
         until_updates(folder, 40)
@@ -84,7 +81,7 @@ def test_kills_in_the_middle_change_nothing(straight: Path, tmp_path: Path) -> N
     folder = tmp_path / "killed"
     settings = (f"run_dir={folder}", *STEP, "service.checkpoint_minutes=0.01")
     with started("tangram-train", *settings, cwd=tmp_path) as process:
-        for victim, updates in (("role=player", 40), ("-m tangram_cli master", 100)):
+        for victim, updates in (("role=player", 40), ("-m tangram_cli master", 80)):
             until_updates(folder, updates)
             found = [pid for pid in pids_of(folder) if victim in _line(pid)]
             os.kill(min(found), signal.SIGKILL)

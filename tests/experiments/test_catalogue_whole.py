@@ -20,6 +20,8 @@ AGENTS = {
     "game_paper": "paper",
     "game_reward": "tangram",
     "worlds": "tangram",
+    "pictures": "tangram",
+    "pictures_game": "tangram",
 }
 
 

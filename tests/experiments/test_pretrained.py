@@ -187,3 +187,7 @@ def test_the_command(
     monkeypatch.setattr(sys, "argv", ["pretrained", "square", str(tmp_path / "nowhere")])
     assert main() == 2
     assert "pretrained: cannot read" in capsys.readouterr().err
+    out = run / "config.yaml"  # a file is in the way: seen before the run is read
+    monkeypatch.setattr(sys, "argv", ["pretrained", "square", "nowhere", f"--out={out}"])
+    assert main() == 2
+    assert capsys.readouterr().err.startswith(f"pretrained: --out={out}/square/card.json cannot b")

@@ -17,7 +17,7 @@ from tangram_agent.checkpoints import (
     set_aside,
 )
 from tangram_sim.errors import RunError
-from tests.agent.builders import watched_disk
+from tests.agent.builders import BFLOAT, watched_disk
 
 pytestmark = pytest.mark.fast
 
@@ -187,6 +187,12 @@ def test_a_changed_manifest_is_refused_and_another_format_is_not_taken_for_corru
     assert type(caught.value) is kind
 
 
+def seal(path: Path, body: dict[str, object]) -> None:
+    """Write a manifest whose checksum holds."""
+    told = hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()
+    (path / "manifest.json").write_text(json.dumps({"format_version": 3, "sha256": told, **body}))
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -202,13 +208,19 @@ def test_a_forged_manifest_is_corrupt_though_its_checksum_holds(
     tmp_path: Path, change: dict[str, object], reason: str
 ) -> None:
     path = save(tmp_path)
-    body = {"updates": 5, "files": {}, "counters": {}} | change
-    seal = hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()
-    manifest = {"format_version": 3, "sha256": seal, **body}
-    (path / "manifest.json").write_text(json.dumps(manifest))
+    seal(path, {"updates": 5, "files": {}, "counters": {}} | change)
     with pytest.raises(CorruptError) as caught:
         load_checkpoint(path)
     assert caught.value.why == f"manifest.json: {reason}"
+
+
+def test_a_forged_file_is_corrupt_though_its_checksums_hold(tmp_path: Path) -> None:
+    path = save(tmp_path)
+    (path / "replay.safetensors").write_bytes(BFLOAT)
+    files = {"replay": hashlib.sha256(BFLOAT).hexdigest()}
+    seal(path, {"updates": 5, "files": files, "counters": {}})
+    with pytest.raises(CorruptError, match=r"replay\.safetensors: not safetensors: 'BF16'"):
+        load_checkpoint(path)
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"updates":' * 100_000, "[1]", ""])

@@ -10,8 +10,11 @@ from PIL import Image
 
 import worker.film as film_module
 from conf.cli import composed
-from tangram_agent.runs import load_run
+from tangram_agent.lookahead import Lookahead
+from tangram_agent.process import VARIABLE
+from tangram_agent.runs import load_changed, load_run
 from tangram_agent.setup import Setup
+from tangram_sim.arrays import Floats, Ints
 from tangram_sim.errors import ConfigError, RunError, TangramError
 from tangram_sim.geometry import outlines, pairs_overlap
 from tests.agent.builders import PAIR, SQUARE, setup
@@ -140,6 +143,22 @@ def test_without_pyav_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatc
 # Puzzles, and random targets of several tokens
 
 
+def test_what_looks_ahead_plays_one_by_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def stays(own: Lookahead, corners: Floats, *_: object) -> tuple[Ints, Floats]:
+        asked.append(len(corners))
+        return np.zeros(len(corners), np.int64), own._layout.poses(corners)[:, 0]
+
+    monkeypatch.setattr(Lookahead, "choose", stays)
+    puzzles = str(write_puzzles(tmp_path / "mine.json", drawn("cat"), drawn("fish")))
+    write_run(tmp_path / "run", GAME, sim=SIM | {"backend": "physics", "motion": "slide"})
+    run = load_changed(tmp_path / "run", {"agent": {"lookahead": "learned"}})
+    for what in ({"episodes": 2}, {"puzzle": (puzzles,)}):
+        make_show(run, PlayConfig(str(run.folder), **what))
+    assert asked == [1] * len(asked) == [1] * 4 * run.setup.horizon
+
+
 def test_puzzles_by_name_start_beside_their_figures_and_elsewhere_with_another_seed(
     tmp_path: Path,
 ) -> None:
@@ -246,7 +265,9 @@ def test_no_window_without_a_display(
         play_run(of_game(tmp_path, puzzle=("cat",), live=True))
 
 
-def test_a_window_needs_no_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_window_needs_no_out(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     shown: list[PlayConfig] = []
     monkeypatch.setattr("worker.play.play_run", lambda config: shown.append(config) or 0)
     given = ["run_dir=pretrained/square", "live=true"]
@@ -254,6 +275,13 @@ def test_a_window_needs_no_out(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [config.live for config in shown] == [True]
     with pytest.raises(ConfigError, match="out=.*a.gif changes nothing with live=true"):
         _play(composed("play", [*given, "out=a.gif"]))
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    assert _play(composed("play", given)) == 0
+    assert capsys.readouterr().err == "loads and plays pretrained/square\n"
+    monkeypatch.setenv(VARIABLE, "3")  # a child's
+    assert _play(composed("play", given)) == 0
+    assert capsys.readouterr().err == ""
 
 
 # Runs side by side
