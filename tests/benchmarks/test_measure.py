@@ -92,3 +92,22 @@ def test_wrong_arguments_are_answered_in_one_line() -> None:
     assert done.returncode == 2
     assert "invalid choice: 'nothing'" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+def test_what_is_seen_of_single_tokens_is_exact(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One scene of each kind; those of several tokens are held by the tests of tangram_vision."""
+    out = tmp_path / "seeing.json"
+    monkeypatch.setattr(sys, "argv", ["tangram-bench", "seeing", "scenes=1", f"out={out}"])
+    assert main() == 0
+    content = json.loads(out.read_text())
+    rows = {(row["what"], row["pictures"]): row for row in content["rows"]}
+    assert len(rows) == len(content["rows"]) == 12
+    for pictures, position, degrees in (("128 grey", 2e-3, 0.5), ("128 binary", 5e-3, 2.0)):
+        row = rows["one token, five shapes", pictures]
+        assert (row["scenes"], row["all found"], row["sure but wrong"]) == (5, 1.0, 0.0)
+        assert row["95th perc."] < position
+        assert row["95th perc. (°)"] < degrees
+    assert [row["all found"] for row in content["disturbed"]] == [1.0] * 5
