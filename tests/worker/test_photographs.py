@@ -168,7 +168,7 @@ def test_tokens_must_lie_within_the_arena(tmp_path: Path) -> None:
     setup = load_run("pretrained/square").setup
     target = photo(tmp_path / "it.png", levels(setup.layout, POSES[:1]))
     near = replace(setup, sim=replace(setup.sim, arena=0.4))
-    with pytest.raises(ConfigError, match="it.png shows tokens that reach 0.262 .* arena only 0.2: "):
+    with pytest.raises(ConfigError, match="it.png shows tokens that reach 0.262 .*only 0.2: "):
         read_photograph(target, near)
 
 
