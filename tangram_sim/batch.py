@@ -86,6 +86,7 @@ class BatchedEnv:
             are found in pictures.
         seen_goals: `goals` as an agent sees them, with one noise for the whole episode.
         sight: what is found in pictures, where these are the agent's only source, else None.
+        pictures: (B, P, P) of the tokens, as the camera had them last.
     """
 
     def __init__(
@@ -132,7 +133,7 @@ class BatchedEnv:
         self.sight = None if observed is None else Sight(layout, observed, count, sim.arena)
         self._targets: TargetPictures | None = None
         self._late = np.zeros(count, np.int64), np.zeros((count, 3))  # what was told a step before
-        self._pictures: Pixels = np.zeros((count, 0, 0), np.uint8)  # after the last step
+        self.pictures: Pixels = np.zeros((count, sim.pixels, sim.pixels), np.uint8)
         self._moves: Ints = np.zeros((count, layout.tokens), dtype=np.int64)
         self.steps_done = self.horizon  # no episode yet
         self.corners: Floats = np.zeros((count, layout.corner_count, 2))
@@ -221,7 +222,7 @@ class BatchedEnv:
         camera = self._move(command, command.idle | blocked)
         if self.sight is not None:
             told = named, np.where(refused[:, None], 0.0, velocity)
-            self.sight.follow(self._pictures, *(self._late if self.sim.delay else told))
+            self.sight.follow(self.pictures, *(self._late if self.sim.delay else told))
             self._late = told
         self._look()
         self.steps_done += 1
@@ -276,8 +277,8 @@ class BatchedEnv:
         if self.sim.pixels:
             self._targets = TargetPictures(np.stack(pictures))
         if self.sight is not None:
-            states = [self._picture(b) for b in range(self.count)]
-            self.sight.begin(np.stack(pictures), np.stack(states))
+            self.pictures = np.stack([self._picture(b) for b in range(self.count)])
+            self.sight.begin(np.stack(pictures), self.pictures)
 
     def _picture(self, b: int) -> Pixels:
         """(P, P) of an environment, as the camera has it now."""
@@ -293,8 +294,8 @@ class BatchedEnv:
                 pictures.append(self._picture(b))
         if self._targets is None:
             return None
-        self._pictures = np.stack(pictures)
-        return self._targets.rewards(self._pictures)
+        self.pictures = np.stack(pictures)
+        return self._targets.rewards(self.pictures)
 
     def _rewards(self, share: Floats, camera: Floats | None) -> Floats:
         """(B,) of the configured reward, with the raw overlap and Eq. 14 of the pictures."""

@@ -11,9 +11,9 @@ from tangram_sim.arrays import Floats
 from tangram_sim.drawing import contact_sheet
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import Layout
-from tangram_sim.strokes import PAPER, SAMPLES, Point, colour_of, draw_outline, shown
 from tangram_sim.targets import turned_figure
 from worker.puzzles import Figure
+from worker.views import outlined
 
 _ROUNDING = 1e-9
 
@@ -58,19 +58,9 @@ def read_photograph(target: str, setup: Setup) -> Photograph:
 
 def draw_photograph(photograph: Photograph, layout: Layout, size: int) -> Image.Image:
     """The photograph with the outlines of what was seen, and how much that was below."""
-    picture = photograph.picture
-    share = size * SAMPLES / max(picture.size)
-    width, height = (round(side * share) for side in picture.size)
-    left, top = (size * SAMPLES - width) // 2, (size * SAMPLES - height) // 2
-    canvas = Image.new("RGB", (size * SAMPLES, size * SAMPLES), PAPER)
-    canvas.paste(picture.resize((width, height), Image.Resampling.BILINEAR), (left, top))
-    for k in range(layout.tokens):
-        own = photograph.outlines[layout.corners_of(k)] * share + (left, top)
-        points: list[Point] = [(float(x), float(y)) for x, y in own]
-        draw_outline(canvas, points, PAPER, 3.0)
-        draw_outline(canvas, points, colour_of(k), 2.0)
+    picture = outlined(photograph.picture, layout, photograph.outlines, size)
     seen = f"{layout.tokens} tokens" if layout.tokens > 1 else layout.shapes[0].name
-    return contact_sheet([shown(canvas)], 1, [f"seen: {seen.replace('_', ' ')}"])
+    return contact_sheet([picture], 1, [f"seen: {seen.replace('_', ' ')}"])
 
 
 def _check_inside(source: str, setup: Setup, corners: Floats) -> None:

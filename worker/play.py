@@ -28,6 +28,7 @@ from worker.photographs import draw_photograph, read_photograph
 from worker.puzzles import find_figures, play_figures
 from worker.rollout import Played, at_once
 from worker.test_set import FixedTests, greedy
+from worker.views import beside, camera_sheets
 
 FRAME_MS = 50
 STILL_START, STILL_END = 10, 30  # frames
@@ -125,14 +126,23 @@ def end_picture(show: Show) -> Image.Image:
 def _frames(show: Show, out: str) -> list[Image.Image]:
     """One picture of the ends, or the film."""
     setup, played = show.setup, show.played
-    still = Path(out).suffix == ".png"
-    if show.seen is not None:
-        if still:
-            return [side_by_side([show.seen, end_picture(show)])]
-        return [show.seen] * SEEN + with_stills(film_pictures(show))
-    if setup.layout.tokens > 1:
-        return [end_picture(show)] if still else with_stills(film_pictures(show))
-    return [draw_sheet(setup, played, played.ends)] if still else draw_motion(setup, played)
+    still, game = Path(out).suffix == ".png", setup.layout.tokens > 1 or show.seen is not None
+    count = len(show.titles)
+    columns, size = tiles(count, WIDTH) if game else _tiles(count, SHEET)
+    sheets = camera_sheets(setup, played, columns, size)
+    if still:
+        end = end_picture(show) if game else draw_sheet(setup, played, played.ends)
+        return [side_by_side([*_before(show), end, *sheets[-1:]])]
+    frames = film_pictures(show) if game else draw_motion(setup, played)
+    if sheets:
+        pairs = zip(frames, beside(frames, sheets), strict=True)
+        frames = [side_by_side(pair) for pair in pairs]
+    return [one for one in _before(show) for _ in range(SEEN)] + with_stills(frames)
+
+
+def _before(show: Show) -> list[Image.Image]:
+    """What is shown before the film: a photograph of the target, if there is one."""
+    return [] if show.seen is None else [show.seen]
 
 
 def save_picture(out: str, frames: Sequence[Image.Image]) -> None:
@@ -156,21 +166,24 @@ def draw_sheet(setup: Setup, played: Played, corners: Floats, width: int = SHEET
     Args:
         width: of all tiles of a row together, about, in pixels.
     """
-    columns = math.ceil(math.sqrt(len(corners)))
-    size = min(max(width // columns, MIN_TILE), MAX_TILE)
+    columns, size = _tiles(len(corners), width)
     scenes = (played.starts, corners, played.goals)
     return episode_sheet(setup.layout, setup.sim.arena, *scenes, columns, size)
+
+
+def _tiles(count: int, width: int) -> tuple[int, int]:
+    """How many tiles stand in a row of so many pixels, and the side of each in pixels."""
+    columns = math.ceil(math.sqrt(count))
+    return columns, min(max(width // columns, MIN_TILE), MAX_TILE)
 
 
 def draw_motion(setup: Setup, played: Played) -> list[Image.Image]:
     """The episodes' frames: start, every action as a motion at constant velocity, end."""
     count = frames_per_action(played.episodes.actions.shape[1])
-    return with_stills(
-        [
-            draw_sheet(setup, played, corners)
-            for corners in motion(setup.layout, played.corners, count)
-        ]
-    )
+    return [
+        draw_sheet(setup, played, corners)
+        for corners in motion(setup.layout, played.corners, count)
+    ]
 
 
 def with_stills(frames: list[Image.Image]) -> list[Image.Image]:

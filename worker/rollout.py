@@ -13,7 +13,7 @@ import numpy as np
 
 from tangram_agent.setup import Setup
 from tangram_agent.types import AWAY, Episodes, Past
-from tangram_sim.arrays import Bools, Floats, Singles
+from tangram_sim.arrays import Bools, Floats, Pixels, Singles
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.seeding import episode_generator
 from tangram_sim.targets import Sides
@@ -41,6 +41,7 @@ class Played:
             played together.
         slowest: (E,) processor time of their slowest choice, in seconds.
         camera: (E,) Eq. 14 of the pictures after the last step; None without a camera.
+        pictures: (E, T + 1, P, P) that were shown to the agent; None where it sees no pictures.
     """
 
     episodes: Episodes
@@ -52,6 +53,7 @@ class Played:
     seconds: Floats
     slowest: Floats
     camera: Floats | None
+    pictures: Pixels | None
 
     @property
     def starts(self) -> Floats:
@@ -74,7 +76,10 @@ class Played:
             rewards=np.empty((count, steps), np.float32),
             goals=np.empty((count, corners, 2), np.float32),
         )
+        pictures = None
         if env.sight is not None:
+            side = env.sim.pixels
+            pictures = np.empty((count, steps + 1, side, side), np.uint8)
             seen = replace(
                 seen,
                 missing=np.empty((count, steps + 1, tokens), np.uint8),
@@ -90,6 +95,7 @@ class Played:
             seconds=np.empty(count),
             slowest=np.zeros(count),
             camera=np.empty(count) if env.sim.pixels else None,
+            pictures=pictures,
         )
 
     def first(self, count: int) -> "Played":
@@ -189,9 +195,10 @@ def _play_group(
 def _look(env: BatchedEnv, played: Played, rows: slice, t: int) -> None:
     played.corners[rows, t], played.episodes.corners[rows, t] = env.corners, env.seen
     played.episodes.placed[rows, t] = env.placed
-    if env.sight is not None and played.episodes.missing is not None:
-        sight = env.sight
-        played.episodes.missing[rows, t] = np.where(sight.away, AWAY, sight.missing)
+    sight, missing = env.sight, played.episodes.missing
+    if sight is not None and missing is not None and played.pictures is not None:
+        missing[rows, t] = np.where(sight.away, AWAY, sight.missing)
+        played.pictures[rows, t] = env.pictures
 
 
 class Rollout:

@@ -1,5 +1,6 @@
 """tangram-play: which episodes are shown, what is drawn of them, and runs side by side."""
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,7 @@ from worker.play import (
     play_run,
 )
 from worker.rollout import Played
+from worker.views import beside, camera_sheets
 
 pytestmark = pytest.mark.fast
 
@@ -61,6 +63,50 @@ def of_game(folder: Path, **settings: Any) -> PlayConfig:
 
 def shown(config: PlayConfig) -> Show:
     return make_show(load_run(config.run_dirs[0]), config)
+
+
+# What the camera sees beside it
+
+OBSERVED = {"observe": "pictures", "pixels": 64, "picture": "grey"}
+
+
+def test_the_cameras_view_stands_beside_the_table(tmp_path: Path) -> None:
+    for suffix, frames in ((".png", 1), (".gif", 6)):
+        sizes = []
+        for sim in ({}, OBSERVED):
+            out = tmp_path / f"it{suffix}"
+            play_run(of_square(tmp_path, out=str(out), episodes=2, changes={"sim": sim}))
+            with Image.open(out) as picture:
+                sizes.append(picture.size)
+                assert getattr(picture, "n_frames", 1) >= frames
+        assert sizes[1][0] > 2 * sizes[0][0]
+        assert sizes[1][1] == sizes[0][1]
+
+
+def test_only_what_was_found_is_drawn_over_the_cameras_view(tmp_path: Path) -> None:
+    write_run(tmp_path / "run", SQUARE)
+    run = load_changed(tmp_path / "run", {"sim": OBSERVED})
+    played = play_episodes(run, PlayConfig(str(tmp_path / "run"), episodes=2))
+
+    def coloured() -> int:
+        (first, _) = camera_sheets(run.setup, played, 1, 60)
+        red, _, blue = np.asarray(first, np.int64).transpose(2, 0, 1)
+        return np.count_nonzero(blue > red + 30)
+
+    both, missing = coloured(), played.episodes.missing
+    assert missing is not None
+    missing[1] = 1
+    one = coloured()
+    missing[0] = 1
+    assert both > one > coloured() == 0
+    assert camera_sheets(run.setup, replace(played, pictures=None), 1, 60) == []
+
+
+def test_every_frame_has_the_view_of_its_moment() -> None:
+    views: Any = list("abcd")
+    frames: Any = range(1 + 3 * 6)
+    assert "".join(map(str, beside(frames, views))) == "aaaaaabbbbbbccccccd"
+    assert beside([*frames, 19], views)[-2:] == ["d", "d"]  # a game's film has its end once more
 
 
 # Episodes of one run
