@@ -70,6 +70,7 @@ def ended(layout: Layout, corners: Floats, goals: Floats, **more: Any) -> Played
         "seconds": np.ones(count),
         "slowest": np.ones(count),
         "camera": None,
+        "pictures": None,
     }
     travels = Episodes(**{name: more.get(name, column) for name, column in seen.items()})
     rest: dict[str, Any] = {name: more.get(name, column) for name, column in known.items()}
