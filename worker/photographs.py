@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from PIL import Image
 
 from tangram_agent.setup import Setup
@@ -12,10 +11,8 @@ from tangram_sim.drawing import contact_sheet
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import Layout
 from tangram_sim.targets import turned_figure
-from worker.puzzles import Figure
+from worker.puzzles import Figure, reach_beyond
 from worker.views import outlined
-
-_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +61,8 @@ def draw_photograph(photograph: Photograph, layout: Layout, size: int) -> Image.
 
 
 def _check_inside(source: str, setup: Setup, corners: Floats) -> None:
-    reach = float(np.abs(corners).max())
-    if reach > setup.sim.arena / 2.0 + _ROUNDING:
+    reach = reach_beyond(setup, corners)
+    if reach is not None:
         raise ConfigError(
             f"{source} shows tokens that reach {reach:.3g} from their middle at the run's scale, "
             f"and its arena only {setup.sim.arena / 2.0:.3g}: lay them nearer together"

@@ -180,9 +180,15 @@ def _placed(puzzle: Puzzle, setup: Setup) -> tuple[Floats, Bools]:
         ) from None
 
 
-def _check_inside(puzzle: Puzzle, setup: Setup, corners: Floats) -> None:
+def reach_beyond(setup: Setup, corners: Floats) -> float | None:
+    """How far corners (V, 2) reach from the middle where a run's arena does not; else None."""
     reach = float(np.abs(corners).max())
-    if reach > setup.sim.arena / 2.0 + _ROUNDING:
+    return reach if reach > setup.sim.arena / 2.0 + _ROUNDING else None
+
+
+def _check_inside(puzzle: Puzzle, setup: Setup, corners: Floats) -> None:
+    reach = reach_beyond(setup, corners)
+    if reach is not None:
         raise ConfigError(
             f"puzzle '{puzzle.name}' reaches {reach:.3g} from its middle, and the run's arena only "
             f"{setup.sim.arena / 2.0:.3g}: name a run of a larger arena or of smaller tokens"
