@@ -23,6 +23,7 @@ WEIGHTS = "weights.safetensors"
 CARD = "card.json"
 CARD_TEXT = "card.md"
 CONTACTS = "contacts"  # no agent, but a model that agents look ahead by; see contacts.py
+NO_AGENT = "{} is no agent but a model of contacts, for agent.lookahead=learned"
 FORMAT = 2
 PACKAGED: Traversable = files("tangram_agent") / PREFIX
 
@@ -71,11 +72,7 @@ def packaged(run_dir: str | Path) -> Traversable:
     names = agent_names()
     if name not in names:
         known = ", ".join(f"{PREFIX}/{one}" for one in names) or "none come with this version"
-        what = (
-            f"{run_dir} is no agent but a model of contacts, for agent.lookahead=learned"
-            if name == CONTACTS
-            else f"no pretrained agent '{name}'"
-        )
+        what = NO_AGENT.format(run_dir) if name == CONTACTS else f"no pretrained agent '{name}'"
         raise RunError(f"{what}: choose from {known}")
     return PACKAGED / name
 

@@ -92,6 +92,8 @@ def test_an_unknown_name_lists_those_that_there_are(package: Path) -> None:
     contacts = "pretrained/contacts is no agent but a model of contacts, for agent.lookahead=l"
     with pytest.raises(RunError, match=contacts):
         load_run("pretrained/contacts")
+    with pytest.raises(RunError, match="no agent but a model of contacts.*: give the folder of an"):
+        load_run(write_agent(Path("pretrained/contacts"), name="contacts"))
     with pytest.raises(RunError, match="has no checkpoint 00000010"):
         load_run("pretrained/square", "00000010")
 
