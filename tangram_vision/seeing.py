@@ -17,7 +17,7 @@ from tangram_vision.blobs import Blobs, find_blobs, likeness
 from tangram_vision.edges import refined
 from tangram_vision.kinds import Kind, kinds_of
 from tangram_vision.levels import coverage
-from tangram_vision.piles import Laid, arrangements
+from tangram_vision.piles import Laid, arrangements, reaching_out
 from tangram_vision.samples import binary, settled
 
 SURE = 0.5  # confidence from which a token counts as seen
@@ -107,8 +107,9 @@ class _Puzzle:
         singles = self._singles()
         left = Counter({kind.shape: len(kind.tokens) for kind in self.kinds})
         # Blobs that look like one token first: they cost nothing.
-        whole = np.flatnonzero(~self.blobs.cut).tolist()
-        order = sorted(whole, key=lambda blob: (blob not in singles, -blob))
+        cut = self.blobs.cut.tolist()
+        shown = [blob for blob in range(len(cut)) if not cut[blob] or self._piles(blob, left)]
+        order = sorted(shown, key=lambda blob: (blob not in singles, -blob))
         best: list[_Explained] = []
         for found in self._whole(order, singles, left, []):
             if len(found) > len(best):
@@ -142,7 +143,7 @@ class _Puzzle:
         single = singles.get(blob)
         if single is not None and left[self.kinds[single.laid.kinds[0]].shape]:
             yield single
-        if left.total() > 1:
+        if left.total() > 1 or self.blobs.cut[blob]:
             yield from self._piles(blob, left)
 
     def _piles(self, blob: int, left: Counter[int]) -> list[_Explained]:
@@ -154,7 +155,8 @@ class _Puzzle:
         side = self.blobs.cover.shape[1]
         cover = self.blobs.cover[self.blobs.base[blob] :][:side]
         self._tries += 1
-        found = [one for one in arrangements(cover, self.kinds, counts) if one.differs < _DIFFERS]
+        search = reaching_out if self.blobs.cut[blob] else arrangements
+        found = [one for one in search(cover, self.kinds, counts) if one.differs < _DIFFERS]
         sets: dict[tuple[int, ...], list[Laid]] = {}
         for one in found:
             sets.setdefault(tuple(sorted(self.kinds[k].shape for k in one.kinds)), []).append(one)

@@ -166,6 +166,21 @@ def test_what_is_not_to_be_seen_is_missing(shown: str) -> None:
     assert seen.confidence[0] == 0.0
 
 
+@pytest.mark.parametrize("beyond", [1.0, 3.0])
+@pytest.mark.parametrize("shape", TANS)
+def test_what_reaches_the_edge_of_the_picture_is_seen(shape: str, beyond: float) -> None:
+    """A camera that is shifted by 2 px cuts tokens that lie in the arena."""
+    layout, rng = layout_of(shape, scale=0.8), np.random.default_rng(7)
+    for _ in range(4):
+        poses, flipped = scene(layout, rng, 0.0)
+        edge = ARENA / 2.0 + beyond * ARENA / 128
+        poses[0, 1] += edge - layout.corners(poses, flipped)[:, 1].max()
+        seen = see(grey(layout.corners(poses, flipped), layout, 128), layout, ARENA)
+        [[distance, turn]] = errors(layout, poses, flipped, seen)
+        assert distance < 0.002
+        assert turn < 0.6
+
+
 def test_a_small_token_that_is_blurred_is_as_large_as_it_is() -> None:
     """The blur reaches its middle, from which its level is told."""
     layout, rng = layout_of("small_triangle", scale=0.6), np.random.default_rng(6)
