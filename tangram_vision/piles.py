@@ -20,7 +20,7 @@ from tangram_vision.edges import NARROW, WIDE, Outlines
 from tangram_vision.kinds import Kind
 from tangram_vision.ramps import fitted, ramps, unlike
 
-_TRIED = 48  # corner fits that are refined
+_TRIED = 120  # corner fits that are refined
 _BEAM = (10, 6, 4)  # of those followed, by the number of tokens laid before
 _LEAVES = 8  # whole arrangements that are compared
 _MOST_STEPS = 40  # outlines whose corners are tried
