@@ -183,11 +183,11 @@ class BatchedEnv:
         else:
             self.seen_goals = self.sight.goals
         self._look()
-        self._moves[:] = self.sim.actions_per_token * self._named(done)
         self.actuation.begin(generators)
         if self.sim.damping_spread:
             for world, damping in zip(self._worlds, self.actuation.damping, strict=True):
                 world.damp(float(damping))
+        self._moves[:] = self.sim.actions_per_token * self._named(done)
         self.steps_done = 0
 
     def _done(self, generators: Sequence[np.random.Generator]) -> Bools:
