@@ -175,7 +175,6 @@ class BatchedEnv:
         self.goals = self.layout.corners(*targets)
         done = self._done(generators)
         starts = sample_starts(self.layout, self.sim, targets, done, generators)
-        self._moves[:] = self.sim.actions_per_token * done
         self._generators = generators
         self._late = np.zeros(self.count, np.int64), np.zeros((self.count, 3))
         self._begin(targets, starts)
@@ -188,6 +187,7 @@ class BatchedEnv:
         if self.sim.damping_spread:
             for world, damping in zip(self._worlds, self.actuation.damping, strict=True):
                 world.damp(float(damping))
+        self._moves[:] = self.sim.actions_per_token * self._named(done)
         self.steps_done = 0
 
     def _done(self, generators: Sequence[np.random.Generator]) -> Bools:
@@ -197,6 +197,14 @@ class BatchedEnv:
             for row, generator in zip(done, generators, strict=True):
                 row[generator.permutation(len(row))[self.task.tokens :]] = True
         return done
+
+    def _named(self, flags: Bools) -> Bools:
+        """(B, K) flags of the world's tokens, as the agent names these."""
+        if self.sight is None or not flags.any():
+            return flags
+        every = (np.full(self.count, token) for token in range(self.layout.tokens))
+        hands = np.stack([self.sight.hands(token, self.corners) for token in every], axis=1)
+        return np.take_along_axis(flags, hands, axis=1)
 
     def step(self, actions: Floats) -> StepResult:
         """Play one action in every environment.

@@ -20,7 +20,7 @@ from tangram_vision.edges import NARROW, WIDE, Outlines
 from tangram_vision.kinds import Kind
 from tangram_vision.ramps import fitted, ramps, unlike
 
-_TRIED = 48  # corner fits that are refined
+_TRIED = 120  # corner fits that are refined
 _BEAM = (10, 6, 4)  # of those followed, by the number of tokens laid before
 _LEAVES = 8  # whole arrangements that are compared
 _MOST_STEPS = 40  # outlines whose corners are tried
@@ -32,6 +32,9 @@ _FLAT = np.radians(165.0)
 _SLACK = np.radians(25.0)
 _RUGGED = 1.2  # pixels that an outline may leave its polygon
 _ROUNDS = (WIDE, WIDE, NARROW)
+_BEYOND = 40  # pixels around a picture in which a token that reaches out of it may lie
+_SHOWN = 0.6  # share of such a token that must be seen
+_FEW = 3  # of its fits that are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +84,22 @@ def arrangements(cover: Singles, kinds: Sequence[Kind], left: Sequence[int]) -> 
     return [replace(laid, poses=laid.poses + origin) for laid in found]
 
 
+def reaching_out(cover: Singles, kinds: Sequence[Kind], left: Sequence[int]) -> list[Laid]:
+    """Single tokens that explain what reaches beyond the picture, the best first.
+
+    Args:
+        cover: (P, P) coverage by it alone, the whole picture.
+        kinds: all of the layout.
+        left: how many tokens there are of each of their shapes.
+    """
+    search, found = _Search(cover, kinds, _BEYOND), list[Laid]()
+    for name, rough in search.corners(cover, float(cover.sum()) / _SHOWN, tuple(left))[:_FEW]:
+        poses, differs = fitted([kinds[name]], rough[None], cover)
+        if not any(search.same((name,), poses, laid.kinds, laid.poses) for laid in found):
+            found.append(Laid((name,), poses, differs))
+    return sorted(found, key=lambda laid: laid.differs)
+
+
 class _Search:
     """Depth first, the best token next, over what is left of one pile (P, P).
 
@@ -88,8 +107,15 @@ class _Search:
         steps: outlines whose corners were tried.
     """
 
-    def __init__(self, cover: Singles, kinds: Sequence[Kind]) -> None:
-        self._cover, self._kinds = cover, kinds
+    def __init__(self, cover: Singles, kinds: Sequence[Kind], beyond: int = 0) -> None:
+        """Search a pile.
+
+        Args:
+            cover: of it.
+            kinds: of which it is.
+            beyond: pixels around the picture in which it may go on.
+        """
+        self._cover, self._kinds, self._beyond = cover, kinds, beyond
         self.steps = 0
         self._smallest = min(kind.area for kind in kinds)
 
@@ -117,7 +143,7 @@ class _Search:
             yield from self._rest(others, now, (*laid, kind), np.vstack([poses, pose]))
         most = MAX_PILE - len(laid) - len(blobs) + 1
         if not single and most > 1 and self._sums(area, left, most):
-            for kind, pose in self._corners(part, area, left, len(laid)):
+            for kind, pose in self.corners(part, area, left, len(laid)):
                 here = ramps([self._kinds[kind]], pose[None], rest.shape[0])[0]
                 now = _without(left, self._kinds[kind].shape)
                 gone = np.clip(rest - here, 0.0, 1.0).astype(np.float32)
@@ -150,14 +176,18 @@ class _Search:
             for some in combinations(sizes, count)
         )
 
-    def _corners(
-        self, part: Singles, area: float, left: tuple[int, ...], depth: int
+    def corners(
+        self, part: Singles, area: float, left: tuple[int, ...], depth: int = 0
     ) -> list[tuple[int, Floats]]:
         """Tokens at the corners of a part, those first that explain most of its outline."""
         self.steps += 1
         names, poses = self._proposed(part, area, left)
         if not len(names):
             return []
+        # What lies beyond the picture may be a token.
+        part = np.pad(part, self._beyond, constant_values=1.0)
+        corner = np.array([self._beyond, -self._beyond, 0.0])
+        poses += corner
         outside = self._outside(part, names, poses)
         order = np.argsort(outside, kind="stable")[:_TRIED]
         order = order[outside[order] < _OUTSIDE]
@@ -174,7 +204,7 @@ class _Search:
                 kept.append((int(names[i]), poses[i]))
             if len(kept) == _BEAM[min(depth, 2)]:
                 break
-        return kept
+        return [(name, pose - corner) for name, pose in kept]
 
     def _proposed(self, part: Singles, area: float, left: tuple[int, ...]) -> tuple[Ints, Floats]:
         """Kinds (n,) and poses (n, 3) with a corner, and an edge, at a corner of the outline."""

@@ -1,23 +1,26 @@
 """One picture -> where each token of a known set lies, on which side, and how sure that is.
 
 Blobs that look like one token are fitted at once; the others are searched for tokens that touch.
-All tokens are known, so what explains one blob leaves less for the others: the first explanation of
-all is taken. Tokens that look alike come in any order.
+All tokens are known, so what explains one blob leaves less for the others: all are explained
+together. Tokens that look alike come in any order.
 """
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 
 from tangram_sim.arrays import Bools, Complex, Floats, Ints, Pixels
 from tangram_sim.layout import Layout
+from tangram_sim.targets import MAX_PILE
 from tangram_vision.blobs import Blobs, find_blobs, likeness
 from tangram_vision.edges import refined
 from tangram_vision.kinds import Kind, kinds_of
 from tangram_vision.levels import coverage
-from tangram_vision.piles import Laid, arrangements
+from tangram_vision.piles import Laid, arrangements, reaching_out
 from tangram_vision.samples import binary, settled
 
 SURE = 0.5  # confidence from which a token counts as seen
@@ -100,6 +103,11 @@ class _Puzzle:
     _known: dict[tuple[int, tuple[int, ...]], list[_Explained]] = field(default_factory=dict)
     _tries: int = 0
 
+    @cached_property
+    def _sizes(self) -> dict[int, tuple[float, float]]:
+        """Area and perimeter of each shape."""
+        return {kind.shape: (kind.area, kind.perimeter) for kind in self.kinds}
+
     def explained(self) -> list[_Explained]:
         """What the blobs are, as many as can be explained with the tokens that there are."""
         if not len(self.blobs):
@@ -107,14 +115,24 @@ class _Puzzle:
         singles = self._singles()
         left = Counter({kind.shape: len(kind.tokens) for kind in self.kinds})
         # Blobs that look like one token first: they cost nothing.
-        whole = np.flatnonzero(~self.blobs.cut).tolist()
-        order = sorted(whole, key=lambda blob: (blob not in singles, -blob))
+        alone = Counter(self.kinds[one.laid.kinds[0]].shape for one in singles.values())
+        if len(singles) == len(self.blobs) and alone <= left:
+            return [singles[blob] for blob in sorted(singles, reverse=True)]
+        cut = self.blobs.cut.tolist()
+        shown = [blob for blob in range(len(cut)) if not cut[blob] or self._piles(blob, left)]
+        order = sorted(shown, key=lambda blob: (blob not in singles, -blob))
         best: list[_Explained] = []
-        for found in self._whole(order, singles, left, []):
-            if len(found) > len(best):
-                best = found
-            if len(best) == len(order) or self._tries >= _TRIES:
-                break
+        for whole in (True, False):
+            every = []
+            for found in self._whole(order, singles, left, [], whole):
+                every.append(found)
+                piles = any(len(one.laid.kinds) > 1 for one in found)
+                if self._tries >= _TRIES or (len(found) == len(order) and not (whole and piles)):
+                    break
+            best = max(every, key=_rank, default=best)
+            if len(best) == len(order):
+                return _doubted(best, every)
+            self._tries = 0
         return best
 
     def _whole(
@@ -123,17 +141,38 @@ class _Puzzle:
         singles: dict[int, _Explained],
         left: Counter[int],
         found: list[_Explained],
+        whole: bool,
     ) -> Iterator[list[_Explained]]:
-        """Explanations of all blobs from some on; those of fewer where there is none."""
+        """Explanations of blobs from some on, all of them where they are to be whole."""
         if not order:
             yield found
             return
         blob, rest = order[0], order[1:]
         for one in self._options(blob, singles, left):
             used = Counter(self.kinds[number].shape for number in one.laid.kinds)
-            yield from self._whole(rest, singles, left - used, [*found, one])
-        # It stays unexplained, or waits for tokens that others do not need.
-        yield from self._whole(rest, singles, left, found)
+            if not whole or self._enough(rest, left - used):
+                yield from self._whole(rest, singles, left - used, [*found, one], whole)
+        if not whole:
+            # It stays unexplained.
+            yield from self._whole(rest, singles, left, found, whole)
+
+    def _enough(self, order: Sequence[int], left: Counter[int]) -> bool:
+        """Whether tokens that are left have the areas of blobs."""
+        if not order:
+            return True
+        blob, rest = order[0], order[1:]
+        area = float(self.blobs.area[blob])
+        return any(
+            self._enough(rest, left - Counter(some))
+            for count in range(1, MAX_PILE + 1)
+            for some in set(combinations(sorted(left.elements()), count))
+            if self.blobs.cut[blob] or self._area_off(area, some) < 1.0
+        )
+
+    def _area_off(self, area: float, shapes: Sequence[int]) -> float:
+        """How far an area is from that of tokens of these shapes, over what it may be."""
+        own = [self._sizes[shape] for shape in shapes]
+        return abs(area - sum(size for size, _ in own)) / (_AREA * sum(round_ for _, round_ in own))
 
     def _options(
         self, blob: int, singles: dict[int, _Explained], left: Counter[int]
@@ -142,7 +181,7 @@ class _Puzzle:
         single = singles.get(blob)
         if single is not None and left[self.kinds[single.laid.kinds[0]].shape]:
             yield single
-        if left.total() > 1:
+        if left.total() > 1 or self.blobs.cut[blob]:
             yield from self._piles(blob, left)
 
     def _piles(self, blob: int, left: Counter[int]) -> list[_Explained]:
@@ -154,7 +193,8 @@ class _Puzzle:
         side = self.blobs.cover.shape[1]
         cover = self.blobs.cover[self.blobs.base[blob] :][:side]
         self._tries += 1
-        found = [one for one in arrangements(cover, self.kinds, counts) if one.differs < _DIFFERS]
+        search = reaching_out if self.blobs.cut[blob] else arrangements
+        found = [one for one in search(cover, self.kinds, counts) if one.differs < _DIFFERS]
         sets: dict[tuple[int, ...], list[Laid]] = {}
         for one in found:
             sets.setdefault(tuple(sorted(self.kinds[k].shape for k in one.kinds)), []).append(one)
@@ -196,6 +236,22 @@ class _Puzzle:
             )
             for row in best.tolist()
         }
+
+
+def _doubted(best: Sequence[_Explained], every: Sequence[Sequence[_Explained]]) -> list[_Explained]:
+    """The best of every explanation, doubtful where others that are as good have other tokens."""
+    told = list(best)
+    for other in every:
+        if _rank(other) > (len(best), _rank(best)[1] - _ALIKE):
+            for i, (one, that) in enumerate(zip(best, other, strict=True)):
+                if sorted(one.laid.kinds) != sorted(that.laid.kinds):
+                    told[i] = replace(told[i], doubtful=True)
+    return told
+
+
+def _rank(found: Sequence[_Explained]) -> tuple[int, float]:
+    """More is better, then what differs least."""
+    return len(found), -max((one.laid.differs for one in found), default=0.0)
 
 
 def _plane(z: Complex) -> Floats:

@@ -3,12 +3,19 @@
 import json
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tangram_lab.benchmarks.cli import main
 from tangram_lab.benchmarks.measure import Bound, compared, rates, single
+from tangram_lab.benchmarks.seeing import NEAR, _same
+from tangram_sim.config import SimConfig
+from tangram_sim.world import make_world
+from tangram_vision.seeing import Seen
+from tests.sim.builders import SEVEN, layout_of
 
 LABELS = ("stage", "case", "unit")
 
@@ -111,3 +118,19 @@ def test_what_is_seen_of_single_tokens_is_exact(
         assert row["95th perc."] < position
         assert row["95th perc. (°)"] < degrees
     assert [row["all found"] for row in content["disturbed"]] == [1.0] * 5
+
+
+@pytest.mark.fast
+def test_a_small_token_that_lies_elsewhere_gives_another_picture() -> None:
+    layout = layout_of(*SEVEN, scale=0.6)
+    sim = SimConfig(backend="kinematic", pixels=128, picture="grey")
+    poses = np.array(
+        [[(token % 3) * 0.6 - 0.6, (token // 3) * 0.6 - 0.6, 0.0] for token in range(7)]
+    )
+    sides, sure = np.zeros(7, np.bool_), np.ones(7)
+    with closing(make_world(layout, sim)) as world:
+        world.place(poses, sides)
+        picture = world.picture()
+        off = poses + np.array([(1.5 * NEAR * (token == 4), 0.0, 0.0) for token in range(7)])
+        same = [_same(world, Seen(lying, sides, sure, 7), picture) for lying in (poses, off)]
+    assert same == [True, False]

@@ -125,6 +125,37 @@ def test_what_has_two_explanations_is_doubtful() -> None:
     assert not seen.found.any()
 
 
+def test_which_of_two_blobs_is_a_pile_is_doubtful() -> None:
+    """Two small triangles make a medium one, and another medium one lies beside them."""
+    layout = layout_of("medium_triangle", "small_triangle", "small_triangle", scale=0.6)
+    other = layout_of("medium_triangle", "medium_triangle", scale=0.6)
+    places = np.array([[0.4, 0.2, 0.5], [-0.4, 0.2, 2.0]])
+    seen = see(grey(other.corners(places), other, 128), layout, ARENA)
+    assert (seen.confidence > 0.0).all()
+    assert not seen.found.any()
+
+
+PILES = {
+    "what explains best is not found first": [
+        *([-0.522, -0.041, -3.134], [-0.774, 0.705, 0.187], [-0.495, 0.3, -1.564]),
+        *([-0.151, -0.661, -0.905], [-0.452, 0.171, 1.578], [-0.232, -0.5, -2.475]),
+        [-0.394, -0.588, -0.905],
+    ],
+    "rough corners": [
+        *([-0.186, 0.214, 0.95], [-0.665, 0.184, -0.316], [0.494, -0.228, -1.612]),
+        *([0.123, 0.142, -2.977], [-0.013, 0.091, -2.192], [0.478, -0.021, 3.1]),
+        [0.492, -0.428, 0.744],
+    ],
+}
+
+
+@pytest.mark.parametrize("poses", PILES.values(), ids=PILES)
+def test_seven_tokens_in_piles_are_seen(poses: list[list[float]]) -> None:
+    layout, sides = layout_of(*SEVEN, scale=0.6), np.zeros(7, np.bool_)
+    seen = see(grey(layout.corners(np.array(poses)), layout, 128), layout, ARENA)
+    assert (errors(layout, np.array(poses), sides, seen) < (0.01, 2.0)).all()
+
+
 def disturbed(picture: Pixels, rng: np.random.Generator) -> Pixels:
     side = np.arange(len(picture)) / len(picture)
     lit = picture * (1.0 - 0.2 * side) + rng.normal(0.0, 8.0, picture.shape)
@@ -164,6 +195,21 @@ def test_what_is_not_to_be_seen_is_missing(shown: str) -> None:
     seen = see(pictures[shown], layout, ARENA)
     assert not seen.found.any()
     assert seen.confidence[0] == 0.0
+
+
+@pytest.mark.parametrize("beyond", [1.0, 3.0])
+@pytest.mark.parametrize("shape", TANS)
+def test_what_reaches_the_edge_of_the_picture_is_seen(shape: str, beyond: float) -> None:
+    """A camera that is shifted by 2 px cuts tokens that lie in the arena."""
+    layout, rng = layout_of(shape, scale=0.8), np.random.default_rng(7)
+    for _ in range(4):
+        poses, flipped = scene(layout, rng, 0.0)
+        edge = ARENA / 2.0 + beyond * ARENA / 128
+        poses[0, 1] += edge - layout.corners(poses, flipped)[:, 1].max()
+        seen = see(grey(layout.corners(poses, flipped), layout, 128), layout, ARENA)
+        [[distance, turn]] = errors(layout, poses, flipped, seen)
+        assert distance < 0.002
+        assert turn < 0.6
 
 
 def test_a_small_token_that_is_blurred_is_as_large_as_it_is() -> None:

@@ -14,6 +14,7 @@ from tangram_agent.setup import Setup, make_setup
 from tangram_agent.types import Episodes
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.errors import ConfigError
+from tangram_sim.kinematics import KinematicWorld
 from worker.looking import environments
 from worker.rollout import Rollout
 
@@ -65,6 +66,26 @@ def test_nothing_exact_leaks(monkeypatch: pytest.MonkeyPatch, shapes: tuple[str,
         np.testing.assert_array_equal(column, getattr(other, name), err_msg=name)
 
 
+@pytest.mark.parametrize("shapes", [("square",), ("small_triangle", "small_triangle", "square")])
+def test_the_same_pictures_give_the_same_episodes(
+    monkeypatch: pytest.MonkeyPatch, shapes: tuple[str, ...]
+) -> None:
+    """Played again with the pictures of before, in a world that lies of poses and blocks."""
+    task = setup(*shapes)
+    policy, take, tape = Policy(task), BatchedEnv._picture, list[Any]()
+    monkeypatch.setattr(BatchedEnv, "_picture", lambda *of: tape.append(take(*of)) or tape[-1])
+    whole = played(task, policy)
+    noise, shown = np.random.default_rng(9), iter(tape)
+    monkeypatch.setattr(BatchedEnv, "_picture", lambda *of: [take(*of), next(shown)][1])
+    monkeypatch.setattr(BatchedEnv, "_covered", lambda env, _: noise.uniform(0, 1, env.count))
+    poses = KinematicWorld.poses
+    lie = lambda world: poses(world) + noise.normal(0, 1, poses(world).shape)  # noqa: E731
+    monkeypatch.setattr(KinematicWorld, "poses", lie)
+    other = played(task, policy)
+    for name, column in whole.arrays.items():
+        np.testing.assert_array_equal(column, getattr(other, name), err_msg=name)
+
+
 def test_what_is_seen_is_near_and_the_reward_is_that_of_pictures() -> None:
     task = setup("square", pixels=128, picture="grey")
     with closing(environments(task, 4)) as env:
@@ -92,6 +113,19 @@ def test_alike_tokens_are_moved_where_they_are_seen() -> None:
         assert sure.sum() >= 4
         np.testing.assert_allclose(moved[sure, 1], [[0.1, 0.0]] * sure.sum(), atol=0.02)
         np.testing.assert_allclose(moved[sure, 0], 0.0, atol=0.02)
+
+
+def test_in_a_stage_the_tokens_that_lie_on_their_targets_are_those_that_are_placed() -> None:
+    """As the agent names them: alike tokens have no names in pictures."""
+    task = setup(*["small_triangle"] * 3, pixels=128, stages=[{"updates": 0, "tokens": 1}])
+    with closing(environments(task, 8)) as env:
+        env.task = task.sim.stage_task(task.sim.stage(0))
+        env.reset([np.random.default_rng(i) for i in range(8)])
+        seen, goals = task.layout.bases(env.seen), task.layout.bases(env.seen_goals)
+        gap = np.linalg.norm(seen[:, :, None] - goals[:, None], axis=-1).min(axis=2)
+        sure = ~(env.sight.missing | env.sight.goals_missing.any(axis=1, keepdims=True))
+        assert sure.sum() > 16
+        np.testing.assert_array_equal((gap < 0.02)[sure], env.placed[sure])
 
 
 def test_what_is_missing_travels_and_is_not_learned_from() -> None:
