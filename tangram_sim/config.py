@@ -1,7 +1,7 @@
 """Settings of the simulated world and of the reward."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -283,6 +283,12 @@ class SimConfig(Settings, section="sim"):
     def stage_task(self, stage: int) -> StageConfig:
         """What is played in a stage."""
         return self.stages[stage - 1] if stage else self.task
+
+    @property
+    def blind(self) -> "SimConfig":
+        """The same world without a camera, and so without what disturbs one."""
+        usual = {name: getattr(SimConfig, name) for name in (*CAMERA, "observe")}
+        return replace(self, **usual)
 
     @property
     def inexact(self) -> dict[str, object]:
