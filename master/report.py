@@ -132,6 +132,8 @@ def activity(trainer: Trainer, players: int) -> str:
         return "learning, workers wait" if players and not limiter.may_insert() else "learning"
     if not players:
         return "waiting for workers to join"
+    if trainer.episodes and not limiter.transitions:
+        return "waiting for an episode in which pictures show all tokens"
     if limiter.transitions < starts:
         return f"filling the replay, {limiter.transitions:,} of {starts:,}"
     return "waiting for episodes"

@@ -3,7 +3,7 @@
 Legend: B scenes, K tokens, M options. Shares are of a piece's area.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -79,7 +79,7 @@ class EngineWorlds:
 
     def __init__(self, layout: Layout, sim: SimConfig) -> None:
         """Load the engine."""
-        self._world = make_world(layout, replace(sim, pixels=0))
+        self._world = make_world(layout, sim.blind)
 
     def slid(self, table: Table, token: Ints, way: Floats) -> Floats:
         """See `Foresight.slid`."""

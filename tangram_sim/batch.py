@@ -283,7 +283,7 @@ class BatchedEnv:
                 pictures.append(self._picture(b))
             world.place(starts[0][b], starts[1][b])
         if self.sim.pixels:
-            self._targets = TargetPictures(np.stack(pictures))
+            self._targets = TargetPictures(np.stack(pictures), self._lens.disturbs)
         if self.sight is not None:
             self.pictures = np.stack([self._picture(b) for b in range(self.count)])
             self.sight.begin(np.stack(pictures), self.pictures)

@@ -1,7 +1,7 @@
 """Settings of the simulated world and of the reward."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,9 @@ CAMERA = (
     *("light_gradient", "camera_turn", "camera_shift"),
 )
 NO_PICTURES: dict[str, object] = {"pixels": 0}
+# From one corner to the other light falls off by sqrt(2) times as much: beyond this, ground in the
+# shade is as dark as half a token, and counts as one in Eq. 14.
+MAX_LIGHT_GRADIENT = 0.24
 # A fifth of the arena is a whole token: nothing is left to see beyond.
 MAX_CORNER_NOISE = 0.2
 # What an action says is told a token otherwise by at most this much; see SimConfig.
@@ -238,7 +241,7 @@ class SimConfig(Settings, section="sim"):
         0.0,
         "share by which light falls off across a picture, in a direction that each episode draws",
         low=0,
-        high=0.5,
+        high=MAX_LIGHT_GRADIENT,
         unless=NO_PICTURES,
     )
     camera_turn: float = setting(
@@ -280,6 +283,12 @@ class SimConfig(Settings, section="sim"):
     def stage_task(self, stage: int) -> StageConfig:
         """What is played in a stage."""
         return self.stages[stage - 1] if stage else self.task
+
+    @property
+    def blind(self) -> "SimConfig":
+        """The same world without a camera, and so without what disturbs one."""
+        usual = {name: getattr(SimConfig, name) for name in (*CAMERA, "observe")}
+        return replace(self, **usual)
 
     @property
     def inexact(self) -> dict[str, object]:

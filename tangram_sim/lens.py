@@ -37,12 +37,16 @@ class Lens:
 
     Attributes:
         moves: whether the camera does not always stand where it should.
+        disturbs: whether anything is other than it should be.
     """
 
     def __init__(self, sim: SimConfig) -> None:
         self._sim = sim
         self._views: list[View] = []
         self.moves = bool(sim.camera_turn or sim.camera_shift)
+        self.disturbs = self.moves or bool(
+            sim.picture_noise or sim.picture_blur or sim.light_gradient
+        )
 
     def begin(self, generators: Generators) -> list[View]:
         """Draw how each of B episodes is seen."""

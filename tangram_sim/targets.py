@@ -7,6 +7,7 @@ their other side.
 import math
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import combinations
 
 import numpy as np
 
@@ -30,6 +31,7 @@ from tangram_sim.shapes import Shape, mirror_image, tan, turn_onto
 Generators = Sequence[np.random.Generator]
 Sides = tuple[Floats, Bools]
 MAX_PILE = 3  # tokens that touch and can be found in a picture: more are searched for too long
+_NO_TURN = 1e-6  # radians
 MIN_THICKNESS = 1e-3  # of a token, arenas
 
 
@@ -114,6 +116,8 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
                 f"sim.stages: tokens must be at most the {layout.tokens} that there are, got "
                 f"{stage.tokens} (in the stage from update {stage.updates}); 0 moves all"
             )
+    if sim.observe == "pictures":
+        _check_names(layout)
     together = [
         t for t in (sim.task, *sim.stages) if t.targets in ("connected", "figures", "mixed")
     ]
@@ -126,6 +130,23 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
     if any(task.targets == "figures" for task in (sim.task, *sim.stages)):
         _check_full_set(layout)
         _check_figures_fit(layout, sim)
+
+
+def _check_names(layout: Layout) -> None:
+    """What is found in pictures has no name: tokens of one name must be equal, others unlike."""
+    for one, other in combinations(layout.shapes, 2):
+        turn = turn_onto(one.corners, other.corners)
+        if one.name == other.name:
+            if turn is None or abs(turn) > _NO_TURN:
+                raise ConfigError(
+                    f"sim.observe=pictures takes tokens of one name for equal, and two of "
+                    f"{one.name} have other corners: give them names of their own"
+                )
+        elif turn is not None or turn_onto(mirror_image(one.corners), other.corners) is not None:
+            raise ConfigError(
+                f"sim.observe=pictures cannot tell {one.name} from {other.name}, which may look "
+                "alike: take equal tokens of one name, or set sim.observe=corners"
+            )
 
 
 def _check_world(layout: Layout, sim: SimConfig) -> None:

@@ -67,11 +67,13 @@ def check_world(layout: Layout, sim: SimConfig) -> None:
 
     Raises:
         SamplingError: see `check_room`.
-        ConfigError: the engine is asked for and not installed, or see `check_targets`.
+        ConfigError: the engine or OpenCV is needed and not installed, or see `check_targets`.
     """
     check_room(layout, sim)
     if sim.backend == "physics" and find_spec("pybullet") is None:
         raise _no_engine("no module named 'pybullet'")
+    if sim.observe == "pictures" and find_spec("cv2") is None:
+        raise no_opencv("no module named 'cv2'")
 
 
 def check_room(layout: Layout, sim: SimConfig) -> None:
@@ -103,6 +105,14 @@ def make_world(layout: Layout, sim: SimConfig) -> World:
     except ModuleNotFoundError as error:
         raise _no_engine(str(error)) from error
     return PhysicsWorld(layout, sim)
+
+
+def no_opencv(why: str) -> ConfigError:
+    """What is raised where pictures are to be observed, and nothing can look at them."""
+    return ConfigError(
+        f"sim.observe=pictures needs OpenCV ({why}): install opencv-python-headless, or set "
+        "sim.observe=corners"
+    )
 
 
 def _no_engine(why: str) -> ConfigError:

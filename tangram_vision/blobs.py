@@ -10,6 +10,7 @@ from tangram_sim.arrays import Bools, Complex, Floats, Ints, Singles
 from tangram_vision.kinds import ORDERS, POWERS, Kind
 
 _HALO = 3.0  # pixels around a blob that may still show a part of it
+_MOST_ROWS = 32767  # of all blobs below each other: OpenCV looks into no taller picture
 _TURNS: Floats = np.linspace(-np.pi, np.pi, 120, endpoint=False)
 _TURNED: Complex = np.exp(1j * _TURNS[:, None] * ORDERS)
 # Higher moments tell less and are noisier.
@@ -45,7 +46,10 @@ class Blobs:
 
 
 def find_blobs(cover: Singles, smallest: float) -> Blobs:
-    """The blobs of coverage (P, P) of at least so many square pixels, the largest first."""
+    """The blobs of coverage (P, P) of at least so many square pixels, the largest first.
+
+    So many that no tokens could be are left out.
+    """
     pixels = len(cover)
     ground = (cover < 0.5).astype(np.uint8)
     distance, label = cv2.distanceTransformWithLabels(
@@ -57,6 +61,7 @@ def find_blobs(cover: Singles, smallest: float) -> Blobs:
     own, weight = label[rows], cover.ravel()[rows].astype(np.float64)
     area = np.bincount(own, weight)
     kept = [i for i in np.argsort(-area, kind="stable").tolist() if area[i] >= smallest]
+    del kept[_MOST_ROWS // pixels :]
     if not kept:
         none = np.zeros((0, len(POWERS)), np.complex128)
         return Blobs(cover[:0], np.zeros(0), none[:, 0], none, np.zeros(0, np.bool_))

@@ -36,6 +36,7 @@ _POINTS = 100  # of the light along a side
 _BORDER = 3.0  # how much more the picture's border tells of the ground
 _ROUNDS = 12
 _STEEP = 3.0  # how much steeper edges are made: less than a third is a shadow
+_NOTHING = "no token"
 _GROUND, _TOKEN = 230, 60  # levels of the picture that is looked at
 
 
@@ -113,7 +114,7 @@ def _told(cover: Singles, spots: "_Spots", layout: Layout, view: float) -> str:
     count = len(spots.boxes)
     edge = f" ({spots.cut} more at its edge left out)" if spots.cut else ""
     areas = "1 area" if count == 1 else f"{count} areas"
-    found = f"{areas}{edge}, by shape {_listed(_looks(cover, layout, view))}"
+    found = f"{areas}{edge}, by shape {_listed(_looks(cover, layout, view)) or _NOTHING}"
     wanted = _listed([shape.name for shape in layout.shapes])
     return (
         f"shows {found if count <= _MANY else f'more than {_MANY} areas'}, and the run moves "
@@ -130,7 +131,7 @@ def _looks(cover: Singles, layout: Layout, view: float) -> list[str]:
     share = blobs.area[:, None] / np.array([kind.area for kind in kinds])
     far = np.where((share > 1.0 / _SIZE) & (share < _SIZE), far, np.inf)
     return [
-        layout.shapes[kinds[int(one.argmin())].tokens[0]].name if one.min() < _LIKE else "no token"
+        layout.shapes[kinds[int(one.argmin())].tokens[0]].name if one.min() < _LIKE else _NOTHING
         for one in far
     ]
 

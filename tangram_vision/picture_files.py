@@ -65,7 +65,7 @@ def _upright(image: Image.Image) -> Image.Image:
     if image.mode.startswith("I"):  # 16 bits of grey
         levels = np.clip(np.asarray(image, dtype=np.int64) >> 8, 0, 255)
         image = Image.fromarray(levels.astype(np.uint8))
-    if image.mode in ("1", "P", "PA", "LA"):
+    if image.mode in ("1", "P", "PA", "LA") or "transparency" in image.info:
         image = image.convert("RGBA")
     image.thumbnail((LONGEST, LONGEST), Image.Resampling.BOX)
     image = ImageOps.exif_transpose(image)

@@ -123,7 +123,7 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "sim.picture": (CAMERA, "grey"),
     "sim.picture_noise": (CAMERA, 64.0),
     "sim.picture_blur": (CAMERA, 2.0),
-    "sim.light_gradient": (CAMERA, 0.5),
+    "sim.light_gradient": (CAMERA, 0.24),
     "sim.camera_turn": (CAMERA, 20.0),
     "sim.camera_shift": (CAMERA, 3.0),
     "sim.observe": (SEEN, "pictures"),

@@ -13,6 +13,7 @@ from conf.cli import composed, entry, tell
 from conf.commands import Plain
 
 if TYPE_CHECKING:
+    from tangram_agent.setup import Setup
     from tangram_sim.layout import Layout
     from worker.config import EvalConfig, PlayConfig
 
@@ -113,9 +114,13 @@ def _play(settings: Plain) -> int:
     config = from_mapping(PlayConfig, with_changes(paths))
     if not config.live:
         check_writable("out", Path(config.out).absolute())
-    layouts = _check_played(config.run_dirs, config)
+    setups = _check_played(config.run_dirs, config)
     if config.tokens is not None and config.run_dir is not None:
-        _check_tokens(config.tokens, config.run_dir, layouts[0])
+        _check_tokens(config.tokens, config.run_dir, setups[0].layout)
+    if config.target is not None:
+        from worker.photographs import read_photograph
+
+        read_photograph(config.target, setups[0])
     tell(f"loads and plays {', '.join(config.run_dirs)}")
 
     if config.compare is not None:
@@ -127,8 +132,8 @@ def _play(settings: Plain) -> int:
     return play_run(config)
 
 
-def _check_played(run_dirs: Sequence[str], config: "EvalConfig | PlayConfig") -> list["Layout"]:
-    """Refuse what cannot be played before torch is loaded; returns what the runs move."""
+def _check_played(run_dirs: Sequence[str], config: "EvalConfig | PlayConfig") -> list["Setup"]:
+    """Refuse what cannot be played before torch is loaded; returns what the runs play."""
     from tangram_agent.runs import read_changed
 
     setups = [read_changed(run_dir, config.changes).setup for run_dir in run_dirs]
@@ -138,7 +143,7 @@ def _check_played(run_dirs: Sequence[str], config: "EvalConfig | PlayConfig") ->
 
         source, names = source_and_names(config.puzzle)
         find_figures(source, setups[0], names, skip_invalid=config.skip_invalid)
-    return [setup.layout for setup in setups]
+    return setups
 
 
 def _check_tokens(name: str, run_dir: str, moved: "Layout") -> None:

@@ -1,6 +1,7 @@
 """Settings of a worker process and of the tools that show what a run has learned."""
 
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -62,6 +63,13 @@ def _check_connect(value: str) -> None:
 def _check_out(value: str) -> None:
     if not Path(value).name:
         raise ConfigError(f"out must name a file, got '{value}': set out=scores.json")
+
+
+def _check_kept(out: str, name: str, source: str | None) -> None:
+    """Refuse to write over what is read."""
+    with suppress(OSError):  # one of both is no file
+        if source is not None and Path(out).samefile(source):
+            raise ConfigError(f"out={out} would be written over {name}={source}: name another file")
 
 
 @dataclass(frozen=True)
@@ -137,6 +145,8 @@ class EvalConfig(Settings):
         super().__post_init__()
         if self.out is not None:
             _check_out(self.out)
+            source, _ = source_and_names(self.puzzle) if self.puzzle else (None, None)
+            _check_kept(self.out, "puzzle", source)
         if self.sheet is not None and Path(self.sheet).suffix != ".png":
             raise ConfigError(f"sheet must end with .png, got '{self.sheet}'")
         if self.puzzle is not None:
@@ -264,6 +274,8 @@ class PlayConfig(Settings):
             _refuse(self.changes, (*OF_TARGETS, "starts"), "puzzle", "leave puzzle out")
         if self.target is not None:
             _refuse(self.changes, OF_TARGETS, "target", "leave target out")
+            if not self.live:
+                _check_kept(self.out, "target", self.target)
 
     @property
     def run_dirs(self) -> tuple[str, ...]:

@@ -5,8 +5,8 @@ import numpy as np
 from tangram_agent.setup import Setup
 from tangram_sim.arrays import Pixels
 from tangram_sim.batch import BatchedEnv
-from tangram_sim.errors import ConfigError
 from tangram_sim.sight import Eye, Look
+from tangram_sim.world import no_opencv
 
 
 def environments(setup: Setup, count: int) -> BatchedEnv:
@@ -25,11 +25,8 @@ def make_eye(setup: Setup) -> Eye | None:
     try:
         # Only here: most workers look at nothing, and its import takes time and memory.
         from tangram_vision.seeing import see  # noqa: PLC0415
-    except ModuleNotFoundError as error:
-        raise ConfigError(
-            f"sim.observe=pictures needs OpenCV ({error}): install opencv-python-headless, or set "
-            "sim.observe=corners"
-        ) from error
+    except ImportError as error:  # also a library that OpenCV needs in its turn
+        raise no_opencv(str(error)) from error
     layout, arena = setup.layout, setup.sim.arena
 
     def look(picture: Pixels) -> Look:

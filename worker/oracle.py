@@ -3,8 +3,6 @@
 Legend: B environments, K tokens, V corners.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
 from tangram_agent.types import Past
@@ -129,7 +127,7 @@ class _Engine:
         sim = env.sim
         self._tried = sim.backend == "physics" and sim.motion == "lift"
         if self._tried:
-            self._world = make_world(Layout(env.layout.shapes[:1]), replace(sim, pixels=0))
+            self._world = make_world(Layout(env.layout.shapes[:1]), sim.blind)
         x, y, turn = reach(sim)
         most = np.array([sim.arena * np.hypot(x, y), np.pi * turn])
         self._told = np.linspace(0.0, most, _PROBES)

@@ -40,7 +40,7 @@ def read_photograph(target: str, setup: Setup) -> Photograph:
         # Only here: other targets need no OpenCV.
         from tangram_vision.photos import find_tokens  # noqa: PLC0415
         from tangram_vision.picture_files import read_picture  # noqa: PLC0415
-    except ModuleNotFoundError as error:
+    except ImportError as error:  # also a library that OpenCV needs in its turn
         raise ConfigError(
             f"target needs OpenCV ({error}): install opencv-python-headless, or leave target out"
         ) from error

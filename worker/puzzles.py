@@ -5,7 +5,7 @@ Legend: E episodes, K tokens.
 
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from tangram_agent.setup import Setup
 from tangram_sim.arrays import Bools, Floats
 from tangram_sim.assembly import Puzzle, PuzzleRules
 from tangram_sim.batch import BatchedEnv
-from tangram_sim.config import CAMERA, RewardConfig, SimConfig
+from tangram_sim.config import RewardConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.puzzles import SPLITS, PuzzleFile, library, read_puzzles
 from tangram_sim.seeding import episode_generator
@@ -123,9 +123,7 @@ def play_figures(
             "sim.observe=pictures cannot tell the pieces of a puzzle apart, which touch: set "
             "sim.observe=corners"
         )
-    # Without a camera nothing disturbs its pictures either.
-    without = {} if looks else {name: getattr(SimConfig, name) for name in CAMERA}
-    sim = replace(setup.sim, **without)
+    sim = setup.sim if looks else setup.sim.blind
     targets = (np.stack([f.poses for f in figures]), np.stack([f.flipped for f in figures]))
     envs, eye = min(at_once(setup), len(figures)), make_eye(setup)
     with closing(BatchedEnv(setup.layout, sim, RewardConfig(), envs, eye)) as env:

@@ -1,7 +1,9 @@
 """How the run stands: collected once, the same everywhere, and never the end of the loop."""
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -77,6 +79,17 @@ def test_what_is_waited_for(
     made.checkpointer.homeless = True
     said = "waiting for the run folder, which is gone or another one"
     assert made.reporter.flush(0).texts["activity"] == said
+
+
+def test_it_is_told_where_nothing_can_be_learned_from(tmp_path: Path) -> None:
+    made = loop(tmp_path, MADE, FakeHub(MADE, roles=["player"]))
+    episodes = arrival(MADE, 1).episodes
+    gone = np.ones((4, MADE.horizon + 1, 1), np.uint8)
+    made.guard.trainer.insert(replace(episodes, missing=gone, goals_missing=gone[:, 0]))
+    said = "waiting for an episode in which pictures show all tokens"
+    assert made.reporter.flush(0).texts["activity"] == said
+    made.guard.trainer.insert(episodes)
+    assert made.reporter.flush(0).texts["activity"] == "learning, workers wait"
 
 
 def test_a_status_that_cannot_be_told_as_it_is_ends_nothing_and_keeps_the_scores(

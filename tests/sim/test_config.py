@@ -73,6 +73,7 @@ REFUSED = [
     (SimConfig, {"pixels": 15}, "sim.pixels must be 0 or at least 16, got 15"),
     (SimConfig, {"observe": "pictures"}, "^sim.observe=pictures needs .*: set sim.pixels=128$"),
     (SimConfig, {"pixels": 64, "picture": "x"}, "^sim.picture must be one of binary, grey, got"),
+    (SimConfig, {"pixels": 64, "light_gradient": 0.25}, "between 0 and 0.24, got 0.25$"),
     (SimConfig, {"pixels": 64, "camera_turn": 90.0}, "^sim.camera_turn must be between 0 and 45"),
     (SimConfig, {"motion": "fly"}, "sim.motion must be one of lift, slide, got 'fly'"),
     (SimConfig, {"motion": "slide", "backend": "kinematic"}, "needs .* got sim.backend=kinematic"),

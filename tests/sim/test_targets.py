@@ -22,6 +22,9 @@ pytestmark = pytest.mark.fast
 
 GAME = layout_of(*SEVEN, scale=0.6)
 TRIPLE = layout_of(*TRIO, scale=0.6)
+SEEN = {"observe": "pictures", "pixels": 64}
+SIDE = 0.125**0.5  # of the square tan, whose full square is 1
+BOX = {"name": "box", "corners": [[0, 0], [SIDE, 0], [SIDE, SIDE], [0, SIDE]]}
 KINDS = ("uniform", "gaussian", "connected", "figures", "mixed")
 PUZZLES = [*library("train"), *library("test")]
 
@@ -152,6 +155,17 @@ def test_a_narrow_gaussian_widens_until_there_is_room() -> None:
             GAME,
             {"targets": "mixed", "observe": "pictures", "pixels": 64},
             "pictures tells at most 3 tokens .* got 7 in sim.targets=mixed: set sim.targets",
+        ),
+        (
+            layout_of("parallelogram", "parallelogram_mirrored"),
+            SEEN,
+            "cannot tell parallelogram from parallelogram_mirrored, which may look alike: take ",
+        ),
+        (layout_of("square", BOX), SEEN, "cannot tell square from box, which may look alike: "),
+        (
+            layout_of(BOX, BOX | {"corners": [[0, 0], [1, 0], [1, 2], [0, 2]]}),
+            SEEN,
+            "takes tokens of one name for equal, and two of box have other corners: give them ",
         ),
         (
             layout_of("square"),

@@ -16,7 +16,7 @@ from tangram_sim.layout import Layout
 from tangram_sim.pictures import BACKGROUND, TOKEN_GRAY, rasterise
 from tangram_sim.rewards import TargetPictures
 from tangram_sim.sampling import sample_batch
-from tangram_sim.world import World, check_world, make_world
+from tangram_sim.world import World, check_room, check_world, make_world
 from tests.sim.builders import LOPSIDED, SQUARE_SCALE, TRIO, angle_gap, layout_of, random_poses
 
 pytestmark = pytest.mark.fast
@@ -296,3 +296,7 @@ def test_a_missing_engine_is_named_also_before_a_world_is_made(
     check_world(layout_of("square"), SimConfig(backend="kinematic"))
     with pytest.raises(ConfigError, match=r"needs PyBullet .*: install pybullet, or set"):
         check_world(layout_of("square"), SimConfig())
+    seen = SimConfig(backend="kinematic", observe="pictures", pixels=64)
+    check_room(layout_of("square"), seen)  # a master looks at nothing
+    with pytest.raises(ConfigError, match=r"needs OpenCV .*: install opencv-.*, or set"):
+        check_world(layout_of("square"), seen)

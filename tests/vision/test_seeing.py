@@ -212,6 +212,13 @@ def test_what_reaches_the_edge_of_the_picture_is_seen(shape: str, beyond: float)
         assert turn < 0.6
 
 
+def test_specks_as_large_as_a_token_end_nothing_however_many() -> None:
+    speck = np.pad(np.full((4, 4), 80, np.uint8), 2, constant_values=255)
+    side = 4.0 * ARENA / 320
+    layout = layout_of({"name": "speck", "corners": [[0, 0], [side, 0], [side, side], [0, side]]})
+    assert see(np.tile(speck, (40, 40)), layout, ARENA).blobs < 40 * 40
+
+
 def test_a_small_token_that_is_blurred_is_as_large_as_it_is() -> None:
     """The blur reaches its middle, from which its level is told."""
     layout, rng = layout_of("small_triangle", scale=0.6), np.random.default_rng(6)

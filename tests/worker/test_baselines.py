@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tangram_agent.foresight import EngineWorlds
 from tangram_sim.kinematics import wrap
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.sim.builders import SEVEN
@@ -64,6 +65,14 @@ def test_the_oracle_ends_on_its_target_in_every_world(
     assert oracle["angle_error_deg_p90"] < 1e-2
     short = formula["position_error_p90"] / 1e-3 / made.sim.arena
     assert max(short, formula["angle_error_deg_p90"] / 0.5) > 1.0
+
+
+def test_worlds_that_are_tried_in_have_no_camera() -> None:
+    seen = {"observe": "pictures", "pixels": 64, "picture_noise": 8.0}
+    made = setup(SQUARE, backend="physics", damping=0.1, **seen)
+    EngineWorlds(made.layout, made.sim)
+    with closing(FixedTests(made, 2, 2)) as tests:
+        assert tests.play(playing(Told(oracle_policy), tests.env)).camera is not None
 
 
 @pytest.mark.parametrize(("sim", "actions"), [WORLDS[i] for i in (0, 1, 2, 4)])

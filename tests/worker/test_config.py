@@ -158,6 +158,8 @@ def test_puzzles_are_for_the_agent_of_the_game_if_there_is_one(
 ) -> None:
     monkeypatch.setattr("worker.config.agent_names", lambda: ["square", "tangram7"])
     assert EvalConfig(puzzle=("test",)).run == "pretrained/tangram7"
+    with pytest.raises(ConfigError, match="^out=.* would be written over puzzle=.*: name another"):
+        EvalConfig(puzzle=(__file__,), out=__file__)
     assert EvalConfig("runs/one", puzzle=("test",)).run == "runs/one"
     with pytest.raises(ConfigError, match="say which run: run_dir=runs/..."):
         EvalConfig()

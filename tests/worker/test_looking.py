@@ -128,6 +128,23 @@ def test_in_a_stage_the_tokens_that_lie_on_their_targets_are_those_that_are_plac
         np.testing.assert_array_equal((gap < 0.02)[sure], env.placed[sure])
 
 
+@pytest.mark.parametrize(
+    "sim",
+    [
+        {"gain": [0.1, 0.1, 1.0]},  # told to go far beyond what it goes
+        {"camera_shift": 32.0},
+        {"picture_blur": 8.0},
+    ],
+    ids=str,
+)
+def test_what_no_picture_shows_ends_no_worker(sim: dict[str, Any]) -> None:
+    task = setup("square", **sim)
+    episodes = played(task, Policy(task), 8)
+    assert (episodes.missing if "gain" in sim else episodes.goals_missing).any()
+    spec = EpisodeSpec.of(task)
+    assert EpisodeBatch(1, 0, episodes).encode(spec)
+
+
 def test_what_is_missing_travels_and_is_not_learned_from() -> None:
     task = setup("square")
     episodes = played(task, Policy(task), 4)

@@ -75,7 +75,7 @@ def test_tokens_are_found_where_they_lie(tmp_path: Path, dark: bool, bad: str) -
     np.testing.assert_array_equal(seen.flipped, FLIPPED)
 
 
-@pytest.mark.parametrize("mode", ["RGBA", "P", "I;16", "upright"])
+@pytest.mark.parametrize("mode", ["RGBA", "P", "I;16", "upright", "one level"])
 def test_every_kind_of_file_shows_the_same(tmp_path: Path, mode: str) -> None:
     grey = levels(LAYOUT, POSES).astype(np.uint8)
     exif = Image.Exif()
@@ -84,6 +84,9 @@ def test_every_kind_of_file_shows_the_same(tmp_path: Path, mode: str) -> None:
     elif mode == "upright":
         picture = Image.fromarray(np.rot90(grey))
         exif[0x0112] = 6  # the camera was held upright
+    elif mode == "one level":  # and another that is transparent
+        picture = Image.fromarray(np.where(grey < 140, 60, 61).astype(np.uint8))
+        picture.info["transparency"] = 61
     else:
         picture = Image.fromarray(grey).convert(mode)
     if mode == "RGBA":  # nothing but the tokens is drawn
@@ -110,6 +113,10 @@ REFUSED = {
     "small": (
         levels(LAYOUT, POSES)[::24, ::24].repeat(4, 0).repeat(4, 1),
         "shows tokens too small",
+    ),
+    "dirt": (
+        np.random.default_rng(0).integers(0, 256, (600, 600)).astype(np.float64),
+        r"shows .* areas \(.*\), by shape no token, and the run moves",
     ),
     "tiny": (np.zeros((20, 400)), "has 400 x 20 pixels, and at least 32 along each side are "),
 }
@@ -180,3 +187,12 @@ def test_a_photograph_is_instead_of_other_targets() -> None:
     with pytest.raises(ConfigError, match="^sim.targets=uniform changes nothing with target: "):
         PlayConfig(target="it.png", changes={"sim": {"targets": "uniform"}})
     assert PlayConfig(target="it.png").run_dirs == ("pretrained/tangram7",)
+
+
+def test_a_photograph_is_not_written_over(tmp_path: Path) -> None:
+    target, link = photo(tmp_path / "it.png", levels(LAYOUT, POSES)), tmp_path / "link.png"
+    link.symlink_to(target)
+    for out in (target, str(link)):
+        with pytest.raises(ConfigError, match="^out=.* would be written over target=.*it.png: "):
+            PlayConfig(out=out, target=target)
+    PlayConfig(out=str(tmp_path / "another.png"), target=target)
