@@ -32,18 +32,18 @@ def corner_bound(tokens: int, sim: SimConfig) -> float:
     can be told, which is the arena's width unless the world says otherwise; turning keeps a corner
     within the start's margin for every angle. A token that slides may push another as far as it
     goes itself, in each action of the episode; one that settles moves others by less than an arena,
-    wherever it was set down. What an agent sees may lie further out by the noise's bound, and where
-    pictures show nothing of a token it is taken to lie where it was told to go, whatever the world
-    makes of that.
+    wherever it was set down. What an agent sees may lie further out by the noise's bound. Pictures
+    show a token with its middle in them, wherever the camera stands, and while they show nothing
+    of it, it is taken to lie where it was told to go, whatever the world makes of that.
     """
     pushes = 0 if tokens == 1 else horizon(tokens, sim) if sim.motion == "slide" else 1
-    way = float(reach(sim)[:2].max())
+    way, inside = float(reach(sim)[:2].max()), 0.5
     if sim.observe == "pictures":
-        way = max(way, 1.0)
+        way, inside = max(way, 1.0), 1.0
     # One that only turns pushes others by less than an arena, too.
     push = max(way, 1.0) if sim.motion == "slide" else 1.0
     moved = sim.actions_per_token * way + pushes * push
-    return (sim.arena * (0.5 + moved) + noise_bound(sim)) * _ROUNDING
+    return (sim.arena * (inside + moved) + noise_bound(sim)) * _ROUNDING
 
 
 def chosen_tokens(actions: Floats, tokens: int) -> Ints:

@@ -12,6 +12,7 @@ from tangram_agent.messages import EpisodeBatch, decode_from_worker
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup, make_setup
 from tangram_agent.types import Episodes
+from tangram_sim.arrays import Singles
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.errors import ConfigError
 from tangram_sim.kinematics import KinematicWorld
@@ -131,7 +132,7 @@ def test_in_a_stage_the_tokens_that_lie_on_their_targets_are_those_that_are_plac
 @pytest.mark.parametrize(
     "sim",
     [
-        {"gain": [0.1, 0.1, 1.0]},  # told to go far beyond what it goes
+        {"gain": [0.4, 0.4, 1.0]},  # told to go further than it goes
         {"camera_shift": 32.0},
         {"picture_blur": 8.0},
     ],
@@ -139,7 +140,13 @@ def test_in_a_stage_the_tokens_that_lie_on_their_targets_are_those_that_are_plac
 )
 def test_what_no_picture_shows_ends_no_worker(sim: dict[str, Any]) -> None:
     task = setup("square", **sim)
-    episodes = played(task, Policy(task), 8)
+
+    def far(*scene: Any) -> Singles:
+        """As far as an action can be told."""
+        return np.stack([np.sign(one.uniform(-1.0, 1.0, 3)) for one in scene[3]]).astype(np.float32)
+
+    with closing(environments(task, 4)) as env:
+        episodes = Rollout(env, 0, "player", 0, 0).play(far, 24)
     assert (episodes.missing if "gain" in sim else episodes.goals_missing).any()
     spec = EpisodeSpec.of(task)
     assert EpisodeBatch(1, 0, episodes).encode(spec)
