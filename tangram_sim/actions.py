@@ -37,7 +37,8 @@ def corner_bound(tokens: int, sim: SimConfig) -> float:
     of it, it is taken to lie where it was told to go, whatever the world makes of that.
     """
     pushes = 0 if tokens == 1 else horizon(tokens, sim) if sim.motion == "slide" else 1
-    way, inside = float(reach(sim)[:2].max()), 0.5
+    inside = 0.5
+    way = float(reach(sim)[:2].max())
     if sim.observe == "pictures":
         way, inside = max(way, 1.0), 1.0
     # One that only turns pushes others by less than an arena, too.
