@@ -245,8 +245,8 @@ class PlayConfig(Settings):
     puzzle: tuple[str, ...] | None = setting(None, PUZZLE_HELP, only={"compare": None})
     target: str | None = setting(
         None,
-        "instead of random targets: a photograph of the run's tokens, PNG or JPEG, dark on light "
-        "ground or the reverse, at most three touching",
+        "instead of random targets: a photograph of all tokens of the run, PNG or JPEG, dark on "
+        "light ground or the reverse, at most three touching",
         only={"compare": None, "puzzle": None},
     )
     turns: int = setting(1, TURNS_HELP, low=1, high=MAX_TURNS, unless={"puzzle": None})
