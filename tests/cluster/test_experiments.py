@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tangram_agent.checkpoints import list_checkpoints
+from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
 from tests.cluster.processes import (
     LIMIT_S,
     all_ended,
@@ -78,43 +78,35 @@ def test_a_report_is_drawn(study: Path, tmp_path: Path) -> None:
         assert "<svg" in (tmp_path / "report" / "figures" / f"{name}.svg").read_text()
 
 
-def test_a_signal_stops_a_study_and_the_same_command_goes_on(tmp_path: Path) -> None:
+def test_no_training_outlives_its_study_and_the_same_command_goes_on_until_a_signal(
+    tmp_path: Path,
+) -> None:
     study = tmp_path / "study"
-    arguments = (*SMALL, *ONE, f"run_dir={study}")
+    arguments = (*SMALL, *ONE, LONG, f"run_dir={study}")
     run_dir = study / RUN
-    with started("tangram-experiment", *arguments, LONG, cwd=tmp_path) as process:
-        wait_for_file(run_dir / "curve.jsonl", process)
-        children = pids_of(study)
-        process.send_signal(signal.SIGINT)
-        assert process.wait(LIMIT_S) == 130
-        assert all_ended(children)
-    assert len(children) >= 4
-    assert list_checkpoints(run_dir / "checkpoints")
-    done = json.loads((run_dir / "result.json").read_text())
-    assert done["ended_by"].startswith("SIG")
-
-    listed = run_here("tangram-experiment", *arguments, LONG, "dry=true", cwd=tmp_path)
-    assert listed.splitlines()[:2] == ["tangram, seed 0", "tangram, seed 0, test actions_2"]
-    bound = f"budget.overrides.tangram=['max_updates={done['updates'] + 5}']"
-    settings = run_dir / "config.yaml"
-    settings.write_text(settings.read_text().replace("1000000", str(done["updates"] + 5)))
-    run("tangram-experiment", *arguments, bound, cwd=tmp_path)
-    again = json.loads((run_dir / "result.json").read_text())
-    assert again["updates"] == done["updates"] + 5
-    assert again["run_id"] == done["run_id"]
-
-
-def test_a_study_that_is_killed_leaves_no_training_behind(tmp_path: Path) -> None:
-    study = tmp_path / "study"
-    arguments = (*SMALL, *ONE, f"run_dir={study}")
-    run_dir = study / RUN
-    with started("tangram-experiment", *arguments, LONG, cwd=tmp_path) as process:
-        wait_for_file(run_dir / "curve.jsonl", process)
+    curve = run_dir / "curve.jsonl"
+    with started("tangram-experiment", *arguments, cwd=tmp_path) as process:
+        wait_for_file(curve, process)
+        run_id = json.loads((run_dir / "connection.json").read_text())["run_id"]
         children = [pid for pid in pids_of(study) if pid != process.pid]
         assert len(children) >= 3
         process.kill()
         assert all_ended(children)
-    assert list_checkpoints(run_dir / "checkpoints")
+    reached = load_checkpoint(list_checkpoints(run_dir / "checkpoints")[-1], []).updates
+
+    listed = run_here("tangram-experiment", *arguments, "dry=true", cwd=tmp_path)
+    assert listed.splitlines()[:2] == ["tangram, seed 0", "tangram, seed 0, test actions_2"]
+    curve.rename(tmp_path / "curve.jsonl")
+    with started("tangram-experiment", *arguments, cwd=tmp_path) as process:
+        wait_for_file(curve, process)
+        children = pids_of(study)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(LIMIT_S) == 130
+        assert all_ended(children)
+    done = json.loads((run_dir / "result.json").read_text())
+    assert done["ended_by"].startswith("SIG")
+    assert done["updates"] > reached
+    assert done["run_id"] == run_id
 
 
 def test_wrong_settings_are_told_before_anything_starts(tmp_path: Path) -> None:

@@ -63,25 +63,19 @@ def assert_same(one: Path, other: Path) -> None:
     assert ours.counters["rate_limiter"] == pytest.approx(theirs.counters["rate_limiter"])
 
 
-def test_the_same_numbers_come_twice_and_a_stop_in_the_middle_changes_nothing(
+def test_the_same_numbers_come_twice_and_stops_and_kills_in_the_middle_change_nothing(
     straight: Path, tmp_path: Path
 ) -> None:
+    """tangram-train starts them again; a master learns again what its checkpoint had not seen."""
     folder = tmp_path / "stopped"
-    with started("tangram-train", f"run_dir={folder}", *STEP, cwd=tmp_path) as process:
+    settings = (f"run_dir={folder}", *STEP, "service.checkpoint_minutes=0.01")
+    with started("tangram-train", *settings, cwd=tmp_path) as process:
         until_updates(folder, 40)
         process.terminate()
         assert process.wait(LIMIT_S) == 0
     assert load_checkpoint(list_checkpoints(folder / "checkpoints")[-1], []).updates < UPDATES
-    run("tangram-train", f"run_dir={folder}", "resume=auto", *STEP, cwd=tmp_path)
-    assert_same(folder, straight)
-
-
-def test_kills_in_the_middle_change_nothing(straight: Path, tmp_path: Path) -> None:
-    """tangram-train starts them again; a master learns again what its checkpoint had not seen."""
-    folder = tmp_path / "killed"
-    settings = (f"run_dir={folder}", *STEP, "service.checkpoint_minutes=0.01")
-    with started("tangram-train", *settings, cwd=tmp_path) as process:
-        for victim, updates in (("role=player", 40), ("-m tangram_cli master", 80)):
+    with started("tangram-train", *settings, "resume=auto", cwd=tmp_path) as process:
+        for victim, updates in (("role=player", 80), ("-m tangram_cli master", 110)):
             until_updates(folder, updates)
             found = [pid for pid in pids_of(folder) if victim in _line(pid)]
             os.kill(min(found), signal.SIGKILL)
