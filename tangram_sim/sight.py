@@ -51,8 +51,8 @@ class Sight:
             go, and before it was ever found in the middle of the arena.
         missing: (B, K) tokens that are not found, or not surely.
         away: (B, K) those of them that should have left the picture by what they were told.
-        goals: (B, V, 2) of the target; a piece that is missing lies where its token began.
-        goals_missing: (B, K) pieces of the target, alike.
+        goals: (B, V, 2) of the target; a piece that is not found lies where its token began.
+        goals_missing: (B, K) pieces of the target that are not found, or not surely.
     """
 
     def __init__(self, layout: Layout, eye: Eye, count: int, arena: float) -> None:
@@ -77,9 +77,12 @@ class Sight:
         poses, flipped, gone = self._poses.copy(), self._flipped.copy(), np.ones_like(self.missing)
         for b, target in enumerate(targets):
             look = self._eye(target)
-            found = look.known & look.sure
-            poses[b, found], flipped[b, found] = look.poses[found], look.flipped[found]
-            gone[b] = ~found
+            # A piece that could lie otherwise as well is covered there, too.
+            poses[b, look.known], flipped[b, look.known] = (
+                look.poses[look.known],
+                look.flipped[look.known],
+            )
+            gone[b] = ~(look.known & look.sure)
         self.goals, self.goals_missing = self._layout.corners(poses, flipped), gone
 
     def follow(self, states: Pixels, moved: Ints, ways: Floats) -> None:

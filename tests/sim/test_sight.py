@@ -76,6 +76,13 @@ def test_a_piece_of_the_target_that_is_missing_lies_where_its_token_begins() -> 
     assert seen.goals_missing.tolist() == [[False, False, True]]
 
 
+def test_a_piece_of_the_target_that_could_lie_otherwise_is_covered_where_it_was_seen() -> None:
+    seen = sight(look(START), look(GOAL, doubtful=0))
+    seen.begin(PICTURES, PICTURES)
+    assert places(seen.goals[0]) == [[x, y] for x, y, _ in GOAL]
+    assert seen.goals_missing.tolist() == [[True, False, False]]
+
+
 def test_a_hand_takes_the_token_that_lies_where_one_is_seen() -> None:
     seen = sight(look(START), look(GOAL))
     seen.begin(PICTURES, PICTURES)
