@@ -77,12 +77,9 @@ class Sight:
         poses, flipped, gone = self._poses.copy(), self._flipped.copy(), np.ones_like(self.missing)
         for b, target in enumerate(targets):
             look = self._eye(target)
-            # A piece that could lie otherwise as well is covered there, too.
-            poses[b, look.known], flipped[b, look.known] = (
-                look.poses[look.known],
-                look.flipped[look.known],
-            )
-            gone[b] = ~(look.known & look.sure)
+            known = look.known  # a piece that could lie otherwise as well is covered there, too
+            poses[b, known], flipped[b, known] = look.poses[known], look.flipped[known]
+            gone[b] = ~(known & look.sure)
         self.goals, self.goals_missing = self._layout.corners(poses, flipped), gone
 
     def follow(self, states: Pixels, moved: Ints, ways: Floats) -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from tests.cluster.processes import LIMIT_S, run
 
-UPDATES = 500
+UPDATES = 800
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -27,10 +27,10 @@ QUICK = ("sim=kinematic", "service.eval_seconds=1")
 
 
 def test_a_short_training_learns_position_and_angle_and_leaves_a_whole_run(trained: Path) -> None:
-    """The paper's plateau is 0.758 and 22 degrees; so short a training ends near 0.98 and 1."""
+    """The paper's plateau is 0.758 with no angle learned; this is far above after 800 updates."""
     result = json.loads((trained / "result.json").read_text())
     assert result["mean_reward"] > 0.88
-    assert result["angle_error_deg_median"] < 5.0
+    assert result["angle_error_deg_median"] < 2.0
     assert result["position_error_median"] < 0.03
     assert result["mean_reward_camera"] == pytest.approx(result["mean_reward"], abs=0.05)
     assert result["raw_overlap"] == pytest.approx((result["mean_reward"] + 1) / 2, abs=1e-6)
