@@ -80,7 +80,8 @@ def publish(
     scores = score_policies(chosen.run.setup, policies(chosen.run), config)
     card = make_card(name, chosen, seeds, scores)
     card |= {"tests": {"episodes": tests, "seed": TEST_SEED, "scores": scores}}
-    if has_all_tans(chosen.run.setup.layout):
+    setup = chosen.run.setup
+    if has_all_tans(setup.layout) and setup.sim.observe != "pictures":  # of pieces that touch
         card |= {"puzzles": {split: _on_figures(chosen.run, split) for split in FIGURES}}
     card |= {"sha256": hashlib.sha256(weights).hexdigest()}
     folder = target / name
@@ -193,7 +194,12 @@ def make_card(
     setup, result = chosen.run.setup, chosen.result
     acting = sum(math.prod(shape) for shape in Policy(setup).shapes.values())
     world = "".join(f", {name} {told(value)}" for name, value in setup.sim.inexact.items())
-    source = f"simulated by this project ({setup.sim.backend}{world}), random starts and targets"
+    seen = f", {setup.sim.picture} pictures of {setup.sim.pixels} px" * (
+        setup.sim.observe == "pictures"
+    )
+    source = (
+        f"simulated by this project ({setup.sim.backend}{world}{seen}), random starts and targets"
+    )
     each = ("seed", "train_s", "episodes", *_ROWS)
     return {
         "format": FORMAT,
@@ -233,17 +239,32 @@ def _task(setup: Setup) -> dict[str, Any]:
 def _limits(setup: Setup, scores: Scores) -> list[str]:
     sim, one = setup.sim, setup.layout.tokens == 1
     pieces = "One token of this shape and size" if one else "This token set and size"
-    noise = (
-        f"Corners with noise of {sim.corner_noise:g} of the arena, as in training."
-        if sim.corner_noise
-        else "Exact corners only: it was trained without noise and never saw a wrong corner."
-    )
+    if sim.observe == "pictures":
+        seen = (
+            f"Trained from {sim.picture} pictures of {sim.pixels} pixels of one straight camera; "
+            "docs/pictures.md tells which others it can use."
+        )
+        known = "Tokens and target lie on even ground, and no more than three of them touch."
+        target = "The target's pieces must show: a silhouette of all of them is not enough."
+    else:
+        seen = (
+            f"Corners with noise of {sim.corner_noise:g} of the arena, as in training."
+            if sim.corner_noise
+            else "Exact corners only: it was trained without noise and never saw a wrong corner."
+        )
+        known = (
+            "Each corner must be known by its number: the target's corners come in the token's "
+            "order."
+        )
+        target = (
+            "The target's pieces must be known, each by its corners: a silhouette is not enough."
+        )
     several = [
         {
             "lift": "Tokens are lifted and set down: it knows nothing of pushes along the table.",
             "slide": "Tokens slide, and push others by the simulation's friction.",
         }[sim.motion],
-        "The target's pieces must be known, each by its corners: a silhouette is not enough.",
+        target,
     ]
     motion = {
         "exact": "Model-based: it takes every motion to be exact, and in a world that does not do "
@@ -254,8 +275,8 @@ def _limits(setup: Setup, scores: Scores) -> list[str]:
     return [
         f"{pieces}, in an arena of this width: another task needs another training.",
         motion[setup.agent.motion],
-        noise,
-        "Each corner must be known by its number: the target's corners come in the token's order.",
+        seen,
+        known,
         *(["Nothing stops a token at the arena's edge."] if one else several),
         f"One of ten tests ends below a raw overlap of {scores['raw_overlap_p10']:.4f}.",
     ]

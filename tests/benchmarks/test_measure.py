@@ -118,6 +118,11 @@ def test_what_is_seen_of_single_tokens_is_exact(
         assert row["95th perc."] < position
         assert row["95th perc. (°)"] < degrees
     assert [row["all found"] for row in content["disturbed"]] == [1.0] * 5
+    scores = {(row["way"], row["pictures"]): row["mean reward"] for row in content["square"]}
+    assert len(scores) == len(content["square"]) == 12
+    assert scores["the fit (`see`)", "128 grey"] > 0.995
+    assert scores["moments", "128 grey"] > 0.995
+    assert 0.9 < scores["cv2.minAreaRect", "128 grey"] < 0.999
 
 
 @pytest.mark.fast

@@ -13,6 +13,7 @@ from tangram_agent.runs import load_run
 from tangram_lab.experiments.pretrained import Candidate, main, make_card, publish
 from tangram_sim.errors import ConfigError, RunError
 from tests.agent.builders import random_transitions, setup
+from tests.sim.builders import SEVEN
 from tests.worker.builders import write_run
 from worker.config import EvalConfig
 from worker.evaluate import evaluate_run
@@ -114,6 +115,24 @@ def test_a_card_tells_the_world_that_it_was_trained_in(tmp_path: Path) -> None:
     seed = Candidate(load_run(tmp_path), SEED_0)
     card = make_card("square", seed, [seed], {"this run": {"raw_overlap_p10": 0.9}})
     assert card["data"]["source"].startswith("simulated by this project (kinematic, gain [0.8,1")
+
+
+def test_an_agent_of_pictures_is_told_as_such_and_skips_figures_of_pieces_that_touch(
+    tmp_path: Path,
+) -> None:
+    run, seven = finished(tmp_path, 0, 0.5), {"shapes": list(SEVEN), "scale": 0.6}
+    seen = {"backend": "kinematic", "observe": "pictures", "picture": "grey", "pixels": 128}
+    write_run(run, tokens=seven, sim=seen)
+    folder = publish([run], "seen", tmp_path / "out", TESTS)
+    card = json.loads((folder / "card.json").read_text())
+    assert "puzzles" not in card
+    assert card["data"]["source"] == (
+        "simulated by this project (kinematic, grey pictures of 128 px), random starts and targets"
+    )
+    text = " ".join(card["limits"])
+    assert "Trained from grey pictures of 128 pixels" in text
+    assert "by its number" not in text
+    assert "Exact corners" not in text
 
 
 def test_an_agent_is_evaluated_like_a_run(tmp_path: Path) -> None:
