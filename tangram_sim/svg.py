@@ -67,6 +67,23 @@ def parse_svg(text: str, name: str) -> Sketch:
     return Sketch(name, tuple((_kind(outline), outline) for outline in units))
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what overflows is out of bounds later
+def svg_outlines(text: str, name: str) -> list[Floats]:
+    """All outlines (V, 2) that an SVG draws, y up, each of at least three corners.
+
+    Raises:
+        ConfigError: not an SVG that can be read, or it draws none.
+    """
+    outlines = [
+        _outline(element, motion, f"SVG '{name}', polygon {i + 1}") * (1.0, -1.0)
+        for i, (element, motion) in enumerate(_polygons(_root(text, name), name))
+    ]
+    found = [outline for outline in outlines if len(outline) >= 3]
+    if not found:
+        raise ConfigError(f"SVG '{name}' draws no polygon: draw the outline of a silhouette")
+    return found
+
+
 def _kind(outline: Floats) -> str:
     """The tan of the same number of corners whose size, then shape, is closest to an outline."""
     kinds = [kind for kind in VARIANTS if len(tan(kind).corners) == len(outline)]

@@ -68,14 +68,7 @@ def find_tokens(picture: Image.Image, layout: Layout, source: str) -> Found:
         ConfigError: says what was found instead.
     """
     cover = _coverage(np.asarray(picture.convert("L")))
-    spots = _Spots.of(cover, float(layout.areas.min() / layout.areas.sum()))
-    if not len(spots.boxes):
-        at_edge = f" but what reaches its edge ({spots.cut})" if spots.cut else ""
-        raise ConfigError(
-            f"{source} shows nothing{at_edge} that is darker or lighter than its ground by "
-            f"{MIN_CONTRAST} of 255 levels: take it with dark tokens on light ground, or light "
-            "ones on dark"
-        )
+    spots = _spots(cover, layout, source)
     unit = float(np.sqrt(spots.cover.sum() / layout.areas.sum()))
     smallest = float(np.sqrt(layout.areas.min()) * unit)
     if smallest < _SMALL:
@@ -90,6 +83,51 @@ def find_tokens(picture: Image.Image, layout: Layout, source: str) -> Found:
         raise ConfigError(f"{source} {_told(_smaller(part, _PIXELS[-1]), spots, layout, view)}")
     middle = np.array([corner[0] + len(part) / 2.0, -corner[1] - len(part) / 2.0]) / unit
     return Found(seen.poses + (*middle, 0.0), seen.flipped, unit)
+
+
+@dataclass(frozen=True, eq=False)
+class Shade:
+    """What a photograph shows of a silhouette.
+
+    Attributes:
+        cover: (P, P) coverage by it, of a square around it.
+        corner: column and row of the square's upper left corner in the photograph.
+        pixels: of the photograph along a side of the square.
+    """
+
+    cover: Singles
+    corner: tuple[int, int]
+    pixels: int
+
+
+def find_silhouette(picture: Image.Image, layout: Layout, source: str) -> Shade:
+    """The silhouette that a photograph shows, of one part or of several.
+
+    Args:
+        picture: the photograph.
+        layout: the tokens that are to fill it.
+        source: what errors call the photograph.
+
+    Raises:
+        ConfigError: it shows none.
+    """
+    cover = _coverage(np.asarray(picture.convert("L")))
+    spots = _spots(cover, layout, source)
+    part, corner = spots.cut_out()
+    return Shade(_smaller(part, _PIXELS[0]), corner, len(part))
+
+
+def _spots(cover: Singles, layout: Layout, source: str) -> "_Spots":
+    """The areas of a photograph that may be tokens, or parts of a silhouette."""
+    spots = _Spots.of(cover, float(layout.areas.min() / layout.areas.sum()))
+    if not len(spots.boxes):
+        at_edge = f" but what reaches its edge ({spots.cut})" if spots.cut else ""
+        raise ConfigError(
+            f"{source} shows nothing{at_edge} that is darker or lighter than its ground by "
+            f"{MIN_CONTRAST} of 255 levels: take it with dark tokens on light ground, or light "
+            "ones on dark"
+        )
+    return spots
 
 
 def _seen(cover: Singles, layout: Layout, view: float) -> Seen | None:

@@ -121,6 +121,10 @@ def _play(settings: Plain) -> int:
         from worker.photographs import read_photograph
 
         read_photograph(config.target, setups[0])
+    if config.silhouette is not None:
+        from worker.silhouettes import read_silhouette
+
+        read_silhouette(config.silhouette, setups[0])
     tell(f"loads and plays {', '.join(config.run_dirs)}")
 
     if config.compare is not None:

@@ -231,7 +231,7 @@ class PlayConfig(Settings):
         "episodes shown side by side",
         low=1,
         high=MAX_SHOWN,
-        only={"puzzle": None, "target": None},
+        only={"puzzle": None, "target": None, "silhouette": None},
     )
     seed: int = setting(0, "of the episodes, and of the starts of puzzles", low=0, high=MAX_SEED)
     compare: tuple[str, ...] | None = setting(
@@ -248,6 +248,12 @@ class PlayConfig(Settings):
         "instead of random targets: a photograph of all tokens of the run, PNG or JPEG, dark on "
         "light ground or the reverse, at most three touching",
         only={"compare": None, "puzzle": None},
+    )
+    silhouette: str | None = setting(
+        None,
+        "instead of random targets: an outline that tells no pieces, a PNG, JPEG or SVG, or the "
+        "name of a puzzle of the library; how the run's tokens fill it is searched first",
+        only={"compare": None, "puzzle": None, "target": None},
     )
     turns: int = setting(1, TURNS_HELP, low=1, high=MAX_TURNS, unless={"puzzle": None})
     skip_invalid: bool = setting(False, SKIP_HELP, unless={"puzzle": None})
@@ -276,6 +282,10 @@ class PlayConfig(Settings):
             _refuse(self.changes, OF_TARGETS, "target", "leave target out")
             if not self.live:
                 _check_kept(self.out, "target", self.target)
+        if self.silhouette is not None:
+            _refuse(self.changes, (*OF_TARGETS, "starts"), "silhouette", "leave silhouette out")
+            if not self.live:
+                _check_kept(self.out, "silhouette", self.silhouette)
 
     @property
     def run_dirs(self) -> tuple[str, ...]:
@@ -289,7 +299,7 @@ class PlayConfig(Settings):
         elif (
             self.compare is None
             and self.tokens is None
-            and not ((self.puzzle or self.target) is not None and GAME in agent_names())
+            and not ((self.puzzle or self.target or self.silhouette) and GAME in agent_names())
         ):
             raise ConfigError(
                 "say which run: run_dir=runs/..., or which ones: compare=[runs/a,runs/b]"

@@ -27,6 +27,7 @@ from worker.film import WIDTH, Show, film_pictures, frames_per_action, show_live
 from worker.photographs import draw_photograph, read_photograph
 from worker.puzzles import find_figures, play_figures
 from worker.rollout import Played, at_once
+from worker.silhouettes import draw_silhouette, read_silhouette
 from worker.test_set import FixedTests, greedy
 from worker.views import beside, camera_sheets
 
@@ -74,6 +75,8 @@ def make_show(run: Run, config: PlayConfig) -> Show:
         return puzzle_show(run, config)
     if config.target is not None:
         return photograph_show(run, config, config.target)
+    if config.silhouette is not None:
+        return silhouette_show(run, config, config.silhouette)
     titles = [f"target {i + 1}" for i in range(config.episodes)]
     return Show(run.setup, play_episodes(run, config), titles, "episode")
 
@@ -115,6 +118,19 @@ def photograph_show(run: Run, config: PlayConfig, target: str) -> Show:
     played = play_figures(run.setup, [figure], player, config.seed, touching=False)
     seen = draw_photograph(photograph, run.setup.layout, tiles(1, WIDTH)[1])
     return Show(run.setup, played, [figure.title], "photograph", seen)
+
+
+def silhouette_show(run: Run, config: PlayConfig, name: str) -> Show:
+    """A silhouette that is filled first, with the tokens outside of it at first.
+
+    Raises:
+        ConfigError: a silhouette that the run's tokens do not fill.
+    """
+    setup = replace(run.setup, sim=replace(run.setup.sim, starts="outside"))
+    found = read_silhouette(name, setup)
+    played = play_figures(setup, [found.figure], greedy(run.policy), config.seed)
+    seen = draw_silhouette(found, setup.layout, tiles(1, WIDTH)[1])
+    return Show(setup, played, [found.figure.title], "silhouette", seen)
 
 
 def end_picture(show: Show) -> Image.Image:

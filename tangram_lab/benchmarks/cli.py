@@ -38,6 +38,7 @@ TRIALS = {
     "attack": ("every attack that is known, on trainings that run; what held", None),
     "fuzz": ("mutated messages against decoder and master", None),
     "pixels": ("DDPG on pixels, no tokens looked for: how far it gets", 60.0),
+    "silhouettes": ("silhouettes filled with seven tans: how many, how fast", None),
     "seeing": ("tokens found in pictures: how exactly, how surely, how fast", None),
     "soak": ("memory and open files of a long training, drawn", 60.0),
 }
@@ -76,7 +77,7 @@ def _parser() -> argparse.ArgumentParser:
         elif name == "fuzz":
             one.add_argument("--messages", type=int, default=1_000_000, help="for the decoder")
             one.add_argument("--live", type=int, default=100_000, help="for a live master")
-        elif name == "seeing":
+        elif name in ("seeing", "silhouettes"):
             one.add_argument("--scenes", type=int, default=200, help="of each kind (200)")
         if name != "attack":
             one.add_argument("--seed", type=int, default=0, help="of everything random (0)")
@@ -121,10 +122,13 @@ def _run(arguments: argparse.Namespace) -> int:
     from tangram_lab.benchmarks.fuzz_wire import run_fuzz
     from tangram_lab.benchmarks.pixels import run_pixels
     from tangram_lab.benchmarks.seeing import run_seeing
+    from tangram_lab.benchmarks.silhouettes import run_silhouettes
     from tangram_lab.benchmarks.soak import run_soak
 
     if arguments.kind == "seeing":
         return run_seeing(arguments.scenes, arguments.seed, arguments.out)
+    if arguments.kind == "silhouettes":
+        return run_silhouettes(arguments.scenes, arguments.seed, arguments.out)
     if arguments.kind == "pixels":
         return run_pixels(arguments.minutes, arguments.seed, arguments.out)
     with tempfile.TemporaryDirectory(prefix="tangram-") as folder:

@@ -1,0 +1,130 @@
+"""Filling outlines: what can be filled is, what cannot is searched through."""
+
+import time
+
+import numpy as np
+import pytest
+import shapely
+from shapely import Polygon
+
+from tangram_lab.benchmarks.silhouettes import convex_outlines
+from tangram_sim.arrays import Floats
+from tangram_sim.config import SimConfig
+from tangram_sim.connected import sample_connected
+from tangram_sim.layout import Layout
+from tangram_vision.dissections import Area, Budget, Search, Tokens, dissection, straightened
+from tangram_vision.silhouettes import covered, fill_outline, overlap
+from tests.sim.builders import SEVEN, TRIO, layout_of
+
+pytestmark = pytest.mark.fast
+
+LAYOUT = layout_of(*SEVEN, scale=1.0)
+
+
+def polygon(points: Floats) -> Polygon:
+    return Polygon(np.column_stack([points.real, points.imag]))
+
+
+def whole(poses: Floats, mirrored: bool = False, layout: Layout = LAYOUT) -> Area:
+    """What tokens cover, or the mirror image of that."""
+    sides = np.zeros(layout.tokens, np.bool_)
+    if mirrored:
+        poses, sides = layout.mirrored(poses, sides)
+    outlines = [layout.corners(poses, sides)[layout.corners_of(k)] for k in range(layout.tokens)]
+    return shapely.union_all([Polygon(one) for one in outlines], grid_size=1e-9)
+
+
+def gluing(seed: int) -> Floats:
+    return sample_connected(LAYOUT, SimConfig(arena=4.0), np.random.default_rng(seed))
+
+
+def test_thirteen_of_the_twenty_convex_outlines_are_filled_and_seven_searched_through() -> None:
+    """Wang and Hsiung, 1942: a proof by hand of what the complete search finds."""
+    every = convex_outlines(1.0)
+    assert len(every) == 20
+    assert all(polygon(z).area == pytest.approx(1.0) for z in every)
+    filled = [fill_outline(polygon(z * np.exp(0.3j)), LAYOUT, 60.0)[0] for z in every]
+    assert sum(one.found is not None for one in filled) == 13
+    assert [one.complete for one in filled if one.found is None] == [True] * 7
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_random_gluings_are_filled_at_any_angle(seed: int) -> None:
+    area = whole(gluing(seed), mirrored=seed % 2 == 1)
+    (filled,) = fill_outline(area, LAYOUT, 30.0)
+    assert filled.found is not None
+    assert filled.iou == pytest.approx(overlap(covered(LAYOUT, filled.found), area))
+    assert filled.iou > 0.999
+    assert filled.nodes >= 7
+
+
+def test_parts_that_meet_in_a_corner_holes_and_angles_off_the_grid_are_filled() -> None:
+    """A ring of tans around a hole, and one tan that touches it in a corner, turned freely."""
+    poses = gluing(3)
+    corners = LAYOUT.corners(poses)
+    tip = corners[int(corners[:, 0].argmax())]
+    square = SEVEN.index("square")
+    poses[square] = (*(tip + 0.25 * np.array([np.cos(0.2), np.sin(0.2)])), 0.2)
+    area = whole(poses)
+    (filled,) = fill_outline(area, LAYOUT, 30.0)
+    assert filled.found is not None
+    assert filled.iou > 0.99
+
+
+def test_dissections_of_one_outline_differ() -> None:
+    side = polygon(np.array([0.0, 1.0, 1.0 + 1.0j, 1.0j]))
+    every = fill_outline(side, LAYOUT, 30.0, count=5)
+    assert len(every) == 5
+    laid = {tuple(map(tuple, one.found.poses.round(3))) for one in every if one.found}
+    assert len(laid) == 5
+    assert all(one.iou > 0.999 for one in every)
+
+
+def test_a_budget_ends_the_search_and_nothing_is_claimed() -> None:
+    strip = polygon(np.array([0.0, 4.0, 4.0 + 0.25j, 0.25j]))
+    (filled,) = fill_outline(strip, LAYOUT, 30.0)
+    assert (filled.found, filled.complete) == (None, True)
+    unfilled = convex_outlines(1.0)[-1]
+    budget = Budget(time.perf_counter() + 30.0, nodes=3)
+    assert list(Search(Tokens(LAYOUT), 0.004, budget).run(polygon(unfilled))) == []
+    assert budget.spent()
+    (late,) = fill_outline(polygon(unfilled), LAYOUT, 0.0)
+    assert (late.found, late.complete) == (None, False)
+
+
+def test_an_area_that_is_not_that_of_the_tokens_is_left_at_once() -> None:
+    (filled,) = fill_outline(whole(gluing(0)).buffer(0.05, join_style="mitre"), LAYOUT, 30.0)
+    assert (filled.found, filled.complete) == (None, True)
+    assert filled.nodes < 20
+
+
+def test_other_token_sets_fill_what_they_cover() -> None:
+    layout = layout_of(*TRIO, scale=1.0)
+    poses = sample_connected(layout, SimConfig(arena=4.0), np.random.default_rng(5))
+    (filled,) = fill_outline(whole(poses, layout=layout), layout, 30.0)
+    assert filled.found is not None
+    assert filled.iou > 0.999
+
+
+def test_corners_of_tokens_are_told_once_for_each_turn_that_looks_alike() -> None:
+    tokens = Tokens(LAYOUT)
+    assert tokens.counts == (2, 1, 2, 1, 1)
+    assert len(tokens.corners) == 14
+    assert np.degrees(tokens.angles).round() == pytest.approx([45, 90, 90, 135, 135, 180, 180, 180])
+    assert tokens.unit == pytest.approx(1.0)
+
+
+def test_laid_tokens_are_where_their_corners_were_put() -> None:
+    area = whole(gluing(1))
+    tokens = Tokens(LAYOUT)
+    laid = next(Search(tokens, 0.004, Budget(time.perf_counter() + 30.0)).run(area))
+    found = dissection(tokens, laid)
+    assert sorted(one.shape for one in laid) == [0, 0, 1, 2, 2, 3, 4]
+    assert covered(LAYOUT, found).area == pytest.approx(1.0, abs=1e-3)
+
+
+def test_corners_within_a_side_are_none() -> None:
+    ring = np.array([0.0, 0.5 + 0.001j, 1.0, 1.0 + 1e-4j, 1.0 + 1.0j, 1.0j])
+    assert straightened(ring, 0.004) == pytest.approx(
+        [0.0, 1.0 + 1e-4j, 1.0 + 1.0j, 1.0j], abs=2e-4
+    )

@@ -1,0 +1,87 @@
+"""Silhouettes in pictures: outlined, filled, and judged by their pixels."""
+
+from contextlib import closing
+
+import numpy as np
+import pytest
+import shapely
+from shapely import Polygon
+
+from tangram_sim.config import SimConfig
+from tangram_sim.puzzles import load_puzzle
+from tangram_sim.targets import placement, turned_figure
+from tangram_sim.world import make_world
+from tangram_vision.dissections import Dissection
+from tangram_vision.levels import coverage
+from tangram_vision.outlines import BINARY_WAYS, GREY_WAYS, outline
+from tangram_vision.silhouettes import Filled, covered, fill_picture, overlap
+from tests.sim.builders import SEVEN, layout_of
+
+pytestmark = pytest.mark.fast
+
+ARENA = 2.0
+LAYOUT = layout_of(*SEVEN, scale=0.6)
+
+
+def seen(name: str, pixels: int, picture: str, angle: float = 0.7) -> tuple[Filled, Dissection]:
+    """How a figure's picture is filled, and the figure."""
+    poses, flipped = placement(load_puzzle(name), LAYOUT)
+    truth = Dissection(turned_figure(LAYOUT, (poses, flipped), angle), flipped)
+    sim = SimConfig(backend="kinematic", arena=ARENA, pixels=pixels, picture=picture)
+    with closing(make_world(LAYOUT, sim)) as world:
+        world.place(truth.poses, truth.flipped)
+        cover = coverage(world.picture())
+    assert cover is not None
+    return fill_picture(cover, LAYOUT, ARENA, 20.0), truth
+
+
+@pytest.mark.parametrize(
+    ("pixels", "picture", "least"),
+    [(128, "grey", 0.99), (128, "binary", 0.98), (64, "grey", 0.97)],
+)
+@pytest.mark.parametrize("name", ["cat", "swan", "hut", "exclamation_mark"])
+def test_figures_are_filled_from_their_pictures(
+    name: str, pixels: int, picture: str, least: float
+) -> None:
+    filled, truth = seen(name, pixels, picture)
+    assert filled.found is not None
+    middle = np.array([-ARENA / 2.0, ARENA / 2.0, 0.0])
+    laid = Dissection(filled.found.poses + middle, filled.found.flipped)
+    assert overlap(covered(LAYOUT, laid), covered(LAYOUT, truth)) > least
+    assert filled.iou > least - 0.01
+
+
+def test_a_picture_of_something_else_is_not_filled() -> None:
+    """A disc of the tokens' area: whatever is found says that it does not fit."""
+    y, x = np.mgrid[:128, :128] - 63.5
+    radius = 128 / ARENA * np.sqrt(0.36 / np.pi)
+    disc = np.clip(radius - np.hypot(x, y) + 0.5, 0.0, 1.0).astype(np.float32)
+    filled = fill_picture(disc, LAYOUT, ARENA, 3.0)
+    assert filled.found is None or filled.iou < 0.95
+
+
+@pytest.mark.parametrize("way", [GREY_WAYS[0], GREY_WAYS[1], BINARY_WAYS[0], BINARY_WAYS[1]])
+def test_an_outline_has_the_sides_and_the_hole_that_the_picture_shows(way: object) -> None:
+    """An L with a square hole, turned by half a radian."""
+    corners = np.array([0, 60, 60 + 30j, 30 + 30j, 30 + 60j, 60j]) - 25 - 25j
+    hole = np.array([8 + 8j, 20 + 8j, 20 + 20j, 8 + 20j]) - 25 - 25j
+    true = shapely.difference(
+        *(
+            Polygon(np.column_stack([z.real, z.imag]))
+            for z in ((one * np.exp(0.5j) + 64 - 64j) for one in (corners, hole))
+        )
+    )
+    times = 8
+    y, x = np.mgrid[: 128 * times, : 128 * times]
+    points = ((x + 0.5) / times, -(y + 0.5) / times)
+    fine = shapely.contains_xy(true, *points).astype(np.float32)
+    cover = fine.reshape(128, times, 128, times).mean(axis=(1, 3))
+    found = outline(cover, way)  # type: ignore[arg-type]
+    assert overlap(found, true) > 0.985
+    (part,) = shapely.get_parts(found)
+    assert (len(part.exterior.coords) - 1, len(part.interiors)) == (6, 1)
+
+
+def test_nothing_has_no_outline() -> None:
+    assert outline(np.zeros((64, 64), np.float32), GREY_WAYS[0]).is_empty
+    assert fill_picture(np.zeros((64, 64), np.float32), LAYOUT, ARENA, 1.0).found is None

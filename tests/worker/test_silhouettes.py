@@ -1,0 +1,122 @@
+"""tangram-play silhouette=: files of outlines and pictures, and such as cannot be filled."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, ImageDraw
+
+from tangram_agent.runs import load_run
+from tangram_sim.errors import ConfigError
+from tangram_sim.puzzles import load_puzzle
+from worker.config import PlayConfig
+from worker.play import play_run
+from worker.silhouettes import read_silhouette
+
+pytestmark = pytest.mark.fast
+
+SQUARE = '<path d="M 1 1 H 9 V 9 H 1 Z"/>'
+
+
+def svg(path: Path, *content: str) -> str:
+    path.write_text(f'<svg xmlns="http://www.w3.org/2000/svg">{"".join(content)}</svg>')
+    return str(path)
+
+
+def picture(path: Path, ground: int = 235, ink: int = 40) -> str:
+    """The cat, turned, drawn large and averaged."""
+    puzzle, times = load_puzzle("cat", 1.0), 4
+    corners = puzzle.corners @ (1.0, 1j) * np.exp(0.4j) * 75.0 * times
+    canvas = Image.new("L", (400 * times, 300 * times), ground)
+    for k in range(7):
+        own = corners[puzzle.layout.corners_of(k)] + (200.0 - 150.0j) * times
+        ImageDraw.Draw(canvas).polygon([(float(z.real), float(-z.imag)) for z in own], ink)
+    canvas.reduce(times).save(path)
+    return str(path)
+
+
+def read(name: str) -> object:
+    return read_silhouette(name, load_run("pretrained/tangram7").setup)
+
+
+@pytest.mark.parametrize("name", ["cat", "cat.png", "dark.jpg", "square.svg", "pieces.svg"])
+def test_silhouettes_are_filled_whatever_they_come_from(tmp_path: Path, name: str) -> None:
+    picture(tmp_path / "cat.png")
+    picture(tmp_path / "dark.jpg", ground=30, ink=220)
+    svg(tmp_path / "square.svg", SQUARE)
+    svg(tmp_path / "pieces.svg", '<polygon points="0,0 8,0 8,8"/><polygon points="0,0 8,8 0,8"/>')
+    source = name if name == "cat" else str(tmp_path / name)
+    shown = read_silhouette(source, load_run("pretrained/tangram7").setup)
+    assert shown.told.startswith("filled in ")
+    assert float(shown.told.split()[-1]) > 0.97
+    assert shown.figure.name == Path(name).stem
+    width, height = shown.picture.size
+    assert shown.outlines.min() >= 0.0
+    assert (shown.outlines <= (width, height)).all()
+
+
+def test_a_silhouette_is_played(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "cat.png"
+    config = PlayConfig(silhouette="cat", out=str(out), changes={"sim": {"backend": "kinematic"}})
+    assert play_run(config) == 0
+    printed = capsys.readouterr().out
+    assert "1 silhouette, coverage 0.99" in printed
+    with Image.open(out) as drawn:
+        assert drawn.width > drawn.height > 300
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (('<path d="M 1 1 H 9 V 3 H 1 Z"/>',), "cannot be filled with .*all ways .* were tried"),
+        (('<path d="M 1 1 L 9 9 Z"/>',), "draws no polygon|nothing that has an area"),
+        ((), "draws no polygon"),
+        (('<path d="M 1 1 H 9 V 9 H 1 Z"/>' * 17,), "more than 16 polygons"),
+        (('<path d="M 1 1 C 9 9 9 9 1 1 Z"/>',), "M, L, H, V, Z"),
+    ],
+)
+def test_an_outline_that_cannot_be_filled_is_refused(
+    tmp_path: Path, content: tuple[str, ...], message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        read(svg(tmp_path / "it.svg", *content))
+
+
+def test_a_hole_is_not_filled(tmp_path: Path) -> None:
+    """A square within another is a hole; no tans make a frame of that width."""
+    with pytest.raises(ConfigError, match="cannot be filled"):
+        read(svg(tmp_path / "frame.svg", SQUARE, '<path d="M 2 2 H 8 V 8 H 2 Z"/>'))
+
+
+def test_a_picture_of_something_else_is_refused(tmp_path: Path) -> None:
+    canvas = Image.new("L", (200, 200), 235)
+    ImageDraw.Draw(canvas).ellipse((40, 40, 160, 160), 30)
+    canvas.save(tmp_path / "disc.png")
+    with pytest.raises(
+        ConfigError, match=r"disc\.png (was not filled|cannot be filled) with large"
+    ):
+        read(str(tmp_path / "disc.png"))
+    Image.new("L", (200, 200), 235).save(tmp_path / "nothing.png")
+    with pytest.raises(ConfigError, match=r"nothing\.png shows nothing"):
+        read(str(tmp_path / "nothing.png"))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"puzzle": ("cat",)}, "silhouette"),
+        ({"target": "photo.png"}, "silhouette"),
+        ({"out": "cat.png", "silhouette": "cat.png"}, "written over silhouette"),
+        ({"changes": {"sim": {"targets": "uniform"}}}, "leave silhouette out"),
+    ],
+)
+def test_settings_that_a_silhouette_has_no_use_for_are_refused(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    settings: dict[str, object],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    picture(tmp_path / "cat.png")
+    with pytest.raises(ConfigError, match=message):
+        PlayConfig(**({"silhouette": "cat"} | settings))  # type: ignore[arg-type]
