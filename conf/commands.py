@@ -240,6 +240,7 @@ those that come with tangram-rl or your own, see docs/puzzles.md.""",
 Shows a run. It plays episodes with the newest weights of a run, noise off, and draws them.
 It assembles puzzles: those that come with tangram-rl or your own, see docs/puzzles.md.
 With target=photo.png it assembles what a photograph shows, see docs/pictures.md.
+With silhouette=cat.png it finds how tokens fill an outline first, see docs/silhouettes.md.
 With compare=[...] several runs play the same episodes side by side.""",
         (
             "tangram-play run_dir=runs/my_run out=tests.png episodes=20",

@@ -25,6 +25,7 @@ from tangram_vision.dissections import Area
 
 _MARGIN = 3  # pixels around a picture
 _SHORT = 10  # points of a chain that is no silhouette's
+_MOST = 4_000  # points of all chains: seven tans of 60 pixels have less than half of it
 _DUST = 6.0  # square pixels of a ring that is none
 _ROUNDED = 1  # points beside a corner that lie within its rounding
 _PARALLEL = np.radians(12.0)
@@ -92,11 +93,14 @@ class _Side:
 
 
 def outline(cover: Singles, way: Way) -> Area:
-    """The outline of the silhouette that coverage (P, P) shows; it may be empty."""
-    rings = [_sides(z, way) for z in _chains(cover, way.blur)]
-    every = [side for ring in rings for side in ring]
-    if way.grid and every:
-        _turn_to_grid(every)
+    """The outline of the silhouette that coverage (P, P) shows; empty if it is too rugged."""
+    every = _chains(cover, way.blur)
+    if sum(map(len, every)) > _MOST:
+        return Polygon()
+    rings = [_sides(z, way) for z in every]
+    sides = [side for ring in rings for side in ring]
+    if way.grid and sides:
+        _turn_to_grid(sides)
     polygons = []
     for ring in rings:
         z = _corners(ring)

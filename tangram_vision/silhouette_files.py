@@ -82,25 +82,21 @@ def _puzzle(path: Path, source: str) -> Puzzle:
 
 
 def _joined(polygons: list[Polygon], source: str) -> Area:
-    """One area of several outlines; one that lies in another is a hole in it."""
+    """One area of several outlines; one that lies in another is a hole in it, and so on."""
     if sum(len(one.exterior.coords) for one in polygons) > _POINTS:
         raise ConfigError(
             f"{source} has more than {_POINTS} corners: draw straight sides, or give a PNG of it"
         )
     valid = [shapely.make_valid(one) for one in polygons]
-    whole = shapely.union_all(
-        [one for one in valid if not any(o is not one and _holds(o, one) for o in valid)]
-    )
-    holes = [one for one in valid if any(o is not one and _holds(o, one) for o in valid)]
-    area = shapely.difference(whole, shapely.union_all(holes))
+    inside = [sum(shapely.contains_properly(other, one) for other in valid) for one in valid]
+    area: Area = Polygon()
+    for depth in range(max(inside) + 1):
+        own = shapely.union_all([one for one, d in zip(valid, inside, strict=True) if d == depth])
+        area = shapely.difference(area, own) if depth % 2 else shapely.union(area, own)
     size = float(np.sqrt(area.area))
     if not size > 0.0:
         raise ConfigError(f"{source} draws nothing that has an area: draw an outline")
     return grown(grown(area, _SEAM * size), -_SEAM * size)
-
-
-def _holds(outer: Area, inner: Area) -> bool:
-    return bool(shapely.contains_properly(outer, inner))
 
 
 def _from_outline(area: Area, layout: Layout, seconds: float) -> Silhouette:

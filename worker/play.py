@@ -95,7 +95,7 @@ def puzzle_show(run: Run, config: PlayConfig) -> Show:
     Raises:
         ConfigError: puzzles that the run cannot play, or too many of them.
     """
-    setup = replace(run.setup, sim=replace(run.setup.sim, starts="outside"))
+    setup = _beside(run.setup)
     source, names = source_and_names(config.puzzle or ())
     found = find_figures(source, setup, names, config.turns, config.skip_invalid)
     if len(found.figures) > MAX_SHOWN:
@@ -126,11 +126,16 @@ def silhouette_show(run: Run, config: PlayConfig, name: str) -> Show:
     Raises:
         ConfigError: a silhouette that the run's tokens do not fill.
     """
-    setup = replace(run.setup, sim=replace(run.setup.sim, starts="outside"))
+    setup = _beside(run.setup)
     found = read_silhouette(name, setup)
     played = play_figures(setup, [found.figure], greedy(run.policy), config.seed)
     seen = draw_silhouette(found, setup.layout, tiles(1, WIDTH)[1])
     return Show(setup, played, [found.figure.title], "silhouette", seen)
+
+
+def _beside(setup: Setup) -> Setup:
+    """The same task with all tokens beside the target at first."""
+    return replace(setup, sim=replace(setup.sim, starts="outside"))
 
 
 def end_picture(show: Show) -> Image.Image:

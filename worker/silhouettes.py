@@ -10,7 +10,7 @@ from tangram_sim.arrays import Floats
 from tangram_sim.drawing import contact_sheet
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import Layout
-from tangram_sim.targets import turned_figure
+from tangram_sim.targets import has_all_tans, turned_figure
 from worker.puzzles import Figure, reach_beyond
 from worker.views import outlined
 
@@ -51,7 +51,8 @@ def read_silhouette(name: str, setup: Setup) -> Shown:
         ) from error
     source, layout = f"silhouette={name}", setup.layout
     drawn = fill_silhouette(name, source, layout, SECONDS)
-    filled, tokens = drawn.filled, ", ".join(shape.name for shape in layout.shapes)
+    filled, names = drawn.filled, ", ".join(shape.name for shape in layout.shapes)
+    tokens = "the seven tans" if has_all_tans(layout) else names
     if filled.found is None:
         why = (
             f"all ways to lay them were tried, {filled.nodes} steps"

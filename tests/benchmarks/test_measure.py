@@ -139,3 +139,18 @@ def test_a_small_token_that_lies_elsewhere_gives_another_picture() -> None:
         off = poses + np.array([(1.5 * NEAR * (token == 4), 0.0, 0.0) for token in range(7)])
         same = [_same(world, Seen(lying, sides, sure, 7), picture) for lying in (poses, off)]
     assert same == [True, False]
+
+
+@pytest.mark.slow
+def test_silhouettes_are_counted_by_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "silhouettes.json"
+    monkeypatch.setattr("tangram_lab.benchmarks.silhouettes.TURNS", 1)
+    monkeypatch.setattr("tangram_lab.benchmarks.silhouettes.CAMERAS", ((128, "grey"),))
+    monkeypatch.setattr(sys, "argv", ["tangram-bench", "silhouettes", "scenes=2", f"out={out}"])
+    assert main() == 0
+    content = json.loads(out.read_text())
+    exact, grey = content["rows"]
+    assert (exact["figures"], exact["filled"], exact["test (14)"]) == (29, 1.0, 1.0)
+    assert (grey["silhouette"], grey["filled"], grey["convex (13)"]) == ("128 px grey", 1.0, 1.0)
+    (convex,) = content["convex"]
+    assert (convex["filled"], convex["searched through, none found"]) == (13, 7)

@@ -98,6 +98,14 @@ def test_an_area_that_is_not_that_of_the_tokens_is_left_at_once() -> None:
     assert filled.nodes < 20
 
 
+def test_a_corner_that_no_tokens_make_ends_the_search_at_once() -> None:
+    side, way = (2.0 / np.sqrt(3.0)) ** 0.5, np.exp(1j * np.pi / 3.0)
+    rhombus = side * np.array([0.0, 1.0, 1.0 + way, way])  # 60 degrees, and the tokens' area
+    budget = Budget(time.perf_counter() + 30.0)
+    assert list(Search(Tokens(LAYOUT), 0.004, budget).run(polygon(rhombus))) == []
+    assert budget.taken == 1
+
+
 def test_other_token_sets_fill_what_they_cover() -> None:
     layout = layout_of(*TRIO, scale=1.0)
     poses = sample_connected(layout, SimConfig(arena=4.0), np.random.default_rng(5))

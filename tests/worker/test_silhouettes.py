@@ -1,14 +1,18 @@
 """tangram-play silhouette=: files of outlines and pictures, and such as cannot be filled."""
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image, ImageDraw
+from shapely import box
 
 from tangram_agent.runs import load_run
 from tangram_sim.errors import ConfigError
 from tangram_sim.puzzles import load_puzzle
+from tangram_vision.silhouette_files import Silhouette, _joined, fill_silhouette
 from worker.config import PlayConfig
 from worker.play import play_run
 from worker.silhouettes import read_silhouette
@@ -86,6 +90,8 @@ def test_a_hole_is_not_filled(tmp_path: Path) -> None:
     """A square within another is a hole; no tans make a frame of that width."""
     with pytest.raises(ConfigError, match="cannot be filled"):
         read(svg(tmp_path / "frame.svg", SQUARE, '<path d="M 2 2 H 8 V 8 H 2 Z"/>'))
+    nested = [box(i, i, 10 - i, 10 - i) for i in range(4)]
+    assert _joined(nested, "it").area == pytest.approx(100 - 64 + 36 - 16)
 
 
 def test_a_picture_of_something_else_is_refused(tmp_path: Path) -> None:
@@ -93,12 +99,24 @@ def test_a_picture_of_something_else_is_refused(tmp_path: Path) -> None:
     ImageDraw.Draw(canvas).ellipse((40, 40, 160, 160), 30)
     canvas.save(tmp_path / "disc.png")
     with pytest.raises(
-        ConfigError, match=r"disc\.png (was not filled|cannot be filled) with large"
+        ConfigError, match=r"disc\.png (was not filled|cannot be filled) with the seven"
     ):
         read(str(tmp_path / "disc.png"))
     Image.new("L", (200, 200), 235).save(tmp_path / "nothing.png")
     with pytest.raises(ConfigError, match=r"nothing\.png shows nothing"):
         read(str(tmp_path / "nothing.png"))
+
+
+def test_what_fills_a_picture_badly_is_not_played(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def worse(*given: Any) -> Silhouette:
+        drawn = fill_silhouette(*given)
+        return replace(drawn, filled=replace(drawn.filled, iou=0.9))
+
+    monkeypatch.setattr("tangram_vision.silhouette_files.fill_silhouette", worse)
+    with pytest.raises(ConfigError, match=r"best found, IoU 0\.90"):
+        read(picture(tmp_path / "cat.png"))
 
 
 @pytest.mark.parametrize(
