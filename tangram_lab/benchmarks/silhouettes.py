@@ -149,7 +149,7 @@ def _convex_row(layout: Layout) -> dict[str, Any]:
 def _area(layout: Layout, figure: Shape) -> Area:
     """The outline of a figure without the seams of its pieces."""
     whole = covered(layout, figure.laid)
-    if figure.kind == "test":  # drawn by hand
+    if figure.kind != "gluing":  # drawn by hand, or laid with a tolerance
         whole = grown(grown(whole, _SEAM), -_SEAM)
     return whole
 
