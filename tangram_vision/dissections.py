@@ -217,11 +217,13 @@ class Search:
     ) -> Iterator[list[tuple[Laid, Polygon]]]:
         """For each convex corner of a part the tokens that may lie there."""
         tried, corners, at = [], [], []
-        for number, (point, along, angle, leaving, coming) in enumerate(self._convex(part)):
+        options: list[list[tuple[Laid, Polygon]]] = []
+        for point, along, angle, leaving, coming in self._convex(part):
             slack = _TURN + 3.0 * self._tolerance / min(abs(leaving), abs(coming))
             if np.abs(self._tokens.angles - angle).min() > slack:
                 yield []  # no corners of tokens make this one
                 return
+            options.append([])
             for corner in self._tokens.corners:
                 if not left[corner.shape] or corner.angle > angle + slack:
                     continue
@@ -232,16 +234,14 @@ class Search:
                     continue
                 tried.append(point + along * corner.body)
                 corners.append((corner, point, along))
-                at.append(number)
-        count = 1 + max(at, default=-1)
-        options: list[list[tuple[Laid, Polygon]]] = [[] for _ in range(count)]
+                at.append(options[-1])
         if tried:
             z = np.array(tried)
             polygons = shapely.polygons(np.stack([z.real, z.imag], axis=-1))
             room = grown(part, _GROWN * self._tolerance)
             shapely.prepare(room)
             for i in np.flatnonzero(shapely.contains(room, polygons)).tolist():
-                options[at[i]].append((_laid(*corners[i]), polygons[i]))
+                at[i].append((_laid(*corners[i]), polygons[i]))
         yield from options
 
     def _convex(self, part: Polygon) -> Iterator[tuple[complex, complex, float, float, float]]:
