@@ -279,7 +279,7 @@ def dissection(tokens: Tokens, laid: Sequence[Laid]) -> Dissection:
     return Dissection(poses, flipped)
 
 
-@np.errstate(invalid="ignore")  # of corners that all but lie in a straight side
+@np.errstate(invalid="ignore", divide="ignore")  # of corners all but within a straight side
 def grown(area: Area, distance: float) -> Area:
     """An area with all sides so far further out, or in where the distance is negative."""
     return shapely.buffer(area, distance, join_style="mitre", mitre_limit=_MITRE)
