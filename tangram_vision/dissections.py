@@ -21,7 +21,7 @@ from shapely import MultiPolygon, Polygon
 
 from tangram_sim.arrays import Bools, Complex, Floats, Ints
 from tangram_sim.layout import Layout
-from tangram_sim.shapes import Shape, mirror_image, turn_onto
+from tangram_vision.kinds import Kind, kinds_of
 
 Area: TypeAlias = "Polygon | MultiPolygon"
 
@@ -112,25 +112,18 @@ class Tokens:
 
     def __init__(self, layout: Layout) -> None:
         """Find which of them are alike, and their different corners."""
-        self.own: list[list[int]] = []
-        shapes: list[Shape] = []
-        for token, shape in enumerate(layout.shapes):
-            alike = next((i for i, one in enumerate(shapes) if _same(one, shape)), None)
-            if alike is None:
-                shapes.append(shape)
-                self.own.append([token])
-            else:
-                self.own[alike].append(token)
-        self.counts = tuple(len(tokens) for tokens in self.own)
-        self.areas = np.array([shape.area for shape in shapes])
+        kinds = kinds_of(layout, 1.0, 1)  # in the units of the layout
+        shapes = {kind.shape: kind for kind in kinds}
+        self.own = [kind.tokens for kind in shapes.values()]
+        self.counts = tuple(map(len, self.own))
+        self.areas = np.array([kind.area for kind in shapes.values()])
         self.unit = float(np.sqrt(layout.areas.sum()))
-        most = max(len(shape.corners) for shape in shapes)
+        most = max(len(kind.corners) for kind in kinds)
         # Large ones first: what is left is then hard to fill, and that is soon seen.
         self.corners = [
             corner
-            for number in np.argsort(-self.areas, kind="stable").tolist()
-            for flipped in ((False, True) if shapes[number].mirror is None else (False,))
-            for corner in _corners(number, shapes[number], flipped, most)
+            for kind in sorted(kinds, key=lambda kind: -kind.area)
+            for corner in _corners(kind, most)
         ]
 
     @cached_property
@@ -303,24 +296,16 @@ def _polygons(area: Area) -> list[Polygon]:
     return [one for one in shapely.get_parts(area).tolist() if one.geom_type == "Polygon"]
 
 
-def _same(one: Shape, other: Shape) -> bool:
-    if len(one.corners) != len(other.corners):
-        return False
-    turn = turn_onto(one.corners, other.corners)
-    return turn is not None and abs(turn) < 1e-6
-
-
-def _corners(number: int, shape: Shape, flipped: bool, most: int) -> Iterator[_Corner]:
+def _corners(kind: Kind, most: int) -> Iterator[_Corner]:
     """The corners of a shape on one side of which no turn makes another."""
-    corners = mirror_image(shape.corners) if flipped else shape.corners
-    body: Complex = corners @ np.array([1.0, 1j])
-    for i in range(len(body) // shape.symmetry):
+    body: Complex = kind.corners @ np.array([1.0, 1j])
+    for i in range(kind.different):
         leaving, coming = body[(i + 1) % len(body)] - body[i], body[i - 1] - body[i]
         along = leaving / abs(leaving)
         own = np.roll((body - body[i]) / along, -i)
         yield _Corner(
-            number,
-            flipped,
+            kind.shape,
+            kind.flipped,
             float(np.angle(coming / leaving)),
             float(abs(leaving)),
             float(abs(coming)),

@@ -186,6 +186,9 @@ def with_absolute_paths(settings: Plain) -> Plain:
     result = dict(settings)
     for name in ("run_dir", "out", "sheet", "target"):
         result[name] = _absolute(result.get(name), is_run=name == "run_dir")
+    silhouette = result.get("silhouette")
+    if isinstance(silhouette, str) and Path(silhouette).suffix:  # else a puzzle's name
+        result["silhouette"] = _absolute(silhouette, is_run=False)
     puzzle = check_puzzle(result.get("puzzle"))
     if puzzle is not None and is_puzzle_source(puzzle[0]) and puzzle[0] not in SPLITS:
         puzzle = (str(_absolute(puzzle[0], is_run=False)), *puzzle[1:])

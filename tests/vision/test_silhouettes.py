@@ -82,6 +82,12 @@ def test_an_outline_has_the_sides_and_the_hole_that_the_picture_shows(way: objec
     assert (len(part.exterior.coords) - 1, len(part.interiors)) == (6, 1)
 
 
+def test_what_is_too_rugged_has_no_outline() -> None:
+    """A hundred thousand crossings would take minutes to be cut into sides."""
+    noise = (np.random.default_rng(0).random((256, 256)) < 0.5).astype(np.float32)
+    assert outline(noise, GREY_WAYS[0]).is_empty
+
+
 def test_nothing_has_no_outline() -> None:
     assert outline(np.zeros((64, 64), np.float32), GREY_WAYS[0]).is_empty
     assert fill_picture(np.zeros((64, 64), np.float32), LAYOUT, ARENA, 1.0).found is None

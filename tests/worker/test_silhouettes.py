@@ -1,5 +1,6 @@
 """tangram-play silhouette=: files of outlines and pictures, and such as cannot be filled."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -7,12 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image, ImageDraw
-from shapely import box
+from shapely import Polygon, box
 
 from tangram_agent.runs import load_run
 from tangram_sim.errors import ConfigError
-from tangram_sim.puzzles import load_puzzle
+from tangram_sim.puzzles import PACKAGED, load_puzzle
 from tangram_vision.silhouette_files import Silhouette, _joined, fill_silhouette
+from worker.cli import with_absolute_paths
 from worker.config import PlayConfig
 from worker.play import play_run
 from worker.silhouettes import read_silhouette
@@ -92,6 +94,36 @@ def test_a_hole_is_not_filled(tmp_path: Path) -> None:
         read(svg(tmp_path / "frame.svg", SQUARE, '<path d="M 2 2 H 8 V 8 H 2 Z"/>'))
     nested = [box(i, i, 10 - i, 10 - i) for i in range(4)]
     assert _joined(nested, "it").area == pytest.approx(100 - 64 + 36 - 16)
+
+
+def test_a_puzzle_file_of_one_is_filled_and_one_of_more_is_refused(tmp_path: Path) -> None:
+    content = json.loads((PACKAGED / "test.json").read_text())
+    for count in (1, 2):
+        some = content | {"puzzles": content["puzzles"][:count]}
+        (tmp_path / f"{count}.json").write_text(json.dumps(some))
+    shown = read_silhouette(str(tmp_path / "1.json"), load_run("pretrained/tangram7").setup)
+    assert float(shown.told.split()[-1]) > 0.97
+    with pytest.raises(ConfigError, match="has 2 puzzles, and one silhouette is filled"):
+        read(str(tmp_path / "2.json"))
+
+
+def test_an_outline_of_too_many_corners_is_refused() -> None:
+    turn = np.linspace(0.0, 2.0 * np.pi, 2_001, endpoint=False)
+    with pytest.raises(ConfigError, match="more than 2000 corners"):
+        _joined([Polygon(np.column_stack([np.cos(turn), np.sin(turn)]))], "it")
+
+
+def test_a_file_is_named_from_where_the_command_was_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    for given, meant in (
+        ("it.svg", str(tmp_path / "it.svg")),
+        ("~/it.png", str(tmp_path / "home" / "it.png")),
+        ("cat", "cat"),
+    ):
+        assert with_absolute_paths({"silhouette": given})["silhouette"] == meant
 
 
 def test_a_picture_of_something_else_is_refused(tmp_path: Path) -> None:
