@@ -2,6 +2,8 @@
 
 import json
 import signal
+import subprocess
+import time
 from pathlib import Path
 
 import pytest
@@ -41,6 +43,16 @@ def scores(study: Path, training: str) -> tuple[dict[str, float], dict[str, floa
     files = (run_dir / "result.json", run_dir / "tests" / "actions_2.json")
     result, test = (json.loads(path.read_text()) for path in files)
     return result, test
+
+
+def wait_for_updates(run_dir: Path, beyond: int, process: subprocess.Popen[bytes]) -> None:
+    """Wait until the learning curve of a run tells of more updates than these."""
+    curve, end = run_dir / "curve.jsonl", time.monotonic() + LIMIT_S
+    wait_for_file(curve, process)
+    while all(json.loads(line)["updates"] <= beyond for line in curve.read_text().split("\n")[:-1]):
+        assert process.poll() is None, f"the process ended before {curve} told of {beyond} updates"
+        assert time.monotonic() < end, f"no more than {beyond} updates after {LIMIT_S} s"
+        time.sleep(0.05)
 
 
 def test_every_training_is_done_and_tested(study: Path) -> None:
@@ -84,9 +96,8 @@ def test_no_training_outlives_its_study_and_the_same_command_goes_on_until_a_sig
     study = tmp_path / "study"
     arguments = (*SMALL, *ONE, LONG, f"run_dir={study}")
     run_dir = study / RUN
-    curve = run_dir / "curve.jsonl"
     with started("tangram-experiment", *arguments, cwd=tmp_path) as process:
-        wait_for_file(curve, process)
+        wait_for_updates(run_dir, 0, process)
         run_id = json.loads((run_dir / "connection.json").read_text())["run_id"]
         children = [pid for pid in pids_of(study) if pid != process.pid]
         assert len(children) >= 3
@@ -96,9 +107,9 @@ def test_no_training_outlives_its_study_and_the_same_command_goes_on_until_a_sig
 
     listed = run_here("tangram-experiment", *arguments, "dry=true", cwd=tmp_path)
     assert listed.splitlines()[:2] == ["tangram, seed 0", "tangram, seed 0, test actions_2"]
-    curve.rename(tmp_path / "curve.jsonl")
+    (run_dir / "curve.jsonl").rename(tmp_path / "curve.jsonl")
     with started("tangram-experiment", *arguments, cwd=tmp_path) as process:
-        wait_for_file(curve, process)
+        wait_for_updates(run_dir, reached, process)
         children = pids_of(study)
         process.send_signal(signal.SIGINT)
         assert process.wait(LIMIT_S) == 130
