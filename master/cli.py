@@ -44,13 +44,14 @@ def _keys(settings: Plain) -> int:
 def _train(settings: Plain) -> int:
     from master.config import MasterConfig
     from tangram_agent.setup import SECTIONS, from_mapping
-    from tangram_sim.world import check_world
+    from tangram_sim.world import check_shown, check_world
 
     _make_absolute(settings)
     rest = {name: value for name, value in settings.items() if name not in SECTIONS}
     config = from_mapping(MasterConfig, rest)
     # The children check it again; a wrong task is refused before any of them starts.
     setup = _task(settings)
+    check_shown(setup.sim, setup.fills)
     check_world(setup.layout, setup.sim)
     tell(f"starts in {config.run_dir}")
 
@@ -63,7 +64,7 @@ def _master(settings: Plain) -> int:
     from master.config import MasterConfig
     from tangram_agent.setup import SECTIONS, from_mapping
     from tangram_sim.settings import refuse_ignored
-    from tangram_sim.world import check_room
+    from tangram_sim.world import check_room, check_shown
 
     _make_absolute(settings)
     rest = {name: value for name, value in settings.items() if name not in SECTIONS}
@@ -72,6 +73,7 @@ def _master(settings: Plain) -> int:
         given, alone = f"workers={config.workers}", "service.mode=async in tangram-master"
         refuse_ignored(given, alone, "start them with tangram-worker", 1)
     setup = _task(settings)
+    check_shown(setup.sim, setup.fills)
     check_room(setup.layout, setup.sim)
     tell(f"starts in {config.run_dir}")
 

@@ -1,7 +1,7 @@
 """What learns, without sockets: networks, replay, hindsight, rate limiter, and their state."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -10,6 +10,8 @@ import torch
 from master.rate_limiter import LAG_UPDATES, RateLimiter
 from master.resumable import check_same_task
 from tangram_agent.checkpoints import ACTING, SETUP
+from tangram_agent.filling_learner import FillLearner
+from tangram_agent.filling_replay import FillReplay
 from tangram_agent.learner import Learner
 from tangram_agent.motion import Motions, motions_of
 from tangram_agent.relabelling import with_relabelled
@@ -44,10 +46,15 @@ class Trainer:
         agent, layout = setup.agent, setup.layout
         self.setup = setup
         self.reward = make_reward(setup.reward, layout, setup.sim)
-        self.learner = Learner(setup, seed, device)
-        self.replay = ReplayBuffer(
-            agent.replay_capacity, layout.corner_count, layout.tokens, setup.action_size
-        )
+        self.learner: Learner | FillLearner
+        self.replay: ReplayBuffer | FillReplay
+        if setup.fills:
+            self.learner, self.replay = FillLearner(setup, seed, device), FillReplay(setup)
+        else:
+            self.learner = Learner(setup, seed, device)
+            self.replay = ReplayBuffer(
+                agent.replay_capacity, layout.corner_count, layout.tokens, setup.action_size
+            )
         self.rate_limiter = RateLimiter(
             agent.updates_per_transition, agent.learning_starts, lag_updates
         )
@@ -85,11 +92,12 @@ class Trainer:
 
     def insert(self, episodes: Episodes) -> None:
         """Take in episodes as they were played, and relabelled."""
-        # What is credited piece by piece is relabelled anew for every update.
-        relabels = () if self.setup.credits_pieces else self.setup.agent.hindsight
-        generator = self._generators["hindsight"]
-        seen = episodes.seen_whole()
-        if seen.count:
+        generator, seen = self._generators["hindsight"], episodes.seen_whole()
+        if isinstance(self.replay, FillReplay):
+            self.replay.insert(seen, generator)
+        elif seen.count:
+            # What is credited piece by piece is relabelled anew for every update.
+            relabels = () if self.setup.credits_pieces else self.setup.agent.hindsight
             self.replay.add(
                 with_relabelled(seen, relabels, self.setup.layout, self.reward, generator)
             )
@@ -99,11 +107,17 @@ class Trainer:
 
     def update(self, share: float) -> dict[str, float]:
         """One update, at the used share of the budget; returns its losses."""
-        self.batch = self.replay.sample(self.setup.agent.batch_size, self._generators["replay"])
-        prepared = self.learner.prepared(self.batch, self._generators["hindsight"])
-        losses = self.learner.update(prepared, share, self._motions())
+        losses = self._learned(share)
         self.rate_limiter.updated()
         return losses
+
+    def _learned(self, share: float) -> dict[str, float]:
+        size, generator = self.setup.agent.batch_size, self._generators["replay"]
+        if isinstance(self.learner, FillLearner) and isinstance(self.replay, FillReplay):
+            return self.learner.learn(self.replay.sample(size, generator), share)
+        self.batch = cast("ReplayBuffer", self.replay).sample(size, generator)
+        prepared = self.learner.prepared(self.batch, self._generators["hindsight"])
+        return self.learner.update(prepared, share, self._motions())
 
     def _motions(self) -> Motions | None:
         """What whole episodes of the replay tell of the motion, where it is learned."""
@@ -111,7 +125,8 @@ class Trainer:
             return None
         steps = self.setup.horizon
         count = max(1, SEEN_MOTIONS // steps)
-        past, ends = self.replay.sample_episodes(count, steps, self._generators["motion"])
+        buffer = cast("ReplayBuffer", self.replay)
+        past, ends = buffer.sample_episodes(count, steps, self._generators["motion"])
         return motions_of(past, ends.astype(np.float64), self.setup.layout, self.setup.sim)
 
     def go_back(self, state: dict[str, npt.NDArray[Any]]) -> None:

@@ -130,6 +130,7 @@ class EpisodeSpec:
         action_size: A.
         bound: largest |coordinate| that a corner can reach.
         observed: whether pictures are what is observed: then some of it can be missing.
+        goal_rows: G, corners of a target; 0: V.
     """
 
     tokens: int
@@ -138,6 +139,7 @@ class EpisodeSpec:
     action_size: int
     bound: float
     observed: bool = False
+    goal_rows: int = 0
 
     def __post_init__(self) -> None:
         for name in ("tokens", "corners", "horizon", "action_size"):
@@ -156,6 +158,7 @@ class EpisodeSpec:
             setup.action_size,
             setup.bound,
             setup.sim.observe == "pictures",
+            setup.goal_rows if setup.fills else 0,
         )
 
     @cached_property
@@ -196,7 +199,7 @@ def _columns(spec: EpisodeSpec, count: int) -> tuple[Column, ...]:
         Column("placed", "u1", (e, t + 1, k), 0, 1),
         Column("actions", "<f4", (e, t, spec.action_size), -one, one),
         Column("rewards", "<f4", (e, t), -MAX_REWARD, MAX_REWARD),
-        Column("goals", "<f4", (e, v, 2), -reach, reach),
+        Column("goals", "<f4", (e, spec.goal_rows or v, 2), -reach, reach),
         *(missing if spec.observed else ()),
     )
 

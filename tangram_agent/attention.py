@@ -32,7 +32,7 @@ class GraphAttention(nn.Module):
         self.combine = nn.Linear(width, width, bias=False)
 
     def forward(self, nodes: Tensor, edges: Tensor) -> Tensor:
-        """Messages (B, N, W) from nodes (B, N, W) along edges (N, N).
+        """Messages (B, N, W) from nodes (B, N, W) along edges (N, N), or (B, N, N) of each graph.
 
         A node without any edge gets a message of zeros.
         """
@@ -41,6 +41,8 @@ class GraphAttention(nn.Module):
         # All heads of the whole batch as one batch: (3, B * M, N, D).
         stacked = joint.permute(2, 0, 3, 1, 4).reshape(3, -1, count, self.key_width)
         query, key, value = stacked.unbind()
+        if edges.ndim == 3:
+            edges = edges.repeat_interleave(self.heads, dim=0)
         apart = torch.where(edges, 0.0, NO_EDGE).expand(len(query), -1, -1)
         scores = torch.baddbmm(apart, query, key.transpose(1, 2), alpha=self.scale)
         messages = softmax_mean(scores, value) * edges.any(dim=-1, keepdim=True)
@@ -78,7 +80,7 @@ class EncoderLayer(nn.Module):
             self.transform = nn.Sequential(nn.Linear(config.width, config.width), nn.ReLU())
 
     def forward(self, nodes: Tensor, edges: Tensor) -> Tensor:
-        """(B, N, W) -> (B, N, W)."""
+        """(B, N, W) -> (B, N, W); edges as for `GraphAttention`."""
         nodes = nodes + self.attention(nodes, edges)
         encoded: Tensor = nodes + self.transform(nodes)
         return encoded
@@ -99,7 +101,7 @@ class GraphEncoder(nn.Module):
     def forward(self, features: Tensor, edges: Tensor) -> tuple[Tensor, Tensor]:
         """Node embeddings (B, N, W) of features (B, N, F), and their mean over the graph (B, W).
 
-        Edges are (N, N).
+        Edges are (N, N), or (B, N, N).
         """
         nodes = self.embed(features)
         for layer in self.layers:

@@ -142,8 +142,9 @@ class AgentConfig(Settings, section="agent"):
     readout: str = setting(
         "pair",
         "a velocity and a value for each pair of a token and a piece of the target; or, as in the "
-        "paper, one velocity of the set's next token and one value of the whole scene",
-        choices=("pair", "token"),
+        "paper, one velocity of the set's next token and one value of the whole scene; or, of "
+        "sim.observe=silhouette, a value of what is left to fill, whose actions are exact",
+        choices=("pair", "token", "outline"),
         part=NETWORK,
     )
     order: str = setting(
@@ -201,11 +202,12 @@ class AgentConfig(Settings, section="agent"):
     )
     lookahead: str = setting(
         "none",
-        "several tokens that slide, exploration off: plan orders, places and ways of two legs by "
+        "exploration off. Several tokens that slide: plan orders, places and ways of two legs by "
         "trying them in a world of its own: the engine, which is planning with the simulator, or a "
-        "model of contacts that was learned from the engine's short pushes",
-        choices=("none", "engine", "learned"),
-        only={"readout": "pair"},
+        "model of contacts that was learned from the engine's short pushes. Outlines: lay all "
+        "tokens in thought, by the values of what would be left",
+        choices=("none", "engine", "learned", "values"),
+        only={"readout": ("pair", "outline")},
     )
     beam: int = setting(
         4,

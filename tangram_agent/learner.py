@@ -125,10 +125,10 @@ class Learner:
         self.parameters = parameter_count(self.actor, self.critic)
         self.motion = networks.motion
         networks.to(self.device)
-        self.acting = _frozen(networks.playing)
+        self.acting = frozen(networks.playing)
         self.parts: dict[str, nn.Module] = {"actor": self.actor, "critic": self.critic}
         if self.bootstraps:
-            self.target_actor, self.target_critic = _frozen(self.actor), _frozen(self.critic)
+            self.target_actor, self.target_critic = frozen(self.actor), frozen(self.critic)
             self.parts |= {"target_actor": self.target_actor, "target_critic": self.target_critic}
         if self.motion is not None:
             self.parts["motion"] = self.motion
@@ -193,7 +193,7 @@ class Learner:
         self._follow()
         # One wait for the device, after everything has been asked of it.
         numbers = dict(zip(values, torch.stack(list(values.values())).tolist(), strict=True))
-        _check_finite(self.updates + 1, numbers)
+        check_finite(self.updates + 1, numbers)
         self.updates += 1
         return numbers
 
@@ -340,9 +340,13 @@ class Learner:
         (self.actor_optimiser if part == "actor" else self.critic_optimiser).step()
         return norm
 
-    def _set_learning_rate(self, progress: float) -> None:
+    def rate_factor(self, progress: float) -> float:
+        """By which learning rates have fallen at a used share of the budget: along a cosine."""
         share, low = min(max(progress, 0.0), 1.0), self.config.lr_final
-        factor = low + (1.0 - low) * 0.5 * (1.0 + math.cos(math.pi * share))
+        return low + (1.0 - low) * 0.5 * (1.0 + math.cos(math.pi * share))
+
+    def _set_learning_rate(self, progress: float) -> None:
+        factor = self.rate_factor(progress)
         self.actor_optimiser.rate = self.config.actor_lr * factor
         self.critic_optimiser.rate = self.config.critic_lr * factor
 
@@ -415,11 +419,13 @@ class Learner:
         return {"actor": self.actor_optimiser, "critic": self.critic_optimiser, **fit}
 
 
-def _frozen(module: nn.Module) -> nn.Module:
+def frozen(module: nn.Module) -> nn.Module:
+    """A copy that no gradient reaches."""
     return copy.deepcopy(module).requires_grad_(False)
 
 
-def _check_finite(updates: int, numbers: dict[str, float]) -> None:
+def check_finite(updates: int, numbers: dict[str, float]) -> None:
+    """Raise NotFiniteError unless all numbers of an update are finite."""
     if not all(map(math.isfinite, numbers.values())):
         listed = ", ".join(f"{name}={value:g}" for name, value in numbers.items())
         raise NotFiniteError(f"update {updates} is not finite ({listed})")

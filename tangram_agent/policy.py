@@ -8,13 +8,17 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import nn
 
+from tangram_agent.filler import Filler
+from tangram_agent.filling import Filling
 from tangram_agent.foresight import Foresight
 from tangram_agent.networks import Networks
 from tangram_agent.planning import Planner
 from tangram_agent.scenes import Scenes, next_token
 from tangram_agent.setup import Setup
 from tangram_agent.types import Past, Weights
+from tangram_agent.values import OutlineValue
 from tangram_agent.weights import load_arrays, to_arrays
 from tangram_sim.actions import make_actions
 from tangram_sim.arrays import Floats, Singles
@@ -27,21 +31,29 @@ class Policy:
 
     Attributes:
         version: of the weights that are loaded; -1 before the first.
+        network: what they are of.
     """
 
     def __init__(self, setup: Setup) -> None:
         self.layout, self.config, self.sim = setup.layout, setup.agent, setup.sim
         self.tokens = setup.layout.tokens
         self.version = -1
-        networks = Networks(setup)
-        self._network = networks.playing
-        self._planner = Planner(networks, setup) if setup.pairs else None
-        self._network.requires_grad_(False)
+        self._planner: Planner | None = None
+        self._filler: Filler | None = None
+        if setup.fills:
+            value = OutlineValue(Filling(setup.layout).shapes, setup.net)
+            self.network: nn.Module = value
+            self._filler = Filler(value, setup)
+        else:
+            networks = Networks(setup)
+            self.network = networks.playing
+            self._planner = Planner(networks, setup) if setup.pairs else None
+        self.network.requires_grad_(False)
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Names and shapes of the tensors that `load` accepts."""
-        return {name: tuple(p.shape) for name, p in self._network.named_parameters()}
+        return {name: tuple(p.shape) for name, p in self.network.named_parameters()}
 
     def load(self, weights: Weights) -> None:
         """Take over broadcast weights.
@@ -49,14 +61,14 @@ class Policy:
         Raises:
             RunError: they belong to another layout or network.
         """
-        load_arrays(self._network, weights.tensors)
+        load_arrays(self.network, weights.tensors)
         self.version = weights.version
         if self._planner is not None:
             self._planner.forget()
 
     def weights(self) -> Weights:
         """A copy of the weights that are loaded."""
-        return Weights(self.version, to_arrays(self._network))
+        return Weights(self.version, to_arrays(self.network))
 
     def foresight(self) -> Foresight | None:
         """A world to try actions in, where the agent looks ahead."""
@@ -77,11 +89,13 @@ class Policy:
         Args:
             corners: (B, V, 2) of the tokens.
             placed: (B, K) which tokens are placed.
-            goals: (B, V, 2) corners of the targets.
+            goals: (B, V, 2) corners of the targets, or (B, G, 2) rows of their outlines.
             refine: take the steps of `agent.refine_steps`, where the agent has such.
             past: what was seen of these episodes before, if anything: an agent that learns what a
                 command comes to corrects itself by it.
         """
+        if self._filler is not None:
+            return self._filling(self._filler, corners, placed, goals)
         if self._planner is None:
             token, velocity = self._velocity(corners, placed, goals)
             flip = np.zeros(len(token), dtype=np.bool_)
@@ -93,6 +107,22 @@ class Policy:
             token, flip, velocity = choice.token, choice.flip, choice.velocity
         return make_actions(token, velocity, flip, self.tokens, self.sim)
 
+    def _filling(
+        self,
+        filler: Filler,
+        corners: Floats | Singles,
+        placed: Flags,
+        outlines: Floats | Singles,
+        generators: Sequence[np.random.Generator] = (),
+    ) -> Singles:
+        """Actions (B, A) on outlines (B, G, 2); with generators a share of them goes anywhere."""
+        share = self.config.uniform_share
+        drawn = [generator.random() < share for generator in generators]
+        anything = np.array(drawn) if drawn else np.zeros(len(corners), np.bool_)
+        exact = np.asarray(corners, np.float64), np.asarray(placed, np.bool_)
+        step = filler.choose(*exact, np.asarray(outlines, np.float64), anything, generators)
+        return make_actions(step.token, step.velocity, step.flip, self.tokens, self.sim)
+
     def _velocity(
         self, corners: Floats | Singles, placed: Flags, goals: Floats | Singles
     ) -> tuple[npt.NDArray[np.int64], Singles]:
@@ -101,7 +131,7 @@ class Policy:
         token = next_token(flags)
         with torch.inference_mode():
             scenes = Scenes(_tensor(corners), flags, _tensor(goals), token)
-            velocity, _ = self._network(scenes)
+            velocity, _ = self.network(scenes)
         return token.numpy(), velocity.numpy()
 
     def explore(
@@ -116,6 +146,8 @@ class Policy:
 
         Each environment has its own generator, so the noise does not depend on the batching.
         """
+        if self._filler is not None:
+            return self._filling(self._filler, corners, placed, goals, generators)
         actions = self.act(corners, placed, goals, refine=False, past=past)
         for i, (action, generator) in enumerate(zip(actions, generators, strict=True)):
             velocity = action[-3:]

@@ -10,7 +10,7 @@ from typing import Any, TypeVar, cast, get_origin, get_type_hints
 import dacite
 
 from tangram_agent.config import AgentConfig, NetConfig
-from tangram_sim.actions import action_size, corner_bound, horizon
+from tangram_sim.actions import action_size, corner_bound, goal_rows, horizon
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import Layout, TokensConfig, make_layout
@@ -22,6 +22,11 @@ Settings = TypeVar("Settings")
 
 # Settings of the agent that have no effect but on pairs of several tokens.
 _SEVERAL_ONLY = ("order", "credit", "pairs_per_transition", "push_weight", "lookahead")
+# Those that have none on outlines.
+_NOT_OF_OUTLINES = (
+    *("egocentric", "offsets", "orientation", "edges", "afterstate", "angle_head", "squash"),
+    *("saturation_penalty", "saturation_limit", "actor_lr", "noise"),
+)
 MAX_PLANNED = 8  # tokens: a look ahead finds the best order over all their subsets
 SECTIONS = ("tokens", "sim", "reward", "agent", "net")
 
@@ -53,7 +58,13 @@ class Setup:
             self._refuse(("edges",), "net.kind=mlp", "set net.kind=mha")
         if one:
             self._refuse(_SEVERAL_ONLY, "one token", "take a set of several")
-        if not self.contacts:
+        if self.fills:
+            self._check_fills()
+        elif agent.lookahead == "values":
+            refuse_ignored(
+                "agent.lookahead=values", f"agent.readout={agent.readout}", "set agent=outline"
+            )
+        elif not self.contacts:
             slide = "train with sim.motion=slide"
             apart = ("push_weight", "lookahead")
             self._refuse(apart, "tokens that do not push each other", slide)
@@ -69,6 +80,51 @@ class Setup:
             )
         if self.pairs and not one:
             self._check_credit(f"{self.layout.tokens} tokens on pairs")
+
+    def _check_fills(self) -> None:
+        """Refuse what an agent of outlines cannot use, or outlines that no agent sees."""
+        agent, sim = self.agent, self.sim
+        if sim.observe != "silhouette":
+            raise ConfigError(
+                f"agent.readout=outline needs sim.observe=silhouette, got {sim.observe}: set "
+                "sim=silhouette, or another agent"
+            )
+        if self.net.kind != "mha":
+            refuse_ignored(f"net.kind={self.net.kind}", "outlines", "set net.kind=mha")
+        self._refuse(_NOT_OF_OUTLINES, "outlines", "leave it out")
+        if agent.lookahead not in ("none", "values"):
+            refuse_ignored(
+                f"agent.lookahead={agent.lookahead}", "outlines", "set agent.lookahead=values"
+            )
+        for name, value in _changed(self.reward).items():
+            refuse_ignored(
+                f"reward.{name}={told(value)}",
+                "an agent that learns what fills outlines",
+                "leave it out",
+            )
+        if any(relabel.strategy != "final" for relabel in agent.hindsight):
+            refuse_ignored("agent.hindsight.strategy", "outlines", "use final")
+        if not agent.hindsight:
+            raise ConfigError(
+                "agent.hindsight=[] leaves an agent of outlines without a filled one to learn "
+                "from: name final, as in agent.hindsight=[{strategy:final,copies:6}]"
+            )
+        needed = {
+            "tokens": (self.layout.tokens > 1, "a set of several tokens"),
+            "agent.gamma": (agent.gamma > 0.0, "agent.gamma=1"),
+            "sim.motion": (sim.motion == "lift", "sim.motion=lift"),
+            "sim.starts": (sim.starts == "outside", "sim.starts=outside"),
+            "sim.actions_per_token": (sim.actions_per_token == 1, "sim.actions_per_token=1"),
+            "sim.allow_flip": (
+                sim.allow_flip or not self.layout.any_chiral,
+                "sim.allow_flip=true",
+            ),
+            "sim.corner_noise": (not sim.corner_noise, "exact corners, sim.corner_noise=0"),
+            "sim": (not sim.inexact and not sim.action_noise, "a world whose motion is exact"),
+        }
+        for name, (holds, remedy) in needed.items():
+            if not holds:
+                raise ConfigError(f"{name}: an agent of outlines needs {remedy}: set it so")
 
     def _check_credit(self, several: str) -> None:
         """Refuse what several tokens on pairs cannot use, or cannot learn."""
@@ -114,6 +170,16 @@ class Setup:
     def pairs(self) -> bool:
         """Whether the agent acts on pairs of a token and a piece of the target."""
         return self.agent.readout == "pair"
+
+    @property
+    def fills(self) -> bool:
+        """Whether the agent fills outlines: it is told of no piece of the target."""
+        return self.agent.readout == "outline"
+
+    @property
+    def goal_rows(self) -> int:
+        """G: corners of a target as agents see it."""
+        return goal_rows(self.layout, self.sim)
 
     @property
     def credits_pieces(self) -> bool:

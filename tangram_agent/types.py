@@ -26,7 +26,7 @@ class Episodes:
         placed: (E, T + 1, K) uint8, 1 where a token is placed.
         actions: (E, T, A) float32 in [-1, 1].
         rewards: (E, T) float32 of the goal that was played.
-        goals: (E, V, 2) float32, target corners.
+        goals: (E, V, 2) float32, target corners, or (E, G, 2) rows of its outline.
         missing: (E, T + 1, K) uint8, 1 where a token was not found in a picture, `AWAY` where it
             should have left that; None where pictures are not what is observed.
         goals_missing: (E, K) uint8, the same of the target's pieces.

@@ -47,6 +47,14 @@ def corner_bound(tokens: int, sim: SimConfig) -> float:
     return (sim.arena * (inside + moved) + noise_bound(sim)) * _ROUNDING
 
 
+def goal_rows(layout: Layout, sim: SimConfig) -> int:
+    """G, the corners of a target as agents see it: its pieces', or rows of their outline.
+
+    An outline has no more corners than its pieces, and each ring one row more, see `rings`.
+    """
+    return layout.corner_count + layout.tokens * (sim.observe == "silhouette")
+
+
 def chosen_tokens(actions: Floats, tokens: int) -> Ints:
     """(B,) the token that each action (B, A) moves: the first entry cuts [-1, 1] into K parts."""
     if tokens == 1:

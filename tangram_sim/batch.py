@@ -14,6 +14,7 @@ from tangram_sim.actions import (
     chosen_tokens,
     corner_bound,
     flips,
+    goal_rows,
     horizon,
     velocities,
 )
@@ -23,12 +24,12 @@ from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.geometry import outlines, overlap_share, shared_area
 from tangram_sim.layout import Layout
-from tangram_sim.lens import Lens
+from tangram_sim.lens import Lens, View
 from tangram_sim.observation_noise import see
 from tangram_sim.rewards import TargetPictures, make_reward, scaled_overlap
 from tangram_sim.sight import Eye, Sight
 from tangram_sim.targets import Sides, sample_starts, sample_targets
-from tangram_sim.world import make_world
+from tangram_sim.world import check_shown, make_world
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +78,7 @@ class BatchedEnv:
         task: what is played from the next `reset` on.
         action_size: A.
         bound: largest |coordinate| that a corner can reach, arena units.
+        goal_rows: G, corners of a target as agents see it.
         steps_done: steps taken in this episode.
         corners: (B, V, 2) of the tokens.
         placed: (B, K) which tokens are placed.
@@ -84,7 +86,8 @@ class BatchedEnv:
         actuation: the world that each episode has drawn.
         seen: `corners` as an agent sees them, new noise at every step if there is any, or as they
             are found in pictures.
-        seen_goals: `goals` as an agent sees them, with one noise for the whole episode.
+        seen_goals: (B, G, 2) `goals` as an agent sees them, with one noise for the whole episode,
+            or rows of their outlines, see `rings`.
         sight: what is found in pictures, where these are the agent's only source, else None.
         pictures: (B, P, P) of the tokens, as the camera had them last.
     """
@@ -96,6 +99,7 @@ class BatchedEnv:
         reward: RewardConfig,
         count: int = 1,
         eye: Eye | None = None,
+        outlines: bool = False,
     ) -> None:
         """Open `count` worlds.
 
@@ -105,12 +109,15 @@ class BatchedEnv:
             reward: what an action is worth.
             count: B.
             eye: finds tokens in pictures, for `sim.observe=pictures`.
+            outlines: whether who plays takes rows of outlines for goals, with
+                `sim.observe=silhouette`.
 
         Raises:
-            ConfigError: pictures are to be observed, and there is no eye.
+            ConfigError: pictures are to be observed, and there is no eye; or silhouettes are.
         """
         if count < 1:
             raise ValueError(f"count must be at least 1, got {count}")
+        check_shown(sim, outlines)
         if sim.observe == "pictures" and eye is None:
             raise ConfigError(
                 "sim.observe=pictures is for tangram-train, tangram-worker and tangram-eval, which "
@@ -124,6 +131,7 @@ class BatchedEnv:
         self.horizon = horizon(layout.tokens, sim)
         self.action_size = action_size(layout.tokens, sim)
         self.bound = corner_bound(layout.tokens, sim)
+        self.goal_rows = goal_rows(layout, sim)
         self.task = sim.task
         self._ends_by_placing = layout.tokens > 1 or sim.actions_per_token == 1
         self._worlds = [make_world(layout, sim) for _ in range(count)]
@@ -157,13 +165,18 @@ class BatchedEnv:
         return np.where(either.all(axis=1, keepdims=True), placed, either)
 
     def reset(
-        self, generators: Sequence[np.random.Generator], targets: Sides | None = None
+        self,
+        generators: Sequence[np.random.Generator],
+        targets: Sides | None = None,
+        views: Sequence[View] | None = None,
     ) -> None:
         """Begin an episode in every environment: a new target and a new start.
 
         Args:
             generators: one per environment; all of the episode's randomness comes from it.
             targets: poses (B, K, 3) and sides (B, K) to assemble; None: they are drawn.
+            views: how targets that are given were seen before; then they are known as they were
+                seen, and in the camera's pictures only the tokens are looked for.
 
         Raises:
             SamplingError: no layout without overlap was found.
@@ -177,8 +190,10 @@ class BatchedEnv:
         starts = sample_starts(self.layout, self.sim, targets, done, generators)
         self._generators = generators
         self._late = np.zeros(self.count, np.int64), np.zeros((self.count, 3))
-        self._begin(targets, starts)
-        if self.sight is None:
+        self._begin(targets, starts, views)
+        if self.sim.observe == "silhouette":
+            self.seen_goals = self._outlined()
+        elif self.sight is None:
             self.seen_goals = see(self.goals, self.sim, generators)
         else:
             self.seen_goals = self.sight.goals
@@ -189,6 +204,14 @@ class BatchedEnv:
                 world.damp(float(damping))
         self._moves[:] = self.sim.actions_per_token * self._named(done)
         self.steps_done = 0
+
+    def _outlined(self) -> Floats:
+        """(B, G, 2) rows of the targets' outlines."""
+        # Only here: most runs need no shapely.
+        from tangram_sim.rings import as_rows, covered_area  # noqa: PLC0415
+
+        areas = [covered_area(goal, self.layout) for goal in self.goals]
+        return np.stack([as_rows(area, self.layout, self.goal_rows) for area in areas])
 
     def _done(self, generators: Sequence[np.random.Generator]) -> Bools:
         """(B, K) tokens that lie on their targets already: in a stage with fewer to move."""
@@ -270,11 +293,11 @@ class BatchedEnv:
         covered: Floats = common.sum(axis=1) / layout.areas[tokens]
         return covered
 
-    def _begin(self, targets: Sides, starts: Sides) -> None:
+    def _begin(self, targets: Sides, starts: Sides, known: Sequence[View] | None) -> None:
         """Photograph the targets and put the tokens at their starts."""
         # World after world, here and in `_move`: the engine's memory of each fills the cache.
         pictures = []
-        views = self._lens.begin(self._generators)
+        views = self._lens.begin(self._generators) if known is None else self._lens.stand(known)
         for b, world in enumerate(self._worlds):
             if self._lens.moves:
                 world.aim(views[b].x, views[b].y, views[b].turn)
@@ -286,7 +309,8 @@ class BatchedEnv:
             self._targets = TargetPictures(np.stack(pictures), self._lens.disturbs)
         if self.sight is not None:
             self.pictures = np.stack([self._picture(b) for b in range(self.count)])
-            self.sight.begin(np.stack(pictures), self.pictures)
+            goals = None if known is None else self.goals
+            self.sight.begin(np.stack(pictures), self.pictures, goals)
 
     def _picture(self, b: int) -> Pixels:
         """(P, P) of an environment, as the camera has it now."""

@@ -17,7 +17,9 @@ SOURCES = ("polygon", "camera")
 EXACT_SUBSTEPS = 4
 MIN_PIXELS = 16
 PICTURES = ("binary", "grey")
-OBSERVED = ("corners", "pictures")
+# What the target looks like without its pieces.
+SILHOUETTES = ("silhouette", "silhouette_pictures")
+OBSERVED = ("corners", "pictures", *SILHOUETTES)
 # The settings of the camera.
 CAMERA = (
     *("pixels", "picture", "picture_noise", "picture_blur"),
@@ -161,7 +163,9 @@ class SimConfig(Settings, section="sim"):
     observe: str = setting(
         "corners",
         "what agents see: corners as they are, or what is found in the camera's pictures; then "
-        "Eq. 14 is measured on pictures, too, and scores are exact polygons all the same",
+        "Eq. 14 is measured on pictures, too, and scores are exact polygons all the same; "
+        "silhouette: of the target only its outline, which agent=outline fills itself and others "
+        "have filled by a search; silhouette_pictures: only the outline's picture, in tangram-eval",
         choices=OBSERVED,
     )
     motion: str = setting(
@@ -327,18 +331,22 @@ class SimConfig(Settings, section="sim"):
             )
         if 0 < self.pixels < MIN_PIXELS:
             raise ConfigError(f"sim.pixels must be 0 or at least {MIN_PIXELS}, got {self.pixels}")
-        if self.observe == "pictures":
+        if self.observe in ("pictures", "silhouette_pictures"):
             self._check_observed()
+        if self.observe == "silhouette" and self.pixels:
+            remedy = "set sim.observe=silhouette_pictures"
+            refuse_ignored(f"sim.pixels={self.pixels}", "sim.observe=silhouette", remedy, 0)
 
     def _check_observed(self) -> None:
         if not self.pixels:
             raise ConfigError(
-                "sim.observe=pictures needs pictures, got sim.pixels=0: set sim.pixels=128"
+                f"sim.observe={self.observe} needs pictures, got sim.pixels=0: set sim.pixels=128"
             )
         if self.corner_noise:
             given = f"sim.corner_noise={told(self.corner_noise)}"
             remedy = "set sim.picture_noise"
-            refuse_ignored(given, "sim.observe=pictures", remedy, SimConfig.corner_noise)
+            because = f"sim.observe={self.observe}"
+            refuse_ignored(given, because, remedy, SimConfig.corner_noise)
 
     def _check_stages(self) -> None:
         entries: tuple[object, ...] = tuple(self.stages)

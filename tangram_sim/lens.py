@@ -53,6 +53,11 @@ class Lens:
         self._views = [self._view(generator) for generator in generators]
         return self._views
 
+    def stand(self, views: Sequence[View]) -> list[View]:
+        """See B episodes as something was seen before."""
+        self._views = list(views)
+        return self._views
+
     def _view(self, generator: np.random.Generator) -> View:
         sim = self._sim
         way = _direction(generator) if sim.camera_shift else np.zeros(2)

@@ -69,11 +69,20 @@ class Sight:
         self.corners: Floats = layout.corners(self._poses)
         self.goals, self.goals_missing = self.corners, self.missing
 
-    def begin(self, targets: Pixels, states: Pixels) -> None:
-        """Look at pictures (B, P, P) of targets and starts."""
+    def begin(self, targets: Pixels, states: Pixels, goals: Floats | None = None) -> None:
+        """Look at pictures (B, P, P) of targets and starts, or of starts where goals are known.
+
+        Args:
+            targets: pictures of them.
+            states: pictures of the starts.
+            goals: (B, V, 2) as a look before has found them.
+        """
         self._poses[:], self._flipped[:], self.missing = 0.0, False, np.ones_like(self.missing)
         count = len(self._poses)
         self.follow(states, np.zeros(count, np.int64), np.zeros((count, 3)))
+        if goals is not None:
+            self.goals, self.goals_missing = goals, np.zeros_like(self.missing)
+            return
         poses, flipped, gone = self._poses.copy(), self._flipped.copy(), np.ones_like(self.missing)
         for b, target in enumerate(targets):
             look = self._eye(target)

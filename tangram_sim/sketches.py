@@ -42,25 +42,30 @@ class FaultError(Exception):
     """What is wrong with one puzzle; its text says where."""
 
 
-def read_text(path: Path) -> str:
-    """The text of a puzzle file.
+def read_text(path: Path, source: str | None = None) -> str:
+    """The text of a drawing.
+
+    Args:
+        path: of the file.
+        source: what errors call it; a puzzle file by default.
 
     Raises:
         ConfigError: not a file that can be read, too large, or not UTF-8.
     """
+    source = source or f"puzzle file {path}"
     if not path.is_file():
-        raise ConfigError(f"puzzle file {path} is no file: check the path")
+        raise ConfigError(f"{source} is no file: check the path")
     try:
         with path.open("rb") as file:
             content = file.read(MAX_BYTES + 1)
     except OSError as error:
-        raise ConfigError(f"puzzle file {path} cannot be read ({error.strerror})") from None
+        raise ConfigError(f"{source} cannot be read ({error.strerror})") from None
     if len(content) > MAX_BYTES:
-        raise ConfigError(f"puzzle file {path} is larger than {MAX_BYTES} bytes: split it")
+        raise ConfigError(f"{source} is larger than {MAX_BYTES} bytes: split it")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise ConfigError(f"puzzle file {path} is not UTF-8: save it as UTF-8") from None
+        raise ConfigError(f"{source} is not UTF-8: save it as UTF-8") from None
 
 
 def parse_sketches(text: str, source: str) -> list[Sketch | list[str]]:
@@ -73,23 +78,22 @@ def parse_sketches(text: str, source: str) -> list[Sketch | list[str]]:
     Raises:
         ConfigError: nothing of the file can be used.
     """
-    content = _loaded(text, source)
+    content = loaded(text, source)
     if not isinstance(content, dict) or set(content) != {"format", "version", "puzzles"}:
         raise ConfigError(
             f"{source} must be a mapping with exactly the keys format, version, puzzles, "
             f"got {shown(content)}"
         )
-    if content["format"] != FORMAT:
-        raise ConfigError(f"{source}: format must be '{FORMAT}', got {shown(content['format'])}")
-    if type(content["version"]) is not int or content["version"] != VERSION:
-        raise ConfigError(
-            f"{source}: version must be {VERSION}, got {shown(content['version'])}: "
-            "write the file anew, or read it with the release that wrote it"
-        )
+    check_format(content, FORMAT, VERSION, source)
     return _sketches(_entries(content["puzzles"], source))
 
 
-def _loaded(text: str, source: str) -> Any:
+def loaded(text: str, source: str) -> Any:
+    """What a JSON text holds, no key of a mapping given twice.
+
+    Raises:
+        ConfigError: it is too long, or no JSON.
+    """
     if len(text) > MAX_BYTES:
         raise ConfigError(f"{source} is longer than {MAX_BYTES} characters: split it")
     try:
@@ -103,6 +107,17 @@ def _loaded(text: str, source: str) -> Any:
             else "its nesting and numbers"
         )
         raise ConfigError(f"{source} is not JSON that can be read: check {place}") from None
+
+
+def check_format(content: dict[str, Any], name: str, version: int, source: str) -> None:
+    """Raise ConfigError unless a file is of a format and version."""
+    if content["format"] != name:
+        raise ConfigError(f"{source}: format must be '{name}', got {shown(content['format'])}")
+    if type(content["version"]) is not int or content["version"] != version:
+        raise ConfigError(
+            f"{source}: version must be {version}, got {shown(content['version'])}: "
+            "write the file anew, or read it with the release that wrote it"
+        )
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -181,11 +196,16 @@ def _piece(entry: Any, where: str) -> tuple[str, Floats]:
     if not isinstance(corners, list) or len(corners) != count:
         got = len(corners) if isinstance(corners, list) else shown(corners)
         raise FaultError(f"{where} ({kind}): corners must be a list of {count} pairs, got {got}")
-    return kind, np.array([_point(corner, f"{where} ({kind})") for corner in corners])
+    return kind, np.array([drawn_point(corner, f"{where} ({kind})") for corner in corners])
 
 
-def _point(corner: Any, where: str) -> tuple[float, float]:
-    if not isinstance(corner, list) or len(corner) != 2 or not all(map(_is_number, corner)):
+def drawn_point(corner: Any, where: str) -> tuple[float, float]:
+    """A corner, checked.
+
+    Raises:
+        FaultError: it is no pair of numbers, or they are not finite or too large.
+    """
+    if not isinstance(corner, list) or len(corner) != 2 or not all(map(is_number, corner)):
         raise FaultError(
             f"{where}: a corner must be [x, y], finite and within +-{MAX_COORDINATE:g}, "
             f"got {shown(corner)}"
@@ -193,7 +213,8 @@ def _point(corner: Any, where: str) -> tuple[float, float]:
     return float(corner[0]), float(corner[1])
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
+    """Whether a value is a finite number within +-MAX_COORDINATE."""
     # A whole number may be too large for a float; NaN fails every comparison.
     return type(value) in (int, float) and -MAX_COORDINATE <= value <= MAX_COORDINATE
 

@@ -116,8 +116,8 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
                 f"sim.stages: tokens must be at most the {layout.tokens} that there are, got "
                 f"{stage.tokens} (in the stage from update {stage.updates}); 0 moves all"
             )
-    if sim.observe == "pictures":
-        _check_names(layout)
+    if sim.observe in ("pictures", "silhouette_pictures"):
+        _check_names(layout, sim.observe)
     together = [
         t for t in (sim.task, *sim.stages) if t.targets in ("connected", "figures", "mixed")
     ]
@@ -132,19 +132,19 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
         _check_figures_fit(layout, sim)
 
 
-def _check_names(layout: Layout) -> None:
+def _check_names(layout: Layout, observe: str) -> None:
     """What is found in pictures has no name: tokens of one name must be equal, others unlike."""
     for one, other in combinations(layout.shapes, 2):
         turn = turn_onto(one.corners, other.corners)
         if one.name == other.name:
             if turn is None or abs(turn) > _NO_TURN:
                 raise ConfigError(
-                    f"sim.observe=pictures takes tokens of one name for equal, and two of "
+                    f"sim.observe={observe} takes tokens of one name for equal, and two of "
                     f"{one.name} have other corners: give them names of their own"
                 )
         elif turn is not None or turn_onto(mirror_image(one.corners), other.corners) is not None:
             raise ConfigError(
-                f"sim.observe=pictures cannot tell {one.name} from {other.name}, which may look "
+                f"sim.observe={observe} cannot tell {one.name} from {other.name}, which may look "
                 "alike: take equal tokens of one name, or set sim.observe=corners"
             )
 

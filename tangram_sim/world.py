@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 
 from tangram_sim.arrays import Bools, Floats, Pixels
-from tangram_sim.config import SimConfig
+from tangram_sim.config import SILHOUETTES, SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.kinematics import KinematicWorld
 from tangram_sim.layout import Layout
@@ -89,6 +89,24 @@ def check_room(layout: Layout, sim: SimConfig) -> None:
         generators = [np.random.default_rng(0)]
         targets = sample_targets(layout, sim, task, generators)
         sample_starts(layout, sim, targets, done, generators)
+
+
+def check_shown(sim: SimConfig, outlines: bool) -> None:
+    """Refuse to show silhouettes to who knows nothing of them.
+
+    Args:
+        sim: the world.
+        outlines: whether outlines are known, see `rings`.
+
+    Raises:
+        ConfigError: says who takes them.
+    """
+    if sim.observe in SILHOUETTES and not (outlines and sim.observe == "silhouette"):
+        raise ConfigError(
+            f"sim.observe={sim.observe} is for an agent of outlines: train one with sim=silhouette "
+            "agent=outline; tangram-eval puzzle= fills what it shows to others by a search, and "
+            "tangram-play silhouette= too; set sim.observe=corners"
+        )
 
 
 def make_world(layout: Layout, sim: SimConfig) -> World:

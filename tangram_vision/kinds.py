@@ -11,7 +11,7 @@ import numpy as np
 
 from tangram_sim.arrays import Complex, Floats, Ints
 from tangram_sim.layout import Layout
-from tangram_sim.shapes import Shape, mirror_image, turn_onto
+from tangram_sim.sides import Side, sides_of
 
 # Moments z^a conj(z)^b: a turn by t multiplies one by e^(i (a - b) t).
 POWERS = ((2, 0), (3, 0), (4, 0), (2, 1), (3, 1))
@@ -44,26 +44,14 @@ class Lines:
 
 
 @dataclass(frozen=True, eq=False)
-class Kind:
-    """A shape on one of its sides.
+class Kind(Side):
+    """A shape on one of its sides, in pixels.
 
     Attributes:
-        shape: number among the different shapes of a layout.
-        flipped: whether it is the other side of a chiral shape.
-        corners: (C, 2) counter-clockwise.
-        different: corners of which no turn makes another.
-        area: square pixels.
         moments: (F,) over area and its root to the moment's degree.
-        tokens: those of the layout that have this shape.
     """
 
-    shape: int
-    flipped: bool
-    corners: Floats
-    different: int
-    area: float
     moments: Complex
-    tokens: tuple[int, ...]
 
     @cached_property
     def perimeter(self) -> float:
@@ -80,23 +68,13 @@ class Kind:
 def kinds_of(layout: Layout, arena: float, pixels: int) -> tuple[Kind, ...]:
     """All different shapes of a layout as pictures show them, chiral ones on both sides."""
     unit = pixels / arena
-    found: list[tuple[Shape, list[int]]] = []
-    for token, shape in enumerate(layout.shapes):
-        alike = (tokens for one, tokens in found if _same(one, shape))
-        tokens = next(alike, None)
-        if tokens is None:
-            found.append((shape, [token]))
-        else:
-            tokens.append(token)
     kinds = []
-    for number, (shape, tokens) in enumerate(found):
-        sides = (False, True) if shape.mirror is None else (False,)
-        for flipped in sides:
-            corners = (mirror_image(shape.corners) if flipped else shape.corners) * unit
-            area = shape.area * unit**2
-            own = moments_of(*_filled(corners), area)
-            different = len(corners) // shape.symmetry
-            kinds.append(Kind(number, flipped, corners, different, area, own, tuple(tokens)))
+    for side in sides_of(layout):
+        corners, area = side.corners * unit, side.area * unit**2
+        own = moments_of(*_filled(corners), area)
+        kinds.append(
+            Kind(side.shape, side.flipped, corners, side.different, area, side.tokens, own)
+        )
     return tuple(kinds)
 
 
@@ -105,11 +83,6 @@ def moments_of(z: Complex, weight: Floats, area: float) -> Complex:
     return np.array(
         [(weight * z**a * z.conj() ** b).sum() / area ** (1 + (a + b) / 2) for a, b in POWERS]
     )
-
-
-def _same(one: Shape, other: Shape) -> bool:
-    turn = turn_onto(one.corners, other.corners)
-    return turn is not None and abs(turn) < 1e-6
 
 
 def _filled(corners: Floats) -> tuple[Complex, Floats]:

@@ -21,7 +21,7 @@ import shapely
 from shapely import Polygon
 
 from tangram_sim.arrays import Complex, Floats, Singles
-from tangram_vision.dissections import Area
+from tangram_sim.dissections import Area
 
 _MARGIN = 3  # pixels around a picture
 _SHORT = 10  # points of a chain that is no silhouette's

@@ -22,6 +22,7 @@ from tangram_vision.blobs import find_blobs, likeness
 from tangram_vision.kinds import kinds_of
 from tangram_vision.levels import MIN_CONTRAST
 from tangram_vision.seeing import Seen, see
+from tangram_vision.tilts import from_above
 
 # Along a side, at most, in which tokens are searched: the fewer, the less a skew matters.
 _PIXELS = (256, 128, 80)
@@ -91,8 +92,9 @@ class Shade:
 
     Attributes:
         cover: (P, P) coverage by it, of a square around it.
-        corner: column and row of the square's upper left corner in the photograph.
-        pixels: of the photograph along a side of the square.
+        corner: column and row of the square's upper left corner in the photograph, about where
+            that was taken aslant.
+        pixels: of the photograph along a side of the square, likewise.
     """
 
     cover: Singles
@@ -100,13 +102,16 @@ class Shade:
     pixels: int
 
 
-def find_silhouette(picture: Image.Image, layout: Layout, source: str) -> Shade:
+def find_silhouette(
+    picture: Image.Image, layout: Layout, source: str, tilted: bool = True
+) -> Shade:
     """The silhouette that a photograph shows, of one part or of several.
 
     Args:
         picture: the photograph.
         layout: the tokens that are to fill it.
         source: what errors call the photograph.
+        tilted: whether the camera may have looked aslant, which is then corrected.
 
     Raises:
         ConfigError: it shows none.
@@ -114,6 +119,9 @@ def find_silhouette(picture: Image.Image, layout: Layout, source: str) -> Shade:
     cover = _coverage(np.asarray(picture.convert("L")))
     spots = _spots(cover, layout, source)
     part, corner = spots.cut_out()
+    if tilted:
+        part, moved = from_above(part)
+        corner = corner[0] + moved[0], corner[1] + moved[1]
     return Shade(_smaller(part, _PIXELS[0]), corner, len(part))
 
 

@@ -63,7 +63,7 @@ def _check_size(image: Image.Image, source: str) -> None:
 
 def _upright(image: Image.Image) -> Image.Image:
     if image.mode.startswith("I"):  # 16 bits of grey
-        levels = np.clip(np.asarray(image, dtype=np.int64) >> 8, 0, 255)
+        levels = np.clip(np.asarray(image) >> 8, 0, 255)
         image = Image.fromarray(levels.astype(np.uint8))
     if image.mode in ("1", "P", "PA", "LA") or "transparency" in image.info:
         image = image.convert("RGBA")

@@ -1,36 +1,39 @@
 """A silhouette from a file or by name -> where a layout's tokens lie that fill it.
 
-A file is a PNG or JPEG of it, dark on light or the reverse; an SVG of its outline, or of pieces
-that make it up; or a puzzle, whose pieces are forgotten. Its scale, its place and its angle are
-free: the area tells the scale.
+A file is a PNG or JPEG of it, dark on light or the reverse, or draws its outline. Its place and its
+angle are free, and so is its scale: the area tells it, and must be the tokens' where the file tells
+it, too.
+
+Legend: H x W pixels of a picture.
 """
 
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import shapely
 from PIL import Image, ImageDraw
-from shapely import Polygon
 
-from tangram_sim.arrays import Floats
-from tangram_sim.assembly import Puzzle, PuzzleRules
+from tangram_sim.arrays import Bools, Floats
+from tangram_sim.dissections import Area
 from tangram_sim.errors import ConfigError
-from tangram_sim.geometry import outlines
 from tangram_sim.layout import Layout
-from tangram_sim.puzzles import load_puzzle, read_puzzles
-from tangram_sim.sketches import read_text
-from tangram_sim.svg import svg_outlines
-from tangram_vision.dissections import Area, Dissection, grown
-from tangram_vision.photos import find_silhouette
+from tangram_vision.outline_files import Drawn, read_outline
+from tangram_vision.photos import Shade, find_silhouette
 from tangram_vision.picture_files import read_picture
-from tangram_vision.silhouettes import Filled, fill_outline, fill_picture
+from tangram_vision.silhouettes import (
+    Filled,
+    attempt_outline,
+    fill_outline,
+    fill_picture,
+    moved,
+)
 
 _DRAWN = 640  # pixels along the longer side of an outline that is drawn
 _BORDER = 0.1  # of it, around the outline
 _INK, _PAPER = (55, 60, 68), (250, 250, 247)
-_SEAM = 0.004  # of the root of its area: gaps between drawn pieces that are closed
-_POINTS = 2_000  # corners of an outline
+_OFF = 0.05  # of the tokens' area, by which that of a drawing of known scale may be wrong
 PICTURES = (".png", ".jpg", ".jpeg")
 
 
@@ -40,91 +43,92 @@ class Silhouette:
 
     Attributes:
         picture: of it, in colour.
-        filled: how; poses are in the units of the layout, from the picture's upper left corner.
+        mask: (H, W) which of its pixels are the silhouette's.
+        filled: how, in different ways, or how it was tried; poses are in the units of the layout,
+            from the picture's upper left corner.
         unit: pixels of the picture in such a unit.
+        share: its area over that of the tokens where the file tells its scale, and they differ.
     """
 
     picture: Image.Image
-    filled: Filled
+    mask: Bools
+    filled: tuple[Filled, ...]
     unit: float
+    share: float | None = None
 
 
-def fill_silhouette(name: str, source: str, layout: Layout, seconds: float) -> Silhouette:
+def fill_silhouette(
+    name: str, source: str, layout: Layout, scale: float, seconds: float, count: int = 1
+) -> Silhouette:
     """Read a silhouette and fill it.
 
     Args:
         name: of a file, or of a puzzle of the library.
         source: what errors call it.
         layout: the tokens.
+        scale: side of the full square that they are cut from, in their units.
         seconds: for the search.
+        count: of different ways to fill it, at most.
 
     Raises:
         ConfigError: a file that cannot be used; whether it was filled is not checked.
     """
     path = Path(name)
-    if path.suffix.lower() in PICTURES:
-        return _from_picture(read_picture(path, source), source, layout, seconds)
-    if path.suffix.lower() == ".svg":
-        drawn = [Polygon(one) for one in svg_outlines(read_text(path), path.stem)]
-        return _from_outline(_joined(drawn, source), layout, seconds)
-    puzzle = _puzzle(path, source) if path.suffix.lower() == ".json" else load_puzzle(name, 1.0)
-    pieces = outlines(puzzle.layout.corners(puzzle.poses)[None], puzzle.layout)[0]
-    return _from_outline(_joined([Polygon(one) for one in pieces], source), layout, seconds)
-
-
-def _puzzle(path: Path, source: str) -> Puzzle:
-    found = read_puzzles(path, PuzzleRules(1.0, subset=True)).puzzles
-    if len(found) != 1:
+    if path.suffix.lower() not in PICTURES:
+        return _from_outline(read_outline(name, source), layout, scale, seconds, count)
+    if count > 1:
         raise ConfigError(
-            f"{source} has {len(found)} puzzles, and one silhouette is filled: take a file of one"
+            f"solutions={count} needs an exact outline, and {source} is a picture, whose pixels "
+            "are fitted by one: leave solutions out, or draw the outline as SVG or JSON"
         )
-    return found[0]
+    return _from_picture(read_picture(path, source), source, layout, seconds)
 
 
-def _joined(polygons: list[Polygon], source: str) -> Area:
-    """One area of several outlines; one that lies in another is a hole in it, and so on."""
-    if sum(len(one.exterior.coords) for one in polygons) > _POINTS:
-        raise ConfigError(
-            f"{source} has more than {_POINTS} corners: draw straight sides, or give a PNG of it"
-        )
-    valid = [shapely.make_valid(one) for one in polygons]
-    inside = [sum(shapely.contains_properly(other, one) for other in valid) for one in valid]
-    area: Area = Polygon()
-    for depth in range(max(inside) + 1):
-        own = shapely.union_all([one for one, d in zip(valid, inside, strict=True) if d == depth])
-        area = shapely.difference(area, own) if depth % 2 else shapely.union(area, own)
-    size = float(np.sqrt(area.area))
-    if not size > 0.0:
-        raise ConfigError(f"{source} draws nothing that has an area: draw an outline")
-    return grown(grown(area, _SEAM * size), -_SEAM * size)
+def _from_outline(
+    drawn: Drawn, layout: Layout, scale: float, seconds: float, count: int
+) -> Silhouette:
+    """Scaled to the tokens' area, unless it tells another scale, filled, and drawn."""
+    area, total = drawn.area, float(layout.areas.sum())
+    own = float(np.sqrt(total / area.area))
+    share = None if drawn.side is None else float(area.area * (scale / drawn.side) ** 2 / total)
+    wrong = share is not None and abs(share - 1.0) > _OFF
+    if wrong and drawn.side is not None:
+        own = scale / drawn.side
+    placed, size, unit = _framed(area, own)
+    filled = attempt_outline(placed, layout, seconds) if wrong else None
+    every = (filled,) if filled else tuple(fill_outline(placed, layout, seconds, count))
+    mask = _mask(placed, size, unit)
+    return Silhouette(_inked(mask), mask, every, unit, share if wrong else None)
 
 
-def _from_outline(area: Area, layout: Layout, seconds: float) -> Silhouette:
-    """Scaled to the tokens' area, filled, and drawn."""
+def _framed(area: Area, scale: float) -> tuple[Area, tuple[int, int], float]:
+    """An area so many times as large in a picture, its width and height, and pixels of a unit."""
     low_x, low_y, high_x, high_y = area.bounds
-    scale = float(np.sqrt(layout.areas.sum() / area.area))
     border = _BORDER * max(high_x - low_x, high_y - low_y)
+    width, height = high_x - low_x + 2.0 * border, high_y - low_y + 2.0 * border
+    pixels = _DRAWN / max(width, height)
 
     def placed(points: Floats) -> Floats:
-        moved: Floats = (points - (low_x - border, high_y + border)) * scale
-        return moved
+        moved_there: Floats = (points - (low_x - border, high_y + border)) * scale
+        return moved_there
 
-    own = shapely.transform(area, placed)
-    (filled,) = fill_outline(own, layout, seconds)
-    width, height = high_x - low_x + 2.0 * border, high_y - low_y + 2.0 * border
-    unit = _DRAWN / (max(width, height) * scale)
-    size = (round(width * scale * unit), round(height * scale * unit))
-    return Silhouette(_drawn(own, size, unit), filled, unit)
+    size = (round(width * pixels), round(height * pixels))
+    return shapely.transform(area, placed), size, pixels / scale
 
 
-def _drawn(area: Area, size: tuple[int, int], unit: float) -> Image.Image:
-    canvas = Image.new("RGB", size, _PAPER)
+def _mask(area: Area, size: tuple[int, int], unit: float) -> Bools:
+    canvas = Image.new("1", size)
     brush = ImageDraw.Draw(canvas)
-    for part in shapely.get_parts(area).tolist():
-        for ring, ink in ((part.exterior, _INK), *((hole, _PAPER) for hole in part.interiors)):
+    # What lies in a hole is smaller than what has the hole, and is drawn after it.
+    for part in sorted(shapely.get_parts(area).tolist(), key=lambda part: -part.area):
+        for ring, ink in ((part.exterior, 1), *((hole, 0) for hole in part.interiors)):
             points = np.asarray(ring.coords) * (unit, -unit)
             brush.polygon([(float(x), float(y)) for x, y in points], ink)
-    return canvas
+    return np.asarray(canvas, np.bool_)
+
+
+def _inked(mask: Bools) -> Image.Image:
+    return Image.fromarray(np.where(mask[..., None], _INK, _PAPER).astype(np.uint8))
 
 
 def _from_picture(picture: Image.Image, source: str, layout: Layout, seconds: float) -> Silhouette:
@@ -134,8 +138,18 @@ def _from_picture(picture: Image.Image, source: str, layout: Layout, seconds: fl
     view = float(np.sqrt(layout.areas.sum() / share))
     filled = fill_picture(shade.cover, layout, view, seconds)
     unit = shade.pixels / view
+    way = np.array([shade.corner[0], -shade.corner[1]]) / unit
     if filled.found is not None:
-        corner = np.array([shade.corner[0], -shade.corner[1], 0.0]) / (unit, unit, 1.0)
-        moved = Dissection(filled.found.poses + corner, filled.found.flipped)
-        filled = replace(filled, found=moved)
-    return Silhouette(picture, filled, unit)
+        filled = replace(filled, found=moved(filled.found, way))
+    if filled.attempt is not None:
+        filled = replace(filled, attempt=moved(filled.attempt, way))
+    return Silhouette(picture, _shaded(shade, picture.size), (filled,), unit)
+
+
+def _shaded(shade: Shade, size: tuple[int, int]) -> Bools:
+    """(H, W) where a photograph of such a width and height shows the silhouette."""
+    width, height = size
+    large = cv2.resize(shade.cover, (shade.pixels, shade.pixels), interpolation=cv2.INTER_LINEAR)
+    room = np.pad(np.asarray(large) > 0.5, ((height, height), (width, width)))
+    left, top = shade.corner
+    return room[height - top :, width - left :][:height, :width]

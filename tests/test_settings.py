@@ -331,6 +331,13 @@ def test_every_setting_of_a_command_is_read() -> None:
         (ONE, "sim.spread", 0.1, "sim.targets=uniform"),
         *((ONE, f"sim.{name}", value, "sim.pixels=0") for name, value in DISTURBED.items()),
         (over(SEEN, sim={"observe": "pictures"}), "sim.corner_noise", 0.01, "sim.observe=pictures"),
+        (over(ONE, sim={"observe": "silhouette"}), "sim.pixels", 64, "sim.observe=silhouette"),
+        (
+            over(SEEN, sim={"observe": "silhouette_pictures"}),
+            "sim.corner_noise",
+            0.01,
+            "sim.observe=silhouette_pictures",
+        ),
         (SLIDE, "sim.max_overlap", 0.1, "sim.motion=slide"),
         (ONE, "reward.sharpness", 10.0, "reward.name=overlap"),
     ],

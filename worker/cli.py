@@ -54,13 +54,14 @@ def _of_the_run(settings: Plain) -> tuple[str, Plain] | None:
 def _worker(settings: Plain) -> int:
     from tangram_agent.setup import SECTIONS, from_mapping, make_setup
     from tangram_sim.rewards import check_reward
-    from tangram_sim.world import check_world
+    from tangram_sim.world import check_shown, check_world
     from worker.config import WorkerConfig
 
     rest = {name: value for name, value in settings.items() if name not in SECTIONS}
     config = from_mapping(WorkerConfig, rest)
     setup = make_setup(settings)
-    check_world(setup.layout, setup.sim)  # before anything is connected
+    check_shown(setup.sim, setup.fills)  # before anything is connected
+    check_world(setup.layout, setup.sim)
     check_reward(setup.reward, setup.layout, setup.sim)
 
     from worker.session import keep_part
@@ -121,10 +122,12 @@ def _play(settings: Plain) -> int:
         from worker.photographs import read_photograph
 
         read_photograph(config.target, setups[0])
+    filled = None
     if config.silhouette is not None:
         from worker.silhouettes import read_silhouette
 
-        read_silhouette(config.silhouette, setups[0])
+        given = (config.silhouette, setups[0], config.solutions, config.attempt)
+        filled = read_silhouette(*given)
     tell(f"loads and plays {', '.join(config.run_dirs)}")
 
     if config.compare is not None:
@@ -133,7 +136,7 @@ def _play(settings: Plain) -> int:
         return compare_runs(config)
     from worker.play import play_run
 
-    return play_run(config)
+    return play_run(config, filled)
 
 
 def _check_played(run_dirs: Sequence[str], config: "EvalConfig | PlayConfig") -> list["Setup"]:

@@ -10,6 +10,7 @@ from typing import Any
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import MAX_INDEX, ROLES
 from tangram_agent.pretrained import PREFIX, agent_names
+from tangram_sim.config import SILHOUETTES
 from tangram_sim.errors import ConfigError
 from tangram_sim.puzzles import SPLITS
 from tangram_sim.settings import Settings, check_folder, declared, refuse_ignored, setting, told
@@ -20,6 +21,7 @@ OF_TARGETS = ("targets", "spread", "mirrored")  # settings of sim that say nothi
 MAX_EPISODES = 1_000_000
 MAX_SHOWN = 100
 MAX_TURNS = 360
+MAX_SOLUTIONS = 20
 GAME = "tangram7"  # the agent that plays puzzles unless another is named
 PICTURES = (".gif", ".mp4", ".png")
 MIN_COMPARED, MAX_COMPARED = 2, 4
@@ -151,6 +153,11 @@ class EvalConfig(Settings):
             raise ConfigError(f"sheet must end with .png, got '{self.sheet}'")
         if self.puzzle is not None:
             _refuse(self.changes, OF_TARGETS, "puzzle", "leave puzzle out")
+        observe = self.changes.get("sim", {}).get("observe")
+        if self.puzzle is None and observe in SILHOUETTES:
+            raise ConfigError(
+                f"sim.observe={observe} hides the pieces of puzzles, got none: add puzzle=test"
+            )
 
     @property
     def run(self) -> str:
@@ -251,9 +258,17 @@ class PlayConfig(Settings):
     )
     silhouette: str | None = setting(
         None,
-        "instead of random targets: an outline that tells no pieces, a PNG, JPEG or SVG, or the "
-        "name of a puzzle of the library; how the run's tokens fill it is searched first",
+        "instead of random targets: an outline that tells no pieces, a PNG, JPEG, SVG or JSON, or "
+        "the name of a puzzle of the library; how the run's tokens fill it is searched first",
         only={"compare": None, "puzzle": None, "target": None},
+    )
+    solutions: int = setting(
+        1,
+        "draw so many different ways to fill the silhouette, if there are; the first is laid",
+        low=1,
+        high=MAX_SOLUTIONS,
+        only={"live": False},
+        unless={"silhouette": None},
     )
     turns: int = setting(1, TURNS_HELP, low=1, high=MAX_TURNS, unless={"puzzle": None})
     skip_invalid: bool = setting(False, SKIP_HELP, unless={"puzzle": None})
@@ -292,6 +307,11 @@ class PlayConfig(Settings):
         """The runs to show, one or several."""
         named = f"{PREFIX}/{self.tokens}" if self.tokens is not None else game_run()
         return self.compare or (self.run_dir or named,)
+
+    @property
+    def attempt(self) -> Path | None:
+        """Beside which file a silhouette that cannot be filled is drawn."""
+        return None if self.live else Path(self.out)
 
     def _check_one_of_both(self) -> None:
         if self.run_dir is not None:

@@ -4,7 +4,7 @@ import json
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,9 @@ from tangram_agent.files import write_whole
 from tangram_agent.outcome import plural
 from tangram_agent.runs import Run, load_changed
 from tangram_agent.setup import Setup
-from tangram_sim.config import SimConfig
+from tangram_sim.arrays import Floats
+from tangram_sim.config import SILHOUETTES, SimConfig
+from tangram_sim.errors import ConfigError
 from tangram_sim.game_drawing import figure_sheet
 from tangram_sim.settings import told
 from worker.baselines import (
@@ -32,9 +34,9 @@ from worker.baselines import (
 )
 from worker.config import EvalConfig, source_and_names
 from worker.fitted import fitted_policy
-from worker.metrics import assembled, pose_errors, summarise
+from worker.metrics import SOLVED, assembled, pose_errors, summarise
 from worker.oracle import oracle_policy
-from worker.puzzles import Figure, Figures, find_figures, play_figures
+from worker.puzzles import Figure, find_figures, play_figures
 from worker.rollout import Played, at_once
 from worker.sweeping import sweeping_policy
 from worker.test_set import FixedTests, greedy
@@ -70,6 +72,7 @@ _SEVERAL = {
     "raw_overlap_p10": ("covered, 10th perc.", 3),
     "iou": ("IoU", 3),
     "share_solved": ("solved, 95 % covered", 3),
+    "share_solved_iou": ("solved, IoU 0.95", 3),
     "mean_train_reward": ("reward as trained on", 3),
     "position_error_median": ("position, median", 4),
     "position_error_p90": ("position, 90th perc.", 4),
@@ -81,6 +84,7 @@ _SEVERAL = {
     "blocked": ("blocked by others", 2),
     "actions_used": ("actions", 2),
     "seconds_per_puzzle": ("seconds", 3),
+    "search_seconds": ("of them the search", 3),
     "ms_per_decision": ("ms for each action", 1),
     "ms_slowest": ("CPU ms of the slowest", 0),
 }
@@ -122,6 +126,11 @@ def policies(run: Run) -> dict[str, Player]:
     world = run.policy.foresight()
     fixed = fixed if run.setup.pairs and layout.tokens > 1 and world is None else []
     result: dict[str, Player] = {RUN: greedy(run.policy)}
+    if run.setup.fills:
+        if run.setup.agent.lookahead == "values":
+            alone = {"lookahead": "none", "beam": AgentConfig.beam}
+            result["lookahead=none"] = greedy(run.with_settings({"agent": alone}).policy)
+        return result | {"random": random_policy(layout, sim)}
     for name in fixed:
         other = run.with_settings({"agent": {"order": name}})
         result[f"order={name}"] = greedy(other.policy)
@@ -165,16 +174,21 @@ def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
     source, names = source_and_names(config.puzzle or ())
     setup = run.setup
     found = find_figures(source, setup, names, config.turns, config.skip_invalid)
-    scores, lines, played = score_puzzles(setup, found.figures, policies(run), config.seed)
+    if setup.fills:
+        score = score_outlines
+    else:
+        score = score_hidden if setup.sim.observe in SILHOUETTES else score_puzzles
+    scored = score(setup, found.figures, policies(run), config.seed)
+    scores, lines = scored.means, scored.puzzles
     console = Console(highlight=False)
     count = len(found.figures)
     which = f"{plural(count, 'puzzle')} of {Path(source or 'the library').name}"
-    caption = f"{which}, {_told(setup)}; positions in arena units"
+    caption = f"{which}, {_told(setup)}; {scored.told}"
     console.print(scores_table(_title(run), caption, scores))
     console.print(puzzles_table(lines, full=config.out))
     print_faults(console, found.faults)
     if config.sheet is not None:
-        write_sheet(config.sheet, setup, found, played)
+        write_sheet(config.sheet, setup, scored)
         console.print(f"written: {config.sheet}", markup=False, soft_wrap=True)
     return _report(run, config, scores) | {
         "puzzle": list(config.puzzle or ()),
@@ -220,26 +234,105 @@ def _told(setup: Setup) -> str:
 
 def _observed(sim: SimConfig) -> str:
     """What agents see, in words."""
-    if sim.observe == "pictures":
-        return f"{sim.picture} pictures of {sim.pixels} px"
+    if sim.observe in ("pictures", "silhouette_pictures"):
+        pieces = "" if sim.observe == "pictures" else ", pieces hidden"
+        return f"{sim.picture} pictures of {sim.pixels} px{pieces}"
+    if sim.observe == "silhouette":
+        noise = f", corners with noise {sim.corner_noise:g}" if sim.corner_noise else ""
+        return f"exact outlines, pieces hidden{noise}"
     return f"corners with noise {sim.corner_noise:g}" if sim.corner_noise else "exact corners"
+
+
+@dataclass(frozen=True, eq=False)
+class Scored:
+    """Scores of several policies on E puzzles.
+
+    Attributes:
+        means: over all puzzles, by the policies' names.
+        puzzles: what the run made of each.
+        titles: of the puzzles.
+        ends: (E, V, 2) corners of the tokens as the run left them.
+        goals: (E, V, 2) corners of the puzzles' pieces.
+        told: what is to be known of the scores.
+    """
+
+    means: dict[str, Scores]
+    puzzles: list[dict[str, Any]]
+    titles: list[str]
+    ends: Floats
+    goals: Floats
+    told: str
 
 
 def score_puzzles(
     setup: Setup, figures: Sequence[Figure], players: Mapping[str, Player], seed: int
-) -> tuple[dict[str, Scores], list[dict[str, Any]], Played]:
-    """Scores of each policy on the same starts; those of the run also one by one.
-
-    Returns:
-        Means over all figures by the policies' names; a mapping for each figure; how the run
-        played them.
-    """
+) -> Scored:
+    """Scores of each policy on the same starts."""
     scores, played = dict[str, Scores](), dict[str, Played]()
     for name, player in players.items():
         played[name] = play_figures(setup, figures, player, seed)
-        means = summarise(setup.layout, setup.sim, played[name], own_reward=False)
-        scores[name] = means | of_several(setup, played[name])
-    return scores, _one_by_one(setup, figures, played[RUN]), played[RUN]
+        own = summarise(setup.layout, setup.sim, played[name], own_reward=False)
+        scores[name] = own | of_several(setup, played[name])
+    run, titles = played[RUN], [figure.title for figure in figures]
+    each = _one_by_one(setup, figures, run)
+    return Scored(scores, each, titles, run.ends, run.goals, "positions in arena units")
+
+
+def score_outlines(
+    setup: Setup, figures: Sequence[Figure], players: Mapping[str, Player], seed: int
+) -> Scored:
+    """Scores of each policy that sees the outlines of puzzles, and fills them itself."""
+    played = {name: play_figures(setup, figures, player, seed) for name, player in players.items()}
+    names = ("coverage", "iou", "blocked", "refused", "actions_used")
+    scores: dict[str, Scores] = {}
+    for name, own in played.items():
+        found = assembled(setup.layout, own)
+        means = {key: value for key, value in found.means().items() if key in names}
+        solved = {"share_solved_iou": float(np.mean(found.iou >= SOLVED))}
+        scores[name] = means | solved | of_several(setup, own)
+    run, found = played[RUN], assembled(setup.layout, played[RUN])
+    each = [
+        {
+            "name": figure.name,
+            "degrees": figure.degrees,
+            "coverage": float(found.coverage[e]),
+            "iou": float(found.iou[e]),
+            "solved": bool(found.iou[e] >= SOLVED),
+            **{name: int(getattr(found, name)[e]) for name in names[2:]},
+            "seconds": float(run.seconds[e]),
+        }
+        for e, figure in enumerate(figures)
+    ]
+    titles = [figure.title for figure in figures]
+    told = "filled by the run itself; any dissection counts, so no errors of position and angle"
+    return Scored(scores, each, titles, run.ends, run.goals, told)
+
+
+def score_hidden(
+    setup: Setup, figures: Sequence[Figure], players: Mapping[str, Player], seed: int
+) -> Scored:
+    """Scores of each policy that lays what a search found in the silhouettes.
+
+    Raises:
+        ConfigError: OpenCV or shapely is not installed.
+    """
+    try:
+        # Only here: other puzzles need neither.
+        from worker.hidden import hide, means, one_by_one, play_hidden  # noqa: PLC0415
+    except ImportError as error:
+        raise ConfigError(
+            f"sim.observe={setup.sim.observe} needs OpenCV and shapely ({error}): install "
+            "opencv-python-headless and shapely, or set sim.observe=corners"
+        ) from error
+    hidden = hide(setup, figures, seed)
+    laid = {name: play_hidden(hidden, player, seed) for name, player in players.items()}
+    scores = {name: means(hidden, own) for name, own in laid.items()}
+    told = (
+        f"{hidden.filled} of {len(figures)} filled by the search; any dissection counts, so no "
+        "errors of position and angle, and no pieces under others"
+    )
+    each, ends = one_by_one(hidden, laid[RUN]), laid[RUN].ends
+    return Scored(scores, each, hidden.titles, ends, hidden.goals, told)
 
 
 def of_several(setup: Setup, played: Played) -> Scores:
@@ -255,15 +348,15 @@ def of_several(setup: Setup, played: Played) -> Scores:
     return scores
 
 
-def write_sheet(path: str, setup: Setup, found: Figures, played: Played) -> None:
+def write_sheet(path: str, setup: Setup, scored: Scored) -> None:
     """Write a picture of every figure's end, of at most `MAX_PICTURES`.
 
     Raises:
         RunError: the file is not writable.
     """
     picture = BytesIO()
-    ends, goals = played.ends[:MAX_PICTURES], played.goals[:MAX_PICTURES]
-    sheet = figure_sheet(setup.layout, setup.sim.arena, ends, goals, found.titles[:MAX_PICTURES])
+    ends, goals = scored.ends[:MAX_PICTURES], scored.goals[:MAX_PICTURES]
+    sheet = figure_sheet(setup.layout, setup.sim.arena, ends, goals, scored.titles[:MAX_PICTURES])
     sheet.save(picture, format="PNG")
     write_whole(Path(path), picture.getvalue())
 
@@ -313,13 +406,15 @@ def puzzles_table(puzzles: Sequence[Mapping[str, Any]], full: str | None) -> Tab
     left = len(puzzles) - MAX_LINES
     rest = f"and {left:,} more: all are in {full or 'the file that out= names'}"
     table = Table(caption=rest if left > 0 else None)
-    for name in ("puzzle", "covered", "IoU", "wrong", "blocked", ""):
+    counts = [name for name in ("wrong", "blocked") if all(name in one for one in puzzles)]
+    for name in ("puzzle", "covered", "IoU", *counts, ""):
         table.add_column(name, justify="left" if name in ("puzzle", "") else "right")
     for one in puzzles[:MAX_LINES]:
         name = f"{one['name']} {one['degrees']:g}°" if one["degrees"] else str(one["name"])
         shares = (f"{one[key]:.3f}" for key in ("coverage", "iou"))
-        solved = "solved" if one["solved"] else ""
-        table.add_row(name, *shares, str(one["wrong"]), str(one["blocked"]), solved)
+        unfilled = "" if one.get("filled", True) else "not filled"
+        end = "solved" if one["solved"] else unfilled
+        table.add_row(name, *shares, *(str(one[count]) for count in counts), end)
     return table
 
 

@@ -43,6 +43,7 @@ class Show:
         titles: what each is called.
         kind: what one is called.
         seen: a picture of where the target comes from, if from one.
+        note: what else is to be told.
     """
 
     setup: Setup
@@ -50,12 +51,14 @@ class Show:
     titles: list[str]
     kind: str
     seen: Image.Image | None = None
+    note: str = ""
 
     def told(self) -> str:
         """What was shown and how well it went, in words."""
         mean = float(self.played.overlap.mean())
         score = "raw overlap" if self.kind == "episode" else "coverage"
-        return f"{plural(len(self.titles), self.kind)}, {score} {mean:.3f}"
+        note = f"; {self.note}" if self.note else ""
+        return f"{plural(len(self.titles), self.kind)}, {score} {mean:.3f}{note}"
 
 
 def frames_per_action(horizon: int) -> int:

@@ -11,7 +11,7 @@ from tangram_sim.world import no_opencv
 
 def environments(setup: Setup, count: int) -> BatchedEnv:
     """So many environments of a run, to be closed by whoever asked."""
-    return BatchedEnv(setup.layout, setup.sim, setup.reward, count, make_eye(setup))
+    return BatchedEnv(setup.layout, setup.sim, setup.reward, count, make_eye(setup), setup.fills)
 
 
 def make_eye(setup: Setup) -> Eye | None:

@@ -118,7 +118,7 @@ def assembled(layout: Layout, played: Played) -> Assembled:
     refused = played.refused.sum(axis=1)
     return Assembled(
         coverage=coverage,
-        iou=_iou(layout, played.ends, coverage),
+        iou=iou(layout, played.ends, coverage),
         wrong=_wrong(layout, played, covered),
         doubly_used=((covered > USED + _ROUNDING).sum(axis=2) > 1).sum(axis=1),
         refused=refused,
@@ -140,7 +140,8 @@ def covered_shares(layout: Layout, ends: Floats, goals: Floats) -> Floats:
     return shares
 
 
-def _iou(layout: Layout, ends: Floats, coverage: Floats) -> Floats:
+def iou(layout: Layout, ends: Floats, coverage: Floats) -> Floats:
+    """(E,) intersection over union of tokens at corners (E, V, 2) and targets covered so much."""
     whole = layout.areas.sum()
     common = coverage * whole
     share: Floats = common / (whole + union_area(ends, layout) - common)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw, ImageFont, ImageOps
 from rich.console import Console
 
 from tangram_agent.files import write_whole
@@ -27,7 +27,7 @@ from worker.film import WIDTH, Show, film_pictures, frames_per_action, show_live
 from worker.photographs import draw_photograph, read_photograph
 from worker.puzzles import find_figures, play_figures
 from worker.rollout import Played, at_once
-from worker.silhouettes import draw_silhouette, read_silhouette
+from worker.silhouettes import Shown, draw_silhouette, read_silhouette
 from worker.test_set import FixedTests, greedy
 from worker.views import beside, camera_sheets
 
@@ -43,8 +43,12 @@ GAP = 24  # pixels between runs
 PAPER, TEXT, FAINT, RULE = (250, 250, 247), (31, 41, 55), (107, 114, 128), (214, 214, 208)
 
 
-def play_run(config: PlayConfig) -> int:
+def play_run(config: PlayConfig, silhouette: Shown | None = None) -> int:
     """Play puzzles, a photograph or random episodes, noise off, and draw them side by side.
+
+    Args:
+        config: the settings.
+        silhouette: what fills theirs, if that was searched before.
 
     Returns:
         Exit status 0.
@@ -56,7 +60,7 @@ def play_run(config: PlayConfig) -> int:
     """
     torch.set_num_threads(1)
     (run_dir,) = config.run_dirs
-    show = make_show(load_changed(run_dir, config.changes), config)
+    show = make_show(load_changed(run_dir, config.changes), config, silhouette)
     if config.live:
         show_live(show)
         return 0
@@ -65,8 +69,8 @@ def play_run(config: PlayConfig) -> int:
     return 0
 
 
-def make_show(run: Run, config: PlayConfig) -> Show:
-    """What the settings name, played by a run.
+def make_show(run: Run, config: PlayConfig, silhouette: Shown | None = None) -> Show:
+    """What the settings name, played by a run; see `play_run`.
 
     Raises:
         ConfigError: puzzles or a photograph that the run cannot play.
@@ -76,7 +80,8 @@ def make_show(run: Run, config: PlayConfig) -> Show:
     if config.target is not None:
         return photograph_show(run, config, config.target)
     if config.silhouette is not None:
-        return silhouette_show(run, config, config.silhouette)
+        given = (config.silhouette, run.setup, config.solutions, config.attempt)
+        return silhouette_show(run, config, silhouette or read_silhouette(*given))
     titles = [f"target {i + 1}" for i in range(config.episodes)]
     return Show(run.setup, play_episodes(run, config), titles, "episode")
 
@@ -120,17 +125,12 @@ def photograph_show(run: Run, config: PlayConfig, target: str) -> Show:
     return Show(run.setup, played, [figure.title], "photograph", seen)
 
 
-def silhouette_show(run: Run, config: PlayConfig, name: str) -> Show:
-    """A silhouette that is filled first, with the tokens outside of it at first.
-
-    Raises:
-        ConfigError: a silhouette that the run's tokens do not fill.
-    """
+def silhouette_show(run: Run, config: PlayConfig, found: Shown) -> Show:
+    """A silhouette as it was found to be filled, with the tokens outside of it at first."""
     setup = _beside(run.setup)
-    found = read_silhouette(name, setup)
     played = play_figures(setup, [found.figure], greedy(run.policy), config.seed)
-    seen = draw_silhouette(found, setup.layout, tiles(1, WIDTH)[1])
-    return Show(setup, played, [found.figure.title], "silhouette", seen)
+    seen = draw_silhouette(found, setup.layout, WIDTH if _is_still(config.out) else WIDTH // 2)
+    return Show(setup, played, [found.figure.title], "silhouette", seen, found.told)
 
 
 def _beside(setup: Setup) -> Setup:
@@ -147,7 +147,7 @@ def end_picture(show: Show) -> Image.Image:
 def _frames(show: Show, out: str) -> list[Image.Image]:
     """One picture of the ends, or the film."""
     setup, played = show.setup, show.played
-    still, game = Path(out).suffix == ".png", setup.layout.tokens > 1 or show.seen is not None
+    still, game = _is_still(out), setup.layout.tokens > 1 or show.seen is not None
     count = len(show.titles)
     columns, size = tiles(count, WIDTH) if game else _tiles(count, SHEET)
     sheets = camera_sheets(setup, played, columns, size)
@@ -158,7 +158,12 @@ def _frames(show: Show, out: str) -> list[Image.Image]:
     if sheets:
         pairs = zip(frames, beside(frames, sheets), strict=True)
         frames = [side_by_side(pair) for pair in pairs]
-    return [one for one in _before(show) for _ in range(SEEN)] + with_stills(frames)
+    before = [ImageOps.pad(one, frames[0].size, color=PAPER) for one in _before(show)]
+    return [one for one in before for _ in range(SEEN)] + with_stills(frames)
+
+
+def _is_still(out: str) -> bool:
+    return Path(out).suffix == ".png"
 
 
 def _before(show: Show) -> list[Image.Image]:
@@ -173,7 +178,7 @@ def save_picture(out: str, frames: Sequence[Image.Image]) -> None:
         RunError: `out` is not writable.
     """
     picture = BytesIO()
-    if Path(out).suffix == ".png":
+    if _is_still(out):
         frames[-1].save(picture, format="PNG")
     else:
         save = save_mp4 if Path(out).suffix == ".mp4" else save_gif
@@ -305,7 +310,7 @@ def distinct_names(folders: Sequence[Path]) -> list[str]:
 
 def _films(config: PlayConfig, shown: Sequence[tuple[Setup, Played]]) -> list[list[Image.Image]]:
     """For each run its frames, equally many: only the last one for a PNG."""
-    if Path(config.out).suffix == ".png":
+    if _is_still(config.out):
         scenes = [[played.ends] for _, played in shown]
     else:
         scenes = equally_long(shown)

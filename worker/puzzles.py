@@ -14,8 +14,9 @@ from tangram_agent.setup import Setup
 from tangram_sim.arrays import Bools, Floats
 from tangram_sim.assembly import Puzzle, PuzzleRules
 from tangram_sim.batch import BatchedEnv
-from tangram_sim.config import RewardConfig
+from tangram_sim.config import SILHOUETTES, RewardConfig
 from tangram_sim.errors import ConfigError
+from tangram_sim.lens import View
 from tangram_sim.puzzles import SPLITS, PuzzleFile, library, read_puzzles
 from tangram_sim.seeding import episode_generator
 from tangram_sim.targets import placement, turned_figure
@@ -102,7 +103,12 @@ def find_figures(
 
 
 def play_figures(
-    setup: Setup, figures: Sequence[Figure], player: Player, seed: int, touching: bool = True
+    setup: Setup,
+    figures: Sequence[Figure],
+    player: Player,
+    seed: int,
+    touching: bool = True,
+    views: Sequence[View] | None = None,
 ) -> Played:
     """Assemble E figures, one episode each; where the tokens start is decided by seed and figure.
 
@@ -112,28 +118,35 @@ def play_figures(
         player: moves them.
         seed: of the starts.
         touching: whether their pieces touch, so that no picture tells them apart.
+        views: E, how they were seen before, in pictures that told their pieces.
 
     Raises:
-        ConfigError: pictures are to be observed, and pieces touch.
+        ConfigError: pictures are to be observed, and pieces touch; or silhouettes are.
         SamplingError: the tokens find no room to start.
     """
     looks = setup.sim.observe == "pictures"
-    if looks and touching:
+    if looks and touching and views is None:
         raise ConfigError(
             "sim.observe=pictures cannot tell the pieces of a puzzle apart, which touch: set "
-            "sim.observe=corners"
+            "sim.observe=corners, or silhouette_pictures in tangram-eval"
         )
-    sim = setup.sim if looks else setup.sim.blind
+    shows = looks or setup.sim.observe in SILHOUETTES
+    sim = setup.sim if shows else setup.sim.blind
     targets = (np.stack([f.poses for f in figures]), np.stack([f.flipped for f in figures]))
     envs, eye = min(at_once(setup), len(figures)), make_eye(setup)
-    with closing(BatchedEnv(setup.layout, sim, RewardConfig(), envs, eye)) as env:
+    opened = BatchedEnv(setup.layout, sim, RewardConfig(), envs, eye, setup.fills)
+    with closing(opened) as env:
         choose, count = playing(player, env), len(figures)
-        return play(env, choose, lambda i: _generator(figures[i], seed), count, targets)
+
+        def generator(number: int) -> np.random.Generator:
+            return figure_generator(figures[number], seed)
+
+        return play(env, choose, generator, count, targets, views=views)
 
 
-def _generator(figure: Figure, seed: int) -> np.random.Generator:
-    """A figure's own, whatever else is in its file."""
-    return episode_generator(seed, f"puzzle {figure.name}", 0, 0, round(figure.degrees * 1000))
+def figure_generator(figure: Figure, seed: int, what: str = "puzzle") -> np.random.Generator:
+    """A figure's own, whatever else is in its file; `what` it is for."""
+    return episode_generator(seed, f"{what} {figure.name}", 0, 0, round(figure.degrees * 1000))
 
 
 def _read(source: str | None, scale: float, skip_invalid: bool) -> PuzzleFile:

@@ -15,6 +15,7 @@ from tangram_agent.setup import Setup
 from tangram_agent.types import AWAY, Episodes, Past
 from tangram_sim.arrays import Bools, Floats, Pixels, Singles
 from tangram_sim.batch import BatchedEnv
+from tangram_sim.lens import View
 from tangram_sim.seeding import episode_generator
 from tangram_sim.targets import Sides
 
@@ -74,7 +75,7 @@ class Played:
             placed=np.empty((count, steps + 1, tokens), np.uint8),
             actions=np.empty((count, steps, env.action_size), np.float32),
             rewards=np.empty((count, steps), np.float32),
-            goals=np.empty((count, corners, 2), np.float32),
+            goals=np.empty((count, env.goal_rows, 2), np.float32),
         )
         pictures = None
         if env.sight is not None:
@@ -132,6 +133,7 @@ def play(
     count: int,
     targets: Sides | None = None,
     go_on: Callable[[], bool] = lambda: True,
+    views: Sequence[View] | None = None,
 ) -> Played:
     """So many episodes, as many at a time as there are environments.
 
@@ -144,14 +146,17 @@ def play(
         targets: poses (E, K, 3) and sides (E, K) to assemble instead of targets that are drawn.
         go_on: asked before each action; if not, the episodes that are being played are left out
             of what is returned.
+        views: E, how these targets were seen before; see `BatchedEnv.reset`.
     """
     whole = -(-count // env.count) * env.count
     played = Played.empty(env, whole)
     for first in range(0, whole, env.count):
         numbers = np.arange(first, first + env.count) % count
         these = None if targets is None else (targets[0][numbers], targets[1][numbers])
+        seen = None if views is None else [views[i] for i in numbers.tolist()]
         generators = [generator(i) for i in numbers.tolist()]
-        if not _play_group(env, choose, generators, these, played, first, go_on):
+        env.reset(generators, these, seen)
+        if not _play_group(env, choose, generators, played, first, go_on):
             return played.first(first)
     return played.first(count)
 
@@ -160,14 +165,12 @@ def _play_group(
     env: BatchedEnv,
     choose: Choose,
     generators: Generators,
-    targets: Sides | None,
     played: Played,
     first: int,
     go_on: Callable[[], bool],
 ) -> bool:
-    """One episode in every environment, into the rows from `first` on; False if told to end."""
+    """The episode in every environment, into the rows from `first` on; False if told to end."""
     rows, seen = slice(first, first + env.count), played.episodes
-    env.reset(generators, targets)
     seen.goals[rows], played.goals[rows] = env.seen_goals, env.goals
     if env.sight is not None and seen.goals_missing is not None:
         seen.goals_missing[rows] = env.sight.goals_missing

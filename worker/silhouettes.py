@@ -1,20 +1,40 @@
-"""A silhouette as what a run is to assemble: it is filled with the run's tokens first."""
+"""A silhouette as what a run is to assemble: it is filled with the run's tokens first.
+
+What cannot be filled is told, and drawn as far as it could be.
+
+Legend: H x W pixels of a picture, N ways to fill it, V corners.
+"""
 
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from PIL import Image
+import numpy as np
+from PIL import Image, ImageDraw, ImageFilter
+from PIL.PngImagePlugin import PngInfo
 
+from tangram_agent.files import write_whole
+from tangram_agent.outcome import plural
 from tangram_agent.setup import Setup
-from tangram_sim.arrays import Floats
+from tangram_sim.arrays import Bools, Floats
 from tangram_sim.drawing import contact_sheet
-from tangram_sim.errors import ConfigError
+from tangram_sim.errors import ConfigError, RunError
+from tangram_sim.game_drawing import tiles
 from tangram_sim.layout import Layout
 from tangram_sim.targets import has_all_tans, turned_figure
 from worker.puzzles import Figure, reach_beyond
 from worker.views import outlined
 
+if TYPE_CHECKING:  # they need OpenCV and shapely
+    from tangram_sim.dissections import Dissection
+    from tangram_vision.silhouette_files import Silhouette
+
 SECONDS = 5.0  # of the search
+MARK = "tangram-play: a silhouette that was not filled"  # within pictures of these
+RED = (220, 38, 38)
+_TILE = 480  # pixels of a picture that is alone
+_EDGE = 3  # pixels: what differs less widely is the roughness of edges
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,8 +43,8 @@ class Shown:
 
     Attributes:
         picture: of it, in colour.
-        outlines: (V, 2) corners of the tokens that fill it, pixels of the picture, y down.
-        figure: the tokens in the middle of a run's arena.
+        outlines: (N, V, 2) corners of the tokens that fill it, pixels of the picture, y down.
+        figure: the tokens in the middle of a run's arena, as the first way has them.
         told: how it was filled, in words.
     """
 
@@ -34,8 +54,14 @@ class Shown:
     told: str
 
 
-def read_silhouette(name: str, setup: Setup) -> Shown:
+def read_silhouette(name: str, setup: Setup, count: int = 1, out: Path | None = None) -> Shown:
     """A silhouette, filled with a run's tokens.
+
+    Args:
+        name: of a file, or of a puzzle of the library.
+        setup: the run.
+        count: of different ways to fill it, at most.
+        out: a PNG file for the best attempt where nothing fills it; None is none.
 
     Raises:
         ConfigError: it cannot be read or filled, or OpenCV or shapely is not installed.
@@ -43,45 +69,134 @@ def read_silhouette(name: str, setup: Setup) -> Shown:
     try:
         # Only here: other targets need neither.
         from tangram_vision.silhouette_files import fill_silhouette  # noqa: PLC0415
-        from tangram_vision.silhouettes import SOLVED  # noqa: PLC0415
     except ImportError as error:
         raise ConfigError(
             f"silhouette needs OpenCV and shapely ({error}): install opencv-python-headless and "
             "shapely, or leave silhouette out"
         ) from error
     source, layout = f"silhouette={name}", setup.layout
-    drawn = fill_silhouette(name, source, layout, SECONDS)
-    filled, names = drawn.filled, ", ".join(shape.name for shape in layout.shapes)
-    tokens = "the seven tans" if has_all_tans(layout) else names
-    if filled.found is None:
-        why = (
-            f"all ways to lay them were tried, {filled.nodes} steps"
-            if filled.complete
-            else f"none was found in {filled.seconds:.1f} s"
-        )
-        raise ConfigError(
-            f"{source} cannot be filled with {tokens} ({why}): draw sides that are straight, and "
-            "corners where tokens have theirs"
-        )
-    if filled.iou < SOLVED:
-        raise ConfigError(
-            f"{source} was not filled with {tokens} in {filled.seconds:.1f} s: best found, IoU "
-            f"{filled.iou:.2f}; give a larger picture or its outline as SVG"
-        )
-    found = filled.found
-    poses = turned_figure(layout, (found.poses, found.flipped), 0.0)
-    reach = reach_beyond(setup, layout.corners(poses, found.flipped))
+    drawn = fill_silhouette(name, source, layout, setup.tokens.scale, SECONDS, count)
+    laid = [one.found for one in drawn.filled if one.found is not None and one.solved]
+    if not laid:
+        beside = "" if out is None else f"; {_kept(_draw_attempt(drawn, layout), out)}"
+        raise ConfigError(f"{source} {_unfilled(drawn, layout)}{beside}")
+    poses = turned_figure(layout, (laid[0].poses, laid[0].flipped), 0.0)
+    reach = reach_beyond(setup, layout.corners(poses, laid[0].flipped))
     if reach is not None:
         raise ConfigError(
             f"{source} reaches {reach:.3g} from its middle at the run's scale, and its arena only "
             f"{setup.sim.arena / 2.0:.3g}: name a run of a larger arena"
         )
-    outlines = layout.corners(found.poses, found.flipped) * (drawn.unit, -drawn.unit)
-    told = f"filled in {filled.seconds:.2f} s, IoU {filled.iou:.3f}"
-    return Shown(drawn.picture, outlines, Figure(Path(name).stem, 0.0, poses, found.flipped), told)
+    outlines = np.stack([_corners(drawn, layout, one) for one in laid])
+    figure = Figure(Path(name).stem, 0.0, poses, laid[0].flipped)
+    return Shown(drawn.picture, outlines, figure, _told(drawn, count))
 
 
-def draw_silhouette(silhouette: Shown, layout: Layout, size: int) -> Image.Image:
-    """The silhouette with the outlines of the tokens that fill it, and how well, below."""
-    picture = outlined(silhouette.picture, layout, silhouette.outlines, size)
-    return contact_sheet([picture], 1, [silhouette.told])
+def _corners(drawn: "Silhouette", layout: Layout, laid: "Dissection") -> Floats:
+    """(V, 2) of the tokens, pixels of the picture."""
+    return layout.corners(laid.poses, laid.flipped) * (drawn.unit, -drawn.unit)
+
+
+def _told(drawn: "Silhouette", count: int) -> str:
+    """How it was filled."""
+    first, found = drawn.filled[0], len(drawn.filled)
+    if count == 1:
+        return f"filled in {first.seconds:.2f} s, IoU {first.iou:.3f}"
+    others = ", all that there are" if first.complete else ""
+    more = "" if found == count or first.complete else f", no more in {SECONDS:g} s"
+    return f"{plural(found, 'dissection')}{others}{more}"
+
+
+def _unfilled(drawn: "Silhouette", layout: Layout) -> str:
+    """Why it was not filled, and what to do."""
+    (filled,) = drawn.filled
+    names = ", ".join(shape.name for shape in layout.shapes)
+    tokens = "the seven tans" if has_all_tans(layout) else names
+    if drawn.share is not None:
+        share = f"{drawn.share:.2f}" if 0.01 <= drawn.share < 100.0 else f"{drawn.share:.2g}"
+        return (
+            f"covers {share} of {tokens}: mend the outline or its side, or name a run of its pieces"
+        )
+    best = f"best found: IoU {filled.iou:.2f}" if filled.iou else "no token could be laid"
+    if filled.complete:
+        return (
+            f"cannot be filled with {tokens} (no dissection: all ways were tried, {filled.nodes} "
+            "steps): draw sides that are straight, and corners where tokens have theirs"
+        )
+    return (
+        f"was not filled with {tokens} in {filled.seconds:.1f} s ({best}): draw sides that are "
+        "straight, or give a larger picture or its outline as SVG"
+    )
+
+
+# What is drawn
+
+
+def draw_silhouette(silhouette: Shown, layout: Layout, width: int) -> Image.Image:
+    """The silhouette with the outlines of the tokens that fill it, in all ways that were found.
+
+    Args:
+        silhouette: what was found.
+        layout: the tokens.
+        width: of all ways together in pixels, about; one alone is as wide as a film.
+    """
+    count = len(silhouette.outlines)
+    columns, size = tiles(count, _TILE if count == 1 else width)
+    pictures = [outlined(silhouette.picture, layout, one, size) for one in silhouette.outlines]
+    captions = [f"{i + 1} of {count}" for i in range(count)]
+    return contact_sheet(pictures, columns, captions if count > 1 else [silhouette.told])
+
+
+def _draw_attempt(drawn: "Silhouette", layout: Layout) -> Image.Image:
+    """The tokens that could be laid, and in red what they miss and where they stand over."""
+    (filled,) = drawn.filled
+    laid = filled.found or filled.attempt
+    count = 0 if laid is None else len(laid.laid)
+    corners = np.zeros((len(layout.body), 2)) if laid is None else _corners(drawn, layout, laid)
+    lies = np.zeros(layout.tokens, np.bool_)
+    if laid is not None:
+        lies[laid.laid] = True
+    picture = _reddened(drawn.picture, drawn.mask, corners, layout, lies)
+    told = (
+        f"{count} of {plural(layout.tokens, 'token')}, IoU {filled.iou:.2f}; red: missing or over"
+    )
+    return contact_sheet([outlined(picture, layout, corners, _TILE, lies)], 1, [told])
+
+
+def _reddened(
+    picture: Image.Image, mask: Bools, corners: Floats, layout: Layout, lies: Bools
+) -> Image.Image:
+    """The picture with red where the silhouette (H, W) and the tokens that lie differ."""
+    tokens = Image.new("1", picture.size)
+    for k in np.flatnonzero(lies).tolist():
+        own = corners[layout.corners_of(k)]
+        ImageDraw.Draw(tokens).polygon([(float(x), float(y)) for x, y in own], 1)
+    differs = Image.fromarray(mask ^ np.asarray(tokens, np.bool_)).convert("L")
+    wide = differs.filter(ImageFilter.MinFilter(_EDGE)).filter(ImageFilter.MaxFilter(_EDGE))
+    red = picture.copy()
+    red.paste(RED, None, wide)
+    return red
+
+
+def _kept(picture: Image.Image, out: Path) -> str:
+    """Write an attempt, and say where; no other picture is written over."""
+    path = out.with_suffix(".png")
+    if path != out and path.exists() and not _is_ours(path):
+        return f"the best attempt is not drawn, as {path} is something else: give out=NAME.png"
+    marked, data = PngInfo(), BytesIO()
+    marked.add_text("Comment", MARK)
+    picture.save(data, format="PNG", pnginfo=marked)
+    try:
+        write_whole(path, data.getvalue())
+    except RunError as error:
+        return f"the best attempt is not drawn: {error}"
+    return f"the best attempt is drawn in {path}"
+
+
+def _is_ours(path: Path) -> bool:
+    """Whether a file is the picture of an attempt of before."""
+    try:
+        with Image.open(path, formats=("PNG",)) as picture:
+            return bool(picture.info.get("Comment") == MARK)
+    except (OSError, SyntaxError, ValueError):
+        return False

@@ -33,7 +33,8 @@ class FixedTests:
     """Test episodes that are the same whoever plays them.
 
     Attributes:
-        setup: the task; its camera is on here, whether or not it is while training.
+        setup: the task; its camera is on here, whether or not it is while training, but where
+            outlines are shown.
         env: where they are played.
     """
 
@@ -47,7 +48,9 @@ class FixedTests:
             at_once: most episodes played at a time.
             role, seed: name the set; the defaults name `seeding.evaluation_generators`.
         """
-        self.setup = replace(setup, sim=replace(setup.sim, pixels=setup.sim.pixels or PIXELS))
+        shown = setup.sim.observe == "silhouette"  # and no camera
+        pixels = setup.sim.pixels or (0 if shown else PIXELS)
+        self.setup = replace(setup, sim=replace(setup.sim, pixels=pixels))
         self._episodes = episodes
         self._set = (seed, role, 0, 0)
         self.env = environments(self.setup, min(at_once, episodes))

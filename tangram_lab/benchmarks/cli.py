@@ -39,9 +39,11 @@ TRIALS = {
     "fuzz": ("mutated messages against decoder and master", None),
     "pixels": ("DDPG on pixels, no tokens looked for: how far it gets", 60.0),
     "silhouettes": ("silhouettes filled with seven tans: how many, how fast", None),
+    "outlines": ("outlines filled by an agent, and by who learned nothing", None),
     "seeing": ("tokens found in pictures: how exactly, how surely, how fast", None),
     "soak": ("memory and open files of a long training, drawn", 60.0),
 }
+OUTLINES = "runs/outlines"
 # Option -> its bounds.
 BOUNDS = {
     "runs": (1, 10_000),
@@ -77,8 +79,10 @@ def _parser() -> argparse.ArgumentParser:
         elif name == "fuzz":
             one.add_argument("--messages", type=int, default=1_000_000, help="for the decoder")
             one.add_argument("--live", type=int, default=100_000, help="for a live master")
-        elif name in ("seeing", "silhouettes"):
+        elif name in ("outlines", "seeing", "silhouettes"):
             one.add_argument("--scenes", type=int, default=200, help="of each kind (200)")
+        if name == "outlines":
+            one.add_argument("--run_dir", default=OUTLINES, help=f"of agent=outline ({OUTLINES})")
         if name != "attack":
             one.add_argument("--seed", type=int, default=0, help="of everything random (0)")
         one.add_argument("--out", type=Path, help="JSON file of the results")
@@ -108,7 +112,7 @@ def _check(arguments: argparse.Namespace) -> None:
 
 
 def _dashed(argument: str) -> str:
-    return f"--{argument}" if re.fullmatch(r"[a-z]+=.*", argument) else argument
+    return f"--{argument}" if re.fullmatch(r"[a-z_]+=.*", argument) else argument
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -120,15 +124,17 @@ def _run(arguments: argparse.Namespace) -> int:
     from tangram_lab.benchmarks.attack import run_attack
     from tangram_lab.benchmarks.chaos import run_chaos
     from tangram_lab.benchmarks.fuzz_wire import run_fuzz
+    from tangram_lab.benchmarks.outlines import run_outlines
     from tangram_lab.benchmarks.pixels import run_pixels
     from tangram_lab.benchmarks.seeing import run_seeing
     from tangram_lab.benchmarks.silhouettes import run_silhouettes
     from tangram_lab.benchmarks.soak import run_soak
 
-    if arguments.kind == "seeing":
-        return run_seeing(arguments.scenes, arguments.seed, arguments.out)
-    if arguments.kind == "silhouettes":
-        return run_silhouettes(arguments.scenes, arguments.seed, arguments.out)
+    of_scenes = {"seeing": run_seeing, "silhouettes": run_silhouettes}
+    if arguments.kind in of_scenes:
+        return of_scenes[arguments.kind](arguments.scenes, arguments.seed, arguments.out)
+    if arguments.kind == "outlines":
+        return run_outlines(arguments.run_dir, arguments.scenes, arguments.seed, arguments.out)
     if arguments.kind == "pixels":
         return run_pixels(arguments.minutes, arguments.seed, arguments.out)
     with tempfile.TemporaryDirectory(prefix="tangram-") as folder:

@@ -2,7 +2,7 @@
 
 Figures are the library's test split at eight angles, the 13 convex ones, and random gluings; the
 search knows none of them. A figure counts as filled where tokens and figure have an IoU of 0.95, on
-exact polygons.
+exact polygons. Some are given to general optimisation, too, for as long, and photographed aslant.
 """
 
 import time
@@ -17,16 +17,19 @@ import numpy as np
 from rich.progress import track
 from shapely import Polygon
 
+from tangram_lab.benchmarks.covering import Attempt, Board
 from tangram_lab.benchmarks.measure import show, write
+from tangram_lab.benchmarks.rivals import RIVALS, Rival
 from tangram_lab.benchmarks.seeing import ARENA, SCALE, SEVEN
+from tangram_lab.benchmarks.tilted import tilted_rows
 from tangram_sim.arrays import Complex
 from tangram_sim.config import SimConfig
 from tangram_sim.connected import sample_connected
+from tangram_sim.dissections import Area, Dissection, grown
 from tangram_sim.layout import Layout, TokensConfig, make_layout
 from tangram_sim.puzzles import library
 from tangram_sim.targets import placement, turned_figure
 from tangram_sim.world import World, make_world
-from tangram_vision.dissections import Area, Dissection, grown
 from tangram_vision.levels import coverage
 from tangram_vision.silhouettes import (
     SOLVED,
@@ -38,7 +41,9 @@ from tangram_vision.silhouettes import (
 )
 
 SECONDS = 5.0  # for each figure, by the clock
+RIVAL_SECONDS = SECONDS  # the same, of processor time
 TURNS = 8
+EACH = 13  # figures of each kind for what takes seconds each: as many as there are convex ones
 CAMERAS = ((256, "binary"), (128, "grey"), (128, "binary"), (64, "grey"), (64, "binary"))
 _SEAM = 2e-3  # arena units: gaps between pieces that are drawn by hand
 
@@ -54,21 +59,30 @@ class Shape:
 def run_silhouettes(scenes: int, seed: int, out: Path | None) -> int:
     """Print the tables; returns the exit status, 0 whatever was found."""
     layout = make_layout(TokensConfig(SEVEN, SCALE))
-    figures = list(_figures(layout, scenes, seed))
-    rows = [_row("exact outline", layout, figures, list(_outlined(layout, figures)))]
+    figures = list(figures_of(layout, scenes, seed))
+    outlined = list(_outlined(layout, figures))
+    rows = [row_of("exact outline", layout, figures, outlined)]
     for pixels, picture in CAMERAS:
         found = list(
             _pictured(layout, figures, SimConfig(arena=ARENA, pixels=pixels, picture=picture))
         )
-        rows.append(_row(f"{pixels} px {picture}", layout, figures, found))
+        rows.append(row_of(f"{pixels} px {picture}", layout, figures, found))
     show("silhouettes filled with seven tans, one core", rows)
     convex = [_convex_row(layout)]
     show("convex figures of the area of seven tans", convex)
-    write(out, {"scenes": scenes, "seed": seed, "rows": rows, "convex": convex})
+    drawn = _drawn(figures, seed)
+    rivals = list(
+        _rival_rows(layout, [figures[i] for i in drawn], [outlined[i] for i in drawn], seed)
+    )
+    show("exact outlines by general optimisation, a step is a state that is evaluated", rivals)
+    tilted = list(tilted_rows(layout, [area_of(layout, figures[i]) for i in drawn], seed))
+    show("pictures taken aslant, 512 px grey", tilted)
+    tables = {"rows": rows, "convex": convex, "rivals": rivals, "tilted": tilted}
+    write(out, {"scenes": scenes, "seed": seed, **tables})
     return 0
 
 
-def _figures(layout: Layout, scenes: int, seed: int) -> Iterator[Shape]:
+def figures_of(layout: Layout, scenes: int, seed: int) -> Iterator[Shape]:
     """The test split at all angles, the 13 convex figures at a random one, and random gluings."""
     generator = np.random.default_rng(seed)
     for puzzle in library("test", SCALE):
@@ -146,7 +160,7 @@ def _convex_row(layout: Layout) -> dict[str, Any]:
     }
 
 
-def _area(layout: Layout, figure: Shape) -> Area:
+def area_of(layout: Layout, figure: Shape) -> Area:
     """The outline of a figure without the seams of its pieces."""
     whole = covered(layout, figure.laid)
     if figure.kind != "gluing":  # drawn by hand, or laid with a tolerance
@@ -156,9 +170,46 @@ def _area(layout: Layout, figure: Shape) -> Area:
 
 def _outlined(layout: Layout, figures: list[Shape]) -> Iterator[Filled]:
     for figure in track(figures, "exact outlines"):
-        area, begin = _area(layout, figure), time.process_time()
+        area, begin = area_of(layout, figure), time.process_time()
         (filled,) = fill_outline(area, layout, SECONDS)
         yield replace(filled, seconds=time.process_time() - begin)
+
+
+def _drawn(figures: list[Shape], seed: int) -> list[int]:
+    """Numbers of so many figures of each kind, by chance."""
+    generator, kinds = np.random.default_rng(seed), np.array([one.kind for one in figures])
+    return [
+        int(number)
+        for kind in dict.fromkeys(kinds.tolist())
+        for number in generator.permutation(np.flatnonzero(kinds == kind))[:EACH]
+    ]
+
+
+def _rival_rows(
+    layout: Layout, figures: list[Shape], searched: list[Filled], seed: int
+) -> Iterator[dict[str, Any]]:
+    """A row for the search, and one for each rival on the same figures."""
+    yield _rival_row("the search", layout, figures, searched)
+    for name, rival in RIVALS.items():
+        found = [
+            _attempted(rival, layout, figure, [seed, number])
+            for number, figure in enumerate(track(figures, name))
+        ]
+        yield _rival_row(name, layout, figures, found)
+
+
+def _attempted(rival: Rival, layout: Layout, figure: Shape, seed: list[int]) -> Filled:
+    board = Board(area_of(layout, figure), layout)
+    return rival(Attempt(board, RIVAL_SECONDS), np.random.default_rng(seed))
+
+
+def _rival_row(
+    name: str, layout: Layout, figures: list[Shape], found: list[Filled]
+) -> dict[str, Any]:
+    row = row_of(name, layout, figures, found)
+    seconds = sum(one.seconds for one in found)
+    rate = sum(one.nodes for one in found) / seconds
+    return {"by": row.pop("silhouette"), **row, "steps in a s": rate}
 
 
 def _pictured(layout: Layout, figures: list[Shape], sim: SimConfig) -> Iterator[Filled]:
@@ -180,7 +231,7 @@ def _seen(layout: Layout, world: World, figure: Shape) -> Filled:
     return replace(filled, found=Dissection(filled.found.poses + middle, filled.found.flipped))
 
 
-def _row(what: str, layout: Layout, figures: list[Shape], found: list[Filled]) -> dict[str, Any]:
+def row_of(what: str, layout: Layout, figures: list[Shape], found: list[Filled]) -> dict[str, Any]:
     """A row of the table."""
     iou = np.array(
         [

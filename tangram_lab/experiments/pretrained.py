@@ -97,8 +97,8 @@ def _on_figures(run: Run, split: str) -> dict[str, Any]:
     """Scores of a run on the figures of a split."""
     found = find_figures(split, run.setup, None, TURNS, False)
     players = {RUN: greedy(run.policy)}
-    scores, _, _ = score_puzzles(run.setup, found.figures, players, TEST_SEED)
-    return {"turns": TURNS, "scores": scores[RUN]}
+    scored = score_puzzles(run.setup, found.figures, players, TEST_SEED)
+    return {"turns": TURNS, "scores": scored.means[RUN]}
 
 
 def median(seeds: Sequence[Candidate]) -> Candidate:

@@ -54,7 +54,10 @@ def changed(section: str, **values: Any) -> dict[str, dict[str, Any]]:
         (changed("agent", angle_head="x"), "agent.angle_head must be one of plain, kfold"),
         (changed("agent", edges="x"), "agent.edges must be one of paper, complete, got 'x'"),
         (changed("agent", lr_final=1.5), "agent.lr_final must be between 0 and 1, got 1.5"),
-        (changed("agent", readout="x"), "agent.readout must be one of pair, token, got 'x'"),
+        (
+            changed("agent", readout="x"),
+            "agent.readout must be one of pair, token, outline, got 'x'",
+        ),
         (changed("agent", order="x"), "agent.order must be one of learned, listed, size, random"),
         (changed("agent", reapply=-1), "agent.reapply must be between 0 and 100, got -1"),
         (changed("agent", lookahead="x"), "agent.lookahead must be one of none, engine, learned"),

@@ -11,7 +11,9 @@ import pytest
 
 from tangram_lab.benchmarks.cli import main
 from tangram_lab.benchmarks.measure import Bound, compared, rates, single
-from tangram_lab.benchmarks.seeing import NEAR, _same
+from tangram_lab.benchmarks.rivals import RIVALS
+from tangram_lab.benchmarks.seeing import NEAR, SCALE, _same
+from tangram_lab.benchmarks.silhouettes import convex_outlines
 from tangram_sim.config import SimConfig
 from tangram_sim.world import make_world
 from tangram_vision.seeing import Seen
@@ -146,11 +148,28 @@ def test_silhouettes_are_counted_by_kind(tmp_path: Path, monkeypatch: pytest.Mon
     out = tmp_path / "silhouettes.json"
     monkeypatch.setattr("tangram_lab.benchmarks.silhouettes.TURNS", 1)
     monkeypatch.setattr("tangram_lab.benchmarks.silhouettes.CAMERAS", ((128, "grey"),))
+    monkeypatch.setattr("tangram_lab.benchmarks.silhouettes.EACH", 1)
+    # All of them are searched through in tests/sim/test_dissections.py.
+    few = convex_outlines(float(np.sqrt(layout_of(*SEVEN, scale=SCALE).areas.sum())))[2:6]
+    monkeypatch.setattr("tangram_lab.benchmarks.silhouettes.convex_outlines", lambda _: few)
+    monkeypatch.setattr("tangram_lab.benchmarks.silhouettes.RIVAL_SECONDS", 0.3)
+    monkeypatch.setattr("tangram_lab.benchmarks.tilted.TILTS", (0.0,))  # others take their time
+    own = {"genetic algorithm": RIVALS["genetic algorithm"]}
+    monkeypatch.setattr("tangram_lab.benchmarks.silhouettes.RIVALS", own)
     monkeypatch.setattr(sys, "argv", ["tangram-bench", "silhouettes", "scenes=2", f"out={out}"])
     assert main() == 0
     content = json.loads(out.read_text())
     exact, grey = content["rows"]
-    assert (exact["figures"], exact["filled"], exact["test (14)"]) == (29, 1.0, 1.0)
-    assert (grey["silhouette"], grey["filled"], grey["convex (13)"]) == ("128 px grey", 1.0, 1.0)
+    assert (exact["figures"], exact["filled"], exact["test (14)"]) == (19, 1.0, 1.0)
+    assert (grey["silhouette"], grey["filled"], grey["convex (3)"]) == ("128 px grey", 1.0, 1.0)
     (convex,) = content["convex"]
-    assert (convex["filled"], convex["searched through, none found"]) == (13, 7)
+    assert (convex["filled"], convex["searched through, none found"]) == (3, 1)
+    search, genetic = content["rivals"]
+    assert (search["by"], search["figures"], search["filled"]) == ("the search", 3, 1.0)
+    assert {"test (1)", "convex (1)", "gluing (1)"} < set(search)
+    # How many it fills depends on the machine, since it goes by the clock.
+    assert (genetic["by"], genetic["figures"]) == ("genetic algorithm", 3)
+    assert genetic["IoU, median"] > 0.3
+    (tilted,) = content["tilted"]
+    assert (tilted["tilt (°)"], tilted["figures"]) == (0.0, 3)
+    assert tilted["filled when straightened"] == 1.0

@@ -54,7 +54,7 @@ def test_help_config_and_version_are_shown_and_leave_nothing_behind(
     text, _, examples = out.partition("Examples:\n")
     assert [line.split()[0] for line in examples.strip().splitlines()] == [command] * 3
     if command in TRAINING:
-        assert "  agent    mlp, paper, tangram*\n" in text
+        assert "  agent    mlp, outline, paper, tangram*\n" in text
         for group in ("tokens", "sim", "reward", "net", "service"):
             assert f"\n  {group} " in text
     assert SETTING.get(command, "seed: 0") in text
@@ -73,6 +73,15 @@ WRONG = [
         "tangram-train tokens=tangram2 sim.motion=slide agent.lookahead=engine",
         "agent.lookahead=engine is for play, an evaluator would be silent for minutes: leave it",
     ),
+    (
+        "tangram-train sim.observe=silhouette",
+        "is for an agent of outlines: train one",
+    ),
+    (
+        "tangram-master sim.observe=silhouette",
+        "is for an agent of outlines: train one",
+    ),
+    ("tangram-eval run_dir=x sim.observe=silhouette", "got none: add puzzle=test"),
     ("tangram-train +~zzz", "cannot read '+~zzz'"),
     ("tangram-train zzz=1", "unknown setting 'zzz' (--help and --cfg job list them)"),
     ("tangram-train --seed=1", "unknown option '--seed=1': settings carry no dashes, as in seed=1"),
@@ -82,7 +91,7 @@ WRONG = [
     ("tangram-train tokens.shapes=[square", "cannot read 'tokens.shapes=[square'"),
     ("tangram-train seed=1,2", "Ambiguous value for argument 'seed=1,2': a list is [1,2]"),
     ("tangram-train run_dir=${foo}", "cannot resolve the config: Interpolation key 'foo'"),
-    ("tangram-train agent=best", "unknown agent 'best': choose from mlp, paper, tangram"),
+    ("tangram-train agent=best", "unknown agent 'best': choose from mlp, outline, paper, tangram"),
     ("tangram-train tokens=pentagon", "unknown tokens 'pentagon': choose from hexagon, large_tri"),
     ("tangram-train tokens.shapes=[blob]", "unknown shape 'blob': choose from large_triangle"),
     ("tangram-master tokens.shapes=[blob]", "unknown shape 'blob': choose from large_triangle"),

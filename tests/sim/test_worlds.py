@@ -9,14 +9,15 @@ import pytest
 
 from tangram_sim import world as world_module
 from tangram_sim.arrays import Floats
-from tangram_sim.config import SimConfig, StageConfig
+from tangram_sim.batch import BatchedEnv
+from tangram_sim.config import RewardConfig, SimConfig, StageConfig
 from tangram_sim.errors import ConfigError, SamplingError
 from tangram_sim.geometry import area, clip, overlap_share
 from tangram_sim.layout import Layout
 from tangram_sim.pictures import BACKGROUND, TOKEN_GRAY, rasterise
 from tangram_sim.rewards import TargetPictures
 from tangram_sim.sampling import sample_batch
-from tangram_sim.world import World, check_room, check_world, make_world
+from tangram_sim.world import World, check_room, check_shown, check_world, make_world
 from tests.sim.builders import LOPSIDED, SQUARE_SCALE, TRIO, angle_gap, layout_of, random_poses
 
 pytestmark = pytest.mark.fast
@@ -300,3 +301,20 @@ def test_a_missing_engine_is_named_also_before_a_world_is_made(
     check_room(layout_of("square"), seen)  # a master looks at nothing
     with pytest.raises(ConfigError, match=r"needs OpenCV .*: install opencv-.*, or set"):
         check_world(layout_of("square"), seen)
+
+
+@pytest.mark.parametrize("observe", ["silhouette", "silhouette_pictures"])
+def test_silhouettes_are_shown_to_who_knows_outlines(observe: str) -> None:
+    """A master asks before it starts, an environment when it is made."""
+    pixels = 64 if observe == "silhouette_pictures" else 0
+    shown = SimConfig(backend="kinematic", observe=observe, pixels=pixels)
+    reason = f"^sim.observe={observe} is for an agent of outlines: .*corners$"
+    with pytest.raises(ConfigError, match=reason):
+        check_shown(shown, outlines=False)
+    with pytest.raises(ConfigError, match=reason):
+        BatchedEnv(layout_of("square"), shown, RewardConfig(), 1)
+    if pixels:  # nobody learns from them yet
+        with pytest.raises(ConfigError, match=reason):
+            check_shown(shown, outlines=True)
+    else:
+        check_shown(shown, outlines=True)

@@ -8,10 +8,10 @@ import shapely
 from shapely import Polygon
 
 from tangram_sim.config import SimConfig
+from tangram_sim.dissections import Dissection
 from tangram_sim.puzzles import load_puzzle
 from tangram_sim.targets import placement, turned_figure
 from tangram_sim.world import make_world
-from tangram_vision.dissections import Dissection
 from tangram_vision.levels import coverage
 from tangram_vision.outlines import BINARY_WAYS, GREY_WAYS, outline
 from tangram_vision.silhouettes import Filled, covered, fill_picture, overlap

@@ -315,7 +315,7 @@ def test_a_window_needs_no_out(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shown: list[PlayConfig] = []
-    monkeypatch.setattr("worker.play.play_run", lambda config: shown.append(config) or 0)
+    monkeypatch.setattr("worker.play.play_run", lambda config, _: shown.append(config) or 0)
     given = ["run_dir=pretrained/square", "live=true"]
     assert _play(composed("play", given)) == 0
     assert [config.live for config in shown] == [True]

@@ -11,9 +11,26 @@ from tangram_lab.benchmarks.silhouettes import convex_outlines
 from tangram_sim.arrays import Floats
 from tangram_sim.config import SimConfig
 from tangram_sim.connected import sample_connected
-from tangram_sim.layout import Layout
-from tangram_vision.dissections import Area, Budget, Search, Tokens, dissection, straightened
-from tangram_vision.silhouettes import covered, fill_outline, overlap
+from tangram_sim.dissections import (
+    Area,
+    Budget,
+    Dissection,
+    Laid,
+    Search,
+    Tokens,
+    dissection,
+    straightened,
+)
+from tangram_sim.layout import Layout, TokensConfig, make_layout
+from tangram_vision.silhouettes import (
+    _alike,
+    _attempted,
+    attempt_outline,
+    covered,
+    fill_outline,
+    overlap,
+    pieces,
+)
 from tests.sim.builders import SEVEN, TRIO, layout_of
 
 pytestmark = pytest.mark.fast
@@ -38,8 +55,11 @@ def gluing(seed: int) -> Floats:
     return sample_connected(LAYOUT, SimConfig(arena=4.0), np.random.default_rng(seed))
 
 
-def test_thirteen_of_the_twenty_convex_outlines_are_filled_and_seven_searched_through() -> None:
+def test_thirteen_of_the_twenty_convex_outlines_are_filled_and_seven_searched_through(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Wang and Hsiung, 1942: a proof by hand of what the complete search finds."""
+    monkeypatch.setattr("tangram_vision.silhouettes._LOOSE", ())  # no best attempt is asked for
     every = convex_outlines(1.0)
     assert len(every) == 20
     assert all(polygon(z).area == pytest.approx(1.0) for z in every)
@@ -136,3 +156,73 @@ def test_corners_within_a_side_are_none() -> None:
     assert straightened(ring, 0.004) == pytest.approx(
         [0.0, 1.0 + 1e-4j, 1.0 + 1.0j, 1.0j], abs=2e-4
     )
+
+
+def test_what_nothing_fills_keeps_the_tokens_that_could_be_laid() -> None:
+    """Three tans fit into a strip as high as a small triangle, and five into a ring."""
+    strip = polygon(np.array([0.0, 4.0, 4.0 + 0.25j, 0.25j]))
+    (filled,) = fill_outline(strip, LAYOUT, 30.0)
+    assert filled.attempt is not None
+    laid = filled.attempt.laid.tolist()
+    assert sorted(SEVEN[k] for k in laid) == ["parallelogram", "small_triangle", "small_triangle"]
+    assert filled.iou == pytest.approx(0.25, abs=0.01)
+    assert covered(LAYOUT, filled.attempt).area == pytest.approx(0.25, abs=0.01)
+    (late,) = fill_outline(strip, LAYOUT, 0.0)
+    assert (late.attempt, late.iou) == (None, 0.0)
+
+
+def test_a_search_remembers_the_most_that_it_laid() -> None:
+    search = Search(Tokens(LAYOUT), 0.004, Budget(time.perf_counter() + 30.0))
+    assert list(search.run(polygon(convex_outlines(1.0)[-1]))) == []
+    assert 0 < len(search.best) < 7
+    laid = next(search.run(whole(gluing(1))))
+    assert search.best == laid
+
+
+def test_tokens_that_lie_on_each_other_are_no_better_attempt() -> None:
+    """Two large triangles, one all but on the other, cover a little more than one alone."""
+    tokens, side = Tokens(LAYOUT), polygon(np.array([0.0, 1.0, 1.0 + 1.0j, 1.0j]) - 0.5 - 0.5j)
+    large = int(tokens.areas.argmax())
+    one = [Laid(large, False, np.zeros(3))]
+    two = [*one, Laid(large, False, np.array([0.05, 0.0, 0.0]))]
+    for tried in ([one, two], [two, one]):
+        found, iou = _attempted(side, LAYOUT, tokens, 0.0, tried)
+        assert found is not None
+        assert len(found.laid) == 1
+        assert iou == pytest.approx(0.25, abs=0.01)
+    both, more = _attempted(side, LAYOUT, tokens, 0.0, [two])
+    assert both is not None
+    assert more > 0.26
+
+
+def test_an_attempt_says_what_was_laid() -> None:
+    filled = attempt_outline(polygon(np.array([0.0, 1.0, 1.0 + 0.83j, 0.83j])), LAYOUT, 30.0)
+    assert filled.attempt is not None
+    assert 4 <= len(pieces(LAYOUT, filled.attempt)) < 7
+    assert filled.iou > 0.8
+    assert not filled.solved
+
+
+def test_dissections_that_look_alike_are_one() -> None:
+    """A triangle whose sides are all but equal lies in its outline in three ways, to the eye one.
+
+    Turned off each other by a tenth of a percent, within the search's tolerance.
+    """
+    corners = ((0.0, 0.0), (1.0, 0.0), (0.5, 0.867))
+    layout = make_layout(TokensConfig(({"name": "even", "corners": corners},), 1.0))
+    every = fill_outline(Polygon(corners), layout, 30.0, count=5)
+    assert len(every) == 1
+    assert every[0].complete
+
+
+def test_equal_tokens_that_are_swapped_are_one_dissection() -> None:
+    (filled,) = fill_outline(whole(gluing(2)), LAYOUT, 30.0)
+    assert filled.found is not None
+    swapped = np.arange(7)
+    large = [k for k, name in enumerate(SEVEN) if name == "large_triangle"]
+    swapped[large] = large[::-1]
+    other = Dissection(filled.found.poses[swapped], filled.found.flipped[swapped])
+    moved = Dissection(filled.found.poses + (0.1, 0.0, 0.0), filled.found.flipped)
+    tokens = Tokens(LAYOUT)
+    assert _alike(tokens, LAYOUT, filled.found, other)
+    assert not _alike(tokens, LAYOUT, filled.found, moved)

@@ -21,7 +21,7 @@ from shapely import MultiPolygon, Polygon
 
 from tangram_sim.arrays import Bools, Complex, Floats, Ints
 from tangram_sim.layout import Layout
-from tangram_vision.kinds import Kind, kinds_of
+from tangram_sim.sides import Side, sides_of
 
 Area: TypeAlias = "Polygon | MultiPolygon"
 
@@ -48,12 +48,43 @@ class Laid(NamedTuple):
     pose: Floats
 
 
+class Place(NamedTuple):
+    """A token in its place, and what comes of it.
+
+    Attributes:
+        laid: the token.
+        rest: what is left to fill.
+        left: how many tokens are left of each shape.
+        filled: whether all is filled, and no token left.
+        dead: whether what is left has parts of which no tokens have the areas.
+    """
+
+    laid: Laid
+    rest: Area
+    left: tuple[int, ...]
+    filled: bool
+    dead: bool
+
+
 @dataclass(frozen=True, eq=False)
 class Dissection:
-    """K tokens that fill an outline, by poses (K, 3) and sides (K,)."""
+    """K tokens that fill an outline, or some of them that could be laid.
+
+    Attributes:
+        poses: (K, 3) x, y and angle.
+        flipped: (K,) which lie on their other side.
+        lies: (K,) which were laid; None is all.
+    """
 
     poses: Floats
     flipped: Bools
+    lies: Bools | None = None
+
+    @property
+    def laid(self) -> Ints:
+        """Numbers of the tokens that were laid."""
+        every = np.arange(len(self.poses))
+        return every if self.lies is None else every[self.lies]
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,18 +143,18 @@ class Tokens:
 
     def __init__(self, layout: Layout) -> None:
         """Find which of them are alike, and their different corners."""
-        kinds = kinds_of(layout, 1.0, 1)  # in the units of the layout
-        shapes = {kind.shape: kind for kind in kinds}
-        self.own = [kind.tokens for kind in shapes.values()]
+        sides = sides_of(layout)
+        shapes = {side.shape: side for side in sides}
+        self.own = [side.tokens for side in shapes.values()]
         self.counts = tuple(map(len, self.own))
-        self.areas = np.array([kind.area for kind in shapes.values()])
+        self.areas = np.array([side.area for side in shapes.values()])
         self.unit = float(np.sqrt(layout.areas.sum()))
-        most = max(len(kind.corners) for kind in kinds)
+        most = max(len(side.corners) for side in sides)
         # Large ones first: what is left is then hard to fill, and that is soon seen.
         self.corners = [
             corner
-            for kind in sorted(kinds, key=lambda kind: -kind.area)
-            for corner in _corners(kind, most)
+            for side in sorted(sides, key=lambda side: -side.area)
+            for corner in _corners(side, most)
         ]
 
     @cached_property
@@ -148,36 +179,77 @@ class Search:
 
     Attributes:
         budget: what it may cost.
+        best: the tokens of greatest area that were laid at a time.
     """
 
-    def __init__(self, tokens: Tokens, tolerance: float, budget: Budget) -> None:
-        """Search with a tolerance: how far an outline's sides may be from where they should be."""
+    def __init__(
+        self, tokens: Tokens, tolerance: float, budget: Budget, loose: bool = False
+    ) -> None:
+        """Search with a tolerance: how far an outline's sides may be from where they should be.
+
+        Args:
+            tokens: that fill the outline.
+            tolerance: in its units.
+            budget: what it may cost.
+            loose: go on where something cannot be filled: for the best attempt, of an outline that
+                nothing fills.
+        """
         self._tokens, self._tolerance, self.budget = tokens, tolerance, budget
-        self._least = float(tokens.areas.min())
+        self._least, self._loose = float(tokens.areas.min()), loose
+        self.best: list[Laid] = []
+        self._most = 0.0
 
     def run(self, outline: Area) -> Iterator[list[Laid]]:
         """Different ways to fill an outline; there are no others where the budget was enough."""
-        yield from self._fill(shapely.make_valid(outline), self._tokens.counts, [])
+        yield from self._fill(valid(outline), self._tokens.counts, [])
 
     def _fill(self, rest: Area, left: tuple[int, ...], laid: list[Laid]) -> Iterator[list[Laid]]:
-        parts = [part for part in _polygons(rest) if part.area > _DUST * self._least]
+        self._remember(laid)
+        parts = self._parts(rest)
         if not parts:
             if not any(left):
                 yield laid
             return
         self.budget.taken += 1
-        if self.budget.spent() or not self._divides([part.area for part in parts], left):
+        if self.budget.spent():
+            return
+        if not (self._loose or self._divides([part.area for part in parts], left)):
             return
         for one, polygon in self._fewest(parts, left):
-            now = tuple(count - (shape == one.shape) for shape, count in enumerate(left))
-            gone = shapely.difference(rest, polygon, grid_size=_GRID * self._tokens.unit)
-            yield from self._fill(self._opened(gone), now, [*laid, one])
+            yield from self._fill(self._without(rest, polygon), less(left, one), [*laid, one])
             if self.budget.spent():
                 return
 
-    def _opened(self, rest: Area) -> Area:
-        """Without slivers narrower than two tolerances."""
-        return grown(grown(rest, -self._tolerance), self._tolerance)
+    def places(self, rest: Area, left: tuple[int, ...]) -> list[Place]:
+        """All that may lie at the corner of what is left where least may, and what then is left.
+
+        Args:
+            rest: what is left to fill.
+            left: how many tokens there are of each shape.
+        """
+        parts = self._parts(rest)
+        if not parts or not self._divides([part.area for part in parts], left):
+            return []
+        places = []
+        for one, polygon in self._fewest(parts, left):
+            gone, now = self._without(rest, polygon), less(left, one)
+            own = self._parts(gone)
+            open_to = self._divides([part.area for part in own], now)
+            places.append(Place(one, gone, now, filled=not own and open_to, dead=not open_to))
+        return places
+
+    def _parts(self, rest: Area) -> list[Polygon]:
+        return [part for part in polygons(rest) if part.area > _DUST * self._least]
+
+    def _without(self, rest: Area, polygon: Polygon) -> Area:
+        """What is left, without slivers narrower than two tolerances."""
+        gone = shapely.difference(rest, polygon, grid_size=_GRID * self._tokens.unit)
+        return opened(gone, self._tolerance)
+
+    def _remember(self, laid: list[Laid]) -> None:
+        area = float(sum(self._tokens.areas[one.shape] for one in laid))
+        if area > self._most:
+            self.best, self._most = laid, area
 
     def _divides(self, areas: Sequence[float], left: tuple[int, ...]) -> bool:
         """Whether tokens that are left have the areas of all parts."""
@@ -199,6 +271,8 @@ class Search:
         best: list[tuple[Laid, Polygon]] | None = None
         for part in parts:
             for options in self._options(part, left):
+                if self._loose and not options:
+                    continue
                 if best is None or len(options) < len(best):
                     best = options
                 if not best:
@@ -213,7 +287,7 @@ class Search:
         options: list[list[tuple[Laid, Polygon]]] = []
         for point, along, angle, leaving, coming in self._convex(part):
             slack = _TURN + 3.0 * self._tolerance / min(abs(leaving), abs(coming))
-            if np.abs(self._tokens.angles - angle).min() > slack:
+            if not self._loose and np.abs(self._tokens.angles - angle).min() > slack:
                 yield []  # no corners of tokens make this one
                 return
             options.append([])
@@ -243,13 +317,7 @@ class Search:
         Then the lengths of the sides that leave it and come to it, negative where they end at a
         corner that is not convex.
         """
-        for ring, outer in ((part.exterior, True), *((hole, False) for hole in part.interiors)):
-            z: Complex = np.asarray(ring.coords)[:-1] @ np.array([1.0, 1.0j])
-            if ring.is_ccw != outer:
-                z = z[::-1]
-            z = straightened(z, self._tolerance)
-            if len(z) < 3:
-                continue
+        for z, _, _ in rings(part, self._tolerance):
             ahead, behind = np.roll(z, -1) - z, np.roll(z, 1) - z
             inside = np.angle(behind / ahead) % (2.0 * np.pi)
             convex = inside < _CONVEX
@@ -261,21 +329,39 @@ class Search:
                 yield complex(z[i]), along, float(inside[i]), *lengths
 
 
+def less(left: tuple[int, ...], one: Laid) -> tuple[int, ...]:
+    """How many tokens are left of each shape without one."""
+    return tuple(count - (shape == one.shape) for shape, count in enumerate(left))
+
+
 def dissection(tokens: Tokens, laid: Sequence[Laid]) -> Dissection:
-    """What was found, token by token of the layout."""
+    """What was found, token by token of the layout; some may not have been laid."""
     count = sum(tokens.counts)
     poses, flipped = np.zeros((count, 3)), np.zeros(count, np.bool_)
+    lies = np.zeros(count, np.bool_)
     left = [list(own) for own in tokens.own]
     for one in laid:
         token = left[one.shape].pop(0)
-        poses[token], flipped[token] = one.pose, one.flipped
-    return Dissection(poses, flipped)
+        poses[token], flipped[token], lies[token] = one.pose, one.flipped, True
+    return Dissection(poses, flipped, None if lies.all() else lies)
 
 
 @np.errstate(invalid="ignore", divide="ignore")  # of corners all but within a straight side
 def grown(area: Area, distance: float) -> Area:
     """An area with all sides so far further out, or in where the distance is negative."""
-    return shapely.buffer(area, distance, join_style="mitre", mitre_limit=_MITRE)
+    return valid(shapely.buffer(area, distance, join_style="mitre", mitre_limit=_MITRE))
+
+
+def valid(area: Area) -> Area:
+    """The same area by rings that do not cross: what crosses breaks whatever is done with it."""
+    if shapely.is_valid(area):
+        return area
+    return shapely.union_all(polygons(shapely.make_valid(area)))
+
+
+def opened(area: Area, tolerance: float) -> Area:
+    """An area without slivers narrower than two tolerances."""
+    return grown(grown(area, -tolerance), tolerance)
 
 
 def straightened(z: Complex, tolerance: float) -> Complex:
@@ -292,20 +378,37 @@ def straightened(z: Complex, tolerance: float) -> Complex:
     return z
 
 
-def _polygons(area: Area) -> list[Polygon]:
+def rings(area: Area, tolerance: float) -> list[tuple[Complex, int, bool]]:
+    """Each ring of an area: its corners (n,), the part it belongs to, and whether it is outside.
+
+    Counter-clockwise, holes clockwise: the area lies to the left of every side.
+    """
+    found = []
+    for part, polygon in enumerate(polygons(area)):
+        every = ((polygon.exterior, True), *((hole, False) for hole in polygon.interiors))
+        for ring, outer in every:
+            z: Complex = np.asarray(ring.coords)[:-1] @ np.array([1.0, 1.0j])
+            z = straightened(z if ring.is_ccw == outer else z[::-1], tolerance)
+            if len(z) >= 3:
+                found.append((z, part, outer))
+    return found
+
+
+def polygons(area: Area) -> list[Polygon]:
+    """The parts of an area."""
     return [one for one in shapely.get_parts(area).tolist() if one.geom_type == "Polygon"]
 
 
-def _corners(kind: Kind, most: int) -> Iterator[_Corner]:
+def _corners(side: Side, most: int) -> Iterator[_Corner]:
     """The corners of a shape on one side of which no turn makes another."""
-    body: Complex = kind.corners @ np.array([1.0, 1j])
-    for i in range(kind.different):
+    body: Complex = side.corners @ np.array([1.0, 1j])
+    for i in range(side.different):
         leaving, coming = body[(i + 1) % len(body)] - body[i], body[i - 1] - body[i]
         along = leaving / abs(leaving)
         own = np.roll((body - body[i]) / along, -i)
         yield _Corner(
-            kind.shape,
-            kind.flipped,
+            side.shape,
+            side.flipped,
             float(np.angle(coming / leaving)),
             float(abs(leaving)),
             float(abs(coming)),

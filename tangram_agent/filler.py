@@ -1,0 +1,184 @@
+"""Acting on outlines: the place whose rest is most surely filled, by itself or by a beam.
+
+Where nothing fits any more, a token that is left goes to where it covers most of what is left.
+
+Legend: B environments, K tokens, V corners, G rows of an outline.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+import torch
+from shapely import Polygon
+from torch import nn
+
+from tangram_agent.filling import UNUSED, Filling, Rests
+from tangram_agent.setup import Setup
+from tangram_agent.values import Corners
+from tangram_sim.actions import velocities_of
+from tangram_sim.arrays import Bools, Floats, Ints, Singles
+from tangram_sim.dissections import Area, Laid, Place, polygons
+from tangram_sim.geometry import outlines
+from tangram_sim.rings import covered_area
+
+_ANGLES = 8  # that a token is tried at where nothing fits
+_FREE = 0.5  # of what a token may cover of others
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What B environments play: tokens (B,), whether to turn them over (B,), velocities (B, 3)."""
+
+    token: Ints
+    flip: Bools
+    velocity: Singles
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """What is left in an environment, and the places that led here from what there is now."""
+
+    row: int
+    places: tuple[Place, ...]
+
+
+class Filler:
+    """Chooses where the next token goes."""
+
+    def __init__(self, value: nn.Module, setup: Setup) -> None:
+        # (n,) logits of `Corners`, see `OutlineValue`.
+        self._value, self._layout, self._sim = value, setup.layout, setup.sim
+        self._filling = Filling(setup.layout)
+        self._beam = setup.agent.beam if setup.agent.lookahead == "values" else 1
+
+    def choose(
+        self,
+        corners: Floats,
+        placed: Bools,
+        goals: Floats,
+        anything: Bools,
+        generators: Sequence[np.random.Generator] = (),
+    ) -> Step:
+        """What to play.
+
+        Args:
+            corners: (B, V, 2) of the tokens.
+            placed: (B, K) which are placed.
+            goals: (B, G, 2) outlines to fill.
+            anything: (B,) where any place will do, drawn by the environment's generator.
+            generators: one for each environment, where some explore.
+        """
+        count = len(corners)
+        rests = [self._filling.rest(goals[b], corners[b], placed[b]) for b in range(count)]
+        every = [self._live(rests[b], self._filling.left(~placed[b])) for b in range(count)]
+        wanted_of = [[] if anything[b] else every[b] for b in range(count)]
+        beam = 1 if len(generators) else self._beam
+        # A beam of one plays what is best now, and looks no further.
+        plans = self._plans(wanted_of, beam, 1 if beam == 1 else None)
+        token, flip = np.zeros(count, np.int64), np.zeros(count, np.bool_)
+        wanted, here = np.zeros((count, 3)), self._layout.poses(corners)
+        sides = self._layout.flipped(corners)
+        for b, plan in enumerate(plans):
+            place = plan[0] if plan else None
+            if anything[b] and every[b]:
+                place = every[b][int(generators[b].integers(len(every[b])))]
+            laid = place.laid if place else None
+            if laid is None and not len(generators):  # nothing is learned from where it then lies
+                laid = self._rough(rests[b], corners[b], placed[b])
+            token[b], wanted[b] = self._taken(laid, here[b], sides[b], placed[b])
+            flip[b] = laid is not None and bool(sides[b, token[b]] != laid.flipped)
+        way = wanted - here[np.arange(count), token]
+        velocity = np.clip(velocities_of(way, self._sim), -1.0, 1.0).astype(np.float32)
+        return Step(token, flip, velocity)
+
+    def _live(self, rest: Area, left: tuple[int, ...]) -> list[Place]:
+        return [place for place in self._filling.places(rest, left) if not place.dead]
+
+    def values(self, places: Sequence[Place]) -> Floats:
+        """How surely what is left can be filled, as logits; a filled one is surest."""
+        found = np.full(len(places), np.inf)
+        still = [i for i, place in enumerate(places) if not place.filled]
+        if still:
+            seen = [self._filling.seen(places[i].rest, places[i].left) for i in still]
+            every = Rests.joined(seen)
+            with torch.inference_mode():
+                logits = self._value(Corners.of(every)).numpy()
+            # What has more corners than are seen is not judged, and is taken last.
+            found[still] = np.where((every.part != UNUSED).any(axis=1), logits, -np.inf)
+        return found
+
+    def plan(self, rest: Area, left: tuple[int, ...], beam: int) -> list[Place]:
+        """The places that lead furthest, to the end, by a beam of such a width."""
+        (found,) = self._plans([self._live(rest, left)], beam)
+        return list(found)
+
+    def _plans(
+        self, every: Sequence[list[Place]], beam: int, steps: int | None = None
+    ) -> list[tuple[Place, ...]]:
+        """Of each environment the places that lead furthest; none where there are none.
+
+        Args:
+            every: what may be laid now.
+            beam: states of each depth that are followed.
+            steps: how far; None: to the end.
+        """
+        found: list[tuple[Place, ...]] = [()] * len(every)
+        states = [_State(b, (one,)) for b, places in enumerate(every) for one in places]
+        while states:
+            values = self.values([state.places[-1] for state in states])
+            kept: list[_State] = []
+            for b in {state.row for state in states}:
+                own = [i for i, state in enumerate(states) if state.row == b]
+                own = [own[i] for i in np.argsort(-values[own], kind="stable")[:beam]]
+                found[b] = states[own[0]].places
+                if not found[b][-1].filled:
+                    kept += [states[i] for i in own]
+            if len(kept) and len(kept[0].places) == steps:
+                break
+            states = [
+                _State(state.row, (*state.places, place))
+                for state in kept
+                for place in self._live(state.places[-1].rest, state.places[-1].left)
+            ]
+        return found
+
+    def _taken(
+        self, laid: Laid | None, here: Floats, sides: Bools, placed: Bools
+    ) -> tuple[int, Floats]:
+        """The token that goes to a place, and its pose there; without one any stays where it is."""
+        left = np.flatnonzero(~placed)
+        if laid is None:
+            token = int(left[0]) if len(left) else 0
+            return token, here[token]
+        alike = [token for token in self._filling.tokens_of(laid.shape) if not placed[token]]
+        far = [
+            (bool(sides[token] != laid.flipped), float(np.hypot(*(here[token] - laid.pose)[:2])))
+            for token in alike
+        ]
+        return alike[min(range(len(alike)), key=far.__getitem__)], laid.pose
+
+    def _rough(self, rest: Area, corners: Floats, placed: Bools) -> Laid | None:
+        """Where a token that is left covers most of what is left; None if it covers others."""
+        sides, tried, laid = self._layout.flipped(corners), [], []
+        for token in np.flatnonzero(~placed).tolist():
+            for part in polygons(rest):
+                for angle in np.arange(_ANGLES) * (2.0 * np.pi / _ANGLES):
+                    pose = np.array([part.centroid.x, part.centroid.y, angle])
+                    laid.append(Laid(self._filling.shape_of(token), bool(sides[token]), pose))
+                    tried.append((token, pose))
+        if not tried:
+            return None
+        poses = self._layout.poses(np.repeat(corners[None], len(tried), axis=0))
+        for row, (token, pose) in zip(poses, tried, strict=True):
+            row[token] = pose
+        own = outlines(self._layout.corners(poses, np.tile(sides, (len(tried), 1))), self._layout)
+        tokens = np.array([token for token, _ in tried])
+        bodies = shapely.polygons(own[np.arange(len(tried)), tokens])
+        covered = shapely.area(shapely.intersection(bodies, rest))
+        others = covered_area(corners, self._layout, placed) if placed.any() else Polygon()
+        over = shapely.area(shapely.intersection(bodies, others))
+        covered[over > _FREE * self._sim.max_overlap * self._layout.areas[tokens]] = 0.0
+        best = int(covered.argmax())
+        return laid[best] if covered[best] > 0.0 else None

@@ -1,0 +1,72 @@
+"""Learning which states can be filled: Q-learning over afterstates, with hindsight (Sec. III-B).
+
+Every action leads to a known state, so the value of an action is that of what is left. A state
+that tokens filled has the value 1. One that was played has that of the best it could have gone on
+to, by the target network: 1 where that is filled, 0 where nothing fits (Eq. 5, reward at the end).
+
+Legend: n states, M places.
+"""
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from tangram_agent.adam import Adam
+from tangram_agent.filling import Filling
+from tangram_agent.filling_replay import FILLED, OPEN, FillBatch
+from tangram_agent.learner import Learner, average_so_far, check_finite, frozen, polyak_update
+from tangram_agent.networks import initialise, parameter_count
+from tangram_agent.setup import Setup
+from tangram_agent.values import Corners, OutlineValue
+
+
+class FillLearner(Learner):
+    """The value of what is left, its target and its optimiser."""
+
+    def __init__(self, setup: Setup, seed: int, device: str = "cpu") -> None:
+        self.config, self.device, self.updates = setup.agent, torch.device(device), 0
+        self.bootstraps, self.motion, self._fit = setup.bootstraps, None, None
+        value = OutlineValue(Filling(setup.layout).shapes, setup.net)
+        initialise(value, torch.Generator().manual_seed(seed))
+        self.playing: nn.Module = value.to(self.device)
+        self.value, self.target, self.acting = value, frozen(value), frozen(value)
+        self.parameters = parameter_count(value)
+        self.parts = {"value": self.value, "target": self.target, "acting": self.acting}
+        self._lists = self.parameter_lists()
+        self.critic_optimiser = Adam(self._lists["value"], self.config.critic_lr)
+
+    def learn(self, batch: FillBatch, progress: float = 0.0) -> dict[str, float]:
+        """One step on a batch; see `Learner.update`.
+
+        Returns:
+            critic_loss, q (mean value of states that were played) and critic_gradient.
+        """
+        self.critic_optimiser.rate = self.config.critic_lr * self.rate_factor(progress)
+        y = torch.cat([torch.ones(len(batch.filled), device=self.device), self.targets(batch)])
+        states = [Corners.of(rests, self.device) for rests in (batch.filled, batch.played)]
+        logits = self.value(Corners(*map(torch.cat, zip(*states, strict=True))))
+        loss = nn.functional.binary_cross_entropy_with_logits(logits, y)
+        norm = self._step("value", loss)
+        polyak_update(self._lists["target"], self._lists["value"], self.config.polyak)
+        rho = average_so_far(self.config.acting_average, self.updates)
+        polyak_update(self._lists["acting"], self._lists["playing"], rho)
+        q = logits.detach()[len(batch.filled) :].sigmoid().mean()
+        numbers = {"critic_loss": loss.item(), "q": q.item(), "critic_gradient": norm.item()}
+        check_finite(self.updates + 1, numbers)
+        self.updates += 1
+        return numbers
+
+    def targets(self, batch: FillBatch) -> Tensor:
+        """(n',) values of states that were played, by what each could have gone on to."""
+        ends = torch.from_numpy(batch.ends.astype(np.int64)).to(self.device)
+        best = torch.zeros(ends.shape, device=self.device)
+        best[ends == FILLED] = 1.0
+        rows = np.flatnonzero(batch.ends.ravel() == OPEN)
+        if len(rows):
+            with torch.no_grad():
+                ahead = self.target(Corners.of(batch.places.at(rows), self.device)).sigmoid()
+            best.view(-1)[torch.from_numpy(rows).to(self.device)] = self.config.gamma * ahead
+        return best.amax(dim=1)
+
+    def _optimisers(self) -> dict[str, Adam]:  # type: ignore[override]
+        return {"value": self.critic_optimiser}

@@ -1,0 +1,185 @@
+"""What the agent of outlines learns from: states that it played, and those that hindsight fills.
+
+In its purest form hindsight needs no other goal: whatever tokens have come to cover is an outline
+that they fill, and so is what any of them cover. What went wrong teaches, too: of each state that
+was played the states are kept that it could have gone on to.
+
+Legend: E episodes, T steps, n rows, M places, K tokens, N corners, S shapes.
+"""
+
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from shapely.errors import GEOSException
+
+from tangram_agent.filling import MOST_PLACES, UNUSED, Filling, Rests
+from tangram_agent.setup import Setup
+from tangram_agent.types import Episodes, Flags
+from tangram_sim.arrays import Bools
+from tangram_sim.dissections import Area
+from tangram_sim.errors import RunError
+
+Array = npt.NDArray[Any]
+OPEN, FILLED = 1, 2  # of a place that a state could go on to; 0: there is none, or it is dead
+_COUNTERS = "counters"
+
+
+@dataclass(frozen=True, eq=False)
+class FillBatch:
+    """States to learn from.
+
+    Attributes:
+        filled: states (n,) that tokens filled.
+        played: states (n',) that were played.
+        places: (n' * M) what each of them could have gone on to.
+        ends: (n', M) of these OPEN, FILLED, or 0.
+    """
+
+    filled: Rests
+    played: Rests
+    places: Rests
+    ends: Flags
+
+
+class FillReplay:
+    """Two rings over preallocated arrays: of states that were played and of those of hindsight.
+
+    Attributes:
+        capacity: states kept of each.
+    """
+
+    def __init__(self, setup: Setup) -> None:
+        """Allocate everything at once."""
+        self.capacity = setup.agent.replay_capacity
+        self._filling = Filling(setup.layout)
+        self._copies = sum(one.copies for one in setup.agent.hindsight)
+        size = self._filling.corners, self._filling.shapes
+        self._played = Rests.empty(self.capacity, *size)
+        self._places = Rests.empty(self.capacity * MOST_PLACES, *size)
+        self._ends = np.zeros((self.capacity, MOST_PLACES), np.uint8)
+        self._filled = Rests.empty(self.capacity, *size)
+        self._added = np.zeros(2, np.int64)  # played, filled
+
+    def __len__(self) -> int:
+        return min(int(self._added.min()), self.capacity)
+
+    def insert(self, episodes: Episodes, generator: np.random.Generator) -> None:
+        """Take in episodes as they were played, and what their tokens came to cover."""
+        for corners, placed, goal in zip(
+            episodes.corners, episodes.placed, episodes.goals, strict=True
+        ):
+            # Corners are no worker's invention where it plays by the rules; where not, no geometry
+            # that a library trips over may end the run.
+            with suppress(GEOSException):
+                self._insert(corners, placed.astype(np.bool_), goal, generator)
+
+    def _insert(
+        self, corners: Array, placed: Bools, goal: Array, generator: np.random.Generator
+    ) -> None:
+        """One episode: corners (T + 1, V, 2), placed (T + 1, K) and the outline (G, 2)."""
+        filling, inside = self._filling, self._filling.inside(corners[-1], goal)
+        for step in range(len(corners) - 1):
+            laid = placed[step]
+            if (laid & ~inside).any():
+                break  # nothing fitted any more
+            rest = filling.rest(goal, corners[step], laid)
+            self._add_played(rest, filling.left(~laid))
+        own = np.flatnonzero(placed[-1] & inside)
+        for _ in range(self._copies if len(own) else 0):
+            chosen = np.zeros(placed.shape[1], np.bool_)
+            chosen[generator.permutation(own)[: generator.integers(1, len(own) + 1)]] = True
+            covered = filling.covered(corners[-1], chosen)
+            self._add_filled(filling.seen(covered, filling.left(chosen)))
+
+    def _add_played(self, rest: Area, left: tuple[int, ...]) -> None:
+        row = int(self._added[0]) % self.capacity
+        places = self._filling.places(rest, left)[:MOST_PLACES]
+        first = row * MOST_PLACES
+        _put(self._played, row, self._filling.seen(rest, left))
+        self._ends[row] = 0
+        for i, place in enumerate(places):
+            self._ends[row, i] = FILLED if place.filled else OPEN * (not place.dead)
+            _put(self._places, first + i, self._filling.seen(place.rest, place.left))
+        self._added[0] += 1
+
+    def _add_filled(self, seen: Rests) -> None:
+        _put(self._filled, int(self._added[1]) % self.capacity, seen)
+        self._added[1] += 1
+
+    def sample(self, size: int, generator: np.random.Generator) -> FillBatch:
+        """`size` states, half of them of hindsight, drawn uniformly with replacement.
+
+        Raises:
+            ValueError: there are none of one kind.
+        """
+        if not len(self):
+            raise ValueError("cannot sample from an empty replay buffer")
+        kept = np.minimum(self._added, self.capacity)
+        played = generator.integers(kept[0], size=size - size // 2)
+        filled = generator.integers(kept[1], size=size // 2)
+        places = (played[:, None] * MOST_PLACES + np.arange(MOST_PLACES)).ravel()
+        return FillBatch(
+            self._filled.at(filled).turned(generator),
+            self._played.at(played).turned(generator),
+            self._places.at(places),
+            self._ends[played],
+        )
+
+    def _columns(self) -> Iterator[tuple[str, Array, int, int]]:
+        """Name, column, rows that a state takes in it, and which counter counts these."""
+        for name, rests, rows, counter in (
+            ("played", self._played, 1, 0),
+            ("places", self._places, MOST_PLACES, 0),
+            ("filled", self._filled, 1, 1),
+        ):
+            for part, column in vars(rests).items():
+                yield f"{name}_{part}", column, rows, counter
+        yield "ends", self._ends, 1, 0
+
+    def state(self) -> dict[str, Array]:
+        """The kept states and the counters, as arrays for a checkpoint (mostly views)."""
+        kept = np.minimum(self._added, self.capacity)
+        columns = {name: column[: kept[c] * n] for name, column, n, c in self._columns()}
+        return columns | {_COUNTERS: self._added.copy()}
+
+    def load_state(self, state: Mapping[str, Array]) -> None:
+        """Take over a state from `state()`.
+
+        Raises:
+            RunError: columns are missing, of another layout, type or capacity, or hold what no
+                state has.
+        """
+        added = np.asarray(state.get(_COUNTERS, ()), np.int64)
+        if added.shape != (2,) or (added < 0).any():
+            raise RunError("replay state: no counters: not a replay of outlines")
+        kept = np.minimum(added, self.capacity)
+        for name, column, rows, counter in self._columns():
+            part, shape = state.get(name), (int(kept[counter]) * rows, *column.shape[1:])
+            if part is None or part.shape != shape or part.dtype != column.dtype:
+                raise RunError(
+                    f"replay state: '{name}' does not fit (expected {column.dtype} {shape}): was "
+                    "the checkpoint written with other tokens or another agent.replay_capacity?"
+                )
+            column[: len(part)] = part
+        self._added = added
+        self.check_valid()
+
+    def check_valid(self) -> None:
+        """Raise RunError unless every kept number is finite and every index within its bounds."""
+        for rests in (self._played, self._places, self._filled):
+            used = rests.part[rests.part != UNUSED]
+            if not np.isfinite(rests.points).all():
+                raise RunError("replay buffer: corners that are not finite")
+            if max(rests.follow.max(), used.max(initial=0)) >= self._filling.corners:
+                raise RunError("replay buffer: an index beyond the corners")
+        if self._ends.max() > FILLED:
+            raise RunError("replay buffer: 'ends' holds what no place has")
+
+
+def _put(rests: Rests, row: int, one: Rests) -> None:
+    for name, column in vars(rests).items():
+        column[row] = getattr(one, name)[0]

@@ -1,0 +1,93 @@
+"""How many exact outlines an agent fills by itself, and by a beam; beside it, who learned nothing.
+
+The figures are those of `silhouettes.py`. All ways lay tokens at the same places: they differ in
+which they take. *Largest first* takes the first place, as the search orders them; *by chance*
+values places at random. So what stands above them is what was learned.
+"""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from rich.progress import track
+from torch import nn
+
+from tangram_agent.filler import Filler
+from tangram_agent.filling import Filling
+from tangram_agent.runs import load_run
+from tangram_agent.setup import Setup
+from tangram_agent.values import Corners
+from tangram_lab.benchmarks.measure import show, write
+from tangram_lab.benchmarks.silhouettes import Shape, area_of, figures_of, row_of
+from tangram_sim.dissections import Tokens, dissection
+from tangram_sim.errors import ConfigError
+from tangram_vision.silhouettes import Filled, covered, overlap
+
+BEAMS = (1, 4, 12)
+
+
+class LargestFirst(nn.Module):
+    """All states are worth the same: the first place, of the largest token, is taken."""
+
+    def forward(self, corners: Corners) -> torch.Tensor:
+        """(n,) zeros."""
+        return torch.zeros(len(corners.points))
+
+
+class ByChance(nn.Module):
+    """States are worth what chance says."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__()
+        self._generator = torch.Generator().manual_seed(seed)
+
+    def forward(self, corners: Corners) -> torch.Tensor:
+        """(n,) random numbers."""
+        return torch.rand(len(corners.points), generator=self._generator)
+
+
+def run_outlines(run_dir: str, scenes: int, seed: int, out: Path | None) -> int:
+    """Print the table; returns the exit status, 0 whatever was found.
+
+    Raises:
+        ConfigError: a run whose agent fills no outlines.
+    """
+    run = load_run(run_dir)
+    if not run.setup.fills:
+        raise ConfigError(f"run_dir={run_dir} fills no outlines: take one of agent=outline")
+    torch.set_num_threads(1)
+    figures = list(figures_of(run.setup.layout, scenes, seed))
+    ways: dict[str, nn.Module] = {
+        "the agent": run.policy.network,
+        "largest first": LargestFirst(),
+        "by chance": ByChance(seed),
+    }
+    rows = []
+    for name, value in ways.items():
+        for beam in BEAMS:
+            told = f"{name}, {f'beam of {beam}' if beam > 1 else 'no search'}"
+            found = list(_filled(value, run.setup, figures, beam, told))
+            rows.append(row_of(told, run.setup.layout, figures, found))
+    show("exact outlines filled with seven tans, one core", rows)
+    write(out, {"run": run_dir, "scenes": scenes, "seed": seed, "rows": rows})
+    return 0
+
+
+def _filled(
+    value: nn.Module, setup: Setup, figures: list[Shape], beam: int, told: str
+) -> Iterator[Filled]:
+    filler, filling = Filler(value, setup), Filling(setup.layout)
+    tokens = Tokens(setup.layout)
+    every = np.ones(setup.layout.tokens, np.bool_)
+    for figure in track(figures, told):
+        area, begin = area_of(setup.layout, figure), time.process_time()
+        plan = filler.plan(area, filling.left(every), beam)
+        seconds = time.process_time() - begin
+        laid = [place.laid for place in plan]
+        found, iou = None, 0.0
+        if plan and plan[-1].filled:
+            found = dissection(tokens, laid)
+            iou = overlap(covered(setup.layout, found), area)
+        yield Filled(found, iou, seconds, len(plan), False)
