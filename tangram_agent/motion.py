@@ -27,6 +27,7 @@ from tangram_sim.layout import Layout
 _FEATURES = 26
 _SPREAD, _NOISE = 0.1, 0.02  # deviations of entries of K and of a way, at the start
 _LEAST = 1e-4  # deviation of a way, and of an entry of K: another world may differ more
+_LEAST_GAIN = 1e-2  # of how far a command's own axis goes: what other worlds differ in first
 _BOUNDS = -40.0, 40.0  # logarithms that are believed of weights which came from elsewhere
 _KEPT = 0.998  # of what was seen before, with each update
 _SEARCH_STEPS, _NEAR_ENOUGH = 30, 1e-5
@@ -289,6 +290,7 @@ class Fit:
         model.log_noise.add_(0.5 * (_log(blame.square().sum(dim=(0, 2))) - _log(own)))
         for learned in (model.log_noise, model.log_variance):
             learned.clamp_(min=2.0 * math.log(_LEAST))
+        model.log_variance.diagonal().clamp_(min=2.0 * math.log(_LEAST_GAIN))
         last = (blame[..., -1] / seen.inverse[..., -1, -1]).square() * moved[..., -1]
         error = (last.sum() / (3.0 * moved[..., -1].sum()).clamp(min=1.0)).sqrt()
         return {

@@ -291,8 +291,15 @@ def test_whatever_variances_are_told_commands_are_finite() -> None:
 
 
 def test_what_a_world_never_varied_may_still_be_learned_in_another() -> None:
+    """First of all how far a command goes: half or twice as far is believed from one action."""
     model = MotionModel()
     fit, told = Fit(model), commands(64)
     for _ in range(300):
         fit.step(seen(told, told))
     assert model.variance.min() >= 1e-4**2 * 0.99
+    for gain in (0.5, 2.0):
+        once = torch.tensor([[0.4, -0.3, 0.2]])
+        belief = model.belief(seen(gain * once, once))
+        others = 0.3 * commands(16, seed=1)
+        believed = model.predict(belief.at(torch.zeros(16, dtype=torch.int64)), others)[0]
+        torch.testing.assert_close(believed, gain * others, atol=0.03, rtol=0.0)
