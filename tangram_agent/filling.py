@@ -138,6 +138,10 @@ class Filling:
         """What may be laid next, see `Search.places`."""
         return self._search.places(rest, left)
 
+    def is_filled(self, rest: Area, left: tuple[int, ...]) -> bool:
+        """Whether nothing is left to fill, and no token."""
+        return self._search.is_filled(rest, left)
+
     def seen(self, rest: Area, left: tuple[int, ...]) -> Rests:
         """One state; empty where it has too many corners."""
         found = Rests.empty(1, self.corners, self.shapes)

@@ -65,7 +65,7 @@ class FillLearner(Learner):
         if len(rows):
             with torch.no_grad():
                 ahead = self.target(Corners.of(batch.places.at(rows), self.device)).sigmoid()
-            best.view(-1)[torch.from_numpy(rows).to(self.device)] = self.config.gamma * ahead
+            best.view(-1)[torch.from_numpy(rows).to(self.device)] = ahead
         return best.amax(dim=1)
 
     def _optimisers(self) -> dict[str, Adam]:  # type: ignore[override]

@@ -1,8 +1,9 @@
 """What the agent of outlines learns from: states that it played, and those that hindsight fills.
 
 In its purest form hindsight needs no other goal: whatever tokens have come to cover is an outline
-that they fill, and so is what any of them cover. What went wrong teaches, too: of each state that
-was played the states are kept that it could have gone on to.
+that they fill, and so is what any of them cover; and where play filled the outline, so it did all
+states on the way. What went wrong teaches, too: of each state that was played the states are kept
+that it could have gone on to.
 
 Legend: E episodes, T steps, n rows, M places, K tokens, N corners, S shapes.
 """
@@ -24,7 +25,7 @@ from tangram_sim.dissections import Area
 from tangram_sim.errors import RunError
 
 Array = npt.NDArray[Any]
-OPEN, FILLED = 1, 2  # of a place that a state could go on to; 0: there is none, or it is dead
+OPEN, FILLED = 1, 2  # of a place; 0: there is none, or it is dead
 _COUNTERS = "counters"
 
 
@@ -36,7 +37,7 @@ class FillBatch:
         filled: states (n,) that tokens filled.
         played: states (n',) that were played.
         places: (n' * M) what each of them could have gone on to.
-        ends: (n', M) of these OPEN, FILLED, or 0.
+        ends: (n', M) of these OPEN, FILLED, or 0; FILLED, too, where play went on and filled all.
     """
 
     filled: Rests
@@ -82,12 +83,14 @@ class FillReplay:
     ) -> None:
         """One episode: corners (T + 1, V, 2), placed (T + 1, K) and the outline (G, 2)."""
         filling, inside = self._filling, self._filling.inside(corners[-1], goal)
+        end = filling.rest(goal, corners[-1], placed[-1])
+        solved = filling.is_filled(end, filling.left(~placed[-1]))
         for step in range(len(corners) - 1):
             laid = placed[step]
             if (laid & ~inside).any():
                 break  # nothing fitted any more
             rest = filling.rest(goal, corners[step], laid)
-            self._add_played(rest, filling.left(~laid))
+            self._add_played(rest, filling.left(~laid), solved)
         own = np.flatnonzero(placed[-1] & inside)
         for _ in range(self._copies if len(own) else 0):
             chosen = np.zeros(placed.shape[1], np.bool_)
@@ -95,7 +98,7 @@ class FillReplay:
             covered = filling.covered(corners[-1], chosen)
             self._add_filled(filling.seen(covered, filling.left(chosen)))
 
-    def _add_played(self, rest: Area, left: tuple[int, ...]) -> None:
+    def _add_played(self, rest: Area, left: tuple[int, ...], solved: bool) -> None:
         row = int(self._added[0]) % self.capacity
         places = self._filling.places(rest, left)[:MOST_PLACES]
         first = row * MOST_PLACES
@@ -104,6 +107,8 @@ class FillReplay:
         for i, place in enumerate(places):
             self._ends[row, i] = FILLED if place.filled else OPEN * (not place.dead)
             _put(self._places, first + i, self._filling.seen(place.rest, place.left))
+        if solved:  # no matter by which place: a state is worth its best one
+            self._ends[row, 0] = FILLED
         self._added[0] += 1
 
     def _add_filled(self, seen: Rests) -> None:

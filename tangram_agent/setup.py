@@ -111,7 +111,7 @@ class Setup:
             )
         needed = {
             "tokens": (self.layout.tokens > 1, "a set of several tokens"),
-            "agent.gamma": (agent.gamma > 0.0, "agent.gamma=1"),
+            "agent.gamma": (agent.gamma == 1.0, "agent.gamma=1"),
             "sim.motion": (sim.motion == "lift", "sim.motion=lift"),
             "sim.starts": (sim.starts == "outside", "sim.starts=outside"),
             "sim.actions_per_token": (sim.actions_per_token == 1, "sim.actions_per_token=1"),

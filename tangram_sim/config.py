@@ -40,7 +40,7 @@ UNKNOWN = (
 )
 MOTIONS = ("lift", "slide")
 STARTS = ("anywhere", "outside")
-TARGETS = ("uniform", "gaussian", "connected", "figures", "mixed")
+TARGETS = ("uniform", "gaussian", "connected", "figures", "touching", "mixed")
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,8 @@ class SimConfig(Settings, section="sim"):
     targets: str = setting(
         "uniform",
         "uniform: pieces apart, anywhere; gaussian: apart, around the arena's centre; connected: "
-        "edge to edge; figures: puzzles of the train split; mixed: uniform or connected by chance",
+        "edge to edge; figures: puzzles of the train split; touching: connected or figures by "
+        "chance; mixed: uniform or connected by chance",
         choices=TARGETS,
     )
     spread: float = setting(

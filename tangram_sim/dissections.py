@@ -233,10 +233,14 @@ class Search:
         places = []
         for one, polygon in self._fewest(parts, left):
             gone, now = self._without(rest, polygon), less(left, one)
-            own = self._parts(gone)
-            open_to = self._divides([part.area for part in own], now)
-            places.append(Place(one, gone, now, filled=not own and open_to, dead=not open_to))
+            open_to = self._divides([part.area for part in self._parts(gone)], now)
+            filled = self.is_filled(gone, now)
+            places.append(Place(one, gone, now, filled=filled, dead=not open_to))
         return places
+
+    def is_filled(self, rest: Area, left: tuple[int, ...]) -> bool:
+        """Whether nothing is left to fill, and no token."""
+        return not any(left) and not self._parts(rest)
 
     def _parts(self, rest: Area) -> list[Polygon]:
         return [part for part in polygons(rest) if part.area > _DUST * self._least]

@@ -31,6 +31,8 @@ from tangram_sim.shapes import Shape, mirror_image, tan, turn_onto
 Generators = Sequence[np.random.Generator]
 Sides = tuple[Floats, Bools]
 MAX_PILE = 3  # tokens that touch and can be found in a picture: more are searched for too long
+_BY_CHANCE = {"touching": ("connected", "figures"), "mixed": ("uniform", "connected")}
+_TOGETHER = "connected", "figures", "touching", "mixed"  # with pieces that touch
 _NO_TURN = 1e-6  # radians
 MIN_THICKNESS = 1e-3  # of a token, arenas
 
@@ -118,18 +120,15 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
             )
     if sim.observe in ("pictures", "silhouette_pictures"):
         _check_names(layout, sim.observe)
-    together = [
-        t for t in (sim.task, *sim.stages) if t.targets in ("connected", "figures", "mixed")
-    ]
+    together = [t for t in (sim.task, *sim.stages) if t.targets in _TOGETHER]
     if sim.observe == "pictures" and together and layout.tokens > MAX_PILE:
         raise ConfigError(
             f"sim.observe=pictures tells at most {MAX_PILE} tokens that touch from each other, got "
             f"{layout.tokens} in sim.targets={together[0].targets}: set sim.targets=uniform, or "
             "sim.observe=corners"
         )
-    if any(task.targets == "figures" for task in (sim.task, *sim.stages)):
-        _check_full_set(layout)
-        _check_figures_fit(layout, sim)
+    for task in (sim.task, *sim.stages):
+        _check_figures(layout, sim, task.targets)
 
 
 def _check_names(layout: Layout, observe: str) -> None:
@@ -224,9 +223,8 @@ def _is_piece(puzzle: Puzzle, piece: int, shape: Shape) -> bool:
 
 
 def _kind(task: StageConfig, rng: np.random.Generator) -> str:
-    if task.targets != "mixed":
-        return task.targets
-    return ("uniform", "connected")[int(rng.random() < 0.5)]
+    kinds = _BY_CHANCE.get(task.targets)
+    return task.targets if kinds is None else kinds[int(rng.random() < 0.5)]
 
 
 def _sides(layout: Layout, sim: SimConfig, generators: Generators) -> Bools:
@@ -271,12 +269,19 @@ def _scale(layout: Layout) -> float:
     return float(np.sqrt(shape.area / tan(shape.name).area))
 
 
-def _check_figures_fit(layout: Layout, sim: SimConfig) -> None:
-    """Raise unless every figure fits into the arena at any angle."""
+def _check_figures(layout: Layout, sim: SimConfig, targets: str) -> None:
+    """Raise unless every figure is one of the tokens and fits into the arena at any angle."""
+    if targets not in ("figures", "touching"):
+        return
+    if not has_all_tans(layout):
+        raise ConfigError(
+            f"sim.targets={targets} needs all seven tans, got tokens {', '.join(_tans(layout))}: "
+            "set tokens=tangram7, or another kind of targets"
+        )
     extent = PuzzleRules().max_extent * _scale(layout)
     if extent > sim.arena:
         raise ConfigError(
-            f"sim.targets=figures needs an arena of width {extent:g} for tokens.scale="
+            f"sim.targets={targets} needs an arena of width {extent:g} for tokens.scale="
             f"{_scale(layout):g}, got {sim.arena:g}: raise sim.arena, or lower tokens.scale"
         )
 
@@ -284,14 +289,6 @@ def _check_figures_fit(layout: Layout, sim: SimConfig) -> None:
 def has_all_tans(layout: Layout) -> bool:
     """Whether the tokens are the seven tans, which every figure has."""
     return _tans(layout) == sorted(name for name, count in COUNTS.items() for _ in range(count))
-
-
-def _check_full_set(layout: Layout) -> None:
-    if not has_all_tans(layout):
-        raise ConfigError(
-            f"sim.targets=figures needs all seven tans, got tokens {', '.join(_tans(layout))}: set "
-            "tokens=tangram7, or another kind of targets"
-        )
 
 
 def _tans(layout: Layout) -> list[str]:

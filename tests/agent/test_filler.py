@@ -136,7 +136,7 @@ def test_filled_is_surer_than_any_value() -> None:
         ({"lookahead": "engine"}, {}, "agent.lookahead=engine"),
         ({"hindsight": []}, {}, "without a filled one"),
         ({"hindsight": [{"strategy": "near", "position": 0.1}]}, {}, "hindsight.strategy"),
-        ({"gamma": 0.0}, {}, "needs agent.gamma=1"),
+        ({"gamma": 0.9}, {}, "needs agent.gamma=1"),
         ({}, {"starts": "anywhere"}, "sim.starts=outside"),
         ({}, {"actions_per_token": 2}, "sim.actions_per_token=1"),
         ({}, {"gain": [1.1, 1.0, 1.0]}, "a world whose motion is exact"),

@@ -55,8 +55,8 @@ def test_a_solved_episode_gives_its_states_and_what_they_could_go_on_to() -> Non
     state = rows(replay)
     assert state["counters"].tolist() == [2, 3]
     assert state["played_left"].tolist() == [[2], [1]]
-    # Either diagonal, then the one triangle that is left.
-    assert state["ends"].tolist() == [[OPEN] * 2 + [0] * 6, [FILLED] + [0] * 7]
+    # Either diagonal, then the one triangle that is left; both states were filled by play.
+    assert state["ends"].tolist() == [[FILLED, OPEN] + [0] * 6, [FILLED] + [0] * 7]
     corners = (state["played_part"] != UNUSED).sum(axis=1)
     assert corners.tolist() == [4, 3]
     # Hindsight: both triangles are a square, each alone a triangle.
@@ -73,6 +73,7 @@ def test_what_went_wrong_teaches_up_to_where_it_did() -> None:
     replay.insert(episode([5.0, 5.0, 0.0]), np.random.default_rng(0))
     state = rows(replay)
     assert state["counters"].tolist() == [2, 3]
+    assert state["ends"].tolist() == [[OPEN] * 2 + [0] * 6, [FILLED] + [0] * 7]
     assert set(state["filled_left"].ravel().tolist()) == {1}
 
 
@@ -133,8 +134,8 @@ def test_an_empty_replay_cannot_be_sampled() -> None:
         FillReplay(MADE).sample(4, np.random.default_rng(0))
 
 
-def learned(gamma: float = 1.0) -> tuple[FillLearner, FillReplay]:
-    made = outline_setup(agent={"replay_capacity": 8, "batch_size": 8, "gamma": gamma})
+def learned() -> tuple[FillLearner, FillReplay]:
+    made = outline_setup(agent={"replay_capacity": 8, "batch_size": 8})
     replay = FillReplay(made)
     replay.insert(episode(other_half()), np.random.default_rng(0))
     replay.insert(episode([5.0, 5.0, 0.0]), np.random.default_rng(0))
@@ -143,8 +144,8 @@ def learned(gamma: float = 1.0) -> tuple[FillLearner, FillReplay]:
 
 def test_a_state_is_worth_the_best_that_it_can_go_on_to() -> None:
     """Eq. 5 by hand: 1 where a place fills all, else the target's value, 0 where there is none."""
-    learner, replay = learned(gamma=0.9)
-    batch = replay.sample(16, np.random.default_rng(2))
+    learner, replay = learned()
+    batch = replay.sample(64, np.random.default_rng(2))
     batch.ends[0] = 0
     targets = learner.targets(batch)
     assert targets[0] == 0.0
@@ -156,7 +157,7 @@ def test_a_state_is_worth_the_best_that_it_can_go_on_to() -> None:
             if end == OPEN:
                 one = batch.places.at(slice(row * MOST_PLACES + i, row * MOST_PLACES + i + 1))
                 with torch.no_grad():
-                    wanted = max(wanted, 0.9 * float(learner.target(Corners.of(one)).sigmoid()[0]))
+                    wanted = max(wanted, float(learner.target(Corners.of(one)).sigmoid()[0]))
         assert float(targets[row]) == pytest.approx(wanted, abs=1e-6)
     assert {0.0, 1.0} < set(targets.tolist())
 

@@ -25,7 +25,7 @@ TRIPLE = layout_of(*TRIO, scale=0.6)
 SEEN = {"observe": "pictures", "pixels": 64}
 SIDE = 0.125**0.5  # of the square tan, whose full square is 1
 BOX = {"name": "box", "corners": [[0, 0], [SIDE, 0], [SIDE, SIDE], [0, SIDE]]}
-KINDS = ("uniform", "gaussian", "connected", "figures", "mixed")
+KINDS = ("uniform", "gaussian", "connected", "figures", "touching", "mixed")
 PUZZLES = [*library("train"), *library("test")]
 
 
@@ -86,7 +86,7 @@ def test_targets_lie_inside_and_apart(kind: str, mirrored: float) -> None:
     assert np.abs(GAME.corners(poses, flipped)).max() <= 1.0 + 1e-9
     for one, sides in zip(poses, flipped, strict=True):
         assert largest_overlap(GAME, one, sides) < 1e-7
-    if kind != "figures":  # they need either side
+    if kind not in ("figures", "touching"):  # figures need either side
         assert (not flipped.any(), bool(flipped[:, 6].all())) == (mirrored == 0.0, mirrored == 1.0)
     assert not flipped[:, :6].any()
 
@@ -124,6 +124,17 @@ def test_mixed_is_uniform_and_connected_in_turns() -> None:
     assert 15 < sum(whole) < 45
 
 
+def test_touching_is_connected_and_figures_in_turns() -> None:
+    rings = {round(union(p.layout, p.poses).length, 5) for p in library("train")}
+    drawn = 0
+    for pair in zip(*sampled("touching", 60), strict=True):
+        area = union(GAME, *pair)
+        figure = round(area.length, 5) in rings
+        assert figure or area.buffer(1e-6).geom_type == "Polygon"
+        drawn += figure
+    assert 15 < drawn < 45
+
+
 @pytest.mark.parametrize("spread", [0.05, 0.2])
 def test_gaussian_centres_have_the_spread_that_was_asked_for(spread: float) -> None:
     layout = layout_of("small_triangle", scale=0.2)
@@ -145,6 +156,7 @@ def test_a_narrow_gaussian_widens_until_there_is_room() -> None:
     ("layout", "settings", "reason"),
     [
         (TRIPLE, {"targets": "figures"}, "figures needs all seven tans, got tokens para"),
+        (TRIPLE, {"targets": "touching"}, "touching needs all seven tans, got tokens para"),
         (TRIPLE, {"stages": (StageConfig(targets="figures"),)}, "figures needs all seven tans"),
         (
             layout_of(*SEVEN, scale=0.8),
