@@ -88,6 +88,11 @@ _SEVERAL = {
     "ms_per_decision": ("ms for each action", 1),
     "ms_slowest": ("CPU ms of the slowest", 0),
 }
+# What is told of filled outlines: nothing of where a piece should lie.
+_OF_AREAS = (
+    *("mean_reward", "mean_reward_camera", "raw_overlap", "raw_overlap_p10"),
+    *("coverage", "iou", "blocked", "refused", "actions_used"),
+)
 _COUNTS = ("wrong", "doubly_used", "refused", "blocked", "actions_used")
 
 
@@ -155,9 +160,11 @@ def score_policies(
 
 
 def _scored(tests: FixedTests, player: Player) -> Scores:
-    played = tests.play(playing(player, tests.env))
+    played, setup = tests.play(playing(player, tests.env)), tests.setup
     scores: Scores = dict(tests.scores(played))
-    return scores | (of_several(tests.setup, played) if tests.setup.layout.tokens > 1 else {})
+    if setup.fills:
+        return {key: scores[key] for key in _OF_AREAS if key in scores} | _filled(setup, played)
+    return scores | (of_several(setup, played) if setup.layout.tokens > 1 else {})
 
 
 def _episodes(run: Run, config: EvalConfig) -> dict[str, Any]:
@@ -283,13 +290,7 @@ def score_outlines(
 ) -> Scored:
     """Scores of each policy that sees the outlines of puzzles, and fills them itself."""
     played = {name: play_figures(setup, figures, player, seed) for name, player in players.items()}
-    names = ("coverage", "iou", "blocked", "refused", "actions_used")
-    scores: dict[str, Scores] = {}
-    for name, own in played.items():
-        found = assembled(setup.layout, own)
-        means = {key: value for key, value in found.means().items() if key in names}
-        solved = {"share_solved_iou": float(np.mean(found.iou >= SOLVED))}
-        scores[name] = means | solved | of_several(setup, own)
+    scores = {name: _filled(setup, own) for name, own in played.items()}
     run, found = played[RUN], assembled(setup.layout, played[RUN])
     each = [
         {
@@ -298,7 +299,8 @@ def score_outlines(
             "coverage": float(found.coverage[e]),
             "iou": float(found.iou[e]),
             "solved": bool(found.iou[e] >= SOLVED),
-            **{name: int(getattr(found, name)[e]) for name in names[2:]},
+            **{name: int(getattr(found, name)[e]) for name in ("blocked", "refused")},
+            "actions_used": int(found.actions_used[e]),
             "seconds": float(run.seconds[e]),
         }
         for e, figure in enumerate(figures)
@@ -306,6 +308,14 @@ def score_outlines(
     titles = [figure.title for figure in figures]
     told = "filled by the run itself; any dissection counts, so no errors of position and angle"
     return Scored(scores, each, titles, run.ends, run.goals, told)
+
+
+def _filled(setup: Setup, played: Played) -> Scores:
+    """Scores of filled outlines; any dissection counts, so none tells of single pieces."""
+    found = assembled(setup.layout, played)
+    means = {key: value for key, value in found.means().items() if key in _OF_AREAS}
+    solved = float(np.mean(found.iou >= SOLVED))
+    return means | {"share_solved_iou": solved} | of_several(setup, played)
 
 
 def score_hidden(

@@ -30,7 +30,7 @@ from tangram_sim.errors import ConfigError, RunError, TangramError
 from tangram_sim.settings import told
 from tangram_sim.targets import has_all_tans
 from worker.config import EvalConfig
-from worker.evaluate import RUN, policies, score_policies, score_puzzles
+from worker.evaluate import RUN, policies, score_outlines, score_policies, score_puzzles
 from worker.puzzles import find_figures
 from worker.test_set import greedy
 
@@ -39,6 +39,7 @@ RESULT = "result.json"
 MAX_BYTES = 1_000_000  # of the weights: they travel with every installation
 FIGURES, TURNS = ("test", "train"), 4  # splits of the library, and angles of each figure
 TESTS, TEST_SEED = 400, 1  # tests that no choice was made on: training is scored on seed 0
+AHEAD = {"agent": {"lookahead": "values", "beam": 12}}  # as an agent of outlines ships
 
 
 class Candidate(NamedTuple):
@@ -75,6 +76,8 @@ def publish(
     seeds = sorted((_read(path) for path in run_dirs), key=lambda one: int(one.result["seed"]))
     _check_one_setup(seeds)
     chosen = median(seeds)
+    if chosen.run.setup.fills:
+        chosen = chosen._replace(run=chosen.run.with_settings(AHEAD))
     weights = _weights(chosen.run)
     config = EvalConfig(str(chosen.run.folder), episodes=tests, seed=TEST_SEED)
     scores = score_policies(chosen.run.setup, policies(chosen.run), config)
@@ -97,7 +100,8 @@ def _on_figures(run: Run, split: str) -> dict[str, Any]:
     """Scores of a run on the figures of a split."""
     found = find_figures(split, run.setup, None, TURNS, False)
     players = {RUN: greedy(run.policy)}
-    scored = score_puzzles(run.setup, found.figures, players, TEST_SEED)
+    score = score_outlines if run.setup.fills else score_puzzles
+    scored = score(run.setup, found.figures, players, TEST_SEED)
     return {"turns": TURNS, "scores": scored.means[RUN]}
 
 
@@ -170,6 +174,7 @@ _ROWS = {
     "raw_overlap": ("raw overlap, 0 to 1", 4),
     "raw_overlap_p10": ("raw overlap, 10th percentile", 4),
     "share_solved": ("share of targets covered by 0.95 or more", 3),
+    "share_solved_iou": ("share with an intersection over union of 0.95 or more", 3),
     "iou": ("intersection over union", 4),
     "wrong": ("pieces under a token of another shape", 2),
     "blocked": ("placements blocked by other tokens", 2),
@@ -208,6 +213,7 @@ def make_card(
         "task": _task(setup),
         "agent": setup.agent.name,
         "net": setup.net.kind,
+        "targets": setup.sim.targets,
         "parameters": {"acting": acting, "trained": result["parameters"]},
         "data": {"source": source, **_picked(result, "episodes", "transitions")},
         "budget": _picked(result, *_BUDGET),
@@ -233,10 +239,13 @@ def _task(setup: Setup) -> dict[str, Any]:
         "arena": setup.sim.arena,
         "actions_per_token": setup.sim.actions_per_token,
         "backend": setup.sim.backend,
+        "observe": setup.sim.observe,
     }
 
 
 def _limits(setup: Setup, scores: Scores) -> list[str]:
+    if setup.fills:
+        return _limits_of_outlines(setup, scores)
     sim, one = setup.sim, setup.layout.tokens == 1
     pieces = "One token of this shape and size" if one else "This token set and size"
     if sim.observe == "pictures":
@@ -278,6 +287,20 @@ def _limits(setup: Setup, scores: Scores) -> list[str]:
         seen,
         known,
         *(["Nothing stops a token at the arena's edge."] if one else several),
+        f"One of ten tests ends below a raw overlap of {scores['raw_overlap_p10']:.4f}.",
+    ]
+
+
+def _limits_of_outlines(setup: Setup, scores: Scores) -> list[str]:
+    return [
+        "This token set and size, in an arena of this width: another task needs another training.",
+        "Exact outlines, without noise: what is found in a picture was never learned from.",
+        "Model-based: it takes tokens exactly to places at the outline's corners, which are given "
+        "by geometry; which of them to take is all that it learned.",
+        f"It thinks {setup.agent.beam} fillings ahead at a time (agent.lookahead=values); without, "
+        "it fills far fewer outlines. A search that goes back where it is stuck fills all of them, "
+        "see docs/silhouettes.md.",
+        "Tokens are lifted and set down: it knows nothing of pushes along the table.",
         f"One of ten tests ends below a raw overlap of {scores['raw_overlap_p10']:.4f}.",
     ]
 
@@ -341,6 +364,12 @@ def _about(card: Mapping[str, Any]) -> str:
     task = card["task"]
     tokens, count = ", ".join(task["tokens"]), task["actions_per_token"]
     arena, actions = f"{task['arena']:g}", f"{count} action{'s' * (count > 1)}"
+    if task.get("observe") == "silhouette":
+        return (
+            f"An agent that fills outlines with {len(task['tokens'])} tangram tokens ({tokens}; "
+            f"full square of side {task['scale']:g}) and is told of no piece, in a square arena of "
+            f"width {arena}."
+        )
     if len(task["tokens"]) > 1:
         return (
             f"An agent that assembles {len(task['tokens'])} tangram tokens ({tokens}; full square "
@@ -361,12 +390,19 @@ def _puzzles(card: Mapping[str, Any]) -> str:
         return ""
     turns = next(iter(found.values()))["turns"]
     return f"""\
-On the figures of tangram_sim/puzzles, each at {turns} angles; it trained on random targets \
-only, so that neither split was seen:
+On the figures of tangram_sim/puzzles, each at {turns} angles; {_trained_on(card)}:
 
 {_table({f"{name} split": one["scores"] for name, one in found.items()})}
 
 """
+
+
+def _trained_on(card: Mapping[str, Any]) -> str:
+    if card["targets"] in ("figures", "touching"):
+        return (
+            "it trained on outlines of the train split, among others, and never on the test split"
+        )
+    return "it trained on random targets only, so that neither split was seen"
 
 
 def _table(columns: Mapping[str, Mapping[str, Any]]) -> str:

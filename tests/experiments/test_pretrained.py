@@ -10,9 +10,12 @@ import pytest
 import yaml
 
 from tangram_agent.runs import load_run
+from tangram_lab.experiments import pretrained
 from tangram_lab.experiments.pretrained import Candidate, main, make_card, publish
 from tangram_sim.errors import ConfigError, RunError
 from tests.agent.builders import random_transitions, setup
+from tests.agent.outlines import AGENT as FILLER
+from tests.agent.outlines import SIM as OUTLINES
 from tests.sim.builders import SEVEN
 from tests.worker.builders import write_run
 from worker.config import EvalConfig
@@ -133,6 +136,28 @@ def test_an_agent_of_pictures_is_told_as_such_and_skips_figures_of_pieces_that_t
     assert "Trained from grey pictures of 128 pixels" in text
     assert "by its number" not in text
     assert "Exact corners" not in text
+
+
+def test_an_agent_of_outlines_ships_with_its_beam_and_is_told_as_such(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pretrained, "FIGURES", ("test",))
+    monkeypatch.setattr(pretrained, "TURNS", 1)
+    run, seven = finished(tmp_path, 0, 0.5), {"shapes": list(SEVEN), "scale": 0.6}
+    sim = {"backend": "kinematic", "arena": 2.0, "allow_flip": True}
+    write_run(run, tokens=seven, sim=OUTLINES | sim | {"targets": "touching"}, agent=FILLER)
+    folder = publish([run], "outlines", tmp_path / "out", 1)
+    agent, card = load_run(folder).setup.agent, json.loads((folder / "card.json").read_text())
+    assert (agent.lookahead, agent.beam) == ("values", 12)
+    assert set(card["tests"]["scores"]) == {"this run", "lookahead=none", "random"}
+    told = {*card["tests"]["scores"]["this run"], *card["puzzles"]["test"]["scores"]}
+    assert {"iou", "share_solved_iou", "raw_overlap_p10", "seconds_per_puzzle"} <= told
+    assert not any("error" in name or name == "wrong" for name in told)
+    text = (folder / "card.md").read_text()
+    assert "An agent that fills outlines with 7 tangram tokens" in text
+    assert "it trained on outlines of the train split, among others" in text
+    assert "It thinks 12 fillings ahead at a time" in text
+    assert "must be known" not in text
 
 
 def test_an_agent_is_evaluated_like_a_run(tmp_path: Path) -> None:

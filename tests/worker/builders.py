@@ -9,6 +9,7 @@ import yaml
 
 from tangram_agent.checkpoints import save_checkpoint
 from tangram_agent.config import ServiceConfig
+from tangram_agent.filling_learner import FillLearner
 from tangram_agent.learner import Learner
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup, make_setup
@@ -21,7 +22,8 @@ from worker.rollout import Played
 
 def weights(made: Setup, version: int) -> Weights:
     """Random weights; every version has its own, and all of them move the tokens visibly."""
-    return Learner(made, seed=version).acting_weights(version)
+    learner = FillLearner if made.fills else Learner
+    return learner(made, seed=version).acting_weights(version)
 
 
 def policy(made: Setup, version: int = 1) -> Policy:
