@@ -126,11 +126,17 @@ def photograph_show(run: Run, config: PlayConfig, target: str) -> Show:
 
 
 def silhouette_show(run: Run, config: PlayConfig, found: Shown) -> Show:
-    """A silhouette as it was found to be filled, with the tokens outside of it at first."""
-    setup = _beside(run.setup)
+    """A silhouette, with the tokens outside of it at first.
+
+    It is laid as it was found to be filled, or by an agent of outlines, which is shown no more
+    than its outline: what was found then only tells how much is covered.
+    """
+    setup, fills = _beside(run.setup), run.setup.fills
     played = play_figures(setup, [found.figure], greedy(run.policy), config.seed)
-    seen = draw_silhouette(found, setup.layout, WIDTH if _is_still(config.out) else WIDTH // 2)
-    return Show(setup, played, [found.figure.title], "silhouette", seen, found.told)
+    width = WIDTH if _is_still(config.out) else WIDTH // 2
+    seen = draw_silhouette(found, setup.layout, width, bare=fills)
+    told = "filled by the run itself" if fills else found.told
+    return Show(setup, played, [found.figure.title], "silhouette", seen, told)
 
 
 def _beside(setup: Setup) -> Setup:

@@ -22,6 +22,7 @@ from tangram_sim.drawing import contact_sheet
 from tangram_sim.errors import ConfigError, RunError
 from tangram_sim.game_drawing import tiles
 from tangram_sim.layout import Layout
+from tangram_sim.settings import refuse_ignored
 from tangram_sim.targets import has_all_tans, turned_figure
 from worker.puzzles import Figure, reach_beyond
 from worker.views import outlined
@@ -64,17 +65,25 @@ def read_silhouette(name: str, setup: Setup, count: int = 1, out: Path | None = 
         out: a PNG file for the best attempt where nothing fills it; None is none.
 
     Raises:
-        ConfigError: it cannot be read or filled, or OpenCV or shapely is not installed.
+        ConfigError: it cannot be read or filled, or OpenCV or shapely is not installed; or the
+            run's agent fills outlines itself, and can do nothing with this.
     """
     try:
         # Only here: other targets need neither.
-        from tangram_vision.silhouette_files import fill_silhouette  # noqa: PLC0415
+        from tangram_vision.silhouette_files import PICTURES, fill_silhouette  # noqa: PLC0415
     except ImportError as error:
         raise ConfigError(
             f"silhouette needs OpenCV and shapely ({error}): install opencv-python-headless and "
             "shapely, or leave silhouette out"
         ) from error
     source, layout = f"silhouette={name}", setup.layout
+    if setup.fills and count > 1:
+        refuse_ignored(f"solutions={count}", "an agent of outlines", "name another run")
+    if setup.fills and Path(name).suffix.lower() in PICTURES:
+        raise ConfigError(
+            f"{source} is a picture, and this agent sees exact outlines: draw it as SVG or JSON, "
+            "or name a run that lays what a search finds, as pretrained/tangram7"
+        )
     drawn = fill_silhouette(name, source, layout, setup.tokens.scale, SECONDS, count)
     laid = [one.found for one in drawn.filled if one.found is not None and one.solved]
     if not laid:
@@ -132,14 +141,21 @@ def _unfilled(drawn: "Silhouette", layout: Layout) -> str:
 # What is drawn
 
 
-def draw_silhouette(silhouette: Shown, layout: Layout, width: int) -> Image.Image:
+def draw_silhouette(
+    silhouette: Shown, layout: Layout, width: int, bare: bool = False
+) -> Image.Image:
     """The silhouette with the outlines of the tokens that fill it, in all ways that were found.
 
     Args:
         silhouette: what was found.
         layout: the tokens.
         width: of all ways together in pixels, about; one alone is as wide as a film.
+        bare: without any tokens, as an agent of outlines is shown it.
     """
+    if bare:
+        nobody = np.zeros(layout.tokens, np.bool_)
+        picture = outlined(silhouette.picture, layout, silhouette.outlines[0], _TILE, nobody)
+        return contact_sheet([picture], 1, ["what the agent is shown"])
     count = len(silhouette.outlines)
     columns, size = tiles(count, _TILE if count == 1 else width)
     pictures = [outlined(silhouette.picture, layout, one, size) for one in silhouette.outlines]

@@ -13,6 +13,10 @@ from tangram_agent.runs import load_run
 from tangram_sim.errors import ConfigError
 from tangram_sim.puzzles import PACKAGED, load_puzzle
 from tangram_vision.silhouette_files import Silhouette, fill_silhouette
+from tests.agent.outlines import AGENT as FILLER
+from tests.agent.outlines import SIM as OUTLINES
+from tests.sim.builders import SEVEN
+from tests.worker.builders import write_run
 from worker.cli import with_absolute_paths
 from worker.config import PlayConfig
 from worker.play import play_run
@@ -74,6 +78,42 @@ def test_a_silhouette_is_played(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "1 silhouette, coverage 0.99" in printed
     with Image.open(out) as drawn:
         assert drawn.width > drawn.height > 300
+
+
+@pytest.fixture
+def filler(tmp_path: Path) -> Path:
+    """A run of an agent of outlines that learned nothing."""
+    tokens, sim = {"shapes": list(SEVEN), "scale": 0.6}, {"backend": "kinematic", "arena": 2.0}
+    folder = tmp_path / "filler"
+    write_run(folder, tokens=tokens, sim=OUTLINES | sim | {"allow_flip": True}, agent=FILLER)
+    return folder
+
+
+def test_an_agent_of_outlines_is_shown_the_bare_silhouette(
+    filler: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its two halves are of few colours: those of the tokens are on the right side only."""
+    out, name = tmp_path / "square.png", svg(tmp_path / "square.svg", SQUARE)
+    play_run(PlayConfig(str(filler), silhouette=name, out=str(out)))
+    assert "; filled by the run itself" in capsys.readouterr().out
+    with Image.open(out) as drawn:
+        left = drawn.convert("RGB").crop((0, 0, drawn.width // 2 - 40, drawn.height))
+        wide = np.ptp(np.asarray(left, np.int64), axis=-1)
+    assert wide.max() < 40  # nothing is of a token's colour
+
+
+@pytest.mark.parametrize(
+    ("name", "count", "message"),
+    [
+        ("cat", 3, r"solutions=3 changes nothing with an agent of outlines: leave it out"),
+        ("cat.png", 1, r"cat.png is a picture, and this agent sees exact outlines: draw it as SVG"),
+    ],
+)
+def test_what_an_agent_of_outlines_has_no_use_for_is_refused(
+    filler: Path, name: str, count: int, message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        read_silhouette(name, load_run(filler).setup, count)
 
 
 @pytest.mark.parametrize(
