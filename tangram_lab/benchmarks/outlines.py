@@ -1,6 +1,7 @@
 """How many exact outlines an agent fills by itself, and by a beam; beside it, who learned nothing.
 
-The figures are those of `silhouettes.py`. All ways lay tokens at the same places: they differ in
+The figures are those of `silhouettes.py`, but for convex ones that agents may have trained on: the
+train split draws some of them. All ways lay tokens at the same places: they differ in
 which they take. *Largest first* takes the first place, as the search orders them; *by chance*
 values places at random. So what stands above them is what was learned.
 """
@@ -10,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import shapely
 import torch
 from rich.progress import track
 from torch import nn
@@ -20,12 +22,18 @@ from tangram_agent.runs import load_run
 from tangram_agent.setup import Setup
 from tangram_agent.values import Corners
 from tangram_lab.benchmarks.measure import show, write
+from tangram_lab.benchmarks.seeing import SCALE
 from tangram_lab.benchmarks.silhouettes import Shape, area_of, figures_of, row_of
-from tangram_sim.dissections import Tokens, dissection
+from tangram_sim.arrays import Floats
+from tangram_sim.dissections import Area, Dissection, Tokens, dissection
 from tangram_sim.errors import ConfigError
-from tangram_vision.silhouettes import Filled, covered, overlap
+from tangram_sim.layout import Layout
+from tangram_sim.puzzles import library
+from tangram_sim.targets import placement
+from tangram_vision.silhouettes import Filled, covered, overlap, silhouette
 
 BEAMS = (1, 4, 12)
+_NEAR = 1e-3  # of an arena's half, and radians: two outlines are one
 
 
 class LargestFirst(nn.Module):
@@ -58,7 +66,7 @@ def run_outlines(run_dir: str, scenes: int, seed: int, out: Path | None) -> int:
     if not run.setup.fills:
         raise ConfigError(f"run_dir={run_dir} fills no outlines: take one of agent=outline")
     torch.set_num_threads(1)
-    figures = list(figures_of(run.setup.layout, scenes, seed))
+    figures = _never_drawn(run.setup.layout, list(figures_of(run.setup.layout, scenes, seed)))
     ways: dict[str, nn.Module] = {
         "the agent": run.policy.network,
         "largest first": LargestFirst(),
@@ -73,6 +81,39 @@ def run_outlines(run_dir: str, scenes: int, seed: int, out: Path | None) -> int:
     show("exact outlines filled with seven tans, one core", rows)
     write(out, {"run": run_dir, "scenes": scenes, "seed": seed, "rows": rows})
     return 0
+
+
+def _never_drawn(layout: Layout, figures: list[Shape]) -> list[Shape]:
+    """All but those whose outline is one of the train split, at any angle or in a mirror."""
+    drawn = [Dissection(*placement(puzzle, layout)) for puzzle in library("train", SCALE)]
+    known = [_reading(silhouette(layout, laid)) for laid in drawn]
+    own = (_reading(silhouette(layout, one.laid)) for one in figures)
+    return [
+        one
+        for one, reading in zip(figures, own, strict=True)
+        if not any(_alike(reading, other) for other in known)
+    ]
+
+
+def _reading(area: Area) -> Floats:
+    """(n, 2) sides and turns along the largest ring of an outline."""
+    part = max(shapely.get_parts(area).tolist(), key=lambda one: one.area)
+    z = shapely.get_coordinates(part.exterior)[:-1] @ (1.0, 1.0j)
+    side = np.roll(z, -1) - z
+    return np.column_stack([np.abs(side), np.angle(side / np.roll(side, 1))])
+
+
+def _alike(one: Floats, other: Floats) -> bool:
+    """Whether two readings are the same but for where they begin, or in a mirror."""
+    if len(one) != len(other):
+        return False
+    # Back along the ring, the turn comes after the side; in a mirror it has the other sign.
+    mirrored = np.column_stack([other[::-1, 0], np.roll(other[::-1, 1], 1)])
+    return any(
+        np.allclose(one, np.roll(reading, i, axis=0), atol=_NEAR)
+        for reading in (other, mirrored)
+        for i in range(len(one))
+    )
 
 
 def _filled(
