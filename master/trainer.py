@@ -93,8 +93,9 @@ class Trainer:
     def insert(self, episodes: Episodes) -> None:
         """Take in episodes as they were played, and relabelled."""
         generator, seen = self._generators["hindsight"], episodes.seen_whole()
+        learned_from = seen.transitions
         if isinstance(self.replay, FillReplay):
-            self.replay.insert(seen, generator)
+            learned_from = self.replay.insert(seen, generator)
         elif seen.count:
             # What is credited piece by piece is relabelled anew for every update.
             relabels = () if self.setup.credits_pieces else self.setup.agent.hindsight
@@ -102,7 +103,7 @@ class Trainer:
                 with_relabelled(seen, relabels, self.setup.layout, self.reward, generator)
             )
         # The pace is that of what can be learned from.
-        self.rate_limiter.inserted(seen.transitions)
+        self.rate_limiter.inserted(learned_from)
         self.episodes += episodes.count
 
     def update(self, share: float) -> dict[str, float]:

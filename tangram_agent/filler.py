@@ -20,6 +20,7 @@ from tangram_agent.values import Corners
 from tangram_sim.actions import velocities_of
 from tangram_sim.arrays import Bools, Floats, Ints, Singles
 from tangram_sim.dissections import Area, Laid, Place, polygons
+from tangram_sim.errors import ConfigError
 from tangram_sim.geometry import outlines
 from tangram_sim.rings import covered_area
 
@@ -50,7 +51,7 @@ class Filler:
     def __init__(self, value: nn.Module, setup: Setup) -> None:
         # (n,) logits of `Corners`, see `OutlineValue`.
         self._value, self._layout, self._sim = value, setup.layout, setup.sim
-        self._filling = Filling(setup.layout)
+        self._filling, self._rows = Filling(setup.layout), setup.goal_rows
         self._beam = setup.agent.beam if setup.agent.lookahead == "values" else 1
 
     def choose(
@@ -69,8 +70,16 @@ class Filler:
             goals: (B, G, 2) outlines to fill.
             anything: (B,) where any place will do, drawn by the environment's generator.
             generators: one for each environment, where some explore.
+
+        Raises:
+            ConfigError: goals of another form, as the corners of pieces are.
         """
         count = len(corners)
+        if goals.shape != (count, self._rows, 2):
+            raise ConfigError(
+                f"goals of an agent of outlines have the shape {(count, self._rows, 2)}, got "
+                f"{goals.shape}: give rows that tangram_sim.rings.as_rows makes"
+            )
         rests = [self._filling.rest(goals[b], corners[b], placed[b]) for b in range(count)]
         every = [self._live(rests[b], self._filling.left(~placed[b])) for b in range(count)]
         wanted_of = [[] if anything[b] else every[b] for b in range(count)]

@@ -89,6 +89,7 @@ class Filling:
     """The game of one set of tokens.
 
     Attributes:
+        tokens: K.
         corners: N.
         shapes: S.
     """
@@ -100,7 +101,8 @@ class Filling:
         self._shape: Ints = np.zeros(layout.tokens, np.int64)
         for shape, tokens in enumerate(self._tokens.own):
             self._shape[list(tokens)] = shape
-        self.corners, self.shapes = layout.corner_count + layout.tokens, len(self._tokens.own)
+        self.tokens, self.shapes = layout.tokens, len(self._tokens.own)
+        self.corners = layout.corner_count + layout.tokens
 
     def shape_of(self, token: int) -> int:
         """The number of a token's shape."""
@@ -137,6 +139,10 @@ class Filling:
     def places(self, rest: Area, left: tuple[int, ...]) -> list[Place]:
         """What may be laid next, see `Search.places`."""
         return self._search.places(rest, left)
+
+    def fits(self, rest: Area, left: tuple[int, ...]) -> bool:
+        """Whether all tokens that are left have the areas of what is left to fill."""
+        return self._search.fits(rest, left)
 
     def is_filled(self, rest: Area, left: tuple[int, ...]) -> bool:
         """Whether nothing is left to fill, and no token."""

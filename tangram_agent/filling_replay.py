@@ -20,7 +20,7 @@ from shapely.errors import GEOSException
 from tangram_agent.filling import MOST_PLACES, UNUSED, Filling, Rests
 from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes, Flags
-from tangram_sim.arrays import Bools
+from tangram_sim.arrays import Bools, Ints
 from tangram_sim.dissections import Area
 from tangram_sim.errors import RunError
 
@@ -68,21 +68,35 @@ class FillReplay:
     def __len__(self) -> int:
         return min(int(self._added.min()), self.capacity)
 
-    def insert(self, episodes: Episodes, generator: np.random.Generator) -> None:
-        """Take in episodes as they were played, and what their tokens came to cover."""
+    def insert(self, episodes: Episodes, generator: np.random.Generator) -> int:
+        """Take in episodes as they were played, and what their tokens came to cover.
+
+        Returns:
+            How many transitions there are in those that something is learned from.
+        """
+        used = 0
         for corners, placed, goal in zip(
             episodes.corners, episodes.placed, episodes.goals, strict=True
         ):
             # Corners are no worker's invention where it plays by the rules; where not, no geometry
             # that a library trips over may end the run.
             with suppress(GEOSException):
-                self._insert(corners, placed.astype(np.bool_), goal, generator)
+                if self._insert(corners, placed.astype(np.bool_), goal, generator):
+                    used += len(corners) - 1
+        return used
 
     def _insert(
         self, corners: Array, placed: Bools, goal: Array, generator: np.random.Generator
-    ) -> None:
-        """One episode: corners (T + 1, V, 2), placed (T + 1, K) and the outline (G, 2)."""
+    ) -> bool:
+        """One episode: corners (T + 1, V, 2), placed (T + 1, K) and the outline (G, 2).
+
+        Returns:
+            Whether it was taken: hindsight has a state of it.
+        """
         filling, inside = self._filling, self._filling.inside(corners[-1], goal)
+        filled = self._hindsight(corners[-1], np.flatnonzero(placed[-1] & inside), generator)
+        if not filled:
+            return False
         end = filling.rest(goal, corners[-1], placed[-1])
         solved = filling.is_filled(end, filling.left(~placed[-1]))
         for step in range(len(corners) - 1):
@@ -91,29 +105,38 @@ class FillReplay:
                 break  # nothing fitted any more
             rest = filling.rest(goal, corners[step], laid)
             self._add_played(rest, filling.left(~laid), solved)
-        own = np.flatnonzero(placed[-1] & inside)
+        for seen in filled:
+            _put(self._filled, int(self._added[1]) % self.capacity, seen)
+            self._added[1] += 1
+        return True
+
+    def _hindsight(self, corners: Array, own: Ints, generator: np.random.Generator) -> list[Rests]:
+        """What some of their own tokens (n,) cover; nothing where they lie on each other."""
+        filling, found = self._filling, list[Rests]()
         for _ in range(self._copies if len(own) else 0):
-            chosen = np.zeros(placed.shape[1], np.bool_)
+            chosen = np.zeros(filling.tokens, np.bool_)
             chosen[generator.permutation(own)[: generator.integers(1, len(own) + 1)]] = True
-            covered = filling.covered(corners[-1], chosen)
-            self._add_filled(filling.seen(covered, filling.left(chosen)))
+            covered, left = filling.covered(corners, chosen), filling.left(chosen)
+            seen = filling.seen(covered, left)
+            if filling.fits(covered, left) and _is_seen(seen):
+                found.append(seen)
+        return found
 
     def _add_played(self, rest: Area, left: tuple[int, ...], solved: bool) -> None:
+        state = self._filling.seen(rest, left)
+        if not _is_seen(state):
+            return
         row = int(self._added[0]) % self.capacity
-        places = self._filling.places(rest, left)[:MOST_PLACES]
-        first = row * MOST_PLACES
-        _put(self._played, row, self._filling.seen(rest, left))
+        places = [place for place in self._filling.places(rest, left) if not place.dead]
+        _put(self._played, row, state)
         self._ends[row] = 0
-        for i, place in enumerate(places):
-            self._ends[row, i] = FILLED if place.filled else OPEN * (not place.dead)
-            _put(self._places, first + i, self._filling.seen(place.rest, place.left))
-        if solved:  # no matter by which place: a state is worth its best one
+        for i, place in enumerate(places[:MOST_PLACES]):
+            seen = self._filling.seen(place.rest, place.left)
+            self._ends[row, i] = FILLED if place.filled else OPEN * _is_seen(seen)
+            _put(self._places, row * MOST_PLACES + i, seen)
+        if solved and places:  # no matter by which place: a state is worth its best one
             self._ends[row, 0] = FILLED
         self._added[0] += 1
-
-    def _add_filled(self, seen: Rests) -> None:
-        _put(self._filled, int(self._added[1]) % self.capacity, seen)
-        self._added[1] += 1
 
     def sample(self, size: int, generator: np.random.Generator) -> FillBatch:
         """`size` states, half of them of hindsight, drawn uniformly with replacement.
@@ -183,6 +206,11 @@ class FillReplay:
                 raise RunError("replay buffer: an index beyond the corners")
         if self._ends.max() > FILLED:
             raise RunError("replay buffer: 'ends' holds what no place has")
+
+
+def _is_seen(rest: Rests) -> bool:
+    """Whether a state has corners, and no more than are seen."""
+    return bool((rest.part != UNUSED).any())
 
 
 def _put(rests: Rests, row: int, one: Rests) -> None:

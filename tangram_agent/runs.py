@@ -107,6 +107,11 @@ class Run:
 
     def _checked(self, observation: object) -> dict[str, Floats]:
         """The entries as arrays, all for as many rows."""
+        if self.setup.fills:
+            raise ConfigError(
+                f"{self.folder} fills outlines, which no observation has: call policy.act with "
+                "goals that tangram_sim.rings.as_rows makes"
+            )
         corners = 2 * self.setup.layout.corner_count
         wanted = {
             "observation": corners + self.setup.layout.tokens,

@@ -96,6 +96,8 @@ class Setup:
             refuse_ignored(
                 f"agent.lookahead={agent.lookahead}", "outlines", "set agent.lookahead=values"
             )
+        if agent.lookahead == "values" and agent.beam == 1:
+            refuse_ignored("agent.lookahead=values", "agent.beam=1", "set agent.beam=12")
         for name, value in _changed(self.reward).items():
             refuse_ignored(
                 f"reward.{name}={told(value)}",

@@ -228,15 +228,18 @@ class Search:
             left: how many tokens there are of each shape.
         """
         parts = self._parts(rest)
-        if not parts or not self._divides([part.area for part in parts], left):
+        if not parts or not self.fits(rest, left):
             return []
         places = []
         for one, polygon in self._fewest(parts, left):
             gone, now = self._without(rest, polygon), less(left, one)
-            open_to = self._divides([part.area for part in self._parts(gone)], now)
-            filled = self.is_filled(gone, now)
-            places.append(Place(one, gone, now, filled=filled, dead=not open_to))
+            filled, dead = self.is_filled(gone, now), not self.fits(gone, now)
+            places.append(Place(one, gone, now, filled=filled, dead=dead))
         return places
+
+    def fits(self, rest: Area, left: tuple[int, ...]) -> bool:
+        """Whether all tokens that are left have the areas of all parts of what is left to fill."""
+        return self._divides([part.area for part in self._parts(rest)], left)
 
     def is_filled(self, rest: Area, left: tuple[int, ...]) -> bool:
         """Whether nothing is left to fill, and no token."""

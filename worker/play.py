@@ -22,6 +22,7 @@ from tangram_sim.errors import ConfigError, RunError
 from tangram_sim.game_drawing import figure_sheet, tiles
 from tangram_sim.kinematics import wrap
 from tangram_sim.layout import Layout
+from tangram_sim.settings import told
 from worker.config import MAX_SHOWN, PlayConfig, source_and_names
 from worker.film import WIDTH, Show, film_pictures, frames_per_action, show_live
 from worker.photographs import draw_photograph, read_photograph
@@ -40,6 +41,8 @@ COMPARED = 1080  # pixels across, about, of all runs together
 HEADER = 44  # pixels above a run's episodes
 TITLE, SCORE = 18, 13  # pixels of the header's two lines
 GAP = 24  # pixels between runs
+OF_STARTS = ("targets", "spread", "mirrored", "starts")
+_DRAWN_BY = f"sim.arena, {', '.join(OF_STARTS)}"
 PAPER, TEXT, FAINT, RULE = (250, 250, 247), (31, 41, 55), (107, 114, 128), (214, 214, 208)
 
 
@@ -128,8 +131,8 @@ def photograph_show(run: Run, config: PlayConfig, target: str) -> Show:
 def silhouette_show(run: Run, config: PlayConfig, found: Shown) -> Show:
     """A silhouette, with the tokens outside of it at first.
 
-    It is laid as it was found to be filled, or by an agent of outlines, which is shown no more
-    than its outline: what was found then only tells how much is covered.
+    It is laid as it was found to be filled, or by an agent of outlines: that is shown no more than
+    the outline of what was found, which is the silhouette's within the search's tolerance.
     """
     setup, fills = _beside(run.setup), run.setup.fills
     played = play_figures(setup, [found.figure], greedy(run.policy), config.seed)
@@ -283,20 +286,24 @@ def check_same_task(runs: Sequence[Run]) -> None:
     """
     first = runs[0]
     for run in runs[1:]:
-        for what, one, other in (
-            ("tokens", _tokens(first.setup), _tokens(run.setup)),
-            ("sim.arena", f"{first.setup.sim.arena:g}", f"{run.setup.sim.arena:g}"),
-        ):
-            if one != other:
+        here, there = (_drawn_by(one.setup) for one in (run, first))
+        for what, other in here.items():
+            if other != there[what]:
                 raise RunError(
                     f"cannot compare {run.folder} with {first.folder}: {what} is {other} here and "
-                    f"{one} there; the same starts need the same tokens and arena"
+                    f"{there[what]} there; the same starts need the same tokens and {_DRAWN_BY}"
                 )
         if run.setup.layout.fingerprint() != first.setup.layout.fingerprint():
             raise RunError(
                 f"cannot compare {run.folder} with {first.folder}: their tokens have other "
                 "corners; the same starts need the same tokens and arena"
             )
+
+
+def _drawn_by(setup: Setup) -> dict[str, str]:
+    """What decides which episodes are drawn."""
+    sim = {f"sim.{name}": told(getattr(setup.sim, name)) for name in ("arena", *OF_STARTS)}
+    return {"tokens": _tokens(setup), **sim}
 
 
 def _tokens(setup: Setup) -> str:

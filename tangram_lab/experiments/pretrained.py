@@ -336,7 +336,7 @@ tangram-play run_dir={PREFIX}/{name} out={name}.gif
 from tangram_agent.runs import load_run
 
 run = load_run("{PREFIX}/{name}")
-actions = run.policy.act(corners, placed, goals)  # see docs/inference.md
+actions = run.policy.act(corners, placed, goals)  # see docs/inference.md{_goals(card)}
 ```
 
 ## Training
@@ -356,7 +356,7 @@ training{_played_by(card)}; the {card["selection"]} ships.
 {_table(dict(zip(names, seeds, strict=True)))}
 
 This agent on {tests["episodes"]} other tests (seed {tests["seed"]}), which nothing was chosen \
-on, beside policies that learned nothing:
+on, beside {_beside(card)}:
 
 {_table(compared)}
 
@@ -370,7 +370,7 @@ def _about(card: Mapping[str, Any]) -> str:
     task = card["task"]
     tokens, count = ", ".join(task["tokens"]), task["actions_per_token"]
     arena, actions = f"{task['arena']:g}", f"{count} action{'s' * (count > 1)}"
-    if task["observe"] == "silhouette":
+    if task.get("observe") == "silhouette":
         return (
             f"An agent that fills outlines with {len(task['tokens'])} tangram tokens ({tokens}; "
             f"full square of side {task['scale']:g}) and is told of no piece, in a square arena of "
@@ -404,7 +404,16 @@ On the figures of tangram_sim/puzzles, each at {turns} angles; {_trained_on(card
 
 
 def _played_by(card: Mapping[str, Any]) -> str:
-    return ", without looking ahead" if card["task"]["observe"] == "silhouette" else ""
+    return ", without looking ahead" if card["task"].get("observe") == "silhouette" else ""
+
+
+def _goals(card: Mapping[str, Any]) -> str:
+    return "; goals are outlines" if card["task"].get("observe") == "silhouette" else ""
+
+
+def _beside(card: Mapping[str, Any]) -> str:
+    alone = "itself without looking ahead and " * ("lookahead=none" in card["tests"]["scores"])
+    return f"{alone}policies that learned nothing"
 
 
 def _trained_on(card: Mapping[str, Any]) -> str:

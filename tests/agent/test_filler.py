@@ -112,6 +112,13 @@ def test_exploring_takes_any_place_that_is_not_dead() -> None:
     assert min(inside) == 1
 
 
+def test_corners_of_pieces_are_no_outline() -> None:
+    made = outline_setup()
+    corners = made.layout.corners(np.zeros((1, 2, 3)))
+    with pytest.raises(ConfigError, match=r"got \(1, 6, 2\): give rows that .*as_rows makes"):
+        Policy(made).act(corners, np.zeros((1, 2)), corners)
+
+
 def test_filled_is_surer_than_any_value() -> None:
     made = outline_setup()
     filler = Filler(Indifferent(), made)
@@ -137,6 +144,7 @@ def test_filled_is_surer_than_any_value() -> None:
         ({"hindsight": []}, {}, "without a filled one"),
         ({"hindsight": [{"strategy": "near", "position": 0.1}]}, {}, "hindsight.strategy"),
         ({"gamma": 0.9}, {}, "needs agent.gamma=1"),
+        ({"lookahead": "values", "beam": 1}, {}, "agent.lookahead=values changes nothing with"),
         ({}, {"starts": "anywhere"}, "sim.starts=outside"),
         ({}, {"actions_per_token": 2}, "sim.actions_per_token=1"),
         ({}, {"gain": [1.1, 1.0, 1.0]}, "a world whose motion is exact"),

@@ -88,6 +88,32 @@ def test_nothing_is_learned_after_a_token_lay_beside() -> None:
     assert rows(replay)["counters"].tolist() == [1, 3]
 
 
+PILED = [np.array([FAR, FAR]), np.array([HALF, FAR]), np.array([HALF, HALF])]
+
+
+def test_tokens_that_lie_on_each_other_are_no_outline_that_they_fill() -> None:
+    replay, generator = FillReplay(MADE), np.random.default_rng(1)
+    for _ in range(4):
+        replay.insert(played_in(MADE, PILED, GOAL), generator)
+    assert set(rows(replay)["filled_left"].ravel().tolist()) == {1}
+
+
+def test_what_no_tokens_fill_is_never_marked_as_filled() -> None:
+    """Both lie where there is room for one: nothing is left to fill, but it was none of theirs."""
+    replay = FillReplay(MADE)
+    replay.insert(played_in(MADE, PILED, np.array([HALF, HALF])), np.random.default_rng(0))
+    state = rows(replay)
+    assert state["counters"][0] >= 1
+    assert not state["ends"].any()
+
+
+def test_episodes_that_nothing_is_learned_from_do_not_count() -> None:
+    replay, nowhere = FillReplay(MADE), [np.array([FAR, FAR])] * 3
+    assert replay.insert(played_in(MADE, nowhere, GOAL), np.random.default_rng(0)) == 0
+    assert rows(replay)["counters"].tolist() == [0, 0]
+    assert replay.insert(episode([5.0, 5.0, 0.0]), np.random.default_rng(0)) == 2
+
+
 def test_a_full_ring_forgets_the_oldest_and_comes_back_whole() -> None:
     replay, generator = FillReplay(MADE), np.random.default_rng(0)
     for _ in range(6):

@@ -42,6 +42,18 @@ def test_what_workers_play_is_learned_from() -> None:
     assert policy.version == 1
 
 
+def test_a_worker_that_plays_nonsense_asks_for_no_update() -> None:
+    """Nothing is placed, so hindsight has no state, and there is nothing to sample."""
+    made, played = trainer(MADE), rolled_out(MADE)
+    played.placed[:] = 0
+    for _ in range(20):
+        made.insert(played)
+    assert (len(made.replay), made.rate_limiter.may_update()) == (0, False)
+    made.insert(rolled_out(MADE))
+    assert made.rate_limiter.may_update()
+    made.update(0.0)
+
+
 def test_a_trainer_goes_on_from_its_state_bit_by_bit() -> None:
     one, other = trainer(MADE), trainer(MADE, seed=5)
     one.insert(rolled_out(MADE))
