@@ -373,6 +373,11 @@ def own(side: float) -> dict[str, Any]:
         ({}, {"tokens": PAIR}, r"tokens is \[square, large_triangle\]"),
         ({}, {"tokens": SQUARE | {"scale": 0.5}}, "of scale 0.5 here"),
         ({}, {"sim": {"backend": "kinematic", "arena": 3.0}}, "sim.arena is 3 here and 2 there"),
+        (
+            {},
+            {"sim": {"backend": "kinematic", "targets": "gaussian"}},
+            "sim.targets is gaussian here and uniform there; the same starts need",
+        ),
         (own(0.3), own(0.4), "their tokens have other corners"),
     ],
 )
