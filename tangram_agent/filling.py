@@ -141,12 +141,8 @@ class Filling:
         return self._search.places(rest, left)
 
     def fits(self, rest: Area, left: tuple[int, ...]) -> bool:
-        """Whether all tokens that are left have the areas of what is left to fill."""
+        """See `Search.fits`."""
         return self._search.fits(rest, left)
-
-    def is_filled(self, rest: Area, left: tuple[int, ...]) -> bool:
-        """Whether nothing is left to fill, and no token."""
-        return self._search.is_filled(rest, left)
 
     def seen(self, rest: Area, left: tuple[int, ...]) -> Rests:
         """One state; empty where it has too many corners."""

@@ -97,8 +97,8 @@ class FillReplay:
         filled = self._hindsight(corners[-1], np.flatnonzero(placed[-1] & inside), generator)
         if not filled:
             return False
-        end = filling.rest(goal, corners[-1], placed[-1])
-        solved = filling.is_filled(end, filling.left(~placed[-1]))
+        end, left = filling.rest(goal, corners[-1], placed[-1]), filling.left(~placed[-1])
+        solved = not any(left) and filling.fits(end, left)
         for step in range(len(corners) - 1):
             laid = placed[step]
             if (laid & ~inside).any():

@@ -148,6 +148,12 @@ class Run:
                 )
         return shown
 
+    def unlearned(self) -> "Run":
+        """The same run with all weights 0, so that it values everything alike."""
+        weights = self.policy.weights()
+        none = replace(weights, tensors={k: np.zeros_like(v) for k, v in weights.tensors.items()})
+        return replace(self, policy=_policy(self.setup, none))
+
     def with_settings(self, changes: Changes) -> "Run":
         """The same weights, played with other settings: `{"agent": {"refine_steps": 20}}`.
 

@@ -233,17 +233,16 @@ class Search:
         places = []
         for one, polygon in self._fewest(parts, left):
             gone, now = self._without(rest, polygon), less(left, one)
-            filled, dead = self.is_filled(gone, now), not self.fits(gone, now)
-            places.append(Place(one, gone, now, filled=filled, dead=dead))
+            open_to = self.fits(gone, now)
+            places.append(Place(one, gone, now, filled=open_to and not any(now), dead=not open_to))
         return places
 
     def fits(self, rest: Area, left: tuple[int, ...]) -> bool:
-        """Whether all tokens that are left have the areas of all parts of what is left to fill."""
-        return self._divides([part.area for part in self._parts(rest)], left)
+        """Whether all tokens that are left have the areas of all parts of what is left to fill.
 
-    def is_filled(self, rest: Area, left: tuple[int, ...]) -> bool:
-        """Whether nothing is left to fill, and no token."""
-        return not any(left) and not self._parts(rest)
+        Without a token left: whether nothing is left to fill.
+        """
+        return self._divides([part.area for part in self._parts(rest)], left)
 
     def _parts(self, rest: Area) -> list[Polygon]:
         return [part for part in polygons(rest) if part.area > _DUST * self._least]

@@ -4,7 +4,7 @@ import json
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,6 @@ from rich.table import Table
 from tangram_agent.config import ORDERS, AgentConfig
 from tangram_agent.files import write_whole
 from tangram_agent.outcome import plural
-from tangram_agent.policy import Policy
 from tangram_agent.runs import Run, load_changed
 from tangram_agent.setup import Setup
 from tangram_sim.arrays import Floats
@@ -136,7 +135,9 @@ def policies(run: Run) -> dict[str, Player]:
         if run.setup.agent.lookahead == "values":
             alone = {"lookahead": "none", "beam": AgentConfig.beam}
             result["lookahead=none"] = greedy(run.with_settings({"agent": alone}).policy)
-        return result | {"largest first": _largest_first(run), "random": random_policy(layout, sim)}
+        # Of places that are worth the same the first is taken: that of the largest token.
+        nothing = greedy(run.unlearned().policy)
+        return result | {"largest first": nothing, "random": random_policy(layout, sim)}
     for name in fixed:
         other = run.with_settings({"agent": {"order": name}})
         result[f"order={name}"] = greedy(other.policy)
@@ -150,16 +151,6 @@ def policies(run: Run) -> dict[str, Player]:
     if layout.tokens == 1:
         result["position only"] = position_policy(layout, sim)
     return result | {"random": random_policy(layout, sim)}
-
-
-def _largest_first(run: Run) -> Player:
-    """The same places and the same beam with nothing learned: of equal values the first is taken.
-
-    That is a place of the largest token that fits, see `tangram_sim.dissections`.
-    """
-    equal, weights = Policy(run.setup), run.policy.weights()
-    equal.load(replace(weights, tensors={k: 0.0 * v for k, v in weights.tensors.items()}))
-    return greedy(equal)
 
 
 def score_policies(

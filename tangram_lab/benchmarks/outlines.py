@@ -36,14 +36,6 @@ BEAMS = (1, 4, 12)
 _NEAR = 1e-3  # of an arena's half, and radians: two outlines are one
 
 
-class LargestFirst(nn.Module):
-    """All states are worth the same: the first place, of the largest token, is taken."""
-
-    def forward(self, corners: Corners) -> torch.Tensor:
-        """(n,) zeros."""
-        return torch.zeros(len(corners.points))
-
-
 class ByChance(nn.Module):
     """States are worth what chance says."""
 
@@ -69,7 +61,7 @@ def run_outlines(run_dir: str, scenes: int, seed: int, out: Path | None) -> int:
     figures = _never_drawn(run.setup.layout, list(figures_of(run.setup.layout, scenes, seed)))
     ways: dict[str, nn.Module] = {
         "the agent": run.policy.network,
-        "largest first": LargestFirst(),
+        "largest first": run.unlearned().policy.network,
         "by chance": ByChance(seed),
     }
     rows = []
