@@ -29,11 +29,13 @@ class Schedule:
     """Which weights are scored, and when: at most one evaluation each `interval` seconds.
 
     A version that nothing newer follows is scored without waiting for the interval's end, and
-    whatever happens the newest version is scored in the end.
+    whatever happens the newest version is scored in the end. It stands still when nothing follows
+    for `still` seconds, and for as long as scoring takes: an agent that learns in bursts, since it
+    waits for pictures, would else be scored all the time, on a core that its players need.
     """
 
     def __init__(self, interval: float, still: float) -> None:
-        self._interval, self._still = interval, still
+        self._interval, self._still, self._least_still = interval, still, still
         self._newest: Weights | None = None
         self._arrived = self._began = -np.inf
 
@@ -49,6 +51,10 @@ class Schedule:
             return None
         weights, self._newest, self._began = self._newest, None, now
         return weights
+
+    def scored(self, now: float) -> None:
+        """Note that what was due is scored."""
+        self._still = max(self._least_still, now - self._began)
 
 
 def run_evaluator(config: WorkerConfig, setup: Setup) -> int:
@@ -72,6 +78,7 @@ def run_evaluator(config: WorkerConfig, setup: Setup) -> int:
                 scores = _evaluate(tests, policy, client)
                 if scores is not None:
                     client.send_scores(scores)
+                schedule.scored(time.monotonic())
     return 0
 
 

@@ -109,3 +109,20 @@ def test_schedule(timeline: list[tuple[float, int, int]]) -> None:
         schedule.offer(replace(weights(made, 1), version=arrives) if arrives else None, now)
         due = schedule.due(now)
         assert (due.version if due else 0) == expected, f"at {now} s"
+
+
+@pytest.mark.fast
+def test_weights_that_come_in_bursts_wait_for_as_long_as_scoring_takes() -> None:
+    schedule = Schedule(interval=60.0, still=2.0)
+    made = setup()
+    versions = [replace(weights(made, 1), version=version) for version in (1, 2, 3)]
+    schedule.offer(versions[0], 0.0)
+    assert schedule.due(0.0) is versions[0]
+    schedule.scored(20.0)
+    schedule.offer(versions[1], 21.0)
+    assert schedule.due(40.9) is None
+    assert schedule.due(41.0) is versions[1]
+    schedule.scored(42.0)
+    schedule.offer(versions[2], 43.0)
+    assert schedule.due(44.9) is None
+    assert schedule.due(45.0) is versions[2]
