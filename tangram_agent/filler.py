@@ -18,10 +18,12 @@ from tangram_agent.filling import UNUSED, Filling, Rests
 from tangram_agent.setup import Setup
 from tangram_agent.values import Corners
 from tangram_sim.actions import velocities_of
+from tangram_sim.areas import Area, polygons
 from tangram_sim.arrays import Bools, Floats, Ints, Singles
-from tangram_sim.dissections import Area, Laid, Place, polygons
+from tangram_sim.dissections import Laid, Place
 from tangram_sim.errors import ConfigError
 from tangram_sim.geometry import outlines
+from tangram_sim.layout import Layout
 from tangram_sim.rings import covered_area
 
 _ANGLES = 8  # that a token is tried at where nothing fits
@@ -45,12 +47,34 @@ class _State:
     places: tuple[Place, ...]
 
 
+class Fillable:
+    """How surely a layout's tokens fill what is left, by a network that learned it."""
+
+    def __init__(self, value: nn.Module, layout: Layout) -> None:
+        """Judge tokens of the same shapes, in the same order, as it learned; of any size."""
+        # (n,) logits of `Corners`, see `OutlineValue`.
+        self._value, self._filling = value, Filling(layout)
+
+    def __call__(self, rests: Sequence[Area], left: Sequence[tuple[int, ...]]) -> Floats:
+        """(n,) logits; minus infinity where there are more corners than are seen.
+
+        Args:
+            rests: n, what is left to fill.
+            left: n, how many tokens there are of each shape.
+        """
+        every = Rests.joined([self._filling.seen(*one) for one in zip(rests, left, strict=True)])
+        with torch.inference_mode():
+            logits = self._value(Corners.of(every)).numpy()
+        seen = (every.part != UNUSED).any(axis=1)
+        return np.where(seen, logits, -np.inf).astype(np.float64)
+
+
 class Filler:
     """Chooses where the next token goes."""
 
     def __init__(self, value: nn.Module, setup: Setup) -> None:
-        # (n,) logits of `Corners`, see `OutlineValue`.
-        self._value, self._layout, self._sim = value, setup.layout, setup.sim
+        self._fillable, self._layout = Fillable(value, setup.layout), setup.layout
+        self._sim = setup.sim
         self._filling, self._rows = Filling(setup.layout), setup.goal_rows
         self._beam = setup.agent.beam if setup.agent.lookahead == "values" else 1
 
@@ -110,12 +134,8 @@ class Filler:
         found = np.full(len(places), np.inf)
         still = [i for i, place in enumerate(places) if not place.filled]
         if still:
-            seen = [self._filling.seen(places[i].rest, places[i].left) for i in still]
-            every = Rests.joined(seen)
-            with torch.inference_mode():
-                logits = self._value(Corners.of(every)).numpy()
-            # What has more corners than are seen is not judged, and is taken last.
-            found[still] = np.where((every.part != UNUSED).any(axis=1), logits, -np.inf)
+            rests = [places[i].rest for i in still]
+            found[still] = self._fillable(rests, [places[i].left for i in still])
         return found
 
     def plan(self, rest: Area, left: tuple[int, ...], beam: int) -> list[Place]:

@@ -12,8 +12,9 @@ import numpy as np
 import shapely
 
 from tangram_agent.types import Flags
+from tangram_sim.areas import Area, opened, rings
 from tangram_sim.arrays import AnyArray, Bools, Ints, Singles
-from tangram_sim.dissections import Area, Budget, Place, Search, Tokens, opened, rings
+from tangram_sim.dissections import Budget, Place, Search, Tokens
 from tangram_sim.geometry import outlines
 from tangram_sim.layout import Layout
 from tangram_sim.rings import as_area, covered_area

@@ -20,8 +20,8 @@ from shapely.errors import GEOSException
 from tangram_agent.filling import MOST_PLACES, UNUSED, Filling, Rests
 from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes, Flags
+from tangram_sim.areas import Area
 from tangram_sim.arrays import Bools, Ints
-from tangram_sim.dissections import Area
 from tangram_sim.errors import RunError
 
 Array = npt.NDArray[Any]

@@ -13,17 +13,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 import shapely
-from shapely import MultiPolygon, Polygon
+from shapely import Polygon
 
+from tangram_sim.areas import Area, grown, opened, polygons, rings, valid
 from tangram_sim.arrays import Bools, Complex, Floats, Ints
 from tangram_sim.layout import Layout
 from tangram_sim.sides import Side, sides_of
-
-Area: TypeAlias = "Polygon | MultiPolygon"
 
 _SLACK = 0.35  # of the smallest token's area, by which a part's may be wrong
 _DUST = 0.2  # of it: smaller parts are left unfilled
@@ -31,7 +30,6 @@ _GRID = 1e-7  # of the root of all tokens' area, to which corners are rounded
 _TURN = np.radians(1.0)  # by which a corner may be wrong, and more where its sides are short
 _CONVEX = np.radians(179.0)
 _GROWN = 1.5  # tolerances that a token may reach out of what is left
-_MITRE = 5.0  # of the sharpest corner, 45 degrees: 2.6
 
 
 class Laid(NamedTuple):
@@ -88,7 +86,7 @@ class Dissection:
 
 
 @dataclass(frozen=True, eq=False)
-class _Corner:
+class Corner:
     """A corner of a shape on one side, in the frame of the edge that leaves it.
 
     Attributes:
@@ -182,20 +180,16 @@ class Search:
         best: the tokens of greatest area that were laid at a time.
     """
 
-    def __init__(
-        self, tokens: Tokens, tolerance: float, budget: Budget, loose: bool = False
-    ) -> None:
+    def __init__(self, tokens: Tokens, tolerance: float, budget: Budget) -> None:
         """Search with a tolerance: how far an outline's sides may be from where they should be.
 
         Args:
             tokens: that fill the outline.
             tolerance: in its units.
             budget: what it may cost.
-            loose: go on where something cannot be filled: for the best attempt, of an outline that
-                nothing fills.
         """
         self._tokens, self._tolerance, self.budget = tokens, tolerance, budget
-        self._least, self._loose = float(tokens.areas.min()), loose
+        self._least = float(tokens.areas.min())
         self.best: list[Laid] = []
         self._most = 0.0
 
@@ -205,7 +199,7 @@ class Search:
 
     def _fill(self, rest: Area, left: tuple[int, ...], laid: list[Laid]) -> Iterator[list[Laid]]:
         self._remember(laid)
-        parts = self._parts(rest)
+        parts = parts_of(rest, self._least)
         if not parts:
             if not any(left):
                 yield laid
@@ -213,7 +207,7 @@ class Search:
         self.budget.taken += 1
         if self.budget.spent():
             return
-        if not (self._loose or self._divides([part.area for part in parts], left)):
+        if not self._divides([part.area for part in parts], left):
             return
         for one, polygon in self._fewest(parts, left):
             yield from self._fill(self._without(rest, polygon), less(left, one), [*laid, one])
@@ -227,7 +221,7 @@ class Search:
             rest: what is left to fill.
             left: how many tokens there are of each shape.
         """
-        parts = self._parts(rest)
+        parts = parts_of(rest, self._least)
         if not parts or not self.fits(rest, left):
             return []
         places = []
@@ -242,15 +236,10 @@ class Search:
 
         Without a token left: whether nothing is left to fill.
         """
-        return self._divides([part.area for part in self._parts(rest)], left)
-
-    def _parts(self, rest: Area) -> list[Polygon]:
-        return [part for part in polygons(rest) if part.area > _DUST * self._least]
+        return self._divides([part.area for part in parts_of(rest, self._least)], left)
 
     def _without(self, rest: Area, polygon: Polygon) -> Area:
-        """What is left, without slivers narrower than two tolerances."""
-        gone = shapely.difference(rest, polygon, grid_size=_GRID * self._tokens.unit)
-        return opened(gone, self._tolerance)
+        return without(rest, polygon, self._tolerance, self._tokens.unit)
 
     def _remember(self, laid: list[Laid]) -> None:
         area = float(sum(self._tokens.areas[one.shape] for one in laid))
@@ -277,8 +266,6 @@ class Search:
         best: list[tuple[Laid, Polygon]] | None = None
         for part in parts:
             for options in self._options(part, left):
-                if self._loose and not options:
-                    continue
                 if best is None or len(options) < len(best):
                     best = options
                 if not best:
@@ -291,9 +278,9 @@ class Search:
         """For each convex corner of a part the tokens that may lie there."""
         tried, corners, at = [], [], []
         options: list[list[tuple[Laid, Polygon]]] = []
-        for point, along, angle, leaving, coming in self._convex(part):
+        for point, along, angle, leaving, coming in convex_corners(part, self._tolerance):
             slack = _TURN + 3.0 * self._tolerance / min(abs(leaving), abs(coming))
-            if not self._loose and np.abs(self._tokens.angles - angle).min() > slack:
+            if np.abs(self._tokens.angles - angle).min() > slack:
                 yield []  # no corners of tokens make this one
                 return
             options.append([])
@@ -314,25 +301,45 @@ class Search:
             room = grown(part, _GROWN * self._tolerance)
             shapely.prepare(room)
             for i in np.flatnonzero(shapely.contains(room, polygons)).tolist():
-                at[i].append((_laid(*corners[i]), polygons[i]))
+                at[i].append((laid_at(*corners[i]), polygons[i]))
         yield from options
 
-    def _convex(self, part: Polygon) -> Iterator[tuple[complex, complex, float, float, float]]:
-        """Each convex corner: its place, the direction of the side that leaves it, and its angle.
 
-        Then the lengths of the sides that leave it and come to it, negative where they end at a
-        corner that is not convex.
-        """
-        for z, _, _ in rings(part, self._tolerance):
-            ahead, behind = np.roll(z, -1) - z, np.roll(z, 1) - z
-            inside = np.angle(behind / ahead) % (2.0 * np.pi)
-            convex = inside < _CONVEX
-            signs = np.where(convex, 1.0, -1.0)
-            leaving, coming = np.abs(ahead) * np.roll(signs, -1), np.abs(behind) * np.roll(signs, 1)
-            for i in np.flatnonzero(convex).tolist():
-                along = complex(ahead[i] / abs(ahead[i]))
-                lengths = float(leaving[i]), float(coming[i])
-                yield complex(z[i]), along, float(inside[i]), *lengths
+def parts_of(rest: Area, least: float) -> list[Polygon]:
+    """The parts of what is left to fill, without dust; the smallest token has the area `least`."""
+    return [part for part in polygons(rest) if part.area > _DUST * least]
+
+
+def without(rest: Area, polygon: Polygon, tolerance: float, unit: float) -> Area:
+    """What a token leaves of what was left, without slivers narrower than two tolerances.
+
+    Args:
+        rest: what was left.
+        polygon: the token in its place.
+        tolerance: in their units.
+        unit: the root of all tokens' area.
+    """
+    return opened(shapely.difference(rest, polygon, grid_size=_GRID * unit), tolerance)
+
+
+def convex_corners(
+    part: Polygon, tolerance: float
+) -> Iterator[tuple[complex, complex, float, float, float]]:
+    """Each convex corner: its place, the direction of the side that leaves it, and its angle.
+
+    Then the lengths of the sides that leave it and come to it, negative where they end at a
+    corner that is not convex.
+    """
+    for z, _, _ in rings(part, tolerance):
+        ahead, behind = np.roll(z, -1) - z, np.roll(z, 1) - z
+        inside = np.angle(behind / ahead) % (2.0 * np.pi)
+        convex = inside < _CONVEX
+        signs = np.where(convex, 1.0, -1.0)
+        leaving, coming = np.abs(ahead) * np.roll(signs, -1), np.abs(behind) * np.roll(signs, 1)
+        for i in np.flatnonzero(convex).tolist():
+            along = complex(ahead[i] / abs(ahead[i]))
+            lengths = float(leaving[i]), float(coming[i])
+            yield complex(z[i]), along, float(inside[i]), *lengths
 
 
 def less(left: tuple[int, ...], one: Laid) -> tuple[int, ...]:
@@ -352,67 +359,14 @@ def dissection(tokens: Tokens, laid: Sequence[Laid]) -> Dissection:
     return Dissection(poses, flipped, None if lies.all() else lies)
 
 
-@np.errstate(invalid="ignore", divide="ignore")  # of corners all but within a straight side
-def grown(area: Area, distance: float) -> Area:
-    """An area with all sides so far further out, or in where the distance is negative."""
-    return valid(shapely.buffer(area, distance, join_style="mitre", mitre_limit=_MITRE))
-
-
-def valid(area: Area) -> Area:
-    """The same area by rings that do not cross: what crosses breaks whatever is done with it."""
-    if shapely.is_valid(area):
-        return area
-    return shapely.union_all(polygons(shapely.make_valid(area)))
-
-
-def opened(area: Area, tolerance: float) -> Area:
-    """An area without slivers narrower than two tolerances."""
-    return grown(grown(area, -tolerance), tolerance)
-
-
-def straightened(z: Complex, tolerance: float) -> Complex:
-    """Corners (n,) of a ring without those that lie within a straight side, or on another."""
-    z = z[np.abs(z - np.roll(z, 1)) > 0.5 * tolerance]
-    while len(z) > 3:
-        before = np.roll(z, 1)
-        side = np.roll(z, -1) - before
-        off = np.abs(((z - before) * side.conj()).imag) / np.maximum(np.abs(side), 1e-12)
-        least = int(off.argmin())
-        if off[least] > 0.7 * tolerance:
-            break
-        z = np.delete(z, least)
-    return z
-
-
-def rings(area: Area, tolerance: float) -> list[tuple[Complex, int, bool]]:
-    """Each ring of an area: its corners (n,), the part it belongs to, and whether it is outside.
-
-    Counter-clockwise, holes clockwise: the area lies to the left of every side.
-    """
-    found = []
-    for part, polygon in enumerate(polygons(area)):
-        every = ((polygon.exterior, True), *((hole, False) for hole in polygon.interiors))
-        for ring, outer in every:
-            z: Complex = np.asarray(ring.coords)[:-1] @ np.array([1.0, 1.0j])
-            z = straightened(z if ring.is_ccw == outer else z[::-1], tolerance)
-            if len(z) >= 3:
-                found.append((z, part, outer))
-    return found
-
-
-def polygons(area: Area) -> list[Polygon]:
-    """The parts of an area."""
-    return [one for one in shapely.get_parts(area).tolist() if one.geom_type == "Polygon"]
-
-
-def _corners(side: Side, most: int) -> Iterator[_Corner]:
+def _corners(side: Side, most: int) -> Iterator[Corner]:
     """The corners of a shape on one side of which no turn makes another."""
     body: Complex = side.corners @ np.array([1.0, 1j])
     for i in range(side.different):
         leaving, coming = body[(i + 1) % len(body)] - body[i], body[i - 1] - body[i]
         along = leaving / abs(leaving)
         own = np.roll((body - body[i]) / along, -i)
-        yield _Corner(
+        yield Corner(
             side.shape,
             side.flipped,
             float(np.angle(coming / leaving)),
@@ -424,7 +378,8 @@ def _corners(side: Side, most: int) -> Iterator[_Corner]:
         )
 
 
-def _laid(corner: _Corner, point: complex, along: complex) -> Laid:
+def laid_at(corner: Corner, point: complex, along: complex) -> Laid:
+    """A token with a corner at a point, and the edge that leaves it along a direction."""
     turn = along / corner.along
     place = point - corner.place * turn
     return Laid(corner.shape, corner.flipped, np.array([place.real, place.imag, np.angle(turn)]))

@@ -10,8 +10,8 @@ import numpy as np
 import shapely
 from shapely import Polygon
 
+from tangram_sim.areas import Area, grown, rings, valid
 from tangram_sim.arrays import AnyArray, Bools, Floats
-from tangram_sim.dissections import Area, grown, rings, valid
 from tangram_sim.errors import ConfigError
 from tangram_sim.geometry import outlines
 from tangram_sim.layout import Layout

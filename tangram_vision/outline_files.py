@@ -15,9 +15,9 @@ import numpy as np
 import shapely
 from shapely import Polygon
 
+from tangram_sim.areas import Area, grown
 from tangram_sim.arrays import Bools, Floats
 from tangram_sim.assembly import Puzzle, PuzzleRules
-from tangram_sim.dissections import Area, grown
 from tangram_sim.errors import ConfigError
 from tangram_sim.geometry import outlines
 from tangram_sim.puzzles import load_puzzle, parse_puzzles

@@ -20,8 +20,8 @@ import numpy as np
 import shapely
 from shapely import Polygon
 
+from tangram_sim.areas import Area
 from tangram_sim.arrays import Complex, Floats, Singles
-from tangram_sim.dissections import Area
 
 _MARGIN = 3  # pixels around a picture
 _SHORT = 10  # points of a chain that is no silhouette's
@@ -60,9 +60,15 @@ GREY_WAYS = tuple(
 # Blurred, the steps of binary pictures become less, and corners rounder.
 BINARY_WAYS = tuple(
     Way(spread, cost, grid, blur)
-    for spread, cost in ((0.32, 9.0), (0.32, 5.0), (0.32, 16.0), (0.25, 9.0), (0.2, 5.0))
-    for grid in (True, False)
-    for blur in (0.7, 0.0)
+    for grid, blur in ((True, 0.7), (False, 0.7), (True, 0.0))
+    for spread, cost in (
+        (0.2, 5.0),
+        (0.32, 9.0),
+        (0.15, 5.0),
+        (0.32, 5.0),
+        (0.32, 16.0),
+        (0.25, 9.0),
+    )
 )
 
 

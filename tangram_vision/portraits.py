@@ -6,9 +6,9 @@ The engine draws tokens one by one, and where two meet it can leave out what lie
 import numpy as np
 import shapely
 
+from tangram_sim.areas import Area
 from tangram_sim.arrays import Pixels
 from tangram_sim.config import SimConfig
-from tangram_sim.dissections import Area
 from tangram_sim.lens import View
 from tangram_sim.pictures import BACKGROUND, TOKEN_GRAY, averaged, taken_pixels
 

@@ -15,20 +15,15 @@ import numpy as np
 import shapely
 from PIL import Image, ImageDraw
 
+from tangram_sim.areas import Area
 from tangram_sim.arrays import Bools, Floats
-from tangram_sim.dissections import Area
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import Layout
 from tangram_vision.outline_files import Drawn, read_outline
 from tangram_vision.photos import Shade, find_silhouette
 from tangram_vision.picture_files import read_picture
-from tangram_vision.silhouettes import (
-    Filled,
-    attempt_outline,
-    fill_outline,
-    fill_picture,
-    moved,
-)
+from tangram_vision.silhouette_pictures import fill_picture, moved
+from tangram_vision.silhouettes import TOGETHER, Filled, Method, attempt_outline, fill_outline
 
 _DRAWN = 640  # pixels along the longer side of an outline that is drawn
 _BORDER = 0.1  # of it, around the outline
@@ -58,7 +53,13 @@ class Silhouette:
 
 
 def fill_silhouette(
-    name: str, source: str, layout: Layout, scale: float, seconds: float, count: int = 1
+    name: str,
+    source: str,
+    layout: Layout,
+    scale: float,
+    seconds: float,
+    count: int = 1,
+    method: Method = TOGETHER,
 ) -> Silhouette:
     """Read a silhouette and fill it.
 
@@ -69,23 +70,24 @@ def fill_silhouette(
         scale: side of the full square that they are cut from, in their units.
         seconds: for the search.
         count: of different ways to fill it, at most.
+        method: how it is filled.
 
     Raises:
         ConfigError: a file that cannot be used; whether it was filled is not checked.
     """
     path = Path(name)
     if path.suffix.lower() not in PICTURES:
-        return _from_outline(read_outline(name, source), layout, scale, seconds, count)
+        return _from_outline(read_outline(name, source), layout, scale, seconds, count, method)
     if count > 1:
         raise ConfigError(
             f"solutions={count} needs an exact outline, and {source} is a picture, whose pixels "
             "are fitted by one: leave solutions out, or draw the outline as SVG or JSON"
         )
-    return _from_picture(read_picture(path, source), source, layout, seconds)
+    return _from_picture(read_picture(path, source), source, layout, seconds, method)
 
 
 def _from_outline(
-    drawn: Drawn, layout: Layout, scale: float, seconds: float, count: int
+    drawn: Drawn, layout: Layout, scale: float, seconds: float, count: int, method: Method
 ) -> Silhouette:
     """Scaled to the tokens' area, unless it tells another scale, filled, and drawn."""
     area, total = drawn.area, float(layout.areas.sum())
@@ -96,7 +98,7 @@ def _from_outline(
         own = scale / drawn.side
     placed, size, unit = _framed(area, own)
     filled = attempt_outline(placed, layout, seconds) if wrong else None
-    every = (filled,) if filled else tuple(fill_outline(placed, layout, seconds, count))
+    every = (filled,) if filled else tuple(fill_outline(placed, layout, seconds, count, method))
     mask = _mask(placed, size, unit)
     return Silhouette(_inked(mask), mask, every, unit, share if wrong else None)
 
@@ -131,12 +133,14 @@ def _inked(mask: Bools) -> Image.Image:
     return Image.fromarray(np.where(mask[..., None], _INK, _PAPER).astype(np.uint8))
 
 
-def _from_picture(picture: Image.Image, source: str, layout: Layout, seconds: float) -> Silhouette:
+def _from_picture(
+    picture: Image.Image, source: str, layout: Layout, seconds: float, method: Method
+) -> Silhouette:
     """The scale is that at which as many pixels are covered as the tokens are large."""
     shade = find_silhouette(picture, layout, source)
     share = float(shade.cover.sum()) / shade.cover.size
     view = float(np.sqrt(layout.areas.sum() / share))
-    filled = fill_picture(shade.cover, layout, view, seconds)
+    filled = fill_picture(shade.cover, layout, view, seconds, method)
     unit = shade.pixels / view
     way = np.array([shade.corner[0], -shade.corner[1]]) / unit
     if filled.found is not None:

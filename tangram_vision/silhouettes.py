@@ -1,55 +1,52 @@
-"""A silhouette -> where a layout's tokens lie that fill it.
+"""The outline of a silhouette -> where a layout's tokens lie that fill it.
 
-An outline is searched as it is, with rising tolerance. A picture is outlined in several ways; each
-dissection that the search finds is fitted to all pixels, and what then differs judges. Where
-nothing fills it, the tokens that could be laid are looked for in the time that is left.
-
-Legend: K tokens, P pixels along a side of a picture.
+It is searched with rising tolerance. Where nothing fills it, a beam tells the tokens that could be
+laid. Legend: K tokens.
 """
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 
 import numpy as np
 import shapely
 from shapely import Polygon
 
-from tangram_sim.arrays import Complex, Floats, Singles
-from tangram_sim.dissections import (
-    Area,
-    Budget,
-    Dissection,
-    Laid,
-    Search,
-    Tokens,
-    dissection,
-    grown,
-    straightened,
-)
+from tangram_sim.areas import Area, grown, straightened
+from tangram_sim.arrays import Complex, Floats
+from tangram_sim.dissections import Budget, Dissection, Laid, Search, Tokens, dissection
 from tangram_sim.geometry import outlines
 from tangram_sim.layout import Layout
-from tangram_vision.kinds import Kind, kinds_of
-from tangram_vision.outlines import BINARY_WAYS, GREY_WAYS, Way, outline
-from tangram_vision.ramps import fitted, ramps
-from tangram_vision.samples import binary
+from tangram_vision.beams import Beam, Values
 
 # Of the root of all tokens' area, the full square's side where they are the tans.
 TOLERANCES = (0.004, 0.008, 0.014, 0.022, 0.035, 0.05, 0.07, 0.09)
 SOLVED = 0.95  # IoU from which a silhouette counts as filled
-_EACH_S = 0.5  # that one outline of a picture is searched
-_EACH = 2  # dissections of an outline that are compared
-_ALIKE = 0.02  # of a picture that may differ where the search ends
-_MARGIN = 3  # pixels around a silhouette
 _ROUND = 1e-9
 # Of the root of all tokens' area: gaps between pieces that are closed, and what a side of an
 # outline may be off so that no corner of a piece within it is left.
 _SEAM, _STRAIGHT, _GRID = 0.004, 1e-4, 1e-6
 _SHARE = 0.9  # of the time, for the search; the rest is for the best attempt
-_LOOSE = (0.008, 0.022, 0.05)  # tolerances of attempts
-_LOOSE_STEPS = 100
+_LOOSE = (0.004, 0.022, 0.05)  # tolerances of a beam, for outlines
 _SAME = 0.9  # of a token's area, from which two lie at one place
+
+
+@dataclass(frozen=True, eq=False)
+class Method:
+    """How silhouettes are filled.
+
+    Attributes:
+        search: whether by a search, which goes back where it is stuck.
+        width: states that a beam follows where no search has found anything.
+        values: what ranks these; None: the area of the tokens that lie.
+    """
+
+    search: bool = True
+    width: int = 12
+    values: Values | None = None
+
+
+TOGETHER = Method()
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +61,7 @@ class Filled:
         nodes: steps of the search.
         complete: whether all of an outline was searched: no other dissection fills it.
         attempt: where nothing was found, the tokens that could be laid; None if none could.
+        by: what found it, the search or the beam.
     """
 
     found: Dissection | None
@@ -72,6 +70,7 @@ class Filled:
     nodes: int
     complete: bool
     attempt: Dissection | None = None
+    by: str = "search"
 
     @property
     def solved(self) -> bool:
@@ -121,18 +120,23 @@ def overlap(one: Area, other: Area) -> float:
     return float(common / max(one.area + other.area - common, 1e-300))
 
 
-def fill_outline(area: Area, layout: Layout, seconds: float, count: int = 1) -> list[Filled]:
+def fill_outline(
+    area: Area, layout: Layout, seconds: float, count: int = 1, method: Method = TOGETHER
+) -> list[Filled]:
     """Up to `count` different dissections of an outline of the tokens' area, or one that failed.
+
+    The search is complete, so that what a beam lays after it is no more than an attempt.
 
     Args:
         area: in the units of the layout.
         layout: its tokens.
         seconds: for all of it.
-        count: at most so many.
+        count: at most so many; a beam finds one.
+        method: how.
     """
     tokens, begin = Tokens(layout), time.perf_counter()
     budget, tried = Budget(begin + _SHARE * seconds), list[list[Laid]]()
-    for tolerance in TOLERANCES:
+    for tolerance in TOLERANCES if method.search else ():
         search = Search(tokens, tolerance * tokens.unit, budget)
         every: list[Filled] = []
         for laid in search.run(area):
@@ -143,32 +147,39 @@ def fill_outline(area: Area, layout: Layout, seconds: float, count: int = 1) -> 
                 every.append(Filled(found, iou, passed, budget.taken, False))
             if len(every) == count:
                 return every
+        if every:
+            return [replace(one, complete=not budget.spent()) for one in every]
         tried.append(search.best)
-        if every or budget.spent():
+        if budget.spent():
             break
-    complete = not budget.spent()
-    if every:
-        return [replace(one, complete=complete) for one in every]
-    nearest, iou = _attempted(area, layout, tokens, begin + seconds, tried)
-    return [Filled(None, iou, time.perf_counter() - begin, budget.taken, complete, nearest)]
+    loose = Budget(begin + seconds)
+    nearest, iou = nearest_fill(area, layout, loose, tried, method)
+    passed = time.perf_counter() - begin
+    if method.search:
+        complete = not budget.spent()
+        return [Filled(None, iou, passed, budget.taken, complete, nearest)]
+    if nearest is not None and nearest.lies is None and iou >= SOLVED:
+        return [Filled(nearest, iou, passed, loose.taken, False, by="beam")]
+    return [Filled(None, iou, passed, loose.taken, False, nearest)]
 
 
 def attempt_outline(area: Area, layout: Layout, seconds: float) -> Filled:
     """The tokens that could be laid in an outline whose area is not theirs."""
-    tokens, begin = Tokens(layout), time.perf_counter()
-    nearest, iou = _attempted(area, layout, tokens, begin + seconds, ())
-    return Filled(None, iou, time.perf_counter() - begin, 0, False, nearest)
+    begin = time.perf_counter()
+    budget = Budget(begin + seconds)
+    laid, iou = nearest_fill(area, layout, budget, (), TOGETHER)
+    return Filled(None, iou, time.perf_counter() - begin, budget.taken, False, laid)
 
 
-def _attempted(
-    area: Area, layout: Layout, tokens: Tokens, until: float, tried: Sequence[list[Laid]]
+def nearest_fill(
+    area: Area, layout: Layout, budget: Budget, tried: Sequence[list[Laid]], method: Method
 ) -> tuple[Dissection | None, float]:
-    """What comes nearest to an outline, of what was tried and of loose searches; and its IoU."""
-    every = [*tried]
+    """What comes nearest to an outline, of what was tried and of beams; and its IoU."""
+    tokens, every = Tokens(layout), [*tried]
+    beam = Beam(tokens, method.width, method.values)
     for tolerance in _LOOSE:
-        search = Search(tokens, tolerance * tokens.unit, Budget(until, _LOOSE_STEPS), loose=True)
-        next(search.run(area), None)
-        every.append(search.best)
+        states = beam.run(area, tokens.counts, tolerance * tokens.unit, budget)
+        every += [list(state.laid) for state in states[:1]]
     found = [dissection(tokens, laid) for laid in every if laid]
     if not found:
         return None, 0.0
@@ -192,94 +203,3 @@ def _alike(tokens: Tokens, layout: Layout, one: Dissection, other: Dissection | 
         if (common.max(axis=1) < _SAME * shapely.area(mine[own])).any():
             return False
     return True
-
-
-def fill_picture(cover: Singles, layout: Layout, view: float, seconds: float) -> Filled:
-    """The dissection that explains a picture's coverage (P, P) best.
-
-    Args:
-        cover: about 0 on the ground and 1 in the silhouette.
-        layout: the tokens.
-        view: width of the picture, in the units of the layout.
-        seconds: for all of it.
-    """
-    tokens, begin = Tokens(layout), time.perf_counter()
-    kinds, unit = kinds_of(layout, view, len(cover)), view / len(cover)
-    crop, corner = _cropped(cover)
-    sharp = binary(cover)
-    ways = BINARY_WAYS if sharp else GREY_WAYS
-    budget, tried = Budget(begin + _SHARE * seconds), list[list[Laid]]()
-    best, iou, least = None, 0.0, np.inf
-    for found in _tried(crop, ways, tokens, unit, budget, tried):
-        own, rough = _in_pixels(found, kinds, unit)
-        poses, differs = fitted(own, rough, crop)
-        if differs < least:
-            least, iou = differs, _pixel_overlap(own, poses, crop, sharp)
-            best = moved(Dissection(poses * (unit, unit, 1.0), found.flipped), corner * unit)
-        if least < _ALIKE:
-            break
-    nearest = None
-    if best is None:
-        area = shapely.transform(outline(crop, ways[0]), lambda points: points * unit)
-        laid, iou = _attempted(area, layout, tokens, begin + seconds, tried)
-        nearest = None if laid is None else moved(laid, corner * unit)
-    return Filled(best, iou, time.perf_counter() - begin, budget.taken, False, nearest)
-
-
-def _tried(
-    crop: Singles,
-    ways: Sequence[Way],
-    tokens: Tokens,
-    unit: float,
-    budget: Budget,
-    tried: list[list[Laid]],
-) -> Iterator[Dissection]:
-    """Dissections of the outlines that a picture may have, in the units of the layout.
-
-    What each search laid at most goes into `tried`.
-    """
-    end = budget.until
-    for way in ways:
-        area = shapely.transform(outline(crop, way), lambda points: points * unit)
-        for tolerance in TOLERANCES[1:]:
-            budget.until = min(time.perf_counter() + _EACH_S, end)
-            search = Search(tokens, tolerance * tokens.unit, budget)
-            yield from (dissection(tokens, laid) for laid in islice(search.run(area), _EACH))
-            tried.append(search.best)
-            if time.perf_counter() > end:
-                return
-
-
-def _pixel_overlap(kinds: Sequence[Kind], poses: Floats, cover: Singles, sharp: bool) -> float:
-    """Intersection over union of tokens and coverage (P, P), which is sharp or grey at edges."""
-    drawn = np.minimum(ramps(kinds, poses, len(cover)).sum(axis=0), 1.0)
-    seen = np.clip(cover, 0.0, 1.0)
-    if sharp:
-        drawn = np.round(drawn)
-    return float(np.minimum(drawn, seen).sum() / np.maximum(drawn, seen).sum())
-
-
-def _cropped(cover: Singles) -> tuple[Singles, Floats]:
-    """The square around what is covered, and its upper left corner, x and y, in pixels."""
-    rows, columns = (np.flatnonzero((cover > 0.3).any(axis=axis)) for axis in (1, 0))
-    if not len(rows):
-        return cover, np.zeros(2)
-    top, left = max(0, int(rows[0]) - _MARGIN), max(0, int(columns[0]) - _MARGIN)
-    part = cover[top : int(rows[-1]) + _MARGIN + 1, left : int(columns[-1]) + _MARGIN + 1]
-    side = max(part.shape)
-    room = ((0, side - part.shape[0]), (0, side - part.shape[1]))
-    return np.pad(part, room), np.array([left, -top], np.float64)
-
-
-def moved(found: Dissection, way: Floats) -> Dissection:
-    """The same dissection so far (2,) away."""
-    return replace(found, poses=found.poses + (*way, 0.0))
-
-
-def _in_pixels(found: Dissection, kinds: Sequence[Kind], unit: float) -> tuple[list[Kind], Floats]:
-    """Kinds and poses (K, 3) of a dissection's tokens, as pictures have them."""
-    own = [
-        next(kind for kind in kinds if token in kind.tokens and kind.flipped == flipped)
-        for token, flipped in enumerate(found.flipped.tolist())
-    ]
-    return own, found.poses / (unit, unit, 1.0)

@@ -14,8 +14,8 @@ import numpy as np
 import shapely
 from scipy.optimize import least_squares
 
+from tangram_sim.areas import straightened
 from tangram_sim.arrays import Floats, Singles
-from tangram_sim.dissections import straightened
 from tangram_vision.outlines import Way, outline
 
 _PIXELS = 256  # along a side of the picture whose sides are looked at

@@ -126,7 +126,7 @@ def _play(settings: Plain) -> int:
     if config.silhouette is not None:
         from worker.silhouettes import read_silhouette
 
-        given = (config.silhouette, setups[0], config.solutions, config.attempt)
+        given = (config.silhouette, setups[0], config.solutions, config.solve, config.attempt)
         filled = read_silhouette(*given)
     tell(f"loads and plays {', '.join(config.run_dirs)}")
 

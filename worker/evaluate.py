@@ -32,7 +32,7 @@ from worker.baselines import (
     position_policy,
     random_policy,
 )
-from worker.config import EvalConfig, source_and_names
+from worker.config import TOGETHER, EvalConfig, source_and_names
 from worker.fitted import fitted_policy
 from worker.metrics import SOLVED, assembled, pose_errors, summarise
 from worker.oracle import oracle_policy
@@ -183,11 +183,13 @@ def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
     source, names = source_and_names(config.puzzle or ())
     setup = run.setup
     found = find_figures(source, setup, names, config.turns, config.skip_invalid)
+    given = setup, found.figures, policies(run), config.seed
     if setup.fills:
-        score = score_outlines
+        scored = score_outlines(*given)
+    elif setup.sim.observe in SILHOUETTES:
+        scored = score_hidden(*given, config.solve)
     else:
-        score = score_hidden if setup.sim.observe in SILHOUETTES else score_puzzles
-    scored = score(setup, found.figures, policies(run), config.seed)
+        scored = score_puzzles(*given)
     scores, lines = scored.means, scored.puzzles
     console = Console(highlight=False)
     count = len(found.figures)
@@ -321,9 +323,13 @@ def _filled(setup: Setup, played: Played) -> Scores:
 
 
 def score_hidden(
-    setup: Setup, figures: Sequence[Figure], players: Mapping[str, Player], seed: int
+    setup: Setup,
+    figures: Sequence[Figure],
+    players: Mapping[str, Player],
+    seed: int,
+    solve: str = TOGETHER,
 ) -> Scored:
-    """Scores of each policy that lays what a search found in the silhouettes.
+    """Scores of each policy that lays what was found in the silhouettes.
 
     Raises:
         ConfigError: OpenCV or shapely is not installed.
@@ -336,15 +342,20 @@ def score_hidden(
             f"sim.observe={setup.sim.observe} needs OpenCV and shapely ({error}): install "
             "opencv-python-headless and shapely, or set sim.observe=corners"
         ) from error
-    hidden = hide(setup, figures, seed)
+    hidden = hide(setup, figures, seed, solve)
     laid = {name: play_hidden(hidden, player, seed) for name, player in players.items()}
     scores = {name: means(hidden, own) for name, own in laid.items()}
     told = (
-        f"{hidden.filled} of {len(figures)} filled by the search; any dissection counts, so no "
-        "errors of position and angle, and no pieces under others"
+        f"{hidden.filled} of {len(figures)} filled ({_by(hidden.filled_by)}); any dissection "
+        "counts, so no errors of position and angle, and no pieces under others"
     )
     each, ends = one_by_one(hidden, laid[RUN]), laid[RUN].ends
     return Scored(scores, each, hidden.titles, ends, hidden.goals, told)
+
+
+def _by(counts: Mapping[str, int]) -> str:
+    """Who filled how many, in words."""
+    return ", ".join(f"{count} by the {who}" for who, count in counts.items())
 
 
 def of_several(setup: Setup, played: Played) -> Scores:

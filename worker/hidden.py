@@ -14,17 +14,21 @@ from typing import Any
 import numpy as np
 
 from tangram_agent.setup import Setup
+from tangram_sim.areas import Area
 from tangram_sim.arrays import Bools, Floats, Ints
 from tangram_sim.config import SimConfig
-from tangram_sim.dissections import Area, Dissection
+from tangram_sim.dissections import Dissection
 from tangram_sim.geometry import overlap_share
 from tangram_sim.kinematics import wrap
 from tangram_sim.layout import Layout
 from tangram_sim.lens import Lens, View
 from tangram_vision.levels import coverage
 from tangram_vision.portraits import portrait
-from tangram_vision.silhouettes import Filled, fill_outline, fill_picture, silhouette
+from tangram_vision.silhouette_pictures import fill_picture
+from tangram_vision.silhouettes import Filled, Method, fill_outline, silhouette
 from worker.baselines import Player
+from worker.config import TOGETHER
+from worker.methods import method_of
 from worker.metrics import SOLVED, iou
 from worker.puzzles import Figure, figure_generator, play_figures
 from worker.rollout import Played
@@ -41,11 +45,13 @@ class Search:
         laid: where the tokens are to be laid; None where nothing was found.
         iou: of what was found with what was shown: an outline, or a picture's pixels.
         seconds: that it took.
+        by: what found it, the search or the beam; empty where nothing was found.
     """
 
     laid: Figure | None
     iou: float
     seconds: float
+    by: str
 
     @property
     def filled(self) -> bool:
@@ -70,9 +76,17 @@ class Hidden:
     views: tuple[View, ...] | None
 
     @property
+    def filled_by(self) -> dict[str, int]:
+        """How many the search fills, and how many the beam."""
+        return {
+            by: sum(search.filled and search.by == by for search in self.searches)
+            for by in ("search", "beam")
+        }
+
+    @property
     def filled(self) -> int:
-        """How many the search fills."""
-        return sum(search.filled for search in self.searches)
+        """How many are filled, as far as who looked for it can tell."""
+        return sum(self.filled_by.values())
 
     @cached_property
     def found(self) -> Ints:
@@ -122,19 +136,24 @@ class Laid:
         return np.asarray(self.iou >= SOLVED)
 
 
-def hide(setup: Setup, figures: Sequence[Figure], seed: int) -> Hidden:
+def hide(setup: Setup, figures: Sequence[Figure], seed: int, solve: str = TOGETHER) -> Hidden:
     """Search how a run's tokens fill puzzles of which only the silhouettes are shown.
 
     Args:
         setup: with `sim.observe` one of `SILHOUETTES`.
         figures: E puzzles.
         seed: of what disturbs the camera.
+        solve: who searches, see `worker.config.SOLVERS`.
+
+    Raises:
+        ConfigError: nobody learned to fill outlines with these tokens.
     """
     layout, sim, shown = setup.layout, setup.sim, tuple(figures)
+    method = method_of(solve, layout)
     if sim.observe == "silhouette":
-        searches = tuple(_outline_search(layout, figure) for figure in shown)
+        searches = tuple(_outline_search(layout, figure, method) for figure in shown)
         return Hidden(_seeing(setup, "corners"), shown, searches, None)
-    seen = [_picture_search(layout, sim, figure, seed) for figure in shown]
+    seen = [_picture_search(layout, sim, figure, seed, method) for figure in shown]
     searches, views = (tuple(column) for column in zip(*seen, strict=True))
     return Hidden(_seeing(setup, "pictures"), shown, searches, views)
 
@@ -145,22 +164,23 @@ def _seeing(setup: Setup, observe: str) -> Setup:
     return replace(setup, sim=replace(setup.sim, observe=observe, **usual))
 
 
-def _outline_search(layout: Layout, figure: Figure) -> Search:
-    (filled,) = fill_outline(_silhouette(layout, figure), layout, SECONDS)
+def _outline_search(layout: Layout, figure: Figure, method: Method) -> Search:
+    (filled,) = fill_outline(_silhouette(layout, figure), layout, SECONDS, method=method)
     return _search(figure, filled, np.zeros(3))
 
 
 def _picture_search(
-    layout: Layout, sim: SimConfig, figure: Figure, seed: int
+    layout: Layout, sim: SimConfig, figure: Figure, seed: int, method: Method
 ) -> tuple[Search, View]:
     lens, generator = Lens(sim), figure_generator(figure, seed, "portrait")
     (view,) = lens.begin([generator])
     picture = lens.taken(0, portrait(_silhouette(layout, figure), sim, view), generator)
     cover = coverage(picture)
     if cover is None:  # nothing is to be seen
-        return Search(None, 0.0, 0.0), view
+        return Search(None, 0.0, 0.0, ""), view
     corner = np.array([-sim.arena / 2.0, sim.arena / 2.0, 0.0])  # from which it is measured
-    return _search(figure, fill_picture(cover, layout, sim.arena, SECONDS), corner), view
+    filled = fill_picture(cover, layout, sim.arena, SECONDS, method)
+    return _search(figure, filled, corner), view
 
 
 def _silhouette(layout: Layout, figure: Figure) -> Area:
@@ -174,7 +194,7 @@ def _search(figure: Figure, filled: Filled, corner: Floats) -> Search:
         poses = found.poses + corner
         poses[:, 2] = wrap(poses[:, 2])
         laid = Figure(figure.name, figure.degrees, poses, found.flipped)
-    return Search(laid, filled.iou, filled.seconds)
+    return Search(laid, filled.iou, filled.seconds, filled.by if laid else "")
 
 
 def play_hidden(hidden: Hidden, player: Player, seed: int) -> Laid:
@@ -207,6 +227,7 @@ def means(hidden: Hidden, laid: Laid) -> dict[str, Any]:
         **{name: float(np.mean(getattr(laid, name))) for name in names},
         "share_solved_iou": float(np.mean(laid.solved)),
         "filled": hidden.filled,
+        "filled_by": hidden.filled_by,
         "not_filled": len(hidden.figures) - hidden.filled,
         "search_seconds": float(np.mean([search.seconds for search in hidden.searches])),
         "seconds_per_puzzle": float(np.mean(laid.seconds)),
@@ -223,6 +244,7 @@ def one_by_one(hidden: Hidden, laid: Laid) -> list[dict[str, Any]]:
             "iou": float(laid.iou[e]),
             "solved": bool(laid.solved[e]),
             "filled": search.filled,
+            "filled_by": search.by if search.filled else "",
             "search_iou": search.iou,
             **{name: int(getattr(laid, name)[e]) for name in ("blocked", "refused")},
             "actions_used": int(laid.actions_used[e]),

@@ -24,6 +24,7 @@ from tangram_sim.game_drawing import tiles
 from tangram_sim.layout import Layout
 from tangram_sim.settings import refuse_ignored
 from tangram_sim.targets import has_all_tans, turned_figure
+from worker.config import BY_BEAM, TOGETHER
 from worker.puzzles import Figure, reach_beyond
 from worker.views import outlined
 
@@ -55,22 +56,26 @@ class Shown:
     told: str
 
 
-def read_silhouette(name: str, setup: Setup, count: int = 1, out: Path | None = None) -> Shown:
+def read_silhouette(
+    name: str, setup: Setup, count: int = 1, solve: str = TOGETHER, out: Path | None = None
+) -> Shown:
     """A silhouette, filled with a run's tokens.
 
     Args:
         name: of a file, or of a puzzle of the library.
         setup: the run.
         count: of different ways to fill it, at most.
+        solve: who finds them, see `worker.config.SOLVERS`.
         out: a PNG file for the best attempt where nothing fills it; None is none.
 
     Raises:
-        ConfigError: it cannot be read or filled, or OpenCV or shapely is not installed; or the
-            run's agent fills outlines itself, and can do nothing with this.
+        ConfigError: it cannot be read or filled, or OpenCV or shapely is not installed; or there is
+            one way at most that is found or can be shown.
     """
     try:
         # Only here: other targets need neither.
-        from tangram_vision.silhouette_files import PICTURES, fill_silhouette  # noqa: PLC0415
+        from tangram_vision.silhouette_files import fill_silhouette  # noqa: PLC0415
+        from worker.methods import method_of  # noqa: PLC0415
     except ImportError as error:
         raise ConfigError(
             f"silhouette needs OpenCV and shapely ({error}): install opencv-python-headless and "
@@ -79,12 +84,10 @@ def read_silhouette(name: str, setup: Setup, count: int = 1, out: Path | None = 
     source, layout = f"silhouette={name}", setup.layout
     if setup.fills and count > 1:
         refuse_ignored(f"solutions={count}", "an agent of outlines", "name another run")
-    if setup.fills and Path(name).suffix.lower() in PICTURES:
-        raise ConfigError(
-            f"{source} is a picture, and this agent sees exact outlines: draw it as SVG or JSON, "
-            "or name a run that lays what a search finds, as pretrained/tangram7"
-        )
-    drawn = fill_silhouette(name, source, layout, setup.tokens.scale, SECONDS, count)
+    if solve in BY_BEAM and count > 1:
+        refuse_ignored(f"solutions={count}", f"solve={solve}, which finds one", "set solve=solver")
+    method = method_of(solve, layout)
+    drawn = fill_silhouette(name, source, layout, setup.tokens.scale, SECONDS, count, method)
     laid = [one.found for one in drawn.filled if one.found is not None and one.solved]
     if not laid:
         beside = "" if out is None else f"; {_kept(_draw_attempt(drawn, layout), out)}"
@@ -110,7 +113,7 @@ def _told(drawn: "Silhouette", count: int) -> str:
     """How it was filled."""
     first, found = drawn.filled[0], len(drawn.filled)
     if count == 1:
-        return f"filled in {first.seconds:.2f} s, IoU {first.iou:.3f}"
+        return f"filled by the {first.by} in {first.seconds:.2f} s, IoU {first.iou:.3f}"
     others = ", all that there are" if first.complete else ""
     more = "" if found == count or first.complete else f", no more in {SECONDS:g} s"
     return f"{plural(found, 'dissection')}{others}{more}"

@@ -16,8 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
+from tangram_sim.areas import Area, straightened
 from tangram_sim.arrays import Bools, Complex, Floats, Ints
-from tangram_sim.dissections import Area, Dissection, straightened
+from tangram_sim.dissections import Dissection
 from tangram_sim.layout import Layout
 from tangram_vision.silhouettes import SOLVED, Filled, covered, overlap
 

@@ -24,8 +24,9 @@ from tangram_agent.values import Corners
 from tangram_lab.benchmarks.measure import show, write
 from tangram_lab.benchmarks.seeing import SCALE
 from tangram_lab.benchmarks.silhouettes import Shape, area_of, figures_of, row_of
+from tangram_sim.areas import Area
 from tangram_sim.arrays import Floats
-from tangram_sim.dissections import Area, Dissection, Tokens, dissection
+from tangram_sim.dissections import Dissection, Tokens, dissection
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import Layout
 from tangram_sim.puzzles import library

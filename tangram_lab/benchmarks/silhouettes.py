@@ -22,29 +22,33 @@ from tangram_lab.benchmarks.measure import show, write
 from tangram_lab.benchmarks.rivals import RIVALS, Rival
 from tangram_lab.benchmarks.seeing import ARENA, SCALE, SEVEN
 from tangram_lab.benchmarks.tilted import tilted_rows
+from tangram_sim.areas import Area, grown
 from tangram_sim.arrays import Complex
 from tangram_sim.config import SimConfig
 from tangram_sim.connected import sample_connected
-from tangram_sim.dissections import Area, Dissection, grown
+from tangram_sim.dissections import Dissection
 from tangram_sim.layout import Layout, TokensConfig, make_layout
 from tangram_sim.puzzles import library
 from tangram_sim.targets import placement, turned_figure
 from tangram_sim.world import World, make_world
 from tangram_vision.levels import coverage
-from tangram_vision.silhouettes import (
-    SOLVED,
-    Filled,
-    covered,
-    fill_outline,
-    fill_picture,
-    overlap,
-)
+from tangram_vision.silhouette_pictures import fill_picture
+from tangram_vision.silhouettes import SOLVED, Filled, Method, covered, fill_outline, overlap
+from worker.methods import method_of
 
 SECONDS = 5.0  # for each figure, by the clock
 RIVAL_SECONDS = SECONDS  # the same, of processor time
 TURNS = 8
 EACH = 13  # figures of each kind for what takes seconds each: as many as there are convex ones
-CAMERAS = ((256, "binary"), (128, "grey"), (128, "binary"), (64, "grey"), (64, "binary"))
+BY_SIZE = "beam, largest first"  # the beam of who learned nothing
+# Pixels, picture, and who fills what it shows; see `worker.methods`.
+CAMERAS = (
+    (256, "binary", ("together",)),
+    (128, "grey", ("together", "beam", BY_SIZE, "agent")),
+    (128, "binary", ("together",)),
+    (64, "grey", ("together", "solver", "beam", BY_SIZE)),
+    (64, "binary", ("together", "solver")),
+)
 _SEAM = 2e-3  # arena units: gaps between pieces that are drawn by hand
 
 
@@ -62,11 +66,13 @@ def run_silhouettes(scenes: int, seed: int, out: Path | None) -> int:
     figures = list(figures_of(layout, scenes, seed))
     outlined = list(_outlined(layout, figures))
     rows = [row_of("exact outline", layout, figures, outlined)]
-    for pixels, picture in CAMERAS:
-        found = list(
-            _pictured(layout, figures, SimConfig(arena=ARENA, pixels=pixels, picture=picture))
-        )
-        rows.append(row_of(f"{pixels} px {picture}", layout, figures, found))
+    for pixels, picture, players in CAMERAS:
+        sim = SimConfig(arena=ARENA, pixels=pixels, picture=picture)
+        for name in players:
+            method = Method(search=False) if name == BY_SIZE else method_of(name, layout)
+            title = f"{pixels} px {picture}, {name}"
+            found = list(_pictured(layout, figures, sim, method, title))
+            rows.append(row_of(title, layout, figures, found))
     show("silhouettes filled with seven tans, one core", rows)
     convex = [_convex_row(layout)]
     show("convex figures of the area of seven tans", convex)
@@ -212,18 +218,20 @@ def _rival_row(
     return {"by": row.pop("silhouette"), **row, "steps in a s": rate}
 
 
-def _pictured(layout: Layout, figures: list[Shape], sim: SimConfig) -> Iterator[Filled]:
+def _pictured(
+    layout: Layout, figures: list[Shape], sim: SimConfig, method: Method, title: str
+) -> Iterator[Filled]:
     with closing(make_world(layout, sim)) as world:
-        for figure in track(figures, f"{sim.pixels} px {sim.picture}"):
-            yield _seen(layout, world, figure)
+        for figure in track(figures, title):
+            yield _seen(layout, world, figure, method)
 
 
-def _seen(layout: Layout, world: World, figure: Shape) -> Filled:
+def _seen(layout: Layout, world: World, figure: Shape, method: Method) -> Filled:
     world.place(figure.laid.poses, figure.laid.flipped)
     cover = coverage(world.picture())
     assert cover is not None
     begin = time.process_time()
-    filled = fill_picture(cover, layout, ARENA, SECONDS)
+    filled = fill_picture(cover, layout, ARENA, SECONDS, method)
     filled = replace(filled, seconds=time.process_time() - begin)
     if filled.found is None:
         return filled
@@ -252,6 +260,8 @@ def row_of(what: str, layout: Layout, figures: list[Shape], found: list[Filled])
         },
         "IoU, median": float(np.median(iou)),
         "CPU s, median": float(np.median(seconds)),
+        "95th perc.": float(np.percentile(seconds, 95)),
         "99th perc.": float(np.percentile(seconds, 99)),
+        "by the beam": float(np.mean([one.by == "beam" for one in found])),
         "steps, median": float(np.median([one.nodes for one in found])),
     }

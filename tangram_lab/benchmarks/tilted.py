@@ -11,11 +11,12 @@ import numpy as np
 import shapely
 from PIL import Image, ImageDraw
 
+from tangram_sim.areas import Area
 from tangram_sim.arrays import Floats
-from tangram_sim.dissections import Area
 from tangram_sim.layout import Layout
 from tangram_vision.photos import find_silhouette
-from tangram_vision.silhouettes import SOLVED, fill_picture
+from tangram_vision.silhouette_pictures import fill_picture
+from tangram_vision.silhouettes import SOLVED
 
 TILTS = (0.0, 5.0, 10.0, 15.0)  # degrees
 PIXELS = 512

@@ -147,7 +147,9 @@ def test_a_small_token_that_lies_elsewhere_gives_another_picture() -> None:
 def test_silhouettes_are_counted_by_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "silhouettes.json"
     monkeypatch.setattr("tangram_lab.benchmarks.silhouettes.TURNS", 1)
-    monkeypatch.setattr("tangram_lab.benchmarks.silhouettes.CAMERAS", ((128, "grey"),))
+    monkeypatch.setattr(
+        "tangram_lab.benchmarks.silhouettes.CAMERAS", ((128, "grey", ("together", "beam")),)
+    )
     monkeypatch.setattr("tangram_lab.benchmarks.silhouettes.EACH", 1)
     # All of them are searched through in tests/sim/test_dissections.py.
     few = convex_outlines(float(np.sqrt(layout_of(*SEVEN, scale=SCALE).areas.sum())))[2:6]
@@ -159,9 +161,11 @@ def test_silhouettes_are_counted_by_kind(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(sys, "argv", ["tangram-bench", "silhouettes", "scenes=2", f"out={out}"])
     assert main() == 0
     content = json.loads(out.read_text())
-    exact, grey = content["rows"]
+    exact, grey, beam = content["rows"]
     assert (exact["figures"], exact["filled"], exact["test (14)"]) == (19, 1.0, 1.0)
-    assert (grey["silhouette"], grey["filled"], grey["convex (3)"]) == ("128 px grey", 1.0, 1.0)
+    assert grey["silhouette"] == "128 px grey, together"
+    assert (grey["filled"], grey["convex (3)"]) == (1.0, 1.0)
+    assert (beam["filled"] > 0.8, beam["by the beam"]) == (True, 1.0)
     (convex,) = content["convex"]
     assert (convex["filled"], convex["searched through, none found"]) == (3, 1)
     search, genetic = content["rivals"]

@@ -9,10 +9,11 @@ from hypothesis.extra.numpy import arrays
 from shapely import Polygon
 
 from tangram_sim.actions import goal_rows
+from tangram_sim.areas import rings
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.connected import sample_connected
-from tangram_sim.dissections import Budget, Search, Tokens, dissection, rings
+from tangram_sim.dissections import Budget, Search, Tokens, dissection
 from tangram_sim.errors import ConfigError
 from tangram_sim.puzzles import library
 from tangram_sim.rings import as_area, as_rows, covered_area

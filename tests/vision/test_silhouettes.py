@@ -1,20 +1,27 @@
 """Silhouettes in pictures: outlined, filled, and judged by their pixels."""
 
+from collections.abc import Sequence
 from contextlib import closing
+from typing import Any
 
 import numpy as np
 import pytest
 import shapely
 from shapely import Polygon
 
+from tangram_sim.areas import Area
+from tangram_sim.arrays import Singles
 from tangram_sim.config import SimConfig
-from tangram_sim.dissections import Dissection
+from tangram_sim.connected import sample_connected
+from tangram_sim.dissections import Dissection, Laid
 from tangram_sim.puzzles import load_puzzle
 from tangram_sim.targets import placement, turned_figure
 from tangram_sim.world import make_world
+from tangram_vision.kinds import kinds_of
 from tangram_vision.levels import coverage
 from tangram_vision.outlines import BINARY_WAYS, GREY_WAYS, outline
-from tangram_vision.silhouettes import Filled, covered, fill_picture, overlap
+from tangram_vision.silhouette_pictures import _cropped, _Explainer, fill_picture
+from tangram_vision.silhouettes import Filled, Method, covered, overlap
 from tests.sim.builders import SEVEN, layout_of
 
 pytestmark = pytest.mark.fast
@@ -91,3 +98,65 @@ def test_what_is_too_rugged_has_no_outline() -> None:
 def test_nothing_has_no_outline() -> None:
     assert outline(np.zeros((64, 64), np.float32), GREY_WAYS[0]).is_empty
     assert fill_picture(np.zeros((64, 64), np.float32), LAYOUT, ARENA, 1.0).found is None
+
+
+def rough(seed: int, pixels: int) -> tuple[Singles, Dissection]:
+    """Coverage by tokens laid edge to edge by chance, binary, and how they lie."""
+    own = np.random.default_rng(seed)
+    poses = sample_connected(LAYOUT, SimConfig(arena=ARENA), own)
+    truth = Dissection(poses, np.zeros(LAYOUT.tokens, np.bool_))
+    sim = SimConfig(backend="kinematic", arena=ARENA, pixels=pixels, picture="binary")
+    with closing(make_world(LAYOUT, sim)) as world:
+        world.place(truth.poses, truth.flipped)
+        cover = coverage(world.picture())
+    assert cover is not None
+    return cover, truth
+
+
+def test_coarse_pictures_are_filled_by_the_beam_where_no_search_fills_them() -> None:
+    middle, by, solved = np.array([-ARENA / 2.0, ARENA / 2.0, 0.0]), list[str](), 0
+    for seed in range(4):
+        cover, truth = rough(seed, 64)
+        filled = fill_picture(cover, LAYOUT, ARENA, 20.0)
+        assert filled.found is not None
+        laid = Dissection(filled.found.poses + middle, filled.found.flipped)
+        by.append(filled.by)
+        solved += overlap(covered(LAYOUT, laid), covered(LAYOUT, truth)) > 0.9
+    assert solved >= 3
+    assert set(by) == {"search", "beam"}
+
+
+def test_tokens_that_lie_wrong_are_laid_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The only thing that ever explains all of a figure has two tokens turned about."""
+    cover, truth = rough(1, 128)
+    _, corner = _cropped(cover)
+    poses = truth.poses + (ARENA / 2.0, -ARENA / 2.0, 0.0) - (*corner * ARENA / 128, 0.0)
+    poses[[2, 5], 2] += 0.8
+    wrong = Dissection(poses, truth.flipped)
+    lay, iou = _Explainer._lay, []
+
+    def offered(self: _Explainer, area: Area, kept: Sequence[Laid], *rest: Any) -> bool:
+        if kept:
+            return lay(self, area, kept, *rest)
+        return self._offer([self._laid(wrong, k) for k in range(7)], "beam")
+
+    monkeypatch.setattr(_Explainer, "_lay", offered)
+    for tried in (0, 12):
+        monkeypatch.setattr("tangram_vision.silhouette_pictures._TRIED", tried)
+        iou.append(fill_picture(cover, LAYOUT, ARENA, 20.0, Method(search=False)).iou)
+    assert iou[0] < 0.95
+    assert iou[1] > 0.97
+
+
+def test_what_explains_a_picture_worse_is_forgotten() -> None:
+    cover, truth = rough(1, 128)
+    crop, corner = _cropped(cover)
+    unit = ARENA / 128
+    explainer = _Explainer(crop, LAYOUT, kinds_of(LAYOUT, ARENA, 128), unit, Method())
+    poses = truth.poses + (ARENA / 2.0, -ARENA / 2.0, 0.0) - (*corner * unit, 0.0)
+    off = poses + np.array([(0.1 * (k == 0), 0.0, 0.8 * (k == 0)) for k in range(7)])
+    for own, alike in ((off, False), (poses, True), (off, True)):
+        laid = [explainer._laid(Dissection(own, truth.flipped), k) for k in range(7)]
+        assert explainer._offer(laid, "beam") is alike
+    assert explainer.best is not None
+    assert explainer.best.differs < 0.02

@@ -62,7 +62,7 @@ def test_silhouettes_are_filled_whatever_they_come_from(tmp_path: Path, name: st
     svg(tmp_path / "pieces.svg", '<polygon points="0,0 8,0 8,8"/><polygon points="0,0 8,8 0,8"/>')
     source = name if name == "cat" else str(tmp_path / name)
     shown = read_silhouette(source, load_run("pretrained/tangram7").setup)
-    assert shown.told.startswith("filled in ")
+    assert shown.told.startswith("filled by the search in ")
     assert float(shown.told.split()[-1]) > 0.97
     assert shown.figure.name == Path(name).stem
     width, height = shown.picture.size
@@ -102,18 +102,15 @@ def test_an_agent_of_outlines_is_shown_the_bare_silhouette(
     assert wide.max() < 40  # nothing is of a token's colour
 
 
-@pytest.mark.parametrize(
-    ("name", "count", "message"),
-    [
-        ("cat", 3, r"solutions=3 changes nothing with an agent of outlines: leave it out"),
-        ("cat.png", 1, r"cat.png is a picture, and this agent sees exact outlines: draw it as SVG"),
-    ],
-)
-def test_what_an_agent_of_outlines_has_no_use_for_is_refused(
-    filler: Path, name: str, count: int, message: str
-) -> None:
-    with pytest.raises(ConfigError, match=message):
-        read_silhouette(name, load_run(filler).setup, count)
+def test_an_agent_of_outlines_fills_what_a_picture_shows(filler: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.png"
+    play_run(PlayConfig(str(filler), silhouette=picture(tmp_path / "it.png"), out=str(out)))
+    assert out.exists()
+
+
+def test_an_agent_of_outlines_has_one_solution(filler: Path) -> None:
+    with pytest.raises(ConfigError, match=r"solutions=3 changes nothing with an agent of outlines"):
+        read_silhouette("cat", load_run(filler).setup, 3)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,124 @@
+"""A beam lays tokens in outlines of which corners are wrong or lost."""
+
+import time
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+import shapely
+from shapely import Polygon
+
+from tangram_sim.areas import Area
+from tangram_sim.arrays import Floats
+from tangram_sim.config import SimConfig
+from tangram_sim.connected import sample_connected
+from tangram_sim.dissections import Budget, Dissection, Search, Tokens, dissection
+from tangram_vision.beams import Beam, State, Values
+from tangram_vision.silhouettes import Method, covered, fill_outline, overlap
+from tests.sim.builders import SEVEN, layout_of
+
+pytestmark = pytest.mark.fast
+
+LAYOUT = layout_of(*SEVEN, scale=1.0)
+TOKENS = Tokens(LAYOUT)
+SQUARE = Polygon([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
+
+
+def gluing(seed: int) -> Area:
+    poses = sample_connected(LAYOUT, SimConfig(arena=3.3), np.random.default_rng(seed))
+    return covered(LAYOUT, Dissection(poses, np.zeros(7, np.bool_)))
+
+
+def cut(area: Area, size: float = 0.08) -> Area:
+    """Without the first convex corner, along a line that no tan has a side on."""
+    z = np.asarray(shapely.get_parts(shapely.normalize(area))[0].exterior.coords)[:-1] @ (1.0, 1j)
+    hull = np.asarray(area.convex_hull.exterior.coords)[:-1] @ (1.0, 1j)
+    i = int(np.flatnonzero(np.isin(np.round(z, 9), np.round(hull, 9)))[0])
+    ahead, behind = z[(i + 1) % len(z)] - z[i], z[i - 1] - z[i]
+    off = (z[i] + size * ahead / abs(ahead), z[i] + 0.4 * size * behind / abs(behind))
+    return shapely.difference(area, Polygon([(p.real, p.imag) for p in (z[i], *off)]))
+
+
+def beam(
+    area: Area, width: int = 12, values: Values | None = None, tolerance: float = 0.035
+) -> list[State]:
+    return Beam(TOKENS, width, values).run(
+        area, TOKENS.counts, tolerance, Budget(time.perf_counter() + 60.0)
+    )
+
+
+def test_outlines_that_lost_a_corner_are_filled() -> None:
+    """No search fills one, whatever its tolerance: tokens have no corner there."""
+    filled = 0
+    for seed in range(6):
+        whole = gluing(seed)
+        rough = cut(whole)
+        exact = Search(TOKENS, 0.014, Budget(time.perf_counter() + 60.0))
+        assert list(exact.run(rough)) == []
+        best = beam(rough)[0]
+        fits = overlap(covered(LAYOUT, dissection(TOKENS, best.laid)), whole) > 0.9
+        filled += fits and not any(best.left)
+    assert filled >= 5
+
+
+def test_what_covers_most_by_least_comes_first() -> None:
+    states = beam(gluing(1))
+    uncovered = [float(TOKENS.areas @ state.left) + state.over for state in states]
+    assert uncovered == sorted(uncovered)
+    assert len(states) == 12
+
+
+def test_a_token_that_reaches_out_is_worth_less() -> None:
+    inside = State((), (1, 0, 0, 0, 0), SQUARE, 0.0)
+    worth = Beam(TOKENS, 1)._worth([inside, inside._replace(over=TOKENS.areas.min())])
+    assert worth[0] - worth[1] == pytest.approx(1.0)
+    judged = Beam(TOKENS, 1, lambda rests, _: np.zeros(len(rests)))
+    assert judged._worth([inside, inside._replace(over=TOKENS.areas.min())]).tolist() == [0.0, -1.0]
+
+
+@pytest.mark.parametrize(("sign", "first"), [(1.0, "small_triangle"), (-1.0, "large_triangle")])
+def test_values_say_what_is_followed(sign: float, first: str) -> None:
+    """A beam of one lays what leaves the most worth."""
+
+    def values(rests: Sequence[Area], left: Sequence[tuple[int, ...]]) -> Floats:
+        assert len(rests) == len(left)
+        return sign * 50.0 * np.array([rest.area for rest in rests])
+
+    laid = beam(SQUARE, 1, values)[0].laid
+    assert SEVEN[TOKENS.own[laid[0].shape][0]] == first
+
+
+def test_what_nobody_judges_is_followed_last() -> None:
+    """Where all states are such, those that reach out least are followed."""
+
+    def nothing(rests: Sequence[Area], _: Sequence[tuple[int, ...]]) -> Floats:
+        return np.full(len(rests), -np.inf)
+
+    assert len(beam(SQUARE, 4, nothing)[0].laid) >= 4
+
+
+def test_there_may_be_nothing_to_lay() -> None:
+    assert beam(Polygon()) == []
+    assert Beam(TOKENS, 12).run(SQUARE, TOKENS.counts, 0.035, Budget(0.0)) == []
+
+
+def test_a_wider_beam_fills_more() -> None:
+    solved = [
+        sum(
+            fill_outline(gluing(seed), LAYOUT, 60.0, method=Method(search=False, width=width))[
+                0
+            ].solved
+            for seed in range(12)
+        )
+        for width in (1, 12)
+    ]
+    assert solved[0] < solved[1]
+    assert solved[1] >= 10
+
+
+def test_who_filled_it_is_told() -> None:
+    (by_search,) = fill_outline(gluing(1), LAYOUT, 60.0)
+    (by_beam,) = fill_outline(gluing(1), LAYOUT, 60.0, method=Method(search=False))
+    assert (by_search.by, by_beam.by) == ("search", "beam")
+    assert not by_beam.complete
+    assert min(by_search.iou, by_beam.iou) > 0.95

@@ -1,0 +1,67 @@
+"""Who finds how a silhouette is filled: `solve`.
+
+The agent of outlines that comes with the package judges states for the beam, where a run's tokens
+are those that it learned with, of any size.
+"""
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+from tangram_agent.pretrained import PREFIX
+from tangram_agent.runs import load_run, read_changed
+from tangram_sim.areas import Area
+from tangram_sim.arrays import Floats
+from tangram_sim.errors import ConfigError
+from tangram_sim.layout import Layout
+from tangram_vision.silhouettes import Method
+from worker.config import BY_BEAM, TOGETHER
+
+if TYPE_CHECKING:  # needs torch
+    from tangram_agent.filler import Fillable
+
+JUDGE = f"{PREFIX}/tangram7_silhouette"
+
+
+class Learned:
+    """Values of the agent of outlines, which is loaded when it is asked first."""
+
+    def __init__(self, layout: Layout) -> None:
+        self._layout = layout
+
+    def __call__(self, rests: Sequence[Area], left: Sequence[tuple[int, ...]]) -> Floats:
+        """See `tangram_agent.filler.Fillable`."""
+        return self._fillable(rests, left)
+
+    @cached_property
+    def _fillable(self) -> "Fillable":
+        # Only here: most silhouettes are filled before anything learned is asked.
+        from tangram_agent.filler import Fillable  # noqa: PLC0415
+
+        return Fillable(load_run(JUDGE).policy.network, self._layout)
+
+
+def method_of(solve: str, layout: Layout) -> Method:
+    """How silhouettes are filled.
+
+    Args:
+        solve: one of `worker.config.SOLVERS`.
+        layout: the tokens.
+
+    Raises:
+        ConfigError: no agent learned to fill outlines with these tokens.
+    """
+    learned = [shape.name for shape in read_changed(JUDGE, {}).setup.layout.shapes]
+    known = [shape.name for shape in layout.shapes] == learned
+    values = Learned(layout) if known else None
+    if solve in BY_BEAM and values is None:
+        raise ConfigError(
+            f"solve={solve} needs an agent that learned to fill outlines with these tokens, and "
+            f"{JUDGE} learned it with seven tans: set solve=solver"
+        )
+    return {
+        TOGETHER: Method(values=values),
+        "solver": Method(),
+        "beam": Method(search=False, values=values),
+        "agent": Method(search=False, width=1, values=values),
+    }[solve]
