@@ -33,6 +33,7 @@ Values: TypeAlias = Callable[[Sequence[Area], Sequence[tuple[int, ...]]], Floats
 
 _OVER = 0.5  # of the smallest token's area that a token may reach out of what is left
 _TURN = np.radians(1.0)  # that a corner's angle may be wrong, and more where its sides are short
+_CORNERS = 40  # of a part that are looked at: tans leave no more
 _SIZE = 0.25  # value of a token as large as the smallest one
 _UNSEEN = -20.0  # value of what is not judged
 
@@ -102,7 +103,12 @@ class Beam:
         best: list[State] = []
         while kept and not budget.spent():
             budget.taken += len(kept)
-            states = [state for before in kept for state in self._next(before, tolerance)]
+            states = [
+                state
+                for before in kept
+                if not budget.spent()
+                for state in self._next(before, tolerance)
+            ]
             order = np.argsort(-self._worth(states), kind="stable")[: self._width]
             kept = [states[i] for i in order.tolist()]
             best = sorted([*best, *kept], key=self._uncovered)[: self._width]
@@ -141,6 +147,8 @@ class Beam:
     def _places(self, part: Polygon, left: tuple[int, ...], tolerance: float) -> list[list[_Place]]:
         """For each convex corner of a part what may lie there."""
         found = list(convex_corners(part, tolerance))
+        if len(found) > _CORNERS:  # of a rugged outline those with the longest sides
+            found = sorted(found, key=lambda one: -min(abs(one[3]), abs(one[4])))[:_CORNERS]
         if not found:
             return []
         point, along, angle, leaving, coming = np.array(found).T[..., None]

@@ -97,6 +97,15 @@ def test_what_nobody_judges_is_followed_last() -> None:
     assert len(beam(SQUARE, 4, nothing)[0].laid) >= 4
 
 
+def test_of_a_rugged_outline_few_corners_are_looked_at() -> None:
+    """A disc with a thousand teeth would else be tried at each of them."""
+    turn = np.linspace(0.0, 2.0 * np.pi, 2000, endpoint=False)
+    z = (0.56 + 0.02 * (np.arange(2000) % 2)) * np.exp(1j * turn)
+    teeth = Polygon(np.column_stack([z.real, z.imag]))
+    places = Beam(TOKENS, 1)._places(teeth, TOKENS.counts, 1e-4)
+    assert len(places) == 40
+
+
 def test_there_may_be_nothing_to_lay() -> None:
     assert beam(Polygon()) == []
     assert Beam(TOKENS, 12).run(SQUARE, TOKENS.counts, 0.035, Budget(0.0)) == []
