@@ -25,12 +25,20 @@ from tangram_vision.kinds import Kind, kinds_of
 from tangram_vision.outlines import BINARY_WAYS, GREY_WAYS, Way, outline
 from tangram_vision.ramps import fitted, ramps
 from tangram_vision.samples import binary
-from tangram_vision.silhouettes import TOGETHER, TOLERANCES, Filled, Method, nearest_fill, pieces
+from tangram_vision.silhouettes import (
+    SOLVED,
+    TOGETHER,
+    TOLERANCES,
+    Filled,
+    Method,
+    nearest_fill,
+    pieces,
+)
 
 _EACH_S = 0.5  # that one outline is searched
 _EACH = 2  # dissections of an outline that are compared, of a search
 _BEST = 3  # and of a beam
-_ALIKE = 0.02  # of a picture that may differ where nothing better is looked for
+_ALIKE = 0.02  # of a picture that may differ where nothing better is looked for, if it is filled
 _ROUGH = (0.035, 0.07)  # tolerances of a beam
 _AGAIN = 3  # tokens that are laid anew
 _TRIED = 12  # choices of these
@@ -195,7 +203,7 @@ class _Explainer:
         poses, differs = fitted(kinds, free, self._cover, touching(kinds, free))
         if self.best is None or differs < self.best.differs:
             self.best = _Explained(replace(found, poses=poses * size), kinds, poses, differs, by)
-        return self.best.differs < _ALIKE
+        return self.best.differs < _ALIKE and _overlap(self.best, self._cover) >= SOLVED
 
 
 def _ways(cover: Singles) -> Sequence[Way]:

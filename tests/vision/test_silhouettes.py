@@ -148,7 +148,7 @@ def test_tokens_that_lie_wrong_are_laid_anew(monkeypatch: pytest.MonkeyPatch) ->
     assert iou[1] > 0.97
 
 
-def test_what_explains_a_picture_worse_is_forgotten() -> None:
+def test_what_explains_a_picture_worse_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
     cover, truth = rough(1, 128)
     crop, corner = _cropped(cover)
     unit = ARENA / 128
@@ -160,3 +160,5 @@ def test_what_explains_a_picture_worse_is_forgotten() -> None:
         assert explainer._offer(laid, "beam") is alike
     assert explainer.best is not None
     assert explainer.best.differs < 0.02
+    monkeypatch.setattr("tangram_vision.silhouette_pictures._overlap", lambda *_: 0.94)
+    assert explainer._offer(laid, "beam") is False
