@@ -36,8 +36,11 @@ class Learned:
     @cached_property
     def _fillable(self) -> "Fillable":
         # Only here: most silhouettes are filled before anything learned is asked.
+        import torch  # noqa: PLC0415
+
         from tangram_agent.filler import Fillable  # noqa: PLC0415
 
+        torch.set_num_threads(1)  # more are slower for so little, above all beside other work
         return Fillable(load_run(JUDGE).policy.network, self._layout)
 
 
