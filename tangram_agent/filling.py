@@ -14,7 +14,7 @@ import shapely
 from tangram_agent.types import Flags
 from tangram_sim.areas import Area, opened, rings
 from tangram_sim.arrays import AnyArray, Bools, Ints, Singles
-from tangram_sim.dissections import Budget, Place, Search, Tokens
+from tangram_sim.dissections import Budget, Place, Search, Tokens, without
 from tangram_sim.geometry import outlines
 from tangram_sim.layout import Layout
 from tangram_sim.rings import as_area, covered_area
@@ -130,8 +130,7 @@ class Filling:
         if not laid.any():
             return area
         covered = covered_area(np.asarray(corners), self._layout, laid)
-        grid = 1e-7 * self._tokens.unit
-        return opened(shapely.difference(area, covered, grid_size=grid), self._tolerance)
+        return without(area, covered, self._tolerance, self._tokens.unit)
 
     def covered(self, corners: AnyArray, tokens: Bools) -> Area:
         """What tokens (K,) cover, as something to fill."""

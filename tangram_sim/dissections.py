@@ -310,16 +310,16 @@ def parts_of(rest: Area, least: float) -> list[Polygon]:
     return [part for part in polygons(rest) if part.area > _DUST * least]
 
 
-def without(rest: Area, polygon: Polygon, tolerance: float, unit: float) -> Area:
-    """What a token leaves of what was left, without slivers narrower than two tolerances.
+def without(rest: Area, laid: Area, tolerance: float, unit: float) -> Area:
+    """What tokens leave of what was left, without slivers narrower than two tolerances.
 
     Args:
         rest: what was left.
-        polygon: the token in its place.
+        laid: the tokens in their places.
         tolerance: in their units.
         unit: the root of all tokens' area.
     """
-    return opened(shapely.difference(rest, polygon, grid_size=_GRID * unit), tolerance)
+    return opened(shapely.difference(rest, laid, grid_size=_GRID * unit), tolerance)
 
 
 def convex_corners(

@@ -101,7 +101,7 @@ class Beam:
         """
         kept = [State((), left, valid(outline), 0.0)]
         best: list[State] = []
-        while kept and not budget.spent():
+        while kept:
             budget.taken += len(kept)
             states = [
                 state

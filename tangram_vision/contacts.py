@@ -5,6 +5,7 @@ complex numbers, in pixels. Legend: n tokens, m contacts.
 """
 
 from collections.abc import Sequence
+from itertools import combinations, product
 from typing import NamedTuple
 
 import numpy as np
@@ -50,18 +51,17 @@ def touching(kinds: Sequence[Kind], poses: Floats) -> list[Contact]:
     """The contacts of tokens with poses (n, 3)."""
     found = []
     radii = [float(np.hypot(*kind.corners.T).max()) for kind in kinds]
-    for one in range(len(kinds)):
-        for other in range(one + 1, len(kinds)):
-            apart = float(np.hypot(*(poses[one, :2] - poses[other, :2])))
-            if apart > radii[one] + radii[other] + _GAP:
-                continue
-            for edge in range(len(kinds[one].corners)):
-                for against in range(len(kinds[other].corners)):
-                    contact = Contact(one, edge, other, against)
-                    gap = _gap(kinds, poses, contact)
-                    near = abs(gap.wide) < _GAP and abs(gap.turn) < _PARALLEL
-                    if near and gap.shared > _SHORT:
-                        found.append(contact)
+    for one, other in combinations(range(len(kinds)), 2):
+        apart = float(np.hypot(*(poses[one, :2] - poses[other, :2])))
+        if apart > radii[one] + radii[other] + _GAP:
+            continue
+        edges = (range(len(kinds[token].corners)) for token in (one, other))
+        for edge, against in product(*edges):
+            contact = Contact(one, edge, other, against)
+            gap = _gap(kinds, poses, contact)
+            near = abs(gap.wide) < _GAP and abs(gap.turn) < _PARALLEL
+            if near and gap.shared > _SHORT:
+                found.append(contact)
     return found
 
 

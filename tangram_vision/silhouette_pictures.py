@@ -15,9 +15,9 @@ from itertools import combinations, islice
 import numpy as np
 import shapely
 
-from tangram_sim.areas import Area, opened
+from tangram_sim.areas import Area
 from tangram_sim.arrays import Floats, Singles
-from tangram_sim.dissections import Budget, Dissection, Laid, Search, Tokens, dissection
+from tangram_sim.dissections import Budget, Dissection, Laid, Search, Tokens, dissection, without
 from tangram_sim.layout import Layout
 from tangram_vision.beams import Beam
 from tangram_vision.contacts import touching
@@ -179,7 +179,8 @@ class _Explainer:
         choices = combinations(range(count), min(_AGAIN, count))
         for again in sorted(choices, key=lambda some: -wrong[list(some)].sum())[:_TRIED]:
             others = [k for k in range(count) if k not in again]
-            rest = opened(shapely.difference(area, shapely.union_all(bodies[others])), tolerance)
+            covered = shapely.union_all(bodies[others])
+            rest = without(area, covered, tolerance, self._tokens.unit)
             kept = [self._laid(best.found, k) for k in others]
             left = tuple(sum(k in own for k in again) for own in self._tokens.own)
             if self._lay(rest, kept, left, _ROUGH[:1]):

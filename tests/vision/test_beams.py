@@ -111,6 +111,11 @@ def test_there_may_be_nothing_to_lay() -> None:
     assert Beam(TOKENS, 12).run(SQUARE, TOKENS.counts, 0.035, Budget(0.0)) == []
 
 
+def test_a_beam_ends_within_a_depth() -> None:
+    """Of a rugged outline one depth can take seconds."""
+    assert Beam(TOKENS, 12).run(SQUARE, TOKENS.counts, 0.035, Budget(np.inf, nodes=1)) == []
+
+
 def test_a_wider_beam_fills_more() -> None:
     solved = [
         sum(
