@@ -11,7 +11,7 @@ import dacite
 
 from tangram_agent.config import AgentConfig, NetConfig
 from tangram_sim.actions import action_size, corner_bound, goal_rows, horizon
-from tangram_sim.config import RewardConfig, SimConfig
+from tangram_sim.config import SILHOUETTES, RewardConfig, SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import Layout, TokensConfig, make_layout
 from tangram_sim.rewards import reward_identity
@@ -84,7 +84,7 @@ class Setup:
     def _check_fills(self) -> None:
         """Refuse what an agent of outlines cannot use, or outlines that no agent sees."""
         agent, sim = self.agent, self.sim
-        if sim.observe != "silhouette":
+        if sim.observe not in SILHOUETTES:
             raise ConfigError(
                 f"agent.readout=outline needs sim.observe=silhouette, got {sim.observe}: set "
                 "sim=silhouette, or another agent"

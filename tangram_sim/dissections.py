@@ -114,7 +114,7 @@ class Budget:
     """What a search may cost, and what it did.
 
     Attributes:
-        until: when it ends, see `time.perf_counter`.
+        until: when it ends, see `time.thread_time`.
         nodes: steps that it may take.
         taken: steps that were taken.
     """
@@ -125,7 +125,7 @@ class Budget:
 
     def spent(self) -> bool:
         """Whether the search must end."""
-        return self.taken >= self.nodes or time.perf_counter() > self.until
+        return self.taken >= self.nodes or time.thread_time() > self.until
 
 
 class Tokens:

@@ -38,9 +38,9 @@ class Look:
 
 
 class Eye(Protocol):
-    """Finds tokens in a picture (P, P)."""
+    """Finds tokens in a picture (P, P), told where those lay before that should not have moved."""
 
-    def __call__(self, picture: Pixels, /) -> Look: ...  # noqa: D102
+    def __call__(self, picture: Pixels, before: Look | None = None, /) -> Look: ...  # noqa: D102
 
 
 class Sight:
@@ -102,7 +102,10 @@ class Sight:
         # What was given away before stays as it is.
         self.missing = self.missing.copy()
         for b, (state, token) in enumerate(zip(states, moved.tolist(), strict=True)):
-            self._take(b, self._eye(state), token, ways[b])
+            stayed = ~self.missing[b]
+            stayed[token] &= not ways[b].any()
+            before = Look(self._poses[b], self._flipped[b], stayed, stayed)
+            self._take(b, self._eye(state, before), token, ways[b])
         self.corners = self._layout.corners(self._poses, self._flipped)
         beyond = np.abs(self.corners).max(axis=2) > self._half
         out = np.logical_or.reduceat(beyond, self._layout.starts[:-1], axis=1)

@@ -101,7 +101,12 @@ def check_shown(sim: SimConfig, outlines: bool) -> None:
     Raises:
         ConfigError: says who takes them.
     """
-    if sim.observe in SILHOUETTES and not (outlines and sim.observe == "silhouette"):
+    if sim.observe == "silhouette_pictures" and outlines:
+        raise ConfigError(
+            "sim.observe=silhouette_pictures is for tangram-eval puzzle=, no agent learns from it: "
+            "set sim.observe=silhouette"
+        )
+    if sim.observe in SILHOUETTES and not outlines:
         raise ConfigError(
             f"sim.observe={sim.observe} is for an agent of outlines: train one with sim=silhouette "
             "agent=outline; tangram-eval puzzle= fills what it shows to others by a search, and "

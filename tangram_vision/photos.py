@@ -22,7 +22,7 @@ from tangram_vision.blobs import find_blobs, likeness
 from tangram_vision.kinds import kinds_of
 from tangram_vision.levels import MIN_CONTRAST
 from tangram_vision.seeing import Seen, see
-from tangram_vision.tilts import from_above
+from tangram_vision.tilts import from_above, shift
 
 # Along a side, at most, in which tokens are searched: the fewer, the less a skew matters.
 _PIXELS = (256, 128, 80)
@@ -91,15 +91,13 @@ class Shade:
     """What a photograph shows of a silhouette.
 
     Attributes:
-        cover: (P, P) coverage by it, of a square around it.
-        corner: column and row of the square's upper left corner in the photograph, about where
-            that was taken aslant.
-        pixels: of the photograph along a side of the square, likewise.
+        cover: (P, P) coverage by it, of a square around it, as from straight above.
+        back: homography (3, 3) of the square's points, 0 to 1 to the right and down, to columns and
+            rows of the photograph.
     """
 
     cover: Singles
-    corner: tuple[int, int]
-    pixels: int
+    back: Floats
 
 
 def find_silhouette(
@@ -119,10 +117,9 @@ def find_silhouette(
     cover = _coverage(np.asarray(picture.convert("L")))
     spots = _spots(cover, layout, source)
     part, corner = spots.cut_out()
-    if tilted:
-        part, moved = from_above(part)
-        corner = corner[0] + moved[0], corner[1] + moved[1]
-    return Shade(_smaller(part, _PIXELS[0]), corner, len(part))
+    above, back = from_above(part) if tilted else (part, np.eye(3))
+    size = np.diag([len(above), len(above), 1.0])
+    return Shade(_smaller(above, _PIXELS[0]), shift(*corner) @ back @ size)
 
 
 def _spots(cover: Singles, layout: Layout, source: str) -> "_Spots":

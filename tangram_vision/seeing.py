@@ -2,7 +2,8 @@
 
 Blobs that look like one token are fitted at once; the others are searched for tokens that touch.
 All tokens are known, so what explains one blob leaves less for the others: all are explained
-together. Tokens that look alike come in any order.
+together. Tokens that look alike come in any order. Who looked before need not find again what has
+not moved.
 """
 
 from collections import Counter
@@ -13,14 +14,17 @@ from itertools import combinations
 
 import numpy as np
 
-from tangram_sim.arrays import Bools, Complex, Floats, Ints, Pixels
+from tangram_sim.arrays import Bools, Complex, Floats, Ints, Pixels, Singles
 from tangram_sim.layout import Layout
+from tangram_sim.sight import Look
 from tangram_sim.targets import MAX_PILE
 from tangram_vision.blobs import Blobs, find_blobs, likeness
 from tangram_vision.edges import refined
 from tangram_vision.kinds import Kind, kinds_of
 from tangram_vision.levels import coverage
 from tangram_vision.piles import Laid, arrangements, reaching_out
+from tangram_vision.ramps import fitted, ramps
+from tangram_vision.recalling import recalled
 from tangram_vision.samples import binary, settled
 
 SURE = 0.5  # confidence from which a token counts as seen
@@ -71,18 +75,26 @@ class _Explained:
     doubtful: bool = False
 
 
-def see(picture: Pixels, layout: Layout, arena: float) -> Seen:
-    """What a picture (P, P) of an arena shows of a layout's tokens."""
+def see(picture: Pixels, layout: Layout, arena: float, before: Look | None = None) -> Seen:
+    """What a picture (P, P) of an arena shows of a layout's tokens.
+
+    Args:
+        picture: of all of them, and nothing else of their size.
+        layout: the tokens.
+        arena: width of the picture.
+        before: where those lay that are not told to have moved; None: nothing is known.
+    """
     pixels = len(picture)
     kinds = kinds_of(layout, arena, pixels)
     cover = coverage(picture)
     poses, flipped = np.zeros((layout.tokens, 3)), np.zeros(layout.tokens, np.bool_)
     confidence, count = np.zeros(layout.tokens), 0
     if cover is not None:
-        blobs = find_blobs(cover, _SMALLEST * min(kind.area for kind in kinds))
-        count = len(blobs)
+        puzzle = _puzzle(cover, kinds, Counter({kind.shape: len(kind.tokens) for kind in kinds}))
+        count = len(puzzle.blobs)
         left = {kind.shape: list(kind.tokens) for kind in kinds}
-        for one in _Puzzle(blobs, kinds, sharp=binary(cover)).explained():
+        stayed = None if before is None else _stayed(puzzle, cover, before, arena)
+        for one in stayed or puzzle.explained():
             for number, pose in zip(one.laid.kinds, one.laid.poses, strict=True):
                 token = left[kinds[number].shape].pop(0)
                 poses[token], flipped[token] = pose, kinds[number].flipped
@@ -93,12 +105,61 @@ def see(picture: Pixels, layout: Layout, arena: float) -> Seen:
     return Seen(poses, flipped, confidence, count)
 
 
+def _puzzle(cover: Singles, kinds: Sequence[Kind], left: Counter[int]) -> "_Puzzle":
+    """What coverage (P, P) by so many tokens of each shape shows."""
+    blobs = find_blobs(cover, _SMALLEST * min(kind.area for kind in kinds))
+    return _Puzzle(blobs, kinds, left, binary(cover))
+
+
+def _stayed(
+    puzzle: "_Puzzle", cover: Singles, before: Look, arena: float
+) -> list[_Explained] | None:
+    """What all blobs are, where piles have tokens that lie where they lay before.
+
+    Returns:
+        None where no pile has any, or where they and what else is found do not explain all piles.
+    """
+    kinds, side = puzzle.kinds, len(cover)
+    piles = puzzle.piles()
+    if piles is None:
+        return None
+    names, poses = recalled(kinds, before, arena, piles)
+    if not names:
+        return None
+    gone = ramps([kinds[name] for name in names], poses, side).sum(axis=0)
+    rest = np.clip(cover - gone, 0.0, None).astype(np.float32)
+    left = puzzle.left - Counter(kinds[name].shape for name in names)
+    alone = list[_Explained]()
+    for one in _puzzle(rest, kinds, left).explained():
+        if _levels_at(piles, one.laid.poses).max() < 0.5:
+            alone.append(one)
+        else:
+            names, poses = [*names, *one.laid.kinds], np.vstack([poses, one.laid.poses])
+    poses, differs = fitted([kinds[name] for name in names], poses, piles)
+    if differs >= _DIFFERS:
+        return None
+    return [*alone, _Explained(Laid(tuple(names), poses, differs), _sureness(differs))]
+
+
+def _levels_at(cover: Singles, poses: Floats) -> Floats:
+    """(n,) coverage (P, P) in the middle of tokens."""
+    column, row = poses[:, 0].astype(np.int64), (-poses[:, 1]).astype(np.int64)
+    most = len(cover) - 1
+    return cover[np.clip(row, 0, most), np.clip(column, 0, most)].astype(np.float64)
+
+
+def _sureness(differs: float) -> float:
+    """Of a pile that is explained but for such a share of it."""
+    return 1.0 - 0.5 * differs / _DIFFERS
+
+
 @dataclass
 class _Puzzle:
     """The blobs of a picture, to be explained together."""
 
     blobs: Blobs
     kinds: Sequence[Kind]
+    left: Counter[int]
     sharp: bool
     _known: dict[tuple[int, tuple[int, ...]], list[_Explained]] = field(default_factory=dict)
     _tries: int = 0
@@ -112,8 +173,7 @@ class _Puzzle:
         """What the blobs are, as many as can be explained with the tokens that there are."""
         if not len(self.blobs):
             return []
-        singles = self._singles()
-        left = Counter({kind.shape: len(kind.tokens) for kind in self.kinds})
+        singles, left = self._singles, self.left
         # Blobs that look like one token first: they cost nothing.
         alone = Counter(self.kinds[one.laid.kinds[0]].shape for one in singles.values())
         if len(singles) == len(self.blobs) and alone <= left:
@@ -201,7 +261,7 @@ class _Puzzle:
         options = [
             _Explained(
                 best[0],
-                1.0 - 0.5 * best[0].differs / _DIFFERS,
+                _sureness(best[0].differs),
                 len(best) > 1 and best[1].differs < best[0].differs + _ALIKE,
             )
             for best in sets.values()
@@ -209,6 +269,14 @@ class _Puzzle:
         self._known[key] = options
         return options
 
+    def piles(self) -> Singles | None:
+        """(P, P) coverage by what is whole and no single token; None if there is none."""
+        blobs = self.blobs
+        many = [b for b in range(len(blobs)) if b not in self._singles and not blobs.cut[b]]
+        side = blobs.cover.shape[1]
+        return blobs.cover.reshape(-1, side, side)[many].sum(axis=0) if many else None
+
+    @cached_property
     def _singles(self) -> dict[int, _Explained]:
         """The blobs that look like one token."""
         blobs, kinds = self.blobs, self.kinds

@@ -7,7 +7,7 @@ it, too.
 Legend: H x W pixels of a picture.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -17,13 +17,15 @@ from PIL import Image, ImageDraw
 
 from tangram_sim.areas import Area
 from tangram_sim.arrays import Bools, Floats
+from tangram_sim.dissections import Dissection
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import Layout
 from tangram_vision.outline_files import Drawn, read_outline
 from tangram_vision.photos import Shade, find_silhouette
 from tangram_vision.picture_files import read_picture
-from tangram_vision.silhouette_pictures import fill_picture, moved
+from tangram_vision.silhouette_pictures import fill_picture
 from tangram_vision.silhouettes import TOGETHER, Filled, Method, attempt_outline, fill_outline
+from tangram_vision.tilts import mapped, shift
 
 _DRAWN = 640  # pixels along the longer side of an outline that is drawn
 _BORDER = 0.1  # of it, around the outline
@@ -39,17 +41,20 @@ class Silhouette:
     Attributes:
         picture: of it, in colour.
         mask: (H, W) which of its pixels are the silhouette's.
-        filled: how, in different ways, or how it was tried; poses are in the units of the layout,
-            from the picture's upper left corner.
-        unit: pixels of the picture in such a unit.
+        filled: how, in different ways, or how it was tried; poses are in the units of the layout.
+        drawing: homography (3, 3) of points in such units to columns and rows of the picture.
         share: its area over that of the tokens where the file tells its scale, and they differ.
     """
 
     picture: Image.Image
     mask: Bools
     filled: tuple[Filled, ...]
-    unit: float
+    drawing: Floats
     share: float | None = None
+
+    def corners(self, layout: Layout, found: Dissection) -> Floats:
+        """(V, 2) of the tokens, columns and rows of the picture."""
+        return mapped(self.drawing, layout.corners(found.poses, found.flipped))
 
 
 def fill_silhouette(
@@ -100,7 +105,8 @@ def _from_outline(
     filled = attempt_outline(placed, layout, seconds) if wrong else None
     every = (filled,) if filled else tuple(fill_outline(placed, layout, seconds, count, method))
     mask = _mask(placed, size, unit)
-    return Silhouette(_inked(mask), mask, every, unit, share if wrong else None)
+    drawing = np.diag([unit, -unit, 1.0])
+    return Silhouette(_inked(mask), mask, every, drawing, share if wrong else None)
 
 
 def _framed(area: Area, scale: float) -> tuple[Area, tuple[int, int], float]:
@@ -141,19 +147,13 @@ def _from_picture(
     share = float(shade.cover.sum()) / shade.cover.size
     view = float(np.sqrt(layout.areas.sum() / share))
     filled = fill_picture(shade.cover, layout, view, seconds, method)
-    unit = shade.pixels / view
-    way = np.array([shade.corner[0], -shade.corner[1]]) / unit
-    if filled.found is not None:
-        filled = replace(filled, found=moved(filled.found, way))
-    if filled.attempt is not None:
-        filled = replace(filled, attempt=moved(filled.attempt, way))
-    return Silhouette(picture, _shaded(shade, picture.size), (filled,), unit)
+    drawing = shade.back @ np.diag([1.0 / view, -1.0 / view, 1.0])
+    return Silhouette(picture, _shaded(shade, picture.size), (filled,), drawing)
 
 
 def _shaded(shade: Shade, size: tuple[int, int]) -> Bools:
     """(H, W) where a photograph of such a width and height shows the silhouette."""
-    width, height = size
-    large = cv2.resize(shade.cover, (shade.pixels, shade.pixels), interpolation=cv2.INTER_LINEAR)
-    room = np.pad(np.asarray(large) > 0.5, ((height, height), (width, width)))
-    left, top = shade.corner
-    return room[height - top :, width - left :][:height, :width]
+    pixels = 1.0 / len(shade.cover)
+    # OpenCV has the middle of a pixel at whole numbers.
+    matrix = shift(-0.5, -0.5) @ shade.back @ np.diag([pixels, pixels, 1.0]) @ shift(0.5, 0.5)
+    return np.asarray(cv2.warpPerspective(shade.cover, matrix, size)) > 0.5

@@ -77,22 +77,22 @@ def fill_picture(
         seconds: for all of it.
         method: how.
     """
-    begin, unit = time.perf_counter(), view / len(cover)
+    begin, unit = time.thread_time(), view / len(cover)
     crop, corner = _cropped(cover)
     explainer = _Explainer(crop, layout, kinds_of(layout, view, len(cover)), unit, method)
     explainer.run(Budget(begin + _SHARE * seconds))
     best, nodes = explainer.best, explainer.budget.taken
     if best is not None:
         iou = _overlap(best, crop)
-        found = moved(best.found, corner * unit)
-        return Filled(found, iou, time.perf_counter() - begin, nodes, False, by=best.by)
+        found = _moved(best.found, corner * unit)
+        return Filled(found, iou, time.thread_time() - begin, nodes, False, by=best.by)
     area, late = explainer.outlined(_ways(crop)[0]), Budget(begin + seconds)
     laid, iou = nearest_fill(area, layout, late, explainer.attempts, method)
-    attempt = None if laid is None else moved(laid, corner * unit)
-    return Filled(None, iou, time.perf_counter() - begin, nodes, False, attempt)
+    attempt = None if laid is None else _moved(laid, corner * unit)
+    return Filled(None, iou, time.thread_time() - begin, nodes, False, attempt)
 
 
-def moved(found: Dissection, way: Floats) -> Dissection:
+def _moved(found: Dissection, way: Floats) -> Dissection:
     """The same dissection so far (2,) away."""
     return replace(found, poses=found.poses + (*way, 0.0))
 
@@ -140,7 +140,7 @@ class _Explainer:
     def _search(self, area: Area) -> bool:
         """Offer what a search finds; whether pixels are then alike."""
         end = self.budget.until
-        self.budget.until = min(time.perf_counter() + _EACH_S, end)
+        self.budget.until = min(time.thread_time() + _EACH_S, end)
         for tolerance in TOLERANCES[1:]:
             search = Search(self._tokens, tolerance * self._tokens.unit, self.budget)
             for laid in islice(search.run(area), _EACH):

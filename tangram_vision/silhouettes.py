@@ -134,7 +134,7 @@ def fill_outline(
         count: at most so many; a beam finds one.
         method: how.
     """
-    tokens, begin = Tokens(layout), time.perf_counter()
+    tokens, begin = Tokens(layout), time.thread_time()
     budget, tried = Budget(begin + _SHARE * seconds), list[list[Laid]]()
     for tolerance in TOLERANCES if method.search else ():
         search = Search(tokens, tolerance * tokens.unit, budget)
@@ -143,7 +143,7 @@ def fill_outline(
             found = dissection(tokens, laid)
             iou = overlap(covered(layout, found), area)
             if iou >= SOLVED and not any(_alike(tokens, layout, found, one.found) for one in every):
-                passed = time.perf_counter() - begin
+                passed = time.thread_time() - begin
                 every.append(Filled(found, iou, passed, budget.taken, False))
             if len(every) == count:
                 return every
@@ -154,7 +154,7 @@ def fill_outline(
             break
     loose = Budget(begin + seconds)
     nearest, iou = nearest_fill(area, layout, loose, tried, method)
-    passed = time.perf_counter() - begin
+    passed = time.thread_time() - begin
     if method.search:
         complete = not budget.spent()
         return [Filled(None, iou, passed, budget.taken, complete, nearest)]
@@ -165,10 +165,10 @@ def fill_outline(
 
 def attempt_outline(area: Area, layout: Layout, seconds: float) -> Filled:
     """The tokens that could be laid in an outline whose area is not theirs."""
-    begin = time.perf_counter()
+    begin = time.thread_time()
     budget = Budget(begin + seconds)
     laid, iou = nearest_fill(area, layout, budget, (), TOGETHER)
-    return Filled(None, iou, time.perf_counter() - begin, budget.taken, False, laid)
+    return Filled(None, iou, time.thread_time() - begin, budget.taken, False, laid)
 
 
 def nearest_fill(

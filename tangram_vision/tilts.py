@@ -31,22 +31,36 @@ _REST = 0.25  # share of it that may remain
 _MARGIN = 8  # pixels around the silhouette
 
 
-def from_above(cover: Singles) -> tuple[Singles, tuple[int, int]]:
+def from_above(cover: Singles) -> tuple[Singles, Floats]:
     """Coverage (P, P) as if seen from straight above, of about the same area.
 
     Returns:
-        The coverage (Q, Q), and the column and row of its upper left corner in the picture
-        before: the silhouette's middle stays about where it was. Where nothing is to be corrected,
-        the picture itself and zeros.
+        The coverage (Q, Q), and the homography (3, 3) of its points to those of the picture before;
+        pixels begin at whole numbers. Where nothing is to be corrected, the picture itself, and the
+        homography that changes nothing.
     """
     size = len(cover)
     small = cv2.resize(cover, (min(size, _PIXELS),) * 2, interpolation=cv2.INTER_AREA)
     sides = _sides(np.asarray(small, np.float32)) * (size / len(small))
     correction = _correction(sides) if len(sides) >= _LEAST else None
     if correction is None:
-        return cover, (0, 0)
-    matrix, corner, side = _placed(correction, sides)
-    return np.asarray(cv2.warpPerspective(cover, matrix, (side, side)), np.float32), corner
+        return cover, np.eye(3)
+    matrix, side = _placed(correction, sides)
+    above = np.asarray(cv2.warpPerspective(cover, matrix, (side, side)), np.float32)
+    # OpenCV has the middle of a pixel at whole numbers.
+    return above, shift(0.5, 0.5) @ np.linalg.inv(matrix) @ shift(-0.5, -0.5)
+
+
+def shift(right: float, down: float) -> Floats:
+    """The homography (3, 3) that moves points so far."""
+    return np.array([[1.0, 0.0, right], [0.0, 1.0, down], [0.0, 0.0, 1.0]])
+
+
+def mapped(matrix: Floats, points: Floats) -> Floats:
+    """Points (..., 2) by a homography (3, 3)."""
+    there = np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1) @ matrix.T
+    found: Floats = there[..., :2] / there[..., 2:]
+    return found
 
 
 def _sides(cover: Singles) -> Floats:
@@ -73,7 +87,7 @@ def _correction(sides: Floats) -> Floats | None:
     start = np.append(_START, _grid(own, length))
 
     def off(unknown: Floats) -> Floats:
-        return _off(_mapped(_matrix(unknown[:3]), own), unknown[3])
+        return _off(mapped(_matrix(unknown[:3]), own), unknown[3])
 
     def residuals(unknown: Floats) -> Floats:
         return np.concatenate([off(unknown) * weight, (unknown[:3] - _START) / _USUAL])
@@ -104,13 +118,6 @@ def _matrix(unknown: Floats) -> Floats:
     )
 
 
-def _mapped(matrix: Floats, points: Floats) -> Floats:
-    """Points (..., 2) by a homography."""
-    there = np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1) @ matrix.T
-    mapped: Floats = there[..., :2] / there[..., 2:]
-    return mapped
-
-
 def _grid(sides: Floats, length: Floats) -> float:
     """The angle of the grid that sides (S, 2, 2) are nearest to."""
     along = (sides[:, 1] - sides[:, 0]) @ np.array([1.0, 1j])
@@ -124,16 +131,10 @@ def _off(sides: Floats, grid: float) -> Floats:
     return off
 
 
-def _placed(matrix: Floats, sides: Floats) -> tuple[Floats, tuple[int, int], int]:
-    """The homography into a square around the silhouette.
-
-    Returns:
-        That, the upper left corner of the square, and its pixels.
-    """
-    ends = _mapped(matrix, sides)
+def _placed(matrix: Floats, sides: Floats) -> tuple[Floats, int]:
+    """The homography into a square around the silhouette, and the square's pixels."""
+    ends = mapped(matrix, sides)
     low, high = ends.min(axis=(0, 1)), ends.max(axis=(0, 1))
     side = int(np.ceil((high - low).max())) + 2 * _MARGIN
-    left, top = np.round((low + high - side) / 2.0).astype(np.int64).tolist()
-    shift = np.array([[1.0, 0.0, -left], [0.0, 1.0, -top], [0.0, 0.0, 1.0]])
-    placed: Floats = shift @ matrix
-    return placed, (left, top), side
+    left, top = np.round((low + high - side) / 2.0).tolist()
+    return shift(-left, -top) @ matrix, side

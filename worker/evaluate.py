@@ -4,12 +4,11 @@ import json
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from rich.console import Console
 from rich.table import Table
@@ -19,11 +18,9 @@ from tangram_agent.files import write_whole
 from tangram_agent.outcome import plural
 from tangram_agent.runs import Run, load_changed
 from tangram_agent.setup import Setup
-from tangram_sim.arrays import Floats
 from tangram_sim.config import SILHOUETTES, SimConfig
-from tangram_sim.errors import ConfigError
 from tangram_sim.game_drawing import figure_sheet
-from tangram_sim.settings import told
+from tangram_sim.settings import refuse_ignored, told
 from worker.baselines import (
     Player,
     Told,
@@ -34,19 +31,27 @@ from worker.baselines import (
 )
 from worker.config import TOGETHER, EvalConfig, source_and_names
 from worker.fitted import fitted_policy
-from worker.metrics import SOLVED, assembled, pose_errors, summarise
 from worker.oracle import oracle_policy
-from worker.puzzles import Figure, find_figures, play_figures
-from worker.rollout import Played, at_once
+from worker.puzzles import find_figures
+from worker.rollout import at_once
+from worker.scores import (
+    OF_AREAS,
+    RUN,
+    Scored,
+    Scores,
+    of_outlines,
+    of_several,
+    score_hidden,
+    score_outlines,
+    score_pictured,
+    score_puzzles,
+)
 from worker.sweeping import sweeping_policy
 from worker.test_set import FixedTests, greedy
 
 MAX_PICTURES = 100  # on a sheet
-RUN = "this run"
 MAX_PADDED = 5  # policies in a table
 MAX_LINES = 40  # of puzzles and of faults on the screen
-
-Scores = dict[str, Any]  # numbers, and `coverage_each` of the episodes of several tokens
 
 # Scores in the order of the table, with their labels and digits; the rest is only in the file.
 _REWARDS = {
@@ -88,12 +93,6 @@ _SEVERAL = {
     "ms_per_decision": ("ms for each action", 1),
     "ms_slowest": ("CPU ms of the slowest", 0),
 }
-# What is told of filled outlines: nothing of where a piece should lie.
-_OF_AREAS = (
-    *("mean_reward", "mean_reward_camera", "raw_overlap", "raw_overlap_p10"),
-    *("coverage", "iou", "blocked", "refused", "actions_used"),
-)
-_COUNTS = ("wrong", "doubly_used", "refused", "blocked", "actions_used")
 
 
 def evaluate_run(config: EvalConfig) -> int:
@@ -165,7 +164,7 @@ def _scored(tests: FixedTests, player: Player) -> Scores:
     played, setup = tests.play(playing(player, tests.env)), tests.setup
     scores: Scores = dict(tests.scores(played))
     if setup.fills:
-        return {key: scores[key] for key in _OF_AREAS if key in scores} | _filled(setup, played)
+        return {key: scores[key] for key in OF_AREAS if key in scores} | of_outlines(setup, played)
     return scores | (of_several(setup, played) if setup.layout.tokens > 1 else {})
 
 
@@ -183,8 +182,12 @@ def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
     source, names = source_and_names(config.puzzle or ())
     setup = run.setup
     found = find_figures(source, setup, names, config.turns, config.skip_invalid)
+    if setup.fills and config.solve != TOGETHER:
+        refuse_ignored(f"solve={config.solve}", "a run that fills outlines itself", "leave it out")
     given = setup, found.figures, policies(run), config.seed
-    if setup.fills:
+    if setup.fills and setup.sim.observe == "silhouette_pictures":
+        scored = score_pictured(run, found.figures, config.seed)
+    elif setup.fills:
         scored = score_outlines(*given)
     elif setup.sim.observe in SILHOUETTES:
         scored = score_hidden(*given, config.solve)
@@ -254,123 +257,6 @@ def _observed(sim: SimConfig) -> str:
     return f"corners with noise {sim.corner_noise:g}" if sim.corner_noise else "exact corners"
 
 
-@dataclass(frozen=True, eq=False)
-class Scored:
-    """Scores of several policies on E puzzles.
-
-    Attributes:
-        means: over all puzzles, by the policies' names.
-        puzzles: what the run made of each.
-        titles: of the puzzles.
-        ends: (E, V, 2) corners of the tokens as the run left them.
-        goals: (E, V, 2) corners of the puzzles' pieces.
-        told: what is to be known of the scores.
-    """
-
-    means: dict[str, Scores]
-    puzzles: list[dict[str, Any]]
-    titles: list[str]
-    ends: Floats
-    goals: Floats
-    told: str
-
-
-def score_puzzles(
-    setup: Setup, figures: Sequence[Figure], players: Mapping[str, Player], seed: int
-) -> Scored:
-    """Scores of each policy on the same starts."""
-    scores, played = dict[str, Scores](), dict[str, Played]()
-    for name, player in players.items():
-        played[name] = play_figures(setup, figures, player, seed)
-        own = summarise(setup.layout, setup.sim, played[name], own_reward=False)
-        scores[name] = own | of_several(setup, played[name])
-    run, titles = played[RUN], [figure.title for figure in figures]
-    each = _one_by_one(setup, figures, run)
-    return Scored(scores, each, titles, run.ends, run.goals, "positions in arena units")
-
-
-def score_outlines(
-    setup: Setup, figures: Sequence[Figure], players: Mapping[str, Player], seed: int
-) -> Scored:
-    """Scores of each policy that sees the outlines of puzzles, and fills them itself."""
-    played = {name: play_figures(setup, figures, player, seed) for name, player in players.items()}
-    scores = {name: _filled(setup, own) for name, own in played.items()}
-    run, found = played[RUN], assembled(setup.layout, played[RUN])
-    each = [
-        {
-            "name": figure.name,
-            "degrees": figure.degrees,
-            "coverage": float(found.coverage[e]),
-            "iou": float(found.iou[e]),
-            "solved": bool(found.iou[e] >= SOLVED),
-            **{name: int(getattr(found, name)[e]) for name in ("blocked", "refused")},
-            "actions_used": int(found.actions_used[e]),
-            "seconds": float(run.seconds[e]),
-        }
-        for e, figure in enumerate(figures)
-    ]
-    titles = [figure.title for figure in figures]
-    told = "filled by the run itself; any dissection counts, so no errors of position and angle"
-    return Scored(scores, each, titles, run.ends, run.goals, told)
-
-
-def _filled(setup: Setup, played: Played) -> Scores:
-    """Scores of filled outlines; any dissection counts, so none tells of single pieces."""
-    found = assembled(setup.layout, played)
-    means = {key: value for key, value in found.means().items() if key in _OF_AREAS}
-    solved = float(np.mean(found.iou >= SOLVED))
-    return means | {"share_solved_iou": solved} | of_several(setup, played)
-
-
-def score_hidden(
-    setup: Setup,
-    figures: Sequence[Figure],
-    players: Mapping[str, Player],
-    seed: int,
-    solve: str = TOGETHER,
-) -> Scored:
-    """Scores of each policy that lays what was found in the silhouettes.
-
-    Raises:
-        ConfigError: OpenCV or shapely is not installed.
-    """
-    try:
-        # Only here: other puzzles need neither.
-        from worker.hidden import hide, means, one_by_one, play_hidden  # noqa: PLC0415
-    except ImportError as error:
-        raise ConfigError(
-            f"sim.observe={setup.sim.observe} needs OpenCV and shapely ({error}): install "
-            "opencv-python-headless and shapely, or set sim.observe=corners"
-        ) from error
-    hidden = hide(setup, figures, seed, solve)
-    laid = {name: play_hidden(hidden, player, seed) for name, player in players.items()}
-    scores = {name: means(hidden, own) for name, own in laid.items()}
-    told = (
-        f"{hidden.filled} of {len(figures)} filled ({_by(hidden.filled_by)}); any dissection "
-        "counts, so no errors of position and angle, and no pieces under others"
-    )
-    each, ends = one_by_one(hidden, laid[RUN]), laid[RUN].ends
-    return Scored(scores, each, hidden.titles, ends, hidden.goals, told)
-
-
-def _by(counts: Mapping[str, int]) -> str:
-    """Who filled how many, in words."""
-    return ", ".join(f"{count} by the {who}" for who, count in counts.items())
-
-
-def of_several(setup: Setup, played: Played) -> Scores:
-    """What only evaluations tell: time, and every coverage, for tests on pairs of episodes."""
-    seconds = float(np.mean(played.seconds))
-    scores: Scores = {
-        "seconds_per_puzzle": seconds,
-        "ms_per_decision": 1e3 * seconds / played.refused.shape[1],
-        "coverage_each": np.round(played.overlap, 6).tolist(),
-    }
-    if at_once(setup) == 1:
-        scores["ms_slowest"] = 1e3 * float(played.slowest.max())
-    return scores
-
-
 def write_sheet(path: str, setup: Setup, scored: Scored) -> None:
     """Write a picture of every figure's end, of at most `MAX_PICTURES`.
 
@@ -382,25 +268,6 @@ def write_sheet(path: str, setup: Setup, scored: Scored) -> None:
     sheet = figure_sheet(setup.layout, setup.sim.arena, ends, goals, scored.titles[:MAX_PICTURES])
     sheet.save(picture, format="PNG")
     write_whole(Path(path), picture.getvalue())
-
-
-def _one_by_one(setup: Setup, figures: Sequence[Figure], played: Played) -> list[dict[str, Any]]:
-    found = assembled(setup.layout, played)
-    position, angle = pose_errors(setup.layout, played.ends, played.goals)
-    return [
-        {
-            "name": figure.name,
-            "degrees": figure.degrees,
-            "coverage": float(found.coverage[e]),
-            "iou": float(found.iou[e]),
-            "solved": bool(found.solved[e]),
-            **{name: int(getattr(found, name)[e]) for name in _COUNTS},
-            "position_errors": position[e].tolist(),
-            "angle_errors_deg": angle[e].tolist(),
-            "seconds": float(played.seconds[e]),
-        }
-        for e, figure in enumerate(figures)
-    ]
 
 
 def scores_table(title: str, caption: str, scores: Mapping[str, Scores]) -> Table:

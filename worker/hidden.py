@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from tangram_agent.config import AgentConfig, NetConfig
 from tangram_agent.setup import Setup
 from tangram_sim.areas import Area
 from tangram_sim.arrays import Bools, Floats, Ints
@@ -25,10 +26,8 @@ from tangram_sim.lens import Lens, View
 from tangram_vision.levels import coverage
 from tangram_vision.portraits import portrait
 from tangram_vision.silhouette_pictures import fill_picture
-from tangram_vision.silhouettes import Filled, Method, fill_outline, silhouette
+from tangram_vision.silhouettes import TOGETHER, Filled, Method, fill_outline, silhouette
 from worker.baselines import Player
-from worker.config import TOGETHER
-from worker.methods import method_of
 from worker.metrics import SOLVED, iou
 from worker.puzzles import Figure, figure_generator, play_figures
 from worker.rollout import Played
@@ -136,20 +135,16 @@ class Laid:
         return np.asarray(self.iou >= SOLVED)
 
 
-def hide(setup: Setup, figures: Sequence[Figure], seed: int, solve: str = TOGETHER) -> Hidden:
+def hide(setup: Setup, figures: Sequence[Figure], seed: int, method: Method = TOGETHER) -> Hidden:
     """Search how a run's tokens fill puzzles of which only the silhouettes are shown.
 
     Args:
         setup: with `sim.observe` one of `SILHOUETTES`.
         figures: E puzzles.
         seed: of what disturbs the camera.
-        solve: who searches, see `worker.config.SOLVERS`.
-
-    Raises:
-        ConfigError: nobody learned to fill outlines with these tokens.
+        method: how they are filled.
     """
     layout, sim, shown = setup.layout, setup.sim, tuple(figures)
-    method = method_of(solve, layout)
     if sim.observe == "silhouette":
         searches = tuple(_outline_search(layout, figure, method) for figure in shown)
         return Hidden(_seeing(setup, "corners"), shown, searches, None)
@@ -161,7 +156,10 @@ def hide(setup: Setup, figures: Sequence[Figure], seed: int, solve: str = TOGETH
 def _seeing(setup: Setup, observe: str) -> Setup:
     """The task of who sees what was found; which targets training drew does not matter."""
     usual = {name: getattr(SimConfig, name) for name in ("targets", "spread", "stages")}
-    return replace(setup, sim=replace(setup.sim, observe=observe, **usual))
+    sim = replace(setup.sim, observe=observe, **usual)
+    if setup.fills:  # who lays it sees pieces
+        return replace(setup, sim=sim, agent=AgentConfig(), net=NetConfig())
+    return replace(setup, sim=sim)
 
 
 def _outline_search(layout: Layout, figure: Figure, method: Method) -> Search:

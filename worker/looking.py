@@ -29,8 +29,8 @@ def make_eye(setup: Setup) -> Eye | None:
         raise no_opencv(str(error)) from error
     layout, arena = setup.layout, setup.sim.arena
 
-    def look(picture: Pixels) -> Look:
-        seen = see(picture, layout, arena)
+    def look(picture: Pixels, before: Look | None = None) -> Look:
+        seen = see(picture, layout, arena, before)
         return Look(seen.poses, seen.flipped, np.asarray(seen.confidence > 0.0), seen.found)
 
     return look

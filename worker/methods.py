@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 from tangram_agent.pretrained import PREFIX
-from tangram_agent.runs import load_run, read_changed
+from tangram_agent.runs import Run, load_run, read_changed
 from tangram_sim.areas import Area
 from tangram_sim.arrays import Floats
 from tangram_sim.errors import ConfigError
@@ -68,3 +68,12 @@ def method_of(solve: str, layout: Layout) -> Method:
         "beam": Method(search=False, values=values),
         "agent": Method(search=False, width=1, values=values),
     }[solve]
+
+
+def learned_method(run: Run) -> Method:
+    """By the beam of an agent of outlines, as wide as that looks ahead, without a search."""
+    from tangram_agent.filler import Fillable  # noqa: PLC0415  # needs torch
+
+    agent = run.setup.agent
+    width = agent.beam if agent.lookahead == "values" else 1
+    return Method(search=False, width=width, values=Fillable(run.policy.network, run.setup.layout))

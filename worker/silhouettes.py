@@ -29,7 +29,6 @@ from worker.puzzles import Figure, reach_beyond
 from worker.views import outlined
 
 if TYPE_CHECKING:  # they need OpenCV and shapely
-    from tangram_sim.dissections import Dissection
     from tangram_vision.silhouette_files import Silhouette
 
 SECONDS = 5.0  # of the search
@@ -99,14 +98,9 @@ def read_silhouette(
             f"{source} reaches {reach:.3g} from its middle at the run's scale, and its arena only "
             f"{setup.sim.arena / 2.0:.3g}: name a run of a larger arena"
         )
-    outlines = np.stack([_corners(drawn, layout, one) for one in laid])
+    outlines = np.stack([drawn.corners(layout, one) for one in laid])
     figure = Figure(Path(name).stem, 0.0, poses, laid[0].flipped)
     return Shown(drawn.picture, outlines, figure, _told(drawn, count))
-
-
-def _corners(drawn: "Silhouette", layout: Layout, laid: "Dissection") -> Floats:
-    """(V, 2) of the tokens, pixels of the picture."""
-    return layout.corners(laid.poses, laid.flipped) * (drawn.unit, -drawn.unit)
 
 
 def _told(drawn: "Silhouette", count: int) -> str:
@@ -171,7 +165,7 @@ def _draw_attempt(drawn: "Silhouette", layout: Layout) -> Image.Image:
     (filled,) = drawn.filled
     laid = filled.found or filled.attempt
     count = 0 if laid is None else len(laid.laid)
-    corners = np.zeros((len(layout.body), 2)) if laid is None else _corners(drawn, layout, laid)
+    corners = np.zeros((len(layout.body), 2)) if laid is None else drawn.corners(layout, laid)
     lies = np.zeros(layout.tokens, np.bool_)
     if laid is not None:
         lies[laid.laid] = True

@@ -45,7 +45,7 @@ class Camera:
         self._look = Look(np.zeros((tokens, 3)), nothing, nothing, nothing)
         self.shown: list[Pixels] = []
 
-    def __call__(self, picture: Pixels) -> Look:
+    def __call__(self, picture: Pixels, _: Look | None = None) -> Look:
         """Keep it."""
         self.shown.append(picture)
         return self._look

@@ -30,8 +30,9 @@ from tangram_sim.errors import ConfigError, RunError, TangramError
 from tangram_sim.settings import told
 from tangram_sim.targets import has_all_tans
 from worker.config import EvalConfig
-from worker.evaluate import RUN, policies, score_outlines, score_policies, score_puzzles
+from worker.evaluate import policies, score_policies
 from worker.puzzles import find_figures
+from worker.scores import RUN, score_outlines, score_puzzles
 from worker.test_set import greedy
 
 PACKAGE = Path(__file__).resolve().parents[2] / "tangram_agent" / "pretrained"

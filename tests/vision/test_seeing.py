@@ -12,7 +12,10 @@ from tangram_sim.connected import sample_connected
 from tangram_sim.layout import Layout
 from tangram_sim.lens import Lens
 from tangram_sim.pictures import rasterise
+from tangram_sim.puzzles import library
 from tangram_sim.sampling import sample_batch
+from tangram_sim.sight import Look
+from tangram_sim.targets import placement
 from tangram_vision.seeing import Seen, see
 from tests.sim.builders import LOPSIDED, SEVEN, layout_of, pieces
 
@@ -154,6 +157,61 @@ def test_seven_tokens_in_piles_are_seen(poses: list[list[float]]) -> None:
     layout, sides = layout_of(*SEVEN, scale=0.6), np.zeros(7, np.bool_)
     seen = see(grey(layout.corners(np.array(poses)), layout, 128), layout, ARENA)
     assert (errors(layout, np.array(poses), sides, seen) < (0.01, 2.0)).all()
+
+
+SEVEN_TANS = layout_of(*SEVEN, scale=0.6)
+
+
+def lying(name: str) -> tuple[Floats, Any]:
+    """A figure of the library, which is a pile of seven."""
+    (puzzle,) = [one for one in library("test", 0.6) if one.name == name]
+    return placement(puzzle, SEVEN_TANS)
+
+
+def before(poses: Floats, flipped: Any, *moved: int) -> Look:
+    """Of tokens that moved nothing is known: they are said to lie in the middle of the others."""
+    stayed = ~np.isin(np.arange(7), moved)
+    told = np.where(stayed[:, None], poses, poses[stayed].mean(axis=0))
+    return Look(told, flipped, stayed, stayed)
+
+
+@pytest.mark.parametrize("moved", [0, 2, 4, 5, 6])
+@pytest.mark.parametrize("pixels", [128, 64])
+def test_a_whole_figure_is_told_apart_by_who_knows_what_lay_there(moved: int, pixels: int) -> None:
+    """The token that came last is what the others leave."""
+    poses, flipped = lying("heart")
+    picture = grey(SEVEN_TANS.corners(poses, flipped), SEVEN_TANS, pixels)
+    assert not see(picture, SEVEN_TANS, ARENA).found.any()
+    seen = see(picture, SEVEN_TANS, ARENA, before(poses, flipped, moved))
+    assert seen.found.all()
+    assert (errors(SEVEN_TANS, poses, flipped, seen) < (0.5 / pixels, 3.0)).all()
+
+
+def test_a_token_that_was_pushed_is_found_where_it_lies_now() -> None:
+    """The square lay elsewhere, as far as is known; a triangle was pushed by two pixels."""
+    poses, flipped = lying("heart")
+    known = before(poses, flipped, 5)
+    poses[4] += (0.06, -0.05, 0.02)
+    poses[5] = (-0.8, 0.8, 0.3)
+    seen = see(grey(SEVEN_TANS.corners(poses, flipped), SEVEN_TANS, 128), SEVEN_TANS, ARENA, known)
+    assert seen.found.all()
+    assert (errors(SEVEN_TANS, poses, flipped, seen) < (0.005, 2.0)).all()
+
+
+def test_what_was_known_and_is_wrong_is_forgotten() -> None:
+    """Of another figure in the same place: as if nothing had been known."""
+    poses, flipped = lying("swan")
+    picture = grey(SEVEN_TANS.corners(poses, flipped), SEVEN_TANS, 128)
+    seen = see(picture, SEVEN_TANS, ARENA, before(*lying("heart")))
+    np.testing.assert_array_equal(seen.confidence, see(picture, SEVEN_TANS, ARENA).confidence)
+
+
+def test_what_lies_alone_is_seen_alike_whatever_was_known() -> None:
+    layout, rng = SEVEN_TANS, np.random.default_rng(8)
+    poses, flipped = scene(layout, rng, 0.05)
+    picture = grey(layout.corners(poses, flipped), layout, 128)
+    alone, told = see(picture, layout, ARENA), see(picture, layout, ARENA, before(*lying("heart")))
+    np.testing.assert_array_equal(told.poses, alone.poses)
 
 
 def disturbed(picture: Pixels, rng: np.random.Generator) -> Pixels:

@@ -17,8 +17,9 @@ from tests.agent.builders import PAIR, SQUARE
 from tests.worker.builders import write_run
 from tests.worker.puzzle_files import GAME, SIM, drawn, write_puzzles
 from worker.config import EvalConfig, PlayConfig
-from worker.evaluate import RUN, evaluate_run, scores_table
+from worker.evaluate import evaluate_run, scores_table
 from worker.play import play_run
+from worker.scores import RUN
 
 pytestmark = pytest.mark.fast
 

@@ -26,9 +26,10 @@ from tests.worker.builders import write_run
 from tests.worker.puzzle_files import GAME, SIM, drawn, write_puzzles
 from worker.baselines import exact_policy, random_policy
 from worker.config import EvalConfig
-from worker.evaluate import RUN, evaluate_run, score_hidden
+from worker.evaluate import evaluate_run
 from worker.hidden import Hidden, hide, lay, means, one_by_one, play_hidden
 from worker.puzzles import Figure, find_figures, play_figures
+from worker.scores import RUN, score_hidden
 
 pytestmark = pytest.mark.fast
 

@@ -69,7 +69,12 @@ def test_values_are_those_of_the_agent_whatever_the_scale() -> None:
 @pytest.mark.parametrize(("solve", "by"), [("together", "search"), ("beam", "beam")])
 def test_it_is_told_who_filled_what(solve: str, by: str) -> None:
     made = game(OUTLINE)
-    hidden = hide(made, find_figures("test", made, ["heart", "swan"]).figures, 0, solve)
+    hidden = hide(
+        made,
+        find_figures("test", made, ["heart", "swan"]).figures,
+        0,
+        method_of(solve, made.layout),
+    )
     laid = play_hidden(hidden, exact(hidden), seed=0)
     assert means(hidden, laid)["filled_by"] == {"search": 0, "beam": 0} | {by: 2}
     assert [one["filled_by"] for one in one_by_one(hidden, laid)] == [by, by]

@@ -7,11 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import shapely
 from PIL import Image, ImageDraw
 
 from tangram_agent.runs import load_run
+from tangram_lab.benchmarks.tilted import photographed
 from tangram_sim.errors import ConfigError
 from tangram_sim.puzzles import PACKAGED, load_puzzle
+from tangram_sim.rings import covered_area
 from tangram_vision.silhouette_files import Silhouette, fill_silhouette
 from tests.agent.outlines import AGENT as FILLER
 from tests.agent.outlines import SIM as OUTLINES
@@ -68,6 +71,19 @@ def test_silhouettes_are_filled_whatever_they_come_from(tmp_path: Path, name: st
     width, height = shown.picture.size
     assert shown.outlines.min() >= 0.0
     assert (shown.outlines <= (width, height)).all()
+
+
+def test_tokens_are_drawn_where_a_tilted_camera_saw_them(tmp_path: Path) -> None:
+    puzzle = load_puzzle("cat", 1.0)
+    area = covered_area(puzzle.corners, puzzle.layout)
+    photographed(area, 15.0, 120.0).save(tmp_path / "aslant.png")
+    setup = load_run("pretrained/tangram7").setup
+    shown = read_silhouette(str(tmp_path / "aslant.png"), setup)
+    tokens = covered_area(shown.outlines[0], setup.layout)
+    ink = np.asarray(shown.picture.convert("L")) < 128
+    side = np.arange(len(ink)) + 0.5
+    drawn = shapely.contains_xy(tokens, *np.meshgrid(side, side))
+    assert (drawn & ink).sum() > 0.96 * (drawn | ink).sum()
 
 
 def test_a_silhouette_is_played(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
