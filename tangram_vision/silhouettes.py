@@ -12,20 +12,21 @@ import numpy as np
 import shapely
 from shapely import Polygon
 
-from tangram_sim.areas import Area, grown, straightened
+from tangram_sim.areas import Area, straightened
 from tangram_sim.arrays import Complex, Floats
 from tangram_sim.dissections import Budget, Dissection, Laid, Search, Tokens, dissection
 from tangram_sim.geometry import outlines
 from tangram_sim.layout import Layout
+from tangram_sim.rings import covered_area, unit_of
 from tangram_vision.beams import Beam, Values
 
 # Of the root of all tokens' area, the full square's side where they are the tans.
 TOLERANCES = (0.004, 0.008, 0.014, 0.022, 0.035, 0.05, 0.07, 0.09)
 SOLVED = 0.95  # IoU from which a silhouette counts as filled
 _ROUND = 1e-9
-# Of the root of all tokens' area: gaps between pieces that are closed, and what a side of an
-# outline may be off so that no corner of a piece within it is left.
-_SEAM, _STRAIGHT, _GRID = 0.004, 1e-4, 1e-6
+# Of the root of all tokens' area: what a side of an outline may be off so that no corner of a piece
+# within it is left.
+_STRAIGHT, _GRID = 1e-4, 1e-6
 _SHARE = 0.9  # of the time, for the search; the rest is for the best attempt
 _LOOSE = (0.004, 0.022, 0.05)  # tolerances of a beam, for outlines
 _SAME = 0.9  # of a token's area, from which two lie at one place
@@ -97,8 +98,8 @@ def silhouette(layout: Layout, laid: Dissection) -> Area:
     No seam is left and no corner of a piece within a straight side, and where a ring begins does
     not depend on the pieces.
     """
-    unit = float(np.sqrt(layout.areas.sum()))
-    closed = grown(grown(covered(layout, laid), _SEAM * unit), -_SEAM * unit)
+    unit = unit_of(layout)
+    closed = covered_area(layout.corners(laid.poses, laid.flipped), layout)
 
     def ring(points: Floats) -> Floats:
         z: Complex = points[:-1] @ np.array([1.0, 1.0j])

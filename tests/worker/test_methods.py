@@ -1,10 +1,13 @@
 """Who finds how silhouettes are filled."""
 
+import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from tangram_agent.config import AgentConfig
 from tangram_agent.runs import load_run
 from tangram_sim.areas import Area
 from tangram_sim.dissections import Budget, Search, Tokens
@@ -14,11 +17,13 @@ from tangram_sim.rings import covered_area
 from tangram_sim.targets import placement
 from tangram_vision.silhouettes import Method
 from tests.sim.builders import SEVEN, TRIO, layout_of
-from tests.worker.test_hidden import OUTLINE, exact, game
+from tests.worker.test_hidden import OUTLINE, game
+from worker.baselines import exact_policy
 from worker.config import EvalConfig, PlayConfig
-from worker.hidden import hide, means, one_by_one, play_hidden
-from worker.methods import Learned, method_of
+from worker.evaluate import evaluate_run
+from worker.methods import Learned, learned_method, method_of
 from worker.puzzles import find_figures
+from worker.scores import RUN, score_hidden
 from worker.silhouettes import read_silhouette
 
 
@@ -69,16 +74,12 @@ def test_values_are_those_of_the_agent_whatever_the_scale() -> None:
 @pytest.mark.parametrize(("solve", "by"), [("together", "search"), ("beam", "beam")])
 def test_it_is_told_who_filled_what(solve: str, by: str) -> None:
     made = game(OUTLINE)
-    hidden = hide(
-        made,
-        find_figures("test", made, ["heart", "swan"]).figures,
-        0,
-        method_of(solve, made.layout),
-    )
-    laid = play_hidden(hidden, exact(hidden), seed=0)
-    assert means(hidden, laid)["filled_by"] == {"search": 0, "beam": 0} | {by: 2}
-    assert [one["filled_by"] for one in one_by_one(hidden, laid)] == [by, by]
-    assert laid.iou.min() > 0.95
+    figures = find_figures("test", made, ["heart", "swan"]).figures
+    formula = exact_policy(made.layout, made.sim)
+    scored = score_hidden(made, figures, {RUN: formula}, 0, solve)
+    assert scored.means[RUN]["filled_by"] == {"search": 0, "beam": 0} | {by: 2}
+    assert [one["filled_by"] for one in scored.puzzles] == [by, by]
+    assert scored.means[RUN]["share_solved_iou"] == 1.0
 
 
 @pytest.mark.fast
@@ -88,6 +89,42 @@ def test_a_drawing_is_filled_by_who_is_named() -> None:
     assert read_silhouette("swan", setup, solve="solver").told.startswith("filled by the search ")
     with pytest.raises(ConfigError, match=r"solutions=2 changes nothing with solve=beam, which"):
         read_silhouette("swan", setup, 2, solve="beam")
+
+
+FILLER = "pretrained/tangram7_silhouette"
+SHOWN = {"sim": {"backend": "kinematic", "observe": "silhouette_pictures", "pixels": 64}}
+
+
+@pytest.mark.fast
+def test_an_agent_of_outlines_fills_pictures_itself(tmp_path: Path) -> None:
+    """By its own beam; what it finds is laid by the formula, as what others find is."""
+    out, grey = tmp_path / "scores.json", {"sim": SHOWN["sim"] | {"picture": "grey"}}
+    config = EvalConfig(FILLER, puzzle=("heart", "swan"), out=str(out), changes=grey)
+    assert evaluate_run(config) == 0
+    report = json.loads(out.read_text())
+    assert report["filled_by"] == {"search": 0, "beam": 2}
+    assert report["share_solved_iou"] == 1.0
+    largest, solver = (report["baselines"][name] for name in ("largest first", "solver"))
+    assert largest["filled_by"]["search"] == 0
+    assert largest["search_seconds"] != report["search_seconds"]
+    assert solver["filled_by"] == {"search": 2, "beam": 0}
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize(
+    ("settings", "width"), [({}, 12), ({"lookahead": "none", "beam": AgentConfig.beam}, 1)]
+)
+def test_a_run_fills_by_as_wide_a_beam_as_it_looks_ahead(settings: Any, width: int) -> None:
+    run = load_run(FILLER)
+    method = learned_method(run.with_settings({"agent": settings}) if settings else run)
+    assert told(method) == (False, width, True)
+
+
+@pytest.mark.fast
+def test_a_run_that_fills_outlines_asks_nobody() -> None:
+    config = EvalConfig(FILLER, puzzle=("heart",), solve="beam", changes=SHOWN)
+    with pytest.raises(ConfigError, match="^solve=beam changes nothing with a run that fills "):
+        evaluate_run(config)
 
 
 @pytest.mark.fast
