@@ -42,7 +42,7 @@ def _keys(settings: Plain) -> int:
 
 
 def _train(settings: Plain) -> int:
-    from master.config import MasterConfig
+    from master.config import MasterConfig, check_compiling
     from tangram_agent.setup import SECTIONS, from_mapping
     from tangram_sim.world import check_shown, check_world
 
@@ -52,6 +52,7 @@ def _train(settings: Plain) -> int:
     # The children check it again; a wrong task is refused before any of them starts.
     setup = _task(settings)
     check_shown(setup.sim, setup.fills)
+    check_compiling(config.service, setup.fills)
     check_world(setup.layout, setup.sim)
     tell(f"starts in {config.run_dir}")
 
@@ -61,7 +62,7 @@ def _train(settings: Plain) -> int:
 
 
 def _master(settings: Plain) -> int:
-    from master.config import MasterConfig
+    from master.config import MasterConfig, check_compiling
     from tangram_agent.setup import SECTIONS, from_mapping
     from tangram_sim.settings import refuse_ignored
     from tangram_sim.world import check_room, check_shown
@@ -74,6 +75,7 @@ def _master(settings: Plain) -> int:
         refuse_ignored(given, alone, "start them with tangram-worker", 1)
     setup = _task(settings)
     check_shown(setup.sim, setup.fills)
+    check_compiling(config.service, setup.fills)
     check_room(setup.layout, setup.sim)
     tell(f"starts in {config.run_dir}")
 

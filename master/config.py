@@ -1,13 +1,16 @@
 """Settings of a run: of its master, and of a whole training on one machine."""
 
+import os
+import shutil
 from dataclasses import dataclass, field
 
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import ROLES
 from tangram_sim.errors import ConfigError
-from tangram_sim.settings import Settings, check_folder, declared, setting
+from tangram_sim.settings import Settings, check_folder, declared, refuse_ignored, setting
 
 MAX_WORKERS = 1024
+COMPILERS = ("g++", "clang++")
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,28 @@ class KeysConfig(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_folder("run_dir", self.run_dir)
+
+
+def check_compiling(service: ServiceConfig, fills: bool) -> None:
+    """Refuse to compile what is not compiled, or without a compiler.
+
+    Args:
+        service: the run's.
+        fills: whether the agent fills outlines.
+
+    Raises:
+        ConfigError: says what is missing.
+    """
+    if not service.compile:
+        return
+    if fills:
+        refuse_ignored("service.compile=true", "an agent of outlines", "leave it out", False)
+    named = os.environ.get("CXX")
+    if not any(shutil.which(name) for name in ([named] if named else COMPILERS)):
+        raise ConfigError(
+            f"service.compile=true needs a C++ compiler, and {named or ' or '.join(COMPILERS)} is "
+            "not found: install g++, or set service.compile=false"
+        )
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,7 @@ from master.signals import StopSignals
 from master.trainer import Trainer, choose_device
 from tangram_agent.addresses import LOCAL, dns_error, reachable, with_host
 from tangram_agent.arrays import EpisodeSpec
+from tangram_agent.compiling import CACHE
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import OPEN, WINDOW
 from tangram_agent.process import Watchdog, watch_parent
@@ -141,8 +142,8 @@ def open_run(
         TangramError: the port or a checkpoint cannot be used, or there is no such device.
     """
     service, folder = config.service, claim.run
-    trainer = Trainer(setup, config.seed, choose_device(service.device))
-    found = _restore(config, folder, trainer)
+    trainer, found = _make_trainer(config, setup, folder)
+    watchdog.progress()
     rest = found or Restored(_new_record(folder.journal), {})
     run_id = rest.record.run_id
     guard = DivergenceGuard(trainer, folder.bad_batch)
@@ -249,12 +250,20 @@ def _keys(service: ServiceConfig, folder: RunFolder) -> Keys | None:
     return None
 
 
-def _restore(config: MasterConfig, folder: RunFolder, trainer: Trainer) -> Restored | None:
-    """Take over the newest checkpoint, or the networks of another run, where this is asked for."""
+def _make_trainer(
+    config: MasterConfig, setup: Setup, folder: RunFolder
+) -> tuple[Trainer, Restored | None]:
+    """What learns, with the newest checkpoint, or the networks of another run, where asked for."""
+    service = config.service
+    device = choose_device(service.device)
+    trainer = Trainer(setup, config.seed, device, compiled=service.compile)
     found = restore_run(folder.checkpoints, trainer) if config.resume == "auto" else None
     if found is None and config.warm_start is not None:
         warm_start(Path(config.warm_start), trainer)
-    return found
+    if service.compile:
+        log.info("compiles its update: up to a minute at first, seconds once %s has it", CACHE)
+        trainer.learner.compile_ahead()
+    return trainer, found
 
 
 def _new_record(journal: Path) -> Record:

@@ -18,11 +18,12 @@ from tangram_agent.relabelling import with_relabelled
 from tangram_agent.replay import ReplayBuffer
 from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes, Transitions, Weights
-from tangram_sim.errors import ConfigError
+from tangram_sim.errors import ConfigError, RunError
 from tangram_sim.rewards import make_reward
 
 STREAMS = ("replay", "hindsight", "motion")
 SEEN_MOTIONS = 256  # transitions of whole episodes that the motion model sees in an update
+COMPILED = "compiled"  # of a checkpoint's values: how its updates were made
 LEARNER = "learner"  # the checkpoint's file of networks and optimisers
 
 Arrays = dict[str, dict[str, npt.NDArray[Any]]]
@@ -33,6 +34,7 @@ class Trainer:
 
     Attributes:
         setup: the task and the agent.
+        compiled: whether updates are compiled; a run stays with what it began with.
         learner: networks and optimisers.
         replay: transitions played, and relabelled ones.
         rate_limiter: decides whether to learn or to take in episodes.
@@ -41,17 +43,22 @@ class Trainer:
     """
 
     def __init__(
-        self, setup: Setup, seed: int, device: str, lag_updates: int = LAG_UPDATES
+        self,
+        setup: Setup,
+        seed: int,
+        device: str,
+        lag_updates: int = LAG_UPDATES,
+        compiled: bool = False,
     ) -> None:
         agent, layout = setup.agent, setup.layout
-        self.setup = setup
+        self.setup, self.compiled = setup, compiled
         self.reward = make_reward(setup.reward, layout, setup.sim)
         self.learner: Learner | FillLearner
         self.replay: ReplayBuffer | FillReplay
         if setup.fills:
             self.learner, self.replay = FillLearner(setup, seed, device), FillReplay(setup)
         else:
-            self.learner = Learner(setup, seed, device)
+            self.learner = Learner(setup, seed, device, compiled)
             self.replay = ReplayBuffer(
                 agent.replay_capacity, layout.corner_count, layout.tokens, setup.action_size
             )
@@ -154,6 +161,7 @@ class Trainer:
         counters = {
             "episodes": self.episodes,
             "rate_limiter": self.rate_limiter.state(),
+            COMPILED: self.compiled,
             "generators": generators,
             SETUP: self.setup.contents(),
         }
@@ -163,9 +171,16 @@ class Trainer:
         """Take over a state from `state()`; settings stay those of this process.
 
         Raises:
-            RunError: the state belongs to another task or network.
+            RunError: the state belongs to another task or network, or its updates were compiled and
+                these are not, or the reverse.
         """
         check_same_task(self.setup, counters[SETUP])
+        before = bool(counters.get(COMPILED, False))
+        if before != self.compiled:
+            raise RunError(
+                f"the run learned with service.compile={str(before).lower()} so far, and its "
+                "numbers would not be the same otherwise: go on with that"
+            )
         self.learner.load_state(arrays[LEARNER])
         self.replay.load_state(arrays["replay"])
         self.rate_limiter.load_state(counters["rate_limiter"])

@@ -1,5 +1,6 @@
 """Adam as torch.optim has it, without the compiler of torch: its import takes 1.4 s and 70 MB."""
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -16,42 +17,56 @@ class Adam:
     """Steps of parameters along their gradients.
 
     Attributes:
-        rate: of the next step.
-        slots: what is kept of every parameter, by the names of torch.optim; empty before a step.
+        slots: what is kept of every parameter, by the names of torch.optim. These tensors stay the
+            same, as do the parameters: a compiled update holds on to them.
     """
 
-    def __init__(self, parameters: Sequence[Tensor], rate: float) -> None:
-        self.rate = rate
-        self.slots: dict[str, list[Tensor]] = {}
+    def __init__(self, parameters: Sequence[Tensor]) -> None:
         self._parameters = list(parameters)
+        scalars = [parameter.new_zeros(()) for parameter in self._parameters]
+        averages = ([torch.zeros_like(one) for one in self._parameters] for _ in range(2))
+        columns = (scalars, *averages)
+        self.slots = {
+            name: [one.detach() for one in column]
+            for name, column in zip(NAMES, columns, strict=True)
+        }
 
     def load(self, slots: dict[str, list[Tensor]]) -> None:
-        """Take over what was kept of the same parameters: torch reads beyond the end of others.
+        """Take over what was kept of the same parameters; nothing is as before the first step.
 
         Raises:
             RunError: it is of other parameters.
         """
-        forms = [(one.shape, one.dtype) for one in self._parameters]
-        wanted = dict.fromkeys(NAMES, forms) | {"step": [((), kind) for _, kind in forms]}
-        found = {name: [(one.shape, one.dtype) for one in own] for name, own in slots.items()}
+        wanted, found = (
+            {name: [(one.shape, one.dtype) for one in own] for name, own in kept.items()}
+            for kept in (self.slots, slots)
+        )
         if slots and found != wanted:
             raise RunError(
                 "the optimiser's averages are not those of this network: start a new run, "
                 "warm_start=RUN_DIR takes its networks alone"
             )
-        self.slots = slots
+        for name, own in self.slots.items():
+            for i, one in enumerate(own):
+                one.copy_(slots[name][i] if slots else torch.zeros_like(one))
 
     @torch.no_grad()
-    def step(self) -> None:
-        """One step along `grad` of each parameter."""
-        if not self.slots:
-            scalars = [parameter.new_zeros(()) for parameter in self._parameters]
-            averages = ([torch.zeros_like(one) for one in self._parameters] for _ in range(2))
-            self.slots = dict(zip(NAMES, (scalars, *averages), strict=True))
+    def step(self, gradients: Sequence[Tensor], rate: float | Tensor) -> None:
+        """One step along the gradient of each parameter.
+
+        Args:
+            gradients: one for each parameter.
+            rate: of this step; a tensor where the step is traced: then it is told in operations
+                that a compiler can fuse, else one kernel of torch does it all.
+        """
         steps, means, squares = (self.slots[name] for name in NAMES)
+        if isinstance(rate, Tensor):
+            for one in zip(self._parameters, gradients, means, squares, steps, strict=True):
+                _told(*one, rate)
+            return
         adam(
             self._parameters,
-            [parameter.grad for parameter in self._parameters if parameter.grad is not None],
+            list(gradients),
             means,
             squares,
             max_exp_avg_sqs=[],
@@ -60,8 +75,20 @@ class Adam:
             amsgrad=False,
             beta1=BETAS[0],
             beta2=BETAS[1],
-            lr=self.rate,
+            lr=rate,
             weight_decay=0.0,
             eps=EPSILON,
             maximize=False,
         )
+
+
+def _told(
+    parameter: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, step: Tensor, rate: Tensor
+) -> None:
+    """The step of one parameter (Kingma and Ba 2014, algorithm 1)."""
+    step.add_(1.0)
+    mean.lerp_(gradient, 1.0 - BETAS[0])
+    square.lerp_(gradient * gradient, 1.0 - BETAS[1])
+    # 1 - beta^t, without the digits that it loses while t is small.
+    whole, whole_square = (-torch.expm1(math.log(beta) * step) for beta in BETAS)
+    parameter.sub_(rate / whole * mean / ((square / whole_square).sqrt() + EPSILON))

@@ -365,6 +365,11 @@ class ServiceConfig(Settings, section="service"):
     )
     device: str = setting("auto", "of the learner", choices=("auto", "cpu", "cuda"))
     threads: int = setting(1, "torch threads of the master", low=1, high=1024)
+    compile: bool = setting(
+        False,
+        "whether an update is compiled as a whole: up to a minute when first, seconds later, then "
+        "two to three times as fast; needs g++ or clang++",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from tangram_agent.adam import Adam
 from tangram_agent.filling import Filling
 from tangram_agent.filling_replay import FILLED, OPEN, FillBatch
-from tangram_agent.learner import Learner, average_so_far, check_finite, frozen, polyak_update
+from tangram_agent.learner import Learner, check_finite, frozen, polyak_update
 from tangram_agent.networks import initialise, parameter_count
 from tangram_agent.setup import Setup
 from tangram_agent.values import Corners, OutlineValue
@@ -33,7 +33,7 @@ class FillLearner(Learner):
         self.parameters = parameter_count(value)
         self.parts = {"value": self.value, "target": self.target, "acting": self.acting}
         self._lists = self.parameter_lists()
-        self.critic_optimiser = Adam(self._lists["value"], self.config.critic_lr)
+        self.optimisers = {"value": Adam(self._lists["value"])}
 
     def learn(self, batch: FillBatch, progress: float = 0.0) -> dict[str, float]:
         """One step on a batch; see `Learner.update`.
@@ -41,15 +41,14 @@ class FillLearner(Learner):
         Returns:
             critic_loss, q (mean value of states that were played) and critic_gradient.
         """
-        self.critic_optimiser.rate = self.config.critic_lr * self.rate_factor(progress)
+        rates = self.rates(progress)
         y = torch.cat([torch.ones(len(batch.filled), device=self.device), self.targets(batch)])
         states = [Corners.of(rests, self.device) for rests in (batch.filled, batch.played)]
         logits = self.value(Corners(*map(torch.cat, zip(*states, strict=True))))
         loss = nn.functional.binary_cross_entropy_with_logits(logits, y)
-        norm = self._step("value", loss)
+        norm = self._step("value", loss, rates.critic)
         polyak_update(self._lists["target"], self._lists["value"], self.config.polyak)
-        rho = average_so_far(self.config.acting_average, self.updates)
-        polyak_update(self._lists["acting"], self._lists["playing"], rho)
+        polyak_update(self._lists["acting"], self._lists["playing"], rates.kept)
         q = logits.detach()[len(batch.filled) :].sigmoid().mean()
         numbers = {"critic_loss": loss.item(), "q": q.item(), "critic_gradient": norm.item()}
         check_finite(self.updates + 1, numbers)
@@ -67,6 +66,3 @@ class FillLearner(Learner):
                 ahead = self.target(Corners.of(batch.places.at(rows), self.device)).sigmoid()
             best.view(-1)[torch.from_numpy(rows).to(self.device)] = ahead
         return best.amax(dim=1)
-
-    def _optimisers(self) -> dict[str, Adam]:  # type: ignore[override]
-        return {"value": self.critic_optimiser}

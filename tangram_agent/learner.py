@@ -10,8 +10,7 @@ Legend: M views, K tokens.
 
 import copy
 import math
-from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,28 +18,22 @@ import torch
 from torch import Tensor, nn
 
 from tangram_agent.adam import Adam
+from tangram_agent.compiling import Compiled
 from tangram_agent.config import AgentConfig
 from tangram_agent.motion import Fit, MotionModel, Motions
-from tangram_agent.networks import VELOCITY, Networks, View, initialise, parameter_count
-from tangram_agent.pairs import Pairs
+from tangram_agent.networks import VELOCITY, Networks, initialise, parameter_count
 from tangram_agent.relabelling import (
-    ContactBatch,
-    PairBatch,
-    SceneBatch,
     make_pairs,
     with_contacts,
     with_scenes,
 )
-from tangram_agent.scenes import Scenes, next_token
 from tangram_agent.setup import Setup
+from tangram_agent.steps import Batch, Meeting, Stepping, Steps, Sums
 from tangram_agent.types import Transitions, Weights
 from tangram_agent.weights import load_arrays, to_arrays, under
-from tangram_sim.actions import chosen_tokens
-from tangram_sim.arrays import Bools, Floats, Ints
 from tangram_sim.errors import RunError
 
 Array = npt.NDArray[Any]
-Batch = Transitions | PairBatch
 _COUNTER = "updates"
 
 
@@ -57,10 +50,14 @@ def saturation(raw: Tensor, limit: float) -> Tensor:
     return torch.relu(raw.abs() - limit).square().mean()
 
 
-def polyak_update(targets: list[Tensor], sources: list[Tensor], rho: float) -> None:
+def polyak_update(targets: list[Tensor], sources: list[Tensor], rho: float | Tensor) -> None:
     """Eq. 4: target <- rho * target + (1 - rho) * source, parameter by parameter."""
     with torch.no_grad():
-        torch._foreach_lerp_(targets, sources, 1.0 - rho)
+        if isinstance(rho, Tensor):  # the update is traced
+            for target, source in zip(targets, sources, strict=True):
+                target.lerp_(source, 1.0 - rho)
+        else:
+            torch._foreach_lerp_(targets, sources, 1.0 - rho)
 
 
 def average_so_far(rho: float, updates: int) -> float:
@@ -75,28 +72,15 @@ class NotFiniteError(RunError):
     """Numbers of an update, or weights, that are not finite."""
 
 
-@dataclass(frozen=True, eq=False)
-class Steps:
-    """A batch as both losses see it.
+class Rates(NamedTuple):
+    """Learning rates of an update, and how much the running average keeps; tensors where traced."""
 
-    Attributes:
-        view: where the action was taken.
-        velocity: (M, 3) of the action, in the arena's axes.
-        reward: (M,) what the critic learns, less what follows.
-        done: (M,) 1 where nothing follows.
-        start: where the actor is asked from: mostly the same view.
-        follow: what the action came to.
-        seen_after: that too where an afterstate critic is to see it as it was, else it sees the
-            exact motion.
-    """
+    actor: float | Tensor
+    critic: float | Tensor
+    kept: float | Tensor
 
-    view: View
-    velocity: Tensor
-    reward: Tensor
-    done: Tensor
-    start: View
-    follow: View
-    seen_after: View | None = None
+
+NUMBERS = ("critic_loss", "q", "critic_gradient", "actor_loss", "saturation", "actor_gradient")
 
 
 class Learner:
@@ -108,15 +92,28 @@ class Learner:
             target networks.
         parts: networks by the names under which a checkpoint has them.
         playing: what a worker plays with: the actor, or both networks where both play.
+        optimisers: of the networks that learn, by their names in `parts`.
         acting: its running average, which is what workers get.
+        steps: makes what the losses see of a batch.
     """
 
-    def __init__(self, setup: Setup, seed: int, device: str = "cpu") -> None:
+    def __init__(
+        self, setup: Setup, seed: int, device: str = "cpu", compiled: bool = False
+    ) -> None:
+        """Networks with the weights of a seed.
+
+        Args:
+            setup: the task and the agent.
+            seed: of the weights.
+            device: where it learns.
+            compiled: whether an update is compiled as a whole, see `Compiled`.
+        """
         self.config: AgentConfig = setup.agent
         self.device = torch.device(device)
         self.updates = 0
         self.bootstraps = setup.bootstraps
-        self._setup, self._layout, self._tokens = setup, setup.layout, setup.layout.tokens
+        self._setup, self._layout = setup, setup.layout
+        self.steps = Stepping(setup, self.device)
         networks = Networks(setup)
         self.actor, self.critic = networks.actor, networks.critic
         generator = torch.Generator().manual_seed(seed)
@@ -136,9 +133,11 @@ class Learner:
         self.playing = networks.playing
         # Kept as lists: walking the modules takes a fifth of a small network's update.
         self._lists = self.parameter_lists()
-        self.actor_optimiser = Adam(self._lists["actor"], self.config.actor_lr)
-        self.critic_optimiser = Adam(self._lists["critic"], self.config.critic_lr)
+        self.optimisers = {part: Adam(self._lists[part]) for part in ("actor", "critic")}
         self._fit = None if self.motion is None else Fit(self.motion)
+        self._step_all = self._all_steps
+        if compiled:
+            self._step_all = Compiled(self._all_steps, self._changed_by_update())
 
     def parameter_lists(self) -> dict[str, list[Tensor]]:
         """Parameters by the names of `parts`, and those of `playing`."""
@@ -175,75 +174,36 @@ class Learner:
             NotFiniteError: one of these is not finite. The update does not count, and the networks
                 may be spoilt: load a state from before.
         """
-        self._set_learning_rate(progress)
-        steps = self.steps(batch)
-        # Made once where critic and actor see the same: as it stands, from the same token.
-        features = None
-        if not self.config.afterstate and steps.start is steps.view:
-            features = self.actor.head.see(steps.view)
-        if isinstance(batch, SceneBatch):
-            loss, q = self.scene_loss(batch)
-        else:
-            loss, q = self.critic_loss(steps, features)
-        if isinstance(batch, ContactBatch):
-            loss = loss + self.push_loss(batch)
-        values = self._critic_step(loss, q) | self._actor_step(steps, features)
+        values: dict[str, Tensor] = {}
         if self._fit is not None and motions is not None:
-            values |= self._fit.step(motions.to(self.device))
-        self._follow()
+            values = self._fit.step(motions.to(self.device))
+        found = self._step_all(self.steps(batch), self.rates(progress))
+        values = dict(zip(NUMBERS, found.unbind(), strict=True)) | values
         # One wait for the device, after everything has been asked of it.
         numbers = dict(zip(values, torch.stack(list(values.values())).tolist(), strict=True))
         check_finite(self.updates + 1, numbers)
         self.updates += 1
         return numbers
 
-    def steps(self, batch: Batch) -> Steps:
-        """A batch as tensors on the device."""
-        return self._of_pairs(batch) if isinstance(batch, PairBatch) else self._of_scenes(batch)
-
-    def _of_scenes(self, batch: Transitions) -> Steps:
-        state, placed = self._tensor(batch.state), self._tensor(batch.placed)
-        goal, action = self._tensor(batch.goal), self._tensor(batch.action)
-        taken = Scenes(
-            state,
-            placed,
-            goal,
-            self._index(chosen_tokens(batch.action.astype(np.float64), self._tokens)),
-        )
-        start = taken if self._tokens == 1 else Scenes(state, placed, goal, next_token(placed))
-        following, flags = self._tensor(batch.next_state), self._tensor(batch.next_placed)
-        return Steps(
-            view=taken,
-            velocity=action[:, -VELOCITY:],
-            reward=self._tensor(batch.reward),
-            done=self._tensor(batch.done),
-            start=start,
-            follow=Scenes(following, flags, goal, next_token(flags)),
-        )
-
-    def _of_pairs(self, batch: PairBatch) -> Steps:
-        after = self._pairs(batch, batch.after, batch.after_flipped)
-        return Steps(
-            view=self._pairs(batch, batch.before, batch.before_flipped),
-            velocity=self._tensor(batch.velocity),
-            reward=self._tensor(batch.reward),
-            done=self._tensor(batch.done),
-            start=self._pairs(batch, batch.start, batch.start_flipped),
-            follow=after,
-            seen_after=after,
-        )
-
-    def _pairs(self, batch: PairBatch, pose: Floats, flipped: Bools) -> Pairs:
-        """The pairs (M,) with their tokens where they lay at some time."""
-        return Pairs(
-            pose=self._tensor(pose),
-            flipped=self._tensor(flipped),
-            token=self._index(batch.token),
-            goal=self._tensor(batch.goal),
-            goal_flipped=self._tensor(batch.goal_flipped),
-            piece=self._index(batch.piece),
-            covered=self._tensor(batch.covered),
-        )
+    def _all_steps(self, steps: Steps, rates: Rates) -> Tensor:
+        """All steps of one update, on the device alone; its `NUMBERS`."""
+        # Made once where critic and actor see the same: as it stands, from the same token.
+        features = None
+        if not self.config.afterstate and steps.start is steps.view:
+            features = self.actor.head.see(steps.view)
+        if steps.scenes is None:
+            loss, q = self.critic_loss(steps, features)
+        else:
+            loss, q = self.scene_loss(steps.scenes)
+        if steps.meeting is not None:
+            loss = loss + self.push_loss(steps.meeting)
+        norm = self._step("critic", loss, rates.critic)
+        value_loss, penalty = self.actor_loss(steps, features)
+        total = value_loss + self.config.saturation_penalty * penalty
+        actor_norm = self._step("actor", total, rates.actor)
+        self._follow(rates.kept)
+        every = loss, q.mean(), norm, value_loss, penalty, actor_norm
+        return torch.stack([one.detach() for one in every])
 
     def critic_loss(self, steps: Steps, features: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Mean squared Bellman error of Eq. 3, and the values (M,)."""
@@ -258,103 +218,73 @@ class Learner:
         q = self.critic(steps.start, velocity, None, features)
         return -q.mean(), saturation(raw, self.config.saturation_limit)
 
-    def push_loss(self, batch: ContactBatch) -> Tensor:
+    def push_loss(self, meeting: Meeting) -> Tensor:
         """Mean squared error of what tokens that slide push away."""
-        before = self._pairs(batch, batch.before, batch.before_flipped)
-        # Where tokens meet, the other one has the place of a piece that nothing covers.
-        meeting = replace(
-            before,
-            goal=self._tensor(batch.other_pose),
-            goal_flipped=self._tensor(batch.other_flipped),
-            piece=self._index(batch.other),
-            covered=torch.zeros_like(before.covered),
-        )
-        share = self.critic.pushed(meeting, self._tensor(batch.after))
-        return (share - self._tensor(batch.pushed)).square().mean()
+        share = self.critic.pushed(meeting.pairs, meeting.to)
+        return (share - meeting.pushed).square().mean()
 
-    def scene_loss(self, batch: SceneBatch) -> tuple[Tensor, Tensor]:
+    def scene_loss(self, scenes: Sums) -> tuple[Tensor, Tensor]:
         """Mean squared error of the reward as a sum over all pairs of a scene, and the sums (B,).
 
         As in value decomposition networks (Sunehag et al. 2018): nobody says which pair earned it.
         """
-        count, tokens = batch.poses.shape[:2]
-        token, piece = (part.reshape(-1) for part in np.indices((tokens, tokens)))
-        pairs = Pairs(
-            pose=self._tensor(batch.poses[:, token].reshape(-1, 3)),
-            flipped=self._tensor(batch.flips[:, token].reshape(-1)),
-            token=self._index(np.tile(token, count)),
-            goal=self._tensor(batch.goals[:, piece].reshape(-1, 3)),
-            goal_flipped=self._tensor(batch.goal_flips[:, piece].reshape(-1)),
-            piece=self._index(np.tile(piece, count)),
-            covered=torch.zeros(count * tokens * tokens, device=self.device),
-        )
-        still = torch.zeros(len(pairs.pose), VELOCITY, device=self.device)
-        values = self.critic(pairs, still, pairs).view(count, -1)
-        areas = self._layout.areas
-        weights = self._tensor(np.maximum(areas[token], areas[piece]) / areas.sum())
-        share = values @ weights
-        error = 2.0 * share - 1.0 - self._tensor(batch.returned)
+        still = scenes.pairs.pose.new_zeros(len(scenes.pairs.pose), VELOCITY)
+        values = self.critic(scenes.pairs, still, scenes.pairs)
+        share = values.view(len(scenes.reward), -1) @ scenes.weights
+        error = 2.0 * share - 1.0 - scenes.reward
         return error.square().mean(), share
 
     def _target(self, steps: Steps) -> Tensor:
         """Eq. 5; the target networks are not asked where no transition goes on."""
-        if not self.bootstraps or bool(steps.done.all()):
+        if steps.follow is None:
             return steps.reward
         velocity, _ = self.target_actor(steps.follow)
         following = self.target_critic(steps.follow, velocity)
         return critic_target(steps.reward, steps.done, following, self.config.gamma)
 
-    def _follow(self) -> None:
+    def _follow(self, kept: float | Tensor) -> None:
         """Move target networks and the acting average a little towards the networks."""
         lists, config = self._lists, self.config
         if self.bootstraps:
             polyak_update(lists["target_critic"], lists["critic"], config.polyak)
             polyak_update(lists["target_actor"], lists["actor"], config.polyak)
-        rho = average_so_far(config.acting_average, self.updates)
-        polyak_update(lists["acting"], lists["playing"], rho)
+        polyak_update(lists["acting"], lists["playing"], kept)
 
-    def _critic_step(self, loss: Tensor, q: Tensor) -> dict[str, Tensor]:
-        norm = self._step("critic", loss)
-        return {"critic_loss": loss.detach(), "q": q.detach().mean(), "critic_gradient": norm}
-
-    def _actor_step(self, steps: Steps, features: Tensor | None) -> dict[str, Tensor]:
-        value_loss, penalty = self.actor_loss(steps, features)
-        loss = value_loss + self.config.saturation_penalty * penalty
-        norm = self._step("actor", loss)
-        return {
-            "actor_loss": value_loss.detach(),
-            "saturation": penalty.detach(),
-            "actor_gradient": norm,
-        }
-
-    def _step(self, part: str, loss: Tensor) -> Tensor:
+    def _step(self, part: str, loss: Tensor, rate: float | Tensor) -> Tensor:
         """One step of one network, whatever else the loss depends on; its gradient's norm."""
-        parameters = self._lists[part]
-        gradients = torch.autograd.grad(loss, parameters)
+        gradients = torch.autograd.grad(loss, self._lists[part])
         norm = nn.utils.get_total_norm(gradients)
-        for parameter, gradient in zip(parameters, gradients, strict=True):
-            parameter.grad = gradient
-        clip = self.config.grad_clip
-        if clip > 0.0:
-            nn.utils.clip_grads_with_norm_(parameters, clip, norm)
-        (self.actor_optimiser if part == "actor" else self.critic_optimiser).step()
+        if self.config.grad_clip > 0.0:
+            share = (self.config.grad_clip / (norm + 1e-6)).clamp(max=1.0)
+            torch._foreach_mul_(gradients, share)
+        self.optimisers[part].step(gradients, rate)
         return norm
+
+    def compile_ahead(self) -> None:
+        """Compile updates that are to be compiled: else the first ones take a minute."""
+        if not isinstance(self._step_all, Compiled):
+            return
+        for done in (1, 0) if self.bootstraps else (1,):
+            batch = self.prepared(_blank(self._setup, done), np.random.default_rng(0))
+            self._step_all.prepare(self.steps(batch), self.rates(0.0))
 
     def rate_factor(self, progress: float) -> float:
         """By which learning rates have fallen at a used share of the budget: along a cosine."""
         share, low = min(max(progress, 0.0), 1.0), self.config.lr_final
         return low + (1.0 - low) * 0.5 * (1.0 + math.cos(math.pi * share))
 
-    def _set_learning_rate(self, progress: float) -> None:
-        factor = self.rate_factor(progress)
-        self.actor_optimiser.rate = self.config.actor_lr * factor
-        self.critic_optimiser.rate = self.config.critic_lr * factor
+    def _changed_by_update(self) -> list[Tensor]:
+        """All that `_all_steps` changes."""
+        parameters = [one for own in self.parts.values() for one in own.parameters()]
+        every = self.optimisers.values()
+        kept = [one for each in every for own in each.slots.values() for one in own]
+        return parameters + kept
 
-    def _tensor(self, column: Array) -> Tensor:
-        return torch.from_numpy(np.asarray(column, np.float32)).to(self.device)
-
-    def _index(self, column: Ints) -> Tensor:
-        return torch.from_numpy(np.asarray(column, np.int64)).to(self.device)
+    def rates(self, progress: float) -> Rates:
+        """Of the next update, at a used share of the budget."""
+        factor, config = self.rate_factor(progress), self.config
+        kept = average_so_far(config.acting_average, self.updates)
+        return Rates(config.actor_lr * factor, config.critic_lr * factor, kept)
 
     def acting_weights(self, version: int) -> Weights:
         """A copy of the weights that workers play with."""
@@ -366,7 +296,7 @@ class Learner:
         for part, module in self.parts.items():
             for name, value in to_arrays(module).items():
                 state[f"{part}.{name}"] = value
-        for part, optimiser in self._optimisers().items():
+        for part, optimiser in self._stateful().items():
             for name, tensors in optimiser.slots.items():
                 for i, tensor in enumerate(tensors):
                     state[f"{part}_optimiser.{i}.{name}"] = tensor.cpu().numpy().copy()
@@ -381,7 +311,7 @@ class Learner:
         if _COUNTER not in state:
             raise RunError("learner state: no counter of updates: not a learner's checkpoint")
         self.load_networks(state)
-        for part, optimiser in self._optimisers().items():
+        for part, optimiser in self._stateful().items():
             content: dict[str, dict[int, Tensor]] = {}
             for key, value in under(f"{part}_optimiser.", state).items():
                 i, name = key.split(".", 1)
@@ -414,9 +344,26 @@ class Learner:
             for model in (self.motion, self.acting.get_submodule("motion")):
                 model.load_state_dict(MotionModel().state_dict())
 
-    def _optimisers(self) -> dict[str, Adam | Fit]:
+    def _stateful(self) -> dict[str, Adam | Fit]:
+        """What steps, by the names under which a checkpoint has it."""
         fit = {} if self._fit is None else {"motion": self._fit}
-        return {"actor": self.actor_optimiser, "critic": self.critic_optimiser, **fit}
+        return {**self.optimisers, **fit}
+
+
+def _blank(setup: Setup, done: int) -> Transitions:
+    """A batch in which nothing moves, of tokens that lie in the middle."""
+    count, layout = setup.agent.batch_size, setup.layout
+    corners = layout.corners(np.zeros((count, layout.tokens, 3))).astype(np.float32)
+    return Transitions(
+        state=corners,
+        placed=np.zeros((count, layout.tokens), np.uint8),
+        action=np.zeros((count, setup.action_size), np.float32),
+        reward=np.zeros(count, np.float32),
+        next_state=corners,
+        next_placed=np.zeros((count, layout.tokens), np.uint8),
+        done=np.full(count, done, np.uint8),
+        goal=corners,
+    )
 
 
 def frozen(module: nn.Module) -> nn.Module:

@@ -309,11 +309,11 @@ class Planner:
         """Poses (B, 3) after gradient steps uphill on what the critic says they cover."""
         with torch.enable_grad():
             moved = pose.clone().requires_grad_(True)
-            optimiser = Adam([moved], self._agent.refine_rate)
+            optimiser = Adam([moved])
             for _ in range(self._agent.refine_steps):
                 loss = -self._total(scene, chosen, moved).sum()
-                (moved.grad,) = torch.autograd.grad(loss, [moved])
-                optimiser.step()
+                gradients = torch.autograd.grad(loss, [moved])
+                optimiser.step(gradients, self._agent.refine_rate)
         return moved.detach()
 
 

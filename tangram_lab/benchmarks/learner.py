@@ -9,9 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from tangram_agent.attention import EncoderLayer
-from tangram_agent.learner import Learner, Steps, critic_target
+from tangram_agent.learner import Learner, critic_target
 from tangram_agent.motion import Motions
 from tangram_agent.setup import Setup
+from tangram_agent.steps import Steps
 from tangram_lab.benchmarks.measure import Bound, Row, Work, compare
 from tangram_lab.benchmarks.peers import compare_updates
 from tangram_lab.benchmarks.replay import random_transitions
@@ -22,13 +23,27 @@ BATCHES = (64, 256)
 
 def measure_learner(runs: int) -> list[Row]:
     """Updates per second on one core."""
-    rows = []
+    rows = _compiled(runs)
     bound = Bound(least=3.0)
     for name, setup in (("paper's MHA", preset("paper")), ("ours", preset()), ("7", several(7))):
         for size in BATCHES if name != "7" else BATCHES[:1]:
             case = f"{name if name != '7' else 'ours, 7 tokens'}, batch {size}"
             rows.append(_against_plain(case, with_agent(setup, batch_size=size), runs, bound))
     return rows + compare_updates("learner", runs)
+
+
+def _compiled(runs: int) -> list[Row]:
+    """`service.compile=true` against single operations, which compute the same."""
+    cases = [("perceptron [64, 64]", preset("mlp"), 256, 2.3)]
+    cases += [("ours", preset(), size, 1.5) for size in BATCHES]
+    cases += [("ours, 7 tokens", several(7), BATCHES[0], 1.5)]
+    rows = []
+    for name, setup, size, least in cases:
+        made = with_agent(setup, batch_size=size)
+        whole = updates(made, Learner(made, 0, compiled=True))
+        given = ("learner", f"{name}, batch {size}, compiled", "updates/s"), whole
+        rows.append(compare(*given, ("single operations", updates(made)), runs, Bound(least)))
+    return rows
 
 
 def _against_plain(case: str, setup: Setup, runs: int, bound: Bound) -> Row:
@@ -108,7 +123,7 @@ class PlainLearner(Learner):
                     old.mul_(self.config.polyak).add_(new, alpha=1.0 - self.config.polyak)
         return losses
 
-    def _step(self, part: str, loss: Tensor) -> Tensor:
+    def _step(self, part: str, loss: Tensor, _: float | Tensor) -> Tensor:
         optimiser = self._plain[part]
         optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
@@ -117,8 +132,9 @@ class PlainLearner(Learner):
         return norm
 
     def _target(self, steps: Steps) -> Tensor:
-        velocity, _ = self.target_actor(steps.follow)
-        value = self.target_critic(steps.follow, velocity)
+        follow = steps.follow or steps.view
+        velocity, _ = self.target_actor(follow)
+        value = self.target_critic(follow, velocity)
         return critic_target(steps.reward, steps.done, value, GAMMA)
 
 

@@ -130,14 +130,12 @@ def learn(rows: Tensor, wanted: Tensor, updates: int, seed: int = 0) -> nn.Seque
     layers = network()
     initialise(layers, generator)
     parameters = list(layers.parameters())
-    optimiser = Adam(parameters, RATE)
+    optimiser = Adam(parameters)
     for update in range(updates):
-        optimiser.rate = RATE * (1.0 + np.cos(np.pi * update / updates)) / 2.0
+        rate = RATE * (1.0 + np.cos(np.pi * update / updates)) / 2.0
         drawn = torch.randint(len(rows), (BATCH,), generator=generator)
         loss = nn.functional.smooth_l1_loss(layers(rows[drawn]), wanted[drawn], beta=0.1)
-        for parameter, slope in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
-            parameter.grad = slope
-        optimiser.step()
+        optimiser.step(torch.autograd.grad(loss, parameters), float(rate))
     return layers
 
 

@@ -14,6 +14,7 @@ from tangram_agent.adam import Adam
 from tangram_agent.learner import (
     Learner,
     NotFiniteError,
+    Rates,
     average_so_far,
     critic_target,
     polyak_update,
@@ -133,6 +134,7 @@ def test_the_critic_loss_is_the_mean_squared_bellman_error(agent: dict[str, Any]
     batch = random_transitions(made, 6, done=None)
     assert 0 < batch.done.sum() < 6
     steps = learner.steps(learner.prepared(batch, np.random.default_rng(0)))
+    assert steps.follow is not None
     follow = learner.target_critic(steps.follow, learner.target_actor(steps.follow)[0])
     y = torch.from_numpy(batch.reward) + 0.9 * follow * (1 - torch.from_numpy(batch.done))
     loss, q = learner.critic_loss(steps)
@@ -232,7 +234,7 @@ def test_the_penalty_counts_by_its_weight(readout: str) -> None:
             learner.critic.head.readout.weight.zero_()
         batch = learner.prepared(random_transitions(made, 16), np.random.default_rng(0))
         steps = learner.steps(batch)
-        norms.append(learner._actor_step(steps, None)["actor_gradient"].item())
+        norms.append(learner._all_steps(steps, Rates(0.0, 0.0, 0.0))[-1].item())
     assert norms[1] == pytest.approx(2.0 * norms[0], rel=1e-5)
     assert norms[0] > 0.0
 
@@ -265,32 +267,45 @@ def test_cosine_decay_of_the_learning_rate(
     options: dict[str, Any], progress: float, share: float
 ) -> None:
     learner = Learner(setup(agent=SCENE | {"actor_lr": 2e-3} | options), seed=0)
-    learner.update(random_transitions(setup(), 4), progress)
-    assert learner.actor_optimiser.rate == pytest.approx(2e-3 * share)
-    assert learner.critic_optimiser.rate == pytest.approx(1e-3 * share)
+    rates = learner.rates(progress)
+    assert (rates.actor, rates.critic) == pytest.approx((2e-3 * share, 1e-3 * share))
+
+
+def test_networks_step_by_their_own_rates() -> None:
+    """The first step of Adam is as long as its rate."""
+    learner = Learner(setup(agent=SCENE | {"actor_lr": 2e-3, "critic_lr": 5e-4}), seed=0)
+    before = copied(learner)
+    learner.update(random_transitions(setup(), 16), 0.5)
+    for part, rate in (("actor", 2e-3 * 0.505), ("critic", 5e-4 * 0.505)):
+        assert largest_change(before, learner.state(), part) == pytest.approx(rate, rel=1e-3)
 
 
 def test_steps_are_those_of_torch() -> None:
     generator = torch.Generator().manual_seed(0)
     start = [torch.randn(shape, generator=generator) for shape in ((3, 2), (5,))]
     ours, theirs = ([one.clone().requires_grad_() for one in start] for _ in range(2))
-    optimisers = (Adam(ours, 0.1), torch.optim.Adam(theirs, lr=0.1, fused=True))
+    told = [one.clone() for one in start]
+    traced, optimiser = Adam(told), Adam(ours)
+    judge = torch.optim.Adam(theirs, lr=0.1, fused=True)
     for _ in range(5):
-        for mine, other in zip(ours, theirs, strict=True):
-            mine.grad = torch.randn(mine.shape, generator=generator)
-            other.grad = mine.grad.clone()
-        for optimiser in optimisers:
-            optimiser.step()
-    for mine, other in zip(ours, theirs, strict=True):
+        slopes = [torch.randn(one.shape, generator=generator) for one in start]
+        for other, slope in zip(theirs, slopes, strict=True):
+            other.grad = slope.clone()
+        judge.step()
+        optimiser.step(slopes, 0.1)
+        traced.step(slopes, torch.tensor(0.1))
+    for mine, other, one in zip(ours, theirs, told, strict=True):
         assert torch.equal(mine, other)
+        torch.testing.assert_close(one, other.detach(), rtol=1e-5, atol=1e-6)
 
 
 def test_gradients_are_clipped_to_the_norm() -> None:
     made = setup(agent=SCENE | {"grad_clip": 1e-3})
     learner = Learner(made, seed=0)
     learner.update(random_transitions(made, 16))
-    norms = [p.grad.norm() for p in learner.critic.parameters() if p.grad is not None]
-    assert torch.stack(norms).norm().item() == pytest.approx(1e-3, rel=1e-2)
+    # Averages hold a tenth of the first gradients.
+    norms = [one.norm() for one in learner.optimisers["critic"].slots["exp_avg"]]
+    assert torch.stack(norms).norm().item() == pytest.approx(1e-4, rel=1e-2)
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -84,7 +84,9 @@ def test_the_losses_by_hand(case: str) -> None:
         )
         pushed = own.critic.pushed(meeting, t["after"])
         expected = (pushed - t["pushed"]).square().mean().item()
-        assert learner.push_loss(batch).item() == pytest.approx(expected, rel=1e-6)
+        steps = learner.steps(batch)
+        assert steps.meeting is not None
+        assert learner.push_loss(steps.meeting).item() == pytest.approx(expected, rel=1e-6)
 
 
 @pytest.mark.parametrize(("case", "moves"), [("mlp", {"head"}), ("slide", {"head", "push_head"})])
@@ -149,7 +151,9 @@ def test_a_reward_is_the_sum_over_all_pairs() -> None:
     assert isinstance(scenes, SceneBatch)
     assert not np.allclose(scenes.goals[..., 2], made.layout.poses(batch.goal)[..., 2])
     learner.critic = PerfectCritic(made.layout)
-    loss, share = learner.scene_loss(scenes)
+    steps = learner.steps(scenes)
+    assert steps.scenes is not None
+    loss, share = learner.scene_loss(steps.scenes)
     assert loss.item() < 1e-9
     np.testing.assert_allclose(2.0 * share - 1.0, batch.reward, atol=1e-5)
     assert np.ptp(batch.reward) > 0.2

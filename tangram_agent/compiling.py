@@ -1,0 +1,100 @@
+"""One update as a single graph, compiled: both gradients, both optimisers and all averages.
+
+An update of small networks is a thousand small operations, and most of its time goes from one to
+the next. So the update is traced once, as it is, and torch's compiler makes one piece of C++ of
+it. That is kept in a folder for the next run. Numbers differ from those of single operations in
+their last digits: a run learns one way or the other from its beginning to its end.
+"""
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+CACHE = Path.home() / ".cache" / "tangram-rl" / "compiled"
+_CACHE_SETTING = "TORCHINDUCTOR_CACHE_DIR"
+
+
+class Compiled:
+    """A function of tensors in dataclasses, and of rates, that changes other tensors in place."""
+
+    def __init__(self, function: Callable[..., Tensor], changed: Sequence[Tensor]) -> None:
+        """Compile it when it is called first, and for each form of its arguments.
+
+        Args:
+            function: of a dataclass and of a tuple of rates.
+            changed: what it changes; these must stay the same tensors.
+        """
+        os.environ.setdefault(_CACHE_SETTING, str(CACHE))
+        self._function, self._changed = function, changed
+        self._graphs: dict[Any, Callable[..., Tensor]] = {}
+
+    def __call__(self, steps: Any, rates: tuple[float | Tensor, ...]) -> Tensor:
+        """What the function gives; the rates reach it as tensors."""
+        tensors: list[Tensor] = []
+        form = _form(steps, tensors, {})
+        device = tensors[0].device
+        numbers = [torch.tensor(float(rate), device=device) for rate in rates]
+        if form not in self._graphs:
+            self._graphs[form] = self._graph(steps, type(rates), tensors, numbers)
+        with torch.no_grad():
+            return self._graphs[form](tensors, numbers)
+
+    def prepare(self, steps: Any, rates: tuple[float | Tensor, ...]) -> None:
+        """Compile it for arguments of this form; nothing is changed."""
+        with self._unchanged():
+            self(steps, rates)
+
+    @contextmanager
+    def _unchanged(self) -> Iterator[None]:
+        """What is changed within is undone."""
+        before = [one.detach().clone() for one in self._changed]
+        yield
+        with torch.no_grad():
+            for one, old in zip(self._changed, before, strict=True):
+                one.copy_(old)
+
+    def _graph(
+        self, steps: Any, kind: Callable[..., Any], tensors: list[Tensor], numbers: list[Tensor]
+    ) -> Callable[..., Tensor]:
+        # Only here: the compiler takes seconds and 200 MB to load.
+        from torch.fx.experimental.proxy_tensor import make_fx  # noqa: PLC0415
+
+        def flat(given: list[Tensor], rates: list[Tensor]) -> Tensor:
+            own = dict(zip(map(id, tensors), given, strict=True))
+            return self._function(_with(steps, own, {}), kind(*rates))
+
+        with self._unchanged():  # it is traced by doing it once
+            graph = make_fx(flat)(tensors, numbers)
+        compiled: Callable[..., Tensor] = torch.compile(graph, fullgraph=True)
+        return compiled
+
+
+def _form(part: Any, tensors: list[Tensor], seen: dict[int, int]) -> Any:
+    """What two arguments of one graph have in common; their tensors are listed, each once."""
+    if isinstance(part, Tensor):
+        if id(part) not in seen:
+            seen[id(part)] = len(tensors)
+            tensors.append(part)
+        return seen[id(part)], part.shape, part.dtype
+    if is_dataclass(part):
+        own = [_form(getattr(part, field.name), tensors, seen) for field in fields(part)]
+        return type(part), *own
+    return part
+
+
+def _with(part: Any, tensors: dict[int, Tensor], made: dict[int, Any]) -> Any:
+    """The same with other tensors; what was one object stays one."""
+    if isinstance(part, Tensor):
+        return tensors[id(part)]
+    if not is_dataclass(part) or isinstance(part, type):
+        return part
+    if id(part) not in made:
+        own = {one.name: _with(getattr(part, one.name), tensors, made) for one in fields(part)}
+        made[id(part)] = replace(part, **own)
+    return made[id(part)]

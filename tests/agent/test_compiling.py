@@ -1,0 +1,120 @@
+"""Updates that are compiled as a whole: the same numbers, and a run stays with its own way."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from master.config import check_compiling
+from master.trainer import Trainer
+from tangram_agent.config import ServiceConfig
+from tangram_agent.learner import Learner
+from tangram_agent.setup import Setup
+from tangram_sim.errors import ConfigError, RunError
+from tests.agent.builders import setup
+from tests.agent.test_learner import CASES, changed, copied, play
+
+
+@pytest.fixture
+def traced(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Graphs run as they were traced, without a compiler; the list of them."""
+    graphs: list[Any] = []
+    monkeypatch.setattr(torch, "compile", lambda graph, **_: graphs.append(graph) or graph)
+    return graphs
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_a_graph_updates_as_single_operations_do(case: tuple[str, str], traced: list[Any]) -> None:
+    """All networks, target networks, averages and optimisers, and all numbers."""
+    made = CASES[case]()
+    plain, whole = Learner(made, 0), Learner(made, 0, compiled=True)
+    numbers = [play(learner, made, range(4)) for learner in (plain, whole)]
+    np.testing.assert_allclose(*map(_values, numbers), rtol=2e-4, atol=2e-6)
+    one, other = plain.state(), whole.state()
+    assert one.keys() == other.keys()
+    for name, values in one.items():
+        np.testing.assert_allclose(other[name], values, rtol=1e-3, atol=2e-5, err_msg=name)
+    assert 1 <= len(traced) <= 2
+
+
+def _values(numbers: list[Any]) -> list[list[float]]:
+    return [list(one.values()) for one in numbers]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_what_is_compiled_ahead_changes_nothing_and_is_what_updates_need(
+    case: tuple[str, str], traced: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = _of_batches(CASES[case](), monkeypatch)
+    learner = Learner(made, 0, compiled=True)
+    before = copied(learner)
+    learner.compile_ahead()
+    assert changed(before, learner.state()) == set()
+    ready = len(traced)
+    assert ready == 1 + learner.bootstraps
+    play(learner, made, range(3))
+    assert len(traced) == ready
+
+
+def _of_batches(made: Setup, monkeypatch: pytest.MonkeyPatch) -> Setup:
+    """The setup with the batches that `play` draws."""
+    monkeypatch.setitem(vars(made.agent), "batch_size", 16 if made.pairs else 32)
+    return made
+
+
+@pytest.mark.fast
+def test_a_graph_goes_on_with_what_was_restored(traced: list[Any]) -> None:
+    """It holds on to tensors, which a restored state must fill and not replace."""
+    made = CASES["ddpg", "paper"]()
+    first, second = (Learner(made, seed, compiled=True) for seed in (0, 9))
+    play(second, made, range(1))
+    play(first, made, range(2))
+    second.load_state(copied(first))
+    assert play(first, made, range(2, 4)) == play(second, made, range(2, 4))
+    assert changed(first.state(), second.state()) == set()
+    assert traced
+
+
+@pytest.mark.slow
+def test_a_compiled_update_is_the_same_twice() -> None:
+    """By torch's own compiler."""
+    made = setup(agent={"readout": "pair"}, net={"kind": "mlp", "hidden": [8]})
+    plain, first, second = Learner(made, 0), *(Learner(made, 0, compiled=True) for _ in range(2))
+    expected, once, twice = (play(one, made, range(3)) for one in (plain, first, second))
+    assert once == twice
+    assert changed(first.state(), second.state()) == set()
+    np.testing.assert_allclose(_values(once), _values(expected), rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize("began", [True, False])
+def test_a_run_stays_with_what_it_began_with(began: bool) -> None:
+    made = setup()
+    before = Trainer(made, 0, "cpu", compiled=began)
+    arrays, counters = before.state()
+    Trainer(made, 0, "cpu", compiled=began).load_state(arrays, counters)
+    message = f"learned with service.compile={str(began).lower()} so far"
+    with pytest.raises(RunError, match=message):
+        Trainer(made, 0, "cpu", compiled=not began).load_state(arrays, counters)
+
+
+Refusal = tuple[Callable[[], None], str]
+
+
+@pytest.mark.fast
+def test_what_cannot_be_compiled_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    wanted = ServiceConfig(compile=True)
+    check_compiling(ServiceConfig(), fills=True)
+    with pytest.raises(ConfigError, match="compile=true changes nothing with an agent of"):
+        check_compiling(wanted, fills=True)
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    with pytest.raises(ConfigError, match="no-such-compiler is not found: install g"):
+        check_compiling(wanted, fills=False)
+    monkeypatch.delenv("CXX")
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(ConfigError, match=r"g\+\+ or clang\+\+ is not found"):
+        check_compiling(wanted, fills=False)
