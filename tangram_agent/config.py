@@ -367,8 +367,8 @@ class ServiceConfig(Settings, section="service"):
     threads: int = setting(1, "torch threads of the master", low=1, high=1024)
     compile: bool = setting(
         False,
-        "whether an update is compiled as a whole: takes up to a minute at first and seconds later, "
-        "then learning is 1.3 to 1.9 times as fast; needs g++ or clang++",
+        "whether an update is compiled as a whole: up to a minute at first and seconds later, then "
+        "learning is 1.3 to 1.9 times as fast; needs g++ or clang++",
     )
 
     def __post_init__(self) -> None:
