@@ -143,7 +143,8 @@ def open_run(
     """
     service, folder = config.service, claim.run
     trainer, found = _make_trainer(config, setup, folder)
-    watchdog.progress()
+    if service.compile:  # that takes its time
+        watchdog.progress()
     rest = found or Restored(_new_record(folder.journal), {})
     run_id = rest.record.run_id
     guard = DivergenceGuard(trainer, folder.bad_batch)
