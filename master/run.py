@@ -142,9 +142,7 @@ def open_run(
         TangramError: the port or a checkpoint cannot be used, or there is no such device.
     """
     service, folder = config.service, claim.run
-    trainer, found = _make_trainer(config, setup, folder)
-    if service.compile:  # that takes its time
-        watchdog.progress()
+    trainer, found = _make_trainer(config, setup, folder, watchdog)
     rest = found or Restored(_new_record(folder.journal), {})
     run_id = rest.record.run_id
     guard = DivergenceGuard(trainer, folder.bad_batch)
@@ -252,7 +250,7 @@ def _keys(service: ServiceConfig, folder: RunFolder) -> Keys | None:
 
 
 def _make_trainer(
-    config: MasterConfig, setup: Setup, folder: RunFolder
+    config: MasterConfig, setup: Setup, folder: RunFolder, watchdog: Watchdog
 ) -> tuple[Trainer, Restored | None]:
     """What learns, with the newest checkpoint, or the networks of another run, where asked for."""
     service = config.service
@@ -264,6 +262,7 @@ def _make_trainer(
     if service.compile:
         log.info("compiles its update: up to a minute at first, seconds once %s has it", CACHE)
         trainer.learner.compile_ahead()
+        watchdog.progress()
     return trainer, found
 
 
