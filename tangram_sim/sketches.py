@@ -42,6 +42,12 @@ class FaultError(Exception):
     """What is wrong with one puzzle; its text says where."""
 
 
+def check_file(path: Path, source: str) -> None:
+    """Raise ConfigError unless a path leads to a file; `source` is what the error calls it."""
+    if not path.is_file():
+        raise ConfigError(f"{source} is no file: check the path")
+
+
 def read_text(path: Path, source: str | None = None) -> str:
     """The text of a drawing.
 
@@ -53,8 +59,7 @@ def read_text(path: Path, source: str | None = None) -> str:
         ConfigError: not a file that can be read, too large, or not UTF-8.
     """
     source = source or f"puzzle file {path}"
-    if not path.is_file():
-        raise ConfigError(f"{source} is no file: check the path")
+    check_file(path, source)
     try:
         with path.open("rb") as file:
             content = file.read(MAX_BYTES + 1)

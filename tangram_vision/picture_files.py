@@ -8,6 +8,7 @@ import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 
 from tangram_sim.errors import ConfigError
+from tangram_sim.sketches import check_file
 
 FORMATS = ("PNG", "JPEG")
 MAX_MEGAPIXELS = 64
@@ -28,8 +29,7 @@ def read_picture(path: Path, source: str) -> Image.Image:
     Raises:
         ConfigError: no file, not a PNG or JPEG that can be read, too large or too small.
     """
-    if not path.is_file():
-        raise ConfigError(f"{source} is no file: check the path")
+    check_file(path, source)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

@@ -1,14 +1,17 @@
 """Presets, overrides, help, and the entry of every command."""
 
+import gc
 import shlex
 import sys
 from collections.abc import Callable
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 import yaml
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 
 from conf.cli import composed, entry, with_run_config
 from conf.commands import COMMANDS, GROUPS, OVER, Plain, load
@@ -300,6 +303,20 @@ def entered(monkeypatch: pytest.MonkeyPatch) -> Entered:
         return entry(command, lambda settings: seen.append(settings) or task(settings)), seen
 
     return run
+
+
+@pytest.mark.parametrize("line", ["train seed=3", "train --cfg job", "train nosuch=1", "train -h"])
+def test_collecting_of_garbage_is_on_in_a_task_and_after(entered: Entered, line: str) -> None:
+    collects: list[bool] = []
+    entered(line, lambda _: collects.append(gc.isenabled()) or 0)
+    assert (gc.isenabled(), collects) == (True, [True] if line.endswith("3") else [])
+
+
+def test_a_config_is_composed_once(entered: Entered) -> None:
+    real = ConfigLoaderImpl.load_configuration
+    with patch.object(ConfigLoaderImpl, real.__name__, autospec=True, side_effect=real) as loading:
+        assert entered("train seed=3")[0] == 0
+    assert loading.call_count == 1
 
 
 @pytest.mark.parametrize("form", ["--config-dir {}", "--config-dir={}", "-cd {}"])

@@ -115,6 +115,7 @@ def _play(settings: Plain) -> int:
     config = from_mapping(PlayConfig, with_changes(paths))
     if not config.live:
         check_writable("out", Path(config.out).absolute())
+    _check_drawings(config)
     setups = _check_played(config.run_dirs, config)
     if config.tokens is not None and config.run_dir is not None:
         _check_tokens(config.tokens, config.run_dir, setups[0].layout)
@@ -151,6 +152,16 @@ def _check_played(run_dirs: Sequence[str], config: "EvalConfig | PlayConfig") ->
         source, names = source_and_names(config.puzzle)
         find_figures(source, setups[0], names, skip_invalid=config.skip_invalid)
     return setups
+
+
+def _check_drawings(config: "PlayConfig") -> None:
+    """Refuse a drawing that is not there before what reads drawings is loaded."""
+    from tangram_sim.sketches import check_file
+
+    for name, path in (("target", config.target), ("silhouette", config.silhouette)):
+        # A silhouette may be the name of a puzzle.
+        if path is not None and (name == "target" or Path(path).suffix):
+            check_file(Path(path), f"{name}={path}")
 
 
 def _check_tokens(name: str, run_dir: str, moved: "Layout") -> None:
