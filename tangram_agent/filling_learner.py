@@ -12,9 +12,9 @@ import torch
 from torch import Tensor, nn
 
 from tangram_agent.adam import Adam
-from tangram_agent.filling import Filling
+from tangram_agent.filling import Filling, Rests
 from tangram_agent.filling_replay import FILLED, OPEN, FillBatch
-from tangram_agent.learner import Learner, check_finite, frozen, polyak_update
+from tangram_agent.learner import Learner, Rates, frozen, polyak_update
 from tangram_agent.networks import initialise, parameter_count
 from tangram_agent.setup import Setup
 from tangram_agent.values import Corners, OutlineValue
@@ -41,25 +41,23 @@ class FillLearner(Learner):
         Returns:
             critic_loss, q (mean value of states that were played) and critic_gradient.
         """
-        rates = self.rates(progress)
+        return self._counted(self._step_value(batch, self.rates(progress)))
+
+    def _step_value(self, batch: FillBatch, rates: Rates) -> dict[str, Tensor]:
+        """One step of the network, and its numbers on the device."""
         y = torch.cat([torch.ones(len(batch.filled), device=self.device), self.targets(batch)])
-        states = [Corners.of(rests, self.device) for rests in (batch.filled, batch.played)]
-        logits = self.value(Corners(*map(torch.cat, zip(*states, strict=True))))
+        states = Rests.joined([batch.filled, batch.played])
+        logits = self.value(Corners.of(states, self.device))
         loss = nn.functional.binary_cross_entropy_with_logits(logits, y)
         norm = self._step("value", loss, rates.critic)
         polyak_update(self._lists["target"], self._lists["value"], self.config.polyak)
         polyak_update(self._lists["acting"], self._lists["playing"], rates.kept)
         q = logits.detach()[len(batch.filled) :].sigmoid().mean()
-        numbers = {"critic_loss": loss.item(), "q": q.item(), "critic_gradient": norm.item()}
-        check_finite(self.updates + 1, numbers)
-        self.updates += 1
-        return numbers
+        return {"critic_loss": loss.detach(), "q": q, "critic_gradient": norm}
 
     def targets(self, batch: FillBatch) -> Tensor:
         """(n',) values of states that were played, by what each could have gone on to."""
-        ends = torch.from_numpy(batch.ends.astype(np.int64)).to(self.device)
-        best = torch.zeros(ends.shape, device=self.device)
-        best[ends == FILLED] = 1.0
+        best = torch.from_numpy((batch.ends == FILLED).astype(np.float32)).to(self.device)
         rows = np.flatnonzero(batch.ends.ravel() == OPEN)
         if len(rows):
             with torch.no_grad():

@@ -178,8 +178,14 @@ class Learner:
         if self._fit is not None and motions is not None:
             values = self._fit.step(motions.to(self.device))
         found = self._step_all(self.steps(batch), self.rates(progress))
-        values = dict(zip(NUMBERS, found.unbind(), strict=True)) | values
-        # One wait for the device, after everything has been asked of it.
+        return self._counted(dict(zip(NUMBERS, found.unbind(), strict=True)) | values)
+
+    def _counted(self, values: dict[str, Tensor]) -> dict[str, float]:
+        """The numbers of an update, which now counts: the one wait for the device, at its end.
+
+        Raises:
+            NotFiniteError: one is not finite.
+        """
         numbers = dict(zip(values, torch.stack(list(values.values())).tolist(), strict=True))
         check_finite(self.updates + 1, numbers)
         self.updates += 1

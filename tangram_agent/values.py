@@ -28,12 +28,13 @@ class Corners(NamedTuple):
 
     @staticmethod
     def of(rests: Rests, device: torch.device | None = None) -> "Corners":
-        """On a device."""
+        """On a device, without the rows that no state uses: these would cost the most."""
+        most = max(1, int((rests.part != UNUSED).sum(axis=1).max(initial=0)))
+        columns = (part[:, :most] for part in (rests.points, rests.follow, rests.part))
+        points, follow, part = (torch.from_numpy(np.ascontiguousarray(one)) for one in columns)
+        left = torch.from_numpy(rests.left.astype(np.float32))
         return Corners(
-            torch.from_numpy(rests.points).to(device),
-            torch.from_numpy(rests.follow.astype(np.int64)).to(device),
-            torch.from_numpy(rests.part.astype(np.int64)).to(device),
-            torch.from_numpy(rests.left.astype(np.float32)).to(device),
+            points.to(device), follow.long().to(device), part.long().to(device), left.to(device)
         )
 
 
@@ -50,12 +51,8 @@ class OutlineValue(nn.Module):
     def forward(self, corners: Corners) -> Tensor:
         """(n,) logits, the same for every state without corners."""
         used = corners.part != UNUSED
-        most = max(1, int(used.sum(dim=1).max()))  # rows that no state uses cost the most
-        points, follow, part, left = corners
-        own = Corners(points[:, :most], follow[:, :most], part[:, :most], left)
-        used = used[:, :most]
         edges = used[:, None, :] & used[:, :, None]
-        nodes, _ = self.encoder(features(own), edges)
+        nodes, _ = self.encoder(features(corners), edges)
         mask = used[..., None].to(nodes.dtype)
         mean = (nodes * mask).sum(dim=1) / mask.sum(dim=1).clamp(min=1.0)
         largest = (nodes - _FAR * (1.0 - mask)).amax(dim=1) * used.any(dim=1, keepdim=True)

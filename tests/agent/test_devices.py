@@ -1,0 +1,92 @@
+"""Learning stays on its device, shown without one: torch's `meta` device has shapes and no values.
+
+It refuses to mix with the CPU, as a GPU does, and to give a value to the host. So a tensor made on
+the wrong device, or an update that waits for the device on its way, ends in an error here.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tangram_agent.filling_learner import FillLearner
+from tangram_agent.filling_replay import FillReplay
+from tangram_agent.learner import NUMBERS, Learner
+from tangram_agent.motion import Fit, MotionModel
+from tangram_agent.setup import Setup
+from tangram_agent.steps import Steps
+from tests.agent.builders import random_transitions
+from tests.agent.outlines import outline_setup
+from tests.agent.pair_scenes import PERCEPTRON, seven, transitions
+from tests.agent.test_filling_learning import episode
+from tests.agent.test_learner import CASES, TWINS
+from tests.agent.test_motion import commands, seen
+
+META = "meta"
+EVERY: dict[tuple[str, str], Callable[[], Setup]] = {
+    **CASES,
+    ("pairs", "scenes"): lambda: seven(TWINS | {"credit": "reward"}, PERCEPTRON),
+}
+REFUSED = (NotImplementedError, RuntimeError)
+
+
+def steps_of(learner: Learner, made: Setup, done: int | None) -> Steps:
+    """Of a batch on the learner's device."""
+    drawn = transitions(made, 16, 0) if made.pairs else random_transitions(made, 32, 0, done=done)
+    return learner.steps(learner.prepared(drawn, np.random.default_rng(0)))
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize("done", [0, 1, None])
+@pytest.mark.parametrize("case", EVERY)
+def test_an_update_stays_on_its_device(case: tuple[str, str], done: int | None) -> None:
+    made = EVERY[case]()
+    learner = Learner(made, 0, META)
+    numbers = learner._step_all(steps_of(learner, made, done), learner.rates(0.5))
+    assert (numbers.device.type, len(numbers)) == (META, len(NUMBERS))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", [("ddpg", "paper"), ("ddpg", "several"), ("pairs", "slide")])
+def test_a_traced_update_stays_on_its_device(
+    case: tuple[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch, "compile", lambda graph, **_: graph)
+    made = CASES[case]()
+    learner = Learner(made, 0, META, compiled=True)
+    numbers = learner._step_all(steps_of(learner, made, None), learner.rates(0.5))
+    assert (numbers.device.type, len(numbers)) == (META, len(NUMBERS))
+
+
+@pytest.mark.fast
+def test_the_fit_of_a_motion_stays_on_its_device() -> None:
+    motions = seen(commands(8), commands(8))
+    fit = Fit(MotionModel().to(META))
+    for _ in range(2):  # the second adds to what the first kept
+        found = fit.step(motions.to(torch.device(META)))
+    assert {one.device.type for one in found.values()} == {META}
+
+
+@pytest.mark.fast
+def test_learning_what_can_be_filled_stays_on_its_device() -> None:
+    made = outline_setup(agent={"replay_capacity": 8, "batch_size": 8})
+    replay, generator = FillReplay(made), np.random.default_rng(0)
+    replay.insert(episode([9.0, 9.0, 0.0]), generator)
+    learner = FillLearner(made, 0, META)
+    found = learner._step_value(replay.sample(8, generator), learner.rates(0.5))
+    assert {one.device.type for one in found.values()} == {META}
+
+
+@pytest.mark.fast
+def test_the_device_refuses_what_these_tests_are_for() -> None:
+    """To mix with the CPU, and to give a value to the host."""
+    made = CASES["ddpg", "paper"]()
+    away, here = Learner(made, 0, META), Learner(made, 0)
+    steps = steps_of(away, made, None)
+    with pytest.raises(REFUSED, match="device|meta"):
+        here.critic_loss(steps)
+    loss: Any = away.critic_loss(steps)[0]
+    with pytest.raises(REFUSED, match="meta"):
+        loss.item()
