@@ -23,6 +23,7 @@ from tangram_agent.setup import Setup
 from tangram_agent.types import AWAY
 from tangram_sim.arrays import Singles
 from tangram_sim.errors import ConfigError, WireError
+from tangram_sim.rewards import MAX_REWARD, reward_bounds
 from tangram_sim.settings import check_range
 
 WeightShapes = Mapping[str, tuple[int, ...]]
@@ -32,7 +33,6 @@ MAX_EPISODES = 4096
 MAX_FRAME_BYTES = 32 * 1024
 MAX_BATCH_BYTES = 2 * 2**20
 MAX_WEIGHTS_BYTES = 64 * 2**20
-MAX_REWARD = 1e6
 # Corners and actions are computed in float64; their bounds may be passed by rounding to float32.
 ROUNDING = 1e-6
 LENGTH = struct.Struct("<I")
@@ -131,6 +131,7 @@ class EpisodeSpec:
         bound: largest |coordinate| that a corner can reach.
         observed: whether pictures are what is observed: then some of it can be missing.
         goal_rows: G, corners of a target; 0: V.
+        rewards: least and largest one.
     """
 
     tokens: int
@@ -140,6 +141,7 @@ class EpisodeSpec:
     bound: float
     observed: bool = False
     goal_rows: int = 0
+    rewards: tuple[float, float] = (-MAX_REWARD, MAX_REWARD)
 
     def __post_init__(self) -> None:
         for name in ("tokens", "corners", "horizon", "action_size"):
@@ -159,6 +161,7 @@ class EpisodeSpec:
             setup.bound,
             setup.sim.observe == "pictures",
             setup.goal_rows if setup.fills else 0,
+            reward_bounds(setup.reward, setup.sim, setup.bound),
         )
 
     @cached_property
@@ -198,7 +201,7 @@ def _columns(spec: EpisodeSpec, count: int) -> tuple[Column, ...]:
         Column("corners", "<f4", (e, t + 1, v, 2), -reach, reach),
         Column("placed", "u1", (e, t + 1, k), 0, 1),
         Column("actions", "<f4", (e, t, spec.action_size), -one, one),
-        Column("rewards", "<f4", (e, t), -MAX_REWARD, MAX_REWARD),
+        Column("rewards", "<f4", (e, t), *(bound * one for bound in spec.rewards)),
         Column("goals", "<f4", (e, spec.goal_rows or v, 2), -reach, reach),
         *(missing if spec.observed else ()),
     )

@@ -21,6 +21,7 @@ from tangram_sim.geometry import overlap_share
 from tangram_sim.layout import Layout
 from tangram_sim.pictures import token_pixels
 
+MAX_REWARD = 1e6  # of a user's own function
 RewardFn = Callable[[Floats, Floats], Floats]
 UserReward = Callable[[Floats, Floats, Layout], Any]
 
@@ -154,6 +155,20 @@ def closeness(distance: Floats, reach: float, sharpness: float) -> Floats:
     """
     scaled: Floats = 1.0 - 2.0 * np.log1p(sharpness * distance / reach) / np.log1p(sharpness)
     return scaled
+
+
+def reward_bounds(config: RewardConfig, sim: SimConfig, bound: float) -> tuple[float, float]:
+    """The least and the largest reward where no coordinate is beyond +-bound.
+
+    Nothing is known of a user's own function but that it is finite.
+    """
+    if config.own is not None:
+        return -MAX_REWARD, MAX_REWARD
+    if config.name == "overlap":
+        return -1.0, 1.0
+    farthest = np.array(2.0 * np.sqrt(2.0) * bound)
+    least = closeness(farthest, sim.arena * np.sqrt(2.0), config.sharpness)
+    return min(-1.0, float(least)), 1.0
 
 
 def _corner_distance(achieved: Floats, desired: Floats, layout: Layout, token: int) -> Floats:

@@ -34,8 +34,8 @@ _MANY = 40  # areas whose shapes are told
 _SIZE = 1.6  # times that an area may be larger or smaller than the token that it looks like
 _LIKE = 0.25  # moments nearer than this make an area look like a token
 _POINTS = 100  # of the light along a side
-_BORDER = 3.0  # how much more the picture's border tells of the ground
-_ROUNDS = 12
+_BORDER = 5  # points of the light from each side that show the ground
+_ROUNDS = 24
 _STEEP = 3.0  # how much steeper edges are made: less than a third is a shadow
 _NOTHING = "no token"
 _GROUND, _TOKEN = 230, 60  # levels of the picture that is looked at
@@ -212,13 +212,14 @@ def _coverage(levels: Pixels) -> Singles:
 def _light(grey: Singles) -> tuple[Singles, float]:
     """(H, W) levels of a lit ground, and the deviation from it.
 
-    A curved surface from which most of the picture is not far, above all its border.
+    A curved surface from which most of the picture's border is not far, and then all that it meets
+    within: a figure may cover most of the picture.
     """
     step = max(1, max(grey.shape) // _POINTS)
     some = grey[::step, ::step].astype(np.float64)
     design = _surface(*(np.linspace(-1.0, 1.0, side) for side in some.shape))
-    border = np.full(some.shape, _BORDER)
-    border[2:-2, 2:-2] = 1.0
+    border = np.ones(some.shape)
+    border[_BORDER:-_BORDER, _BORDER:-_BORDER] = 0.0
     weights, noise = border, 1.0
     for left in reversed(range(_ROUNDS)):
         terms = (design * weights[..., None]).reshape(-1, design.shape[-1])

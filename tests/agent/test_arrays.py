@@ -17,7 +17,6 @@ from tangram_agent.arrays import (
     MAX_EPISODES,
     MAX_FRAME_BYTES,
     MAX_FRAMES,
-    MAX_REWARD,
     EpisodeSpec,
     decode_columns,
     decode_tensors,
@@ -27,7 +26,9 @@ from tangram_agent.arrays import (
     split_frames,
 )
 from tangram_agent.types import Episodes
+from tangram_sim.config import RewardConfig
 from tangram_sim.errors import ConfigError, WireError
+from tangram_sim.rewards import MAX_REWARD
 from tests.agent.builders import BFLOAT, PAIR, one_tensor, setup
 from tests.agent.messages import BOUND, SHAPES, SPEC, episodes, weights
 
@@ -118,7 +119,7 @@ BOUNDED: dict[str, tuple[str, str, list[float]]] = {
     "goals": ("[1, 0, 0]", "-4 and 4", [NAN, 4.001]),
     "placed": ("[1, 0, 0]", "0 and 1", [2, 255]),
     "actions": ("[1, 0, 0]", "-1 and 1", [NAN, 1.00001, -1.00001]),
-    "rewards": ("[1, 0]", "-1e+06 and 1e+06", [NAN, INF, 1.1e6, -1.1e6]),
+    "rewards": ("[1, 0]", "-1 and 1", [NAN, INF, 1.1, -1.1]),
 }
 BAD_VALUES = [(name, value) for name, (*_, values) in BOUNDED.items() for value in values]
 
@@ -142,11 +143,25 @@ def test_values_out_of_bounds_are_named(name: str, value: float) -> None:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("corners", BOUND), ("goals", -BOUND), ("actions", 1 + 5e-7), ("rewards", -MAX_REWARD)],
+    [("corners", BOUND), ("goals", -BOUND), ("actions", 1 + 5e-7), ("rewards", -1.0)],
 )
 def test_values_at_their_bounds_pass(name: str, value: float) -> None:
     sent = spoiled(name, value)
     assert same(decode_episodes(encode_episodes(sent, SPEC), 2, SPEC), sent)
+
+
+@pytest.mark.parametrize("reward", ["overlap", "dense", "pose"])
+def test_a_run_takes_no_reward_that_its_own_cannot_be(reward: str) -> None:
+    """Episodes of 1e6 among thousands spoilt for good what a critic had learned."""
+    spec = EpisodeSpec.of(replace(setup(), reward=RewardConfig(reward)))
+    (column,) = [one for one in spec.columns(1) if one.name == "rewards"]
+    worst = np.full(column.shape, spec.rewards[0], np.float32)
+    assert -1.5 < spec.rewards[0] <= -1.0
+    for value in (worst, np.ones_like(worst)):
+        assert np.array_equal(column.decode(column.encode(value)), value)
+    for value in (worst * 1.01, np.full_like(worst, 1.01)):
+        with pytest.raises(WireError, match=r"rewards holds .* must be finite and between -1"):
+            column.decode(value.tobytes())
 
 
 def test_arrays_of_another_task_are_not_sent() -> None:
@@ -192,8 +207,8 @@ def test_a_batch_holds_a_bounded_number_of_episodes() -> None:
 
 def test_the_spec_of_a_setup() -> None:
     made = setup(PAIR, actions_per_token=2)
-    assert EpisodeSpec.of(made) == EpisodeSpec(2, 7, 4, 4, made.bound)
-    assert EpisodeSpec.of(setup()) == EpisodeSpec(1, 4, 1, 3, setup().bound)
+    assert EpisodeSpec.of(made) == EpisodeSpec(2, 7, 4, 4, made.bound, rewards=(-1.0, 1.0))
+    assert EpisodeSpec.of(setup()) == EpisodeSpec(1, 4, 1, 3, setup().bound, rewards=(-1.0, 1.0))
 
 
 @pytest.mark.parametrize("bound", [-1.0, NAN, INF])

@@ -22,6 +22,7 @@ from tangram_sim.rewards import (
     closeness,
     make_reward,
     pinned,
+    reward_bounds,
     reward_identity,
 )
 from tangram_sim.sampling import sample_batch
@@ -68,6 +69,22 @@ def test_mean_overlap_of_a_right_place_at_any_angle(shape: str, expected: float)
 
 
 ZERO = (math.sqrt(101.0) - 1.0) / 100.0
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=25, deadline=None)
+@pytest.mark.parametrize("name", ["overlap", "dense", "pose"])
+def test_no_reward_is_beyond_its_bounds(name: str, seed: int) -> None:
+    """Wherever tokens lie within the bound of all coordinates."""
+    rng, layout, sim = np.random.default_rng(seed), layout_of(*TRIO), SimConfig()
+    config = RewardConfig(name)
+    poses = random_poses(rng, 40, layout.tokens, 8.0)
+    poses[::2, :, :2] = 8.0 * np.sign(poses[::2, :, :2])
+    corners = layout.corners(poses)
+    bound = float(np.abs(corners).max())
+    found = make_reward(config, layout, sim)(corners[:20], corners[20:])
+    low, high = reward_bounds(config, sim, bound)
+    assert low - 1e-9 <= found.min() <= found.max() <= high + 1e-9
 
 
 @pytest.mark.parametrize(
