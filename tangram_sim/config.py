@@ -319,6 +319,8 @@ class SimConfig(Settings, section="sim"):
                     f"sim.{name} must be three numbers, of x, y and turn, as in "
                     f"sim.{name}={told(getattr(SimConfig, name))}, got {told(value)}"
                 )
+        if self.observe in ("pictures", "silhouette_pictures"):
+            self._check_observed()
         super().__post_init__()
         if self.motion == "slide" and self.backend == "kinematic":
             raise ConfigError(
@@ -332,8 +334,6 @@ class SimConfig(Settings, section="sim"):
             )
         if 0 < self.pixels < MIN_PIXELS:
             raise ConfigError(f"sim.pixels must be 0 or at least {MIN_PIXELS}, got {self.pixels}")
-        if self.observe in ("pictures", "silhouette_pictures"):
-            self._check_observed()
         if self.observe == "silhouette" and self.pixels:
             remedy = "set sim.observe=silhouette_pictures"
             refuse_ignored(f"sim.pixels={self.pixels}", "sim.observe=silhouette", remedy, 0)

@@ -44,8 +44,12 @@ class FaultError(Exception):
 
 def check_file(path: Path, source: str) -> None:
     """Raise ConfigError unless a path leads to a file; `source` is what the error calls it."""
-    if not path.is_file():
-        raise ConfigError(f"{source} is no file: check the path")
+    try:
+        there, why = path.is_file(), ""
+    except OSError as error:  # a name that is too long, or a folder that may not be read
+        there, why = False, f" ({error.strerror})"
+    if not there:
+        raise ConfigError(f"{source} is no file{why}: check the path")
 
 
 def read_text(path: Path, source: str | None = None) -> str:

@@ -183,7 +183,9 @@ def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
     setup = run.setup
     found = find_figures(source, setup, names, config.turns, config.skip_invalid)
     if setup.fills and config.solve != TOGETHER:
-        refuse_ignored(f"solve={config.solve}", "a run that fills outlines itself", "leave it out")
+        refuse_ignored(
+            f"solve={config.solve}", "a run that fills outlines itself", "name another run"
+        )
     given = setup, found.figures, policies(run), config.seed
     if setup.fills and setup.sim.observe == "silhouette_pictures":
         scored = score_pictured(run, found.figures, config.seed)

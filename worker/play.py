@@ -25,6 +25,7 @@ from tangram_sim.layout import Layout
 from tangram_sim.settings import told
 from worker.config import MAX_SHOWN, PlayConfig, source_and_names
 from worker.film import WIDTH, Show, film_pictures, frames_per_action, show_live
+from worker.metrics import SOLVED, assembled
 from worker.photographs import draw_photograph, read_photograph
 from worker.puzzles import find_figures, play_figures
 from worker.rollout import Played, at_once
@@ -138,7 +139,10 @@ def silhouette_show(run: Run, config: PlayConfig, found: Shown) -> Show:
     played = play_figures(setup, [found.figure], greedy(run.policy), config.seed)
     width = WIDTH if _is_still(config.out) else WIDTH // 2
     seen = draw_silhouette(found, setup.layout, width, bare=fills)
-    told = "filled by the run itself" if fills else found.told
+    told = found.told
+    if fills:
+        solved = assembled(setup.layout, played).iou[0] >= SOLVED
+        told = "filled by the run itself" if solved else f"not filled by the run itself, but {told}"
     return Show(setup, played, [found.figure.title], "silhouette", seen, told)
 
 

@@ -89,7 +89,7 @@ def score_outlines(
         for e, figure in enumerate(figures)
     ]
     titles = [figure.title for figure in figures]
-    told = "filled by the run itself; any dissection counts, so no errors of position and angle"
+    told = "played by the run itself; any dissection counts, so no errors of position and angle"
     return Scored(scores, each, titles, run.ends, run.goals, told)
 
 

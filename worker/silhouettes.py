@@ -207,9 +207,11 @@ def _kept(picture: Image.Image, out: Path) -> str:
 
 
 def _is_ours(path: Path) -> bool:
-    """Whether a file is the picture of an attempt of before."""
+    """Whether a path leads to the picture of an attempt of before."""
+    if not path.is_file():
+        return False
     try:
         with Image.open(path, formats=("PNG",)) as picture:
             return bool(picture.info.get("Comment") == MARK)
-    except (OSError, SyntaxError, ValueError):
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
         return False

@@ -72,6 +72,11 @@ REFUSED = [
     (SimConfig, {"corner_noise": 0.3}, "sim.corner_noise must be between 0 and 0.2, got 0.3"),
     (SimConfig, {"pixels": 15}, "sim.pixels must be 0 or at least 16, got 15"),
     (SimConfig, {"observe": "pictures"}, "^sim.observe=pictures needs .*: set sim.pixels=128$"),
+    (
+        SimConfig,
+        {"observe": "pictures", "picture": "grey"},
+        "^sim.observe=pictures needs .*: set sim.pixels=128$",
+    ),
     (SimConfig, {"observe": "silhouette_pictures"}, "^sim.observe=silhouette_pictures needs pict"),
     (SimConfig, {"pixels": 64, "picture": "x"}, "^sim.picture must be one of binary, grey, got"),
     (SimConfig, {"pixels": 64, "light_gradient": 0.25}, "between 0 and 0.24, got 0.25$"),

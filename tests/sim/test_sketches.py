@@ -77,6 +77,8 @@ def test_files_that_cannot_be_read_are_refused(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "missing.json", Path("/dev/zero")):
         with pytest.raises(ConfigError, match="is no file: check the path"):
             read_puzzles(path)
+    with pytest.raises(ConfigError, match=r"is no file \(File name too long\): check the path"):
+        read_puzzles(tmp_path / ("a" * 300))
 
 
 def test_a_file_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:

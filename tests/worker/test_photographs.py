@@ -75,6 +75,20 @@ def test_tokens_are_found_where_they_lie(tmp_path: Path, dark: bool, bad: str) -
     np.testing.assert_array_equal(seen.flipped, FLIPPED)
 
 
+@pytest.mark.parametrize("share", [0.4, 0.6, 0.8])
+@pytest.mark.parametrize("dark", [False, True])
+def test_a_token_may_cover_most_of_a_photograph(tmp_path: Path, dark: bool, share: float) -> None:
+    """The ground is what the picture's border shows."""
+    layout, side = layout_of("square", scale=0.8), 400
+    unit = side * np.sqrt(share / float(layout.areas[0]))
+    canvas = Image.new("L", (side, side), 20 if dark else 250)
+    corners = layout.corners(np.zeros((1, 3))) * unit + side / 2.0
+    ImageDraw.Draw(canvas).polygon([(x, y) for x, y in corners.tolist()], 250 if dark else 20)
+    canvas.save(tmp_path / "it.png")
+    picture = read_picture(tmp_path / "it.png", "it")
+    assert find_tokens(picture, layout, "it").unit == pytest.approx(unit, rel=0.01)
+
+
 @pytest.mark.parametrize("mode", ["RGBA", "P", "I;16", "upright", "one level"])
 def test_every_kind_of_file_shows_the_same(tmp_path: Path, mode: str) -> None:
     grey = levels(LAYOUT, POSES).astype(np.uint8)

@@ -111,7 +111,7 @@ def test_an_agent_of_outlines_is_shown_the_bare_silhouette(
     """Its two halves are of few colours: those of the tokens are on the right side only."""
     out, name = tmp_path / "square.png", svg(tmp_path / "square.svg", SQUARE)
     play_run(PlayConfig(str(filler), silhouette=name, out=str(out)))
-    assert "; filled by the run itself" in capsys.readouterr().out
+    assert "; not filled by the run itself, but filled by the search in" in capsys.readouterr().out
     with Image.open(out) as drawn:
         left = drawn.convert("RGB").crop((0, 0, drawn.width // 2 - 40, drawn.height))
         wide = np.ptp(np.asarray(left, np.int64), axis=-1)

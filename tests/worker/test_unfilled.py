@@ -1,6 +1,9 @@
 """Silhouettes that cannot be filled are told and drawn, and several dissections are drawn."""
 
 import json
+import os
+import struct
+import zlib
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -84,6 +87,22 @@ def test_an_area_of_known_scale_is_told(tmp_path: Path) -> None:
     del content["puzzles"][1:], content["puzzles"][0]["pieces"][-1]  # a sixteenth
     (tmp_path / "six.json").write_text(json.dumps(content))
     assert "covers 0.94 of the seven tans" in refused(str(tmp_path / "six.json"), None)
+
+
+@pytest.mark.parametrize("kind", ["pipe", "bomb"])
+def test_nothing_is_waited_for_or_unpacked_where_an_attempt_is_to_be_drawn(
+    tmp_path: Path, kind: str
+) -> None:
+    beside, size = tmp_path / "out.png", struct.pack(">II", 20_000, 20_000)
+    if kind == "pipe":
+        os.mkfifo(beside)
+    else:
+        Image.new("L", (9, 9)).save(beside)
+        head = b"IHDR" + size + beside.read_bytes()[24:29]
+        crc = struct.pack(">I", zlib.crc32(head))
+        beside.write_bytes(beside.read_bytes()[:12] + head + crc + beside.read_bytes()[33:])
+    strip = outline(tmp_path / "strip.json", STRIP)
+    assert f"as {beside} is something else" in refused(strip, tmp_path / "out.gif")
 
 
 def test_only_pictures_of_attempts_are_written_over(tmp_path: Path) -> None:
