@@ -72,7 +72,7 @@ class Looks:
             "pictures": camera,
             "scenes": len(self.ms),
             "all found": float(found.mean()),
-            "same picture": float((self.same | found).mean()),
+            "same picture": float(self.same.mean()),
             "sure but wrong": float(wrong.mean()),
             "position, median": float(np.median(position)),
             "95th perc.": float(np.percentile(position, 95)),
