@@ -17,7 +17,7 @@ from rich.progress import track
 from torch import nn
 
 from tangram_agent.filler import Filler
-from tangram_agent.filling import Filling
+from tangram_agent.filling import UNUSED, Filling
 from tangram_agent.runs import load_run
 from tangram_agent.setup import Setup
 from tangram_agent.values import Corners
@@ -49,6 +49,22 @@ class ByChance(nn.Module):
         return torch.rand(len(corners.points), generator=self._generator)
 
 
+class Simplest(nn.Module):
+    """States are worth the more, the simpler what is left: few corners, or a short outline."""
+
+    def __init__(self, corners: float, length: float) -> None:
+        """What a corner costs, and what a length of the root of all tokens' area does."""
+        super().__init__()
+        self._corners, self._length = corners, length
+
+    def forward(self, corners: Corners) -> torch.Tensor:
+        """(n,) minus the costs."""
+        index = corners.follow[..., None].expand_as(corners.points)
+        sides = (corners.points.gather(1, index) - corners.points).norm(dim=-1)
+        used = corners.part != UNUSED
+        return -(self._corners * used + self._length * sides * used).sum(dim=1)
+
+
 def run_outlines(run_dir: str, scenes: int, seed: int, out: Path | None) -> int:
     """Print the table; returns the exit status, 0 whatever was found.
 
@@ -63,6 +79,8 @@ def run_outlines(run_dir: str, scenes: int, seed: int, out: Path | None) -> int:
     ways: dict[str, nn.Module] = {
         "the agent": run.policy.network,
         "largest first": run.unlearned().policy.network,
+        "fewest corners": Simplest(1.0, 0.0),
+        "shortest outline": Simplest(0.0, 1.0),
         "by chance": ByChance(seed),
     }
     rows = []

@@ -53,7 +53,7 @@ class Looks:
     Attributes:
         off: (N, K, 2) distance and degrees of each token; infinite where it is not surely seen.
         ms: (N,) CPU time of one look.
-        same: (N,) scenes of which what was seen gives the same picture.
+        same: (N,) scenes of which what was seen gives the same picture, found as it lies or not.
     """
 
     off: Floats
@@ -72,7 +72,7 @@ class Looks:
             "pictures": camera,
             "scenes": len(self.ms),
             "all found": float(found.mean()),
-            "same picture": float(self.same.mean()),
+            "same picture": float((self.same | found).mean()),
             "sure but wrong": float(wrong.mean()),
             "position, median": float(np.median(position)),
             "95th perc.": float(np.percentile(position, 95)),

@@ -49,7 +49,7 @@ def test_figures_that_agents_trained_on_are_left_out_and_the_rest_is_counted(
     rows = json.loads((tmp_path / "out.json").read_text())["rows"]
     assert [row["silhouette"] for row in rows] == [
         f"{who}, {beam}"
-        for who in ("the agent", "largest first", "by chance")
+        for who in ("the agent", "largest first", "fewest corners", "shortest outline", "by chance")
         for beam in ("no search", "beam of 4", "beam of 12")
     ]
     assert {row["figures"] for row in rows} == {2}
