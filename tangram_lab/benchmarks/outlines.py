@@ -62,7 +62,8 @@ class Simplest(nn.Module):
         index = corners.follow[..., None].expand_as(corners.points)
         sides = (corners.points.gather(1, index) - corners.points).norm(dim=-1)
         used = corners.part != UNUSED
-        return -(self._corners * used + self._length * sides * used).sum(dim=1)
+        costs: torch.Tensor = used * (self._corners + self._length * sides)
+        return -costs.sum(dim=1)
 
 
 def run_outlines(run_dir: str, scenes: int, seed: int, out: Path | None) -> int:

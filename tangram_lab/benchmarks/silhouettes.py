@@ -36,7 +36,7 @@ from tangram_vision.silhouette_pictures import fill_picture
 from tangram_vision.silhouettes import SOLVED, Filled, Method, covered, fill_outline, overlap
 from worker.methods import method_of
 
-SECONDS = 5.0  # for each figure, by the clock
+SECONDS = 5.0  # of processor time for each figure
 RIVAL_SECONDS = SECONDS  # the same, of processor time
 TURNS = 8
 EACH = 13  # figures of each kind for what takes seconds each: as many as there are convex ones

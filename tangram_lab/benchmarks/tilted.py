@@ -24,7 +24,7 @@ _WIDTH = 0.6  # of the picture that a figure takes
 _DISTANCE = 1.6  # widths of the figure, from which a telephone's camera shows it so large
 _FINE = 4  # points along a pixel
 _INK, _PAPER = 50, 225
-SECONDS = 10.0  # by the clock: a picture is made besides
+SECONDS = 10.0  # of processor time
 
 
 def tilted_rows(layout: Layout, areas: Sequence[Area], seed: int) -> Iterator[dict[str, Any]]:
