@@ -15,12 +15,13 @@ from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
 from tangram_agent.setup import Setup, make_setup
 from tests.agent.builders import random_episodes
+from tests.agent.no_reward import NOTHING
 from tests.cluster.processes import LIMIT_S, started, wait_for_file
 from worker.client import Client
 from worker.connection import Timing
 
 EPISODES = 3  # in each batch
-FIRST_TAG = 2.0  # rewards of hindsight twins are at most 1
+FIRST_TAG = 2.0  # rewards of hindsight twins are 0
 QUICK = Timing(retry_s=0.2, heartbeat_s=0.2, resend_s=1.0, silence_s=1.5)
 PATIENT = replace(QUICK, silence_s=30.0)  # a master on a busy machine may be silent for seconds
 MASTER = (
@@ -31,6 +32,7 @@ MASTER = (
     "agent.learning_starts=30",
     "agent.batch_size=16",
     "agent.replay_capacity=2000000",  # nothing makes room for anything
+    f"reward.name={NOTHING}",
 )
 TCP = ("service.bind=127.0.0.1", "service.auth=off")  # for those who know its address alone
 
