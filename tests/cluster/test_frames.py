@@ -131,8 +131,8 @@ def test_strangers_with_stale_or_foreign_keys_are_turned_away(tmp_path: Path) ->
             more_acknowledged(made, 3)
             line = f"wrong or stale connection file: what answers at {mine['endpoint']} does not"
             said = tmp_path / "said"
-            line_of = f"connect={stale}", f"reward.name={NOTHING}"
-            with started("tangram-worker", *line_of, cwd=tmp_path, err=said) as who:
+            given = f"connect={stale}", f"reward.name={NOTHING}"
+            with started("tangram-worker", *given, cwd=tmp_path, err=said) as who:
                 until(made, lambda: line in said.read_text())
                 assert who.poll() is None  # it waits for the file to become right
                 stale.write_text(json.dumps(mine))
