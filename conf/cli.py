@@ -149,7 +149,7 @@ def _run(config_name: str, task: Callable[[Plain], int], stored: Stored | None) 
     os.environ["HYDRA_FULL_ERROR"] = "1"
     _register(config_name)
     try:
-        if any(text.startswith(("-", "hydra")) for text in sys.argv[1:]):
+        if any(_key(text).startswith(("-", "hydra")) for text in sys.argv[1:]):
             hydra.main(version_base="1.3", config_path="pkg://conf", config_name=config_name)(job)()
         else:
             with hydra.initialize_config_module("conf", version_base="1.3"):

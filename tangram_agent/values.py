@@ -34,7 +34,7 @@ class Corners(NamedTuple):
         points, follow, part = (torch.from_numpy(np.ascontiguousarray(one)) for one in columns)
         left = torch.from_numpy(rests.left.astype(np.float32))
         return Corners(
-            points.to(device), follow.long().to(device), part.long().to(device), left.to(device)
+            points.to(device), follow.to(device).long(), part.to(device).long(), left.to(device)
         )
 
 
@@ -67,8 +67,8 @@ def features(corners: Corners) -> Tensor:
     follow = follow.clamp(max=most - 1)
     before = torch.zeros_like(follow)
     before.scatter_(1, follow, torch.arange(most, device=follow.device).expand(count, -1))
-    ahead = _taken(points, follow) - points
-    behind = _taken(points, before) - points
+    ahead = taken(points, follow) - points
+    behind = taken(points, before) - points
     lengths = [side.norm(dim=-1, keepdim=True) for side in (ahead, behind)]
     out, back = (
         s / length.clamp(min=1e-6) for s, length in zip((ahead, behind), lengths, strict=True)
@@ -94,5 +94,6 @@ def features(corners: Corners) -> Tensor:
     return torch.cat(every, dim=-1) * used[..., None]
 
 
-def _taken(points: Tensor, index: Tensor) -> Tensor:
+def taken(points: Tensor, index: Tensor) -> Tensor:
+    """(n, N, 2) the points of rows (n, N), as `Corners.follow` names them."""
     return points.gather(1, index[..., None].expand(-1, -1, points.shape[-1]))

@@ -160,7 +160,7 @@ def closeness(distance: Floats, reach: float, sharpness: float) -> Floats:
 def reward_bounds(config: RewardConfig, sim: SimConfig, bound: float) -> tuple[float, float]:
     """The least and the largest reward where no coordinate is beyond +-bound.
 
-    Nothing is known of a user's own function but that it is finite.
+    Of a user's own function nothing is known: it may return up to MAX_REWARD.
     """
     if config.own is not None:
         return -MAX_REWARD, MAX_REWARD

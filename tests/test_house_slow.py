@@ -42,17 +42,24 @@ def test_the_launcher_needs_no_torch() -> None:
 
 
 @pytest.mark.parametrize(
-    "line", ["eval episodes=3 sim.damping=3", "play sim.gain=0", "play puzzle=nowhere.json"]
+    "line",
+    [
+        "eval episodes=3 sim.damping=3",
+        "play sim.gain=0",
+        "play puzzle=nowhere.json",
+        "play target=nowhere.png",
+        "play silhouette=nowhere.png",
+    ],
 )
-def test_what_cannot_be_played_is_refused_without_torch(line: str) -> None:
+def test_what_cannot_be_played_is_refused_without_torch_or_opencv(line: str) -> None:
     given = [*line.split(), "run_dir=pretrained/tangram7"]
     told = run_python(
         "import sys\n"
         "from worker.cli import evaluate, play\n"
         f"command, *sys.argv[1:] = {given}\n"
-        "print({'eval': evaluate, 'play': play}[command](), 'torch' in sys.modules)"
+        "print({'eval': evaluate, 'play': play}[command](), {'torch', 'cv2'} & set(sys.modules))"
     )
-    assert told == "2 False"
+    assert told == "2 set()"
 
 
 def test_learning_needs_no_compiler() -> None:

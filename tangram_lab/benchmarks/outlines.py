@@ -20,7 +20,7 @@ from tangram_agent.filler import Filler
 from tangram_agent.filling import UNUSED, Filling
 from tangram_agent.runs import load_run
 from tangram_agent.setup import Setup
-from tangram_agent.values import Corners
+from tangram_agent.values import Corners, taken
 from tangram_lab.benchmarks.measure import show, write
 from tangram_lab.benchmarks.seeing import SCALE
 from tangram_lab.benchmarks.silhouettes import Shape, area_of, figures_of, row_of
@@ -59,8 +59,7 @@ class Simplest(nn.Module):
 
     def forward(self, corners: Corners) -> torch.Tensor:
         """(n,) minus the costs."""
-        index = corners.follow[..., None].expand_as(corners.points)
-        sides = (corners.points.gather(1, index) - corners.points).norm(dim=-1)
+        sides = (taken(corners.points, corners.follow) - corners.points).norm(dim=-1)
         used = corners.part != UNUSED
         costs: torch.Tensor = used * (self._corners + self._length * sides)
         return -costs.sum(dim=1)

@@ -53,7 +53,7 @@ class Looks:
     Attributes:
         off: (N, K, 2) distance and degrees of each token; infinite where it is not surely seen.
         ms: (N,) CPU time of one look.
-        same: (N,) scenes of which what was seen gives the same picture, found as it lies or not.
+        same: (N,) scenes of which what was seen gives the same picture.
     """
 
     off: Floats

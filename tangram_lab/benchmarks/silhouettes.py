@@ -37,7 +37,7 @@ from tangram_vision.silhouettes import SOLVED, Filled, Method, covered, fill_out
 from worker.methods import method_of
 
 SECONDS = 5.0  # of processor time for each figure
-RIVAL_SECONDS = SECONDS  # the same, of processor time
+RIVAL_SECONDS = SECONDS  # the same for rivals
 TURNS = 8
 EACH = 13  # figures of each kind for what takes seconds each: as many as there are convex ones
 BY_SIZE = "beam, largest first"  # the beam of who learned nothing

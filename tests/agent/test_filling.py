@@ -104,8 +104,9 @@ def test_features_of_a_square() -> None:
     """Every corner: half a side from the middle, sides of one unit, a right angle, all its area."""
     side = UNIT  # the unit of what is seen
     square = Polygon([(0, 0), (side, 0), (side, side), (0, side)])
-    seen = features(Corners.of(FILLING.seen(square, (2,))))[0]
-    corners, unused = seen[:4], seen[4:]
+    longer = Polygon([(0, 0), (side, 0), (side, side), (side / 2, 2 * side), (0, side)])
+    both = Rests.joined([FILLING.seen(one, (2,)) for one in (square, longer)])
+    corners, unused = features(Corners.of(both))[0].split([4, 1])
     assert (unused == 0).all()
     assert corners[:, :2].abs() == pytest.approx(0.5, abs=1e-5)
     out, back, lengths = corners[:, 2:4], corners[:, 4:6], corners[:, 6:8]

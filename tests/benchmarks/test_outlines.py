@@ -1,13 +1,16 @@
-"""The table of who fills exact outlines: figures that no agent trained on, and three who choose."""
+"""The table of who fills exact outlines: figures that no agent trained on, and those who choose."""
 
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely.affinity
 
+from tangram_agent.filling import Filling, Rests
+from tangram_agent.values import Corners
 from tangram_lab.benchmarks import outlines
-from tangram_lab.benchmarks.outlines import run_outlines
+from tangram_lab.benchmarks.outlines import Simplest, run_outlines
 from tangram_lab.benchmarks.seeing import SCALE
 from tangram_lab.benchmarks.silhouettes import Shape
 from tangram_sim.dissections import Dissection
@@ -16,7 +19,7 @@ from tangram_sim.layout import Layout
 from tangram_sim.puzzles import library
 from tangram_sim.targets import placement, turned_figure
 from tests.agent.outlines import AGENT, SIM
-from tests.sim.builders import SEVEN
+from tests.sim.builders import SEVEN, layout_of
 from tests.worker.builders import write_run
 
 pytestmark = pytest.mark.fast
@@ -55,6 +58,19 @@ def test_figures_that_agents_trained_on_are_left_out_and_the_rest_is_counted(
     assert {row["figures"] for row in rows} == {2}
     # Two squares: with a beam of 12 even chance finds how they are filled.
     assert np.array([row["test (1)"] for row in rows])[[2, 5, 8]].max() == 1.0
+
+
+def test_the_simplest_rest_is_that_of_few_corners_or_a_short_outline() -> None:
+    """A square of all the area, and as large a strip with a corner more, beside unused rows."""
+    filling = Filling(layout_of(*SEVEN, scale=SCALE))
+    side = float(np.sqrt(layout_of(*SEVEN, scale=SCALE).areas.sum()))
+    square = shapely.box(0, 0, side, side)
+    strip = shapely.Polygon([(0, 0), (4, 0), (4, 0.25), (2, 0.3), (0, 0.25)])
+    strip = shapely.affinity.scale(strip, side, side, origin=(0, 0))
+    corners = Corners.of(Rests.joined([filling.seen(one, (1,) * 5) for one in (square, strip)]))
+    assert Simplest(1.0, 0.0)(corners).tolist() == [-4.0, -5.0]
+    lengths = [-4.0, -strip.length / side]
+    assert Simplest(0.0, 1.0)(corners).tolist() == pytest.approx(lengths, abs=1e-4)
 
 
 def test_a_run_that_fills_no_outlines_is_refused(tmp_path: Path) -> None:

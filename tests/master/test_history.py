@@ -41,7 +41,7 @@ from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.config import ServiceConfig
 from tangram_agent.process import Watchdog
 from tangram_sim.config import RewardConfig
-from tangram_sim.errors import TangramError
+from tangram_sim.errors import TangramError, WireError
 from tests.agent.builders import random_episodes
 from tests.agent.no_reward import NOTHING
 from tests.master.builders import ShownProgress, small_setup
@@ -132,6 +132,8 @@ class Worker:
         """Until the master sends it home, or is one of another run."""
         try:
             act()
+        except WireError:  # it would send what nobody takes
+            raise
         except TangramError:
             self.alive = False
         self.alive = self.alive and not self.client.stopped
