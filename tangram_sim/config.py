@@ -39,7 +39,7 @@ UNKNOWN = (
     *("damping", "damping_spread"),
 )
 MOTIONS = ("lift", "slide")
-STARTS = ("anywhere", "outside")
+STARTS = ("anywhere", "outside", "piles")
 TARGETS = ("uniform", "gaussian", "connected", "figures", "touching", "mixed")
 
 
@@ -196,7 +196,9 @@ class SimConfig(Settings, section="sim"):
         only={"targets": "gaussian"},
     )
     starts: str = setting(
-        "anywhere", "in the arena, or outside of the target where there is room", choices=STARTS
+        "anywhere",
+        "in the arena; outside of the target where there is room; or so, in piles of 1 to 3 tokens",
+        choices=STARTS,
     )
     mirrored: float = setting(
         0.0,

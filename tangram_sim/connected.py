@@ -1,4 +1,4 @@
-"""Targets that hang together: each piece shares a part of an edge with one before it.
+"""Pieces that hang together: each shares a part of an edge with one before it.
 
 Points and directions are complex numbers here. Legend: n candidates, k pieces laid before, C
 corners of a piece, filled up to those of the largest by repeating the last one, and edges alike.
@@ -11,6 +11,7 @@ import numpy as np
 from tangram_sim.arrays import Bools, Complex, Floats, Ints
 from tangram_sim.config import SimConfig
 from tangram_sim.errors import SamplingError
+from tangram_sim.geometry import outlines, pairs_overlap
 from tangram_sim.kinematics import wrap
 from tangram_sim.layout import Layout
 from tangram_sim.sampling import MAX_TRIES, check_fits
@@ -18,6 +19,9 @@ from tangram_sim.sampling import MAX_TRIES, check_fits
 _CHUNK = 16  # candidates that are checked together
 _ALIGNED = 0.7  # share of pieces that meet another corner to corner
 _TOUCHING = 1e-9  # depth of an overlap, as a share of the arena: rounding
+MAX_PILE = 3  # tokens that touch and can be found in a picture: more are searched for too long
+_CLEAR_TRIES = 64  # of a pile outside of what is only to be avoided; then as often anywhere
+PILES_APART = 1.0 / 64.0  # as a share of the arena
 
 
 def sample_connected(layout: Layout, sim: SimConfig, rng: np.random.Generator) -> Floats:
@@ -31,15 +35,78 @@ def sample_connected(layout: Layout, sim: SimConfig, rng: np.random.Generator) -
             `MAX_TRIES` tries.
     """
     check_fits(layout, sim)
-    bodies = _bodies(layout)
     order = rng.permutation(layout.tokens)
+    return _laid_out(layout, order, _chained(layout, order, sim, rng), sim, rng)
+
+
+def sample_piles(
+    layout: Layout, sim: SimConfig, rng: np.random.Generator, avoid: Floats | None = None
+) -> Floats:
+    """One layout (K, 3) of piles of one to three tokens edge to edge, at least one of several.
+
+    The piles lie at least `PILES_APART` of the arena apart: two pixels of a picture of 128. No
+    token lies on its other side.
+
+    Args:
+        layout: the tokens.
+        sim: the arena.
+        rng: draws it.
+        avoid: (M, C, 2) outlines that piles keep clear of where there is room.
+
+    Raises:
+        SamplingError: a token does not fit into the arena, or no layout was found in `MAX_TRIES`
+            tries.
+    """
+    check_fits(layout, sim)
+    for _ in range(MAX_TRIES // _CLEAR_TRIES):  # each tries as often for every pile
+        poses = _piles(layout, sim, rng, avoid)
+        if poses is not None:
+            return poses
+    raise SamplingError(
+        f"no piles within an arena of width {sim.arena:g} in {MAX_TRIES} tries: raise sim.arena, "
+        "lower tokens.scale, or set sim.starts=anywhere"
+    )
+
+
+def _piles(
+    layout: Layout, sim: SimConfig, rng: np.random.Generator, avoid: Floats | None
+) -> Floats | None:
+    """One try to lay piles; None where one finds no room, or each is of one token."""
+    order, sizes = rng.permutation(layout.tokens), rng.integers(1, MAX_PILE + 1, layout.tokens)
+    parts = [part for part in np.split(order, np.cumsum(sizes)) if len(part)]
+    if len(parts) == layout.tokens:
+        return None
+    bodies, poses, before = _bodies(layout), np.zeros((layout.tokens, 3)), order[:0]
+    for own in parts:
+        for number in range(2 * _CLEAR_TRIES):
+            pile = _laid_out(layout, own, _chained(layout, own, sim, rng), sim, rng)
+            laid, new = bodies.of(before).at(poses[before]), bodies.of(own).at(pile[own])
+            if not _apart(new, laid, -PILES_APART * sim.arena).all():
+                continue
+            if avoid is None or number >= _CLEAR_TRIES or _clear(layout, pile, own, avoid):
+                break
+        else:
+            return None
+        poses[own], before = pile[own], np.concatenate([before, own])
+    return poses
+
+
+def _clear(layout: Layout, poses: Floats, own: Ints, avoid: Floats) -> bool:
+    """Whether tokens of their own (n,) in poses (K, 3) overlap none of the outlines (M, C, 2)."""
+    pieces = outlines(layout.corners(poses)[None], layout)[0, own]
+    every = np.repeat(pieces, len(avoid), axis=0), np.tile(avoid, (len(own), 1, 1))
+    return not pairs_overlap(*every).any()
+
+
+def _chained(layout: Layout, order: Ints, sim: SimConfig, rng: np.random.Generator) -> Floats:
+    """Poses (K, 3) in which each token of an order (n,) touches one before it; 0 of the others."""
+    bodies = _bodies(layout)
     turns, shifts = np.ones(layout.tokens, np.complex128), np.zeros(layout.tokens, np.complex128)
     for number, token in enumerate(order[1:], 1):
         before = order[:number]
         laid = bodies.of(before).moved(turns[before, None], shifts[before, None])
         turns[token], shifts[token] = _attached(bodies.of(token), laid, sim, rng)
-    poses = np.column_stack([shifts.real, shifts.imag, np.angle(turns)])
-    return _laid_out(layout, poses, sim, rng)
+    return np.column_stack([shifts.real, shifts.imag, np.angle(turns)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +130,12 @@ class _Outlines:
         return _Outlines(
             self.corners[which], self.edges[which], self.lengths[which], self.count[which]
         )
+
+    def at(self, poses: Floats) -> "_Outlines":
+        """The outlines in poses (..., 3)."""
+        turn: Complex = np.exp(1j * poses[..., 2:])
+        shift: Complex = poses[..., :1] + 1j * poses[..., 1:2]
+        return self.moved(turn, shift)
 
     def moved(self, turn: Complex, shift: Complex) -> "_Outlines":
         """The outlines turned by a complex number of length 1, then shifted."""
@@ -138,12 +211,14 @@ def _extent(pieces: _Outlines, laid: _Outlines) -> Floats:
     return gaps
 
 
-def _laid_out(layout: Layout, poses: Floats, sim: SimConfig, rng: np.random.Generator) -> Floats:
-    """The whole turned by any angle and moved to where all of it lies in the arena."""
+def _laid_out(
+    layout: Layout, own: Ints, poses: Floats, sim: SimConfig, rng: np.random.Generator
+) -> Floats:
+    """The whole turned by any angle and moved to where all of its own tokens lie in the arena."""
     turn = rng.uniform(-np.pi, np.pi)
     centres = (poses[:, :2] @ (1.0, 1j)) * np.exp(1j * turn)
     turned = np.column_stack([centres.real, centres.imag, poses[:, 2] + turn])
-    corners = layout.corners(turned)
+    corners = layout.corners(turned)[np.isin(layout.token_of_corner, own)]
     low, high = corners.min(axis=0), corners.max(axis=0)
     room = sim.arena - (high - low)
     turned[:, :2] += room * rng.random(2) - sim.arena / 2.0 - low

@@ -16,7 +16,7 @@ from tangram_sim.actuation import reach
 from tangram_sim.arrays import Bools, Floats
 from tangram_sim.assembly import COUNTS, Puzzle, PuzzleRules
 from tangram_sim.config import SimConfig, StageConfig
-from tangram_sim.connected import sample_connected
+from tangram_sim.connected import MAX_PILE, sample_connected, sample_piles
 from tangram_sim.errors import ConfigError
 from tangram_sim.fitting import kind_of
 from tangram_sim.geometry import outlines
@@ -30,7 +30,6 @@ from tangram_sim.shapes import Shape, mirror_image, tan, turn_onto
 
 Generators = Sequence[np.random.Generator]
 Sides = tuple[Floats, Bools]
-MAX_PILE = 3  # tokens that touch and can be found in a picture: more are searched for too long
 _BY_CHANCE = {"touching": ("connected", "figures"), "mixed": ("uniform", "connected")}
 _TOGETHER = "connected", "figures", "touching", "mixed"  # with pieces that touch
 _NO_TURN = 1e-6  # radians
@@ -71,7 +70,7 @@ def sample_starts(
 
     Args:
         layout: the tokens.
-        sim: says whether starts keep clear of the target.
+        sim: says whether starts keep clear of the target, or are piles.
         targets: see `sample_targets`.
         done: (B, K) tokens that lie on their targets already; the others keep clear of them.
         generators: one for each environment.
@@ -80,6 +79,8 @@ def sample_starts(
         SamplingError: no room.
     """
     poses, flipped = targets
+    if sim.starts == "piles":
+        return _piles(layout, sim, targets, generators)
     if sim.allow_flip:
         drawn = [rng.random(layout.tokens) < 0.5 for rng in generators]
         flipped = np.where(done, flipped, np.stack(drawn) & layout.chiral)
@@ -89,14 +90,28 @@ def sample_starts(
     return sample_batch(layout, sim, generators, flipped, avoid, laid=laid), flipped
 
 
+def _piles(layout: Layout, sim: SimConfig, targets: Sides, generators: Generators) -> Sides:
+    """Starts in piles, those with chiral tokens on their other side as a mirror shows them."""
+    starts, sides = [], np.zeros(layout.tokens, np.bool_)
+    flipped = np.asarray(targets[1].any(axis=1))
+    goals = outlines(layout.corners(*targets), layout)
+    for other_side, avoid, rng in zip(flipped.tolist(), goals, generators, strict=True):
+        mirrored = rng.random() < 0.5 if sim.allow_flip else other_side
+        # A mirror shows the target, too; its outlines then go round the other way.
+        kept = avoid[:, ::-1] * (1.0, -1.0) if mirrored else avoid
+        poses = sample_piles(layout, sim, rng, kept)
+        starts.append(layout.mirrored(poses, sides) if mirrored else (poses, sides))
+    return np.stack([poses for poses, _ in starts]), np.stack([own for _, own in starts])
+
+
 def check_targets(layout: Layout, sim: SimConfig) -> None:
     """Refuse what these tokens cannot play.
 
     Raises:
         ConfigError: figures of tokens that are not all seven tans or too large for the arena, flips
-            or other sides of tokens that look the same on both, what one token does to others, a
-            token too thin for the arena, a world in which none could move, or a stage that moves
-            more than there are.
+            or other sides of tokens that look the same on both, what one token does to others,
+            piles of one token or of some, a token too thin for the arena, a world in which none
+            could move, or a stage that moves more than there are.
     """
     if sim.allow_flip and not layout.any_chiral:
         raise ConfigError(
@@ -112,6 +127,7 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
             refuse_ignored(f"sim.{name}={told(value)}", "one token", "take a set of several", usual)
     _check_thick(layout, sim)
     _check_world(layout, sim)
+    _check_piles(layout, sim)
     for stage in sim.stages:
         if stage.tokens > layout.tokens:
             raise ConfigError(
@@ -129,6 +145,20 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
         )
     for task in (sim.task, *sim.stages):
         _check_figures(layout, sim, task.targets)
+
+
+def _check_piles(layout: Layout, sim: SimConfig) -> None:
+    if sim.starts != "piles":
+        return
+    if layout.tokens == 1:
+        refuse_ignored("sim.starts=piles", "one token", "take a set of several")
+    for stage in sim.stages:
+        if 0 < stage.tokens < layout.tokens:
+            raise ConfigError(
+                f"sim.starts=piles has all {layout.tokens} tokens in piles, and a stage of "
+                f"sim.stages leaves all but {stage.tokens} on the target: give it tokens:0, or set "
+                "sim.starts=anywhere"
+            )
 
 
 def _check_names(layout: Layout, observe: str) -> None:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from tangram_sim.arrays import Complex, Floats, Ints, Singles
-from tangram_sim.targets import MAX_PILE
+from tangram_sim.connected import MAX_PILE
 from tangram_vision.blobs import find_blobs, likeness
 from tangram_vision.edges import NARROW, WIDE, Outlines
 from tangram_vision.kinds import Kind

@@ -14,7 +14,7 @@ from tangram_lab.benchmarks.measure import show, write
 from tangram_lab.benchmarks.square_seeing import square_rows
 from tangram_sim.arrays import Bools, Floats, Pixels
 from tangram_sim.config import SimConfig
-from tangram_sim.connected import sample_connected
+from tangram_sim.connected import sample_piles
 from tangram_sim.fitting import overlap_depths
 from tangram_sim.geometry import outlines
 from tangram_sim.layout import Layout, TokensConfig, make_layout
@@ -114,7 +114,7 @@ def _scenes(scenes: int, seed: int) -> Iterator[dict[str, Any]]:
         gap = APART * ARENA / pixels
         kinds = {f"seven tokens, {APART:g} px apart": _anywhere(layout, sim, gap)}
         if pixels == 128:
-            kinds["piles of two or three, edge to edge"] = _piled(layout, sim, gap)
+            kinds["piles of two or three, edge to edge"] = _piled(layout, sim)
             kinds["pairs that touch by chance"] = _touching(layout, sim, gap)
         for what, draw in kinds.items():
             yield _looks(layout, sim, draw, scenes, seed).row(what, f"{pixels} {picture}")
@@ -200,7 +200,7 @@ def _off(layout: Layout, poses: Floats, flipped: Bools, seen: Seen) -> Floats:
 def _one_off(
     layout: Layout, poses: Floats, flipped: Bools, seen: Seen, token: int, as_token: int
 ) -> tuple[float, float]:
-    if not seen.found[as_token]:
+    if not seen.sure[as_token]:
         return np.inf, np.inf
     if seen.flipped[as_token] != flipped[token]:
         return ARENA, 180.0
@@ -230,22 +230,11 @@ def _anywhere(layout: Layout, sim: SimConfig, gap: float) -> Draw:
     return draw
 
 
-def _piled(layout: Layout, sim: SimConfig, gap: float) -> Draw:
-    """One to three tokens edge to edge in each pile, at least one pile of several; piles apart."""
+def _piled(layout: Layout, sim: SimConfig) -> Draw:
+    """One to three tokens edge to edge in each pile, as with sim.starts=piles."""
 
     def draw(generator: np.random.Generator) -> Scene:
-        flipped = np.zeros(layout.tokens, np.bool_)
-        while True:
-            order, group = generator.permutation(layout.tokens), np.empty(layout.tokens)
-            poses, first, number = np.empty((layout.tokens, 3)), 0, 0
-            while first < layout.tokens:
-                own = order[first : first + int(generator.integers(1, 4))]
-                names = tuple(layout.shapes[token].name for token in own)
-                part = make_layout(TokensConfig(names, SCALE))
-                poses[own] = sample_connected(part, sim, generator)
-                group[own], first, number = number, first + len(own), number + 1
-            if number < layout.tokens and _gap(layout, (poses, flipped), group) >= gap:
-                return poses, flipped
+        return sample_piles(layout, sim, generator), np.zeros(layout.tokens, np.bool_)
 
     return draw
 

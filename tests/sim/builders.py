@@ -44,9 +44,13 @@ def pieces(layout: Layout, poses: Floats, flipped: Any = None) -> list[shapely.P
 
 
 def largest_overlap(layout: Layout, poses: Floats, flipped: Any = None) -> float:
-    """The largest area that two tokens of one layout (K, 3) share."""
+    """The largest area that two tokens of one layout (K, 3) share.
+
+    On a grid: without one GEOS 3.14 takes some pieces that only share an edge for one and the same.
+    """
     own = pieces(layout, poses, flipped)
-    return max((a.intersection(b).area for i, a in enumerate(own) for b in own[:i]), default=0.0)
+    both = [shapely.intersection(a, b, grid_size=1e-12) for i, a in enumerate(own) for b in own[:i]]
+    return max((shared.area for shared in both), default=0.0)
 
 
 def angle_gap(first: Floats, second: Floats) -> Floats:

@@ -87,7 +87,7 @@ REFUSED = [
     (SimConfig, {"max_overlap": 1.1}, "sim.max_overlap must be between 0 and 1, got 1.1"),
     (SimConfig, {"targets": "x"}, "sim.targets must be one of uniform, .* mixed, got 'x'"),
     (SimConfig, {"spread": 0.0}, "sim.spread must be between 0.001 and 1, got 0"),
-    (SimConfig, {"starts": "x"}, "sim.starts must be one of anywhere, outside, got 'x'"),
+    (SimConfig, {"starts": "x"}, "sim.starts must be one of anywhere, outside, piles, got 'x'"),
     (SimConfig, {"mirrored": 2.0}, "sim.mirrored must be between 0 and 1, got 2"),
     (SimConfig, {"stages": UNSORTED}, "must begin one after the other, got updates .5, 1.: sort"),
     (SimConfig, {"stages": TWICE}, "must begin one after the other, got updates .5, 5.: sort them"),

@@ -219,9 +219,12 @@ def starts_of(sim: SimConfig, layout: Layout, count: int) -> tuple[np.ndarray, n
     return starts[0], overlap_area(corners, goals, layout)
 
 
+@pytest.mark.parametrize("starts", ["outside", "piles"])
 @pytest.mark.parametrize("kind", ["uniform", "connected", "figures"])
-def test_starts_keep_clear_of_the_target_where_there_is_room(kind: str) -> None:
-    sim = SimConfig(targets=kind, starts="outside", mirrored=0.5)
+def test_starts_keep_clear_of_the_target_where_there_is_room(kind: str, starts: str) -> None:
+    sim = SimConfig(
+        targets=kind, starts=starts, mirrored=0.5, arena=2.5 if starts == "piles" else 2.0
+    )
     assert starts_of(sim, GAME, 24)[1].max() < 1e-7
     assert starts_of(replace(sim, starts="anywhere"), GAME, 24)[1].max() > 0.01
 
@@ -231,6 +234,40 @@ def test_starts_lie_on_the_target_where_there_is_no_other_room() -> None:
     starts, on = starts_of(SimConfig(starts="outside", arena=1.6), layout, 12)
     assert on.min() > 0.0
     assert np.abs(layout.corners(starts)).max() <= 0.8
+
+
+@pytest.mark.parametrize("settings", [{}, {"mirrored": 1.0}, {"allow_flip": True}])
+def test_starts_in_piles_lie_on_any_side_that_can_be_played(settings: dict[str, Any]) -> None:
+    sim, generators = SimConfig(starts="piles", **settings), evaluation_generators(24)
+    targets = sample_targets(GAME, sim, sim.task, generators)
+    done = np.zeros((24, GAME.tokens), dtype=np.bool_)
+    poses, flipped = sample_starts(GAME, sim, targets, done, generators)
+    for pose, own in zip(poses, flipped, strict=True):
+        assert largest_overlap(GAME, pose, own) < 1e-8
+        together = shapely.union_all([piece.buffer(1e-6) for piece in pieces(GAME, pose, own)])
+        assert 3 <= len(shapely.get_parts(together)) < GAME.tokens
+    if sim.allow_flip:
+        assert 0 < flipped.any(axis=1).sum() < 24
+    else:
+        np.testing.assert_array_equal(flipped, targets[1])
+
+
+@pytest.mark.parametrize(
+    ("layout", "settings", "message"),
+    [
+        (layout_of("square"), {}, "sim.starts=piles changes nothing with one token: leave it out"),
+        (
+            GAME,
+            {"stages": (StageConfig(tokens=2), StageConfig(updates=9))},
+            "all 7 tokens in piles, and a stage of sim.stages leaves all but 2 on the target: give",
+        ),
+    ],
+)
+def test_piles_that_nobody_plays_are_refused(
+    layout: Layout, settings: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        check_targets(layout, SimConfig(starts="piles", **settings))
 
 
 # Stages: which is played when, and what lies on its target already.
