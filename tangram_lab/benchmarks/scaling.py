@@ -1,4 +1,4 @@
-"""More workers: real ones in miniature trainings, and 64 synthetic ones of one master.
+"""More workers: real ones in miniature trainings, and up to 1,000 synthetic ones of one master.
 
 Two runs that are compared are alive at one time; while one is measured, the processes of the other
 are stopped. So what else the machine does meets both.
@@ -30,12 +30,12 @@ LINEAR = Bound(least=0.9)
 SAME = Bound(least=0.9)
 FRESH = Bound(most=2.0)
 PERCENTILE = 99.0
-SYNTHETIC = 64
+SYNTHETIC = 64, 1000
 BATCH = 32
 PUBLISH_S = 0.5
 SETTLE_S = 2.0  # several broadcasts
 SPAN_S = 4.0
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
 ENDLESS = ("max_updates=0", "service.checkpoint_minutes=60", "service.http_port=-1")
 # Play is slow, learning is next to nothing, and the evaluator rests.
 PLAYING = (
@@ -86,6 +86,11 @@ class Run:
         spent = (process.cpu_times() for process in processes_of(self.folder))
         return float(sum(one.user + one.system for one in spent))
 
+    def master_size(self) -> tuple[float, float]:
+        """Its resident memory in MiB, and how many descriptors it has open."""
+        (master,) = processes_of(self.folder)
+        return master.memory_info().rss / 2**20, float(master.num_fds())
+
     def rates(self, *names: str) -> dict[str, float]:
         """By how much some numbers grow in a second, and CPU seconds as "cpu"."""
         with self.awake():
@@ -112,7 +117,8 @@ def measure_scaling(runs: int) -> list[Row]:
     """Real workers, synthetic ones, and what a message costs the master."""
     with tempfile.TemporaryDirectory(prefix="tangram-") as folder:
         real = list(_real(runs, Path(folder)))
-        return [*real, *_synthetic(runs, Path(folder)), *measure_costs(runs)]
+        fed = [row for count in SYNTHETIC for row in _synthetic(runs, Path(folder), count)]
+        return [*real, *fed, *measure_costs(runs)]
 
 
 def _real(runs: int, folder: Path) -> Iterator[Row]:
@@ -130,14 +136,17 @@ def _real(runs: int, folder: Path) -> Iterator[Row]:
     yield single((STAGE, "2 workers, efficiency", "of twice 1 worker"), shares, bound)
 
 
-def _synthetic(runs: int, folder: Path) -> Iterator[Row]:
-    """A master that learns, with many players and with one."""
+def _synthetic(runs: int, folder: Path, count: int) -> Iterator[Row]:
+    """A master that learns, with so many players and with one."""
     names = ("updates", "hub/batches")
     with ExitStack() as stack:
-        one, many = (stack.enter_context(_fed(folder / f"players_{n}", n)) for n in (1, SYNTHETIC))
+        one, many = (
+            stack.enter_context(_fed(folder / f"{n}_beside_{count}", n)) for n in (1, count)
+        )
         found = [(many.rates(*names), one.rates(*names)) for _ in range(runs)]
         ages = _ages(many)
-    case, against = f"{SYNTHETIC} synthetic workers", "1 synthetic worker"
+        sizes = [run.master_size() for run in (many, one)]
+    case, against = f"{count:,} synthetic workers", "1 synthetic worker"
     for name, unit, bound in (
         ("updates", "updates/s", SAME),
         ("hub/batches", "messages/s", None),
@@ -151,6 +160,8 @@ def _synthetic(runs: int, folder: Path) -> Iterator[Row]:
     yield compared((STAGE, case, "updates per CPU second"), ours, against, theirs)
     text = f"{case}, age of the weights, {PERCENTILE:g}th percentile"
     yield single((STAGE, text, "broadcast periods"), ages, FRESH)
+    for unit, ours, theirs in zip(("MiB", "descriptors"), *sizes, strict=True):
+        yield compared((STAGE, f"{case}, the master's", unit), [ours], against, [theirs])
 
 
 def _ages(run: Run) -> Sequence[float]:
