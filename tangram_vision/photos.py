@@ -15,9 +15,9 @@ import numpy as np
 from PIL import Image
 
 from tangram_sim.arrays import Bools, Floats, Ints, Pixels, Singles
+from tangram_sim.connected import MAX_PILE
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import Layout
-from tangram_sim.targets import MAX_PILE
 from tangram_vision.blobs import find_blobs, likeness
 from tangram_vision.kinds import kinds_of
 from tangram_vision.levels import MIN_CONTRAST
@@ -37,7 +37,7 @@ _POINTS = 100  # of the light along a side
 _BORDER = 5  # points of the light from each side that show the ground
 _ROUNDS = 24
 _STEEP = 3.0  # how much steeper edges are made: less than a third is a shadow
-_NOTHING = "no token"
+_NOTHING = "no token alone"
 _GROUND, _TOKEN = 230, 60  # levels of the picture that is looked at
 
 
@@ -157,12 +157,14 @@ def _told(cover: Singles, spots: "_Spots", layout: Layout, view: float) -> str:
     count = len(spots.boxes)
     edge = f" ({spots.cut} more at its edge left out)" if spots.cut else ""
     areas = "1 area" if count == 1 else f"{count} areas"
-    found = f"{areas}{edge}, by shape {_listed(_looks(cover, layout, view)) or _NOTHING}"
-    wanted = _listed([shape.name for shape in layout.shapes])
+    looks, names = _looks(cover, layout, view), [shape.name for shape in layout.shapes]
+    found = f"{areas}{edge}, by shape {_listed(looks) or _NOTHING}"
+    lacks = _listed(list((Counter(names) - Counter(looks)).elements()))
     return (
         f"shows {found if count <= _MANY else f'more than {_MANY} areas'}, and the run moves "
-        f"{wanted}: lay them all in the picture and nothing else, at most {MAX_PILE} touching, and "
-        "take it from straight above"
+        f"{_listed(names)}{f' (not found: {lacks})' if lacks and count <= _MANY else ''}: lay them "
+        f"all in the picture and nothing else, at most {MAX_PILE} touching, and take it from "
+        "straight above"
     )
 
 
