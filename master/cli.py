@@ -53,6 +53,7 @@ def _train(settings: Plain) -> int:
     setup = _task(settings)
     check_shown(setup.sim, setup.fills)
     check_compiling(config.service, setup.fills)
+    setup.check_learnable()
     check_world(setup.layout, setup.sim)
     tell(f"starts in {config.run_dir}")
 
@@ -76,6 +77,7 @@ def _master(settings: Plain) -> int:
     setup = _task(settings)
     check_shown(setup.sim, setup.fills)
     check_compiling(config.service, setup.fills)
+    setup.check_learnable()
     check_room(setup.layout, setup.sim)
     tell(f"starts in {config.run_dir}")
 

@@ -106,7 +106,7 @@ class DivergenceGuard:
         self.trainer.go_back(self._good)
 
     def _write_batch(self) -> Path:
-        batch = {} if self.trainer.batch is None else vars(self.trainer.batch)
+        batch = {} if self.trainer.batch is None else self.trainer.batch.arrays
         write_whole(self._evidence, safetensors.numpy.save(batch), above=False)
         return self._evidence
 

@@ -60,7 +60,11 @@ class Trainer:
         else:
             self.learner = Learner(setup, seed, device, compiled)
             self.replay = ReplayBuffer(
-                agent.replay_capacity, layout.corner_count, layout.tokens, setup.action_size
+                agent.replay_capacity,
+                layout.corner_count,
+                layout.tokens,
+                setup.action_size,
+                setup.sim.observe == "pictures",
             )
         self.rate_limiter = RateLimiter(
             agent.updates_per_transition, agent.learning_starts, lag_updates
@@ -99,7 +103,8 @@ class Trainer:
 
     def insert(self, episodes: Episodes) -> None:
         """Take in episodes as they were played, and relabelled."""
-        generator, seen = self._generators["hindsight"], episodes.seen_whole()
+        generator = self._generators["hindsight"]
+        seen = episodes.learnable(self.setup.agent.confidence)
         learned_from = seen.transitions
         if isinstance(self.replay, FillReplay):
             learned_from = self.replay.insert(seen, generator)

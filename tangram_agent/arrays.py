@@ -129,7 +129,7 @@ class EpisodeSpec:
         horizon: T, steps of every episode.
         action_size: A.
         bound: largest |coordinate| that a corner can reach.
-        observed: whether pictures are what is observed: then some of it can be missing.
+        observed: whether pictures are what is observed: then some of it is not surely seen.
         goal_rows: G, corners of a target; 0: V.
         rewards: least and largest one.
     """
@@ -193,9 +193,9 @@ class EpisodeSpec:
 def _columns(spec: EpisodeSpec, count: int) -> tuple[Column, ...]:
     e, t, v, k = count, spec.horizon, spec.corners, spec.tokens
     reach, one = spec.bound * (1 + ROUNDING), 1 + ROUNDING
-    missing = (
-        Column("missing", "u1", (e, t + 1, k), 0, AWAY),
-        Column("goals_missing", "u1", (e, k), 0, 1),
+    confidence = (
+        Column("confidence", "<f4", (e, t + 1, k), AWAY, 1),
+        Column("goals_confidence", "<f4", (e, k), 0, 1),
     )
     return (
         Column("corners", "<f4", (e, t + 1, v, 2), -reach, reach),
@@ -203,7 +203,7 @@ def _columns(spec: EpisodeSpec, count: int) -> tuple[Column, ...]:
         Column("actions", "<f4", (e, t, spec.action_size), -one, one),
         Column("rewards", "<f4", (e, t), *(bound * one for bound in spec.rewards)),
         Column("goals", "<f4", (e, spec.goal_rows or v, 2), -reach, reach),
-        *(missing if spec.observed else ()),
+        *(confidence if spec.observed else ()),
     )
 
 

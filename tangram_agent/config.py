@@ -99,6 +99,13 @@ class AgentConfig(Settings, section="agent"):
     orientation: bool = setting(
         True, "(cos k*theta, sin k*theta) of each target relative to the moving token", part=NETWORK
     )
+    confidence: bool = setting(
+        False,
+        "with sim.observe=pictures: tell the agent how surely each token is seen. It may then move "
+        "one that could lie otherwise as well; without it, it moves the others first",
+        only={"readout": "pair", "credit": "piece", "lookahead": "none"},
+        part=NETWORK,
+    )
     edges: str = setting(
         "paper",
         "of the graph: paper (Sec. IV-A) or complete (every node sees every other)",

@@ -29,6 +29,11 @@ class Lying:
     pose: Floats
     flipped: Bools
 
+    def instead(self, others: "Lying", where: Bools) -> "Lying":
+        """Others in the place of those where (M,) that is said, index for index the same."""
+        pose = np.where(where[:, None], others.pose, self.pose)
+        return Lying(self.index, pose, np.where(where, others.flipped, self.flipped))
+
     def outlines(self, layout: Layout) -> Floats:
         """Counter-clockwise corners (M, C, 2)."""
         body = layout.body[layout.padded_corners][self.index]

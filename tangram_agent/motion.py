@@ -11,7 +11,7 @@ Legend: B episodes, T actions of each, F features; a command and a way have 3 en
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -23,17 +23,20 @@ from tangram_sim.arrays import Floats
 from tangram_sim.config import SimConfig
 from tangram_sim.errors import RunError
 from tangram_sim.layout import Layout
+from tangram_sim.sight import PILED
 
 _FEATURES = 26
 _SPREAD, _NOISE = 0.1, 0.02  # deviations of entries of K and of a way, at the start
 _LEAST = 1e-4  # deviation of a way, and of an entry of K: another world may differ more
 _LEAST_GAIN = 1e-2  # of how far a command's own axis goes: what other worlds differ in first
 _BOUNDS = -40.0, 40.0  # logarithms that are believed of weights which came from elsewhere
+_FAR, _FAR_LEAST = 12.0, 0.02  # medians, and a way, beside what is usual that are no motion
 _KEPT = 0.998  # of what was seen before, with each update
 _SEARCH_STEPS, _NEAR_ENOUGH = 30, 1e-5
 _SHORT = 0.01  # share of a half turn
 _SLOPES = 0.1, 10.0  # of what a command comes to, as the search takes them
 _NOISE_DEVIATIONS = 8.0  # of a corner's noise that are no motion
+_SEEN = 0.005  # of what a token that lies still seems to move in pictures
 _STILL = 1e-6  # an action that moves no more was refused or blocked
 
 
@@ -61,7 +64,8 @@ class Motions:
     Attributes:
         command: (B, T, 3).
         way: (B, T, 3) of the token that it named, by the shorter turn.
-        moved: (B, T) 1 where it moved; an action that was refused or blocked tells nothing.
+        moved: (B, T) 1 where it was seen to move; an action that was refused or blocked tells
+            nothing.
     """
 
     command: Tensor
@@ -87,8 +91,14 @@ def motions_of(past: Past, now: Floats, layout: Layout, sim: SimConfig) -> Motio
     )
     way = velocities_of((after - before).reshape(-1, 3), sim).reshape(count, steps, 3)
     # Seen with noise, what was blocked or refused seems to have moved; a lone token never is.
-    still = _STILL + (_NOISE_DEVIATIONS * sim.corner_noise if layout.tokens > 1 else 0.0)
+    noise = _SEEN if sim.observe == "pictures" else _NOISE_DEVIATIONS * sim.corner_noise
+    still = _STILL + (noise if layout.tokens > 1 else 0.0)
     moved = np.abs(way).max(axis=-1, initial=0.0) > still
+    if past.confidence is not None:
+        # What touches others may be seen wrongly, and one wrong way spoils what is believed.
+        sure = past.confidence[:, -1 - way.shape[1] :] > PILED
+        named = np.take_along_axis(sure[:, :-1] & sure[:, 1:], token[..., 0], axis=2)[..., 0]
+        moved &= named
     command = actions[:, -3:].reshape(count, steps, 3).clip(-1.0, 1.0)
     return Motions(*(torch.from_numpy(part.astype(np.float64)) for part in (command, way, moved)))
 
@@ -272,7 +282,8 @@ class Fit:
 
         The error is that of each episode's last action, those before it being known.
         """
-        model, seen = self._model, self._model.beside_usual(motions)
+        model, motions = self._model, self._plausible(motions)
+        seen = model.beside_usual(motions)
         usual = model.mean.double()
         squares = torch.einsum("btf,bdtu,bug->dfg", seen.phi, seen.inverse, seen.phi)
         blame = torch.einsum("bdtu,bdu->bdt", seen.inverse, seen.off)
@@ -297,6 +308,17 @@ class Fit:
             "motion_error": error.float(),
             "motion_noise": model.log_noise.exp().mean().sqrt(),
         }
+
+    def _plausible(self, motions: Motions) -> Motions:
+        """The motions without those far beside what is usual: tokens that met others on their way.
+
+        Far is far beyond the median, so that of worlds that differ none is left out.
+        """
+        off = self._model.beside_usual(motions).off.abs()
+        moved = motions.moved > 0.0
+        usual = off.mT[moved].median(dim=0).values if moved.any() else off.new_zeros(3)
+        near = (off <= _FAR * usual[:, None] + _FAR_LEAST).all(dim=1)
+        return replace(motions, moved=motions.moved * near)
 
     def _add(self, name: str, more: Tensor) -> None:
         before = self.slots.get(name, [torch.zeros_like(one) for one in more])

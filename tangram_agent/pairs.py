@@ -33,6 +33,7 @@ class Pairs:
         goal_flipped: (M,) 1 where that lies on its other side.
         piece: (M,) its index.
         covered: (M,) share of the piece that other tokens cover already.
+        confidence: (M,) how surely the token is seen; None: it surely is.
     """
 
     pose: Tensor
@@ -42,6 +43,7 @@ class Pairs:
     goal_flipped: Tensor
     piece: Tensor
     covered: Tensor
+    confidence: Tensor | None = None
 
     def at(self, pose: Tensor) -> "Pairs":
         """The same pairs with their tokens elsewhere."""
@@ -52,7 +54,8 @@ class PairGraph(nn.Module):
     """The graph of a pair: the token's corners, its base, the target piece's corners.
 
     The edges are those of Sec. IV-A. Shapes of fewer corners repeat their last one. Every node also
-    knows both shapes and what of the piece is covered.
+    knows both shapes, what of the piece is covered and, with `agent.confidence`, how surely the
+    token is seen.
     """
 
     tokens = 1  # in view
@@ -70,7 +73,7 @@ class PairGraph(nn.Module):
         super().__init__()
         self.arena = arena
         self.egocentric, self.offsets = agent.egocentric, agent.offsets
-        self.orientation = agent.orientation
+        self.orientation, self.confidence = agent.orientation, agent.confidence
         self.corners = int(layout.padded_corners.shape[1])
         self.nodes = 2 * self.corners + 1
         constants = {
@@ -90,12 +93,13 @@ class PairGraph(nn.Module):
     @property
     def features(self) -> int:
         """F, with the options that are switched on."""
-        return 3 + 2 * self.offsets + _ANGLES * self.orientation + 2 * _KINDS + 4
+        own = 2 * self.offsets + _ANGLES * self.orientation + self.confidence
+        return 3 + own + 2 * _KINDS + 4
 
     @property
     def inputs(self) -> int:
         """Numbers that a perceptron sees of a pair."""
-        own = 2 * self.corners * self.offsets
+        own = 2 * self.corners * self.offsets + self.confidence
         return 2 + _ANGLES * self.orientation + 2 * self.corners + own + 2 * _KINDS + 4
 
     def base_node(self, pairs: Pairs) -> Tensor:
@@ -190,6 +194,7 @@ class PairGraph(nn.Module):
             self.kind[pairs.token],
             self.kind[pairs.piece],
             torch.stack([other_side, pairs.covered, ratio, near], dim=-1),
+            *self._confidence(pairs),
         ]
         return torch.cat(parts, dim=-1)
 
@@ -209,6 +214,7 @@ class PairGraph(nn.Module):
             self.kind[pairs.token],
             self.kind[pairs.piece],
             torch.stack([ratio, near, pairs.covered, other_side], dim=-1),
+            *self._confidence(pairs),
         ]
         everywhere = torch.cat(of_pair, dim=-1)[:, None].expand(-1, self.nodes, -1)
         target = self.target_flag.expand(len(own), -1, -1)
@@ -219,6 +225,13 @@ class PairGraph(nn.Module):
         """Displacements (M, C, 2) of the token's corners and of the piece's, from their centres."""
         body = _mirrored(self.body[pairs.piece], _signs(other_side)[:, None])
         return self.body[pairs.token], turn(body, unit(angle)[:, None])
+
+    def _confidence(self, pairs: Pairs) -> list[Tensor]:
+        """(M, 1), for agents that know it."""
+        if not self.confidence:
+            return []
+        sure = torch.ones_like(pairs.covered) if pairs.confidence is None else pairs.confidence
+        return [sure[:, None]]
 
     def _sizes(self, pairs: Pairs, place: Tensor) -> tuple[Tensor, Tensor]:
         """(M,) how much larger the piece is, and (M,) how near, 1 where both centres are one."""

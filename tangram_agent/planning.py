@@ -79,6 +79,7 @@ class Scene:
         goal_flipped: (B, K) their sides.
         covered: (B, K, K) share of the second, a piece, that tokens other than the first cover.
         worth: (B, K) sum of the values of what each token covers.
+        confidence: (B, K) how surely each token is seen.
     """
 
     pose: Tensor
@@ -87,6 +88,7 @@ class Scene:
     goal_flipped: Tensor
     covered: Tensor
     worth: Tensor
+    confidence: Tensor
 
     def pairs(self, c: Candidates) -> Pairs:
         """The pairs (M,) of candidates; a token that is turned over has changed its side."""
@@ -98,6 +100,7 @@ class Scene:
             goal_flipped=self.goal_flipped[c.row, c.piece],
             piece=c.piece,
             covered=self.covered[c.row, c.token, c.piece],
+            confidence=self.confidence[c.row, c.token],
         )
 
     def meetings(self, movers: Candidates, other: Candidates, where: Tensor) -> Pairs:
@@ -186,8 +189,9 @@ class Planner:
             belief = self._belief(corners, past)
             if self._motion is not None and belief is not None and past is not None:
                 corners = self._motion.ahead(belief, corners, past, self._layout, self._sim)
-            scene = self._scene(corners, self._layout.poses(corners), goals)
-            candidates, pose = self._short_list(scene, self._open(placed, goals))
+            closed, sure = self._seen(placed, past)
+            scene = self._scene(corners, goals, sure)
+            candidates, pose = self._short_list(scene, self._open(closed, goals))
             velocity, reached = self._reached(scene, candidates, pose, belief)
             best = self._best(scene, candidates, reached)
         chosen, pose, velocity = candidates.at(best), pose[best], velocity[best]
@@ -243,16 +247,30 @@ class Planner:
         command = self._motion.command(own, way)
         return command, self._graph.moved(pairs, self._motion.predict(own, command)[0]).pose
 
-    def _scene(self, corners: Floats, start: Floats, goals: Floats) -> Scene:
+    def _seen(self, placed: Bools, past: Past | None) -> tuple[Bools, Floats]:
+        """(B, K) tokens that no action should name, and how surely each is seen.
+
+        Of tokens that are not surely seen the agent judges for itself, where it knows that.
+        """
+        if past is None or past.confidence is None or past.placed is None:
+            return placed, np.ones(placed.shape)
+        sure = np.maximum(past.confidence[:, -1].astype(np.float64), 0.0)
+        if not self._agent.confidence:
+            return placed, sure
+        gone = np.asarray((past.placed > 0) | (sure == 0.0))
+        return np.where(gone.all(axis=1, keepdims=True), placed, gone), sure
+
+    def _scene(self, corners: Floats, goals: Floats, confidence: Floats) -> Scene:
         layout = self._layout
         covered = covering(corners, goals, layout)
         return Scene(
-            pose=as_tensor(start),
+            pose=as_tensor(layout.poses(corners)),
             flipped=as_tensor(layout.flipped(corners)),
             goal=as_tensor(layout.poses(goals)),
             goal_flipped=as_tensor(layout.flipped(goals)),
             covered=as_tensor(covered_share(covered, layout)),
             worth=as_tensor(worths(covered, layout)),
+            confidence=as_tensor(confidence),
         )
 
     def _open(self, placed: Bools, goals: Floats) -> Bools:

@@ -23,9 +23,10 @@ from tangram_agent.coverage import (
 )
 from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes, Flags, Transitions
-from tangram_sim.actions import chosen_tokens
+from tangram_sim.actions import chosen_tokens, velocities
 from tangram_sim.arrays import Bools, Floats, Ints, Singles
 from tangram_sim.layout import Layout
+from tangram_sim.sight import SURE
 
 # (achieved corners (B, V, 2), desired corners (B, V, 2)) -> rewards (B,)
 RewardFunction = Callable[[Floats, Floats], Floats]
@@ -97,7 +98,7 @@ def _goals(
 
 def _transitions(episodes: Episodes, goals: Singles, rewards: Singles) -> Transitions:
     count, steps = episodes.count, episodes.steps
-    size = count * steps
+    size, sure = count * steps, episodes.confidence
     return Transitions(
         state=episodes.corners[:, :-1].reshape(size, *episodes.corners.shape[2:]),
         placed=episodes.placed[:, :-1].reshape(size, -1),
@@ -107,11 +108,13 @@ def _transitions(episodes: Episodes, goals: Singles, rewards: Singles) -> Transi
         next_placed=episodes.placed[:, 1:].reshape(size, -1),
         done=episodes.placed[:, 1:].all(axis=-1).astype(np.uint8).reshape(size),
         goal=goals,
+        confidence=None if sure is None else sure[:, :-1].reshape(size, -1),
+        next_confidence=None if sure is None else sure[:, 1:].reshape(size, -1),
     )
 
 
 def _concatenate(batches: list[Transitions]) -> Transitions:
-    columns = {name: [getattr(batch, name) for batch in batches] for name in vars(batches[0])}
+    columns = {name: [getattr(batch, name) for batch in batches] for name in batches[0].arrays}
     return Transitions(**{name: np.concatenate(parts) for name, parts in columns.items()})
 
 
@@ -120,8 +123,10 @@ class PairBatch:
     """M pairs as they were before and after an action, and what that is worth.
 
     Attributes:
-        before, after: (M, 3) poses of the token.
-        start: (M, 3) where the actor is asked from: mostly before, else after.
+        before, after: (M, 3) poses of the token; of one that was not surely seen before, after is
+            where it was told to go, which is all that is known when an action is chosen.
+        start: (M, 3) where the actor is asked from: mostly before, else where it came to, to mend
+            what it proposed itself: nobody plays that, as starts are far from targets.
         before_flipped, after_flipped, start_flipped: (M,) whether it lay on its other side.
         velocity: (M, 3) of the action.
         token: (M,) which moved.
@@ -129,6 +134,8 @@ class PairBatch:
         goal_flipped: (M,) its side.
         piece: (M,) its index.
         covered: (M,) share of the piece that was covered before the action.
+        confidence: (M,) how surely the token was seen before the action.
+        start_confidence: (M,) how surely it is seen where the actor is asked from.
         reward: (M,) what the action is worth: with several tokens what the token covers newly of
             the piece, over the larger of both areas, or 0 where whole scenes teach that; with one
             the environment's reward.
@@ -147,6 +154,8 @@ class PairBatch:
     goal_flipped: Bools
     piece: Ints
     covered: Floats
+    confidence: Floats
+    start_confidence: Floats
     reward: Floats
     done: Flags
 
@@ -212,13 +221,21 @@ def make_pairs(batch: Transitions, setup: Setup, generator: np.random.Generator)
         # Most goals are where the token came to lie: else it would know them by its own turn.
         piece.pose[:, 2] += _alike(piece.index, layout, generator)
         reward, done = batch.reward.astype(np.float64), batch.done
-    start = _again(before, after, generator)
+    again = generator.random(len(rows)) < _CORRECTED
+    start = after.instead(before, ~again)
+    sure, sure_after = np.ones(len(rows)), np.ones(len(rows))
+    if agent.confidence and batch.confidence is not None and batch.next_confidence is not None:
+        both = batch.confidence, batch.next_confidence
+        sure, sure_after = (part[rows, token].astype(np.float64) for part in both)
+    velocity = velocities(batch.action[rows].astype(np.float64), setup.sim)
+    told = Lying(token, np.asarray(before.pose + velocity), before.flipped)
+    seen = told.instead(after, sure >= SURE)
     return PairBatch(
         before=before.pose,
-        after=after.pose,
+        after=seen.pose,
         start=start.pose,
         before_flipped=before.flipped,
-        after_flipped=after.flipped,
+        after_flipped=seen.flipped,
         start_flipped=start.flipped,
         velocity=batch.action[rows, -3:],
         token=token,
@@ -226,6 +243,8 @@ def make_pairs(batch: Transitions, setup: Setup, generator: np.random.Generator)
         goal_flipped=piece.flipped,
         piece=piece.index,
         covered=covered,
+        confidence=sure,
+        start_confidence=np.where(again, sure_after, sure),
         reward=reward,
         done=done,
     )
@@ -272,19 +291,6 @@ def _alike(piece: Ints, layout: Layout, generator: np.random.Generator) -> Float
     order = np.array([shape.symmetry for shape in layout.shapes])[piece]
     turn: Floats = 2.0 * np.pi / order * generator.integers(order)
     return turn
-
-
-def _again(before: Lying, after: Lying, generator: np.random.Generator) -> Lying:
-    """Where tokens (M,) are for the actor: mostly before the action, else after it.
-
-    From there it corrects what it proposed itself, which nobody plays: starts are far from targets.
-    """
-    again = generator.random(len(before.index)) < _CORRECTED
-    return Lying(
-        before.index,
-        np.where(again[:, None], after.pose, before.pose),
-        np.where(again, after.flipped, before.flipped),
-    )
 
 
 def _strategies(agent: AgentConfig, count: int, generator: np.random.Generator) -> Ints:

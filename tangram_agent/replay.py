@@ -19,7 +19,14 @@ class ReplayBuffer:
         added: transitions ever added; the next one goes to slot `added % capacity`.
     """
 
-    def __init__(self, capacity: int, corners: int, tokens: int, action_size: int) -> None:
+    def __init__(
+        self,
+        capacity: int,
+        corners: int,
+        tokens: int,
+        action_size: int,
+        confidence: bool = False,
+    ) -> None:
         """Allocate everything at once.
 
         Args:
@@ -27,6 +34,7 @@ class ReplayBuffer:
             corners: V.
             tokens: K.
             action_size: A.
+            confidence: whether transitions tell how surely tokens were seen.
         """
         self.capacity, self.added = capacity, 0
         self._first = 0  # number of the first row that was ever kept here
@@ -41,6 +49,8 @@ class ReplayBuffer:
             "done": np.zeros(capacity, np.uint8),
             "goal": np.zeros(points, np.float32),
         }
+        for name in ("confidence", "next_confidence") if confidence else ():
+            self._columns[name] = np.zeros(flags, np.float32)
 
     def __len__(self) -> int:
         return min(self.added - self._first, self.capacity)
@@ -95,7 +105,11 @@ class ReplayBuffer:
         state, action, following = (
             self._columns[name] for name in ("state", "action", "next_state")
         )
-        past = Past(state[rows].astype(np.float32), action[rows].astype(np.float32))
+        sure = None
+        if "confidence" in self._columns:
+            now = self._columns["next_confidence"][rows[:, -1:]]
+            sure = np.concatenate([self._columns["confidence"][rows], now], axis=1)
+        past = Past(state[rows].astype(np.float32), action[rows].astype(np.float32), sure)
         return past, following[rows[:, -1]].astype(np.float32)
 
     def check_valid(self) -> None:
@@ -134,7 +148,8 @@ class ReplayBuffer:
             if part is None or part.shape != shape or part.dtype != column.dtype or added < kept:
                 raise RunError(
                     f"replay state: '{name}' does not fit the layout (expected {column.dtype} "
-                    f"{shape}): was the checkpoint written with other tokens?"
+                    f"{shape}): was the checkpoint written with other tokens, or by another "
+                    "version?"
                 )
         # Oldest first: the state's own ring was full if it held fewer than were ever added.
         order = np.roll(np.arange(kept), -(added % kept) if added > kept else 0)[-self.capacity :]

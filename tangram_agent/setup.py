@@ -21,7 +21,9 @@ from tangram_sim.targets import check_targets
 Settings = TypeVar("Settings")
 
 # Settings of the agent that have no effect but on pairs of several tokens.
-_SEVERAL_ONLY = ("order", "credit", "pairs_per_transition", "push_weight", "lookahead")
+_SEVERAL_ONLY = (
+    *("order", "credit", "pairs_per_transition", "push_weight", "lookahead", "confidence"),
+)
 # Those that have none on outlines.
 _NOT_OF_OUTLINES = (
     *("egocentric", "offsets", "orientation", "edges", "afterstate", "angle_head", "squash"),
@@ -80,6 +82,27 @@ class Setup:
             )
         if self.pairs and not one:
             self._check_credit(f"{self.layout.tokens} tokens on pairs")
+
+    def check_learnable(self) -> None:
+        """Refuse to learn how far to trust pictures where none are seen, or motions not foreseen.
+
+        An agent that learned it may play there.
+
+        Raises:
+            ConfigError: names the setting and the remedy.
+        """
+        sim = self.sim
+        if not self.agent.confidence:
+            return
+        if sim.observe != "pictures":
+            where, remedy = f"sim.observe={sim.observe}", "set sim.observe=pictures"
+            refuse_ignored("agent.confidence=true", where, remedy, False)
+        if sim.inexact:
+            raise ConfigError(
+                "agent.confidence=true learns from where a token should have come to, which nobody "
+                f"knows with {', '.join(f'sim.{name}' for name in sim.inexact)} as set: leave that "
+                "out, or set agent.confidence=false"
+            )
 
     def _check_fills(self) -> None:
         """Refuse what an agent of outlines cannot use, or outlines that no agent sees."""

@@ -117,13 +117,15 @@ class Stepping:
         )
 
     def _of_pairs(self, batch: PairBatch) -> Steps:
-        after = self._pairs(batch, batch.after, batch.after_flipped)
+        sure = self._tensor(batch.confidence)
+        after = self._pairs(batch, batch.after, batch.after_flipped, sure)
+        start = self._tensor(batch.start_confidence)
         return Steps(
-            view=self._pairs(batch, batch.before, batch.before_flipped),
+            view=self._pairs(batch, batch.before, batch.before_flipped, sure),
             velocity=self._tensor(batch.velocity),
             reward=self._tensor(batch.reward),
             done=self._tensor(batch.done),
-            start=self._pairs(batch, batch.start, batch.start_flipped),
+            start=self._pairs(batch, batch.start, batch.start_flipped, start),
             follow=self._if_any_follows(batch.done, after),
             seen_after=after,
             meeting=self._meeting(batch) if isinstance(batch, ContactBatch) else None,
@@ -134,7 +136,9 @@ class Stepping:
         """What follows, where a target network is to be asked of it."""
         return follow if self._bootstraps and not done.all() else None
 
-    def _pairs(self, batch: PairBatch, pose: Floats, flipped: Bools) -> Pairs:
+    def _pairs(
+        self, batch: PairBatch, pose: Floats, flipped: Bools, confidence: Tensor | None = None
+    ) -> Pairs:
         """The pairs (M,) with their tokens where they lay at some time."""
         return Pairs(
             pose=self._tensor(pose),
@@ -144,6 +148,7 @@ class Stepping:
             goal_flipped=self._tensor(batch.goal_flipped),
             piece=self._index(batch.piece),
             covered=self._tensor(batch.covered),
+            confidence=confidence,
         )
 
     def _meeting(self, batch: ContactBatch) -> Meeting:

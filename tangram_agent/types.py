@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from tangram_sim.actions import chosen_tokens
 from tangram_sim.arrays import Singles
+from tangram_sim.sight import SURE
 
 Flags = npt.NDArray[np.uint8]
-AWAY = 2  # of `Episodes.missing`
+AWAY = -1.0  # confidence of a token that should have left the picture
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,9 +29,9 @@ class Episodes:
         actions: (E, T, A) float32 in [-1, 1].
         rewards: (E, T) float32 of the goal that was played.
         goals: (E, V, 2) float32, target corners, or (E, G, 2) rows of its outline.
-        missing: (E, T + 1, K) uint8, 1 where a token was not found in a picture, `AWAY` where it
-            should have left that; None where pictures are not what is observed.
-        goals_missing: (E, K) uint8, the same of the target's pieces.
+        confidence: (E, T + 1, K) float32 in [0, 1], how surely tokens were seen in a picture, see
+            `tangram_sim.sight.Look`, or `AWAY`; None where pictures are not what is observed.
+        goals_confidence: (E, K) float32 in [0, 1], the same of the target's pieces.
     """
 
     corners: Singles
@@ -37,31 +39,42 @@ class Episodes:
     actions: Singles
     rewards: Singles
     goals: Singles
-    missing: Flags | None = None
-    goals_missing: Flags | None = None
+    confidence: Singles | None = None
+    goals_confidence: Singles | None = None
 
     @property
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """Those that there are, by name."""
         return {name: array for name, array in vars(self).items() if array is not None}
 
-    def seen_whole(self) -> "Episodes":
-        """Those in which nothing was missing; of several tokens some may have left the picture.
+    def learnable(self, doubts: bool) -> "Episodes":
+        """Those that show what their actions did; of several tokens some may have left the picture.
 
         Where those lie is only known by what they were told, but to lose an episode of many actions
         for one that left is worse.
+
+        Args:
+            doubts: whether the agent knows how surely it sees a token. Else all tokens are to be
+                surely seen at all times; with it those that an action named, after that.
         """
-        if self.missing is None or self.goals_missing is None:
+        if self.confidence is None or self.goals_confidence is None:
             return self
-        several = self.missing.shape[2] > 1
-        gone = (self.missing > 0) & ((self.missing != AWAY) | (not several))
-        whole = ~(gone.any(axis=(1, 2)) | self.goals_missing.any(axis=1))
+        several = self.confidence.shape[2] > 1
+        gone = (self.confidence < SURE) & ((self.confidence != AWAY) | (not several))
+        if doubts:
+            named = chosen_tokens(
+                self.actions.reshape(self.transitions, -1).astype(np.float64), gone.shape[2]
+            )
+            index = named.reshape(self.count, self.steps, 1)
+            gone = np.take_along_axis(gone[:, 1:], index, axis=2)
+        whole = ~(gone.any(axis=(1, 2)) | (self.goals_confidence < SURE).any(axis=1))
         return Episodes(
             corners=self.corners[whole],
             placed=self.placed[whole],
             actions=self.actions[whole],
             rewards=self.rewards[whole],
             goals=self.goals[whole],
+            confidence=self.confidence[whole],
         )
 
     @property
@@ -82,15 +95,20 @@ class Episodes:
 
 @dataclass(frozen=True, eq=False)
 class Past:
-    """What was seen and done in B episodes before now, T actions in each.
+    """What was seen and done in B episodes so far, T actions in each.
 
     Attributes:
         corners: (B, T, V, 2) of the tokens before each action.
         actions: (B, T, A).
+        confidence: (B, T + 1, K) how surely tokens were seen before each action, and now; None:
+            all were.
+        placed: (B, K) which are placed now, where some are not surely seen.
     """
 
     corners: Singles
     actions: Singles
+    confidence: Singles | None = None
+    placed: Flags | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +122,8 @@ class Transitions:
         reward: (B,) float32.
         done: (B,) uint8, 1 where next_state is terminal; a time limit is not.
         goal: (B, V, 2) float32 target corners.
+        confidence, next_confidence: (B, K) float32, how surely tokens were seen, where pictures are
+            what is observed.
     """
 
     state: Singles
@@ -114,6 +134,13 @@ class Transitions:
     next_placed: Flags
     done: Flags
     goal: Singles
+    confidence: Singles | None = None
+    next_confidence: Singles | None = None
+
+    @property
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """Those that there are, by name."""
+        return {name: array for name, array in vars(self).items() if array is not None}
 
     @property
     def count(self) -> int:

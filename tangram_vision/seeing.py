@@ -14,10 +14,10 @@ from itertools import combinations
 
 import numpy as np
 
-from tangram_sim.arrays import Bools, Complex, Floats, Ints, Pixels, Singles
+from tangram_sim.arrays import Complex, Floats, Ints, Pixels, Singles
+from tangram_sim.connected import MAX_PILE
 from tangram_sim.layout import Layout
-from tangram_sim.sight import Look
-from tangram_sim.targets import MAX_PILE
+from tangram_sim.sight import PILED, SURE, Look
 from tangram_vision.blobs import Blobs, find_blobs, likeness
 from tangram_vision.edges import refined
 from tangram_vision.kinds import Kind, kinds_of
@@ -27,7 +27,6 @@ from tangram_vision.ramps import fitted, ramps
 from tangram_vision.recalling import recalled
 from tangram_vision.samples import binary, settled
 
-SURE = 0.5  # confidence from which a token counts as seen
 _DOUBTFUL = 0.4  # of tokens that could as well lie otherwise
 _SMALLEST = 0.4  # of the smallest token: less is dirt
 _CLOSE = 0.15  # moments nearer than this to the nearest are compared by their edges
@@ -39,25 +38,14 @@ _TRIES = 8  # piles that are searched for one picture
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class Seen(Look):
     """What was seen of K tokens.
 
     Attributes:
-        poses: (K, 3) x, y (arena units) and angle; 0 where a token is missing.
-        flipped: (K,) which lie on their other side.
-        confidence: (K,) in [0, 1]; 0 where a token is missing.
         blobs: connected areas that were found.
     """
 
-    poses: Floats
-    flipped: Bools
-    confidence: Floats
     blobs: int
-
-    @property
-    def found(self) -> Bools:
-        """(K,) tokens that are seen well enough."""
-        return np.asarray(self.confidence >= SURE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +138,7 @@ def _levels_at(cover: Singles, poses: Floats) -> Floats:
 
 def _sureness(differs: float) -> float:
     """Of a pile that is explained but for such a share of it."""
-    return 1.0 - 0.5 * differs / _DIFFERS
+    return PILED - (PILED - SURE) * differs / _DIFFERS
 
 
 @dataclass

@@ -145,6 +145,7 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "agent.offsets": (ONE, False),
     "agent.orientation": (ONE, False),
     "agent.edges": (ONE, "complete"),
+    "agent.confidence": (over(SEVERAL, sim={"pixels": 64, "observe": "pictures"}), True),
     "agent.afterstate": (ONE, False),
     "agent.motion": (ONE, "exact"),
     "agent.angle_head": (ONE, "plain"),

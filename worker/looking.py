@@ -1,7 +1,5 @@
 """How a worker looks at pictures, where these are what its agent observes."""
 
-import numpy as np
-
 from tangram_agent.setup import Setup
 from tangram_sim.arrays import Pixels
 from tangram_sim.batch import BatchedEnv
@@ -30,7 +28,6 @@ def make_eye(setup: Setup) -> Eye | None:
     layout, arena = setup.layout, setup.sim.arena
 
     def look(picture: Pixels, before: Look | None = None) -> Look:
-        seen = see(picture, layout, arena, before)
-        return Look(seen.poses, seen.flipped, np.asarray(seen.confidence > 0.0), seen.found)
+        return see(picture, layout, arena, before)
 
     return look

@@ -83,8 +83,8 @@ class Played:
             pictures = np.empty((count, steps + 1, side, side), np.uint8)
             seen = replace(
                 seen,
-                missing=np.empty((count, steps + 1, tokens), np.uint8),
-                goals_missing=np.empty((count, tokens), np.uint8),
+                confidence=np.empty((count, steps + 1, tokens), np.float32),
+                goals_confidence=np.empty((count, tokens), np.float32),
             )
         return Played(
             episodes=seen,
@@ -172,14 +172,15 @@ def _play_group(
     """The episode in every environment, into the rows from `first` on; False if told to end."""
     rows, seen = slice(first, first + env.count), played.episodes
     seen.goals[rows], played.goals[rows] = env.seen_goals, env.goals
-    if env.sight is not None and seen.goals_missing is not None:
-        seen.goals_missing[rows] = env.sight.goals_missing
+    if env.sight is not None and seen.goals_confidence is not None:
+        seen.goals_confidence[rows] = env.sight.goals_confidence
     began = time.perf_counter()
     for t in range(env.horizon):
         if not go_on():
             return False
         _look(env, played, rows, t)
-        past = Past(seen.corners[rows, :t], seen.actions[rows, :t])
+        sure = None if seen.confidence is None else seen.confidence[rows, : t + 1]
+        past = Past(seen.corners[rows, :t], seen.actions[rows, :t], sure, seen.placed[rows, t])
         asked = time.process_time()
         actions = choose(env.seen, env.closed, env.seen_goals, generators, past)
         spent = time.process_time() - asked
@@ -198,9 +199,9 @@ def _play_group(
 def _look(env: BatchedEnv, played: Played, rows: slice, t: int) -> None:
     played.corners[rows, t], played.episodes.corners[rows, t] = env.corners, env.seen
     played.episodes.placed[rows, t] = env.placed
-    sight, missing = env.sight, played.episodes.missing
-    if sight is not None and missing is not None and played.pictures is not None:
-        missing[rows, t] = np.where(sight.away, AWAY, sight.missing)
+    sight, confidence = env.sight, played.episodes.confidence
+    if sight is not None and confidence is not None and played.pictures is not None:
+        confidence[rows, t] = np.where(sight.away, AWAY, sight.confidence)
         played.pictures[rows, t] = env.pictures
 
 

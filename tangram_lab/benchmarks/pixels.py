@@ -41,8 +41,7 @@ class Camera:
     """An eye that looks for nothing and keeps the pictures that it is shown."""
 
     def __init__(self, tokens: int) -> None:
-        nothing = np.zeros(tokens, np.bool_)
-        self._look = Look(np.zeros((tokens, 3)), nothing, nothing, nothing)
+        self._look = Look(np.zeros((tokens, 3)), np.zeros(tokens, np.bool_), np.zeros(tokens))
         self.shown: list[Pixels] = []
 
     def __call__(self, picture: Pixels, _: Look | None = None) -> Look:

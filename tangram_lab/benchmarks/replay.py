@@ -36,7 +36,7 @@ def filled(setup: Setup, capacity: int) -> ReplayBuffer:
     """A full buffer of random numbers."""
     layout = setup.layout
     replay = ReplayBuffer(capacity, layout.corner_count, layout.tokens, setup.action_size)
-    chunk = vars(random_transitions(setup, CHUNK))
+    chunk = random_transitions(setup, CHUNK).arrays
     replay.added = capacity
     for name, column in columns(replay).items():
         column[:] = np.resize(chunk[name], column.shape)

@@ -95,7 +95,9 @@ class PerfectCritic:
     def __call__(self, before: Pairs, velocity: Tensor, pairs: Pairs) -> Tensor:
         del before, velocity  # as an afterstate critic does
         parts = {
-            name: part.detach().numpy().astype(np.float64) for name, part in vars(pairs).items()
+            name: part.detach().numpy().astype(np.float64)
+            for name, part in vars(pairs).items()
+            if part is not None
         }
         token, piece = parts["token"].astype(np.int64), parts["piece"].astype(np.int64)
         own = Lying(token, parts["pose"], parts["flipped"] > 0.5)

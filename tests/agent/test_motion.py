@@ -126,6 +126,21 @@ def fitted(ways: Callable[[torch.Tensor], torch.Tensor], steps: int, updates: in
     return model
 
 
+def test_what_others_stopped_does_not_spoil_what_is_usual() -> None:
+    """One motion of twenty ends anywhere on its way; one gain differs by more than the screen."""
+
+    def world(told: torch.Tensor) -> torch.Tensor:
+        chance = torch.Generator().manual_seed(int(1e6 * told.abs().sum()))
+        met = torch.rand(told.shape[:2], generator=chance) < 0.05
+        share = torch.rand(told.shape[:2], generator=chance) * met
+        return told * (1.0 - share[..., None]) * torch.tensor([1.0, 0.5, 1.0])
+
+    model, told = fitted(world, 8, 60), commands(500, seed=1000)
+    off = (model.predict(model.prior(500), told)[0] - told * torch.tensor([1.0, 0.5, 1.0])).abs()
+    assert off.max() < 0.01
+    assert model.noise.sqrt().max() < 0.005
+
+
 def test_a_world_that_turns_too_little_is_known_after_a_few_updates() -> None:
     """A shift is shortened by its length and a turn cut, as one step of the engine has it."""
 
@@ -194,6 +209,19 @@ def test_motions_are_those_of_the_token_that_each_action_named(tokens: dict, del
     np.testing.assert_allclose(motions.way[0, 0], [0.1, -0.05, turned], atol=1e-5)
     np.testing.assert_allclose(motions.command[0], actions[0, : 2 - delay, -3:])
     assert motions.moved.tolist() == [[1.0, 0.0][: 2 - delay]]
+
+
+def test_what_lies_still_in_pictures_was_refused() -> None:
+    """Poses that are seen differ a little from picture to picture."""
+    made = setup(PAIR, observe="pictures", pixels=64)
+    poses = np.zeros((2, 2, 2, 3))
+    poses[:, 1, 1] = [[0.004, -0.004, 0.01], [0.03, 0.0, 0.0]]
+    corners = made.layout.corners(poses)
+    past = Past(corners[:, :1].astype(np.float32), np.full((2, 1, 4), 0.5, np.float32))
+    seen = motions_of(past, corners[:, 1], made.layout, made.sim)
+    assert seen.moved.tolist() == [[0.0], [1.0]]
+    exact = motions_of(past, corners[:, 1], made.layout, setup(PAIR).sim)
+    assert exact.moved.tolist() == [[1.0], [1.0]]
 
 
 @pytest.mark.parametrize("capacity", [7, 12, 100])

@@ -26,7 +26,7 @@ PARALLELOGRAM = 6
 MADE = seven()
 LAYOUT = MADE.layout
 BATCH = transitions(MADE, COUNT)
-EXACT = {name: column.astype(np.float64) for name, column in vars(BATCH).items()}
+EXACT = {name: column.astype(np.float64) for name, column in BATCH.arrays.items()}
 ROWS = np.repeat(np.arange(COUNT), PAIRS)
 NAMES = np.array([shape.name for shape in LAYOUT.shapes])
 SYMMETRY = np.array([shape.symmetry for shape in LAYOUT.shapes])
@@ -145,12 +145,12 @@ def test_sides_of_hindsight_are_mostly_the_tokens_own() -> None:
 
 
 def test_the_same_generator_gives_the_same_pairs_and_the_transitions_stay() -> None:
-    before = {name: column.copy() for name, column in vars(BATCH).items()}
+    before = {name: column.copy() for name, column in BATCH.arrays.items()}
     one, again, other = (made_pairs([FINAL, NEAR], seed) for seed in (3, 3, 4))
     for name, column in vars(one).items():
         np.testing.assert_array_equal(column, vars(again)[name])
     assert not np.array_equal(one.goal, other.goal)
-    for name, column in vars(BATCH).items():
+    for name, column in BATCH.arrays.items():
         np.testing.assert_array_equal(column, before[name])
 
 

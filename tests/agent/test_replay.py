@@ -22,7 +22,7 @@ def buffer(capacity: int) -> ReplayBuffer:
 def numbered(first: int, count: int) -> Transitions:
     """Transitions whose reward is their number."""
     batch = random_transitions(MADE, count, seed=first)
-    return Transitions(**{**vars(batch), "reward": np.arange(first, first + count, dtype="f4")})
+    return Transitions(**{**batch.arrays, "reward": np.arange(first, first + count, dtype="f4")})
 
 
 def rewards(replay: ReplayBuffer) -> list[float]:
@@ -43,7 +43,7 @@ def test_equals_a_naive_oracle_under_random_operations(seed: int) -> None:
                 replay.add(batch)
                 for i in range(count):
                     oracle.append(float(number + i))
-                    parts = {name: column[i : i + 1] for name, column in vars(batch).items()}
+                    parts = {name: column[i : i + 1] for name, column in batch.arrays.items()}
                     rows[float(number + i)] = Transitions(**parts)
                 number += count
             case 1 if oracle:
@@ -51,7 +51,7 @@ def test_equals_a_naive_oracle_under_random_operations(seed: int) -> None:
                 assert drawn.count == 7
                 for i, reward in enumerate(drawn.reward.tolist()):
                     assert reward in oracle
-                    for name, column in vars(drawn).items():
+                    for name, column in drawn.arrays.items():
                         np.testing.assert_array_equal(column[i], getattr(rows[reward], name)[0])
             case _:
                 if seed % 2:  # a restart with room for more or fewer

@@ -22,6 +22,7 @@ AGENTS = {
     "worlds": "tangram",
     "pictures": "tangram",
     "pictures_game": "tangram",
+    "pictures_piles": "tangram",
 }
 
 

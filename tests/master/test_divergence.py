@@ -108,7 +108,7 @@ def test_too_many_in_a_row_end_the_run_and_the_batch_is_kept(
     assert guard.undone == 5
     batch = safetensors.numpy.load_file(tmp_path / "bad")
     assert learning.batch is not None
-    assert same(batch, vars(learning.batch))
+    assert same(batch, learning.batch.arrays)
 
 
 def test_weights_that_went_bad_without_a_loss_are_never_given_out(

@@ -48,7 +48,7 @@ def errors(layout: Layout, poses: Floats, flipped: Any, seen: Seen) -> Floats:
 def _error(
     layout: Layout, poses: Floats, flipped: Any, seen: Seen, token: int, as_token: int
 ) -> tuple[float, float]:
-    if not seen.found[as_token] or seen.flipped[as_token] != flipped[token]:
+    if not seen.sure[as_token] or seen.flipped[as_token] != flipped[token]:
         return np.inf, np.inf
     turn = np.pi / layout.symmetries[token]
     off = seen.poses[as_token] - poses[token]
@@ -113,7 +113,7 @@ def test_tokens_that_touch_are_seen(names: tuple[str, ...]) -> None:
         assert seen.blobs == 1
         off = errors(layout, poses, sides, seen)
         # What could as well lie otherwise is told with low confidence.
-        every.append((off < (0.01, 2.0)).all() or not seen.found.all())
+        every.append((off < (0.01, 2.0)).all() or not seen.sure.all())
         assert np.isinf(off).any() or (off < (0.01, 2.0)).all()
     assert all(every)
 
@@ -125,7 +125,7 @@ def test_what_has_two_explanations_is_doubtful() -> None:
     picture = grey(other.corners(np.array([[0.1, 0.2, 0.5]])), other, 128)
     seen = see(picture, layout, ARENA)
     assert (seen.confidence > 0.0).all()
-    assert not seen.found.any()
+    assert not seen.sure.any()
 
 
 def test_which_of_two_blobs_is_a_pile_is_doubtful() -> None:
@@ -135,7 +135,7 @@ def test_which_of_two_blobs_is_a_pile_is_doubtful() -> None:
     places = np.array([[0.4, 0.2, 0.5], [-0.4, 0.2, 2.0]])
     seen = see(grey(other.corners(places), other, 128), layout, ARENA)
     assert (seen.confidence > 0.0).all()
-    assert not seen.found.any()
+    assert not seen.sure.any()
 
 
 PILES = {
@@ -172,7 +172,7 @@ def before(poses: Floats, flipped: Any, *moved: int) -> Look:
     """Of tokens that moved nothing is known: they are said to lie in the middle of the others."""
     stayed = ~np.isin(np.arange(7), moved)
     told = np.where(stayed[:, None], poses, poses[stayed].mean(axis=0))
-    return Look(told, flipped, stayed, stayed)
+    return Look(told, flipped, stayed.astype(float))
 
 
 @pytest.mark.parametrize("moved", [0, 2, 4, 5, 6])
@@ -181,9 +181,9 @@ def test_a_whole_figure_is_told_apart_by_who_knows_what_lay_there(moved: int, pi
     """The token that came last is what the others leave."""
     poses, flipped = lying("heart")
     picture = grey(SEVEN_TANS.corners(poses, flipped), SEVEN_TANS, pixels)
-    assert not see(picture, SEVEN_TANS, ARENA).found.any()
+    assert not see(picture, SEVEN_TANS, ARENA).sure.any()
     seen = see(picture, SEVEN_TANS, ARENA, before(poses, flipped, moved))
-    assert seen.found.all()
+    assert seen.sure.all()
     assert (errors(SEVEN_TANS, poses, flipped, seen) < (0.5 / pixels, 3.0)).all()
 
 
@@ -194,7 +194,7 @@ def test_a_token_that_was_pushed_is_found_where_it_lies_now() -> None:
     poses[4] += (0.06, -0.05, 0.02)
     poses[5] = (-0.8, 0.8, 0.3)
     seen = see(grey(SEVEN_TANS.corners(poses, flipped), SEVEN_TANS, 128), SEVEN_TANS, ARENA, known)
-    assert seen.found.all()
+    assert seen.sure.all()
     assert (errors(SEVEN_TANS, poses, flipped, seen) < (0.005, 2.0)).all()
 
 
@@ -251,7 +251,7 @@ def test_what_is_not_to_be_seen_is_missing(shown: str) -> None:
         ),
     }
     seen = see(pictures[shown], layout, ARENA)
-    assert not seen.found.any()
+    assert not seen.sure.any()
     assert seen.confidence[0] == 0.0
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from master.trainer import Trainer
 from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.messages import EpisodeBatch, decode_from_worker
 from tangram_agent.policy import Policy
@@ -14,8 +15,9 @@ from tangram_agent.setup import Setup, make_setup
 from tangram_agent.types import Episodes
 from tangram_sim.arrays import Singles
 from tangram_sim.batch import BatchedEnv
-from tangram_sim.errors import ConfigError
+from tangram_sim.errors import ConfigError, RunError
 from tangram_sim.kinematics import KinematicWorld
+from tangram_sim.sight import SURE
 from worker.looking import environments
 from worker.rollout import Rollout
 
@@ -62,7 +64,7 @@ def test_nothing_exact_leaks(monkeypatch: pytest.MonkeyPatch, shapes: tuple[str,
     whole = played(task, policy)
     noisy(monkeypatch)
     other = played(task, policy)
-    assert other.arrays.keys() == whole.arrays.keys() > {"missing", "goals_missing"}
+    assert other.arrays.keys() == whole.arrays.keys() > {"confidence", "goals_confidence"}
     for name, column in whole.arrays.items():
         np.testing.assert_array_equal(column, getattr(other, name), err_msg=name)
 
@@ -124,7 +126,7 @@ def test_in_a_stage_the_tokens_that_lie_on_their_targets_are_those_that_are_plac
         env.reset([np.random.default_rng(i) for i in range(8)])
         seen, goals = task.layout.bases(env.seen), task.layout.bases(env.seen_goals)
         gap = np.linalg.norm(seen[:, :, None] - goals[:, None], axis=-1).min(axis=2)
-        sure = ~(env.sight.missing | env.sight.goals_missing.any(axis=1, keepdims=True))
+        sure = ~(env.sight.missing | (env.sight.goals_confidence < SURE).any(axis=1, keepdims=True))
         assert sure.sum() > 16
         np.testing.assert_array_equal((gap < 0.02)[sure], env.placed[sure])
 
@@ -147,7 +149,8 @@ def test_what_no_picture_shows_ends_no_worker(sim: dict[str, Any]) -> None:
 
     with closing(environments(task, 4)) as env:
         episodes = Rollout(env, 0, "player", 0, 0).play(far, 24)
-    assert (episodes.missing if "gain" in sim else episodes.goals_missing).any()
+    seen = episodes.confidence if "gain" in sim else episodes.goals_confidence
+    assert (np.asarray(seen) < SURE).any()
     spec = EpisodeSpec.of(task)
     assert EpisodeBatch(1, 0, episodes).encode(spec)
 
@@ -158,12 +161,35 @@ def test_what_is_missing_travels_and_is_not_learned_from() -> None:
     spec = EpisodeSpec.of(task)
     frames = EpisodeBatch(1, 0, episodes).encode(spec)
     arrived = decode_from_worker(frames, spec).episodes
-    np.testing.assert_array_equal(arrived.missing, episodes.missing)
-    gone = np.asarray(episodes.missing).any(axis=(1, 2))
+    np.testing.assert_array_equal(arrived.confidence, episodes.confidence)
+    gone = (np.asarray(episodes.confidence) < SURE).any(axis=(1, 2))
     assert 0 < gone.sum() < len(gone)  # random actions leave the picture
-    seen = arrived.seen_whole()
+    seen = arrived.learnable(False)
     np.testing.assert_array_equal(seen.corners, episodes.corners[~gone])
-    assert replace(episodes, missing=None).seen_whole().count == len(gone)
+    assert replace(episodes, confidence=None).learnable(False).count == len(gone)
+
+
+def piled(**agent: Any) -> Setup:
+    """Three tokens that begin in piles, which pictures do not always tell apart."""
+    made = setup("small_triangle", "medium_triangle", "parallelogram", starts="piles")
+    return replace(made, agent=replace(made.agent, learning_starts=8, batch_size=8, **agent))
+
+
+def test_who_knows_its_doubts_learns_from_more_episodes_and_goes_on_as_before() -> None:
+    knows, other = piled(confidence=True), piled()
+    trainer, plain = Trainer(knows, 0, "cpu"), Trainer(other, 0, "cpu")
+    episodes = played(knows, Policy(knows), 6)
+    doubtful = np.asarray((episodes.confidence > 0.0) & (episodes.confidence < SURE))
+    assert doubtful.any()
+    for one in (trainer, plain):
+        one.insert(episodes)
+    assert 0 < len(plain.replay) < len(trainer.replay)
+    arrays, counters = trainer.state()
+    again = Trainer(knows, 1, "cpu")
+    again.load_state(arrays, counters)
+    assert trainer.update(0.0) == again.update(0.0)
+    with pytest.raises(RunError):
+        again.load_state(*plain.state())
 
 
 def test_without_an_eye_pictures_are_refused() -> None:

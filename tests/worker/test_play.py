@@ -93,11 +93,11 @@ def test_only_what_was_found_is_drawn_over_the_cameras_view(tmp_path: Path) -> N
         red, _, blue = np.asarray(first, np.int64).transpose(2, 0, 1)
         return np.count_nonzero(blue > red + 30)
 
-    both, missing = coloured(), played.episodes.missing
-    assert missing is not None
-    missing[1] = 1
+    both, confidence = coloured(), played.episodes.confidence
+    assert confidence is not None
+    confidence[1] = 0.4
     one = coloured()
-    missing[0] = 1
+    confidence[0] = 0.0
     assert both > one > coloured() == 0
     assert camera_sheets(run.setup, replace(played, pictures=None), 1, 60) == []
 
