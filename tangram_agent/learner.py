@@ -134,7 +134,7 @@ class Learner:
         # Kept as lists: walking the modules takes a fifth of a small network's update.
         self._lists = self.parameter_lists()
         self.optimisers = {part: Adam(self._lists[part]) for part in ("actor", "critic")}
-        self._fit = None if self.motion is None else Fit(self.motion)
+        self._fit = None if self.motion is None else Fit(self.motion, setup.screens_motions)
         self._step_all = self._all_steps
         if compiled:
             self._step_all = Compiled(self._all_steps, self._changed_by_update())

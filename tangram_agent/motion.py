@@ -36,7 +36,7 @@ _SEARCH_STEPS, _NEAR_ENOUGH = 30, 1e-5
 _SHORT = 0.01  # share of a half turn
 _SLOPES = 0.1, 10.0  # of what a command comes to, as the search takes them
 _NOISE_DEVIATIONS = 8.0  # of a corner's noise that are no motion
-_SEEN = 0.005  # of what a token that lies still seems to move in pictures
+_SEEN = 0.64  # pixels that a token which lies still may seem to move
 _STILL = 1e-6  # an action that moves no more was refused or blocked
 
 
@@ -91,10 +91,11 @@ def motions_of(past: Past, now: Floats, layout: Layout, sim: SimConfig) -> Motio
     )
     way = velocities_of((after - before).reshape(-1, 3), sim).reshape(count, steps, 3)
     # Seen with noise, what was blocked or refused seems to have moved; a lone token never is.
-    noise = _SEEN if sim.observe == "pictures" else _NOISE_DEVIATIONS * sim.corner_noise
+    seen = _SEEN / sim.pixels if sim.observe == "pictures" else 0.0
+    noise = max(seen, _NOISE_DEVIATIONS * sim.corner_noise)
     still = _STILL + (noise if layout.tokens > 1 else 0.0)
     moved = np.abs(way).max(axis=-1, initial=0.0) > still
-    if past.confidence is not None:
+    if past.confidence is not None and layout.tokens > 1:
         # What touches others may be seen wrongly, and one wrong way spoils what is believed.
         sure = past.confidence[:, -1 - way.shape[1] :] > PILED
         named = np.take_along_axis(sure[:, :-1] & sure[:, 1:], token[..., 0], axis=2)[..., 0]
@@ -255,9 +256,16 @@ class Fit:
         slots: sums of squares and products of each axis; empty before a step.
     """
 
-    def __init__(self, model: MotionModel) -> None:
+    def __init__(self, model: MotionModel, screened: bool = False) -> None:
+        """With sums of nothing.
+
+        Args:
+            model: what is fitted.
+            screened: whether motions far beside what is usual are left out, where only tokens that
+                met others, or were seen wrongly, can make such.
+        """
         self.slots: dict[str, list[Tensor]] = {}
-        self._model = model
+        self._model, self._screened = model, screened
 
     def load(self, slots: dict[str, list[Tensor]]) -> None:
         """Take over the sums of the same model.
@@ -282,7 +290,9 @@ class Fit:
 
         The error is that of each episode's last action, those before it being known.
         """
-        model, motions = self._model, self._plausible(motions)
+        model = self._model
+        if self._screened:
+            motions = self._plausible(motions)
         seen = model.beside_usual(motions)
         usual = model.mean.double()
         squares = torch.einsum("btf,bdtu,bug->dfg", seen.phi, seen.inverse, seen.phi)
@@ -310,10 +320,7 @@ class Fit:
         }
 
     def _plausible(self, motions: Motions) -> Motions:
-        """The motions without those far beside what is usual: tokens that met others on their way.
-
-        Far is far beyond the median, so that of worlds that differ none is left out.
-        """
+        """The motions without those that are many medians beside what is usual."""
         off = self._model.beside_usual(motions).off.abs()
         moved = motions.moved > 0.0
         usual = off.mT[moved].median(dim=0).values if moved.any() else off.new_zeros(3)

@@ -23,7 +23,7 @@ from tangram_agent.coverage import (
 )
 from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes, Flags, Transitions
-from tangram_sim.actions import chosen_tokens, velocities
+from tangram_sim.actions import chosen_tokens, flips, velocities
 from tangram_sim.arrays import Bools, Floats, Ints, Singles
 from tangram_sim.layout import Layout
 from tangram_sim.sight import SURE
@@ -226,9 +226,10 @@ def make_pairs(batch: Transitions, setup: Setup, generator: np.random.Generator)
     sure, sure_after = np.ones(len(rows)), np.ones(len(rows))
     if agent.confidence and batch.confidence is not None and batch.next_confidence is not None:
         both = batch.confidence, batch.next_confidence
-        sure, sure_after = (part[rows, token].astype(np.float64) for part in both)
+        sure, sure_after = (np.maximum(part[rows, token].astype(np.float64), 0.0) for part in both)
     velocity = velocities(batch.action[rows].astype(np.float64), setup.sim)
-    told = Lying(token, np.asarray(before.pose + velocity), before.flipped)
+    sides = before.flipped ^ flips(batch.action.astype(np.float64), layout, setup.sim)[rows]
+    told = Lying(token, np.asarray(before.pose + velocity), sides)
     seen = told.instead(after, sure >= SURE)
     return PairBatch(
         before=before.pose,

@@ -149,7 +149,7 @@ class ReplayBuffer:
                 raise RunError(
                     f"replay state: '{name}' does not fit the layout (expected {column.dtype} "
                     f"{shape}): was the checkpoint written with other tokens, or by another "
-                    "version?"
+                    "version? Then start a new run"
                 )
         # Oldest first: the state's own ring was full if it held fewer than were ever added.
         order = np.roll(np.arange(kept), -(added % kept) if added > kept else 0)[-self.capacity :]

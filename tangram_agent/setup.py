@@ -231,6 +231,16 @@ class Setup:
         return self.pairs and agent.afterstate and agent.motion == "learned"
 
     @property
+    def screens_motions(self) -> bool:
+        """Whether a motion far beside what is usual tells nothing: of an exact world in pictures.
+
+        There it is that of a token which met others or was seen wrongly. Elsewhere it may be what
+        that world does.
+        """
+        sim = self.sim
+        return sim.observe == "pictures" and self.layout.tokens > 1 and not sim.inexact
+
+    @property
     def contacts(self) -> bool:
         """Whether tokens push each other out of their places."""
         return self.sim.motion == "slide"

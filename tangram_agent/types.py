@@ -63,7 +63,8 @@ class Episodes:
         gone = (self.confidence < SURE) & ((self.confidence != AWAY) | (not several))
         if doubts:
             named = chosen_tokens(
-                self.actions.reshape(self.transitions, -1).astype(np.float64), gone.shape[2]
+                self.actions.reshape(self.transitions, self.actions.shape[2]).astype(np.float64),
+                gone.shape[2],
             )
             index = named.reshape(self.count, self.steps, 1)
             gone = np.take_along_axis(gone[:, 1:], index, axis=2)

@@ -71,11 +71,11 @@ def sample_piles(
 def _piles(
     layout: Layout, sim: SimConfig, rng: np.random.Generator, avoid: Floats | None
 ) -> Floats | None:
-    """One try to lay piles; None where one finds no room, or each is of one token."""
-    order, sizes = rng.permutation(layout.tokens), rng.integers(1, MAX_PILE + 1, layout.tokens)
-    parts = [part for part in np.split(order, np.cumsum(sizes)) if len(part)]
-    if len(parts) == layout.tokens:
-        return None
+    """One try to lay piles; None where one finds no room."""
+    order, parts = rng.permutation(layout.tokens), list[Ints]()
+    while len(parts) in (0, layout.tokens):  # at least one is of several
+        sizes = rng.integers(1, MAX_PILE + 1, layout.tokens)
+        parts = [part for part in np.split(order, np.cumsum(sizes)) if len(part)]
     bodies, poses, before = _bodies(layout), np.zeros((layout.tokens, 3)), order[:0]
     for own in parts:
         for number in range(2 * _CLEAR_TRIES):

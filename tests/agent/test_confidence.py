@@ -9,14 +9,14 @@ import torch
 
 from tangram_agent.motion import motions_of
 from tangram_agent.networks import Networks, initialise
-from tangram_agent.pairs import PairGraph
+from tangram_agent.pairs import PairGraph, Pairs
 from tangram_agent.planning import Planner
 from tangram_agent.relabelling import make_pairs
 from tangram_agent.replay import ReplayBuffer
 from tangram_agent.setup import Setup
 from tangram_agent.steps import Stepping
 from tangram_agent.types import AWAY, Episodes, Past, Transitions
-from tangram_sim.actions import make_actions
+from tangram_sim.actions import flips, make_actions
 from tangram_sim.arrays import Floats, Singles
 from tangram_sim.errors import ConfigError
 from tests.agent.builders import SMALL, setup
@@ -77,14 +77,20 @@ def test_which_episodes_are_learned_from(
     assert unsure.learnable(True).count == 0
 
 
+def test_no_episodes_are_none() -> None:
+    played = episodes([[1, 1, 1], [1, 1, 1], [0, 0, 0]], [0, 1])
+    assert played.learnable(True).learnable(True).count == 0
+
+
 def with_confidence(batch: Transitions, before: Floats, after: Floats) -> Transitions:
     shares = (np.asarray(part, np.float32) for part in (before, after))
     return replace(batch, **dict(zip(("confidence", "next_confidence"), shares, strict=True)))
 
 
-def test_a_doubtful_token_is_judged_by_where_it_was_told_to_go() -> None:
+@pytest.mark.parametrize("allow_flip", [False, True])
+def test_a_doubtful_token_is_judged_by_where_it_was_told_to_go(allow_flip: bool) -> None:
     """A sure one by where it came to: the reward is that of where it is seen after the action."""
-    made = seven(KNOWS)
+    made = seven(KNOWS, allow_flip=allow_flip)
     batch, full = transitions(made, 40), np.ones((40, 7))
     rng = np.random.default_rng(1)
     before = np.where(rng.random((40, 7)) < 0.5, DOUBTFUL, 1.0)
@@ -95,7 +101,10 @@ def test_a_doubtful_token_is_judged_by_where_it_was_told_to_go() -> None:
     told = plain.before + plain.velocity * (made.sim.arena, made.sim.arena, np.pi)
     expected = np.where(doubtful[:, None], told, plain.after)
     np.testing.assert_allclose(known.after, expected, atol=1e-12)
-    sides = np.where(doubtful, plain.before_flipped, plain.after_flipped)
+    each = len(plain.token) // 40
+    turned = np.repeat(flips(batch.action.astype(float), made.layout, made.sim), each)
+    assert turned[doubtful].any() == allow_flip
+    sides = np.where(doubtful, plain.before_flipped ^ turned, plain.after_flipped)
     np.testing.assert_array_equal(known.after_flipped, sides)
     for name in ("reward", "goal", "start", "covered", "before", "token"):
         np.testing.assert_array_equal(vars(known)[name], vars(plain)[name], err_msg=name)
@@ -150,6 +159,7 @@ def chosen(made: Setup, confidence: Singles, placed: np.ndarray, likes: Floats) 
     graph = PairGraph(made.layout, made.sim.arena, made.agent)
     networks = PerfectNetworks(PerfectCritic(made.layout, None, likes), graph)
     closed = placed | (confidence < 0.5)
+    closed = np.where(closed.all(axis=1, keepdims=True), placed, closed)  # as `BatchedEnv.closed`
     past = seen(confidence, placed)
     chooser = Planner(cast("Networks", networks), made)
     return chooser.choose(corners, closed, goals, past=past).token.tolist()
@@ -174,9 +184,34 @@ def test_who_knows_it_may_move_a_doubtful_token_and_never_one_that_is_gone() -> 
         assert {token == 2 for token in played} == {moved}
 
 
-def test_where_nothing_is_seen_something_is_played() -> None:
+def test_where_nothing_is_seen_a_token_that_is_left_is_played() -> None:
     placed = np.zeros((6, 7), np.bool_)
-    assert len(chosen(seven(KNOWS), np.zeros((6, 7)), placed, np.ones(7))) == 6
+    placed[:, 0] = True
+    assert 0 not in chosen(seven(KNOWS), np.zeros((6, 7)), placed, np.ones(7))
+
+
+def test_what_the_camera_is_sure_of_reaches_the_networks_in_play(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    told = dict[int, float]()
+    see = PairGraph.vectors
+
+    def watched(graph: PairGraph, pairs: Pairs) -> torch.Tensor:
+        assert pairs.confidence is not None
+        told.update(zip(pairs.token.tolist(), pairs.confidence.tolist(), strict=True))
+        return see(graph, pairs)
+
+    monkeypatch.setattr(PairGraph, "vectors", watched)
+    made = seven(KNOWS, PERCEPTRON)
+    networks = Networks(made)
+    initialise(networks, torch.Generator().manual_seed(0))
+    rng = np.random.default_rng(2)
+    corners, goals = (made.layout.corners(*random_scene(made.layout, rng, 1)) for _ in range(2))
+    confidence, placed = np.linspace(0.25, 1.0, 7)[None], np.zeros((1, 7), np.bool_)
+    chooser = Planner(networks.requires_grad_(False), made)
+    chooser.choose(corners, confidence < 0.5, goals, past=seen(confidence, placed))
+    expected = dict(enumerate(confidence[0].astype(np.float32).tolist()))
+    assert told == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("delay", [False, True])

@@ -116,10 +116,12 @@ def test_turns_are_compared_by_the_shorter_way() -> None:
     assert expected == pytest.approx(1.01, abs=1e-3)  # it went 0.02 further, not back
 
 
-def fitted(ways: Callable[[torch.Tensor], torch.Tensor], steps: int, updates: int) -> MotionModel:
+def fitted(
+    ways: Callable[[torch.Tensor], torch.Tensor], steps: int, updates: int, screened: bool = False
+) -> MotionModel:
     """A model after so many updates with 256 motions each."""
     model = MotionModel()
-    fit = Fit(model)
+    fit = Fit(model, screened)
     for update in range(updates):
         told = commands(256, seed=update).view(-1, steps, 3)
         fit.step(Motions(told, ways(told), torch.ones(told.shape[:2])))
@@ -127,7 +129,7 @@ def fitted(ways: Callable[[torch.Tensor], torch.Tensor], steps: int, updates: in
 
 
 def test_what_others_stopped_does_not_spoil_what_is_usual() -> None:
-    """One motion of twenty ends anywhere on its way; one gain differs by more than the screen."""
+    """One motion of twenty ends anywhere on its way."""
 
     def world(told: torch.Tensor) -> torch.Tensor:
         chance = torch.Generator().manual_seed(int(1e6 * told.abs().sum()))
@@ -135,7 +137,7 @@ def test_what_others_stopped_does_not_spoil_what_is_usual() -> None:
         share = torch.rand(told.shape[:2], generator=chance) * met
         return told * (1.0 - share[..., None]) * torch.tensor([1.0, 0.5, 1.0])
 
-    model, told = fitted(world, 8, 60), commands(500, seed=1000)
+    model, told = fitted(world, 8, 60, screened=True), commands(500, seed=1000)
     off = (model.predict(model.prior(500), told)[0] - told * torch.tensor([1.0, 0.5, 1.0])).abs()
     assert off.max() < 0.01
     assert model.noise.sqrt().max() < 0.005
@@ -209,6 +211,22 @@ def test_motions_are_those_of_the_token_that_each_action_named(tokens: dict, del
     np.testing.assert_allclose(motions.way[0, 0], [0.1, -0.05, turned], atol=1e-5)
     np.testing.assert_allclose(motions.command[0], actions[0, : 2 - delay, -3:])
     assert motions.moved.tolist() == [[1.0, 0.0][: 2 - delay]]
+
+
+@pytest.mark.parametrize(
+    ("tokens", "sim", "screened"),
+    [
+        (PAIR, {}, True),
+        (SQUARE, {}, False),  # it meets nothing
+        (PAIR, {"observe": "corners"}, False),
+        (PAIR, {"gain_spread": 1.5}, False),  # far from usual may be what that world does
+    ],
+)
+def test_motions_are_screened_only_where_the_world_is_exact_and_seen(
+    tokens: dict, sim: dict, screened: bool
+) -> None:
+    made = setup(tokens, {"motion": "learned"}, **{"observe": "pictures", "pixels": 64} | sim)
+    assert made.screens_motions == screened
 
 
 def test_what_lies_still_in_pictures_was_refused() -> None:
