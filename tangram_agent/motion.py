@@ -181,14 +181,19 @@ class MotionModel(nn.Module):
             prior.covariance - seen.along.mT @ gain,
         )
 
+    def off(self, motions: Motions) -> Tensor:
+        """(B, 3, T) how far ways are from the usual one, 0 where nothing moved."""
+        usual = features(motions.command) @ self.mean.double().mT
+        return (_shortest(motions.way - usual) * motions.moved[..., None]).mT
+
     def beside_usual(self, motions: Motions) -> _Seen:
         """What was seen, beside what was to be expected."""
         moved = motions.moved[..., None]
         phi = features(motions.command) * moved
-        off = _shortest(motions.way - phi @ self.mean.double().mT) * moved
         along = phi[:, None] * self.variance[:, None]
         noise = torch.diag_embed(self.noise[:, None].expand(3, phi.shape[1]))
-        return _Seen(phi, off.mT, along, torch.linalg.inv(along @ phi[:, None].mT + noise))
+        inverse = torch.linalg.inv(along @ phi[:, None].mT + noise)
+        return _Seen(phi, self.off(motions), along, inverse)
 
     def predict(self, belief: Belief, command: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and deviation (B, 3) of what commands (B, 3) come to."""
@@ -321,7 +326,7 @@ class Fit:
 
     def _plausible(self, motions: Motions) -> Motions:
         """The motions without those that are many medians beside what is usual."""
-        off = self._model.beside_usual(motions).off.abs()
+        off = self._model.off(motions).abs()
         moved = motions.moved > 0.0
         usual = off.mT[moved].median(dim=0).values if moved.any() else off.new_zeros(3)
         near = (off <= _FAR * usual[:, None] + _FAR_LEAST).all(dim=1)

@@ -223,14 +223,12 @@ def make_pairs(batch: Transitions, setup: Setup, generator: np.random.Generator)
         reward, done = batch.reward.astype(np.float64), batch.done
     again = generator.random(len(rows)) < _CORRECTED
     start = after.instead(before, ~again)
-    sure, sure_after = np.ones(len(rows)), np.ones(len(rows))
+    seen, sure, sure_after = after, np.ones(len(rows)), np.ones(len(rows))
     if agent.confidence and batch.confidence is not None and batch.next_confidence is not None:
         both = batch.confidence, batch.next_confidence
+        # One that left the picture has less than none.
         sure, sure_after = (np.maximum(part[rows, token].astype(np.float64), 0.0) for part in both)
-    velocity = velocities(batch.action[rows].astype(np.float64), setup.sim)
-    sides = before.flipped ^ flips(batch.action.astype(np.float64), layout, setup.sim)[rows]
-    told = Lying(token, np.asarray(before.pose + velocity), sides)
-    seen = told.instead(after, sure >= SURE)
+        seen = _told(batch, setup, rows, before).instead(after, sure >= SURE)
     return PairBatch(
         before=before.pose,
         after=seen.pose,
@@ -292,6 +290,14 @@ def _alike(piece: Ints, layout: Layout, generator: np.random.Generator) -> Float
     order = np.array([shape.symmetry for shape in layout.shapes])[piece]
     turn: Floats = 2.0 * np.pi / order * generator.integers(order)
     return turn
+
+
+def _told(batch: Transitions, setup: Setup, rows: Ints, before: Lying) -> Lying:
+    """Where tokens (M,) were told to go."""
+    action = batch.action.astype(np.float64)
+    way, turned = velocities(action, setup.sim), flips(action, setup.layout, setup.sim)
+    pose = np.asarray(before.pose + way[rows])
+    return Lying(before.index, pose, before.flipped ^ turned[rows])
 
 
 def _strategies(agent: AgentConfig, count: int, generator: np.random.Generator) -> Ints:

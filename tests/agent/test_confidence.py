@@ -125,6 +125,14 @@ def test_the_actor_is_asked_again_of_a_token_as_it_is_seen_then() -> None:
     assert steps.start.confidence.tolist() == pairs.start_confidence.tolist()  # type: ignore[union-attr]
 
 
+def test_no_network_sees_less_than_none() -> None:
+    made = seven(KNOWS)
+    left = with_confidence(transitions(made, 8), np.full((8, 7), AWAY), np.full((8, 7), AWAY))
+    pairs = make_pairs(left, made, np.random.default_rng(0))
+    assert not pairs.confidence.any()
+    assert not pairs.start_confidence.any()
+
+
 @pytest.mark.parametrize("net", [SMALL, PERCEPTRON])
 def test_only_networks_of_agents_that_know_it_see_it(net: dict[str, Any]) -> None:
     values = []
