@@ -64,7 +64,7 @@ class Trainer:
                 layout.corner_count,
                 layout.tokens,
                 setup.action_size,
-                setup.sim.observe == "pictures",
+                setup.sim.looks,
             )
         self.rate_limiter = RateLimiter(
             agent.updates_per_transition, agent.learning_starts, lag_updates

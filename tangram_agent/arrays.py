@@ -131,6 +131,7 @@ class EpisodeSpec:
         bound: largest |coordinate| that a corner can reach.
         observed: whether pictures are what is observed: then some of it is not surely seen.
         goal_rows: G, corners of a target; 0: V.
+        traced: whether targets are outlines that were traced in pictures.
         rewards: least and largest one.
     """
 
@@ -141,6 +142,7 @@ class EpisodeSpec:
     bound: float
     observed: bool = False
     goal_rows: int = 0
+    traced: bool = False
     rewards: tuple[float, float] = (-MAX_REWARD, MAX_REWARD)
 
     def __post_init__(self) -> None:
@@ -159,8 +161,9 @@ class EpisodeSpec:
             setup.horizon,
             setup.action_size,
             setup.bound,
-            setup.sim.observe == "pictures",
+            setup.sim.looks,
             setup.goal_rows if setup.fills else 0,
+            setup.traces,
             reward_bounds(setup.reward, setup.sim, setup.bound),
         )
 
@@ -192,7 +195,7 @@ class EpisodeSpec:
 @lru_cache
 def _columns(spec: EpisodeSpec, count: int) -> tuple[Column, ...]:
     e, t, v, k = count, spec.horizon, spec.corners, spec.tokens
-    reach, one = spec.bound * (1 + ROUNDING), 1 + ROUNDING
+    reach, one, rows = spec.bound * (1 + ROUNDING), 1 + ROUNDING, spec.goal_rows or v
     confidence = (
         Column("confidence", "<f4", (e, t + 1, k), AWAY, 1),
         Column("goals_confidence", "<f4", (e, k), 0, 1),
@@ -202,8 +205,9 @@ def _columns(spec: EpisodeSpec, count: int) -> tuple[Column, ...]:
         Column("placed", "u1", (e, t + 1, k), 0, 1),
         Column("actions", "<f4", (e, t, spec.action_size), -one, one),
         Column("rewards", "<f4", (e, t), *(bound * one for bound in spec.rewards)),
-        Column("goals", "<f4", (e, spec.goal_rows or v, 2), -reach, reach),
+        Column("goals", "<f4", (e, rows, 2), -reach, reach),
         *(confidence if spec.observed else ()),
+        *((Column("achieved", "<f4", (e, rows, 2), -reach, reach),) if spec.traced else ()),
     )
 
 

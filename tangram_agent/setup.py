@@ -202,6 +202,11 @@ class Setup:
         return self.agent.readout == "outline"
 
     @property
+    def traces(self) -> bool:
+        """Whether outlines are traced in the camera's pictures, and may be wrong."""
+        return self.fills and self.sim.observe == "silhouette_pictures"
+
+    @property
     def goal_rows(self) -> int:
         """G: corners of a target as agents see it."""
         return goal_rows(self.layout, self.sim)

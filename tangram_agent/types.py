@@ -31,7 +31,9 @@ class Episodes:
         goals: (E, V, 2) float32, target corners, or (E, G, 2) rows of its outline.
         confidence: (E, T + 1, K) float32 in [0, 1], how surely tokens were seen in a picture, see
             `tangram_sim.sight.Look`, or `AWAY`; None where pictures are not what is observed.
-        goals_confidence: (E, K) float32 in [0, 1], the same of the target's pieces.
+        goals_confidence: (E, K) float32 in [0, 1], the same of the target's pieces; 1 of outlines.
+        achieved: (E, G, 2) rows of the outline of what tokens came to cover, as it was traced in
+            the camera's picture of it; None where targets are not traced.
     """
 
     corners: Singles
@@ -41,6 +43,7 @@ class Episodes:
     goals: Singles
     confidence: Singles | None = None
     goals_confidence: Singles | None = None
+    achieved: Singles | None = None
 
     @property
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
@@ -76,6 +79,7 @@ class Episodes:
             rewards=self.rewards[whole],
             goals=self.goals[whole],
             confidence=self.confidence[whole],
+            achieved=None if self.achieved is None else self.achieved[whole],
         )
 
     @property

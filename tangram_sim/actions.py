@@ -7,7 +7,7 @@ import numpy as np
 
 from tangram_sim.actuation import full_scale, reach
 from tangram_sim.arrays import Bools, Floats, Ints, Singles
-from tangram_sim.config import SimConfig
+from tangram_sim.config import SILHOUETTES, SimConfig
 from tangram_sim.kinematics import wrap
 from tangram_sim.layout import Layout
 from tangram_sim.observation_noise import noise_bound
@@ -39,7 +39,7 @@ def corner_bound(tokens: int, sim: SimConfig) -> float:
     pushes = 0 if tokens == 1 else horizon(tokens, sim) if sim.motion == "slide" else 1
     inside = 0.5
     way = float(reach(sim)[:2].max())
-    if sim.observe == "pictures":
+    if sim.looks:
         way, inside = max(way, 1.0), 1.0
     # One that only turns pushes others by less than an arena, too.
     push = max(way, 1.0) if sim.motion == "slide" else 1.0
@@ -50,9 +50,12 @@ def corner_bound(tokens: int, sim: SimConfig) -> float:
 def goal_rows(layout: Layout, sim: SimConfig) -> int:
     """G, the corners of a target as agents see it: its pieces', or rows of their outline.
 
-    An outline has no more corners than its pieces, and each ring one row more, see `rings`.
+    An outline has no more corners than its pieces, and each ring one row more, see `rings`; one
+    that was traced in a picture may have others.
     """
-    return layout.corner_count + layout.tokens * (sim.observe == "silhouette")
+    if sim.observe not in SILHOUETTES:
+        return layout.corner_count
+    return (layout.corner_count + layout.tokens) * (2 if sim.looks else 1)
 
 
 def chosen_tokens(actions: Floats, tokens: int) -> Ints:

@@ -13,6 +13,7 @@ from tangram_sim.arrays import Complex
 
 Area: TypeAlias = "Polygon | MultiPolygon"
 
+_ROUND = 1e-9  # of an area's size, to which corners are rounded where areas are intersected
 _MITRE = 5.0  # of the sharpest corner, 45 degrees: 2.6
 
 
@@ -46,6 +47,13 @@ def straightened(z: Complex, tolerance: float) -> Complex:
             break
         z = np.delete(z, least)
     return z
+
+
+def overlap(one: Area, other: Area) -> float:
+    """Intersection over union of two areas."""
+    size = _ROUND * float(np.sqrt(one.area + other.area))
+    common = shapely.intersection(one, other, grid_size=size).area
+    return float(common / max(one.area + other.area - common, 1e-300))
 
 
 def rings(area: Area, tolerance: float) -> list[tuple[Complex, int, bool]]:

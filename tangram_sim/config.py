@@ -20,6 +20,7 @@ PICTURES = ("binary", "grey")
 # What the target looks like without its pieces.
 SILHOUETTES = ("silhouette", "silhouette_pictures")
 OBSERVED = ("corners", "pictures", *SILHOUETTES)
+LOOKED_AT = ("pictures", "silhouette_pictures")
 # The settings of the camera.
 CAMERA = (
     *("pixels", "picture", "picture_noise", "picture_blur"),
@@ -165,7 +166,7 @@ class SimConfig(Settings, section="sim"):
         "what agents see: corners as they are, or what is found in the camera's pictures; then "
         "Eq. 14 is measured on pictures, too, and scores are exact polygons all the same; "
         "silhouette: of the target only its outline, which agent=outline fills itself and others "
-        "have filled by a search; silhouette_pictures: only the outline's picture, in tangram-eval",
+        "have filled by a search; silhouette_pictures: the same, but only in the camera's pictures",
         choices=OBSERVED,
     )
     motion: str = setting(
@@ -270,6 +271,11 @@ class SimConfig(Settings, section="sim"):
     )
 
     @property
+    def looks(self) -> bool:
+        """Whether agents see nothing but the camera's pictures."""
+        return self.observe in LOOKED_AT
+
+    @property
     def task(self) -> StageConfig:
         """What is played without a curriculum and before its first stage, and what tests are."""
         return StageConfig(targets=self.targets, spread=self.spread)
@@ -321,7 +327,7 @@ class SimConfig(Settings, section="sim"):
                     f"sim.{name} must be three numbers, of x, y and turn, as in "
                     f"sim.{name}={told(getattr(SimConfig, name))}, got {told(value)}"
                 )
-        if self.observe in ("pictures", "silhouette_pictures"):
+        if self.looks:
             self._check_observed()
         super().__post_init__()
         if self.motion == "slide" and self.backend == "kinematic":

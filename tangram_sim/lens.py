@@ -38,11 +38,12 @@ class Lens:
     Attributes:
         moves: whether the camera does not always stand where it should.
         disturbs: whether anything is other than it should be.
+        views: B, how the episodes are seen.
     """
 
     def __init__(self, sim: SimConfig) -> None:
         self._sim = sim
-        self._views: list[View] = []
+        self.views: list[View] = []
         self.moves = bool(sim.camera_turn or sim.camera_shift)
         self.disturbs = self.moves or bool(
             sim.picture_noise or sim.picture_blur or sim.light_gradient
@@ -50,13 +51,13 @@ class Lens:
 
     def begin(self, generators: Generators) -> list[View]:
         """Draw how each of B episodes is seen."""
-        self._views = [self._view(generator) for generator in generators]
-        return self._views
+        self.views = [self._view(generator) for generator in generators]
+        return self.views
 
     def stand(self, views: Sequence[View]) -> list[View]:
         """See B episodes as something was seen before."""
-        self._views = list(views)
-        return self._views
+        self.views = list(views)
+        return self.views
 
     def _view(self, generator: np.random.Generator) -> View:
         sim = self._sim
@@ -68,7 +69,7 @@ class Lens:
 
     def taken(self, episode: int, picture: Pixels, generator: np.random.Generator) -> Pixels:
         """A picture (P, P) of an episode as it comes out."""
-        sim, light = self._sim, self._views[episode].light
+        sim, light = self._sim, self.views[episode].light
         if not (light.any() or sim.picture_blur or sim.picture_noise):
             return picture
         levels = picture.astype(np.float64)

@@ -134,7 +134,7 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
                 f"sim.stages: tokens must be at most the {layout.tokens} that there are, got "
                 f"{stage.tokens} (in the stage from update {stage.updates}); 0 moves all"
             )
-    if sim.observe in ("pictures", "silhouette_pictures"):
+    if sim.looks:
         _check_names(layout, sim.observe)
     together = [t for t in (sim.task, *sim.stages) if t.targets in _TOGETHER]
     if sim.observe == "pictures" and together and layout.tokens > MAX_PILE:

@@ -72,7 +72,7 @@ def check_world(layout: Layout, sim: SimConfig) -> None:
     check_room(layout, sim)
     if sim.backend == "physics" and find_spec("pybullet") is None:
         raise _no_engine("no module named 'pybullet'")
-    if sim.observe == "pictures" and find_spec("cv2") is None:
+    if sim.looks and find_spec("cv2") is None:
         raise no_opencv("no module named 'cv2'")
 
 
@@ -101,11 +101,6 @@ def check_shown(sim: SimConfig, outlines: bool) -> None:
     Raises:
         ConfigError: says who takes them.
     """
-    if sim.observe == "silhouette_pictures" and outlines:
-        raise ConfigError(
-            "sim.observe=silhouette_pictures is for tangram-eval puzzle=, no agent learns from it: "
-            "set sim.observe=silhouette"
-        )
     if sim.observe in SILHOUETTES and not outlines:
         raise ConfigError(
             f"sim.observe={sim.observe} is for an agent of outlines: train one with sim=silhouette "

@@ -22,6 +22,7 @@ from shapely import Polygon
 
 from tangram_sim.areas import Area
 from tangram_sim.arrays import Complex, Floats, Singles
+from tangram_vision.samples import binary
 
 _MARGIN = 3  # pixels around a picture
 _SHORT = 10  # points of a chain that is no silhouette's
@@ -96,6 +97,11 @@ class _Side:
     def foot(self, point: complex) -> complex:
         """The point of its line that is nearest."""
         return self.middle + self.along * ((point - self.middle) * self.along.conjugate()).real
+
+
+def ways_of(cover: Singles) -> Sequence[Way]:
+    """The ways in which coverage (P, P) may be outlined, the best one first."""
+    return BINARY_WAYS if binary(cover) else GREY_WAYS
 
 
 def outline(cover: Singles, way: Way) -> Area:

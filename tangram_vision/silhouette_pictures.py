@@ -22,7 +22,7 @@ from tangram_sim.layout import Layout
 from tangram_vision.beams import Beam
 from tangram_vision.contacts import touching
 from tangram_vision.kinds import Kind, kinds_of
-from tangram_vision.outlines import BINARY_WAYS, GREY_WAYS, Way, outline
+from tangram_vision.outlines import Way, outline, ways_of
 from tangram_vision.ramps import fitted, ramps
 from tangram_vision.samples import binary
 from tangram_vision.silhouettes import (
@@ -86,7 +86,7 @@ def fill_picture(
         iou = _overlap(best, crop)
         found = _moved(best.found, corner * unit)
         return Filled(found, iou, time.thread_time() - begin, nodes, False, by=best.by)
-    area, late = explainer.outlined(_ways(crop)[0]), Budget(begin + seconds)
+    area, late = explainer.outlined(ways_of(crop)[0]), Budget(begin + seconds)
     laid, iou = nearest_fill(area, layout, late, explainer.attempts, method)
     attempt = None if laid is None else _moved(laid, corner * unit)
     return Filled(None, iou, time.thread_time() - begin, nodes, False, attempt)
@@ -120,7 +120,7 @@ class _Explainer:
     def run(self, budget: Budget) -> None:
         """Until pixels are alike, or the budget is spent."""
         self.budget = budget
-        for way in _ways(self._cover):
+        for way in ways_of(self._cover):
             area, before = self.outlined(way), self.best
             if self._method.search and self._search(area):
                 return
@@ -205,10 +205,6 @@ class _Explainer:
         if self.best is None or differs < self.best.differs:
             self.best = _Explained(replace(found, poses=poses * size), kinds, poses, differs, by)
         return self.best.differs < _ALIKE and _overlap(self.best, self._cover) >= SOLVED
-
-
-def _ways(cover: Singles) -> Sequence[Way]:
-    return BINARY_WAYS if binary(cover) else GREY_WAYS
 
 
 def _wrong(best: _Explained, cover: Singles) -> Floats:

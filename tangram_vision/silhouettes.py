@@ -12,7 +12,7 @@ import numpy as np
 import shapely
 from shapely import Polygon
 
-from tangram_sim.areas import Area, straightened
+from tangram_sim.areas import Area, overlap, straightened
 from tangram_sim.arrays import Complex, Floats
 from tangram_sim.dissections import Budget, Dissection, Laid, Search, Tokens, dissection
 from tangram_sim.geometry import outlines
@@ -23,7 +23,7 @@ from tangram_vision.beams import Beam, Values
 # Of the root of all tokens' area, the full square's side where they are the tans.
 TOLERANCES = (0.004, 0.008, 0.014, 0.022, 0.035, 0.05, 0.07, 0.09)
 SOLVED = 0.95  # IoU from which a silhouette counts as filled
-_ROUND = 1e-9
+_ROUND = 1e-9  # of the tokens' size, to which corners are rounded
 # Of the root of all tokens' area: what a side of an outline may be off so that no corner of a piece
 # within it is left.
 _STRAIGHT, _GRID = 1e-4, 1e-6
@@ -112,13 +112,6 @@ def silhouette(layout: Layout, laid: Dissection) -> Area:
         outer, *holes = (ring(np.asarray(one.coords)) for one in (part.exterior, *part.interiors))
         parts.append(Polygon(outer, holes))
     return shapely.normalize(shapely.union_all(parts))
-
-
-def overlap(one: Area, other: Area) -> float:
-    """Intersection over union of two areas."""
-    size = _ROUND * float(np.sqrt(one.area + other.area))
-    common = shapely.intersection(one, other, grid_size=size).area
-    return float(common / max(one.area + other.area - common, 1e-300))
 
 
 def fill_outline(

@@ -250,7 +250,7 @@ def _told(setup: Setup) -> str:
 
 def _observed(sim: SimConfig) -> str:
     """What agents see, in words."""
-    if sim.observe in ("pictures", "silhouette_pictures"):
+    if sim.looks:
         pieces = "" if sim.observe == "pictures" else ", pieces hidden"
         return f"{sim.picture} pictures of {sim.pixels} px{pieces}"
     if sim.observe == "silhouette":

@@ -5,7 +5,7 @@ Legend: E episodes, K tokens.
 
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,6 @@ import numpy as np
 from tangram_agent.setup import Setup
 from tangram_sim.arrays import Bools, Floats
 from tangram_sim.assembly import Puzzle, PuzzleRules
-from tangram_sim.batch import BatchedEnv
 from tangram_sim.config import SILHOUETTES, RewardConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.lens import View
@@ -21,7 +20,7 @@ from tangram_sim.puzzles import SPLITS, PuzzleFile, library, read_puzzles
 from tangram_sim.seeding import episode_generator
 from tangram_sim.targets import placement, turned_figure
 from worker.baselines import Player, playing
-from worker.looking import make_eye
+from worker.looking import environments
 from worker.rollout import Played, at_once, play
 
 _ROUNDING = 1e-9
@@ -133,9 +132,8 @@ def play_figures(
     shows = looks or setup.sim.observe in SILHOUETTES
     sim = setup.sim if shows else setup.sim.blind
     targets = (np.stack([f.poses for f in figures]), np.stack([f.flipped for f in figures]))
-    envs, eye = min(at_once(setup), len(figures)), make_eye(setup)
-    opened = BatchedEnv(setup.layout, sim, RewardConfig(), envs, eye, setup.fills)
-    with closing(opened) as env:
+    shown, envs = replace(setup, sim=sim), min(at_once(setup), len(figures))
+    with closing(environments(shown, envs, RewardConfig())) as env:
         choose, count = playing(player, env), len(figures)
 
         def generator(number: int) -> np.random.Generator:

@@ -85,6 +85,7 @@ class Played:
                 seen,
                 confidence=np.empty((count, steps + 1, tokens), np.float32),
                 goals_confidence=np.empty((count, tokens), np.float32),
+                achieved=np.empty_like(seen.goals) if env.traces else None,
             )
         return Played(
             episodes=seen,
@@ -189,6 +190,8 @@ def _play_group(
         seen.actions[rows, t], seen.rewards[rows, t] = actions, result.rewards
         played.refused[rows, t], played.blocked[rows, t] = result.refused, result.blocked
     _look(env, played, rows, env.horizon)
+    if seen.achieved is not None:
+        seen.achieved[rows] = env.achieved
     played.seconds[rows] = (time.perf_counter() - began) / env.count
     played.overlap[rows] = result.overlap
     if played.camera is not None:

@@ -16,11 +16,11 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from tangram_sim.areas import Area, straightened
+from tangram_sim.areas import Area, overlap, straightened
 from tangram_sim.arrays import Bools, Complex, Floats, Ints
 from tangram_sim.dissections import Dissection
 from tangram_sim.layout import Layout
-from tangram_vision.silhouettes import SOLVED, Filled, covered, overlap
+from tangram_vision.silhouettes import SOLVED, Filled, covered
 
 POINTS = 256  # a tan has 16 of them at least; more make evaluations fewer
 _TURNS = 8

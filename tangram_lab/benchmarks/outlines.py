@@ -24,14 +24,14 @@ from tangram_agent.values import Corners, taken
 from tangram_lab.benchmarks.measure import show, write
 from tangram_lab.benchmarks.seeing import SCALE
 from tangram_lab.benchmarks.silhouettes import Shape, area_of, figures_of, row_of
-from tangram_sim.areas import Area
+from tangram_sim.areas import Area, overlap
 from tangram_sim.arrays import Floats
 from tangram_sim.dissections import Dissection, Tokens, dissection
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import Layout
 from tangram_sim.puzzles import library
 from tangram_sim.targets import placement
-from tangram_vision.silhouettes import Filled, covered, overlap, silhouette
+from tangram_vision.silhouettes import Filled, covered, silhouette
 
 BEAMS = (1, 4, 12)
 _NEAR = 1e-3  # of an arena's half, and radians: two outlines are one

@@ -22,7 +22,7 @@ from tangram_lab.benchmarks.measure import show, write
 from tangram_lab.benchmarks.rivals import RIVALS, Rival
 from tangram_lab.benchmarks.seeing import ARENA, SCALE, SEVEN
 from tangram_lab.benchmarks.tilted import tilted_rows
-from tangram_sim.areas import Area, grown
+from tangram_sim.areas import Area, grown, overlap
 from tangram_sim.arrays import Complex
 from tangram_sim.config import SimConfig
 from tangram_sim.connected import sample_connected
@@ -33,7 +33,7 @@ from tangram_sim.targets import placement, turned_figure
 from tangram_sim.world import World, make_world
 from tangram_vision.levels import coverage
 from tangram_vision.silhouette_pictures import fill_picture
-from tangram_vision.silhouettes import SOLVED, Filled, Method, covered, fill_outline, overlap
+from tangram_vision.silhouettes import SOLVED, Filled, Method, covered, fill_outline
 from worker.methods import method_of
 
 SECONDS = 5.0  # of processor time for each figure

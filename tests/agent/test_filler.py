@@ -174,3 +174,15 @@ def test_values_are_for_outlines_alone() -> None:
     corners = replace(made.sim, observe="corners")
     with pytest.raises(ConfigError, match="agent.lookahead=values"):
         replace(made, sim=corners, agent=AgentConfig(lookahead="values"))
+
+
+def test_a_token_that_reaches_out_is_taken_last() -> None:
+    """The more it does, in smallest tokens, the less it is worth; the sum of all counts."""
+    made = outline_setup(observe="silhouette_pictures", pixels=64)
+    filler, filling = Filler(Indifferent(), made), Filling(made.layout, traced=True)
+    leg = float(np.sqrt(2.0 * made.layout.areas[0]))
+    places = filling.places(shapely.box(0, 0, leg, leg), (2,))
+    costs = [0.3, 0.1, 0.2]
+    given = [place._replace(cost=cost) for place, cost in zip(places * 3, costs, strict=False)]
+    (plan,) = filler._plans([given], 1, 1)
+    assert [place.cost for place in plan] == [0.1]

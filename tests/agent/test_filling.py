@@ -140,3 +140,67 @@ def test_a_value_does_not_depend_on_what_it_is_valued_with() -> None:
     assert both == pytest.approx(alone, abs=1e-5)
     assert again == pytest.approx(alone[0], abs=1e-5)
     assert abs(alone[0] - alone[1]) > 1e-4
+
+
+TRACED = Filling(MADE.layout, traced=True)
+HALVES = np.array([[0.0, 0, 0], [2 * LEG, 0, 0]])  # two triangles apart
+
+
+def rows_of(area: shapely.Geometry) -> np.ndarray:
+    return as_rows(area, MADE.layout, MADE.goal_rows)
+
+
+@pytest.mark.parametrize(("size", "ends"), [(1.0, "filled"), (0.97, "filled"), (1.12, "dead")])
+def test_a_last_token_in_a_traced_outline_need_not_fit(size: float, ends: str) -> None:
+    """It may reach out, which costs; but what it leaves open must be within 5 % of all tokens."""
+    leg = size * LEG
+    places = TRACED.places(Polygon([(0, 0), (leg, 0), (0, leg)]), (1,))
+    best = min(places, key=lambda place: place.cost)
+    assert getattr(best, ends)
+    assert not (best.filled and best.dead)
+    assert best.cost == pytest.approx(max(0.0, 1.0 - size**2), abs=1e-6)
+
+
+def test_what_fits_costs_nothing() -> None:
+    assert {place.cost for place in FILLING.places(SQUARE, (2,))} == {0.0}
+
+
+@pytest.mark.parametrize(("size", "solved"), [(1.0, True), (1.005, True), (1.05, False)])
+def test_a_traced_outline_is_filled_where_most_is_shared(size: float, solved: bool) -> None:
+    layout = MADE.layout
+    corners = layout.corners(HALVES)
+    outline = rows_of(covered_area(size * corners, layout))
+    whole = np.array([True, True])
+    assert TRACED.solved(outline, corners, whole) == solved
+    assert not TRACED.solved(outline, corners, np.array([True, False]))
+    assert FILLING.solved(rows_of(covered_area(corners, layout)), corners, whole)
+
+
+def test_hindsight_of_a_traced_outline_takes_away_what_others_cover() -> None:
+    """It is learned as it was traced, wrong as that is, and not as the tokens lie."""
+    layout = MADE.layout
+    corners = layout.corners(HALVES)
+    traced = rows_of(covered_area(1.03 * corners, layout))
+    first, both = np.array([True, False]), np.array([True, True])
+    seen = TRACED.hindsight(corners, first, traced)
+    assert seen is not None
+    assert seen.left.tolist() == [[1]]
+    assert (seen.part != UNUSED).sum() == 3
+    own = FILLING.hindsight(corners, first, None)
+    assert own is not None
+    sides = [
+        np.linalg.norm(one.points[0, one.follow[0, 0]] - one.points[0, 0]) for one in (seen, own)
+    ]
+    assert sides[0] == pytest.approx(1.03 * sides[1], rel=0.03)
+    everything = TRACED.hindsight(corners, both, traced)
+    assert everything is not None
+    assert (everything.part != UNUSED).sum() == 6
+
+
+def test_tokens_that_lie_on_each_other_fill_no_traced_outline() -> None:
+    layout = MADE.layout
+    piled = layout.corners(np.zeros((2, 3)))
+    traced = rows_of(covered_area(piled, layout))
+    assert TRACED.hindsight(piled, np.array([True, True]), traced) is None
+    assert TRACED.hindsight(piled, np.array([True, False]), traced) is None
+    assert not TRACED.solved(traced, piled, np.array([True, True]))

@@ -6,7 +6,8 @@ from shapely import Polygon
 
 from tangram_lab.benchmarks.covering import Attempt, Board
 from tangram_lab.benchmarks.rivals import RIVALS
-from tangram_vision.silhouettes import Filled, covered, overlap
+from tangram_sim.areas import overlap
+from tangram_vision.silhouettes import Filled, covered
 from tests.sim.builders import layout_of
 
 pytestmark = pytest.mark.fast

@@ -8,13 +8,13 @@ import pytest
 import shapely
 from shapely import Polygon
 
-from tangram_sim.areas import Area
+from tangram_sim.areas import Area, overlap
 from tangram_sim.arrays import Floats
 from tangram_sim.config import SimConfig
 from tangram_sim.connected import sample_connected
 from tangram_sim.dissections import Budget, Dissection, Search, Tokens, dissection
 from tangram_vision.beams import Beam, State, Values
-from tangram_vision.silhouettes import Method, covered, fill_outline, overlap
+from tangram_vision.silhouettes import Method, covered, fill_outline
 from tests.sim.builders import SEVEN, layout_of
 
 pytestmark = pytest.mark.fast
@@ -95,15 +95,6 @@ def test_what_nobody_judges_is_followed_last() -> None:
         return np.full(len(rests), -np.inf)
 
     assert len(beam(SQUARE, 4, nothing)[0].laid) >= 4
-
-
-def test_of_a_rugged_outline_few_corners_are_looked_at() -> None:
-    """A disc with a thousand teeth would else be tried at each of them."""
-    turn = np.linspace(0.0, 2.0 * np.pi, 2000, endpoint=False)
-    z = (0.56 + 0.02 * (np.arange(2000) % 2)) * np.exp(1j * turn)
-    teeth = Polygon(np.column_stack([z.real, z.imag]))
-    places = Beam(TOKENS, 1)._places(teeth, TOKENS.counts, 1e-4)
-    assert len(places) == 40
 
 
 def test_there_may_be_nothing_to_lay() -> None:

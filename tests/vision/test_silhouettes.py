@@ -9,7 +9,7 @@ import pytest
 import shapely
 from shapely import Polygon
 
-from tangram_sim.areas import Area
+from tangram_sim.areas import Area, overlap
 from tangram_sim.arrays import Singles
 from tangram_sim.config import SimConfig
 from tangram_sim.connected import sample_connected
@@ -21,7 +21,7 @@ from tangram_vision.kinds import kinds_of
 from tangram_vision.levels import coverage
 from tangram_vision.outlines import BINARY_WAYS, GREY_WAYS, outline
 from tangram_vision.silhouette_pictures import _cropped, _Explainer, fill_picture
-from tangram_vision.silhouettes import Filled, Method, covered, overlap
+from tangram_vision.silhouettes import Filled, Method, covered
 from tests.sim.builders import SEVEN, layout_of
 
 pytestmark = pytest.mark.fast

@@ -7,7 +7,7 @@ from PIL import Image, ImageDraw
 from shapely import Polygon
 
 from tangram_lab.benchmarks.tilted import photographed
-from tangram_sim.areas import Area
+from tangram_sim.areas import Area, overlap
 from tangram_sim.arrays import Singles
 from tangram_sim.config import SimConfig
 from tangram_sim.connected import sample_connected
@@ -15,7 +15,7 @@ from tangram_sim.dissections import Dissection
 from tangram_vision.outlines import Way, outline
 from tangram_vision.photos import find_silhouette
 from tangram_vision.silhouette_pictures import fill_picture
-from tangram_vision.silhouettes import covered, overlap
+from tangram_vision.silhouettes import covered
 from tangram_vision.tilts import from_above, mapped
 from tests.sim.builders import SEVEN, layout_of
 

@@ -14,13 +14,14 @@ from PIL import Image
 
 import tangram_sim  # noqa: F401  # registers the environments
 from tangram_agent.setup import Setup
+from tangram_sim.areas import overlap
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.config import RewardConfig
 from tangram_sim.dissections import Dissection
 from tangram_sim.errors import ConfigError
 from tangram_sim.geometry import overlap_share
 from tangram_vision import silhouettes
-from tangram_vision.silhouettes import Filled, covered, fill_outline, overlap
+from tangram_vision.silhouettes import Filled, covered, fill_outline
 from tests.agent.builders import setup
 from tests.worker.builders import write_run
 from tests.worker.puzzle_files import GAME, SIM, drawn, write_puzzles
