@@ -25,7 +25,7 @@ train: .venv/.installed-run  ## train an agent on this machine; settings go into
 
 # Ends with pytest's own summary line. Three tests at a time, on two cores too: those of real processes wait a lot.
 test: lint  ## lint, then all tests, a short training through real processes included
-	@$(BIN)/python -m pytest --numprocesses=3 --dist=loadgroup $(ARGS)
+	@OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses=3 --dist=loadgroup $(ARGS)
 
 lint: .venv/.installed-dev  ## ruff, mypy, import-linter, hadolint and shellcheck; changes nothing
 	$(BIN)/ruff check .

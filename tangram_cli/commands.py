@@ -5,6 +5,7 @@ current folder or on PYTHONPATH would be imported in place of ours, so whoever c
 door finds these three beside this package, wherever else they may lie.
 """
 
+import os
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -34,6 +35,9 @@ class OwnPackages:
 def run(module: str, function: str) -> int:
     """Run a command out of our packages and return its exit status; 130 after Ctrl-C."""
     sys.meta_path.insert(0, OwnPackages)
+    # numpy multiplies small matrices here: more threads wait for each other, longer than they
+    # compute, the more so beside other work. Before numpy is imported.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         # Late: what a command needs may only be imported once our packages come first.
         command: Callable[[], int] = getattr(import_module(module), function)

@@ -35,6 +35,7 @@ from worker.views import beside, camera_sheets
 
 FRAME_MS = 50
 STILL_START, STILL_END = 10, 30  # frames
+SHOWN = "what the agent is shown"
 SEEN = 30  # frames of what was seen before a film
 SHEET = 720  # pixels across, about
 MIN_TILE, MAX_TILE = 64, 240
@@ -136,9 +137,10 @@ def silhouette_show(run: Run, config: PlayConfig, found: Shown) -> Show:
     the outline of what was found, which is the silhouette's within the search's tolerance.
     """
     setup, fills = _beside(run.setup), run.setup.fills
+    shown = f"the agent sees its picture of {setup.sim.pixels} px" if setup.traces else SHOWN
     played = play_figures(setup, [found.figure], greedy(run.policy), config.seed)
     width = WIDTH if _is_still(config.out) else WIDTH // 2
-    seen = draw_silhouette(found, setup.layout, width, bare=fills)
+    seen = draw_silhouette(found, setup.layout, width, bare=shown * fills)
     told = found.told
     if fills:
         solved = assembled(setup.layout, played).iou[0] >= SOLVED

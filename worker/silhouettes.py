@@ -139,7 +139,7 @@ def _unfilled(drawn: "Silhouette", layout: Layout) -> str:
 
 
 def draw_silhouette(
-    silhouette: Shown, layout: Layout, width: int, bare: bool = False
+    silhouette: Shown, layout: Layout, width: int, bare: str = ""
 ) -> Image.Image:
     """The silhouette with the outlines of the tokens that fill it, in all ways that were found.
 
@@ -147,12 +147,12 @@ def draw_silhouette(
         silhouette: what was found.
         layout: the tokens.
         width: of all ways together in pixels, about; one alone is as wide as a film.
-        bare: without any tokens, as an agent of outlines is shown it.
+        bare: what it is called without any tokens, as an agent of outlines is shown it.
     """
     if bare:
         nobody = np.zeros(layout.tokens, np.bool_)
         picture = outlined(silhouette.picture, layout, silhouette.outlines[0], _TILE, nobody)
-        return contact_sheet([picture], 1, ["what the agent is shown"])
+        return contact_sheet([picture], 1, [bare])
     count = len(silhouette.outlines)
     columns, size = tiles(count, _TILE if count == 1 else width)
     pictures = [outlined(silhouette.picture, layout, one, size) for one in silhouette.outlines]

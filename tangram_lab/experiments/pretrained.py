@@ -26,13 +26,14 @@ from tangram_agent.policy import Policy
 from tangram_agent.pretrained import CARD, CARD_TEXT, CONFIG, FORMAT, PREFIX, WEIGHTS
 from tangram_agent.runs import Run, load_run
 from tangram_agent.setup import Setup
+from tangram_sim.config import SILHOUETTES, SimConfig
 from tangram_sim.errors import ConfigError, RunError, TangramError
 from tangram_sim.settings import told
 from tangram_sim.targets import has_all_tans
 from worker.config import EvalConfig
 from worker.evaluate import policies, score_policies
 from worker.puzzles import find_figures
-from worker.scores import RUN, score_outlines, score_puzzles
+from worker.scores import RUN, score_outlines, score_pictured, score_puzzles
 from worker.test_set import greedy
 
 PACKAGE = Path(__file__).resolve().parents[2] / "tangram_agent" / "pretrained"
@@ -99,10 +100,12 @@ def publish(
 
 def _on_figures(run: Run, split: str) -> dict[str, Any]:
     """Scores of a run on the figures of a split."""
-    found = find_figures(split, run.setup, None, TURNS, False)
-    players = {RUN: greedy(run.policy)}
-    score = score_outlines if run.setup.fills else score_puzzles
-    scored = score(run.setup, found.figures, players, TEST_SEED)
+    figures = find_figures(split, run.setup, None, TURNS, False).figures
+    if run.setup.traces:
+        scored = score_pictured(run, figures, TEST_SEED)
+    else:
+        score = score_outlines if run.setup.fills else score_puzzles
+        scored = score(run.setup, figures, {RUN: greedy(run.policy)}, TEST_SEED)
     return {"turns": TURNS, "scores": scored.means[RUN]}
 
 
@@ -200,9 +203,7 @@ def make_card(
     setup, result = chosen.run.setup, chosen.result
     acting = sum(math.prod(shape) for shape in Policy(setup).shapes.values())
     world = "".join(f", {name} {told(value)}" for name, value in setup.sim.inexact.items())
-    seen = f", {setup.sim.picture} pictures of {setup.sim.pixels} px" * (
-        setup.sim.observe == "pictures"
-    )
+    seen = f", {_pictures(setup.sim)}" * setup.sim.looks
     drawn = ", outlines of the train split among them" * (setup.sim.targets == "touching")
     source = (
         f"simulated by this project ({setup.sim.backend}{world}{seen}), random starts and targets"
@@ -234,6 +235,10 @@ def make_card(
     }
 
 
+def _pictures(sim: SimConfig) -> str:
+    return f"{sim.picture} pictures of {sim.pixels} px"
+
+
 def _picked(result: Mapping[str, Any], *names: str) -> dict[str, Any]:
     return {name: result[name] for name in names}
 
@@ -255,9 +260,9 @@ def _limits(setup: Setup, scores: Scores) -> list[str]:
         return _limits_of_outlines(setup, scores)
     sim, one = setup.sim, setup.layout.tokens == 1
     pieces = "One token of this shape and size" if one else "This token set and size"
-    if sim.observe == "pictures":
+    if sim.looks:
         seen = (
-            f"Trained from {sim.picture} pictures of {sim.pixels} pixels of one straight camera; "
+            f"Trained from {_pictures(sim)} of one straight camera; "
             "docs/pictures.md tells which others it can use."
         )
         known = "Tokens and target lie on even ground, and no more than three of them touch."
@@ -301,12 +306,14 @@ def _limits(setup: Setup, scores: Scores) -> list[str]:
 def _limits_of_outlines(setup: Setup, scores: Scores) -> list[str]:
     return [
         "This token set and size, in an arena of this width: another task needs another training.",
-        "Exact outlines, without noise: what is found in a picture was never learned from.",
+        f"Trained from {_pictures(setup.sim)} of one straight camera."
+        if setup.traces
+        else "Exact outlines, without noise: what is found in a picture was never learned from.",
         "Model-based: it takes tokens exactly to places at the outline's corners, which are given "
         "by geometry; which of them to take is all that it learned.",
         f"It thinks {setup.agent.beam} fillings ahead at a time (agent.lookahead=values); without, "
-        "it fills far fewer outlines. A search that goes back where it is stuck fills all of them, "
-        "see docs/silhouettes.md.",
+        "it fills far fewer outlines. A search that goes back where it is stuck needs nothing "
+        "learned, see docs/silhouettes.md.",
         "Tokens are lifted and set down: it knows nothing of pushes along the table.",
         f"{1.0 - scores['share_solved_iou']:.1%} of the tests are not filled.",
     ]
@@ -371,9 +378,10 @@ def _about(card: Mapping[str, Any]) -> str:
     task = card["task"]
     tokens, count = ", ".join(task["tokens"]), task["actions_per_token"]
     arena, actions = f"{task['arena']:g}", f"{count} action{'s' * (count > 1)}"
-    if task.get("observe") == "silhouette":
+    if task.get("observe") in SILHOUETTES:
+        what = "outlines" if task["observe"] == "silhouette" else "silhouettes in pictures"
         return (
-            f"An agent that fills outlines with {len(task['tokens'])} tangram tokens ({tokens}; "
+            f"An agent that fills {what} with {len(task['tokens'])} tangram tokens ({tokens}; "
             f"full square of side {task['scale']:g}) and is told of no piece, in a square arena of "
             f"width {arena}."
         )
@@ -405,11 +413,11 @@ On the figures of tangram_sim/puzzles, each at {turns} angles; {_trained_on(card
 
 
 def _played_by(card: Mapping[str, Any]) -> str:
-    return ", without looking ahead" if card["task"].get("observe") == "silhouette" else ""
+    return ", without looking ahead" if card["task"].get("observe") in SILHOUETTES else ""
 
 
 def _goals(card: Mapping[str, Any]) -> str:
-    return "; goals are outlines" if card["task"].get("observe") == "silhouette" else ""
+    return "; goals are outlines" if card["task"].get("observe") in SILHOUETTES else ""
 
 
 def _beside(card: Mapping[str, Any]) -> str:
