@@ -14,13 +14,21 @@ ON_SOCKETS: dict[str, object] = {"bind": LOCAL}
 
 @dataclass(frozen=True)
 class NetConfig(Settings, section="net"):
-    """Size and kind of actor and critic; the defaults are the paper's network."""
+    """Size and kind of the networks; the defaults are the paper's."""
 
     kind: str = setting(
-        "mha", "attention network (Eqs. 8-13) or perceptron", choices=("mha", "mlp")
+        "mha",
+        "attention network (Eqs. 8-13) or perceptron; or, of an agent of outlines, convolutions "
+        "over a small picture of what is left, its crop",
+        choices=("mha", "mlp", "crops"),
     )
     hidden: tuple[int, ...] = setting(
-        (64, 64), "widths of the hidden layers", low=1, high=65536, only={"kind": "mlp"}
+        (64, 64),
+        "widths of the hidden layers; of crops the channels of the convolutions, each of which "
+        "halves the picture",
+        low=1,
+        high=65536,
+        only={"kind": ("mlp", "crops")},
     )
     width: int = setting(64, "size of a node's embedding", low=1, high=4096, only={"kind": "mha"})
     layers: int = setting(3, "rounds of message passing", low=1, high=64, only={"kind": "mha"})

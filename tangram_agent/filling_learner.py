@@ -12,12 +12,12 @@ import torch
 from torch import Tensor, nn
 
 from tangram_agent.adam import Adam
-from tangram_agent.filling import Filling, Rests
+from tangram_agent.filling import Rests
 from tangram_agent.filling_replay import FILLED, OPEN, FillBatch
 from tangram_agent.learner import Learner, Rates, frozen, polyak_update
-from tangram_agent.networks import initialise, parameter_count
+from tangram_agent.networks import initialise, outline_network, parameter_count
 from tangram_agent.setup import Setup
-from tangram_agent.values import Corners, OutlineValue
+from tangram_agent.values import Corners
 
 
 class FillLearner(Learner):
@@ -26,7 +26,7 @@ class FillLearner(Learner):
     def __init__(self, setup: Setup, seed: int, device: str = "cpu") -> None:
         self.config, self.device, self.updates = setup.agent, torch.device(device), 0
         self.bootstraps, self.motion, self._fit = setup.bootstraps, None, None
-        value = OutlineValue(Filling(setup.layout).shapes, setup.net)
+        value = outline_network(setup)
         initialise(value, torch.Generator().manual_seed(seed))
         self.playing: nn.Module = value.to(self.device)
         self.value, self.target, self.acting = value, frozen(value), frozen(value)

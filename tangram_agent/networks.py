@@ -14,11 +14,14 @@ from torch import Tensor, nn
 
 from tangram_agent.attention import GraphEncoder
 from tangram_agent.config import AgentConfig, NetConfig
+from tangram_agent.crops import CropValue
+from tangram_agent.filling import Filling
 from tangram_agent.graph import Graph
 from tangram_agent.motion import MotionModel
 from tangram_agent.pairs import PairGraph, Pairs
 from tangram_agent.scenes import SceneGraph, Scenes
 from tangram_agent.setup import Setup
+from tangram_agent.values import OutlineValue
 
 View = Scenes | Pairs
 
@@ -226,6 +229,12 @@ class Networks(nn.Module):
         return self if self._both_play else self.actor
 
 
+def outline_network(setup: Setup) -> nn.Module:
+    """What an agent of outlines learns: logits (M,) of what is left, by its corners or its crop."""
+    kind = CropValue if setup.net.kind == "crops" else OutlineValue
+    return kind(Filling(setup.layout).shapes, setup.net)
+
+
 def perceptron(inputs: int, hidden: tuple[int, ...], outputs: int) -> nn.Sequential:
     """Linear layers with ReLU between."""
     layers: list[nn.Module] = []
@@ -239,8 +248,8 @@ def initialise(module: nn.Module, generator: torch.Generator) -> None:
     """Uniform weights and biases within 1/sqrt(inputs), from an explicit generator."""
     with torch.no_grad():
         for layer in module.modules():
-            if isinstance(layer, nn.Linear):
-                bound = 1.0 / math.sqrt(layer.in_features)
+            if isinstance(layer, nn.Linear | nn.Conv2d):
+                bound = 1.0 / math.sqrt(layer.weight[0].numel())
                 layer.weight.uniform_(-bound, bound, generator=generator)
                 if layer.bias is not None:
                     layer.bias.uniform_(-bound, bound, generator=generator)

@@ -11,14 +11,12 @@ import torch
 from torch import nn
 
 from tangram_agent.filler import Filler
-from tangram_agent.filling import Filling
 from tangram_agent.foresight import Foresight
-from tangram_agent.networks import Networks
+from tangram_agent.networks import Networks, outline_network
 from tangram_agent.planning import Planner
 from tangram_agent.scenes import Scenes, next_token
 from tangram_agent.setup import Setup
 from tangram_agent.types import Past, Weights
-from tangram_agent.values import OutlineValue
 from tangram_agent.weights import load_arrays, to_arrays
 from tangram_sim.actions import make_actions
 from tangram_sim.arrays import Floats, Singles
@@ -41,7 +39,7 @@ class Policy:
         self._planner: Planner | None = None
         self._filler: Filler | None = None
         if setup.fills:
-            value = OutlineValue(Filling(setup.layout).shapes, setup.net)
+            value = outline_network(setup)
             self.network: nn.Module = value
             self._filler = Filler(value, setup)
         else:

@@ -56,8 +56,7 @@ class Setup:
                 f"agent.replay_capacity must hold an episode, {self.horizon} actions, "
                 f"got {agent.replay_capacity}"
             )
-        if self.net.kind == "mlp":
-            self._refuse(("edges",), "net.kind=mlp", "set net.kind=mha")
+        self._check_net()
         if one:
             self._refuse(_SEVERAL_ONLY, "one token", "take a set of several")
         if self.fills:
@@ -104,6 +103,17 @@ class Setup:
                 "out, or set agent.confidence=false"
             )
 
+    def _check_net(self) -> None:
+        """Refuse a kind of network that does not see what the agent sees."""
+        if self.net.kind == "mlp":
+            self._refuse(("edges",), "net.kind=mlp", "set net.kind=mha")
+        if self.net.kind == "crops" and not self.fills:
+            raise ConfigError(
+                "net.kind=crops sees what is left to fill of an outline, which an agent of "
+                f"agent.readout={self.agent.readout} is not shown: set sim=silhouette "
+                "agent=outline, or net=mha"
+            )
+
     def _check_fills(self) -> None:
         """Refuse what an agent of outlines cannot use, or outlines that no agent sees."""
         agent, sim = self.agent, self.sim
@@ -112,8 +122,8 @@ class Setup:
                 f"agent.readout=outline needs sim.observe=silhouette, got {sim.observe}: set "
                 "sim=silhouette, or another agent"
             )
-        if self.net.kind != "mha":
-            refuse_ignored(f"net.kind={self.net.kind}", "outlines", "set net.kind=mha")
+        if self.net.kind == "mlp":
+            refuse_ignored("net.kind=mlp", "outlines", "set net.kind=mha or crops")
         self._refuse(_NOT_OF_OUTLINES, "outlines", "leave it out")
         if agent.lookahead not in ("none", "values"):
             refuse_ignored(

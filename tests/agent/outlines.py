@@ -14,17 +14,20 @@ from tests.sim.builders import SEVEN
 TWO = {"shapes": ["small_triangle", "small_triangle"], "scale": 1.0}
 ALL = {"shapes": list(SEVEN), "scale": 0.6}
 AGENT = {"readout": "outline", "gamma": 1.0, "hindsight": [{"strategy": "final", "copies": 3}]}
+CROPS: dict[str, Any] = {"kind": "crops", "hidden": [8, 16]}
 SIM = {"observe": "silhouette", "starts": "outside", "targets": "connected"}
 
 
 def outline_setup(
-    tokens: dict[str, Any] = TWO, agent: dict[str, Any] | None = None, **sim: Any
+    tokens: dict[str, Any] = TWO,
+    agent: dict[str, Any] | None = None,
+    net: dict[str, Any] | None = None,
+    **sim: Any,
 ) -> Setup:
-    """A kinematic one with a small network."""
+    """A kinematic one with a small network, of corners unless another one is given."""
     flips = {"allow_flip": True} if "parallelogram" in tokens["shapes"] else {}
-    net = SMALL | {"scale": "sqrt_d"}
     own = {"reapply": 2, "motion": "learned"} | AGENT | (agent or {})
-    return setup(tokens, own, net, **(SIM | flips | sim))
+    return setup(tokens, own, net or SMALL | {"scale": "sqrt_d"}, **(SIM | flips | sim))
 
 
 def played_in(made: Setup, ways: list[Floats], goal: Floats) -> Episodes:

@@ -73,7 +73,7 @@ def changed(section: str, **values: Any) -> dict[str, dict[str, Any]]:
             changed("agent", hindsight=[{"strategy": "near", "copies": 0}]),
             "hindsight.copies must be between 1 and 64, got 0",
         ),
-        (changed("net", kind="cnn"), "net.kind must be one of mha, mlp, got 'cnn'"),
+        (changed("net", kind="cnn"), "net.kind must be one of mha, mlp, crops, got 'cnn'"),
         (changed("net", width=65), "net.width must be a multiple of net.heads, got 65 and 4"),
         (changed("net", hidden=[]), "net.hidden must name at least one layer"),
         (changed("net", hidden=[0]), "net.hidden must be between 1 and 65536, got 0"),
