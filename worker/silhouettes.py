@@ -138,9 +138,7 @@ def _unfilled(drawn: "Silhouette", layout: Layout) -> str:
 # What is drawn
 
 
-def draw_silhouette(
-    silhouette: Shown, layout: Layout, width: int, bare: str = ""
-) -> Image.Image:
+def draw_silhouette(silhouette: Shown, layout: Layout, width: int, bare: str = "") -> Image.Image:
     """The silhouette with the outlines of the tokens that fill it, in all ways that were found.
 
     Args:

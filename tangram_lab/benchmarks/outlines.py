@@ -4,11 +4,15 @@ The figures are those of `silhouettes.py`, but for convex ones that agents may h
 train split draws some of them. All ways lay tokens at the same places: they differ in
 which they take. *Largest first* takes the first place, as the search orders them; *by chance*
 values places at random. So what stands above them is what was learned.
+
+An agent that learned from pictures fills pictures by its own camera, beside the one that comes with
+the package and learned from exact outlines.
 """
 
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import shapely
@@ -16,14 +20,14 @@ import torch
 from rich.progress import track
 from torch import nn
 
-from tangram_agent.filler import Filler
+from tangram_agent.filler import Fillable, Filler
 from tangram_agent.filling import UNUSED, Filling
-from tangram_agent.runs import load_run
+from tangram_agent.runs import Run, load_run
 from tangram_agent.setup import Setup
 from tangram_agent.values import Corners, taken
 from tangram_lab.benchmarks.measure import show, write
 from tangram_lab.benchmarks.seeing import SCALE
-from tangram_lab.benchmarks.silhouettes import Shape, area_of, figures_of, row_of
+from tangram_lab.benchmarks.silhouettes import Shape, area_of, figures_of, pictured, row_of
 from tangram_sim.areas import Area, overlap
 from tangram_sim.arrays import Floats
 from tangram_sim.dissections import Dissection, Tokens, dissection
@@ -31,7 +35,8 @@ from tangram_sim.errors import ConfigError
 from tangram_sim.layout import Layout
 from tangram_sim.puzzles import library
 from tangram_sim.targets import placement
-from tangram_vision.silhouettes import Filled, covered, silhouette
+from tangram_vision.silhouettes import Filled, Method, covered, silhouette
+from worker.methods import JUDGE
 
 BEAMS = (1, 4, 12)
 _NEAR = 1e-3  # of an arena's half, and radians: two outlines are one
@@ -76,6 +81,14 @@ def run_outlines(run_dir: str, scenes: int, seed: int, out: Path | None) -> int:
         raise ConfigError(f"run_dir={run_dir} fills no outlines: take one of agent=outline")
     torch.set_num_threads(1)
     figures = _never_drawn(run.setup.layout, list(figures_of(run.setup.layout, scenes, seed)))
+    rows = list(_seen_rows(run, figures) if run.setup.traces else _rows(run, figures, seed))
+    show("silhouettes filled with seven tans, one core", rows)
+    write(out, {"run": run_dir, "scenes": scenes, "seed": seed, "rows": rows})
+    return 0
+
+
+def _rows(run: Run, figures: list[Shape], seed: int) -> Iterator[dict[str, Any]]:
+    """Exact outlines, by the agent and by who learned nothing."""
     ways: dict[str, nn.Module] = {
         "the agent": run.policy.network,
         "largest first": run.unlearned().policy.network,
@@ -83,15 +96,27 @@ def run_outlines(run_dir: str, scenes: int, seed: int, out: Path | None) -> int:
         "shortest outline": Simplest(0.0, 1.0),
         "by chance": ByChance(seed),
     }
-    rows = []
     for name, value in ways.items():
         for beam in BEAMS:
             told = f"{name}, {f'beam of {beam}' if beam > 1 else 'no search'}"
             found = list(_filled(value, run.setup, figures, beam, told))
-            rows.append(row_of(told, run.setup.layout, figures, found))
-    show("exact outlines filled with seven tans, one core", rows)
-    write(out, {"run": run_dir, "scenes": scenes, "seed": seed, "rows": rows})
-    return 0
+            yield row_of(told, run.setup.layout, figures, found)
+
+
+def _seen_rows(run: Run, figures: list[Shape]) -> Iterator[dict[str, Any]]:
+    """Pictures by the run's camera, by beams that differ in who judges their states."""
+    layout = run.setup.layout
+    judges = {
+        "the agent": Fillable(run.policy.network, layout),
+        "learned from exact outlines": Fillable(load_run(JUDGE).policy.network, layout),
+        "largest first": None,
+    }
+    for name, values in judges.items():
+        for beam in (1, BEAMS[-1]):
+            told = f"{name}, beam of {beam}"
+            method = Method(search=False, width=beam, values=values)
+            found = list(pictured(layout, figures, run.setup.sim, method, told))
+            yield row_of(told, layout, figures, found)
 
 
 def _never_drawn(layout: Layout, figures: list[Shape]) -> list[Shape]:

@@ -71,7 +71,7 @@ def run_silhouettes(scenes: int, seed: int, out: Path | None) -> int:
         for name in players:
             method = Method(search=False) if name == BY_SIZE else method_of(name, layout)
             title = f"{pixels} px {picture}, {name}"
-            found = list(_pictured(layout, figures, sim, method, title))
+            found = list(pictured(layout, figures, sim, method, title))
             rows.append(row_of(title, layout, figures, found))
     show("silhouettes filled with seven tans, one core", rows)
     convex = [_convex_row(layout)]
@@ -218,9 +218,10 @@ def _rival_row(
     return {"by": row.pop("silhouette"), **row, "steps in a s": rate}
 
 
-def _pictured(
+def pictured(
     layout: Layout, figures: list[Shape], sim: SimConfig, method: Method, title: str
 ) -> Iterator[Filled]:
+    """What the camera shows of figures, filled one after the other."""
     with closing(make_world(layout, sim)) as world:
         for figure in track(figures, title):
             yield _seen(layout, world, figure, method)

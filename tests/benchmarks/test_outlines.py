@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -77,3 +78,31 @@ def test_a_run_that_fills_no_outlines_is_refused(tmp_path: Path) -> None:
     write_run(tmp_path)
     with pytest.raises(ConfigError, match="fills no outlines: take one of agent=outline"):
         run_outlines(str(tmp_path), 1, 0, None)
+
+
+def test_an_agent_of_pictures_fills_those_of_its_camera(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tokens = {"shapes": list(SEVEN), "scale": SCALE}
+    sim = {"arena": 2.0, "allow_flip": True, "backend": "kinematic", "pixels": 128}
+    sim |= {"observe": "silhouette_pictures", "picture": "grey"}
+    made = write_run(tmp_path, tokens=tokens, sim=SIM | sim, agent=AGENT)
+    shown = [drawn(made.layout, "test", "two_squares", "test")]
+    monkeypatch.setattr(outlines, "figures_of", lambda *_: iter(shown))
+    asked = list[tuple[int, str]]()
+    real = outlines.pictured
+
+    def pictured(layout: Layout, figures: Any, camera: Any, *rest: Any) -> Any:
+        asked.append((camera.pixels, camera.picture))
+        return real(layout, figures, camera, *rest)
+
+    monkeypatch.setattr(outlines, "pictured", pictured)
+    assert run_outlines(str(tmp_path), 0, 0, tmp_path / "out.json") == 0
+    rows = json.loads((tmp_path / "out.json").read_text())["rows"]
+    assert [row["silhouette"] for row in rows] == [
+        f"{who}, beam of {beam}"
+        for who in ("the agent", "learned from exact outlines", "largest first")
+        for beam in (1, 12)
+    ]
+    assert set(asked) == {(128, "grey")}
+    assert rows[3]["filled"] == 1.0
