@@ -118,6 +118,10 @@ class Hub:
         """Processes that take part, by role and index."""
         return self._registry.peers
 
+    def count(self, role: str) -> int:
+        """How many of a role take part."""
+        return self._registry.count(role)
+
     @property
     def keys(self) -> Keys | None:
         """As their file has them by now; None on plain sockets."""
@@ -312,7 +316,7 @@ class Hub:
         peer.damaged = 0
         if self._info.lockstep and not self._is_ordered(peer, batch):
             return None
-        room = self._waiting.room(peer.key, peer.ledger, len(self.peers))
+        room = self._waiting.room(peer.key, peer.ledger, len(self._registry))
         verdict = peer.ledger.take(batch.sequence, room)
         if verdict is not Verdict.NEW:
             self.counters[verdict.value] += 1

@@ -124,6 +124,9 @@ class FakeHub:
         self.polls = 0
         self.on_poll = lambda: None
 
+    def count(self, role: str) -> int:
+        return sum(peer.role == role for peer in self.peers)
+
     def poll(self, timeout_s: float) -> list[Any]:
         self.polls += 1
         assert self.polls < 10_000, "the loop does not end"
