@@ -19,6 +19,7 @@ from tangram_agent.motion import MotionModel
 from tangram_agent.pairs import PairGraph, Pairs
 from tangram_agent.scenes import SceneGraph, Scenes
 from tangram_agent.setup import Setup
+from tangram_agent.types import Weights
 
 View = Scenes | Pairs
 
@@ -222,8 +223,25 @@ class Networks(nn.Module):
 
     @property
     def playing(self) -> nn.Module:
-        """What a worker needs: the actor, or all networks where the critic chooses."""
+        """What is kept to play with: the actor, or all networks where the critic may choose.
+
+        What of it travels to workers is less where it has nothing to choose, see `travels`.
+        """
         return self if self._both_play else self.actor
+
+
+def travels(name: str, setup: Setup) -> bool:
+    """Whether workers need a parameter of `Networks.playing`, of this name, to play.
+
+    Who plays a finished run may set `agent.refine_steps`, so that a checkpoint keeps all of them.
+    """
+    return setup.critic_plays or not name.startswith("critic.")
+
+
+def travelling(weights: Weights, setup: Setup) -> Weights:
+    """Of all weights to play with those that a broadcast brings."""
+    needed = {name: tensor for name, tensor in weights.tensors.items() if travels(name, setup)}
+    return Weights(weights.version, needed)
 
 
 def perceptron(inputs: int, hidden: tuple[int, ...], outputs: int) -> nn.Sequential:
