@@ -158,6 +158,8 @@ class Loop:
         self.hub.publish(weights)
         self._published = weights.version
         self.reporter.published(weights.version)
+        if self.service.publish_seconds > 0.0:  # else after every update, whatever it costs
+            self._publish.rest(self.hub.broadcast_s)
 
     def finish(self, launched: bool) -> RunStatus:
         """Send and keep the final weights, have them scored, draw the test episodes.

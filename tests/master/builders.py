@@ -111,6 +111,7 @@ class FakeHub:
 
     endpoint, weights_endpoint = "tcp://127.0.0.1:1", "tcp://127.0.0.1:2"
     open_to_all = False
+    broadcast_s = 0.0
 
     def __init__(
         self, made: Setup, script: Iterable[list[Any]] = (), roles: Iterable[str] = ("player",)
