@@ -101,6 +101,7 @@ class StatusCollector:
             "most_players": record.workers,
             "evaluators": self._hub.count("evaluator"),
             "lag_updates": trainer.rate_limiter.lag,
+            "broadcast_s": self._hub.broadcast_s,
             "replay": len(trainer.replay),
             "replay_capacity": trainer.replay.capacity,
             "undone_updates": self._guard.undone,

@@ -28,6 +28,7 @@ def test_what_is_told(tmp_path: Path) -> None:
     hub = FakeHub(
         MADE, [[arrival(MADE, 1)], [arrival(MADE, 2)], [scores(MADE, 2)]], ["player", "evaluator"]
     )
+    hub.broadcast_s = 0.25
     made = loop(tmp_path, MADE, hub, {"publish_seconds": 0.0}, max_updates=4)
     made.run()
     last = made.reporter.flush(queue=3)
@@ -40,6 +41,7 @@ def test_what_is_told(tmp_path: Path) -> None:
         "players": 1,
         "evaluators": 1,
         "queue": 3,
+        "broadcast_s": 0.25,
     }
     assert expected.items() <= dict(last.numbers).items()
     assert last.texts["activity"] == "waiting for episodes"
