@@ -52,6 +52,9 @@ from tangram_sim.errors import WireError
 MAX_DRAIN = 256
 # Damaged messages of one peer without an intact batch between them: then it must end.
 MAX_DAMAGED = 100
+# Of broadcasts to all workers together: half of a gigabit line, and what a fifteenth of a core
+# encrypts. Many workers have somewhat older weights rather than a slower learner.
+BROADCAST_BYTES_S = 60e6
 
 
 class Hub:
@@ -118,10 +121,20 @@ class Hub:
         """Processes that take part, by role and index."""
         return self._registry.peers
 
+    def count(self, role: str) -> int:
+        """How many of a role take part."""
+        return self._registry.count(role)
+
     @property
     def keys(self) -> Keys | None:
         """As their file has them by now; None on plain sockets."""
         return self._sockets.keys
+
+    @property
+    def broadcast_s(self) -> float:
+        """How long the newest weights take to all who take part, at `BROADCAST_BYTES_S`."""
+        size = sum(map(len, self._weights or ()))
+        return size * len(self._registry) / BROADCAST_BYTES_S
 
     def poll(self, timeout_s: float) -> list[Arrival]:
         """Wait for a message, then take and answer what is there.
@@ -312,7 +325,7 @@ class Hub:
         peer.damaged = 0
         if self._info.lockstep and not self._is_ordered(peer, batch):
             return None
-        room = self._waiting.room(peer.key, peer.ledger, len(self.peers))
+        room = self._waiting.room(peer.key, peer.ledger, len(self._registry))
         verdict = peer.ledger.take(batch.sequence, room)
         if verdict is not Verdict.NEW:
             self.counters[verdict.value] += 1

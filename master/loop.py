@@ -101,7 +101,7 @@ class Loop:
             else:
                 self._arrived.append(arrival)
         record = self.clock.record
-        record.workers = max(record.workers, self._count("player"))
+        record.workers = max(record.workers, self.hub.count("player"))
 
     def insert(self) -> None:
         """Move batches into the replay while the learner keeps up; senders of others wait."""
@@ -158,6 +158,8 @@ class Loop:
         self.hub.publish(weights)
         self._published = weights.version
         self.reporter.published(weights.version)
+        if self.service.publish_seconds > 0.0:  # else after every update, whatever it costs
+            self._publish.rest(self.hub.broadcast_s)
 
     def finish(self, launched: bool) -> RunStatus:
         """Send and keep the final weights, have them scored, draw the test episodes.
@@ -209,9 +211,6 @@ class Loop:
         self.hub.acknowledge(arrival)
         self.reporter.inserted(arrival)
 
-    def _count(self, role: str) -> int:
-        return sum(peer.role == role for peer in self.hub.peers)
-
     def _wait_for_scores(self, launched: bool) -> None:
         """Wait a bounded time for scores, if there is an evaluator that can send them."""
         record, signalled = self.clock.record, self.signals.reason is not None
@@ -222,7 +221,7 @@ class Loop:
             waited_s = time.monotonic() - begun_s
             hurried = self.signals.reason is not None and not signalled
             # One that was launched may still be loading: on a busy machine that takes a minute.
-            hopeless = (signalled or not launched) and not self._count("evaluator")
+            hopeless = (signalled or not launched) and not self.hub.count("evaluator")
             if waited_s >= limit_s or hurried or hopeless:
                 return
             if not told:

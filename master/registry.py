@@ -136,6 +136,14 @@ class Registry:
         """Live ones, by role and index."""
         return [self._by_key[key] for key in sorted(self._by_key)]
 
+    def __len__(self) -> int:
+        """How many are live."""
+        return len(self._by_key)
+
+    def count(self, role: str) -> int:
+        """How many of a role are live."""
+        return sum(one == role for one, _ in self._by_key)
+
     def find(self, identity: bytes) -> Peer | None:
         """The peer of a connection."""
         return self._by_identity.get(identity)

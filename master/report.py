@@ -76,15 +76,15 @@ class StatusCollector:
         trainer, share = self._guard.trainer, self._budget.share
         self._rates.mark(time.monotonic(), trainer.transitions, trainer.updates, share)
 
-    def collect(self, queue: int) -> RunStatus:
+    def collect(self, queue: int, each: bool = True) -> RunStatus:
         """The present state.
 
         Args:
             queue: batches that have come and wait for their insert.
+            each: with a row for each worker, which takes milliseconds where there are many.
         """
         trainer, record, rates = self._guard.trainer, self._clock.read(), self._rates
-        peers, left_s = self._hub.peers, rates.left_s()
-        players = sum(peer.role == "player" for peer in peers)
+        players, left_s = self._hub.count("player"), rates.left_s()
         bounded = self._budget.bounded
         numbers = {
             "episodes": trainer.episodes,
@@ -99,8 +99,9 @@ class StatusCollector:
             "updates_per_s": rates.updates_per_s(),
             "players": players,
             "most_players": record.workers,
-            "evaluators": len(peers) - players,
+            "evaluators": self._hub.count("evaluator"),
             "lag_updates": trainer.rate_limiter.lag,
+            "broadcast_s": self._hub.broadcast_s,
             "replay": len(trainer.replay),
             "replay_capacity": trainer.replay.capacity,
             "undone_updates": self._guard.undone,
@@ -119,7 +120,7 @@ class StatusCollector:
             "run_id": record.run_id,
             "activity": HOMELESS if self._checkpointer.homeless else activity(trainer, players),
         }
-        return RunStatus(numbers, texts, _workers(peers, trainer.updates))
+        return RunStatus(numbers, texts, _workers(self._hub.peers if each else (), trainer.updates))
 
 
 HOMELESS = "waiting for the run folder, which is gone or another one"
@@ -254,9 +255,10 @@ class Reporter:
         if self._log.due():
             self.flush(queue)
             return
-        status = self._status.collect(queue)
+        listened = self._listen.due()
+        status = self._status.collect(queue, each=listened)
         self._progress.show(status)
-        if self._listen.due():
+        if listened:
             for listen in self._listeners:
                 listen(status)
 

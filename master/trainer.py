@@ -14,6 +14,7 @@ from tangram_agent.filling_learner import FillLearner
 from tangram_agent.filling_replay import FillReplay
 from tangram_agent.learner import Learner
 from tangram_agent.motion import Motions, motions_of
+from tangram_agent.networks import travelling
 from tangram_agent.relabelling import with_relabelled
 from tangram_agent.replay import ReplayBuffer
 from tangram_agent.setup import Setup
@@ -149,8 +150,8 @@ class Trainer:
         self.rate_limiter.updated(self.updates - before)
 
     def weights(self) -> Weights:
-        """The acting weights; their version is the number of updates."""
-        return self.learner.acting_weights(self.updates)
+        """What workers need to play; its version is the number of updates."""
+        return travelling(self.learner.acting_weights(self.updates), self.setup)
 
     def state(self) -> tuple[Arrays, dict[str, Any]]:
         """Arrays by file, and JSON values, for a checkpoint.
@@ -158,7 +159,7 @@ class Trainer:
         The caller sees to it that they are finite, see `divergence`.
         """
         arrays = {
-            ACTING: dict(self.weights().tensors),
+            ACTING: dict(self.learner.acting_weights(self.updates).tensors),
             LEARNER: self.learner.state(),
             "replay": self.replay.state(),
         }

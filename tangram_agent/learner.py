@@ -91,9 +91,9 @@ class Learner:
         bootstraps: whether the critic's target counts what follows (Eq. 5): only then are there
             target networks.
         parts: networks by the names under which a checkpoint has them.
-        playing: what a worker plays with: the actor, or both networks where both play.
+        playing: what is played with: the actor, or both networks where both may play.
         optimisers: of the networks that learn, by their names in `parts`.
-        acting: its running average, which is what workers get.
+        acting: its running average, of which workers get what they need.
         steps: makes what the losses see of a batch.
     """
 
@@ -293,7 +293,7 @@ class Learner:
         return Rates(config.actor_lr * factor, config.critic_lr * factor, kept)
 
     def acting_weights(self, version: int) -> Weights:
-        """A copy of the weights that workers play with."""
+        """A copy of the weights to play with, as a checkpoint keeps them."""
         return Weights(version, to_arrays(self.acting))
 
     def state(self) -> dict[str, Array]:

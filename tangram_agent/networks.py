@@ -21,6 +21,7 @@ from tangram_agent.motion import MotionModel
 from tangram_agent.pairs import PairGraph, Pairs
 from tangram_agent.scenes import SceneGraph, Scenes
 from tangram_agent.setup import Setup
+from tangram_agent.types import Weights
 from tangram_agent.values import OutlineValue
 
 View = Scenes | Pairs
@@ -225,7 +226,10 @@ class Networks(nn.Module):
 
     @property
     def playing(self) -> nn.Module:
-        """What a worker needs: the actor, or all networks where the critic chooses."""
+        """What is kept to play with: the actor, or all networks where the critic may choose.
+
+        What of it travels to workers is less where it has nothing to choose, see `travels`.
+        """
         return self if self._both_play else self.actor
 
 
@@ -233,6 +237,20 @@ def outline_network(setup: Setup) -> nn.Module:
     """What an agent of outlines learns: logits (M,) of what is left, by its corners or its crop."""
     kind = CropValue if setup.net.kind == "crops" else OutlineValue
     return kind(Filling(setup.layout).shapes, setup.net)
+
+
+def travels(name: str, setup: Setup) -> bool:
+    """Whether workers need a parameter of `Networks.playing`, of this name, to play.
+
+    Who plays a finished run may set `agent.refine_steps`, so that a checkpoint keeps all of them.
+    """
+    return setup.critic_plays or not name.startswith("critic.")
+
+
+def travelling(weights: Weights, setup: Setup) -> Weights:
+    """Of all weights to play with those that a broadcast brings."""
+    needed = {name: tensor for name, tensor in weights.tensors.items() if travels(name, setup)}
+    return Weights(weights.version, needed)
 
 
 def perceptron(inputs: int, hidden: tuple[int, ...], outputs: int) -> nn.Sequential:

@@ -103,6 +103,10 @@ class Scene:
             confidence=self.confidence[c.row, c.token],
         )
 
+    def leaves_no_choice(self, candidates: Candidates) -> bool:
+        """Whether each environment has one candidate, so that nobody need say which is better."""
+        return len(candidates.row) == len(self.pose)
+
     def meetings(self, movers: Candidates, other: Candidates, where: Tensor) -> Pairs:
         """Pairs (M,) of tokens that move and of others that lie at poses (M, 3) in the same rows.
 
@@ -294,9 +298,10 @@ class Planner:
         candidates = Candidates(row, token, flip.float(), piece)
         pairs = scene.pairs(candidates)
         pose = self._guide.proposed(pairs)
-        best = candidates.best(self._valued(pairs, pose), _SHORT_LIST)
-        candidates, pose = candidates.at(best), pose[best]
-        pairs = scene.pairs(candidates)
+        if not scene.leaves_no_choice(candidates):
+            best = candidates.best(self._valued(pairs, pose), _SHORT_LIST)
+            candidates, pose = candidates.at(best), pose[best]
+            pairs = scene.pairs(candidates)
         for _ in range(self._agent.reapply):
             pose = self._guide.proposed(pairs.at(pose))
         return candidates, pose
@@ -308,6 +313,8 @@ class Planner:
 
     def _best(self, scene: Scene, candidates: Candidates, pose: Tensor) -> Tensor:
         """Index (B,) of the best candidate of each row."""
+        if scene.leaves_no_choice(candidates):
+            return torch.arange(len(pose))
         # What a token covers already it gives up.
         total = self._total(scene, candidates, pose) - scene.worth[candidates.row, candidates.token]
         if self._contacts:

@@ -3,7 +3,7 @@
 Legend: B environments, K tokens, V corners, A entries of an action.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +12,7 @@ from torch import nn
 
 from tangram_agent.filler import Filler
 from tangram_agent.foresight import Foresight
-from tangram_agent.networks import Networks, outline_network
+from tangram_agent.networks import Networks, outline_network, travels
 from tangram_agent.planning import Planner
 from tangram_agent.scenes import Scenes, next_token
 from tangram_agent.setup import Setup
@@ -34,6 +34,7 @@ class Policy:
 
     def __init__(self, setup: Setup) -> None:
         self.layout, self.config, self.sim = setup.layout, setup.agent, setup.sim
+        self._setup = setup
         self.tokens = setup.layout.tokens
         self.version = -1
         self._planner: Planner | None = None
@@ -50,16 +51,28 @@ class Policy:
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Names and shapes of the tensors that `load` accepts."""
-        return {name: tuple(p.shape) for name, p in self.network.named_parameters()}
+        """Names and shapes of the tensors that a broadcast brings, see `follow`."""
+        every = self.network.named_parameters()
+        return {name: tuple(p.shape) for name, p in every if travels(name, self._setup)}
 
-    def load(self, weights: Weights) -> None:
-        """Take over broadcast weights.
+    def follow(self, weights: Weights) -> None:
+        """Take over broadcast weights: of those that `load` wants what playing needs.
 
         Raises:
             RunError: they belong to another layout or network.
         """
-        load_arrays(self.network, weights.tensors)
+        self._load(weights, self.shapes)
+
+    def load(self, weights: Weights) -> None:
+        """Take over weights as a checkpoint keeps them.
+
+        Raises:
+            RunError: they belong to another layout or network.
+        """
+        self._load(weights)
+
+    def _load(self, weights: Weights, names: Collection[str] | None = None) -> None:
+        load_arrays(self.network, weights.tensors, names)
         self.version = weights.version
         if self._planner is not None:
             self._planner.forget()

@@ -176,3 +176,7 @@ class Every:
             return False
         self._next_s = now_s + self._seconds
         return True
+
+    def rest(self, seconds: float) -> None:
+        """Not to be due for so long from now, if that is longer than it would be."""
+        self._next_s = max(self._next_s, time.monotonic() + seconds)

@@ -222,6 +222,15 @@ class Setup:
         return goal_rows(self.layout, self.sim)
 
     @property
+    def critic_plays(self) -> bool:
+        """Whether the critic has a say in what is played; else the actor alone decides.
+
+        Of one token that stays on its side there is one proposal, and nothing to choose.
+        """
+        one = self.layout.tokens == 1 and not self.sim.allow_flip
+        return self.pairs and not (one and self.agent.refine_steps == 0)
+
+    @property
     def credits_pieces(self) -> bool:
         """Whether the critic learns what a token covers of each piece of the target.
 

@@ -159,7 +159,7 @@ class Weights:
 
     Attributes:
         version: number of the broadcast, rising within an epoch.
-        tensors: name -> float32 array of the acting network.
+        tensors: name -> float32 array of the acting network, or of what of it travels.
     """
 
     version: int

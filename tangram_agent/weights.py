@@ -1,5 +1,6 @@
 """A network's parameters as named arrays, and back."""
 
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -13,13 +14,21 @@ Array = npt.NDArray[Any]
 MOST = 1e6  # of a parameter's magnitude; what is learned stays far below
 
 
-def load_arrays(module: nn.Module, arrays: dict[str, Array]) -> None:
+def load_arrays(
+    module: nn.Module, arrays: dict[str, Array], names: Collection[str] | None = None
+) -> None:
     """Copy named arrays into a module's parameters.
+
+    Args:
+        module: takes them.
+        arrays: by the names of parameters.
+        names: of those that there must be; None: all.
 
     Raises:
         RunError: names or shapes differ, or numbers are none; says which first.
     """
-    own = dict(module.named_parameters())
+    every = module.named_parameters()
+    own = {name: p for name, p in every if names is None or name in names}
     if set(own) != set(arrays):
         odd = min(set(own) ^ set(arrays))
         raise RunError(

@@ -201,14 +201,14 @@ def steps_of(setup: Setup) -> Iterator[str]:
     """Digests of a short seeded run: of what is played, of what is learned, and so on."""
     trainer, policy = Trainer(setup, 0, "cpu"), Policy(setup)
     with closing(environments(setup, ENVS)) as env:
-        policy.load(trainer.weights())
+        policy.follow(trainer.weights())
         env.reset([np.random.default_rng(i) for i in range(ENVS)])
         yield digest(policy.act(env.seen, env.placed, env.seen_goals))
         result = env.step(np.zeros((ENVS, setup.action_size)))
         yield digest(result.rewards, np.array(result.camera_rewards, np.float64))
         rollout = Rollout(env, 0, "player", 0, 0)
         for turn in range(TURNS):
-            policy.load(trainer.weights())
+            policy.follow(trainer.weights())
             rollout.follow(trainer.updates)
             played = rollout.play(policy.explore)
             yield digest(played.corners, played.actions, played.rewards, played.goals)

@@ -48,6 +48,8 @@ from worker.outbox import NewestWeights, Outbox
 STEP_S = 0.1
 # Between two log lines of what is waited for.
 TELL_S = 60.0
+# Times `Timing.resend_s`: the longest that is waited before all is sent again.
+MOST_PATIENCE = 8.0
 
 log = logging.getLogger(__name__)
 
@@ -102,6 +104,7 @@ class Client:
         # The master wants this process to end, and why.
         self._dismissed, self._dismissal = False, ""
         self._hello_at = self._heartbeat_at = self._resend_at = 0.0
+        self._patience_s = self._timing.resend_s
 
     def __enter__(self) -> Self:
         return self
@@ -192,7 +195,7 @@ class Client:
             return False
         frames = EpisodeBatch(self.outbox.next, weights_version, episodes).encode(self._spec)
         if not self.outbox:
-            self._resend_at = time.monotonic() + self._timing.resend_s
+            self._be_patient(time.monotonic())
         self.outbox.add(frames)
         self._post(frames)
         self.poll()
@@ -303,10 +306,23 @@ class Client:
         return self.joined and sockets is not None and sockets.send(frames)
 
     def _resend(self, now: float) -> None:
-        self._resend_at = now + self._timing.resend_s
+        """Send all again, and next time later: a master that is behind has it already.
+
+        What was lost is sent again at once after a WELCOME, and soon after a REJECT.
+        """
+        self._patience_s = min(2.0 * self._patience_s, MOST_PATIENCE * self._timing.resend_s)
+        self._resend_at = now + self._patience_s
+        self._post_all()
+
+    def _post_all(self) -> None:
         for frames in self.outbox.messages:
             self.counters["resent"] += 1
             self._post(frames)
+
+    def _be_patient(self, now: float) -> None:
+        """Count the time until all is sent again from now on, as in the beginning."""
+        self._patience_s = self._timing.resend_s
+        self._resend_at = now + self._patience_s
 
     def _want_weights(self) -> None:
         self._post(WantWeights(self.newest.epoch, self.newest.version).encode())
@@ -340,7 +356,7 @@ class Client:
         match message:
             case Ack(sequence):
                 if self.outbox.remove(sequence):
-                    self._resend_at = now + self._timing.resend_s
+                    self._be_patient(now)
             case Reject():
                 self._take_back(message, now)
             case Go():
@@ -384,7 +400,8 @@ class Client:
         sockets.subscribe(reachable(welcome.weights_endpoint, host_of(address.endpoint)))
         self._want_weights()
         self._heartbeat_at = now + self._timing.heartbeat_s
-        self._resend(now)
+        self._be_patient(now)
+        self._post_all()
 
     def _take_back(self, reject: Reject, now: float) -> None:
         self.counters["rejected" if reject.final else "out_of_turn"] += 1

@@ -47,7 +47,8 @@ class Timing:
         join_s: to find the master at the start.
         retry_s: between two HELLOs, and before a resend that the master asked for.
         heartbeat_s: between two signs of life.
-        resend_s: without an acknowledgement before all is sent again.
+        resend_s: without an acknowledgement before all is sent again, twice as long each time after
+            that, up to eight times.
         silence_s: without an answer before the connection is made anew.
         lost_s: without an answer, over all connections, before giving up.
     """

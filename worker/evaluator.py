@@ -74,7 +74,7 @@ def run_evaluator(config: WorkerConfig, setup: Setup) -> int:
             schedule.offer(client.newest_weights(), time.monotonic())
             weights = schedule.due(time.monotonic())
             if weights is not None:
-                policy.load(weights)
+                policy.follow(weights)
                 scores = _evaluate(tests, policy, client)
                 if scores is not None:
                     client.send_scores(scores)

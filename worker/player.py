@@ -44,7 +44,7 @@ def run_player(config: WorkerConfig, setup: Setup) -> int:
             # Weights change here and nowhere else: a batch is played with one version.
             newest = client.newest_weights()
             if newest is not None:
-                policy.load(newest)
+                policy.follow(newest)
             episodes = _play(rollout, policy, client, groups=math.ceil(size / env.count))
             for batch in parts(episodes, size):
                 if not client.send(batch, policy.version):
@@ -68,7 +68,7 @@ def _play_in_step(client: Client, policy: Policy, rollout: Rollout, report: Repo
                 newest = client.wait_for_weights()
             if newest is None:
                 return
-            policy.load(newest)
+            policy.follow(newest)
         rollout.episode = order.first_episode
         episodes = _play(rollout, policy, client, groups=order.episodes // rollout.envs)
         if episodes.count < order.episodes or not client.send(episodes, policy.version):
@@ -83,7 +83,7 @@ def _take_first_weights(client: Client, policy: Policy, report: Report) -> bool:
         weights = client.wait_for_weights()
     if weights is None:
         return False
-    policy.load(weights)
+    policy.follow(weights)
     return True
 
 

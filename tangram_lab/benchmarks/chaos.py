@@ -92,13 +92,13 @@ class Witness(Thread):
             first = client.wait_for_weights()
             if first is None:
                 return
-            policy.load(first)
+            policy.follow(first)
             me = client.welcome
             rollout = Rollout(env, me.seed, "witness", me.index, me.incarnation)
             while client.wait_for_window():
                 newest = client.newest_weights()
                 if newest is not None:
-                    policy.load(newest)
+                    policy.follow(newest)
                 episodes = rollout.play(policy.explore)
                 self.sent.append(keys(episodes.corners[:, 0], episodes.actions[:, 0]))
                 if not client.send(episodes, policy.version):

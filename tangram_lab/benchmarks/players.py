@@ -12,7 +12,7 @@ from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes
 from worker.client import Client
 
-PAUSE_S = 0.002  # between two rounds over all clients
+PAUSE_S = 0.002  # between two rounds over all clients, or as long as a round took
 
 
 @dataclass
@@ -84,10 +84,12 @@ def play(connect: str, setup: Setup, episodes: Episodes, count: int, path: Path)
             for i in range(count)
         ]
         while not all(client.stopped for client in clients):
+            begin = time.monotonic()
             for player, client in enumerate(clients):
                 _step(player, client, episodes, ages)
             ages.write()
-            time.sleep(PAUSE_S)
+            # Many share few cores with the master: they leave it half of one.
+            time.sleep(max(PAUSE_S, time.monotonic() - begin))
 
 
 def _step(player: int, client: Client, episodes: Episodes, ages: Ages) -> None:

@@ -118,16 +118,21 @@ def ours(case: Case, setup: Setup, episodes: Episodes) -> Iterator[Work]:
 @contextmanager
 def connected(case: Case, setup: Setup, episodes: Episodes, workers: int = 1) -> Iterator[Hub]:
     """A Hub that a process sends to, as one worker or as several."""
-    keys, spec = case.keys, EpisodeSpec.of(setup)
-    info = WelcomeInfo("bench", 0, setup.fingerprints(), spec, WINDOW)
-    with ExitStack() as stack:
-        folder = stack.enter_context(tempfile.TemporaryDirectory())
-        bind = f"{IPC}{folder}/hub" if case.way == UNIX else "127.0.0.1"
-        hub = stack.enter_context(Hub(bind, 0, info, keys=keys))
-        connect = Path(folder) / "connection.json"
-        connect.write_text(json.dumps(_connection(hub, keys)))
+    with opened(case.way, setup, case.keys) as (hub, folder):
+        connect = folder / "connection.json"
+        connect.write_text(json.dumps(_connection(hub, hub.keys)))
         with child(send_batches, str(connect), setup, episodes, workers):
             yield hub
+
+
+@contextmanager
+def opened(way: str, setup: Setup, keys: Keys | None) -> Iterator[tuple[Hub, Path]]:
+    """A Hub, and a folder that is there as long."""
+    info = WelcomeInfo("bench", 0, setup.fingerprints(), EpisodeSpec.of(setup), WINDOW)
+    with tempfile.TemporaryDirectory() as folder:
+        bind = f"{IPC}{folder}/hub" if way == UNIX else "127.0.0.1"
+        with Hub(bind, 0, info, keys=keys) as hub:
+            yield hub, Path(folder)
 
 
 def take_batches(hub: Hub) -> int:

@@ -8,7 +8,6 @@ seeds.
 import argparse
 import hashlib
 import json
-import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -201,7 +200,7 @@ def make_card(
         tested: scores of the shipped weights and of the policies to compare with.
     """
     setup, result = chosen.run.setup, chosen.result
-    acting = sum(math.prod(shape) for shape in Policy(setup).shapes.values())
+    acting = sum(parameter.numel() for parameter in Policy(setup).network.parameters())
     world = "".join(f", {name} {told(value)}" for name, value in setup.sim.inexact.items())
     seen = f", {_pictures(setup.sim)}" * setup.sim.looks
     drawn = ", outlines of the train split among them" * (setup.sim.targets == "touching")

@@ -9,10 +9,11 @@ import pytest
 
 from tangram_agent.learner import Learner
 from tangram_agent.messages import decode_weights
+from tangram_agent.networks import travelling
 from tangram_agent.policy import Policy
 from tangram_agent.runs import Run
 from tangram_agent.setup import Setup
-from tangram_agent.types import Transitions, Weights
+from tangram_agent.types import Past, Transitions, Weights
 from tangram_sim.actions import chosen_tokens, flips, velocities
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.env import TangramEnv
@@ -38,6 +39,12 @@ def policy_of(made: Setup) -> Policy:
 
 def scene_of(batch: Transitions) -> Scene:
     return batch.state, batch.placed, batch.goal
+
+
+def past_of(made: Setup, count: int) -> Past:
+    """One action that did not do what it should have."""
+    batch = random_transitions(made, count)
+    return Past(batch.state[:, None], batch.action[:, None])
 
 
 def generators(count: int) -> list[np.random.Generator]:
@@ -69,6 +76,49 @@ def test_weights_travel_to_workers(made: Setup) -> None:
         np.testing.assert_array_equal(tensor, weights.tensors[name])
     with pytest.raises(RunError, match="on one side only"):
         policy.load(Weights(0, {}))
+
+
+ONE = {"shapes": ["parallelogram"], "scale": 0.8}
+HAS_A_SAY = [
+    (setup(agent=PAPER), False),
+    (setup(agent={"reapply": 2, "motion": "learned"}), False),
+    (setup(ONE), False),
+    (setup(ONE, mirrored=0.5), False),
+    (setup(ONE, allow_flip=True), True),
+    (setup(agent={"refine_steps": 2}), True),
+    (setup(PAIR), True),
+    (setup(PAIR, {"order": "size"}), True),  # which piece is to be chosen
+]
+
+
+@pytest.mark.parametrize(("made", "has"), HAS_A_SAY)
+def test_a_critic_travels_where_it_has_a_say_in_what_is_played(made: Setup, has: bool) -> None:
+    """What did not come is no number here: whoever asked it would not act as others do."""
+    whole, told = Learner(made, 0).acting_weights(7), Policy(made)
+    sent = travelling(whole, made).tensors
+    left_out = {name.partition(".")[0] for name in whole.tensors.keys() - sent.keys()}
+    assert (made.critic_plays, left_out) == (has, {"critic"} if made.pairs and not has else set())
+    assert {name: tensor.shape for name, tensor in sent.items()} == told.shapes
+    for parameter in told.network.parameters():
+        parameter.fill_(np.nan)
+    told.follow(Weights(7, sent))
+    scene, knows = scene_of(random_transitions(made, 20)), policy_of(made)
+    for past in (None, past_of(made, 20)):
+        np.testing.assert_array_equal(told.act(*scene, past=past), knows.act(*scene, past=past))
+        one, other = (p.explore(*scene, generators(20), past) for p in (told, knows))
+        np.testing.assert_array_equal(one, other)
+        assert np.isfinite(one).all()
+
+
+def test_what_travels_is_no_checkpoint() -> None:
+    """Who plays a finished run may set what makes its critic play."""
+    policy, whole = Policy(setup()), Learner(setup(), 0).acting_weights(7)
+    sent = travelling(whole, setup())
+    for take, weights in ((policy.load, sent), (policy.follow, whole)):
+        with pytest.raises(RunError, match="'critic.head.* is on one side only"):
+            take(weights)
+    policy.load(whole)
+    policy.follow(sent)
 
 
 def test_weights_are_a_copy() -> None:

@@ -111,6 +111,7 @@ class FakeHub:
 
     endpoint, weights_endpoint = "tcp://127.0.0.1:1", "tcp://127.0.0.1:2"
     open_to_all = False
+    broadcast_s = 0.0
 
     def __init__(
         self, made: Setup, script: Iterable[list[Any]] = (), roles: Iterable[str] = ("player",)
@@ -123,6 +124,9 @@ class FakeHub:
         self.log: list[tuple[str, Any]] = []
         self.polls = 0
         self.on_poll = lambda: None
+
+    def count(self, role: str) -> int:
+        return sum(peer.role == role for peer in self.peers)
 
     def poll(self, timeout_s: float) -> list[Any]:
         self.polls += 1

@@ -27,6 +27,7 @@ from tangram_agent.messages import (
     decode_weights,
 )
 from tangram_agent.schema import PROTOCOL
+from tangram_agent.types import Weights
 from tangram_sim.errors import WireError
 from tests.agent.messages import (
     FINGERPRINTS,
@@ -49,6 +50,19 @@ def test_hello_is_answered_with_all_that_a_worker_needs(stage: Stage) -> None:
     [peer] = hub.peers
     assert (peer.role, peer.index, peer.incarnation) == ("player", 4, 1)
     assert hub.counters["welcomed"] == 1
+
+
+def test_broadcasts_take_so_long_as_their_bytes_for_all_who_take_part(stage: Stage) -> None:
+    """At half a gigabit: 1,000 workers with 290 kB each, 290 MB in all, take 4.8 s."""
+    assert stage.hub.broadcast_s == 0.0
+    tensors = {"a": np.zeros(72_500, np.float32)}
+    stage.hub.publish(Weights(1, tensors))
+    assert stage.hub.broadcast_s == 0.0
+    for i, role in enumerate(("player", "player", "evaluator"), 1):
+        stage.dealer().join(process=f"p{i}", role=role)
+        assert stage.hub.broadcast_s == pytest.approx(i * 290e3 / 60e6, rel=1e-3)
+    stage.hub.publish(Weights(2, {}))
+    assert stage.hub.broadcast_s < 1e-4
 
 
 NO_ROOM = Room(RESERVE + HANDSHAKES)

@@ -16,6 +16,7 @@ from master import loop as loop_module
 from master import metrics as metrics_module
 from master.delivery import EpisodesArrived
 from master.result import make_result
+from tangram_agent import process as process_module
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
 from tangram_agent.messages import Go
 from tangram_agent.process import Every
@@ -153,6 +154,36 @@ def test_weights_are_sent_once_and_at_a_bounded_rate_or_after_every_update(
     made.run()
     made.finish(launched=False)
     assert hub.values("publish") == versions
+
+
+@pytest.mark.parametrize(
+    ("publish_seconds", "broadcast_s", "at"),
+    [
+        (0.5, 0.0, [0, 2, 4, 6, 8, 10]),
+        (0.5, 0.4, [0, 2, 4, 6, 8, 10]),
+        (0.5, 1.2, [0, 5, 10]),
+        (1.5, 1.2, [0, 6]),
+        # As in the paper, however many there are.
+        (0.0, 1.2, [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11]),
+    ],
+)
+def test_weights_are_sent_less_often_where_they_are_long_on_their_way(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    publish_seconds: float,
+    broadcast_s: float,
+    at: list[int],
+) -> None:
+    """There are new ones all the time, and one looks every quarter of a second."""
+    hub = FakeHub(MADE)
+    made = loop(tmp_path, MADE, hub, {"publish_seconds": publish_seconds})
+    hub.broadcast_s, clock = broadcast_s, 0.0
+    monkeypatch.setattr(process_module.time, "monotonic", lambda: clock)
+    made._publish = Every(publish_seconds, at_once=True)
+    for turn in range(12):
+        clock, made.guard.trainer.learner.updates = turn / 4, turn
+        made.publish_due()
+    assert hub.values("publish") == at
 
 
 @pytest.mark.parametrize("often", [False, True])

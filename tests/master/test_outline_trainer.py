@@ -38,7 +38,7 @@ def test_what_workers_play_is_learned_from() -> None:
     assert set(numbers) == {"critic_loss", "q", "critic_gradient"}
     assert made.updates == 1
     policy = Policy(MADE)
-    policy.load(made.weights())
+    policy.follow(made.weights())
     assert policy.version == 1
 
 

@@ -6,9 +6,11 @@ from typing import Any
 
 import pytest
 
+from tangram_agent.checkpoints import ACTING
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
-from tests.agent.builders import random_episodes
+from tangram_agent.types import Weights
+from tests.agent.builders import random_episodes, setup
 from tests.agent.pair_scenes import PERCEPTRON, seven
 from tests.master.builders import AGENT, FakeHub, arrival, loop, play_on, trainer
 
@@ -44,8 +46,27 @@ def test_workers_take_the_weights_of_the_master() -> None:
     made = made_setup(mirrored=0.5)
     master, policy = trainer(made), Policy(made)
     play_on(master, 1, count=2)
-    policy.load(master.weights())
+    policy.follow(master.weights())
     assert policy.version == master.updates > 0
+
+
+@pytest.mark.parametrize("refine_steps", [0, 1])
+def test_a_critic_without_a_say_stays_with_the_master_and_in_checkpoints(refine_steps: int) -> None:
+    made = setup(
+        agent=AGENT
+        | {"readout": "pair", "motion": "learned", "gamma": 0.0}
+        | {"refine_steps": refine_steps}
+    )
+    master, policy = trainer(made), Policy(made)
+    play_on(master, 1)
+    arrays, _ = master.state()
+    policy.load(Weights(1, arrays[ACTING]))
+    policy.follow(master.weights())
+    parts = [
+        {name.partition(".")[0] for name in one}
+        for one in (master.weights().tensors, arrays[ACTING])
+    ]
+    assert parts == [{"actor", "motion", *["critic"] * refine_steps}, {"actor", "critic", "motion"}]
 
 
 @pytest.mark.parametrize(("stages", "expected"), [(STAGES, TOLD), ([], [])])

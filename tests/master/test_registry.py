@@ -44,6 +44,8 @@ def test_any_index_is_the_lowest_that_is_free_within_the_role(registry: Registry
     assert (fresh.index, fresh.incarnation) == (1, 2)
     names = ["evaluator 0", "player 0", "player 1", "player 2", "player 3"]
     assert [p.name for p in registry.peers] == names
+    counts = [registry.count(role) for role in ("player", "evaluator", "other")]
+    assert (len(registry), counts) == (5, [4, 1, 0])
 
 
 def test_the_newest_process_of_an_index_wins_also_after_a_restart(registry: Registry) -> None:

@@ -8,6 +8,7 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from master.result import SCORES, make_result
+from tangram_agent.process import Every
 from tests.master.builders import (
     FakeHub,
     arrival,
@@ -27,6 +28,7 @@ def test_what_is_told(tmp_path: Path) -> None:
     hub = FakeHub(
         MADE, [[arrival(MADE, 1)], [arrival(MADE, 2)], [scores(MADE, 2)]], ["player", "evaluator"]
     )
+    hub.broadcast_s = 0.25
     made = loop(tmp_path, MADE, hub, {"publish_seconds": 0.0}, max_updates=4)
     made.run()
     last = made.reporter.flush(queue=3)
@@ -39,6 +41,7 @@ def test_what_is_told(tmp_path: Path) -> None:
         "players": 1,
         "evaluators": 1,
         "queue": 3,
+        "broadcast_s": 0.25,
     }
     assert expected.items() <= dict(last.numbers).items()
     assert last.texts["activity"] == "waiting for episodes"
@@ -55,6 +58,19 @@ def test_what_is_told(tmp_path: Path) -> None:
     }
     of_status = {n if "/" in n else f"run/{n}" for n in last.numbers if not n.startswith("test/")}
     assert expected_tags | of_status <= set(events.Tags()["scalars"])
+
+
+def test_who_takes_part_is_told_one_by_one_to_those_who_listen_only(tmp_path: Path) -> None:
+    """The terminal's line needs no row for each of a thousand workers, ten times in a second."""
+    hub = FakeHub(MADE, roles=["player"] * 3 + ["evaluator"])
+    made = loop(tmp_path, MADE, hub)
+    made.reporter._tick = Every(0.0)
+    for _ in range(3):
+        made.reporter.tick(0)
+    rows = [len(status.workers) for status in shown(made)]
+    counts = [(status.numbers["players"], status.numbers["evaluators"]) for status in shown(made)]
+    assert (rows, counts) == ([4, 0, 0], [(3, 1)] * 3)
+    assert [len(status.workers) for status in hub.values("tell")] == [4]
 
 
 @pytest.mark.parametrize(

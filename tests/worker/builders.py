@@ -11,6 +11,7 @@ from tangram_agent.checkpoints import save_checkpoint
 from tangram_agent.config import ServiceConfig
 from tangram_agent.filling_learner import FillLearner
 from tangram_agent.learner import Learner
+from tangram_agent.networks import travelling
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup, make_setup
 from tangram_agent.types import Episodes, Weights
@@ -24,6 +25,11 @@ def weights(made: Setup, version: int) -> Weights:
     """Random weights; every version has its own, and all of them move the tokens visibly."""
     learner = FillLearner if made.fills else Learner
     return learner(made, seed=version).acting_weights(version)
+
+
+def sent(made: Setup, version: int) -> Weights:
+    """What a master sends of them."""
+    return travelling(weights(made, version), made)
 
 
 def policy(made: Setup, version: int = 1) -> Policy:

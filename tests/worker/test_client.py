@@ -182,6 +182,36 @@ def test_without_an_acknowledgement_all_is_sent_again_in_order(master: StandIn) 
         assert set(numbers(master.heard)) == {2}
 
 
+@pytest.mark.parametrize(
+    ("acknowledged", "seconds"),
+    [
+        ((), [10, 30, 70, 150, 230, 310]),
+        # The master is at work again: as in the beginning.
+        ((30,), [10, 30, 40, 60, 100, 180, 260, 340]),
+        ((30, 70), [10, 30, 40, 60, 80, 100, 140, 220, 300]),
+    ],
+)
+def test_a_master_that_is_behind_is_sent_all_again_less_and_less_often(
+    master: StandIn, acknowledged: tuple[int, ...], seconds: list[int]
+) -> None:
+    """Ten seconds after the first batch, then twice as long each time, up to eight times."""
+    slow = replace(QUICK, resend_s=10.0, heartbeat_s=1e6, silence_s=1e6)
+    with welcomed(master, slow) as client:
+        for _ in range(3):
+            assert client.send(episodes(), 1)
+        begin, sent = client._resend_at - 10.0, list[int]()
+        sockets, answers = client._connection.sockets, iter((1, 2))
+        assert sockets is not None
+        for second in range(350):
+            before = client.counters["resent"]
+            client._do_what_is_due(sockets, begin + second)
+            if client.counters["resent"] > before:
+                sent.append(second)
+            if second in acknowledged:
+                client._handle(Ack(next(answers), duplicate=False), begin + second)
+        assert sent == seconds
+
+
 def test_what_came_out_of_turn_is_sent_again_with_all_before_it(master: StandIn) -> None:
     with welcomed(master) as client:
         for _ in range(2):

@@ -10,7 +10,7 @@ from master.delivery import Arrival, ScoresArrived
 from master.hub import Hub
 from tangram_agent.config import ServiceConfig
 from tests.agent.builders import PAIR, SQUARE, setup
-from tests.worker.builders import policy, weights
+from tests.worker.builders import policy, sent, weights
 from tests.worker.conversation import QUICK, collect, open_hub, with_master
 from worker.config import WorkerConfig
 from worker.evaluator import Schedule, run_evaluator
@@ -36,11 +36,11 @@ def test_the_newest_weights_are_scored_on_the_fixed_tests(tokens: dict) -> None:
     made = setup(tokens, pixels=32)
 
     def script(hub: Hub) -> list[ScoresArrived]:
-        hub.publish(weights(made, 5))
+        hub.publish(sent(made, 5))
         first = collect(hub, bool)
         # The interval of an hour does not hold up the last version: no other follows it.
         for version in (6, 7, 8):
-            hub.publish(weights(made, version))
+            hub.publish(sent(made, version))
         return first + collect(hub, lambda found: found and found[-1].scores.weights_version == 8)
 
     hub = open_hub(made)
@@ -70,7 +70,7 @@ def test_a_long_evaluation_keeps_in_touch_and_can_be_stopped() -> None:
     service = replace(SERVICE, envs=1, eval_episodes=100_000)
 
     def script(hub: Hub) -> list[Arrival]:
-        hub.publish(weights(made, 1))
+        hub.publish(sent(made, 1))
         return collect(hub, lambda _: hub.counters["heartbeats"] >= 3)
 
     hub = open_hub(made)

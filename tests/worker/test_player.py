@@ -26,7 +26,7 @@ from tangram_sim.errors import TangramError
 from tangram_sim.sampling import sample_poses
 from tangram_sim.seeding import episode_generator
 from tests.agent.builders import setup
-from tests.worker.builders import policy, weights, write_run
+from tests.worker.builders import policy, sent, write_run
 from tests.worker.conversation import LIMIT_S, QUICK, collect, open_hub, with_master
 from worker.client import Client
 from worker.config import WorkerConfig
@@ -74,7 +74,7 @@ def test_weights_change_between_batches_only_and_batches_tell_which() -> None:
 
     # 32 groups to a batch, and new weights all the time: most come in the middle of one.
     service = replace(SERVICE, envs=1, batch_episodes=32)
-    sets = [weights(made, i) for i in range(5)]
+    sets = [sent(made, i) for i in range(5)]
 
     def script(hub: Hub) -> list[EpisodesArrived]:
         arrived: list[EpisodesArrived] = []
@@ -108,7 +108,7 @@ def test_messages_hold_the_episodes_of_this_worker_in_order() -> None:
     made = greedy_setup()
 
     def script(hub: Hub) -> list[EpisodesArrived]:
-        hub.publish(weights(made, 1))
+        hub.publish(sent(made, 1))
         arrived = []
         while len(arrived) < 5:
             batch = collect(hub, bool)
@@ -130,9 +130,9 @@ def test_nothing_is_played_ahead_while_the_window_is_full() -> None:
     service = replace(SERVICE, batch_episodes=4)
 
     def script(hub: Hub) -> list[EpisodesArrived]:
-        hub.publish(weights(made, 1))
+        hub.publish(sent(made, 1))
         first = collect(hub, lambda batches: len(batches) == 2)
-        hub.publish(weights(made, 2))
+        hub.publish(sent(made, 2))
         # The first heartbeat from now on tells the worker of version 2 and makes it ask if it has
         # none; that answer goes out before the one to the second.
         heard = hub.counters["heartbeats"]
@@ -153,7 +153,7 @@ def test_in_lockstep_what_is_ordered_is_played_and_nothing_else() -> None:
     def script(hub: Hub) -> list[EpisodesArrived]:
         arrived = []
         for number in range(3):
-            hub.publish(weights(made, number))
+            hub.publish(sent(made, number))
             hub.order({0: Go(number, number, 16 * number, 8)})  # every other eight
             arrived += collect(hub, bool)
             hub.acknowledge(arrived[-1])
@@ -172,7 +172,7 @@ def test_in_lockstep_a_player_with_other_environments_says_so() -> None:
     made, hub = greedy_setup(), open_hub(greedy_setup(), lockstep=True)
 
     def script(hub: Hub) -> None:
-        hub.publish(weights(made, 0))
+        hub.publish(sent(made, 0))
         hub.order({0: Go(0, 0, 0, 6)})
         collect(hub, lambda _: hub.counters["byes"] == 1)
 
@@ -200,7 +200,7 @@ def test_a_signal_ends_a_player_with_a_goodbye(
     made = greedy_setup()
 
     def script(hub: Hub) -> None:
-        hub.publish(weights(made, 1))
+        hub.publish(sent(made, 1))
         for batch in collect(hub, bool):
             hub.acknowledge(batch)
         os.kill(os.getpid(), number)
@@ -227,7 +227,7 @@ def test_a_player_whose_index_is_taken_goes_on_if_it_asked_for_none(
     made = greedy_setup()
 
     def script(hub: Hub) -> list[int]:
-        hub.publish(weights(made, 1))
+        hub.publish(sent(made, 1))
         [first, *_] = collect(hub, bool)
         with Client(hub.endpoint, "player", 0, made.fingerprints(), EpisodeSpec.of(made)) as taker:
             collect(hub, lambda _: taker.poll() or taker.joined)
@@ -280,7 +280,7 @@ def test_a_process_whose_parent_is_gone_takes_its_leave(tmp_path: Path) -> None:
         ) as process:
             try:
                 lifeline.started()
-                hub.publish(weights(made, 1))
+                hub.publish(sent(made, 1))
                 assert collect(hub, lambda found: found or process.poll() is not None)
                 lifeline.cut()
                 collect(hub, lambda _: hub.counters["byes"] == 1)
@@ -306,7 +306,7 @@ def test_what_is_too_large_for_a_message_is_split(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("tangram_agent.arrays.MAX_EPISODES", 3)
 
     def script(hub: Hub) -> list[EpisodesArrived]:
-        hub.publish(weights(made, 1))
+        hub.publish(sent(made, 1))
         return collect(hub, lambda batches: len(batches) >= 2)
 
     hub = open_hub(made, seed=3)
