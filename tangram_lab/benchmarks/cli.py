@@ -28,6 +28,7 @@ RATES = {
     "replay": "the replay buffer, against numpy alone",
     "learner": "updates, against a plain per-head attention and Stable-Baselines3",
     "train": "a whole training, against Stable-Baselines3 (minutes=)",
+    "soon": "whole trainings that play well, from the command to their end (seeds=)",
     "peers": "piece by piece, against Stable-Baselines3",
     "scaling": "more workers, and 64 synthetic ones",
     "growth": "what grows with tokens, replay and width, and how",
@@ -71,6 +72,7 @@ def _parser() -> argparse.ArgumentParser:
         if name in ("all", "train"):
             limit = "that a rival's training may last (5)"
             one.add_argument("--minutes", type=float, default=5.0, help=limit)
+        if name in ("all", "train", "soon"):
             one.add_argument("--seeds", type=int, default=3, help="trainings of each (3)")
     for name, (text, minutes) in TRIALS.items():
         one = kinds.add_parser(name, help=text, description=text)

@@ -14,6 +14,7 @@ from tangram_lab.benchmarks.profile import show_profile
 from tangram_lab.benchmarks.replay import measure_replay
 from tangram_lab.benchmarks.scaling import measure_scaling
 from tangram_lab.benchmarks.sim import measure_sim
+from tangram_lab.benchmarks.soon import measure_soon
 from tangram_lab.benchmarks.train import measure_train
 from tangram_lab.benchmarks.wire import measure_wire
 
@@ -26,6 +27,7 @@ STAGES: dict[str, Callable[[argparse.Namespace], Sequence[Row]]] = {
     "peers": lambda given: measure_peers(given.runs),
     "scaling": lambda given: measure_scaling(given.runs),
     "growth": lambda given: measure_growth(given.runs),
+    "soon": lambda given: measure_soon(given.seeds),
     "train": lambda given: measure_train(given.seeds, given.minutes),
 }
 
