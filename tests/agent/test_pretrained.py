@@ -129,7 +129,7 @@ def test_the_packages_own_agents_are_whole_small_and_good(name: str) -> None:
     run = load_run(f"pretrained/{name}")
     card = json.loads((folder / CARD).read_bytes())
     assert [shape.name for shape in run.setup.layout.shapes] == card["task"]["tokens"]
-    assert card["scores"]["mean_reward"] > 0.9
+    assert card["tests"]["scores"]["this run"]["mean_reward"] > 0.9  # as it ships
     assert len((folder / WEIGHTS).read_bytes()) < 1_000_000
     assert f"# pretrained/{name}\n" in (folder / "card.md").read_text()
 
