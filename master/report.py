@@ -134,7 +134,7 @@ def activity(trainer: Trainer, players: int) -> str:
     if not players:
         return "waiting for workers to join"
     if trainer.episodes and not limiter.transitions:
-        return "waiting for an episode in which pictures show all tokens"
+        return "waiting for an episode in which pictures show all tokens: larger sim.pixels help"
     if limiter.transitions < starts:
         return f"filling the replay, {limiter.transitions:,} of {starts:,}"
     return "waiting for episodes"

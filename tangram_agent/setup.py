@@ -29,6 +29,7 @@ _NOT_OF_OUTLINES = (
     *("egocentric", "offsets", "orientation", "edges", "afterstate", "angle_head", "squash"),
     *("saturation_penalty", "saturation_limit", "actor_lr", "noise"),
 )
+MAX_HALVED = 5  # times that a crop of 32 pixels is halved to one
 MAX_PLANNED = 8  # tokens: a look ahead finds the best order over all their subsets
 SECTIONS = ("tokens", "sim", "reward", "agent", "net")
 
@@ -49,6 +50,11 @@ class Setup:
         Raises:
             ConfigError: names the setting and the remedy.
         """
+        if self.fills and self.layout.tokens == 1:  # before the set's own remedies, which lead here
+            raise ConfigError(
+                f"tokens={self.layout.shapes[0].name}: an agent of outlines needs a set of several "
+                "tokens: set tokens=tangram7, or another agent"
+            )
         check_targets(self.layout, self.sim)
         agent, one = self.agent, self.layout.tokens == 1
         if agent.replay_capacity < self.horizon:
@@ -91,6 +97,14 @@ class Setup:
             ConfigError: names the setting and the remedy.
         """
         sim = self.sim
+        moved = [
+            f"sim.{name}={told(getattr(sim, name))}" for name in ("camera_turn", "camera_shift")
+        ]
+        if self.traces and (sim.camera_turn or sim.camera_shift):
+            raise ConfigError(
+                f"{', '.join(moved)}: an agent of outlines takes tokens to where it sees them, and "
+                "learns nothing where the camera stands elsewhere: set both to 0"
+            )
         if not self.agent.confidence:
             return
         if sim.observe != "pictures":
@@ -107,6 +121,11 @@ class Setup:
         """Refuse a kind of network that does not see what the agent sees."""
         if self.net.kind == "mlp":
             self._refuse(("edges",), "net.kind=mlp", "set net.kind=mha")
+        if self.net.kind == "crops" and len(self.net.hidden) > MAX_HALVED:
+            raise ConfigError(
+                f"net.hidden={told(self.net.hidden)}: each of the convolutions of net.kind=crops "
+                f"halves 32 pixels, so there may be {MAX_HALVED}, got {len(self.net.hidden)}"
+            )
         if self.net.kind == "crops" and not self.fills:
             raise ConfigError(
                 "net.kind=crops sees what is left to fill of an outline, which an agent of "
@@ -120,11 +139,11 @@ class Setup:
         if sim.observe not in SILHOUETTES:
             raise ConfigError(
                 f"agent.readout=outline needs sim.observe=silhouette, got {sim.observe}: set "
-                "sim=silhouette, or another agent"
+                "sim=silhouette or sim=silhouette_pictures, or another agent"
             )
         if self.net.kind == "mlp":
             refuse_ignored("net.kind=mlp", "outlines", "set net.kind=mha or crops")
-        self._refuse(_NOT_OF_OUTLINES, "outlines", "leave it out")
+        self._refuse(_NOT_OF_OUTLINES, "outlines", "take another agent")
         if agent.lookahead not in ("none", "values"):
             refuse_ignored(
                 f"agent.lookahead={agent.lookahead}", "outlines", "set agent.lookahead=values"
@@ -135,7 +154,7 @@ class Setup:
             refuse_ignored(
                 f"reward.{name}={told(value)}",
                 "an agent that learns what fills outlines",
-                "leave it out",
+                "take another agent",
             )
         if any(relabel.strategy != "final" for relabel in agent.hindsight):
             refuse_ignored("agent.hindsight.strategy", "outlines", "use final")
@@ -144,22 +163,32 @@ class Setup:
                 "agent.hindsight=[] leaves an agent of outlines without a filled one to learn "
                 "from: name final, as in agent.hindsight=[{strategy:final,copies:6}]"
             )
-        needed = {
-            "tokens": (self.layout.tokens > 1, "a set of several tokens"),
-            "agent.gamma": (agent.gamma == 1.0, "agent.gamma=1"),
-            "sim.motion": (sim.motion == "lift", "sim.motion=lift"),
-            "sim.starts": (sim.starts == "outside", "sim.starts=outside"),
-            "sim.actions_per_token": (sim.actions_per_token == 1, "sim.actions_per_token=1"),
-            "sim.allow_flip": (
-                sim.allow_flip or not self.layout.any_chiral,
-                "sim.allow_flip=true",
-            ),
-            "sim.corner_noise": (not sim.corner_noise, "exact corners, sim.corner_noise=0"),
-            "sim": (not sim.inexact and not sim.action_noise, "a world whose motion is exact"),
+        self._check_world_of_outlines()
+
+    def _check_world_of_outlines(self) -> None:
+        """Refuse a game in which a token does not go where an agent of outlines takes it, once."""
+        sim, flips = self.sim, self.layout.any_chiral
+        wanted: dict[str, object] = {
+            "motion": "lift",
+            "starts": "outside",
+            "actions_per_token": 1,
+            "allow_flip": flips or sim.allow_flip,
+            "corner_noise": 0.0,
+            "action_noise": 0.0,
+            **{name: getattr(SimConfig, name) for name in sim.inexact},
         }
-        for name, (holds, remedy) in needed.items():
-            if not holds:
-                raise ConfigError(f"{name}: an agent of outlines needs {remedy}: set it so")
+        if self.agent.gamma != 1.0:
+            raise ConfigError(
+                f"agent.gamma={told(self.agent.gamma)}: an agent of outlines learns what comes of "
+                "an action at the end: set agent.gamma=1"
+            )
+        for name, value in wanted.items():
+            given = getattr(sim, name)
+            if given != value:
+                raise ConfigError(
+                    f"sim.{name}={told(given)}: an agent of outlines needs a token to go where it "
+                    f"takes it, once, from outside: set sim.{name}={told(value)}"
+                )
 
     def _check_credit(self, several: str) -> None:
         """Refuse what several tokens on pairs cannot use, or cannot learn."""

@@ -103,9 +103,9 @@ def check_shown(sim: SimConfig, outlines: bool) -> None:
     """
     if sim.observe in SILHOUETTES and not outlines:
         raise ConfigError(
-            f"sim.observe={sim.observe} is for an agent of outlines: train one with sim=silhouette "
-            "agent=outline; tangram-eval puzzle= fills what it shows to others by a search, and "
-            "tangram-play silhouette= too; set sim.observe=corners"
+            f"sim.observe={sim.observe} is for an agent of outlines: train one with "
+            f"sim={sim.observe} agent=outline; tangram-eval puzzle= fills what it shows to others "
+            "by a search, and tangram-play silhouette= too; set sim.observe=corners"
         )
 
 

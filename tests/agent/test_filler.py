@@ -143,12 +143,12 @@ def test_filled_is_surer_than_any_value() -> None:
         ({"lookahead": "engine"}, {}, "agent.lookahead=engine"),
         ({"hindsight": []}, {}, "without a filled one"),
         ({"hindsight": [{"strategy": "near", "position": 0.1}]}, {}, "hindsight.strategy"),
-        ({"gamma": 0.9}, {}, "needs agent.gamma=1"),
+        ({"gamma": 0.9}, {}, r"agent.gamma=0.9: .* set agent.gamma=1"),
         ({"lookahead": "values", "beam": 1}, {}, "agent.lookahead=values changes nothing with"),
-        ({}, {"starts": "anywhere"}, "sim.starts=outside"),
-        ({}, {"actions_per_token": 2}, "sim.actions_per_token=1"),
-        ({}, {"gain": [1.1, 1.0, 1.0]}, "a world whose motion is exact"),
-        ({}, {"action_noise": 0.01}, "a world whose motion is exact"),
+        ({}, {"starts": "anywhere"}, r"sim.starts=anywhere: .* set sim.starts=outside"),
+        ({}, {"actions_per_token": 2}, r"actions_per_token=2: .* set sim.actions_per_token=1"),
+        ({}, {"gain": [1.1, 1.0, 1.0]}, r"sim.gain=.*: .* set sim.gain=\[1,1,1\]"),
+        ({}, {"action_noise": 0.01}, r"action_noise=0.01: .* set sim.action_noise=0"),
         ({}, {"corner_noise": 0.01}, "sim.corner_noise"),
     ],
 )
@@ -186,3 +186,12 @@ def test_a_token_that_reaches_out_is_taken_last() -> None:
     given = [place._replace(cost=cost) for place, cost in zip(places * 3, costs, strict=False)]
     (plan,) = filler._plans([given], 1, 1)
     assert [place.cost for place in plan] == [0.1]
+    # What reached out before counts as what does now: 0.3 and 0 against 0 and 0.2.
+    rest = shapely.box(0, 0, leg, leg)
+    first, second = (places[0]._replace(cost=cost, rest=rest, left=(2,)) for cost in (0.3, 0.0))
+    next_costs = {id(first.rest): 0.0}
+    second = second._replace(rest=shapely.box(0, 0, leg, leg))
+    next_costs[id(second.rest)] = 0.2
+    filler._live = lambda gone, _: [places[0]._replace(cost=next_costs[id(gone)], left=(1,))]  # type: ignore[method-assign]
+    (plan,) = filler._plans([[first, second]], 2, 2)
+    assert [place.cost for place in plan] == [0.0, 0.2]

@@ -202,5 +202,18 @@ def test_tokens_that_lie_on_each_other_fill_no_traced_outline() -> None:
     piled = layout.corners(np.zeros((2, 3)))
     traced = rows_of(covered_area(piled, layout))
     assert TRACED.hindsight(piled, np.array([True, True]), traced) is None
+    # Nor one that was traced elsewhere, by a third of a token.
+    apart = layout.corners(HALVES)
+    elsewhere = rows_of(covered_area(apart + [LEG / 3.0, 0.0], layout))
+    assert TRACED.hindsight(apart, np.array([True, True]), elsewhere) is None
     assert TRACED.hindsight(piled, np.array([True, False]), traced) is None
     assert not TRACED.solved(traced, piled, np.array([True, True]))
+
+
+def test_in_a_traced_outline_a_token_lies_that_reaches_out_by_half() -> None:
+    """Outlines are wrong there; in an exact one it lies beside."""
+    layout = MADE.layout
+    outline = rows_of(covered_area(layout.corners(HALVES), layout))
+    shifted = layout.corners(HALVES + [[0.15 * LEG, 0, 0], [LEG, 0, 0]])
+    assert TRACED.inside(shifted, outline).tolist() == [True, False]
+    assert FILLING.inside(shifted, outline).tolist() == [False, False]

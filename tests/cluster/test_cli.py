@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from conf.cli import composed
-from tangram_cli.commands import COMMANDS, COMMON_NAMES
+from tangram_cli.commands import COMMANDS, COMMON_NAMES, run
 from tests.cluster.processes import BIN, ended, here, refused
 
 pytestmark = pytest.mark.cluster
@@ -35,6 +35,16 @@ SETTING = {
 }
 
 
+@pytest.mark.parametrize(("given", "found"), [(None, "1"), ("4", "4")])
+def test_numpy_computes_in_one_thread_unless_told_otherwise(
+    monkeypatch: pytest.MonkeyPatch, given: str | None, found: str
+) -> None:
+    monkeypatch.setattr(os, "environ", {"OPENBLAS_NUM_THREADS": given} if given else {})
+    monkeypatch.setattr(sys, "meta_path", list(sys.meta_path))
+    assert run("os", "getpid") == os.getpid()
+    assert os.environ["OPENBLAS_NUM_THREADS"] == found
+
+
 @pytest.mark.parametrize("place", ["tangram_cli.commands.import_module", "master.cli.entry"])
 def test_ctrl_c_ends_a_command_without_a_word_also_while_it_loads(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], place: str
@@ -54,7 +64,7 @@ def test_help_config_and_version_are_shown_and_leave_nothing_behind(
     text, _, examples = out.partition("Examples:\n")
     assert [line.split()[0] for line in examples.strip().splitlines()] == [command] * 3
     if command in TRAINING:
-        assert "  agent    mlp, outline, paper, tangram*\n" in text
+        assert "  agent    mlp, outline, paper, quick, tangram*\n" in text
         for group in ("tokens", "sim", "reward", "net", "service"):
             assert f"\n  {group} " in text
     assert SETTING.get(command, "seed: 0") in text

@@ -102,7 +102,7 @@ def test_it_is_told_where_nothing_can_be_learned_from(tmp_path: Path) -> None:
     episodes = arrival(MADE, 1).episodes
     gone = np.zeros((4, MADE.horizon + 1, 1), np.float32)
     made.guard.trainer.insert(replace(episodes, confidence=gone, goals_confidence=gone[:, 0]))
-    said = "waiting for an episode in which pictures show all tokens"
+    said = "waiting for an episode in which pictures show all tokens: larger sim.pixels help"
     assert made.reporter.flush(0).texts["activity"] == said
     made.guard.trainer.insert(episodes)
     assert made.reporter.flush(0).texts["activity"] == "learning, workers wait"

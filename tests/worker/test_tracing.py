@@ -113,3 +113,54 @@ def test_who_does_not_look_cannot_play() -> None:
         with pytest.raises(ConfigError, match=r"sim.observe=silhouette_pictures is for tangram-"):
             BatchedEnv(task.layout, task.sim, RewardConfig(), 1, *given)
     assert make_tracer(outline_setup()) is None
+
+
+def shown(count: int = 2, **sim: Any) -> Any:
+    """Rows of the same targets, as environments with this camera see them."""
+    task = traced(**sim)
+    poses = np.tile([[[0.0, 0.0, 0.3], [0.6, 0.1, 1.0]]], (count, 1, 1))
+    with closing(environments(task, count)) as env:
+        generators = [np.random.default_rng(i) for i in range(count)]
+        env.reset(generators, (poses, np.zeros((count, 2), np.bool_)))
+        return env.seen_goals
+
+
+def test_outlines_are_traced_in_what_the_lens_makes_of_them() -> None:
+    """Noise changes them, a few pixels at most."""
+    clear, noisy = shown(), shown(picture_noise=8.0)
+    assert not np.array_equal(clear, noisy)
+    for one, other in zip(clear, noisy, strict=True):
+        assert overlap(as_area(one), as_area(other)) > 0.85
+
+
+def test_each_episode_has_a_camera_of_its_own() -> None:
+    """Turned to one side or the other, as each draws: the same target at other angles."""
+    sides = []
+    for rows in shown(8, camera_turn=10.0, pixels=128):
+        z = (rows[:3] - rows[0]) @ (1.0, 1j)
+        sides.append(float(np.angle(z[1]) % (np.pi / 4)))
+    assert max(sides) - min(sides) > np.radians(10.0)
+
+
+def test_what_is_achieved_is_taken_by_the_camera_not_put_together_from_what_was_seen(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    task, areas = traced(), list[Any]()
+    real = PictureTracer.portrait
+    monkeypatch.setattr(PictureTracer, "portrait", lambda *of: areas.append(of[1]) or real(*of))
+    with closing(environments(task, 1)) as env:
+        env.reset([np.random.default_rng(0)])
+        _ = env.achieved
+        true = covered_area(env.corners[0], task.layout)
+        assert areas[-1].equals(true)
+        assert not areas[-1].equals(covered_area(env.seen[0], task.layout))
+
+
+def test_a_camera_that_stands_elsewhere_teaches_nothing() -> None:
+    for sim, told in (
+        ({"camera_turn": 5.0}, "camera_turn=5"),
+        ({"camera_shift": 0.5}, "shift=0.5"),
+    ):
+        with pytest.raises(ConfigError, match=f"{told}.*set both to 0"):
+            traced(**sim).check_learnable()
+    traced().check_learnable()
