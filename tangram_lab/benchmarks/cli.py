@@ -28,7 +28,7 @@ RATES = {
     "replay": "the replay buffer, against numpy alone",
     "learner": "updates, against a plain per-head attention and Stable-Baselines3",
     "train": "a whole training, against Stable-Baselines3 (minutes=)",
-    "soon": "whole trainings that play well, from the command to their end (seeds=)",
+    "soon": "whole trainings that play well, from the command to their scores (seeds=)",
     "peers": "piece by piece, against Stable-Baselines3",
     "scaling": "more workers, and 64 synthetic ones",
     "growth": "what grows with tokens, replay and width, and how",

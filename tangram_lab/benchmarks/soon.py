@@ -1,4 +1,4 @@
-"""How soon a training is over that plays well: from the command to its end, processes and all."""
+"""How soon a training plays well: from the command to its scores, all processes' start included."""
 
 import tempfile
 import time
@@ -24,7 +24,7 @@ class Case:
         name: in the table.
         settings: of tangram-train.
         score: in result.json, which is to reach `GOAL`.
-        most_s: seconds that it may take.
+        most_s: seconds that it may take to its scores.
     """
 
     name: str
@@ -67,14 +67,10 @@ class Course:
     """How one training went: its score, and the seconds of its parts."""
 
     score: float
-    start_s: float  # until the master could be joined
-    train_s: float  # until the last update, from when the first weights were out
-    rest_s: float  # the last scores, files, and the end of all processes
-
-    @property
-    def whole_s(self) -> float:
-        """From the command to its end."""
-        return self.start_s + self.train_s + self.rest_s
+    start_s: float  # from the command until the master could be joined
+    train_s: float  # from the first weights to the last update
+    scored_s: float  # from the command until the final weights were scored
+    ended_s: float  # from the command until all its processes had ended
 
 
 def measure_soon(seeds: int, cases: Sequence[Case] = CASES) -> list[Row]:
@@ -85,10 +81,15 @@ def measure_soon(seeds: int, cases: Sequence[Case] = CASES) -> list[Row]:
 def _rows(case: Case, seeds: int) -> list[Row]:
     every = [_course(case, seed) for seed in range(seeds)]
     bound = None if case.most_s is None else Bound(most=case.most_s)
-    whole = single((STAGE, case.told, "s"), [one.whole_s for one in every], bound)
+    whole = single((STAGE, case.told, "s"), [one.scored_s for one in every], bound)
+    named = {
+        "until it can be joined": "start_s",
+        "learning": "train_s",
+        "until all has ended": "ended_s",
+    }
     parts = [
-        single((STAGE, f"{case.name}: {name}", "s"), [getattr(one, f"{key}_s") for one in every])
-        for name, key in (("until it can be joined", "start"), ("learning", "train"))
+        single((STAGE, f"{case.name}: {name}", "s"), [getattr(one, key) for one in every])
+        for name, key in named.items()
     ]
     scores, goal = [one.score for one in every], Bound(least=GOAL)
     score = single((STAGE, f"{case.name}: {case.score}, its least counts", ""), scores)
@@ -98,20 +99,21 @@ def _rows(case: Case, seeds: int) -> list[Row]:
 def _course(case: Case, seed: int) -> Course:
     with tempfile.TemporaryDirectory(prefix="tangram-") as name:
         folder = Path(name) / "run"
-        begin, joined = time.monotonic(), None
+        begin, joined, scored = time.monotonic(), None, None
         launcher = start_training(folder, *case.settings, f"seed={seed}")
         while launcher.poll() is None:
             if joined is None and (folder / "connection.json").exists():
                 joined = time.monotonic() - begin
+            if scored is None and (folder / "result.json").exists():
+                scored = time.monotonic() - begin
             if time.monotonic() - begin > PATIENCE_S:
                 launcher.terminate()
             time.sleep(LOOK_S)
-        whole = time.monotonic() - begin
-        if launcher.returncode or joined is None:
+        ended = time.monotonic() - begin
+        if launcher.returncode or joined is None or scored is None:
             raise TangramError(f"the training of {case.told} failed: {_last(folder)}")
         result = result_of(folder)
-    train = float(result["train_s"])
-    return Course(float(result[case.score]), joined, train, whole - joined - train)
+    return Course(float(result[case.score]), joined, float(result["train_s"]), scored, ended)
 
 
 def _last(folder: Path) -> str:

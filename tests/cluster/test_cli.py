@@ -101,7 +101,10 @@ WRONG = [
     ("tangram-train tokens.shapes=[square", "cannot read 'tokens.shapes=[square'"),
     ("tangram-train seed=1,2", "Ambiguous value for argument 'seed=1,2': a list is [1,2]"),
     ("tangram-train run_dir=${foo}", "cannot resolve the config: Interpolation key 'foo'"),
-    ("tangram-train agent=best", "unknown agent 'best': choose from mlp, outline, paper, tangram"),
+    (
+        "tangram-train agent=best",
+        "unknown agent 'best': choose from mlp, outline, paper, quick, tangram",
+    ),
     ("tangram-train tokens=pentagon", "unknown tokens 'pentagon': choose from hexagon, large_tri"),
     ("tangram-train tokens.shapes=[blob]", "unknown shape 'blob': choose from large_triangle"),
     ("tangram-master tokens.shapes=[blob]", "unknown shape 'blob': choose from large_triangle"),
