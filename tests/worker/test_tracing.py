@@ -125,12 +125,25 @@ def shown(count: int = 2, **sim: Any) -> Any:
         return env.seen_goals
 
 
-def test_outlines_are_traced_in_what_the_lens_makes_of_them() -> None:
-    """Noise changes them, a few pixels at most."""
-    clear, noisy = shown(), shown(picture_noise=8.0)
-    assert not np.array_equal(clear, noisy)
-    for one, other in zip(clear, noisy, strict=True):
-        assert overlap(as_area(one), as_area(other)) > 0.85
+@pytest.mark.parametrize("noise", [0.0, 8.0])
+def test_outlines_are_traced_in_what_the_lens_makes_of_them(
+    monkeypatch: pytest.MonkeyPatch, noise: float
+) -> None:
+    """Each in the picture of it, with the noise that the camera has, and no other."""
+    drawn, looked_at = list[Any](), list[Any]()
+    draw, trace = PictureTracer.portrait, PictureTracer.trace
+    monkeypatch.setattr(PictureTracer, "portrait", lambda *of: drawn.append(draw(*of)) or drawn[-1])
+    monkeypatch.setattr(
+        PictureTracer,
+        "trace",
+        lambda own, picture, one: looked_at.append(picture) or trace(own, picture, one),
+    )
+    shown(picture_noise=noise)
+    assert len(drawn) == len(looked_at) == 2
+    for before, after in zip(drawn, looked_at, strict=True):
+        off = after.astype(float) - before
+        assert (np.abs(off).max() > 10.0) == (noise > 0.0)
+        assert np.abs(off).mean() < noise + 1e-9
 
 
 def test_each_episode_has_a_camera_of_its_own() -> None:
