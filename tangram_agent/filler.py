@@ -14,7 +14,7 @@ import torch
 from shapely import Polygon
 from torch import nn
 
-from tangram_agent.filling import UNUSED, Filling, Rests
+from tangram_agent.filling import Filling, Rests
 from tangram_agent.setup import Setup
 from tangram_agent.values import Corners
 from tangram_sim.actions import velocities_of
@@ -65,8 +65,7 @@ class Fillable:
         every = Rests.joined([self._filling.seen(*one) for one in zip(rests, left, strict=True)])
         with torch.inference_mode():
             logits = self._value(Corners.of(every)).numpy()
-        seen = (every.part != UNUSED).any(axis=1)
-        return np.where(seen, logits, -np.inf).astype(np.float64)
+        return np.where(every.known, logits, -np.inf).astype(np.float64)
 
 
 class Filler:

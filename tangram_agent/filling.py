@@ -60,6 +60,11 @@ class Rests:
     def __len__(self) -> int:
         return len(self.points)
 
+    @property
+    def known(self) -> Bools:
+        """(n,) states that have corners, and no more than are seen."""
+        return np.asarray((self.part != UNUSED).any(axis=1))
+
     @staticmethod
     def empty(count: int, corners: int, shapes: int) -> "Rests":
         """States of no corners."""
@@ -170,7 +175,7 @@ class Filling:
             own = self.rest(outline, corners, ~tokens)
             fills = self._apart(covered, tokens) and overlap(own, covered) >= _OWN
         seen = self.seen(own, self.left(tokens))
-        return seen if fills and bool((seen.part != UNUSED).any()) else None
+        return seen if fills and bool(seen.known.all()) else None
 
     def _apart(self, covered: Area, tokens: Bools) -> bool:
         """Whether what tokens (K,) cover is as much as they can, all but for a little."""

@@ -131,7 +131,7 @@ class FillReplay:
 
     def _add_played(self, rest: Area, left: tuple[int, ...], solved: bool) -> None:
         state = self._filling.seen(rest, left)
-        if not _is_seen(state):
+        if not state.known.all():
             return
         row = int(self._added[0]) % self.capacity
         places = [place for place in self._filling.places(rest, left) if not place.dead]
@@ -139,7 +139,7 @@ class FillReplay:
         self._ends[row] = 0
         for i, place in enumerate(places[:MOST_PLACES]):
             seen = self._filling.seen(place.rest, place.left)
-            self._ends[row, i] = FILLED if place.filled else OPEN * _is_seen(seen)
+            self._ends[row, i] = FILLED if place.filled else OPEN * bool(seen.known.all())
             _put(self._places, row * MOST_PLACES + i, seen)
         if solved and places:  # no matter by which place: a state is worth its best one
             self._ends[row, 0] = FILLED
@@ -213,11 +213,6 @@ class FillReplay:
                 raise RunError("replay buffer: an index beyond the corners")
         if self._ends.max() > FILLED:
             raise RunError("replay buffer: 'ends' holds what no place has")
-
-
-def _is_seen(rest: Rests) -> bool:
-    """Whether a state has corners, and no more than are seen."""
-    return bool((rest.part != UNUSED).any())
 
 
 def _put(rests: Rests, row: int, one: Rests) -> None:

@@ -97,14 +97,13 @@ class Setup:
             ConfigError: names the setting and the remedy.
         """
         sim = self.sim
-        moved = [
-            f"sim.{name}={told(getattr(sim, name))}" for name in ("camera_turn", "camera_shift")
-        ]
-        if self.traces and (sim.camera_turn or sim.camera_shift):
-            raise ConfigError(
-                f"{', '.join(moved)}: an agent of outlines takes tokens to where it sees them, and "
-                "learns nothing where the camera stands elsewhere: set both to 0"
-            )
+        for name in ("camera_turn", "camera_shift") if self.traces else ():
+            if getattr(sim, name):
+                raise ConfigError(
+                    f"sim.{name}={told(getattr(sim, name))}: an agent of outlines takes tokens to "
+                    "where it sees them, and learns nothing where the camera stands elsewhere: set "
+                    f"sim.{name}=0"
+                )
         if not self.agent.confidence:
             return
         if sim.observe != "pictures":

@@ -34,6 +34,22 @@ class LoosePlace(NamedTuple):
     over: float
 
 
+class _Fit(NamedTuple):
+    """The same, of which most is thrown away again: a token's corner, by number, and where it is.
+
+    Attributes:
+        corner: number of the corner.
+        at: its place, and the direction of the edge that leaves it.
+        polygon: see `LoosePlace`.
+        over: see there.
+    """
+
+    corner: int
+    at: tuple[complex, complex]
+    polygon: Polygon
+    over: float
+
+
 class LoosePlaces:
     """Finds them for one set of tokens."""
 
@@ -48,14 +64,18 @@ class LoosePlaces:
 
     def __call__(self, rest: Area, left: tuple[int, ...]) -> list[LoosePlace]:
         """What may lie at the corner of what is left where least may, but something."""
-        least: list[LoosePlace] = []
+        least: list[_Fit] = []
         for part in parts_of(rest, self._least):
-            for places in self._of(part, left):
-                if places and (not least or len(places) < len(least)):
-                    least = places
-        return least
+            for fits in self._of(part, left):
+                if fits and (not least or len(fits) < len(least)):
+                    least = fits
+        corners = self._tokens.corners
+        return [
+            LoosePlace(laid_at(corners[fit.corner], *fit.at), fit.polygon, fit.over)
+            for fit in least
+        ]
 
-    def _of(self, part: Polygon, left: tuple[int, ...]) -> list[list[LoosePlace]]:
+    def _of(self, part: Polygon, left: tuple[int, ...]) -> list[list["_Fit"]]:
         """For each convex corner of a part what may lie there."""
         found = list(convex_corners(part, self._tolerance))
         if len(found) > _CORNERS:  # of a rugged outline those with the longest sides
@@ -74,9 +94,8 @@ class LoosePlaces:
         z = point[rows] + along[rows] * self._bodies[corners]
         polygons = shapely.polygons(np.stack([z.real, z.imag], axis=-1))
         over = shapely.area(polygons) - shapely.area(shapely.intersection(part, polygons))
-        places: list[list[LoosePlace]] = [[] for _ in found]
+        at: list[list[_Fit]] = [[] for _ in found]
         for i in np.flatnonzero(over < _OVER * self._least).tolist():
-            row, corner = int(rows[i]), self._tokens.corners[int(corners[i])]
-            laid = laid_at(corner, *found[row][:2])
-            places[row].append(LoosePlace(laid, polygons[i], float(over[i])))
-        return places
+            row = int(rows[i])
+            at[row].append(_Fit(int(corners[i]), found[row][:2], polygons[i], float(over[i])))
+        return at
