@@ -39,7 +39,7 @@ from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.compiling import CACHE
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import OPEN, WINDOW
-from tangram_agent.process import Watchdog, watch_parent
+from tangram_agent.process import Watchdog, keep_memory, watch_parent
 from tangram_agent.setup import Setup
 
 # A clean end after the parent's death; a large replay takes seconds to write.
@@ -72,7 +72,6 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
     with ExitStack() as opened:
         opened.enter_context(logging_to(console, form))
         launched = watch_parent(_tell_news, GRACE_S)
-        torch.set_num_threads(config.service.threads)
         Room.here()  # before anything is written
         folder = RunFolder(config.run_dir)
         folder.prepare(config.resume)
@@ -253,6 +252,8 @@ def _make_trainer(
     config: MasterConfig, setup: Setup, folder: RunFolder, watchdog: Watchdog
 ) -> tuple[Trainer, Restored | None]:
     """What learns, with the newest checkpoint, or the networks of another run, where asked for."""
+    torch.set_num_threads(config.service.threads)
+    keep_memory()
     service = config.service
     device = choose_device(service.device)
     trainer = Trainer(setup, config.seed, device, compiled=service.compile)

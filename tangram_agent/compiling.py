@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.fx import GraphModule
 
 CACHE = Path.home() / ".cache" / "tangram-rl" / "compiled"
 _CACHE_SETTING = "TORCHINDUCTOR_CACHE_DIR"
@@ -63,16 +64,55 @@ class Compiled:
         self, steps: Any, kind: Callable[..., Any], tensors: list[Tensor], numbers: list[Tensor]
     ) -> Callable[..., Tensor]:
         # Only here: the compiler takes seconds and 200 MB to load.
+        from torch._inductor import standalone_compile  # noqa: PLC0415
         from torch.fx.experimental.proxy_tensor import make_fx  # noqa: PLC0415
 
-        def flat(given: list[Tensor], rates: list[Tensor]) -> Tensor:
-            own = dict(zip(map(id, tensors), given, strict=True))
-            return self._function(_with(steps, own, {}), kind(*rates))
+        count = len(tensors)
+
+        def flat(*given: Tensor) -> tuple[Tensor]:
+            own = dict(zip(map(id, tensors), given[:count], strict=True))
+            return (self._function(_with(steps, own, {}), kind(*given[count:])),)
 
         with self._unchanged():  # it is traced by doing it once
-            graph = make_fx(flat)(tensors, numbers)
-        compiled: Callable[..., Tensor] = torch.compile(graph, fullgraph=True)
-        return compiled
+            graph, constants = _lifted(make_fx(flat)(*tensors, *numbers))
+        example: list[Any] = [*constants, *tensors, *numbers]
+        # Which arguments a graph fits is known from their form: nothing else needs to look at them.
+        # What calls its pieces is C++ as well, where it can be.
+        patches = {"cpp_wrapper": tensors[0].device.type == "cpu"}
+        with torch.no_grad():
+            compiled = standalone_compile(
+                graph,
+                example,
+                dynamic_shapes="from_example_inputs",
+                options={"config_patches": patches},
+            )
+
+        def call(given: list[Tensor], rates: list[Tensor]) -> Tensor:
+            found: Tensor = compiled(*constants, *given, *rates)[0]
+            return found
+
+        return call
+
+
+def _lifted(traced: GraphModule) -> tuple[GraphModule, list[Tensor]]:
+    """A graph of arguments alone, and the tensors to call it with before its own arguments.
+
+    Weights and averages are constants in what was traced. As arguments they may change, and the
+    kept code fits those of the next run.
+    """
+    graph, constants, places = traced.graph, [], {}
+    first = next(iter(graph.nodes))
+    for node in list(graph.nodes):
+        node.meta.clear()  # that of another compilation
+        if node.op != "get_attr":
+            continue
+        if node.target not in places:
+            with graph.inserting_before(first):
+                places[node.target] = graph.placeholder(node.target)
+            constants.append(getattr(traced, node.target).detach())
+        node.replace_all_uses_with(places[node.target])
+        graph.erase_node(node)
+    return GraphModule({}, graph), constants
 
 
 def _form(part: Any, tensors: list[Tensor], seen: dict[int, int]) -> Any:
@@ -81,7 +121,7 @@ def _form(part: Any, tensors: list[Tensor], seen: dict[int, int]) -> Any:
         if id(part) not in seen:
             seen[id(part)] = len(tensors)
             tensors.append(part)
-        return seen[id(part)], part.shape, part.dtype
+        return seen[id(part)], part.shape, part.stride(), part.dtype
     if is_dataclass(part):
         own = [_form(getattr(part, field.name), tensors, seen) for field in fields(part)]
         return type(part), *own

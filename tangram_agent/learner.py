@@ -10,6 +10,7 @@ Legend: M views, K tokens.
 
 import copy
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,6 +59,16 @@ def polyak_update(targets: list[Tensor], sources: list[Tensor], rho: float | Ten
                 target.lerp_(source, 1.0 - rho)
         else:
             torch._foreach_lerp_(targets, sources, 1.0 - rho)
+
+
+def gradient_norm(gradients: Sequence[Tensor], traced: bool) -> Tensor:
+    """The norm of all gradients together; in operations that a compiler can fuse, if it is traced.
+
+    torch's own is one kernel for all of them.
+    """
+    if not traced:
+        return nn.utils.get_total_norm(gradients)
+    return torch.stack([one.square().sum() for one in gradients]).sum().sqrt()
 
 
 def average_so_far(rho: float, updates: int) -> float:
@@ -259,7 +270,7 @@ class Learner:
     def _step(self, part: str, loss: Tensor, rate: float | Tensor) -> Tensor:
         """One step of one network, whatever else the loss depends on; its gradient's norm."""
         gradients = torch.autograd.grad(loss, self._lists[part])
-        norm = nn.utils.get_total_norm(gradients)
+        norm = gradient_norm(gradients, traced=isinstance(rate, Tensor))
         if self.config.grad_clip > 0.0:
             share = (self.config.grad_clip / (norm + 1e-6)).clamp(max=1.0)
             torch._foreach_mul_(gradients, share)
@@ -359,7 +370,7 @@ class Learner:
 def _blank(setup: Setup, done: int) -> Transitions:
     """A batch in which nothing moves, of tokens that lie in the middle."""
     count, layout = setup.agent.batch_size, setup.layout
-    corners = layout.corners(np.zeros((count, layout.tokens, 3))).astype(np.float32)
+    corners = layout.corners(np.zeros((count, layout.tokens, 3))).astype(np.float32, order="C")
     return Transitions(
         state=corners,
         placed=np.zeros((count, layout.tokens), np.uint8),

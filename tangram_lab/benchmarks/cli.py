@@ -22,7 +22,7 @@ examples:
   tangram-bench attack out=attack.json      every attack that is known, on real trainings
 """
 RATES = {
-    "sim": "the simulation, against a bare PyBullet loop",
+    "sim": "the simulation, also where tokens are seen in pictures, against a bare PyBullet loop",
     "acting": "the policy in batches, against one at a time",
     "wire": "worker to master, against bare ROUTER-DEALER sockets",
     "replay": "the replay buffer, against numpy alone",

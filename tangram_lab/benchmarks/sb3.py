@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -42,6 +43,7 @@ class Rival:
         seconds: of training; without a goal, those after the first updates.
         goal: raw overlap at which it ends; 0 measures the speed only.
         envs: played at a time, in one process.
+        actions: of an episode.
         updates: for each transition; below 1 a share of the environments' steps.
         twins: goals made up for each transition.
         batch: transitions in one update.
@@ -54,6 +56,7 @@ class Rival:
     seconds: float = 10.0
     goal: float = 0.0
     envs: int = 1
+    actions: int = 1
     updates: float = 1.0
     twins: int = 1
     batch: int = 256
@@ -87,7 +90,7 @@ def make_model(rival: Rival) -> Any:
     noise = importlib.import_module(f"{LIBRARY}.common.noise").NormalActionNoise
     model = library.DDPG(
         "MultiInputPolicy",
-        make_envs(rival.envs),
+        make_envs(rival.envs, rival.actions),
         action_noise=noise(np.zeros(3), np.full(3, NOISE)),
         batch_size=rival.batch,
         buffer_size=CAPACITY,
@@ -106,12 +109,17 @@ def make_model(rival: Rival) -> Any:
     return model
 
 
-def make_envs(count: int) -> Any:
-    """So many of our environments, one square, in Stable-Baselines3's own loop over them."""
+def make_envs(count: int, actions: int = 1) -> Any:
+    """Our environments with one square, in Stable-Baselines3's own loop over them.
+
+    Args:
+        count: of environments.
+        actions: of an episode.
+    """
     from tangram_sim.env import TangramEnv  # noqa: PLC0415 - loads the engine
 
     vector = importlib.import_module(f"{LIBRARY}.common.vec_env").DummyVecEnv
-    return vector([TangramEnv] * count)
+    return vector([partial(TangramEnv, actions_per_token=actions)] * count)
 
 
 def observation(corners: Floats, placed: Bools, goals: Floats) -> dict[str, Floats]:

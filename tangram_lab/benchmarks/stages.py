@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 
 import torch
 
+from tangram_agent.process import keep_memory
 from tangram_lab.benchmarks.acting import measure_acting
 from tangram_lab.benchmarks.growth import draw_growth, measure_growth
 from tangram_lab.benchmarks.learner import measure_learner
@@ -37,7 +38,8 @@ def run_stages(given: argparse.Namespace) -> int:
 
     With `out` the table goes into a Markdown file beside the JSON, and growth is drawn there.
     """
-    torch.set_num_threads(1)
+    torch.set_num_threads(1)  # as a master does
+    keep_memory()
     if given.kind == "profile":
         show_profile(given.out)
         return 0

@@ -123,7 +123,7 @@ SPAN_S = 12.0
 WARM_UPDATES = 300.0
 WORKERS, ENVS = (1, 2), (1, 16)
 SMALL, LARGE = (64, 64), (256, 256, 256)
-FASTER = Bound(least=4.0)
+FASTER, STILL_FASTER = Bound(least=4.0), Bound(least=1.2)
 
 Numbers = dict[str, float]
 
@@ -137,30 +137,49 @@ def measure_train(seeds: int, minutes: float) -> list[Row]:
     """
     label()  # says at once what is missing
     return [
+        _equal(SMALL, seeds, None, compiled=False),
         _equal(SMALL, seeds, FASTER),
+        _equal(SMALL, seeds, STILL_FASTER, actions=2),
         _equal(LARGE, 1, None),
         _attention(),
         *measure_quality(seeds, minutes * 60.0),
     ]
 
 
-def _equal(hidden: tuple[int, ...], runs: int, bound: Bound | None) -> Row:
-    """Transitions in a second with the same networks."""
+def _equal(
+    hidden: tuple[int, ...],
+    runs: int,
+    bound: Bound | None,
+    *,
+    compiled: bool = True,
+    actions: int = 1,
+) -> Row:
+    """Transitions in a second with the same networks; of two actions half of them go on."""
     net = list(hidden)
-    settings = ("agent=mlp", "agent.batch_size=256", "agent.learning_starts=256")
-    sizes = f"net.hidden={json.dumps(net, separators=(',', ':'))}"
-    rival = Rival(hidden=hidden, seconds=SPAN_S, twins=1)
+    settings = [
+        "agent=mlp",
+        "agent.batch_size=256",
+        "agent.learning_starts=256",
+        f"net.hidden={json.dumps(net, separators=(',', ':'))}",
+        f"sim.actions_per_token={actions}",
+        f"service.compile={str(compiled).lower()}",
+    ]
+    rival = Rival(hidden=hidden, seconds=SPAN_S, twins=1, actions=actions)
     ours: dict[int, list[float]] = {workers: [] for workers in WORKERS}
     theirs: dict[int, list[float]] = {envs: [] for envs in ENVS}
     for seed in range(runs):
         for workers, found in ours.items():
-            numbers = _pace(*settings, sizes, f"workers={workers}", f"seed={seed}")
+            numbers = _pace(*settings, f"workers={workers}", f"seed={seed}")
             # One update for each transition; players may be some ahead, so updates count.
             found.append(numbers["updates"])
         for envs, found in theirs.items():
             found.append(train_rival(replace(rival, envs=envs, seed=seed))["rate"])
     workers, envs = (max(way, key=lambda n: statistics.median(way[n])) for way in (ours, theirs))
     case = f"perceptron {net}, batch 256, an update a transition, {workers} worker(s)"
+    if actions > 1:
+        case += ", half of them go on"
+    if compiled:
+        case += ", compiled"
     against = f"{label()}, {envs} environment(s)"
     return compared((STAGE, case, "transitions/s"), ours[workers], against, theirs[envs], bound)
 

@@ -101,16 +101,18 @@ def random_transitions(made: Setup, count: int, seed: int = 0, done: int | None 
     layout = made.layout
     poses = rng.uniform([-0.7, -0.7, -3], [0.7, 0.7, 3], (count, 3, layout.tokens, 3))
     corners = layout.corners(poses).astype(np.float32)
+    # As a replay gives them: each in rows of its own.
+    before, after, goal = (np.ascontiguousarray(corners[:, i]) for i in range(3))
     ends = rng.integers(0, 2, count) if done is None else np.full(count, done)
     return Transitions(
-        state=corners[:, 0],
+        state=before,
         placed=np.zeros((count, layout.tokens), np.uint8),
         action=rng.uniform(-1, 1, (count, made.action_size)).astype(np.float32),
         reward=rng.uniform(-1, 1, count).astype(np.float32),
-        next_state=corners[:, 1],
+        next_state=after,
         next_placed=np.repeat(ends[:, None], layout.tokens, axis=1).astype(np.uint8),
         done=ends.astype(np.uint8),
-        goal=corners[:, 2],
+        goal=goal,
     )
 
 

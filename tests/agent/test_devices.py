@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import torch._inductor
 
 from tangram_agent.filling_learner import FillLearner
 from tangram_agent.filling_replay import FillReplay
@@ -53,7 +54,7 @@ def test_an_update_stays_on_its_device(case: tuple[str, str], done: int | None) 
 def test_a_traced_update_stays_on_its_device(
     case: tuple[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(torch, "compile", lambda graph, **_: graph)
+    monkeypatch.setattr(torch._inductor, "standalone_compile", lambda graph, *_, **__: graph)
     made = CASES[case]()
     learner = Learner(made, 0, META, compiled=True)
     numbers = learner._step_all(steps_of(learner, made, None), learner.rates(0.5))

@@ -174,3 +174,33 @@ def test_a_process_that_hangs_ends_with_its_stack(hang: str, steps: int) -> None
 def test_a_watchdog_that_is_off_or_was_left_ends_nothing() -> None:
     done = ended("time.sleep(0.8)", 1, hangs=False)  # longer than it waited
     assert (done.returncode, done.stdout, done.stderr) == (0, "left in order\n", "")
+
+
+# Frees 40 MB in each of fifty rounds, and tells how many pages the system gave it meanwhile.
+FREEING = """
+    import resource, sys
+    import numpy as np
+    from tangram_agent.process import keep_memory
+    if sys.argv[1] == "kept":
+        keep_memory()
+    def work():
+        return sum(part[0] for part in [np.ones(500_000) for _ in range(10)])
+    work()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(50):
+        work()
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.parametrize(("memory", "least", "most"), [("kept", 0, 2_000), ("given", 50_000, None)])
+def test_memory_that_was_freed_is_kept(memory: str, least: int, most: int | None) -> None:
+    """Without it the system gives the same pages again and again: the test can fail."""
+    pages = int(_output(FREEING, memory))
+    assert least <= pages <= (most or pages)
+
+
+def _output(code: str, *arguments: str) -> str:
+    command = [sys.executable, "-c", textwrap.dedent(code), *arguments]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, check=True, timeout=LIMIT_S)
+    return done.stdout.decode()
