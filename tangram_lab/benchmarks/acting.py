@@ -39,11 +39,11 @@ def measure_acting(runs: int) -> list[Row]:
 
 
 def act(setup: Setup, count: int) -> Work:
-    """Actions for so many environments at a time."""
-    policy, rng = Policy(setup), np.random.default_rng(0)
-    corners, goals = rng.uniform(-1, 1, (2, count, setup.layout.corner_count, 2))
-    placed = np.zeros((count, setup.layout.tokens), dtype=np.bool_)
-    return lambda: len(policy.act(corners, placed, goals))
+    """Actions for so many environments at a time, all at their start."""
+    policy = Policy(setup)
+    with closing(BatchedEnv(setup.layout, setup.sim, setup.reward, count)) as env:
+        env.reset([np.random.default_rng(number) for number in range(count)])
+    return lambda: len(policy.act(env.seen, env.placed, env.seen_goals))
 
 
 class _Clocked:

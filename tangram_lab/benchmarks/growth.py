@@ -62,7 +62,7 @@ def _curves() -> list[Curve]:
         return nullcontext(updates(_wide(width)))
 
     return [
-        Curve("update by tokens", products, TOKENS, by_tokens, lambda k: _products(several(k))),
+        Curve("update by tokens", constant, TOKENS[1:], by_tokens, lambda _: 1.0),
         Curve("episode by tokens", "tokens squared", TOKENS, _episodes, lambda k: float(k**2)),
         Curve("update by width", products, WIDTHS, by_width, lambda w: _products(_wide(w))),
         Curve("sample by replay size", constant, SIZES, _samples, lambda _: 1.0),

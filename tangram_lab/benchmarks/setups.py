@@ -45,14 +45,10 @@ def preset(agent: str = "tangram", tokens: str = "square") -> Setup:
 SEVEN = tuple(name for name, count in COUNTS.items() for _ in range(count))
 
 
-def several(count: int, agent: str = "tangram") -> Setup:
-    """The first tans of the game, one action each, in an arena that is wide enough for all.
-
-    One velocity for the next token: the rivals that these are measured against know no pairs.
-    """
-    setup = with_agent(preset(agent), readout="token")
-    sim = replace(setup.sim, arena=3.0)
-    return replace(setup, tokens=TokensConfig(SEVEN[:count], 0.6), sim=sim)
+def several(count: int) -> Setup:
+    """The first tans of the game, each moved once, in the game's arena."""
+    setup = preset()
+    return replace(setup, tokens=TokensConfig(SEVEN[:count], 0.6))
 
 
 def with_sim(setup: Setup, **values: Any) -> Setup:
