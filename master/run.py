@@ -36,7 +36,7 @@ from master.signals import StopSignals
 from master.trainer import Trainer, choose_device
 from tangram_agent.addresses import LOCAL, dns_error, reachable, with_host
 from tangram_agent.arrays import EpisodeSpec
-from tangram_agent.compiling import CACHE
+from tangram_agent.compiling import cache_folder
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import OPEN, WINDOW
 from tangram_agent.process import Watchdog, keep_memory, watch_parent
@@ -141,6 +141,7 @@ def open_run(
         TangramError: the port or a checkpoint cannot be used, or there is no such device.
     """
     service, folder = config.service, claim.run
+    _prepare_process(service.threads)
     trainer, found = _make_trainer(config, setup, folder, watchdog)
     rest = found or Restored(_new_record(folder.journal), {})
     run_id = rest.record.run_id
@@ -248,12 +249,16 @@ def _keys(service: ServiceConfig, folder: RunFolder) -> Keys | None:
     return None
 
 
+def _prepare_process(threads: int) -> None:
+    """What holds for all learning of this process."""
+    torch.set_num_threads(threads)
+    keep_memory()
+
+
 def _make_trainer(
     config: MasterConfig, setup: Setup, folder: RunFolder, watchdog: Watchdog
 ) -> tuple[Trainer, Restored | None]:
     """What learns, with the newest checkpoint, or the networks of another run, where asked for."""
-    torch.set_num_threads(config.service.threads)
-    keep_memory()
     service = config.service
     device = choose_device(service.device)
     trainer = Trainer(setup, config.seed, device, compiled=service.compile)
@@ -261,7 +266,8 @@ def _make_trainer(
     if found is None and config.warm_start is not None:
         warm_start(Path(config.warm_start), trainer)
     if service.compile:
-        log.info("compiles its update: up to a minute at first, seconds once %s has it", CACHE)
+        kept = cache_folder()
+        log.info("compiles its update: up to a minute at first, seconds once %s has it", kept)
         trainer.learner.compile_ahead()
         watchdog.progress()
     return trainer, found

@@ -2,11 +2,15 @@
 
 An update of small networks is a thousand small operations, and most of its time goes from one to
 the next. So the update is traced once, as it is, and torch's compiler makes one piece of C++ of
-it. That is kept in a folder for the next run. Numbers differ from those of single operations in
-their last digits: a run learns one way or the other from its beginning to its end.
+it, or kernels of Triton on a GPU. They are kept in a folder for the next run. Numbers differ from
+those of single operations in their last digits: a run learns one way or the other from its
+beginning to its end.
 """
 
 import os
+import platform
+import re
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass, replace
@@ -17,8 +21,23 @@ import torch
 from torch import Tensor
 from torch.fx import GraphModule
 
-CACHE = Path.home() / ".cache" / "tangram-rl" / "compiled"
+from tangram_sim.errors import RunError
+
 _CACHE_SETTING = "TORCHINDUCTOR_CACHE_DIR"
+_FLAGS = re.compile(rb"^(?:flags|Features)\s*:(.*)$", re.MULTILINE)
+
+
+def cache_folder() -> Path:
+    """Where compiled updates are kept: what one processor runs another one may not.
+
+    A home is often shared by many machines, so each version of torch and each kind of processor has
+    its own folder. torch's own setting comes first.
+    """
+    processor = Path("/proc/cpuinfo")
+    found = _FLAGS.search(processor.read_bytes()) if processor.exists() else None
+    kind = f"{zlib.crc32(found[1]):08x}" if found else platform.machine()
+    own = Path.home() / ".cache" / "tangram-rl" / "compiled" / f"{torch.__version__}-{kind}"
+    return Path(os.environ.get(_CACHE_SETTING, own))
 
 
 class Compiled:
@@ -31,7 +50,7 @@ class Compiled:
             function: of a dataclass and of a tuple of rates.
             changed: what it changes; these must stay the same tensors.
         """
-        os.environ.setdefault(_CACHE_SETTING, str(CACHE))
+        os.environ[_CACHE_SETTING] = str(cache_folder())
         self._function, self._changed = function, changed
         self._graphs: dict[Any, Callable[..., Tensor]] = {}
 
@@ -47,9 +66,20 @@ class Compiled:
             return self._graphs[form](tensors, numbers)
 
     def prepare(self, steps: Any, rates: tuple[float | Tensor, ...]) -> None:
-        """Compile it for arguments of this form; nothing is changed."""
-        with self._unchanged():
-            self(steps, rates)
+        """Compile it for arguments of this form; nothing is changed.
+
+        Raises:
+            RunError: the compiler fails, or what it keeps is damaged or cannot be written.
+        """
+        try:
+            with self._unchanged():
+                self(steps, rates)
+        except (OSError, ImportError, RuntimeError) as error:
+            why = str(error).strip().splitlines()[0] if str(error).strip() else repr(error)
+            raise RunError(
+                f"the update cannot be compiled ({why}): empty {cache_folder()} if that was of "
+                "another machine or is damaged, or learn with service.compile=false"
+            ) from error
 
     @contextmanager
     def _unchanged(self) -> Iterator[None]:
@@ -76,9 +106,12 @@ class Compiled:
         with self._unchanged():  # it is traced by doing it once
             graph, constants = _lifted(make_fx(flat)(*tensors, *numbers))
         example: list[Any] = [*constants, *tensors, *numbers]
-        # Which arguments a graph fits is known from their form: nothing else needs to look at them.
-        # What calls its pieces is C++ as well, where it can be.
-        patches = {"cpp_wrapper": tensors[0].device.type == "cpu"}
+        patches = {
+            # What calls the compiled pieces one after the other is C++ as well; on a CPU alone.
+            "cpp_wrapper": tensors[0].device.type == "cpu",
+            # Headers compiled ahead lie in /tmp, where others of the machine may put their own.
+            "cpp_cache_precompile_headers": False,
+        }
         with torch.no_grad():
             compiled = standalone_compile(
                 graph,

@@ -383,7 +383,7 @@ class ServiceConfig(Settings, section="service"):
     compile: bool = setting(
         False,
         "whether an update is compiled as a whole: up to a minute at first and seconds later, then "
-        "learning is 1.3 to 1.9 times as fast; needs g++ or clang++",
+        "an update is 1.1 to 2.5 times as fast; needs g++ or clang++",
     )
 
     def __post_init__(self) -> None:

@@ -62,9 +62,10 @@ def polyak_update(targets: list[Tensor], sources: list[Tensor], rho: float | Ten
 
 
 def gradient_norm(gradients: Sequence[Tensor], traced: bool) -> Tensor:
-    """The norm of all gradients together; in operations that a compiler can fuse, if it is traced.
+    """The norm of all gradients together, ().
 
-    torch's own is one kernel for all of them.
+    torch's own is one kernel for all of them, which compiled code cannot call directly: what is
+    traced is told in single operations.
     """
     if not traced:
         return nn.utils.get_total_norm(gradients)
@@ -281,9 +282,10 @@ class Learner:
         """Compile updates that are to be compiled: else the first ones take a minute."""
         if not isinstance(self._step_all, Compiled):
             return
-        for done in (1, 0) if self.bootstraps else (1,):
-            batch = self.prepared(_blank(self._setup, done), np.random.default_rng(0))
-            self._step_all.prepare(self.steps(batch), self.rates(0.0))
+        # Some go on in nearly every batch of those that bootstrap; none elsewhere.
+        blank = _blank(self._setup, done=0 if self.bootstraps else 1)
+        batch = self.prepared(blank, np.random.default_rng(0))
+        self._step_all.prepare(self.steps(batch), self.rates(0.0))
 
     def rate_factor(self, progress: float) -> float:
         """By which learning rates have fallen at a used share of the budget: along a cosine."""

@@ -28,7 +28,7 @@ GRACE_S = 10.0
 WIND_S = 1.0
 STDERR = 2
 FORMATS = ("text", "json")
-# Numbers of glibc's mallopt, and how many bytes stay with the process; the second's most is this.
+# Options of glibc's mallopt and their values in bytes; of the second glibc takes no more.
 TRIM_THRESHOLD, MMAP_THRESHOLD = (-1, 2**28), (-3, 2**25)
 NO_EVENT = "note"
 
@@ -145,10 +145,11 @@ class Watchdog:
 
 
 def keep_memory() -> None:
-    """Keep memory that was freed for the next update; other C libraries than glibc do as they do.
+    """Keep memory that was freed for what comes next; other C libraries than glibc do as they do.
 
-    An update frees tens of megabytes at its end. glibc hands them back to the system, and to get
-    them again, page by page, takes a sixth of an update of attention.
+    An update frees tens of megabytes at its end, and so does a picture that was looked at. glibc
+    hands them back to the system. To get them again, page by page, takes a sixth of an update of
+    attention, and a tenth of an episode in which tokens are seen.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:

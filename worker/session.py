@@ -14,7 +14,7 @@ import torch
 from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.messages import TAKEN_OVER
 from tangram_agent.policy import Policy
-from tangram_agent.process import Watchdog, formatter, watch_parent
+from tangram_agent.process import Watchdog, formatter, keep_memory, watch_parent
 from tangram_agent.setup import Setup
 from tangram_sim.errors import TangramError
 from worker.client import Client
@@ -49,6 +49,7 @@ def joined(config: WorkerConfig, setup: Setup, policy: Policy) -> Iterator[Clien
     watch_parent()
     # Several workers share one machine: more threads each would only get in each other's way.
     torch.set_num_threads(1)
+    keep_memory()
     service = config.service
     log_as(config.role, service.log_format)
     spec = EpisodeSpec.of(setup)

@@ -43,7 +43,7 @@ class Rival:
         seconds: of training; without a goal, those after the first updates.
         goal: raw overlap at which it ends; 0 measures the speed only.
         envs: played at a time, in one process.
-        actions: of an episode.
+        actions: of an episode, whose one token takes them all.
         updates: for each transition; below 1 a share of the environments' steps.
         twins: goals made up for each transition.
         batch: transitions in one update.

@@ -96,6 +96,9 @@ class Run:
     def rates(self, *names: str) -> dict[str, float]:
         """By how much some numbers grow in a second, and CPU seconds as "cpu"."""
         with self.awake():
+            # Who was stopped for long is let in anew.
+            episodes = self.numbers()["episodes"]
+            self.wait(lambda now: now["episodes"] > episodes)
             time.sleep(SETTLE_S)
             begin, spent, before = time.monotonic(), self.cpu_s(), self.numbers()
             time.sleep(SPAN_S)

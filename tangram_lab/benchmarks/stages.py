@@ -38,7 +38,7 @@ def run_stages(given: argparse.Namespace) -> int:
 
     With `out` the table goes into a Markdown file beside the JSON, and growth is drawn there.
     """
-    torch.set_num_threads(1)  # as a master does
+    torch.set_num_threads(1)  # both as masters and workers do
     keep_memory()
     if given.kind == "profile":
         show_profile(given.out)

@@ -1,6 +1,7 @@
 """Updates that are compiled as a whole: the same numbers, and a run stays with its own way."""
 
 import shutil
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,9 @@ import torch._inductor
 
 from master.config import COMPILERS, check_compiling
 from master.trainer import Trainer
+from tangram_agent.compiling import Compiled, cache_folder
 from tangram_agent.config import ServiceConfig
-from tangram_agent.learner import Learner
+from tangram_agent.learner import Learner, Rates
 from tangram_agent.setup import Setup
 from tangram_sim.errors import ConfigError, RunError
 from tests.agent.builders import PAPER, setup
@@ -66,7 +68,7 @@ def test_what_is_compiled_ahead_changes_nothing_and_is_what_updates_need(
     learner.compile_ahead()
     assert changed(before, learner.state()) == set()
     ready = len(traced)
-    assert ready == 1 + learner.bootstraps
+    assert ready == 1
     play(learner, made, range(3))
     assert len(traced) == ready
 
@@ -88,6 +90,48 @@ def test_a_graph_goes_on_with_what_was_restored(traced: list[Any]) -> None:
     assert play(first, made, range(2, 4)) == play(second, made, range(2, 4))
     assert changed(first.state(), second.state()) == set()
     assert traced
+
+
+@dataclass(frozen=True)
+class Rows:
+    """What `Compiled` takes, the smallest."""
+
+    own: torch.Tensor
+
+
+@pytest.mark.fast
+def test_what_lies_otherwise_in_memory_is_compiled_anew(traced: list[Any]) -> None:
+    """Compiled code takes its arguments as they lay when it was made."""
+    total = torch.zeros(())
+    whole = Compiled(lambda rows, _: total.add_(rows.own[0].sum()), [total])
+    rows = torch.arange(4.0).reshape(2, 2)
+    for own, graphs in ((rows, 1), (rows.clone(), 1), (rows.T, 2)):
+        whole(Rows(own), Rates(0.0, 0.0, 0.0))
+        assert len(traced) == graphs
+    assert total == 1.0 + 1.0 + 2.0
+
+
+@pytest.mark.fast
+def test_a_compiler_that_fails_is_told_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: Any, **__: Any) -> Any:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(torch._inductor, "standalone_compile", fails)
+    learner = Learner(CASES["ddpg", "paper"](), 0, compiled=True)
+    before = copied(learner)
+    with pytest.raises(RunError, match=r"No space left.*: empty .*service.compile=false"):
+        learner.compile_ahead()
+    assert changed(before, learner.state()) == set()
+
+
+@pytest.mark.fast
+def test_each_torch_and_each_processor_has_its_own_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR", raising=False)
+    here = cache_folder()
+    assert here.name.startswith(torch.__version__)
+    monkeypatch.setattr(Path, "read_bytes", lambda _: b"model: 1\nflags\t\t: fpu sse\n")
+    assert cache_folder() != here
+    assert cache_folder().parent == here.parent
 
 
 @pytest.mark.slow

@@ -193,11 +193,10 @@ FREEING = """
 """
 
 
-@pytest.mark.parametrize(("memory", "least", "most"), [("kept", 0, 2_000), ("given", 50_000, None)])
-def test_memory_that_was_freed_is_kept(memory: str, least: int, most: int | None) -> None:
-    """Without it the system gives the same pages again and again: the test can fail."""
-    pages = int(_output(FREEING, memory))
-    assert least <= pages <= (most or pages)
+def test_memory_that_was_freed_is_kept() -> None:
+    """Without it the system gives the same pages again and again, large ones or small ones."""
+    kept, given = (int(_output(FREEING, memory)) for memory in ("kept", "given"))
+    assert 10 * kept < given
 
 
 def _output(code: str, *arguments: str) -> str:
