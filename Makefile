@@ -15,7 +15,7 @@ $(error make knows no $(firstword $(STRAY))=...: settings go into ARGS="...", as
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help train test lint settings format paper bench docs lock sbom clean
+.PHONY: help train studio test lint settings format paper bench docs lock sbom clean
 
 help:  ## list these commands
 	@sed -nE 's/^([a-z]+):.*## (.*)/  make \1\t\2/p' Makefile | expand -t 16
@@ -41,6 +41,9 @@ settings: .venv/.installed-run  ## write docs/settings.md from the declarations 
 format: .venv/.installed-dev  ## sort and lay out the code
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+studio: .venv/.installed-studio  ## a page to play on and to watch from; settings go into ARGS="open=true"
+	@$(BIN)/tangram-studio $(ARGS)
 
 paper: .venv/.installed-run  ## all figures and tables of the paper: BUDGET=smoke, laptop or paper
 	@$(BIN)/tangram-experiment budget=$(BUDGET) $(ARGS)
@@ -75,6 +78,10 @@ clean:  ## remove caches and build products; .venv and runs/ stay
 	@.ci/install .venv docs
 	@touch .venv/.installed-run $@
 
+.venv/.installed-studio: pyproject.toml lock.txt
+	@.ci/install .venv studio
+	@touch .venv/.installed-run $@
+
 .venv/.installed-dev: pyproject.toml lock.txt
-	@.ci/install .venv dev,docs,human,peers,slurm,video
-	@touch .venv/.installed-run .venv/.installed-docs $@
+	@.ci/install .venv dev,docs,human,peers,slurm,studio,video
+	@touch .venv/.installed-run .venv/.installed-docs .venv/.installed-studio $@
