@@ -6,6 +6,7 @@ whole batch, and a batch of episodes travels as a few raw frames.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -57,6 +58,20 @@ class StepResult:
     tokens: Ints
     covered: Floats
     done: bool
+
+
+class Starts(NamedTuple):
+    """Where the tokens of B episodes lie at first.
+
+    Attributes:
+        poses: (B, K, 3).
+        flipped: (B, K) tokens that lie on their other side.
+        placed: (B, K) tokens that are placed already.
+    """
+
+    poses: Floats
+    flipped: Bools
+    placed: Bools
 
 
 class BatchedEnv:
@@ -172,6 +187,7 @@ class BatchedEnv:
         generators: Sequence[np.random.Generator],
         targets: Sides | None = None,
         views: Sequence[View] | None = None,
+        starts: Starts | None = None,
     ) -> None:
         """Begin an episode in every environment: a new target and a new start.
 
@@ -180,6 +196,7 @@ class BatchedEnv:
             targets: poses (B, K, 3) and sides (B, K) to assemble; None: they are drawn.
             views: how targets that are given were seen before; then they are known as they were
                 seen, and in the camera's pictures only the tokens are looked for.
+            starts: where tokens lie, and which are placed already; None: they are drawn.
 
         Raises:
             SamplingError: no layout without overlap was found.
@@ -189,8 +206,10 @@ class BatchedEnv:
         if targets is None:
             targets = sample_targets(self.layout, self.sim, self.task, generators)
         self.goals = self.layout.corners(*targets)
-        done = self._done(generators)
-        starts = sample_starts(self.layout, self.sim, targets, done, generators)
+        if starts is None:
+            done = self._done(generators)
+            sides = sample_starts(self.layout, self.sim, targets, done, generators)
+            starts = Starts(*sides, done)
         self._generators = generators
         self._late = np.zeros(self.count, np.int64), np.zeros((self.count, 3))
         self._begin(targets, starts, views)
@@ -205,7 +224,7 @@ class BatchedEnv:
         if self.sim.damping_spread:
             for world, damping in zip(self._worlds, self.actuation.damping, strict=True):
                 world.damp(float(damping))
-        self._moves[:] = self.sim.actions_per_token * self._named(done)
+        self._moves[:] = self.sim.actions_per_token * self._named(starts.placed)
         self.steps_done = 0
 
     @property
@@ -313,7 +332,7 @@ class BatchedEnv:
         covered: Floats = common.sum(axis=1) / layout.areas[tokens]
         return covered
 
-    def _begin(self, targets: Sides, starts: Sides, known: Sequence[View] | None) -> None:
+    def _begin(self, targets: Sides, starts: Starts, known: Sequence[View] | None) -> None:
         """Photograph the targets and put the tokens at their starts."""
         # World after world, here and in `_move`: the engine's memory of each fills the cache.
         pictures = []
@@ -324,7 +343,7 @@ class BatchedEnv:
             if self.sim.pixels:
                 world.place(targets[0][b], targets[1][b])
                 pictures.append(self._picture(b))
-            world.place(starts[0][b], starts[1][b])
+            world.place(starts.poses[b], starts.flipped[b])
         if self.sim.pixels:
             self._targets = TargetPictures(np.stack(pictures), self._lens.disturbs)
         if self.sight is not None:

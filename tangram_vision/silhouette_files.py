@@ -10,13 +10,15 @@ Legend: H x W pixels of a picture.
 from dataclasses import dataclass
 from pathlib import Path
 
+import contourpy
 import cv2
 import numpy as np
 import shapely
 from PIL import Image, ImageDraw
+from shapely import Polygon
 
 from tangram_sim.areas import Area
-from tangram_sim.arrays import Bools, Floats
+from tangram_sim.arrays import Bools, Floats, Singles
 from tangram_sim.dissections import Dissection
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import Layout
@@ -43,6 +45,7 @@ class Silhouette:
         mask: (H, W) which of its pixels are the silhouette's.
         filled: how, in different ways, or how it was tried; poses are in the units of the layout.
         drawing: homography (3, 3) of points in such units to columns and rows of the picture.
+        area: of it, in such units.
         share: its area over that of the tokens where the file tells its scale, and they differ.
     """
 
@@ -50,6 +53,7 @@ class Silhouette:
     mask: Bools
     filled: tuple[Filled, ...]
     drawing: Floats
+    area: Area
     share: float | None = None
 
     def corners(self, layout: Layout, found: Dissection) -> Floats:
@@ -106,7 +110,7 @@ def _from_outline(
     every = (filled,) if filled else tuple(fill_outline(placed, layout, seconds, count, method))
     mask = _mask(placed, size, unit)
     drawing = np.diag([unit, -unit, 1.0])
-    return Silhouette(_inked(mask), mask, every, drawing, share if wrong else None)
+    return Silhouette(_inked(mask), mask, every, drawing, placed, share if wrong else None)
 
 
 def _framed(area: Area, scale: float) -> tuple[Area, tuple[int, int], float]:
@@ -148,7 +152,18 @@ def _from_picture(
     view = float(np.sqrt(layout.areas.sum() / share))
     filled = fill_picture(shade.cover, layout, view, seconds, method)
     drawing = shade.back @ np.diag([1.0 / view, -1.0 / view, 1.0])
-    return Silhouette(picture, _shaded(shade, picture.size), (filled,), drawing)
+    area = _traced(shade.cover, view / len(shade.cover))
+    return Silhouette(picture, _shaded(shade, picture.size), (filled,), drawing, area)
+
+
+def _traced(cover: Singles, unit: float) -> Area:
+    """What coverage (P, P) shows along its half level, a pixel being so large, y up."""
+    levels = np.pad(cover, 1)  # so that every line is closed
+    middles = np.arange(len(levels)) - 0.5
+    lines = contourpy.contour_generator(middles, middles, levels).lines(0.5)
+    rings = [Polygon(line) for line in lines if len(line) > 3]
+    area: Area = shapely.make_valid(shapely.symmetric_difference_all(rings))
+    return shapely.transform(area, lambda points: points * (unit, -unit))
 
 
 def _shaded(shade: Shade, size: tuple[int, int]) -> Bools:

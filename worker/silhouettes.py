@@ -90,7 +90,7 @@ def read_silhouette(
     laid = [one.found for one in drawn.filled if one.found is not None and one.solved]
     if not laid:
         beside = "" if out is None else f"; {_kept(_draw_attempt(drawn, layout), out)}"
-        raise ConfigError(f"{source} {_unfilled(drawn, layout)}{beside}")
+        raise ConfigError(f"{source} {why_unfilled(drawn, layout)}{beside}")
     poses = turned_figure(layout, (laid[0].poses, laid[0].flipped), 0.0)
     reach = reach_beyond(setup, layout.corners(poses, laid[0].flipped))
     if reach is not None:
@@ -113,7 +113,7 @@ def _told(drawn: "Silhouette", count: int) -> str:
     return f"{plural(found, 'dissection')}{others}{more}"
 
 
-def _unfilled(drawn: "Silhouette", layout: Layout) -> str:
+def why_unfilled(drawn: "Silhouette", layout: Layout) -> str:
     """Why it was not filled, and what to do."""
     (filled,) = drawn.filled
     names = ", ".join(shape.name for shape in layout.shapes)

@@ -3,7 +3,7 @@
 import json
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -26,6 +26,7 @@ PATIENCE_S = 10.0
 ASK_AGAIN_S = 1.0
 MINUTE_S = 60.0
 UNKNOWN = -1.0
+TABLE_COLUMNS = ("process", "heard of", "weights", "batches", "episodes", "waiting")
 REFUSED = {
     "refused_keys": ("refused keys", "with no key for this run and role: see audit.jsonl"),
     "refused_handshakes": ("ended handshakes", "connections that showed no key"),
@@ -104,6 +105,23 @@ def ask_status(
     )
 
 
+def ask_alone(connect: str, patience_s: float = PATIENCE_S) -> RunStatus:
+    """As `ask_status`, for who has no context of sockets."""
+    with zmq.Context() as context:
+        return ask_status(connect, context, patience_s)
+
+
+def status_rows(status: RunStatus) -> list[tuple[str, str]]:
+    """What people want to know of a run that goes on, as names and texts."""
+    numbers = defaultdict(lambda: UNKNOWN, status.numbers)
+    return [*_lines(numbers, status.texts), *_scores(numbers)]
+
+
+def worker_rows(status: RunStatus) -> list[tuple[str, ...]]:
+    """Each process that takes part, as texts under TABLE_COLUMNS."""
+    return [_worker_row(row) for row in status.workers.tolist()]
+
+
 def _nobody(config: Path) -> str:
     """Why no master can be asked; each writes its config when it starts."""
     if not config.is_file():
@@ -128,11 +146,10 @@ def _plain(status: RunStatus) -> dict[str, Any]:
 def _print(console: Console, status: RunStatus, connect: str) -> None:
     texts = status.texts
     console.print(f"run {texts.get('run', '?')} ({texts.get('run_id', '?')})", highlight=False)
-    numbers = defaultdict(lambda: UNKNOWN, status.numbers)
-    _print_rows(console, [*_lines(numbers, texts), *_scores(numbers)])
+    _print_rows(console, status_rows(status))
     if len(status.workers):
         console.print(_table(status))
-    if numbers["evaluators"] == 0:  # whole, so that it can be copied
+    if status.numbers.get("evaluators") == 0:  # whole, so that it can be copied
         said = f"no evaluator yet (tangram-train starts its own): {_evaluator(connect)}"
         console.print(said, soft_wrap=True, markup=False, highlight=False)
 
@@ -198,17 +215,20 @@ def _age(seconds: float) -> str:
 
 def _table(status: RunStatus) -> Table:
     table = Table(box=None, padding=(0, 2))
-    for name in ("process", "heard of", "weights", "batches", "episodes", "waiting"):
+    for name in TABLE_COLUMNS:
         table.add_column(name, justify="left" if name == "process" else "right")
-    for row in status.workers.tolist():
-        one = dict(zip(WORKER_COLUMNS, row, strict=True))
-        behind = "-" if one["behind"] < 0 else f"{one['behind']:,.0f} behind"
-        table.add_row(
-            f"{'evaluator' if one['evaluator'] else 'worker'} {one['index']:.0f}",
-            f"{one['silent_s']:.1f} s ago",
-            behind,
-            f"{one['batches']:,.0f}",
-            f"{one['episodes']:,.0f}",
-            f"{one['waiting']:,.0f}",
-        )
+    for row in worker_rows(status):
+        table.add_row(*row)
     return table
+
+
+def _worker_row(row: Sequence[float]) -> tuple[str, ...]:
+    one = dict(zip(WORKER_COLUMNS, row, strict=True))
+    return (
+        f"{'evaluator' if one['evaluator'] else 'worker'} {one['index']:.0f}",
+        f"{one['silent_s']:.1f} s ago",
+        "-" if one["behind"] < 0 else f"{one['behind']:,.0f} behind",
+        f"{one['batches']:,.0f}",
+        f"{one['episodes']:,.0f}",
+        f"{one['waiting']:,.0f}",
+    )
