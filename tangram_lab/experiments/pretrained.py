@@ -44,7 +44,12 @@ AHEAD: dict[str, dict[str, Any]] = {
     "agent": {"lookahead": "values", "beam": 12}
 }  # as an agent of outlines ships
 # And one of pictures: in finer ones than it learned from it lays tokens more exactly.
-FINER = {**AHEAD, "sim": {"pixels": 128}}
+FINER: dict[str, dict[str, Any]] = {**AHEAD, "sim": {"pixels": 128}}
+# And one of tokens that slide: by what it learned of contacts, with an action more for each token.
+PLANNED: dict[str, dict[str, Any]] = {
+    "agent": {"lookahead": "learned", "beam": 2},
+    "sim": {"actions_per_token": 2},
+}
 
 
 class Candidate(NamedTuple):
@@ -81,8 +86,8 @@ def publish(
     seeds = sorted((_read(path) for path in run_dirs), key=lambda one: int(one.result["seed"]))
     _check_one_setup(seeds)
     chosen = median(seeds)
-    if chosen.run.setup.fills:
-        shipped = FINER if chosen.run.setup.traces else AHEAD
+    shipped = _shipped(chosen.run.setup)
+    if shipped:
         chosen = chosen._replace(run=chosen.run.with_settings(shipped))
     weights = _weights(chosen.run)
     config = EvalConfig(str(chosen.run.folder), episodes=tests, seed=TEST_SEED)
@@ -100,6 +105,13 @@ def publish(
     write_whole(folder / CARD_TEXT, card_text(card).encode())
     write_whole(folder / CARD, (json.dumps(card, indent=1) + "\n").encode())
     return folder
+
+
+def _shipped(setup: Setup) -> dict[str, dict[str, Any]]:
+    """What an agent ships with beside what it was trained with."""
+    if setup.fills:
+        return FINER if setup.traces else AHEAD
+    return PLANNED if setup.sim.motion == "slide" and setup.layout.tokens > 1 else {}
 
 
 def _on_figures(run: Run, split: str) -> dict[str, Any]:
@@ -420,7 +432,11 @@ On the figures of tangram_sim/puzzles, each at {turns} angles; {_trained_on(card
 
 
 def _played_by(card: Mapping[str, Any]) -> str:
-    return ", without looking ahead" if card["task"].get("observe") in SILHOUETTES else ""
+    if "lookahead=none" not in card["tests"]["scores"]:
+        return ""
+    alone = "without looking ahead"
+    outlines = card["task"].get("observe") in SILHOUETTES
+    return f", {alone}" if outlines else f", with one action for each token and {alone}"
 
 
 def _goals(card: Mapping[str, Any]) -> str:
