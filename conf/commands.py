@@ -250,6 +250,19 @@ With compare=[...] several runs play the same episodes side by side.""",
         ("worker.config:PlayConfig",),
         over=OVER,
     ),
+    "studio": Command(
+        "tangram-studio",
+        """\
+Serves a page to play on and to watch from, on this machine alone, and prints its address,
+which has a token in it. Choose, lay out, draw or drop a figure: the agent says how seven
+tans fill it and lays it, while you may take tans away. Or watch a run, or two side by side.""",
+        (
+            "tangram-studio",
+            "tangram-studio open=true",
+            "tangram-studio port=0    # any free one",
+        ),
+        ("tangram_studio.config:StudioConfig",),
+    ),
     "experiments": Command(
         "tangram-experiment",
         """\

@@ -53,6 +53,7 @@ worker = partial(run, "worker.cli", "worker")
 status = partial(run, "worker.cli", "status")
 evaluate = partial(run, "worker.cli", "evaluate")
 play = partial(run, "worker.cli", "play")
+studio = partial(run, "tangram_studio.cli", "studio")
 experiment = partial(run, "tangram_lab.experiments.cli", "experiment")
 report = partial(run, "tangram_lab.experiments.cli", "report")
 bench = partial(run, "tangram_lab.benchmarks.cli", "main")
@@ -65,6 +66,7 @@ COMMANDS: dict[str, Callable[[], int]] = {
     "status": status,
     "eval": evaluate,
     "play": play,
+    "studio": studio,
     "experiment": experiment,
     "report": report,
     "bench": bench,

@@ -1,0 +1,15 @@
+"""The settings of tangram-studio."""
+
+from dataclasses import dataclass
+
+from tangram_sim.settings import Settings, setting
+
+
+@dataclass(frozen=True)
+class StudioConfig(Settings):
+    """A page to play on and to watch from (tangram-studio)."""
+
+    port: int = setting(
+        8765, "where it listens, on this machine alone; 0 for any free port", low=0, high=65535
+    )
+    open: bool = setting(False, "show the page in this machine's browser at once")

@@ -1,0 +1,214 @@
+"""What a page shows -> how the seven tans fill it, or which figure of them comes nearest.
+
+A drawing goes the way of a file: it is written down and read without trust, see
+`tangram_vision.silhouette_files`. What no tans fill is told why, and approached.
+
+Legend: K tokens, V corners, N rings.
+"""
+
+import base64
+import json
+from dataclasses import dataclass
+from functools import lru_cache
+from io import BytesIO
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import shapely
+from PIL import Image
+
+from tangram_sim.areas import Area, polygons
+from tangram_sim.arrays import Floats
+from tangram_sim.dissections import Dissection
+from tangram_sim.errors import ConfigError
+from tangram_sim.puzzles import library
+from tangram_sim.strokes import colour_of
+from tangram_sim.targets import placement, turned_figure
+from tangram_studio.messages import Fill
+from tangram_studio.playing import Sides, player
+from tangram_vision.approximations import nearest_figure
+from tangram_vision.outline_files import FORMAT, VERSION
+from tangram_vision.silhouette_files import PICTURES, Silhouette, fill_silhouette
+from tangram_vision.silhouettes import Method, silhouette
+from worker.methods import method_of
+from worker.puzzles import reach_beyond
+from worker.silhouettes import why_unfilled
+
+SUFFIXES = (*PICTURES, ".svg", ".json")
+SECONDS = 5.0  # of a search,
+FREE_SECONDS = 1.0  # where sides are not straight, so that hardly anything fits,
+NEAREST_SECONDS = 2.5  # and of what comes nearest
+LAYOUT = "the layout"
+_SHOWN = 480  # pixels along the longer side of what is seen
+_ROUND = 5  # digits of what is sent
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """How a silhouette is filled.
+
+    Attributes:
+        goal: the tokens in the middle of the arena.
+        exact: whether they fill it; if not they come as near as was found.
+        iou: area that tokens and silhouette share over the area of both together.
+        how: it was filled, or why not.
+        seen: PNG of what was seen, a black figure.
+        size: its width and height.
+        pieces: K outlines of (V, 2), pixels of that picture, y down.
+        outline: N rings of (M, 2) of the silhouette in the arena.
+        laid: N rings of what the tokens cover.
+    """
+
+    goal: Sides
+    exact: bool
+    iou: float
+    how: str
+    seen: str
+    size: tuple[int, int]
+    pieces: list[list[list[float]]]
+    outline: list[list[list[float]]]
+    laid: list[list[list[float]]]
+
+
+def fill(asked: Fill) -> Answer:
+    """Fill what a page asks for.
+
+    Raises:
+        ConfigError: it draws nothing that has an area, or reaches out of the arena.
+    """
+    if sum(one is not None for one in (asked.puzzle, asked.outlines, asked.pieces)) != 1:
+        raise ConfigError("a puzzle, a drawing or pieces are to be filled, one of them")
+    layout, scale = player("lift").layout, player("lift").run.setup.tokens.scale
+    if asked.puzzle is not None:
+        return _filled(asked.puzzle, "the puzzle", asked.who)
+    content = {"format": FORMAT, "version": VERSION, "outlines": asked.outlines}
+    if asked.pieces is not None:
+        poses, flipped = asked.pieces.sides
+        corners = layout.corners(poses, flipped)
+        every = [corners[layout.corners_of(k)].tolist() for k in range(layout.tokens)]
+        content |= {"outlines": every, "side": scale}
+    with TemporaryDirectory(prefix="tangram-studio-") as folder:
+        path = Path(folder) / "drawing.json"
+        path.write_text(json.dumps(content), encoding="utf-8")
+        source = "the drawing" if asked.pieces is None else LAYOUT
+        return _filled(str(path), source, asked.who, asked.free)
+
+
+def fill_file(name: str, data: bytes, who: str) -> Answer:
+    """Fill what a file shows: a PNG or JPEG, an SVG, outlines or a puzzle as JSON.
+
+    Args:
+        name: of the file; only its ending matters.
+        data: its content.
+        who: see `Fill`.
+
+    Raises:
+        ConfigError: it cannot be used.
+    """
+    suffix = Path(name).suffix.lower()
+    if suffix not in SUFFIXES:
+        raise ConfigError(
+            f"a file of the kind '{suffix or name[:40]}' cannot be read: drop one of "
+            f"{', '.join(SUFFIXES)}"
+        )
+    with TemporaryDirectory(prefix="tangram-studio-") as folder:
+        path = Path(folder) / f"file{suffix}"
+        path.write_bytes(data)
+        return _filled(str(path), "the file", who)
+
+
+def tans() -> dict[str, object]:
+    """What a page is told at first: the tokens, their full square's side and area, the library."""
+    own = player("lift")
+    layout, scale = own.layout, own.run.setup.tokens.scale
+    chiral = layout.chiral.tolist()
+    tokens = [
+        {
+            "name": shape.name,
+            "corners": layout.body[layout.corners_of(k)].round(_ROUND).tolist(),
+            "colour": "#{:02x}{:02x}{:02x}".format(*colour_of(k)),
+            "chiral": chiral[k],
+        }
+        for k, shape in enumerate(layout.shapes)
+    ]
+    every = [puzzle for split in ("train", "test") for puzzle in library(split, scale)]
+    figures = [
+        {"name": puzzle.name, "outline": _rings(silhouette(layout, Dissection(*sides)))}
+        for puzzle, sides in ((one, placement(one, layout)) for one in every)
+    ]
+    return {
+        "tokens": tokens,
+        "side": scale,
+        "area": float(layout.areas.sum()),
+        "figures": figures,
+    }
+
+
+def _filled(name: str, source: str, who: str, free: bool = False) -> Answer:
+    setup = player("lift").run.setup
+    layout = setup.layout
+    seconds = FREE_SECONDS if free else SECONDS
+    drawn = fill_silhouette(name, source, layout, setup.tokens.scale, seconds, method=_method(who))
+    first = drawn.filled[0]
+    if first.found is not None and first.solved:
+        how = f"filled by the {_called(who, first.by)} in {first.seconds:.2f} s"
+        return _answer(drawn, first.found, True, first.iou, how)
+    why = f"{source} {why_unfilled(drawn, layout)}"
+    if drawn.share is not None:  # of a known scale, so that it is another figure's
+        lie = "the tans lie on each other: move them apart"
+        raise ConfigError(lie if source == LAYOUT else why)
+    starts = [one for one in (first.found, first.attempt) if one is not None]
+    found, iou = nearest_figure(drawn.area, layout, NEAREST_SECONDS, starts=starts)
+    return _answer(drawn, found, False, iou, why)
+
+
+@lru_cache(maxsize=2)
+def _method(who: str) -> Method:
+    # The agent alone looks ahead, as it ships.
+    return method_of("beam" if who == "agent" else who, player("lift").layout)
+
+
+def _called(who: str, by: str) -> str:
+    return "agent alone" if who == "agent" else {"beam": "agent, looking ahead"}.get(by, by)
+
+
+def _answer(drawn: Silhouette, found: Dissection, exact: bool, iou: float, how: str) -> Answer:
+    setup = player("lift").run.setup
+    layout = setup.layout
+    poses = turned_figure(layout, (found.poses, found.flipped), 0.0)
+    reach = reach_beyond(setup, layout.corners(poses, found.flipped))
+    if reach is not None:
+        raise ConfigError(
+            f"the figure reaches {reach:.2f} from its middle and the table only "
+            f"{setup.sim.arena / 2.0:g}: draw it less long"
+        )
+    seen, share = _seen(drawn)
+    corners = drawn.corners(layout, found) * share
+    pieces = [corners[layout.corners_of(k)].round(1).tolist() for k in range(layout.tokens)]
+    moved = poses[0, :2] - found.poses[0, :2]
+    area = shapely.transform(drawn.area, lambda points: points + moved)
+    goal = Sides(poses, found.flipped)
+    width, height = (round(side * share) for side in drawn.picture.size)
+    laid = silhouette(layout, Dissection(poses, found.flipped))
+    rings = _rings(area), _rings(laid)
+    return Answer(goal, exact, float(iou), how, seen, (width, height), pieces, *rings)
+
+
+def _seen(drawn: Silhouette) -> tuple[str, float]:
+    """A small PNG of what was seen as an address, and the share by which it is smaller."""
+    mask = Image.fromarray(np.where(drawn.mask, 0, 255).astype(np.uint8))
+    share = min(1.0, _SHOWN / max(mask.size))
+    mask = mask.resize([round(side * share) for side in mask.size], Image.Resampling.BOX)
+    data = BytesIO()
+    mask.quantize(16).save(data, format="PNG", optimize=True)
+    return "data:image/png;base64," + base64.b64encode(data.getvalue()).decode(), share
+
+
+def _rings(area: Area) -> list[list[list[float]]]:
+    every = []
+    for part in polygons(area):
+        for ring in (part.exterior, *part.interiors):
+            points: Floats = np.asarray(ring.coords)[:-1]
+            every.append(points.round(_ROUND).tolist())
+    return every

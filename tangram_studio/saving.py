@@ -1,0 +1,109 @@
+"""What was played as a file: a GIF of its moves, an SVG of the tokens, a puzzle file.
+
+Legend: K tokens, F frames, V corners.
+"""
+
+import json
+from collections.abc import Sequence
+from io import BytesIO
+
+import numpy as np
+
+from tangram_sim.arrays import Floats
+from tangram_sim.drawing import save_gif
+from tangram_sim.errors import ConfigError
+from tangram_sim.game_drawing import Held, draw_game
+from tangram_sim.kinematics import wrap
+from tangram_sim.layout import Layout
+from tangram_sim.puzzles import parse_puzzles
+from tangram_sim.sketches import FORMAT, VERSION
+from tangram_sim.strokes import colour_of
+from tangram_studio.playing import Move, Sides, player
+
+FRAMES = 10  # of a move: a GIF shows 20 in a second, and twice as fast as the page
+FRAME_MS = 50
+MOVES = 60  # that a GIF shows, the last ones
+_PIXELS, _STILL = 360, 20
+_DIGITS = 6
+_SVG = 500  # pixels
+
+
+def gif(moves: Sequence[Move], goal: Sides) -> bytes:
+    """The moves as an animation.
+
+    Raises:
+        ConfigError: nothing was played.
+    """
+    if not moves:
+        raise ConfigError("nothing was played yet: let the agent lay a figure first")
+    own = player("lift")
+    layout, arena = own.layout, own.run.setup.sim.arena
+    target = layout.corners(*goal)
+    pictures = [
+        draw_game(layout, arena, layout.corners(poses, goal.flipped), target, _PIXELS, held)
+        for move in moves[-MOVES:]
+        for poses, held in _shown(move)
+    ]
+    end = draw_game(
+        layout, arena, layout.corners(moves[-1].frames[-1], goal.flipped), target, _PIXELS
+    )
+    data = BytesIO()
+    save_gif([pictures[0]] * (_STILL // 2) + pictures + [end] * _STILL, data, FRAME_MS)
+    return data.getvalue()
+
+
+def _shown(move: Move) -> list[tuple[Floats, Held | None]]:
+    """Poses (K, 3) at equal times of a move, and what is held then."""
+    frames, shown = move.frames, list[tuple[Floats, Held | None]]()
+    for share in np.arange(1, FRAMES + 1) / FRAMES:
+        at = share * (len(frames) - 1)
+        first = min(int(at), len(frames) - 2) if len(frames) > 1 else 0
+        way = frames[min(first + 1, len(frames) - 1)] - frames[first]
+        way[:, 2] = wrap(way[:, 2])
+        height = float(np.sin(np.pi * share)) if len(frames) == 2 else 0.0
+        held = None if move.token is None else Held(move.token, height, move.blocked)
+        shown.append((frames[first] + (at - first) * way, held))
+    return shown
+
+
+def svg(tokens: Sides) -> bytes:
+    """The tokens as they lie, a polygon each, y down."""
+    own = player("lift")
+    layout, half = own.layout, own.run.setup.sim.arena / 2.0
+    lines = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{-half:g} {-half:g} {2 * half:g} '
+        f'{2 * half:g}" width="{_SVG}" height="{_SVG}">'
+    ]
+    for k, own_corners in enumerate(_each(layout, tokens)):
+        points = " ".join(f"{x:.{_DIGITS}g},{-y:.{_DIGITS}g}" for x, y in own_corners.tolist())
+        red, green, blue = colour_of(k)
+        lines.append(f'<polygon points="{points}" fill="rgb({red},{green},{blue})"/>')
+    return "\n".join([*lines, "</svg>", ""]).encode()
+
+
+def puzzle_file(tokens: Sides, name: str) -> bytes:
+    """The tokens as they lie as a puzzle, which tangram-play and tangram-eval take.
+
+    Raises:
+        ConfigError: they are no figure, as where they lie on each other.
+    """
+    own = player("lift")
+    layout, scale = own.layout, own.run.setup.tokens.scale
+    pieces = [
+        {"shape": shape.name, "corners": (corners / scale).round(_DIGITS).tolist()}
+        for shape, corners in zip(layout.shapes, _each(layout, tokens), strict=True)
+    ]
+    content = {"format": FORMAT, "version": VERSION, "puzzles": [{"name": name, "pieces": pieces}]}
+    text = json.dumps(content)
+    try:
+        parse_puzzles(text, "the figure")  # what nobody could read is not saved
+    except ConfigError as error:
+        first = str(error).partition(";")[0]
+        raise ConfigError(f"this is no puzzle, and was not saved: {first}") from None
+    return text.encode() + b"\n"
+
+
+def _each(layout: Layout, tokens: Sides) -> list[Floats]:
+    """The corners (V, 2) of each token."""
+    corners = layout.corners(*tokens)
+    return [corners[layout.corners_of(k)] for k in range(layout.tokens)]

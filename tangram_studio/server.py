@@ -1,0 +1,310 @@
+"""The server of the page: on this machine alone, and for those alone who have its token."""
+
+import asyncio
+import logging
+import os
+import secrets
+import socket
+import webbrowser
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+from functools import partial
+from http.cookies import CookieError, SimpleCookie
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import Headers, QueryParams
+from starlette.requests import Request
+from starlette.responses import JSONResponse, PlainTextResponse, RedirectResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from tangram_sim.errors import ConfigError, TangramError
+from tangram_studio import watching
+from tangram_studio.config import StudioConfig
+from tangram_studio.filling import fill_file, tans
+from tangram_studio.jobs import Jobs
+from tangram_studio.messages import MAX_BYTES, write
+from tangram_studio.playing import player
+from tangram_studio.session import Session, plain
+
+HOST = "127.0.0.1"
+PAGES = 64  # at once
+BACKLOG = 128
+COUNT_S = 0.2  # that pages may take to hear how many there are
+MAX_UPLOAD = 10 * 10**6  # bytes
+STATIC = files("tangram_studio") / "static"
+TYPES = {
+    ".html": "text/html",
+    ".js": "text/javascript",
+    ".css": "text/css",
+    ".svg": "image/svg+xml",
+}
+# Nothing of another host, nothing within another's page.
+GUARDS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "img-src 'self' data: blob:; connect-src 'self'; form-action 'none'; base-uri 'none'; "
+    "frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+NOT_LET_IN = (
+    "This page needs its token: open the address that tangram-studio printed in its terminal, with "
+    "?token=... at its end. Each start of tangram-studio has a new one.\n"
+)
+WRONG_HOST = "This server answers to this machine's own names alone: open the printed address.\n"
+FULL = 4429  # codes of a socket that is closed
+SHUT = 4403
+
+log = logging.getLogger(__name__)
+
+
+class Door:
+    """Lets nobody in who does not show the token, nor what another site's page sends."""
+
+    def __init__(self, app: ASGIApp, token: str, port: int) -> None:
+        """Stand before an app."""
+        self._app, self._token, self._cookie = app, token, f"tangram_studio_{port}"
+        self._hosts = {f"{name}:{port}" for name in (HOST, "localhost")}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """As ASGI."""
+        if scope["type"] == "lifespan":
+            await self._app(scope, receive, send)
+            return
+        answer = self._checked(scope)
+        if answer is None:
+            await self._app(scope, receive, partial(_guarded, send))
+        elif scope["type"] == "websocket":
+            await receive()
+            await send({"type": "websocket.close", "code": SHUT})
+        else:
+            await answer(scope, receive, partial(_guarded, send))
+
+    def _checked(self, scope: Scope) -> Response | None:
+        """What is answered in place of the app; None: come in."""
+        headers = Headers(scope=scope)
+        if headers.get("host") not in self._hosts:
+            return PlainTextResponse(WRONG_HOST, 403)
+        origin = headers.get("origin")
+        if origin is not None and urlsplit(origin).netloc != headers["host"]:
+            return PlainTextResponse(WRONG_HOST, 403)
+        given = QueryParams(scope["query_string"]).get("token")
+        if given is not None and self._is_token(given) and scope["type"] == "http":
+            # The token leaves the address: it is neither seen over a shoulder nor kept in history.
+            inside = RedirectResponse("/", 303)
+            inside.set_cookie(self._cookie, self._token, httponly=True, samesite="strict")
+            return inside
+        if not self._is_token(_cookies(headers).get(self._cookie, "")):
+            return PlainTextResponse(NOT_LET_IN, 403)
+        return None
+
+    def _is_token(self, given: str) -> bool:
+        return secrets.compare_digest(given.encode(), self._token.encode())
+
+
+async def _guarded(send: Send, message: Message) -> None:
+    if message["type"] == "http.response.start":
+        own = [(name.lower().encode(), value.encode()) for name, value in GUARDS.items()]
+        message = {**message, "headers": [*message["headers"], *own]}
+    await send(message)
+
+
+def _cookies(headers: Headers) -> dict[str, str]:
+    try:
+        return {k: one.value for k, one in SimpleCookie(headers.get("cookie", "")).items()}
+    except CookieError:
+        return {}
+
+
+class Studio:
+    """What the pages share."""
+
+    def __init__(self) -> None:
+        """Start the processes that think, half of the machine's cores for what takes long."""
+        many = max(1, (os.cpu_count() or 2) // 2)
+        self.fills, self.moves = Jobs(many, warm), Jobs(many, warm)
+        self._pages: set[WebSocket] = set()
+        self._tans: dict[str, object] | None = None
+
+    @asynccontextmanager
+    async def lifespan(self, _: Starlette) -> AsyncIterator[None]:
+        """The processes live as long as the server."""
+        first = [asyncio.create_task(jobs.ready()) for jobs in (self.fills, self.moves)]
+        try:
+            yield
+        finally:
+            for task in first:
+                task.cancel()
+            self.fills.close()
+            self.moves.close()
+
+    async def play(self, socket: WebSocket) -> None:
+        """A page's socket."""
+        await socket.accept()
+        if len(self._pages) >= PAGES:
+            await socket.close(FULL)
+            return
+        self._pages.add(socket)
+        session = Session(socket.send_text, socket.send_bytes, self.fills, self.moves)
+        try:
+            await self._count()
+            while True:
+                await session.hear(await socket.receive_text())
+        except (WebSocketDisconnect, KeyError):  # the latter: bytes, which no page sends
+            pass
+        finally:
+            self._pages.discard(socket)
+            await session.end()
+            await self._count()
+
+    async def _count(self) -> None:
+        """Tell all pages how many there are, none waiting for one that does not listen."""
+        text = write("pages", count=len(self._pages))
+        telling = {asyncio.create_task(_told(page, text)) for page in self._pages}
+        if telling:
+            await asyncio.wait(telling, timeout=COUNT_S)
+        for task in telling:
+            task.cancel()
+
+    async def figures(self, _: Request) -> Response:
+        """The tokens, and the library."""
+        if self._tans is None:
+            self._tans = await self.fills.do(tans)
+        return JSONResponse(self._tans)
+
+    async def drop(self, request: Request) -> Response:
+        """A file that was dropped on the page."""
+        size = request.headers.get("content-length", "")
+        if not size.isdecimal() or int(size) > MAX_UPLOAD:
+            limit = MAX_UPLOAD // 10**6
+            return _refused(f"the file is larger than {limit} MB: make it smaller", 413)
+        data = bytearray()
+        async for part in request.stream():
+            data += part
+            if len(data) > MAX_UPLOAD:
+                return _refused("the file is larger than it said", 413)
+        name, who = (request.query_params.get(key, "") for key in ("name", "who"))
+        if who not in ("together", "agent"):
+            return _refused("who must be together or agent", 400)
+        try:
+            answer = await self.fills.do(fill_file, name, bytes(data), who)
+        except TangramError as error:
+            return _refused(str(error), 400)
+        return JSONResponse(plain(answer))
+
+
+def warm() -> None:
+    """Load what every process needs."""
+    player("lift")
+    player("slide")
+
+
+async def _told(page: WebSocket, text: str) -> None:
+    with suppress(WebSocketDisconnect, RuntimeError):  # it is going
+        await page.send_text(text)
+
+
+async def _watch(request: Request) -> Response:
+    return await _answered(watching.view, request)
+
+
+async def _episodes(request: Request) -> Response:
+    return await _answered(watching.episodes_picture, request)
+
+
+async def _runs(_: Request) -> Response:
+    found = await run_in_threadpool(watching.recent_runs, Path("runs"))
+    return JSONResponse({"runs": found})
+
+
+async def _answered(task: Any, request: Request) -> Response:
+    try:
+        found = await run_in_threadpool(task, request.query_params.get("run", ""))
+    except TangramError as error:
+        return _refused(str(error), 400)
+    if isinstance(found, bytes):
+        return Response(found, media_type="image/png")
+    return JSONResponse(found)
+
+
+async def _file(request: Request) -> Response:
+    name = request.path_params.get("name", "index.html")
+    known = {one.name: one for one in STATIC.iterdir()}
+    if name not in known:
+        return PlainTextResponse(f"there is no {name} here: open /\n", 404)
+    return Response(known[name].read_bytes(), media_type=TYPES[Path(name).suffix])
+
+
+def _refused(why: str, status: int) -> Response:
+    return JSONResponse({"error": why}, status)
+
+
+def make_app(token: str, port: int) -> ASGIApp:
+    """The app of a studio behind its door."""
+    studio = Studio()
+    routes = [
+        Route("/", _file),
+        Route("/api/figures", studio.figures),
+        Route("/api/drop", studio.drop, methods=["POST"]),
+        Route("/api/runs", _runs),
+        Route("/api/watch", _watch),
+        Route("/api/episodes", _episodes),
+        WebSocketRoute("/api/play", studio.play),
+        Route("/{name}", _file),
+    ]
+    return Door(Starlette(routes=routes, lifespan=studio.lifespan), token, port)
+
+
+def serve(config: StudioConfig) -> int:
+    """Serve the page until Ctrl-C.
+
+    Returns:
+        Exit status 0.
+
+    Raises:
+        ConfigError: the port cannot be used.
+    """
+    listener = socket.socket()
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((HOST, config.port))
+        listener.listen(BACKLOG)  # who comes before it has begun waits
+    except OSError as error:
+        listener.close()
+        raise ConfigError(
+            f"cannot listen on {HOST}, port {config.port} ({error.strerror}): choose another with "
+            "port=8766, or any free one with port=0"
+        ) from None
+    port = listener.getsockname()[1]
+    token = secrets.token_urlsafe(24)
+    address = f"http://{HOST}:{port}/?token={token}"
+    print(f"tangram-studio is at {address}", flush=True)  # noqa: T201
+    print(  # noqa: T201
+        f"on this machine alone; from another: ssh -L {port}:{HOST}:{port} THIS_MACHINE, then the "
+        "same address there. Ctrl-C ends it.",
+        flush=True,
+    )
+    if config.open:
+        webbrowser.open(address)
+    logging.basicConfig(format="%(asctime)s tangram-studio: %(message)s", datefmt="%H:%M:%S")
+    server = uvicorn.Server(
+        uvicorn.Config(
+            make_app(token, port),
+            log_level="warning",
+            access_log=False,
+            ws_max_size=MAX_BYTES,
+            ws="websockets-sansio",
+            timeout_graceful_shutdown=2,
+            server_header=False,
+        )
+    )
+    server.run(sockets=[listener])
+    return 0

@@ -1,0 +1,177 @@
+"""One page's conversation: the newest that it asks for is done, instead of what was before."""
+
+import asyncio
+import logging
+import secrets
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+from tangram_sim.errors import TangramError
+from tangram_studio import filling, playing, saving
+from tangram_studio.filling import Answer
+from tangram_studio.jobs import Jobs
+from tangram_studio.messages import Asked, Fill, Next, Play, Save, read, write
+from tangram_studio.playing import Move, Round, Sides
+
+ROUNDS = 5  # of a figure that is not laid yet: an agent that gets nowhere ends, too
+LAID = 0.95  # IoU from which a figure counts as laid
+_KINDS = {"gif": "image/gif", "svg": "image/svg+xml", "json": "application/json"}
+_LOST = "something went wrong here that should not: the terminal of tangram-studio says what"
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class Game:
+    """A figure that is being laid.
+
+    Attributes:
+        goal: the figure.
+        motion: whether tokens are carried or pushed.
+        scene: the tokens as they lie.
+        done: the round until now; None: nothing yet.
+        rounds: before it.
+    """
+
+    goal: Sides
+    motion: str
+    scene: Sides
+    done: Round | None = None
+    rounds: int = 0
+
+
+class Session:
+    """A page that is connected."""
+
+    def __init__(
+        self,
+        tell: Callable[[str], Awaitable[None]],
+        give: Callable[[bytes], Awaitable[None]],
+        fills: Jobs,
+        moves: Jobs,
+    ) -> None:
+        """Begin.
+
+        Args:
+            tell: sends a message to the page.
+            give: sends a file.
+            fills: do what takes long.
+            moves: do what must not wait for it.
+        """
+        self._tell, self._give, self._fills, self._moves = tell, give, fills, moves
+        self._game: Game | None = None
+        self._goal: Sides | None = None
+        self._played: list[Move] = []  # of this figure, what was interrupted among them
+        self._number = 0
+        self._doing: asyncio.Task[None] | None = None
+
+    async def hear(self, text: str | bytes) -> None:
+        """Begin what a message asks for; what was being done before ends."""
+        try:
+            asked = read(text)
+        except TangramError as error:
+            await self._say("refused", why=str(error))
+            return
+        if isinstance(asked, Next) and self._doing is not None and not self._doing.done():
+            return  # it is on its way
+        await self.end()
+        self._number = self._number if isinstance(asked, Next) else asked.number
+        self._doing = asyncio.create_task(self._do(asked))
+
+    async def end(self) -> None:
+        """End what is being done."""
+        if self._doing is not None:
+            self._doing.cancel()
+            with suppress(asyncio.CancelledError):
+                await self._doing
+
+    async def _do(self, asked: Asked) -> None:
+        try:
+            await self._answer(asked)
+        except TangramError as error:
+            await self._say("refused", why=str(error))
+        except Exception:  # a page must hear of everything
+            log.exception("a page's %s failed", type(asked).__name__.lower())
+            await self._say("refused", why=_LOST)
+
+    async def _say(self, told: str, **content: Any) -> None:
+        await self._tell(write(told, number=self._number, **content))
+
+    async def _answer(self, asked: Asked) -> None:
+        match asked:
+            case Fill():
+                self._game = None
+                found = await self._fills.do(filling.fill, asked, waits=self._waits)
+                await self._say("filled", **plain(found))
+            case Play():
+                await self._begin(asked)
+            case Next():
+                await self._next()
+            case Save():
+                await self._save(asked)
+
+    async def _waits(self, ahead: int) -> None:
+        await self._say("wait", ahead=ahead)
+
+    async def _begin(self, asked: Play) -> None:
+        goal = Sides(*asked.goal.sides)
+        if asked.start is None:
+            seed = secrets.randbelow(2**31)
+            given = goal, asked.motion, seed
+            poses = await self._moves.do(playing.begin, *given, waits=self._waits)
+            scene, self._played = Sides(poses, goal.flipped), []
+        else:
+            scene = Sides(*asked.start.sides)
+        self._game, self._goal = Game(goal, asked.motion, scene), goal
+        await self._next()
+
+    async def _next(self) -> None:
+        game = self._game
+        if game is None:
+            return
+        move = await self._move(game)
+        while move.token is None and move.iou < LAID and game.rounds + 1 < ROUNDS:
+            game.done, game.rounds = None, game.rounds + 1
+            move = await self._move(game)
+        game.done, game.scene = move.done, Sides(move.frames[-1], game.scene.flipped)
+        over = move.token is None
+        if over:
+            self._game = None
+        else:
+            self._played = [*self._played, move][-saving.MOVES :]
+        await self._say(
+            "move",
+            token=move.token,
+            frames=move.frames.round(5).tolist(),
+            flipped=game.scene.flipped.tolist(),
+            blocked=move.blocked,
+            lifts=game.motion == "lift",
+            coverage=move.coverage,
+            iou=move.iou,
+            over=over,
+        )
+
+    async def _move(self, game: Game) -> Move:
+        given = game.scene, game.goal, game.motion, game.done
+        return await self._moves.do(playing.next_move, *given, waits=self._waits)
+
+    async def _save(self, asked: Save) -> None:
+        given = asked, self._played, self._goal
+        data = await self._fills.do(_saved, *given, waits=self._waits)
+        await self._say("saved", kind=asked.kind, type=_KINDS[asked.kind])
+        await self._give(data)
+
+
+def _saved(asked: Save, moves: list[Move], goal: Sides | None) -> bytes:
+    tokens = Sides(*asked.tokens.sides)
+    if asked.kind == "gif":
+        return saving.gif(moves, tokens if goal is None else goal)
+    return saving.svg(tokens) if asked.kind == "svg" else saving.puzzle_file(tokens, asked.name)
+
+
+def plain(answer: Answer) -> dict[str, Any]:
+    """How a silhouette is filled, as a page is told."""
+    goal = {"poses": answer.goal.poses.round(6).tolist(), "flipped": answer.goal.flipped.tolist()}
+    return vars(answer) | {"goal": goal}

@@ -1,0 +1,356 @@
+// The page: its tabs, its connection, and what is said between a person and the agent.
+
+import { Board, make, pathOf, tray } from "./board.js";
+import { Pen } from "./draw.js";
+import { startWatch } from "./watch.js";
+
+const $ = (id) => document.getElementById(id);
+const LIMIT = 10e6; // bytes of a file
+const AGAIN_MS = 2000;
+const RESTART_MS = 700; // after the last key that moved a tan
+const SHUT = 4403;
+const FULL = 4429;
+
+const per_cent = (share) => `${(100 * share).toFixed(1)} %`;
+
+class Studio {
+  constructor({ figures, tokens, side, area }) {
+    this.board = new Board($("board"), tokens);
+    this.pen = new Pen(this.board, side);
+    this.area = area;
+    this.number = 0; // of what is asked for: answers to what was asked before are dropped
+    this.goal = null;
+    this.name = "figure";
+    this.board.onDrag = (done, byKey) => this.dragged(done, byKey);
+    this.board.onMove = () => this.want();
+    this.board.onShown = (move) => this.shown(move);
+    this.pen.onChange = (next) => this.measured(next);
+    this.pen.onEnd = () => this.fillDrawing();
+    this.library(figures);
+    this.controls();
+    this.source("library");
+    this.connect();
+  }
+
+  // The connection
+
+  connect() {
+    const address = new URL("api/play", location.href);
+    address.protocol = address.protocol.replace("http", "ws");
+    this.socket = new WebSocket(address);
+    this.socket.binaryType = "arraybuffer";
+    this.socket.onopen = () => this.banner("");
+    this.socket.onmessage = ({ data }) => this.hear(data);
+    this.socket.onclose = ({ code }) => this.closed(code);
+  }
+
+  async closed(code) {
+    this.board.halt();
+    if (code === FULL) {
+      this.banner("Too many pages are open on this studio: close one, then load this page again.");
+      return;
+    }
+    // Whoever is refused at the door sees no more than a failed connection: ask in plain HTTP.
+    const door = await fetch("api/runs").catch(() => null);
+    if (code === SHUT || door?.status === 403) {
+      this.banner("tangram-studio was started anew: open the address that it printed now.");
+      return;
+    }
+    this.banner("Lost the connection to tangram-studio: is it still running? Trying again.");
+    setTimeout(() => this.connect(), AGAIN_MS);
+  }
+
+  banner(text) {
+    $("banner").textContent = text;
+    $("banner").hidden = !text;
+  }
+
+  send(message) {
+    if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
+  }
+
+  hear(data) {
+    if (typeof data !== "string") {
+      this.file(data);
+      return;
+    }
+    const message = JSON.parse(data);
+    if (message.told === "pages") {
+      $("pages").textContent = message.count > 1 ? `${message.count} pages are open, each with a table of its own` : "";
+    } else if (message.told === "saved") this.saving = message;
+    else if (message.number !== this.number) return;
+    else if (message.told === "filled") this.filled(message);
+    else if (message.told === "move") this.moved(message);
+    else if (message.told === "wait") {
+      this.say(`Others are served first: ${message.ahead} before you. It goes on by itself.`);
+    } else if (message.told === "refused") this.refused(message.why);
+  }
+
+  say(text, bad = false) {
+    $("status").textContent = text;
+    $("status").classList.toggle("bad", bad);
+  }
+
+  refused(why) {
+    this.board.halt();
+    this.say(`That did not work: ${why}`, true);
+  }
+
+  // What is to be laid
+
+  library(figures) {
+    $("library").append(...figures.map(({ name, outline }) => {
+      const button = document.createElement("button");
+      const every = outline.flat();
+      const [xs, ys] = [0, 1].map((i) => every.map((point) => point[i]));
+      const side = Math.max(Math.max(...xs) - Math.min(...xs), Math.max(...ys) - Math.min(...ys)) * 1.1;
+      const x = (Math.max(...xs) + Math.min(...xs) - side) / 2;
+      const y = (-Math.max(...ys) - Math.min(...ys) - side) / 2;
+      const picture = make("svg", { viewBox: `${x} ${y} ${side} ${side}`, "aria-hidden": true });
+      picture.append(make("path", { d: pathOf(outline), transform: "scale(1,-1)", "fill-rule": "evenodd" }));
+      button.append(picture, name.replaceAll("_", " "));
+      button.dataset.figure = name;
+      button.addEventListener("click", () => {
+        this.name = name;
+        this.fill({ puzzle: name });
+      });
+      return button;
+    }));
+  }
+
+  source(kind) {
+    for (const panel of document.querySelectorAll("[data-source]")) panel.hidden = panel.dataset.source !== kind;
+    this.board.halt();
+    this.number += 1;
+    this.board.mode = { lay: "lay", draw: "draw" }[kind] ?? "play";
+    this.board.choose(-1);
+    const drawing = kind === "draw";
+    $("board").classList.toggle("pen", drawing);
+    if (drawing) $("board").setAttribute("tabindex", 0);
+    else $("board").removeAttribute("tabindex");
+    for (const tan of this.board.tans) tan.style.display = drawing ? "none" : "";
+    this.pen.clear();
+    if (kind === "lay" || drawing) {
+      this.board.show([]);
+      $("answer").hidden = true;
+      this.goal = null;
+    }
+    if (kind === "lay") this.board.put(tray(this.board.tokens));
+    this.say({
+      library: "Choose a figure: the agent lays it.",
+      lay: "Lay a figure of the seven tans, then show it to the agent.",
+      draw: "Draw a figure on the table; when it is closed, the agent begins.",
+      file: "Drop a picture on the table.",
+    }[kind]);
+  }
+
+  fill(what) {
+    this.board.halt();
+    this.number += 1;
+    this.say("The agent looks at it …");
+    this.send({ ask: "fill", number: this.number, who: $("who").value, ...what });
+  }
+
+  fillDrawing() {
+    const outlines = this.pen.line.length > 2 ? [...this.pen.rings, this.pen.line] : this.pen.rings;
+    if (!outlines.length) {
+      this.say("Nothing is drawn yet: close an outline first.", true);
+      return;
+    }
+    this.name = "drawing";
+    this.fill({ outlines, free: this.pen.kind === "free" });
+  }
+
+  async drop(file) {
+    if (!file) return;
+    this.board.halt();
+    this.number += 1;
+    const own = this.number;
+    if (file.size > LIMIT) {
+      this.refused(`${file.name} is larger than 10 MB: make it smaller`);
+      return;
+    }
+    this.name = file.name.replace(/\.[^.]*$/, "").replace(/[^A-Za-z0-9_-]+/g, "_").slice(0, 40) || "file";
+    this.say(`The agent looks at ${file.name} …`);
+    const query = new URLSearchParams({ name: file.name, who: $("who").value });
+    const answer = await fetch(`api/drop?${query}`, { method: "POST", body: file }).catch(() => null);
+    const content = await answer?.json().catch(() => null);
+    if (own !== this.number) return;
+    if (!content) this.refused("the connection to tangram-studio was lost: is it still running?");
+    else if (content.error) this.refused(content.error);
+    else this.filled(content);
+  }
+
+  measured(next) {
+    const area = this.pen.area(next) / this.area;
+    $("area").textContent = area
+      ? `Area: ${area.toFixed(2)} of the seven tans. Any size will do: it is scaled to 1.00.`
+      : "";
+  }
+
+  // What the agent answers
+
+  filled(answer) {
+    this.goal = answer.goal;
+    this.exact = answer.exact;
+    this.iou = answer.iou;
+    $("answer").hidden = false;
+    $("seen-picture").src = answer.seen;
+    const [width, height] = answer.size;
+    $("seen-pieces").setAttribute("viewBox", `0 0 ${width} ${height}`);
+    $("seen-pieces").replaceChildren(...answer.pieces.map((piece, k) => make("polygon", {
+      points: piece.map((point) => point.join(",")).join(" "), fill: this.board.tokens[k].colour,
+    })));
+    $("told").textContent = answer.exact
+      ? `What it sees, and how it will lay it: ${answer.how}, IoU ${answer.iou.toFixed(3)}.`
+      : `Seven tans do not fill it: ${answer.how}. The nearest figure that was found has IoU ${answer.iou.toFixed(2)}.`;
+    this.board.mode = "play";
+    this.board.choose(-1);
+    $("board").classList.remove("pen");
+    for (const tan of this.board.tans) tan.style.display = "";
+    this.pen.clear();
+    this.board.show(answer.laid, answer.exact ? [] : answer.outline);
+    this.play(null);
+  }
+
+  play(start) {
+    this.board.halt();
+    this.number += 1;
+    this.asking = true;
+    this.over = false;
+    this.send({ ask: "play", number: this.number, goal: this.goal, start, motion: $("motion").value });
+  }
+
+  moved(move) {
+    this.asking = false;
+    this.over = move.over;
+    this.board.add(move);
+    this.want();
+  }
+
+  // Two moves lie ready, so that none is waited for.
+  want() {
+    if (this.over || this.asking || this.board.queue.length > 1) return;
+    this.asking = true;
+    this.send({ ask: "next" });
+  }
+
+  dragged(done, byKey = false) {
+    if (this.board.mode !== "play") return;
+    clearTimeout(this.timer);
+    this.board.halt();
+    this.number += 1; // what was asked for is no longer wanted
+    if (!this.goal) return;
+    this.say("You moved a tan: the agent goes on from here.");
+    if (done) this.timer = setTimeout(() => this.play(this.board.scene), byKey ? RESTART_MS : 0);
+  }
+
+  shown(move) {
+    const so_far = `covers ${per_cent(move.coverage)}, IoU ${move.iou.toFixed(3)}`;
+    if (!move.over) {
+      this.say(move.blocked ? `Others are in the way: it tries another tan. It ${so_far}.` : `It ${so_far}.`);
+    } else if (move.iou >= 0.95) this.say(`Laid: ${so_far}.${this.exact ? "" : " Of the nearest figure."}`);
+    else this.say(`It can do no more: ${so_far} of the figure.`);
+  }
+
+  // Files
+
+  save(kind) {
+    if (!this.goal) return;
+    this.say("The file is made …");
+    this.send({ ask: "save", number: this.number, kind, tokens: this.board.scene, name: this.name });
+  }
+
+  file(data) {
+    const { kind, type } = this.saving;
+    const link = document.createElement("a");
+    link.href = URL.createObjectURL(new Blob([data], { type }));
+    link.download = `${this.name}.${kind}`;
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+    this.say(`Saved ${link.download}, ${Math.ceil(data.byteLength / 1000)} kB.`);
+  }
+
+  controls() {
+    for (const one of document.querySelectorAll("[name=source]")) {
+      one.addEventListener("change", () => this.source(one.value));
+    }
+    const pens = {
+      polygon: "Click corner after corner, then the first again. By keyboard: Tab to the table, arrow keys, Space sets a corner, Enter closes.",
+      free: "Draw around the figure in one stroke. Wobbly lines are no harm; the nearest figure of tans is looked for.",
+    };
+    for (const one of document.querySelectorAll("[name=pen]")) {
+      one.addEventListener("change", () => {
+        this.pen.kind = one.value;
+        $("draw-help").textContent = pens[one.value];
+        this.source("draw");
+      });
+    }
+    $("draw-help").textContent = pens.polygon;
+    $("snap").addEventListener("change", () => { this.pen.snaps = $("snap").checked; });
+    $("draw-undo").addEventListener("click", () => this.pen.undo());
+    $("draw-clear").addEventListener("click", () => this.source("draw"));
+    $("draw-done").addEventListener("click", () => this.fillDrawing());
+    $("lay-clear").addEventListener("click", () => this.source("lay"));
+    $("lay-done").addEventListener("click", () => {
+      this.name = "layout";
+      this.fill({ pieces: this.board.scene });
+    });
+    const chosen = (act) => () => {
+      if (this.board.mode !== "lay") this.say("Start again to lay another figure.");
+      else if (this.board.chosen >= 0) act(this.board.chosen);
+      else this.say("Click a tan first.");
+    };
+    $("turn-left").addEventListener("click", chosen((k) => this.board.turn(k)));
+    $("turn-right").addEventListener("click", chosen((k) => this.board.turn(k, -Math.PI / 4)));
+    $("turn-over").addEventListener("click", chosen((k) => this.board.over(k)));
+    $("again").addEventListener("click", () => this.play(null));
+    for (const kind of ["gif", "svg", "json"]) $(`save-${kind}`).addEventListener("click", () => this.save(kind));
+    $("file").addEventListener("change", () => this.drop($("file").files[0]));
+    const board = $("board");
+    document.addEventListener("dragover", (event) => {
+      event.preventDefault();
+      board.classList.add("over");
+    });
+    document.addEventListener("dragleave", () => board.classList.remove("over"));
+    document.addEventListener("drop", (event) => {
+      event.preventDefault();
+      board.classList.remove("over");
+      document.querySelector("[name=source][value=file]").click();
+      this.drop(event.dataTransfer.files[0]);
+    });
+  }
+}
+
+const tabs = ["play", "watch"];
+const show = (name) => {
+  for (const one of tabs) {
+    $(one).hidden = one !== name;
+    $(`tab-${one}`).setAttribute("aria-selected", one === name);
+    $(`tab-${one}`).tabIndex = one === name ? 0 : -1;
+  }
+  history.replaceState(null, "", `#${name}`);
+};
+for (const one of tabs) {
+  $(`tab-${one}`).addEventListener("click", () => show(one));
+  $(`tab-${one}`).addEventListener("keydown", (event) => {
+    if (event.key !== "ArrowLeft" && event.key !== "ArrowRight") return;
+    const other = tabs[1 - tabs.indexOf(one)];
+    show(other);
+    $(`tab-${other}`).focus();
+  });
+}
+startWatch($("watch"));
+if (location.hash === "#watch") show("watch");
+
+const begin = async () => {
+  const answer = await fetch("api/figures").catch(() => null);
+  if (!answer?.ok) {
+    $("banner").hidden = false;
+    $("banner").textContent = "tangram-studio is still loading its agents, or has ended: trying again.";
+    setTimeout(begin, AGAIN_MS);
+    return;
+  }
+  window.studio = new Studio(await answer.json());
+};
+begin();

@@ -1,0 +1,191 @@
+"""A page's conversation, with tasks that are done at once and in this process."""
+
+import asyncio
+import json
+from collections.abc import Callable
+from typing import Any, cast
+
+import pytest
+
+from tangram_sim.errors import TangramError
+from tangram_studio import filling, playing
+from tangram_studio.jobs import Jobs
+from tangram_studio.session import Session
+from tests.studio.test_playing import figure
+
+pytestmark = pytest.mark.slow
+
+
+class Here:
+    """Does tasks in this process, those that are held back only when they may go on."""
+
+    def __init__(self) -> None:
+        self.open = asyncio.Event()
+        self.open.set()
+        self.done: list[str] = []
+
+    async def do(self, task: Callable[..., Any], *given: object, waits: Any = None) -> Any:
+        if not self.open.is_set():
+            await waits(3)
+            await self.open.wait()
+        self.done.append(task.__name__)
+        return task(*given)
+
+
+class Page:
+    """Asks, and keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.told: list[dict[str, Any]] = []
+        self.files: list[bytes] = []
+        self.jobs = Here()
+        jobs = cast(Jobs, self.jobs)
+        self.session = Session(self._tell, self._give, jobs, jobs)
+
+    async def _tell(self, text: str) -> None:
+        self.told.append(json.loads(text))
+
+    async def _give(self, data: bytes) -> None:
+        self.files.append(data)
+
+    async def ask(self, ask: str, **content: Any) -> dict[str, Any]:
+        """Ask, and wait until it is done; the last thing that was told."""
+        await self.session.hear(json.dumps({"ask": ask, **content}))
+        if self.session._doing is not None:
+            await asyncio.wait([self.session._doing])
+        return self.told[-1]
+
+
+def plain(name: str) -> dict[str, Any]:
+    goal = figure(name)
+    return {"poses": goal.poses.tolist(), "flipped": goal.flipped.tolist()}
+
+
+def test_a_figure_is_filled_played_to_its_end_and_saved() -> None:
+    async def talk() -> None:
+        page = Page()
+        found = await page.ask("fill", number=1, puzzle="cat")
+        assert (found["told"], found["number"], found["exact"]) == ("filled", 1, True)
+        assert found["iou"] > 0.999
+        move = await page.ask("play", number=2, goal=found["goal"])
+        tokens = list[int | None]()
+        while not move["over"]:
+            assert (move["told"], move["number"], move["lifts"]) == ("move", 2, True)
+            tokens.append(move["token"])
+            move = await page.ask("next")
+        assert sorted(map(int, cast(list[int], tokens))) == list(range(7))
+        assert (move["token"], move["iou"] > 0.99) == (None, True)
+        count = len(page.told)
+        await page.ask("next")  # nothing is being played any more
+        assert len(page.told) == count
+        last = {"poses": move["frames"][-1], "flipped": move["flipped"]}
+        saved = await page.ask("save", number=3, kind="svg", tokens=last, name="cat")
+        assert (saved["told"], saved["type"]) == ("saved", "image/svg+xml")
+        assert page.files[0].startswith(b"<svg")
+
+    asyncio.run(talk())
+
+
+def test_it_goes_on_from_where_a_token_was_taken() -> None:
+    async def talk() -> None:
+        page, goal = Page(), plain("cat")
+        start = {"poses": [*goal["poses"][:6], [0.9, -0.9, 1.0]], "flipped": goal["flipped"]}
+        move = await page.ask("play", number=5, goal=goal, start=start)
+        assert (move["token"], move["over"]) == (6, False)
+        end = await page.ask("next")
+        assert (end["over"], end["iou"] > 0.99) == (True, True)
+
+    asyncio.run(talk())
+
+
+@pytest.mark.parametrize(
+    ("message", "why"),
+    [
+        ("{", "the page's message is not understood"),
+        ('{"ask": "fill", "number": 1}', "a puzzle, a drawing or pieces are to be filled"),
+        ('{"ask": "fill", "number": 1, "puzzle": "unicorn"}', "unknown puzzle 'unicorn'"),
+    ],
+)
+def test_what_cannot_be_done_is_told(message: str, why: str) -> None:
+    async def talk() -> None:
+        page = Page()
+        await page.session.hear(message)
+        if page.session._doing is not None:
+            await asyncio.wait([page.session._doing])
+        (told,) = page.told
+        assert told["told"] == "refused"
+        assert why in told["why"]
+
+    asyncio.run(talk())
+
+
+def test_a_failure_of_the_code_is_told_and_logged(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(filling, "fill", broken)
+
+    async def talk() -> None:
+        told = await Page().ask("fill", number=1, puzzle="cat")
+        assert "terminal" in told["why"]
+
+    asyncio.run(talk())
+    assert "a page's fill failed" in caplog.text
+
+
+def test_the_newest_question_takes_the_place_of_the_one_before() -> None:
+    async def talk() -> None:
+        page = Page()
+        page.jobs.open.clear()
+        await page.session.hear('{"ask": "fill", "number": 1, "puzzle": "cat"}')
+        await asyncio.sleep(0)
+        await page.session.hear('{"ask": "fill", "number": 2, "puzzle": "swan"}')
+        await asyncio.sleep(0)
+        page.jobs.open.set()
+        assert page.session._doing is not None
+        await asyncio.wait([page.session._doing])
+        assert [(one["told"], one["number"]) for one in page.told] == [
+            ("wait", 1),
+            ("wait", 2),
+            ("filled", 2),
+        ]
+        assert page.told[0]["ahead"] == 3
+
+    asyncio.run(talk())
+
+
+def test_moves_that_get_nowhere_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = list[object]()
+
+    def stuck(scene: playing.Sides, *rest: object) -> playing.Move:
+        calls.append(rest)
+        return playing.Move(None, scene.poses[None], False, 0.1, 0.1, cast(playing.Round, None))
+
+    monkeypatch.setattr(playing, "next_move", stuck)
+
+    async def talk() -> None:
+        goal = plain("cat")
+        end = await Page().ask("play", number=1, goal=goal, start=goal)
+        assert (end["over"], end["iou"]) == (True, 0.1)
+
+    asyncio.run(talk())
+    assert len(calls) == 5
+
+
+def test_an_error_of_a_task_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: object) -> None:
+        raise TangramError("no room: make it smaller")
+
+    monkeypatch.setattr(playing, "begin", refused)
+
+    async def talk() -> None:
+        told = await Page().ask("play", number=9, goal=plain("cat"))
+        assert (told["told"], told["number"], told["why"]) == (
+            "refused",
+            9,
+            "no room: make it smaller",
+        )
+
+    asyncio.run(talk())
