@@ -4,7 +4,7 @@ SHELL := /bin/bash
 BIN := .venv/bin
 ARGS ?=
 BUDGET ?= laptop
-SCRIPTS := .ci/install .ci/run $(shell find docker slurm -name "*.sh" -o -name "*.sbatch" 2>/dev/null)
+SCRIPTS := .ci/install .ci/run $(shell find docker slurm studio -name "*.sh" -o -name "*.sbatch" 2>/dev/null)
 
 # make takes name=value for a variable of its own and drops what it does not know.
 KNOWN := ARGS BUDGET

@@ -186,7 +186,7 @@ class Loop:
                 "one is lost; a copy of the folder goes on from there with resume=auto"
             ) from None
         self._wait_for_scores(launched)
-        self.reporter.draw(self.folder.picture)
+        self.reporter.draw()
         return self.reporter.flush(len(self._arrived))
 
     def dismiss(self, reason: str) -> None:

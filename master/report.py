@@ -4,6 +4,7 @@ import logging
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -28,6 +29,7 @@ from tangram_agent.process import Every
 from tangram_agent.setup import Setup
 from tangram_sim.arrays import Floats
 from tangram_sim.drawing import episode_sheet
+from tangram_sim.errors import RunError
 
 UNKNOWN = -1.0
 PICTURE_COLUMNS = 4
@@ -186,6 +188,7 @@ class Reporter:
         progress: Progress,
         metrics: Metrics,
         listeners: Sequence[Callable[[RunStatus], None]],
+        picture: Path,
     ) -> None:
         """Report nothing yet.
 
@@ -196,12 +199,14 @@ class Reporter:
             progress: for the user.
             metrics: the curves.
             listeners: get the status about once in a second.
+            picture: where the newest test episodes are drawn.
         """
         self._trainer, self._record, self._status = trainer, record, status
         self._progress, self._metrics, self._listeners = progress, metrics, listeners
         self._losses, self._play = Means(), Means()
         self._tick, self._listen = Every(TICK_S, at_once=True), Every(LISTEN_S, at_once=True)
         self._log, self._picture = Every(LOG_S), Every(PICTURE_S, at_once=True)
+        self._path = picture
         self._published: OrderedDict[int, Sent] = OrderedDict()
         self._latest: Scores | None = None
         self._stage = -1
@@ -246,6 +251,8 @@ class Reporter:
         if len(scores.ends) and self._picture.due():
             picture = scores_picture(scores, self._trainer.setup, CURVE_PIXELS)
             self._metrics.picture(np.asarray(picture), updates)
+            with suppress(RunError):  # a disk that fails is told where the run needs it
+                self.draw()
 
     def tick(self, queue: int) -> None:
         """Tell how the run stands where it is time, and write the curves; see `collect`."""
@@ -287,7 +294,7 @@ class Reporter:
         """Write what runs are compared by."""
         self._metrics.hyperparameters(result)
 
-    def draw(self, path: Path) -> None:
+    def draw(self) -> None:
         """Draw the test episodes of the last evaluation, where there is one with pictures.
 
         Raises:
@@ -296,7 +303,7 @@ class Reporter:
         if self._latest is not None and len(self._latest.ends):
             drawn = BytesIO()
             scores_picture(self._latest, self._trainer.setup, PICTURE_PIXELS).save(drawn, "PNG")
-            write_whole(path, drawn.getvalue(), above=False)
+            write_whole(self._path, drawn.getvalue(), above=False)
 
     def _now(self) -> Sent:
         return Sent(time.monotonic(), self._trainer.episodes, self._record.train_s)

@@ -52,7 +52,7 @@ class RunFolder:
         audit: who joined, left and was refused.
         result: the scores of the final weights.
         bad_batch: what the learner could not learn from, where that ended the run.
-        picture: the test episodes, played with the final weights.
+        picture: the test episodes of the newest evaluation, drawn now and then, and at the end.
         again: path -> writes it again where the folder was made anew.
     """
 

@@ -18,7 +18,14 @@ from tangram_cli.commands import COMMANDS
 pytestmark = pytest.mark.fast
 
 ROOT = Path(__file__).parents[1]
-OURS = ("tangram_agent", "tangram_cli", "tangram_lab", "tangram_sim", "tangram_vision")
+OURS = (
+    "tangram_agent",
+    "tangram_cli",
+    "tangram_lab",
+    "tangram_sim",
+    "tangram_studio",
+    "tangram_vision",
+)
 PACKAGES = ("conf", "master", "worker", *OURS)
 
 
@@ -52,7 +59,7 @@ def test_import_contracts_catch_every_wrong_arrow(tmp_path: Path) -> None:
     wrong = {
         "tangram_sim/wrong.py": "import torch, pybullet, cv2, zmq, omegaconf, tangram_sim.engine",
         "tangram_agent/wrong.py": "import worker.config, conf.help, tangram_vision.seeing",
-        "master/wrong.py": "import tangram_lab.experiments.plan, tangram_sim.wrong",
+        "master/wrong.py": "import tangram_lab.experiments.plan, tangram_sim.wrong, uvicorn",
     }
     for path, code in wrong.items():
         (tmp_path / path).write_text(code)
@@ -64,7 +71,7 @@ def test_import_contracts_catch_every_wrong_arrow(tmp_path: Path) -> None:
 def test_command_lines_load_nothing_heavy() -> None:
     loaded = run_python(
         "import master.cli, tangram_cli.commands, tangram_lab.benchmarks.cli, sys\n"
-        "import tangram_lab.experiments.cli, worker.cli\n"
+        "import tangram_lab.experiments.cli, tangram_studio.cli, worker.cli\n"
         "print({'torch', 'numpy', 'hydra', 'zmq', 'gymnasium'} & set(sys.modules))"
     )
     assert loaded == "set()"

@@ -219,7 +219,7 @@ class Panel {
     if (!episodes) {
       const why = folder === null ? "A master sends no pictures: name its run folder."
         : state === "ended" ? "This run left no picture of test episodes."
-        : "Test episodes are drawn when the run ends.";
+        : "Test episodes are drawn after the first evaluation.";
       this.picture.replaceChildren(make("figcaption", {}, why));
       return;
     }

@@ -23,6 +23,7 @@ WITH_HELP = (
     "tangram-keys",
     "tangram-eval",
     "tangram-play",
+    "tangram-studio",
     "tangram-experiment",
     "tangram-report",
 )
@@ -30,6 +31,7 @@ WITH_HELP = (
 SETTING = {
     "tangram-worker": "role: player",
     "tangram-keys": "add: null",
+    "tangram-studio": "port: 8765",
     "tangram-experiment": "jobs: 2",
     "tangram-report": "runs: ???",
 }

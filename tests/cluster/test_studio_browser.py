@@ -10,6 +10,7 @@ import re
 import shutil
 import time
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -520,6 +521,46 @@ def test_runs_are_watched_while_they_train_and_side_by_side(page: Page, tmp_path
 def test_a_wrong_run_has_its_words(page: Page, run: str) -> None:
     watched(page, run)
     expect(page.locator("#watch")).to_contain_text(run)
+
+
+# In motion
+
+
+@pytest.mark.skipif("TANGRAM_STUDIO_PICTURES" not in os.environ, reason="it makes a picture")
+def test_the_page_in_motion_is_filmed(browser: Browser, running: Running) -> None:
+    """A cat that is drawn, laid, taken apart and mended: studio.gif, which README shows."""
+    context = browser.new_context(viewport={"width": 1000, "height": 720})
+    page, frames = opened(context.new_page(), running), list[Image.Image]()
+
+    def keep() -> None:
+        with Image.open(BytesIO(page.screenshot())) as whole:
+            frames.append(whole.convert("RGB").resize((800, 576), Image.Resampling.LANCZOS))
+
+    source(page, "draw")
+    page.locator("[name=pen][value=free]").check()
+    page.mouse.move(*on_table(page, *CAT[0]))
+    page.mouse.down()
+    for point in [*CAT, CAT[0]]:
+        page.mouse.move(*on_table(page, *point), steps=3)
+        keep()
+    page.mouse.up()
+    began = time.monotonic()
+    while not page.evaluate("studio.over && !studio.board.move") and len(frames) < 110:
+        page.wait_for_timeout(100)
+        keep()
+    assert time.monotonic() - began < LONG_MS / 1000
+    x, y, _ = page.evaluate("studio.board.poses[0]")
+    drag(page, [(x, y), (0.6, 0.3), (0.75, 0.75)])
+    for _ in range(14):
+        page.wait_for_timeout(100)
+        keep()
+    status(page).to_contain_text("Of the nearest figure")
+    keep()
+    context.close()
+    film = [frame.quantize(64, dither=Image.Dither.NONE) for frame in [*frames, *frames[-1:] * 8]]
+    path = Path(os.environ["TANGRAM_STUDIO_PICTURES"]) / "studio.gif"
+    film[0].save(path, save_all=True, append_images=film[1:], duration=130, loop=0, optimize=True)
+    assert path.stat().st_size < 4_000_000
 
 
 # Many

@@ -209,7 +209,8 @@ def loop(
     checkpointer = Checkpointer(service, claim, guard, hub, kept, clock)  # type: ignore[arg-type]
     status = StatusCollector("run", guard, hub, budget, clock, checkpointer)  # type: ignore[arg-type]
     metrics = Metrics(run_folder.tensorboard, run_folder.curve)
-    reporter = Reporter(learner, record, status, ShownProgress(), metrics, [hub.tell])
+    shown = ShownProgress(), metrics, [hub.tell], run_folder.picture
+    reporter = Reporter(learner, record, status, *shown)
     return Loop(
         service=service,
         folder=run_folder,

@@ -266,12 +266,20 @@ def test_a_run_whose_folder_is_gone_ends_with_one_line_and_makes_none(
     with pytest.raises(RunError, match=r"^run_dir .*/run is gone: the run ended without a check"):
         made.finish(launched=False)
     with pytest.raises(RunError, match=r"cannot write .*/test_episodes.png \(No such file or dir"):
-        made.reporter.draw(made.folder.picture)
+        made.reporter.draw()
     with pytest.raises(RunError, match=r"cannot write .*/result.json \(No such file or directory"):
         made.folder.write_result({})
     made.dismiss("the end")
     made.reporter._metrics.close()
     assert not folder.exists()
+
+
+def test_test_episodes_are_drawn_while_it_learns(tmp_path: Path) -> None:
+    made = loop(tmp_path, MADE, FakeHub(MADE, batches(1)))
+    assert not made.folder.picture.exists()
+    made.reporter.scored(scores(MADE, 0).scores)
+    with Image.open(made.folder.picture) as picture:
+        assert picture.format == "PNG"
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,22 @@
+#!/usr/bin/env bash
+# Tries the studio's page in a real browser, as root on Debian: every way that a person may take.
+#
+#   studio/try.sh
+#
+# Installs Debian's chromium, runs all tests of the studio (20 browsers at once, and how soon the first
+# move comes, among them) and keeps the pictures of docs/studio.md. Ends with status 1 if one fails. The
+# chromium package stays.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+
+if ! command -v chromium >/dev/null; then
+    [[ $EUID -eq 0 ]] || { echo "try.sh: no chromium: run 'sudo apt-get install chromium'" >&2; exit 1; }
+    echo "installing chromium"
+    apt-get update -qq
+    apt-get install -y -qq --no-install-recommends chromium fonts-dejavu-core >/dev/null
+fi
+make --no-print-directory .venv/.installed-dev
+export TANGRAM_TRY_STUDIO=1 TANGRAM_STUDIO_PICTURES=${TANGRAM_STUDIO_PICTURES:-$PWD/docs/images}
+OPENBLAS_NUM_THREADS=1 .venv/bin/python -m pytest -rP --durations=5 tests/studio \
+    tests/cluster/test_studio.py tests/cluster/test_studio_watch.py tests/cluster/test_studio_browser.py |
+    grep -vE '^(-+ Captured|_+ .* _+$)'
