@@ -176,8 +176,7 @@ def open_run(
     opened.enter_context(closing(metrics))
     status = StatusCollector(folder.path.name, guard, hub, budget, clock, checkpointer)
     listeners = [hub.tell, *([] if health is None else [health.update])]
-    shown = progress, metrics, listeners, folder.picture
-    reporter = Reporter(trainer, rest.record, status, *shown)
+    reporter = Reporter(trainer, rest.record, status, progress, metrics, listeners, folder.picture)
     loop = Loop(
         service=service,
         folder=folder,
