@@ -8,6 +8,7 @@ Legend: H x W pixels of a picture.
 """
 
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 
 import contourpy
@@ -17,7 +18,7 @@ import shapely
 from PIL import Image, ImageDraw
 from shapely import Polygon
 
-from tangram_sim.areas import Area
+from tangram_sim.areas import Area, valid
 from tangram_sim.arrays import Bools, Floats, Singles
 from tangram_sim.dissections import Dissection
 from tangram_sim.errors import ConfigError
@@ -161,8 +162,9 @@ def _traced(cover: Singles, unit: float) -> Area:
     levels = np.pad(cover, 1)  # so that every line is closed
     middles = np.arange(len(levels)) - 0.5
     lines = contourpy.contour_generator(middles, middles, levels).lines(0.5)
-    rings = [Polygon(line) for line in lines if len(line) > 3]
-    area: Area = shapely.make_valid(shapely.symmetric_difference_all(rings))
+    rings = [valid(Polygon(line)) for line in lines if len(line) > 3]
+    # A ring within another is a hole.
+    area: Area = valid(reduce(shapely.symmetric_difference, rings, Polygon()))
     return shapely.transform(area, lambda points: points * (unit, -unit))
 
 

@@ -37,7 +37,8 @@ def test_a_run_is_watched_while_it_goes_on_and_after_its_end(folder: Path) -> No
         assert dict(shown["rows"])["does"] == shown["activity"]
         assert {row[0] for row in shown["workers"]["rows"]} <= {"worker 0", "evaluator 0"}
         assert 0 <= shown["share"] <= 1
-        assert shown["episodes"] is None
+        wait_for_file(folder / "test_episodes.png", process)  # newest ones, while it learns
+        assert seen_live(folder)["episodes"]["at"] > 0
         process.send_signal(signal.SIGINT)
         process.wait(LIMIT_S)
     shown = view(str(folder))
