@@ -11,7 +11,7 @@ import pytest
 from tangram_sim.arrays import Floats
 from tangram_sim.errors import ConfigError
 from tangram_vision.outline_files import MAX_MEETINGS, _meetings, read_outline
-from tangram_vision.silhouette_files import Silhouette, fill_silhouette
+from tangram_vision.silhouette_files import Silhouette, _traced, fill_silhouette
 from tests.sim.builders import SEVEN, layout_of
 
 pytestmark = pytest.mark.fast
@@ -147,3 +147,15 @@ def test_sides_that_meet_are_counted_but_for_neighbours() -> None:
     assert _meetings([square, square + (1.0, 0.0)]) == 7  # one whole side, at its ends others
     assert _meetings([square[[0, 2, 1, 3]]]) == 1
     assert _meetings([np.random.default_rng(0).random((2_000, 2))]) < 2 * MAX_MEETINGS + 2_000
+
+
+def test_a_picture_is_traced_with_its_holes_and_what_lies_in_them() -> None:
+    cover = np.zeros((60, 60), np.float32)
+    cover[10:50, 10:50] = 1.0
+    cover[20:30, 20:30] = 0.0
+    cover[24:26, 24:26] = 1.0
+    area = _traced(cover, 0.1)
+    # Half a pixel's corners are cut off, each an eighth of it.
+    expected = (40**2 - 10**2 + 2**2) - 4 / 8 + 4 / 8 - 4 / 8
+    assert area.area == pytest.approx(expected * 0.01)
+    assert area.bounds == pytest.approx((1.0, -5.0, 5.0, -1.0))
