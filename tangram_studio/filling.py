@@ -22,7 +22,7 @@ from tangram_sim.areas import Area, polygons
 from tangram_sim.arrays import Floats
 from tangram_sim.dissections import Dissection
 from tangram_sim.errors import ConfigError
-from tangram_sim.puzzles import library
+from tangram_sim.puzzles import library, load_puzzle
 from tangram_sim.strokes import colour_of
 from tangram_sim.targets import placement, turned_figure
 from tangram_studio.messages import Fill
@@ -81,6 +81,7 @@ def fill(asked: Fill) -> Answer:
         raise ConfigError("a puzzle, a drawing or pieces are to be filled, one of them")
     layout, scale = player("lift").layout, player("lift").run.setup.tokens.scale
     if asked.puzzle is not None:
+        load_puzzle(asked.puzzle)  # a name of the library, not of a file
         return _filled(asked.puzzle, "the puzzle", asked.who)
     content = {"format": FORMAT, "version": VERSION, "outlines": asked.outlines}
     if asked.pieces is not None:

@@ -12,7 +12,7 @@ from collections.abc import Awaitable, Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import wait
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from tangram_sim.errors import TangramError
 
@@ -39,6 +39,7 @@ class Jobs:
         self._processes, self._warm = processes, warm
         self._turns = asyncio.Semaphore(processes)
         self._waiting, self.started = 0, 0
+        self._working: set[asyncio.Task[Any]] = set()
         self._pool = self._start()
 
     async def ready(self) -> None:
@@ -59,19 +60,40 @@ class Jobs:
             TangramError: the process ended, or took too long; or whatever the task raises.
         """
         await self._turn(waits)
+        # Whoever asked may go: what a process has begun it ends, and until then it is not free.
+        work = asyncio.create_task(self._work(task, given))
+        self._working.add(work)
+        work.add_done_callback(self._ended)
+        return await asyncio.shield(work)
+
+    async def _work(self, task: Callable[..., Given], given: tuple[object, ...]) -> Given:
+        """Do a task in a process, once more where that ends meanwhile; then the turn is over."""
         try:
-            pool = self._pool
-            return await asyncio.wait_for(
-                asyncio.wrap_future(pool.submit(task, *given)), timeout=LIMIT_S
-            )
-        except BrokenProcessPool:
-            self._renew(pool)
-            raise TangramError("the process that worked on it ended: try it again") from None
-        except TimeoutError:
-            self._renew(pool)
-            raise TangramError(f"it took more than {LIMIT_S:g} s: make it simpler") from None
+            for _ in range(2):
+                pool = self._pool
+                future: asyncio.Future[Given] | None = None
+                try:
+                    future = asyncio.wrap_future(pool.submit(task, *given))
+                    return await asyncio.wait_for(future, timeout=LIMIT_S)
+                except BrokenProcessPool:
+                    self._renew(pool)
+                except TimeoutError:
+                    self._renew(pool)
+                    raise TangramError(
+                        f"it took more than {LIMIT_S:g} s: make it simpler"
+                    ) from None
+                except asyncio.CancelledError:
+                    # Of another task's pool, which was ended with that; not this task.
+                    if future is None or not future.cancelled() or _is_cancelled():
+                        raise
+            raise TangramError("the process that worked on it ended: make it simpler")
         finally:
             self._turns.release()
+
+    def _ended(self, work: "asyncio.Task[Any]") -> None:
+        self._working.discard(work)
+        if not work.cancelled():
+            work.exception()  # heard, also where nobody waits for it any more
 
     async def _turn(self, waits: Waits | None) -> None:
         """Wait for a process that is free."""
@@ -83,8 +105,10 @@ class Jobs:
                 await waits(self._waiting - 1)
             await turn
         except BaseException:
-            if not turn.cancel():
+            if turn.done() and not turn.cancelled():
                 self._turns.release()
+            else:
+                turn.cancel()
             raise
         finally:
             self._waiting -= 1
@@ -104,6 +128,12 @@ class Jobs:
     def close(self) -> None:
         """End the processes."""
         _end(self._pool)
+
+
+def _is_cancelled() -> bool:
+    """Whether the running task itself was told to end."""
+    task = asyncio.current_task()
+    return task is not None and task.cancelling() > 0
 
 
 def _end(pool: ProcessPoolExecutor) -> None:

@@ -86,13 +86,11 @@ class Save(Struct, tag_field="ask", tag="save", forbid_unknown_fields=True):
     """Send what was played as a file.
 
     Attributes:
-        number: see `Fill`.
         kind: gif, of all moves; svg, of the tokens as they lie; json, a puzzle file of the figure.
         tokens: as they lie.
         name: of the figure.
     """
 
-    number: Count
     kind: Literal["gif", "svg", "json"]
     tokens: Tokens
     name: Annotated[str, Meta(max_length=64)] = "figure"

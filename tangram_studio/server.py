@@ -6,20 +6,19 @@ import os
 import secrets
 import socket
 import webbrowser
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, suppress
 from functools import partial
-from http.cookies import CookieError, SimpleCookie
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 import uvicorn
+from anyio import to_thread
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers, QueryParams
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, PlainTextResponse, RedirectResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -32,7 +31,7 @@ from tangram_studio.filling import fill_file, tans
 from tangram_studio.jobs import Jobs
 from tangram_studio.messages import MAX_BYTES, write
 from tangram_studio.playing import player
-from tangram_studio.session import Session, plain
+from tangram_studio.session import LOST, Session, plain
 
 HOST = "127.0.0.1"
 PAGES = 64  # at once
@@ -62,6 +61,11 @@ NOT_LET_IN = (
 WRONG_HOST = "This server answers to this machine's own names alone: open the printed address.\n"
 FULL = 4429  # codes of a socket that is closed
 SHUT = 4403
+NO_BYTES = 1003
+UPLOADS = 8  # at once
+UPLOAD_S = 60.0  # that one may take to come
+WATCH_S = 10.0  # that a run may take to be read
+OPEN = 512  # connections at once
 
 log = logging.getLogger(__name__)
 
@@ -94,7 +98,7 @@ class Door:
         if headers.get("host") not in self._hosts:
             return PlainTextResponse(WRONG_HOST, 403)
         origin = headers.get("origin")
-        if origin is not None and urlsplit(origin).netloc != headers["host"]:
+        if origin is not None and origin != f"http://{headers['host']}":
             return PlainTextResponse(WRONG_HOST, 403)
         given = QueryParams(scope["query_string"]).get("token")
         if given is not None and self._is_token(given) and scope["type"] == "http":
@@ -102,7 +106,7 @@ class Door:
             inside = RedirectResponse("/", 303)
             inside.set_cookie(self._cookie, self._token, httponly=True, samesite="strict")
             return inside
-        if not self._is_token(_cookies(headers).get(self._cookie, "")):
+        if not any(map(self._is_token, _cookies(headers, self._cookie))):
             return PlainTextResponse(NOT_LET_IN, 403)
         return None
 
@@ -117,11 +121,12 @@ async def _guarded(send: Send, message: Message) -> None:
     await send(message)
 
 
-def _cookies(headers: Headers) -> dict[str, str]:
-    try:
-        return {k: one.value for k, one in SimpleCookie(headers.get("cookie", "")).items()}
-    except CookieError:
-        return {}
+def _cookies(headers: Headers, name: str) -> Iterator[str]:
+    """The values of a cookie; others are of other programs of this machine, in whatever form."""
+    for one in ";".join(headers.getlist("cookie")).split(";"):
+        key, _, value = one.partition("=")
+        if key.strip() == name:
+            yield value.strip()
 
 
 class Studio:
@@ -132,6 +137,7 @@ class Studio:
         many = max(1, (os.cpu_count() or 2) // 2)
         self.fills, self.moves = Jobs(many, warm), Jobs(many, warm)
         self._pages: set[WebSocket] = set()
+        self._uploads = 0
         self._tans: dict[str, object] | None = None
 
     @asynccontextmanager
@@ -157,8 +163,14 @@ class Studio:
         try:
             await self._count()
             while True:
-                await session.hear(await socket.receive_text())
-        except (WebSocketDisconnect, KeyError):  # the latter: bytes, which no page sends
+                message = await socket.receive()
+                if message["type"] == "websocket.disconnect":
+                    break
+                if message.get("text") is None:  # no page sends bytes
+                    await socket.close(NO_BYTES)
+                    break
+                await session.hear(message["text"])
+        except (WebSocketDisconnect, RuntimeError):  # it is going
             pass
         finally:
             self._pages.discard(socket)
@@ -177,7 +189,10 @@ class Studio:
     async def figures(self, _: Request) -> Response:
         """The tokens, and the library."""
         if self._tans is None:
-            self._tans = await self.fills.do(tans)
+            try:
+                self._tans = await self.fills.do(tans)
+            except TangramError as error:
+                return _refused(str(error), 503)
         return JSONResponse(self._tans)
 
     async def drop(self, request: Request) -> Response:
@@ -186,19 +201,45 @@ class Studio:
         if not size.isdecimal() or int(size) > MAX_UPLOAD:
             limit = MAX_UPLOAD // 10**6
             return _refused(f"the file is larger than {limit} MB: make it smaller", 413)
-        data = bytearray()
-        async for part in request.stream():
-            data += part
-            if len(data) > MAX_UPLOAD:
-                return _refused("the file is larger than it said", 413)
+        if self._uploads >= UPLOADS:
+            return _refused("others' files are looked at first: drop it again in a moment", 429)
+        self._uploads += 1
+        try:
+            async with asyncio.timeout(UPLOAD_S):
+                data = await request.body()
+            return await self._seen(request, data)
+        except TimeoutError:
+            return _refused(f"the file did not come within {UPLOAD_S:g} s: drop it again", 408)
+        except ClientDisconnect:
+            return Response(status_code=400)  # nobody hears it
+        except Exception:  # a page must hear of everything
+            log.exception("a file was not filled")
+            return _refused(LOST, 500)
+        finally:
+            self._uploads -= 1
+
+    async def _seen(self, request: Request, data: bytes) -> Response:
+        """How a file is filled, unless its sender leaves."""
         name, who = (request.query_params.get(key, "") for key in ("name", "who"))
         if who not in ("together", "agent"):
             return _refused("who must be together or agent", 400)
+        looks = asyncio.create_task(self.fills.do(fill_file, name, data, who))
+        leaves = asyncio.create_task(_left(request))
+        await asyncio.wait((looks, leaves), return_when=asyncio.FIRST_COMPLETED)
+        leaves.cancel()
+        if not looks.done():
+            looks.cancel()
+            raise ClientDisconnect
         try:
-            answer = await self.fills.do(fill_file, name, bytes(data), who)
+            return JSONResponse(plain(looks.result()))
         except TangramError as error:
             return _refused(str(error), 400)
-        return JSONResponse(plain(answer))
+
+
+async def _left(request: Request) -> None:
+    """Return when whoever asked has left."""
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
 
 
 def warm() -> None:
@@ -227,7 +268,11 @@ async def _runs(_: Request) -> Response:
 
 async def _answered(task: Any, request: Request) -> Response:
     try:
-        found = await run_in_threadpool(task, request.query_params.get("run", ""))
+        run = request.query_params.get("run", "")
+        reading = to_thread.run_sync(task, run, abandon_on_cancel=True)
+        found = await asyncio.wait_for(reading, WATCH_S)
+    except TimeoutError:
+        return _refused(f"it could not be read within {WATCH_S:g} s: is its disk there?", 400)
     except TangramError as error:
         return _refused(str(error), 400)
     if isinstance(found, bytes):
@@ -304,6 +349,7 @@ def serve(config: StudioConfig) -> int:
             ws="websockets-sansio",
             timeout_graceful_shutdown=2,
             server_header=False,
+            limit_concurrency=OPEN,
         )
     )
     server.run(sockets=[listener])

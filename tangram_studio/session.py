@@ -12,13 +12,13 @@ from tangram_sim.errors import TangramError
 from tangram_studio import filling, playing, saving
 from tangram_studio.filling import Answer
 from tangram_studio.jobs import Jobs
-from tangram_studio.messages import Asked, Fill, Next, Play, Save, read, write
+from tangram_studio.messages import Fill, Next, Play, Save, read, write
 from tangram_studio.playing import Move, Round, Sides
 
 ROUNDS = 5  # of a figure that is not laid yet: an agent that gets nowhere ends, too
 LAID = 0.95  # IoU from which a figure counts as laid
 _KINDS = {"gif": "image/gif", "svg": "image/svg+xml", "json": "application/json"}
-_LOST = "something went wrong here that should not: the terminal of tangram-studio says what"
+LOST = "something went wrong here that should not: the terminal of tangram-studio says what"
 
 log = logging.getLogger(__name__)
 
@@ -66,40 +66,45 @@ class Session:
         self._played: list[Move] = []  # of this figure, what was interrupted among them
         self._number = 0
         self._doing: asyncio.Task[None] | None = None
+        self._saving: asyncio.Task[None] | None = None
 
     async def hear(self, text: str | bytes) -> None:
         """Begin what a message asks for; what was being done before ends."""
         try:
             asked = read(text)
         except TangramError as error:
-            await self._say("refused", why=str(error))
+            await self._tell(write("refused", number=None, why=str(error)))
+            return
+        if isinstance(asked, Save):  # beside what is being played
+            if self._saving is not None and not self._saving.done():
+                await self._tell(write("unsaved", why="another file is being made: wait for it"))
+                return
+            self._saving = asyncio.create_task(self._save(asked))
             return
         if isinstance(asked, Next) and self._doing is not None and not self._doing.done():
             return  # it is on its way
-        await self.end()
+        await _ended(self._doing)
         self._number = self._number if isinstance(asked, Next) else asked.number
         self._doing = asyncio.create_task(self._do(asked))
 
     async def end(self) -> None:
         """End what is being done."""
-        if self._doing is not None:
-            self._doing.cancel()
-            with suppress(asyncio.CancelledError):
-                await self._doing
+        for task in (self._doing, self._saving):
+            await _ended(task)
 
-    async def _do(self, asked: Asked) -> None:
+    async def _do(self, asked: Fill | Play | Next) -> None:
         try:
             await self._answer(asked)
         except TangramError as error:
             await self._say("refused", why=str(error))
         except Exception:  # a page must hear of everything
             log.exception("a page's %s failed", type(asked).__name__.lower())
-            await self._say("refused", why=_LOST)
+            await self._say("refused", why=LOST)
 
     async def _say(self, told: str, **content: Any) -> None:
         await self._tell(write(told, number=self._number, **content))
 
-    async def _answer(self, asked: Asked) -> None:
+    async def _answer(self, asked: Fill | Play | Next) -> None:
         match asked:
             case Fill():
                 self._game = None
@@ -109,8 +114,6 @@ class Session:
                 await self._begin(asked)
             case Next():
                 await self._next()
-            case Save():
-                await self._save(asked)
 
     async def _waits(self, ahead: int) -> None:
         await self._say("wait", ahead=ahead)
@@ -158,10 +161,24 @@ class Session:
         return await self._moves.do(playing.next_move, *given, waits=self._waits)
 
     async def _save(self, asked: Save) -> None:
-        given = asked, self._played, self._goal
-        data = await self._fills.do(_saved, *given, waits=self._waits)
-        await self._say("saved", kind=asked.kind, type=_KINDS[asked.kind])
-        await self._give(data)
+        try:
+            data = await self._fills.do(_saved, asked, self._played, self._goal)
+        except TangramError as error:
+            await self._tell(write("unsaved", why=str(error)))
+        except Exception:  # a page must hear of everything
+            log.exception("a page's save failed")
+            await self._tell(write("unsaved", why=LOST))
+        else:
+            kind = asked.kind
+            await self._tell(write("saved", kind=kind, type=_KINDS[kind], name=asked.name))
+            await self._give(data)
+
+
+async def _ended(task: "asyncio.Task[None] | None") -> None:
+    if task is not None:
+        task.cancel()
+        with suppress(asyncio.CancelledError):
+            await task
 
 
 def _saved(asked: Save, moves: list[Move], goal: Sides | None) -> bytes:

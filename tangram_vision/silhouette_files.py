@@ -154,6 +154,10 @@ def _from_picture(
     filled = fill_picture(shade.cover, layout, view, seconds, method)
     drawing = shade.back @ np.diag([1.0 / view, -1.0 / view, 1.0])
     area = _traced(shade.cover, view / len(shade.cover))
+    if not area.area > 0.0:
+        raise ConfigError(
+            f"{source} shows lines that are too thin to have an area: fill the figure with one tone"
+        )
     return Silhouette(picture, _shaded(shade, picture.size), (filled,), drawing, area)
 
 

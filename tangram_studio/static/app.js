@@ -20,6 +20,7 @@ class Studio {
     this.area = area;
     this.number = 0; // of what is asked for: answers to what was asked before are dropped
     this.goal = null;
+    this.over = true;
     this.name = "figure";
     this.board.onDrag = (done, byKey) => this.dragged(done, byKey);
     this.board.onMove = () => this.want();
@@ -39,13 +40,23 @@ class Studio {
     address.protocol = address.protocol.replace("http", "ws");
     this.socket = new WebSocket(address);
     this.socket.binaryType = "arraybuffer";
-    this.socket.onopen = () => this.banner("");
+    this.socket.onopen = () => this.resume();
     this.socket.onmessage = ({ data }) => this.hear(data);
     this.socket.onclose = ({ code }) => this.closed(code);
   }
 
+  // What was asked for while nobody heard it, or was being laid.
+  resume() {
+    this.banner("");
+    if (this.looking) {
+      if (this.last) this.send(this.last);
+    } else if (this.goal && !this.over) this.play(this.board.scene);
+  }
+
   async closed(code) {
+    clearTimeout(this.timer);
     this.board.halt();
+    this.asking = false;
     if (code === FULL) {
       this.banner("Too many pages are open on this studio: close one, then load this page again.");
       return;
@@ -78,7 +89,8 @@ class Studio {
     if (message.told === "pages") {
       $("pages").textContent = message.count > 1 ? `${message.count} pages are open, each with a table of its own` : "";
     } else if (message.told === "saved") this.saving = message;
-    else if (message.number !== this.number) return;
+    else if (message.told === "unsaved") this.say(`Nothing was saved: ${message.why}`, true);
+    else if (message.number !== null && message.number !== this.number) return;
     else if (message.told === "filled") this.filled(message);
     else if (message.told === "move") this.moved(message);
     else if (message.told === "wait") {
@@ -93,6 +105,8 @@ class Studio {
 
   refused(why) {
     this.board.halt();
+    this.looking = false;
+    this.over = true;
     this.say(`That did not work: ${why}`, true);
   }
 
@@ -119,6 +133,9 @@ class Studio {
   }
 
   source(kind) {
+    clearTimeout(this.timer);
+    this.looking = false;
+    this.over = true;
     for (const panel of document.querySelectorAll("[data-source]")) panel.hidden = panel.dataset.source !== kind;
     this.board.halt();
     this.number += 1;
@@ -144,11 +161,21 @@ class Studio {
     }[kind]);
   }
 
-  fill(what) {
+  // Something new is looked at: what was before is over.
+  look(what) {
+    clearTimeout(this.timer);
+    this.dropping?.abort();
     this.board.halt();
     this.number += 1;
-    this.say("The agent looks at it …");
-    this.send({ ask: "fill", number: this.number, who: $("who").value, ...what });
+    this.looking = true;
+    this.last = null;
+    this.say(`The agent looks at ${what} …`);
+  }
+
+  fill(what) {
+    this.look("it");
+    this.last = { ask: "fill", number: this.number, who: $("who").value, ...what };
+    this.send(this.last);
   }
 
   fillDrawing() {
@@ -163,17 +190,16 @@ class Studio {
 
   async drop(file) {
     if (!file) return;
-    this.board.halt();
-    this.number += 1;
+    this.look(file.name);
     const own = this.number;
     if (file.size > LIMIT) {
       this.refused(`${file.name} is larger than 10 MB: make it smaller`);
       return;
     }
     this.name = file.name.replace(/\.[^.]*$/, "").replace(/[^A-Za-z0-9_-]+/g, "_").slice(0, 40) || "file";
-    this.say(`The agent looks at ${file.name} …`);
+    this.dropping = new AbortController();
     const query = new URLSearchParams({ name: file.name, who: $("who").value });
-    const answer = await fetch(`api/drop?${query}`, { method: "POST", body: file }).catch(() => null);
+    const answer = await fetch(`api/drop?${query}`, { method: "POST", body: file, signal: this.dropping.signal }).catch(() => null);
     const content = await answer?.json().catch(() => null);
     if (own !== this.number) return;
     if (!content) this.refused("the connection to tangram-studio was lost: is it still running?");
@@ -191,6 +217,7 @@ class Studio {
   // What the agent answers
 
   filled(answer) {
+    this.looking = false;
     this.goal = answer.goal;
     this.exact = answer.exact;
     this.iou = answer.iou;
@@ -214,6 +241,7 @@ class Studio {
   }
 
   play(start) {
+    clearTimeout(this.timer);
     this.board.halt();
     this.number += 1;
     this.asking = true;
@@ -239,8 +267,9 @@ class Studio {
     if (this.board.mode !== "play") return;
     clearTimeout(this.timer);
     this.board.halt();
+    if (!this.goal || this.looking) return;
     this.number += 1; // what was asked for is no longer wanted
-    if (!this.goal) return;
+    this.over = true;
     this.say("You moved a tan: the agent goes on from here.");
     if (done) this.timer = setTimeout(() => this.play(this.board.scene), byKey ? RESTART_MS : 0);
   }
@@ -258,14 +287,14 @@ class Studio {
   save(kind) {
     if (!this.goal) return;
     this.say("The file is made …");
-    this.send({ ask: "save", number: this.number, kind, tokens: this.board.scene, name: this.name });
+    this.send({ ask: "save", kind, tokens: this.board.scene, name: this.name });
   }
 
   file(data) {
-    const { kind, type } = this.saving;
+    const { kind, type, name } = this.saving;
     const link = document.createElement("a");
     link.href = URL.createObjectURL(new Blob([data], { type }));
-    link.download = `${this.name}.${kind}`;
+    link.download = `${name}.${kind}`;
     link.click();
     setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
     this.say(`Saved ${link.download}, ${Math.ceil(data.byteLength / 1000)} kB.`);
@@ -306,7 +335,10 @@ class Studio {
     $("turn-over").addEventListener("click", chosen((k) => this.board.over(k)));
     $("again").addEventListener("click", () => this.play(null));
     for (const kind of ["gif", "svg", "json"]) $(`save-${kind}`).addEventListener("click", () => this.save(kind));
-    $("file").addEventListener("change", () => this.drop($("file").files[0]));
+    $("file").addEventListener("change", () => {
+      this.drop($("file").files[0]);
+      $("file").value = ""; // so that the same one can be chosen again
+    });
     const board = $("board");
     document.addEventListener("dragover", (event) => {
       event.preventDefault();

@@ -88,10 +88,7 @@ export class Board {
 
   begin() {
     this.move = this.queue.shift() ?? null;
-    if (!this.move) {
-      this.idle = performance.now();
-      return;
-    }
+    if (!this.move) return;
     if (this.idle && this.move.token !== null) this.frames.waited += performance.now() - this.idle;
     this.flipped = [...this.move.flipped];
     this.since = this.last = performance.now();

@@ -6,7 +6,8 @@ const NEAR = 0.06; // arena units within which a corner snaps
 const CLOSE = 0.05; // to the first corner, which closes the outline
 const POINT = 0.012; // between points of a free hand
 const KEY = 0.05;
-const MOST = 1500; // points
+const MOST = 1500; // points of all outlines
+const RINGS = 50;
 
 const far = ([ax, ay], [bx, by]) => Math.hypot(ax - bx, ay - by);
 export const areaOf = (ring) => Math.abs(ring.reduce((sum, [x, y], i) => {
@@ -38,6 +39,10 @@ export class Pen {
     svg.addEventListener("pointerup", () => this.up());
     svg.addEventListener("pointercancel", () => this.up());
     svg.addEventListener("keydown", (event) => this.key(event));
+  }
+
+  get count() {
+    return this.rings.reduce((sum, ring) => sum + ring.length, this.line.length);
   }
 
   get on() {
@@ -95,7 +100,7 @@ export class Pen {
       return;
     }
     if (this.line.length && far(there, this.line.at(-1)) < 1e-6) return;
-    if (this.line.length < MOST) this.line.push(there);
+    if (this.count < MOST) this.line.push(there);
     this.spot = there;
     this.draw();
   }
@@ -105,7 +110,7 @@ export class Pen {
     this.spot = null;
     const point = this.board.at(event);
     if (this.stroke) {
-      if (far(point, this.line.at(-1)) > POINT && this.line.length < MOST) this.line.push(point);
+      if (far(point, this.line.at(-1)) > POINT && this.count < MOST) this.line.push(point);
       this.draw();
     } else if (this.kind === "polygon" && this.line.length) this.draw(this.snapped(point));
   }
@@ -121,7 +126,7 @@ export class Pen {
   }
 
   close() {
-    if (this.line.length > 2) {
+    if (this.line.length > 2 && this.rings.length < RINGS) {
       this.rings.push(this.line);
       this.line = [];
       this.draw();

@@ -14,14 +14,17 @@ import time
 import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import psutil
 import pytest
+from PIL import Image, ImageDraw
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
+from tangram_sim.errors import TangramError
 from tangram_studio.jobs import Jobs
 from tangram_studio.server import MAX_UPLOAD, PAGES
 from tests.cluster.processes import BIN, refused
@@ -139,6 +142,8 @@ def test_a_file_without_the_token_is_not_read(running: Running) -> None:
         {"Cookie": ""},
         {"Cookie": "tangram_studio_1=x"},
         {"Origin": "http://evil.example"},
+        {"Origin": "http://["},
+        {"Origin": "null"},
         {"Host": "evil.example"},
     ],
 )
@@ -153,7 +158,9 @@ def test_a_socket_without_the_token_or_of_another_site_is_refused(
     connection.close()
 
 
-@pytest.mark.parametrize("headers", [{"Host": "evil.example"}, {"Origin": "http://evil.example"}])
+@pytest.mark.parametrize(
+    "headers", [{"Host": "evil.example"}, {"Origin": "http://evil.example"}, {"Origin": "http://["}]
+)
 def test_another_host_or_site_is_refused_even_with_the_token(
     running: Running, headers: dict[str, str]
 ) -> None:
@@ -168,6 +175,15 @@ def test_the_token_becomes_a_cookie_and_leaves_the_address(running: Running) -> 
     assert kept.startswith(f"{running.cookie};")
     assert "HttpOnly" in kept
     assert "SameSite=strict" in kept
+
+
+@pytest.mark.parametrize(
+    "other", ['a={"x":"y"}', "a b=c@d", "a[0]=1", "a,b=1", "expires", "\xe9=1"]
+)
+def test_cookies_of_other_programs_lock_nobody_out(running: Running, other: str) -> None:
+    assert running.get("/", f"{other}; {running.cookie}")[0] == 200
+    assert running.get("/", f"tangram_studio_{running.port}=old; {running.cookie}")[0] == 200
+    assert running.get("/", other)[0] == 403
 
 
 def test_it_listens_on_this_machine_alone(running: Running) -> None:
@@ -275,6 +291,24 @@ def test_a_file_that_is_too_large_is_refused_before_it_is_read(running: Running)
     assert (status, b"larger than 10 MB" in body) == (413, True)  # of a length that is not told
 
 
+def test_thin_rings_are_no_figure(running: Running) -> None:
+    rings = Image.new("L", (2000, 2000), 255)
+    for reach in range(4, 990, 4):
+        box = (1000 - reach, 1000 - reach, 1000 + reach, 1000 + reach)
+        ImageDraw.Draw(rings).ellipse(box, outline=0)
+    data = BytesIO()
+    rings.save(data, "PNG")
+    status, content = running.drop("rings.png", data.getvalue())
+    assert status in (200, 400)
+    assert "terminal" not in content.get("error", "")
+
+
+def test_a_puzzle_is_a_name_and_no_file(running: Running) -> None:
+    with running.page() as page:
+        ask(page, "fill", number=1, puzzle=str(ROOT / "docs/images/silhouette.png"))
+        assert "unknown puzzle" in told(page, "refused")["why"]
+
+
 def test_a_picture_is_filled(running: Running) -> None:
     status, content = running.drop("s.png", (ROOT / "docs/images/silhouette.png").read_bytes())
     assert (status, content["exact"]) == (200, True)
@@ -339,24 +373,26 @@ def children(process: subprocess.Popen[str]) -> list[psutil.Process]:
     ]
 
 
-def test_a_process_that_is_killed_is_replaced(running: Running) -> None:
+def test_processes_that_are_killed_are_replaced_and_nobody_hears_of_it(running: Running) -> None:
     with running.page() as page:
         ask(page, "fill", number=1, puzzle="cat")
         told(page, "filled")
         for child in children(running.process):
             child.kill()
-        until = time.monotonic() + WAIT_S
-        number = 2
+        ask(page, "fill", number=2, puzzle="swan")
+        found = told(page, "filled")
+        assert (found["number"], found["exact"]) == (2, True)
+        ask(page, "play", number=3, goal=found["goal"])
+        assert told(page, "move")["number"] == 3
+
+
+def test_bytes_are_no_message(running: Running) -> None:
+    with running.page() as page, pytest.raises(ConnectionClosed) as closed:
+        page.send(b"\0")
         while True:
-            ask(page, "fill", number=number, puzzle="cat")
-            content = page.recv(timeout=WAIT_S)
-            message = json.loads(content)
-            if message["told"] == "filled":
-                break
-            if message["told"] == "refused":
-                assert "the process that worked on it ended: try it again" in message["why"]
-                number += 1
-            assert time.monotonic() < until
+            page.recv(timeout=WAIT_S)
+    assert closed.value.rcvd is not None
+    assert closed.value.rcvd.code == 1003
 
 
 # How it starts and ends
@@ -407,14 +443,14 @@ def test_a_task_that_takes_too_long_is_ended_and_the_next_is_done(
         try:
             await jobs.ready()
             monkeypatch.setattr("tangram_studio.jobs.LIMIT_S", 0.5)
-            with pytest.raises(Exception, match="it took more than 0.5 s: make it simpler"):
+            with pytest.raises(TangramError, match="it took more than 0.5 s: make it simpler"):
                 await jobs.do(time.sleep, 60)
             monkeypatch.setattr("tangram_studio.jobs.LIMIT_S", WAIT_S)
             assert await jobs.do(os.getpid) != os.getpid()
-            with pytest.raises(Exception, match="the process that worked on it ended: try"):
+            with pytest.raises(TangramError, match="the process that worked on it ended: make"):
                 await jobs.do(os._exit, 3)
             assert await jobs.do(abs, -2) == 2
-            assert jobs.started == 3
+            assert jobs.started == 4  # the second time, too
         finally:
             jobs.close()
 
@@ -439,13 +475,27 @@ def test_who_comes_later_is_told_how_many_come_first() -> None:
             assert await asyncio.gather(*rest) == [1, 2]
             await slow
             assert [name for name, _ in heard] == ["1", "2"]
-            # One that nobody waits for any more takes no turn.
-            held = asyncio.create_task(jobs.do(time.sleep, 0.5))
-            gone = asyncio.create_task(jobs.do(abs, -3))
-            await asyncio.sleep(0.05)
-            gone.cancel()
-            await held
-            assert await jobs.do(abs, -4) == 4
+        finally:
+            jobs.close()
+
+    asyncio.run(work())
+
+
+def test_who_leaves_takes_no_turn_along_and_leaves_none_behind() -> None:
+    async def work() -> None:
+        jobs = Jobs(1, nothing)
+        try:
+            await jobs.ready()
+            begun = time.monotonic()
+            asked = [asyncio.create_task(jobs.do(time.sleep, 1.2)) for _ in range(4)]
+            await asyncio.sleep(0.6)  # longer than the wait that is not worth a word
+            for task in asked:  # what has begun goes on, the rest never begins
+                task.cancel()
+            await asyncio.gather(*asked, return_exceptions=True)
+            pids = await asyncio.gather(*(jobs.do(os.getpid) for _ in range(3)))
+            assert len(set(pids)) == 1
+            assert time.monotonic() - begun >= 1.2  # not beside what had begun
+            assert jobs._turns._value == 1
         finally:
             jobs.close()
 

@@ -390,6 +390,52 @@ def test_two_browsers_have_a_table_each(page: Page, browser: Browser, running: R
     expect(page.locator("#pages")).to_have_text("")
 
 
+def test_a_file_is_saved_while_it_plays_on(page: Page) -> None:
+    page.locator("[data-figure=cat]").click()
+    moving(page)
+    with page.expect_download():
+        page.locator("#save-gif").click()
+    page.locator("#save-json").click()  # in mid-move: nobody's puzzle, perhaps
+    status(page).to_have_text(LAID)
+
+
+def test_a_tan_that_is_touched_while_it_looks_loses_no_figure(page: Page) -> None:
+    page.evaluate(
+        "studio.send = ((send) => (m) => setTimeout(() => send(m), 1500))(studio.send.bind(studio))"
+    )
+    page.locator("[data-figure=cat]").click()
+    page.get_by_role("button", name="medium triangle").focus()
+    page.keyboard.press("ArrowUp")
+    status(page).to_have_text(LAID)
+    assert page.evaluate("studio.name") == "cat"
+
+
+def test_keys_of_before_do_not_bring_an_old_figure_back(page: Page) -> None:
+    page.locator("[data-figure=swan]").click()
+    moving(page)
+    page.get_by_role("button", name="medium triangle").focus()
+    page.keyboard.press("ArrowUp")
+    page.locator("[data-figure=cat]").click()
+    status(page).to_have_text(LAID)
+    (cat,) = [
+        one
+        for one in page.evaluate("fetch('api/figures').then((a) => a.json())")["figures"]
+        if one["name"] == "cat"
+    ]
+    ys = [y for ring in cat["outline"] for _, y in ring]
+    laid = [y for k in range(7) for _, y in page.evaluate(f"studio.board.corners({k})")]
+    assert max(laid) == pytest.approx(max(ys), abs=0.05)
+
+
+def test_it_goes_on_after_a_short_loss(page: Page) -> None:
+    page.locator("[data-figure=cat]").click()
+    moving(page)
+    page.evaluate("studio.socket.close()")
+    expect(page.locator("#banner")).to_contain_text("Lost the connection")
+    status(page).to_have_text(LAID)
+    expect(page.locator("#banner")).to_be_hidden()
+
+
 def test_a_page_without_the_token_shows_how_to_get_it(browser: Browser, running: Running) -> None:
     context = browser.new_context()
     page = context.new_page()

@@ -14,7 +14,7 @@ TOKENS = {"poses": [[0.0, 0.0, 0.0]] * 7, "flipped": [False] * 7}
 RING = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]
 FILL = {"ask": "fill", "number": 1}
 PLAY = {"ask": "play", "number": 2, "goal": TOKENS}
-SAVE = {"ask": "save", "number": 3, "kind": "gif", "tokens": TOKENS}
+SAVE = {"ask": "save", "kind": "gif", "tokens": TOKENS}
 
 
 @pytest.mark.parametrize(

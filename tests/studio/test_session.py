@@ -26,7 +26,8 @@ class Here:
 
     async def do(self, task: Callable[..., Any], *given: object, waits: Any = None) -> Any:
         if not self.open.is_set():
-            await waits(3)
+            if waits is not None:
+                await waits(3)
             await self.open.wait()
         self.done.append(task.__name__)
         return task(*given)
@@ -51,8 +52,9 @@ class Page:
     async def ask(self, ask: str, **content: Any) -> dict[str, Any]:
         """Ask, and wait until it is done; the last thing that was told."""
         await self.session.hear(json.dumps({"ask": ask, **content}))
-        if self.session._doing is not None:
-            await asyncio.wait([self.session._doing])
+        begun = [one for one in (self.session._doing, self.session._saving) if one is not None]
+        if begun:
+            await asyncio.wait(begun)
         return self.told[-1]
 
 
@@ -79,7 +81,7 @@ def test_a_figure_is_filled_played_to_its_end_and_saved() -> None:
         await page.ask("next")  # nothing is being played any more
         assert len(page.told) == count
         last = {"poses": move["frames"][-1], "flipped": move["flipped"]}
-        saved = await page.ask("save", number=3, kind="svg", tokens=last, name="cat")
+        saved = await page.ask("save", kind="svg", tokens=last, name="cat")
         assert (saved["told"], saved["type"]) == ("saved", "image/svg+xml")
         assert page.files[0].startswith(b"<svg")
 
@@ -114,6 +116,7 @@ def test_what_cannot_be_done_is_told(message: str, why: str) -> None:
             await asyncio.wait([page.session._doing])
         (told,) = page.told
         assert told["told"] == "refused"
+        assert told["number"] == (None if message == "{" else 1)
         assert why in told["why"]
 
     asyncio.run(talk())
@@ -152,6 +155,39 @@ def test_the_newest_question_takes_the_place_of_the_one_before() -> None:
             ("filled", 2),
         ]
         assert page.told[0]["ahead"] == 3
+
+    asyncio.run(talk())
+
+
+def test_a_file_is_made_beside_what_is_played(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def talk() -> None:
+        page, goal = Page(), plain("cat")
+        move = await page.ask("play", number=1, goal=goal)
+        last = {"poses": move["frames"][-1], "flipped": move["flipped"]}
+        page.jobs.open.clear()
+        await page.session.hear('{"ask": "next"}')
+        await page.session.hear(json.dumps({"ask": "save", "kind": "gif", "tokens": last}))
+        await page.session.hear(json.dumps({"ask": "save", "kind": "svg", "tokens": last}))
+        assert page.told[-1]["told"] == "unsaved"  # one file at a time
+        page.jobs.open.set()
+        assert page.session._doing is not None
+        assert page.session._saving is not None
+        await asyncio.wait([page.session._doing, page.session._saving])
+        kinds = sorted(one["told"] for one in page.told if one["told"] != "wait")
+        assert kinds == ["move", "move", "saved", "unsaved"]
+        assert page.files[0].startswith(b"GIF89a")
+
+    asyncio.run(talk())
+
+
+def test_what_cannot_be_saved_is_told_and_ends_nothing() -> None:
+    async def talk() -> None:
+        page, goal = Page(), plain("cat")
+        await page.ask("play", number=1, goal=goal)
+        heap = {"poses": [[0.0, 0.0, 0.0]] * 7, "flipped": [False] * 7}
+        told = await page.ask("save", kind="json", tokens=heap)
+        assert (told["told"], "this is no puzzle" in told["why"]) == ("unsaved", True)
+        assert (await page.ask("next"))["told"] == "move"
 
     asyncio.run(talk())
 
