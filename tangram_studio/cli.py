@@ -20,8 +20,8 @@ def _studio(settings: Plain) -> int:
     missing = [name for name in ("starlette", "uvicorn", "websockets") if find_spec(name) is None]
     if missing:
         raise ConfigError(
-            f"tangram-studio needs {', '.join(missing)}: install the extra, pip install "
-            "'tangram-rl[studio]', or type make studio in a clone"
+            f"tangram-studio needs {', '.join(missing)}: in a clone type make studio, or "
+            "pip install -c constraints.txt '.[studio]'"
         )
     tell("loads the agents")
 

@@ -155,10 +155,12 @@ def _filled(name: str, source: str, who: str, free: bool = False) -> Answer:
     if first.found is not None and first.solved:
         how = f"filled by the {_called(who, first.by)} in {first.seconds:.2f} s"
         return _answer(drawn, first.found, True, first.iou, how)
-    why = f"{source} {why_unfilled(drawn, layout)}"
+    why = f"{source[0].upper()}{source[1:]} {why_unfilled(drawn, layout)}."
+    if free:
+        why = "Drawn by a free hand."
     if drawn.share is not None:  # of a known scale, so that it is another figure's
         lie = "the tans lie on each other: move them apart"
-        raise ConfigError(lie if source == LAYOUT else why)
+        raise ConfigError(lie if source == LAYOUT else why.rstrip("."))
     starts = [one for one in (first.found, first.attempt) if one is not None]
     found, iou = nearest_figure(drawn.area, layout, NEAREST_SECONDS, starts=starts)
     return _answer(drawn, found, False, iou, why)

@@ -7,6 +7,7 @@ replaced.
 import asyncio
 import multiprocessing
 import os
+import signal
 import threading
 from collections.abc import Awaitable, Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -145,6 +146,7 @@ def _end(pool: ProcessPoolExecutor) -> None:
 
 def _begin(warm: Callable[[], None]) -> None:
     """In a new process: end with the server, however that ends, and load what is needed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the server's, which ends this one
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_follow, args=(parent.sentinel,), daemon=True).start()

@@ -352,5 +352,6 @@ def serve(config: StudioConfig) -> int:
             limit_concurrency=OPEN,
         )
     )
-    server.run(sockets=[listener])
+    with suppress(KeyboardInterrupt):  # Ctrl-C is how it ends
+        server.run(sockets=[listener])
     return 0

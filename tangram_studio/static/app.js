@@ -27,6 +27,11 @@ class Studio {
     this.board.onShown = (move) => this.shown(move);
     this.pen.onChange = (next) => this.measured(next);
     this.pen.onEnd = () => this.fillDrawing();
+    this.pen.again = (event) => {
+      if (this.kind !== "draw" || !this.over || this.looking || event.target.matches(".tan")) return false;
+      this.source("draw");
+      return true;
+    };
     this.library(figures);
     this.controls();
     this.source("library");
@@ -133,32 +138,43 @@ class Studio {
   }
 
   source(kind) {
+    this.kind = kind;
+    for (const panel of document.querySelectorAll("[data-source]")) panel.hidden = panel.dataset.source !== kind;
+    const hint = {
+      library: "Choose a figure: the agent lays it.",
+      lay: "Lay a figure of the seven tans, then show it to the agent.",
+      draw: "Draw a figure on the table; when it is closed, the agent begins.",
+      file: "Drop a picture on the table.",
+    }[kind];
+    const mine = kind === "lay" || kind === "draw"; // the table is the person's
+    if (!mine && this.board.mode === "play") {
+      if (this.over) this.say(hint); // what is being laid goes on
+      return;
+    }
     clearTimeout(this.timer);
     this.looking = false;
     this.over = true;
-    for (const panel of document.querySelectorAll("[data-source]")) panel.hidden = panel.dataset.source !== kind;
-    this.board.halt();
+    this.goal = null;
     this.number += 1;
-    this.board.mode = { lay: "lay", draw: "draw" }[kind] ?? "play";
+    this.board.halt();
+    this.board.show([]);
+    this.board.put(tray(this.board.tokens));
+    $("answer").hidden = true;
+    this.table(mine ? kind : "play");
+    this.say(hint);
+    if (mine) $("board").scrollIntoView({ block: "nearest" });
+  }
+
+  // What a hand on the table does.
+  table(mode) {
+    this.board.mode = mode;
     this.board.choose(-1);
-    const drawing = kind === "draw";
+    const drawing = mode === "draw";
     $("board").classList.toggle("pen", drawing);
     if (drawing) $("board").setAttribute("tabindex", 0);
     else $("board").removeAttribute("tabindex");
     for (const tan of this.board.tans) tan.style.display = drawing ? "none" : "";
     this.pen.clear();
-    if (kind === "lay" || drawing) {
-      this.board.show([]);
-      $("answer").hidden = true;
-      this.goal = null;
-    }
-    if (kind === "lay") this.board.put(tray(this.board.tokens));
-    this.say({
-      library: "Choose a figure: the agent lays it.",
-      lay: "Lay a figure of the seven tans, then show it to the agent.",
-      draw: "Draw a figure on the table; when it is closed, the agent begins.",
-      file: "Drop a picture on the table.",
-    }[kind]);
   }
 
   // Something new is looked at: what was before is over.
@@ -170,6 +186,7 @@ class Studio {
     this.looking = true;
     this.last = null;
     this.say(`The agent looks at ${what} …`);
+    $("board").scrollIntoView({ block: "nearest" });
   }
 
   fill(what) {
@@ -181,7 +198,7 @@ class Studio {
   fillDrawing() {
     const outlines = this.pen.line.length > 2 ? [...this.pen.rings, this.pen.line] : this.pen.rings;
     if (!outlines.length) {
-      this.say("Nothing is drawn yet: close an outline first.", true);
+      this.say("Nothing is drawn yet: three corners are needed at least.", true);
       return;
     }
     this.name = "drawing";
@@ -228,14 +245,11 @@ class Studio {
     $("seen-pieces").replaceChildren(...answer.pieces.map((piece, k) => make("polygon", {
       points: piece.map((point) => point.join(",")).join(" "), fill: this.board.tokens[k].colour,
     })));
+    const share = `shares ${per_cent(answer.iou)} with it (IoU, the shared area over that of both together)`;
     $("told").textContent = answer.exact
-      ? `What it sees, and how it will lay it: ${answer.how}, IoU ${answer.iou.toFixed(3)}.`
-      : `Seven tans do not fill it: ${answer.how}. The nearest figure that was found has IoU ${answer.iou.toFixed(2)}.`;
-    this.board.mode = "play";
-    this.board.choose(-1);
-    $("board").classList.remove("pen");
-    for (const tan of this.board.tans) tan.style.display = "";
-    this.pen.clear();
+      ? `What it sees, and how it will lay it; equal tans may swap. It was ${answer.how}, IoU ${answer.iou.toFixed(3)}.`
+      : `Seven tans do not fill it. The nearest figure that was found ${share}; red dashes are what was shown. ${answer.how}`;
+    this.table("play");
     this.board.show(answer.laid, answer.exact ? [] : answer.outline);
     this.play(null);
   }
@@ -246,6 +260,7 @@ class Studio {
     this.number += 1;
     this.asking = true;
     this.over = false;
+    this.say("The agent lays it.");
     this.send({ ask: "play", number: this.number, goal: this.goal, start, motion: $("motion").value });
   }
 
@@ -278,8 +293,9 @@ class Studio {
     const so_far = `covers ${per_cent(move.coverage)}, IoU ${move.iou.toFixed(3)}`;
     if (!move.over) {
       this.say(move.blocked ? `Others are in the way: it tries another tan. It ${so_far}.` : `It ${so_far}.`);
-    } else if (move.iou >= 0.95) this.say(`Laid: ${so_far}.${this.exact ? "" : " Of the nearest figure."}`);
-    else this.say(`It can do no more: ${so_far} of the figure.`);
+    } else if (move.iou >= 0.95) {
+      this.say(this.exact ? `Laid: ${so_far}.` : `Laid: covers ${per_cent(move.coverage)} of the nearest figure.`);
+    } else this.say(`It can do no more: ${so_far} of the figure.`);
   }
 
   // Files
@@ -287,7 +303,7 @@ class Studio {
   save(kind) {
     if (!this.goal) return;
     this.say("The file is made …");
-    this.send({ ask: "save", kind, tokens: this.board.scene, name: this.name });
+    this.send({ ask: "save", kind, tokens: kind === "json" ? this.goal : this.board.scene, name: this.name });
   }
 
   file(data) {
@@ -312,6 +328,7 @@ class Studio {
       one.addEventListener("change", () => {
         this.pen.kind = one.value;
         $("draw-help").textContent = pens[one.value];
+        $("snap").parentElement.hidden = one.value === "free";
         this.source("draw");
       });
     }
@@ -334,6 +351,10 @@ class Studio {
     $("turn-right").addEventListener("click", chosen((k) => this.board.turn(k, -Math.PI / 4)));
     $("turn-over").addEventListener("click", chosen((k) => this.board.over(k)));
     $("again").addEventListener("click", () => this.play(null));
+    $("motion").addEventListener("change", () => {
+      if (this.goal && !this.looking) this.play(this.over ? null : this.board.scene);
+    });
+    $("who").addEventListener("change", () => this.say("That is for the next figure."));
     for (const kind of ["gif", "svg", "json"]) $(`save-${kind}`).addEventListener("click", () => this.save(kind));
     $("file").addEventListener("change", () => {
       this.drop($("file").files[0]);

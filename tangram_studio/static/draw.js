@@ -26,6 +26,7 @@ export class Pen {
     this.spot = null; // where the keyboard is
     this.onChange = () => {};
     this.onEnd = () => {}; // an outline is closed
+    this.again = () => false; // (event): whether another drawing begins
     const lengths = [];
     for (let a = 0; a <= 4; a += 1) {
       for (let b = 0; b <= 4; b += 1) {
@@ -80,11 +81,12 @@ export class Pen {
   }
 
   down(event) {
-    if (!this.on || event.button) return;
+    if (event.button || !(this.on || this.again(event))) return;
     event.preventDefault();
     this.board.svg.focus({ preventScroll: true });
     const point = this.board.at(event);
     if (this.kind === "free") {
+      this.rings = []; // a stroke is a whole figure
       this.line = [point];
       this.stroke = true;
       this.board.svg.setPointerCapture(event.pointerId);

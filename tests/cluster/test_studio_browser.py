@@ -170,6 +170,8 @@ def test_what_was_taken_away_while_it_plays_is_laid_again(page: Page) -> None:
     drag(page, [(x, y), (0.0, 0.85), (-0.85, 0.85)])
     status(page).to_contain_text("the agent goes on from here")
     assert page.evaluate(f"studio.board.poses[{token}]")[0] < -0.7
+    ring = f"getComputedStyle(studio.board.tans[{token}]).outlineStyle"
+    assert page.evaluate(ring) == "none"  # of 5 px it would cover the table
     moving(page, token)  # that very one
     shot(page, "taken")
     status(page).to_have_text(LAID)
@@ -293,11 +295,24 @@ def test_a_cat_by_a_free_hand_becomes_the_nearest_figure(page: Page) -> None:
     source(page, "draw")
     page.locator("[name=pen][value=free]").check()
     drag(page, [*CAT, CAT[0]])
-    expect(page.locator("#told")).to_contain_text("The nearest figure that was found has IoU 0.")
+    expect(page.locator("#told")).to_contain_text("The nearest figure that was found shares")
     moving(page)
     page.wait_for_timeout(3_000)
     shot(page, "cat")
-    status(page).to_contain_text("Of the nearest figure")
+    status(page).to_contain_text("of the nearest figure")
+
+
+def test_a_free_hand_draws_again_where_the_last_was_refused_or_laid(page: Page) -> None:
+    source(page, "draw")
+    page.locator("[name=pen][value=free]").check()
+    drag(page, [(-0.9, 0.8 + 0.001 * i) for i in range(2)] + [(0.9, 0.8), (0.0, 0.81), (-0.9, 0.8)])
+    status(page).to_contain_text("That did not work")
+    for width in (0.4, 0.3):
+        square = [(-width, -width), (width, -width), (width, width), (-width, width)]
+        drag(page, [*square, square[0]])
+        assert page.evaluate("studio.last.outlines.length") == 1
+        moving(page)
+        status(page).to_have_text(re.compile("^Laid: "))
 
 
 @pytest.mark.parametrize(
@@ -467,6 +482,17 @@ def test_a_lost_connection_and_a_new_studio_are_told(browser: Browser, tmp_path:
 # Everybody
 
 
+def test_what_is_laid_goes_on_while_another_way_is_looked_at(page: Page) -> None:
+    page.locator("[data-figure=cat]").click()
+    moving(page)
+    source(page, "file")
+    source(page, "library")
+    page.locator("#motion").select_option("slide")  # at once, from where they lie
+    moving(page)
+    page.locator("#motion").select_option("lift")
+    status(page).to_have_text(LAID)
+
+
 def test_tabs_and_figures_are_reached_by_keys(page: Page) -> None:
     page.locator("#tab-play").focus()
     page.keyboard.press("ArrowRight")
@@ -524,7 +550,9 @@ def test_a_drawing_in_which_tans_leave_room_is_still_told(page: Page, tmp_path: 
     picture.save(tmp_path / "disc.png")
     source(page, "file")
     page.locator("#file").set_input_files(tmp_path / "disc.png")
-    expect(page.locator("#told")).to_contain_text("Seven tans do not fill it: the file")
+    expect(page.locator("#told")).to_contain_text(
+        "Seven tans do not fill it. The nearest figure that was found"
+    )
     moving(page)
 
 
@@ -600,7 +628,7 @@ def test_the_page_in_motion_is_filmed(browser: Browser, running: Running) -> Non
     for _ in range(14):
         page.wait_for_timeout(100)
         keep()
-    status(page).to_contain_text("Of the nearest figure")
+    status(page).to_contain_text("of the nearest figure")
     keep()
     context.close()
     film = [frame.quantize(64, dither=Image.Dither.NONE) for frame in [*frames, *frames[-1:] * 8]]
