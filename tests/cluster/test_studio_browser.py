@@ -307,7 +307,7 @@ def test_a_free_hand_draws_again_where_the_last_was_refused_or_laid(page: Page) 
     page.locator("[name=pen][value=free]").check()
     drag(page, [(-0.9, 0.8 + 0.001 * i) for i in range(2)] + [(0.9, 0.8), (0.0, 0.81), (-0.9, 0.8)])
     status(page).to_contain_text("That did not work")
-    for width in (0.4, 0.3):
+    for width in (0.4, 0.6):
         square = [(-width, -width), (width, -width), (width, width), (-width, width)]
         drag(page, [*square, square[0]])
         assert page.evaluate("studio.last.outlines.length") == 1
