@@ -260,7 +260,7 @@ class Studio {
     this.number += 1;
     this.asking = true;
     this.over = false;
-    this.say("The agent lays it.");
+    if (!start) this.say("The agent lays it.");
     this.send({ ask: "play", number: this.number, goal: this.goal, start, motion: $("motion").value });
   }
 

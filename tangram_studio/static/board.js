@@ -27,6 +27,7 @@ export class Board {
     this.mode = "play"; // or lay, draw
     this.queue = [];
     this.move = null;
+    this.ms = MOVE_MS; // that a move takes
     this.frames = { shown: 0, longest: 0, moves: 0, waited: 0 };
     this.onDrag = () => {}; // (done): a person takes a tan, or has let it go
     this.onMove = () => {}; // (move): its showing begins
@@ -104,7 +105,7 @@ export class Board {
       this.frames.longest = Math.max(this.frames.longest, now - this.last);
       this.last = now;
       const still = own.token === null || this.calm.matches;
-      const share = still ? 1 : Math.min((now - this.since) / MOVE_MS, 1);
+      const share = still ? 1 : Math.min((now - this.since) / this.ms, 1);
       this.between(own, share);
       if (share < 1) {
         requestAnimationFrame(tick);

@@ -70,11 +70,14 @@ def page(browser: Browser, running: Running) -> Iterator[Page]:
     assert with_errors == []
 
 
-def opened(page: Page, running: Running) -> Page:
+def opened(page: Page, running: Running, quick: bool = True) -> Page:
+    """The page; unless its pace is what is looked at, a move takes a fifth of its second."""
     page.set_default_timeout(LONG_MS)
     expect.set_options(timeout=LONG_MS)
     page.goto(running.url)
     page.locator("[data-figure=cat]").wait_for()
+    if quick:
+        page.evaluate("studio.board.ms = 200")
     return page
 
 
@@ -125,13 +128,21 @@ def moving(page: Page, token: int | None = None) -> None:
     pytest.fail(f"nothing moves: {page.locator('#status').inner_text()}")
 
 
+def after(page: Page, moves: int) -> None:
+    """Wait until so many moves are over, or all are."""
+    end = time.monotonic() + LONG_MS / 1000
+    while page.evaluate("studio.board.frames.moves") < moves and time.monotonic() < end:
+        page.wait_for_timeout(20)
+    page.wait_for_timeout(100)  # in mid-move
+
+
 # A figure, and files
 
 
 def test_a_figure_is_seen_laid_and_saved(page: Page, tmp_path: Path) -> None:
     page.locator("[data-figure=cat]").click()
     moving(page)
-    page.wait_for_timeout(2_500)
+    after(page, 4)
     shot(page, "play")
     status(page).to_have_text(LAID)
     expect(page.locator("#told")).to_contain_text("filled by the search")
@@ -155,9 +166,7 @@ def test_a_figure_is_seen_laid_and_saved(page: Page, tmp_path: Path) -> None:
 def test_what_was_taken_away_while_it_plays_is_laid_again(page: Page) -> None:
     page.locator("[data-figure=swan]").click()
     moving(page)
-    end = time.monotonic() + LONG_MS / 1000
-    while page.evaluate("studio.board.frames.moves") < 2 and time.monotonic() < end:
-        page.wait_for_timeout(50)
+    after(page, 2)
     token = page.evaluate(
         """() => {  // one that lies in its place
             const goal = studio.goal.poses.map(([x, y]) => [x, y]);
@@ -182,7 +191,7 @@ def test_tans_are_pushed_too(page: Page) -> None:
     page.locator("[data-figure=cat]").click()
     moving(page)
     assert page.evaluate("studio.board.move.frames.length") == 21
-    page.wait_for_timeout(6_000)
+    after(page, 6)
     shot(page, "pushed")
     status(page).to_have_text(re.compile("^(Laid|It can do no more): covers"))
 
@@ -297,7 +306,7 @@ def test_a_cat_by_a_free_hand_becomes_the_nearest_figure(page: Page) -> None:
     drag(page, [*CAT, CAT[0]])
     expect(page.locator("#told")).to_contain_text("The nearest figure that was found shares")
     moving(page)
-    page.wait_for_timeout(3_000)
+    after(page, 3)
     shot(page, "cat")
     status(page).to_contain_text("of the nearest figure")
 
@@ -604,7 +613,7 @@ def test_a_wrong_run_has_its_words(page: Page, run: str) -> None:
 def test_the_page_in_motion_is_filmed(browser: Browser, running: Running) -> None:
     """A cat that is drawn, laid, taken apart and mended: studio.gif, which README shows."""
     context = browser.new_context(viewport={"width": 1000, "height": 720})
-    page, frames = opened(context.new_page(), running), list[Image.Image]()
+    page, frames = opened(context.new_page(), running, quick=False), list[Image.Image]()
 
     def keep() -> None:
         with Image.open(BytesIO(page.screenshot())) as whole:
@@ -646,7 +655,7 @@ def test_twenty_browsers_see_twenty_frames_a_second_or_are_told_to_wait(
 ) -> None:
     pages = list[Page]()
     for _ in range(BROWSERS):
-        pages.append(opened(browser.new_context().new_page(), running))
+        pages.append(opened(browser.new_context().new_page(), running, quick=False))
         pages[-1].evaluate(
             """() => new MutationObserver(() => {
                 if ($status.textContent.startsWith("Others are served first")) window.waited = true;
