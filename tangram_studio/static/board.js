@@ -37,6 +37,7 @@ export class Board {
     this.goal = make("path", { class: "goal", d: "" });
     this.wanted = make("path", { class: "wanted", d: "" });
     this.tans = tokens.map((token, k) => this.tan(token, k));
+    this.shadow = make("polygon", { class: "shadow" });
     this.ink = make("g");
     this.table.append(this.goal, this.wanted, ...this.tans, this.ink);
     svg.append(this.table);
@@ -73,6 +74,14 @@ export class Board {
         `translate(${x},${y}) rotate(${(angle * 180) / Math.PI}) scale(${size},${mirror})`);
       tan.classList.toggle("held", k === held && height > 0);
     });
+    const lifted = held >= 0 && height > 0;
+    this.shadow.style.display = lifted ? "" : "none";
+    if (lifted) {
+      const [dx, dy] = [0.05 * height, -0.07 * height];
+      const points = this.corners(held).map(([x, y]) => `${x + dx},${y + dy}`);
+      this.shadow.setAttribute("points", points.join(" "));
+      if (this.shadow.nextSibling !== this.tans[held]) this.table.insertBefore(this.shadow, this.tans[held]);
+    }
   }
 
   show(outline, wanted = []) {

@@ -650,31 +650,21 @@ def test_the_page_in_motion_is_filmed(browser: Browser, running: Running) -> Non
 
 
 @pytest.mark.skipif(not TRIED, reason="20 browsers take two cores for a minute: studio/try.sh")
-def test_twenty_browsers_see_twenty_frames_a_second_or_are_told_to_wait(
-    browser: Browser, running: Running
-) -> None:
-    pages = list[Page]()
-    for _ in range(BROWSERS):
-        pages.append(opened(browser.new_context().new_page(), running, quick=False))
-        pages[-1].evaluate(
-            """() => new MutationObserver(() => {
-                if ($status.textContent.startsWith("Others are served first")) window.waited = true;
-            }).observe($status = document.getElementById("status"), {childList: true})""".replace(
-                "$status", "window.its"
-            )
-        )
+def test_twenty_browsers_see_twenty_frames_a_second(browser: Browser, running: Running) -> None:
+    pages = [
+        opened(browser.new_context().new_page(), running, quick=False) for _ in range(BROWSERS)
+    ]
     for number, one in enumerate(pages):
         one.evaluate(f"document.querySelectorAll('[data-figure]')[{number}].click()")
-    slow = list[str]()
+    rates, waited = list[float](), list[float]()
     for one in pages:
         status(one).to_have_text(LAID)
-        frames = one.evaluate("({...studio.board.frames, told: window.waited === true})")
-        rate = frames["shown"] / max(frames["moves"], 1)  # a move takes a second
-        line = f"{rate:.0f} frames a second, longest {frames['longest']:.0f} ms, {frames}"
-        print(line)
-        if rate < 20 and not frames["told"]:
-            slow.append(line)
-    assert slow == []
+        frames = one.evaluate("studio.board.frames")
+        rates.append(frames["shown"] / frames["moves"])  # a move takes a second
+        waited.append(frames["waited"])
+    told = {"frames_a_second": sorted(map(round, rates)), "waited_ms": sorted(map(round, waited))}
+    print(json.dumps(told))
+    assert min(rates) >= 20
     for one in pages:
         one.context.close()
 
