@@ -116,8 +116,9 @@ class AgentConfig(Settings, section="agent"):
     )
     edges: str = setting(
         "paper",
-        "of the graph: paper (Sec. IV-A) or complete (every node sees every other)",
-        choices=("paper", "complete"),
+        "of the graph: paper (Sec. IV-A) or complete (every node sees every other); or inputs: a "
+        "perceptron of whole scenes is told the paper's, as a matrix beside the features",
+        choices=("paper", "complete", "inputs"),
         part=NETWORK,
     )
     afterstate: bool = setting(
@@ -140,6 +141,12 @@ class AgentConfig(Settings, section="agent"):
     )
     squash: str = setting(
         "clamp", "of the actor's outputs", choices=("tanh", "clamp"), part=NETWORK
+    )
+    imitates: bool = setting(
+        False,
+        "the actor copies those actions of a batch that came to what was asked, as hindsight's "
+        "did, and does not climb the critic: the method without policy gradients",
+        part=LEARNING,
     )
     saturation_penalty: float = setting(
         1.0,

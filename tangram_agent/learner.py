@@ -92,6 +92,7 @@ class Rates(NamedTuple):
     kept: float | Tensor
 
 
+REACHED = 0.99  # reward of an action that came to what was asked
 NUMBERS = ("critic_loss", "q", "critic_gradient", "actor_loss", "saturation", "actor_gradient")
 
 
@@ -232,9 +233,25 @@ class Learner:
 
     def actor_loss(self, steps: Steps, features: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Minus the value of the actor's own actions (Eq. 6), and the saturation penalty."""
+        if self.config.imitates:
+            return self.imitation_loss(steps, features)
         velocity, raw = self.actor(steps.start, features)
         q = self.critic(steps.start, velocity, None, features)
         return -q.mean(), saturation(raw, self.config.saturation_limit)
+
+    def imitation_loss(self, steps: Steps, features: Tensor | None) -> tuple[Tensor, Tensor]:
+        """How far the actor is from the actions that came to what was asked, and the penalty.
+
+        The shift's squared error and 1 - cos of the turn's, modulo the symmetry, over the actions
+        of reward `REACHED` and more: goal-conditioned supervised learning (Ghosh et al. 2021).
+        """
+        velocity, raw = self.actor(steps.view, features)
+        error = velocity - steps.velocity
+        turn = 1.0 - torch.cos(math.pi * self.actor.graph.symmetry_of(steps.view) * error[:, 2])
+        reached = (steps.reward >= REACHED).to(error.dtype)
+        each = (error[:, :2].square().sum(-1) + turn) * reached
+        penalty = saturation(raw, self.config.saturation_limit)
+        return each.sum() / reached.sum().clamp(min=1.0), penalty
 
     def push_loss(self, meeting: Meeting) -> Tensor:
         """Mean squared error of what tokens that slide push away."""

@@ -62,7 +62,7 @@ class SceneGraph(nn.Module):
         )
         self.arena, self.any_chiral = arena, layout.any_chiral
         self.egocentric, self.offsets = agent.egocentric, agent.offsets
-        self.orientation = agent.orientation
+        self.orientation, self.tells_edges = agent.orientation, agent.edges == "inputs"
         owner = torch.as_tensor(layout.token_of_corner)
         one_hot = nn.functional.one_hot(owner, layout.tokens).T.float()
         symmetry = torch.tensor([float(shape.symmetry) for shape in layout.shapes])
@@ -93,7 +93,7 @@ class SceneGraph(nn.Module):
     @property
     def inputs(self) -> int:
         """Numbers that a perceptron sees of a scene."""
-        return self.nodes * self.features
+        return self.nodes * (self.features + self.nodes * self.tells_edges)
 
     def base_node(self, scenes: Scenes) -> Tensor:
         """Node index (M,) of the base of the token that moves."""
@@ -147,8 +147,12 @@ class SceneGraph(nn.Module):
         return torch.cat(parts, dim=-1)
 
     def vectors(self, scenes: Scenes) -> Tensor:
-        """(M, inputs): the features of all nodes in one row."""
-        return self.node_features(scenes).flatten(1)
+        """(M, inputs): the features of all nodes in one row, and perhaps the edges."""
+        features = self.node_features(scenes).flatten(1)
+        if not self.tells_edges:
+            return features
+        edges = self.adjacency.to(features.dtype).flatten().expand(len(features), -1)
+        return torch.cat([features, edges], dim=1)
 
     def _flags(self, placed: Tensor) -> Tensor:
         """Whether a node is the target's, and whether it is placed: (M, N, 2)."""

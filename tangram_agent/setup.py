@@ -27,7 +27,7 @@ _SEVERAL_ONLY = (
 # Those that have none on outlines.
 _NOT_OF_OUTLINES = (
     *("egocentric", "offsets", "orientation", "edges", "afterstate", "angle_head", "squash"),
-    *("saturation_penalty", "saturation_limit", "actor_lr", "noise"),
+    *("imitates", "saturation_penalty", "saturation_limit", "actor_lr", "noise"),
 )
 MAX_HALVED = 5  # times that a crop of 32 pixels is halved to one
 MAX_PLANNED = 8  # tokens: a look ahead finds the best order over all their subsets
@@ -118,8 +118,11 @@ class Setup:
 
     def _check_net(self) -> None:
         """Refuse a kind of network that does not see what the agent sees."""
-        if self.net.kind == "mlp":
+        edges, scenes = self.agent.edges, self.net.kind == "mlp" and not self.pairs
+        if self.net.kind == "mlp" and not (scenes and edges == "inputs"):
             self._refuse(("edges",), "net.kind=mlp", "set net.kind=mha")
+        if self.net.kind == "mha" and edges == "inputs":
+            refuse_ignored("agent.edges=inputs", "net.kind=mha", "set agent=mlp", "paper")
         if self.net.kind == "crops" and len(self.net.hidden) > MAX_HALVED:
             raise ConfigError(
                 f"net.hidden={told(self.net.hidden)}: each of the convolutions of net.kind=crops "

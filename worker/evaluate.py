@@ -39,6 +39,7 @@ from worker.scores import (
     RUN,
     Scored,
     Scores,
+    of_each,
     of_outlines,
     of_several,
     score_hidden,
@@ -165,7 +166,7 @@ def _scored(tests: FixedTests, player: Player) -> Scores:
     scores: Scores = dict(tests.scores(played))
     if setup.fills:
         return {key: scores[key] for key in OF_AREAS if key in scores} | of_outlines(setup, played)
-    return scores | (of_several(setup, played) if setup.layout.tokens > 1 else {})
+    return scores | (of_several(setup, played) if setup.layout.tokens > 1 else of_each(played))
 
 
 def _episodes(run: Run, config: EvalConfig) -> dict[str, Any]:

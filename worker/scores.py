@@ -23,7 +23,7 @@ if TYPE_CHECKING:  # needs OpenCV and shapely
     from worker.hidden import Hidden, Laid
 
 RUN = "this run"
-Scores = dict[str, Any]  # numbers, and `coverage_each` of the episodes of several tokens
+Scores = dict[str, Any]  # numbers, and `coverage_each` of the episodes
 
 # What is told of filled outlines: nothing of where a piece should lie.
 OF_AREAS = (
@@ -176,13 +176,18 @@ def _by(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{count} by the {who}" for who, count in counts.items())
 
 
+def of_each(played: Played) -> Scores:
+    """Every coverage, for differences that are paired by episode."""
+    return {"coverage_each": np.round(played.overlap, 6).tolist()}
+
+
 def of_several(setup: Setup, played: Played) -> Scores:
-    """What only evaluations tell: time, and every coverage, for tests on pairs of episodes."""
+    """What only evaluations tell of several tokens: time, and every coverage."""
     seconds = float(np.mean(played.seconds))
     scores: Scores = {
         "seconds_per_puzzle": seconds,
         "ms_per_decision": 1e3 * seconds / played.refused.shape[1],
-        "coverage_each": np.round(played.overlap, 6).tolist(),
+        **of_each(played),
     }
     if at_once(setup) == 1:
         scores["ms_slowest"] = 1e3 * float(played.slowest.max())

@@ -140,14 +140,16 @@ def make_jobs(
         presets: the folder of the user's own presets, where the study was given one.
     """
     jobs: list[Job] = []
-    for seed in config.budget.seeds:
+    seeds = {name: config.seeds(name) for name in config.wanted()}
+    for seed in sorted({seed for own in seeds.values() for seed in own}):
         trainings: dict[str, Job] = {}
-        for name in config.wanted():
+        for name in (name for name, own in seeds.items() if seed in own):
             source = config.trainings[name].after
             needs = None if source is None else trainings[source]
             trainings[name] = _training(config, name, seed, needs, resolved[name], presets)
             tests = (
-                _test(config, trainings[name], test, asked[test]) for test in config.tests_of(name)
+                _test(config, trainings[name], test, asked[test])
+                for test in config.tests_of(name, seed)
             )
             jobs += [trainings[name], *tests]
     return jobs

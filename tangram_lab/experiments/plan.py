@@ -20,7 +20,7 @@ from tangram_sim.settings import (
     setting,
 )
 
-FORMAT = 2
+FORMAT = 3
 Kind = Literal["curves", "complexity", "tests", "rewards", "ranking", "game", "worlds"]
 KINDS: tuple[str, ...] = get_args(Kind)
 PLAN = "plan.json"
@@ -66,8 +66,10 @@ class ExperimentConfig:
         title, note: for the report.
         source: where the paper has it.
         kind: of figure and table: one of KINDS.
-        trainings, tests: names in the catalogue; every test is made of every training.
+        trainings, tests: names in the catalogue; every test is made of every training, and the
+            first one's scores are what figures and tables show where they show one.
         labels: of trainings that are called otherwise here than in the catalogue.
+        main: whether README shows it: its trainings have all of the budget's main seeds.
     """
 
     title: str
@@ -77,6 +79,7 @@ class ExperimentConfig:
     trainings: tuple[str, ...]
     tests: tuple[str, ...] = ()
     labels: dict[str, str] = field(default_factory=dict)
+    main: bool = False
 
     def __post_init__(self) -> None:
         check_choice("kind", self.kind, KINDS)
@@ -92,22 +95,29 @@ class BudgetConfig:
         name: of the preset.
         note: for the report: what is smaller than in the paper.
         seeds: of every training.
+        main_seeds: of those that README shows.
         test_episodes: of every test.
+        test_seed: of these episodes: those that no decision was made on, but where nothing is
+            learned anyway.
         overrides: of tangram-train, by family; `all` holds for every family.
     """
 
     name: str
     note: str
     seeds: tuple[int, ...]
+    main_seeds: tuple[int, ...]
     test_episodes: int
+    test_seed: int
     overrides: dict[str, tuple[str, ...]]
 
     def __post_init__(self) -> None:
         check_range("budget.test_episodes", self.test_episodes, 1)
-        if not self.seeds or len(set(self.seeds)) < len(self.seeds):
-            raise ConfigError(f"budget.seeds must be different numbers, got {list(self.seeds)}")
-        for seed in self.seeds:
-            check_range("budget.seeds", seed, 0)
+        check_range("budget.test_seed", self.test_seed, 0)
+        for name, seeds in (("seeds", self.seeds), ("main_seeds", self.main_seeds)):
+            if not seeds or len(set(seeds)) < len(seeds):
+                raise ConfigError(f"budget.{name} must be different numbers, got {list(seeds)}")
+            for seed in seeds:
+                check_range(f"budget.{name}", seed, 0)
 
 
 @dataclass(frozen=True)
@@ -156,9 +166,21 @@ class StudyConfig(Settings):
     def test_command(self, name: str) -> list[str]:
         """Everything that tangram-eval is told; puzzles are as many as there are."""
         overrides = self.tests[name].overrides
+        seed = f"seed={self.budget.test_seed}"
         if any(text.startswith("puzzle=") for text in overrides):
-            return list(overrides)
-        return [f"episodes={self.budget.test_episodes}", *overrides]
+            return [seed, *overrides]
+        return [f"episodes={self.budget.test_episodes}", seed, *overrides]
+
+    def seeds(self, training: str) -> list[int]:
+        """Of a training: those of all experiments that need it."""
+        found = set[int]()
+        for experiment in self.experiments.values():
+            if any(training in self._sources(wanted) for wanted in experiment.trainings):
+                found.update(self._seeds_of(experiment))
+        return sorted(found)
+
+    def _seeds_of(self, experiment: ExperimentConfig) -> tuple[int, ...]:
+        return self.budget.main_seeds if experiment.main else self.budget.seeds
 
     def wanted(self) -> list[str]:
         """The trainings of all experiments, those that others begin with before them."""
@@ -180,9 +202,13 @@ class StudyConfig(Settings):
             yield current
             current = self.trainings[current].after
 
-    def tests_of(self, training: str) -> list[str]:
-        """The tests of a training in all experiments."""
-        found = [e.tests for e in self.experiments.values() if training in e.trainings]
+    def tests_of(self, training: str, seed: int | None = None) -> list[str]:
+        """The tests of a training, or of one of its seeds, in all experiments."""
+        found = [
+            e.tests
+            for e in self.experiments.values()
+            if training in e.trainings and (seed is None or seed in self._seeds_of(e))
+        ]
         return list(dict.fromkeys(name for tests in found for name in tests))
 
 
@@ -210,8 +236,8 @@ def plan_content(config: StudyConfig, source: Mapping[str, Any]) -> dict[str, An
     budget = {
         "name": config.budget.name,
         "note": config.budget.note,
-        "seeds": list(config.budget.seeds),
         "test_episodes": config.budget.test_episodes,
+        "test_seed": config.budget.test_seed,
     }
     wanted = config.wanted()
     tests = {test: None for name in wanted for test in config.tests_of(name)}
@@ -226,6 +252,7 @@ def plan_content(config: StudyConfig, source: Mapping[str, Any]) -> dict[str, An
                 "family": config.trainings[name].family,
                 "overrides": config.command(name),
                 "after": config.trainings[name].after,
+                "seeds": config.seeds(name),
             }
             for name in wanted
         },
@@ -252,7 +279,7 @@ def joined_plan(path: Path, content: dict[str, Any]) -> dict[str, Any]:
         raise ConfigError(
             f"{path} is of format {found}, and this version writes {FORMAT}: choose another run_dir"
         )
-    for name in ("name", "test_episodes"):
+    for name in ("name", "test_episodes", "test_seed"):
         earlier, now = known["budget"].get(name), content["budget"][name]
         if earlier != now:
             raise ConfigError(
@@ -260,5 +287,7 @@ def joined_plan(path: Path, content: dict[str, Any]) -> dict[str, Any]:
                 "another run_dir"
             )
     merged = {n: known[n] | content[n] for n in ("experiments", "trainings", "tests")}
-    seeds = sorted({*known["budget"].get("seeds", ()), *content["budget"]["seeds"]})
-    return content | merged | {"budget": content["budget"] | {"seeds": seeds}}
+    for name, one in known["trainings"].items():
+        seeds = sorted({*one.get("seeds", ()), *merged["trainings"][name]["seeds"]})
+        merged["trainings"][name] = merged["trainings"][name] | {"seeds": seeds}
+    return content | merged

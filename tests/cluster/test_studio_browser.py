@@ -641,7 +641,7 @@ def test_the_page_in_motion_is_filmed(browser: Browser, running: Running) -> Non
     status(page).to_contain_text("of the nearest figure")
     keep()
     context.close()
-    colours = frames[len(frames) // 3].quantize(128)  # all tans are seen on it; one palette, no flicker
+    colours = frames[len(frames) // 3].quantize(128)
     film = [
         frame.quantize(palette=colours, dither=Image.Dither.NONE)
         for frame in [*frames, *frames[-1:] * 8]

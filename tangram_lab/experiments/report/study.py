@@ -154,8 +154,8 @@ class Budget:
 
     name: str
     note: str
-    seeds: tuple[Count, ...]
     test_episodes: Count = 0
+    test_seed: Count = 0
 
 
 @dataclass(frozen=True)
@@ -181,12 +181,17 @@ class Study:
 
 
 @dataclass(frozen=True)
+class _Planned(TrainingConfig):
+    seeds: tuple[Count, ...] = ()
+
+
+@dataclass(frozen=True)
 class _Plan:
     command: str
     commit: str | None
     budget: Budget
     experiments: dict[str, ExperimentConfig]
-    trainings: dict[str, TrainingConfig]
+    trainings: dict[str, _Planned]
     tests: dict[str, TestConfig]
 
 
@@ -254,12 +259,13 @@ def _planned(folder: Path) -> Study:
     tests = {name: Trial(**vars(one), name=name) for name, one in plan.tests.items()}
     trainings = {
         name: Training(
-            **vars(one),
-            name=name,
-            seeds=tuple(
-                read_seed(seed_folder(folder, name, seed), seed, tests)
-                for seed in plan.budget.seeds
-            ),
+            **vars(one)
+            | {
+                "name": name,
+                "seeds": tuple(
+                    read_seed(seed_folder(folder, name, seed), seed, tests) for seed in one.seeds
+                ),
+            },
         )
         for name, one in plan.trainings.items()
     }
@@ -370,7 +376,7 @@ def _unplanned(folder: Path, configs: Iterable[Path]) -> Study:
                 seeds=tuple(read_seed(runs[seed], seed, ()) for seed in sorted(runs)),
             )
         )
-    budget = Budget("", NOTE, tuple(sorted({seed for _, runs in groups.values() for seed in runs})))
+    budget = Budget("", NOTE)
     rows = tuple(trainings)
     only = Experiment("runs", f"Runs of {folder.name}", "", "ranking", NOTE, rows, ())
     return Study({}, "", None, budget, (only,), rows, ())

@@ -122,7 +122,8 @@ def _each_seed(study: Study, measure: Measure) -> list[Column]:
     def cell(seed: int) -> Cell:
         return lambda one: measure.show(one.values(measure.key).get(seed))
 
-    return [(f"seed {seed}", cell(seed)) for seed in study.budget.seeds]
+    seeds = sorted({seed.number for one in study.trainings for seed in one.seeds})
+    return [(f"seed {seed}", cell(seed)) for seed in seeds]
 
 
 def _papers(experiment: Experiment, head: str, pattern: str) -> Column:
