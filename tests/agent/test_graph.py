@@ -37,6 +37,20 @@ def test_paper_features_equal_those_of_the_layout(tokens: dict[str, object]) -> 
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-6)
 
 
+def test_a_perceptron_is_told_the_edges_as_a_matrix_beside_the_features() -> None:
+    """Nine nodes of a square have 4 features and 9 entries each: 117 numbers."""
+    made = setup(agent={**PAPER, "edges": "inputs"}, net={"kind": "mlp"})
+    batch, graph = random_transitions(made, 6), graph_of(made)
+    parts = (torch.from_numpy(np.asarray(p, np.float32)) for p in (batch.state, batch.placed))
+    goal = torch.from_numpy(np.asarray(batch.goal, np.float32))
+    scenes = Scenes(*parts, goal, torch.zeros(6, dtype=torch.long))
+    seen = graph.vectors(scenes)
+    assert (graph.inputs, seen.shape) == (117, (6, 117))
+    assert torch.equal(seen[:, :36], graph.node_features(scenes).flatten(1))
+    edges = torch.from_numpy(made.layout.adjacency).float().flatten()
+    assert torch.equal(seen[:, 36:], edges.expand(6, -1))
+
+
 def test_offsets_are_corner_directions_of_every_piece() -> None:
     """The square's corners lie on the diagonals; its base has no offset."""
     made = setup(agent={**PAPER, "offsets": True})

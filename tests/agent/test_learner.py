@@ -20,6 +20,7 @@ from tangram_agent.learner import (
     polyak_update,
     saturation,
 )
+from tangram_agent.relabelling import PairBatch
 from tangram_agent.scenes import Scenes, next_token
 from tangram_agent.setup import Setup
 from tangram_sim.errors import RunError
@@ -117,6 +118,34 @@ def test_after_the_first_update_the_actor_itself_plays() -> None:
 def test_saturation_counts_what_lies_beyond_the_limit() -> None:
     raw = torch.tensor([[0.0, 2.0], [-3.0, 4.0]])
     assert saturation(raw, 2.0).item() == pytest.approx((1 + 4) / 4)
+
+
+def imitation(rewards: list[float], off: tuple[float, float, float]) -> float:
+    """The loss of an actor that is off from what was played, with such rewards."""
+    made = setup(agent={"imitates": True})
+    learner, drawn = Learner(made, 0), random_transitions(made, len(rewards), 0)
+    batch = learner.prepared(drawn, np.random.default_rng(0))
+    assert isinstance(batch, PairBatch)
+    steps = learner.steps(replace(batch, reward=np.array(rewards)))
+    velocity, _ = learner.actor(steps.view)
+    played = velocity.detach() + torch.tensor(off)
+    return float(learner.actor_loss(replace(steps, velocity=played))[0].detach())
+
+
+@pytest.mark.parametrize(
+    ("rewards", "off", "expected"),
+    [
+        ([1.0, 1.0], (0.3, 0.4, 0.0), 0.25),
+        ([1.0, 0.98], (0.3, 0.4, 0.0), 0.25),  # the second did not come to what was asked
+        ([0.5, -1.0], (0.3, 0.4, 0.0), 0.0),
+        ([1.0, 1.0], (0.0, 0.0, 0.5), 0.0),  # a square looks the same after a quarter turn
+        ([1.0, 1.0], (0.0, 0.0, 0.25), 2.0),
+    ],
+)
+def test_imitation_asks_for_the_actions_that_came_to_what_was_asked(
+    rewards: list[float], off: tuple[float, float, float], expected: float
+) -> None:
+    assert imitation(rewards, off) == pytest.approx(expected, abs=1e-5)
 
 
 @pytest.mark.parametrize(

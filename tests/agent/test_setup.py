@@ -52,7 +52,10 @@ def changed(section: str, **values: Any) -> dict[str, dict[str, Any]]:
         ),
         (changed("agent", squash="relu"), "agent.squash must be one of tanh, clamp, got 'relu'"),
         (changed("agent", angle_head="x"), "agent.angle_head must be one of plain, kfold"),
-        (changed("agent", edges="x"), "agent.edges must be one of paper, complete, got 'x'"),
+        (
+            changed("agent", edges="x"),
+            "agent.edges must be one of paper, complete, inputs, got 'x'",
+        ),
         (changed("agent", lr_final=1.5), "agent.lr_final must be between 0 and 1, got 1.5"),
         (
             changed("agent", readout="x"),

@@ -32,14 +32,14 @@ def experiment(kind: str, trainings: list[str], source: str = "beyond", **more: 
 
 
 def plan(experiments: Row, trainings: Row, tests: Row, seeds: tuple[int, ...] = (0, 1, 2)) -> Row:
-    budget = {"name": "laptop", "note": "Narrower MHA.", "seeds": list(seeds), "test_episodes": 100}
+    budget = {"name": "laptop", "note": "Narrower MHA.", "test_episodes": 100, "test_seed": 2}
     return {
-        "format": 2,
+        "format": 3,
         "command": "tangram-experiment experiment=[all] budget=laptop run_dir=runs/paper jobs=2",
         "commit": "0123abc",
         "budget": budget,
         "experiments": experiments,
-        "trainings": trainings,
+        "trainings": {name: one | {"seeds": list(seeds)} for name, one in trainings.items()},
         "tests": tests,
     }
 

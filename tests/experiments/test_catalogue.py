@@ -33,6 +33,13 @@ def test_every_training_and_test_of_the_catalogue_is_used() -> None:
     used = {name for e in config.experiments.values() for name in e.trainings}
     assert used == set(config.trainings)
     assert {name for e in config.experiments.values() for name in e.tests} == set(config.tests)
+    assert all(experiment.tests for experiment in config.experiments.values())
+
+
+def test_no_two_rows_have_one_label() -> None:
+    config = study("laptop", choices("experiment"))
+    labels = [training.label for training in config.trainings.values()]
+    assert len(set(labels)) == len(labels)
 
 
 @pytest.mark.parametrize("name", choices("experiment"))

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.slow
 BUDGETS = choices("budget")
 # The agent of each family that is not called like its agent.
 AGENTS = {
-    "start": "tangram",
+    **dict.fromkeys(("start", "long", "raw"), "tangram"),
     "matched": "tangram",
     "mlp_large": "mlp",
     "game": "tangram",

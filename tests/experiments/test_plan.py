@@ -25,7 +25,9 @@ def content(run_dir: Path, **changes: Any) -> dict[str, Any]:
             "name": "tiny",
             "note": "Nothing is learned.",
             "seeds": [0, 1],
+            "main_seeds": [0, 1, 2],
             "test_episodes": 5,
+            "test_seed": 2,
             "overrides": {"all": ["a=1", "b=1"], "ours": ["b=2"]},
         },
         "families": {"ours": ["agent=tangram"], "theirs": ["agent=paper"]},
@@ -72,6 +74,15 @@ def test_each_training_is_told_the_last_word_and_comes_once_with_all_its_tests(
 
 
 WARM = {"label": "x", "family": "ours", "after": "warm"}
+BUDGET: dict[str, Any] = {
+    "name": "",
+    "note": "",
+    "seeds": [0],
+    "main_seeds": [0],
+    "test_episodes": 1,
+    "test_seed": 0,
+    "overrides": {},
+}
 REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"jobs": 0}, "jobs must be between 1 and 1024, got 0"),
     ({"experiments": {"x": experiment(["squre"], [])}}, "x: trainings 'squre' is not in the cat"),
@@ -87,12 +98,14 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"families": {"ours": []}}, "training paper: family 'theirs' is not in the catalogue"),
     ({"trainings": {"square": WARM}, "experiments": {}}, "training square: after 'warm' is not in"),
     *(
-        ({"budget": {"name": "", "note": "", "test_episodes": 1, "overrides": {}} | change}, text)
+        ({"budget": BUDGET | change}, text)
         for change, text in (
             ({"seeds": []}, "budget.seeds must be different numbers, got"),
             ({"seeds": [1, 1]}, "budget.seeds must be different numbers, got"),
             ({"seeds": [0, -1]}, "budget.seeds must be at least 0, got -1"),
-            ({"seeds": [0], "test_episodes": 0}, "budget.test_episodes must be at least 1, got 0"),
+            ({"main_seeds": []}, "budget.main_seeds must be different numbers, got"),
+            ({"test_episodes": 0}, "budget.test_episodes must be at least 1, got 0"),
+            ({"test_seed": -1}, "budget.test_seed must be at least 0, got -1"),
         )
     ),
 ]
@@ -121,15 +134,16 @@ def test_a_circle_of_warm_starts_is_refused(tmp_path: Path) -> None:
 
 def test_the_plan_says_everything_that_a_report_needs(tmp_path: Path) -> None:
     plan = plan_content(study(tmp_path), {"command": "tangram-experiment x", "commit": "abc"})
-    assert (plan["format"], plan["command"], plan["commit"]) == (2, "tangram-experiment x", "abc")
+    assert (plan["format"], plan["command"], plan["commit"]) == (3, "tangram-experiment x", "abc")
     texts = {"name": "tiny", "note": "Nothing is learned."}
-    assert plan["budget"] == {**texts, "seeds": [0, 1], "test_episodes": 5}
+    assert plan["budget"] == {**texts, "test_episodes": 5, "test_seed": 2}
     assert list(plan["experiments"]) == ["one", "two"]
     assert plan["trainings"]["warm"] == {
         "label": "warm",
         "family": "ours",
         "overrides": ["agent=tangram", "a=1", "b=2"],
         "after": "square",
+        "seeds": [0, 1],
     }
     told = {"label": "1 % noise", "overrides": ("sim.corner_noise=0.01",)}
     assert plan["tests"]["noisy"] == told
@@ -157,7 +171,8 @@ def test_a_plan_keeps_what_was_there(tmp_path: Path) -> None:
     [
         ({}, {"name": "huge"}, "was made with budget.name=tiny, now it is huge: choose another"),
         ({}, {"test_episodes": 6}, "was made with budget.test_episodes=5, now it is 6"),
-        ({"format": 1}, {}, "is of format 1, and this version writes 2: choose another run_dir"),
+        ({}, {"test_seed": 0}, "was made with budget.test_seed=2, now it is 0"),
+        ({"format": 2}, {}, "is of format 2, and this version writes 3: choose another run_dir"),
     ],
 )
 def test_another_budget_or_version_needs_another_folder(
@@ -176,7 +191,15 @@ def test_seeds_may_be_added_and_none_is_forgotten(
 ) -> None:
     budget = content(tmp_path)["budget"] | {"seeds": seeds}
     found = joined(tmp_path, plan_content(study(tmp_path), {}), budget=budget)
-    assert found["budget"]["seeds"] == expected
+    assert {tuple(one["seeds"]) for one in found["trainings"].values()} == {tuple(expected)}
+
+
+def test_what_readme_shows_has_the_main_seeds_and_what_it_begins_with_too(tmp_path: Path) -> None:
+    main = experiment(["warm"], ["noisy"]) | {"main": True}
+    config = study(tmp_path, experiments={"one": experiment(["square"], ["twice"]), "two": main})
+    assert (config.seeds("square"), config.seeds("warm")) == ([0, 1, 2], [0, 1, 2])
+    assert (config.tests_of("square", 0), config.tests_of("square", 2)) == (["twice"], [])
+    assert config.tests_of("warm", 2) == ["noisy"]
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"budget": 1}', "[" * 100_000])
@@ -238,7 +261,7 @@ def test_each_job_is_a_command(tmp_path: Path) -> None:
     assert job.ready
     for test, setting in (("twice", "sim.actions_per_token=2"), ("noisy", "sim.corner_noise=0.01")):
         trial, out = jobs[f"warm, seed 1, test {test}"], run_dir / "tests" / f"{test}.json"
-        head = ("eval", f"run_dir='{run_dir}'", f"out='{out}'", "episodes=5")
+        head = ("eval", f"run_dir='{run_dir}'", f"out='{out}'", "episodes=5", "seed=2")
         assert trial.command == (*head, setting)
         assert (trial.needs, trial.leaves, trial.trains) == (job, out, False)
         assert trial.log == run_dir / "tests.log"
@@ -286,9 +309,20 @@ def test_what_cannot_be_read_is_not_done(tmp_path: Path, text: str | None) -> No
         assert not job.done
 
 
-RANDOM = {"sim": {"actions_per_token": 2, "arena": 2.0}, "episodes": 5, "updates": 3}
+RANDOM = {
+    "sim": {"actions_per_token": 2, "arena": 2.0},
+    "episodes": 5,
+    "test_seed": 2,
+    "updates": 3,
+}
 # Under `puzzles` a test's file has the scores of each.
-FIGURES = {"puzzle": ["test"], "turns": 8, "updates": 3, "puzzles": [{"name": "cat"}]}
+FIGURES = {
+    "puzzle": ["test"],
+    "turns": 8,
+    "test_seed": 2,
+    "updates": 3,
+    "puzzles": [{"name": "cat"}],
+}
 
 
 @pytest.mark.parametrize(
@@ -299,6 +333,7 @@ FIGURES = {"puzzle": ["test"], "turns": 8, "updates": 3, "puzzles": [{"name": "c
         (RANDOM, {"sim": {"actions_per_token": 3}}, False),
         (RANDOM, {"sim": None}, False),
         (RANDOM, {"episodes": 6}, False),
+        (RANDOM, {"test_seed": 0}, False),
         (RANDOM, {"updates": 2}, False),
         (FIGURES, {}, True),
         (FIGURES, {"puzzle": ["train"]}, False),

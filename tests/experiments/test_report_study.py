@@ -32,7 +32,7 @@ PAPER = {"label": "MHA", "family": "paper", "overrides": []}
 def test_a_study_is_read_with_what_its_runs_have_left(tmp_path: Path) -> None:
     write_study(tmp_path)
     study = read_runs(tmp_path)
-    assert study.budget == Budget("laptop", "Narrower MHA.", (0, 1, 2), 100)
+    assert study.budget == Budget("laptop", "Narrower MHA.", 100, 2)
     paper, mlp, ours, triangle, *_ = study.trainings
     assert [one.name for one in study.experiments[0].trainings] == ["paper", "mlp", "ours"]
     done, cut = "finished", "not finished"
@@ -97,11 +97,14 @@ def budget(**changes: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"format": 1}, "its format is 1, but this version reads 2"),
+        ({"format": 2}, "its format is 2, but this version reads 3"),
         ({"budget": {}}, "missing required field `name` - at `$.budget`; run its tangram-experi"),
         ({"budget": []}, "Expected `object`, got `array` - at `$.budget`"),
         *(
-            (budget(seeds=[value]), "- at `$.budget.seeds[0]`; run its tangram-experiment")
+            (
+                {"trainings": {"paper": PAPER | {"seeds": [value]}}},
+                "- at `$.trainings[...].seeds[0]`; run its tangram-experiment",
+            )
             for value in (True, -1, 1.5, "1", None)
         ),
         (budget(test_episodes=-1), "Expected `int` >= 0 - at `$.budget.test_episodes`"),
