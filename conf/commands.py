@@ -283,12 +283,12 @@ and again. tangram-report draws the figures and tables of what is there.""",
         "tangram-report",
         """\
 Reports on a study. It reads the runs that tangram-experiment made, finished or not, and writes
-their curves and tables beside the paper's values, as Markdown. Of a folder whose folders are
-runs, such as a sweep's, it makes one table.""",
+their curves and tables beside the paper's values, as Markdown, and data.json, which has all
+numbers. Of a folder whose folders are runs, such as a sweep's, it makes one table.""",
         (
             "tangram-report runs=runs/experiments/laptop out=report",
-            "tangram-report runs=runs/experiments/laptop out=docs/results.md",
             "tangram-report runs=runs/my_study out=runs/my_study/report",
+            "tangram-report check=true    # in a clone: pages against data, data against code",
         ),
         ("tangram_lab.experiments.cli:ReportConfig",),
     ),

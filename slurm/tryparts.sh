@@ -213,7 +213,7 @@ try_sweep() {
     held "a sweep of 3 seeds and 2 agents left six complete runs" \
         test "$(grep -l '"ended_by": "max_updates=40"' "$out"/*/result.json | wc -l)" = 6
     held "tangram-report made one table of them" report "$out"
-    grep -E '^\| (training|.* 3 of 3) ' "$work/report/README.md" | sed 's/^/  /' || true
+    grep -E '^\| (training|.* 3 of 3) ' "$work/report/tables.md" | sed 's/^/  /' || true
     held "each agent stands there with three seeds" \
-        test "$(grep -cE '^\| .*\| 3 of 3 \|' "$work/report/README.md")" = 2
+        test "$(grep -cE '^\| .*\| 3 of 3 \|' "$work/report/tables.md")" = 2
 }

@@ -3,13 +3,18 @@
 Everything heavy is imported after the config was composed, so --help and wrong input are instant.
 """
 
-from dataclasses import dataclass, field
+import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 from conf.cli import composed, entry, own_presets
 from conf.commands import Plain
 from tangram_sim.errors import ConfigError
-from tangram_sim.settings import Settings, declared
+from tangram_sim.settings import Settings, setting
+
+ROOT = Path(__file__).parents[2]
+RESULTS = "docs/results"
+GENERATED = ("settings.md",)  # pages that are written from declarations
 
 
 def experiment() -> int:
@@ -64,24 +69,43 @@ def _asked(name: str, overrides: list[str]) -> Plain:
 class ReportConfig(Settings):
     """A study and where to report on it; files of the same names are replaced."""
 
-    runs: str = field(
-        metadata=declared("folder that tangram-experiment made, or one whose folders are runs")
+    runs: str | None = setting(
+        None,
+        "folder that tangram-experiment made, or one whose folders are runs",
+        unless={"check": True},
     )
-    out: str = field(
-        metadata=declared(
-            "folder for README.md, figures and data.json, or the page itself as in docs/results.md"
-        )
+    out: str | None = setting(
+        None, "folder for tables.md, data.json and figures", unless={"check": True}
+    )
+    fingerprints: bool = setting(
+        False,
+        "keep in data.json what 20 updates of each family come to, a minute, so that check can "
+        "tell whether this code still trains alike",
+        unless={"check": True},
+    )
+    check: bool = setting(
+        False,
+        "in a clone: whether README and docs show what docs/results/data.json holds, and whether "
+        "this code still trains as the code that made it",
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, value in (("runs", self.runs), ("out", self.out)):
-            if not value.strip():
-                raise ConfigError(f"{name} must name a folder, got '{value}': set {name}=...")
+        if not self.check:
+            _folder("runs", self.runs)
+            _folder("out", self.out)
+
+
+def _folder(name: str, value: str | None) -> Path:
+    if value is None or not value.strip():
+        raise ConfigError(f"{name} must name a folder, got '{value or ''}': set {name}=...")
+    return Path(value)
 
 
 def report() -> int:
     """tangram-report: figures and tables of a study."""
+    if sys.argv[1:2] == ["check"]:
+        sys.argv[1] = "check=true"
     return entry("report", _report)
 
 
@@ -89,12 +113,28 @@ def _report(settings: Plain) -> int:
     from tangram_agent.setup import from_mapping
 
     config = from_mapping(ReportConfig, _with_absolute(settings, "runs", "out"))
+    if config.check:
+        return _check()
 
     from tangram_lab.experiments.report.page import write_report
 
-    for path in write_report(Path(config.runs), Path(config.out)):
+    runs, out = _folder("runs", config.runs), _folder("out", config.out)
+    for path in write_report(runs, out, config.fingerprints):
         print(f"written: {path}")
     return 0
+
+
+def _check() -> int:
+    from tangram_lab.experiments.report.check import check
+
+    if not (ROOT / RESULTS).is_dir():
+        raise ConfigError(f"check looks at {RESULTS} of a clone, which {ROOT} lacks: run it in one")
+    pages = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    wrong = check(ROOT / RESULTS, (page for page in pages if page.name not in GENERATED))
+    for line in wrong:
+        print(line)
+    print(f"{len(wrong)} wrong" if wrong else "every score of README and docs is in the data")
+    return 1 if wrong else 0
 
 
 def _with_absolute(settings: Plain, *names: str) -> Plain:

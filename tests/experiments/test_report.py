@@ -11,7 +11,8 @@ from PIL import Image
 
 from tangram_lab.experiments.cli import ReportConfig, _with_absolute, report
 from tangram_lab.experiments.report import page as report_page
-from tangram_lab.experiments.report.page import write_report
+from tangram_lab.experiments.report.data import read_data
+from tangram_lab.experiments.report.page import tables_page, write_report
 from tangram_sim.errors import ConfigError, RunError
 from tests.experiments.builders import (
     experiment,
@@ -49,18 +50,21 @@ def patch() -> Iterator[pytest.MonkeyPatch]:
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory, patch: pytest.MonkeyPatch) -> Path:
     """The folder beside a page on the study of the builders."""
-    patch.setattr(report_page, "draw_paper_pictures", lambda out: [("Puzzle", "p.png", "A cat.")])
+    picture = ("Puzzle", "p.png", "A cat.")
+    patch.setattr(report_page, "draw_paper_pictures", lambda out, draws: [picture])
     runs, out = tmp_path_factory.mktemp("runs"), tmp_path_factory.mktemp("out") / "new"
     write_study(runs)
-    assert write_report(runs, out / "report.md") == [
-        out / "report.md",
-        out / "report" / "data.json",
-    ]
-    return out / "report"
+    assert write_report(runs, out) == [out / "tables.md", out / "data.json"]
+    return out
 
 
 def test_the_page_is_the_golden_one(made: Path) -> None:
-    assert made.with_suffix(".md").read_text() == GOLDEN.read_text()
+    assert (made / "tables.md").read_text() == GOLDEN.read_text()
+
+
+def test_the_page_comes_from_the_data_alone(made: Path) -> None:
+    study, _ = read_data(made / "data.json")
+    assert tables_page(study, made) == GOLDEN.read_text()
 
 
 def test_every_figure_of_the_page_is_there_as_png_and_svg(made: Path) -> None:
@@ -77,7 +81,7 @@ def test_every_figure_of_the_page_is_there_as_png_and_svg(made: Path) -> None:
 
 
 def test_same_runs_give_the_same_bytes(tmp_path: Path, patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(report_page, "draw_paper_pictures", lambda out: [])
+    patch.setattr(report_page, "draw_paper_pictures", lambda out, draws: [])
     study = plan({"a": experiment("ranking", ["one"])}, {"one": training("one", "x")}, {}, (0,))
     write_plan(tmp_path / "runs", study)
     write_run(tmp_path / "runs", "one", result(0), learning_curve(0, 0.7))
@@ -112,15 +116,15 @@ def test_data_holds_all_numbers(made: Path) -> None:
 def test_command_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(report_page, "draw_paper_pictures", lambda out: [])
+    monkeypatch.setattr(report_page, "draw_paper_pictures", lambda out, draws: [])
     monkeypatch.setenv("HYDRA_FULL_ERROR", "")
     monkeypatch.chdir(tmp_path)
     write_plan(tmp_path / "runs", plan({}, {}, {}))
     monkeypatch.setattr(sys, "argv", ["tangram-report", "runs=runs", "out=out"])
     assert report() == 0
-    assert (tmp_path / "out" / "README.md").exists()
+    assert (tmp_path / "out" / "tables.md").exists()
     assert capsys.readouterr().out.splitlines() == [
-        f"written: {tmp_path / 'out' / name}" for name in ("README.md", "data.json")
+        f"written: {tmp_path / 'out' / name}" for name in ("tables.md", "data.json")
     ]
     monkeypatch.setattr(sys, "argv", ["tangram-report", "runs=nowhere", "out=out"])
     assert report() == 2

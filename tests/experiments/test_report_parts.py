@@ -1,6 +1,7 @@
 """The parts of a report: looks, the paper's values, sweeps, commands, Markdown, numbers."""
 
 import bisect
+import math
 import statistics
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import trim_mean
 
 from tangram_lab.experiments.report.figures import (
     PALETTE,
@@ -35,9 +37,18 @@ from tangram_lab.experiments.report.numbers import (
 )
 from tangram_lab.experiments.report.page import command
 from tangram_lab.experiments.report.references import falls_short, papers
+from tangram_lab.experiments.report.statistics import interquartile_mean, profile
 from tangram_lab.experiments.report.study import Seed, Training, read_runs
 from tangram_lab.experiments.report.style import LINES
-from tangram_lab.experiments.report.tables import paired, picture, plain, table, worlds_table
+from tangram_lab.experiments.report.tables import (
+    paired,
+    picture,
+    plain,
+    ranking_table,
+    score_table,
+    table,
+    worlds_table,
+)
 from tests.experiments.builders import (
     cells,
     experiment,
@@ -174,7 +185,7 @@ def test_sweeps_over_noise_and_actions(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "kept"),
     [
-        ("experiment=[all] run_dir='my runs' jobs=2", " 'run_dir=my runs' jobs=2"),
+        ("experiment=[all] run_dir='my runs' jobs=2 seed=1", " seed=1"),
         (
             "experiments.fig4.tests=[a] experiments.fig5.tests=[]",
             " 'experiments.fig4.tests=[a]'",
@@ -322,3 +333,63 @@ def test_numbers_as_people_read_them(found: object, expected: object) -> None:
 )
 def test_in_which_worlds_the_exact_hand_is_no_oracle(override: str, short: bool) -> None:
     assert falls_short(override) == short
+
+
+# Statistics
+
+
+def test_a_difference_is_paired_by_episode_and_averaged_over_the_seeds(tmp_path: Path) -> None:
+    one = experiment("ranking", ["ours", "less"], tests=["random"])
+    names = {"ours": training("ours", "x"), "less": training("less", "x")}
+    tests = {"random": {"label": "random", "overrides": []}}
+    write_plan(tmp_path, plan({"a": one}, names, tests, (0, 1)))
+    each: dict[str, tuple[list[float], list[float]]] = {
+        "ours": ([0.9, 0.5, 0.7], [0.7, 0.7, 0.9]),  # 0.8, 0.6, 0.8 over the seeds
+        "less": ([0.7, 0.5, 0.6], [0.7, 0.5, 0.6]),
+    }
+    for name, seeds in each.items():
+        for seed, coverage in enumerate(seeds):
+            test = scores(2 * float(np.mean(coverage)) - 1, coverage_each=coverage)
+            write_run(tmp_path, name, result(seed), [], {"random": test})
+    study = read_runs(tmp_path)
+    (row,) = cells("\n".join(ranking_table(study, study.experiments[0])), "less")
+    differences = 2 * np.array([-0.1, -0.1, -0.2])  # a reward is twice a coverage, less 1
+    half = 1.96 * differences.std(ddof=1) / math.sqrt(3)
+    mean = differences.mean()
+    assert row[2] == f"{mean:+.4f} ({mean - half:+.4f} to {mean + half:+.4f})"
+
+
+def test_an_interquartile_mean_leaves_out_the_quarters_and_comes_twice_alike() -> None:
+    values = np.array([[0.0], [0.5], [0.6], [0.7], [0.8], [0.9], [1.0], [-1.0]])
+    found = interquartile_mean(values)
+    assert found.estimate == pytest.approx(trim_mean(values, 0.25, axis=None))
+    assert found.estimate == pytest.approx(0.65)
+    assert found.low < found.estimate < found.high
+    before = np.random.get_state(legacy=False)  # noqa: NPY002
+    assert interquartile_mean(values) == found
+    assert str(np.random.get_state(legacy=False)) == str(before)  # noqa: NPY002
+
+
+def test_a_profile_is_the_share_of_runs_above_each_level() -> None:
+    shares, interval = profile(np.array([[0.1, 0.9], [0.3, 0.9]]), np.array([0.0, 0.2, 0.95]))
+    assert shares.tolist() == [1.0, 0.75, 0.0]
+    assert (interval[0] <= shares).all()
+    assert (interval[1] >= shares).all()
+
+
+@pytest.mark.parametrize(("seeds", "shown"), [(4, False), (5, True)])
+def test_a_quartile_needs_five_seeds(tmp_path: Path, seeds: int, shown: bool) -> None:
+    one = experiment("curves", ["ours"], tests=["random"])
+    tests = {"random": {"label": "random", "overrides": []}}
+    content = plan({"a": one}, {"ours": training("ours", "x")}, tests, tuple(range(seeds)))
+    write_plan(tmp_path, content)
+    for seed in range(seeds):
+        test = {"random": scores(0.5 + seed / 10)}
+        write_run(tmp_path, "ours", result(seed), learning_curve(seed, 0.9), test)
+    study = read_runs(tmp_path)
+    lines = score_table(study, study.experiments[0], REWARD)
+    assert ("interquartile mean" in lines[0]) is shown
+    row = cells("\n".join(lines), "ours")[0]
+    assert row[1] == ("0.700 (0.500 to 0.900)" if shown else "0.650 (0.500 to 0.800)")
+    if shown:
+        assert row[2].startswith("0.7000 (")

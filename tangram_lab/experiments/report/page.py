@@ -1,16 +1,16 @@
 """The page of a report with its figures and its data."""
 
-import json
 import shlex
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 from matplotlib.figure import Figure
 
 from tangram_agent.files import write_whole
 from tangram_lab.experiments.pictures import draw_paper_pictures
+from tangram_lab.experiments.report.data import read_data, write_data
 from tangram_lab.experiments.report.figures import (
     curve_parts,
     draw_curves,
@@ -21,9 +21,10 @@ from tangram_lab.experiments.report.figures import (
     sweep_parts,
     sweeps,
 )
-from tangram_lab.experiments.report.numbers import ANGLE, DENSE, REWARD, thinned
+from tangram_lab.experiments.report.fingerprints import make_fingerprints
+from tangram_lab.experiments.report.numbers import ANGLE, DENSE, REWARD
 from tangram_lab.experiments.report.references import lacking
-from tangram_lab.experiments.report.study import Experiment, Row, Seed, Study, Training, read_runs
+from tangram_lab.experiments.report.study import Experiment, Study, Training, read_runs
 from tangram_lab.experiments.report.style import drawing, save
 from tangram_lab.experiments.report.tables import (
     assembly_table,
@@ -36,15 +37,13 @@ from tangram_lab.experiments.report.tables import (
     ranking_table,
     score_table,
     shell,
-    single_tests,
     table,
     test_table,
     worlds_table,
 )
 from tangram_sim.errors import RunError
 
-FORMAT = 1  # of data.json
-DIGITS = 6  # of its curves
+DATA, TABLES, FIGURES = "data.json", "tables.md", "figures"
 HOW_TO_READ = (
     "Scores are those of the fixed tests, exploration off. The mean reward is Eq. 14 on exact "
     "polygons: -1 is no overlap, 1 is perfect. Where several seeds were trained, numbers are their "
@@ -73,13 +72,13 @@ WORLDS = (
 REACHED = "Episodes are those at the first evaluation in which a seed reached the mean reward."
 
 
-def write_report(runs: Path, out: Path) -> list[Path]:
+def write_report(runs: Path, out: Path, fingerprints: bool = False) -> list[Path]:
     """Report on a study; files of an earlier report in the same place are replaced.
 
     Args:
         runs: the study's folder, or one whose folders are runs.
-        out: folder for README.md, data.json and figures/, or the page itself, `NAME.md`, with the
-            others in the folder NAME beside it.
+        out: folder for tables.md, data.json and figures/.
+        fingerprints: whether data.json is to tell which code made it.
 
     Returns:
         The page and the data.
@@ -88,34 +87,42 @@ def write_report(runs: Path, out: Path) -> list[Path]:
         RunError: a file of the study is not what it should be, or `out` cannot be written.
     """
     study = read_runs(runs)
-    path, beside = (out, out.with_suffix("")) if out.suffix == ".md" else (out / "README.md", out)
-    figures, data = beside / "figures", beside / "data.json"
     try:
-        figures.mkdir(parents=True, exist_ok=True)
+        (out / FIGURES).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunError(
-            f"cannot make {figures} ({error.strerror}): choose another folder with out=..."
+            f"cannot make {out / FIGURES} ({error.strerror}): choose another folder with out=..."
         ) from None
-    page = Page(study, path.parent, figures.relative_to(path.parent).as_posix())
+    made = make_fingerprints(study.plan["trainings"]) if fingerprints and study.plan else {}
+    write_data(out / DATA, study, made)
+    if study.plan:  # what is drawn is what the data have
+        study, _ = read_data(out / DATA)
     with drawing():
-        lines = [*page.opening(data.relative_to(path.parent).as_posix()), *page.pictures()]
-        for experiment in study.experiments:
-            lines += page.section(experiment)
-    lines += closing(study)
-    write_whole(path, ("\n".join(lines).rstrip() + "\n").encode())
-    write_whole(data, (_json(study_data(study), "") + "\n").encode())
-    return [path, data]
+        write_whole(out / TABLES, Page(study, out).text().encode())
+    return [out / TABLES, out / DATA]
+
+
+def tables_page(study: Study, out: Path) -> str:
+    """The page anew, with the figures that lie there already."""
+    return Page(study, out, draws=False).text()
 
 
 @dataclass(frozen=True)
 class Page:
-    """The page of a study: its folder, and the folder of the figures in it."""
+    """The page of a study, its folder, and whether its figures are drawn or lie there."""
 
     study: Study
     out: Path
-    figures: str
+    draws: bool = True
 
-    def opening(self, data: str) -> list[str]:
+    def text(self) -> str:
+        """The whole page."""
+        lines = [*self.opening(), *self.pictures()]
+        for experiment in self.study.experiments:
+            lines += self.section(experiment)
+        return "\n".join([*lines, *closing(self.study)]).rstrip() + "\n"
+
+    def opening(self) -> list[str]:
         """Title, how to read it, and the experiments."""
         study = self.study
         rows = [
@@ -126,7 +133,7 @@ class Page:
             *(f"# Experiments, budget `{study.budget.name}`" if study.plan else "# Runs", ""),
             *(plain(study.budget.note), "", HOW_TO_READ, ""),
             *table(["experiment", "source", "runs finished"], rows, "---"),
-            f"`tangram-report` wrote this page; [{data}]({data}) holds all of its numbers.",
+            f"`tangram-report` wrote this page; [{DATA}]({DATA}) holds all of its numbers.",
             "",
         ]
 
@@ -134,9 +141,9 @@ class Page:
         """The paper's Figs. 1 to 3, which need no training."""
         lines: list[str] = []
         for title, file, caption in (
-            draw_paper_pictures(self.out / self.figures) if self.study.plan else []
+            draw_paper_pictures(self.out / FIGURES, self.draws) if self.study.plan else []
         ):
-            lines += [f"## {plain(title)}", "", *picture(title, f"{self.figures}/{file}")]
+            lines += [f"## {plain(title)}", "", *picture(title, f"{FIGURES}/{file}")]
             lines += [f"*{plain(caption)}*", ""]
         return lines
 
@@ -166,12 +173,17 @@ class Page:
             return lines
         return [*lines, "Make it again:", "", *shell(command(self.study, experiment))]
 
-    def _figure(self, name: str, title: str, caption: str, drawn: Figure | None) -> list[str]:
+    def _figure(
+        self, name: str, title: str, caption: str, draw: Callable[[], Figure | None]
+    ) -> list[str]:
         """Save a figure and embed it; nothing if there was nothing to draw."""
-        if drawn is None:
+        file = f"{FIGURES}/{name}"
+        if self.draws:
+            if (drawn := draw()) is None:
+                return []
+            save(drawn, self.out / FIGURES, name)
+        elif not (self.out / f"{file}.png").exists():
             return []
-        save(drawn, self.out / self.figures, name)
-        file = f"{self.figures}/{name}"
         return [*picture(title, f"{file}.png"), f"*{caption}* ([SVG]({file}.svg))", ""]
 
     def _curves(self, one: Experiment) -> list[str]:
@@ -180,8 +192,8 @@ class Page:
         for measure in (REWARD, DENSE) if both else (REWARD,):
             name, title = one.name + "_dense" * (measure is DENSE), f": {measure.label}" * both
             for number, part in enumerate(curve_parts(self.study, one), 1):
-                drawn = draw_curves(self.study, one, measure, part)
-                lines += self._figure(_numbered(name, number), one.title + title, BAND, drawn)
+                draw = partial(draw_curves, self.study, one, measure, part)
+                lines += self._figure(_numbered(name, number), one.title + title, BAND, draw)
             lines += score_table(self.study, one, measure)
         return [*lines, *effort_table(one), REACHED, ""]
 
@@ -190,15 +202,15 @@ class Page:
         for sweep in sweeps(one):
             name, title = f"{one.name}_{sweep.name}", f"{one.title}: {sweep.name}"
             for number, part in enumerate(sweep_parts(self.study, one), 1):
-                drawn = draw_sweep(self.study, one, sweep, part)
-                lines += self._figure(_numbered(name, number), title, SWEEP, drawn)
+                draw = partial(draw_sweep, self.study, one, sweep, part)
+                lines += self._figure(_numbered(name, number), title, SWEEP, draw)
         for measure in (REWARD, ANGLE):
             lines += test_table(self.study, one, measure)
-        singles = [line for m in (REWARD, ANGLE) for line in single_tests(one, m)]
-        return lines + details("Every seed", singles)
+        return lines
 
     def _ranking(self, one: Experiment) -> list[str]:
-        dots, singles = draw_ranking(self.study, one), draw_single_seeds(self.study, one)
+        dots = partial(draw_ranking, self.study, one)
+        singles = partial(draw_single_seeds, self.study, one)
         return [
             *self._figure(one.name, one.title, DOTS, dots),
             *ranking_table(self.study, one),
@@ -207,7 +219,8 @@ class Page:
 
     def _worlds(self, one: Experiment) -> list[str]:
         """A picture and a long table, or a short one where nothing is changed step by step."""
-        lines = self._figure(one.name, one.title, WORLDS, draw_worlds(self.study, one))
+        draw = partial(draw_worlds, self.study, one)
+        lines = self._figure(one.name, one.title, WORLDS, draw)
         rows = worlds_table(one)
         return lines + (details("Every test", rows) if lines else rows)
 
@@ -232,7 +245,7 @@ def _concerns(word: str, experiment: Experiment) -> bool:
     key = word.partition("=")[0]
     if key.startswith("experiments."):
         return key.startswith(f"experiments.{experiment.name}.")
-    return key not in ("experiment", "budget", "dry")
+    return key not in ("experiment", "budget", "dry", "run_dir", "jobs")
 
 
 def _gaps(experiment: Experiment, training: Training) -> Iterator[str]:
@@ -301,39 +314,3 @@ def _settings(one: Training) -> str:
     began = f", begins with the networks of `{one.after}`" if one.after else ""
     settings = " ".join(f"`{text}`" for text in one.overrides) or "(defaults)"
     return f"- **{plain(one.label)}** (`{one.name}`{began}): {settings}"
-
-
-# data.json: everything that the report was drawn from, so that the runs may be deleted
-
-
-def study_data(study: Study) -> Row:
-    """The plan, and of every run its state, result, tests and a curve of at most 60 points."""
-    runs = {one.name: [_seed_data(seed) for seed in one.seeds] for one in study.trainings}
-    return {"format": FORMAT, "plan": study.plan, "runs": runs}
-
-
-def _seed_data(seed: Seed) -> Row:
-    points = thinned(seed.curve)
-    names = dict.fromkeys(name for point in points for name in point)
-    return {
-        "seed": seed.number,
-        "state": seed.state,
-        "result": seed.result,
-        "tests": seed.tests,
-        "curve": {name: [_rounded(point.get(name)) for point in points] for name in names},
-    }
-
-
-def _rounded(value: Any) -> Any:
-    return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
-
-
-def _json(value: Any, indent: str) -> str:
-    """JSON with a line for each innermost collection, so that changes can be read."""
-    inner = indent + " "
-    if isinstance(value, dict) and any(isinstance(one, dict | list) for one in value.values()):
-        pairs = (f"{inner}{json.dumps(k)}: {_json(v, inner)}" for k, v in value.items())
-        return "{\n" + ",\n".join(pairs) + f"\n{indent}}}"
-    if isinstance(value, list) and any(isinstance(one, dict | list) for one in value):
-        return "[\n" + ",\n".join(inner + _json(one, inner) for one in value) + f"\n{indent}]"
-    return json.dumps(value, ensure_ascii=False)

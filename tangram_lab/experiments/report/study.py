@@ -30,6 +30,7 @@ AXES = ("updates", "episodes", "train_s")
 REMAKE = "run its tangram-experiment command again, or name another folder with runs=..."
 RETRAIN = "delete this folder of the seed and train it again, or leave it out"
 RETEST = "delete the file and run tangram-experiment again"
+FINISHED = "finished"
 # What may differ between the runs of one setting, where nobody planned them.
 APART = ("seed", "run_dir", "resume")
 AGENT = "agent.name"
@@ -60,7 +61,7 @@ class Seed:
     @property
     def finished(self) -> bool:
         """Whether it trained to its bound."""
-        return self.state == "finished"
+        return self.state == FINISHED
 
 
 @dataclass(frozen=True)
@@ -181,29 +182,33 @@ class Study:
 
 
 @dataclass(frozen=True)
-class _Planned(TrainingConfig):
+class Planned(TrainingConfig):
+    """A training and its seeds."""
+
     seeds: tuple[Count, ...] = ()
 
 
 @dataclass(frozen=True)
-class _Plan:
+class Plan:
+    """What plan.json must hold."""
+
     command: str
     commit: str | None
     budget: Budget
     experiments: dict[str, ExperimentConfig]
-    trainings: dict[str, _Planned]
+    trainings: dict[str, Planned]
     tests: dict[str, TestConfig]
 
 
 _SCORES = ("mean_reward_dense", "angle_error_deg_median", "position_error_median")
 _MAY = [(name, float | None, None) for name in _SCORES]
 _BASELINE: Any = msgspec.defstruct("_BASELINE", [("mean_reward", float | None, None), *_MAY])
-_TEST = msgspec.defstruct(
-    "_TEST", [("mean_reward", float), ("baselines", dict[str, _BASELINE], {}), *_MAY]
+TEST = msgspec.defstruct(
+    "TEST", [("mean_reward", float), ("baselines", dict[str, _BASELINE], {}), *_MAY]
 )
 _POINT = msgspec.defstruct("_POINT", [*((name, float) for name in (*AXES, "mean_reward")), *_MAY])
-_RESULT = msgspec.defstruct(
-    "_RESULT",
+RESULT = msgspec.defstruct(
+    "RESULT",
     [
         *((name, float | None) for name in ("mean_reward", *_SCORES)),
         *((name, float) for name in (*AXES, "wall_s", "parameters")),
@@ -213,27 +218,36 @@ _RESULT = msgspec.defstruct(
 )
 
 
-def _read(path: Path, remedy: str) -> bytes:
+def read_bytes(path: Path, remedy: str) -> bytes:
+    """A file's content; RunError with the remedy where it cannot be read."""
     try:
         return path.read_bytes()
     except OSError as error:
         raise RunError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
 
 
-def _parsed(text: bytes, kind: Any, place: str, remedy: str) -> tuple[Row, Any]:
+def parsed(text: bytes, kind: Any, place: str, remedy: str) -> tuple[Row, Any]:
     """A JSON mapping as it stands, and what must be in it, checked."""
     try:
         row = msgspec.json.decode(text, type=Row)
-        return row, msgspec.convert(row, kind)
-    except (msgspec.ValidationError, ConfigError) as error:
+    except msgspec.ValidationError as error:
         raise RunError(f"{place}: {error}; {remedy}") from None
     except (ValueError, RecursionError) as error:
         raise RunError(f"{place}: it is not JSON ({error}); {remedy}") from None
+    return row, converted(row, kind, place, remedy)
+
+
+def converted(row: Row, kind: Any, place: str, remedy: str) -> Any:
+    """What must be in a mapping, checked."""
+    try:
+        return msgspec.convert(row, kind)
+    except (msgspec.ValidationError, ConfigError) as error:
+        raise RunError(f"{place}: {error}; {remedy}") from None
 
 
 def _content(path: Path, kind: Any, remedy: str) -> Row:
     """The content of a file, checked, without what nobody else is told."""
-    row, _ = _parsed(_read(path, remedy), kind, str(path), remedy)
+    row, _ = parsed(read_bytes(path, remedy), kind, str(path), remedy)
     return {name: value for name, value in row.items() if name not in PRIVATE}
 
 
@@ -255,16 +269,25 @@ def read_runs(folder: Path) -> Study:
 
 
 def _planned(folder: Path) -> Study:
-    content, plan = _read_plan(folder / PLAN)
+    path = folder / PLAN
+    content, _ = parsed(read_bytes(path, REMAKE), Row, str(path), REMAKE)
+    plan = checked_plan(content, str(path))
+    return make_study(
+        content,
+        plan,
+        lambda name, seed: read_seed(seed_folder(folder, name, seed), seed, plan.tests),
+    )
+
+
+def make_study(content: Row, plan: "Plan", read: Callable[[str, int], Seed]) -> Study:
+    """A study of a plan whose runs are read by a training's name and a seed."""
     tests = {name: Trial(**vars(one), name=name) for name, one in plan.tests.items()}
     trainings = {
         name: Training(
             **vars(one)
             | {
                 "name": name,
-                "seeds": tuple(
-                    read_seed(seed_folder(folder, name, seed), seed, tests) for seed in one.seeds
-                ),
+                "seeds": tuple(read(name, seed) for seed in one.seeds),
             },
         )
         for name, one in plan.trainings.items()
@@ -284,29 +307,28 @@ def _planned(folder: Path) -> Study:
     return Study(content, plan.command, plan.commit, plan.budget, *known)
 
 
-def _read_plan(path: Path) -> tuple[Row, _Plan]:
-    text = _read(path, REMAKE)
-    content, _ = _parsed(text, Row, str(path), REMAKE)
+def checked_plan(content: Row, place: str) -> Plan:
+    """A plan, checked; RunError where it lacks what it names, or is of another format."""
     if content.get("format") != FORMAT:
         raise RunError(
-            f"{path}: its format is {content.get('format')!r}, but this version reads "
+            f"{place}: its format is {content.get('format')!r}, but this version reads "
             f"{FORMAT}: use the version of tangram-report that fits, or make the study again"
         )
-    plan: _Plan = _parsed(text, _Plan, str(path), REMAKE)[1]
+    plan: Plan = converted(content, Plan, place, REMAKE)
     for name in (*plan.experiments, *plan.trainings, *plan.tests):
         if not PLAIN.fullmatch(name):  # it becomes the name of files and folders
             raise RunError(
-                f"{path}: '{name}' is no name of an experiment, a training or a test: use letters, "
-                "digits, '.', '_' and '-'"
+                f"{place}: '{name}' is no name of an experiment, a training or a test: use "
+                "letters, digits, '.', '_' and '-'"
             )
     for one in plan.experiments.values():
         for key, names in (("trainings", one.trainings), ("tests", one.tests)):
             for name in names:
                 if name not in content[key]:
                     raise RunError(
-                        f"{path}: its {key} lack '{name}', which an experiment names; {REMAKE}"
+                        f"{place}: its {key} lack '{name}', which an experiment names; {REMAKE}"
                     )
-    return content, plan
+    return plan
 
 
 def read_seed(folder: Path, seed: int, tests: Iterable[str]) -> Seed:
@@ -318,9 +340,9 @@ def read_seed(folder: Path, seed: int, tests: Iterable[str]) -> Seed:
     result: Row = {}
     state = "not finished" if folder.exists() else "not started"
     if (path := folder / "result.json").exists():
-        result = _content(path, _RESULT, RETRAIN)
+        result = _content(path, RESULT, RETRAIN)
         stopped = result["ended_by"].startswith("SIG")
-        state = f"stopped by {result['ended_by']}" if stopped else "finished"
+        state = f"stopped by {result['ended_by']}" if stopped else FINISHED
     curve = folder / "curve.jsonl"
     files = {name: test_file(folder, name) for name in tests}
     return Seed(
@@ -328,15 +350,15 @@ def read_seed(folder: Path, seed: int, tests: Iterable[str]) -> Seed:
         state=state,
         result=result,
         curve=tuple(_curve(curve)) if curve.exists() else (),
-        tests={n: _content(file, _TEST, RETEST) for n, file in files.items() if file.exists()},
+        tests={n: _content(file, TEST, RETEST) for n, file in files.items() if file.exists()},
     )
 
 
 def _curve(path: Path) -> Iterator[Row]:
     """The points of a curve; a last line without its end is still being written."""
     last: Row = dict.fromkeys(AXES, 0)
-    for number, line in enumerate(_read(path, RETRAIN).split(b"\n")[:-1], 1):
-        row, _ = _parsed(line, _POINT, f"{path}: line {number}", RETRAIN)
+    for number, line in enumerate(read_bytes(path, RETRAIN).split(b"\n")[:-1], 1):
+        row, _ = parsed(line, _POINT, f"{path}: line {number}", RETRAIN)
         if any(row[axis] < last[axis] for axis in AXES):
             raise RunError(f"{path}: line {number} goes back in {', '.join(AXES)}; {RETRAIN}")
         last = row

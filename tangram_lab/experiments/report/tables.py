@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from tangram_lab.experiments.report.numbers import (
     first_at_least,
 )
 from tangram_lab.experiments.report.references import papers, papers_score, references
+from tangram_lab.experiments.report.statistics import interquartile_mean
 from tangram_lab.experiments.report.study import Experiment, Row, Study, Training, Trial
 from tangram_sim.arrays import Floats
 
@@ -37,6 +37,7 @@ GAME_MEASURES = (
     Measure("blocked", "refused placements", "{:.2f}"),
     Measure("seconds_per_puzzle", "ms per target", "{:,.0f}", 1000),
 )
+ENOUGH = 5  # seeds, for a quartile
 EACH = "coverage_each"  # of a test's file: the coverage of every episode
 ORDERS = ("order=listed", "order=size", "order=random")
 ORDER_NOTE = (
@@ -110,20 +111,33 @@ def _over_seeds(measure: Measure, test: str | None = None) -> Cell:
     return lambda one: measure.show_spread(one.values(measure.key, test))
 
 
-def _measured(*measures: Measure) -> list[Column]:
-    return [(measure.label, _over_seeds(measure)) for measure in measures]
+def _measured(*measures: Measure, test: str | None = None) -> list[Column]:
+    return [(measure.label, _over_seeds(measure, test)) for measure in measures]
 
 
 def _tested(measure: Measure, tests: Iterable[Trial]) -> list[Column]:
     return [(test.label, _over_seeds(measure, test.name)) for test in tests]
 
 
-def _each_seed(study: Study, measure: Measure) -> list[Column]:
-    def cell(seed: int) -> Cell:
-        return lambda one: measure.show(one.values(measure.key).get(seed))
+def _iqm(experiment: Experiment) -> list[Column]:
+    """The interquartile mean of the mean reward, where there are seeds enough for one."""
+    if all(len(one.finished) < ENOUGH for one in experiment.trainings):
+        return []
+    test = main_test(experiment)
 
-    seeds = sorted({seed.number for one in study.trainings for seed in one.seeds})
-    return [(f"seed {seed}", cell(seed)) for seed in seeds]
+    def cell(one: Training) -> str:
+        values = list(one.values(REWARD.key, test).values())
+        if len(values) < ENOUGH:
+            return NOTHING
+        middle, low, high = map(PRECISE.show, interquartile_mean(np.array(values)[:, None]))
+        return f"{middle} ({low} to {high})"
+
+    return [("interquartile mean, 95 % interval", cell)]
+
+
+def main_test(experiment: Experiment) -> str | None:
+    """The test whose scores are shown where one is, None of runs that nobody planned."""
+    return experiment.tests[0].name if experiment.tests else None
 
 
 def _papers(experiment: Experiment, head: str, pattern: str) -> Column:
@@ -141,11 +155,11 @@ def _if_any(column: Column, experiment: Experiment) -> list[Column]:
 
 
 def score_table(study: Study, experiment: Experiment, measure: Measure) -> list[str]:
-    """Final scores: the paper's, ours over the seeds, every seed, and policies without learning."""
+    """Scores: the paper's, ours over the seeds, and policies without learning."""
     told = _papers(experiment, "paper", "{mean_reward:.2f}")
     paper = _if_any(told, experiment) if measure is REWARD else []
-    ours = (f"{measure.label}, {SPREAD}", _over_seeds(measure))
-    columns = [LABEL, SEEDS, *paper, ours, *_each_seed(study, measure)]
+    ours = (f"{measure.label}, {SPREAD}", _over_seeds(measure, main_test(experiment)))
+    columns = [LABEL, SEEDS, *paper, ours, *(_iqm(experiment) if measure is REWARD else [])]
     others = [
         [policy.label, *[""] * (1 + len(paper)), measure.show(policy.score(measure))]
         for policy in references(study, experiment)
@@ -157,7 +171,8 @@ def effort_table(experiment: Experiment) -> list[str]:
     """How soon the paper's two rewards were reached, the errors at the end, and what it took."""
     paper = _papers(experiment, "paper, episodes", "{mean_reward:.2f} after {after:,}")
     soon = [(f"{level:.2f} after, episodes", _soon(level)) for level in LEVELS]
-    took = _measured(ANGLE, POSITION, EPISODES, UPDATES, MINUTES)
+    test = main_test(experiment)
+    took = [*_measured(ANGLE, POSITION, test=test), *_measured(EPISODES, UPDATES, MINUTES)]
     return _table([LABEL, *_if_any(paper, experiment), *soon, *took], experiment.trainings)
 
 
@@ -179,7 +194,8 @@ def complexity_table(experiment: Experiment) -> list[str]:
         *(LABEL, SEEDS, _papers(experiment, "paper: parameters", "{parameters:,}")),
         *(*_measured(PARAMETERS), _papers(experiment, "paper: time, h", "{hours:g}")),
         *(*_measured(HOURS), _papers(experiment, "paper: episodes", "{episodes:,}")),
-        *_measured(EPISODES, UPDATES, REWARD),
+        *_measured(EPISODES, UPDATES),
+        *_measured(REWARD, test=main_test(experiment)),
     ]
     return _table(columns, experiment.trainings)
 
@@ -200,36 +216,45 @@ def test_table(study: Study, experiment: Experiment, measure: Measure) -> list[s
     return table([f"{measure.label}, {SPREAD}", "seeds", *(test.label for test in tests)], rows)
 
 
-def single_tests(experiment: Experiment, measure: Measure) -> list[str]:
-    """Every seed of every training in every test."""
-    alone = [replace(one, seeds=(seed,)) for one in experiment.trainings for seed in one.finished]
-    number: Column = ("seed", lambda one: str(one.seeds[0].number))
-    columns = [(measure.label, LABEL[1]), number, *_tested(measure, experiment.tests)]
-    return _table(columns, alone)
-
-
 def ranking_table(study: Study, experiment: Experiment) -> list[str]:
-    """Every training beside the first: medians and their differences, and every seed."""
-    first = experiment.trainings[0]
-    columns = [LABEL, SEEDS]
-    for measure in (REWARD, ANGLE):
-        columns.append((f"{measure.label}, {SPREAD}", _over_seeds(measure)))
-        columns.append(("difference", _difference(measure, first)))
-    columns += [*_measured(MINUTES), *_each_seed(study, REWARD)]
+    """Every training beside the first: medians, and the difference of their tests in pairs."""
+    first, test = experiment.trainings[0], main_test(experiment)
+    columns = [
+        *(
+            LABEL,
+            SEEDS,
+            (f"{REWARD.label}, {SPREAD}", _over_seeds(REWARD, test)),
+            *_iqm(experiment),
+        ),
+        ("difference, 95 % interval over the tests", _difference(first, test)),
+        (f"{ANGLE.label}, {SPREAD}", _over_seeds(ANGLE, test)),
+        *_measured(MINUTES),
+    ]
+    space = [""] * len(_iqm(experiment))
     others = [
-        [one.label, "", REWARD.show(one.score(REWARD)), "", ANGLE.show(one.score(ANGLE))]
+        [one.label, "", REWARD.show(one.score(REWARD)), *space, "", ANGLE.show(one.score(ANGLE))]
         for one in references(study, experiment)
     ]
     return _table(columns, experiment.trainings, others)
 
 
-def _difference(measure: Measure, first: Training) -> Cell:
+def _difference(first: Training, test: str | None) -> Cell:
+    """Of the mean rewards, on the same test episodes, averaged over the seeds of each."""
+
     def cell(one: Training) -> str:
         if one is first:
             return "reference"
-        return measure.show_difference(one.values(measure.key), first.values(measure.key))
+        ours, theirs = _by_episode(one, test), _by_episode(first, test)
+        return paired(2.0 * (ours - theirs)) if len(ours) == len(theirs) else NOTHING
 
     return cell
+
+
+def _by_episode(training: Training, test: str | None) -> Floats:
+    """(E,) coverage of each episode of a test, averaged over the seeds."""
+    each = [seed.tests.get(test or "", {}).get(EACH) for seed in training.finished]
+    known = [one for one in each if one is not None]
+    return np.mean(known, axis=0) if known else np.zeros(0)
 
 
 # Several tokens

@@ -1,0 +1,153 @@
+"""Whether what pages show is in the data: every score of a page names its source.
+
+A comment above a paragraph, a list or a table says where its numbers are from:
+
+    <!-- data: fig4 table2 -->       these experiments' sections of the tables
+    <!-- data: silhouettes.json -->  a file of docs/results
+    <!-- data: paper -->             the paper's own numbers
+    <!-- data: commit 0123abc -->    an older commit, which the text must name, too
+    <!-- data: none -->              no score: a setting, a size
+"""
+
+import json
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from tangram_lab.experiments.report.data import read_data
+from tangram_lab.experiments.report.fingerprints import differences, make_fingerprints
+from tangram_lab.experiments.report.page import DATA, TABLES, tables_page
+from tangram_lab.experiments.report.references import VALUES
+from tangram_lab.experiments.report.study import Study
+from tangram_sim.errors import RunError
+
+MARK = re.compile(r"<!-- data: (?P<sources>[^>]+?) -->")
+# Three decimals and more: scores have as many, and little else has.
+SCORE = re.compile(r"(?<![\w.])\d+\.\d{3,}(?!\w|\.\d)")
+CODE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
+INLINE = re.compile(r"`[^`\n]*`|\]\([^)]*\)")
+SECTION = re.compile(r'^<a id="(?P<name>[^"]+)"></a>$', re.MULTILINE)
+NO_SCORE, OLDER, PAPERS = "none", "commit", "paper"
+
+
+def check(results: Path, pages: Iterable[Path]) -> list[str]:
+    """What is wrong; nothing where every figure is in the data, and the data are of this code.
+
+    Args:
+        results: folder that tangram-report made.
+        pages: that show figures.
+
+    Raises:
+        RunError: the data cannot be read, or a training for a fingerprint failed.
+    """
+    study, fingerprints = read_data(results / DATA)
+    shown = (results / TABLES).read_text(encoding="utf-8")
+    found = [*_of_the_study(study)]
+    if tables_page(study, results) != shown:
+        found.append(f"{results / TABLES} is not what {DATA} gives: make it anew")
+    numbers = Sources(results, shown)
+    for page in pages:
+        found += check_page(page.name, page.read_text(encoding="utf-8"), numbers)
+    return [*found, *differences(fingerprints, make_fingerprints(study.plan["trainings"]))]
+
+
+def _of_the_study(study: Study) -> Iterator[str]:
+    """Seeds that were planned and not trained, tests that were not made, other commits."""
+    commits = {seed.result.get("commit") for one in study.trainings for seed in one.finished}
+    if len(commits) > 1 or any(str(one).endswith("+") for one in commits):
+        yield f"the runs are of several commits: {', '.join(sorted(map(str, commits)))}"
+    for training in study.trainings:
+        left = [seed.number for seed in training.seeds if not seed.finished]
+        if left:
+            yield f"{training.name} lacks the seeds {left}"
+    for experiment in study.experiments:
+        for training in experiment.trainings:
+            for test in experiment.tests:
+                if any(test.name not in seed.tests for seed in training.finished):
+                    yield f"{training.name} lacks the test {test.name} of {experiment.name}"
+
+
+class Sources:
+    """The numbers that may stand on pages, by the names of their sources."""
+
+    def __init__(self, results: Path, tables: str) -> None:
+        """Read the tables; files are read when they are named."""
+        self._results = results
+        parts = SECTION.split(tables)[1:]
+        self._sections = dict(zip(parts[::2], parts[1::2], strict=True))
+
+    def has(self, source: str, text: str) -> bool:
+        """Whether a number, as it is written, is one of a source.
+
+        Raises:
+            RunError: there is no such source.
+        """
+        if source == NO_SCORE:
+            return True
+        if source == PAPERS:
+            return text.rstrip("0") in json.dumps(VALUES)
+        if source in self._sections:
+            return bool(re.search(rf"(?<![\d.]){re.escape(text)}(?![\d])", self._sections[source]))
+        return any(_rounds_to(number, text) for number in self._file(source))
+
+    def _file(self, name: str) -> Iterator[float]:
+        path = self._results / name
+        if not (path.suffix == ".json" and path.is_file()):
+            raise RunError(
+                f"no source is called {name}: name an experiment of {TABLES}, a .json file of "
+                f"{self._results}, {PAPERS}, {OLDER} or {NO_SCORE}"
+            )
+        yield from _numbers(json.loads(path.read_text(encoding="utf-8")))
+
+
+def _numbers(content: Any) -> Iterator[float]:
+    if isinstance(content, Mapping):
+        content = list(content.values())
+    if isinstance(content, list):
+        for one in content:
+            yield from _numbers(one)
+    elif isinstance(content, int | float) and not isinstance(content, bool):
+        yield float(content)
+
+
+def _rounds_to(number: float, text: str) -> bool:
+    """Whether a number is written so, as it is or halfway between two."""
+    digits = len(text.partition(".")[2])
+    return abs(abs(number) - float(text)) <= 0.500001 * 10.0**-digits
+
+
+def check_page(name: str, text: str, numbers: Sources) -> Iterator[str]:
+    """The scores of a page that have no source, or are not in it."""
+    sources: str | None = None
+    for line, block in _blocks(text):
+        marks = [found["sources"] for found in MARK.finditer(block)]
+        sources = marks[-1] if marks else sources
+        bare = INLINE.sub("", MARK.sub("", block))
+        for score in dict.fromkeys(SCORE.findall(bare)):
+            if wrong := _wrong(sources, score, bare, numbers):
+                yield f"{name}:{line}: {score} {wrong}"
+        if bare.strip():
+            sources = None  # a mark holds for what comes next
+
+
+def _wrong(sources: str | None, score: str, block: str, numbers: Sources) -> str:
+    if sources is None:
+        return "has no source: put <!-- data: ... --> above it"
+    first, *rest = sources.split()
+    if first == OLDER:
+        missing = [one for one in rest if one not in block]
+        return f"is of commit {missing[0]}, which the text does not say" if missing else ""
+    if any(numbers.has(source, score) for source in (first, *rest)):
+        return ""
+    return f"is not in {sources}"
+
+
+def _blocks(text: str) -> Iterator[tuple[int, str]]:
+    """What blank lines set apart, with the number of its first line; code is left out."""
+    blank = CODE.sub(lambda found: "\n" * found[0].count("\n"), text)
+    line = 1
+    for block in re.split(r"(\n[ \t]*\n)", blank):
+        if block.strip():
+            yield line + len(block) - len(block.lstrip("\n")), block
+        line += block.count("\n")

@@ -1,0 +1,195 @@
+"""tangram-report check: what is told of pages, data and code that no longer fit each other."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tangram_lab.experiments.report import check as report_check
+from tangram_lab.experiments.report import fingerprints as report_fingerprints
+from tangram_lab.experiments.report import page
+from tangram_lab.experiments.report.check import Sources, check, check_page
+from tangram_lab.experiments.report.data import read_data
+from tangram_lab.experiments.report.fingerprints import differences
+from tangram_lab.experiments.report.page import write_report
+from tangram_sim.errors import RunError
+from tests.experiments.builders import (
+    experiment,
+    learning_curve,
+    plan,
+    result,
+    scores,
+    training,
+    write_plan,
+    write_run,
+)
+
+pytestmark = pytest.mark.fast
+
+TABLES = '<a id="fig4"></a>\n\n| ours | 0.996 (0.995 to 0.9971) |\n\n<a id="fig5"></a>\n\n0.5\n'
+
+
+@pytest.fixture
+def numbers(tmp_path: Path) -> Sources:
+    (tmp_path / "bench.json").write_text(json.dumps({"a": [{"x": 0.12344, "b": True}], "c": -3.0}))
+    return Sources(tmp_path, TABLES)
+
+
+PAGES = [
+    ("It has 0.996.", ["has no source"]),
+    ("<!-- data: fig4 -->\nIt has 0.996 (0.995).", []),
+    ("<!-- data: fig4 -->\n\nIt has 0.996.", []),
+    ("<!-- data: fig4 -->\n\nIt has 0.996.\n\nAnd 0.995.", ["0.995 has no source"]),
+    ("<!-- data: fig4 -->\nIt has 0.997.", ["0.997 is not in fig4"]),  # it is 0.9971
+    ("<!-- data: fig5 -->\nIt has 0.996.", ["0.996 is not in fig5"]),
+    ("<!-- data: fig5 fig4 -->\nIt has 0.996.", []),
+    ("<!-- data: bench.json -->\nIt has 0.123, 0.1234 and 3.000.", []),
+    ("<!-- data: bench.json -->\nIt has 1.000.", ["1.000 is not in bench.json"]),  # true is none
+    ("<!-- data: paper -->\nThe paper has 0.758 and 0.759.", ["0.759 is not in paper"]),
+    ("<!-- data: commit 0123abc -->\nAt commit 0123abc it had 0.111.", []),
+    ("<!-- data: commit 0123abc -->\nIt had 0.111.", ["is of commit 0123abc, which the text does"]),
+    ("<!-- data: none -->\nA side of 0.125.", []),
+    ("`agent.noise=0.125`, [x](a_0.125.md), 1.25 and version 1.2.345\n\n```\n0.125\n```", []),
+    ("| a |\n| --- |\n| 0.996 |", ["has no source"]),
+]
+
+
+@pytest.mark.parametrize(("text", "expected"), PAGES)
+def test_every_score_of_a_page_has_a_source(
+    numbers: Sources, text: str, expected: list[str]
+) -> None:
+    found = [*check_page("p.md", text, numbers)]
+    assert len(found) == len(expected)
+    assert all(part in line for part, line in zip(expected, found, strict=True))
+
+
+def test_a_line_is_named(numbers: Sources) -> None:
+    text = "one\ntwo\n\n```\nx\n\n```\n\nIt has 0.111."
+    assert [*check_page("p.md", text, numbers)] == [
+        "p.md:9: 0.111 has no source: put <!-- data: ... --> above it"
+    ]
+
+
+@pytest.mark.parametrize("name", ["fig9", "nowhere.json", "../data.yaml"])
+def test_a_source_that_is_none(numbers: Sources, name: str) -> None:
+    with pytest.raises(RunError, match="no source is called"):
+        [*check_page("p.md", f"<!-- data: {name} -->\n0.111", numbers)]
+
+
+# The whole
+
+
+FINGERPRINT = {"x": {"mean_reward": 0.5, "weights": 1000.0}}
+
+
+@pytest.fixture
+def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The report of a whole study of one training."""
+    monkeypatch.setattr(page, "draw_paper_pictures", lambda out, draws: [])
+    monkeypatch.setattr(page, "make_fingerprints", lambda trainings: FINGERPRINT)
+    monkeypatch.setattr(report_check, "make_fingerprints", lambda trainings: FINGERPRINT)
+    one = experiment("curves", ["ours"], tests=["random"])
+    tests = {"random": {"label": "random", "overrides": []}}
+    write_plan(tmp_path, plan({"fig4": one}, {"ours": training("ours", "x")}, tests, (0, 1)))
+    for seed in (0, 1):
+        curve, test = learning_curve(seed, 0.9), {"random": scores(0.912)}
+        write_run(tmp_path, "ours", result(seed), curve, test)
+    write_report(tmp_path, tmp_path / "results", fingerprints=True)
+    return tmp_path / "results"
+
+
+def checked(results: Path, text: str = "<!-- data: fig4 -->\n0.912") -> list[str]:
+    (results.parent / "README.md").write_text(text)
+    return check(results, [results.parent / "README.md"])
+
+
+def changed(results: Path, change: dict[str, Any]) -> None:
+    """A finished run's result is another one."""
+    data = json.loads((results / "data.json").read_text())
+    data["runs"]["ours"][1] |= change
+    (results / "data.json").write_text(json.dumps(data))
+
+
+def test_nothing_is_wrong(results: Path) -> None:
+    assert checked(results) == []
+
+
+def test_a_page_that_shows_something_else(results: Path) -> None:
+    assert checked(results, "<!-- data: fig4 -->\n0.913") == [
+        "README.md:1: 0.913 is not in fig4",
+    ]
+
+
+def test_tables_that_were_changed_by_hand(results: Path) -> None:
+    tables = results / "tables.md"
+    tables.write_text(tables.read_text().replace("0.912", "0.913"))
+    assert any("is not what data.json gives" in line for line in checked(results))
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"state": "not finished", "result": {}, "tests": {}}, "ours lacks the seeds [1]"),
+        ({"tests": {}}, "ours lacks the test random of fig4"),
+        ({"result": result(1, commit="fedcba9")}, "several commits: 0123abc, fedcba9"),
+    ],
+)
+def test_what_the_study_lacks(results: Path, change: dict[str, Any], told: str) -> None:
+    changed(results, change)
+    assert any(told in line for line in checked(results))
+
+
+def test_code_that_trains_otherwise(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = {"x": {"mean_reward": 0.5, "weights": 1003.0}}
+    monkeypatch.setattr(report_check, "make_fingerprints", lambda trainings: now)
+    (found,) = checked(results)
+    assert "family x trains otherwise" in found
+    assert "weights is 1003.0, and was 1000.0" in found
+
+
+def test_a_fingerprint_may_differ_as_processors_do() -> None:
+    assert not [*differences(FINGERPRINT, {"x": {"mean_reward": 0.5001, "weights": 1000.9}})]
+    assert [*differences(FINGERPRINT, {})]
+
+
+def test_a_family_is_trained_by_the_first_of_its_trainings(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    told: dict[str, list[str]] = {}
+
+    def train(folder: Path, overrides: list[str]) -> dict[str, float]:
+        told[folder.name] = overrides
+        return {"weights": 1.0}
+
+    monkeypatch.setattr(report_fingerprints, "_trained", train)
+    names = {"a": training("a", "x", "k=1"), "b": training("b", "x"), "c": training("c", "y")}
+    found = report_fingerprints.make_fingerprints(names)
+    assert (found, told) == (
+        {"x": {"weights": 1.0}, "y": {"weights": 1.0}},
+        {"x": ["k=1"], "y": []},
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"format": 1}, "its format is 1, but this version reads 2"),
+        ({"runs": {}}, "ours, seed 0 of its plan is missing"),
+        ({"runs": 3}, r"Expected `object`, got `int` - at `\$.runs`"),
+        ({"plan": {}}, "its format is None, but this version reads 3"),
+    ],
+)
+def test_data_that_are_not_what_they_should_be(
+    results: Path, change: dict[str, Any], message: str
+) -> None:
+    path = results / "data.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(RunError, match=message):
+        read_data(path)
+
+
+def test_a_curve_whose_columns_differ_in_length(results: Path) -> None:
+    changed(results, {"curve": {"updates": [1.0, 2.0], "mean_reward": [0.5]}})
+    with pytest.raises(RunError, match="seed 1: the columns of its curve are not of one length"):
+        read_data(results / "data.json")
