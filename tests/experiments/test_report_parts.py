@@ -36,6 +36,7 @@ from tangram_lab.experiments.report.numbers import (
     thinned,
 )
 from tangram_lab.experiments.report.page import command
+from tangram_lab.experiments.report.profiles import draw_profile
 from tangram_lab.experiments.report.references import falls_short, papers
 from tangram_lab.experiments.report.statistics import interquartile_mean, profile
 from tangram_lab.experiments.report.study import Seed, Training, read_runs
@@ -393,3 +394,23 @@ def test_a_quartile_needs_five_seeds(tmp_path: Path, seeds: int, shown: bool) ->
     assert row[1] == ("0.700 (0.500 to 0.900)" if shown else "0.650 (0.500 to 0.800)")
     if shown:
         assert row[2].startswith("0.7000 (")
+
+
+@pytest.mark.parametrize(("seeds", "drawn"), [(4, False), (5, True)])
+def test_a_profile_is_drawn_of_the_seeds_that_all_trainings_have(
+    tmp_path: Path, seeds: int, drawn: bool
+) -> None:
+    names = {name: training(name, "x") for name in ("square", "triangle")}
+    tests = {"random": {"label": "random", "overrides": []}}
+    one = experiment("ranking", [*names], tests=["random"])
+    write_plan(tmp_path, plan({"a": one}, names, tests, tuple(range(6))))
+    for name, count in (("square", seeds), ("triangle", 6)):
+        for seed in range(count):
+            write_run(tmp_path, name, result(seed), [], {"random": scores(0.99)})
+    figure = draw_profile(read_runs(tmp_path).experiments[0])
+    assert (figure is not None) is drawn
+    if figure is not None:
+        (line,) = figure.axes[0].lines
+        x, y = np.asarray(line.get_xdata()), np.asarray(line.get_ydata())
+        assert set(y[x < 0.0099]) == {0.0}
+        assert set(y[x > 0.0101]) == {1.0}

@@ -412,14 +412,15 @@ def _compared(known: Part, places: Mapping[float, Trial], policy: str) -> dict[f
 
 def draw_ranking(study: Study, experiment: Experiment) -> Figure | None:
     """A row for each training, a dot for each seed, a tick at the median."""
-    known = [one for one in experiment.trainings if one.values(REWARD.key)]
+    test = experiment.main_test
+    known = [one for one in experiment.trainings if one.values(REWARD.key, test)]
     if not known:
         return None
     figure, panels = new_figure(1.2 + 0.3 * len(known), 1, 2, sharey=True)
     for panel, measure in zip(panels, (REWARD, ANGLE), strict=True):
         shown: list[float] = []
         for row, training in enumerate(known):
-            values = list(training.values(measure.key).values())
+            values = list(training.values(measure.key, test).values())
             _draw_row(panel, row, values, looks(study)[training.name].colour)
             shown += values
             level = position(study, training).score(measure)
@@ -428,7 +429,7 @@ def draw_ranking(study: Study, experiment: Experiment) -> Figure | None:
                 panel.plot(level, row, "D", mfc="white", label=POSITION, **style)
                 shown.append(level)
         first = experiment.trainings[0]
-        if middle := spread(first.values(measure.key).values()):
+        if middle := spread(first.values(measure.key, test).values()):
             label = f"median of {first.label}"
             panel.axvline(middle.median, color=LEVEL, linewidth=1.0, zorder=1, label=label)
         if measure is ANGLE:

@@ -23,6 +23,7 @@ from tangram_lab.experiments.report.figures import (
 )
 from tangram_lab.experiments.report.fingerprints import make_fingerprints
 from tangram_lab.experiments.report.numbers import ANGLE, DENSE, REWARD
+from tangram_lab.experiments.report.profiles import draw_profile
 from tangram_lab.experiments.report.references import lacking
 from tangram_lab.experiments.report.study import Experiment, Study, Training, read_runs
 from tangram_lab.experiments.report.style import drawing, save
@@ -63,6 +64,10 @@ DOTS = (
 SMALL = (
     "Every seed's test scores while it trains; the range of the first training stands in grey "
     "behind each."
+)
+PROFILE = (
+    "The share of all runs that falls short of a perfect mean reward by no more than so much, with "
+    "a stratified bootstrap's interval (Agarwal et al. 2021)."
 )
 SWEEP = "Median over the seeds; the band goes from the least to the most."
 WORLDS = (
@@ -214,6 +219,12 @@ class Page:
         return [
             *self._figure(one.name, one.title, DOTS, dots),
             *ranking_table(self.study, one),
+            *self._figure(
+                f"{one.name}_profile",
+                f"{one.title}: performance profile",
+                PROFILE,
+                partial(draw_profile, one),
+            ),
             *self._figure(f"{one.name}_seeds", f"{one.title}: curves", SMALL, singles),
         ]
 

@@ -12,6 +12,7 @@ import numpy as np
 from tangram_sim.arrays import Floats
 from tangram_sim.errors import RunError
 
+ENOUGH = 5  # seeds, for a quartile
 REPETITIONS = 2000  # of the bootstrap
 SEED = 0  # of its draws: the same data give the same page
 

@@ -148,6 +148,11 @@ class Experiment:
     trainings: tuple[Training, ...]
     tests: tuple[Trial, ...]
 
+    @property
+    def main_test(self) -> str | None:
+        """The test whose scores are shown where one is; None of runs that nobody planned."""
+        return self.tests[0].name if self.tests else None
+
 
 @dataclass(frozen=True)
 class Budget:

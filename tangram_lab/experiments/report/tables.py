@@ -19,7 +19,7 @@ from tangram_lab.experiments.report.numbers import (
     first_at_least,
 )
 from tangram_lab.experiments.report.references import papers, papers_score, references
-from tangram_lab.experiments.report.statistics import interquartile_mean
+from tangram_lab.experiments.report.statistics import ENOUGH, interquartile_mean
 from tangram_lab.experiments.report.study import Experiment, Row, Study, Training, Trial
 from tangram_sim.arrays import Floats
 
@@ -37,7 +37,6 @@ GAME_MEASURES = (
     Measure("blocked", "refused placements", "{:.2f}"),
     Measure("seconds_per_puzzle", "ms per target", "{:,.0f}", 1000),
 )
-ENOUGH = 5  # seeds, for a quartile
 EACH = "coverage_each"  # of a test's file: the coverage of every episode
 ORDERS = ("order=listed", "order=size", "order=random")
 ORDER_NOTE = (
@@ -123,7 +122,7 @@ def _iqm(experiment: Experiment) -> list[Column]:
     """The interquartile mean of the mean reward, where there are seeds enough for one."""
     if all(len(one.finished) < ENOUGH for one in experiment.trainings):
         return []
-    test = main_test(experiment)
+    test = experiment.main_test
 
     def cell(one: Training) -> str:
         values = list(one.values(REWARD.key, test).values())
@@ -133,11 +132,6 @@ def _iqm(experiment: Experiment) -> list[Column]:
         return f"{middle} ({low} to {high})"
 
     return [("interquartile mean, 95 % interval", cell)]
-
-
-def main_test(experiment: Experiment) -> str | None:
-    """The test whose scores are shown where one is, None of runs that nobody planned."""
-    return experiment.tests[0].name if experiment.tests else None
 
 
 def _papers(experiment: Experiment, head: str, pattern: str) -> Column:
@@ -158,7 +152,7 @@ def score_table(study: Study, experiment: Experiment, measure: Measure) -> list[
     """Scores: the paper's, ours over the seeds, and policies without learning."""
     told = _papers(experiment, "paper", "{mean_reward:.2f}")
     paper = _if_any(told, experiment) if measure is REWARD else []
-    ours = (f"{measure.label}, {SPREAD}", _over_seeds(measure, main_test(experiment)))
+    ours = (f"{measure.label}, {SPREAD}", _over_seeds(measure, experiment.main_test))
     columns = [LABEL, SEEDS, *paper, ours, *(_iqm(experiment) if measure is REWARD else [])]
     others = [
         [policy.label, *[""] * (1 + len(paper)), measure.show(policy.score(measure))]
@@ -171,7 +165,7 @@ def effort_table(experiment: Experiment) -> list[str]:
     """How soon the paper's two rewards were reached, the errors at the end, and what it took."""
     paper = _papers(experiment, "paper, episodes", "{mean_reward:.2f} after {after:,}")
     soon = [(f"{level:.2f} after, episodes", _soon(level)) for level in LEVELS]
-    test = main_test(experiment)
+    test = experiment.main_test
     took = [*_measured(ANGLE, POSITION, test=test), *_measured(EPISODES, UPDATES, MINUTES)]
     return _table([LABEL, *_if_any(paper, experiment), *soon, *took], experiment.trainings)
 
@@ -195,7 +189,7 @@ def complexity_table(experiment: Experiment) -> list[str]:
         *(*_measured(PARAMETERS), _papers(experiment, "paper: time, h", "{hours:g}")),
         *(*_measured(HOURS), _papers(experiment, "paper: episodes", "{episodes:,}")),
         *_measured(EPISODES, UPDATES),
-        *_measured(REWARD, test=main_test(experiment)),
+        *_measured(REWARD, test=experiment.main_test),
     ]
     return _table(columns, experiment.trainings)
 
@@ -218,7 +212,7 @@ def test_table(study: Study, experiment: Experiment, measure: Measure) -> list[s
 
 def ranking_table(study: Study, experiment: Experiment) -> list[str]:
     """Every training beside the first: medians, and the difference of their tests in pairs."""
-    first, test = experiment.trainings[0], main_test(experiment)
+    first, test = experiment.trainings[0], experiment.main_test
     columns = [
         *(
             LABEL,
