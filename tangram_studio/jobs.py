@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 from tangram_sim.errors import TangramError
 
 Given = TypeVar("Given")
-Waits = Callable[[int], Awaitable[None]]  # told how many tasks come first
+Waits = Callable[[int], Awaitable[None]]  # told how many tasks come first, when that changes
 LIMIT_S = 30.0  # of a task
 PATIENT_S = 0.3  # of a wait that is not worth a word
 
@@ -39,7 +39,8 @@ class Jobs:
         """
         self._processes, self._warm = processes, warm
         self._turns = asyncio.Semaphore(processes)
-        self._waiting, self.started = 0, 0
+        self._queue: list[object] = []  # who waits, the first in front
+        self.started = 0
         self._working: set[asyncio.Task[Any]] = set()
         self._pool = self._start()
 
@@ -98,12 +99,16 @@ class Jobs:
 
     async def _turn(self, waits: Waits | None) -> None:
         """Wait for a process that is free."""
-        turn = asyncio.ensure_future(self._turns.acquire())
-        self._waiting += 1
+        turn, place, told = asyncio.ensure_future(self._turns.acquire()), object(), -1
+        self._queue.append(place)
         try:
-            done, _ = await asyncio.wait((turn,), timeout=PATIENT_S)
-            if not done and waits is not None:
-                await waits(self._waiting - 1)
+            await asyncio.wait((turn,), timeout=PATIENT_S)
+            while not turn.done():
+                ahead = self._queue.index(place) + len(self._working)
+                if waits is not None and ahead != told:
+                    told = ahead
+                    await waits(ahead)
+                await asyncio.wait((turn,), timeout=PATIENT_S)
             await turn
         except BaseException:
             if turn.done() and not turn.cancelled():
@@ -112,7 +117,7 @@ class Jobs:
                 turn.cancel()
             raise
         finally:
-            self._waiting -= 1
+            self._queue.remove(place)
 
     def _start(self) -> ProcessPoolExecutor:
         self.started += 1

@@ -69,12 +69,14 @@ class Play(Struct, tag_field="ask", tag="play", forbid_unknown_fields=True):
         number: see `Fill`.
         goal: the figure.
         start: where the tokens lie; None: anywhere beside it.
+        shown: moves of the same figure that the page had begun to show; others are forgotten.
         motion: whether tokens are carried or pushed.
     """
 
     number: Count
     goal: Tokens
     start: Tokens | None = None
+    shown: Count = 0
     motion: Motion = "lift"
 
 

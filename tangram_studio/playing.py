@@ -56,12 +56,13 @@ class Move:
     """What one move came to.
 
     Attributes:
-        token: that was moved; None where there is nothing more to do in this round.
+        token: that was moved; None where none was.
         frames: (F, K, 3) poses at equal times of a second, the first before it and the last after.
         blocked: the token could not be set down on others, and lies where it was.
         coverage: share of the figure that is covered after it.
         iou: area that tokens and figure share over the area of both together.
         done: the round until now.
+        ended: no token has an action left in this round.
     """
 
     token: int | None
@@ -70,6 +71,7 @@ class Move:
     coverage: float
     iou: float
     done: Round
+    ended: bool
 
 
 class _Player:
@@ -157,7 +159,7 @@ def next_move(scene: Sides, goal: Sides, motion: str, done: Round | None) -> Mov
             frames = own.frames(before, after, scene.flipped, token)
     coverage = overlap_share(env.corners, env.goals, layout)
     shared = float(iou(layout, env.corners, coverage)[0])
-    return Move(token, frames, blocked, float(coverage[0]), shared, done)
+    return Move(token, frames, blocked, float(coverage[0]), shared, done, bool(placed.all()))
 
 
 def _placed(scene: Sides, goal: Sides) -> Bools:

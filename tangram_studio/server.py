@@ -23,6 +23,7 @@ from starlette.responses import JSONResponse, PlainTextResponse, RedirectRespons
 from starlette.routing import Route, WebSocketRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from tangram_sim.errors import ConfigError, TangramError
 from tangram_studio import watching
@@ -66,6 +67,7 @@ UPLOADS = 8  # at once
 UPLOAD_S = 60.0  # that one may take to come
 WATCH_S = 10.0  # that a run may take to be read
 OPEN = 512  # connections at once
+HEAD_S = 10.0  # that the head of a request may take to come
 
 log = logging.getLogger(__name__)
 
@@ -127,6 +129,42 @@ def _cookies(headers: Headers, name: str) -> Iterator[str]:
         key, _, value = one.partition("=")
         if key.strip() == name:
             yield value.strip()
+
+
+class Prompt(H11Protocol):
+    """HTTP that closes a connection which keeps it waiting for the head of a request."""
+
+    _waits: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Wait for the first."""
+        super().connection_made(transport)
+        self._wait()
+
+    def on_response_complete(self) -> None:
+        """Wait for another."""
+        super().on_response_complete()
+        self._wait()
+
+    def handle_websocket_upgrade(self, event: Any) -> None:
+        """A page's socket may be silent."""
+        self._wait(0.0)
+        super().handle_websocket_upgrade(event)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Wait for nothing."""
+        self._wait(0.0)
+        super().connection_lost(exc)
+
+    def _wait(self, seconds: float = HEAD_S) -> None:
+        if self._waits is not None:
+            self._waits.cancel()
+        self._waits = self.loop.call_later(seconds, self._close) if seconds else None
+
+    def _close(self) -> None:
+        cycle: Any = self.cycle  # None before the first request
+        if cycle is None or cycle.response_complete:
+            self.transport.close()
 
 
 class Studio:
@@ -346,6 +384,7 @@ def serve(config: StudioConfig) -> int:
             log_level="warning",
             access_log=False,
             ws_max_size=MAX_BYTES,
+            http=Prompt,
             ws="websockets-sansio",
             timeout_graceful_shutdown=2,
             server_header=False,

@@ -33,6 +33,7 @@ class Game:
         scene: the tokens as they lie.
         done: the round until now; None: nothing yet.
         rounds: before it.
+        moved: whether anything was moved in it.
     """
 
     goal: Sides
@@ -40,6 +41,17 @@ class Game:
     scene: Sides
     done: Round | None = None
     rounds: int = 0
+    moved: bool = False
+
+    def goes_on(self, move: Move) -> bool:
+        """Whether there is more to try after a move of no token: the next action, or a round."""
+        if not move.ended:
+            self.done = move.done
+            return True
+        if move.iou >= LAID or not self.moved or self.rounds + 1 >= ROUNDS:
+            return False
+        self.done, self.rounds, self.moved = None, self.rounds + 1, False
+        return True
 
 
 class Session:
@@ -64,6 +76,7 @@ class Session:
         self._game: Game | None = None
         self._goal: Sides | None = None
         self._played: list[Move] = []  # of this figure, what was interrupted among them
+        self._sent = 0  # moves of this figure; a page may not have shown the last ones
         self._number = 0
         self._doing: asyncio.Task[None] | None = None
         self._saving: asyncio.Task[None] | None = None
@@ -124,9 +137,12 @@ class Session:
             seed = secrets.randbelow(2**31)
             given = goal, asked.motion, seed
             poses = await self._moves.do(playing.begin, *given, waits=self._waits)
-            scene, self._played = Sides(poses, goal.flipped), []
+            scene, self._played, self._sent = Sides(poses, goal.flipped), [], 0
         else:
             scene = Sides(*asked.start.sides)
+            unseen = max(self._sent - asked.shown, 0)
+            self._played = self._played[: max(len(self._played) - unseen, 0)]
+            self._sent -= unseen
         self._game, self._goal = Game(goal, asked.motion, scene), goal
         await self._next()
 
@@ -135,15 +151,16 @@ class Session:
         if game is None:
             return
         move = await self._move(game)
-        while move.token is None and move.iou < LAID and game.rounds + 1 < ROUNDS:
-            game.done, game.rounds = None, game.rounds + 1
+        while move.token is None and game.goes_on(move):
             move = await self._move(game)
         game.done, game.scene = move.done, Sides(move.frames[-1], game.scene.flipped)
         over = move.token is None
         if over:
             self._game = None
         else:
+            game.moved = True
             self._played = [*self._played, move][-saving.MOVES :]
+            self._sent += 1
         await self._say(
             "move",
             token=move.token,

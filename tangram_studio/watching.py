@@ -113,7 +113,7 @@ def episodes_picture(source: str) -> bytes:
             raise RunError("a master sends no pictures: name its run folder")
         path = folder / PICTURE
         if _file(path, MAX_PICTURE) is None:
-            raise RunError(f"{folder} has no {PICTURE} yet: it is drawn when the run ends")
+            raise RunError(f"{folder} has no {PICTURE} yet: a master draws it twice a minute")
         data = _read(path, MAX_PICTURE)
         if not data.startswith(PNG):
             raise RunError(f"{path} is no PNG: delete it, or name another run")

@@ -40,6 +40,7 @@ TRIALS = {
     "fuzz": ("mutated messages against decoder and master", None),
     "pixels": ("DDPG on pixels, no tokens looked for: how far it gets", 60.0),
     "silhouettes": ("silhouettes filled with seven tans: how many, how fast", None),
+    "nearest": ("drawings that seven tans do not fill: how near they come", None),
     "outlines": ("outlines filled by an agent, and by who learned nothing", None),
     "seeing": ("tokens found in pictures: how exactly, how surely, how fast", None),
     "soak": ("memory and open files of a long training, drawn", 60.0),
@@ -81,7 +82,7 @@ def _parser() -> argparse.ArgumentParser:
         elif name == "fuzz":
             one.add_argument("--messages", type=int, default=1_000_000, help="for the decoder")
             one.add_argument("--live", type=int, default=100_000, help="for a live master")
-        elif name in ("outlines", "seeing", "silhouettes"):
+        elif name in ("nearest", "outlines", "seeing", "silhouettes"):
             one.add_argument("--scenes", type=int, default=200, help="of each kind (200)")
         if name == "outlines":
             one.add_argument("--run_dir", default=OUTLINES, help=f"of agent=outline ({OUTLINES})")
@@ -126,13 +127,14 @@ def _run(arguments: argparse.Namespace) -> int:
     from tangram_lab.benchmarks.attack import run_attack
     from tangram_lab.benchmarks.chaos import run_chaos
     from tangram_lab.benchmarks.fuzz_wire import run_fuzz
+    from tangram_lab.benchmarks.nearest import run_nearest
     from tangram_lab.benchmarks.outlines import run_outlines
     from tangram_lab.benchmarks.pixels import run_pixels
     from tangram_lab.benchmarks.seeing import run_seeing
     from tangram_lab.benchmarks.silhouettes import run_silhouettes
     from tangram_lab.benchmarks.soak import run_soak
 
-    of_scenes = {"seeing": run_seeing, "silhouettes": run_silhouettes}
+    of_scenes = {"nearest": run_nearest, "seeing": run_seeing, "silhouettes": run_silhouettes}
     if arguments.kind in of_scenes:
         return of_scenes[arguments.kind](arguments.scenes, arguments.seed, arguments.out)
     if arguments.kind == "outlines":

@@ -23,7 +23,11 @@ class Studio {
     this.over = true;
     this.name = "figure";
     this.board.onDrag = (done, byKey) => this.dragged(done, byKey);
-    this.board.onMove = () => this.want();
+    this.begun = 0; // moves of this figure that were shown, or begun to be
+    this.board.onMove = (move) => {
+      this.begun += move.token !== null;
+      this.want();
+    };
     this.board.onShown = (move) => this.shown(move);
     this.pen.onChange = (next) => this.measured(next);
     this.pen.onEnd = () => this.fillDrawing();
@@ -196,13 +200,13 @@ class Studio {
   }
 
   fillDrawing() {
-    const outlines = this.pen.line.length > 2 ? [...this.pen.rings, this.pen.line] : this.pen.rings;
-    if (!outlines.length) {
+    const outline = this.pen.whole();
+    if (!outline.length) {
       this.say("Nothing is drawn yet: three corners are needed at least.", true);
       return;
     }
     this.name = "drawing";
-    this.fill({ outlines, free: this.pen.kind === "free" });
+    this.fill({ outlines: [outline], free: this.pen.kind === "free" });
   }
 
   async drop(file) {
@@ -260,8 +264,12 @@ class Studio {
     this.number += 1;
     this.asking = true;
     this.over = false;
-    if (!start) this.say("The agent lays it.");
-    this.send({ ask: "play", number: this.number, goal: this.goal, start, motion: $("motion").value });
+    if (!start) {
+      this.say("The agent lays it.");
+      this.begun = 0;
+    }
+    const [goal, shown, motion] = [this.goal, this.begun, $("motion").value];
+    this.send({ ask: "play", number: this.number, goal, start, shown, motion });
   }
 
   moved(move) {

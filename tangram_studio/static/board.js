@@ -28,7 +28,7 @@ export class Board {
     this.queue = [];
     this.move = null;
     this.ms = MOVE_MS; // that a move takes
-    this.frames = { shown: 0, longest: 0, moves: 0, waited: 0 };
+    this.frames = { shown: 0, moves: 0, waited: 0 };
     this.onDrag = () => {}; // (done): a person takes a tan, or has let it go
     this.onMove = () => {}; // (move): its showing begins
     this.onShown = () => {}; // (move): it is over
@@ -101,7 +101,7 @@ export class Board {
     if (!this.move) return;
     if (this.idle && this.move.token !== null) this.frames.waited += performance.now() - this.idle;
     this.flipped = [...this.move.flipped];
-    this.since = this.last = performance.now();
+    this.since = performance.now();
     this.tans.forEach((tan, k) => {
       tan.classList.toggle("blocked", this.move.blocked && k === this.move.token);
     });
@@ -111,8 +111,6 @@ export class Board {
     const tick = (now) => {
       if (this.move !== own) return;
       this.frames.shown += 1;
-      this.frames.longest = Math.max(this.frames.longest, now - this.last);
-      this.last = now;
       const still = own.token === null || this.calm.matches;
       const share = still ? 1 : Math.min((now - this.since) / this.ms, 1);
       this.between(own, share);

@@ -6,8 +6,7 @@ const NEAR = 0.06; // arena units within which a corner snaps
 const CLOSE = 0.05; // to the first corner, which closes the outline
 const POINT = 0.012; // between points of a free hand
 const KEY = 0.05;
-const MOST = 1500; // points of all outlines
-const RINGS = 50;
+const MOST = 1500; // points of an outline
 
 const far = ([ax, ay], [bx, by]) => Math.hypot(ax - bx, ay - by);
 export const areaOf = (ring) => Math.abs(ring.reduce((sum, [x, y], i) => {
@@ -21,8 +20,8 @@ export class Pen {
     this.board = board;
     this.kind = "polygon";
     this.snaps = true;
-    this.rings = [];
-    this.line = [];
+    this.ring = []; // the outline that was closed
+    this.line = []; // the one that is being drawn
     this.spot = null; // where the keyboard is
     this.onChange = () => {};
     this.onEnd = () => {}; // an outline is closed
@@ -42,16 +41,12 @@ export class Pen {
     svg.addEventListener("keydown", (event) => this.key(event));
   }
 
-  get count() {
-    return this.rings.reduce((sum, ring) => sum + ring.length, this.line.length);
-  }
-
   get on() {
     return this.board.mode === "draw";
   }
 
   clear() {
-    this.rings = [];
+    this.ring = [];
     this.line = [];
     this.stroke = false;
     this.draw();
@@ -59,7 +54,7 @@ export class Pen {
 
   undo() {
     if (this.line.length) this.line.pop();
-    else this.rings.pop();
+    else this.ring = [];
     this.draw();
   }
 
@@ -86,7 +81,7 @@ export class Pen {
     this.board.svg.focus({ preventScroll: true });
     const point = this.board.at(event);
     if (this.kind === "free") {
-      this.rings = []; // a stroke is a whole figure
+      this.ring = [];
       this.line = [point];
       this.stroke = true;
       this.board.svg.setPointerCapture(event.pointerId);
@@ -102,7 +97,8 @@ export class Pen {
       return;
     }
     if (this.line.length && far(there, this.line.at(-1)) < 1e-6) return;
-    if (this.count < MOST) this.line.push(there);
+    this.ring = []; // another begins
+    if (this.line.length < MOST) this.line.push(there);
     this.spot = there;
     this.draw();
   }
@@ -112,7 +108,7 @@ export class Pen {
     this.spot = null;
     const point = this.board.at(event);
     if (this.stroke) {
-      if (far(point, this.line.at(-1)) > POINT && this.count < MOST) this.line.push(point);
+      if (far(point, this.line.at(-1)) > POINT && this.line.length < MOST) this.line.push(point);
       this.draw();
     } else if (this.kind === "polygon" && this.line.length) this.draw(this.snapped(point));
   }
@@ -128,12 +124,17 @@ export class Pen {
   }
 
   close() {
-    if (this.line.length > 2 && this.rings.length < RINGS) {
-      this.rings.push(this.line);
+    if (this.line.length > 2) this.onEnd();
+  }
+
+  // What is drawn, closed: where another corner is set, another outline begins.
+  whole() {
+    if (this.line.length > 2) {
+      this.ring = this.line;
       this.line = [];
       this.draw();
-      this.onEnd();
     }
+    return this.ring;
   }
 
   key(event) {
@@ -154,7 +155,7 @@ export class Pen {
   }
 
   draw(next = null, spot = null) {
-    const ink = [make("path", { class: "drawn", d: pathOf(this.rings) })];
+    const ink = [make("path", { class: "drawn", d: this.ring.length ? pathOf([this.ring]) : "" })];
     const points = (line) => line.map((p) => p.join(",")).join(" ");
     if (this.line.length) {
       ink.push(make("polyline", { class: "line", points: points(this.line) }));
@@ -170,22 +171,8 @@ export class Pen {
     this.onChange(next);
   }
 
-  // Area of what is drawn, holes taken off.
   area(next = null) {
-    const open = next ? [...this.line, next] : this.line;
-    const every = open.length > 2 ? [...this.rings, open] : this.rings;
-    return every.reduce((sum, ring) => {
-      const within = every.filter((other) => other !== ring && contains(other, ring[0])).length;
-      return sum + (within % 2 ? -1 : 1) * areaOf(ring);
-    }, 0);
+    if (!this.line.length) return areaOf(this.ring);
+    return areaOf(next ? [...this.line, next] : this.line);
   }
 }
-
-const contains = (ring, [x, y]) => {
-  let inside = false;
-  ring.forEach(([ax, ay], i) => {
-    const [bx, by] = ring[(i + 1) % ring.length];
-    if (ay > y !== by > y && x < ax + ((bx - ax) * (y - ay)) / (by - ay)) inside = !inside;
-  });
-  return inside;
-};

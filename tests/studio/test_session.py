@@ -192,22 +192,64 @@ def test_what_cannot_be_saved_is_told_and_ends_nothing() -> None:
     asyncio.run(talk())
 
 
-def test_moves_that_get_nowhere_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = list[object]()
+# A letter is a call of the agent: m moves a token, n is an action that moves none, e finds all
+# actions of the round used up.
+@pytest.mark.parametrize(
+    ("calls", "asks", "rounds"),
+    [
+        ("nnm", 1, 1),  # the round goes on
+        ("e", 1, 1),  # nothing was moved in it: it ends
+        ("nne", 1, 1),
+        ("mem", 2, 2),
+        ("mememememe", 6, 5),  # five rounds
+        ("mene", 2, 2),
+    ],
+)
+def test_a_round_goes_on_until_its_actions_are_used_up(
+    monkeypatch: pytest.MonkeyPatch, calls: str, asks: int, rounds: int
+) -> None:
+    left, given = list(calls), list[object]()
 
-    def stuck(scene: playing.Sides, *rest: object) -> playing.Move:
-        calls.append(rest)
-        return playing.Move(None, scene.poses[None], False, 0.1, 0.1, cast(playing.Round, None))
+    def move(
+        scene: playing.Sides, goal: object, motion: str, done: playing.Round | None
+    ) -> playing.Move:
+        given.append(done)
+        kind = left.pop(0)
+        token = 3 if kind == "m" else None
+        used = cast(playing.Round, len(given))
+        return playing.Move(token, scene.poses[None], False, 0.1, 0.1, used, kind == "e")
 
-    monkeypatch.setattr(playing, "next_move", stuck)
+    monkeypatch.setattr(playing, "next_move", move)
 
     async def talk() -> None:
-        goal = plain("cat")
-        end = await Page().ask("play", number=1, goal=goal, start=goal)
-        assert (end["over"], end["iou"]) == (True, 0.1)
+        page, goal = Page(), plain("cat")
+        told = await page.ask("play", number=1, goal=goal, start=goal)
+        for _ in range(asks - 1):
+            assert told["over"] is False
+            told = await page.ask("next")
+        assert told["over"] is (calls[-1] == "e")
 
     asyncio.run(talk())
-    assert len(calls) == 5
+    assert left == []
+    assert given.count(None) == rounds  # begins with nothing done
+
+
+def test_a_file_has_no_move_that_was_not_shown() -> None:
+    async def talk() -> None:
+        page, goal = Page(), plain("cat")
+        move = await page.ask("play", number=1, goal=goal)
+        for _ in range(3):
+            move = await page.ask("next")
+        scene = {"poses": move["frames"][-1], "flipped": move["flipped"]}
+        assert len(page.session._played) == 4
+        await page.ask("play", number=2, goal=goal, start=scene, shown=2)
+        assert len(page.session._played) == 3  # two that were shown, and the new one
+        await page.ask("play", number=3, goal=goal, start=scene, shown=3)
+        assert len(page.session._played) == 4
+        await page.ask("play", number=4, goal=goal)
+        assert len(page.session._played) == 1  # another game
+
+    asyncio.run(talk())
 
 
 def test_an_error_of_a_task_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

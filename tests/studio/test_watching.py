@@ -349,7 +349,7 @@ def test_the_picture_is_given_as_it_is(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "told"),
     [
-        (None, "has no test_episodes.png yet: it is drawn when the run ends"),
+        (None, "has no test_episodes.png yet: a master draws it twice a minute"),
         (b"<svg onload=alert(1)>", "test_episodes.png is no PNG"),
         (b"", "test_episodes.png is no PNG"),
         (PNG * 100, "test_episodes.png has more than"),
