@@ -135,6 +135,8 @@ def _wrong(sources: str | None, score: str, block: str, numbers: Sources) -> str
     if sources is None:
         return "has no source: put <!-- data: ... --> above it"
     first, *rest = sources.split()
+    if rest and NO_SCORE in (first, *rest):
+        return f"has the source {sources}: {NO_SCORE} stands alone"
     if first == OLDER:
         missing = [one for one in rest if one not in block]
         return f"is of commit {missing[0]}, which the text does not say" if missing else ""
