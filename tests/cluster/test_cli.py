@@ -33,7 +33,7 @@ SETTING = {
     "tangram-keys": "add: null",
     "tangram-studio": "port: 8765",
     "tangram-experiment": "jobs: 2",
-    "tangram-report": "runs: ???",
+    "tangram-report": "runs: null",
 }
 
 

@@ -81,7 +81,7 @@ def test_other_settings_are_refused(study: Path) -> None:
 
 def test_a_report_is_drawn(study: Path, tmp_path: Path) -> None:
     run_here("tangram-report", f"runs={study}", f"out={tmp_path / 'report'}", cwd=tmp_path)
-    text = (tmp_path / "report" / "README.md").read_text()
+    text = (tmp_path / "report" / "tables.md").read_text()
     result, test = scores(study, "tangram")
     assert f"| MHA (tangram) | 1 of 1 | {test['mean_reward']:.3f} |" in text
     assert result["host"] not in text
