@@ -50,6 +50,7 @@ PAGES = [
     ("<!-- data: commit 0123abc -->\nAt commit 0123abc it had 0.111.", []),
     ("<!-- data: commit 0123abc -->\nIt had 0.111.", ["is of commit 0123abc, which the text does"]),
     ("<!-- data: none -->\nA side of 0.125.", []),
+    ("<!-- data: fig4 -->\n- 0.996\n<!-- data: fig5 -->\n- 0.995", ["0.995 is not in fig5"]),
     ("<!-- data: fig4 none -->\nA side of 0.125.", ["none stands alone"]),
     ("`agent.noise=0.125`, [x](a_0.125.md), 1.25 and version 1.2.345\n\n```\n0.125\n```", []),
     ("| a |\n| --- |\n| 0.996 |", ["has no source"]),

@@ -37,9 +37,10 @@ from tangram_lab.experiments.report.numbers import (
 )
 from tangram_lab.experiments.report.page import command
 from tangram_lab.experiments.report.profiles import draw_profile
+from tangram_lab.experiments.report.reading import read_runs
 from tangram_lab.experiments.report.references import falls_short, papers
 from tangram_lab.experiments.report.statistics import interquartile_mean, profile
-from tangram_lab.experiments.report.study import Seed, Training, read_runs
+from tangram_lab.experiments.report.study import Seed, Training
 from tangram_lab.experiments.report.style import LINES
 from tangram_lab.experiments.report.tables import (
     paired,

@@ -8,7 +8,8 @@ import pytest
 import yaml
 
 from tangram_lab.experiments.report.page import write_report
-from tangram_lab.experiments.report.study import Budget, Trial, read_runs
+from tangram_lab.experiments.report.reading import read_runs
+from tangram_lab.experiments.report.study import Budget, Trial
 from tangram_sim.errors import RunError
 from tests.experiments.builders import (
     cells,

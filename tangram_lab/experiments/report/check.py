@@ -146,10 +146,10 @@ def _wrong(sources: str | None, score: str, block: str, numbers: Sources) -> str
 
 
 def _blocks(text: str) -> Iterator[tuple[int, str]]:
-    """What blank lines set apart, with the number of its first line; code is left out."""
+    """What blank lines and marks set apart, with the number of its first line; without code."""
     blank = CODE.sub(lambda found: "\n" * found[0].count("\n"), text)
     line = 1
-    for block in re.split(r"(\n[ \t]*\n)", blank):
+    for block in re.split(r"(\n[ \t]*\n|\n(?=<!-- data: ))", blank):
         if block.strip():
             yield line + len(block) - len(block.lstrip("\n")), block
         line += block.count("\n")

@@ -7,20 +7,16 @@ from typing import Any
 
 from tangram_agent.files import write_whole
 from tangram_lab.experiments.report.numbers import thinned
-from tangram_lab.experiments.report.study import (
-    FINISHED,
+from tangram_lab.experiments.report.reading import (
     RESULT,
     TEST,
-    Count,
-    Row,
-    Seed,
-    Study,
     checked_plan,
     converted,
     make_study,
     parsed,
     read_bytes,
 )
+from tangram_lab.experiments.report.study import FINISHED, Count, Row, Seed, Study
 from tangram_lab.experiments.report.tables import EACH
 from tangram_sim.errors import RunError
 

@@ -24,8 +24,9 @@ from tangram_lab.experiments.report.figures import (
 from tangram_lab.experiments.report.fingerprints import make_fingerprints
 from tangram_lab.experiments.report.numbers import ANGLE, DENSE, REWARD
 from tangram_lab.experiments.report.profiles import draw_profile
+from tangram_lab.experiments.report.reading import read_runs
 from tangram_lab.experiments.report.references import lacking
-from tangram_lab.experiments.report.study import Experiment, Study, Training, read_runs
+from tangram_lab.experiments.report.study import Experiment, Study, Training
 from tangram_lab.experiments.report.style import drawing, save
 from tangram_lab.experiments.report.tables import (
     assembly_table,
