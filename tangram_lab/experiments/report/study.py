@@ -1,4 +1,4 @@
-"""What a study is: experiments, the trainings and tests that answer them, and what is done of it."""
+"""What a study is: experiments, the trainings and tests that answer them, and what there is."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
