@@ -163,6 +163,7 @@ def run_study(
         )
     for job in jobs:
         job.check()
+    before = read_object(study.path / PLAN).get("commit")
     plan = joined_plan(study.path / PLAN, plan_content(config, _source()))
     missing = [job for job in jobs if not job.done]
     console = sturdy_console(sys.stdout)
@@ -174,6 +175,14 @@ def run_study(
     study.prepare("auto")
     with study.lock():
         write_whole(study.path / PLAN, _json(plan))
+        if before not in (None, plan["commit"]):
+            console.print(
+                f"what lies in {study.path} was begun at commit {before}, and now it is "
+                f"{plan['commit']}: tangram-report check asks for one",
+                markup=False,
+                highlight=False,
+                soft_wrap=True,
+            )
         with StudyProgress(console, len(jobs), len(jobs) - len(missing)) as progress:
             return Runner(missing, config.jobs, progress).run()
 

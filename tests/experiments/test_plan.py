@@ -9,9 +9,11 @@ import pytest
 import yaml
 
 from tangram_agent.setup import from_mapping
+from tangram_lab.experiments import runner
 from tangram_lab.experiments.cli import _asked
 from tangram_lab.experiments.jobs import Job, make_jobs
 from tangram_lab.experiments.plan import StudyConfig, joined_plan, plan_content
+from tangram_lab.experiments.runner import run_study
 from tangram_sim.errors import ConfigError
 
 pytestmark = pytest.mark.fast
@@ -400,3 +402,21 @@ def test_a_wrong_test_is_told_before_all_trainings(
     config = study(tmp_path, tests=odd, experiments={})
     with pytest.raises(ConfigError, match=f"test odd: {message}"):
         asked(config)
+
+
+@pytest.mark.parametrize(("before", "told"), [("abc", False), ("def", True)])
+def test_another_commit_in_the_same_folder_is_told(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    before: str,
+    told: bool,
+) -> None:
+    monkeypatch.setattr(runner, "_source", lambda: {"command": "x", "commit": "abc"})
+    config = study(tmp_path / "study", experiments={})
+    (tmp_path / "study").mkdir()
+    earlier = plan_content(config, {"command": "x", "commit": before})
+    (tmp_path / "study" / "plan.json").write_text(json.dumps(earlier))
+    assert run_study(config, {}, {}, None) == 0
+    line = "was begun at commit def, and now it is abc: tangram-report check asks for one"
+    assert (line in capsys.readouterr().out) is told
