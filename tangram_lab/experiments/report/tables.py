@@ -222,6 +222,7 @@ def ranking_table(study: Study, experiment: Experiment) -> list[str]:
         ),
         ("difference, 95 % interval over the tests", _difference(first, test)),
         (f"{ANGLE.label}, {SPREAD}", _over_seeds(ANGLE, test)),
+        (f"{LEVELS[0]:.2f} after, episodes", _soon(LEVELS[0])),
         *_measured(MINUTES),
     ]
     space = [""] * len(_iqm(experiment))
