@@ -10,9 +10,10 @@ from tangram_lab.experiments.report import check as report_check
 from tangram_lab.experiments.report import fingerprints as report_fingerprints
 from tangram_lab.experiments.report import page
 from tangram_lab.experiments.report.check import Sources, check, check_page
-from tangram_lab.experiments.report.data import read_data
+from tangram_lab.experiments.report.data import read_data, write_data
 from tangram_lab.experiments.report.fingerprints import differences
 from tangram_lab.experiments.report.page import write_report
+from tangram_lab.experiments.report.reading import read_runs
 from tangram_sim.errors import RunError
 from tests.experiments.builders import (
     experiment,
@@ -189,6 +190,16 @@ def test_data_that_are_not_what_they_should_be(
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
     with pytest.raises(RunError, match=message):
         read_data(path)
+
+
+def test_no_folder_of_this_machine_is_told(tmp_path: Path) -> None:
+    study = plan({}, {}, {}) | {
+        "command": "tangram-experiment run_dir=/home/me/runs 'a=[x,y]' jobs=2"
+    }
+    write_plan(tmp_path, study)
+    write_data(tmp_path / "data.json", read_runs(tmp_path), {})
+    told = json.loads((tmp_path / "data.json").read_text())["plan"]["command"]
+    assert told == "tangram-experiment 'a=[x,y]' jobs=2"
 
 
 def test_a_curve_whose_columns_differ_in_length(results: Path) -> None:

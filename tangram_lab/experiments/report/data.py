@@ -1,6 +1,7 @@
 """data.json: everything that a report is drawn from, so that the runs may be deleted."""
 
 import json
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -57,8 +58,19 @@ def write_data(path: Path, study: Study, fingerprints: Fingerprints) -> None:
         RunError: it cannot be written.
     """
     runs = {one.name: [_seed_data(seed) for seed in one.seeds] for one in study.trainings}
-    content = {"format": FORMAT, "plan": study.plan, "fingerprints": fingerprints, "runs": runs}
+    plan = study.plan | ({"command": _without_paths(study.command)} if study.plan else {})
+    content = {"format": FORMAT, "plan": plan, "fingerprints": fingerprints, "runs": runs}
     write_whole(path, (_json(content, "") + "\n").encode())
+
+
+def _without_paths(command: str) -> str:
+    """A command without a folder of this machine, which tells nothing to anybody else."""
+    try:
+        words = shlex.split(command)
+    except ValueError:
+        return command
+    kept = [word for word in words if not word.startswith("run_dir=/")]
+    return command if kept == words else shlex.join(kept)
 
 
 def _seed_data(seed: Seed) -> Row:
