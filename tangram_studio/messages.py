@@ -91,11 +91,13 @@ class Save(Struct, tag_field="ask", tag="save", forbid_unknown_fields=True):
         kind: gif, of all moves; svg, of the tokens as they lie; json, a puzzle file of the figure.
         tokens: as they lie.
         name: of the figure.
+        shown: see `Play`.
     """
 
     kind: Literal["gif", "svg", "json"]
     tokens: Tokens
     name: Annotated[str, Meta(max_length=64)] = "figure"
+    shown: Count = 0
 
 
 Asked = Fill | Play | Next | Save

@@ -140,9 +140,8 @@ class Session:
             scene, self._played, self._sent = Sides(poses, goal.flipped), [], 0
         else:
             scene = Sides(*asked.start.sides)
-            unseen = max(self._sent - asked.shown, 0)
-            self._played = self._played[: max(len(self._played) - unseen, 0)]
-            self._sent -= unseen
+            self._played = self._seen(asked.shown)
+            self._sent = min(self._sent, asked.shown)
         self._game, self._goal = Game(goal, asked.motion, scene), goal
         await self._next()
 
@@ -173,13 +172,18 @@ class Session:
             over=over,
         )
 
+    def _seen(self, shown: int) -> list[Move]:
+        """What was played, without moves that the page was sent and has not begun to show."""
+        unseen = max(self._sent - shown, 0)
+        return self._played[: max(len(self._played) - unseen, 0)]
+
     async def _move(self, game: Game) -> Move:
         given = game.scene, game.goal, game.motion, game.done
         return await self._moves.do(playing.next_move, *given, waits=self._waits)
 
     async def _save(self, asked: Save) -> None:
         try:
-            data = await self._fills.do(_saved, asked, self._played, self._goal)
+            data = await self._fills.do(_saved, asked, self._seen(asked.shown), self._goal)
         except TangramError as error:
             await self._tell(write("unsaved", why=str(error)))
         except Exception:  # a page must hear of everything

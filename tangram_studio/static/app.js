@@ -57,6 +57,7 @@ class Studio {
   // What was asked for while nobody heard it, or was being laid.
   resume() {
     this.banner("");
+    this.begun = 0; // another session counts anew
     if (this.looking) {
       if (this.last) this.send(this.last);
     } else if (this.goal && !this.over) this.play(this.board.scene);
@@ -311,7 +312,8 @@ class Studio {
   save(kind) {
     if (!this.goal) return;
     this.say("The file is made …");
-    this.send({ ask: "save", kind, tokens: kind === "json" ? this.goal : this.board.scene, name: this.name });
+    const tokens = kind === "json" ? this.goal : this.board.scene;
+    this.send({ ask: "save", kind, tokens, name: this.name, shown: this.begun });
   }
 
   file(data) {

@@ -9,7 +9,7 @@ const KEY = 0.05;
 const MOST = 1500; // points of an outline
 
 const far = ([ax, ay], [bx, by]) => Math.hypot(ax - bx, ay - by);
-export const areaOf = (ring) => Math.abs(ring.reduce((sum, [x, y], i) => {
+const areaOf = (ring) => Math.abs(ring.reduce((sum, [x, y], i) => {
   const [u, v] = ring[(i + 1) % ring.length];
   return sum + (x * v - u * y) / 2;
 }, 0));

@@ -26,7 +26,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from tangram_sim.errors import TangramError
 from tangram_studio.jobs import Jobs
-from tangram_studio.server import HEAD_S, MAX_UPLOAD, PAGES
+from tangram_studio.server import HEAD_S, MAX_UPLOAD, OPEN, PAGES
 from tests.cluster.processes import BIN, refused
 
 pytestmark = [pytest.mark.cluster, pytest.mark.xdist_group("studio")]
@@ -291,24 +291,41 @@ def test_a_file_that_is_too_large_is_refused_before_it_is_read(running: Running)
     assert (status, b"larger than 10 MB" in body) == (413, True)  # of a length that is not told
 
 
-def test_a_connection_that_is_silent_is_closed_and_a_page_is_not(running: Running) -> None:
+BEGUN = (  # requests that stop: a head, and what follows a whole one that was refused
+    (b"GET / HTTP/1.1\r\nHost: ", b""),
+    (b"GET / HTTP/1.1\r\nHost: x\r\n\r\n", b"G"),
+    (b"POST / HTTP/1.1\r\nHost: x\r\nContent-Length: 999\r\n\r\n", b"x"),
+)
+
+
+def test_silent_connections_lock_nobody_out_and_slow_ones_live(running: Running) -> None:
     """Else those who have no token could hold all connections that there may be."""
+    here, picture = ("127.0.0.1", running.port), (ROOT / "docs/images/silhouette.png").read_bytes()
     with ExitStack() as stack, running.page() as page:
-        ask(page, "fill", number=1, puzzle="cat")
-        told(page, "filled")
+        upload = stack.enter_context(socket.create_connection(here, timeout=WAIT_S))
+        head = (
+            f"POST /api/drop?name=a.png&who=together HTTP/1.1\r\nHost: 127.0.0.1:{running.port}\r\n"
+            f"Cookie: {running.cookie}\r\nContent-Length: {len(picture)}\r\n\r\n"
+        )
+        upload.sendall(head.encode() + picture[:100])
         begun = time.monotonic()
-        here = ("127.0.0.1", running.port)
-        raw = [stack.enter_context(socket.create_connection(here)) for _ in range(3)]
-        raw[1].sendall(b"GET / HTTP/1.1\r\nHost: ")
-        raw[2].sendall(b"GET / HTTP/1.1\r\nHost: x\r\n\r\n")
+        raw = [stack.enter_context(socket.create_connection(here, WAIT_S)) for _ in BEGUN]
+        for one, (first, second) in zip(raw, BEGUN, strict=True):
+            one.sendall(first)
+            assert not second or one.recv(4096).startswith(b"HTTP/1.1 403")
+            one.sendall(second)
+        raw += [stack.enter_context(socket.create_connection(here, WAIT_S)) for _ in range(OPEN)]
+        assert running.get("/")[0] == 503
         for one in raw:
-            one.settimeout(HEAD_S + 10)
-            while one.recv(4096):
-                pass
-        assert time.monotonic() - begun < HEAD_S + 5
-        time.sleep(max(begun + HEAD_S + 1 - time.monotonic(), 0))
-        ask(page, "fill", number=2, puzzle="swan")
-        assert told(page, "filled")["number"] == 2
+            with suppress(ConnectionResetError):
+                while one.recv(4096):
+                    pass
+        assert HEAD_S <= time.monotonic() - begun < HEAD_S + 10
+        assert running.get("/")[0] == 200
+        upload.sendall(picture[100:])
+        assert upload.recv(4096).startswith(b"HTTP/1.1 200")
+        ask(page, "fill", number=1, puzzle="swan")
+        assert told(page, "filled")["number"] == 1
 
 
 def test_thin_rings_get_the_nearest_figure(running: Running) -> None:

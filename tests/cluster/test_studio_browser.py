@@ -477,10 +477,21 @@ def test_keys_of_before_do_not_bring_an_old_figure_back(page: Page) -> None:
 def test_it_goes_on_after_a_short_loss(page: Page) -> None:
     page.locator("[data-figure=cat]").click()
     moving(page)
-    page.evaluate("studio.socket.close()")
+    page.evaluate(
+        """() => {
+            const closed = studio.closed.bind(studio);
+            studio.closed = (code) => {
+                studio.before = studio.board.frames.moves;
+                return closed(code);
+            };
+            studio.socket.close();
+        }"""
+    )
     expect(page.locator("#banner")).to_contain_text("Lost the connection")
     status(page).to_have_text(LAID)
     expect(page.locator("#banner")).to_be_hidden()
+    # The server, too, counts anew what it sent.
+    assert page.evaluate("studio.begun === studio.board.frames.moves - studio.before")
 
 
 def test_a_page_without_the_token_shows_how_to_get_it(browser: Browser, running: Running) -> None:

@@ -8,7 +8,7 @@ from typing import Any, cast
 import pytest
 
 from tangram_sim.errors import TangramError
-from tangram_studio import filling, playing
+from tangram_studio import filling, playing, saving
 from tangram_studio.jobs import Jobs
 from tangram_studio.session import Session
 from tests.studio.test_playing import figure
@@ -166,7 +166,8 @@ def test_a_file_is_made_beside_what_is_played(monkeypatch: pytest.MonkeyPatch) -
         last = {"poses": move["frames"][-1], "flipped": move["flipped"]}
         page.jobs.open.clear()
         await page.session.hear('{"ask": "next"}')
-        await page.session.hear(json.dumps({"ask": "save", "kind": "gif", "tokens": last}))
+        gif = {"ask": "save", "kind": "gif", "tokens": last, "shown": 1}
+        await page.session.hear(json.dumps(gif))
         await page.session.hear(json.dumps({"ask": "save", "kind": "svg", "tokens": last}))
         assert page.told[-1]["told"] == "unsaved"  # one file at a time
         page.jobs.open.set()
@@ -241,7 +242,12 @@ def test_a_file_has_no_move_that_was_not_shown() -> None:
         for _ in range(3):
             move = await page.ask("next")
         scene = {"poses": move["frames"][-1], "flipped": move["flipped"]}
+        first, second, *_ = page.session._played
         assert len(page.session._played) == 4
+        await page.ask("save", kind="gif", tokens=scene, shown=2)  # while two more lie ready
+        assert page.files == [saving.gif([first, second], figure("cat"))]
+        told = await page.ask("save", kind="gif", tokens=scene, shown=0)
+        assert "nothing was played yet" in told["why"]
         await page.ask("play", number=2, goal=goal, start=scene, shown=2)
         assert len(page.session._played) == 3  # two that were shown, and the new one
         await page.ask("play", number=3, goal=goal, start=scene, shown=3)
