@@ -168,10 +168,12 @@ def test_what_was_taken_away_while_it_plays_is_laid_again(page: Page) -> None:
     page.locator("[data-figure=swan]").click()
     moving(page)
     after(page, 2)
+    page.evaluate("studio.board.ms = 20_000")  # until the hand is there nothing comes over it
+    page.wait_for_timeout(100)
     token = page.evaluate(
         """() => {  // one that lies in its place
             const goal = studio.goal.poses.map(([x, y]) => [x, y]);
-            const far = studio.board.poses.map(([x, y]) =>
+            const far = studio.board.poses.map(([x, y], k) => k === studio.board.move?.token ? 9 :
                 Math.min(...goal.map(([u, v]) => Math.hypot(x - u, y - v))));
             return far.indexOf(Math.min(...far));
         }"""
@@ -180,6 +182,7 @@ def test_what_was_taken_away_while_it_plays_is_laid_again(page: Page) -> None:
     drag(page, [(x, y), (0.0, 0.85), (-0.85, 0.85)], lets_go=False)
     assert page.evaluate(f"studio.board.poses[{token}]")[0] < -0.7
     status(page).to_contain_text("the agent goes on from here")
+    page.evaluate("studio.board.ms = 200")
     page.mouse.up()  # the agent may bring it back at once
     ring = f"getComputedStyle(studio.board.tans[{token}]).outlineStyle"
     assert page.evaluate(ring) == "none"  # of 5 px it would cover the table
