@@ -146,6 +146,7 @@ class AgentConfig(Settings, section="agent"):
         False,
         "the actor copies those actions of a batch that came to what was asked, as hindsight's "
         "did, and does not climb the critic: the method without policy gradients",
+        unless={"credit": "reward"},  # which tells of no single action what it came to
         part=LEARNING,
     )
     saturation_penalty: float = setting(

@@ -326,6 +326,7 @@ def test_every_setting_of_a_command_is_read() -> None:
         (ONE, "agent.lookahead", "engine", "one token"),
         (SEVERAL, "agent.lookahead", "engine", "tokens that do not push each other"),
         (UNPUNISHED, "agent.saturation_limit", 0.5, "agent.saturation_penalty=0"),
+        (over(SEVERAL, agent={"credit": "reward"}), "agent.imitates", True, "agent.credit=reward"),
         (ONE, "agent.polyak", 0.5, "agent.gamma=0"),
         (MLP, "agent.edges", "complete", "net.kind=mlp"),
         (MLP, "agent.edges", "inputs", "net.kind=mlp"),

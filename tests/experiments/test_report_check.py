@@ -136,6 +136,8 @@ def test_tables_that_were_changed_by_hand(results: Path) -> None:
         ({"state": "not finished", "result": {}, "tests": {}}, "ours lacks the seeds [1]"),
         ({"tests": {}}, "ours lacks the test random of fig4"),
         ({"result": result(1, commit="fedcba9")}, "several commits: 0123abc, fedcba9"),
+        ({"result": result(1, commit="0123abc-dirty")}, "that was changed, or of none: 0123abc-di"),
+        ({"result": result(1, commit=None)}, "that was changed, or of none: None"),
     ],
 )
 def test_what_the_study_lacks(results: Path, change: dict[str, Any], told: str) -> None:
@@ -152,8 +154,17 @@ def test_code_that_trains_otherwise(results: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_a_fingerprint_may_differ_as_processors_do() -> None:
-    assert not [*differences(FINGERPRINT, {"x": {"mean_reward": 0.5001, "weights": 1000.9}})]
-    assert [*differences(FINGERPRINT, {})]
+    near = {"x": {"mean_reward": 0.5001, "weights": 1000.9}}
+    assert not [*differences("x", FINGERPRINT, near)]
+    assert [*differences("x", FINGERPRINT, {"x": {}})]
+
+
+def test_a_family_whose_fingerprint_nobody_kept_is_told(results: Path) -> None:
+    data = json.loads((results / "data.json").read_text())
+    (results / "data.json").write_text(json.dumps(data | {"fingerprints": {}}))
+    assert checked(results) == [
+        "family x has no fingerprint: make the report with fingerprints=true"
+    ]
 
 
 def test_a_family_is_trained_by_the_first_of_its_trainings(

@@ -306,9 +306,6 @@ def test_learning_curves_are_thinned_to_sixty_points() -> None:
         (ANGLE.show(0.0371), "0.04°"),
         (ANGLE.show(-0.001), "0.00°"),
         (MINUTES.show(90.0), "1.5"),
-        (REWARD.show_difference({0: 0.5, 1: 0.6}, {0: 0.7}), "-0.150"),
-        (ANGLE.show_difference({0: 3.0}, {0: 1.0}), "+2.00°"),
-        (ANGLE.show_difference({}, {0: 1.0}), "-"),
         (paired([]), "-"),
         (paired([0.1]), "-"),
         (paired([0.0, 0.0, 0.0]), "+0.0000 (+0.0000 to +0.0000)"),
@@ -361,15 +358,22 @@ def test_a_difference_is_paired_by_episode_and_averaged_over_the_seeds(tmp_path:
     assert row[2] == f"{mean:+.4f} ({mean - half:+.4f} to {mean + half:+.4f})"
 
 
-def test_an_interquartile_mean_leaves_out_the_quarters_and_comes_twice_alike() -> None:
+def test_an_interquartile_mean_leaves_out_the_quarters() -> None:
     values = np.array([[0.0], [0.5], [0.6], [0.7], [0.8], [0.9], [1.0], [-1.0]])
     found = interquartile_mean(values)
     assert found.estimate == pytest.approx(trim_mean(values, 0.25, axis=None))
     assert found.estimate == pytest.approx(0.65)
     assert found.low < found.estimate < found.high
-    before = np.random.get_state(legacy=False)  # noqa: NPY002
-    assert interquartile_mean(values) == found
-    assert str(np.random.get_state(legacy=False)) == str(before)  # noqa: NPY002
+
+
+def test_what_is_drawn_comes_twice_alike_and_disturbs_no_other_draws() -> None:
+    values, told = np.random.default_rng(0).normal(size=(10, 1)), list[Any]()
+    for seed in (1, 2):
+        np.random.seed(seed)  # noqa: NPY002
+        before = str(np.random.get_state(legacy=False))  # noqa: NPY002
+        told.append(interquartile_mean(values))
+        assert str(np.random.get_state(legacy=False)) == before  # noqa: NPY002
+    assert told[0] == told[1]
 
 
 def test_a_profile_is_the_share_of_runs_above_each_level() -> None:

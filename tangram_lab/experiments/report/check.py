@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from tangram_lab.experiments.report.data import read_data
-from tangram_lab.experiments.report.fingerprints import differences, make_fingerprints
+from tangram_lab.experiments.report.fingerprints import differences, families, make_fingerprints
 from tangram_lab.experiments.report.page import DATA, TABLES, tables_page
 from tangram_lab.experiments.report.references import VALUES
 from tangram_lab.experiments.report.study import Study
@@ -29,6 +29,7 @@ CODE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`[^`\n]*`|\]\([^)]*\)")
 SECTION = re.compile(r'^<a id="(?P<name>[^"]+)"></a>$', re.MULTILINE)
 NO_SCORE, OLDER, PAPERS = "none", "commit", "paper"
+CHANGED = "-dirty"  # of a commit in a result: the source tree was not as committed
 
 
 def check(results: Path, pages: Iterable[Path]) -> list[str]:
@@ -49,14 +50,17 @@ def check(results: Path, pages: Iterable[Path]) -> list[str]:
     numbers = Sources(results, shown)
     for page in pages:
         found += check_page(page.name, page.read_text(encoding="utf-8"), numbers)
-    return [*found, *differences(fingerprints, make_fingerprints(study.plan["trainings"]))]
+    trainings = study.plan["trainings"]
+    return [*found, *differences(families(trainings), fingerprints, make_fingerprints(trainings))]
 
 
 def _of_the_study(study: Study) -> Iterator[str]:
     """Seeds that were planned and not trained, tests that were not made, other commits."""
     commits = {seed.result.get("commit") for one in study.trainings for seed in one.finished}
-    if len(commits) > 1 or any(str(one).endswith("+") for one in commits):
+    if len(commits) > 1:
         yield f"the runs are of several commits: {', '.join(sorted(map(str, commits)))}"
+    if changed := sorted(str(one) for one in commits if not one or one.endswith(CHANGED)):
+        yield f"the runs are of a tree that was changed, or of none: {', '.join(changed)}"
     for training in study.trainings:
         left = [seed.number for seed in training.seeds if not seed.finished]
         if left:

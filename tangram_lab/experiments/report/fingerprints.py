@@ -6,7 +6,7 @@ Figures stay true while a training comes to the same numbers as when they were m
 import math
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -45,12 +45,18 @@ def make_fingerprints(trainings: Mapping[str, Mapping[str, Any]]) -> dict[str, F
     Raises:
         RunError: a training failed.
     """
-    firsts = dict[str, list[str]]()
-    for training in trainings.values():
-        firsts.setdefault(training["family"], list(training["overrides"]))
+    firsts = families(trainings)
     with TemporaryDirectory() as folder, ThreadPoolExecutor(AT_ONCE) as pool:
         places = [Path(folder, family) for family in firsts]
         return dict(zip(firsts, pool.map(_trained, places, firsts.values()), strict=True))
+
+
+def families(trainings: Mapping[str, Mapping[str, Any]]) -> dict[str, list[str]]:
+    """Family -> the arguments of the first of its trainings, of those of a plan."""
+    firsts = dict[str, list[str]]()
+    for training in trainings.values():
+        firsts.setdefault(training["family"], list(training["overrides"]))
+    return firsts
 
 
 def _trained(folder: Path, overrides: list[str]) -> Fingerprint:
@@ -77,11 +83,20 @@ def _trained(folder: Path, overrides: list[str]) -> Fingerprint:
     return {**{name: float(result[name]) for name in SCORES}, "weights": total}
 
 
-def differences(stored: Mapping[str, Fingerprint], now: Mapping[str, Fingerprint]) -> Iterator[str]:
-    """Where a family trains otherwise than it did."""
-    for family, fingerprint in stored.items():
-        for name, value in fingerprint.items():
-            found = now.get(family, {}).get(name)
+def differences(
+    names: Iterable[str], stored: Mapping[str, Fingerprint], now: Mapping[str, Fingerprint]
+) -> Iterator[str]:
+    """Where a family trains otherwise than it did, or nobody kept how it did.
+
+    Args:
+        names: of all families.
+        stored, now: family -> its fingerprint.
+    """
+    for family in names:
+        if family not in stored:
+            yield f"family {family} has no fingerprint: make the report with fingerprints=true"
+        for name, value in stored.get(family, {}).items():
+            found = now[family].get(name)
             if found is None or not np.isclose(found, value, rtol=TOLERANCE, atol=TOLERANCE):
                 yield (
                     f"family {family} trains otherwise than when its figures were made: after "

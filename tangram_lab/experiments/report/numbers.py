@@ -61,14 +61,6 @@ class Measure(NamedTuple):
         least, median, most = map(self.show, known)
         return median if least == median == most else f"{median} ({least} to {most})"
 
-    def show_difference(self, ours: Mapping[int, float], theirs: Mapping[int, float]) -> str:
-        """Difference of two medians, with its sign."""
-        one, other = spread(ours.values()), spread(theirs.values())
-        if one is None or other is None:
-            return NOTHING
-        signed = self.pattern.replace("{:", "{:+", 1)
-        return signed.format((one.median - other.median) * self.factor)
-
 
 REWARD = Measure("mean_reward", "mean reward", "{:.3f}", axis="mean reward (\N{MINUS SIGN}1 to 1)")
 DENSE = Measure(

@@ -212,20 +212,18 @@ def test_table(study: Study, experiment: Experiment, measure: Measure) -> list[s
 
 def ranking_table(study: Study, experiment: Experiment) -> list[str]:
     """Every training beside the first: medians, and the difference of their tests in pairs."""
-    first, test = experiment.trainings[0], experiment.main_test
+    first, test, means = experiment.trainings[0], experiment.main_test, _iqm(experiment)
     columns = [
-        *(
-            LABEL,
-            SEEDS,
-            (f"{REWARD.label}, {SPREAD}", _over_seeds(REWARD, test)),
-            *_iqm(experiment),
-        ),
+        LABEL,
+        SEEDS,
+        (f"{REWARD.label}, {SPREAD}", _over_seeds(REWARD, test)),
+        *means,
         ("difference, 95 % interval over the tests", _difference(first, test)),
         (f"{ANGLE.label}, {SPREAD}", _over_seeds(ANGLE, test)),
         (f"{LEVELS[0]:.2f} after, episodes", _soon(LEVELS[0])),
         *_measured(MINUTES),
     ]
-    space = [""] * len(_iqm(experiment))
+    space = [""] * len(means)
     others = [
         [one.label, "", REWARD.show(one.score(REWARD)), *space, "", ANGLE.show(one.score(ANGLE))]
         for one in references(study, experiment)
