@@ -4,13 +4,18 @@ Everything heavy is imported after the config was composed, so --help and wrong 
 """
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from conf.cli import composed, entry, own_presets
 from conf.commands import Plain
 from tangram_sim.errors import ConfigError
 from tangram_sim.settings import Settings, setting
+
+if TYPE_CHECKING:
+    from tangram_agent.setup import Setup
 
 ROOT = Path(__file__).parents[2]
 RESULTS = "docs/results"
@@ -43,11 +48,23 @@ def _resolved(name: str, overrides: list[str]) -> Plain:
     from tangram_agent.setup import make_setup
 
     try:
-        settings = composed("train", ["run_dir=x", *overrides])
+        settings = _composed(overrides)
         make_setup(settings)
     except ConfigError as error:
         raise ConfigError(f"training {name}: {error}") from None
     return settings
+
+
+def _composed(overrides: Sequence[str]) -> Plain:
+    """The whole config that tangram-train makes of its arguments."""
+    return composed("train", ["run_dir=x", *overrides])
+
+
+def _setup(overrides: Sequence[str]) -> "Setup":
+    """The task and the agent that tangram-train makes of its arguments."""
+    from tangram_agent.setup import make_setup
+
+    return make_setup(_composed(overrides))
 
 
 def _asked(name: str, overrides: list[str]) -> Plain:
@@ -79,7 +96,7 @@ class ReportConfig(Settings):
     )
     fingerprints: bool = setting(
         False,
-        "keep in data.json what 20 updates of each family come to, a minute, so that check can "
+        "keep in data.json what 20 updates of each family come to, so that check can "
         "tell whether this code still trains alike",
         unless={"check": True},
     )
@@ -119,7 +136,7 @@ def _report(settings: Plain) -> int:
     from tangram_lab.experiments.report.page import write_report
 
     runs, out = _folder("runs", config.runs), _folder("out", config.out)
-    for path in write_report(runs, out, config.fingerprints):
+    for path in write_report(runs, out, _setup if config.fingerprints else None):
         print(f"written: {path}")
     return 0
 
@@ -130,7 +147,8 @@ def _check() -> int:
     if not (ROOT / RESULTS).is_dir():
         raise ConfigError(f"check looks at {RESULTS} of a clone, which {ROOT} lacks: run it in one")
     pages = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-    wrong = check(ROOT / RESULTS, (page for page in pages if page.name not in GENERATED))
+    shown = (page for page in pages if page.name not in GENERATED)
+    wrong = check(ROOT / RESULTS, shown, _setup)
     for line in wrong:
         print(line)
     print(f"{len(wrong)} wrong" if wrong else "every score of README and docs is in the data")

@@ -1,11 +1,27 @@
 """What README and docs show is in the data, and the data are of this code: tangram-report check."""
 
+import json
 import subprocess
 from pathlib import Path
 
 import pytest
 
-from tests.cluster.processes import BIN
+from conf.cli import composed
+from tangram_agent.checkpoints import ACTING, load_checkpoint, newest_checkpoint
+from tangram_agent.setup import make_setup
+from tangram_agent.types import Weights
+from tangram_lab.experiments.report.fingerprints import (
+    BATCH_EPISODES,
+    ENVS,
+    SCORES,
+    SEED,
+    SETTINGS,
+    TEST_EPISODES,
+    UPDATES,
+    make_fingerprint,
+    sum_of,
+)
+from tests.cluster.processes import BIN, run
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(600)]
 
@@ -19,3 +35,22 @@ def test_every_score_of_the_pages_is_in_the_data_and_the_code_still_trains_alike
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.splitlines()[-1] == "every score of README and docs is in the data"
+
+
+def test_a_fingerprint_is_what_processes_in_lockstep_come_to(tmp_path: Path) -> None:
+    folder, short = tmp_path / "run", [f"{name}={value}" for name, value in SETTINGS.items()]
+    rounds = (
+        f"seed={SEED}",
+        f"max_updates={UPDATES}",
+        "service.mode=lockstep",
+        f"service.envs={ENVS}",
+        f"service.batch_episodes={BATCH_EPISODES}",
+        f"service.eval_episodes={TEST_EPISODES}",
+    )
+    run("tangram-train", f"run_dir={folder}", *short, *rounds, cwd=tmp_path)
+    ours = make_fingerprint(make_setup(composed("train", ["run_dir=x", *short])))
+    result = json.loads((folder / "result.json").read_text())
+    learned = load_checkpoint(newest_checkpoint(folder / "checkpoints"), [ACTING])
+    theirs = {name: result[name] for name in SCORES}
+    theirs["weights"] = sum_of(Weights(learned.updates, learned.arrays[ACTING]))
+    assert ours == pytest.approx(theirs, rel=1e-12)

@@ -1,17 +1,18 @@
 """tangram-report check: what is told of pages, data and code that no longer fit each other."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tangram_agent.setup import Setup
 from tangram_lab.experiments.report import check as report_check
-from tangram_lab.experiments.report import fingerprints as report_fingerprints
 from tangram_lab.experiments.report import page
 from tangram_lab.experiments.report.check import Sources, check, check_page
 from tangram_lab.experiments.report.data import read_data, write_data
-from tangram_lab.experiments.report.fingerprints import differences
+from tangram_lab.experiments.report.fingerprints import differences, families
 from tangram_lab.experiments.report.page import write_report
 from tangram_lab.experiments.report.reading import read_runs
 from tangram_sim.errors import RunError
@@ -86,25 +87,30 @@ def test_a_source_that_is_none(numbers: Sources, name: str) -> None:
 FINGERPRINT = {"x": {"mean_reward": 0.5, "weights": 1000.0}}
 
 
+def never(arguments: Sequence[str]) -> Setup:
+    """Nothing is trained here, see `tests/cluster/test_evidence.py`."""
+    raise AssertionError(arguments)
+
+
 @pytest.fixture
 def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The report of a whole study of one training."""
     monkeypatch.setattr(page, "draw_paper_pictures", lambda out, draws: [])
-    monkeypatch.setattr(page, "make_fingerprints", lambda trainings: FINGERPRINT)
-    monkeypatch.setattr(report_check, "make_fingerprints", lambda trainings: FINGERPRINT)
+    monkeypatch.setattr(page, "make_fingerprints", lambda trainings, make: FINGERPRINT)
+    monkeypatch.setattr(report_check, "make_fingerprints", lambda trainings, make: FINGERPRINT)
     one = experiment("curves", ["ours"], tests=["random"])
     tests = {"random": {"label": "random", "overrides": []}}
     write_plan(tmp_path, plan({"fig4": one}, {"ours": training("ours", "x")}, tests, (0, 1)))
     for seed in (0, 1):
         curve, test = learning_curve(seed, 0.9), {"random": scores(0.912)}
         write_run(tmp_path, "ours", result(seed), curve, test)
-    write_report(tmp_path, tmp_path / "results", fingerprints=True)
+    write_report(tmp_path, tmp_path / "results", never)
     return tmp_path / "results"
 
 
 def checked(results: Path, text: str = "<!-- data: fig4 -->\n0.912") -> list[str]:
     (results.parent / "README.md").write_text(text)
-    return check(results, [results.parent / "README.md"])
+    return check(results, [results.parent / "README.md"], never)
 
 
 def changed(results: Path, change: dict[str, Any]) -> None:
@@ -147,7 +153,7 @@ def test_what_the_study_lacks(results: Path, change: dict[str, Any], told: str) 
 
 def test_code_that_trains_otherwise(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now = {"x": {"mean_reward": 0.5, "weights": 1003.0}}
-    monkeypatch.setattr(report_check, "make_fingerprints", lambda trainings: now)
+    monkeypatch.setattr(report_check, "make_fingerprints", lambda trainings, make: now)
     (found,) = checked(results)
     assert "family x trains otherwise" in found
     assert "weights is 1003.0, and was 1000.0" in found
@@ -167,22 +173,12 @@ def test_a_family_whose_fingerprint_nobody_kept_is_told(results: Path) -> None:
     ]
 
 
-def test_a_family_is_trained_by_the_first_of_its_trainings(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    told: dict[str, list[str]] = {}
-
-    def train(folder: Path, overrides: list[str]) -> dict[str, float]:
-        told[folder.name] = overrides
-        return {"weights": 1.0}
-
-    monkeypatch.setattr(report_fingerprints, "_trained", train)
-    names = {"a": training("a", "x", "k=1"), "b": training("b", "x"), "c": training("c", "y")}
-    found = report_fingerprints.make_fingerprints(names)
-    assert (found, told) == (
-        {"x": {"weights": 1.0}, "y": {"weights": 1.0}},
-        {"x": ["k=1"], "y": []},
-    )
+def test_a_family_is_trained_by_the_first_of_its_trainings_for_a_short_while() -> None:
+    first = training("a", "x", "k=1", "agent.batch_size=64")
+    assert families({"a": first, "b": training("b", "x"), "c": training("c", "y")}) == {
+        "x": ["k=1", "agent.batch_size=16", "agent.learning_starts=32"],
+        "y": ["agent.batch_size=16", "agent.learning_starts=32"],
+    }
 
 
 @pytest.mark.parametrize(

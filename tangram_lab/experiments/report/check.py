@@ -16,7 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from tangram_lab.experiments.report.data import read_data
-from tangram_lab.experiments.report.fingerprints import differences, families, make_fingerprints
+from tangram_lab.experiments.report.fingerprints import (
+    MakeSetup,
+    differences,
+    families,
+    make_fingerprints,
+)
 from tangram_lab.experiments.report.page import DATA, TABLES, tables_page
 from tangram_lab.experiments.report.references import VALUES
 from tangram_lab.experiments.report.study import Study
@@ -32,15 +37,17 @@ NO_SCORE, OLDER, PAPERS = "none", "commit", "paper"
 CHANGED = "-dirty"  # of a commit in a result: the source tree was not as committed
 
 
-def check(results: Path, pages: Iterable[Path]) -> list[str]:
+def check(results: Path, pages: Iterable[Path], make: MakeSetup) -> list[str]:
     """What is wrong; nothing where every figure is in the data, and the data are of this code.
 
     Args:
         results: folder that tangram-report made.
         pages: that show figures.
+        make: the setup that a training's arguments come to.
 
     Raises:
-        RunError: the data cannot be read, or a training for a fingerprint failed.
+        RunError: the data cannot be read.
+        ConfigError: this code refuses a training of them.
     """
     study, fingerprints = read_data(results / DATA)
     shown = (results / TABLES).read_text(encoding="utf-8")
@@ -51,7 +58,8 @@ def check(results: Path, pages: Iterable[Path]) -> list[str]:
     for page in pages:
         found += check_page(page.name, page.read_text(encoding="utf-8"), numbers)
     trainings = study.plan["trainings"]
-    return [*found, *differences(families(trainings), fingerprints, make_fingerprints(trainings))]
+    now = make_fingerprints(trainings, make)
+    return [*found, *differences(families(trainings), fingerprints, now)]
 
 
 def _of_the_study(study: Study) -> Iterator[str]:

@@ -4,83 +4,89 @@ Figures stay true while a training comes to the same numbers as when they were m
 """
 
 import math
-import subprocess
-import sys
-from collections.abc import Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-from tempfile import TemporaryDirectory
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from typing import Any
 
 import numpy as np
+import torch
 
-from master.children import command, environment, override
-from tangram_agent.checkpoints import ACTING, CHECKPOINTS, load_checkpoint, newest_checkpoint
-from tangram_lab.experiments.jobs import read_object
-from tangram_sim.errors import RunError
+from master.trainer import Trainer
+from tangram_agent.policy import Policy
+from tangram_agent.setup import Setup
+from tangram_agent.types import Weights
+from worker.looking import environments
+from worker.rollout import Rollout
+from worker.test_set import FixedTests, greedy
 
 UPDATES = 20
-SETTINGS = (
-    "seed=0",
-    *(f"max_updates={UPDATES}", "max_episodes=0", "service.mode=lockstep"),
-    *("service.envs=4", "service.batch_episodes=8", "service.eval_episodes=8"),
-    *("agent.batch_size=16", "agent.learning_starts=32"),
-)
-# Lockstep has no pace at which weights are sent.
-LEFT_OUT = ("service.publish_seconds",)
+SETTINGS = {"agent.batch_size": 16, "agent.learning_starts": 32}
+SEED, ENVS, BATCH_EPISODES, TEST_EPISODES = 0, 4, 8, 8
 SCORES = ("mean_reward", "raw_overlap", "angle_error_deg_p90", "position_error_p90")
-AT_ONCE = 2  # trainings
 TOLERANCE = 1e-3  # other processors add numbers up in another order
-LONGEST_S = 300
 
 Fingerprint = dict[str, float]
+MakeSetup = Callable[[Sequence[str]], Setup]  # from the arguments of a training
 
 
-def make_fingerprints(trainings: Mapping[str, Mapping[str, Any]]) -> dict[str, Fingerprint]:
+def make_fingerprints(
+    trainings: Mapping[str, Mapping[str, Any]], make: MakeSetup
+) -> dict[str, Fingerprint]:
     """Family -> its fingerprint, by the first of its trainings.
 
     Args:
         trainings: of a plan.
+        make: the setup that arguments come to.
 
     Raises:
-        RunError: a training failed.
+        ConfigError: this code refuses a training.
     """
-    firsts = families(trainings)
-    with TemporaryDirectory() as folder, ThreadPoolExecutor(AT_ONCE) as pool:
-        places = [Path(folder, family) for family in firsts]
-        return dict(zip(firsts, pool.map(_trained, places, firsts.values()), strict=True))
+    torch.set_num_threads(1)
+    return {
+        family: make_fingerprint(make(arguments))
+        for family, arguments in families(trainings).items()
+    }
 
 
 def families(trainings: Mapping[str, Mapping[str, Any]]) -> dict[str, list[str]]:
-    """Family -> the arguments of the first of its trainings, of those of a plan."""
+    """Family -> the arguments of the first of its trainings, with those of a short one."""
     firsts = dict[str, list[str]]()
     for training in trainings.values():
-        firsts.setdefault(training["family"], list(training["overrides"]))
+        if training["family"] not in firsts:
+            said = {text.partition("=")[0]: text for text in training["overrides"]}
+            said |= {name: f"{name}={value}" for name, value in SETTINGS.items()}
+            firsts[training["family"]] = [*said.values()]
     return firsts
 
 
-def _trained(folder: Path, overrides: list[str]) -> Fingerprint:
-    kept = [one for one in overrides if not one.startswith(LEFT_OUT)]
-    said = {text.partition("=")[0]: text for text in (*kept, *SETTINGS)}
-    told = [*command("train"), override("run_dir", str(folder)), *said.values()]
-    log = folder.with_suffix(".log")
-    with log.open("wb") as out:
-        ended = subprocess.run(
-            [sys.executable, *told],
-            env=environment(),
-            stdout=out,
-            stderr=out,
-            timeout=LONGEST_S,
-            check=False,
-        )
-    if ended.returncode:
-        lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
-        raise RunError(f"the training of family {folder.name} failed: {' '.join(lines[-3:])}")
-    result = read_object(folder / "result.json")
-    checkpoint = load_checkpoint(newest_checkpoint(folder / CHECKPOINTS), [ACTING])
-    weights = checkpoint.arrays[ACTING].values()
-    total = math.fsum(float(np.abs(one.astype(np.float64)).sum()) for one in weights)
-    return {**{name: float(result[name]) for name in SCORES}, "weights": total}
+def make_fingerprint(setup: Setup) -> Fingerprint:
+    """The scores after 20 updates, and the sum of all weights without their signs.
+
+    It learns as `tangram-train service.mode=lockstep` does with one worker, number for number, but
+    in this process: a test compares the two.
+    """
+    trainer, policy = Trainer(setup, SEED, "cpu"), Policy(setup)
+    with closing(environments(setup, ENVS)) as env:
+        rollout = Rollout(env, SEED, "player", 0, 0)
+        while trainer.updates < UPDATES:
+            newest = trainer.weights()
+            policy.follow(newest)
+            rollout.follow(newest.version)
+            trainer.insert(rollout.play(policy.explore, BATCH_EPISODES // ENVS))
+            while trainer.rate_limiter.may_update() and trainer.updates < UPDATES:
+                trainer.update(trainer.updates / UPDATES)
+    learned = trainer.learner.acting_weights(trainer.updates)
+    policy.load(learned)
+    with closing(FixedTests(setup, TEST_EPISODES, ENVS)) as tests:
+        scores = tests.scores(tests.play(greedy(policy)))
+    return {**{name: scores[name] for name in SCORES}, "weights": sum_of(learned)}
+
+
+def sum_of(weights: Weights) -> float:
+    """Of all weights, without their signs."""
+    return math.fsum(
+        float(np.abs(one.astype(np.float64)).sum()) for one in weights.tensors.values()
+    )
 
 
 def differences(

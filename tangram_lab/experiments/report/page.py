@@ -21,7 +21,7 @@ from tangram_lab.experiments.report.figures import (
     sweep_parts,
     sweeps,
 )
-from tangram_lab.experiments.report.fingerprints import make_fingerprints
+from tangram_lab.experiments.report.fingerprints import MakeSetup, make_fingerprints
 from tangram_lab.experiments.report.numbers import ANGLE, DENSE, REWARD
 from tangram_lab.experiments.report.profiles import draw_profile
 from tangram_lab.experiments.report.reading import read_runs
@@ -78,13 +78,14 @@ WORLDS = (
 REACHED = "Episodes are those at the first evaluation in which a seed reached the mean reward."
 
 
-def write_report(runs: Path, out: Path, fingerprints: bool = False) -> list[Path]:
+def write_report(runs: Path, out: Path, make: MakeSetup | None = None) -> list[Path]:
     """Report on a study; files of an earlier report in the same place are replaced.
 
     Args:
         runs: the study's folder, or one whose folders are runs.
         out: folder for tables.md, data.json and figures/.
-        fingerprints: whether data.json is to tell which code made it.
+        make: the setup that a training's arguments come to, where data.json is to keep
+            fingerprints of the code.
 
     Returns:
         The page and the data.
@@ -99,7 +100,7 @@ def write_report(runs: Path, out: Path, fingerprints: bool = False) -> list[Path
         raise RunError(
             f"cannot make {out / FIGURES} ({error.strerror}): choose another folder with out=..."
         ) from None
-    made = make_fingerprints(study.plan["trainings"]) if fingerprints and study.plan else {}
+    made = make_fingerprints(study.plan["trainings"], make) if make and study.plan else {}
     write_data(out / DATA, study, made)
     if study.plan:  # what is drawn is what the data have
         study, _ = read_data(out / DATA)
