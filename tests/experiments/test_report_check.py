@@ -1,6 +1,7 @@
 """tangram-report check: what is told of pages, data and code that no longer fit each other."""
 
 import json
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -35,7 +36,7 @@ TABLES = '<a id="fig4"></a>\n\n| ours | 0.996 (0.995 to 0.9971) |\n\n<a id="fig5
 @pytest.fixture
 def numbers(tmp_path: Path) -> Sources:
     (tmp_path / "bench.json").write_text(json.dumps({"a": [{"x": 0.12344, "b": True}], "c": -3.0}))
-    return Sources(tmp_path, TABLES)
+    return Sources(tmp_path, {"": TABLES, "large/": TABLES.replace("0.996", "0.998")})
 
 
 PAGES = [
@@ -46,6 +47,7 @@ PAGES = [
     ("<!-- data: fig4 -->\nIt has 0.997.", ["0.997 is not in fig4"]),  # it is 0.9971
     ("<!-- data: fig5 -->\nIt has 0.996.", ["0.996 is not in fig5"]),
     ("<!-- data: fig5 fig4 -->\nIt has 0.996.", []),
+    ("<!-- data: large/fig4 -->\nIt has 0.998 and 0.996.", ["0.996 is not in large/fig4"]),
     ("<!-- data: bench.json -->\nIt has 0.123, 0.1234 and 3.000.", []),
     ("<!-- data: bench.json -->\nIt has 1.000.", ["1.000 is not in bench.json"]),  # true is none
     ("<!-- data: paper -->\nThe paper has 0.758 and 0.759.", ["0.759 is not in paper"]),
@@ -128,6 +130,28 @@ def test_a_page_that_shows_something_else(results: Path) -> None:
     assert checked(results, "<!-- data: fig4 -->\n0.913") == [
         "README.md:1: 0.913 is not in fig4",
     ]
+
+
+@pytest.fixture
+def both(results: Path) -> Path:
+    """A second report in a folder of the first."""
+    shutil.copytree(results, results.parent / "copy")
+    (results.parent / "copy").rename(results / "large")
+    return results
+
+
+def test_a_report_in_a_folder_of_the_results_is_a_source_too(both: Path) -> None:
+    assert checked(both, "<!-- data: large/fig4 -->\n0.912") == []
+    assert checked(both, "<!-- data: large/fig4 -->\n0.913") == [
+        "README.md:1: 0.913 is not in large/fig4"
+    ]
+
+
+def test_all_reports_are_of_one_commit_and_each_is_whole(both: Path) -> None:
+    changed(both / "large", {"result": result(1, commit="fedcba9")})
+    assert "the runs are of several commits: 0123abc, fedcba9" in checked(both)
+    changed(both / "large", {"state": "not finished", "result": {}, "tests": {}})
+    assert "large/ours lacks the seeds [1]" in checked(both)
 
 
 def test_tables_that_were_changed_by_hand(results: Path) -> None:

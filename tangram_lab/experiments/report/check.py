@@ -3,6 +3,7 @@
 A comment above a paragraph, a list or a table says where its numbers are from:
 
     <!-- data: fig4 table2 -->       these experiments' sections of the tables
+    <!-- data: paper_size/fig4 -->   the same of the report in that folder of docs/results
     <!-- data: silhouettes.json -->  a file of docs/results
     <!-- data: paper -->             the paper's own numbers
     <!-- data: commit 0123abc -->    an older commit, which the text must name, too
@@ -11,7 +12,7 @@ A comment above a paragraph, a list or a table says where its numbers are from:
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,7 @@ def check(results: Path, pages: Iterable[Path], make: MakeSetup) -> list[str]:
     """What is wrong; nothing where every figure is in the data, and the data are of this code.
 
     Args:
-        results: folder that tangram-report made.
+        results: folder that tangram-report made; folders in it may hold further reports.
         pages: that show figures.
         make: the setup that a training's arguments come to.
 
@@ -49,26 +50,39 @@ def check(results: Path, pages: Iterable[Path], make: MakeSetup) -> list[str]:
         RunError: the data cannot be read.
         ConfigError: this code refuses a training of them.
     """
-    study, fingerprints = read_data(results / DATA)
-    shown = (results / TABLES).read_text(encoding="utf-8")
-    found = [*_of_the_study(study)]
-    if tables_page(study, results) != shown:
-        found.append(f"{results / TABLES} is not what {DATA} gives: make it anew")
-    numbers = Sources(results, shown)
+    found, tables, commits = list[str](), dict[str, str](), set[str | None]()
+    for prefix, folder in reports(results).items():
+        study, fingerprints = read_data(folder / DATA)
+        tables[prefix] = (folder / TABLES).read_text(encoding="utf-8")
+        if tables_page(study, folder) != tables[prefix]:
+            found.append(f"{folder / TABLES} is not what {DATA} gives: make it anew")
+        found += (f"{prefix}{line}" for line in _lacks(study))
+        commits |= {seed.result.get("commit") for one in study.trainings for seed in one.finished}
+        trainings = study.plan["trainings"]
+        now = make_fingerprints(trainings, make)
+        found += (f"{prefix}{line}" for line in differences(families(trainings), fingerprints, now))
+    found += _of_commits(commits)
+    numbers = Sources(results, tables)
     for page in pages:
         found += check_page(page.name, page.read_text(encoding="utf-8"), numbers)
-    trainings = study.plan["trainings"]
-    now = make_fingerprints(trainings, make)
-    return [*found, *differences(families(trainings), fingerprints, now)]
+    return found
 
 
-def _of_the_study(study: Study) -> Iterator[str]:
-    """Seeds that were planned and not trained, tests that were not made, other commits."""
-    commits = {seed.result.get("commit") for one in study.trainings for seed in one.finished}
+def reports(results: Path) -> dict[str, Path]:
+    """What stands before the names of a report's experiments -> its folder."""
+    others = sorted(path.parent for path in results.glob(f"*/{DATA}"))
+    return {"": results, **{f"{folder.name}/": folder for folder in others}}
+
+
+def _of_commits(commits: Collection[str | None]) -> Iterator[str]:
     if len(commits) > 1:
         yield f"the runs are of several commits: {', '.join(sorted(map(str, commits)))}"
     if changed := sorted(str(one) for one in commits if not one or one.endswith(CHANGED)):
         yield f"the runs are of a tree that was changed, or of none: {', '.join(changed)}"
+
+
+def _lacks(study: Study) -> Iterator[str]:
+    """Seeds that were planned and not trained, tests that were not made."""
     for training in study.trainings:
         left = [seed.number for seed in training.seeds if not seed.finished]
         if left:
@@ -83,11 +97,14 @@ def _of_the_study(study: Study) -> Iterator[str]:
 class Sources:
     """The numbers that may stand on pages, by the names of their sources."""
 
-    def __init__(self, results: Path, tables: str) -> None:
-        """Read the tables; files are read when they are named."""
+    def __init__(self, results: Path, tables: Mapping[str, str]) -> None:
+        """Take the tables of each report; files are read when they are named."""
         self._results = results
-        parts = SECTION.split(tables)[1:]
-        self._sections = dict(zip(parts[::2], parts[1::2], strict=True))
+        self._sections = dict[str, str]()
+        for prefix, text in tables.items():
+            parts = SECTION.split(text)[1:]
+            names = (prefix + name for name in parts[::2])
+            self._sections |= zip(names, parts[1::2], strict=True)
 
     def has(self, source: str, text: str) -> bool:
         """Whether a number, as it is written, is one of a source.
