@@ -401,21 +401,29 @@ def test_a_quartile_needs_five_seeds(tmp_path: Path, seeds: int, shown: bool) ->
         assert row[2].startswith("0.7000 (")
 
 
-@pytest.mark.parametrize(("seeds", "drawn"), [(4, False), (5, True)])
+@pytest.mark.parametrize(
+    ("seeds", "shapes", "lines"),
+    [
+        (4, ("square", "parallelogram"), []),
+        (5, ("square", "parallelogram"), ["all 2 tasks alike"]),  # one agent's tasks
+        (5, ("square", "square"), ["one", "two"]),  # agents at one task
+    ],
+)
 def test_a_profile_is_drawn_of_the_seeds_that_all_trainings_have(
-    tmp_path: Path, seeds: int, drawn: bool
+    tmp_path: Path, seeds: int, shapes: tuple[str, str], lines: list[str]
 ) -> None:
-    names = {name: training(name, "x") for name in ("square", "triangle")}
+    names = {name: training(name, "x") for name in ("one", "two")}
     tests = {"random": {"label": "random", "overrides": []}}
     one = experiment("ranking", [*names], tests=["random"])
     write_plan(tmp_path, plan({"a": one}, names, tests, tuple(range(6))))
-    for name, count in (("square", seeds), ("triangle", 6)):
+    for name, count, shape in (("one", seeds, shapes[0]), ("two", 6, shapes[1])):
         for seed in range(count):
-            write_run(tmp_path, name, result(seed), [], {"random": scores(0.99)})
+            content = result(seed, tokens=[shape])
+            write_run(tmp_path, name, content, [], {"random": scores(0.99)})
     figure = draw_profile(read_runs(tmp_path).experiments[0])
-    assert (figure is not None) is drawn
-    if figure is not None:
-        (line,) = figure.axes[0].lines
+    drawn = [] if figure is None else figure.axes[0].lines
+    assert [line.get_label() for line in drawn] == lines
+    for line in drawn:
         x, y = np.asarray(line.get_xdata()), np.asarray(line.get_ydata())
         assert set(y[x < 0.0099]) == {0.0}
         assert set(y[x > 0.0101]) == {1.0}

@@ -67,8 +67,8 @@ SMALL = (
     "behind each."
 )
 PROFILE = (
-    "The share of all runs that falls short of a perfect mean reward by no more than so much, with "
-    "a stratified bootstrap's interval (Agarwal et al. 2021)."
+    "The share of an agent's runs that fall short of a perfect mean reward by no more than so "
+    "much, with a stratified bootstrap's interval (Agarwal et al. 2021)."
 )
 SWEEP = "Median over the seeds; the band goes from the least to the most."
 WORLDS = (
