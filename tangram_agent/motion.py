@@ -86,15 +86,19 @@ def motions_of(past: Past, now: Floats, layout: Layout, sim: SimConfig) -> Motio
         poses, steps = poses[:, 1:], max(steps - 1, 0)
     actions = past.actions[:, :steps].reshape(count * steps, size).astype(np.float64)
     token = chosen_tokens(actions, layout.tokens).reshape(count, steps, 1, 1)
-    before, after = (
-        np.take_along_axis(part, token, axis=2)[:, :, 0] for part in (poses[:, :-1], poses[:, 1:])
-    )
-    way = velocities_of((after - before).reshape(-1, 3), sim).reshape(count, steps, 3)
+    ways = velocities_of((poses[:, 1:] - poses[:, :-1]).reshape(-1, 3), sim)
+    ways = ways.reshape(count, steps, layout.tokens, 3)
+    way = np.take_along_axis(ways, token, axis=2)[:, :, 0]
     # Seen with noise, what was blocked or refused seems to have moved; a lone token never is.
     seen = _SEEN / sim.pixels if sim.observe == "pictures" else 0.0
     noise = max(seen, _NOISE_DEVIATIONS * sim.corner_noise)
     still = _STILL + (noise if layout.tokens > 1 else 0.0)
     moved = np.abs(way).max(axis=-1, initial=0.0) > still
+    # Where others went, too, it pushed them or was set down on them, and they decided where it came
+    # to lie. Their turns are left out: noise turns a small token by much.
+    shifted = np.abs(ways[..., :2]).max(axis=-1, initial=0.0) > still
+    np.put_along_axis(shifted, token[..., 0], False, axis=2)
+    moved &= ~shifted.any(axis=2)
     if past.confidence is not None and layout.tokens > 1:
         # What touches others may be seen wrongly, and one wrong way spoils what is believed.
         sure = past.confidence[:, -1 - way.shape[1] :] > PILED

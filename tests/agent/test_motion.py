@@ -14,6 +14,7 @@ from tangram_agent.types import Past, Transitions
 from tangram_agent.weights import load_arrays, to_arrays
 from tangram_sim.errors import ConfigError, RunError
 from tests.agent.builders import PAIR, SQUARE, random_episodes, setup
+from tests.agent.pair_scenes import SEVEN
 
 pytestmark = pytest.mark.fast
 
@@ -211,6 +212,30 @@ def test_motions_are_those_of_the_token_that_each_action_named(tokens: dict, del
     np.testing.assert_allclose(motions.way[0, 0], [0.1, -0.05, turned], atol=1e-5)
     np.testing.assert_allclose(motions.command[0], actions[0, : 2 - delay, -3:])
     assert motions.moved.tolist() == [[1.0, 0.0][: 2 - delay]]
+
+
+@pytest.mark.parametrize(("other", "tells"), [(0.0, 1.0), (1e-9, 1.0), (1e-4, 0.0)])
+def test_a_motion_that_shifted_another_token_tells_nothing(other: float, tells: float) -> None:
+    """One that is set down on others comes to lie elsewhere than it was told, in any world."""
+    made = setup(PAIR)
+    poses = np.zeros((1, 2, 2, 3))
+    poses[0, 1] = [[0.0, other, 0.0], [0.1, 0.2, 0.3]]
+    corners = made.layout.corners(poses)
+    past = Past(corners[:, :1], np.array([[[1.0, 0.1, 0.2, 0.3]]], np.float32))
+    assert motions_of(past, corners[:, 1], made.layout, made.sim).moved.tolist() == [[tells]]
+
+
+def test_noise_on_the_corners_of_small_tokens_is_no_contact() -> None:
+    layout = setup(SEVEN, corner_noise=0.01).layout
+    rng = np.random.default_rng(0)
+    before = rng.uniform(-0.5, 0.5, (50, layout.tokens, 3))
+    after = before.copy()
+    after[:, 0, :2] += 0.6
+    shape = 50, layout.corner_count, 2
+    seen = [layout.corners(p) + 0.02 * rng.standard_normal(shape) for p in (before, after)]
+    action = np.array([-1.0, 0.3, 0.3, 0.0], np.float32)
+    past = Past(seen[0][:, None], np.tile(action, (50, 1, 1)))
+    assert motions_of(past, seen[1], layout, setup(SEVEN, corner_noise=0.01).sim).moved.all()
 
 
 @pytest.mark.parametrize(
