@@ -53,7 +53,7 @@ paper: .venv/.installed-run  ## all figures and tables of the paper: BUDGET=smok
 EXPERIMENTS := $(basename $(notdir $(wildcard conf/experiment/*.yaml)))
 evidence: .venv/.installed-dev  ## everything that README and docs/results.md show, anew: a day on two cores
 	@$(BIN)/tangram-experiment "experiment=[$(shell echo $(EXPERIMENTS) | tr ' ' ',')]" budget=laptop "budget.main_seeds=[0,1,2,3,4,5,6,7,8,9]" run_dir=runs/evidence $(ARGS)
-	@$(BIN)/tangram-report runs=runs/evidence out=docs/results fingerprints=true
+	@$(BIN)/tangram-report runs=runs/evidence out=docs/results
 	@$(BIN)/tangram-report check
 
 bench: .venv/.installed-dev  ## measure speed against what else one could do; options go into ARGS="runs=9"

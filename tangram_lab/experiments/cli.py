@@ -40,7 +40,7 @@ def _experiment(settings: Plain) -> int:
 
     from tangram_lab.experiments.runner import run_study
 
-    return run_study(config, resolved, asked, own_presets())
+    return run_study(config, resolved, asked, _setup, own_presets())
 
 
 def _resolved(name: str, overrides: list[str]) -> Plain:
@@ -94,12 +94,6 @@ class ReportConfig(Settings):
     out: str | None = setting(
         None, "folder for tables.md, data.json and figures", unless={"check": True}
     )
-    fingerprints: bool = setting(
-        False,
-        "keep in data.json what 20 updates of each family come to, so that check can "
-        "tell whether this code still trains alike",
-        unless={"check": True},
-    )
     check: bool = setting(
         False,
         "in a clone: whether README and docs show what docs/results/data.json holds, and whether "
@@ -136,7 +130,7 @@ def _report(settings: Plain) -> int:
     from tangram_lab.experiments.report.page import write_report
 
     runs, out = _folder("runs", config.runs), _folder("out", config.out)
-    for path in write_report(runs, out, _setup if config.fingerprints else None):
+    for path in write_report(runs, out):
         print(f"written: {path}")
     return 0
 
@@ -151,7 +145,8 @@ def _check() -> int:
     wrong = check(ROOT / RESULTS, shown, _setup)
     for line in wrong:
         print(line)
-    print(f"{len(wrong)} wrong" if wrong else "every score of README and docs is in the data")
+    fine = "every score of README and docs is in the data, or names the older commit that it is of"
+    print(f"{len(wrong)} wrong" if wrong else fine)
     return 1 if wrong else 0
 
 

@@ -24,6 +24,7 @@ class Job:
 
     Attributes:
         name: for people.
+        training: its name in the catalogue.
         command: the name of one of our commands, and its arguments.
         run_dir: the run folder that it works on.
         leaves: its file.
@@ -33,6 +34,7 @@ class Job:
     """
 
     name: str
+    training: str
     command: tuple[str, ...]
     run_dir: Path
     leaves: Path
@@ -173,7 +175,7 @@ def _training(
         *config.command(name),
         *([] if needs is None else [override("warm_start", str(needs.run_dir))]),
     )
-    return Job(f"{name}, seed {seed}", told, run_dir, run_dir / RESULT, needs, settings)
+    return Job(f"{name}, seed {seed}", name, told, run_dir, run_dir / RESULT, needs, settings)
 
 
 def _test(config: StudyConfig, training: Job, name: str, asked: Mapping[str, Any]) -> Job:
@@ -185,4 +187,4 @@ def _test(config: StudyConfig, training: Job, name: str, asked: Mapping[str, Any
         *config.test_command(name),
     )
     label = f"{training.name}, test {name}"
-    return Job(label, told, training.run_dir, out, training, asked, trains=False)
+    return Job(label, training.training, told, training.run_dir, out, training, asked, trains=False)

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from tangram_agent.messages import MAX_SEED
 from tangram_sim.errors import ConfigError
 from tangram_sim.settings import (
     Settings,
@@ -20,10 +21,11 @@ from tangram_sim.settings import (
     setting,
 )
 
-FORMAT = 3
+FORMAT = 4
 Kind = Literal["curves", "complexity", "tests", "rewards", "ranking", "game", "worlds"]
 KINDS: tuple[str, ...] = get_args(Kind)
 PLAN = "plan.json"
+JOINED = ("experiments", "trainings", "tests", "fingerprints")  # of all commands in a folder
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,7 @@ class BudgetConfig:
             if not seeds or len(set(seeds)) < len(seeds):
                 raise ConfigError(f"budget.{name} must be different numbers, got {list(seeds)}")
             for seed in seeds:
-                check_range(f"budget.{name}", seed, 0)
+                check_range(f"budget.{name}", seed, 0, MAX_SEED)
 
 
 @dataclass(frozen=True)
@@ -257,6 +259,7 @@ def plan_content(config: StudyConfig, source: Mapping[str, Any]) -> dict[str, An
             for name in wanted
         },
         "tests": {name: asdict(config.tests[name]) for name in tests},
+        "fingerprints": {},
     }
 
 
@@ -271,14 +274,15 @@ def joined_plan(path: Path, content: dict[str, Any]) -> dict[str, Any]:
         return content
     try:
         earlier = json.loads(path.read_text(encoding="utf-8"))
-        found = earlier["format"]
-        known = {n: dict(earlier[n]) for n in ("budget", "experiments", "trainings", "tests")}
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        if (found := earlier["format"]) != FORMAT:
+            raise ConfigError(
+                f"{path} is of format {found}, and this version writes {FORMAT}: choose another "
+                "run_dir"
+            )
+        known = {name: dict(earlier[name]) for name in (*JOINED, "budget")}
+        planned = {name: {*map(int, one["seeds"])} for name, one in known["trainings"].items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise ConfigError(f"cannot read {path}: remove it, or choose another run_dir") from None
-    if found != FORMAT:
-        raise ConfigError(
-            f"{path} is of format {found}, and this version writes {FORMAT}: choose another run_dir"
-        )
     for name in ("name", "test_episodes", "test_seed"):
         earlier, now = known["budget"].get(name), content["budget"][name]
         if earlier != now:
@@ -286,8 +290,8 @@ def joined_plan(path: Path, content: dict[str, Any]) -> dict[str, Any]:
                 f"{path.parent} was made with budget.{name}={earlier}, now it is {now}: choose "
                 "another run_dir"
             )
-    merged = {n: known[n] | content[n] for n in ("experiments", "trainings", "tests")}
-    for name, one in known["trainings"].items():
-        seeds = sorted({*one.get("seeds", ()), *merged["trainings"][name]["seeds"]})
-        merged["trainings"][name] = merged["trainings"][name] | {"seeds": seeds}
+    merged = {name: known[name] | content[name] for name in JOINED}
+    for name, seeds in planned.items():
+        every = sorted({*seeds, *merged["trainings"][name]["seeds"]})
+        merged["trainings"][name] = merged["trainings"][name] | {"seeds": every}
     return content | merged

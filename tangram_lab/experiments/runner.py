@@ -7,7 +7,7 @@ import signal
 import sys
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -28,6 +28,13 @@ from master.rundir import RunFolder
 from master.signals import handling
 from tangram_agent.files import write_whole
 from tangram_agent.outcome import duration
+from tangram_lab.experiments.fingerprints import (
+    UPDATES,
+    Fingerprint,
+    MakeSetup,
+    differences,
+    make_fingerprints,
+)
 from tangram_lab.experiments.jobs import Job, make_jobs, read_object
 from tangram_lab.experiments.plan import PLAN, StudyConfig, joined_plan, plan_content
 from tangram_sim.errors import ConfigError
@@ -140,6 +147,7 @@ def run_study(
     config: StudyConfig,
     resolved: Mapping[str, Mapping[str, Any]],
     asked: Mapping[str, Mapping[str, Any]],
+    make: MakeSetup,
     presets: str | None,
 ) -> int:
     """Do everything that is missing.
@@ -148,13 +156,15 @@ def run_study(
         config: the study.
         resolved: the whole config of each training that is wanted.
         asked: the settings of each test of them.
+        make: the setup that the arguments of a training come to.
         presets: the folder of the user's own presets, None where there is none.
 
     Returns:
         Exit status: 0 when all is done, 1 when a job failed, 130 after a signal.
 
     Raises:
-        ConfigError: the folder holds trainings with other settings or budget, or is in use.
+        ConfigError: the folder holds trainings with other settings or budget, or of code that
+            trained otherwise, or is in use.
     """
     study, jobs = RunFolder(config.run_dir), make_jobs(config, resolved, asked, presets)
     if not next(path for path in (study.path, *study.path.parents) if path.exists()).is_dir():
@@ -163,7 +173,6 @@ def run_study(
         )
     for job in jobs:
         job.check()
-    before = read_object(study.path / PLAN).get("commit")
     plan = joined_plan(study.path / PLAN, plan_content(config, _source()))
     missing = [job for job in jobs if not job.done]
     console = sturdy_console(sys.stdout)
@@ -174,17 +183,30 @@ def run_study(
         return 0
     study.prepare("auto")
     with study.lock():
+        plan["fingerprints"] |= _fingerprints(plan, make, missing)
         write_whole(study.path / PLAN, _json(plan))
-        if before not in (None, plan["commit"]):
-            console.print(
-                f"what lies in {study.path} was begun at commit {before}, and now it is "
-                f"{plan['commit']}: tangram-report check asks for one",
-                markup=False,
-                highlight=False,
-                soft_wrap=True,
-            )
         with StudyProgress(console, len(jobs), len(jobs) - len(missing)) as progress:
             return Runner(missing, config.jobs, progress).run()
+
+
+def _fingerprints(
+    plan: Mapping[str, Any], make: MakeSetup, missing: Iterable[Job]
+) -> dict[str, Fingerprint]:
+    """Training -> the fingerprint of this code, of those that lack a seed.
+
+    Raises:
+        ConfigError: other seeds of one are of code that trained otherwise.
+    """
+    names = dict.fromkeys(job.training for job in missing if job.trains)
+    before = plan["fingerprints"]
+    found = make_fingerprints({name: plan["trainings"][name]["overrides"] for name in names}, make)
+    for name, now in found.items():
+        if name in before and (others := differences(before[name], now)):
+            raise ConfigError(
+                f"other seeds of {name} are of code that trained otherwise: after {UPDATES} "
+                f"updates {others[0]}: choose another run_dir"
+            )
+    return found
 
 
 def _source() -> dict[str, object]:

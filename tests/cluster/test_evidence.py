@@ -10,12 +10,13 @@ from conf.cli import composed
 from tangram_agent.checkpoints import ACTING, load_checkpoint, newest_checkpoint
 from tangram_agent.setup import make_setup
 from tangram_agent.types import Weights
-from tangram_lab.experiments.report.fingerprints import (
+from tangram_lab.experiments.fingerprints import (
     BATCH_EPISODES,
+    BATCH_SIZE,
     ENVS,
+    LEARNING_STARTS,
     SCORES,
     SEED,
-    SETTINGS,
     TEST_EPISODES,
     UPDATES,
     make_fingerprint,
@@ -34,12 +35,14 @@ def test_every_score_of_the_pages_is_in_the_data_and_the_code_still_trains_alike
         command, cwd=tmp_path, capture_output=True, text=True, timeout=500, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    assert done.stdout.splitlines()[-1] == "every score of README and docs is in the data"
+    assert done.stdout.startswith("every score of README and docs is in the data")
 
 
 def test_a_fingerprint_is_what_processes_in_lockstep_come_to(tmp_path: Path) -> None:
-    folder, short = tmp_path / "run", [f"{name}={value}" for name, value in SETTINGS.items()]
-    rounds = (
+    folder = tmp_path / "run"
+    short = (
+        f"agent.batch_size={BATCH_SIZE}",
+        f"agent.learning_starts={LEARNING_STARTS}",
         f"seed={SEED}",
         f"max_updates={UPDATES}",
         "service.mode=lockstep",
@@ -47,8 +50,8 @@ def test_a_fingerprint_is_what_processes_in_lockstep_come_to(tmp_path: Path) -> 
         f"service.batch_episodes={BATCH_EPISODES}",
         f"service.eval_episodes={TEST_EPISODES}",
     )
-    run("tangram-train", f"run_dir={folder}", *short, *rounds, cwd=tmp_path)
-    ours = make_fingerprint(make_setup(composed("train", ["run_dir=x", *short])))
+    run("tangram-train", f"run_dir={folder}", *short, cwd=tmp_path)
+    ours = make_fingerprint(make_setup(composed("train", ["run_dir=x"])))
     result = json.loads((folder / "result.json").read_text())
     learned = load_checkpoint(newest_checkpoint(folder / "checkpoints"), [ACTING])
     theirs = {name: result[name] for name in SCORES}

@@ -31,16 +31,20 @@ def experiment(kind: str, trainings: list[str], source: str = "beyond", **more: 
     return {**texts, "kind": kind, "trainings": trainings, "tests": []} | more
 
 
+FINGERPRINT = {"mean_reward": 0.5, "weights": 1000.0}
+
+
 def plan(experiments: Row, trainings: Row, tests: Row, seeds: tuple[int, ...] = (0, 1, 2)) -> Row:
     budget = {"name": "laptop", "note": "Narrower MHA.", "test_episodes": 100, "test_seed": 2}
     return {
-        "format": 3,
+        "format": 4,
         "command": "tangram-experiment experiment=[all] budget=laptop run_dir=runs/paper jobs=2",
         "commit": "0123abc",
         "budget": budget,
         "experiments": experiments,
         "trainings": {name: one | {"seeds": list(seeds)} for name, one in trainings.items()},
         "tests": tests,
+        "fingerprints": dict.fromkeys(trainings, FINGERPRINT),
     }
 
 
@@ -54,6 +58,7 @@ def result(seed: int, mean_reward: float | None = 0.75, **more: Any) -> Row:
         "test_episodes": 100,
         "episodes": 20_640,
         "updates": 2000,
+        "scored_updates": 2000,
         "wall_s": 60.0 + seed,
         "train_s": 54.0 + 6 * seed,
         "ended_by": "max_updates=2000",
@@ -92,6 +97,9 @@ def scores(mean_reward: float, baselines: Row | None = BASELINES, **more: Any) -
         "mean_reward": mean_reward,
         "angle_error_deg_median": 100.0 * (1.0 - mean_reward),
         "run_dir": "/home/somebody/run",
+        "episodes": 100,
+        "test_seed": 2,
+        "updates": 2000,
     } | more
     return row if baselines is None else row | {"baselines": baselines}
 
@@ -101,6 +109,7 @@ def of_several(coverage: list[float], **more: Any) -> Row:
     return {
         "coverage": float(np.mean(coverage)),
         "coverage_each": coverage,
+        "episodes": len(coverage),
         "share_solved": float(np.mean(np.array(coverage) >= 0.95)),
         "iou": 0.9,
         "wrong": 0.25,

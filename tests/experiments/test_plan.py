@@ -1,6 +1,7 @@
 """Which trainings and tests a study consists of, what it refuses, and the processes it needs."""
 
 import json
+import re
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -8,12 +9,11 @@ from typing import Any
 import pytest
 import yaml
 
-from tangram_agent.setup import from_mapping
+from tangram_agent.setup import Setup, from_mapping
 from tangram_lab.experiments import runner
 from tangram_lab.experiments.cli import _asked
 from tangram_lab.experiments.jobs import Job, make_jobs
 from tangram_lab.experiments.plan import StudyConfig, joined_plan, plan_content
-from tangram_lab.experiments.runner import run_study
 from tangram_sim.errors import ConfigError
 
 pytestmark = pytest.mark.fast
@@ -104,7 +104,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         for change, text in (
             ({"seeds": []}, "budget.seeds must be different numbers, got"),
             ({"seeds": [1, 1]}, "budget.seeds must be different numbers, got"),
-            ({"seeds": [0, -1]}, "budget.seeds must be at least 0, got -1"),
+            ({"seeds": [0, -1]}, "budget.seeds must be between 0 and 9.22337e\\+18, got -1"),
             ({"main_seeds": []}, "budget.main_seeds must be different numbers, got"),
             ({"test_episodes": 0}, "budget.test_episodes must be at least 1, got 0"),
             ({"test_seed": -1}, "budget.test_seed must be at least 0, got -1"),
@@ -136,7 +136,7 @@ def test_a_circle_of_warm_starts_is_refused(tmp_path: Path) -> None:
 
 def test_the_plan_says_everything_that_a_report_needs(tmp_path: Path) -> None:
     plan = plan_content(study(tmp_path), {"command": "tangram-experiment x", "commit": "abc"})
-    assert (plan["format"], plan["command"], plan["commit"]) == (3, "tangram-experiment x", "abc")
+    assert (plan["format"], plan["command"], plan["commit"]) == (4, "tangram-experiment x", "abc")
     texts = {"name": "tiny", "note": "Nothing is learned."}
     assert plan["budget"] == {**texts, "test_episodes": 5, "test_seed": 2}
     assert list(plan["experiments"]) == ["one", "two"]
@@ -174,7 +174,7 @@ def test_a_plan_keeps_what_was_there(tmp_path: Path) -> None:
         ({}, {"name": "huge"}, "was made with budget.name=tiny, now it is huge: choose another"),
         ({}, {"test_episodes": 6}, "was made with budget.test_episodes=5, now it is 6"),
         ({}, {"test_seed": 0}, "was made with budget.test_seed=2, now it is 0"),
-        ({"format": 2}, {}, "is of format 2, and this version writes 3: choose another run_dir"),
+        ({"format": 2}, {}, "is of format 2, and this version writes 4: choose another run_dir"),
     ],
 )
 def test_another_budget_or_version_needs_another_folder(
@@ -183,6 +183,22 @@ def test_another_budget_or_version_needs_another_folder(
     before = plan_content(study(tmp_path), {}) | earlier
     with pytest.raises(ConfigError, match=message):
         joined(tmp_path, before, budget=content(tmp_path)["budget"] | budget)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"trainings": {"tangram": []}},
+        {"trainings": {"tangram": {}}},
+        {"trainings": {"tangram": {"seeds": None}}},
+        {"trainings": {"tangram": {"seeds": ["a"]}}},
+        {"tests": None},
+        {"budget": 3},
+    ],
+)
+def test_a_damaged_plan_is_told(tmp_path: Path, damage: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match="cannot read .*plan.json: remove it, or choose"):
+        joined(tmp_path, plan_content(study(tmp_path), {}) | damage)
 
 
 @pytest.mark.parametrize(
@@ -404,19 +420,36 @@ def test_a_wrong_test_is_told_before_all_trainings(
         asked(config)
 
 
-@pytest.mark.parametrize(("before", "told"), [("abc", False), ("def", True)])
-def test_another_commit_in_the_same_folder_is_told(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    before: str,
-    told: bool,
+@pytest.mark.parametrize(
+    ("before", "told"),
+    [
+        ({}, None),
+        ({"a": {"weights": 100.05, "reward": 0.5}}, None),  # as processors differ
+        ({"b": {"weights": 7.0, "reward": 0.5}}, None),  # nothing of it is to be trained
+        (
+            {"a": {"weights": 101.0, "reward": 0.5}},
+            "other seeds of a are of code that trained otherwise: after 20 updates weights is "
+            "100.0, and was 101.0: choose another run_dir",
+        ),
+        ({"a": {"weights": 100.0}}, "reward is 0.5, and was None"),
+    ],
+)
+def test_seeds_of_a_training_are_of_code_that_trains_alike(
+    monkeypatch: pytest.MonkeyPatch, before: dict[str, Any], told: str | None
 ) -> None:
-    monkeypatch.setattr(runner, "_source", lambda: {"command": "x", "commit": "abc"})
-    config = study(tmp_path / "study", experiments={})
-    (tmp_path / "study").mkdir()
-    earlier = plan_content(config, {"command": "x", "commit": before})
-    (tmp_path / "study" / "plan.json").write_text(json.dumps(earlier))
-    assert run_study(config, {}, {}, None) == 0
-    line = "was begun at commit def, and now it is abc: tangram-report check asks for one"
-    assert (line in capsys.readouterr().out) is told
+    now = {"weights": 100.0, "reward": 0.5}
+    monkeypatch.setattr(runner, "make_fingerprints", lambda found, make: dict.fromkeys(found, now))
+    plan = {"trainings": {"a": {"overrides": ["seed=1"]}}, "fingerprints": before}
+    jobs = [
+        Job("a, seed 0", "a", (), Path("a"), Path("a")),
+        Job("b, seed 0, test t", "b", (), Path("b"), Path("b"), trains=False),
+    ]
+
+    def make(arguments: object) -> Setup:
+        raise AssertionError(arguments)
+
+    if told is None:
+        assert runner._fingerprints(plan, make, jobs) == {"a": now}
+    else:
+        with pytest.raises(ConfigError, match=re.escape(told)):
+            runner._fingerprints(plan, make, jobs)

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.fast
 
 
 def job(folder: Path, **settings: object) -> Job:
-    return Job("square, seed 0", ("x",), folder, folder / "result.json", None, settings)
+    return Job("square, seed 0", "square", ("x",), folder, folder / "result.json", None, settings)
 
 
 @pytest.mark.parametrize(

@@ -119,7 +119,8 @@ def test_command_line(
     monkeypatch.setattr(report_page, "draw_paper_pictures", lambda out, draws: [])
     monkeypatch.setenv("HYDRA_FULL_ERROR", "")
     monkeypatch.chdir(tmp_path)
-    write_plan(tmp_path / "runs", plan({}, {}, {}))
+    write_plan(tmp_path / "runs", plan({}, {"ours": training("ours", "x")}, {}, (0,)))
+    write_run(tmp_path / "runs", "ours", result(0), [])
     monkeypatch.setattr(sys, "argv", ["tangram-report", "runs=runs", "out=out"])
     assert report() == 0
     assert (tmp_path / "out" / "tables.md").exists()
@@ -139,7 +140,8 @@ def test_folders_are_named() -> None:
 
 
 def test_a_report_that_cannot_be_written(tmp_path: Path) -> None:
-    write_plan(tmp_path, plan({}, {}, {}))
+    write_plan(tmp_path, plan({}, {"ours": training("ours", "x")}, {}, (0,)))
+    write_run(tmp_path, "ours", result(0), [])
     (tmp_path / "out").write_text("a file")
-    with pytest.raises(RunError, match="cannot make .*figures .*: choose another folder with out="):
+    with pytest.raises(RunError, match="cannot write to .*out .*: make room, or choose another fo"):
         write_report(tmp_path, tmp_path / "out")

@@ -9,15 +9,16 @@ from typing import Any
 import pytest
 
 from tangram_agent.setup import Setup
+from tangram_lab.experiments.fingerprints import differences
 from tangram_lab.experiments.report import check as report_check
 from tangram_lab.experiments.report import page
 from tangram_lab.experiments.report.check import Sources, check, check_page
 from tangram_lab.experiments.report.data import read_data, write_data
-from tangram_lab.experiments.report.fingerprints import differences, families
 from tangram_lab.experiments.report.page import write_report
 from tangram_lab.experiments.report.reading import read_runs
 from tangram_sim.errors import RunError
 from tests.experiments.builders import (
+    FINGERPRINT,
     experiment,
     learning_curve,
     plan,
@@ -48,9 +49,18 @@ PAGES = [
     ("<!-- data: fig5 -->\nIt has 0.996.", ["0.996 is not in fig5"]),
     ("<!-- data: fig5 fig4 -->\nIt has 0.996.", []),
     ("<!-- data: large/fig4 -->\nIt has 0.998 and 0.996.", ["0.996 is not in large/fig4"]),
-    ("<!-- data: bench.json -->\nIt has 0.123, 0.1234 and 3.000.", []),
+    ("<!-- data: bench.json -->\nIt has 0.123, 0.1234 and -3.000.", []),
     ("<!-- data: bench.json -->\nIt has 1.000.", ["1.000 is not in bench.json"]),  # true is none
     ("<!-- data: paper -->\nThe paper has 0.758 and 0.759.", ["0.759 is not in paper"]),
+    ("<!-- data: paper -->\nThe paper has 0.760.", ["0.760 is not in paper"]),
+    ("<!-- data: fig4 -->\nIt has -0.996.", ["-0.996 is not in fig4"]),
+    ("<!-- data: fig4 -->\nFrom 0.995-0.996.", []),
+    ("<!-- data: bench.json -->\nIt has 3.000.", ["3.000 is not in bench.json"]),  # it is -3
+    ("<!-- data: data.json -->\nIt has 0.996.", ["has a source that is none"]),
+    ("<!-- data: fig4 -->\n````\n```\n````  \n\nIt has 0.111.", ["0.111 is not in fig4"]),
+    ("It has 0.996. <!-- data: none -->", ["has no source"]),
+    ("<!-- data: commit -->\nIt had 0.111.", ["name the commit by 7 digits or more"]),
+    ("<!-- data: commit a -->\nIt had a 0.111.", ["name the commit by 7 digits or more"]),
     ("<!-- data: commit 0123abc -->\nAt commit 0123abc it had 0.111.", []),
     ("<!-- data: commit 0123abc -->\nIt had 0.111.", ["is of commit 0123abc, which the text does"]),
     ("<!-- data: none -->\nA side of 0.125.", []),
@@ -79,14 +89,11 @@ def test_a_line_is_named(numbers: Sources) -> None:
 
 @pytest.mark.parametrize("name", ["fig9", "nowhere.json", "../data.yaml"])
 def test_a_source_that_is_none(numbers: Sources, name: str) -> None:
-    with pytest.raises(RunError, match="no source is called"):
-        [*check_page("p.md", f"<!-- data: {name} -->\n0.111", numbers)]
+    (found,) = check_page("p.md", f"<!-- data: {name} -->\n0.111", numbers)
+    assert f"p.md:1: 0.111 has a source that is none: no source is called {name}" in found
 
 
 # The whole
-
-
-FINGERPRINT = {"x": {"mean_reward": 0.5, "weights": 1000.0}}
 
 
 def never(arguments: Sequence[str]) -> Setup:
@@ -98,15 +105,16 @@ def never(arguments: Sequence[str]) -> Setup:
 def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The report of a whole study of one training."""
     monkeypatch.setattr(page, "draw_paper_pictures", lambda out, draws: [])
-    monkeypatch.setattr(page, "make_fingerprints", lambda trainings, make: FINGERPRINT)
-    monkeypatch.setattr(report_check, "make_fingerprints", lambda trainings, make: FINGERPRINT)
+    monkeypatch.setattr(
+        report_check, "make_fingerprints", lambda found, make: dict.fromkeys(found, FINGERPRINT)
+    )
     one = experiment("curves", ["ours"], tests=["random"])
     tests = {"random": {"label": "random", "overrides": []}}
     write_plan(tmp_path, plan({"fig4": one}, {"ours": training("ours", "x")}, tests, (0, 1)))
     for seed in (0, 1):
         curve, test = learning_curve(seed, 0.9), {"random": scores(0.912)}
         write_run(tmp_path, "ours", result(seed), curve, test)
-    write_report(tmp_path, tmp_path / "results", never)
+    write_report(tmp_path, tmp_path / "results")
     return tmp_path / "results"
 
 
@@ -147,11 +155,36 @@ def test_a_report_in_a_folder_of_the_results_is_a_source_too(both: Path) -> None
     ]
 
 
-def test_all_reports_are_of_one_commit_and_each_is_whole(both: Path) -> None:
-    changed(both / "large", {"result": result(1, commit="fedcba9")})
-    assert "the runs are of several commits: 0123abc, fedcba9" in checked(both)
+def test_each_report_is_whole(both: Path) -> None:
     changed(both / "large", {"state": "not finished", "result": {}, "tests": {}})
     assert "large/ours lacks the seeds [1]" in checked(both)
+
+
+@pytest.mark.parametrize("name", ["fig4.png", "fig4.svg", "old.png"])
+def test_figures_are_those_that_were_drawn_of_the_data(results: Path, name: str) -> None:
+    folder = results / "figures"
+    with (folder / name).open("ab") as file:
+        file.write(b"x")
+    assert checked(results) == [f"{folder} has not the figures of data.json: {name}"]
+    (folder / name).unlink()
+    assert (checked(results) == []) == (name == "old.png")
+
+
+def test_a_report_that_fails_leaves_the_earlier_one_whole(results: Path) -> None:
+    before = {path: path.read_bytes() for path in results.rglob("*") if path.is_file()}
+    curve = results.parent / "trainings" / "ours" / "seed_0" / "curve.jsonl"
+    point = json.loads(curve.read_text().splitlines()[-1])
+    with curve.open("a") as file:
+        file.write(json.dumps(point | {"note": "x"}) + "\n")
+    with pytest.raises(RunError, match=r"Expected `float \| null`, got `str`"):
+        write_report(results.parent, results)
+    assert {path: path.read_bytes() for path in results.rglob("*") if path.is_file()} == before
+
+
+def test_nothing_takes_the_place_of_a_report_before_a_run_is_finished(tmp_path: Path) -> None:
+    write_plan(tmp_path, plan({}, {}, {}))
+    with pytest.raises(RunError, match="no run is finished in .*: wait for one"):
+        write_report(tmp_path, tmp_path / "results")
 
 
 def test_tables_that_were_changed_by_hand(results: Path) -> None:
@@ -165,9 +198,15 @@ def test_tables_that_were_changed_by_hand(results: Path) -> None:
     [
         ({"state": "not finished", "result": {}, "tests": {}}, "ours lacks the seeds [1]"),
         ({"tests": {}}, "ours lacks the test random of fig4"),
-        ({"result": result(1, commit="fedcba9")}, "several commits: 0123abc, fedcba9"),
-        ({"result": result(1, commit="0123abc-dirty")}, "that was changed, or of none: 0123abc-di"),
-        ({"result": result(1, commit=None)}, "that was changed, or of none: None"),
+        ({"result": result(1, commit="0123abc-dirty")}, "changed tree, or of none: 0123abc-dirty"),
+        ({"result": result(1, commit=None)}, "of a changed tree, or of none: None"),
+        ({"result": result(1, commit="banana")}, "of a changed tree, or of none: banana"),
+        ({"result": result(1) | {"seed": 7}}, "ours, seed 1: its seed is 7"),
+        ({"result": result(1, ended_by="SIGTERM")}, "seed 1: it did not come to its end"),
+        ({"result": result(1, scored_updates=1999)}, "seed 1: it did not come to its end"),
+        ({"tests": {"random": scores(0.9, episodes=3)}}, "has episodes=3, not 100"),
+        ({"tests": {"random": scores(0.9, test_seed=0)}}, "has test_seed=0, not 2"),
+        ({"tests": {"random": scores(0.9, updates=7)}}, "has updates=7, not 2000"),
     ],
 )
 def test_what_the_study_lacks(results: Path, change: dict[str, Any], told: str) -> None:
@@ -176,42 +215,35 @@ def test_what_the_study_lacks(results: Path, change: dict[str, Any], told: str) 
 
 
 def test_code_that_trains_otherwise(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    now = {"x": {"mean_reward": 0.5, "weights": 1003.0}}
-    monkeypatch.setattr(report_check, "make_fingerprints", lambda trainings, make: now)
-    (found,) = checked(results)
-    assert "family x trains otherwise" in found
-    assert "weights is 1003.0, and was 1000.0" in found
-
-
-def test_a_fingerprint_may_differ_as_processors_do() -> None:
-    near = {"x": {"mean_reward": 0.5001, "weights": 1000.9}}
-    assert not [*differences("x", FINGERPRINT, near)]
-    assert [*differences("x", FINGERPRINT, {"x": {}})]
-
-
-def test_a_family_whose_fingerprint_nobody_kept_is_told(results: Path) -> None:
-    data = json.loads((results / "data.json").read_text())
-    (results / "data.json").write_text(json.dumps(data | {"fingerprints": {}}))
+    now = {"ours": {"mean_reward": 0.5, "weights": 1003.0}}
+    monkeypatch.setattr(report_check, "make_fingerprints", lambda found, make: now)
     assert checked(results) == [
-        "family x has no fingerprint: make the report with fingerprints=true"
+        "ours trains otherwise than when its figures were made: after 20 updates weights is "
+        "1003.0, and was 1000.0: make them anew with make evidence"
     ]
 
 
-def test_a_family_is_trained_by_the_first_of_its_trainings_for_a_short_while() -> None:
-    first = training("a", "x", "k=1", "agent.batch_size=64")
-    assert families({"a": first, "b": training("b", "x"), "c": training("c", "y")}) == {
-        "x": ["k=1", "agent.batch_size=16", "agent.learning_starts=32"],
-        "y": ["agent.batch_size=16", "agent.learning_starts=32"],
-    }
+@pytest.mark.parametrize("kept", [{}, {"ours": {}}, {"ours": {"mean_reward": 0.5}}])
+def test_a_fingerprint_that_nobody_kept_is_told(results: Path, kept: dict[str, Any]) -> None:
+    data = json.loads((results / "data.json").read_text())
+    data["plan"]["fingerprints"] = kept
+    (results / "data.json").write_text(json.dumps(data))
+    (found,) = checked(results)
+    assert "weights is 1000.0, and was None" in found
+
+
+def test_a_fingerprint_may_differ_as_processors_do() -> None:
+    assert not differences(FINGERPRINT, {"mean_reward": 0.5001, "weights": 1000.9})
+    assert differences(FINGERPRINT, {"mean_reward": 0.502, "weights": 1000.0})
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"format": 1}, "its format is 1, but this version reads 2"),
+        ({"format": 1}, "its format is 1, but this version reads 3"),
         ({"runs": {}}, "ours, seed 0 of its plan is missing"),
         ({"runs": 3}, r"Expected `object`, got `int` - at `\$.runs`"),
-        ({"plan": {}}, "its format is None, but this version reads 3"),
+        ({"plan": {}}, "its format is None, but this version reads 4"),
     ],
 )
 def test_data_that_are_not_what_they_should_be(

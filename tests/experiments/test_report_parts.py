@@ -348,7 +348,8 @@ def test_a_difference_is_paired_by_episode_and_averaged_over_the_seeds(tmp_path:
     }
     for name, seeds in each.items():
         for seed, coverage in enumerate(seeds):
-            test = scores(2 * float(np.mean(coverage)) - 1, coverage_each=coverage)
+            mean = 2 * float(np.mean(coverage)) - 1
+            test = scores(mean, coverage_each=coverage, episodes=3)
             write_run(tmp_path, name, result(seed), [], {"random": test})
     study = read_runs(tmp_path)
     (row,) = cells("\n".join(ranking_table(study, study.experiments[0])), "less")

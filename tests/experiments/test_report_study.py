@@ -98,7 +98,7 @@ def budget(**changes: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"format": 2}, "its format is 2, but this version reads 3"),
+        ({"format": 2}, "its format is 2, but this version reads 4"),
         ({"budget": {}}, "missing required field `name` - at `$.budget`; run its tangram-experi"),
         ({"budget": []}, "Expected `object`, got `array` - at `$.budget`"),
         *(
@@ -111,8 +111,10 @@ def budget(**changes: Any) -> dict[str, Any]:
         (budget(test_episodes=-1), "Expected `int` >= 0 - at `$.budget.test_episodes`"),
         ({"command": 3}, "Expected `str`, got `int` - at `$.command`"),
         ({"trainings": {"paper": {}}}, "missing required field `label` - at `$.trainings[...]`"),
-        ({"trainings": {"../x": PAPER}}, "'../x' is no name of"),
+        ({"trainings": {"../x": PAPER | {"seeds": [0]}}}, "'../x' is no name of"),
         ({"tests": {"a b": {"label": ""}}}, "'a b' is no name"),
+        ({"trainings": {"paper": PAPER}}, "seeds must be different numbers, got []"),
+        ({"trainings": {"paper": PAPER | {"seeds": [1, 1]}}}, "seeds must be different numbers"),
         ({"trainings": {}}, "its trainings lack 'paper'"),
         ({"tests": {}}, "its tests lack 'actions_1'"),
     ],

@@ -62,7 +62,7 @@ def job(
     folder: Path, name: str, awaits: str = "", needs: Job | None = None, leaves: bool = True
 ) -> Small:
     run_dir = folder / name
-    return Small(name, (), run_dir, run_dir / "result.json", needs, {}, True, awaits, leaves)
+    return Small(name, name, (), run_dir, run_dir / "result.json", needs, {}, True, awaits, leaves)
 
 
 def start_of(folder: Path, jobs: list[Small], at_once: int) -> int:

@@ -10,32 +10,33 @@ A comment above a paragraph, a list or a table says where its numbers are from:
     <!-- data: none -->              no score: a setting, a size
 """
 
-import json
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from tangram_lab.experiments.report.data import read_data
-from tangram_lab.experiments.report.fingerprints import (
+from tangram_lab.experiments.fingerprints import (
+    UPDATES,
     MakeSetup,
     differences,
-    families,
     make_fingerprints,
 )
-from tangram_lab.experiments.report.page import DATA, TABLES, tables_page
+from tangram_lab.experiments.report.data import read_data
+from tangram_lab.experiments.report.page import DATA, FIGURES, TABLES, figure_sums, tables_page
+from tangram_lab.experiments.report.reading import parsed, read_bytes
 from tangram_lab.experiments.report.references import VALUES
-from tangram_lab.experiments.report.study import Study
+from tangram_lab.experiments.report.study import Row, Seed, Study
 from tangram_sim.errors import RunError
 
 MARK = re.compile(r"<!-- data: (?P<sources>[^>]+?) -->")
 # Three decimals and more: scores have as many, and little else has.
-SCORE = re.compile(r"(?<![\w.])\d+\.\d{3,}(?!\w|\.\d)")
-CODE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
+SCORE = re.compile(r"(?<![\w.])-?\d+\.\d{3,}(?!\w|\.\d)")
+CODE = re.compile(r"^(?P<fence>```+)[^`\n]*\n.*?^(?P=fence)`*[ \t]*$", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`[^`\n]*`|\]\([^)]*\)")
 SECTION = re.compile(r'^<a id="(?P<name>[^"]+)"></a>$', re.MULTILINE)
+MEND = "make it anew"
 NO_SCORE, OLDER, PAPERS = "none", "commit", "paper"
-CHANGED = "-dirty"  # of a commit in a result: the source tree was not as committed
+COMMIT = "[0-9a-f]{7,40}"  # one with -dirty is of a source tree that was not as committed
 
 
 def check(results: Path, pages: Iterable[Path], make: MakeSetup) -> list[str]:
@@ -50,21 +51,18 @@ def check(results: Path, pages: Iterable[Path], make: MakeSetup) -> list[str]:
         RunError: the data cannot be read.
         ConfigError: this code refuses a training of them.
     """
-    found, tables, commits = list[str](), dict[str, str](), set[str | None]()
+    found, tables = list[str](), dict[str, str]()
     for prefix, folder in reports(results).items():
-        study, fingerprints = read_data(folder / DATA)
-        tables[prefix] = (folder / TABLES).read_text(encoding="utf-8")
+        study, figures = read_data(folder / DATA)
+        tables[prefix] = _text(folder / TABLES)
         if tables_page(study, folder) != tables[prefix]:
             found.append(f"{folder / TABLES} is not what {DATA} gives: make it anew")
-        found += (f"{prefix}{line}" for line in _lacks(study))
-        commits |= {seed.result.get("commit") for one in study.trainings for seed in one.finished}
-        trainings = study.plan["trainings"]
-        now = make_fingerprints(trainings, make)
-        found += (f"{prefix}{line}" for line in differences(families(trainings), fingerprints, now))
-    found += _of_commits(commits)
+        if others := figures.items() ^ figure_sums(folder).items():
+            found.append(f"{folder / FIGURES} has not the figures of {DATA}: {min(others)[0]}")
+        found += (f"{prefix}{line}" for line in (*_lacks(study), *_trained_otherwise(study, make)))
     numbers = Sources(results, tables)
     for page in pages:
-        found += check_page(page.name, page.read_text(encoding="utf-8"), numbers)
+        found += check_page(page.name, _text(page), numbers)
     return found
 
 
@@ -74,24 +72,57 @@ def reports(results: Path) -> dict[str, Path]:
     return {"": results, **{f"{folder.name}/": folder for folder in others}}
 
 
-def _of_commits(commits: Collection[str | None]) -> Iterator[str]:
-    if len(commits) > 1:
-        yield f"the runs are of several commits: {', '.join(sorted(map(str, commits)))}"
-    if changed := sorted(str(one) for one in commits if not one or one.endswith(CHANGED)):
-        yield f"the runs are of a tree that was changed, or of none: {', '.join(changed)}"
+def _text(path: Path) -> str:
+    text = read_bytes(path, "make it anew with tangram-report")
+    try:
+        return text.decode()
+    except UnicodeDecodeError:
+        raise RunError(f"{path}: it is not UTF-8; mend it") from None
 
 
 def _lacks(study: Study) -> Iterator[str]:
-    """Seeds that were planned and not trained, tests that were not made."""
+    """Seeds that were planned and not trained, tests that were not made, and what is otherwise."""
     for training in study.trainings:
         left = [seed.number for seed in training.seeds if not seed.finished]
         if left:
             yield f"{training.name} lacks the seeds {left}"
+        for seed in training.finished:
+            yield from (f"{training.name}, seed {seed.number}: {one}" for one in _odd(study, seed))
     for experiment in study.experiments:
         for training in experiment.trainings:
             for test in experiment.tests:
                 if any(test.name not in seed.tests for seed in training.finished):
                     yield f"{training.name} lacks the test {test.name} of {experiment.name}"
+
+
+def _odd(study: Study, seed: Seed) -> Iterator[str]:
+    """Where a run is not what the plan asks for."""
+    result, budget = seed.result, study.budget
+    if not re.fullmatch(COMMIT, result["commit"] or ""):
+        yield f"it is of a changed tree, or of none: {result['commit']}"
+    if result.get("seed") != seed.number:
+        yield f"its seed is {result.get('seed')}"
+    bounded, scored = result["ended_by"].startswith("max_"), result.get("scored_updates")
+    if not bounded or scored != result["updates"]:
+        yield "it did not come to its end"
+    for name, test in seed.tests.items():
+        asked = {"updates": result["updates"], "test_seed": budget.test_seed}
+        if "puzzle" not in test:
+            asked["episodes"] = budget.test_episodes
+        for key, value in asked.items():
+            if test.get(key) != value:
+                yield f"test {name} has {key}={test.get(key)}, not {value}"
+
+
+def _trained_otherwise(study: Study, make: MakeSetup) -> Iterator[str]:
+    """The trainings that would come to other numbers now."""
+    now = make_fingerprints({one.name: one.overrides for one in study.trainings}, make)
+    for name, found in now.items():
+        if others := differences(study.fingerprints.get(name, {}), found):
+            yield (
+                f"{name} trains otherwise than when its figures were made: after {UPDATES} updates "
+                f"{', '.join(others)}: make them anew with make evidence"
+            )
 
 
 class Sources:
@@ -115,43 +146,43 @@ class Sources:
         if source == NO_SCORE:
             return True
         if source == PAPERS:
-            return text.rstrip("0") in json.dumps(VALUES)
+            return float(text) in _numbers(VALUES)
         if source in self._sections:
-            return bool(re.search(rf"(?<![\d.]){re.escape(text)}(?![\d])", self._sections[source]))
+            return bool(re.search(rf"(?<![\d.-]){re.escape(text)}(?!\d)", self._sections[source]))
         return any(_rounds_to(number, text) for number in self._file(source))
 
     def _file(self, name: str) -> Iterator[float]:
         path = self._results / name
-        if not (path.suffix == ".json" and path.is_file()):
+        if name == DATA or not (path.suffix == ".json" and path.is_file()):
             raise RunError(
                 f"no source is called {name}: name an experiment of {TABLES}, a .json file of "
                 f"{self._results}, {PAPERS}, {OLDER} or {NO_SCORE}"
             )
-        yield from _numbers(json.loads(path.read_text(encoding="utf-8")))
+        yield from _numbers(parsed(read_bytes(path, MEND), Row, str(path), MEND)[0])
 
 
 def _numbers(content: Any) -> Iterator[float]:
     if isinstance(content, Mapping):
         content = list(content.values())
-    if isinstance(content, list):
+    if isinstance(content, list | tuple):
         for one in content:
             yield from _numbers(one)
-    elif isinstance(content, int | float) and not isinstance(content, bool):
-        yield float(content)
+    elif isinstance(content, float) or type(content) is int:
+        yield content
 
 
 def _rounds_to(number: float, text: str) -> bool:
     """Whether a number is written so, as it is or halfway between two."""
     digits = len(text.partition(".")[2])
-    return abs(abs(number) - float(text)) <= 0.500001 * 10.0**-digits
+    return abs(number - float(text)) <= 0.500001 * 10.0**-digits
 
 
 def check_page(name: str, text: str, numbers: Sources) -> Iterator[str]:
     """The scores of a page that have no source, or are not in it."""
     sources: str | None = None
     for line, block in _blocks(text):
-        marks = [found["sources"] for found in MARK.finditer(block)]
-        sources = marks[-1] if marks else sources
+        mark = MARK.match(block.lstrip())
+        sources = mark["sources"] if mark else sources
         bare = INLINE.sub("", MARK.sub("", block))
         for score in dict.fromkeys(SCORE.findall(bare)):
             if wrong := _wrong(sources, score, bare, numbers):
@@ -167,11 +198,15 @@ def _wrong(sources: str | None, score: str, block: str, numbers: Sources) -> str
     if rest and NO_SCORE in (first, *rest):
         return f"has the source {sources}: {NO_SCORE} stands alone"
     if first == OLDER:
+        if not (rest and all(re.fullmatch(COMMIT, one) for one in rest)):
+            return f"has the source {sources}: name the commit by 7 digits or more"
         missing = [one for one in rest if one not in block]
         return f"is of commit {missing[0]}, which the text does not say" if missing else ""
-    if any(numbers.has(source, score) for source in (first, *rest)):
-        return ""
-    return f"is not in {sources}"
+    try:
+        found = any(numbers.has(source, score) for source in (first, *rest))
+    except RunError as error:
+        return f"has a source that is none: {error}"
+    return "" if found else f"is not in {sources}"
 
 
 def _blocks(text: str) -> Iterator[tuple[int, str]]:

@@ -2,6 +2,7 @@
 
 import json
 import shlex
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,25 +10,24 @@ from typing import Any
 from tangram_agent.files import write_whole
 from tangram_lab.experiments.report.numbers import thinned
 from tangram_lab.experiments.report.reading import (
+    EACH,
+    POINT,
     RESULT,
-    TEST,
     checked_plan,
+    checked_test,
     converted,
     make_study,
     parsed,
     read_bytes,
 )
 from tangram_lab.experiments.report.study import FINISHED, Count, Row, Seed, Study
-from tangram_lab.experiments.report.tables import EACH
 from tangram_sim.errors import RunError
 
-FORMAT = 2
+FORMAT = 3
 DIGITS = 6  # of its numbers
 EACH_DIGITS = 4  # of the coverage of every episode
 REPORT = "make it again with tangram-report runs=... out=..."
 SETTINGS = ("sim", "agent")  # of a test; the plan has those that it asked for
-
-Fingerprints = dict[str, dict[str, float]]
 
 
 @dataclass(frozen=True)
@@ -42,24 +42,24 @@ class _Run:
 @dataclass(frozen=True)
 class _Data:
     plan: Row
-    fingerprints: Fingerprints
+    figures: dict[str, str]
     runs: dict[str, list[_Run]]
 
 
-def write_data(path: Path, study: Study, fingerprints: Fingerprints) -> None:
+def write_data(path: Path, study: Study, figures: Mapping[str, str]) -> None:
     """The plan, and of every run its state, result, tests and a curve of at most 60 points.
 
     Args:
         path: of the file.
         study: what it is of.
-        fingerprints: of the code that trained, see `fingerprints`.
+        figures: file -> SHA-256 of the pictures that were drawn of it.
 
     Raises:
         RunError: it cannot be written.
     """
     runs = {one.name: [_seed_data(seed) for seed in one.seeds] for one in study.trainings}
     plan = study.plan | ({"command": _without_paths(study.command)} if study.plan else {})
-    content = {"format": FORMAT, "plan": plan, "fingerprints": fingerprints, "runs": runs}
+    content = {"format": FORMAT, "plan": plan, "figures": figures, "runs": runs}
     write_whole(path, (_json(content, "") + "\n").encode())
 
 
@@ -116,8 +116,8 @@ def _json(value: Any, indent: str) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def read_data(path: Path) -> tuple[Study, Fingerprints]:
-    """The study of a data.json, and the fingerprints of the code that trained it.
+def read_data(path: Path) -> tuple[Study, dict[str, str]]:
+    """The study of a data.json, and the sums of its figures.
 
     Raises:
         RunError: the file is not what it should be.
@@ -137,16 +137,18 @@ def read_data(path: Path) -> tuple[Study, Fingerprints]:
             raise RunError(f"{place}: {name}, seed {seed} of its plan is missing; {REPORT}")
         return _read_seed(runs[name, seed], f"{place}: {name}, seed {seed}")
 
-    return make_study(data.plan, checked_plan(data.plan, place), read), data.fingerprints
+    return make_study(data.plan, checked_plan(data.plan, place), read), data.figures
 
 
 def _read_seed(run: _Run, place: str) -> Seed:
     if run.state == FINISHED:
         converted(run.result, RESULT, place, REPORT)
     for name, test in run.tests.items():
-        converted(test, TEST, f"{place}, test {name}", REPORT)
+        checked_test(test, f"{place}, test {name}", REPORT)
     if len({len(column) for column in run.curve.values()}) > 1:
         raise RunError(f"{place}: the columns of its curve are not of one length; {REPORT}")
     rows = zip(*run.curve.values(), strict=True)
     curve = tuple(dict(zip(run.curve, row, strict=True)) for row in rows)
+    for point in curve:
+        converted(point, POINT, f"{place}: its curve", REPORT)
     return Seed(run.seed, run.state, run.result, curve, run.tests)

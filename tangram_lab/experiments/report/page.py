@@ -4,7 +4,9 @@ import shlex
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from matplotlib.figure import Figure
 
@@ -21,7 +23,6 @@ from tangram_lab.experiments.report.figures import (
     sweep_parts,
     sweeps,
 )
-from tangram_lab.experiments.report.fingerprints import MakeSetup, make_fingerprints
 from tangram_lab.experiments.report.numbers import ANGLE, DENSE, REWARD
 from tangram_lab.experiments.report.profiles import draw_profile
 from tangram_lab.experiments.report.reading import read_runs
@@ -78,35 +79,54 @@ WORLDS = (
 REACHED = "Episodes are those at the first evaluation in which a seed reached the mean reward."
 
 
-def write_report(runs: Path, out: Path, make: MakeSetup | None = None) -> list[Path]:
+def write_report(runs: Path, out: Path) -> list[Path]:
     """Report on a study; files of an earlier report in the same place are replaced.
 
     Args:
         runs: the study's folder, or one whose folders are runs.
         out: folder for tables.md, data.json and figures/.
-        make: the setup that a training's arguments come to, where data.json is to keep
-            fingerprints of the code.
 
     Returns:
         The page and the data.
 
     Raises:
-        RunError: a file of the study is not what it should be, or `out` cannot be written.
+        RunError: a file of the study is not what it should be, no run is finished, or `out` cannot
+            be written.
     """
     study = read_runs(runs)
+    if not any(one.finished for one in study.trainings):
+        raise RunError(f"no run is finished in {runs}: wait for one, or name another folder")
     try:
         (out / FIGURES).mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(prefix=".report-", dir=out) as folder:
+            made = Path(folder)
+            _make(study, made)
+            names = [f"{FIGURES}/{path.name}" for path in sorted((made / FIGURES).iterdir())]
+            for name in (*names, DATA, TABLES):
+                (made / name).replace(out / name)
     except OSError as error:
         raise RunError(
-            f"cannot make {out / FIGURES} ({error.strerror}): choose another folder with out=..."
+            f"cannot write to {out} ({error.strerror}): make room, or choose another folder with "
+            "out=..."
         ) from None
-    made = make_fingerprints(study.plan["trainings"], make) if make and study.plan else {}
-    write_data(out / DATA, study, made)
+    return [out / TABLES, out / DATA]
+
+
+def _make(study: Study, out: Path) -> None:
+    """All files of a report, in a folder of their own: an earlier one stays whole until then."""
+    (out / FIGURES).mkdir()
+    write_data(out / DATA, study, {})
     if study.plan:  # what is drawn is what the data have
         study, _ = read_data(out / DATA)
     with drawing():
         write_whole(out / TABLES, Page(study, out).text().encode())
-    return [out / TABLES, out / DATA]
+    write_data(out / DATA, study, figure_sums(out))
+
+
+def figure_sums(out: Path) -> dict[str, str]:
+    """File of a figure -> SHA-256 of its content."""
+    files = sorted((out / FIGURES).iterdir())
+    return {path.name: sha256(path.read_bytes()).hexdigest() for path in files if path.is_file()}
 
 
 def tables_page(study: Study, out: Path) -> str:

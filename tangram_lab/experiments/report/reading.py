@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 
 from tangram_agent.runs import CONFIG, read_config
+from tangram_lab.experiments.fingerprints import Fingerprint
 from tangram_lab.experiments.plan import (
     FORMAT,
     PLAN,
@@ -41,6 +42,7 @@ RETEST = "delete the file and run tangram-experiment again"
 # What may differ between the runs of one setting, where nobody planned them.
 APART = ("seed", "run_dir", "resume")
 AGENT = "agent.name"
+EACH = "coverage_each"  # of a test's file: the coverage of every episode
 NOTE = (
     "Runs that differ in nothing but their seed make one row. Their scores are those of the last "
     "evaluation, on the same test episodes for all of them."
@@ -56,6 +58,10 @@ class Planned(TrainingConfig):
 
     seeds: tuple[Count, ...] = ()
 
+    def __post_init__(self) -> None:
+        if len({*self.seeds}) < max(len(self.seeds), 1):
+            raise ConfigError(f"seeds must be different numbers, got {list(self.seeds)}")
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -67,15 +73,25 @@ class Plan:
     experiments: dict[str, ExperimentConfig]
     trainings: dict[str, Planned]
     tests: dict[str, TestConfig]
+    fingerprints: dict[str, Fingerprint]
 
 
 _SCORES = ("mean_reward_dense", "angle_error_deg_median", "position_error_median")
 _MAY = [(name, float | None, None) for name in _SCORES]
-_BASELINE: Any = msgspec.defstruct("_BASELINE", [("mean_reward", float | None, None), *_MAY])
-TEST = msgspec.defstruct(
-    "TEST", [("mean_reward", float), ("baselines", dict[str, _BASELINE], {}), *_MAY]
+_BASELINE: Any = msgspec.defstruct(
+    "_BASELINE",
+    [("mean_reward", float | None, None), ("coverage_each", tuple[float, ...], ()), *_MAY],
 )
-_POINT = msgspec.defstruct("_POINT", [*((name, float) for name in (*AXES, "mean_reward")), *_MAY])
+TEST = msgspec.defstruct(
+    "TEST",
+    [
+        ("mean_reward", float),
+        ("baselines", dict[str, _BASELINE], {}),
+        ("coverage_each", tuple[float, ...], ()),
+        *_MAY,
+    ],
+)
+POINT = msgspec.defstruct("POINT", [*((name, float) for name in (*AXES, "mean_reward")), *_MAY])
 RESULT = msgspec.defstruct(
     "RESULT",
     [
@@ -92,6 +108,8 @@ def read_bytes(path: Path, remedy: str) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
+        if isinstance(error, PermissionError):
+            remedy = "make it readable"
         raise RunError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
 
 
@@ -112,6 +130,15 @@ def converted(row: Row, kind: Any, place: str, remedy: str) -> Any:
         return msgspec.convert(row, kind)
     except (msgspec.ValidationError, ConfigError) as error:
         raise RunError(f"{place}: {error}; {remedy}") from None
+
+
+def checked_test(row: Row, place: str, remedy: str) -> Row:
+    """The scores of a test, checked: single episodes are as many as it says."""
+    converted(row, TEST, place, remedy)
+    for scores in (row, *row.get("baselines", {}).values()):
+        if len(scores.get(EACH, ())) not in (0, row.get("episodes")):
+            raise RunError(f"{place}: {EACH} is not of its episodes; {remedy}")
+    return row
 
 
 def _content(path: Path, kind: Any, remedy: str) -> Row:
@@ -173,7 +200,7 @@ def make_study(content: Row, plan: "Plan", read: Callable[[str, int], Seed]) -> 
         for name, one in plan.experiments.items()
     )
     known = (experiments, tuple(trainings.values()), tuple(tests.values()))
-    return Study(content, plan.command, plan.commit, plan.budget, *known)
+    return Study(content, plan.command, plan.commit, plan.budget, *known, plan.fingerprints)
 
 
 def checked_plan(content: Row, place: str) -> Plan:
@@ -219,7 +246,11 @@ def read_seed(folder: Path, seed: int, tests: Iterable[str]) -> Seed:
         state=state,
         result=result,
         curve=tuple(_curve(curve)) if curve.exists() else (),
-        tests={n: _content(file, TEST, RETEST) for n, file in files.items() if file.exists()},
+        tests={
+            name: checked_test(_content(file, TEST, RETEST), str(file), RETEST)
+            for name, file in files.items()
+            if file.exists()
+        },
     )
 
 
@@ -227,7 +258,7 @@ def _curve(path: Path) -> Iterator[Row]:
     """The points of a curve; a last line without its end is still being written."""
     last: Row = dict.fromkeys(AXES, 0)
     for number, line in enumerate(read_bytes(path, RETRAIN).split(b"\n")[:-1], 1):
-        row, _ = parsed(line, _POINT, f"{path}: line {number}", RETRAIN)
+        row, _ = parsed(line, POINT, f"{path}: line {number}", RETRAIN)
         if any(row[axis] < last[axis] for axis in AXES):
             raise RunError(f"{path}: line {number} goes back in {', '.join(AXES)}; {RETRAIN}")
         last = row
@@ -270,7 +301,7 @@ def _unplanned(folder: Path, configs: Iterable[Path]) -> Study:
     budget = Budget("", NOTE)
     rows = tuple(trainings)
     only = Experiment("runs", f"Runs of {folder.name}", "", "ranking", NOTE, rows, ())
-    return Study({}, "", None, budget, (only,), rows, ())
+    return Study({}, "", None, budget, (only,), rows, (), {})
 
 
 def _by_number(name: str) -> tuple[int, str]:

@@ -6,11 +6,12 @@ from typing import Annotated, Any
 
 import msgspec
 
+from tangram_lab.experiments.fingerprints import Fingerprint
 from tangram_lab.experiments.plan import TestConfig, TrainingConfig
 from tangram_sim.errors import RunError
 
 Row = dict[str, Any]
-Count = Annotated[int, msgspec.Meta(ge=0)]
+Count = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
 FINISHED = "finished"
 
@@ -147,6 +148,7 @@ class Study:
         plan: content of plan.json; empty for runs that nobody planned.
         command: that made it.
         commit: of the source tree that planned it, or None.
+        fingerprints: training -> of the code that trained it.
     """
 
     plan: Row
@@ -156,3 +158,4 @@ class Study:
     experiments: tuple[Experiment, ...]
     trainings: tuple[Training, ...]
     tests: tuple[Trial, ...]
+    fingerprints: dict[str, Fingerprint]

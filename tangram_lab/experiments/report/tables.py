@@ -18,6 +18,7 @@ from tangram_lab.experiments.report.numbers import (
     Measure,
     first_at_least,
 )
+from tangram_lab.experiments.report.reading import EACH
 from tangram_lab.experiments.report.references import papers, papers_score, references
 from tangram_lab.experiments.report.statistics import ENOUGH, interquartile_mean
 from tangram_lab.experiments.report.study import Experiment, Row, Study, Training, Trial
@@ -37,7 +38,6 @@ GAME_MEASURES = (
     Measure("blocked", "refused placements", "{:.2f}"),
     Measure("seconds_per_puzzle", "ms per target", "{:,.0f}", 1000),
 )
-EACH = "coverage_each"  # of a test's file: the coverage of every episode
 ORDERS = ("order=listed", "order=size", "order=random")
 ORDER_NOTE = (
     "The learned order less a fixed one, on the same starts and targets with the same weights: "
@@ -246,8 +246,13 @@ def _difference(first: Training, test: str | None) -> Cell:
 def _by_episode(training: Training, test: str | None) -> Floats:
     """(E,) coverage of each episode of a test, averaged over the seeds."""
     each = [seed.tests.get(test or "", {}).get(EACH) for seed in training.finished]
-    known = [one for one in each if one is not None]
-    return np.mean(known, axis=0) if known else np.zeros(0)
+    return _over_all([one for one in each if one is not None])
+
+
+def _over_all(each: Sequence[Sequence[float]]) -> Floats:
+    """(E,) means over the seeds; nothing where they were tested on different episodes."""
+    one_set = len({len(one) for one in each}) == 1
+    return np.mean(each, axis=0) if one_set else np.zeros(0)
 
 
 # Several tokens
@@ -313,7 +318,7 @@ def differences(training: Training, test: Trial, order: str) -> Floats:
         own, other = content.get(EACH), content.get("baselines", {}).get(order, {}).get(EACH)
         if own is not None and other is not None and len(own) == len(other):
             each.append(np.subtract(own, other))
-    return np.mean(each, axis=0) if each else np.zeros(0)
+    return _over_all(each)
 
 
 def paired(values: Sequence[float] | Floats) -> str:
