@@ -5,6 +5,7 @@ Links and anchors: tests/test_house_slow.py.
 
 import re
 import shlex
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -106,3 +107,19 @@ def test_what_is_not_there_is_found() -> None:
     assert unknown(words) == ["sim.gone=1", "agent=gone"]
     with pytest.raises(SystemExit):
         unknown(["tangram-bench", "gone"])
+
+
+def test_commits_that_scores_are_of_are_in_the_history() -> None:
+    marks = re.findall(r"<!-- data: commit ([^>]*) -->", "".join(p.read_text() for p in PRESENT))
+    named = sorted({name for mark in marks for name in mark.split()})
+    git = ["git", "-C", str(ROOT)]
+    shallow = subprocess.run(
+        [*git, "rev-parse", "--is-shallow-repository"], capture_output=True, text=True, check=False
+    )
+    if shallow.stdout.strip() != "false":
+        pytest.skip("needs git and the whole history")
+    told = "".join(f"{name}^{{commit}}\n" for name in named)
+    answer = subprocess.run(
+        [*git, "cat-file", "--batch-check"], input=told, capture_output=True, text=True, check=True
+    )
+    assert [line for line in answer.stdout.splitlines() if " commit " not in line] == []

@@ -56,6 +56,12 @@ PAGES = [
     ("<!-- data: fig4 -->\nIt has -0.996.", ["-0.996 is not in fig4"]),
     ("<!-- data: fig4 -->\nFrom 0.995-0.996.", []),
     ("<!-- data: bench.json -->\nIt has 3.000.", ["3.000 is not in bench.json"]),  # it is -3
+    ("<!-- data: pretrained/square -->\nOf 0.160 and 0.3333.", ["0.3333 is not in"]),
+    (
+        "<!-- data: bench.json -->\nIt has 12.3 %, 12 %, and 12.4 %.",
+        ["12.4 % is not in bench.json"],
+    ),
+    ("It has 12.3 %.", ["12.3 % has no source"]),
     ("<!-- data: data.json -->\nIt has 0.996.", ["has a source that is none"]),
     ("<!-- data: fig4 -->\n````\n```\n````  \n\nIt has 0.111.", ["0.111 is not in fig4"]),
     ("It has 0.996. <!-- data: none -->", ["has no source"]),

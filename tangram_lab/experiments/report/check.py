@@ -5,6 +5,7 @@ A comment above a paragraph, a list or a table says where its numbers are from:
     <!-- data: fig4 table2 -->       these experiments' sections of the tables
     <!-- data: paper_size/fig4 -->   the same of the report in that folder of docs/results
     <!-- data: silhouettes.json -->  a file of docs/results
+    <!-- data: pretrained/square --> the card of an agent that comes with the package
     <!-- data: paper -->             the paper's own numbers
     <!-- data: commit 0123abc -->    an older commit, which the text must name, too
     <!-- data: none -->              no score: a setting, a size
@@ -15,6 +16,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from tangram_agent.pretrained import CARD, PACKAGED, is_name
 from tangram_lab.experiments.fingerprints import (
     UPDATES,
     MakeSetup,
@@ -29,8 +31,8 @@ from tangram_lab.experiments.report.study import Row, Seed, Study
 from tangram_sim.errors import RunError
 
 MARK = re.compile(r"<!-- data: (?P<sources>[^>]+?) -->")
-# Three decimals and more: scores have as many, and little else has.
-SCORE = re.compile(r"(?<![\w.])-?\d+\.\d{3,}(?!\w|\.\d)")
+# Three decimals and more, or a percentage with one: scores have as many, and little else has.
+SCORE = re.compile(r"(?<![\w.])-?\d+\.(?:\d+ %|\d{3,}(?!\w|\.\d))")
 CODE = re.compile(r"^(?P<fence>```+)[^`\n]*\n.*?^(?P=fence)`*[ \t]*$", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`[^`\n]*`|\]\([^)]*\)")
 SECTION = re.compile(r'^<a id="(?P<name>[^"]+)"></a>$', re.MULTILINE)
@@ -146,13 +148,14 @@ class Sources:
         if source == NO_SCORE:
             return True
         if source == PAPERS:
-            return float(text) in _numbers(VALUES)
+            return text in (f"{number:.3f}" for number in _numbers(VALUES))
         if source in self._sections:
             return bool(re.search(rf"(?<![\d.-]){re.escape(text)}(?!\d)", self._sections[source]))
         return any(_rounds_to(number, text) for number in self._file(source))
 
     def _file(self, name: str) -> Iterator[float]:
-        path = self._results / name
+        folder = Path(str(PACKAGED), Path(name).name) if is_name(name) else self._results
+        path = folder / (CARD if is_name(name) else name)
         if name == DATA or not (path.suffix == ".json" and path.is_file()):
             raise RunError(
                 f"no source is called {name}: name an experiment of {TABLES}, a .json file of "
@@ -173,8 +176,10 @@ def _numbers(content: Any) -> Iterator[float]:
 
 def _rounds_to(number: float, text: str) -> bool:
     """Whether a number is written so, as it is or halfway between two."""
-    digits = len(text.partition(".")[2])
-    return abs(number - float(text)) <= 0.500001 * 10.0**-digits
+    written, percent, _ = text.partition(" %")
+    digits = len(written.partition(".")[2])
+    shown = 100.0 * number if percent else number
+    return abs(shown - float(written)) <= 0.500001 * 10.0**-digits
 
 
 def check_page(name: str, text: str, numbers: Sources) -> Iterator[str]:
