@@ -51,9 +51,12 @@ paper: .venv/.installed-run  ## all figures and tables of the paper: BUDGET=smok
 
 # Ten seeds for what README shows, three for the rest. Given again, it goes on.
 EXPERIMENTS := $(basename $(notdir $(wildcard conf/experiment/*.yaml)))
+AT_ITS_SIZE = "experiments.fig4.trainings=[paper,mlp]" "experiments.table1.trainings=[paper,mlp]"
 evidence: .venv/.installed-dev  ## everything that README and docs/results.md show, anew: a day on two cores
 	@$(BIN)/tangram-experiment "experiment=[$(shell echo $(EXPERIMENTS) | tr ' ' ',')]" budget=laptop "budget.main_seeds=[0,1,2,3,4,5,6,7,8,9]" run_dir=runs/evidence $(ARGS)
+	@$(BIN)/tangram-experiment "experiment=[fig4,table1]" budget=paper $(AT_ITS_SIZE) run_dir=runs/paper_size $(ARGS)
 	@$(BIN)/tangram-report runs=runs/evidence out=docs/results
+	@$(BIN)/tangram-report runs=runs/paper_size out=docs/results/paper_size
 	@$(BIN)/tangram-report check
 
 bench: .venv/.installed-dev  ## measure speed against what else one could do; options go into ARGS="runs=9"

@@ -173,31 +173,36 @@ def run_study(
         )
     for job in jobs:
         job.check()
-    plan = joined_plan(study.path / PLAN, plan_content(config, _source()))
+    content = plan_content(config, _source())
     missing = [job for job in jobs if not job.done]
     console = sturdy_console(sys.stdout)
     if config.dry:
+        joined_plan(study.path / PLAN, content)
         for job in missing:
             console.print(job.name, highlight=False)
         console.print(f"{len(missing)} of {len(jobs)} jobs to do in {study.path}", highlight=False)
         return 0
     study.prepare("auto")
     with study.lock():
-        plan["fingerprints"] |= _fingerprints(plan, make, missing)
+        plan = joined_plan(study.path / PLAN, content)
+        names = {job.training: None for job in missing if job.trains}
+        if names:
+            told = f"a fingerprint of this code first: {UPDATES} updates of each of {len(names)}"
+            console.print(f"{told} trainings", highlight=False)
+        plan["fingerprints"] |= _fingerprints(plan, make, names)
         write_whole(study.path / PLAN, _json(plan))
         with StudyProgress(console, len(jobs), len(jobs) - len(missing)) as progress:
             return Runner(missing, config.jobs, progress).run()
 
 
 def _fingerprints(
-    plan: Mapping[str, Any], make: MakeSetup, missing: Iterable[Job]
+    plan: Mapping[str, Any], make: MakeSetup, names: Iterable[str]
 ) -> dict[str, Fingerprint]:
-    """Training -> the fingerprint of this code, of those that lack a seed.
+    """Training -> the fingerprint of this code.
 
     Raises:
         ConfigError: other seeds of one are of code that trained otherwise.
     """
-    names = dict.fromkeys(job.training for job in missing if job.trains)
     before = plan["fingerprints"]
     found = make_fingerprints({name: plan["trainings"][name]["overrides"] for name in names}, make)
     for name, now in found.items():

@@ -51,6 +51,7 @@ from tangram_lab.experiments.report.tables import (
     table,
     worlds_table,
 )
+from tangram_sim.errors import RunError
 from tests.experiments.builders import (
     cells,
     experiment,
@@ -332,6 +333,12 @@ def test_numbers_as_people_read_them(found: object, expected: object) -> None:
 )
 def test_in_which_worlds_the_exact_hand_is_no_oracle(override: str, short: bool) -> None:
     assert falls_short(override) == short
+
+
+@pytest.mark.parametrize("override", ["sim.substeps=abc", "sim.foo=[1,"])
+def test_an_override_that_cannot_be_read_is_told(override: str) -> None:
+    with pytest.raises(RunError, match="is no setting: mend the plan"):
+        falls_short(override)
 
 
 # Statistics

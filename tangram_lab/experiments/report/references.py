@@ -9,6 +9,7 @@ import yaml
 from tangram_lab.experiments.report.numbers import Measure
 from tangram_lab.experiments.report.study import Experiment, Row, Study, Training, Trial
 from tangram_sim.config import EXACT_SUBSTEPS, UNKNOWN, SimConfig
+from tangram_sim.errors import RunError
 
 # Name in the files of tests -> name in the report.
 POSITION, PERFECT, RANDOM = "position only", "perfect", "random"
@@ -94,11 +95,18 @@ def _scores(study: Study, key: str, task: Task) -> dict[str, Row]:
 
 
 def falls_short(override: str) -> bool:
-    """Whether tokens fall short of what they are told, so that no policy here is an oracle."""
+    """Whether tokens fall short of what they are told, so that no policy here is an oracle.
+
+    Raises:
+        RunError: it cannot be read.
+    """
     name, _, value = override.partition("=")
-    few = name == "sim.substeps" and int(value) < EXACT_SUBSTEPS
     usual = {f"sim.{one}": getattr(SimConfig, one) for one in UNKNOWN}
-    given = yaml.safe_load(value)
+    try:
+        few = name == "sim.substeps" and int(value) < EXACT_SUBSTEPS
+        given = yaml.safe_load(value)
+    except (ValueError, yaml.YAMLError):
+        raise RunError(f"{override} is no setting: mend the plan of these runs") from None
     given = tuple(given) if isinstance(given, list) else given
     return few or override == "sim=bullet_defaults" or given != usual.get(name, given)
 
