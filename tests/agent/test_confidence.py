@@ -226,7 +226,10 @@ def test_what_the_camera_is_sure_of_reaches_the_networks_in_play(
 def test_what_is_not_surely_seen_tells_nothing_of_the_motion(delay: bool) -> None:
     made = seven(actions_per_token=1, delay=delay)
     batch, steps = transitions(made, 12), 3
-    corners = np.stack([batch.state, batch.next_state, batch.goal, batch.state], axis=1)
+    token = np.clip(np.floor((batch.action[:, 0] + 1.0) / 2.0 * 7), 0, 6).astype(np.int64)
+    poses = np.repeat(made.layout.poses(batch.state.astype(np.float64))[:, None], steps + 1, axis=1)
+    poses[np.arange(12), :, token, 0] += 0.1 * np.arange(steps + 1)  # the others lie still
+    corners = made.layout.corners(poses)
     actions = np.repeat(batch.action[:, None], steps, axis=1)
     share = np.where(np.random.default_rng(0).random((12, steps + 1, 7)) < 0.5, DOUBTFUL, 1.0)
     past = Past(corners[:, :steps], actions, share.astype(np.float32))
@@ -234,7 +237,6 @@ def test_what_is_not_surely_seen_tells_nothing_of_the_motion(delay: bool) -> Non
     every = motions_of(
         replace(past, confidence=None), corners[:, steps].astype(np.float64), made.layout, made.sim
     )
-    token = np.clip(np.floor((batch.action[:, 0] + 1.0) / 2.0 * 7), 0, 6).astype(np.int64)
     own = np.take_along_axis(share, token[:, None, None], axis=2)[..., 0] == 1.0
     sure = own[:, :-1] & own[:, 1:]
     expected = every.moved.numpy() * sure[:, delay:]
