@@ -10,7 +10,7 @@ from tangram_lab.experiments.report.study import Experiment
 from tangram_lab.experiments.report.style import COLOURS, legend_below, make_logarithmic, new_figure
 
 LEVELS = 200
-NEAREST = 1e-5  # to a perfect mean reward
+NEAREST = 1e-4  # to a perfect mean reward
 SHORT_OF = "short of a perfect mean reward by no more than"
 
 
@@ -26,8 +26,9 @@ def draw_profile(experiment: Experiment) -> Figure | None:
         return None
     scores = np.array([[values[seed] for values in each] for seed in sorted(common)])
     short = np.geomspace(NEAREST, 2.0, LEVELS)
-    figure, (panel,) = new_figure(3.4, 1, 1)
-    for number, (label, columns) in enumerate(_lines(experiment)):
+    lines = _lines(experiment)
+    figure, (panel,) = new_figure(3.0 + 0.1 * len(lines), 1, 1)
+    for number, (label, columns) in enumerate(lines):
         shares, (low, high) = profile(scores[:, columns], 1.0 - short)
         colour = COLOURS[number % len(COLOURS)]
         panel.plot(short, shares, color=colour, label=label)
@@ -36,7 +37,7 @@ def draw_profile(experiment: Experiment) -> Figure | None:
     panel.set_xlabel(SHORT_OF)
     panel.set_ylabel(f"share of {len(common)} seeds")
     panel.set_ylim(0.0, 1.05)
-    legend_below(figure, panel)
+    legend_below(figure, panel, 2)
     return figure
 
 
