@@ -94,11 +94,12 @@ def motions_of(past: Past, now: Floats, layout: Layout, sim: SimConfig) -> Motio
     noise = max(seen, _NOISE_DEVIATIONS * sim.corner_noise)
     still = _STILL + (noise if layout.tokens > 1 else 0.0)
     moved = np.abs(way).max(axis=-1, initial=0.0) > still
-    # Where others went, too, it pushed them or was set down on them, and they decided where it came
-    # to lie. Their turns are left out: noise turns a small token by much.
-    shifted = np.abs(ways[..., :2]).max(axis=-1, initial=0.0) > still
-    np.put_along_axis(shifted, token[..., 0], False, axis=2)
-    moved &= ~shifted.any(axis=2)
+    if sim.motion == "lift":
+        # Where others went, too, it was set down on them, and they decided where it came to lie.
+        # Their turns are left out: noise turns a small token by much.
+        shifted = np.abs(ways[..., :2]).max(axis=-1, initial=0.0) > still
+        np.put_along_axis(shifted, token[..., 0], False, axis=2)
+        moved &= ~shifted.any(axis=2)
     if past.confidence is not None and layout.tokens > 1:
         # What touches others may be seen wrongly, and one wrong way spoils what is believed.
         sure = past.confidence[:, -1 - way.shape[1] :] > PILED

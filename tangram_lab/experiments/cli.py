@@ -7,15 +7,11 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from conf.cli import composed, entry, own_presets
 from conf.commands import Plain
 from tangram_sim.errors import ConfigError
 from tangram_sim.settings import Settings, setting
-
-if TYPE_CHECKING:
-    from tangram_agent.setup import Setup
 
 ROOT = Path(__file__).parents[2]
 RESULTS = "docs/results"
@@ -40,7 +36,7 @@ def _experiment(settings: Plain) -> int:
 
     from tangram_lab.experiments.runner import run_study
 
-    return run_study(config, resolved, asked, _setup, own_presets())
+    return run_study(config, resolved, asked, _composed, own_presets())
 
 
 def _resolved(name: str, overrides: list[str]) -> Plain:
@@ -58,13 +54,6 @@ def _resolved(name: str, overrides: list[str]) -> Plain:
 def _composed(overrides: Sequence[str]) -> Plain:
     """The whole config that tangram-train makes of its arguments."""
     return composed("train", ["run_dir=x", *overrides])
-
-
-def _setup(overrides: Sequence[str]) -> "Setup":
-    """The task and the agent that tangram-train makes of its arguments."""
-    from tangram_agent.setup import make_setup
-
-    return make_setup(_composed(overrides))
 
 
 def _asked(name: str, overrides: list[str]) -> Plain:
@@ -142,7 +131,7 @@ def _check() -> int:
         raise ConfigError(f"check looks at {RESULTS} of a clone, which {ROOT} lacks: run it in one")
     pages = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
     shown = (page for page in pages if page.name not in GENERATED)
-    wrong = check(ROOT / RESULTS, shown, _setup)
+    wrong = check(ROOT / RESULTS, shown, _composed)
     for line in wrong:
         print(line)
     fine = "every score of README and docs is in the data, or names the older commit that it is of"

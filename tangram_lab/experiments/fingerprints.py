@@ -5,45 +5,46 @@ of the code has changed.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from master.trainer import Trainer
 from tangram_agent.policy import Policy
-from tangram_agent.setup import Setup
-from tangram_agent.types import Weights
+from tangram_agent.setup import Setup, make_setup
 from worker.looking import environments
 from worker.rollout import Rollout
 from worker.test_set import FixedTests, greedy
 
 UPDATES = 20
-BATCH_SIZE, LEARNING_STARTS = 16, 32  # instead of the agent's
+BATCH_SIZE, LEARNING_STARTS, CAPACITY = 16, 32, 256  # instead of the agent's
 SEED, ENVS, BATCH_EPISODES, TEST_EPISODES = 0, 4, 8, 8
-SCORES = ("mean_reward", "raw_overlap", "angle_error_deg_p90", "position_error_p90")
 TOLERANCE = 1e-3  # other processors add numbers up in another order
 
 Fingerprint = dict[str, float]
-MakeSetup = Callable[[Sequence[str]], Setup]  # from the arguments of a training
+Tensors = Mapping[str, npt.NDArray[Any]]
+Resolve = Callable[[Sequence[str]], Mapping[str, Any]]  # arguments of a training -> its settings
 
 
 def make_fingerprints(
-    arguments: Mapping[str, Sequence[str]], make: MakeSetup
+    arguments: Mapping[str, Sequence[str]], resolve: Resolve
 ) -> dict[str, Fingerprint]:
     """Training -> what it comes to by the code as it is.
 
     Args:
         arguments: training -> its arguments.
-        make: the setup that arguments come to.
+        resolve: the settings that arguments come to.
 
     Raises:
         ConfigError: this code refuses a training.
     """
     torch.set_num_threads(1)
-    return {name: make_fingerprint(make(given)) for name, given in arguments.items()}
+    return {name: make_fingerprint(make_setup(resolve(given))) for name, given in arguments.items()}
 
 
 def differences(before: Fingerprint, now: Fingerprint) -> list[str]:
@@ -56,13 +57,14 @@ def differences(before: Fingerprint, now: Fingerprint) -> list[str]:
 
 
 def make_fingerprint(setup: Setup) -> Fingerprint:
-    """The scores after 20 updates, and the sum of all weights without their signs.
+    """All scores after 20 updates, and sums over the weights: of what they are, and how they moved.
 
     It learns as `tangram-train service.mode=lockstep` does with one worker, number for number, but
     in this process: a test compares the two.
     """
     setup = short(setup)
     trainer, policy = Trainer(setup, SEED, "cpu"), Policy(setup)
+    first = trainer.learner.acting_weights(0).tensors
     with closing(environments(setup, ENVS)) as env:
         rollout = Rollout(env, SEED, "player", 0, 0)
         while trainer.updates < UPDATES:
@@ -76,17 +78,26 @@ def make_fingerprint(setup: Setup) -> Fingerprint:
     policy.load(learned)
     with closing(FixedTests(setup, TEST_EPISODES, ENVS)) as tests:
         scores = tests.scores(tests.play(greedy(policy)))
-    return {**{name: scores[name] for name in SCORES}, "weights": sum_of(learned)}
+    found = scores | sums(first, learned.tensors)
+    return {name: value for name, value in found.items() if name != "episodes"}  # they are given
 
 
 def short(setup: Setup) -> Setup:
     """The same with small batches, that begins to learn soon."""
-    agent = replace(setup.agent, batch_size=BATCH_SIZE, learning_starts=LEARNING_STARTS)
+    agent = replace(
+        setup.agent,
+        batch_size=BATCH_SIZE,
+        learning_starts=LEARNING_STARTS,
+        replay_capacity=CAPACITY,
+    )
     return replace(setup, agent=agent)
 
 
-def sum_of(weights: Weights) -> float:
-    """Of all weights, without their signs."""
-    return math.fsum(
-        float(np.abs(one.astype(np.float64)).sum()) for one in weights.tensors.values()
-    )
+def sums(first: Tensors, last: Tensors) -> Fingerprint:
+    """Of all weights without their signs, and of how far they went."""
+
+    def total(arrays: Iterable[npt.NDArray[Any]]) -> float:
+        return math.fsum(float(np.abs(one.astype(np.float64)).sum()) for one in arrays)
+
+    moved = (last[name].astype(np.float64) - first[name] for name in last)
+    return {"weights": total(last.values()), "moved": total(moved)}

@@ -1,7 +1,7 @@
 """The work of a study as processes: trainings and tests, and whether each is done."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -79,8 +79,7 @@ class Job:
         if not self.trains or not (self.run_dir / CONFIG).exists():
             return
         stored = read_config(self.run_dir / CONFIG)
-        names = [*SECTIONS, *BOUNDS]
-        found = [text for n in names for text in _differences(n, stored, self.settings)]
+        found = changed_settings(stored, self.settings, (*SECTIONS, *BOUNDS))
         if found:
             raise ConfigError(
                 f"{self.run_dir} was trained with other settings ({', '.join(found)}): remove it, "
@@ -101,6 +100,13 @@ def _trained(content: Mapping[str, Any]) -> bool:
     ended_by, scored = content.get("ended_by"), content.get("scored_updates")
     by_budget = isinstance(ended_by, str) and ended_by.startswith(BOUNDS)
     return by_budget and scored is not None and scored == content.get("updates")
+
+
+def changed_settings(
+    stored: Mapping[str, Any], now: Mapping[str, Any], names: Iterable[str]
+) -> list[str]:
+    """Which of these settings are others now; of those that only one of both knows none."""
+    return [text for name in names for text in _differences(name, stored, now)]
 
 
 def _differences(name: str, one: object, other: object) -> Iterator[str]:

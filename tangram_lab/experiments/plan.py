@@ -25,6 +25,11 @@ FORMAT = 4
 Kind = Literal["curves", "complexity", "tests", "rewards", "ranking", "game", "worlds"]
 KINDS: tuple[str, ...] = get_args(Kind)
 PLAN = "plan.json"
+# What a training comes to; the rest is where it runs.
+KEPT = (
+    *("tokens", "sim", "reward", "agent", "net", "service"),
+    *("workers", "max_updates", "max_episodes", "max_hours"),
+)
 JOINED = ("experiments", "trainings", "tests", "fingerprints")  # of all commands in a folder
 
 
@@ -233,8 +238,16 @@ def test_file(run_dir: Path, test: str) -> Path:
 test_file.__test__ = False  # type: ignore[attr-defined] # pytest collects functions of this name
 
 
-def plan_content(config: StudyConfig, source: Mapping[str, Any]) -> dict[str, Any]:
-    """What plan.json says of this command: everything that a report needs to know."""
+def plan_content(
+    config: StudyConfig, source: Mapping[str, Any], resolved: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Any]:
+    """What plan.json says of this command: everything that a report needs to know.
+
+    Args:
+        config: the study.
+        source: where its numbers come from.
+        resolved: the whole config of each training that is wanted.
+    """
     budget = {
         "name": config.budget.name,
         "note": config.budget.note,
@@ -254,6 +267,7 @@ def plan_content(config: StudyConfig, source: Mapping[str, Any]) -> dict[str, An
                 "family": config.trainings[name].family,
                 "overrides": config.command(name),
                 "after": config.trainings[name].after,
+                "settings": {key: resolved[name][key] for key in KEPT if key in resolved[name]},
                 "seeds": config.seeds(name),
             }
             for name in wanted

@@ -31,7 +31,7 @@ from tangram_agent.outcome import duration
 from tangram_lab.experiments.fingerprints import (
     UPDATES,
     Fingerprint,
-    MakeSetup,
+    Resolve,
     differences,
     make_fingerprints,
 )
@@ -147,7 +147,7 @@ def run_study(
     config: StudyConfig,
     resolved: Mapping[str, Mapping[str, Any]],
     asked: Mapping[str, Mapping[str, Any]],
-    make: MakeSetup,
+    resolve: Resolve,
     presets: str | None,
 ) -> int:
     """Do everything that is missing.
@@ -156,7 +156,7 @@ def run_study(
         config: the study.
         resolved: the whole config of each training that is wanted.
         asked: the settings of each test of them.
-        make: the setup that the arguments of a training come to.
+        resolve: the settings that the arguments of a training come to.
         presets: the folder of the user's own presets, None where there is none.
 
     Returns:
@@ -173,7 +173,7 @@ def run_study(
         )
     for job in jobs:
         job.check()
-    content = plan_content(config, _source())
+    content = plan_content(config, _source(), resolved)
     missing = [job for job in jobs if not job.done]
     console = sturdy_console(sys.stdout)
     if config.dry:
@@ -189,14 +189,14 @@ def run_study(
         if names:
             told = f"a fingerprint of this code first: {UPDATES} updates of each of {len(names)}"
             console.print(f"{told} trainings", highlight=False)
-        plan["fingerprints"] |= _fingerprints(plan, make, names)
+        plan["fingerprints"] |= _fingerprints(plan, resolve, names)
         write_whole(study.path / PLAN, _json(plan))
         with StudyProgress(console, len(jobs), len(jobs) - len(missing)) as progress:
             return Runner(missing, config.jobs, progress).run()
 
 
 def _fingerprints(
-    plan: Mapping[str, Any], make: MakeSetup, names: Iterable[str]
+    plan: Mapping[str, Any], resolve: Resolve, names: Iterable[str]
 ) -> dict[str, Fingerprint]:
     """Training -> the fingerprint of this code.
 
@@ -204,7 +204,9 @@ def _fingerprints(
         ConfigError: other seeds of one are of code that trained otherwise.
     """
     before = plan["fingerprints"]
-    found = make_fingerprints({name: plan["trainings"][name]["overrides"] for name in names}, make)
+    found = make_fingerprints(
+        {name: plan["trainings"][name]["overrides"] for name in names}, resolve
+    )
     for name, now in found.items():
         if name in before and (others := differences(before[name], now)):
             raise ConfigError(

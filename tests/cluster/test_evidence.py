@@ -9,18 +9,17 @@ import pytest
 from conf.cli import composed
 from tangram_agent.checkpoints import ACTING, load_checkpoint, newest_checkpoint
 from tangram_agent.setup import make_setup
-from tangram_agent.types import Weights
 from tangram_lab.experiments.fingerprints import (
     BATCH_EPISODES,
     BATCH_SIZE,
+    CAPACITY,
     ENVS,
     LEARNING_STARTS,
-    SCORES,
     SEED,
     TEST_EPISODES,
     UPDATES,
     make_fingerprint,
-    sum_of,
+    sums,
 )
 from tests.cluster.processes import BIN, run
 
@@ -43,6 +42,7 @@ def test_a_fingerprint_is_what_processes_in_lockstep_come_to(tmp_path: Path) -> 
     short = (
         f"agent.batch_size={BATCH_SIZE}",
         f"agent.learning_starts={LEARNING_STARTS}",
+        f"agent.replay_capacity={CAPACITY}",
         f"seed={SEED}",
         f"max_updates={UPDATES}",
         "service.mode=lockstep",
@@ -53,7 +53,7 @@ def test_a_fingerprint_is_what_processes_in_lockstep_come_to(tmp_path: Path) -> 
     run("tangram-train", f"run_dir={folder}", *short, cwd=tmp_path)
     ours = make_fingerprint(make_setup(composed("train", ["run_dir=x"])))
     result = json.loads((folder / "result.json").read_text())
-    learned = load_checkpoint(newest_checkpoint(folder / "checkpoints"), [ACTING])
-    theirs = {name: result[name] for name in SCORES}
-    theirs["weights"] = sum_of(Weights(learned.updates, learned.arrays[ACTING]))
+    learned = load_checkpoint(newest_checkpoint(folder / "checkpoints"), [ACTING]).arrays[ACTING]
+    theirs = {name: result[name] for name in ours if name in result}
+    theirs |= {"weights": sums(learned, learned)["weights"], "moved": ours["moved"]}
     assert ours == pytest.approx(theirs, rel=1e-12)

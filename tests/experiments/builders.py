@@ -31,6 +31,7 @@ def experiment(kind: str, trainings: list[str], source: str = "beyond", **more: 
     return {**texts, "kind": kind, "trainings": trainings, "tests": []} | more
 
 
+SETTINGS = {"agent": {"batch_size": 64}}
 FINGERPRINT = {"mean_reward": 0.5, "weights": 1000.0}
 
 
@@ -42,7 +43,10 @@ def plan(experiments: Row, trainings: Row, tests: Row, seeds: tuple[int, ...] = 
         "commit": "0123abc",
         "budget": budget,
         "experiments": experiments,
-        "trainings": {name: one | {"seeds": list(seeds)} for name, one in trainings.items()},
+        "trainings": {
+            name: one | {"seeds": list(seeds), "settings": SETTINGS}
+            for name, one in trainings.items()
+        },
         "tests": tests,
         "fingerprints": dict.fromkeys(trainings, FINGERPRINT),
     }

@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections import defaultdict
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ from tangram_lab.experiments.plan import StudyConfig, joined_plan, plan_content
 from tangram_sim.errors import ConfigError
 
 pytestmark = pytest.mark.fast
+
+ANY: dict[str, dict[str, Any]] = defaultdict(dict)  # the configs of trainings
 
 
 def content(run_dir: Path, **changes: Any) -> dict[str, Any]:
@@ -135,12 +138,15 @@ def test_a_circle_of_warm_starts_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_plan_says_everything_that_a_report_needs(tmp_path: Path) -> None:
-    plan = plan_content(study(tmp_path), {"command": "tangram-experiment x", "commit": "abc"})
+    resolved = defaultdict(dict, warm={"sim": {"arena": 2.0}, "run_dir": "x", "workers": 1})
+    source = {"command": "tangram-experiment x", "commit": "abc"}
+    plan = plan_content(study(tmp_path), source, resolved)
     assert (plan["format"], plan["command"], plan["commit"]) == (4, "tangram-experiment x", "abc")
     texts = {"name": "tiny", "note": "Nothing is learned."}
     assert plan["budget"] == {**texts, "test_episodes": 5, "test_seed": 2}
     assert list(plan["experiments"]) == ["one", "two"]
     assert plan["trainings"]["warm"] == {
+        "settings": {"sim": {"arena": 2.0}, "workers": 1},
         "label": "warm",
         "family": "ours",
         "overrides": ["agent=tangram", "a=1", "b=2"],
@@ -155,13 +161,13 @@ def joined(folder: Path, earlier: dict[str, Any], **changes: Any) -> dict[str, A
     """The plan of a study with changes, in a folder whose plan is an earlier one."""
     path = folder / "plan.json"
     path.write_text(json.dumps(earlier))
-    return joined_plan(path, plan_content(study(folder, **changes), {"commit": "new"}))
+    return joined_plan(path, plan_content(study(folder, **changes), {"commit": "new"}, ANY))
 
 
 def test_a_plan_keeps_what_was_there(tmp_path: Path) -> None:
     first = study(tmp_path, experiments={"one": experiment(["paper"], ["twice"])})
     second = {"two": experiment(["square"], ["noisy"])}
-    found = joined(tmp_path, plan_content(first, {}), experiments=second)
+    found = joined(tmp_path, plan_content(first, {}, ANY), experiments=second)
     assert found["commit"] == "new"
     assert list(found["experiments"]) == ["one", "two"]
     assert list(found["trainings"]) == ["paper", "square"]
@@ -180,7 +186,7 @@ def test_a_plan_keeps_what_was_there(tmp_path: Path) -> None:
 def test_another_budget_or_version_needs_another_folder(
     tmp_path: Path, earlier: dict[str, Any], budget: dict[str, Any], message: str
 ) -> None:
-    before = plan_content(study(tmp_path), {}) | earlier
+    before = plan_content(study(tmp_path), {}, ANY) | earlier
     with pytest.raises(ConfigError, match=message):
         joined(tmp_path, before, budget=content(tmp_path)["budget"] | budget)
 
@@ -198,7 +204,7 @@ def test_another_budget_or_version_needs_another_folder(
 )
 def test_a_damaged_plan_is_told(tmp_path: Path, damage: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match="cannot read .*plan.json: remove it, or choose"):
-        joined(tmp_path, plan_content(study(tmp_path), {}) | damage)
+        joined(tmp_path, plan_content(study(tmp_path), {}, ANY) | damage)
 
 
 @pytest.mark.parametrize(
@@ -208,7 +214,7 @@ def test_seeds_may_be_added_and_none_is_forgotten(
     tmp_path: Path, seeds: list[int], expected: list[int]
 ) -> None:
     budget = content(tmp_path)["budget"] | {"seeds": seeds}
-    found = joined(tmp_path, plan_content(study(tmp_path), {}), budget=budget)
+    found = joined(tmp_path, plan_content(study(tmp_path), {}, ANY), budget=budget)
     assert {tuple(one["seeds"]) for one in found["trainings"].values()} == {tuple(expected)}
 
 
@@ -225,7 +231,7 @@ def test_a_plan_that_cannot_be_read_is_refused(tmp_path: Path, text: str) -> Non
     path = tmp_path / "plan.json"
     path.write_text(text)
     with pytest.raises(ConfigError, match=r"cannot read .*plan.json: remove it"):
-        joined_plan(path, plan_content(study(tmp_path), {}))
+        joined_plan(path, plan_content(study(tmp_path), {}, ANY))
 
 
 # Processes

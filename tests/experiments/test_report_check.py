@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from tangram_agent.setup import Setup
 from tangram_lab.experiments.fingerprints import differences
 from tangram_lab.experiments.report import check as report_check
 from tangram_lab.experiments.report import page
@@ -19,6 +18,7 @@ from tangram_lab.experiments.report.reading import read_runs
 from tangram_sim.errors import RunError
 from tests.experiments.builders import (
     FINGERPRINT,
+    SETTINGS,
     experiment,
     learning_curve,
     plan,
@@ -102,9 +102,9 @@ def test_a_source_that_is_none(numbers: Sources, name: str) -> None:
 # The whole
 
 
-def never(arguments: Sequence[str]) -> Setup:
-    """Nothing is trained here, see `tests/cluster/test_evidence.py`."""
-    raise AssertionError(arguments)
+def resolve(arguments: Sequence[str]) -> dict[str, Any]:
+    """The settings that arguments come to; what they train: tests/cluster/test_evidence.py."""
+    return SETTINGS | {"later": {"known": True}}
 
 
 @pytest.fixture
@@ -112,7 +112,7 @@ def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The report of a whole study of one training."""
     monkeypatch.setattr(page, "draw_paper_pictures", lambda out, draws: [])
     monkeypatch.setattr(
-        report_check, "make_fingerprints", lambda found, make: dict.fromkeys(found, FINGERPRINT)
+        report_check, "make_fingerprints", lambda found, resolve: dict.fromkeys(found, FINGERPRINT)
     )
     one = experiment("curves", ["ours"], tests=["random"])
     tests = {"random": {"label": "random", "overrides": []}}
@@ -126,7 +126,7 @@ def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def checked(results: Path, text: str = "<!-- data: fig4 -->\n0.912") -> list[str]:
     (results.parent / "README.md").write_text(text)
-    return check(results, [results.parent / "README.md"], never)
+    return check(results, [results.parent / "README.md"], resolve)
 
 
 def changed(results: Path, change: dict[str, Any]) -> None:
@@ -222,11 +222,24 @@ def test_what_the_study_lacks(results: Path, change: dict[str, Any], told: str) 
 
 def test_code_that_trains_otherwise(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now = {"ours": {"mean_reward": 0.5, "weights": 1003.0}}
-    monkeypatch.setattr(report_check, "make_fingerprints", lambda found, make: now)
+    monkeypatch.setattr(report_check, "make_fingerprints", lambda found, resolve: now)
     assert checked(results) == [
         "ours trains otherwise than when its figures were made: after 20 updates weights is "
         "1003.0, and was 1000.0: make them anew with make evidence"
     ]
+
+
+@pytest.mark.parametrize(
+    ("kept", "told"),
+    [({"agent": {"batch_size": 32}}, "agent.batch_size=32, now 64"), ({}, "nobody kept them")],
+)
+def test_other_settings_than_those_that_trained_are_told(
+    results: Path, kept: dict[str, Any], told: str
+) -> None:
+    data = json.loads((results / "data.json").read_text())
+    data["plan"]["trainings"]["ours"]["settings"] = kept
+    (results / "data.json").write_text(json.dumps(data))
+    assert checked(results) == [f"ours has not the settings that it was trained with: {told}"]
 
 
 @pytest.mark.parametrize("kept", [{}, {"ours": {}}, {"ours": {"mean_reward": 0.5}}])

@@ -29,8 +29,8 @@ from tangram_lab.experiments.report.numbers import (
     MINUTES,
     REWARD,
     band,
-    first_at_least,
     points,
+    reached,
     rises_early,
     spread,
     thinned,
@@ -39,7 +39,11 @@ from tangram_lab.experiments.report.page import command
 from tangram_lab.experiments.report.profiles import draw_profile
 from tangram_lab.experiments.report.reading import read_runs
 from tangram_lab.experiments.report.references import falls_short, papers
-from tangram_lab.experiments.report.statistics import interquartile_mean, profile
+from tangram_lab.experiments.report.statistics import (
+    difference,
+    interquartile_mean,
+    profile,
+)
 from tangram_lab.experiments.report.study import Seed, Training
 from tangram_lab.experiments.report.style import LINES
 from tangram_lab.experiments.report.tables import (
@@ -51,6 +55,7 @@ from tangram_lab.experiments.report.tables import (
     table,
     worlds_table,
 )
+from tangram_sim.arrays import Floats
 from tangram_sim.errors import RunError
 from tests.experiments.builders import (
     cells,
@@ -273,12 +278,15 @@ def test_points_without_a_value_are_left_out() -> None:
 
 
 @pytest.mark.parametrize(
-    ("level", "expected"), [(0.1, 100), (0.735, 300), (0.75, 400), (0.8, None)]
+    ("level", "expected"),
+    [(0.1, (0, 100)), (0.735, (200, 300)), (0.75, (300, 400)), (0.8, None)],
 )
-def test_where_a_curve_first_reaches_a_level(level: float, expected: float | None) -> None:
+def test_between_which_evaluations_a_curve_first_reaches_a_level(
+    level: float, expected: tuple[float, float] | None
+) -> None:
     pairs = [(100, 0.2), (200, 0.6), (300, 0.735), (400, 0.75), (500, 0.74)]
     rows = tuple({"episodes": x, "mean_reward": y} for x, y in pairs)
-    assert first_at_least(Seed(0, "finished", result(0, 0.75), rows, {}), level) == expected
+    assert reached(Seed(0, "finished", result(0, 0.75), rows, {}), level) == expected
 
 
 @given(st.integers(0, 300), st.integers(2, 80))
@@ -344,26 +352,39 @@ def test_an_override_that_cannot_be_read_is_told(override: str) -> None:
 # Statistics
 
 
-def test_a_difference_is_paired_by_episode_and_averaged_over_the_seeds(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("seeds", "interval"), [(2, False), (8, True)])
+def test_a_difference_is_of_the_same_episodes_and_its_interval_needs_seeds(
+    tmp_path: Path, seeds: int, interval: bool
+) -> None:
     one = experiment("ranking", ["ours", "less"], tests=["random"])
     names = {"ours": training("ours", "x"), "less": training("less", "x")}
     tests = {"random": {"label": "random", "overrides": []}}
-    write_plan(tmp_path, plan({"a": one}, names, tests, (0, 1)))
-    each: dict[str, tuple[list[float], list[float]]] = {
-        "ours": ([0.9, 0.5, 0.7], [0.7, 0.7, 0.9]),  # 0.8, 0.6, 0.8 over the seeds
-        "less": ([0.7, 0.5, 0.6], [0.7, 0.5, 0.6]),
-    }
-    for name, seeds in each.items():
-        for seed, coverage in enumerate(seeds):
-            mean = 2 * float(np.mean(coverage)) - 1
-            test = scores(mean, coverage_each=coverage, episodes=3)
+    write_plan(tmp_path, plan({"a": one}, names, tests, tuple(range(seeds))))
+    for name, base in (("ours", 0.9), ("less", 0.8)):
+        for seed in range(seeds):
+            coverage = [base, base - 0.2 - 0.01 * (seed % 2), base - 0.1]
+            test = scores(2 * float(np.mean(coverage)) - 1, coverage_each=coverage, episodes=3)
             write_run(tmp_path, name, result(seed), [], {"random": test})
     study = read_runs(tmp_path)
     (row,) = cells("\n".join(ranking_table(study, study.experiments[0])), "less")
-    differences = 2 * np.array([-0.1, -0.1, -0.2])  # a reward is twice a coverage, less 1
-    half = 1.96 * differences.std(ddof=1) / math.sqrt(3)
-    mean = differences.mean()
-    assert row[2] == f"{mean:+.4f} ({mean - half:+.4f} to {mean + half:+.4f})"
+    assert row[2 + interval].startswith("-0.2000")  # a reward is twice a coverage, less 1
+    assert ("to" in row[2 + interval]) == interval
+
+
+def test_the_interval_of_a_difference_has_the_spread_of_seeds_and_of_episodes() -> None:
+    """Against the deviation of the difference over many draws of seeds and episodes."""
+    generator = np.random.default_rng(0)
+
+    def drawn(mean: float, episodes: Floats) -> Floats:
+        return mean + 0.02 * generator.normal(size=(10, 1)) + episodes
+
+    found = difference(drawn(0.8, np.zeros((1, 50))), drawn(0.7, np.zeros((1, 50))))
+    expected = 2 * 1.96 * 0.02 * math.sqrt(2 / 10)
+    assert 0.5 * expected < found.high - found.low < 1.5 * expected
+    hard = 0.1 * generator.normal(size=(1, 50))  # the same episodes are hard for both
+    again = difference(drawn(0.8, hard), drawn(0.7, hard))
+    assert again.high - again.low < 1.5 * expected
+    assert again.low < 0.1 < again.high
 
 
 def test_an_interquartile_mean_leaves_out_the_quarters() -> None:
@@ -391,30 +412,30 @@ def test_a_profile_is_the_share_of_runs_above_each_level() -> None:
     assert (interval[1] >= shares).all()
 
 
-@pytest.mark.parametrize(("seeds", "shown"), [(4, False), (5, True)])
-def test_a_quartile_needs_five_seeds(tmp_path: Path, seeds: int, shown: bool) -> None:
+@pytest.mark.parametrize(("seeds", "shown"), [(4, False), (8, True)])
+def test_a_quartile_needs_eight_seeds(tmp_path: Path, seeds: int, shown: bool) -> None:
     one = experiment("curves", ["ours"], tests=["random"])
     tests = {"random": {"label": "random", "overrides": []}}
     content = plan({"a": one}, {"ours": training("ours", "x")}, tests, tuple(range(seeds)))
     write_plan(tmp_path, content)
     for seed in range(seeds):
-        test = {"random": scores(0.5 + seed / 10)}
+        test = {"random": scores(0.5 + seed / 20)}
         write_run(tmp_path, "ours", result(seed), learning_curve(seed, 0.9), test)
     study = read_runs(tmp_path)
     lines = score_table(study, study.experiments[0], REWARD)
     assert ("interquartile mean" in lines[0]) is shown
     row = cells("\n".join(lines), "ours")[0]
-    assert row[1] == ("0.700 (0.500 to 0.900)" if shown else "0.650 (0.500 to 0.800)")
+    assert row[1] == ("0.675 (0.500 to 0.850)" if shown else "0.575 (0.500 to 0.650)")
     if shown:
-        assert row[2].startswith("0.7000 (")
+        assert row[2].startswith("0.6750 (")
 
 
 @pytest.mark.parametrize(
     ("seeds", "shapes", "lines"),
     [
-        (4, ("square", "parallelogram"), []),
-        (5, ("square", "parallelogram"), ["all 2 tasks alike"]),  # one agent's tasks
-        (5, ("square", "square"), ["one", "two"]),  # agents at one task
+        (7, ("square", "parallelogram"), []),
+        (8, ("square", "parallelogram"), ["all 2 tasks alike"]),  # one agent's tasks
+        (8, ("square", "square"), ["one", "two"]),  # agents at one task
     ],
 )
 def test_a_profile_is_drawn_of_the_seeds_that_all_trainings_have(
@@ -423,8 +444,8 @@ def test_a_profile_is_drawn_of_the_seeds_that_all_trainings_have(
     names = {name: training(name, "x") for name in ("one", "two")}
     tests = {"random": {"label": "random", "overrides": []}}
     one = experiment("ranking", [*names], tests=["random"])
-    write_plan(tmp_path, plan({"a": one}, names, tests, tuple(range(6))))
-    for name, count, shape in (("one", seeds, shapes[0]), ("two", 6, shapes[1])):
+    write_plan(tmp_path, plan({"a": one}, names, tests, tuple(range(9))))
+    for name, count, shape in (("one", seeds, shapes[0]), ("two", 9, shapes[1])):
         for seed in range(count):
             content = result(seed, tokens=[shape])
             write_run(tmp_path, name, content, [], {"random": scores(0.99)})

@@ -13,10 +13,12 @@ from tangram_lab.experiments.report.study import Budget, Trial
 from tangram_sim.errors import RunError
 from tests.experiments.builders import (
     cells,
+    experiment,
     learning_curve,
     plan,
     result,
     scores,
+    training,
     write_plan,
     write_run,
     write_study,
@@ -271,3 +273,17 @@ def test_a_config_without_a_seed_is_refused(tmp_path: Path) -> None:
     (tmp_path / "0" / "config.yaml").write_text("seed: x")
     with pytest.raises(RunError, match="seed must be a number, got 'x'"):
         read_runs(tmp_path)
+
+
+def test_an_experiment_compares_the_seeds_that_all_its_trainings_have(tmp_path: Path) -> None:
+    names = {name: training(name, "x") for name in ("many", "few")}
+    alone = experiment("ranking", ["many"])
+    content = plan({"both": experiment("ranking", [*names]), "alone": alone}, names, {}, (0, 1, 2))
+    content["trainings"]["few"]["seeds"] = [0, 2]
+    write_plan(tmp_path, content)
+    study = read_runs(tmp_path)
+    assert [
+        [[seed.number for seed in one.seeds] for one in found.trainings]
+        for found in study.experiments
+    ] == [[[0, 2], [0, 2]], [[0, 1, 2]]]
+    assert [len(one.seeds) for one in study.trainings] == [3, 2]

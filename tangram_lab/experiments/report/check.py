@@ -19,10 +19,11 @@ from typing import Any
 from tangram_agent.pretrained import CARD, PACKAGED, is_name
 from tangram_lab.experiments.fingerprints import (
     UPDATES,
-    MakeSetup,
+    Resolve,
     differences,
     make_fingerprints,
 )
+from tangram_lab.experiments.jobs import changed_settings
 from tangram_lab.experiments.report.data import read_data
 from tangram_lab.experiments.report.page import DATA, FIGURES, TABLES, figure_sums, tables_page
 from tangram_lab.experiments.report.reading import parsed, read_bytes
@@ -41,13 +42,13 @@ NO_SCORE, OLDER, PAPERS = "none", "commit", "paper"
 COMMIT = "[0-9a-f]{7,40}"  # one with -dirty is of a source tree that was not as committed
 
 
-def check(results: Path, pages: Iterable[Path], make: MakeSetup) -> list[str]:
+def check(results: Path, pages: Iterable[Path], resolve: Resolve) -> list[str]:
     """What is wrong; nothing where every figure is in the data, and the data are of this code.
 
     Args:
         results: folder that tangram-report made; folders in it may hold further reports.
         pages: that show figures.
-        make: the setup that a training's arguments come to.
+        resolve: the settings that a training's arguments come to.
 
     Raises:
         RunError: the data cannot be read.
@@ -61,7 +62,9 @@ def check(results: Path, pages: Iterable[Path], make: MakeSetup) -> list[str]:
             found.append(f"{folder / TABLES} is not what {DATA} gives: make it anew")
         if others := figures.items() ^ figure_sums(folder).items():
             found.append(f"{folder / FIGURES} has not the figures of {DATA}: {min(others)[0]}")
-        found += (f"{prefix}{line}" for line in (*_lacks(study), *_trained_otherwise(study, make)))
+        found += (
+            f"{prefix}{line}" for line in (*_lacks(study), *_trained_otherwise(study, resolve))
+        )
     numbers = Sources(results, tables)
     for page in pages:
         found += check_page(page.name, _text(page), numbers)
@@ -116,9 +119,13 @@ def _odd(study: Study, seed: Seed) -> Iterator[str]:
                 yield f"test {name} has {key}={test.get(key)}, not {value}"
 
 
-def _trained_otherwise(study: Study, make: MakeSetup) -> Iterator[str]:
-    """The trainings that would come to other numbers now."""
-    now = make_fingerprints({one.name: one.overrides for one in study.trainings}, make)
+def _trained_otherwise(study: Study, resolve: Resolve) -> Iterator[str]:
+    """The trainings that have other settings now, or would come to other numbers."""
+    for one in study.trainings:
+        known = changed_settings(one.settings, resolve(one.overrides), one.settings)
+        for change in known or ["nobody kept them"] * (not one.settings):
+            yield f"{one.name} has not the settings that it was trained with: {change}"
+    now = make_fingerprints({one.name: one.overrides for one in study.trainings}, resolve)
     for name, found in now.items():
         if others := differences(study.fingerprints.get(name, {}), found):
             yield (

@@ -135,11 +135,17 @@ def band(
     return Band(grid, values.mean(axis=0), deviation, least, most, len(known))
 
 
-def first_at_least(seed: Seed, level: float) -> float | None:
-    """Episodes until a curve first reaches a mean reward; None if it never does."""
+def reached(seed: Seed, level: float) -> tuple[float, float] | None:
+    """Episodes at the evaluation before, and at the one that first had a mean reward; None if none.
+
+    What lies between nobody looked at.
+    """
     x, y = points(seed.curve, EPISODES.key, REWARD.key)
-    reached = np.flatnonzero(y >= level)
-    return float(x[reached[0]]) if len(reached) else None
+    found = np.flatnonzero(y >= level)
+    if not len(found):
+        return None
+    first = int(found[0])
+    return (float(x[first - 1]) if first else 0.0), float(x[first])
 
 
 def thinned(curve: Sequence[Row], count: int = KEPT) -> list[Row]:

@@ -76,7 +76,10 @@ WORLDS = (
     "Median over the seeds; the band goes from the least to the most. Where a world does as it is "
     "told, but for noise on actions, nothing is left to know: the other two lie on the formula."
 )
-REACHED = "Episodes are those at the first evaluation in which a seed reached the mean reward."
+REACHED = (
+    "Between which episodes: at the last evaluation before, and at the first that had the mean "
+    "reward; medians over the seeds."
+)
 
 
 def write_report(runs: Path, out: Path) -> list[Path]:

@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -54,8 +54,9 @@ NOTE = (
 
 @dataclass(frozen=True)
 class Planned(TrainingConfig):
-    """A training and its seeds."""
+    """A training, its seeds, and the settings that its overrides came to."""
 
+    settings: dict[str, Any] = field(default_factory=dict)
     seeds: tuple[Count, ...] = ()
 
     def __post_init__(self) -> None:
@@ -192,7 +193,11 @@ def make_study(content: Row, plan: "Plan", read: Callable[[str, int], Seed]) -> 
         Experiment(
             *(name, one.title, one.source, one.kind, one.note),
             trainings=tuple(
-                replace(trainings[t], label=one.labels.get(t, trainings[t].label))
+                replace(
+                    trainings[t],
+                    label=one.labels.get(t, trainings[t].label),
+                    seeds=_common(trainings[t], [trainings[name] for name in one.trainings]),
+                )
                 for t in one.trainings
             ),
             tests=tuple(tests[t] for t in one.tests),
@@ -201,6 +206,12 @@ def make_study(content: Row, plan: "Plan", read: Callable[[str, int], Seed]) -> 
     )
     known = (experiments, tuple(trainings.values()), tuple(tests.values()))
     return Study(content, plan.command, plan.commit, plan.budget, *known, plan.fingerprints)
+
+
+def _common(training: Training, others: Sequence[Training]) -> tuple[Seed, ...]:
+    """The seeds of a training that others have, too: what is compared is of the same."""
+    every = set.intersection(*({seed.number for seed in one.seeds} for one in others))
+    return tuple(seed for seed in training.seeds if seed.number in every)
 
 
 def checked_plan(content: Row, place: str) -> Plan:

@@ -1,7 +1,7 @@
 """What a study is: experiments, the trainings and tests that answer them, and what there is."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 import msgspec
@@ -44,10 +44,11 @@ class Seed:
 class Training(TrainingConfig):
     """One setting with its name in folders and files, and every planned seed in the plan's order.
 
-    Its overrides are all arguments of tangram-train.
+    Its overrides are all arguments of tangram-train, its settings what they came to.
     """
 
     name: str = ""
+    settings: Row = field(default_factory=dict)
     seeds: tuple[Seed, ...] = ()
 
     @property

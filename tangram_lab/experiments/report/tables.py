@@ -16,11 +16,11 @@ from tangram_lab.experiments.report.numbers import (
     REWARD,
     UPDATES,
     Measure,
-    first_at_least,
+    reached,
 )
 from tangram_lab.experiments.report.reading import EACH
 from tangram_lab.experiments.report.references import papers, papers_score, references
-from tangram_lab.experiments.report.statistics import ENOUGH, interquartile_mean
+from tangram_lab.experiments.report.statistics import ENOUGH, difference, interquartile_mean
 from tangram_lab.experiments.report.study import Experiment, Row, Study, Training, Trial
 from tangram_sim.arrays import Floats
 
@@ -164,22 +164,26 @@ def score_table(study: Study, experiment: Experiment, measure: Measure) -> list[
 def effort_table(experiment: Experiment) -> list[str]:
     """How soon the paper's two rewards were reached, the errors at the end, and what it took."""
     paper = _papers(experiment, "paper, episodes", "{mean_reward:.2f} after {after:,}")
-    soon = [(f"{level:.2f} after, episodes", _soon(level)) for level in LEVELS]
+    soon = [_soon(level) for level in LEVELS]
     test = experiment.main_test
     took = [*_measured(ANGLE, POSITION, test=test), *_measured(EPISODES, UPDATES, MINUTES)]
     return _table([LABEL, *_if_any(paper, experiment), *soon, *took], experiment.trainings)
 
 
-def _soon(level: float) -> Cell:
-    """Episodes until a mean reward was first reached, and by how many seeds if not by all."""
+def _soon(level: float) -> Column:
+    """Between which episodes a mean reward was first reached, and by how many seeds if not by all.
+
+    Medians of the evaluation before and of the one that had it.
+    """
 
     def cell(one: Training) -> str:
-        reached = one.each(lambda seed: first_at_least(seed, level))
-        few = 0 < len(reached) < len(one.finished)
-        count = f", {len(reached)} of {len(one.finished)} seeds" if few else ""
-        return EPISODES.show_spread(reached) + count
+        found = [pair for seed in one.finished if (pair := reached(seed, level)) is not None]
+        if not found:
+            return NOTHING
+        few = f", {len(found)} of {len(one.finished)} seeds" * (len(found) < len(one.finished))
+        return " to ".join(map(EPISODES.show, np.median(found, axis=0).tolist())) + few
 
-    return cell
+    return f"{level:.2f} reached between episodes", cell
 
 
 def complexity_table(experiment: Experiment) -> list[str]:
@@ -218,9 +222,9 @@ def ranking_table(study: Study, experiment: Experiment) -> list[str]:
         SEEDS,
         (f"{REWARD.label}, {SPREAD}", _over_seeds(REWARD, test)),
         *means,
-        ("difference, 95 % interval over the tests", _difference(first, test)),
+        ("difference, 95 % interval over seeds and tests", _difference(first, test)),
         (f"{ANGLE.label}, {SPREAD}", _over_seeds(ANGLE, test)),
-        (f"{LEVELS[0]:.2f} after, episodes", _soon(LEVELS[0])),
+        _soon(LEVELS[0]),
         *_measured(MINUTES),
     ]
     space = [""] * len(means)
@@ -232,21 +236,26 @@ def ranking_table(study: Study, experiment: Experiment) -> list[str]:
 
 
 def _difference(first: Training, test: str | None) -> Cell:
-    """Of the mean rewards, on the same test episodes, averaged over the seeds of each."""
+    """Of the mean rewards, on the same test episodes; an interval where both have enough seeds."""
 
     def cell(one: Training) -> str:
         if one is first:
             return "reference"
-        ours, theirs = _by_episode(one, test), _by_episode(first, test)
-        return paired(2.0 * (ours - theirs)) if len(ours) == len(theirs) else NOTHING
+        ours, theirs = _each(one, test), _each(first, test)
+        if not (ours and theirs and len({len(row) for row in ours + theirs}) == 1):
+            return NOTHING
+        found = difference(2.0 * np.array(ours), 2.0 * np.array(theirs))
+        if min(len(ours), len(theirs)) < ENOUGH:
+            return f"{found.estimate:+.4f}"
+        return "{:+.4f} ({:+.4f} to {:+.4f})".format(*found)
 
     return cell
 
 
-def _by_episode(training: Training, test: str | None) -> Floats:
-    """(E,) coverage of each episode of a test, averaged over the seeds."""
-    each = [seed.tests.get(test or "", {}).get(EACH) for seed in training.finished]
-    return _over_all([one for one in each if one is not None])
+def _each(training: Training, test: str | None) -> list[list[float]]:
+    """Coverage of each episode of a test, of every seed that has it."""
+    each = (seed.tests.get(test or "", {}).get(EACH) for seed in training.finished)
+    return [one for one in each if one is not None]
 
 
 def _over_all(each: Sequence[Sequence[float]]) -> Floats:
