@@ -15,6 +15,7 @@ import numpy.typing as npt
 import torch
 
 from master.trainer import Trainer
+from tangram_agent.learner import NotFiniteError
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup, make_setup
 from worker.looking import environments
@@ -34,7 +35,7 @@ Resolve = Callable[[Sequence[str]], Mapping[str, Any]]  # arguments of a trainin
 def make_fingerprints(
     arguments: Mapping[str, Sequence[str]], resolve: Resolve
 ) -> dict[str, Fingerprint]:
-    """Training -> what it comes to by the code as it is.
+    """Training -> what it comes to by the code as it is; nothing where that is not finite.
 
     Args:
         arguments: training -> its arguments.
@@ -44,15 +45,23 @@ def make_fingerprints(
         ConfigError: this code refuses a training.
     """
     torch.set_num_threads(1)
-    return {name: make_fingerprint(make_setup(resolve(given))) for name, given in arguments.items()}
+    found = dict[str, Fingerprint]()
+    for name, given in arguments.items():
+        try:
+            found[name] = make_fingerprint(make_setup(resolve(given)))
+        except NotFiniteError:
+            found[name] = {}
+    return found
 
 
 def differences(before: Fingerprint, now: Fingerprint) -> list[str]:
     """The numbers that are not what they were."""
     return [
-        f"{name} is {now[name]}, and was {before.get(name)}"
-        for name in now
-        if not np.isclose(before.get(name, np.nan), now[name], rtol=TOLERANCE, atol=TOLERANCE)
+        f"{name} is {now.get(name)}, and was {before.get(name)}"
+        for name in {**now, **before}
+        if not np.isclose(
+            before.get(name, np.nan), now.get(name, np.nan), rtol=TOLERANCE, atol=TOLERANCE
+        )
     ]
 
 

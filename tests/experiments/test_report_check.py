@@ -254,6 +254,8 @@ def test_a_fingerprint_that_nobody_kept_is_told(results: Path, kept: dict[str, A
 def test_a_fingerprint_may_differ_as_processors_do() -> None:
     assert not differences(FINGERPRINT, {"mean_reward": 0.5001, "weights": 1000.9})
     assert differences(FINGERPRINT, {"mean_reward": 0.502, "weights": 1000.0})
+    assert differences(FINGERPRINT, {})  # it diverges now
+    assert not differences({}, {})
 
 
 @pytest.mark.parametrize(
