@@ -36,7 +36,7 @@ def _experiment(settings: Plain) -> int:
 
     from tangram_lab.experiments.runner import run_study
 
-    return run_study(config, resolved, asked, _composed, own_presets())
+    return run_study(config, resolved, asked, own_presets())
 
 
 def _resolved(name: str, overrides: list[str]) -> Plain:

@@ -5,7 +5,7 @@ of the code has changed.
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from contextlib import closing
 from dataclasses import replace
 from typing import Any
@@ -29,26 +29,22 @@ TOLERANCE = 1e-3  # other processors add numbers up in another order
 
 Fingerprint = dict[str, float]
 Tensors = Mapping[str, npt.NDArray[Any]]
-Resolve = Callable[[Sequence[str]], Mapping[str, Any]]  # arguments of a training -> its settings
 
 
-def make_fingerprints(
-    arguments: Mapping[str, Sequence[str]], resolve: Resolve
-) -> dict[str, Fingerprint]:
+def make_fingerprints(configs: Mapping[str, Mapping[str, Any]]) -> dict[str, Fingerprint]:
     """Training -> what it comes to by the code as it is; nothing where that is not finite.
 
     Args:
-        arguments: training -> its arguments.
-        resolve: the settings that arguments come to.
+        configs: training -> its whole config.
 
     Raises:
         ConfigError: this code refuses a training.
     """
     torch.set_num_threads(1)
     found = dict[str, Fingerprint]()
-    for name, given in arguments.items():
+    for name, config in configs.items():
         try:
-            found[name] = make_fingerprint(make_setup(resolve(given)))
+            found[name] = make_fingerprint(make_setup(config))
         except NotFiniteError:
             found[name] = {}
     return found

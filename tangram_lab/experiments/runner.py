@@ -7,7 +7,7 @@ import signal
 import sys
 import time
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -31,7 +31,6 @@ from tangram_agent.outcome import duration
 from tangram_lab.experiments.fingerprints import (
     UPDATES,
     Fingerprint,
-    Resolve,
     differences,
     make_fingerprints,
 )
@@ -147,7 +146,6 @@ def run_study(
     config: StudyConfig,
     resolved: Mapping[str, Mapping[str, Any]],
     asked: Mapping[str, Mapping[str, Any]],
-    resolve: Resolve,
     presets: str | None,
 ) -> int:
     """Do everything that is missing.
@@ -156,7 +154,6 @@ def run_study(
         config: the study.
         resolved: the whole config of each training that is wanted.
         asked: the settings of each test of them.
-        resolve: the settings that the arguments of a training come to.
         presets: the folder of the user's own presets, None where there is none.
 
     Returns:
@@ -189,24 +186,21 @@ def run_study(
         if names:
             told = f"a fingerprint of this code first: {UPDATES} updates of each of {len(names)}"
             console.print(f"{told} trainings", highlight=False)
-        plan["fingerprints"] |= _fingerprints(plan, resolve, names)
+        plan["fingerprints"] |= _fingerprints(plan, {name: resolved[name] for name in names})
         write_whole(study.path / PLAN, _json(plan))
         with StudyProgress(console, len(jobs), len(jobs) - len(missing)) as progress:
             return Runner(missing, config.jobs, progress).run()
 
 
 def _fingerprints(
-    plan: Mapping[str, Any], resolve: Resolve, names: Iterable[str]
+    plan: Mapping[str, Any], configs: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, Fingerprint]:
     """Training -> the fingerprint of this code.
 
     Raises:
         ConfigError: other seeds of one are of code that trained otherwise.
     """
-    before = plan["fingerprints"]
-    found = make_fingerprints(
-        {name: plan["trainings"][name]["overrides"] for name in names}, resolve
-    )
+    before, found = plan["fingerprints"], make_fingerprints(configs)
     for name, now in found.items():
         if name in before and (others := differences(before[name], now)):
             raise ConfigError(

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
-from tangram_agent.setup import Setup, from_mapping
+from tangram_agent.setup import from_mapping
 from tangram_lab.experiments import runner
 from tangram_lab.experiments.cli import _asked
 from tangram_lab.experiments.jobs import Job, make_jobs
@@ -444,14 +444,11 @@ def test_seeds_of_a_training_are_of_code_that_trains_alike(
     monkeypatch: pytest.MonkeyPatch, before: dict[str, Any], told: str | None
 ) -> None:
     now = {"weights": 100.0, "reward": 0.5}
-    monkeypatch.setattr(runner, "make_fingerprints", lambda found, make: dict.fromkeys(found, now))
+    monkeypatch.setattr(runner, "make_fingerprints", lambda found: dict.fromkeys(found, now))
     plan = {"trainings": {"a": {"overrides": ["seed=1"]}}, "fingerprints": before}
 
-    def make(arguments: object) -> Setup:
-        raise AssertionError(arguments)
-
     if told is None:
-        assert runner._fingerprints(plan, make, ["a"]) == {"a": now}
+        assert runner._fingerprints(plan, {"a": {}}) == {"a": now}
     else:
         with pytest.raises(ConfigError, match=re.escape(told)):
-            runner._fingerprints(plan, make, ["a"])
+            runner._fingerprints(plan, {"a": {}})

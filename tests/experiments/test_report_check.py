@@ -112,7 +112,7 @@ def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The report of a whole study of one training."""
     monkeypatch.setattr(page, "draw_paper_pictures", lambda out, draws: [])
     monkeypatch.setattr(
-        report_check, "make_fingerprints", lambda found, resolve: dict.fromkeys(found, FINGERPRINT)
+        report_check, "make_fingerprints", lambda found: dict.fromkeys(found, FINGERPRINT)
     )
     one = experiment("curves", ["ours"], tests=["random"])
     tests = {"random": {"label": "random", "overrides": []}}
@@ -222,7 +222,7 @@ def test_what_the_study_lacks(results: Path, change: dict[str, Any], told: str) 
 
 def test_code_that_trains_otherwise(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now = {"ours": {"mean_reward": 0.5, "weights": 1003.0}}
-    monkeypatch.setattr(report_check, "make_fingerprints", lambda found, resolve: now)
+    monkeypatch.setattr(report_check, "make_fingerprints", lambda found: now)
     assert checked(results) == [
         "ours trains otherwise than when its figures were made: after 20 updates weights is "
         "1003.0, and was 1000.0: make them anew with make evidence"

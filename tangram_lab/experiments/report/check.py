@@ -12,14 +12,13 @@ A comment above a paragraph, a list or a table says where its numbers are from:
 """
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from tangram_agent.pretrained import CARD, PACKAGED, is_name
 from tangram_lab.experiments.fingerprints import (
     UPDATES,
-    Resolve,
     differences,
     make_fingerprints,
 )
@@ -39,6 +38,7 @@ INLINE = re.compile(r"`[^`\n]*`|\]\([^)]*\)")
 SECTION = re.compile(r'^<a id="(?P<name>[^"]+)"></a>$', re.MULTILINE)
 MEND = "make it anew"
 NO_SCORE, OLDER, PAPERS = "none", "commit", "paper"
+Resolve = Callable[[Sequence[str]], Mapping[str, Any]]  # arguments -> the whole config
 COMMIT = "[0-9a-f]{7,40}"  # one with -dirty is of a source tree that was not as committed
 
 
@@ -48,7 +48,7 @@ def check(results: Path, pages: Iterable[Path], resolve: Resolve) -> list[str]:
     Args:
         results: folder that tangram-report made; folders in it may hold further reports.
         pages: that show figures.
-        resolve: the settings that a training's arguments come to.
+        resolve: the whole config that a training's arguments come to.
 
     Raises:
         RunError: the data cannot be read.
@@ -121,12 +121,12 @@ def _odd(study: Study, seed: Seed) -> Iterator[str]:
 
 def _trained_otherwise(study: Study, resolve: Resolve) -> Iterator[str]:
     """The trainings that have other settings now, or would come to other numbers."""
+    configs = {one.name: resolve(one.overrides) for one in study.trainings}
     for one in study.trainings:
-        known = changed_settings(one.settings, resolve(one.overrides), one.settings)
+        known = changed_settings(one.settings, configs[one.name], one.settings)
         for change in known or ["nobody kept them"] * (not one.settings):
             yield f"{one.name} has not the settings that it was trained with: {change}"
-    now = make_fingerprints({one.name: one.overrides for one in study.trainings}, resolve)
-    for name, found in now.items():
+    for name, found in make_fingerprints(configs).items():
         if others := differences(study.fingerprints.get(name, {}), found):
             yield (
                 f"{name} trains otherwise than when its figures were made: after {UPDATES} updates "
