@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from tangram_agent.messages import MAX_SEED
+from tangram_agent.setup import SECTIONS
 from tangram_sim.errors import ConfigError
 from tangram_sim.settings import (
     Settings,
@@ -26,10 +27,7 @@ Kind = Literal["curves", "complexity", "tests", "rewards", "ranking", "game", "w
 KINDS: tuple[str, ...] = get_args(Kind)
 PLAN = "plan.json"
 # What a training comes to; the rest is where it runs.
-KEPT = (
-    *("tokens", "sim", "reward", "agent", "net", "service"),
-    *("workers", "max_updates", "max_episodes", "max_hours"),
-)
+KEPT = (*SECTIONS, "service", "workers", "max_updates", "max_episodes", "max_hours")
 JOINED = ("experiments", "trainings", "tests", "fingerprints")  # of all commands in a folder
 
 

@@ -287,3 +287,19 @@ def test_an_experiment_compares_the_seeds_that_all_its_trainings_have(tmp_path: 
         for found in study.experiments
     ] == [[[0, 2], [0, 2]], [[0, 1, 2]]]
     assert [len(one.seeds) for one in study.trainings] == [3, 2]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"coverage_each": [0.5] * 99},
+        {"baselines": {"random": {"coverage_each": [0.5]}}},
+        {"coverage_each": [0.5] * 100, "episodes": None},
+    ],
+)
+def test_single_episodes_are_as_many_as_a_test_has(tmp_path: Path, change: dict[str, Any]) -> None:
+    tests = {"random": {"label": "random", "overrides": []}}
+    write_plan(tmp_path, plan({}, {"ours": training("ours", "x")}, tests, (0,)))
+    write_run(tmp_path, "ours", result(0), [], {"random": scores(0.9) | change})
+    file = "trainings/ours/seed_0/tests/random.json"
+    refused(tmp_path, file, "coverage_each is not of its episodes; delete the file")
