@@ -49,14 +49,25 @@ paper: .venv/.installed-run  ## all figures and tables of the paper: BUDGET=smok
 	@$(BIN)/tangram-experiment budget=$(BUDGET) $(ARGS)
 	@$(BIN)/tangram-report runs=runs/experiments/$(BUDGET) out=runs/experiments/$(BUDGET)/report
 
-# Ten seeds for what README shows, three for the rest. Given again, it goes on.
-EXPERIMENTS := $(basename $(notdir $(wildcard conf/experiment/*.yaml)))
-AT_ITS_SIZE = "experiments.fig4.trainings=[paper,mlp]" "experiments.table1.trainings=[paper,mlp]"
-evidence: .venv/.installed-dev  ## everything that README and docs/results.md show, anew: a day on two cores
-	@$(BIN)/tangram-experiment "experiment=[$(shell echo $(EXPERIMENTS) | tr ' ' ',')]" budget=laptop "budget.main_seeds=[0,1,2,3,4,5,6,7,8,9]" run_dir=runs/evidence $(ARGS)
-	@$(BIN)/tangram-experiment "experiment=[fig4,table1]" budget=paper $(AT_ITS_SIZE) run_dir=runs/paper_size $(ARGS)
-	@$(BIN)/tangram-report runs=runs/evidence out=docs/results
-	@$(BIN)/tangram-report runs=runs/paper_size out=docs/results/paper_size
+# Each study is some hours on two cores, and has its runs and a report of its own. Given again, it
+# goes on. Ten seeds for what README shows, three for the rest.
+ONE_TOKEN := fig4 table1 table2 fig5 fig6 shapes method imitation perceptron parts
+ABLATIONS := plateau ablation_paper ablation_tangram raw readings noise actions pose warm_start
+GAME := game game_method game_figures game_parts game_refinement game_slide
+WORLDS := worlds robustness motion_parts
+PICTURES := pictures disturbances doubts
+LAPTOP = budget=laptop "budget.main_seeds=[0,1,2,3,4,5,6,7,8,9]"
+AT_ITS_SIZE = budget=paper "experiments.fig4.trainings=[paper,mlp]" "experiments.table1.trainings=[paper,mlp]"
+# Of a name, experiments and a budget.
+study = $(BIN)/tangram-experiment "experiment=[$(shell echo $(2) | tr ' ' ',')]" $(3) run_dir=runs/evidence/$(1) $(ARGS) \
+	&& $(BIN)/tangram-report runs=runs/evidence/$(1) out=docs/results/$(1)
+evidence: .venv/.installed-dev  ## everything that README and docs show of trainings, anew: a day on two cores
+	@$(call study,one_token,$(ONE_TOKEN),$(LAPTOP))
+	@$(call study,paper_size,fig4 table1,$(AT_ITS_SIZE))
+	@$(call study,ablations,$(ABLATIONS),$(LAPTOP))
+	@$(call study,game,$(GAME),$(LAPTOP))
+	@$(call study,worlds,$(WORLDS),$(LAPTOP))
+	@$(call study,pictures,$(PICTURES),$(LAPTOP))
 	@$(BIN)/tangram-report check
 
 bench: .venv/.installed-dev  ## measure speed against what else one could do; options go into ARGS="runs=9"

@@ -161,3 +161,12 @@ def test_make_refuses_a_variable_that_it_would_drop(given: str, refused: bool) -
     assert (result.returncode != 0) == refused
     name = given.partition("=")[0]
     assert (f'make knows no {name}=...: settings go into ARGS="..."' in result.stderr) == refused
+
+
+def test_the_evidence_has_every_experiment_and_each_in_one_study() -> None:
+    commands = run(["make", "--dry-run", "evidence"]).stdout
+    chosen = re.findall(r'"experiment=\[([^\]]*)\]" budget=laptop', commands)
+    every = sorted(path.stem for path in (ROOT / "conf" / "experiment").glob("*.yaml"))
+    assert sorted(name for names in chosen for name in names.split(",")) == every
+    studies = re.findall(r"tangram-report runs=runs/evidence/(\w+) out=docs/results/\1\n", commands)
+    assert len(studies) == len({*studies}) == len(chosen) + 1  # the paper at its own size

@@ -85,8 +85,8 @@ class ReportConfig(Settings):
     )
     check: bool = setting(
         False,
-        "in a clone: whether README and docs show what docs/results/data.json holds, and whether "
-        "this code still trains as the code that made it",
+        "in a clone: whether README and docs show what the reports in docs/results hold, and "
+        "whether this code still trains as the code that made them",
     )
 
     def __post_init__(self) -> None:

@@ -23,7 +23,7 @@ from worker.rollout import Rollout
 from worker.test_set import FixedTests, greedy
 
 UPDATES = 20
-BATCH_SIZE, LEARNING_STARTS, CAPACITY = 16, 32, 256  # instead of the agent's
+BATCH_SIZE, LEARNING_STARTS, CAPACITY, PACE = 16, 32, 256, 1.0  # instead of the agent's
 SEED, ENVS, BATCH_EPISODES, TEST_EPISODES = 0, 4, 8, 8
 TOLERANCE = 1e-3  # other processors add numbers up in another order
 
@@ -88,12 +88,13 @@ def make_fingerprint(setup: Setup) -> Fingerprint:
 
 
 def short(setup: Setup) -> Setup:
-    """The same with small batches, that begins to learn soon."""
+    """The same with small batches, that begins to learn soon and plays little for each update."""
     agent = replace(
         setup.agent,
         batch_size=BATCH_SIZE,
         learning_starts=LEARNING_STARTS,
         replay_capacity=CAPACITY,
+        updates_per_transition=PACE,
     )
     return replace(setup, agent=agent)
 

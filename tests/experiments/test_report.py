@@ -13,6 +13,7 @@ from tangram_lab.experiments.cli import ReportConfig, _with_absolute, report
 from tangram_lab.experiments.report import page as report_page
 from tangram_lab.experiments.report.data import read_data
 from tangram_lab.experiments.report.page import tables_page, write_report
+from tangram_lab.experiments.report.reading import read_runs
 from tangram_sim.errors import ConfigError, RunError
 from tests.experiments.builders import (
     experiment,
@@ -92,6 +93,18 @@ def test_same_runs_give_the_same_bytes(tmp_path: Path, patch: pytest.MonkeyPatch
     for path in first:
         twin = tmp_path / "second" / path.relative_to(tmp_path / "first")
         assert twin.read_bytes() == path.read_bytes()
+
+
+@pytest.mark.parametrize(("source", "shown"), [("Fig. 5", True), ("Sec. VIII", False)])
+def test_the_papers_pictures_stand_beside_its_figures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str, shown: bool
+) -> None:
+    picture = ("Puzzle", "p.png", "A cat.")
+    monkeypatch.setattr(report_page, "draw_paper_pictures", lambda out, draws: [picture])
+    one = experiment("game", ["one"], source)
+    write_plan(tmp_path, plan({"a": one}, {"one": training("one", "x")}, {}, (0,)))
+    study = read_runs(tmp_path)
+    assert ("A cat." in tables_page(study, tmp_path)) == shown
 
 
 def test_data_holds_all_numbers(made: Path) -> None:

@@ -37,24 +37,24 @@ TABLES = '<a id="fig4"></a>\n\n| ours | 0.996 (0.995 to 0.9971) |\n\n<a id="fig5
 @pytest.fixture
 def numbers(tmp_path: Path) -> Sources:
     (tmp_path / "bench.json").write_text(json.dumps({"a": [{"x": 0.12344, "b": True}], "c": -3.0}))
-    return Sources(tmp_path, {"": TABLES, "large/": TABLES.replace("0.996", "0.998")})
+    return Sources(tmp_path, {"a": TABLES, "large": TABLES.replace("0.996", "0.998")})
 
 
 PAGES = [
     ("It has 0.996.", ["has no source"]),
-    ("<!-- data: fig4 -->\nIt has 0.996 (0.995).", []),
-    ("<!-- data: fig4 -->\n\nIt has 0.996.", []),
-    ("<!-- data: fig4 -->\n\nIt has 0.996.\n\nAnd 0.995.", ["0.995 has no source"]),
-    ("<!-- data: fig4 -->\nIt has 0.997.", ["0.997 is not in fig4"]),  # it is 0.9971
-    ("<!-- data: fig5 -->\nIt has 0.996.", ["0.996 is not in fig5"]),
-    ("<!-- data: fig5 fig4 -->\nIt has 0.996.", []),
+    ("<!-- data: a/fig4 -->\nIt has 0.996 (0.995).", []),
+    ("<!-- data: a/fig4 -->\n\nIt has 0.996.", []),
+    ("<!-- data: a/fig4 -->\n\nIt has 0.996.\n\nAnd 0.995.", ["0.995 has no source"]),
+    ("<!-- data: a/fig4 -->\nIt has 0.997.", ["0.997 is not in a/fig4"]),  # it is 0.9971
+    ("<!-- data: a/fig5 -->\nIt has 0.996.", ["0.996 is not in a/fig5"]),
+    ("<!-- data: a/fig5 a/fig4 -->\nIt has 0.996.", []),
     ("<!-- data: large/fig4 -->\nIt has 0.998 and 0.996.", ["0.996 is not in large/fig4"]),
     ("<!-- data: bench.json -->\nIt has 0.123, 0.1234 and -3.000.", []),
     ("<!-- data: bench.json -->\nIt has 1.000.", ["1.000 is not in bench.json"]),  # true is none
     ("<!-- data: paper -->\nThe paper has 0.758 and 0.759.", ["0.759 is not in paper"]),
     ("<!-- data: paper -->\nThe paper has 0.760.", ["0.760 is not in paper"]),
-    ("<!-- data: fig4 -->\nIt has -0.996.", ["-0.996 is not in fig4"]),
-    ("<!-- data: fig4 -->\nFrom 0.995-0.996.", []),
+    ("<!-- data: a/fig4 -->\nIt has -0.996.", ["-0.996 is not in a/fig4"]),
+    ("<!-- data: a/fig4 -->\nFrom 0.995-0.996.", []),
     ("<!-- data: bench.json -->\nIt has 3.000.", ["3.000 is not in bench.json"]),  # it is -3
     ("<!-- data: pretrained/square -->\nOf 0.160 and 0.3333.", ["0.3333 is not in"]),
     (
@@ -63,15 +63,15 @@ PAGES = [
     ),
     ("It has 12.3 %.", ["12.3 % has no source"]),
     ("<!-- data: data.json -->\nIt has 0.996.", ["has a source that is none"]),
-    ("<!-- data: fig4 -->\n````\n```\n````  \n\nIt has 0.111.", ["0.111 is not in fig4"]),
+    ("<!-- data: a/fig4 -->\n````\n```\n````  \n\nIt has 0.111.", ["0.111 is not in a/fig4"]),
     ("It has 0.996. <!-- data: none -->", ["has no source"]),
     ("<!-- data: commit -->\nIt had 0.111.", ["name the commit by 7 digits or more"]),
     ("<!-- data: commit a -->\nIt had a 0.111.", ["name the commit by 7 digits or more"]),
     ("<!-- data: commit 0123abc -->\nAt commit 0123abc it had 0.111.", []),
     ("<!-- data: commit 0123abc -->\nIt had 0.111.", ["is of commit 0123abc, which the text does"]),
     ("<!-- data: none -->\nA side of 0.125.", []),
-    ("<!-- data: fig4 -->\n- 0.996\n<!-- data: fig5 -->\n- 0.995", ["0.995 is not in fig5"]),
-    ("<!-- data: fig4 none -->\nA side of 0.125.", ["none stands alone"]),
+    ("<!-- data: a/fig4 -->\n- 0.996\n<!-- data: a/fig5 -->\n- 0.995", ["0.995 is not in a/fig5"]),
+    ("<!-- data: a/fig4 none -->\nA side of 0.125.", ["none stands alone"]),
     ("`agent.noise=0.125`, [x](a_0.125.md), 1.25 and version 1.2.345\n\n```\n0.125\n```", []),
     ("| a |\n| --- |\n| 0.996 |", ["has no source"]),
 ]
@@ -93,7 +93,7 @@ def test_a_line_is_named(numbers: Sources) -> None:
     ]
 
 
-@pytest.mark.parametrize("name", ["fig9", "nowhere.json", "../data.yaml"])
+@pytest.mark.parametrize("name", ["fig4", "a/fig9", "nowhere.json", "../data.yaml", "a/data.json"])
 def test_a_source_that_is_none(numbers: Sources, name: str) -> None:
     (found,) = check_page("p.md", f"<!-- data: {name} -->\n0.111", numbers)
     assert f"p.md:1: 0.111 has a source that is none: no source is called {name}" in found
@@ -108,8 +108,8 @@ def resolve(arguments: Sequence[str]) -> dict[str, Any]:
 
 
 @pytest.fixture
-def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The report of a whole study of one training."""
+def report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of the report of a whole study of one training, in one of results."""
     monkeypatch.setattr(page, "draw_paper_pictures", lambda out, draws: [])
     monkeypatch.setattr(
         report_check, "make_fingerprints", lambda found: dict.fromkeys(found, FINGERPRINT)
@@ -120,83 +120,81 @@ def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for seed in (0, 1):
         curve, test = learning_curve(seed, 0.9), {"random": scores(0.912)}
         write_run(tmp_path, "ours", result(seed), curve, test)
-    write_report(tmp_path, tmp_path / "results")
-    return tmp_path / "results"
+    out = tmp_path / "results" / "small"
+    write_report(tmp_path, out)
+    return out
 
 
-def checked(results: Path, text: str = "<!-- data: fig4 -->\n0.912") -> list[str]:
-    (results.parent / "README.md").write_text(text)
-    return check(results, [results.parent / "README.md"], resolve)
+def checked(report: Path, text: str = "<!-- data: small/fig4 -->\n0.912") -> list[str]:
+    page = report.parents[1] / "README.md"
+    page.write_text(text)
+    return check(report.parent, [page], resolve)
 
 
-def changed(results: Path, change: dict[str, Any]) -> None:
+def changed(report: Path, change: dict[str, Any]) -> None:
     """A finished run's result is another one."""
-    data = json.loads((results / "data.json").read_text())
+    data = json.loads((report / "data.json").read_text())
     data["runs"]["ours"][1] |= change
-    (results / "data.json").write_text(json.dumps(data))
+    (report / "data.json").write_text(json.dumps(data))
 
 
-def test_nothing_is_wrong(results: Path) -> None:
-    assert checked(results) == []
+def test_nothing_is_wrong(report: Path) -> None:
+    assert checked(report) == []
 
 
-def test_a_page_that_shows_something_else(results: Path) -> None:
-    assert checked(results, "<!-- data: fig4 -->\n0.913") == [
-        "README.md:1: 0.913 is not in fig4",
+def test_a_page_that_shows_something_else(report: Path) -> None:
+    assert checked(report, "<!-- data: small/fig4 -->\n0.913") == [
+        "README.md:1: 0.913 is not in small/fig4",
     ]
 
 
-@pytest.fixture
-def both(results: Path) -> Path:
-    """A second report in a folder of the first."""
-    shutil.copytree(results, results.parent / "copy")
-    (results.parent / "copy").rename(results / "large")
-    return results
-
-
-def test_a_report_in_a_folder_of_the_results_is_a_source_too(both: Path) -> None:
-    assert checked(both, "<!-- data: large/fig4 -->\n0.912") == []
-    assert checked(both, "<!-- data: large/fig4 -->\n0.913") == [
+def test_each_report_is_a_source_and_whole(report: Path) -> None:
+    large = report.with_name("large")
+    shutil.copytree(report, large)
+    assert checked(report, "<!-- data: large/fig4 -->\n0.912") == []
+    assert checked(report, "<!-- data: large/fig4 -->\n0.913") == [
         "README.md:1: 0.913 is not in large/fig4"
     ]
+    changed(large, {"state": "not finished", "result": {}, "tests": {}})
+    assert "large/ours lacks the seeds [1]" in checked(report)
 
 
-def test_each_report_is_whole(both: Path) -> None:
-    changed(both / "large", {"state": "not finished", "result": {}, "tests": {}})
-    assert "large/ours lacks the seeds [1]" in checked(both)
+def test_results_without_a_report_are_told(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="no report is in .*: make them with make evidence"):
+        check(tmp_path, [], resolve)
 
 
 @pytest.mark.parametrize("name", ["fig4.png", "fig4.svg", "old.png"])
-def test_figures_are_those_that_were_drawn_of_the_data(results: Path, name: str) -> None:
-    folder = results / "figures"
+def test_figures_are_those_that_were_drawn_of_the_data(report: Path, name: str) -> None:
+    folder = report / "figures"
     with (folder / name).open("ab") as file:
         file.write(b"x")
-    assert checked(results) == [f"{folder} has not the figures of data.json: {name}"]
+    assert checked(report) == [f"{folder} has not the figures of data.json: {name}"]
     (folder / name).unlink()
-    assert (checked(results) == []) == (name == "old.png")
+    assert (checked(report) == []) == (name == "old.png")
 
 
-def test_a_report_that_fails_leaves_the_earlier_one_whole(results: Path) -> None:
-    before = {path: path.read_bytes() for path in results.rglob("*") if path.is_file()}
-    curve = results.parent / "trainings" / "ours" / "seed_0" / "curve.jsonl"
+def test_a_report_that_fails_leaves_the_earlier_one_whole(report: Path) -> None:
+    before = {path: path.read_bytes() for path in report.rglob("*") if path.is_file()}
+    curve = report.parents[1] / "trainings" / "ours" / "seed_0" / "curve.jsonl"
     point = json.loads(curve.read_text().splitlines()[-1])
     with curve.open("a") as file:
         file.write(json.dumps(point | {"note": "x"}) + "\n")
     with pytest.raises(RunError, match=r"Expected `float \| null`, got `str`"):
-        write_report(results.parent, results)
-    assert {path: path.read_bytes() for path in results.rglob("*") if path.is_file()} == before
+        write_report(report.parents[1], report)
+    assert {path: path.read_bytes() for path in report.rglob("*") if path.is_file()} == before
 
 
 def test_nothing_takes_the_place_of_a_report_before_a_run_is_finished(tmp_path: Path) -> None:
     write_plan(tmp_path, plan({}, {}, {}))
     with pytest.raises(RunError, match="no run is finished in .*: wait for one"):
-        write_report(tmp_path, tmp_path / "results")
+        write_report(tmp_path, tmp_path / "report")
 
 
-def test_tables_that_were_changed_by_hand(results: Path) -> None:
-    tables = results / "tables.md"
+def test_tables_that_were_changed_by_hand(report: Path) -> None:
+    tables = report / "tables.md"
     tables.write_text(tables.read_text().replace("0.912", "0.913"))
-    assert any("is not what data.json gives" in line for line in checked(results))
+    assert any("is not what data.json gives" in line for line in checked(report))
 
 
 @pytest.mark.parametrize(
@@ -215,16 +213,16 @@ def test_tables_that_were_changed_by_hand(results: Path) -> None:
         ({"tests": {"random": scores(0.9, updates=7)}}, "has updates=7, not 2000"),
     ],
 )
-def test_what_the_study_lacks(results: Path, change: dict[str, Any], told: str) -> None:
-    changed(results, change)
-    assert any(told in line for line in checked(results))
+def test_what_the_study_lacks(report: Path, change: dict[str, Any], told: str) -> None:
+    changed(report, change)
+    assert any(told in line for line in checked(report))
 
 
-def test_code_that_trains_otherwise(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_code_that_trains_otherwise(report: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now = {"ours": {"mean_reward": 0.5, "weights": 1003.0}}
     monkeypatch.setattr(report_check, "make_fingerprints", lambda found: now)
-    assert checked(results) == [
-        "ours trains otherwise than when its figures were made: after 20 updates weights is "
+    assert checked(report) == [
+        "small/ours trains otherwise than when its figures were made: after 20 updates weights is "
         "1003.0, and was 1000.0: make them anew with make evidence"
     ]
 
@@ -234,20 +232,20 @@ def test_code_that_trains_otherwise(results: Path, monkeypatch: pytest.MonkeyPat
     [({"agent": {"batch_size": 32}}, "agent.batch_size=32, now 64"), ({}, "nobody kept them")],
 )
 def test_other_settings_than_those_that_trained_are_told(
-    results: Path, kept: dict[str, Any], told: str
+    report: Path, kept: dict[str, Any], told: str
 ) -> None:
-    data = json.loads((results / "data.json").read_text())
+    data = json.loads((report / "data.json").read_text())
     data["plan"]["trainings"]["ours"]["settings"] = kept
-    (results / "data.json").write_text(json.dumps(data))
-    assert checked(results) == [f"ours has not the settings that it was trained with: {told}"]
+    (report / "data.json").write_text(json.dumps(data))
+    assert checked(report) == [f"small/ours has not the settings that it was trained with: {told}"]
 
 
 @pytest.mark.parametrize("kept", [{}, {"ours": {}}, {"ours": {"mean_reward": 0.5}}])
-def test_a_fingerprint_that_nobody_kept_is_told(results: Path, kept: dict[str, Any]) -> None:
-    data = json.loads((results / "data.json").read_text())
+def test_a_fingerprint_that_nobody_kept_is_told(report: Path, kept: dict[str, Any]) -> None:
+    data = json.loads((report / "data.json").read_text())
     data["plan"]["fingerprints"] = kept
-    (results / "data.json").write_text(json.dumps(data))
-    (found,) = checked(results)
+    (report / "data.json").write_text(json.dumps(data))
+    (found,) = checked(report)
     assert "weights is 1000.0, and was None" in found
 
 
@@ -268,9 +266,9 @@ def test_a_fingerprint_may_differ_as_processors_do() -> None:
     ],
 )
 def test_data_that_are_not_what_they_should_be(
-    results: Path, change: dict[str, Any], message: str
+    report: Path, change: dict[str, Any], message: str
 ) -> None:
-    path = results / "data.json"
+    path = report / "data.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
     with pytest.raises(RunError, match=message):
         read_data(path)
@@ -286,7 +284,7 @@ def test_no_folder_of_this_machine_is_told(tmp_path: Path) -> None:
     assert told == "tangram-experiment 'a=[x,y]' jobs=2"
 
 
-def test_a_curve_whose_columns_differ_in_length(results: Path) -> None:
-    changed(results, {"curve": {"updates": [1.0, 2.0], "mean_reward": [0.5]}})
+def test_a_curve_whose_columns_differ_in_length(report: Path) -> None:
+    changed(report, {"curve": {"updates": [1.0, 2.0], "mean_reward": [0.5]}})
     with pytest.raises(RunError, match="seed 1: the columns of its curve are not of one length"):
-        read_data(results / "data.json")
+        read_data(report / "data.json")

@@ -2,8 +2,7 @@
 
 A comment above a paragraph, a list or a table says where its numbers are from:
 
-    <!-- data: fig4 table2 -->       these experiments' sections of the tables
-    <!-- data: paper_size/fig4 -->   the same of the report in that folder of docs/results
+    <!-- data: worlds/robustness --> that experiment's section of the tables in docs/results/worlds
     <!-- data: silhouettes.json -->  a file of docs/results
     <!-- data: pretrained/square --> the card of an agent that comes with the package
     <!-- data: paper -->             the paper's own numbers
@@ -46,7 +45,7 @@ def check(results: Path, pages: Iterable[Path], resolve: Resolve) -> list[str]:
     """What is wrong; nothing where every figure is in the data, and the data are of this code.
 
     Args:
-        results: folder that tangram-report made; folders in it may hold further reports.
+        results: folder whose folders were made by tangram-report; files of benchmarks lie beside.
         pages: that show figures.
         resolve: the whole config that a training's arguments come to.
 
@@ -55,15 +54,16 @@ def check(results: Path, pages: Iterable[Path], resolve: Resolve) -> list[str]:
         ConfigError: this code refuses a training of them.
     """
     found, tables = list[str](), dict[str, str]()
-    for prefix, folder in reports(results).items():
+    for folder in reports(results):
         study, figures = read_data(folder / DATA)
-        tables[prefix] = _text(folder / TABLES)
-        if tables_page(study, folder) != tables[prefix]:
+        tables[folder.name] = _text(folder / TABLES)
+        if tables_page(study, folder) != tables[folder.name]:
             found.append(f"{folder / TABLES} is not what {DATA} gives: make it anew")
         if others := figures.items() ^ figure_sums(folder).items():
             found.append(f"{folder / FIGURES} has not the figures of {DATA}: {min(others)[0]}")
         found += (
-            f"{prefix}{line}" for line in (*_lacks(study), *_trained_otherwise(study, resolve))
+            f"{folder.name}/{line}"
+            for line in (*_lacks(study), *_trained_otherwise(study, resolve))
         )
     numbers = Sources(results, tables)
     for page in pages:
@@ -71,10 +71,15 @@ def check(results: Path, pages: Iterable[Path], resolve: Resolve) -> list[str]:
     return found
 
 
-def reports(results: Path) -> dict[str, Path]:
-    """What stands before the names of a report's experiments -> its folder."""
-    others = sorted(path.parent for path in results.glob(f"*/{DATA}"))
-    return {"": results, **{f"{folder.name}/": folder for folder in others}}
+def reports(results: Path) -> list[Path]:
+    """The folders of all reports.
+
+    Raises:
+        RunError: there are none.
+    """
+    if folders := sorted(path.parent for path in results.glob(f"*/{DATA}")):
+        return folders
+    raise RunError(f"no report is in {results}: make them with make evidence")
 
 
 def _text(path: Path) -> str:
@@ -138,12 +143,12 @@ class Sources:
     """The numbers that may stand on pages, by the names of their sources."""
 
     def __init__(self, results: Path, tables: Mapping[str, str]) -> None:
-        """Take the tables of each report; files are read when they are named."""
+        """Take the tables of each report by its name; files are read when they are named."""
         self._results = results
         self._sections = dict[str, str]()
-        for prefix, text in tables.items():
+        for report, text in tables.items():
             parts = SECTION.split(text)[1:]
-            names = (prefix + name for name in parts[::2])
+            names = (f"{report}/{name}" for name in parts[::2])
             self._sections |= zip(names, parts[1::2], strict=True)
 
     def has(self, source: str, text: str) -> bool:
@@ -163,9 +168,9 @@ class Sources:
     def _file(self, name: str) -> Iterator[float]:
         folder = Path(str(PACKAGED), Path(name).name) if is_name(name) else self._results
         path = folder / (CARD if is_name(name) else name)
-        if name == DATA or not (path.suffix == ".json" and path.is_file()):
+        if path.name == DATA or not (path.suffix == ".json" and path.is_file()):
             raise RunError(
-                f"no source is called {name}: name an experiment of {TABLES}, a .json file of "
+                f"no source is called {name}: name REPORT/EXPERIMENT, a .json file of "
                 f"{self._results}, {PAPERS}, {OLDER} or {NO_SCORE}"
             )
         yield from _numbers(parsed(read_bytes(path, MEND), Row, str(path), MEND)[0])

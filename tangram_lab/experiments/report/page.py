@@ -168,11 +168,11 @@ class Page:
         ]
 
     def pictures(self) -> list[str]:
-        """The paper's Figs. 1 to 3, which need no training."""
+        """The paper's Figs. 1 to 3, which need no training, where others of its figures are."""
         lines: list[str] = []
-        for title, file, caption in (
-            draw_paper_pictures(self.out / FIGURES, self.draws) if self.study.plan else []
-        ):
+        if not any(one.source.startswith("Fig.") for one in self.study.experiments):
+            return lines
+        for title, file, caption in draw_paper_pictures(self.out / FIGURES, self.draws):
             lines += [f"## {plain(title)}", "", *picture(title, f"{FIGURES}/{file}")]
             lines += [f"*{plain(caption)}*", ""]
         return lines
