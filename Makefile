@@ -14,6 +14,9 @@ ifneq ($(STRAY),)
 $(error make knows no $(firstword $(STRAY))=...: settings go into ARGS="...", as in make train ARGS="seed=1 tokens=parallelogram"; BUDGET=... is for make paper)
 endif
 
+# Processes start sooner where Python keeps what it compiled, and the tests start many.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DEFAULT_GOAL := help
 .PHONY: help train studio test lint settings format paper evidence bench docs lock sbom clean
 
