@@ -7,11 +7,15 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from conf.cli import composed, entry, own_presets
 from conf.commands import Plain
 from tangram_sim.errors import ConfigError
 from tangram_sim.settings import Settings, setting
+
+if TYPE_CHECKING:
+    from tangram_lab.experiments.plan import StudyConfig
 
 ROOT = Path(__file__).parents[2]
 RESULTS = "docs/results"
@@ -124,6 +128,14 @@ def _report(settings: Plain) -> int:
     return 0
 
 
+def _chosen(arguments: list[str]) -> "StudyConfig":
+    """The study that tangram-experiment makes of its arguments."""
+    from tangram_agent.setup import from_mapping
+    from tangram_lab.experiments.plan import StudyConfig
+
+    return from_mapping(StudyConfig, composed("experiments", arguments))
+
+
 def _check() -> int:
     from tangram_lab.experiments.report.check import check
 
@@ -131,7 +143,7 @@ def _check() -> int:
         raise ConfigError(f"check looks at {RESULTS} of a clone, which {ROOT} lacks: run it in one")
     pages = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
     shown = (page for page in pages if page.name not in GENERATED)
-    wrong = check(ROOT / RESULTS, shown, _composed)
+    wrong = check(ROOT / RESULTS, shown, _composed, _chosen)
     for line in wrong:
         print(line)
     fine = "every score of README and docs is in the data, or names the older commit that it is of"

@@ -181,10 +181,11 @@ class StudyConfig(Settings):
         found = set[int]()
         for experiment in self.experiments.values():
             if any(training in self._sources(wanted) for wanted in experiment.trainings):
-                found.update(self._seeds_of(experiment))
+                found.update(self.seeds_of(experiment))
         return sorted(found)
 
-    def _seeds_of(self, experiment: ExperimentConfig) -> tuple[int, ...]:
+    def seeds_of(self, experiment: ExperimentConfig) -> tuple[int, ...]:
+        """Of all trainings of an experiment."""
         return self.budget.main_seeds if experiment.main else self.budget.seeds
 
     def wanted(self) -> list[str]:
@@ -212,7 +213,7 @@ class StudyConfig(Settings):
         found = [
             e.tests
             for e in self.experiments.values()
-            if training in e.trainings and (seed is None or seed in self._seeds_of(e))
+            if training in e.trainings and (seed is None or seed in self.seeds_of(e))
         ]
         return list(dict.fromkeys(name for tests in found for name in tests))
 

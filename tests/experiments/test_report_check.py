@@ -8,7 +8,9 @@ from typing import Any
 
 import pytest
 
+from tangram_agent.setup import from_mapping
 from tangram_lab.experiments.fingerprints import differences
+from tangram_lab.experiments.plan import StudyConfig
 from tangram_lab.experiments.report import check as report_check
 from tangram_lab.experiments.report import page
 from tangram_lab.experiments.report.check import Sources, check, check_page
@@ -107,6 +109,39 @@ def resolve(arguments: Sequence[str]) -> dict[str, Any]:
     return SETTINGS | {"later": {"known": True}}
 
 
+PLANNED: dict[str, Any] = {
+    "run_dir": "x",
+    "budget": {
+        "name": "laptop",
+        "note": "",
+        "seeds": [0, 1],
+        "main_seeds": [0, 1, 2],
+        "test_episodes": 100,
+        "test_seed": 2,
+        "overrides": {},
+    },
+    "families": {"x": []},
+    "trainings": {name: {"label": name, "family": "x"} for name in ("ours", "theirs")},
+    "tests": {name: {"label": name} for name in ("random", "noisy")},
+    "experiments": {
+        "fig4": {
+            "title": "",
+            "source": "",
+            "kind": "curves",
+            "note": "",
+            "trainings": ["ours"],
+            "tests": ["random"],
+        }
+    },
+}
+
+
+def choose(arguments: list[str]) -> StudyConfig:
+    """The study of the fixture as it is in conf/, where tangram-experiment is told these words."""
+    assert arguments == ["experiment=[fig4]", "budget=laptop"]
+    return from_mapping(StudyConfig, PLANNED)
+
+
 @pytest.fixture
 def report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of the report of a whole study of one training, in one of results."""
@@ -128,7 +163,7 @@ def report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def checked(report: Path, text: str = "<!-- data: small/fig4 -->\n0.912") -> list[str]:
     page = report.parents[1] / "README.md"
     page.write_text(text)
-    return check(report.parent, [page], resolve)
+    return check(report.parent, [page], resolve, choose)
 
 
 def changed(report: Path, change: dict[str, Any]) -> None:
@@ -161,7 +196,7 @@ def test_each_report_is_a_source_and_whole(report: Path) -> None:
 
 def test_results_without_a_report_are_told(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="no report is in .*: make them with make evidence"):
-        check(tmp_path, [], resolve)
+        check(tmp_path, [], resolve, choose)
 
 
 @pytest.mark.parametrize("name", ["fig4.png", "fig4.svg", "old.png"])
@@ -216,6 +251,21 @@ def test_tables_that_were_changed_by_hand(report: Path) -> None:
 def test_what_the_study_lacks(report: Path, change: dict[str, Any], told: str) -> None:
     changed(report, change)
     assert any(told in line for line in checked(report))
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"trainings": ["theirs", "ours"]}, "other trainings now: theirs"),
+        ({"tests": []}, "other tests now: random"),
+        ({"main": True}, "other seeds now: 2"),
+    ],
+)
+def test_an_experiment_that_would_be_made_of_others(
+    report: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, Any], told: str
+) -> None:
+    monkeypatch.setitem(PLANNED["experiments"], "fig4", PLANNED["experiments"]["fig4"] | change)
+    assert checked(report) == [f"small/fig4 would be made of {told}"]
 
 
 def test_code_that_trains_otherwise(report: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,11 +22,19 @@ from tangram_lab.experiments.fingerprints import (
     make_fingerprints,
 )
 from tangram_lab.experiments.jobs import changed_settings
+from tangram_lab.experiments.plan import StudyConfig
 from tangram_lab.experiments.report.data import read_data
-from tangram_lab.experiments.report.page import DATA, FIGURES, TABLES, figure_sums, tables_page
+from tangram_lab.experiments.report.page import (
+    DATA,
+    FIGURES,
+    TABLES,
+    arguments,
+    figure_sums,
+    tables_page,
+)
 from tangram_lab.experiments.report.reading import parsed, read_bytes
 from tangram_lab.experiments.report.references import VALUES
-from tangram_lab.experiments.report.study import Row, Seed, Study
+from tangram_lab.experiments.report.study import Experiment, Row, Seed, Study
 from tangram_sim.errors import RunError
 
 MARK = re.compile(r"<!-- data: (?P<sources>[^>]+?) -->")
@@ -37,21 +45,23 @@ INLINE = re.compile(r"`[^`\n]*`|\]\([^)]*\)")
 SECTION = re.compile(r'^<a id="(?P<name>[^"]+)"></a>$', re.MULTILINE)
 MEND = "make it anew"
 NO_SCORE, OLDER, PAPERS = "none", "commit", "paper"
-Resolve = Callable[[Sequence[str]], Mapping[str, Any]]  # arguments -> the whole config
+Resolve = Callable[[Sequence[str]], Mapping[str, Any]]  # of tangram-train -> the whole config
+Choose = Callable[[list[str]], StudyConfig]  # of tangram-experiment -> the study
 COMMIT = "[0-9a-f]{7,40}"  # one with -dirty is of a source tree that was not as committed
 
 
-def check(results: Path, pages: Iterable[Path], resolve: Resolve) -> list[str]:
+def check(results: Path, pages: Iterable[Path], resolve: Resolve, choose: Choose) -> list[str]:
     """What is wrong; nothing where every figure is in the data, and the data are of this code.
 
     Args:
         results: folder whose folders were made by tangram-report; files of benchmarks lie beside.
         pages: that show figures.
         resolve: the whole config that a training's arguments come to.
+        choose: the study that the arguments of tangram-experiment come to.
 
     Raises:
         RunError: the data cannot be read.
-        ConfigError: this code refuses a training of them.
+        ConfigError: this code refuses a training or an experiment of them.
     """
     found, tables = list[str](), dict[str, str]()
     for folder in reports(results):
@@ -63,7 +73,11 @@ def check(results: Path, pages: Iterable[Path], resolve: Resolve) -> list[str]:
             found.append(f"{folder / FIGURES} has not the figures of {DATA}: {min(others)[0]}")
         found += (
             f"{folder.name}/{line}"
-            for line in (*_lacks(study), *_trained_otherwise(study, resolve))
+            for line in (
+                *_lacks(study),
+                *_planned_otherwise(study, choose),
+                *_trained_otherwise(study, resolve),
+            )
         )
     numbers = Sources(results, tables)
     for page in pages:
@@ -103,6 +117,24 @@ def _lacks(study: Study) -> Iterator[str]:
             for test in experiment.tests:
                 if any(test.name not in seed.tests for seed in training.finished):
                     yield f"{training.name} lacks the test {test.name} of {experiment.name}"
+
+
+def _planned_otherwise(study: Study, choose: Choose) -> Iterator[str]:
+    """The experiments that would be made of others now, by the commands that the page prints."""
+    config = choose(arguments(study, [one.name for one in study.experiments]))
+    for one in study.experiments:
+        now = config.experiments[one.name]
+        for what, made, planned in (
+            ("trainings", [training.name for training in one.trainings], now.trainings),
+            ("tests", [test.name for test in one.tests], now.tests),
+            ("seeds", sorted(_seeds(one)), sorted(config.seeds_of(now))),
+        ):
+            if others := {*made} ^ {*planned}:
+                yield f"{one.name} would be made of other {what} now: {', '.join(map(str, others))}"
+
+
+def _seeds(experiment: Experiment) -> set[int]:
+    return {seed.number for training in experiment.trainings for seed in training.seeds}
 
 
 def _odd(study: Study, seed: Seed) -> Iterator[str]:

@@ -27,7 +27,7 @@ from tangram_lab.experiments.report.numbers import (
     spread,
 )
 from tangram_lab.experiments.report.references import (
-    PERFECT,
+    EXACT,
     POSITION,
     papers,
     papers_score,
@@ -120,7 +120,7 @@ def curve_parts(study: Study, experiment: Experiment) -> list[Part]:
 
 def sweep_parts(study: Study, experiment: Experiment) -> list[Part]:
     """The trainings of each figure of a sweep."""
-    shown = (POSITION, PERFECT)
+    shown = (POSITION, EXACT)
     return _parts(experiment, sum(r.name in shown for r in references(study, experiment)))
 
 
@@ -159,7 +159,7 @@ def draw_curves(
             score = policy.score(measure)
             if policy.name == POSITION and score is not None:
                 _draw_level(panel, score, GREY, next(dashes), 1.2, f"{policy.label}: {score:.2f}")
-        panel.axhline(1.0, color=LEVEL, linewidth=1.0, zorder=1, label="perfect: 1")
+        panel.axhline(1.0, color=LEVEL, linewidth=1.0, zorder=1, label="exact oracle: 1")
         panel.set_xlabel(axis.axis)
         _scale_updates(panel, early)
         if axis is EPISODES and measure is REWARD:
@@ -317,7 +317,7 @@ def draw_sweep(study: Study, experiment: Experiment, sweep: Sweep, part: Part) -
 def _draw_others(
     panel: Axes, study: Study, experiment: Experiment, sweep: Sweep, measure: Measure, part: Part
 ) -> None:
-    """The paper's, position only (dashed), and perfect, which sees the same noise."""
+    """The paper's, position only (dashed), and the exact oracle, which sees the same noise."""
 
     def draw(values: Iterable[float | None], shape: str, **style: Any) -> None:
         known = {x: y for x, y in zip(sweep.places, values, strict=True) if y is not None}
@@ -333,7 +333,7 @@ def _draw_others(
         told = [policy.score(measure, test) for test in tests]
         if policy.name == POSITION:
             draw(told, "--", linewidth=1.2, color=GREY, label=policy.label)
-        elif policy.name == PERFECT and measure is REWARD:
+        elif policy.name == EXACT and measure is REWARD:
             draw(told, "-", linewidth=1.0, color=LEVEL, label=policy.label)
 
 

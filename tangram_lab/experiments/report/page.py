@@ -1,7 +1,7 @@
 """The page of a report with its figures and its data."""
 
 import shlex
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
@@ -52,7 +52,7 @@ HOW_TO_READ = (
     "polygons: -1 is no overlap, 1 is perfect. Where several seeds were trained, numbers are their "
     "median, with the least and the most in brackets. Three policies that learned nothing stand "
     "beside them: *position only* asks for the motion to the target's centre and never for a turn, "
-    "*perfect* asks for the exact motion onto the target as it is seen, *random* is chance."
+    "*exact oracle* asks for the exact motion onto the target as it is seen, *random* is chance."
 )
 BAND = (
     "Mean over the seeds; the band is one standard deviation (n - 1). A curve is drawn over the "
@@ -267,20 +267,28 @@ def _numbered(name: str, number: int) -> str:
 
 def command(study: Study, experiment: Experiment) -> str:
     """What runs this experiment alone, into the same folder, with the study's other settings."""
+    return " ".join(("tangram-experiment", *map(_quoted, arguments(study, [experiment.name]))))
+
+
+def _quoted(word: str) -> str:
+    return word if word.startswith(("experiment=[", "budget=")) else shlex.quote(word)
+
+
+def arguments(study: Study, experiments: Sequence[str]) -> list[str]:
+    """What tangram-experiment is told to run these experiments of a study again."""
     try:
         words = shlex.split(study.command)[1:]
     except ValueError:
         words = []
-    chosen = f"experiment=[{experiment.name}] budget={study.budget.name}"
-    kept = (shlex.quote(word) for word in words if _concerns(word, experiment))
-    return " ".join(("tangram-experiment", chosen, *kept))
+    kept = (word for word in words if _concerns(word, experiments))
+    return [f"experiment=[{','.join(experiments)}]", f"budget={study.budget.name}", *kept]
 
 
-def _concerns(word: str, experiment: Experiment) -> bool:
-    """Whether an argument has a meaning where this experiment is run alone."""
+def _concerns(word: str, experiments: Sequence[str]) -> bool:
+    """Whether an argument has a meaning where these experiments are run alone."""
     key = word.partition("=")[0]
     if key.startswith("experiments."):
-        return key.startswith(f"experiments.{experiment.name}.")
+        return key.split(".")[1] in experiments
     return key not in ("experiment", "budget", "dry", "run_dir", "jobs")
 
 

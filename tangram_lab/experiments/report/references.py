@@ -12,8 +12,8 @@ from tangram_sim.config import EXACT_SUBSTEPS, UNKNOWN, SimConfig
 from tangram_sim.errors import RunError
 
 # Name in the files of tests -> name in the report.
-POSITION, PERFECT, RANDOM = "position only", "perfect", "random"
-NAMES = {"position only": POSITION, "exact": PERFECT, "random": RANDOM}
+POSITION, EXACT, RANDOM = "position only", "exact oracle", "random"
+NAMES = {"position only": POSITION, "exact": EXACT, "random": RANDOM}
 # Settings of the simulation that tests set themselves, or that move no token.
 APART = ("sim.actions_per_token", "sim.corner_noise", "sim.pixels")
 
@@ -25,7 +25,7 @@ class Reference:
     """A policy that learned nothing, at one task.
 
     Attributes:
-        name: position only, perfect or random.
+        name: position only, exact oracle or random.
         task: what tells the task from the experiment's others; empty if it has only one.
         by_test: name of a test -> its scores there, the tests that are most like training first.
     """
