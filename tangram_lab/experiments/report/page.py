@@ -307,11 +307,9 @@ def _gaps(experiment: Experiment, training: Training) -> Iterator[str]:
 
 
 def closing(study: Study) -> list[str]:
-    """Budget, machine, versions, and every training with its settings."""
-    name, note = study.budget.name, plain(study.budget.note)
+    """Machine, versions, and every training with its settings."""
     return [
         *("## How it was made", ""),
-        *([f"Budget `{name}`: {note}", ""] if study.plan else []),
         *table(["", ""], _facts(study), "---"),
         *(["The last command that ran trainings of it:", ""] if study.plan else []),
         *(shell(study.command) if study.plan else []),
