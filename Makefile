@@ -55,7 +55,7 @@ paper: .venv/.installed-run  ## all figures and tables of the paper: BUDGET=smok
 # Each study is some hours on two cores, and has its runs and a report of its own. Given again, it
 # goes on. Ten seeds for what README shows, three for the rest.
 ONE_TOKEN := fig4 table1 table2 fig5 fig6 shapes method imitation perceptron parts
-ABLATIONS := plateau ablation_paper ablation_tangram raw readings noise actions pose warm_start
+ABLATIONS := plateau ablation_paper ablation_tangram readings noise actions pose warm_start
 GAME := game game_method game_figures game_parts game_refinement game_slide
 WORLDS := worlds robustness motion_parts
 PICTURES := pictures disturbances doubts
@@ -67,6 +67,7 @@ study = $(BIN)/tangram-experiment "experiment=[$(shell echo $(2) | tr ' ' ',')]"
 evidence: .venv/.installed-dev  ## everything that README and docs show of trainings, anew: a day on two cores
 	@$(call study,one_token,$(ONE_TOKEN),$(LAPTOP))
 	@$(call study,paper_size,fig4 table1,$(AT_ITS_SIZE))
+	@$(call study,raw,raw,$(LAPTOP))
 	@$(call study,ablations,$(ABLATIONS),$(LAPTOP))
 	@$(call study,game,$(GAME),$(LAPTOP))
 	@$(call study,worlds,$(WORLDS),$(LAPTOP))

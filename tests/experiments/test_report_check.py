@@ -1,6 +1,7 @@
 """tangram-report check: what is told of pages, data and code that no longer fit each other."""
 
 import json
+import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -109,11 +110,12 @@ def resolve(arguments: Sequence[str]) -> dict[str, Any]:
     return SETTINGS | {"later": {"known": True}}
 
 
+FIG4 = experiment("curves", ["ours"], tests=["random"], labels={}, main=False)
 PLANNED: dict[str, Any] = {
     "run_dir": "x",
     "budget": {
         "name": "laptop",
-        "note": "",
+        "note": "Narrower MHA.",
         "seeds": [0, 1],
         "main_seeds": [0, 1, 2],
         "test_episodes": 100,
@@ -123,16 +125,7 @@ PLANNED: dict[str, Any] = {
     "families": {"x": []},
     "trainings": {name: {"label": name, "family": "x"} for name in ("ours", "theirs")},
     "tests": {name: {"label": name} for name in ("random", "noisy")},
-    "experiments": {
-        "fig4": {
-            "title": "",
-            "source": "",
-            "kind": "curves",
-            "note": "",
-            "trainings": ["ours"],
-            "tests": ["random"],
-        }
-    },
+    "experiments": {"fig4": FIG4},
 }
 
 
@@ -149,9 +142,8 @@ def report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(
         report_check, "make_fingerprints", lambda found: dict.fromkeys(found, FINGERPRINT)
     )
-    one = experiment("curves", ["ours"], tests=["random"])
     tests = {"random": {"label": "random", "overrides": []}}
-    write_plan(tmp_path, plan({"fig4": one}, {"ours": training("ours", "x")}, tests, (0, 1)))
+    write_plan(tmp_path, plan({"fig4": FIG4}, {"ours": training("ours", "x")}, tests, (0, 1)))
     for seed in (0, 1):
         curve, test = learning_curve(seed, 0.9), {"random": scores(0.912)}
         write_run(tmp_path, "ours", result(seed), curve, test)
@@ -162,7 +154,7 @@ def report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def checked(report: Path, text: str = "<!-- data: small/fig4 -->\n0.912") -> list[str]:
     page = report.parents[1] / "README.md"
-    page.write_text(text)
+    page.write_bytes(text.encode())
     return check(report.parent, [page], resolve, choose)
 
 
@@ -254,18 +246,47 @@ def test_what_the_study_lacks(report: Path, change: dict[str, Any], told: str) -
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("section", "name", "change", "told"),
     [
-        ({"trainings": ["theirs", "ours"]}, "other trainings now: theirs"),
-        ({"tests": []}, "other tests now: random"),
-        ({"main": True}, "other seeds now: 2"),
+        ("experiments", "fig4", {"tests": []}, "random would not be among the tests now"),
+        ("experiments", "fig4", {"note": "new"}, "fig4 would be made with another note now: new"),
+        ("experiments", "fig4", {"main": True}, "ours would be made with another seeds now: [0, 1"),
+        ("experiments", "fig4", {"labels": {"ours": "x"}}, "another labels now: {'ours': 'x'}"),
+        ("trainings", "ours", {"label": "theirs"}, "ours would be made with another label now"),
+        ("trainings", "ours", {"overrides": ["a=1"]}, "another overrides now: ['a=1']"),
+        ("tests", "random", {"overrides": ["a=1"]}, "random would be made with another overrides"),
+        ("budget", "test_seed", 0, "the budget's test_seed is now 0"),
+        ("budget", "note", "Wider.", "the budget's note is now Wider."),
     ],
 )
-def test_an_experiment_that_would_be_made_of_others(
-    report: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, Any], told: str
+def test_what_its_command_would_plan_otherwise(
+    report: Path, monkeypatch: pytest.MonkeyPatch, section: str, name: str, change: Any, told: str
 ) -> None:
-    monkeypatch.setitem(PLANNED["experiments"], "fig4", PLANNED["experiments"]["fig4"] | change)
-    assert checked(report) == [f"small/fig4 would be made of {told}"]
+    before = PLANNED[section][name]
+    value = before | change if isinstance(change, dict) else change
+    monkeypatch.setitem(PLANNED[section], name, value)
+    assert any(told in line for line in checked(report))
+
+
+def test_an_experiment_that_its_command_would_not_make(
+    report: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(PLANNED, "experiments", {})
+    assert "small/fig4 would not be among the experiments now" in checked(report)
+
+
+@pytest.mark.parametrize("ends", ["\r\n", "\r"])
+def test_pages_may_have_other_line_ends(report: Path, ends: str) -> None:
+    text = ends.join(("<!-- data: none -->", "0.125", "", "It has 0.912."))
+    (found,) = checked(report, text)
+    assert "0.912 has no source" in found
+
+
+def test_a_pipe_is_no_data(report: Path) -> None:
+    (report / "data.json").unlink()
+    os.mkfifo(report / "data.json")
+    with pytest.raises(RunError, match="data.json: it is no file; make it again"):
+        checked(report)
 
 
 def test_code_that_trains_otherwise(report: Path, monkeypatch: pytest.MonkeyPatch) -> None:

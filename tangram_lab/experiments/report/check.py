@@ -22,7 +22,7 @@ from tangram_lab.experiments.fingerprints import (
     make_fingerprints,
 )
 from tangram_lab.experiments.jobs import changed_settings
-from tangram_lab.experiments.plan import StudyConfig
+from tangram_lab.experiments.plan import StudyConfig, plan_content
 from tangram_lab.experiments.report.data import read_data
 from tangram_lab.experiments.report.page import (
     DATA,
@@ -34,7 +34,7 @@ from tangram_lab.experiments.report.page import (
 )
 from tangram_lab.experiments.report.reading import parsed, read_bytes
 from tangram_lab.experiments.report.references import VALUES
-from tangram_lab.experiments.report.study import Experiment, Row, Seed, Study
+from tangram_lab.experiments.report.study import Row, Seed, Study
 from tangram_sim.errors import RunError
 
 MARK = re.compile(r"<!-- data: (?P<sources>[^>]+?) -->")
@@ -99,7 +99,7 @@ def reports(results: Path) -> list[Path]:
 def _text(path: Path) -> str:
     text = read_bytes(path, "make it anew with tangram-report")
     try:
-        return text.decode()
+        return text.decode().replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError:
         raise RunError(f"{path}: it is not UTF-8; mend it") from None
 
@@ -120,21 +120,26 @@ def _lacks(study: Study) -> Iterator[str]:
 
 
 def _planned_otherwise(study: Study, choose: Choose) -> Iterator[str]:
-    """The experiments that would be made of others now, by the commands that the page prints."""
+    """Where the commands that the page prints would plan something else now."""
     config = choose(arguments(study, [one.name for one in study.experiments]))
-    for one in study.experiments:
-        now = config.experiments[one.name]
-        for what, made, planned in (
-            ("trainings", [training.name for training in one.trainings], now.trainings),
-            ("tests", [test.name for test in one.tests], now.tests),
-            ("seeds", sorted(_seeds(one)), sorted(config.seeds_of(now))),
-        ):
-            if others := {*made} ^ {*planned}:
-                yield f"{one.name} would be made of other {what} now: {', '.join(map(str, others))}"
+    now = plan_content(config, {}, {name: {} for name in config.wanted()})
+    for key in ("experiments", "trainings", "tests"):
+        for name, before in study.plan[key].items():
+            if (planned := now[key].get(name)) is None:
+                yield f"{name} would not be among the {key} now"
+                continue
+            for part, value in planned.items():
+                # Settings are compared where they are resolved.
+                if part != "settings" and _plain(before.get(part)) != _plain(value):
+                    yield f"{name} would be made with another {part} now: {value}"
+    for part, value in now["budget"].items():
+        if study.plan["budget"].get(part) != value:
+            yield f"the budget's {part} is now {value}"
 
 
-def _seeds(experiment: Experiment) -> set[int]:
-    return {seed.number for training in experiment.trainings for seed in training.seeds}
+def _plain(value: object) -> object:
+    """As JSON has it."""
+    return list(value) if isinstance(value, tuple) else value
 
 
 def _odd(study: Study, seed: Seed) -> Iterator[str]:

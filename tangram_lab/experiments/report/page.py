@@ -286,7 +286,7 @@ def arguments(study: Study, experiments: Sequence[str]) -> list[str]:
 
 def _concerns(word: str, experiments: Sequence[str]) -> bool:
     """Whether an argument has a meaning where these experiments are run alone."""
-    key = word.partition("=")[0]
+    key = word.partition("=")[0].lstrip("+~")
     if key.startswith("experiments."):
         return key.split(".")[1] in experiments
     return key not in ("experiment", "budget", "dry", "run_dir", "jobs")
