@@ -106,8 +106,8 @@ RESULT = msgspec.defstruct(
 
 def read_bytes(path: Path, remedy: str) -> bytes:
     """A file's content; RunError with the remedy where it cannot be read."""
-    if path.exists() and not path.is_file():  # a pipe would never end
-        raise RunError(f"{path}: it is no file; {remedy}")
+    if path.is_fifo():  # it would never end
+        raise RunError(f"{path}: cannot be read (it is a pipe); {remedy}")
     try:
         return path.read_bytes()
     except OSError as error:
