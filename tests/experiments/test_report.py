@@ -95,7 +95,9 @@ def test_same_runs_give_the_same_bytes(tmp_path: Path, patch: pytest.MonkeyPatch
         assert twin.read_bytes() == path.read_bytes()
 
 
-@pytest.mark.parametrize(("source", "shown"), [("Fig. 5", True), ("Sec. VIII", False)])
+@pytest.mark.parametrize(
+    ("source", "shown"), [("Fig. 5", True), ("Table II", True), ("Sec. VIII", False)]
+)
 def test_the_papers_pictures_stand_beside_its_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str, shown: bool
 ) -> None:

@@ -168,9 +168,9 @@ class Page:
         ]
 
     def pictures(self) -> list[str]:
-        """The paper's Figs. 1 to 3, which need no training, where others of its figures are."""
+        """The paper's Figs. 1 to 3, which need no training, where its other figures or tables are."""
         lines: list[str] = []
-        if not any(one.source.startswith("Fig.") for one in self.study.experiments):
+        if not any(one.source.startswith(("Fig.", "Table")) for one in self.study.experiments):
             return lines
         for title, file, caption in draw_paper_pictures(self.out / FIGURES, self.draws):
             lines += [f"## {plain(title)}", "", *picture(title, f"{FIGURES}/{file}")]
