@@ -168,7 +168,7 @@ class Page:
         ]
 
     def pictures(self) -> list[str]:
-        """The paper's Figs. 1 to 3, which need no training, where its other figures or tables are."""
+        """The paper's Figs. 1 to 3, where other figures or tables of it are."""
         lines: list[str] = []
         if not any(one.source.startswith(("Fig.", "Table")) for one in self.study.experiments):
             return lines
