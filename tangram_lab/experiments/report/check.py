@@ -131,7 +131,7 @@ def _planned_otherwise(study: Study, choose: Choose) -> Iterator[str]:
             for part, value in planned.items():
                 # Settings are compared where they are resolved.
                 if part != "settings" and _plain(before.get(part)) != _plain(value):
-                    yield f"{name} would be made with another {part} now: {value}"
+                    yield f"{name} would be made otherwise now: {part} is {value}"
     for part, value in now["budget"].items():
         if study.plan["budget"].get(part) != value:
             yield f"the budget's {part} is now {value}"
