@@ -41,6 +41,11 @@ def played(task: Setup, policy: Policy, groups: int = 2) -> Episodes:
         return Rollout(env, 0, "player", 0, 0).play(policy.explore, groups)
 
 
+def at_random(task: Setup) -> Setup:
+    """All actions are uniform, whatever the untrained weights are: they decide what is seen."""
+    return replace(task, agent=replace(task.agent, uniform_share=1.0))
+
+
 def noisy(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever asks environments for what is exact gets noise."""
     noise = np.random.default_rng(9)
@@ -156,7 +161,7 @@ def test_what_no_picture_shows_ends_no_worker(sim: dict[str, Any]) -> None:
 
 
 def test_what_is_missing_travels_and_is_not_learned_from() -> None:
-    task = setup("square")
+    task = at_random(setup("square"))
     episodes = played(task, Policy(task), 4)
     spec = EpisodeSpec.of(task)
     frames = EpisodeBatch(1, 0, episodes).encode(spec)
@@ -171,7 +176,7 @@ def test_what_is_missing_travels_and_is_not_learned_from() -> None:
 
 def piled(**agent: Any) -> Setup:
     """Three tokens that begin in piles, which pictures do not always tell apart."""
-    made = setup("small_triangle", "medium_triangle", "parallelogram", starts="piles")
+    made = at_random(setup("small_triangle", "medium_triangle", "parallelogram", starts="piles"))
     return replace(made, agent=replace(made.agent, learning_starts=8, batch_size=8, **agent))
 
 
