@@ -99,8 +99,10 @@ class PairGraph(nn.Module):
     @property
     def inputs(self) -> int:
         """Numbers that a perceptron sees of a pair."""
+        placed = 1 if self.egocentric else 2  # in its own frame a token lies at the centre
         own = 2 * self.corners * self.offsets + self.confidence
-        return 2 + _ANGLES * self.orientation + 2 * self.corners + own + 2 * _KINDS + 4
+        positions = placed * 2 * (1 + self.corners)
+        return positions + _ANGLES * self.orientation + own + 2 * _KINDS + 4
 
     def base_node(self, pairs: Pairs) -> Tensor:
         """Node index (M,) of the token's base."""
@@ -181,13 +183,13 @@ class PairGraph(nn.Module):
         radius = self.radius[pairs.token][:, None, None]
         own, offset = self._bodies(pairs, angle, other_side)
         ratio, near = self._sizes(pairs, place)
-        if self.egocentric:
-            where, corners = place, offset + place[:, None]
-        else:
+        centres, corners = place[:, None], offset + place[:, None]
+        if not self.egocentric:
             own, offset = self._to_arena(pairs, own), self._to_arena(pairs, offset)
-            where, corners = pairs.goal[:, :2], offset + pairs.goal[:, None, :2]
+            centres = torch.stack([pairs.pose[:, :2], pairs.goal[:, :2]], dim=1)
+            corners = torch.cat([own + centres[:, :1], offset + centres[:, 1:]], dim=1)
         parts = [
-            where,
+            centres.flatten(1),
             *([self._angles(pairs, angle)] if self.orientation else []),
             (corners / radius * _CORNER_SCALE).flatten(1),
             *([(own / radius).flatten(1)] if self.offsets else []),
