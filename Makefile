@@ -4,14 +4,15 @@ SHELL := /bin/bash
 BIN := .venv/bin
 ARGS ?=
 BUDGET ?= laptop
+KEEP ?= no
 SCRIPTS := .ci/install .ci/run $(shell find docker slurm studio -name "*.sh" -o -name "*.sbatch" 2>/dev/null)
 
 # make takes name=value for a variable of its own and drops what it does not know.
-KNOWN := ARGS BUDGET
+KNOWN := ARGS BUDGET KEEP
 GIVEN := $(foreach name,$(.VARIABLES),$(if $(filter command,$(origin $(name))),$(name)))
 STRAY := $(sort $(filter-out $(KNOWN),$(GIVEN)))
 ifneq ($(STRAY),)
-$(error make knows no $(firstword $(STRAY))=...: settings go into ARGS="...", as in make train ARGS="seed=1 tokens=parallelogram"; BUDGET=... is for make paper)
+$(error make knows no $(firstword $(STRAY))=...: settings go into ARGS="...", as in make train ARGS="seed=1 tokens=parallelogram"; BUDGET=... is for make paper, KEEP=yes for make evidence)
 endif
 
 # Processes start sooner where Python keeps what it compiled, and the tests start many.
@@ -53,7 +54,8 @@ paper: .venv/.installed-run  ## all figures and tables of the paper: BUDGET=smok
 	@$(BIN)/tangram-report runs=runs/experiments/$(BUDGET) out=runs/experiments/$(BUDGET)/report
 
 # Each study is some hours on two cores, and has its runs and a report of its own. Given again, it
-# goes on. Ten seeds for what README shows, three for the rest.
+# goes on. Ten seeds for what README shows, three for the rest. KEEP=yes keeps what this code would
+# make alike.
 ONE_TOKEN := fig4 table1 table2 fig5 fig6 shapes method imitation perceptron parts
 ABLATIONS := plateau ablation_paper ablation_tangram readings noise actions pose warm_start
 GAME := game game_method game_figures game_parts game_refinement game_slide
@@ -62,9 +64,10 @@ PICTURES := pictures disturbances doubts
 LAPTOP = budget=laptop "budget.main_seeds=[0,1,2,3,4,5,6,7,8,9]"
 AT_ITS_SIZE = budget=paper "experiments.fig4.trainings=[paper,mlp]" "experiments.table1.trainings=[paper,mlp]"
 # Of a name, experiments and a budget.
-study = $(BIN)/tangram-experiment "experiment=[$(shell echo $(2) | tr ' ' ',')]" $(3) run_dir=runs/evidence/$(1) $(ARGS) \
+study = $(BIN)/tangram-experiment "experiment=[$(shell echo $(2) | tr ' ' ',')]" $(3) run_dir=runs/evidence/$(1) $(kept) $(ARGS) \
 	&& $(BIN)/tangram-report runs=runs/evidence/$(1) out=docs/results/$(1)
-evidence: .venv/.installed-dev  ## everything that README and docs show of trainings, anew: a day on two cores
+kept = $(and $(filter yes,$(KEEP)),$(wildcard docs/results/$(1)/data.json),keep=docs/results/$(1))
+evidence: .venv/.installed-dev  ## everything that README and docs show of trainings, anew: a day on two cores; or with KEEP=yes what has changed
 	@$(call study,one_token,$(ONE_TOKEN),$(LAPTOP))
 	@$(call study,paper_size,fig4 table1,$(AT_ITS_SIZE))
 	@$(call study,raw,raw,$(LAPTOP))

@@ -154,6 +154,7 @@ def test_every_file_of_conf_is_package_data() -> None:
         ("tokens.scale=2", True),
         ("ARGS=seed=7 tokens=square", False),
         ("BUDGET=smoke", False),
+        ("KEEP=yes", False),
     ],
 )
 def test_make_refuses_a_variable_that_it_would_drop(given: str, refused: bool) -> None:
@@ -161,6 +162,14 @@ def test_make_refuses_a_variable_that_it_would_drop(given: str, refused: bool) -
     assert (result.returncode != 0) == refused
     name = given.partition("=")[0]
     assert (f'make knows no {name}=...: settings go into ARGS="..."' in result.stderr) == refused
+
+
+@pytest.mark.parametrize("keep", ["yes", "no"])
+def test_evidence_that_keeps_what_has_not_changed(keep: str) -> None:
+    commands = run(["make", "--dry-run", "evidence", f"KEEP={keep}"]).stdout
+    found = re.findall(r"run_dir=runs/evidence/(\w+) keep=docs/results/(\w+) ", commands)
+    there = [path.parent.name for path in (ROOT / "docs" / "results").glob("*/data.json")]
+    assert sorted(found) == (sorted(zip(there, there, strict=True)) if keep == "yes" else [])
 
 
 def test_the_evidence_has_every_experiment_and_each_in_one_study() -> None:

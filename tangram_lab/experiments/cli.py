@@ -33,7 +33,7 @@ def _experiment(settings: Plain) -> int:
 
     if not isinstance(settings.get("experiments"), dict):
         raise ConfigError("experiments are chosen by their presets: experiment=[fig4,table2]")
-    config = from_mapping(StudyConfig, _with_absolute(settings, "run_dir"))
+    config = from_mapping(StudyConfig, _with_absolute(settings, "run_dir", "keep"))
     resolved = {name: _resolved(name, config.command(name)) for name in config.wanted()}
     tests = dict.fromkeys(test for name in resolved for test in config.tests_of(name))
     asked = {name: _asked(name, config.test_command(name)) for name in tests}

@@ -1,7 +1,7 @@
 """The work of a study as processes: trainings and tests, and whether each is done."""
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -161,6 +161,23 @@ def make_jobs(
             )
             jobs += [trainings[name], *tests]
     return jobs
+
+
+def without(missing: Sequence[Job], kept: Set[Path]) -> list[Job]:
+    """Of the jobs that are missing those whose runs are not kept whole.
+
+    A training that one of them begins with is made, too: nobody kept its weights.
+
+    Args:
+        missing: in their order, all of one run's from its training on, if that is missing.
+        kept: the files that a kept run would have left.
+    """
+    trained_here = {job.run_dir for job in missing} - {job.run_dir for job in missing if job.trains}
+    made = trained_here | {job.run_dir for job in missing if job.leaves not in kept}
+    for job in reversed(missing):
+        if job.trains and job.needs is not None and job.run_dir in made:
+            made.add(job.needs.run_dir)
+    return [job for job in missing if job.run_dir in made]
 
 
 def _training(

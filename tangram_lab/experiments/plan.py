@@ -143,11 +143,18 @@ class StudyConfig(Settings):
     tests: dict[str, TestConfig]
     experiments: dict[str, ExperimentConfig] = field(default_factory=dict)
     jobs: int = setting(2, "trainings at a time; a learner keeps one core busy", low=1, high=1024)
+    keep: str | None = setting(
+        None,
+        "folder of an earlier report: of its runs those are kept that this code would make alike, "
+        "by their settings and a fingerprint",
+    )
     dry: bool = setting(False, "only list what would be done")
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_folder("run_dir", self.run_dir)
+        if self.keep is not None:
+            check_folder("keep", self.keep)
         for name, experiment in self.experiments.items():
             for kind, wanted in (("trainings", experiment.trainings), ("tests", experiment.tests)):
                 _check_known(f"experiment {name}: {kind}", wanted, getattr(self, kind))

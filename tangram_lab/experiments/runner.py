@@ -8,6 +8,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -34,8 +35,17 @@ from tangram_lab.experiments.fingerprints import (
     differences,
     make_fingerprints,
 )
-from tangram_lab.experiments.jobs import Job, make_jobs, read_object
-from tangram_lab.experiments.plan import PLAN, StudyConfig, joined_plan, plan_content
+from tangram_lab.experiments.jobs import RESULT, Job, make_jobs, read_object, without
+from tangram_lab.experiments.plan import (
+    PLAN,
+    StudyConfig,
+    joined_plan,
+    plan_content,
+    seed_folder,
+    test_file,
+)
+from tangram_lab.experiments.report.data import DATA
+from tangram_lab.experiments.report.kept import KEPT, Runs, keep, kept_runs
 from tangram_sim.errors import ConfigError
 
 
@@ -172,34 +182,53 @@ def run_study(
         job.check()
     content = plan_content(config, _source(), resolved)
     missing = [job for job in jobs if not job.done]
+    configs = {job.training: resolved[job.training] for job in missing if job.trains}
     console = sturdy_console(sys.stdout)
     if config.dry:
-        joined_plan(study.path / PLAN, content)
+        plan = joined_plan(study.path / PLAN, content)
+        earlier = study.path / KEPT if config.keep is None else Path(config.keep, DATA)
+        if earlier.exists() or config.keep is not None:
+            plan["fingerprints"] |= _fingerprints(plan, configs, console)
+            missing = without(missing, _files(kept_runs(earlier, plan), study.path))
         for job in missing:
-            console.print(job.name, highlight=False)
-        console.print(f"{len(missing)} of {len(jobs)} jobs to do in {study.path}", highlight=False)
+            console.print(job.name, highlight=False, soft_wrap=True)
+        told = f"{len(missing)} of {len(jobs)} jobs to do in {study.path}"
+        console.print(told, highlight=False, soft_wrap=True)
         return 0
     study.prepare("auto")
     with study.lock():
         plan = joined_plan(study.path / PLAN, content)
-        names = {job.training: None for job in missing if job.trains}
-        if names:
-            told = f"a fingerprint of this code first: {UPDATES} updates of each of {len(names)}"
-            console.print(f"{told} trainings", highlight=False)
-        plan["fingerprints"] |= _fingerprints(plan, {name: resolved[name] for name in names})
+        plan["fingerprints"] |= _fingerprints(plan, configs, console)
+        if config.keep is not None:
+            keep(Path(config.keep), study.path)
         write_whole(study.path / PLAN, _json(plan))
+        if (study.path / KEPT).exists():
+            missing = without(missing, _files(kept_runs(study.path / KEPT, plan), study.path))
         with StudyProgress(console, len(jobs), len(jobs) - len(missing)) as progress:
             return Runner(missing, config.jobs, progress).run()
 
 
+def _files(kept: Runs, study: Path) -> set[Path]:
+    """Where the files of runs that are kept would lie in a study's folder."""
+    folders = {seed_folder(study, *name): seed for name, seed in kept.items()}
+    return {
+        path
+        for folder, seed in folders.items()
+        for path in (folder / RESULT, *(test_file(folder, test) for test in seed.tests))
+    }
+
+
 def _fingerprints(
-    plan: Mapping[str, Any], configs: Mapping[str, Mapping[str, Any]]
+    plan: Mapping[str, Any], configs: Mapping[str, Mapping[str, Any]], console: Console
 ) -> dict[str, Fingerprint]:
     """Training -> the fingerprint of this code.
 
     Raises:
         ConfigError: other seeds of one are of code that trained otherwise.
     """
+    if configs:
+        told = f"a fingerprint of this code first: {UPDATES} updates of each of {len(configs)}"
+        console.print(f"{told} trainings", highlight=False)
     before, found = plan["fingerprints"], make_fingerprints(configs)
     for name, now in found.items():
         if name in before and (others := differences(before[name], now)):

@@ -91,6 +91,23 @@ def test_a_report_is_drawn(study: Path, tmp_path: Path) -> None:
         assert "<svg" in (tmp_path / "report" / "figures" / f"{name}.svg").read_text()
 
 
+def test_runs_of_an_earlier_report_are_not_made_again(study: Path, tmp_path: Path) -> None:
+    first, again, anew = tmp_path / "first", tmp_path / "again", tmp_path / "anew"
+    run_here("tangram-report", f"runs={study}", f"out={first}", cwd=tmp_path)
+    arguments = (*SMALL, f"run_dir={anew}", f"keep={first}")
+    listed = run_here("tangram-experiment", *arguments, "dry=true", cwd=tmp_path)
+    assert listed.endswith(f"\n0 of 4 jobs to do in {anew}\n")
+    assert not anew.exists()
+    told = run_here("tangram-experiment", *arguments, cwd=tmp_path)
+    assert told.endswith("\n4 of 4 jobs were done before\n")
+    run_here("tangram-report", f"runs={anew}", f"out={again}", cwd=tmp_path)
+    one, other = (json.loads((out / "data.json").read_text()) for out in (first, again))
+    assert one["runs"] == other["runs"]
+    assert {path.name for path in anew.iterdir()} == {"plan.json", "kept.json", ".lock"}
+    line = refused("tangram-experiment", *SMALL, "keep=nowhere", f"run_dir={again}", cwd=tmp_path)
+    assert "nowhere/data.json: cannot be read" in line
+
+
 def test_no_training_outlives_its_study_and_the_same_command_goes_on_until_a_signal(
     tmp_path: Path,
 ) -> None:

@@ -299,7 +299,7 @@ def test_code_that_trains_otherwise(report: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(report_check, "make_fingerprints", lambda found: now)
     assert checked(report) == [
         "small/ours trains otherwise than when its figures were made: after 20 updates weights is "
-        "1003.0, and was 1000.0: make them anew with make evidence"
+        "1003.0, and was 1000.0: make them anew with make evidence KEEP=yes"
     ]
 
 

@@ -23,9 +23,8 @@ from tangram_lab.experiments.fingerprints import (
 )
 from tangram_lab.experiments.jobs import changed_settings
 from tangram_lab.experiments.plan import StudyConfig, plan_content
-from tangram_lab.experiments.report.data import read_data
+from tangram_lab.experiments.report.data import DATA, read_data
 from tangram_lab.experiments.report.page import (
-    DATA,
     FIGURES,
     TABLES,
     arguments,
@@ -172,7 +171,7 @@ def _trained_otherwise(study: Study, resolve: Resolve) -> Iterator[str]:
         if others := differences(study.fingerprints.get(name, {}), found):
             yield (
                 f"{name} trains otherwise than when its figures were made: after {UPDATES} updates "
-                f"{', '.join(others)}: make them anew with make evidence"
+                f"{', '.join(others)}: make them anew with make evidence KEEP=yes"
             )
 
 

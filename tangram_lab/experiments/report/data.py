@@ -23,6 +23,7 @@ from tangram_lab.experiments.report.reading import (
 from tangram_lab.experiments.report.study import FINISHED, Count, Row, Seed, Study
 from tangram_sim.errors import RunError
 
+DATA = "data.json"
 FORMAT = 3
 DIGITS = 6  # of its numbers
 EACH_DIGITS = 4  # of the coverage of every episode
@@ -69,7 +70,7 @@ def _without_paths(command: str) -> str:
         words = shlex.split(command)
     except ValueError:
         return command
-    kept = [word for word in words if not word.startswith("run_dir=/")]
+    kept = [word for word in words if not word.startswith(("run_dir=/", "keep=/"))]
     return command if kept == words else shlex.join(kept)
 
 

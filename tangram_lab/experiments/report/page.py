@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from tangram_agent.files import write_whole
 from tangram_lab.experiments.pictures import draw_paper_pictures
-from tangram_lab.experiments.report.data import read_data, write_data
+from tangram_lab.experiments.report.data import DATA, read_data, write_data
 from tangram_lab.experiments.report.figures import (
     curve_parts,
     draw_curves,
@@ -23,6 +23,7 @@ from tangram_lab.experiments.report.figures import (
     sweep_parts,
     sweeps,
 )
+from tangram_lab.experiments.report.kept import completed
 from tangram_lab.experiments.report.numbers import ANGLE, DENSE, REWARD
 from tangram_lab.experiments.report.profiles import draw_profile
 from tangram_lab.experiments.report.reading import read_runs
@@ -46,7 +47,7 @@ from tangram_lab.experiments.report.tables import (
 )
 from tangram_sim.errors import RunError
 
-DATA, TABLES, FIGURES = "data.json", "tables.md", "figures"
+TABLES, FIGURES = "tables.md", "figures"
 HOW_TO_READ = (
     "Scores are those of the fixed tests, exploration off. The mean reward is Eq. 14 on exact "
     "polygons: -1 is no overlap, 1 is perfect. Where several seeds were trained, numbers are their "
@@ -96,7 +97,7 @@ def write_report(runs: Path, out: Path) -> list[Path]:
         RunError: a file of the study is not what it should be, no run is finished, or `out` cannot
             be written.
     """
-    study = read_runs(runs)
+    study = completed(read_runs(runs), runs)
     if not any(one.finished for one in study.trainings):
         raise RunError(f"no run is finished in {runs}: wait for one, or name another folder")
     try:
@@ -289,7 +290,7 @@ def _concerns(word: str, experiments: Sequence[str]) -> bool:
     key = word.partition("=")[0].lstrip("+~")
     if key.startswith("experiments."):
         return key.split(".")[1] in experiments
-    return key not in ("experiment", "budget", "dry", "run_dir", "jobs")
+    return key not in ("experiment", "budget", "dry", "run_dir", "jobs", "keep")
 
 
 def _gaps(experiment: Experiment, training: Training) -> Iterator[str]:
