@@ -50,6 +50,19 @@ def make_fingerprints(configs: Mapping[str, Mapping[str, Any]]) -> dict[str, Fin
     return found
 
 
+def make_facts(config: Mapping[str, Any]) -> dict[str, Any]:
+    """What the result of every run of a training tells of its task and its agent.
+
+    Args:
+        config: the training's whole config.
+
+    Raises:
+        ConfigError: this code refuses it.
+    """
+    facts = Trainer(short(make_setup(config)), SEED, "cpu").facts()
+    return {name: fact for name, fact in facts.items() if name != "device"}
+
+
 def differences(before: Fingerprint, now: Fingerprint) -> list[str]:
     """The numbers that are not what they were."""
     return [

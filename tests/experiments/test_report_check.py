@@ -65,6 +65,11 @@ PAGES = [
         ["12.4 % is not in bench.json"],
     ),
     ("It has 12.3 %.", ["12.3 % has no source"]),
+    *(
+        (f"<!-- data: a/fig4 bench.json -->\nIt has {odd}.", [f"{odd} is not written as in the"])
+        for odd in ("12.3%", "12.3\N{NO-BREAK SPACE}%", ".123", "-.123", "\N{MINUS SIGN}0.996")
+    ),
+    ("<!-- data: none -->\nA side of .125, and 12.3% of it.", []),
     ("<!-- data: data.json -->\nIt has 0.996.", ["has a source that is none"]),
     ("<!-- data: a/fig4 -->\n````\n```\n````  \n\nIt has 0.111.", ["0.111 is not in a/fig4"]),
     ("It has 0.996. <!-- data: none -->", ["has no source"]),
@@ -107,7 +112,10 @@ def test_a_source_that_is_none(numbers: Sources, name: str) -> None:
 
 def resolve(arguments: Sequence[str]) -> dict[str, Any]:
     """The settings that arguments come to; what they train: tests/cluster/test_evidence.py."""
-    return SETTINGS | {"later": {"known": True}}
+    return SETTINGS | {"later": {"known": True}, "max_updates": 2000}
+
+
+FACTS = {"tokens": ["square"], "parameters": 32_600}  # of every result of the builders
 
 
 FIG4 = experiment("curves", ["ours"], tests=["random"], labels={}, main=False)
@@ -142,6 +150,7 @@ def report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(
         report_check, "make_fingerprints", lambda found: dict.fromkeys(found, FINGERPRINT)
     )
+    monkeypatch.setattr(report_check, "make_facts", lambda config: FACTS)
     tests = {"random": {"label": "random", "overrides": []}}
     write_plan(tmp_path, plan({"fig4": FIG4}, {"ours": training("ours", "x")}, tests, (0, 1)))
     for seed in (0, 1):
@@ -184,6 +193,13 @@ def test_each_report_is_a_source_and_whole(report: Path) -> None:
     ]
     changed(large, {"state": "not finished", "result": {}, "tests": {}})
     assert "large/ours lacks the seeds [1]" in checked(report)
+
+
+def test_tables_without_data_are_told(report: Path) -> None:
+    shutil.copytree(report, report.with_name("bare"))
+    (report.with_name("bare") / "data.json").unlink()
+    with pytest.raises(RunError, match="bare has tables.md and no data.json: make them with"):
+        checked(report)
 
 
 def test_results_without_a_report_are_told(tmp_path: Path) -> None:
@@ -233,7 +249,6 @@ def test_tables_that_were_changed_by_hand(report: Path) -> None:
         ({"result": result(1, commit=None)}, "of a changed tree, or of none: None"),
         ({"result": result(1, commit="banana")}, "of a changed tree, or of none: banana"),
         ({"result": result(1) | {"seed": 7}}, "ours, seed 1: its seed is 7"),
-        ({"result": result(1, ended_by="SIGTERM")}, "seed 1: it did not come to its end"),
         ({"result": result(1, scored_updates=1999)}, "seed 1: it did not come to its end"),
         ({"tests": {"random": scores(0.9, episodes=3)}}, "has episodes=3, not 100"),
         ({"tests": {"random": scores(0.9, test_seed=0)}}, "has test_seed=0, not 2"),
@@ -314,6 +329,26 @@ def test_other_settings_than_those_that_trained_are_told(
     data["plan"]["trainings"]["ours"]["settings"] = kept
     (report / "data.json").write_text(json.dumps(data))
     assert checked(report) == [f"small/ours has not the settings that it was trained with: {told}"]
+
+
+@pytest.mark.parametrize(
+    ("other", "told"),
+    [
+        ({"parameters": 13_508}, "its parameters is 13508, not 32600"),
+        ({"tokens": ["large_triangle"]}, "its tokens is ['large_triangle'], not ['square']"),
+        ({"ended_by": "SIGINT"}, "it was ended by SIGINT, not by ['max_updates=2000',"),
+        ({"ended_by": "max_updates=1000"}, "it was ended by max_updates=1000, not by"),
+        ({"ended_by": "max_episodes=2000"}, "it was ended by max_episodes=2000, not by"),
+    ],
+)
+def test_a_result_of_another_training_is_told(
+    report: Path, other: dict[str, Any], told: str
+) -> None:
+    changed(report, {"result": result(1, 0.9, **other)})
+    assert any(
+        line.startswith(f"small/ours, seed 1 is of another training: {told}")
+        for line in checked(report)
+    )
 
 
 @pytest.mark.parametrize("kept", [{}, {"ours": {}}, {"ours": {"mean_reward": 0.5}}])

@@ -19,9 +19,10 @@ from tangram_agent.pretrained import CARD, PACKAGED, is_name
 from tangram_lab.experiments.fingerprints import (
     UPDATES,
     differences,
+    make_facts,
     make_fingerprints,
 )
-from tangram_lab.experiments.jobs import changed_settings
+from tangram_lab.experiments.jobs import BOUNDS, changed_settings
 from tangram_lab.experiments.plan import StudyConfig, plan_content
 from tangram_lab.experiments.report.data import DATA, read_data
 from tangram_lab.experiments.report.page import (
@@ -33,12 +34,14 @@ from tangram_lab.experiments.report.page import (
 )
 from tangram_lab.experiments.report.reading import parsed, read_bytes
 from tangram_lab.experiments.report.references import VALUES
-from tangram_lab.experiments.report.study import Row, Seed, Study
+from tangram_lab.experiments.report.study import Row, Seed, Study, Training
 from tangram_sim.errors import RunError
 
 MARK = re.compile(r"<!-- data: (?P<sources>[^>]+?) -->")
-# Three decimals and more, or a percentage with one: scores have as many, and little else has.
-SCORE = re.compile(r"(?<![\w.])-?\d+\.(?:\d+ %|\d{3,}(?!\w|\.\d))")
+# Three decimals and more, or a percentage with one: scores have as many, and little else has. How
+# the tables write none is found, too, and told.
+SCORE = re.compile(r"(?<![\w.])[-\N{MINUS SIGN}]?\d*\.(?:\d+\s?%|\d{3,}(?!\w|\.\d))")
+WRITTEN = re.compile(r"-?\d+\.(?:\d+ %|\d+)")
 CODE = re.compile(r"^(?P<fence>```+)[^`\n]*\n.*?^(?P=fence)`*[ \t]*$", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`[^`\n]*`|\]\([^)]*\)")
 SECTION = re.compile(r'^<a id="(?P<name>[^"]+)"></a>$', re.MULTILINE)
@@ -88,11 +91,15 @@ def reports(results: Path) -> list[Path]:
     """The folders of all reports.
 
     Raises:
-        RunError: there are none.
+        RunError: there are none, or one has no data.
     """
-    if folders := sorted(path.parent for path in results.glob(f"*/{DATA}")):
-        return folders
-    raise RunError(f"no report is in {results}: make them with make evidence")
+    folders = sorted({path.parent for name in (DATA, TABLES) for path in results.glob(f"*/{name}")})
+    for folder in folders:
+        if not (folder / DATA).exists():
+            raise RunError(f"{folder} has {TABLES} and no {DATA}: make them with make evidence")
+    if not folders:
+        raise RunError(f"no report is in {results}: make them with make evidence")
+    return folders
 
 
 def _text(path: Path) -> str:
@@ -148,8 +155,7 @@ def _odd(study: Study, seed: Seed) -> Iterator[str]:
         yield f"it is of a changed tree, or of none: {result['commit']}"
     if result.get("seed") != seed.number:
         yield f"its seed is {result.get('seed')}"
-    bounded, scored = result["ended_by"].startswith("max_"), result.get("scored_updates")
-    if not bounded or scored != result["updates"]:
+    if result.get("scored_updates") != result["updates"]:
         yield "it did not come to its end"
     for name, test in seed.tests.items():
         asked = {"updates": result["updates"], "test_seed": budget.test_seed}
@@ -167,12 +173,25 @@ def _trained_otherwise(study: Study, resolve: Resolve) -> Iterator[str]:
         known = changed_settings(one.settings, configs[one.name], one.settings)
         for change in known or ["nobody kept them"] * (not one.settings):
             yield f"{one.name} has not the settings that it was trained with: {change}"
+        yield from _of_another(one, configs[one.name])
     for name, found in make_fingerprints(configs).items():
         if others := differences(study.fingerprints.get(name, {}), found):
             yield (
                 f"{name} trains otherwise than when its figures were made: after {UPDATES} updates "
                 f"{', '.join(others)}: make them anew with make evidence KEEP=yes"
             )
+
+
+def _of_another(training: Training, config: Mapping[str, Any]) -> Iterator[str]:
+    """Results that no run of a training can have: they are of another one."""
+    bounds = [f"{name}={config.get(name)}" for name in BOUNDS]
+    for seed in training.finished:
+        told = f"{training.name}, seed {seed.number} is of another training"
+        for name, fact in make_facts(config).items():
+            if seed.result.get(name) != fact:
+                yield f"{told}: its {name} is {seed.result.get(name)}, not {fact}"
+        if seed.result["ended_by"] not in bounds:
+            yield f"{told}: it was ended by {seed.result['ended_by']}, not by {bounds}"
 
 
 class Sources:
@@ -255,6 +274,8 @@ def _wrong(sources: str | None, score: str, block: str, numbers: Sources) -> str
             return f"has the source {sources}: name the commit by 7 digits or more"
         missing = [one for one in rest if one not in block]
         return f"is of commit {missing[0]}, which the text does not say" if missing else ""
+    if first != NO_SCORE and not WRITTEN.fullmatch(score):
+        return "is not written as in the tables: write 0.123, -0.123 or 12.3 %"
     try:
         found = any(numbers.has(source, score) for source in (first, *rest))
     except RunError as error:
