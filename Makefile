@@ -15,8 +15,10 @@ ifneq ($(STRAY),)
 $(error make knows no $(firstword $(STRAY))=...: settings go into ARGS="...", as in make train ARGS="seed=1 tokens=parallelogram"; BUDGET=... is for make paper, KEEP=yes for make evidence)
 endif
 
-# Processes start sooner where Python keeps what it compiled, and the tests start many.
+# Processes start sooner where Python keeps what it compiled, and the tests start many. Python compiles
+# what it imports; pip would compile all, for half a minute. By pip's rule 0 switches that off.
 unexport PYTHONDONTWRITEBYTECODE
+export PIP_NO_COMPILE := 0
 
 .DEFAULT_GOAL := help
 .PHONY: help train studio test lint settings format paper evidence bench docs lock sbom clean
