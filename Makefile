@@ -11,6 +11,9 @@ SCRIPTS := .ci/install .ci/run $(shell find docker slurm studio -name "*.sh" -o 
 KNOWN := ARGS BUDGET KEEP
 GIVEN := $(foreach name,$(.VARIABLES),$(if $(filter command,$(origin $(name))),$(name)))
 STRAY := $(sort $(filter-out $(KNOWN),$(GIVEN)))
+ifneq ($(filter-out yes no,$(KEEP)),)
+$(error KEEP must be yes or no, got $(KEEP))
+endif
 ifneq ($(STRAY),)
 $(error make knows no $(firstword $(STRAY))=...: settings go into ARGS="...", as in make train ARGS="seed=1 tokens=parallelogram"; BUDGET=... is for make paper, KEEP=yes for make evidence)
 endif

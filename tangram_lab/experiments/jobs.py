@@ -1,7 +1,7 @@
 """The work of a study as processes: trainings and tests, and whether each is done."""
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -55,12 +55,17 @@ class Job:
     @property
     def done(self) -> bool:
         """Whether its file is there and is that of this job, come to its end."""
-        content = read_object(self.leaves)
-        return _trained(content) if self.trains else self._tested(content)
+        return self.fits(read_object(self.leaves), read_object(self.run_dir / RESULT))
 
-    def _tested(self, content: Mapping[str, Any]) -> bool:
-        """A test of the final weights, with the settings that are asked for."""
-        trained = read_object(self.run_dir / RESULT)
+    def fits(self, content: Mapping[str, Any], trained: Mapping[str, Any]) -> bool:
+        """Whether a file's content is that of this job, come to its end.
+
+        Args:
+            content: of a training its result, of a test its scores.
+            trained: the result of the training: a test is of the final weights.
+        """
+        if self.trains:
+            return _trained(content)
         told = {IN_FILES.get(name, name): value for name, value in self.settings.items()}
         return bool(content) and _says(content, {**told, "updates": trained.get("updates")})
 
@@ -75,7 +80,13 @@ class Job:
         self.leaves.parent.mkdir(parents=True, exist_ok=True)
 
     def check(self) -> None:
-        """Raise ConfigError if the folder holds a training with other settings."""
+        """Raise ConfigError if the folder holds other settings, or no weights that are needed."""
+        source = self.needs
+        if source and source.done and not (source.run_dir / CONFIG).exists() and not self.done:
+            raise ConfigError(
+                f"{self.name} needs the weights of {source.run_dir}, which was kept of a report "
+                "and has none: remove it, so that it is trained"
+            )
         if not self.trains or not (self.run_dir / CONFIG).exists():
             return
         stored = read_config(self.run_dir / CONFIG)
@@ -161,23 +172,6 @@ def make_jobs(
             )
             jobs += [trainings[name], *tests]
     return jobs
-
-
-def without(missing: Sequence[Job], kept: Set[Path]) -> list[Job]:
-    """Of the jobs that are missing those whose runs are not kept whole.
-
-    A training that one of them begins with is made, too: nobody kept its weights.
-
-    Args:
-        missing: in their order, all of one run's from its training on, if that is missing.
-        kept: the files that a kept run would have left.
-    """
-    trained_here = {job.run_dir for job in missing} - {job.run_dir for job in missing if job.trains}
-    made = trained_here | {job.run_dir for job in missing if job.leaves not in kept}
-    for job in reversed(missing):
-        if job.trains and job.needs is not None and job.run_dir in made:
-            made.add(job.needs.run_dir)
-    return [job for job in missing if job.run_dir in made]
 
 
 def _training(

@@ -233,7 +233,12 @@ def _check_known(what: str, names: tuple[str, ...], known: Mapping[str, Any]) ->
 
 def seed_folder(study: Path, training: str, seed: int) -> Path:
     """The run folder of one training with one seed."""
-    return study / "trainings" / training / f"seed_{seed}"
+    return training_folder(study, training) / f"seed_{seed}"
+
+
+def training_folder(study: Path, training: str) -> Path:
+    """The folder of all seeds of a training."""
+    return study / "trainings" / training
 
 
 def test_file(run_dir: Path, test: str) -> Path:

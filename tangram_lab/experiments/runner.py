@@ -35,17 +35,16 @@ from tangram_lab.experiments.fingerprints import (
     differences,
     make_fingerprints,
 )
-from tangram_lab.experiments.jobs import RESULT, Job, make_jobs, read_object, without
+from tangram_lab.experiments.jobs import Job, make_jobs, read_object
 from tangram_lab.experiments.plan import (
     PLAN,
     StudyConfig,
     joined_plan,
     plan_content,
-    seed_folder,
-    test_file,
+    training_folder,
 )
-from tangram_lab.experiments.report.data import DATA
-from tangram_lab.experiments.report.kept import KEPT, Runs, keep, kept_runs
+from tangram_lab.experiments.report.kept import Runs, read_kept, runs_to_keep, write_kept
+from tangram_lab.experiments.report.study import Study
 from tangram_sim.errors import ConfigError
 
 
@@ -181,15 +180,12 @@ def run_study(
     for job in jobs:
         job.check()
     content = plan_content(config, _source(), resolved)
-    missing = [job for job in jobs if not job.done]
-    configs = {job.training: resolved[job.training] for job in missing if job.trains}
+    earlier = None if config.keep is None else read_kept(Path(config.keep), content["budget"])
     console = sturdy_console(sys.stdout)
     if config.dry:
         plan = joined_plan(study.path / PLAN, content)
-        earlier = study.path / KEPT if config.keep is None else Path(config.keep, DATA)
-        if earlier.exists() or config.keep is not None:
-            plan["fingerprints"] |= _fingerprints(plan, configs, console)
-            missing = without(missing, _files(kept_runs(earlier, plan), study.path))
+        kept = {} if earlier is None else _kept(plan, earlier, jobs, resolved, study.path, console)
+        missing = [job for job in jobs if not job.done and job.run_dir not in kept]
         for job in missing:
             console.print(job.name, highlight=False, soft_wrap=True)
         told = f"{len(missing)} of {len(jobs)} jobs to do in {study.path}"
@@ -198,44 +194,62 @@ def run_study(
     study.prepare("auto")
     with study.lock():
         plan = joined_plan(study.path / PLAN, content)
-        plan["fingerprints"] |= _fingerprints(plan, configs, console)
-        if config.keep is not None:
-            keep(Path(config.keep), study.path)
+        kept = _kept(plan, earlier, jobs, resolved, study.path, console)
         write_whole(study.path / PLAN, _json(plan))
-        if (study.path / KEPT).exists():
-            missing = without(missing, _files(kept_runs(study.path / KEPT, plan), study.path))
+        write_kept(kept, jobs)
+        missing = [job for job in jobs if not job.done]
         with StudyProgress(console, len(jobs), len(jobs) - len(missing)) as progress:
             return Runner(missing, config.jobs, progress).run()
 
 
-def _files(kept: Runs, study: Path) -> set[Path]:
-    """Where the files of runs that are kept would lie in a study's folder."""
-    folders = {seed_folder(study, *name): seed for name, seed in kept.items()}
-    return {
-        path
-        for folder, seed in folders.items()
-        for path in (folder / RESULT, *(test_file(folder, test) for test in seed.tests))
-    }
+def _kept(
+    plan: dict[str, Any],
+    earlier: Study | None,
+    jobs: Sequence[Job],
+    resolved: Mapping[str, Mapping[str, Any]],
+    study: Path,
+    console: Console,
+) -> Runs:
+    """The runs of an earlier report that are kept; the plan gets the fingerprints of this code.
+
+    Raises:
+        ConfigError: runs that are there are of code that trained otherwise.
+    """
+    wanted = (job.training for job in jobs if job.trains and (earlier is not None or not job.done))
+    configs = {name: resolved[name] for name in wanted}
+    if configs:
+        told = f"a fingerprint of this code first: {UPDATES} updates of each of {len(configs)}"
+        console.print(f"{told} trainings", highlight=False)
+    plan["fingerprints"] |= _fingerprints(plan["fingerprints"], configs, study)
+    if earlier is None:
+        return {}
+    kept = runs_to_keep(earlier, plan, jobs, study)
+    console.print(f"{len(kept)} runs are kept of the earlier report", highlight=False)
+    return kept
 
 
 def _fingerprints(
-    plan: Mapping[str, Any], configs: Mapping[str, Mapping[str, Any]], console: Console
+    before: Mapping[str, Fingerprint], configs: Mapping[str, Mapping[str, Any]], study: Path
 ) -> dict[str, Fingerprint]:
     """Training -> the fingerprint of this code.
 
     Raises:
-        ConfigError: other seeds of one are of code that trained otherwise.
+        ConfigError: runs that are there are of code that trained otherwise.
     """
-    if configs:
-        told = f"a fingerprint of this code first: {UPDATES} updates of each of {len(configs)}"
-        console.print(f"{told} trainings", highlight=False)
-    before, found = plan["fingerprints"], make_fingerprints(configs)
-    for name, now in found.items():
-        if name in before and (others := differences(before[name], now)):
-            raise ConfigError(
-                f"other seeds of {name} are of code that trained otherwise: after {UPDATES} "
-                f"updates {others[0]}: choose another run_dir"
-            )
+    found = make_fingerprints(configs)
+    there = {name: training_folder(study, name) for name in before.keys() & found}
+    others = {
+        there[name]: differences(before[name], found[name])
+        for name in sorted(there)
+        if there[name].exists()
+    }
+    changed = [folder for folder, numbers in others.items() if numbers]
+    if changed:
+        raise ConfigError(
+            f"{changed[0]} is of code that trained otherwise: after {UPDATES} updates "
+            f"{others[changed[0]][0]}: remove {', '.join(map(str, changed))}, or choose another "
+            "run_dir"
+        )
     return found
 
 

@@ -7,15 +7,12 @@ from typing import Any
 
 import pytest
 
-from tangram_lab.experiments.jobs import Job, without
-from tangram_lab.experiments.plan import test_file
-from tangram_lab.experiments.report import page
-from tangram_lab.experiments.report.check import reports
+from tangram_lab.experiments.jobs import Job
+from tangram_lab.experiments.plan import seed_folder, test_file
 from tangram_lab.experiments.report.data import read_data, write_data
-from tangram_lab.experiments.report.kept import KEPT, keep, kept_runs
-from tangram_lab.experiments.report.page import write_report
+from tangram_lab.experiments.report.kept import read_kept, runs_to_keep, write_kept
 from tangram_lab.experiments.report.reading import read_runs
-from tangram_sim.errors import RunError
+from tangram_sim.errors import ConfigError, RunError
 from tests.experiments.builders import (
     FINGERPRINT,
     experiment,
@@ -57,15 +54,62 @@ def planned() -> Plan:
     return content
 
 
-def kept(earlier: Path, content: Plan) -> set[tuple[str, int]]:
-    return {*kept_runs(earlier / "data.json", content)}
+ASKED: Plan = {"random": {}, "twice": {"sim": {"actions_per_token": 2}}}
 
 
-def test_every_finished_run_is_kept_with_its_tests_where_nothing_changed(earlier: Path) -> None:
-    found = kept_runs(earlier / "data.json", planned())
-    assert {*found} == ALL
-    assert {*found["ours", 1].tests} == {*TESTS}
-    assert found["ours", 1].tests["random"]["mean_reward"] == 0.91
+def jobs_of(folder: Path, tests: Plan = ASKED, seeds: tuple[int, ...] = (0, 1, 2)) -> list[Job]:
+    """Of each training and seed: what trains it, and its tests."""
+    jobs: list[Job] = []
+    for seed in seeds:
+        source: Job | None = None
+        for name in TRAININGS:
+            run_dir = seed_folder(folder, name, seed)
+            source = Job(f"{name}, seed {seed}", name, (), run_dir, run_dir / "result.json", source)
+            asked = {name: {"seed": 2, "episodes": 100} | test for name, test in tests.items()}
+            jobs += [
+                source,
+                *(
+                    Job(
+                        test,
+                        name,
+                        (),
+                        run_dir,
+                        test_file(run_dir, test),
+                        source,
+                        told,
+                        trains=False,
+                    )
+                    for test, told in asked.items()
+                ),
+            ]
+    return jobs
+
+
+def kept(
+    report: Path, content: Plan, folder: Path, jobs: list[Job] | None = None
+) -> set[tuple[str, int]]:
+    """Training and seed of what is kept."""
+    earlier = read_kept(report, content["budget"])
+    found = runs_to_keep(earlier, content, jobs_of(folder) if jobs is None else jobs, folder)
+    return {(path.parent.name, int(path.name.removeprefix("seed_"))) for path in found}
+
+
+def test_every_finished_run_is_kept_where_nothing_changed(earlier: Path, tmp_path: Path) -> None:
+    assert kept(earlier, planned(), tmp_path / "new") == ALL
+
+
+def test_what_is_kept_is_done_and_reported_as_it_was(earlier: Path, tmp_path: Path) -> None:
+    folder, jobs = tmp_path / "new", jobs_of(tmp_path / "new")
+    write_plan(folder, planned())
+    before = read_kept(earlier, planned()["budget"])
+    write_kept(runs_to_keep(before, planned(), jobs, folder), jobs)
+    assert [job.done for job in jobs] == [True] * 12 + [False] * 6
+    write_data(tmp_path / "data.json", read_runs(folder), {})
+    after, _ = read_data(tmp_path / "data.json")
+    for one, other in zip(before.trainings, after.trainings, strict=True):
+        assert one.seeds[:2] == other.seeds[:2]
+    again = runs_to_keep(before, planned(), jobs, folder)
+    assert again == {}  # it is there
 
 
 def _other(part: str, name: str, value: Any) -> Callable[[Plan], None]:
@@ -83,50 +127,85 @@ def _without(part: str, name: str) -> Callable[[Plan], None]:
 
 
 OURS = {("ours", 0), ("ours", 1)}
+WARM = {("warm", 0), ("warm", 1)}
+NEAR, FAR = FINGERPRINT | {"weights": 1000.01}, FINGERPRINT | {"weights": 1003.0}
+NARROW = {"settings": {"agent": {"batch_size": 3}}}
 CHANGES = {
-    "another fingerprint": (
-        _other("fingerprints", "warm", FINGERPRINT | {"weights": 1e3 + 3}),
-        OURS,
-    ),
-    "the same but for rounding": (
-        _other("fingerprints", "warm", FINGERPRINT | {"weights": 1e3 + 0.01}),
-        ALL,
-    ),
-    "no fingerprint": (_without("fingerprints", "warm"), OURS),
-    "another setting": (
-        _other("trainings", "warm", {"settings": {"agent": {"batch_size": 32}}}),
-        OURS,
-    ),
+    "only rounded otherwise": (_other("fingerprints", "warm", NEAR), ALL),
     "a setting that was unknown": (_other("trainings", "warm", {"settings": {"later": 1}}), ALL),
     "another label": (_other("trainings", "warm", {"label": "w", "family": "y"}), ALL),
-    "not wanted": (_without("trainings", "warm"), OURS),
-    "it begins with nothing": (_other("trainings", "warm", {"after": None}), OURS),
-    "what it begins with is another": (_other("fingerprints", "ours", {}), set()),
-}
+    # The source of a training that is made anew is made anew: nobody kept its weights.
+    "another fingerprint": (_other("fingerprints", "warm", FAR), set()),
+    "no fingerprint": (_without("fingerprints", "warm"), set()),
+    "an empty one": (_other("fingerprints", "warm", {}), set()),
+    "another setting": (_other("trainings", "warm", NARROW), set()),
+    "not planned": (_without("trainings", "warm"), set()),
+    "it begins with nothing": (_other("trainings", "warm", {"after": None}), set()),
+    "what it begins with is another": (_other("fingerprints", "ours", FAR), set()),
+    "a test is asked otherwise": (_other("tests", "twice", trial("twice", 3)), set()),
+    "a test is called otherwise": (_other("tests", "twice", trial("again", 2)), ALL),
+    "a test is not planned": (_without("tests", "random"), set()),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", CHANGES)
-def test_what_this_code_would_not_make_alike_is_not_kept(earlier: Path, case: str) -> None:
+def test_what_this_code_would_not_make_alike_is_not_kept(
+    earlier: Path, tmp_path: Path, case: str
+) -> None:
     change, expected = CHANGES[case]
     content = planned()
     change(content)
-    assert kept(earlier, content) == expected
+    assert kept(earlier, content, tmp_path / "new") == expected
 
 
-def test_runs_whose_settings_nobody_knows_are_not_kept(earlier: Path) -> None:
+def _data(**changes: Any) -> Callable[[Plan], None]:
+    def change(run: Plan) -> None:
+        run["result"] |= changes.get("result", {})
+        run["tests"]["random"] |= changes.get("test", {})
+        run |= changes.get("run", {})
+
+    return change
+
+
+ODD = {
+    "another seed": _data(result={"seed": 7}),
+    "not its final weights": _data(result={"scored_updates": None}),
+    "it was stopped": _data(result={"ended_by": "SIGTERM"}),
+    "it is not finished": _data(run={"state": "not finished"}),
+    "a test of other weights": _data(test={"updates": 1}),
+    "a test of another seed": _data(test={"test_seed": 0}),
+    "a test of other episodes": _data(test={"episodes": 7}),
+    "a test is missing": _data(run={"tests": {}}),
+}
+
+
+@pytest.mark.parametrize("case", ODD)
+def test_runs_that_are_not_whole_are_not_kept(earlier: Path, tmp_path: Path, case: str) -> None:
+    data = json.loads((earlier / "data.json").read_text())
+    ODD[case](data["runs"]["warm"][1])
+    (earlier / "data.json").write_text(json.dumps(data))
+    assert kept(earlier, planned(), tmp_path / "new") == ALL - {("warm", 1), ("ours", 1)}
+
+
+def test_runs_whose_settings_nobody_knows_are_not_kept(earlier: Path, tmp_path: Path) -> None:
     data = json.loads((earlier / "data.json").read_text())
     data["plan"]["trainings"]["ours"]["settings"] = {}
     (earlier / "data.json").write_text(json.dumps(data))
-    assert kept(earlier, planned()) == set()
+    assert kept(earlier, planned(), tmp_path / "new") == set()
 
 
-def test_a_test_that_is_made_otherwise_now_is_left_out(earlier: Path) -> None:
-    content = planned()
-    content["tests"]["twice"]["overrides"] = ["sim.actions_per_token=3"]
-    del content["tests"]["random"]
-    assert [*kept_runs(earlier / "data.json", content)["ours", 0].tests] == []
-    content["tests"]["twice"] = TESTS["twice"] | {"label": "anything"}
-    assert [*kept_runs(earlier / "data.json", content)["ours", 0].tests] == ["twice"]
+def test_only_what_is_asked_must_be_there(earlier: Path, tmp_path: Path) -> None:
+    few = jobs_of(tmp_path, {"twice": ASKED["twice"]}, seeds=(1,))
+    assert kept(earlier, planned(), tmp_path, few) == {("ours", 1), ("warm", 1)}
+    more = jobs_of(tmp_path, ASKED | {"noisy": {}}, seeds=(1,))
+    assert kept(earlier, planned(), tmp_path, more) == set()
+
+
+def test_what_somebody_began_goes_on(earlier: Path, tmp_path: Path) -> None:
+    """Where it needs the weights of another, these are made, too."""
+    seed_folder(tmp_path, "ours", 0).mkdir(parents=True)
+    seed_folder(tmp_path, "warm", 1).mkdir(parents=True)
+    assert kept(earlier, planned(), tmp_path) == {("warm", 0)}
 
 
 @pytest.mark.parametrize(
@@ -135,84 +214,25 @@ def test_a_test_that_is_made_otherwise_now_is_left_out(earlier: Path) -> None:
 def test_another_budget_is_refused(earlier: Path, name: str, value: Any) -> None:
     content = planned()
     content["budget"][name] = value
-    with pytest.raises(RunError, match=f"was made with budget.{name}=.*, now it is {value}: keep"):
-        kept(earlier, content)
+    with pytest.raises(ConfigError, match=f"budget.{name}=.*, now it is {value}: keep another"):
+        read_kept(earlier, content["budget"])
 
 
 def test_a_folder_without_a_report_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(
-        RunError, match=r"cannot be read .*; name a folder that tangram-report wrote"
-    ):
-        keep(tmp_path, tmp_path)
+    with pytest.raises(RunError, match=r"cannot be read .*; name a folder that tangram-report"):
+        read_kept(tmp_path, planned()["budget"])
     (tmp_path / "data.json").write_text("{}")
     with pytest.raises(RunError, match="its format is None, but this version reads"):
-        keep(tmp_path, tmp_path)
-    assert not (tmp_path / KEPT).exists()
+        read_kept(tmp_path, planned()["budget"])
 
 
-# The report of a study that keeps runs
-
-
-def test_a_report_takes_what_is_kept_where_its_own_runs_are_not_finished(
-    earlier: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(page, "draw_paper_pictures", lambda out, draws: [])
-    runs = tmp_path / "runs"
-    write_plan(runs, planned())
-    keep(earlier, runs)
-    for name, seed in (("ours", 0), ("ours", 2), ("warm", 2)):
-        tests = dict.fromkeys(TESTS, scores(0.5))
-        write_run(runs, name, result(seed, 0.5, commit="4567def"), [], tests)
-    write_report(runs, earlier)  # in its own place
-    study, _ = read_data(earlier / "data.json")
-    found = {one.name: one.values("mean_reward", "random") for one in study.trainings}
-    assert found == {"ours": {0: 0.5, 1: 0.91, 2: 0.5}, "warm": {0: 0.9, 1: 0.91, 2: 0.5}}
-    text = (earlier / "tables.md").read_text()
-    assert "| commit | 0123abc / 4567def |" in text
-    assert "Missing" not in text
-    assert reports(earlier.parent) == [earlier]
-
-
-# The jobs that remain
-
-
-def jobs_of(
-    folder: Path, name: str, *, trained: bool = False, needs: Job | None = None
-) -> list[Job]:
-    """What is missing of a run: its training and two tests, or these alone."""
-    run_dir = folder / name
-    first = Job(name, name, (), run_dir, run_dir / "result.json", needs)
-    tests = [
-        Job(f"{name}_{test}", name, (), run_dir, test_file(run_dir, test), first, trains=False)
-        for test in ("a", "b")
-    ]
-    return tests if trained else [first, *tests]
-
-
-WARM = "s s_a s_b w w_a w_b"  # a source, and what begins with it
-
-
-@pytest.mark.parametrize(
-    ("known", "left"),
-    [
-        ("", f"{WARM} t_a t_b"),
-        ("s s_a s_b", f"{WARM} t_a t_b"),
-        ("w w_a w_b", "s s_a s_b t_a t_b"),
-        (WARM, "t_a t_b"),
-        ("s s_a s_b w w_a", f"{WARM} t_a t_b"),
-        ("t t_a t_b", f"{WARM} t_a t_b"),
-    ],
-)
-def test_a_run_is_kept_whole_or_made_with_what_it_begins_with(
-    tmp_path: Path, known: str, left: str
-) -> None:
-    """A run that was trained here, t, is tested here."""
-    source = jobs_of(tmp_path, "s")
-    warm, trained = jobs_of(tmp_path, "w", needs=source[0]), jobs_of(tmp_path, "t", trained=True)
-    files = set[Path]()
-    for word in known.split():
-        name, _, test = word.partition("_")
-        folder = tmp_path / name
-        files.add(test_file(folder, test) if test else folder / "result.json")
-    found = [job.name for job in without([*source, *warm, *trained], files)]
-    assert found == left.split()
+def test_weights_that_nobody_kept_are_told(earlier: Path, tmp_path: Path) -> None:
+    jobs = jobs_of(tmp_path / "new")
+    before = read_kept(earlier, planned()["budget"])
+    write_kept(runs_to_keep(before, planned(), jobs, tmp_path / "new"), jobs)
+    for job in jobs:
+        job.check()
+    later = jobs_of(tmp_path / "new", {"noisy": {}})
+    told = "noisy needs the weights of .*/ours/seed_0, which was kept of a report and has none: rem"
+    with pytest.raises(ConfigError, match=told):
+        later[1].check()

@@ -434,21 +434,22 @@ def test_a_wrong_test_is_told_before_all_trainings(
         ({"b": {"weights": 7.0, "reward": 0.5}}, None),  # another one's
         (
             {"a": {"weights": 101.0, "reward": 0.5}},
-            "other seeds of a are of code that trained otherwise: after 20 updates weights is "
-            "100.0, and was 101.0: choose another run_dir",
+            "/trainings/a is of code that trained otherwise: after 20 updates weights is 100.0, "
+            "and was 101.0: remove ",
         ),
         ({"a": {"weights": 100.0}}, "reward is 0.5, and was None"),
     ],
 )
 def test_seeds_of_a_training_are_of_code_that_trains_alike(
-    monkeypatch: pytest.MonkeyPatch, before: dict[str, Any], told: str | None
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, before: dict[str, Any], told: str | None
 ) -> None:
+    """Where some of them are there."""
     now = {"weights": 100.0, "reward": 0.5}
     monkeypatch.setattr(runner, "make_fingerprints", lambda found: dict.fromkeys(found, now))
-    plan = {"trainings": {"a": {"overrides": ["seed=1"]}}, "fingerprints": before}
-
+    assert runner._fingerprints(before, {"a": {}}, tmp_path) == {"a": now}
+    (tmp_path / "trainings" / "a" / "seed_0").mkdir(parents=True)
     if told is None:
-        assert runner._fingerprints(plan, {"a": {}}) == {"a": now}
+        assert runner._fingerprints(before, {"a": {}}, tmp_path) == {"a": now}
     else:
         with pytest.raises(ConfigError, match=re.escape(told)):
-            runner._fingerprints(plan, {"a": {}})
+            runner._fingerprints(before, {"a": {}}, tmp_path)

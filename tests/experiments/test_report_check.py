@@ -336,7 +336,7 @@ def test_other_settings_than_those_that_trained_are_told(
     [
         ({"parameters": 13_508}, "its parameters is 13508, not 32600"),
         ({"tokens": ["large_triangle"]}, "its tokens is ['large_triangle'], not ['square']"),
-        ({"ended_by": "SIGINT"}, "it was ended by SIGINT, not by ['max_updates=2000',"),
+        ({"ended_by": "SIGINT"}, "it was ended by SIGINT, not by max_updates=2000"),
         ({"ended_by": "max_updates=1000"}, "it was ended by max_updates=1000, not by"),
         ({"ended_by": "max_episodes=2000"}, "it was ended by max_episodes=2000, not by"),
     ],

@@ -40,7 +40,7 @@ from tangram_sim.errors import RunError
 MARK = re.compile(r"<!-- data: (?P<sources>[^>]+?) -->")
 # Three decimals and more, or a percentage with one: scores have as many, and little else has. How
 # the tables write none is found, too, and told.
-SCORE = re.compile(r"(?<![\w.])[-\N{MINUS SIGN}]?\d*\.(?:\d+\s?%|\d{3,}(?!\w|\.\d))")
+SCORE = re.compile(r"(?<![\w.])[-\N{MINUS SIGN}]?\d*\.(?:\d+[^\S\n]*%|\d{3,}(?!\w|\.\d))")
 WRITTEN = re.compile(r"-?\d+\.(?:\d+ %|\d+)")
 CODE = re.compile(r"^(?P<fence>```+)[^`\n]*\n.*?^(?P=fence)`*[ \t]*$", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`[^`\n]*`|\]\([^)]*\)")
@@ -184,14 +184,18 @@ def _trained_otherwise(study: Study, resolve: Resolve) -> Iterator[str]:
 
 def _of_another(training: Training, config: Mapping[str, Any]) -> Iterator[str]:
     """Results that no run of a training can have: they are of another one."""
-    bounds = [f"{name}={config.get(name)}" for name in BOUNDS]
+    values = {name: config[name] for name in BOUNDS if config.get(name)}
+    bounds = [
+        f"{name}={value if type(value) is int else f'{value:g}'}" for name, value in values.items()
+    ]
+    facts = make_facts(config) if training.finished else {}
     for seed in training.finished:
         told = f"{training.name}, seed {seed.number} is of another training"
-        for name, fact in make_facts(config).items():
+        for name, fact in facts.items():
             if seed.result.get(name) != fact:
                 yield f"{told}: its {name} is {seed.result.get(name)}, not {fact}"
         if seed.result["ended_by"] not in bounds:
-            yield f"{told}: it was ended by {seed.result['ended_by']}, not by {bounds}"
+            yield f"{told}: it was ended by {seed.result['ended_by']}, not by {' or '.join(bounds)}"
 
 
 class Sources:

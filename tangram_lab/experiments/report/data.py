@@ -20,7 +20,7 @@ from tangram_lab.experiments.report.reading import (
     parsed,
     read_bytes,
 )
-from tangram_lab.experiments.report.study import FINISHED, Count, Row, Seed, Study
+from tangram_lab.experiments.report.study import FINISHED, SETTINGS, Count, Row, Seed, Study
 from tangram_sim.errors import RunError
 
 DATA = "data.json"
@@ -28,7 +28,6 @@ FORMAT = 3
 DIGITS = 6  # of its numbers
 EACH_DIGITS = 4  # of the coverage of every episode
 REPORT = "make it again with tangram-report runs=... out=..."
-SETTINGS = ("sim", "agent")  # of a test; the plan has those that it asked for
 
 
 @dataclass(frozen=True)

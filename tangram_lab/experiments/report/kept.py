@@ -1,69 +1,83 @@
 """Runs of an earlier report that are not made again, where this code would make them alike."""
 
-from collections.abc import Mapping
-from dataclasses import replace
+import json
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from tangram_agent.files import write_whole
 from tangram_lab.experiments.fingerprints import differences
-from tangram_lab.experiments.jobs import changed_settings
-from tangram_lab.experiments.plan import PLAN
+from tangram_lab.experiments.jobs import Job, changed_settings
+from tangram_lab.experiments.plan import seed_folder
 from tangram_lab.experiments.report.data import DATA, read_data
-from tangram_lab.experiments.report.reading import checked_plan, make_study, read_bytes
-from tangram_lab.experiments.report.study import Seed, Study
-from tangram_sim.errors import RunError
+from tangram_lab.experiments.report.reading import CURVE, read_bytes
+from tangram_lab.experiments.report.study import SETTINGS, Seed, Study
+from tangram_sim.errors import ConfigError
 
-KEPT = "kept.json"  # in a study's folder: the data of the earlier report
-REMEDY = "name a folder that tangram-report wrote, keep=..."
 BUDGET = ("name", "test_episodes", "test_seed")
-Runs = dict[tuple[str, int], Seed]  # training and seed -> its run
+Runs = dict[Path, Seed]  # by the folder where each belongs
 
 
-def keep(report: Path, study: Path) -> None:
-    """Copy the data of a report into the folder of a study.
-
-    Raises:
-        RunError: the report's data cannot be read.
-    """
-    content = read_bytes(report / DATA, REMEDY)
-    read_data(report / DATA)
-    write_whole(study / KEPT, content)
-
-
-def kept_runs(data: Path, plan: Mapping[str, Any]) -> Runs:
-    """The runs of an earlier report that a plan's code would make alike.
-
-    They have the settings that the plan has, and its fingerprint, and so has the training that
-    they begin with. Tests that the plan makes otherwise are left out.
+def read_kept(report: Path, budget: Mapping[str, Any]) -> Study:
+    """The study of an earlier report.
 
     Args:
-        data: the report's data.
-        plan: content of plan.json, with the fingerprints of this code.
+        report: its folder.
+        budget: of the study that is to keep runs of it, as plan.json has it.
 
     Raises:
-        RunError: the data are not what they should be, or of another budget.
+        RunError: its data cannot be read.
+        ConfigError: it is of another budget.
     """
-    earlier, _ = read_data(data)
+    read_bytes(report / DATA, "name a folder that tangram-report wrote, keep=...")
+    study, _ = read_data(report / DATA)
     for name in BUDGET:
-        before, now = earlier.plan["budget"].get(name), plan["budget"][name]
+        before, now = study.plan["budget"].get(name), budget[name]
         if before != now:
-            raise RunError(
-                f"{data} was made with budget.{name}={before}, now it is {now}: keep another report"
+            raise ConfigError(
+                f"keep={report} was made with budget.{name}={before}, now it is {now}: keep "
+                "another report"
             )
-    same = {
+    return study
+
+
+def runs_to_keep(earlier: Study, plan: Mapping[str, Any], jobs: Sequence[Job], study: Path) -> Runs:
+    """The runs that this code would make alike, and that nobody has begun in the study's folder.
+
+    They have the settings that are planned now and the fingerprint of this code, and so has the
+    training that they begin with; they have all tests that are planned, and these are asked the
+    same. A run whose weights another training begins with is not kept, as nobody kept its weights.
+
+    Args:
+        earlier: what is there.
+        plan: content of plan.json, with the fingerprints of this code.
+        jobs: all of the study, each training before what needs it.
+        study: its folder.
+    """
+    there = {
+        seed_folder(study, one.name, seed.number): seed
+        for one in earlier.trainings
+        if _alike(one.name, earlier, plan)
+        for seed in one.finished
+        if seed.result.get("seed") == seed.number
+    }
+    asked_alike = {
         one.name
         for one in earlier.tests
         if [*one.overrides] == [*plan["tests"].get(one.name, {}).get("overrides", [None])]
     }
-    return {
-        (one.name, seed.number): replace(
-            seed, tests={name: test for name, test in seed.tests.items() if name in same}
-        )
-        for one in earlier.trainings
-        if _alike(one.name, earlier, plan)
-        for seed in one.finished
-    }
+
+    def is_there(job: Job) -> bool:
+        seed = there.get(job.run_dir)
+        same = job.trains or job.leaves.stem in asked_alike
+        return seed is not None and same and job.fits(_left_by(job, seed), seed.result)
+
+    made = {job.run_dir for job in jobs if job.run_dir.exists() or not is_there(job)}
+    for job in reversed(jobs):  # what a training begins with stands before it
+        if job.trains and job.needs is not None and job.run_dir in made and not job.done:
+            made.add(job.needs.run_dir)
+    return {job.run_dir: there[job.run_dir] for job in jobs if job.run_dir not in made}
 
 
 def _alike(name: str, earlier: Study, plan: Mapping[str, Any]) -> bool:
@@ -72,30 +86,37 @@ def _alike(name: str, earlier: Study, plan: Mapping[str, Any]) -> bool:
     now = plan["trainings"].get(name)
     if one is None or now is None or one.after != now["after"]:
         return False
+    # One that diverged has an empty fingerprint, which tells nothing of the code.
     before, code = earlier.fingerprints.get(name), plan["fingerprints"].get(name)
-    if before is None or code is None or differences(before, code):
+    if not before or not code or differences(before, code):
         return False
     known = one.settings and not changed_settings(one.settings, now["settings"], one.settings)
     return bool(known) and (one.after is None or _alike(one.after, earlier, plan))
 
 
-def completed(study: Study, folder: Path) -> Study:
-    """A study with the runs that are kept where its own are not finished.
+def _left_by(job: Job, seed: Seed) -> dict[str, Any]:
+    """The content of the file that a job would leave.
 
-    Args:
-        study: as it was read from its folder.
-        folder: this folder.
-
-    Raises:
-        RunError: what is kept cannot be read.
+    Data have no settings of a test, as its plan has them: they are those that are asked for.
     """
-    if not study.plan or not (folder / KEPT).exists():
-        return study
-    kept = kept_runs(folder / KEPT, study.plan)
-    own = {(one.name, seed.number): seed for one in study.trainings for seed in one.seeds}
+    if job.trains:
+        return seed.result
+    content = seed.tests.get(job.leaves.stem, {})
+    asked = {name: job.settings[name] for name in SETTINGS if name in job.settings}
+    return asked | content if content else {}
 
-    def read(name: str, seed: int) -> Seed:
-        mine = own[name, seed]
-        return mine if mine.finished else kept.get((name, seed), mine)
 
-    return make_study(study.plan, checked_plan(study.plan, str(folder / PLAN)), read)
+def write_kept(kept: Runs, jobs: Iterable[Job]) -> None:
+    """Make the folders of runs that are kept, each whole or not at all."""
+    for run_dir, seed in kept.items():
+        run_dir.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(prefix=".kept-", dir=run_dir.parent) as folder:
+            made = Path(folder) / run_dir.name
+            made.mkdir()
+            lines = "".join(json.dumps(point) + "\n" for point in seed.curve)
+            write_whole(made / CURVE, lines.encode())
+            for job in (job for job in jobs if job.run_dir == run_dir):
+                path = made / job.leaves.relative_to(run_dir)
+                path.parent.mkdir(exist_ok=True)
+                write_whole(path, json.dumps(_left_by(job, seed)).encode())
+            made.rename(run_dir)

@@ -23,7 +23,6 @@ from tangram_lab.experiments.report.figures import (
     sweep_parts,
     sweeps,
 )
-from tangram_lab.experiments.report.kept import completed
 from tangram_lab.experiments.report.numbers import ANGLE, DENSE, REWARD
 from tangram_lab.experiments.report.profiles import draw_profile
 from tangram_lab.experiments.report.reading import read_runs
@@ -97,7 +96,7 @@ def write_report(runs: Path, out: Path) -> list[Path]:
         RunError: a file of the study is not what it should be, no run is finished, or `out` cannot
             be written.
     """
-    study = completed(read_runs(runs), runs)
+    study = read_runs(runs)
     if not any(one.finished for one in study.trainings):
         raise RunError(f"no run is finished in {runs}: wait for one, or name another folder")
     try:

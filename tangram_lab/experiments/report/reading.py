@@ -33,6 +33,7 @@ from tangram_lab.experiments.report.study import (
 )
 from tangram_sim.errors import ConfigError, RunError
 
+CURVE = "curve.jsonl"
 PRIVATE = ("host", "run_dir")  # say nothing to anybody else
 PLAIN = re.compile(r"[A-Za-z0-9][\w.-]*", re.ASCII)
 AXES = ("updates", "episodes", "train_s")
@@ -252,7 +253,7 @@ def read_seed(folder: Path, seed: int, tests: Iterable[str]) -> Seed:
         result = _content(path, RESULT, RETRAIN)
         stopped = result["ended_by"].startswith("SIG")
         state = f"stopped by {result['ended_by']}" if stopped else FINISHED
-    curve = folder / "curve.jsonl"
+    curve = folder / CURVE
     files = {name: test_file(folder, name) for name in tests}
     return Seed(
         number=seed,

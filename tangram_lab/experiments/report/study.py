@@ -14,6 +14,7 @@ Row = dict[str, Any]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
 FINISHED = "finished"
+SETTINGS = ("sim", "agent")  # of a test; the plan has those that it asked for
 
 
 @dataclass(frozen=True)
