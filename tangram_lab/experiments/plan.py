@@ -145,8 +145,8 @@ class StudyConfig(Settings):
     jobs: int = setting(2, "trainings at a time; a learner keeps one core busy", low=1, high=1024)
     keep: str | None = setting(
         None,
-        "folder of an earlier report: of its runs those are kept that this code would make alike, "
-        "by their settings and a fingerprint",
+        "folder of an earlier report: of its runs those are kept that this code would train alike, "
+        "by their settings and 20 updates; that it would test them alike is not looked at",
     )
     dry: bool = setting(False, "only list what would be done")
 
