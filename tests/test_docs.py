@@ -21,7 +21,7 @@ pytestmark = pytest.mark.fast
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = [p.name for p in ROOT.iterdir() if p.is_dir() and p.name[0] != "." and p.name != "site"]
-GENERATED = ("settings.md", "tables.md", "bench.md", "game.md")  # of settings or of runs
+GENERATED = ("settings.md", "tables.md", "bench.md")  # of settings or of runs
 PRESENT = [page for page in PAGES if page.name not in GENERATED]
 SUFFIXES = ("py", "md", "sh", "sbatch", "def", "yaml", "toml", "txt")
 PRIMARIES = {command.name: name for name, command in COMMANDS.items()}
