@@ -164,6 +164,12 @@ def test_make_refuses_a_variable_that_it_would_drop(given: str, refused: bool) -
     assert (f'make knows no {name}=...: settings go into ARGS="..."' in result.stderr) == refused
 
 
+def test_make_refuses_a_keep_that_is_neither_yes_nor_no() -> None:
+    result = run(["make", "--dry-run", "evidence", "KEEP=Yes"])
+    assert result.returncode != 0
+    assert "KEEP must be yes or no, got Yes" in result.stderr
+
+
 @pytest.mark.parametrize("keep", ["yes", "no"])
 def test_evidence_that_keeps_what_has_not_changed(keep: str) -> None:
     commands = run(["make", "--dry-run", "evidence", f"KEEP={keep}"]).stdout
