@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from master.children import command, override
+from tangram_agent.checkpoints import CHECKPOINTS
 from tangram_agent.runs import CONFIG, read_config
 from tangram_agent.setup import SECTIONS
 from tangram_lab.experiments.plan import StudyConfig, seed_folder, test_file
@@ -82,7 +83,7 @@ class Job:
     def check(self) -> None:
         """Raise ConfigError if the folder holds other settings, or no weights that are needed."""
         source = self.needs
-        if source and source.done and not (source.run_dir / CONFIG).exists() and not self.done:
+        if source and source.done and not (source.run_dir / CHECKPOINTS).exists() and not self.done:
             raise ConfigError(
                 f"{self.name} needs the weights of {source.run_dir}, which was kept of a report "
                 "and has none: remove it, so that it is trained"

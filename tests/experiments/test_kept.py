@@ -15,6 +15,7 @@ from tangram_lab.experiments.report.reading import read_runs
 from tangram_sim.errors import ConfigError, RunError
 from tests.experiments.builders import (
     FINGERPRINT,
+    SETTINGS,
     experiment,
     learning_curve,
     plan,
@@ -57,14 +58,19 @@ def planned() -> Plan:
 ASKED: Plan = {"random": {}, "twice": {"sim": {"actions_per_token": 2}}}
 
 
-def jobs_of(folder: Path, tests: Plan = ASKED, seeds: tuple[int, ...] = (0, 1, 2)) -> list[Job]:
+def jobs_of(
+    folder: Path, tests: Plan = ASKED, seeds: tuple[int, ...] = (0, 1, 2), settings: Any = None
+) -> list[Job]:
     """Of each training and seed: what trains it, and its tests."""
     jobs: list[Job] = []
     for seed in seeds:
         source: Job | None = None
         for name in TRAININGS:
             run_dir = seed_folder(folder, name, seed)
-            source = Job(f"{name}, seed {seed}", name, (), run_dir, run_dir / "result.json", source)
+            leaves = run_dir / "result.json"
+            source = Job(
+                f"{name}, seed {seed}", name, (), run_dir, leaves, source, settings or SETTINGS
+            )
             asked = {name: {"seed": 2, "episodes": 100} | test for name, test in tests.items()}
             jobs += [
                 source,
@@ -226,12 +232,17 @@ def test_a_folder_without_a_report_is_refused(tmp_path: Path) -> None:
         read_kept(tmp_path, planned()["budget"])
 
 
-def test_weights_that_nobody_kept_are_told(earlier: Path, tmp_path: Path) -> None:
+def test_other_settings_and_weights_that_nobody_kept_are_told(
+    earlier: Path, tmp_path: Path
+) -> None:
     jobs = jobs_of(tmp_path / "new")
     before = read_kept(earlier, planned()["budget"])
     write_kept(runs_to_keep(before, planned(), jobs, tmp_path / "new"), jobs)
     for job in jobs:
         job.check()
+    (other, *_) = jobs_of(tmp_path / "new", settings={"agent": {"batch_size": 3}})
+    with pytest.raises(ConfigError, match=r"other settings \(agent.batch_size=64, now 3\)"):
+        other.check()
     later = jobs_of(tmp_path / "new", {"noisy": {}})
     told = "noisy needs the weights of .*/ours/seed_0, which was kept of a report and has none: rem"
     with pytest.raises(ConfigError, match=told):

@@ -6,7 +6,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import yaml
+
 from tangram_agent.files import write_whole
+from tangram_agent.runs import CONFIG
 from tangram_lab.experiments.fingerprints import differences
 from tangram_lab.experiments.jobs import Job, changed_settings
 from tangram_lab.experiments.plan import seed_folder
@@ -107,7 +110,7 @@ def _left_by(job: Job, seed: Seed) -> dict[str, Any]:
 
 
 def write_kept(kept: Runs, jobs: Iterable[Job]) -> None:
-    """Make the folders of runs that are kept, each whole or not at all."""
+    """Make the folders of runs that are kept, without weights, each whole or not at all."""
     for run_dir, seed in kept.items():
         run_dir.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(prefix=".kept-", dir=run_dir.parent) as folder:
@@ -119,4 +122,7 @@ def write_kept(kept: Runs, jobs: Iterable[Job]) -> None:
                 path = made / job.leaves.relative_to(run_dir)
                 path.parent.mkdir(exist_ok=True)
                 write_whole(path, json.dumps(_left_by(job, seed)).encode())
+                if job.trains:
+                    settings = yaml.safe_dump(dict(job.settings), sort_keys=False)
+                    write_whole(made / CONFIG, settings.encode())
             made.rename(run_dir)
