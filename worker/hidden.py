@@ -23,6 +23,7 @@ from tangram_sim.geometry import overlap_share
 from tangram_sim.kinematics import wrap
 from tangram_sim.layout import Layout
 from tangram_sim.lens import Lens, View
+from tangram_sim.rewards import scaled_overlap
 from tangram_vision.levels import coverage
 from tangram_vision.portraits import portrait
 from tangram_vision.silhouette_pictures import fill_picture
@@ -222,6 +223,7 @@ def means(hidden: Hidden, laid: Laid) -> dict[str, Any]:
     """Scores of all puzzles, those that were not filled among them."""
     names = ("coverage", "iou", "blocked", "refused", "actions_used")
     return {
+        "mean_reward": float(np.mean(scaled_overlap(laid.coverage))),
         **{name: float(np.mean(getattr(laid, name))) for name in names},
         "share_solved_iou": float(np.mean(laid.solved)),
         "filled": hidden.filled,

@@ -13,6 +13,7 @@ from tangram_agent.runs import Run
 from tangram_agent.setup import Setup
 from tangram_sim.arrays import Floats
 from tangram_sim.errors import ConfigError
+from tangram_sim.rewards import scaled_overlap
 from worker.baselines import Player, exact_policy
 from worker.config import TOGETHER
 from worker.metrics import SOLVED, assembled, pose_errors, summarise
@@ -97,8 +98,12 @@ def of_outlines(setup: Setup, played: Played) -> Scores:
     """Scores of filled outlines; any dissection counts, so none tells of single pieces."""
     found = assembled(setup.layout, played)
     means = {key: value for key, value in found.means().items() if key in OF_AREAS}
-    solved = float(np.mean(found.iou >= SOLVED))
-    return means | {"share_solved_iou": solved} | of_several(setup, played)
+    areas = {
+        "mean_reward": float(np.mean(scaled_overlap(found.coverage))),
+        "share_solved_iou": float(np.mean(found.iou >= SOLVED)),
+        "episodes": float(len(found.coverage)),
+    }
+    return means | areas | of_several(setup, played)
 
 
 def score_hidden(

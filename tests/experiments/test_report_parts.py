@@ -47,6 +47,7 @@ from tangram_lab.experiments.report.statistics import (
 from tangram_lab.experiments.report.study import Seed, Training
 from tangram_lab.experiments.report.style import LINES
 from tangram_lab.experiments.report.tables import (
+    assembly_table,
     paired,
     picture,
     plain,
@@ -61,10 +62,12 @@ from tests.experiments.builders import (
     cells,
     experiment,
     learning_curve,
+    of_several,
     plan,
     result,
     scores,
     training,
+    trial,
     write_plan,
     write_run,
     write_study,
@@ -179,6 +182,32 @@ def test_worlds_stand_beside_the_formula_and_the_oracle(tmp_path: Path) -> None:
     assert [panel["formula"] for panel in lines] == [[1.0, 1.0], [1.0, 0.5]]
     assert [panel["oracle"] for panel in lines] == [[1.0, 1.0], [1.0, 1.0]]
     np.testing.assert_allclose(lines[1]["ours"], [0.85, 0.75])
+
+
+def test_who_learned_nothing_stands_beside_the_agents_once_for_each_task(tmp_path: Path) -> None:
+    """Not what an agent's own weights do otherwise. Another world is another task, by its name."""
+    names, own = ("alike", "also", "unlike"), of_several([0.9, 0.8])
+    for name in names:
+        known = {"largest first": of_several([0.5, 0.7] if name == "unlike" else [0.2, 0.4])}
+        known |= {"lookahead=none": own, "order=size": own, "random": of_several([0.0, 0.2])}
+        write_run(
+            tmp_path, name, result(0, tokens=["square"] * 7), [], {"far": scores(0.7, known, **own)}
+        )
+    one = experiment("game", [*names], tests=["far"])
+    trainings = {name: training(name, "x") for name in names}
+    content = plan({"a": one}, trainings, {"far": trial("far")}, (0,))
+    content["trainings"]["unlike"]["settings"] = {"sim": {"pixels": 64}}
+    write_plan(tmp_path, content)
+    (read,) = read_runs(tmp_path).experiments
+    lines = assembly_table(read)
+    rows = [[cell.strip() for cell in line.split("|")[1:5]] for line in lines[2:] if line]
+    assert rows[3:] == [
+        ["largest first", "far, 7 tokens", "", "0.3000"],
+        ["random", "far, 7 tokens", "", "0.1000"],
+        ["largest first", "far, unlike", "", "0.6000"],
+        ["random", "far, unlike", "", "0.1000"],
+    ]
+    assert "IoU 0.95" not in lines[0]  # what nobody measured has no column
 
 
 def test_sweeps_over_noise_and_actions(tmp_path: Path) -> None:
