@@ -65,7 +65,7 @@ ONE_TOKEN := fig4 table1 table2 fig5 fig6 shapes method imitation perceptron par
 ABLATIONS := plateau ablation_paper ablation_tangram readings noise actions pose warm_start
 GAME := game game_method game_figures game_parts game_refinement game_slide game_planned
 WORLDS := worlds robustness motion_parts
-PICTURES := pictures disturbances doubts outlines
+PICTURES := pictures disturbances doubts outlines hidden
 LAPTOP = budget=laptop "budget.main_seeds=[0,1,2,3,4,5,6,7,8,9]"
 AT_ITS_SIZE = budget=paper "experiments.fig4.trainings=[paper,mlp]" "experiments.table1.trainings=[paper,mlp]"
 # Of a name, experiments and a budget.

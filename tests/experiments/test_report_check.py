@@ -58,6 +58,7 @@ PAGES = [
     ("<!-- data: paper -->\nThe paper has 0.760.", ["0.760 is not in paper"]),
     ("<!-- data: a/fig4 -->\nIt has -0.996.", ["-0.996 is not in a/fig4"]),
     ("<!-- data: a/fig4 -->\nFrom 0.995-0.996.", []),
+    ("<!-- data: a/fig4 -->\nFrom 0.996..0.111.", ["0.111 is not in a/fig4"]),
     ("<!-- data: bench.json -->\nIt has 3.000.", ["3.000 is not in bench.json"]),  # it is -3
     ("<!-- data: pretrained/square -->\nOf 0.160 and 0.3333.", ["0.3333 is not in"]),
     (
@@ -67,7 +68,14 @@ PAGES = [
     ("It has 12.3 %.", ["12.3 % has no source"]),
     *(
         (f"<!-- data: a/fig4 bench.json -->\nIt has {odd}.", [f"{odd} is not written as in the"])
-        for odd in ("12.3%", "12.3\N{NO-BREAK SPACE}%", ".123", "-.123", "\N{MINUS SIGN}0.996")
+        for odd in (
+            "12.3%",
+            "12.3\N{NO-BREAK SPACE}%",
+            "12.3&nbsp;%",
+            ".123",
+            "-.123",
+            "\N{MINUS SIGN}0.996",
+        )
     ),
     ("<!-- data: none -->\nA side of .125, and 12.3% of it.", []),
     ("<!-- data: data.json -->\nIt has 0.996.", ["has a source that is none"]),

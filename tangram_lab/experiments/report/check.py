@@ -40,7 +40,9 @@ from tangram_sim.errors import RunError
 MARK = re.compile(r"<!-- data: (?P<sources>[^>]+?) -->")
 # Three decimals and more, or a percentage with one: scores have as many, and little else has. How
 # the tables write none is found, too, and told.
-SCORE = re.compile(r"(?<![\w.])[-\N{MINUS SIGN}]?\d*\.(?:\d+[^\S\n]*%|\d{3,}(?!\w|\.\d))")
+SCORE = re.compile(
+    r"(?<!\w)(?<!\w\.)[-\N{MINUS SIGN}]?\d*\.(?:\d+(?:[^\S\n]|&\w+;)*%|\d{3,}(?!\w|\.\d))"
+)
 WRITTEN = re.compile(r"-?\d+\.(?:\d+ %|\d+)")
 CODE = re.compile(r"^(?P<fence>```+)[^`\n]*\n.*?^(?P=fence)`*[ \t]*$", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`[^`\n]*`|\]\([^)]*\)")
