@@ -16,6 +16,7 @@ from tangram_agent.files import write_whole
 
 WIDTH_IN = 9.0  # a README shows it a little smaller than that
 DPI = 160
+CROWDED = 1e4  # beyond, two ticks in each decade run into one another
 WIDE = 30.0  # most / least of values that need a logarithmic axis
 LINES = 6  # of a panel, what they are compared with among them
 # Okabe and Ito's colours for all kinds of colour vision, without black and yellow, and two of
@@ -107,15 +108,15 @@ def legend_below(figure: Figure, panel: Axes, columns: int = 4) -> None:
 
 def widen(panel: Axes, axis: str, values: Sequence[float]) -> None:
     """A logarithmic axis, x or y, where the values need one; its ticks are plain numbers."""
-    if values and min(values) > 0.0 and max(values) / min(values) > WIDE:
-        make_logarithmic(panel, axis)
+    if values and min(values) > 0.0 and (ratio := max(values) / min(values)) > WIDE:
+        make_logarithmic(panel, axis, (1.0,) if ratio > CROWDED else (1.0, 3.0))
 
 
-def make_logarithmic(panel: Axes, axis: str) -> None:
-    """A logarithmic axis, x or y, whose ticks are plain numbers."""
+def make_logarithmic(panel: Axes, axis: str, subs: Sequence[float] = (1.0, 3.0)) -> None:
+    """A logarithmic axis, x or y, whose ticks are plain numbers: these in each decade."""
     panel.set(**{f"{axis}scale": "log"})
     scaled = panel.xaxis if axis == "x" else panel.yaxis
-    scaled.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+    scaled.set_major_locator(LogLocator(subs=subs))
     scaled.set_major_formatter(thousands())
     scaled.set_minor_formatter(NullFormatter())
 
