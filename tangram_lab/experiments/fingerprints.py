@@ -25,7 +25,10 @@ from worker.test_set import FixedTests, greedy
 UPDATES = 20
 BATCH_SIZE, LEARNING_STARTS, CAPACITY, PACE = 16, 32, 256, 1.0  # instead of the agent's
 SEED, ENVS, BATCH_EPISODES, TEST_EPISODES = 0, 4, 8, 8
-TOLERANCE = 1e-3  # other processors add numbers up in another order
+TOLERANCE = 1e-3
+# Processors of another make add numbers up in another order. Of 63 trainings an Intel came to the
+# scores of an AMD in 57; all 63 had the same weights, that had moved as far but for 2 %.
+ELSEWHERE = {"weights": TOLERANCE, "moved": 0.1}
 
 Fingerprint = dict[str, float]
 Tensors = Mapping[str, npt.NDArray[Any]]
@@ -63,14 +66,18 @@ def make_facts(config: Mapping[str, Any]) -> dict[str, Any]:
     return {name: fact for name, fact in facts.items() if name != "device"}
 
 
-def differences(before: Fingerprint, now: Fingerprint) -> list[str]:
-    """The numbers that are not what they were."""
+def differences(before: Fingerprint, now: Fingerprint, elsewhere: bool = False) -> list[str]:
+    """The numbers that are not what they were.
+
+    Args:
+        before, now: to compare.
+        elsewhere: they were made on processors of another make, so that scores may differ.
+    """
     return [
         f"{name} is {now.get(name)}, and was {before.get(name)}"
         for name in {**now, **before}
-        if not np.isclose(
-            before.get(name, np.nan), now.get(name, np.nan), rtol=TOLERANCE, atol=TOLERANCE
-        )
+        if (bound := ELSEWHERE.get(name) if elsewhere else TOLERANCE) is not None
+        and not np.isclose(before.get(name, np.nan), now.get(name, np.nan), rtol=bound, atol=bound)
     ]
 
 

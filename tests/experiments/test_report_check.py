@@ -9,8 +9,9 @@ from typing import Any
 
 import pytest
 
+from master.result import processor
 from tangram_agent.setup import from_mapping
-from tangram_lab.experiments.fingerprints import differences
+from tangram_lab.experiments.fingerprints import Fingerprint, differences
 from tangram_lab.experiments.plan import StudyConfig
 from tangram_lab.experiments.report import check as report_check
 from tangram_lab.experiments.report import page
@@ -357,6 +358,26 @@ def test_a_result_of_another_training_is_told(
         line.startswith(f"small/ours, seed 1 is of another training: {told}")
         for line in checked(report)
     )
+
+
+@pytest.mark.parametrize(
+    ("now", "here", "told"),
+    [
+        ({"mean_reward": 0.6, "weights": 1000.0}, True, "mean_reward is 0.6"),
+        ({"mean_reward": 0.6, "weights": 1000.0}, False, ""),
+        ({"mean_reward": 0.5, "weights": 1002.0}, False, "weights is 1002.0"),
+        ({}, False, "weights is None"),
+    ],
+)
+def test_on_another_processor_only_the_weights_are_compared(
+    report: Path, monkeypatch: pytest.MonkeyPatch, now: Fingerprint, here: bool, told: str
+) -> None:
+    monkeypatch.setattr(report_check, "make_fingerprints", lambda found: dict.fromkeys(found, now))
+    data = json.loads((report / "data.json").read_text())
+    data["plan"]["processor"] = processor() if here else "another one"
+    (report / "data.json").write_text(json.dumps(data))
+    found = checked(report)
+    assert told in found[0] if told else not found
 
 
 @pytest.mark.parametrize("kept", [{}, {"ours": {}}, {"ours": {"mean_reward": 0.5}}])

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from master.result import processor
 from tangram_agent.pretrained import CARD, PACKAGED, is_name
 from tangram_lab.experiments.fingerprints import (
     UPDATES,
@@ -176,8 +177,9 @@ def _trained_otherwise(study: Study, resolve: Resolve) -> Iterator[str]:
         for change in known or ["nobody kept them"] * (not one.settings):
             yield f"{one.name} has not the settings that it was trained with: {change}"
         yield from _of_another(one, configs[one.name])
+    elsewhere = study.plan.get("processor", here := processor()) != here
     for name, found in make_fingerprints(configs).items():
-        if others := differences(study.fingerprints.get(name, {}), found):
+        if others := differences(study.fingerprints.get(name, {}), found, elsewhere):
             yield (
                 f"{name} trains otherwise than when its figures were made: after {UPDATES} updates "
                 f"{', '.join(others)}: make them anew with make evidence KEEP=yes"
