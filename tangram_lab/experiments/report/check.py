@@ -177,7 +177,8 @@ def _trained_otherwise(study: Study, resolve: Resolve) -> Iterator[str]:
         for change in known or ["nobody kept them"] * (not one.settings):
             yield f"{one.name} has not the settings that it was trained with: {change}"
         yield from _of_another(one, configs[one.name])
-    elsewhere = study.plan.get("processor", here := processor()) != here
+    here = processor()
+    elsewhere = study.plan.get("processor", here) != here
     for name, found in make_fingerprints(configs).items():
         if others := differences(study.fingerprints.get(name, {}), found, elsewhere):
             yield (
