@@ -90,8 +90,7 @@ class ReportConfig(Settings):
     check: bool = setting(
         False,
         "in a clone: whether README and docs show what the reports in docs/results hold, and "
-        "whether this code still trains as the code that made them, on a processor of another make "
-        "by its weights alone",
+        "whether this code still trains as the code that made them",
     )
 
     def __post_init__(self) -> None:

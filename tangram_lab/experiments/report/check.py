@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from master.result import processor
 from tangram_agent.pretrained import CARD, PACKAGED, is_name
 from tangram_lab.experiments.fingerprints import (
     UPDATES,
@@ -68,22 +67,18 @@ def check(results: Path, pages: Iterable[Path], resolve: Resolve, choose: Choose
         RunError: the data cannot be read.
         ConfigError: this code refuses a training or an experiment of them.
     """
-    found, tables = list[str](), dict[str, str]()
+    found, tables, studies = list[str](), dict[str, str](), dict[str, Study]()
     for folder in reports(results):
         study, figures = read_data(folder / DATA)
-        tables[folder.name] = _text(folder / TABLES)
+        tables[folder.name], studies[folder.name] = _text(folder / TABLES), study
         if tables_page(study, folder) != tables[folder.name]:
             found.append(f"{folder / TABLES} is not what {DATA} gives: make it anew")
         if others := figures.items() ^ figure_sums(folder).items():
             found.append(f"{folder / FIGURES} has not the figures of {DATA}: {min(others)[0]}")
         found += (
-            f"{folder.name}/{line}"
-            for line in (
-                *_lacks(study),
-                *_planned_otherwise(study, choose),
-                *_trained_otherwise(study, resolve),
-            )
+            f"{folder.name}/{line}" for line in (*_lacks(study), *_planned_otherwise(study, choose))
         )
+    found += _trained_otherwise(studies, resolve)
     numbers = Sources(results, tables)
     for page in pages:
         found += check_page(page.name, _text(page), numbers)
@@ -169,25 +164,28 @@ def _odd(study: Study, seed: Seed) -> Iterator[str]:
                 yield f"test {name} has {key}={test.get(key)}, not {value}"
 
 
-def _trained_otherwise(study: Study, resolve: Resolve) -> Iterator[str]:
+def _trained_otherwise(studies: Mapping[str, Study], resolve: Resolve) -> Iterator[str]:
     """The trainings that have other settings now, or would come to other numbers."""
-    configs = {one.name: resolve(one.overrides) for one in study.trainings}
-    for one in study.trainings:
-        known = changed_settings(one.settings, configs[one.name], one.settings)
+    trainings = {
+        f"{report}/{one.name}": (one, resolve(one.overrides), study.fingerprints.get(one.name, {}))
+        for report, study in studies.items()
+        for one in study.trainings
+    }
+    for name, (one, config, _) in trainings.items():
+        known = changed_settings(one.settings, config, one.settings)
         for change in known or ["nobody kept them"] * (not one.settings):
-            yield f"{one.name} has not the settings that it was trained with: {change}"
-        yield from _of_another(one, configs[one.name])
-    here = processor()
-    elsewhere = study.plan.get("processor", here) != here
-    for name, found in make_fingerprints(configs).items():
-        if others := differences(study.fingerprints.get(name, {}), found, elsewhere):
+            yield f"{name} has not the settings that it was trained with: {change}"
+        yield from _of_another(name, one, config)
+    now = make_fingerprints({name: config for name, (_, config, _) in trainings.items()})
+    for name, (_, _, before) in trainings.items():
+        if others := differences(before, now[name]):
             yield (
                 f"{name} trains otherwise than when its figures were made: after {UPDATES} updates "
                 f"{', '.join(others)}: make them anew with make evidence KEEP=yes"
             )
 
 
-def _of_another(training: Training, config: Mapping[str, Any]) -> Iterator[str]:
+def _of_another(name: str, training: Training, config: Mapping[str, Any]) -> Iterator[str]:
     """Results that no run of a training can have: they are of another one."""
     values = {name: config[name] for name in BOUNDS if config.get(name)}
     bounds = [
@@ -195,10 +193,10 @@ def _of_another(training: Training, config: Mapping[str, Any]) -> Iterator[str]:
     ]
     facts = make_facts(config) if training.finished else {}
     for seed in training.finished:
-        told = f"{training.name}, seed {seed.number} is of another training"
-        for name, fact in facts.items():
-            if seed.result.get(name) != fact:
-                yield f"{told}: its {name} is {seed.result.get(name)}, not {fact}"
+        told = f"{name}, seed {seed.number} is of another training"
+        for key, fact in facts.items():
+            if seed.result.get(key) != fact:
+                yield f"{told}: its {key} is {seed.result.get(key)}, not {fact}"
         if seed.result["ended_by"] not in bounds:
             yield f"{told}: it was ended by {seed.result['ended_by']}, not by {' or '.join(bounds)}"
 

@@ -91,8 +91,7 @@ def _alike(name: str, earlier: Study, plan: Mapping[str, Any]) -> bool:
         return False
     # One that diverged has an empty fingerprint, which tells nothing of the code.
     before, code = earlier.fingerprints.get(name), plan["fingerprints"].get(name)
-    elsewhere = earlier.plan.get("processor") != plan.get("processor")
-    if not before or not code or differences(before, code, elsewhere):
+    if not before or not code or differences(before, code):
         return False
     known = one.settings and not changed_settings(one.settings, now["settings"], one.settings)
     return bool(known) and (one.after is None or _alike(one.after, earlier, plan))
