@@ -86,15 +86,15 @@ def make_fingerprints(configs: Mapping[str, Mapping[str, Any]]) -> dict[str, Fin
 def main() -> None:
     """Trainings and their configs from stdin; a line with the name and the numbers of each."""
     torch.set_num_threads(1)
-    known = dict[str, Fingerprint]()
+    known = dict[Setup, Fingerprint]()
     for name, config in json.load(sys.stdin).items():
-        same = json.dumps(config)
-        if same not in known:
+        setup = short(make_setup(config))
+        if setup not in known:
             try:
-                known[same] = make_fingerprint(make_setup(config))
+                known[setup] = make_fingerprint(setup)
             except NotFiniteError:
-                known[same] = {}
-        sys.stdout.write(json.dumps((name, known[same])) + "\n")
+                known[setup] = {}
+        sys.stdout.write(json.dumps((name, known[setup])) + "\n")
         sys.stdout.flush()
 
 
