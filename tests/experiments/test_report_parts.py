@@ -400,6 +400,33 @@ def test_a_difference_is_of_the_same_episodes_and_its_interval_needs_seeds(
     assert ("to" in row[2 + interval]) == interval
 
 
+def test_a_ranking_has_what_learned_nothing_in_a_changed_world(tmp_path: Path) -> None:
+    """There the formula is no oracle, and chance is left out."""
+    one = experiment("ranking", ["ours", "damped"], tests=["random"])
+    names = {
+        "ours": training("ours", "x"),
+        "damped": training("in a damped world", "x", "sim.damping=0.04"),
+    }
+    tests = {"random": {"label": "random", "overrides": []}}
+    write_plan(tmp_path, plan({"a": one}, names, tests, (0,)))
+    known = {"position only": 0.71, "exact": 0.82, "fitted": 0.99, "oracle": 1.0, "random": -0.9}
+    for name in names:
+        baselines = {policy: {"mean_reward": score} for policy, score in known.items()}
+        write_run(tmp_path, name, result(0), [], {"random": scores(0.9) | {"baselines": baselines}})
+    study = read_runs(tmp_path)
+    lines = ranking_table(study, study.experiments[0])
+    found = [[cell.strip() for cell in line.split("|")[1:4:2]] for line in lines[4:] if line]
+    assert found == [
+        ["position only (ours)", "0.710"],
+        ["exact oracle (ours)", "0.820"],
+        ["random (ours)", "-0.900"],
+        ["position only (in a damped world)", "0.710"],
+        ["formula (in a damped world)", "0.820"],
+        ["formula with a fitted motion (in a damped world)", "0.990"],
+        ["oracle told of the world (in a damped world)", "1.000"],
+    ]
+
+
 def test_the_interval_of_a_difference_has_the_spread_of_seeds_and_of_episodes() -> None:
     """Against the deviation of the difference over many draws of seeds and episodes."""
     generator = np.random.default_rng(0)

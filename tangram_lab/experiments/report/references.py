@@ -14,6 +14,13 @@ from tangram_sim.errors import RunError
 # Name in the files of tests -> name in the report.
 POSITION, EXACT, RANDOM = "position only", "exact oracle", "random"
 NAMES = {"position only": POSITION, "exact": EXACT, "random": RANDOM}
+# The same where tokens fall short of what they are told, and only some policies learn or know that.
+CHANGED = {
+    "position only": POSITION,
+    "exact": "formula",
+    "fitted": "formula with a fitted motion",
+    "oracle": "oracle told of the world",
+}
 # Settings of the simulation that tests set themselves, or that move no token.
 APART = ("sim.actions_per_token", "sim.corner_noise", "sim.pixels")
 
@@ -25,7 +32,7 @@ class Reference:
     """A policy that learned nothing, at one task.
 
     Attributes:
-        name: position only, exact oracle or random.
+        name: as tables show it.
         task: what tells the task from the experiment's others; empty if it has only one.
         by_test: name of a test -> its scores there, the tests that are most like training first.
     """
@@ -47,8 +54,13 @@ class Reference:
 
 
 def references(study: Study, experiment: Experiment) -> list[Reference]:
-    """Every policy that a test of the study has, at every task of an experiment."""
+    """Every policy that a test of the study has, at every task where tokens do as they are told."""
     return [one for one in _all(study, experiment) if one.by_test]
+
+
+def references_in_changed_worlds(study: Study, experiment: Experiment) -> list[Reference]:
+    """Every policy that a test of the study has, at every task where tokens fall short."""
+    return [one for one in _all(study, experiment, changed=True) if one.by_test]
 
 
 def lacking(study: Study, experiment: Experiment) -> list[str]:
@@ -68,15 +80,15 @@ def position(study: Study, training: Training) -> Reference:
     return Reference(POSITION, "", _scores(study, POSITION, task_of(training)))
 
 
-def _all(study: Study, experiment: Experiment) -> Iterator[Reference]:
+def _all(study: Study, experiment: Experiment, changed: bool = False) -> Iterator[Reference]:
     firsts: dict[Task, Training] = {}
     for one in experiment.trainings:
         if one.finished:
             firsts.setdefault(task_of(one), one)
     shapes = [one.tokens for one in firsts.values()]
-    for key, name in NAMES.items():
+    for key, name in (CHANGED if changed else NAMES).items():
         for task, one in firsts.items():
-            if not any(map(falls_short, task)):
+            if any(map(falls_short, task)) == changed:
                 label = one.tokens if shapes.count(one.tokens) == 1 else one.label
                 yield Reference(name, label * (len(shapes) > 1), _scores(study, key, task))
 

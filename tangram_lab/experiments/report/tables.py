@@ -20,7 +20,12 @@ from tangram_lab.experiments.report.numbers import (
     reached,
 )
 from tangram_lab.experiments.report.reading import EACH
-from tangram_lab.experiments.report.references import papers, papers_score, references
+from tangram_lab.experiments.report.references import (
+    papers,
+    papers_score,
+    references,
+    references_in_changed_worlds,
+)
 from tangram_lab.experiments.report.statistics import ENOUGH, difference, interquartile_mean
 from tangram_lab.experiments.report.study import Experiment, Row, Study, Training, Trial
 from tangram_sim.arrays import Floats
@@ -233,7 +238,8 @@ def ranking_table(study: Study, experiment: Experiment) -> list[str]:
     space = [""] * len(means)
     others = [
         [one.label, "", REWARD.show(one.score(REWARD)), *space, "", ANGLE.show(one.score(ANGLE))]
-        for one in references(study, experiment)
+        for policies in (references, references_in_changed_worlds)
+        for one in policies(study, experiment)
     ]
     return _table(columns, experiment.trainings, others)
 
