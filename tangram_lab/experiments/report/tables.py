@@ -114,6 +114,16 @@ def _table(
     return table([head for head, _ in columns], [*rows, *others])
 
 
+def _measured_table(
+    head: Sequence[str], rows: Sequence[Sequence[str]], others: Iterable[Sequence[str]] = ()
+) -> list[str]:
+    """A table without the columns that no row has a score in, but for the coverage."""
+    columns = zip(head, *rows, strict=True)
+    told = [name == COVERAGE.label or {*cells} != {NOTHING} for name, *cells in columns]
+    every = (list(compress(row, told)) for row in [*rows, *others])
+    return table(list(compress(head, told)), every)
+
+
 def _over_seeds(measure: Measure, test: str | None = None) -> Cell:
     return lambda one: measure.show_spread(one.values(measure.key, test))
 
@@ -298,10 +308,7 @@ def assembly_table(experiment: Experiment) -> list[str]:
         for one in experiment.trainings
         for test in experiment.tests
     ]
-    every = [*rows, *_baseline_rows(experiment)]
-    columns = zip(head, *rows, strict=True)
-    told = [name == COVERAGE.label or {*cells} != {NOTHING} for name, *cells in columns]
-    return table(list(compress(head, told)), (list(compress(row, told)) for row in every))
+    return _measured_table(head, rows, _baseline_rows(experiment))
 
 
 def _baseline_rows(experiment: Experiment) -> Iterator[list[str]]:
@@ -382,4 +389,4 @@ def worlds_table(experiment: Experiment) -> list[str]:
                     *map(measure.show_spread, (own, *policies)),
                 ]
             )
-    return table([*head, *COMPARED.values()], rows)
+    return _measured_table([*head, *COMPARED.values()], rows)
