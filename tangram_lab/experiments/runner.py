@@ -133,12 +133,16 @@ def _last_evaluation(job: Job) -> dict[str, Any]:
 
 
 def _outcome(result: Mapping[str, Any]) -> str:
-    reward, angle = result.get("mean_reward"), result.get("angle_error_deg_median")
-    if reward is None or angle is None:
-        return "done, without scores"
-    text = f"mean reward {reward:.3f}, angle error {angle:.2f} deg"
+    shown = {
+        "mean_reward": "mean reward {:.3f}",
+        "coverage": "coverage {:.3f}",  # of puzzles with hidden pieces there is nothing else
+        "angle_error_deg_median": "angle error {:.2f} deg",
+    }
+    found = [text.format(result[key]) for key, text in shown.items() if result.get(key) is not None]
     seconds = result.get("train_s")
-    return text if seconds is None else f"{text}, {duration(seconds)} of training"
+    if found and seconds is not None:
+        found.append(f"{duration(seconds)} of training")
+    return ", ".join(found) or "done, without scores"
 
 
 # The runner

@@ -34,6 +34,25 @@ def test_a_test_has_no_bound(tmp_path: Path) -> None:
     assert bound(replace(job(tmp_path, max_updates=20), trains=False)) == ("updates", None)
 
 
+@pytest.mark.parametrize(
+    ("result", "told"),
+    [
+        ({"mean_reward": 0.5, "angle_error_deg_median": 2.0}, "mean reward 0.500, angle error 2"),
+        ({"mean_reward": 0.5, "train_s": 60.0}, "mean reward 0.500, 1:00 of training"),
+        ({"coverage": 0.998, "angle_error_deg_median": None}, "coverage 0.998"),
+        ({}, "done, without scores"),
+    ],
+)
+def test_a_job_that_is_done_tells_the_scores_that_it_has(
+    tmp_path: Path, result: dict[str, float | None], told: str
+) -> None:
+    console = Console(file=io.StringIO(), width=120)
+    with StudyProgress(console, total=1, done=0) as progress:
+        progress.started(job(tmp_path))
+        progress.finished(job(tmp_path), result)
+    assert f"[1/1] square, seed 0: {told}" in console.file.getvalue()  # type: ignore[attr-defined]
+
+
 def shown(folder: Path, curve: str | None, terminal: bool) -> str:
     """What stands on the screen after one look at a running training."""
     if curve is not None:
