@@ -74,18 +74,20 @@ def make_fingerprints(configs: Mapping[str, Mapping[str, Any]]) -> dict[str, Fin
         with subprocess.Popen(
             command, stdin=asked, stdout=subprocess.PIPE, stderr=errors, env=os.environ | KERNELS
         ) as process:
-            lines = track(process.stdout or (), told, len(configs), console=console, transient=True)
-            found = dict[str, Fingerprint](json.loads(line) for line in lines)
+            made = track(process.stdout or (), told, len(configs), console=console, transient=True)
+            lines = list(made)
         if process.returncode:
             errors.seek(0)
             why = errors.read().decode(errors="replace").strip().rpartition("\n")[2]
             raise RunError(f"no fingerprint could be made: {why or describe(process.returncode)}")
-    return found
+    return dict[str, Fingerprint](json.loads(line) for line in lines)
 
 
 def main() -> None:
     """Trainings and their configs from stdin; a line with the name and the numbers of each."""
     torch.set_num_threads(1)
+    lines = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # whatever else prints, as a reward of one's own may
     known = dict[Setup, Fingerprint]()
     for name, config in json.load(sys.stdin).items():
         setup = short(make_setup(config))
@@ -94,8 +96,8 @@ def main() -> None:
                 known[setup] = make_fingerprint(setup)
             except NotFiniteError:
                 known[setup] = {}
-        sys.stdout.write(json.dumps((name, known[setup])) + "\n")
-        sys.stdout.flush()
+        lines.write(json.dumps((name, known[setup])) + "\n")
+        lines.flush()
 
 
 def make_facts(config: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,5 +1,7 @@
 """Fingerprints: the same bits whatever kernels the processor would choose, and errors that tell."""
 
+from pathlib import Path
+
 import pytest
 
 from conf.cli import composed
@@ -16,23 +18,35 @@ OTHERS = [
 
 
 @pytest.mark.slow
-def test_a_fingerprint_is_the_same_on_other_processors(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fingerprint_is_the_same_on_other_processors(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "own.py").write_text(
+        "def near(achieved, desired, layout):\n"
+        "    print('near')\n"
+        "    return -abs(achieved - desired).mean(axis=(1, 2))\n"
+    )
+    own = composed("train", ["run_dir=x", f"reward.name={tmp_path}/own.py:near"])
     found = []
     for kernels in OTHERS:
         with monkeypatch.context() as machine:
             for name, value in kernels.items():
                 machine.setenv(name, value)
-            found.append(make_fingerprints({"one": CONFIG, "same": CONFIG}))
+            found.append(make_fingerprints({"one": CONFIG, "own": own, "same": CONFIG}))
     assert all(one == found[0] for one in found)
-    assert found[0]["one"] == found[0]["same"]
+    assert found[0]["one"] == found[0]["same"] != found[0]["own"]
     assert found[0]["one"]["weights"] > found[0]["one"]["moved"] > 0.0
 
 
 @pytest.mark.fast
-def test_what_cannot_be_made_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_made_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     assert make_fingerprints({}) == {}
     with pytest.raises(ConfigError, match="batch_size"):
         make_fingerprints({"one": CONFIG | {"agent": CONFIG["agent"] | {"batch_size": -1}}})
-    monkeypatch.setattr(fingerprints.sys, "executable", "/bin/false")
-    with pytest.raises(RunError, match="^no fingerprint could be made: status 1$"):
-        make_fingerprints({"one": CONFIG})
+    for end, told in (("exit 1", "status 1"), ("echo no room >&2; exit 3", "no room")):
+        dies = tmp_path / "dies"
+        dies.write_text(f"#!/bin/sh\nprintf '[\"one\", {{'\n{end}\n")  # in the middle of a line
+        dies.chmod(0o700)
+        monkeypatch.setattr(fingerprints.sys, "executable", str(dies))
+        with pytest.raises(RunError, match=f"^no fingerprint could be made: {told}$"):
+            make_fingerprints({"one": CONFIG})
