@@ -45,6 +45,7 @@ KERNELS = {
     "ATEN_CPU_CAPABILITY": "avx2",
     "NPY_DISABLE_CPU_FEATURES": "X86_V4,AVX512_ICL,AVX512_SPR",
     "OPENCV_CPU_DISABLE": "AVX512-SKX",
+    "OPENCV_IPP": "disabled",
 }
 
 Fingerprint = dict[str, float]
@@ -80,7 +81,10 @@ def make_fingerprints(configs: Mapping[str, Mapping[str, Any]]) -> dict[str, Fin
             errors.seek(0)
             why = errors.read().decode(errors="replace").strip().rpartition("\n")[2]
             raise RunError(f"no fingerprint could be made: {why or describe(process.returncode)}")
-    return dict[str, Fingerprint](json.loads(line) for line in lines)
+    found = dict[str, Fingerprint](json.loads(line) for line in lines)
+    if found.keys() != configs.keys():
+        raise RunError(f"fingerprints of {len(found)} of {len(configs)} trainings were made")
+    return found
 
 
 def main() -> None:

@@ -43,10 +43,15 @@ def test_what_cannot_be_made_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     assert make_fingerprints({}) == {}
     with pytest.raises(ConfigError, match="batch_size"):
         make_fingerprints({"one": CONFIG | {"agent": CONFIG["agent"] | {"batch_size": -1}}})
-    for end, told in (("exit 1", "status 1"), ("echo no room >&2; exit 3", "no room")):
-        dies = tmp_path / "dies"
-        dies.write_text(f"#!/bin/sh\nprintf '[\"one\", {{'\n{end}\n")  # in the middle of a line
-        dies.chmod(0o700)
-        monkeypatch.setattr(fingerprints.sys, "executable", str(dies))
-        with pytest.raises(RunError, match=f"^no fingerprint could be made: {told}$"):
+    half = "printf '[\"one\", {'"  # it ends in the middle of a line
+    for script, told in (
+        (f"{half}; exit 1", "^no fingerprint could be made: status 1$"),
+        (f"{half}; echo no room >&2; exit 3", "^no fingerprint could be made: no room$"),
+        ("exit 0", "^fingerprints of 0 of 1 trainings were made$"),
+    ):
+        child = tmp_path / "child"
+        child.write_text(f"#!/bin/sh\n{script}\n")
+        child.chmod(0o700)
+        monkeypatch.setattr(fingerprints.sys, "executable", str(child))
+        with pytest.raises(RunError, match=told):
             make_fingerprints({"one": CONFIG})

@@ -359,13 +359,27 @@ def test_a_result_of_another_training_is_told(
     )
 
 
+@pytest.mark.parametrize(("turns", "told"), [(4, "test random has turns=4, not 8"), (8, "")])
+def test_puzzles_at_fewer_angles_are_told(report: Path, turns: int, told: str) -> None:
+    data = json.loads((report / "data.json").read_text())
+    data["plan"]["tests"]["random"]["overrides"] = ["puzzle=test", "turns=8"]
+    for run in data["runs"]["ours"]:
+        run["tests"]["random"] |= {"puzzle": ["test"], "turns": turns}
+    (report / "data.json").write_text(json.dumps(data))
+    found = [line for line in checked(report) if "turns=4" in line]
+    assert [line.endswith(told) for line in found] == [True, True] * bool(told)
+
+
 @pytest.mark.parametrize("kept", [{}, {"ours": {}}, {"ours": {"mean_reward": 0.5}}])
 def test_a_fingerprint_that_nobody_kept_is_told(report: Path, kept: dict[str, Any]) -> None:
     data = json.loads((report / "data.json").read_text())
     data["plan"]["fingerprints"] = kept
     (report / "data.json").write_text(json.dumps(data))
     (found,) = checked(report)
-    assert "weights is 1000.0, and was None" in found
+    told = (
+        "weights is 1000.0, and was None" if kept.get("ours") else "small/ours has no fingerprint"
+    )
+    assert told in found
 
 
 def test_fingerprints_that_differ() -> None:

@@ -51,6 +51,7 @@ from tangram_lab.experiments.report.tables import (
     paired,
     picture,
     plain,
+    puzzle_order_table,
     ranking_table,
     score_table,
     table,
@@ -175,8 +176,8 @@ def test_worlds_stand_beside_the_formula_and_the_oracle(tmp_path: Path) -> None:
     }
     rows = [row[2:] for row in cells("\n".join(worlds_table(read)), "ours")]
     # Nobody was fitted, so that column is left out.
-    assert rows[0] == ["0.8500 (0.8000 to 0.9000)", "1.0000", "-"]
-    assert rows[2] == ["0.7500 (0.7000 to 0.8000)", "0.5000", "1.0000"]
+    assert rows[0] == ["0.8500 (0.8000 to 0.9000)", "1.0000", "-", "0.7640"]
+    assert rows[2] == ["0.7500 (0.7000 to 0.8000)", "0.5000", "1.0000", "-"]
     drawn = draw_worlds(study, read)
     assert drawn is not None
     lines = [{one.get_label(): [*one.get_ydata()] for one in axes.lines} for axes in drawn.axes]
@@ -399,6 +400,25 @@ def test_a_difference_is_of_the_same_episodes_and_its_interval_needs_seeds(
     (row,) = cells("\n".join(ranking_table(study, study.experiments[0])), "less")
     assert row[2 + interval].startswith("-0.2000")  # a reward is twice a coverage, less 1
     assert ("to" in row[2 + interval]) == interval
+
+
+def test_orders_are_compared_in_puzzles_that_tell_no_episodes(tmp_path: Path) -> None:
+    one = experiment("game", ["seven"], tests=["hidden", "random"])
+    names = {"seven": training("seven", "game", "tokens=tangram7")}
+    tests = {name: {"label": name, "overrides": []} for name in ("hidden", "random")}
+    write_plan(tmp_path, plan({"a": one}, names, tests, (0, 1)))
+    for seed, own in enumerate((0.99, 0.97)):
+        listed = {"coverage": own - 0.01, "share_solved_iou": 0.5}
+        hidden = {"coverage": own, "share_solved_iou": 1.0, "mean_reward": 0.9}
+        hidden |= {"baselines": {"order=listed": listed}}
+        told = of_several([own, own], mean_reward=0.9)
+        write_run(tmp_path, "seven", result(seed), [], {"hidden": hidden, "random": told})
+    study = read_runs(tmp_path)
+    lines = puzzle_order_table(study.experiments[0])
+    assert cells("\n".join(lines), "seven") == [
+        ["hidden", "learned", "0.9800 (0.9700 to 0.9900)", "100.0 %"],
+        ["hidden", "order=listed", "0.9700 (0.9600 to 0.9800)", "50.0 %"],
+    ]
 
 
 def test_a_ranking_has_what_learned_nothing_in_a_changed_world(tmp_path: Path) -> None:

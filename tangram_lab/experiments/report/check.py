@@ -159,9 +159,18 @@ def _odd(study: Study, seed: Seed) -> Iterator[str]:
         asked = {"updates": result["updates"], "test_seed": budget.test_seed}
         if "puzzle" not in test:
             asked["episodes"] = budget.test_episodes
+        elif turns := _turns(study, name):
+            asked["turns"] = turns
         for key, value in asked.items():
             if test.get(key) != value:
                 yield f"test {name} has {key}={test.get(key)}, not {value}"
+
+
+def _turns(study: Study, test: str) -> int | None:
+    """At how many angles a test of puzzles shows each, None where its plan does not tell."""
+    overrides = next(one.overrides for one in study.tests if one.name == test)
+    given = [text.partition("=")[2] for text in overrides if re.fullmatch(r"turns=\d+", text)]
+    return int(given[-1]) if given else None
 
 
 def _trained_otherwise(studies: Mapping[str, Study], resolve: Resolve) -> Iterator[str]:
@@ -178,7 +187,9 @@ def _trained_otherwise(studies: Mapping[str, Study], resolve: Resolve) -> Iterat
         yield from _of_another(name, one, config)
     now = make_fingerprints({name: config for name, (_, config, _) in trainings.items()})
     for name, (_, _, before) in trainings.items():
-        if others := differences(before, now[name]):
+        if not before:
+            yield f"{name} has no fingerprint: nothing tells whether this code trains alike"
+        elif others := differences(before, now[name]):
             yield (
                 f"{name} trains otherwise than when its figures were made: after {UPDATES} updates "
                 f"{', '.join(others)}: make them anew with make evidence KEEP=yes"

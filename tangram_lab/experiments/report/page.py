@@ -37,6 +37,7 @@ from tangram_lab.experiments.report.tables import (
     order_table,
     picture,
     plain,
+    puzzle_order_table,
     ranking_table,
     score_table,
     shell,
@@ -189,7 +190,7 @@ class Page:
                 "complexity": complexity_table,
                 "tests": self._tests,
                 "ranking": self._ranking,
-                "game": lambda one: [*assembly_table(one), *order_table(one)],
+                "game": lambda one: [*assembly_table(one), *_orders(one)],
                 "worlds": self._worlds,
             }
             lines += kinds[experiment.kind](experiment)
@@ -258,7 +259,11 @@ class Page:
         draw = partial(draw_worlds, self.study, one)
         lines = self._figure(one.name, one.title, WORLDS, draw)
         rows = worlds_table(one)
-        return lines + (details("Every test", rows) if lines else rows)
+        return lines + (details("Every test", rows) if lines else rows) + _orders(one)
+
+
+def _orders(one: Experiment) -> list[str]:
+    return [*order_table(one), *puzzle_order_table(one)]
 
 
 def _numbered(name: str, number: int) -> str:

@@ -34,10 +34,11 @@ SPREAD = "median (least to most)"
 LEVELS = (0.70, 0.75)  # that the paper tells of in Fig. 4
 # With several tokens.
 COVERAGE = Measure("coverage", "coverage", "{:.4f}")
+SOLVED_IOU = Measure("share_solved_iou", "solved, IoU 0.95", "{:.1f} %", 100)
 GAME_MEASURES = (
     COVERAGE,
     Measure("share_solved", "solved", "{:.1f} %", 100),
-    Measure("share_solved_iou", "solved, IoU 0.95", "{:.1f} %", 100),
+    SOLVED_IOU,
     Measure("iou", "IoU", "{:.3f}"),
     *(POSITION, ANGLE),
     Measure("wrong", "wrong pieces", "{:.2f}"),
@@ -52,13 +53,19 @@ ORDER_NOTE = (
     "mean difference of the coverage and its 95 % interval over the episodes, each averaged over "
     "the seeds."
 )
+PUZZLE_NOTE = "The same weights in the order that they learned and in fixed ones:"
 # Two-sided 95 % of a normal distribution: there are a hundred pairs and more.
 NORMAL = 1.96
 
 
 # In worlds whose motion is not known: name of a policy in the files of tests -> in tables.
 FORMULA, ORACLE = "exact", "oracle"
-COMPARED = {FORMULA: "formula", "fitted": "fitted", ORACLE: ORACLE}
+COMPARED = {
+    FORMULA: "formula",
+    "fitted": "fitted",
+    ORACLE: ORACLE,
+    "position only": "position only",
+}
 PRECISE = REWARD._replace(pattern="{:.4f}")
 
 
@@ -345,6 +352,26 @@ def order_table(experiment: Experiment) -> list[str]:
             if {*shown} - {NOTHING}:
                 rows.append([one.label, test.label, COVERAGE.show_spread(learned), *shown])
     return [plain(ORDER_NOTE), "", *table(head, rows)] if rows else []
+
+
+def puzzle_order_table(experiment: Experiment) -> list[str]:
+    """Coverage and solved of the same weights in each order, in tests that tell no episodes."""
+    told, measures = ("", *ORDERS), (COVERAGE, SOLVED_IOU)
+    rows = []
+    for one in experiment.trainings:
+        for test in experiment.tests:
+            if any(seed.tests.get(test.name, {}).get(EACH) for seed in one.finished):
+                continue
+            for order in told:
+                values = [
+                    one.compared(order, m.key, test.name) if order else one.values(m.key, test.name)
+                    for m in measures
+                ]
+                if all(values):
+                    shown = (m.show_spread(v) for m, v in zip(measures, values, strict=True))
+                    rows.append([one.label, test.label, order or "learned", *shown])
+    head = ["training", "test", "order", *(m.label for m in measures)]
+    return [plain(PUZZLE_NOTE), "", *table(head, rows)] if rows else []
 
 
 def differences(training: Training, test: Trial, order: str) -> Floats:
