@@ -16,7 +16,7 @@ from tangram_lab.experiments.report import check as report_check
 from tangram_lab.experiments.report import page
 from tangram_lab.experiments.report.check import Sources, check, check_page
 from tangram_lab.experiments.report.data import read_data, write_data
-from tangram_lab.experiments.report.page import write_report
+from tangram_lab.experiments.report.page import tables_page, write_report
 from tangram_lab.experiments.report.reading import read_runs
 from tangram_sim.errors import RunError
 from tests.experiments.builders import (
@@ -223,6 +223,16 @@ def test_figures_are_those_that_were_drawn_of_the_data(report: Path, name: str) 
     assert checked(report) == [f"{folder} has not the figures of data.json: {name}"]
     (folder / name).unlink()
     assert (checked(report) == []) == (name == "old.png")
+
+
+def test_a_report_of_tables_alone_needs_no_folder_of_figures(report: Path) -> None:
+    data = json.loads((report / "data.json").read_text())
+    data["figures"] = {}
+    (report / "data.json").write_text(json.dumps(data))
+    shutil.rmtree(report / "figures")
+    study, _ = read_data(report / "data.json")
+    (report / "tables.md").write_text(tables_page(study, report))
+    assert checked(report) == []
 
 
 def test_a_report_that_fails_leaves_the_earlier_one_whole(report: Path) -> None:

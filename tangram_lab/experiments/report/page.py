@@ -128,8 +128,8 @@ def _make(study: Study, out: Path) -> None:
 
 
 def figure_sums(out: Path) -> dict[str, str]:
-    """File of a figure -> SHA-256 of its content."""
-    files = sorted((out / FIGURES).iterdir())
+    """File of a figure -> SHA-256 of its content; nothing without a folder of them."""
+    files = sorted((out / FIGURES).glob("*"))  # git keeps no folder that is empty
     return {path.name: sha256(path.read_bytes()).hexdigest() for path in files if path.is_file()}
 
 
