@@ -343,7 +343,7 @@ def _facts(study: Study) -> list[tuple[str, str]]:
     return [
         ("runs finished", finished_count(study.trainings)),
         ("seeds", _several(sorted({seed.number for one in study.trainings for seed in one.seeds}))),
-        ("episodes of every test", planned if study.plan else while_training),
+        ("episodes of every test, puzzles apart", planned if study.plan else while_training),
         ("commit", _several(one for one in commits if one is not None)),
         ("processor", _several(row["processor"] for row in results)),
         ("cores", _several(row["cores"] for row in results)),
