@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from itertools import compress
+from itertools import compress, product
 
 import numpy as np
 
@@ -356,20 +356,18 @@ def order_table(experiment: Experiment) -> list[str]:
 
 def puzzle_order_table(experiment: Experiment) -> list[str]:
     """Coverage and solved of the same weights in each order, in tests that tell no episodes."""
-    told, measures = ("", *ORDERS), (COVERAGE, SOLVED_IOU)
-    rows = []
-    for one in experiment.trainings:
-        for test in experiment.tests:
-            if any(seed.tests.get(test.name, {}).get(EACH) for seed in one.finished):
-                continue
-            for order in told:
-                values = [
-                    one.compared(order, m.key, test.name) if order else one.values(m.key, test.name)
-                    for m in measures
-                ]
-                if all(values):
-                    shown = (m.show_spread(v) for m, v in zip(measures, values, strict=True))
-                    rows.append([one.label, test.label, order or "learned", *shown])
+    measures, rows = (COVERAGE, SOLVED_IOU), []
+    for one, test in product(experiment.trainings, experiment.tests):
+        if any(seed.tests.get(test.name, {}).get(EACH) for seed in one.finished):
+            continue
+        of_seeds = {"learned": [one.values(m.key, test.name) for m in measures]}
+        of_seeds |= {
+            order: [one.compared(order, m.key, test.name) for m in measures] for order in ORDERS
+        }
+        for order, values in of_seeds.items():
+            if all(values):
+                shown = (m.show_spread(v) for m, v in zip(measures, values, strict=True))
+                rows.append([one.label, test.label, order, *shown])
     head = ["training", "test", "order", *(m.label for m in measures)]
     return [plain(PUZZLE_NOTE), "", *table(head, rows)] if rows else []
 
