@@ -135,7 +135,7 @@ def _last_evaluation(job: Job) -> dict[str, Any]:
 def _outcome(result: Mapping[str, Any]) -> str:
     shown = {
         "mean_reward": "mean reward {:.3f}",
-        "coverage": "coverage {:.3f}",  # of puzzles with hidden pieces there is nothing else
+        "coverage": "coverage {:.3f}",
         "angle_error_deg_median": "angle error {:.2f} deg",
     }
     found = [text.format(result[key]) for key, text in shown.items() if result.get(key) is not None]
