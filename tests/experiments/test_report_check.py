@@ -380,6 +380,19 @@ def test_puzzles_at_fewer_angles_are_told(report: Path, turns: int, told: str) -
     assert [line.endswith(told) for line in found] == [True, True] * bool(told)
 
 
+@pytest.mark.parametrize(("episodes", "told"), [(200, True), (50, True), (40, False)])
+def test_a_test_may_have_a_number_of_episodes_of_its_own(
+    report: Path, episodes: int, told: bool
+) -> None:
+    data = json.loads((report / "data.json").read_text())
+    data["plan"]["tests"]["random"]["overrides"] = ["episodes=40"]
+    for run in data["runs"]["ours"]:
+        run["tests"]["random"]["episodes"] = episodes
+    (report / "data.json").write_text(json.dumps(data))
+    found = [line for line in checked(report) if "test random has episodes=" in line]
+    assert [f"episodes={episodes}, not 40" in line for line in found] == [True, True] * told
+
+
 @pytest.mark.parametrize("kept", [{}, {"ours": {}}, {"ours": {"mean_reward": 0.5}}])
 def test_a_fingerprint_that_nobody_kept_is_told(report: Path, kept: dict[str, Any]) -> None:
     data = json.loads((report / "data.json").read_text())

@@ -159,18 +159,17 @@ def _odd(study: Study, seed: Seed) -> Iterator[str]:
         asked = {"updates": result["updates"], "test_seed": budget.test_seed}
         if "puzzle" not in test:
             asked["episodes"] = budget.test_episodes
-        elif turns := _turns(study, name):
-            asked["turns"] = turns
+        asked |= _counts(study, name)
         for key, value in asked.items():
             if test.get(key) != value:
                 yield f"test {name} has {key}={test.get(key)}, not {value}"
 
 
-def _turns(study: Study, test: str) -> int | None:
-    """At how many angles a test of puzzles shows each, None where its plan does not tell."""
+def _counts(study: Study, test: str) -> dict[str, int]:
+    """What a test is planned to have of its own: episodes, or angles at which puzzles are shown."""
     overrides = next(one.overrides for one in study.tests if one.name == test)
-    given = [text.partition("=")[2] for text in overrides if re.fullmatch(r"turns=\d+", text)]
-    return int(given[-1]) if given else None
+    given = (re.fullmatch(r"(episodes|turns)=(\d+)", text) for text in overrides)
+    return {found[1]: int(found[2]) for found in given if found}
 
 
 def _trained_otherwise(studies: Mapping[str, Study], resolve: Resolve) -> Iterator[str]:

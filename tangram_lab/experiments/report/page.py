@@ -339,11 +339,11 @@ def _facts(study: Study) -> list[tuple[str, str]]:
         for name in names
     ]
     hours = sum(row["wall_s"] for row in results) / 3600
-    planned = f"{study.budget.test_episodes:,}"
+    planned = f"{study.budget.test_episodes:,}" if study.plan else while_training
     return [
         ("runs finished", finished_count(study.trainings)),
         ("seeds", _several(sorted({seed.number for one in study.trainings for seed in one.seeds}))),
-        ("episodes of every test, puzzles apart", planned if study.plan else while_training),
+        ("episodes of a test that names no number, puzzles apart", planned),
         ("commit", _several(one for one in commits if one is not None)),
         ("processor", _several(row["processor"] for row in results)),
         ("cores", _several(row["cores"] for row in results)),
