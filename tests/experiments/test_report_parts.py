@@ -55,6 +55,7 @@ from tangram_lab.experiments.report.tables import (
     ranking_table,
     score_table,
     table,
+    with_seeds,
     worlds_table,
 )
 from tangram_sim.arrays import Floats
@@ -350,6 +351,13 @@ def test_learning_curves_are_thinned_to_sixty_points() -> None:
         (paired([0.1]), "-"),
         (paired([0.0, 0.0, 0.0]), "+0.0000 (+0.0000 to +0.0000)"),
         (paired([-0.2, -0.1, 0.0, 0.1]), "-0.0500 (-0.1765 to +0.0765)"),
+        (with_seeds([]), "-"),
+        (with_seeds([np.array([0.1, 0.1])]), "+0.1000 (+0.1000 to +0.1000)"),
+        (with_seeds([np.zeros(2), np.zeros(3)]), "-"),  # tested on different episodes
+        (
+            with_seeds([np.array([-0.2, -0.1, 0.0]), np.array([0.2, 0.1, 0.0])]),
+            "+0.0000 (+0.0000 to +0.0000), seeds -0.1000 to +0.1000",
+        ),
     ],
 )
 def test_numbers_as_people_read_them(found: object, expected: object) -> None:

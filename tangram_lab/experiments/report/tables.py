@@ -51,7 +51,8 @@ OF_AGENTS = (*ORDERS, "lookahead=none")  # what its weights do otherwise
 ORDER_NOTE = (
     "The learned order less a fixed one, on the same starts and targets with the same weights: "
     "mean difference of the coverage and its 95 % interval over the episodes, each averaged over "
-    "the seeds."
+    "the seeds; then the means of the seeds, from least to most. Of puzzles the interval is too "
+    "narrow, for each of their angles counts as an episode."
 )
 PUZZLE_NOTE = "The same weights in the order that they learned and in fixed ones:"
 # Two-sided 95 % of a normal distribution: there are a hundred pairs and more.
@@ -283,13 +284,13 @@ def _difference(first: Training, test: str | None) -> Cell:
     return cell
 
 
-def _each(training: Training, test: str | None) -> list[list[float]]:
-    """Coverage of each episode of a test, of every seed that has it."""
+def _each(training: Training, test: str | None) -> list[Floats]:
+    """Of every seed that has a test (E,) the coverage of its episodes."""
     each = (seed.tests.get(test or "", {}).get(EACH) for seed in training.finished)
-    return [one for one in each if one is not None]
+    return [np.array(one) for one in each if one is not None]
 
 
-def _over_all(each: Sequence[Sequence[float]]) -> Floats:
+def _over_all(each: Sequence[Floats]) -> Floats:
     """(E,) means over the seeds; nothing where they were tested on different episodes."""
     one_set = len({len(one) for one in each}) == 1
     return np.mean(each, axis=0) if one_set else np.zeros(0)
@@ -338,17 +339,17 @@ def _baseline_rows(experiment: Experiment) -> Iterator[list[str]]:
 
 
 def order_table(experiment: Experiment) -> list[str]:
-    """Learned order less each fixed one: mean of the paired differences, 95 % interval.
+    """Learned order less each fixed one: mean of the paired differences, 95 % interval, seeds.
 
-    Pairs are the same episode played by the same weights; an episode's difference is averaged over
-    the seeds first, so that pairs are independent.
+    Pairs are the same episode played by the same weights. The interval is over the episodes, of
+    which each was averaged over the seeds; how the seeds differ stands beside it.
     """
     head = ["training", "test", "learned", *(f"less {name}" for name in ORDERS)]
     rows = []
     for one in experiment.trainings:
         for test in experiment.tests:
             learned = one.values(COVERAGE.key, test.name)
-            shown = [paired(differences(one, test, name)) for name in ORDERS]
+            shown = [with_seeds(differences(one, test, name)) for name in ORDERS]
             if {*shown} - {NOTHING}:
                 rows.append([one.label, test.label, COVERAGE.show_spread(learned), *shown])
     return [plain(ORDER_NOTE), "", *table(head, rows)] if rows else []
@@ -372,15 +373,24 @@ def puzzle_order_table(experiment: Experiment) -> list[str]:
     return [plain(PUZZLE_NOTE), "", *table(head, rows)] if rows else []
 
 
-def differences(training: Training, test: Trial, order: str) -> Floats:
-    """(E,) coverage with the learned order less that with another, averaged over the seeds."""
+def differences(training: Training, test: Trial, order: str) -> list[Floats]:
+    """Of each seed (E,) coverage with the learned order less that with another."""
     each = []
     for seed in training.finished:
         content = seed.tests.get(test.name, {})
         own, other = content.get(EACH), content.get("baselines", {}).get(order, {}).get(EACH)
         if own is not None and other is not None and len(own) == len(other):
             each.append(np.subtract(own, other))
-    return _over_all(each)
+    return each
+
+
+def with_seeds(each: Sequence[Floats]) -> str:
+    """`paired` over the seeds' mean, and where there are several seeds, their least and most."""
+    text = paired(_over_all(each))
+    if len(each) < 2 or text == NOTHING:
+        return text
+    means = [float(np.mean(one)) for one in each]
+    return f"{text}, seeds {min(means):+.4f} to {max(means):+.4f}"
 
 
 def paired(values: Sequence[float] | Floats) -> str:
