@@ -382,8 +382,8 @@ training{_played_by(card)}; the {card["selection"]} ships.
 
 {_table(dict(zip(names, seeds, strict=True)))}
 
-This agent on {tests["episodes"]} other tests (seed {tests["seed"]}), which nothing was chosen \
-on, beside {_beside(card)}:
+This agent on {tests["episodes"]} other tests (seed {tests["seed"]}), by which no run was \
+chosen, beside {_beside(card)}:
 
 {_table(compared)}
 
