@@ -151,22 +151,30 @@ def choose(arguments: list[str]) -> StudyConfig:
     return from_mapping(StudyConfig, PLANNED)
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a whole study of one training, with its report in one of results."""
+    folder = tmp_path_factory.mktemp("study")
+    tests = {"random": {"label": "random", "overrides": []}}
+    write_plan(folder, plan({"fig4": FIG4}, {"ours": training("ours", "x")}, tests, (0, 1)))
+    for seed in (0, 1):
+        curve, test = learning_curve(seed, 0.9), {"random": scores(0.912)}
+        write_run(folder, "ours", result(seed), curve, test)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(page, "draw_paper_pictures", lambda out, draws: [])
+        write_report(folder, folder / "results" / "small")
+    return folder
+
+
 @pytest.fixture
-def report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of the report of a whole study of one training, in one of results."""
-    monkeypatch.setattr(page, "draw_paper_pictures", lambda out, draws: [])
+def report(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The report in a copy of the study, to spoil."""
     monkeypatch.setattr(
         report_check, "make_fingerprints", lambda found: dict.fromkeys(found, FINGERPRINT)
     )
     monkeypatch.setattr(report_check, "make_facts", lambda config: FACTS)
-    tests = {"random": {"label": "random", "overrides": []}}
-    write_plan(tmp_path, plan({"fig4": FIG4}, {"ours": training("ours", "x")}, tests, (0, 1)))
-    for seed in (0, 1):
-        curve, test = learning_curve(seed, 0.9), {"random": scores(0.912)}
-        write_run(tmp_path, "ours", result(seed), curve, test)
-    out = tmp_path / "results" / "small"
-    write_report(tmp_path, out)
-    return out
+    shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
+    return tmp_path / "results" / "small"
 
 
 def checked(report: Path, text: str = "<!-- data: small/fig4 -->\n0.912") -> list[str]:
