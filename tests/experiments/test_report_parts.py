@@ -524,8 +524,13 @@ def test_a_quartile_needs_eight_seeds(tmp_path: Path, seeds: int, shown: bool) -
     ],
 )
 def test_a_profile_is_drawn_of_the_seeds_that_all_trainings_have(
-    tmp_path: Path, seeds: int, shapes: tuple[str, str], lines: list[str]
+    tmp_path: Path,
+    seeds: int,
+    shapes: tuple[str, str],
+    lines: list[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr("tangram_lab.experiments.report.statistics.REPETITIONS", 100)
     names = {name: training(name, "x") for name in ("one", "two")}
     tests = {"random": {"label": "random", "overrides": []}}
     one = experiment("ranking", [*names], tests=["random"])
