@@ -288,7 +288,7 @@ numbers. Of a folder whose folders are runs, such as a sweep's, it makes one tab
         (
             "tangram-report runs=runs/experiments/laptop out=report",
             "tangram-report runs=runs/my_study out=runs/my_study/report",
-            "tangram-report check=true    # in a clone: pages against data, data against code",
+            "tangram-report check=true    # or: check. In a clone: pages, data and code",
         ),
         ("tangram_lab.experiments.cli:ReportConfig",),
     ),

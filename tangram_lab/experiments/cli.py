@@ -81,7 +81,7 @@ class ReportConfig(Settings):
 
     runs: str | None = setting(
         None,
-        "folder that tangram-experiment made, or one whose folders are runs",
+        "folder that tangram-experiment made, one whose folders are runs, or an earlier report",
         unless={"check": True},
     )
     out: str | None = setting(

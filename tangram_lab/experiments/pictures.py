@@ -62,12 +62,11 @@ START_SEED = 3  # of Fig. 1 (b)
 CAT_SCALE = 0.8
 
 
-def draw_paper_pictures(out: Path, saves: bool = True) -> list[tuple[str, str, str]]:
+def draw_paper_pictures(out: Path) -> list[tuple[str, str, str]]:
     """Write Figs. 1 to 3 as PNG and SVG; the same version writes the same bytes.
 
     Args:
         out: folder of the files; made if it is missing.
-        saves: whether they are written.
 
     Returns:
         Title, file name of the PNG and caption of each; the SVG lies beside it.
@@ -84,8 +83,7 @@ def draw_paper_pictures(out: Path, saves: bool = True) -> list[tuple[str, str, s
     with drawing():
         for name, title, draw in drawn:
             figure, caption = draw()
-            if saves:
-                save(figure, out, name)
+            save(figure, out, name)
             shown.append((title, f"{name}.png", caption))
     return shown
 

@@ -12,7 +12,7 @@ from PIL import Image
 from tangram_lab.experiments.cli import ReportConfig, _with_absolute, report
 from tangram_lab.experiments.report import page as report_page
 from tangram_lab.experiments.report.data import read_data
-from tangram_lab.experiments.report.page import tables_page, write_report
+from tangram_lab.experiments.report.page import drawn_again, figure_sums, write_report
 from tangram_lab.experiments.report.reading import read_runs
 from tangram_sim.errors import ConfigError, RunError
 from tests.experiments.builders import (
@@ -52,7 +52,7 @@ def patch() -> Iterator[pytest.MonkeyPatch]:
 def made(tmp_path_factory: pytest.TempPathFactory, patch: pytest.MonkeyPatch) -> Path:
     """The folder beside a page on the study of the builders."""
     picture = ("Puzzle", "p.png", "A cat.")
-    patch.setattr(report_page, "draw_paper_pictures", lambda out, draws: [picture])
+    patch.setattr(report_page, "draw_paper_pictures", lambda out: [picture])
     runs, out = tmp_path_factory.mktemp("runs"), tmp_path_factory.mktemp("out") / "new"
     write_study(runs)
     assert write_report(runs, out) == [out / "tables.md", out / "data.json"]
@@ -65,7 +65,7 @@ def test_the_page_is_the_golden_one(made: Path) -> None:
 
 def test_the_page_comes_from_the_data_alone(made: Path) -> None:
     study, _ = read_data(made / "data.json")
-    assert tables_page(study, made) == GOLDEN.read_text()
+    assert drawn_again(study) == (GOLDEN.read_text(), figure_sums(made))
 
 
 def test_every_figure_of_the_page_is_there_as_png_and_svg(made: Path) -> None:
@@ -82,7 +82,7 @@ def test_every_figure_of_the_page_is_there_as_png_and_svg(made: Path) -> None:
 
 
 def test_same_runs_give_the_same_bytes(tmp_path: Path, patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(report_page, "draw_paper_pictures", lambda out, draws: [])
+    patch.setattr(report_page, "draw_paper_pictures", lambda out: [])
     study = plan({"a": experiment("ranking", ["one"])}, {"one": training("one", "x")}, {}, (0,))
     write_plan(tmp_path / "runs", study)
     write_run(tmp_path / "runs", "one", result(0), learning_curve(0, 0.7))
@@ -102,11 +102,11 @@ def test_the_papers_pictures_stand_beside_its_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str, shown: bool
 ) -> None:
     picture = ("Puzzle", "p.png", "A cat.")
-    monkeypatch.setattr(report_page, "draw_paper_pictures", lambda out, draws: [picture])
+    monkeypatch.setattr(report_page, "draw_paper_pictures", lambda out: [picture])
     one = experiment("game", ["one"], source)
     write_plan(tmp_path, plan({"a": one}, {"one": training("one", "x")}, {}, (0,)))
     study = read_runs(tmp_path)
-    assert ("A cat." in tables_page(study, tmp_path)) == shown
+    assert ("A cat." in drawn_again(study)[0]) == shown
 
 
 def test_data_holds_all_numbers(made: Path) -> None:
@@ -131,7 +131,7 @@ def test_data_holds_all_numbers(made: Path) -> None:
 def test_command_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(report_page, "draw_paper_pictures", lambda out, draws: [])
+    monkeypatch.setattr(report_page, "draw_paper_pictures", lambda out: [])
     monkeypatch.setenv("HYDRA_FULL_ERROR", "")
     monkeypatch.chdir(tmp_path)
     write_plan(tmp_path / "runs", plan({}, {"ours": training("ours", "x")}, {}, (0,)))

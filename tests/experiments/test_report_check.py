@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from matplotlib.figure import Figure
 
 from tangram_agent.setup import from_mapping
 from tangram_lab.experiments.fingerprints import differences
@@ -16,7 +17,7 @@ from tangram_lab.experiments.report import check as report_check
 from tangram_lab.experiments.report import page
 from tangram_lab.experiments.report.check import Sources, check, check_page
 from tangram_lab.experiments.report.data import read_data, write_data
-from tangram_lab.experiments.report.page import tables_page, write_report
+from tangram_lab.experiments.report.page import Page, drawn_again, figure_sums, write_report
 from tangram_lab.experiments.report.reading import read_runs
 from tangram_sim.errors import RunError
 from tests.experiments.builders import (
@@ -161,14 +162,22 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
         curve, test = learning_curve(seed, 0.9), {"random": scores(0.912)}
         write_run(folder, "ours", result(seed), curve, test)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(page, "draw_paper_pictures", lambda out, draws: [])
+        patch.setattr(page, "draw_paper_pictures", lambda out: [])
         write_report(folder, folder / "results" / "small")
     return folder
 
 
 @pytest.fixture
 def report(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The report in a copy of the study, to spoil."""
+    """The report in a copy of the study, to spoil; its figures are not drawn again, but copied."""
+    drawn = whole / "results" / "small" / "figures"
+
+    def copied(figure: Figure, folder: Path, name: str) -> None:
+        for path in drawn.glob(f"{name}.*"):
+            shutil.copy(path, folder)
+
+    monkeypatch.setattr(page, "save", copied)
+    monkeypatch.setattr(page, "draw_paper_pictures", lambda out: [])
     monkeypatch.setattr(
         report_check, "make_fingerprints", lambda found: dict.fromkeys(found, FINGERPRINT)
     )
@@ -228,18 +237,45 @@ def test_figures_are_those_that_were_drawn_of_the_data(report: Path, name: str) 
     folder = report / "figures"
     with (folder / name).open("ab") as file:
         file.write(b"x")
-    assert checked(report) == [f"{folder} has not the figures of data.json: {name}"]
+    (found,) = checked(report)
+    assert found.startswith(f"{folder} has not the figures of data.json, as {name}: make it anew")
     (folder / name).unlink()
     assert (checked(report) == []) == (name == "old.png")
 
 
-def test_a_report_of_tables_alone_needs_no_folder_of_figures(report: Path) -> None:
+@pytest.mark.parametrize("what", ["one was forged", "all were deleted", "the code draws another"])
+def test_figures_are_drawn_again(report: Path, monkeypatch: pytest.MonkeyPatch, what: str) -> None:
+    data, folder = json.loads((report / "data.json").read_text()), report / "figures"
+    if what == "one was forged":
+        (folder / "fig4.png").write_bytes(b"forged")
+    elif what == "all were deleted":
+        shutil.rmtree(folder)
+    else:
+        monkeypatch.setattr(page, "save", lambda figure, folder, name: None)
+    data["figures"] = figure_sums(report)
+    (report / "data.json").write_text(json.dumps(data))
+    (found,) = checked(report)
+    assert "has not the figures of data.json, as fig4" in found
+
+
+def test_a_report_is_made_again_from_its_own_data(report: Path) -> None:
+    before = {path: path.read_bytes() for path in report.rglob("*") if path.is_file()}
+    (report / "figures" / "fig4.png").write_bytes(b"old")
+    (report / "tables.md").write_text("old")
+    write_report(report, report)
+    assert {path: path.read_bytes() for path in report.rglob("*") if path.is_file()} == before
+
+
+def test_a_report_of_tables_alone_needs_no_folder_of_figures(
+    report: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Page, "_figure", lambda *given: [])
     data = json.loads((report / "data.json").read_text())
     data["figures"] = {}
     (report / "data.json").write_text(json.dumps(data))
     shutil.rmtree(report / "figures")
     study, _ = read_data(report / "data.json")
-    (report / "tables.md").write_text(tables_page(study, report))
+    (report / "tables.md").write_text(drawn_again(study)[0])
     assert checked(report) == []
 
 

@@ -11,10 +11,14 @@ A comment above a paragraph, a list or a table says where its numbers are from:
 """
 
 import re
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from rich.progress import track
+
+from master.console import sturdy_console
 from tangram_agent.pretrained import CARD, PACKAGED, is_name
 from tangram_lab.experiments.fingerprints import (
     UPDATES,
@@ -29,8 +33,8 @@ from tangram_lab.experiments.report.page import (
     FIGURES,
     TABLES,
     arguments,
+    drawn_again,
     figure_sums,
-    tables_page,
 )
 from tangram_lab.experiments.report.reading import parsed, read_bytes
 from tangram_lab.experiments.report.references import VALUES
@@ -71,10 +75,14 @@ def check(results: Path, pages: Iterable[Path], resolve: Resolve, choose: Choose
     for folder in reports(results):
         study, figures = read_data(folder / DATA)
         tables[folder.name], studies[folder.name] = _text(folder / TABLES), study
-        if tables_page(study, folder) != tables[folder.name]:
-            found.append(f"{folder / TABLES} is not what {DATA} gives: make it anew")
-        if others := figures.items() ^ figure_sums(folder).items():
-            found.append(f"{folder / FIGURES} has not the figures of {DATA}: {min(others)[0]}")
+        text, drawn = drawn_again(study)
+        again = f"make it anew with tangram-report runs={folder} out={folder}"
+        if text != tables[folder.name]:
+            found.append(f"{folder / TABLES} is not what {DATA} gives: {again}")
+        kept = figure_sums(folder).items()
+        if others := (figures.items() ^ kept) | (drawn.items() ^ kept):
+            wrong = min(others)[0]
+            found.append(f"{folder / FIGURES} has not the figures of {DATA}, as {wrong}: {again}")
         found += (
             f"{folder.name}/{line}" for line in (*_lacks(study), *_planned_otherwise(study, choose))
         )
@@ -174,10 +182,11 @@ def _counts(study: Study, test: str) -> dict[str, int]:
 
 def _trained_otherwise(studies: Mapping[str, Study], resolve: Resolve) -> Iterator[str]:
     """The trainings that have other settings now, or would come to other numbers."""
+    planned = [(report, study, one) for report, study in studies.items() for one in study.trainings]
+    console = sturdy_console(sys.stderr)
     trainings = {
         f"{report}/{one.name}": (one, resolve(one.overrides), study.fingerprints.get(one.name, {}))
-        for report, study in studies.items()
-        for one in study.trainings
+        for report, study, one in track(planned, "settings", console=console, transient=True)
     }
     for name, (one, config, _) in trainings.items():
         known = changed_settings(one.settings, config, one.settings)

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from tangram_agent.files import write_whole
 from tangram_lab.experiments.pictures import draw_paper_pictures
+from tangram_lab.experiments.plan import PLAN
 from tangram_lab.experiments.report.data import DATA, read_data, write_data
 from tangram_lab.experiments.report.figures import (
     curve_parts,
@@ -87,7 +88,7 @@ def write_report(runs: Path, out: Path) -> list[Path]:
     """Report on a study; files of an earlier report in the same place are replaced.
 
     Args:
-        runs: the study's folder, or one whose folders are runs.
+        runs: the study's folder, one whose folders are runs, or an earlier report.
         out: folder for tables.md, data.json and figures/.
 
     Returns:
@@ -97,7 +98,7 @@ def write_report(runs: Path, out: Path) -> list[Path]:
         RunError: a file of the study is not what it should be, no run is finished, or `out` cannot
             be written.
     """
-    study = read_runs(runs)
+    study = read_runs(runs) if _is_study(runs) else read_data(runs / DATA)[0]
     if not any(one.finished for one in study.trainings):
         raise RunError(f"no run is finished in {runs}: wait for one, or name another folder")
     try:
@@ -116,15 +117,30 @@ def write_report(runs: Path, out: Path) -> list[Path]:
     return [out / TABLES, out / DATA]
 
 
+def _is_study(folder: Path) -> bool:
+    """Whether runs are here; what has the data of a report alone is one."""
+    return (folder / PLAN).exists() or not (folder / DATA).exists()
+
+
 def _make(study: Study, out: Path) -> None:
     """All files of a report, in a folder of their own: an earlier one stays whole until then."""
-    (out / FIGURES).mkdir()
     write_data(out / DATA, study, {})
     if study.plan:  # what is drawn is what the data have
         study, _ = read_data(out / DATA)
-    with drawing():
-        write_whole(out / TABLES, Page(study, out).text().encode())
+    write_whole(out / TABLES, _drawn(study, out).encode())
     write_data(out / DATA, study, figure_sums(out))
+
+
+def _drawn(study: Study, out: Path) -> str:
+    (out / FIGURES).mkdir()
+    with drawing():
+        return Page(study, out).text()
+
+
+def drawn_again(study: Study) -> tuple[str, dict[str, str]]:
+    """The page of a study, and the sums of its figures, as this code draws them."""
+    with TemporaryDirectory() as folder:
+        return _drawn(study, Path(folder)), figure_sums(Path(folder))
 
 
 def figure_sums(out: Path) -> dict[str, str]:
@@ -133,18 +149,12 @@ def figure_sums(out: Path) -> dict[str, str]:
     return {path.name: sha256(path.read_bytes()).hexdigest() for path in files if path.is_file()}
 
 
-def tables_page(study: Study, out: Path) -> str:
-    """The page anew, with the figures that lie there already."""
-    return Page(study, out, draws=False).text()
-
-
 @dataclass(frozen=True)
 class Page:
-    """The page of a study, its folder, and whether its figures are drawn or lie there."""
+    """The page of a study, and the folder where its figures are drawn."""
 
     study: Study
     out: Path
-    draws: bool = True
 
     def text(self) -> str:
         """The whole page."""
@@ -173,7 +183,7 @@ class Page:
         lines: list[str] = []
         if not any(one.source.startswith(("Fig.", "Table")) for one in self.study.experiments):
             return lines
-        for title, file, caption in draw_paper_pictures(self.out / FIGURES, self.draws):
+        for title, file, caption in draw_paper_pictures(self.out / FIGURES):
             lines += [f"## {plain(title)}", "", *picture(title, f"{FIGURES}/{file}")]
             lines += [f"*{plain(caption)}*", ""]
         return lines
@@ -208,13 +218,10 @@ class Page:
         self, name: str, title: str, caption: str, draw: Callable[[], Figure | None]
     ) -> list[str]:
         """Save a figure and embed it; nothing if there was nothing to draw."""
-        file = f"{FIGURES}/{name}"
-        if self.draws:
-            if (drawn := draw()) is None:
-                return []
-            save(drawn, self.out / FIGURES, name)
-        elif not (self.out / f"{file}.png").exists():
+        if (drawn := draw()) is None:
             return []
+        save(drawn, self.out / FIGURES, name)
+        file = f"{FIGURES}/{name}"
         return [*picture(title, f"{file}.png"), f"*{caption}* ([SVG]({file}.svg))", ""]
 
     def _curves(self, one: Experiment) -> list[str]:

@@ -9,7 +9,7 @@ from tangram_lab.experiments.report.statistics import ENOUGH, profile
 from tangram_lab.experiments.report.study import Experiment
 from tangram_lab.experiments.report.style import COLOURS, legend_below, make_logarithmic, new_figure
 
-LEVELS = 200
+LEVELS = 60
 NEAREST = 1e-4  # to a perfect mean reward
 SHORT_OF = "short of a perfect mean reward by no more than"
 
