@@ -21,7 +21,7 @@ import numpy.typing as npt
 import torch
 from rich.progress import track
 
-from master.children import describe
+from master.children import describe, environment
 from master.console import sturdy_console
 from master.trainer import Trainer
 from tangram_agent.learner import NotFiniteError
@@ -73,7 +73,7 @@ def make_fingerprints(configs: Mapping[str, Mapping[str, Any]]) -> dict[str, Fin
         asked.seek(0)
         command = [sys.executable, "-P", "-m", "tangram_lab.experiments.fingerprints"]
         with subprocess.Popen(
-            command, stdin=asked, stdout=subprocess.PIPE, stderr=errors, env=os.environ | KERNELS
+            command, stdin=asked, stdout=subprocess.PIPE, stderr=errors, env=environment() | KERNELS
         ) as process:
             made = track(process.stdout or (), told, len(configs), console=console, transient=True)
             lines = list(made)

@@ -10,6 +10,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+import msgspec
+
 from tangram_agent.messages import MAX_SEED
 from tangram_agent.setup import SECTIONS
 from tangram_sim.errors import ConfigError
@@ -28,6 +30,10 @@ KINDS: tuple[str, ...] = get_args(Kind)
 PLAN = "plan.json"
 # What a training comes to; the rest is where it runs.
 KEPT = (*SECTIONS, "service", "workers", "max_updates", "max_episodes", "max_hours")
+UNREADABLE = (
+    *(OSError, OverflowError, ValueError, KeyError, TypeError, AttributeError, RecursionError),
+    msgspec.ValidationError,
+)
 JOINED = ("experiments", "trainings", "tests", "fingerprints")  # of all commands in a folder
 
 
@@ -306,7 +312,8 @@ def joined_plan(path: Path, content: dict[str, Any]) -> dict[str, Any]:
             )
         known = {name: dict(earlier[name]) for name in (*JOINED, "budget")}
         planned = {name: {*map(int, one["seeds"])} for name, one in known["trainings"].items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        msgspec.convert(known["fingerprints"], dict[str, dict[str, float]])
+    except UNREADABLE:
         raise ConfigError(f"cannot read {path}: remove it, or choose another run_dir") from None
     for name in ("name", "test_episodes", "test_seed"):
         earlier, now = known["budget"].get(name), content["budget"][name]

@@ -31,7 +31,7 @@ def experiment(kind: str, trainings: list[str], source: str = "beyond", **more: 
     return {**texts, "kind": kind, "trainings": trainings, "tests": []} | more
 
 
-SETTINGS = {"agent": {"batch_size": 64}}
+SETTINGS = {"agent": {"batch_size": 64}, "max_updates": 2000}
 FINGERPRINT = {"mean_reward": 0.5, "weights": 1000.0}
 
 

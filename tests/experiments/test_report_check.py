@@ -121,7 +121,7 @@ def test_a_source_that_is_none(numbers: Sources, name: str) -> None:
 
 def resolve(arguments: Sequence[str]) -> dict[str, Any]:
     """The settings that arguments come to; what they train: tests/cluster/test_evidence.py."""
-    return SETTINGS | {"later": {"known": True}, "max_updates": 2000}
+    return SETTINGS | {"later": {"known": True}}
 
 
 FACTS = {"tokens": ["square"], "parameters": 32_600}  # of every result of the builders
@@ -159,8 +159,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     tests = {"random": {"label": "random", "overrides": []}}
     write_plan(folder, plan({"fig4": FIG4}, {"ours": training("ours", "x")}, tests, (0, 1)))
     for seed in (0, 1):
-        curve, test = learning_curve(seed, 0.9), {"random": scores(0.912)}
-        write_run(folder, "ours", result(seed), curve, test)
+        final, curve = result(seed), learning_curve(seed, 0.9)
+        curve[-1] |= {key: final[key] for key in ("updates", "episodes", "mean_reward")}
+        write_run(folder, "ours", final, curve, {"random": scores(0.912)})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(page, "draw_paper_pictures", lambda out: [])
         write_report(folder, folder / "results" / "small")
@@ -323,6 +324,38 @@ def test_what_the_study_lacks(report: Path, change: dict[str, Any], told: str) -
 
 
 @pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (
+            {"curve": {key: [0.0] for key in ("updates", "episodes", "train_s", "mean_reward")}},
+            "ours, seed 1: its curve ends with updates=0.0, its result with 2000",
+        ),
+        ({"curve": {}}, "its curve ends with mean_reward=None, its result with 0.75"),
+        ({"result": result(1, 0.99)}, "with mean_reward=0.75, its result with 0.99"),
+        ({"result": result(1, episodes=17)}, ", its result with 17"),
+        ({"result": result(1, run_id="one")}, "ours, seed 1 is the run of ours, seed 0"),
+        (
+            {"tests": {"random": scores(0.9, coverage_each=[0.9] * 100)}},
+            "test random has not the mean reward of its episodes: 0.9",
+        ),
+        ({"tests": {"random": scores(1.5)}}, "has not the mean reward of its episodes: 1.5"),
+        (
+            {"tests": {"random": scores(0.9, {"exact": {"mean_reward": 0.3}})}},
+            "ours, test random: exact differs between seeds: [1.0, 0.3]",
+        ),
+    ],
+)
+def test_runs_that_belie_themselves_are_told(
+    report: Path, change: dict[str, Any], told: str
+) -> None:
+    data = json.loads((report / "data.json").read_text())
+    data["runs"]["ours"][0]["result"]["run_id"] = "one"
+    data["runs"]["ours"][1] |= change
+    (report / "data.json").write_text(json.dumps(data))
+    assert any(told in line for line in checked(report))
+
+
+@pytest.mark.parametrize(
     ("section", "name", "change", "told"),
     [
         ("experiments", "fig4", {"tests": []}, "random would not be among the tests now"),
@@ -382,7 +415,10 @@ def test_code_that_trains_otherwise(report: Path, monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.parametrize(
     ("kept", "told"),
-    [({"agent": {"batch_size": 32}}, "agent.batch_size=32, now 64"), ({}, "nobody kept them")],
+    [
+        ({"agent": {"batch_size": 32}, "max_updates": 2000}, "agent.batch_size=32, now 64"),
+        ({"max_updates": 2000, "nonsense": 1}, "nobody kept agent"),
+    ],
 )
 def test_other_settings_than_those_that_trained_are_told(
     report: Path, kept: dict[str, Any], told: str
@@ -470,6 +506,36 @@ def test_data_that_are_not_what_they_should_be(
 ) -> None:
     path = report / "data.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(RunError, match=message):
+        read_data(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("ours", {}, "ours, seed 0 is there twice"),
+        ("ours", {"seed": 77}, "ours, seed 77 is not in its plan"),
+        ("unheard_of", {}, "unheard_of, seed 0 is not in its plan"),
+        ("ours", {"tests": {"foo": scores(0.9)}}, "ours, seed 0: its plan has no test foo"),
+        ("ours", {"tests": {"random": scores(0.9, coverage="x")}}, r"got `str` - at `\$.coverage`"),
+        (
+            "ours",
+            {"tests": {"random": scores(0.9, {"exact": {"share_solved": [1]}})}},
+            r"got `array` - at `\$.baselines\[...\].share_solved`",
+        ),
+    ],
+)
+def test_runs_that_no_plan_has_are_refused(
+    report: Path, name: str, change: dict[str, Any], message: str
+) -> None:
+    path = report / "data.json"
+    data = json.loads(path.read_text())
+    first = data["runs"]["ours"][0]
+    if change.get("tests"):
+        first |= change
+    else:
+        data["runs"].setdefault(name, []).append(first | change)
+    path.write_text(json.dumps(data))
     with pytest.raises(RunError, match=message):
         read_data(path)
 

@@ -27,7 +27,7 @@ from tangram_lab.experiments.fingerprints import (
     make_fingerprints,
 )
 from tangram_lab.experiments.jobs import BOUNDS, changed_settings
-from tangram_lab.experiments.plan import StudyConfig, plan_content
+from tangram_lab.experiments.plan import KEPT, StudyConfig, plan_content
 from tangram_lab.experiments.report.data import DATA, read_data
 from tangram_lab.experiments.report.page import (
     FIGURES,
@@ -38,7 +38,8 @@ from tangram_lab.experiments.report.page import (
 )
 from tangram_lab.experiments.report.reading import parsed, read_bytes
 from tangram_lab.experiments.report.references import VALUES
-from tangram_lab.experiments.report.study import Row, Seed, Study, Training
+from tangram_lab.experiments.report.study import Row, Study, Training
+from tangram_lab.experiments.report.whole import COMMIT, contradicts, lacks
 from tangram_sim.errors import RunError
 
 MARK = re.compile(r"<!-- data: (?P<sources>[^>]+?) -->")
@@ -50,12 +51,13 @@ SCORE = re.compile(
 WRITTEN = re.compile(r"-?\d+\.(?:\d+ %|\d+)")
 CODE = re.compile(r"^(?P<fence>```+)[^`\n]*\n.*?^(?P=fence)`*[ \t]*$", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`[^`\n]*`|\]\([^)]*\)")
+FILE = r"[\w-]+\.json"  # beside the reports
+LAST = "\n## How it was made\n"  # where the last section of tables ends
 SECTION = re.compile(r'^<a id="(?P<name>[^"]+)"></a>$', re.MULTILINE)
 MEND = "make it anew"
 NO_SCORE, OLDER, PAPERS = "none", "commit", "paper"
 Resolve = Callable[[Sequence[str]], Mapping[str, Any]]  # of tangram-train -> the whole config
 Choose = Callable[[list[str]], StudyConfig]  # of tangram-experiment -> the study
-COMMIT = "[0-9a-f]{7,40}"  # one with -dirty is of a source tree that was not as committed
 
 
 def check(results: Path, pages: Iterable[Path], resolve: Resolve, choose: Choose) -> list[str]:
@@ -84,7 +86,8 @@ def check(results: Path, pages: Iterable[Path], resolve: Resolve, choose: Choose
             wrong = min(others)[0]
             found.append(f"{folder / FIGURES} has not the figures of {DATA}, as {wrong}: {again}")
         found += (
-            f"{folder.name}/{line}" for line in (*_lacks(study), *_planned_otherwise(study, choose))
+            f"{folder.name}/{line}"
+            for line in (*lacks(study), *contradicts(study), *_planned_otherwise(study, choose))
         )
     found += _trained_otherwise(studies, resolve)
     numbers = Sources(results, tables)
@@ -116,21 +119,6 @@ def _text(path: Path) -> str:
         raise RunError(f"{path}: it is not UTF-8; mend it") from None
 
 
-def _lacks(study: Study) -> Iterator[str]:
-    """Seeds that were planned and not trained, tests that were not made, and what is otherwise."""
-    for training in study.trainings:
-        left = [seed.number for seed in training.seeds if not seed.finished]
-        if left:
-            yield f"{training.name} lacks the seeds {left}"
-        for seed in training.finished:
-            yield from (f"{training.name}, seed {seed.number}: {one}" for one in _odd(study, seed))
-    for experiment in study.experiments:
-        for training in experiment.trainings:
-            for test in experiment.tests:
-                if any(test.name not in seed.tests for seed in training.finished):
-                    yield f"{training.name} lacks the test {test.name} of {experiment.name}"
-
-
 def _planned_otherwise(study: Study, choose: Choose) -> Iterator[str]:
     """Where the commands that the page prints would plan something else now."""
     config = choose(arguments(study, [one.name for one in study.experiments]))
@@ -154,32 +142,6 @@ def _plain(value: object) -> object:
     return list(value) if isinstance(value, tuple) else value
 
 
-def _odd(study: Study, seed: Seed) -> Iterator[str]:
-    """Where a run is not what the plan asks for."""
-    result, budget = seed.result, study.budget
-    if not re.fullmatch(COMMIT, result["commit"] or ""):
-        yield f"it is of a changed tree, or of none: {result['commit']}"
-    if result.get("seed") != seed.number:
-        yield f"its seed is {result.get('seed')}"
-    if result.get("scored_updates") != result["updates"]:
-        yield "it did not come to its end"
-    for name, test in seed.tests.items():
-        asked = {"updates": result["updates"], "test_seed": budget.test_seed}
-        if "puzzle" not in test:
-            asked["episodes"] = budget.test_episodes
-        asked |= _counts(study, name)
-        for key, value in asked.items():
-            if test.get(key) != value:
-                yield f"test {name} has {key}={test.get(key)}, not {value}"
-
-
-def _counts(study: Study, test: str) -> dict[str, int]:
-    """What a test is planned to have of its own: episodes, or angles at which puzzles are shown."""
-    overrides = next(one.overrides for one in study.tests if one.name == test)
-    given = (re.fullmatch(r"(episodes|turns)=(\d+)", text) for text in overrides)
-    return {found[1]: int(found[2]) for found in given if found}
-
-
 def _trained_otherwise(studies: Mapping[str, Study], resolve: Resolve) -> Iterator[str]:
     """The trainings that have other settings now, or would come to other numbers."""
     planned = [(report, study, one) for report, study in studies.items() for one in study.trainings]
@@ -190,7 +152,8 @@ def _trained_otherwise(studies: Mapping[str, Study], resolve: Resolve) -> Iterat
     }
     for name, (one, config, _) in trainings.items():
         known = changed_settings(one.settings, config, one.settings)
-        for change in known or ["nobody kept them"] * (not one.settings):
+        left = [part for part in KEPT if part in config and part not in one.settings]
+        for change in (*known, *(f"nobody kept {part}" for part in left)):
             yield f"{name} has not the settings that it was trained with: {change}"
         yield from _of_another(name, one, config)
     now = make_fingerprints({name: config for name, (_, config, _) in trainings.items()})
@@ -229,8 +192,10 @@ class Sources:
         self._sections = dict[str, str]()
         for report, text in tables.items():
             parts = SECTION.split(text)[1:]
-            names = (f"{report}/{name}" for name in parts[::2])
-            self._sections |= zip(names, parts[1::2], strict=True)
+            for name, section in zip(parts[::2], parts[1::2], strict=True):
+                if f"{report}/{name}" in self._sections:
+                    raise RunError(f"{TABLES} of {report} has {name} twice: {MEND}")
+                self._sections[f"{report}/{name}"] = section.partition(LAST)[0]
 
     def has(self, source: str, text: str) -> bool:
         """Whether a number, as it is written, is one of a source.
@@ -247,9 +212,9 @@ class Sources:
         return any(_rounds_to(number, text) for number in self._file(source))
 
     def _file(self, name: str) -> Iterator[float]:
-        folder = Path(str(PACKAGED), Path(name).name) if is_name(name) else self._results
-        path = folder / (CARD if is_name(name) else name)
-        if path.name == DATA or not (path.suffix == ".json" and path.is_file()):
+        ours = is_name(name)
+        path = Path(str(PACKAGED), Path(name).name, CARD) if ours else self._results / name
+        if not (ours or re.fullmatch(FILE, name)) or not path.is_file():
             raise RunError(
                 f"no source is called {name}: name REPORT/EXPERIMENT, a .json file of "
                 f"{self._results}, {PAPERS}, {OLDER} or {NO_SCORE}"

@@ -130,14 +130,24 @@ def read_data(path: Path) -> tuple[Study, dict[str, str]]:
             f"{REPORT}"
         )
     data: _Data = converted(content, _Data, place, REPORT)
-    runs = {(name, run.seed): run for name, own in data.runs.items() for run in own}
+    plan = checked_plan(data.plan, place)
+    runs = dict[tuple[str, int], _Run]()
+    for name, run in ((name, run) for name, own in data.runs.items() for run in own):
+        told = f"{place}: {name}, seed {run.seed}"
+        if (name, run.seed) in runs:
+            raise RunError(f"{told} is there twice; {REPORT}")
+        if name not in plan.trainings or run.seed not in plan.trainings[name].seeds:
+            raise RunError(f"{told} is not in its plan; {REPORT}")
+        if others := run.tests.keys() - plan.tests.keys():
+            raise RunError(f"{told}: its plan has no test {min(others)}; {REPORT}")
+        runs[name, run.seed] = run
 
     def read(name: str, seed: int) -> Seed:
         if (name, seed) not in runs:
             raise RunError(f"{place}: {name}, seed {seed} of its plan is missing; {REPORT}")
         return _read_seed(runs[name, seed], f"{place}: {name}, seed {seed}")
 
-    return make_study(data.plan, checked_plan(data.plan, place), read), data.figures
+    return make_study(data.plan, plan, read), data.figures
 
 
 def _read_seed(run: _Run, place: str) -> Seed:

@@ -79,7 +79,11 @@ class Plan:
 
 
 _SCORES = ("mean_reward_dense", "angle_error_deg_median", "position_error_median")
-_MAY = [(name, float | None, None) for name in _SCORES]
+_SHOWN = (  # of several tokens
+    *("coverage", "share_solved", "share_solved_iou", "iou", "wrong", "doubly_used", "blocked"),
+    "seconds_per_puzzle",
+)
+_MAY = [(name, float | None, None) for name in (*_SCORES, *_SHOWN)]
 _BASELINE: Any = msgspec.defstruct(
     "_BASELINE",
     [("mean_reward", float | None, None), ("coverage_each", tuple[float, ...], ()), *_MAY],
@@ -290,7 +294,7 @@ def _unplanned(folder: Path, configs: Iterable[Path]) -> Study:
         if not isinstance(seed, int):
             raise RunError(f"{path}: seed must be a number, got {seed!r}: is this a run's config?")
         settings = {key: value for key, value in settings.items() if key not in APART}
-        key = json.dumps(settings, sort_keys=True, default=str)
+        key = repr(sorted(settings.items()))
         runs = groups.setdefault(key, (settings, {}))[1]
         if seed in runs:
             raise RunError(
@@ -337,5 +341,9 @@ def _told(own: Row, others: Sequence[Row]) -> Iterator[str]:
     for name in dict.fromkeys(name for one in others for name in one):
         if name in own and any(one.get(name) != others[0].get(name) for one in others):
             value = own[name]
-            text = value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
+            text = (
+                value
+                if isinstance(value, str)
+                else json.dumps(value, separators=(",", ":"), default=str)
+            )
             yield f"{name}={text}"
