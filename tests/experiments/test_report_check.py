@@ -67,11 +67,13 @@ PAGES = [
         ["12.4 % is not in bench.json"],
     ),
     ("It has 12.3 %.", ["12.3 % has no source"]),
+    ("It has _0.111_ and __0.112__.", ["0.111 has no source", "0.112 has no source"]),
     *(
         (f"<!-- data: a/fig4 bench.json -->\nIt has {odd}.", [f"{odd} is not written as in the"])
         for odd in (
             "12.3%",
             "12.3\N{NO-BREAK SPACE}%",
+            "12.3\n%",
             "12.3&nbsp;%",
             ".123",
             "-.123",
@@ -103,6 +105,13 @@ def test_every_score_of_a_page_has_a_source(
     assert all(part in line for part, line in zip(expected, found, strict=True))
 
 
+def test_a_section_of_the_tables_is_there_once_and_ends() -> None:
+    with pytest.raises(RunError, match=r"tables\.md of a has fig4 twice"):
+        Sources(Path(), {"a": TABLES + TABLES})
+    numbers = Sources(Path(), {"a": f"{TABLES}\n## How it was made\n\n0.111"})
+    assert [numbers.has("a/fig5", text) for text in ("0.5", "0.111")] == [True, False]
+
+
 def test_a_line_is_named(numbers: Sources) -> None:
     text = "one\ntwo\n\n```\nx\n\n```\n\nIt has 0.111."
     assert [*check_page("p.md", text, numbers)] == [
@@ -110,8 +119,15 @@ def test_a_line_is_named(numbers: Sources) -> None:
     ]
 
 
-@pytest.mark.parametrize("name", ["fig4", "a/fig9", "nowhere.json", "../data.yaml", "a/data.json"])
-def test_a_source_that_is_none(numbers: Sources, name: str) -> None:
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("fig4", "a/fig9", "nowhere.json", "../data.yaml", "a/data.json", "../outside.json"),
+        f"{Path(__file__).parents[2]}/docs/results/bench.json",
+    ],
+)
+def test_a_source_that_is_none(numbers: Sources, tmp_path: Path, name: str) -> None:
+    (tmp_path.parent / "outside.json").write_text('{"x": 0.111}')
     (found,) = check_page("p.md", f"<!-- data: {name} -->\n0.111", numbers)
     assert f"p.md:1: 0.111 has a source that is none: no source is called {name}" in found
 

@@ -46,12 +46,13 @@ MARK = re.compile(r"<!-- data: (?P<sources>[^>]+?) -->")
 # Three decimals and more, or a percentage with one: scores have as many, and little else has. How
 # the tables write none is found, too, and told.
 SCORE = re.compile(
-    r"(?<!\w)(?<!\w\.)[-\N{MINUS SIGN}]?\d*\.(?:\d+(?:[^\S\n]|&\w+;)*%|\d{3,}(?!\w|\.\d))"
+    r"(?<![^\W_])(?<![^\W_]\.)[-\N{MINUS SIGN}]?\d*\."
+    r"(?:\d+(?:\s|&\w+;)*%|\d{3,}(?![^\W_]|\.\d))"
 )
 WRITTEN = re.compile(r"-?\d+\.(?:\d+ %|\d+)")
 CODE = re.compile(r"^(?P<fence>```+)[^`\n]*\n.*?^(?P=fence)`*[ \t]*$", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`[^`\n]*`|\]\([^)]*\)")
-FILE = r"[\w-]+\.json"  # beside the reports
+FILE = r"(?:[\w-]+/)?(?!data\.)[\w-]+\.json"  # beside the reports
 LAST = "\n## How it was made\n"  # where the last section of tables ends
 SECTION = re.compile(r'^<a id="(?P<name>[^"]+)"></a>$', re.MULTILINE)
 MEND = "make it anew"
