@@ -1,6 +1,7 @@
 """The rules of the house: arrows, packaging, tiers of tests."""
 
 import json
+import os
 import re
 import shlex
 import shutil
@@ -32,7 +33,11 @@ PACKAGES = ("conf", "master", "worker", *OURS)
 
 
 def run(command: list[str], cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False, timeout=60)
+    """Without what `make test ARGS=...` would hand on to another make."""
+    own = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
+    return subprocess.run(
+        command, cwd=cwd, env=own, capture_output=True, text=True, check=False, timeout=60
+    )
 
 
 def run_python(code: str) -> str:
