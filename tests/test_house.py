@@ -34,7 +34,8 @@ PACKAGES = ("conf", "master", "worker", *OURS)
 
 def run(command: list[str], cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
     """Without what `make test ARGS=...` would hand on to another make."""
-    own = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
+    handed = ("MAKE", "ARGS", "BUDGET", "KEEP")
+    own = {name: value for name, value in os.environ.items() if not name.startswith(handed)}
     return subprocess.run(
         command, cwd=cwd, env=own, capture_output=True, text=True, check=False, timeout=60
     )
