@@ -73,5 +73,6 @@ def rings(area: Area, tolerance: float) -> list[tuple[Complex, int, bool]]:
 
 
 def polygons(area: Area) -> list[Polygon]:
-    """The parts of an area."""
-    return [one for one in shapely.get_parts(area).tolist() if one.geom_type == "Polygon"]
+    """The parts of an area; none of an empty one."""
+    parts = shapely.get_parts(area).tolist()
+    return [one for one in parts if one.geom_type == "Polygon" and not one.is_empty]

@@ -95,6 +95,19 @@ def test_where_nothing_fits_a_token_still_covers_what_it_can() -> None:
     assert (filler.choose(corners, placed, rows, np.zeros(1, np.bool_), one).velocity == 0).all()
 
 
+def test_who_has_a_token_left_where_all_is_covered_lets_it_lie() -> None:
+    made = outline_setup()
+    corners = made.layout.corners(np.array([[0.3, 0.2, 0.0], [-0.9, 0.9, 0.0]]))[None]
+    first = corners[0, made.layout.corners_of(0)]
+    target = np.concatenate([first, first[:1]])
+    rows = np.concatenate([target, np.zeros((made.goal_rows - len(target), 2))])[None]
+    placed = np.array([[True, False]])
+    assert Filling(made.layout).rest(rows[0], corners[0], placed[0]).is_empty
+    step = Filler(Indifferent(), made).choose(corners, placed, rows, np.zeros(1, np.bool_))
+    assert step.token.tolist() == [1]
+    assert (step.velocity == 0).all()
+
+
 def test_exploring_takes_any_place_that_is_not_dead() -> None:
     made = outline_setup(ALL, {"uniform_share": 1.0}, arena=2.0)
     policy = Policy(made)
