@@ -178,7 +178,7 @@ def test_make_refuses_a_keep_that_is_neither_yes_nor_no() -> None:
     assert "KEEP must be yes or no, got Yes" in result.stderr
 
 
-TO_COME = {"outlines", "game_parts", "game_planned"}
+TO_COME = {"game_parts", "game_planned"}
 
 
 @pytest.mark.parametrize("keep", ["yes", "no"])

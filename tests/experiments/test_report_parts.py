@@ -411,16 +411,17 @@ def test_a_difference_is_of_the_same_episodes_and_its_interval_needs_seeds(
 
 
 def test_orders_are_compared_in_puzzles_that_tell_no_episodes(tmp_path: Path) -> None:
-    one = experiment("game", ["seven"], tests=["hidden", "random"])
+    """Where nobody played in another order, there is nothing to compare."""
+    one = experiment("game", ["seven"], tests=["hidden", "random", "beam"])
     names = {"seven": training("seven", "game", "tokens=tangram7")}
-    tests = {name: {"label": name, "overrides": []} for name in ("hidden", "random")}
+    tests = {name: {"label": name, "overrides": []} for name in ("hidden", "random", "beam")}
     write_plan(tmp_path, plan({"a": one}, names, tests, (0, 1)))
     for seed, own in enumerate((0.99, 0.97)):
         listed = {"coverage": own - 0.01, "share_solved_iou": 0.5}
         hidden = {"coverage": own, "share_solved_iou": 1.0, "mean_reward": 0.9}
-        hidden |= {"baselines": {"order=listed": listed}}
         told = of_several([own, own], mean_reward=0.9)
-        write_run(tmp_path, "seven", result(seed), [], {"hidden": hidden, "random": told})
+        scored = {"hidden": hidden | {"baselines": {"order=listed": listed}}, "beam": hidden}
+        write_run(tmp_path, "seven", result(seed), [], scored | {"random": told})
     study = read_runs(tmp_path)
     lines = puzzle_order_table(study.experiments[0])
     assert cells("\n".join(lines), "seven") == [

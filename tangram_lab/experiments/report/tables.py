@@ -361,14 +361,14 @@ def puzzle_order_table(experiment: Experiment) -> list[str]:
     for one, test in product(experiment.trainings, experiment.tests):
         if any(seed.tests.get(test.name, {}).get(EACH) for seed in one.finished):
             continue
-        of_seeds = {"learned": [one.values(m.key, test.name) for m in measures]}
-        of_seeds |= {
+        fixed = {
             order: [one.compared(order, m.key, test.name) for m in measures] for order in ORDERS
         }
-        for order, values in of_seeds.items():
-            if all(values):
-                shown = (m.show_spread(v) for m, v in zip(measures, values, strict=True))
-                rows.append([one.label, test.label, order, *shown])
+        fixed = {order: values for order, values in fixed.items() if all(values)}
+        learned = {"learned": [one.values(m.key, test.name) for m in measures]} if fixed else {}
+        for order, values in (learned | fixed).items():
+            shown = (m.show_spread(v) for m, v in zip(measures, values, strict=True))
+            rows.append([one.label, test.label, order, *shown])
     head = ["training", "test", "order", *(m.label for m in measures)]
     return [plain(PUZZLE_NOTE), "", *table(head, rows)] if rows else []
 
