@@ -2,9 +2,10 @@
 
 An update of small networks is a thousand small operations, and most of its time goes from one to
 the next. So the update is traced once, as it is, and torch's compiler makes one piece of C++ of
-it, or kernels of Triton on a GPU. They are kept in a folder for the next run. Numbers differ from
-those of single operations in their last digits: a run learns one way or the other from its
-beginning to its end.
+it, or kernels of Triton on a GPU. Those are recorded as a CUDA graph, which the processor asks for
+as a whole. What was compiled is kept in a folder for the next run. Numbers differ from those of
+single operations in their last digits: a run learns one way or the other from its beginning to its
+end.
 """
 
 import os
@@ -124,7 +125,34 @@ class Compiled:
             found: Tensor = compiled(*constants, *given, *rates)[0]
             return found
 
-        return call
+        return call if tensors[0].device.type == "cpu" else self._recorded(call, tensors, numbers)
+
+    def _recorded(
+        self, call: Callable[..., Tensor], tensors: list[Tensor], numbers: list[Tensor]
+    ) -> Callable[..., Tensor]:
+        """The same as a CUDA graph, which has places of its own for its arguments."""
+        given = [
+            torch.empty_strided(one.shape, one.stride(), dtype=one.dtype, device=one.device)
+            for one in (*tensors, *numbers)
+        ]
+        own, rates = given[: len(tensors)], given[len(tensors) :]
+        torch._foreach_copy_(given, [*tensors, *numbers])
+        graph, aside = torch.cuda.CUDAGraph(), torch.cuda.Stream()  # type: ignore[no-untyped-call]
+        with self._unchanged(), torch.no_grad():
+            # What is done at first only must not be recorded, such as the choice of a kernel.
+            aside.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(aside):
+                call(own, rates)
+            torch.cuda.current_stream().wait_stream(aside)
+            with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+                found = call(own, rates)
+
+        def replay(tensors: list[Tensor], numbers: list[Tensor]) -> Tensor:
+            torch._foreach_copy_(given, [*tensors, *numbers])
+            graph.replay()
+            return found.clone()
+
+        return replay
 
 
 def _lifted(traced: GraphModule) -> tuple[GraphModule, list[Tensor]]:

@@ -32,6 +32,7 @@ RATES = {
     "peers": "piece by piece, against Stable-Baselines3",
     "scaling": "more workers, and 64 synthetic ones",
     "growth": "what grows with tokens, replay and width, and how",
+    "gpu": "updates on a GPU, against single operations there and one core",
     "profile": "where an update's and an episode's time goes",
 }
 TRIALS = {

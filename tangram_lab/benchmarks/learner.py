@@ -13,10 +13,11 @@ from tangram_agent.learner import Learner, critic_target
 from tangram_agent.motion import Motions
 from tangram_agent.setup import Setup
 from tangram_agent.steps import Steps
-from tangram_lab.benchmarks.measure import Bound, Row, Work, compare
+from tangram_lab.benchmarks.measure import Bound, Row, Work, compare, compared, rates
 from tangram_lab.benchmarks.peers import compare_updates
 from tangram_lab.benchmarks.replay import random_transitions
 from tangram_lab.benchmarks.setups import preset, several, with_agent
+from tangram_sim.errors import ConfigError
 
 BATCHES = (64, 256)
 
@@ -43,6 +44,31 @@ def _compiled(runs: int) -> list[Row]:
         whole = updates(made, Learner(made, 0, compiled=True))
         given = ("learner", f"{name}, batch {size}, compiled", "updates/s"), whole
         rows.append(compare(*given, ("single operations", updates(made)), runs, Bound(least)))
+    return rows
+
+
+def measure_gpu(runs: int) -> list[Row]:
+    """Updates per second on a GPU, against single operations there and one core, compiled.
+
+    Raises:
+        ConfigError: there is no GPU.
+    """
+    if not torch.cuda.is_available():
+        raise ConfigError("tangram-bench gpu needs a GPU, none is visible: measure the learner")
+    cases = [("perceptron [64, 64]", preset("mlp"), 256)]
+    cases += [("paper's MHA", preset("paper"), 64), ("ours, 7 tokens", several(7), 64)]
+    cases += [("ours", preset(), size) for size in (*BATCHES, 2048)]
+    rows = []
+    for name, setup, size in cases:
+        made = with_agent(setup, batch_size=size)
+        ways = {
+            "ours": updates(made, Learner(made, 0, "cuda", compiled=True)),
+            "single operations on it": updates(made, Learner(made, 0, "cuda")),
+            "one core, compiled": updates(made, Learner(made, 0, compiled=True)),
+        }
+        found, labels = rates(ways, runs), ("gpu", f"{name}, batch {size}, compiled", "updates/s")
+        for against, bound in zip([*ways][1:], (Bound(5.0), None), strict=True):
+            rows.append(compared(labels, found["ours"], against, found[against], bound))
     return rows
 
 

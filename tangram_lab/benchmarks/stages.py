@@ -8,7 +8,7 @@ import torch
 from tangram_agent.process import keep_memory
 from tangram_lab.benchmarks.acting import measure_acting
 from tangram_lab.benchmarks.growth import draw_growth, measure_growth
-from tangram_lab.benchmarks.learner import measure_learner
+from tangram_lab.benchmarks.learner import measure_gpu, measure_learner
 from tangram_lab.benchmarks.measure import Row, page, show, write
 from tangram_lab.benchmarks.peers import measure_peers
 from tangram_lab.benchmarks.profile import show_profile
@@ -30,6 +30,7 @@ STAGES: dict[str, Callable[[argparse.Namespace], Sequence[Row]]] = {
     "growth": lambda given: measure_growth(given.runs),
     "soon": lambda given: measure_soon(given.seeds),
     "train": lambda given: measure_train(given.seeds, given.minutes),
+    "gpu": lambda given: measure_gpu(given.runs),
 }
 
 
@@ -43,7 +44,7 @@ def run_stages(given: argparse.Namespace) -> int:
     if given.kind == "profile":
         show_profile(given.out)
         return 0
-    names = list(STAGES) if given.kind == "all" else [given.kind]
+    names = [name for name in STAGES if name != "gpu"] if given.kind == "all" else [given.kind]
     rows = [row for name in names for row in STAGES[name](given)]
     title, cells = f"{given.kind}: medians, one thread each", [cells_of(row) for row in rows]
     show(title, cells)

@@ -53,6 +53,26 @@ def test_a_graph_updates_as_single_operations_do(case: tuple[str, str], traced: 
     assert 1 <= len(traced) <= 2
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("case", TRACED)
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_gpu_updates_as_a_processor_does(case: tuple[str, str], compiled: bool) -> None:
+    """By torch's own compiler, recorded; what was learned there is gone on with here."""
+    made = CASES[case]()
+    here, there = Learner(made, 0), Learner(made, 0, "cuda", compiled)
+    before = copied(there)
+    there.compile_ahead()
+    assert changed(before, there.state()) == set()
+    numbers = [play(learner, made, range(4)) for learner in (here, there)]
+    np.testing.assert_allclose(*map(_values, numbers), rtol=2e-3, atol=2e-5)
+    assert here.updates == there.updates == 4
+    for name, values in here.state().items():
+        np.testing.assert_allclose(there.state()[name], values, rtol=1e-2, atol=2e-4, err_msg=name)
+    here.load_state(copied(there))
+    numbers = [play(learner, made, range(4, 5)) for learner in (here, there)]
+    np.testing.assert_allclose(*map(_values, numbers), rtol=2e-3, atol=2e-5)
+
+
 def _values(numbers: list[Any]) -> list[list[float]]:
     return [list(one.values()) for one in numbers]
 
