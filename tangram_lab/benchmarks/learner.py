@@ -54,7 +54,9 @@ def measure_gpu(runs: int) -> list[Row]:
         ConfigError: there is no GPU.
     """
     if not torch.cuda.is_available():
-        raise ConfigError("tangram-bench gpu needs a GPU, none is visible: measure the learner")
+        raise ConfigError(
+            "tangram-bench gpu needs a GPU, none is visible: tangram-bench learner measures one core"
+        )
     cases = [("perceptron [64, 64]", preset("mlp"), 256)]
     cases += [("paper's MHA", preset("paper"), 64), ("ours, 7 tokens", several(7), 64)]
     cases += [("ours", preset(), size) for size in (*BATCHES, 2048)]

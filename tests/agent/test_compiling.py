@@ -53,6 +53,7 @@ def test_a_graph_updates_as_single_operations_do(case: tuple[str, str], traced: 
     assert 1 <= len(traced) <= 2
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 @pytest.mark.parametrize("case", TRACED)
 @pytest.mark.parametrize("compiled", [False, True])
