@@ -11,6 +11,7 @@ end.
 import os
 import platform
 import re
+import warnings
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -113,7 +114,9 @@ class Compiled:
             # Headers compiled ahead lie in /tmp, where others of the machine may put their own.
             "cpp_cache_precompile_headers": False,
         }
-        with torch.no_grad():
+        with torch.no_grad(), warnings.catch_warnings():
+            # Ten bits of a product would be quicker on a GPU; a pose needs more.
+            warnings.filterwarnings("ignore", "TensorFloat32")
             compiled = standalone_compile(
                 graph,
                 example,
