@@ -58,6 +58,8 @@ def run_stages(given: argparse.Namespace) -> int:
         if grown:
             draw_growth(grown, given.out.with_name("growth.png"))
     settings = {name: value for name, value in vars(given).items() if name != "out"}
+    if given.kind == "gpu":
+        settings["card"] = torch.cuda.get_device_name()
     write(given.out, {"settings": settings, "rows": [row.plain() for row in rows]})
     return 0
 

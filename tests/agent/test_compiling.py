@@ -54,6 +54,7 @@ def test_a_graph_updates_as_single_operations_do(case: tuple[str, str], traced: 
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's own
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 @pytest.mark.parametrize("case", TRACED)
 @pytest.mark.parametrize("compiled", [False, True])
