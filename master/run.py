@@ -270,6 +270,8 @@ def _make_trainer(
         log.info("compiles its update: up to a minute at first, seconds once %s has it", kept)
         trainer.learner.compile_ahead()
         watchdog.progress()
+    elif device == "cuda" and not setup.fills:
+        log.info("single operations leave a GPU idle: service.compile=true makes a new run faster")
     return trainer, found
 
 

@@ -3,18 +3,21 @@
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
 import torch._inductor
 
-from master.config import COMPILERS, check_compiling
+from master.config import COMPILERS, MasterConfig, check_compiling
+from master.run import _make_trainer
+from master.rundir import RunFolder
 from master.trainer import Trainer
 from tangram_agent.compiling import Compiled, cache_folder
 from tangram_agent.config import ServiceConfig
 from tangram_agent.learner import Learner, Rates
+from tangram_agent.process import Watchdog
 from tangram_agent.setup import Setup
 from tangram_sim.errors import ConfigError, RunError
 from tests.agent.builders import PAPER, setup
@@ -73,6 +76,20 @@ def test_a_gpu_updates_as_a_processor_does(case: tuple[str, str], compiled: bool
     here.load_state(copied(there))
     numbers = [play(learner, made, range(4, 5)) for learner in (here, there)]
     np.testing.assert_allclose(*map(_values, numbers), rtol=2e-3, atol=2e-5)
+
+
+@pytest.mark.fast
+def test_who_has_a_gpu_is_told_to_compile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("master.run.Trainer", lambda made, *_, **__: Trainer(made, 0, "cpu"))
+    caplog.set_level("INFO")
+    config, nobody = MasterConfig(run_dir=str(tmp_path)), cast(Watchdog, None)
+    for device, told in (("cpu", 0), ("cuda", 1)):
+        monkeypatch.setattr("master.run.choose_device", lambda _, found=device: found)
+        _make_trainer(config, CASES["ddpg", "paper"](), RunFolder(tmp_path), nobody)
+        assert len(caplog.messages) == told
+    assert "service.compile=true" in caplog.messages[0]
 
 
 def _values(numbers: list[Any]) -> list[list[float]]:
