@@ -271,7 +271,10 @@ def _make_trainer(
         trainer.learner.compile_ahead()
         watchdog.progress()
     elif device == "cuda" and not setup.fills:
-        log.info("single operations leave a GPU idle: service.compile=true makes a new run faster")
+        log.info(
+            "learns by single operations, which leave a GPU idle: a new run with "
+            "service.compile=true is faster (needs g++ or clang++)"
+        )
     return trainer, found
 
 

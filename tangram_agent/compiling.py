@@ -150,7 +150,8 @@ class Compiled:
             with torch.cuda.graph(graph, capture_error_mode="thread_local"):
                 found = call(own, rates)
 
-        def replay(tensors: list[Tensor], numbers: list[Tensor]) -> Tensor:
+        def replay(tensors: list[Tensor], numbers: list[Tensor], _: Any = call) -> Tensor:
+            # The graph reads its constants where they lie: `call` keeps them.
             torch._foreach_copy_(given, [*tensors, *numbers])
             graph.replay()
             return found.clone()

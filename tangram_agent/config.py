@@ -391,7 +391,7 @@ class ServiceConfig(Settings, section="service"):
     compile: bool = setting(
         False,
         "whether an update is compiled as a whole: up to a minute at first and seconds later, then "
-        "an update is 1.1 to 2.5 times as fast, on a GPU 6 to 12; needs g++ or clang++",
+        "an update is 1.1 to 2.5 times as fast, on a GPU 6 to 13; needs g++ or clang++",
     )
 
     def __post_init__(self) -> None:

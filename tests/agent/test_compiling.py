@@ -74,6 +74,7 @@ def test_a_gpu_updates_as_a_processor_does(case: tuple[str, str], compiled: bool
     for name, values in here.state().items():
         np.testing.assert_allclose(there.state()[name], values, rtol=1e-2, atol=2e-4, err_msg=name)
     here.load_state(copied(there))
+    there.load_state(copied(here))  # into what was recorded
     numbers = [play(learner, made, range(4, 5)) for learner in (here, there)]
     np.testing.assert_allclose(*map(_values, numbers), rtol=2e-3, atol=2e-5)
 
