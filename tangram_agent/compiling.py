@@ -128,7 +128,8 @@ class Compiled:
             found: Tensor = compiled(*constants, *given, *rates)[0]
             return found
 
-        return call if tensors[0].device.type == "cpu" else self._recorded(call, tensors, numbers)
+        on_gpu = tensors[0].device.type == "cuda"
+        return self._recorded(call, tensors, numbers) if on_gpu else call
 
     def _recorded(
         self, call: Callable[..., Tensor], tensors: list[Tensor], numbers: list[Tensor]
