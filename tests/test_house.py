@@ -205,7 +205,7 @@ def test_the_reports_are_of_the_commands_of_evidence() -> None:
 
 
 def _words(arguments: str) -> set[str]:
-    """What a study is made of, without where and how many at a time, and what is still to come."""
+    """What a study is made of, without where and how many at a time."""
     words = set[str]()
     for word in shlex.split(arguments):
         name, _, value = word.partition("=")
