@@ -54,9 +54,7 @@ def measure_gpu(runs: int) -> list[Row]:
         ConfigError: there is no GPU.
     """
     if not torch.cuda.is_available():
-        raise ConfigError(
-            "tangram-bench gpu needs a GPU, none is visible: see tangram-bench learner"
-        )
+        raise ConfigError("gpu needs a GPU, and none is visible: see tangram-bench learner")
     rows = []
     for name, made in gpu_cases().items():
         ways = {

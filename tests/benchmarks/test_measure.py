@@ -1,5 +1,6 @@
 """Ratios, bounds and the command line of the measurements."""
 
+import argparse
 import json
 import subprocess
 import sys
@@ -10,11 +11,14 @@ import numpy as np
 import pytest
 
 from tangram_lab.benchmarks.cli import main
+from tangram_lab.benchmarks.learner import measure_gpu
 from tangram_lab.benchmarks.measure import Bound, compared, rates, single
 from tangram_lab.benchmarks.rivals import RIVALS
 from tangram_lab.benchmarks.seeing import NEAR, SCALE, _same
 from tangram_lab.benchmarks.silhouettes import convex_outlines
+from tangram_lab.benchmarks.stages import STAGES, run_stages
 from tangram_sim.config import SimConfig
+from tangram_sim.errors import ConfigError
 from tangram_sim.world import make_world
 from tangram_vision.seeing import Seen
 from tests.sim.builders import SEVEN, layout_of
@@ -93,6 +97,23 @@ def test_a_number_out_of_its_bounds_is_refused(
     told = capsys.readouterr().err
     assert told.startswith(f"tangram-bench: {reason}")
     assert told.count("\n") == 1
+
+
+@pytest.mark.fast
+def test_what_needs_a_gpu_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(ConfigError, match="gpu needs a GPU, and none is visible"):
+        measure_gpu(1)
+
+
+@pytest.mark.fast
+def test_all_is_all_that_needs_no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    measured = []
+    for name in STAGES:
+        row = single((name, "case", "unit"), [1.0])
+        monkeypatch.setitem(STAGES, name, lambda _, one=row: measured.append(one.stage) or [one])
+    assert run_stages(argparse.Namespace(kind="all", out=None)) == 0
+    assert {*STAGES} - {*measured} == {"gpu"}
 
 
 @pytest.mark.cluster
