@@ -5,7 +5,7 @@ BIN := .venv/bin
 ARGS ?=
 BUDGET ?= laptop
 KEEP ?= no
-SCRIPTS := .ci/install .ci/run $(shell find docker slurm studio -name "*.sh" -o -name "*.sbatch" 2>/dev/null)
+SCRIPTS := .ci/browser .ci/install .ci/run $(shell find docker slurm studio -name "*.sh" -o -name "*.sbatch" 2>/dev/null)
 
 # make takes name=value for a variable of its own and drops what it does not know.
 KNOWN := ARGS BUDGET KEEP
@@ -24,7 +24,7 @@ unexport PYTHONDONTWRITEBYTECODE
 export PIP_NO_COMPILE := 0
 
 .DEFAULT_GOAL := help
-.PHONY: help train studio test lint settings format paper evidence bench docs lock sbom clean
+.PHONY: help train studio test check lint settings format paper evidence bench docs lock sbom clean
 
 help:  ## list these commands
 	@sed -nE 's/^([a-z]+):.*## (.*)/  make \1\t\2/p' Makefile | expand -t 16
@@ -33,8 +33,12 @@ train: .venv/.installed-run  ## train an agent on this machine; settings go into
 	@$(BIN)/tangram-train $(ARGS)
 
 # Ends with pytest's own summary line. Three tests at a time, on two cores too: those of real processes wait a lot.
-test: lint  ## lint, then all tests, a short training through real processes included
-	@OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses=3 --dist=loadgroup $(ARGS)
+PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses=3 --dist=loadgroup
+test: lint .venv/.installed-browser  ## lint, then the tests, a short training through real processes included
+	@$(PYTEST) $(ARGS)
+
+check: lint .venv/.installed-browser  ## lint, then the tests that are too long for make test
+	@$(PYTEST) -m check $(ARGS)
 
 lint: .venv/.installed-dev  ## ruff, mypy, import-linter, hadolint and shellcheck; changes nothing
 	$(BIN)/ruff check .
@@ -118,3 +122,7 @@ clean:  ## remove caches and build products; .venv and runs/ stay
 .venv/.installed-dev: pyproject.toml lock.txt
 	@.ci/install .venv dev,docs,human,peers,slurm,statistics,studio,video
 	@touch .venv/.installed-run .venv/.installed-docs .venv/.installed-studio $@
+
+.venv/.installed-browser: .venv/.installed-dev
+	@.ci/browser
+	@touch $@

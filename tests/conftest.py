@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+from collections.abc import Generator
 
 import hypothesis
 import pytest
@@ -27,17 +28,18 @@ hypothesis.settings.load_profile("untimed")
 
 TIERS = ("fast", "cluster", "slow", "slurm")
 
-
 # Fixtures that take many seconds and are made once for all tests that look at what they made.
 SHARED = ("trained", "study", "straight", "made")
 
+NO_BROWSER = "no chromium"  # begins the reason of those that are skipped
+
 
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Refuse a test without its tier: it would run nowhere or everywhere, by accident.
 
     Tests that share a fixture go to one worker of --dist=loadgroup, all others wherever one is
-    free.
+    free. What is marked `check` runs only where -m names it, whatever else is asked for.
     """
     for item in items:
         for name in SHARED:
@@ -49,3 +51,24 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 f"{item.nodeid} must carry exactly one of the markers {', '.join(TIERS)}, "
                 f"has {', '.join(tiers) or 'none'}"
             )
+    if "check" not in config.option.markexpr:
+        config.hook.pytest_deselected(items=[item for item in items if is_long(item)])
+        items[:] = [item for item in items if not is_long(item)]
+
+
+def is_long(item: pytest.Item) -> bool:
+    """Whether it is left to make check."""
+    return bool(item.get_closest_marker("check"))
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)  # so that it is the last line but one
+def pytest_terminal_summary(
+    terminalreporter: pytest.TerminalReporter,
+) -> Generator[None, None, None]:
+    """Tell in a line of its own that nothing ran in a browser: among dots nobody would notice."""
+    yield
+    skipped = terminalreporter.stats.get("skipped", [])
+    count = sum(NO_BROWSER in str(report.longrepr) for report in skipped)
+    if count:
+        line = f"NOT RUN: {count} tests in a browser. Install it: sudo apt-get install chromium"
+        terminalreporter.write_line(line, yellow=True, bold=True)

@@ -8,10 +8,10 @@ import shutil
 import subprocess
 import sys
 import tarfile
-from contextlib import nullcontext
 from importlib.metadata import version
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 from unittest import mock
 from zipfile import ZipFile
 
@@ -20,7 +20,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from tests.blocks import PAGES
-from tests.conftest import pytest_collection_modifyitems
+from tests.conftest import NO_BROWSER, pytest_collection_modifyitems, pytest_terminal_summary
 from tests.test_house import ROOT, locked, run, run_python
 
 pytestmark = pytest.mark.slow
@@ -74,14 +74,39 @@ def test_learning_needs_no_compiler() -> None:
     assert told == "False"
 
 
+def collected(expression: str, *tests: set[str]) -> list[str]:
+    """Names of tests with these markers, by numbers, that run with -m."""
+    config = mock.Mock(**{"option.markexpr": expression})
+    items: list[Any] = [
+        mock.Mock(nodeid=str(number), fixturenames=(), get_closest_marker=marks.__contains__)
+        for number, marks in enumerate(tests)
+    ]
+    pytest_collection_modifyitems(config, items)
+    return [item.nodeid for item in items]
+
+
+@pytest.mark.parametrize(("tiers", "has"), [(set(), "none"), ({"fast", "slow"}, "fast, slow")])
+def test_each_test_carries_one_tier(tiers: set[str], has: str) -> None:
+    told = f"0 must carry exactly one of the markers .*, has {has}$"
+    with pytest.raises(pytest.UsageError, match=told):
+        collected("", tiers)
+
+
 @pytest.mark.parametrize(
-    ("tiers", "has"), [([], "none"), (["fast"], None), (["fast", "slow"], "fast, slow")]
+    ("expression", "run"), [("", ["0"]), ("fast", ["0"]), ("check or slow", ["0", "1"])]
 )
-def test_each_test_carries_one_tier(tiers: list[str], has: str | None) -> None:
-    item = mock.Mock(nodeid="it", fixturenames=(), get_closest_marker=set(tiers).__contains__)
-    told = f"it must carry exactly one of the markers .*, has {has}$"
-    with nullcontext() if has is None else pytest.raises(pytest.UsageError, match=told):
-        pytest_collection_modifyitems([item])
+def test_what_is_too_long_for_the_gate_runs_by_its_name(expression: str, run: list[str]) -> None:
+    assert collected(expression, {"fast"}, {"fast", "check"}) == run
+
+
+def test_what_was_not_run_in_a_browser_is_told() -> None:
+    skipped = [
+        mock.Mock(longrepr=("test.py", 1, f"Skipped: {why}")) for why in ("no GPU", NO_BROWSER)
+    ]
+    reporter = mock.Mock(stats={"skipped": skipped})
+    list(pytest_terminal_summary(reporter))
+    (line,) = reporter.write_line.call_args.args
+    assert line == "NOT RUN: 1 tests in a browser. Install it: sudo apt-get install chromium"
 
 
 # What is installed
@@ -184,6 +209,7 @@ def test_install_takes_the_cpu_build_where_it_is_offered(tmp_path: Path, offered
     assert not (tmp_path / "ran").exists()
 
 
+@pytest.mark.check
 def test_the_bill_of_materials_has_the_lock(tmp_path: Path) -> None:
     """Of an environment with all extras; make sbom also validates it, which takes long."""
     for module in ("mkdocs", "submitit"):
@@ -212,6 +238,7 @@ def built_site(config: Path, site: Path) -> subprocess.CompletedProcess[str]:
     return run([sys.executable, "-m", "mkdocs", "build", *options])
 
 
+@pytest.mark.check
 def test_the_site_is_whole_and_asks_no_other_host(tmp_path: Path) -> None:
     """Strictly: each link and anchor leads somewhere, and each page is in the navigation."""
     result = built_site(ROOT / "mkdocs.yml", tmp_path)

@@ -174,6 +174,7 @@ def test_each_torch_and_each_processor_has_its_own_folder(monkeypatch: pytest.Mo
     assert cache_folder().parent == here.parent
 
 
+@pytest.mark.check
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's own
 @pytest.mark.skipif(not any(map(shutil.which, COMPILERS)), reason="needs a C++ compiler")

@@ -34,6 +34,7 @@ from tangram_lab.benchmarks.trainings import Growth
 pytestmark = pytest.mark.slow
 
 
+@pytest.mark.check
 @pytest.mark.timeout(300)  # seven processes one after another, on a machine that is busy
 def test_attacks_with_files_hold(tmp_path: Path) -> None:
     rows = list(tried(FILES, tmp_path))

@@ -64,6 +64,7 @@ def bench(*arguments: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(command, capture_output=True, text=True, timeout=110, check=False)
 
 
+@pytest.mark.check
 @pytest.mark.cluster
 def test_a_stage_prints_a_table_and_writes_where_its_numbers_come_from(tmp_path: Path) -> None:
     done = bench("replay", "runs=1", f"out={tmp_path / 'replay.json'}")
@@ -124,6 +125,7 @@ def test_wrong_arguments_are_answered_in_one_line() -> None:
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.check
 @pytest.mark.slow
 def test_what_is_seen_of_single_tokens_is_exact(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -164,6 +166,7 @@ def test_a_small_token_that_lies_elsewhere_gives_another_picture() -> None:
     assert same == [True, False]
 
 
+@pytest.mark.check
 @pytest.mark.slow
 def test_silhouettes_are_counted_by_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "silhouettes.json"

@@ -22,6 +22,7 @@ from tangram_sim.assembly import PuzzleRules
 from tangram_sim.puzzles import read_puzzles
 from tests.cluster.processes import BIN, ended, started
 from tests.cluster.test_studio import SVG, Running, studio
+from tests.conftest import NO_BROWSER
 
 CHROMIUM = shutil.which("chromium")
 TRIED = "TANGRAM_TRY_STUDIO" in os.environ
@@ -35,7 +36,7 @@ pytestmark = [
     pytest.mark.xdist_group("studio"),
     pytest.mark.timeout(300),
     pytest.mark.skipif(
-        CHROMIUM is None and not TRIED, reason="no chromium: studio/try.sh installs it"
+        CHROMIUM is None and not TRIED, reason=f"{NO_BROWSER}: studio/try.sh installs it"
     ),
 ]
 
@@ -164,6 +165,7 @@ def test_a_figure_is_seen_laid_and_saved(page: Page, tmp_path: Path) -> None:
         assert getattr(film, "n_frames", 1) > 60
 
 
+@pytest.mark.check
 def test_what_was_taken_away_while_it_plays_is_laid_again(page: Page) -> None:
     page.locator("[data-figure=swan]").click()
     moving(page)
@@ -191,6 +193,7 @@ def test_what_was_taken_away_while_it_plays_is_laid_again(page: Page) -> None:
     status(page).to_have_text(LAID)
 
 
+@pytest.mark.check
 def test_tans_are_pushed_too(page: Page) -> None:
     page.locator("#motion").select_option("slide")
     page.locator("[data-figure=cat]").click()
@@ -201,6 +204,7 @@ def test_tans_are_pushed_too(page: Page) -> None:
     status(page).to_have_text(re.compile("^(Laid|It can do no more): covers"))
 
 
+@pytest.mark.check
 def test_the_agent_alone_fills_a_figure(page: Page) -> None:
     page.locator("#who").select_option("agent")
     page.locator("[data-figure=square]").click()
@@ -211,6 +215,7 @@ def test_the_agent_alone_fills_a_figure(page: Page) -> None:
 # Laying out
 
 
+@pytest.mark.check
 def test_a_figure_is_laid_out_of_tans_that_snap(page: Page) -> None:
     source(page, "lay")
     (x, y, _), (u, v, _) = (page.evaluate(f"studio.board.poses[{k}]") for k in (0, 1))
@@ -234,6 +239,7 @@ def test_a_figure_is_laid_out_of_tans_that_snap(page: Page) -> None:
     status(page).to_have_text(LAID)
 
 
+@pytest.mark.check
 def test_tans_on_each_other_are_told(page: Page) -> None:
     source(page, "lay")
     (x, y, _), (u, v, _) = (page.evaluate(f"studio.board.poses[{k}]") for k in (0, 1))
@@ -243,6 +249,7 @@ def test_tans_on_each_other_are_told(page: Page) -> None:
     expect(page.locator("#status")).to_have_class("bad")
 
 
+@pytest.mark.check
 def test_a_tan_is_moved_turned_and_turned_over_by_keys(page: Page) -> None:
     source(page, "lay")
     tan = page.get_by_role("button", name="parallelogram")
@@ -272,6 +279,7 @@ def test_a_square_is_drawn_corner_by_corner_with_snapping(page: Page) -> None:
     status(page).to_have_text(LAID)
 
 
+@pytest.mark.check
 def test_a_figure_is_drawn_by_keys_alone(page: Page) -> None:
     source(page, "draw")
     page.locator("#board").focus()
@@ -286,6 +294,7 @@ def test_a_figure_is_drawn_by_keys_alone(page: Page) -> None:
     moving(page)
 
 
+@pytest.mark.check
 def test_a_wrong_corner_is_taken_back(page: Page) -> None:
     source(page, "draw")
     for x, y in ((0.0, 0.0), (0.3, 0.0), (0.3, 0.3)):
@@ -305,6 +314,7 @@ CAT = [  # a head with two ears, a body, a tail
 ]
 
 
+@pytest.mark.check
 def test_a_cat_by_a_free_hand_becomes_the_nearest_figure(page: Page) -> None:
     source(page, "draw")
     page.locator("[name=pen][value=free]").check()
@@ -316,6 +326,7 @@ def test_a_cat_by_a_free_hand_becomes_the_nearest_figure(page: Page) -> None:
     status(page).to_contain_text("of the nearest figure")
 
 
+@pytest.mark.check
 def test_a_free_hand_draws_again_where_the_last_was_refused_or_laid(page: Page) -> None:
     source(page, "draw")
     page.locator("[name=pen][value=free]").check()
@@ -329,6 +340,7 @@ def test_a_free_hand_draws_again_where_the_last_was_refused_or_laid(page: Page) 
         status(page).to_have_text(re.compile("^Laid: "))
 
 
+@pytest.mark.check
 @pytest.mark.parametrize("closed", [False, True])
 def test_corners_after_a_refusal_begin_another_outline(page: Page, closed: bool) -> None:
     source(page, "draw")
@@ -346,6 +358,7 @@ def test_corners_after_a_refusal_begin_another_outline(page: Page, closed: bool)
     status(page).to_have_text(LAID)
 
 
+@pytest.mark.check
 @pytest.mark.parametrize(
     ("points", "why"),
     [
@@ -368,6 +381,7 @@ def test_an_impossible_drawing_is_told_why(
 # Pictures
 
 
+@pytest.mark.check
 def test_a_picture_is_dropped_on_the_table(page: Page) -> None:
     data = list(SILHOUETTE.read_bytes())
     page.evaluate(
@@ -386,6 +400,7 @@ def test_a_picture_is_dropped_on_the_table(page: Page) -> None:
     assert page.evaluate("studio.name") == "a_bird"
 
 
+@pytest.mark.check
 def test_a_photo_with_uneven_light_is_filled(page: Page, tmp_path: Path) -> None:
     with Image.open(SILHOUETTE) as drawn:
         figure = drawn.convert("L").resize((700, 700))
@@ -399,6 +414,7 @@ def test_a_photo_with_uneven_light_is_filled(page: Page, tmp_path: Path) -> None
     moving(page)
 
 
+@pytest.mark.check
 def test_wrong_files_have_their_words(page: Page, tmp_path: Path) -> None:
     source(page, "file")
     wrong = {
@@ -422,6 +438,7 @@ def test_wrong_files_have_their_words(page: Page, tmp_path: Path) -> None:
 # The connection
 
 
+@pytest.mark.check
 def test_two_browsers_have_a_table_each(page: Page, browser: Browser, running: Running) -> None:
     context = browser.new_context()
     other = opened(context.new_page(), running)
@@ -436,6 +453,7 @@ def test_two_browsers_have_a_table_each(page: Page, browser: Browser, running: R
     expect(page.locator("#pages")).to_have_text("")
 
 
+@pytest.mark.check
 def test_a_file_is_saved_while_it_plays_on(page: Page, tmp_path: Path) -> None:
     page.locator("[data-figure=cat]").click()
     moving(page)
@@ -449,6 +467,7 @@ def test_a_file_is_saved_while_it_plays_on(page: Page, tmp_path: Path) -> None:
     status(page).to_have_text(LAID)
 
 
+@pytest.mark.check
 def test_a_tan_that_is_touched_while_it_looks_loses_no_figure(page: Page) -> None:
     page.evaluate(
         "studio.send = ((send) => (m) => setTimeout(() => send(m), 1500))(studio.send.bind(studio))"
@@ -460,6 +479,7 @@ def test_a_tan_that_is_touched_while_it_looks_loses_no_figure(page: Page) -> Non
     assert page.evaluate("studio.name") == "cat"
 
 
+@pytest.mark.check
 def test_keys_of_before_do_not_bring_an_old_figure_back(page: Page) -> None:
     page.locator("[data-figure=swan]").click()
     moving(page)
@@ -497,6 +517,7 @@ def test_it_goes_on_after_a_short_loss(page: Page) -> None:
     assert page.evaluate("studio.begun === studio.board.frames.moves - studio.before")
 
 
+@pytest.mark.check
 def test_a_page_without_the_token_shows_how_to_get_it(browser: Browser, running: Running) -> None:
     context = browser.new_context()
     page = context.new_page()
@@ -508,6 +529,7 @@ def test_a_page_without_the_token_shows_how_to_get_it(browser: Browser, running:
     context.close()
 
 
+@pytest.mark.check
 def test_a_lost_connection_and_a_new_studio_are_told(browser: Browser, tmp_path: Path) -> None:
     context = browser.new_context()
     page = context.new_page()
@@ -528,6 +550,7 @@ def test_a_lost_connection_and_a_new_studio_are_told(browser: Browser, tmp_path:
 # Everybody
 
 
+@pytest.mark.check
 def test_what_is_laid_goes_on_while_another_way_is_looked_at(page: Page) -> None:
     page.locator("[data-figure=cat]").click()
     moving(page)
@@ -539,6 +562,7 @@ def test_what_is_laid_goes_on_while_another_way_is_looked_at(page: Page) -> None
     status(page).to_have_text(LAID)
 
 
+@pytest.mark.check
 def test_tabs_and_figures_are_reached_by_keys(page: Page) -> None:
     page.locator("#tab-play").focus()
     page.keyboard.press("ArrowRight")
@@ -556,6 +580,7 @@ def test_tabs_and_figures_are_reached_by_keys(page: Page) -> None:
     status(page).to_have_text(LAID)
 
 
+@pytest.mark.check
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_it_fits_a_phone_in_light_and_dark(browser: Browser, running: Running, scheme: Any) -> None:
     context = browser.new_context(
@@ -578,6 +603,7 @@ def test_it_fits_a_phone_in_light_and_dark(browser: Browser, running: Running, s
     context.close()
 
 
+@pytest.mark.check
 def test_who_wants_no_motion_sees_where_tans_come_to_lie(
     browser: Browser, running: Running
 ) -> None:
@@ -590,6 +616,7 @@ def test_who_wants_no_motion_sees_where_tans_come_to_lie(
     context.close()
 
 
+@pytest.mark.check
 def test_a_drawing_in_which_tans_leave_room_is_still_told(page: Page, tmp_path: Path) -> None:
     picture = Image.new("L", (300, 300), 255)
     ImageDraw.Draw(picture).ellipse((60, 60, 240, 240), 0)
@@ -611,6 +638,7 @@ def watched(page: Page, run: Path | str) -> None:
     page.keyboard.press("Enter")
 
 
+@pytest.mark.check
 def test_runs_are_watched_while_they_train_and_side_by_side(page: Page, tmp_path: Path) -> None:
     settings = ("agent=quick", "sim=kinematic", "max_updates=100000", "service.eval_seconds=1")
     old = ended(
@@ -637,6 +665,7 @@ def test_runs_are_watched_while_they_train_and_side_by_side(page: Page, tmp_path
     expect(page.locator("#watch")).to_contain_text("SIGTERM")
 
 
+@pytest.mark.check
 @pytest.mark.parametrize(
     ("run", "why"), [("nowhere", "there is no nowhere"), ("/etc/passwd", "is no connection file")]
 )
@@ -648,6 +677,7 @@ def test_a_wrong_run_has_its_words(page: Page, run: str, why: str) -> None:
 # In motion
 
 
+@pytest.mark.check
 @pytest.mark.skipif("TANGRAM_STUDIO_PICTURES" not in os.environ, reason="it makes a picture")
 def test_the_page_in_motion_is_filmed(browser: Browser, running: Running) -> None:
     """A cat that is drawn, laid, taken apart and mended: studio.gif, which README shows."""
@@ -693,6 +723,7 @@ def test_the_page_in_motion_is_filmed(browser: Browser, running: Running) -> Non
 # Many
 
 
+@pytest.mark.check
 @pytest.mark.skipif(not TRIED, reason="20 browsers take two cores for a minute: studio/try.sh")
 def test_twenty_browsers_see_twenty_frames_a_second(browser: Browser, running: Running) -> None:
     pages = [
@@ -713,6 +744,7 @@ def test_twenty_browsers_see_twenty_frames_a_second(browser: Browser, running: R
         one.context.close()
 
 
+@pytest.mark.check
 @pytest.mark.skipif(not TRIED, reason="measured by studio/try.sh, where nothing else runs")
 def test_the_first_move_comes_soon_after_a_figure_is_chosen(page: Page) -> None:
     """How long, for each figure of the library drawn as an outline; told, and kept in a file."""

@@ -48,6 +48,7 @@ def gluing(seed: int) -> Floats:
     return sample_connected(LAYOUT, SimConfig(arena=4.0), np.random.default_rng(seed))
 
 
+@pytest.mark.check
 def test_thirteen_of_the_twenty_convex_outlines_are_filled_and_seven_searched_through(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
