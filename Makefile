@@ -67,7 +67,7 @@ paper: .venv/.installed-run  ## all figures and tables of the paper: BUDGET=smok
 # make alike.
 ONE_TOKEN := fig4 table1 table2 fig5 fig6 shapes method imitation perceptron parts
 ABLATIONS := plateau ablation_paper ablation_tangram readings noise actions pose warm_start
-GAME := game game_method game_figures game_parts game_refinement game_slide game_planned
+GAME := game game_method game_figures game_parts game_refinement game_slide
 WORLDS := worlds robustness motion_parts
 PICTURES := pictures disturbances doubts outlines hidden
 LAPTOP = budget=laptop "budget.main_seeds=[0,1,2,3,4,5,6,7,8,9]"

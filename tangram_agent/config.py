@@ -111,7 +111,7 @@ class AgentConfig(Settings, section="agent"):
         False,
         "with sim.observe=pictures: tell the agent how surely each token is seen. It may then move "
         "one that could lie otherwise as well; without it, it moves the others first",
-        only={"readout": "pair", "credit": "piece", "lookahead": "none"},
+        only={"readout": "pair", "credit": "piece"},
         part=NETWORK,
     )
     edges: str = setting(
@@ -174,7 +174,7 @@ class AgentConfig(Settings, section="agent"):
         "learned",
         "which token is next: that of the best value, the first as listed, the largest, or any",
         choices=ORDERS,
-        only={"readout": "pair", "lookahead": "none"},
+        only={"readout": "pair"},
     )
     reapply: int = setting(
         2,
@@ -188,7 +188,7 @@ class AgentConfig(Settings, section="agent"):
         "gradient steps uphill on the critic before a pose is played, exploration off",
         low=0,
         high=10_000,
-        only={"readout": "pair", "lookahead": "none"},
+        only={"readout": "pair"},
     )
     refine_rate: float = setting(
         0.004,
@@ -221,20 +221,17 @@ class AgentConfig(Settings, section="agent"):
         "several tokens that slide: weight of what later ones push away of what is set down now",
         low=0,
         high=1,
-        only={"readout": "pair", "lookahead": "none"},
+        only={"readout": "pair"},
     )
     lookahead: str = setting(
         "none",
-        "exploration off. Several tokens that slide: plan orders, places and ways of two legs by "
-        "trying them in a world of its own: the engine, which is planning with the simulator, or a "
-        "model of contacts that was learned from the engine's short pushes. Outlines: lay all "
-        "tokens in thought, by the values of what would be left",
-        choices=("none", "engine", "learned", "values"),
-        only={"readout": ("pair", "outline")},
+        "exploration off: lay all tokens in thought, by the values of what would be left",
+        choices=("none", "values"),
+        only={"readout": "outline"},
     )
     beam: int = setting(
         4,
-        "scenes of each depth that a look ahead follows",
+        "fillings of each depth that a look ahead follows",
         low=1,
         high=32,
         unless={"lookahead": "none"},

@@ -9,18 +9,13 @@ row), N meetings of a token with another.
 
 import zlib
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from tangram_agent.adam import Adam
-from tangram_agent.contacts import foreseen, known_contacts
 from tangram_agent.coverage import covered_share, covering, worths
-from tangram_agent.foresight import Foresight
-from tangram_agent.guide import NetworkGuide, as_tensor
-from tangram_agent.lookahead import Lookahead
 from tangram_agent.motion import Belief, motions_of
 from tangram_agent.networks import Critic, Networks
 from tangram_agent.pairs import PairGraph, Pairs
@@ -147,28 +142,11 @@ class Planner:
     """Chooses token, side and pose."""
 
     def __init__(self, networks: Networks, setup: Setup) -> None:
-        self._setup, self._networks = setup, networks
-        self._layout, self._agent = setup.layout, setup.agent
+        self._networks, self._layout, self._agent = networks, setup.layout, setup.agent
         self._motion, self._sim = networks.motion, setup.sim
         self._graph = PairGraph(setup.layout, setup.sim.arena, setup.agent)
         self._contacts = setup.contacts
         self._turns_over = setup.layout.chiral & setup.sim.allow_flip
-        self._known = known_contacts(setup)
-        self._guide = NetworkGuide(networks, setup, self._known)
-
-    @cached_property
-    def _lookahead(self) -> Lookahead:
-        """Made when it is first asked for: its world may load the engine."""
-        return Lookahead(self._layout, self._sim, self._guide, self.world(), self._agent.beam)
-
-    def world(self) -> Foresight:
-        """A new one to look ahead in."""
-        return foreseen(self._setup, self._known)
-
-    def forget(self) -> None:
-        """Drop what was planned with other weights."""
-        if "_lookahead" in vars(self):
-            self._lookahead.forget()
 
     def choose(
         self,
@@ -184,11 +162,9 @@ class Planner:
             corners: (B, V, 2) of the tokens.
             placed: (B, K) which tokens are placed.
             goals: (B, V, 2) of the target.
-            refine: look ahead, or take the gradient steps, as the agent is configured.
+            refine: take the gradient steps, as the agent is configured.
             past: what was seen of these episodes before, if anything.
         """
-        if refine and self._agent.lookahead != "none":
-            return self._planned(corners, placed, goals, past)
         with torch.no_grad():
             belief = self._belief(corners, past)
             if self._motion is not None and belief is not None and past is not None:
@@ -209,15 +185,6 @@ class Planner:
             pose=pose.numpy().astype(np.float64),
             velocity=velocity.numpy(),
         )
-
-    def _planned(self, corners: Floats, placed: Bools, goals: Floats, past: Past | None) -> Choice:
-        """What a look ahead finds."""
-        token, pose = self._lookahead.choose(corners, placed, goals, past)
-        here = self._layout.poses(corners)[np.arange(len(token)), token]
-        with torch.no_grad():
-            way = as_tensor(velocities_of(pose - here, self._sim))
-            velocity = self._command(way, self._belief(corners, past)).numpy()
-        return Choice(token, np.zeros(len(token), dtype=np.bool_), pose, velocity)
 
     def velocity_to(self, pose: Floats, wanted: Floats) -> Singles:
         """Commands (B, 3) that take tokens from poses (B, 3) to others, in worlds not yet seen."""
@@ -297,14 +264,19 @@ class Planner:
         row, token, flip, piece = map(torch.from_numpy, np.nonzero(every))
         candidates = Candidates(row, token, flip.float(), piece)
         pairs = scene.pairs(candidates)
-        pose = self._guide.proposed(pairs)
+        pose = self._proposed(pairs)
         if not scene.leaves_no_choice(candidates):
             best = candidates.best(self._valued(pairs, pose), _SHORT_LIST)
             candidates, pose = candidates.at(best), pose[best]
             pairs = scene.pairs(candidates)
         for _ in range(self._agent.reapply):
-            pose = self._guide.proposed(pairs.at(pose))
+            pose = self._proposed(pairs.at(pose))
         return candidates, pose
+
+    def _proposed(self, pairs: Pairs) -> Tensor:
+        """Poses (M, 3) that the actor gives to the tokens of pairs."""
+        velocity, _ = self._networks.actor(pairs)
+        return self._graph.moved(pairs, velocity).pose
 
     def _valued(self, pairs: Pairs, pose: Tensor) -> Tensor:
         """Values (M,) of moving the tokens of pairs to poses (M, 3)."""
@@ -420,3 +392,8 @@ def _ranks(order: str, layout: Layout, goals: Floats) -> Floats:
         seeds = [zlib.crc32(np.asarray(goal, np.float32).tobytes()) for goal in goals]
         return np.stack([np.random.default_rng(seed).permutation(count) for seed in seeds])
     return np.broadcast_to(np.arange(count), (len(goals), count))
+
+
+def as_tensor(array: Floats | Bools) -> Tensor:
+    """A copy in single precision."""
+    return torch.from_numpy(np.array(array, np.float32))

@@ -11,7 +11,6 @@ import torch
 from torch import nn
 
 from tangram_agent.filler import Filler
-from tangram_agent.foresight import Foresight
 from tangram_agent.networks import Networks, outline_network, travels
 from tangram_agent.planning import Planner
 from tangram_agent.scenes import Scenes, next_token
@@ -74,18 +73,10 @@ class Policy:
     def _load(self, weights: Weights, names: Collection[str] | None = None) -> None:
         load_arrays(self.network, weights.tensors, names)
         self.version = weights.version
-        if self._planner is not None:
-            self._planner.forget()
 
     def weights(self) -> Weights:
         """A copy of the weights that are loaded."""
         return Weights(self.version, to_arrays(self.network))
-
-    def foresight(self) -> Foresight | None:
-        """A world to try actions in, where the agent looks ahead."""
-        if self._planner is None or self.config.lookahead == "none":
-            return None
-        return self._planner.world()
 
     def act(
         self,

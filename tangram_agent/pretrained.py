@@ -22,8 +22,6 @@ CONFIG = "config.yaml"
 WEIGHTS = "weights.safetensors"
 CARD = "card.json"
 CARD_TEXT = "card.md"
-CONTACTS = "contacts"  # no agent, but a model that agents look ahead by; see contacts.py
-NO_AGENT = "{} is no agent but a model of contacts, for agent.lookahead=learned"
 FORMAT = 2
 PACKAGED: Traversable = files("tangram_agent") / PREFIX
 
@@ -47,8 +45,7 @@ def agent_names() -> list[str]:
     """The agents that come with the package."""
     if not PACKAGED.is_dir():
         return []
-    names = (entry.name for entry in PACKAGED.iterdir() if is_agent(entry))
-    return sorted(name for name in names if name != CONTACTS)
+    return sorted(entry.name for entry in PACKAGED.iterdir() if is_agent(entry))
 
 
 def is_agent(folder: Traversable) -> bool:
@@ -72,8 +69,7 @@ def packaged(run_dir: str | Path) -> Traversable:
     names = agent_names()
     if name not in names:
         known = ", ".join(f"{PREFIX}/{one}" for one in names) or "none come with this version"
-        what = NO_AGENT.format(run_dir) if name == CONTACTS else f"no pretrained agent '{name}'"
-        raise RunError(f"{what}: choose from {known}")
+        raise RunError(f"no pretrained agent '{name}': choose from {known}")
     return PACKAGED / name
 
 

@@ -20,7 +20,7 @@ from tangram_agent.checkpoints import (
     load_checkpoint,
     newest_checkpoint,
 )
-from tangram_agent.pretrained import CONTACTS, NO_AGENT, is_agent, is_name, packaged, read_agent
+from tangram_agent.pretrained import is_agent, is_name, packaged, read_agent
 from tangram_agent.setup import Setup, make_setup
 from tangram_agent.stored import load_settings
 from tangram_agent.types import Past, Weights
@@ -291,8 +291,6 @@ def _agent(source: Traversable, folder: Path, checkpoint: str | None, reward: st
     if checkpoint is not None:
         raise RunError(f"{folder} has no checkpoint {checkpoint}: leave the checkpoint out")
     agent = read_agent(source, folder)
-    if agent.card.get("name") == CONTACTS:
-        raise RunError(f"{NO_AGENT.format(folder)}: give the folder of an agent")
     config = _with_reward(_parse_config(agent.config, folder / CONFIG), reward)
     return Stored(folder, config, make_setup(config), agent.weights)
 

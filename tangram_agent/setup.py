@@ -21,16 +21,13 @@ from tangram_sim.targets import check_targets
 Settings = TypeVar("Settings")
 
 # Settings of the agent that have no effect but on pairs of several tokens.
-_SEVERAL_ONLY = (
-    *("order", "credit", "pairs_per_transition", "push_weight", "lookahead", "confidence"),
-)
+_SEVERAL_ONLY = (*("order", "credit", "pairs_per_transition", "push_weight", "confidence"),)
 # Those that have none on outlines.
 _NOT_OF_OUTLINES = (
     *("egocentric", "offsets", "orientation", "edges", "afterstate", "angle_head", "squash"),
     *("imitates", "saturation_penalty", "saturation_limit", "actor_lr", "noise"),
 )
 MAX_HALVED = 5  # times that a crop of 32 pixels is halved to one
-MAX_PLANNED = 8  # tokens: a look ahead finds the best order over all their subsets
 SECTIONS = ("tokens", "sim", "reward", "agent", "net")
 
 
@@ -67,24 +64,9 @@ class Setup:
             self._refuse(_SEVERAL_ONLY, "one token", "take a set of several")
         if self.fills:
             self._check_fills()
-        elif agent.lookahead == "values":
-            refuse_ignored(
-                "agent.lookahead=values", f"agent.readout={agent.readout}", "set agent=outline"
-            )
         elif not self.contacts:
             slide = "train with sim.motion=slide"
-            apart = ("push_weight", "lookahead")
-            self._refuse(apart, "tokens that do not push each other", slide)
-        if agent.lookahead != "none" and self.layout.tokens > MAX_PLANNED:
-            raise ConfigError(
-                f"agent.lookahead={agent.lookahead} plans for at most {MAX_PLANNED} tokens, got "
-                f"{self.layout.tokens}: set agent.lookahead=none, or take fewer tokens"
-            )
-        if agent.lookahead != "none" and self.sim.delay:
-            raise ConfigError(
-                f"agent.lookahead={agent.lookahead} plans for actions that do not come late: "
-                "set sim.delay=false, or agent.lookahead=none"
-            )
+            self._refuse(("push_weight",), "tokens that do not push each other", slide)
         if self.pairs and not one:
             self._check_credit(f"{self.layout.tokens} tokens on pairs")
 
@@ -146,10 +128,6 @@ class Setup:
         if self.net.kind == "mlp":
             refuse_ignored("net.kind=mlp", "outlines", "set net.kind=mha or crops")
         self._refuse(_NOT_OF_OUTLINES, "outlines", "take another agent")
-        if agent.lookahead not in ("none", "values"):
-            refuse_ignored(
-                f"agent.lookahead={agent.lookahead}", "outlines", "set agent.lookahead=values"
-            )
         if agent.lookahead == "values" and agent.beam == 1:
             refuse_ignored("agent.lookahead=values", "agent.beam=1", "set agent.beam=12")
         for name, value in _changed(self.reward).items():

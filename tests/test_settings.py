@@ -70,7 +70,6 @@ SLIDE = over(
     },
     sim={"backend": "physics", "motion": "slide", "arena": 1.6},
 )
-AHEAD = over(SLIDE, agent={"lookahead": "engine"})
 SEEN = over(ONE, sim={"pixels": 16, "arena": 1.2})
 CAMERA = over(SEEN, reward={"source": "camera"})
 UNPUNISHED = over(ONE, agent={"saturation_penalty": 0.0})
@@ -162,7 +161,6 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "agent.pairs_per_transition": (SEVERAL, 2),
     "agent.gamma": (PAPER, 0.5),
     "agent.push_weight": (SLIDE, 0.0),
-    "agent.lookahead": (SLIDE, "engine"),
     "agent.polyak": (PAPER, 0.5),
     "agent.acting_average": (ONE, 0.0),
     "agent.actor_lr": (ONE, 1e-2),
@@ -184,7 +182,8 @@ SHOWS: dict[str, tuple[Config, object]] = {
 # What shows elsewhere, and where.
 ELSEWHERE = {
     "agent.name": "the label of a run in reports",
-    "agent.beam": "tests/agent/test_lookahead.py: a broader one tries more",
+    "agent.lookahead": "tests/agent/test_filler.py: a beam finds what values do not tell",
+    "agent.beam": "the same",
     "reward.sha256": "tests/sim/test_rewards.py: another file is refused",
 }
 
@@ -319,12 +318,8 @@ def test_every_setting_of_a_command_is_read() -> None:
         (PHYSICS, "sim.motion", "slide", "one token"),
         (ONE, "sim.mirrored", 0.5, "tokens that are their own mirror images"),
         (SEVERAL, "agent.refine_rate", 0.01, "agent.refine_steps=0"),
-        (SLIDE, "agent.beam", 8, "agent.lookahead=none"),
-        (AHEAD, "agent.order", "size", "agent.lookahead=engine"),
-        (AHEAD, "agent.push_weight", 0.5, "agent.lookahead=engine"),
-        (AHEAD, "agent.refine_steps", 2, "agent.lookahead=engine"),
-        (ONE, "agent.lookahead", "engine", "one token"),
-        (SEVERAL, "agent.lookahead", "engine", "tokens that do not push each other"),
+        (ONE, "agent.beam", 8, "agent.lookahead=none"),
+        (SEVERAL, "agent.lookahead", "values", "agent.readout=pair"),
         (UNPUNISHED, "agent.saturation_limit", 0.5, "agent.saturation_penalty=0"),
         (over(SEVERAL, agent={"credit": "reward"}), "agent.imitates", True, "agent.credit=reward"),
         (ONE, "agent.polyak", 0.5, "agent.gamma=0"),

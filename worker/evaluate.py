@@ -47,7 +47,6 @@ from worker.scores import (
     score_pictured,
     score_puzzles,
 )
-from worker.sweeping import sweeping_policy
 from worker.test_set import FixedTests, greedy
 
 MAX_PICTURES = 100  # on a sheet
@@ -128,8 +127,7 @@ def policies(run: Run) -> dict[str, Player]:
     """The run, and those to compare it with, by their names in tables and files."""
     layout, sim = run.setup.layout, run.setup.sim
     fixed = [order for order in ORDERS if order not in ("learned", run.setup.agent.order)]
-    world = run.policy.foresight()
-    fixed = fixed if run.setup.pairs and layout.tokens > 1 and world is None else []
+    fixed = fixed if run.setup.pairs and layout.tokens > 1 else []
     result: dict[str, Player] = {RUN: greedy(run.policy)}
     if run.setup.fills:
         if run.setup.agent.lookahead == "values":
@@ -141,10 +139,6 @@ def policies(run: Run) -> dict[str, Player]:
     for name in fixed:
         other = run.with_settings({"agent": {"order": name}})
         result[f"order={name}"] = greedy(other.policy)
-    if world is not None:
-        alone = {"lookahead": "none", "beam": AgentConfig.beam}
-        result["lookahead=none"] = greedy(run.with_settings({"agent": alone}).policy)
-        result["exact+lookahead"] = sweeping_policy(layout, sim, world, run.setup.agent.beam)
     result["exact"] = exact_policy(layout, sim)
     if sim.inexact or (sim.corner_noise and run.setup.horizon > 1):
         result |= {"fitted": Told(fitted_policy), "oracle": Told(oracle_policy)}

@@ -45,11 +45,6 @@ AHEAD: dict[str, dict[str, Any]] = {
 }  # as an agent of outlines ships
 # And one of pictures: in finer ones than it learned from it lays tokens more exactly.
 FINER: dict[str, dict[str, Any]] = {**AHEAD, "sim": {"pixels": 128}}
-# And one of tokens that slide: by what it learned of contacts, with an action more for each token.
-PLANNED: dict[str, dict[str, Any]] = {
-    "agent": {"lookahead": "learned", "beam": 2},
-    "sim": {"actions_per_token": 2},
-}
 
 
 class Candidate(NamedTuple):
@@ -109,9 +104,9 @@ def publish(
 
 def _shipped(setup: Setup) -> dict[str, dict[str, Any]]:
     """What an agent ships with beside what it was trained with."""
-    if setup.fills:
-        return FINER if setup.traces else AHEAD
-    return PLANNED if setup.sim.motion == "slide" and setup.layout.tokens > 1 else {}
+    if not setup.fills:
+        return {}
+    return FINER if setup.traces else AHEAD
 
 
 def _on_figures(run: Run, split: str) -> dict[str, Any]:
@@ -434,9 +429,7 @@ On the figures of tangram_sim/puzzles, each at {turns} angles; {_trained_on(card
 def _played_by(card: Mapping[str, Any]) -> str:
     if "lookahead=none" not in card["tests"]["scores"]:
         return ""
-    alone = "without looking ahead"
-    outlines = card["task"].get("observe") in SILHOUETTES
-    return f", {alone}" if outlines else f", with one action for each token and {alone}"
+    return ", without looking ahead"
 
 
 def _goals(card: Mapping[str, Any]) -> str:

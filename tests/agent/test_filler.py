@@ -153,7 +153,6 @@ def test_filled_is_surer_than_any_value() -> None:
         ({"noise": 0.2}, {}, "agent.noise=0.2"),
         ({"actor_lr": 0.1}, {}, "agent.actor_lr"),
         ({"orientation": False}, {}, "agent.orientation"),
-        ({"lookahead": "engine"}, {}, "agent.lookahead=engine"),
         ({"hindsight": []}, {}, "without a filled one"),
         ({"hindsight": [{"strategy": "near", "position": 0.1}]}, {}, "hindsight.strategy"),
         ({"gamma": 0.9}, {}, r"agent.gamma=0.9: .* set agent.gamma=1"),

@@ -89,11 +89,6 @@ def test_an_unknown_name_lists_those_that_there_are(package: Path) -> None:
     known = "no pretrained agent 'cat': choose from pretrained/other, pretrained/square"
     with pytest.raises(RunError, match=known):
         load_run("pretrained/cat")
-    contacts = "pretrained/contacts is no agent but a model of contacts, for agent.lookahead=l"
-    with pytest.raises(RunError, match=contacts):
-        load_run("pretrained/contacts")
-    with pytest.raises(RunError, match="no agent but a model of contacts.*: give the folder of an"):
-        load_run(write_agent(Path("pretrained/contacts"), name="contacts"))
     with pytest.raises(RunError, match="has no checkpoint 00000010"):
         load_run("pretrained/square", "00000010")
 

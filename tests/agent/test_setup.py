@@ -63,9 +63,9 @@ def changed(section: str, **values: Any) -> dict[str, dict[str, Any]]:
         ),
         (changed("agent", order="x"), "agent.order must be one of learned, listed, size, random"),
         (changed("agent", reapply=-1), "agent.reapply must be between 0 and 100, got -1"),
-        (changed("agent", lookahead="x"), "agent.lookahead must be one of none, engine, learned"),
+        (changed("agent", lookahead="x"), "agent.lookahead must be one of none, values, got 'x'"),
         (
-            changed("agent", lookahead="engine", beam=0),
+            changed("agent", lookahead="values", beam=0),
             "agent.beam must be between 1 and 32, got 0",
         ),
         (changed("agent", refine_steps=-1), "agent.refine_steps must be between 0 and 10000"),
@@ -222,16 +222,6 @@ REWARD = {"credit": "reward"}
         (SEVERAL, {"agent": {"hindsight": FUTURE}}, "strategy=future changes nothing"),
         (SEVERAL, {"agent": {"push_weight": 0.5}}, "agent.push_weight=0.5 .* sim.motion=slide"),
         (SEVERAL, {"agent": {"readout": "token", "order": "size"}}, "agent.order=size changes"),
-        (
-            {"shapes": ["square"] * 9, "scale": 0.3},
-            {"agent": {"lookahead": "engine"}, "sim": {"motion": "slide"}},
-            "lookahead=engine plans for at most 8 tokens, got 9: set agent.lookahead=none, or take",
-        ),
-        (
-            SEVERAL,
-            {"agent": {"lookahead": "engine"}, "sim": {"motion": "slide", "delay": True}},
-            "lookahead=engine plans for actions that do not come late: set sim.delay=false",
-        ),
         (ONE, {"agent": {"order": "size"}}, "agent.order=size changes nothing with one token"),
         (ONE, {"agent": {"pairs_per_transition": 2}}, "changes nothing with one token"),
         (ONE, {"agent": {"readout": "token", "reapply": 0}}, "agent.reapply=0 changes nothing"),

@@ -82,8 +82,8 @@ WRONG = [
     ("tangram-train noise=1", "unknown setting 'noise' (did you mean 'agent.noise'?)"),
     ("tangram-train agent.gama=0", "unknown setting 'agent.gama' (did you mean 'agent.gamma'?)"),
     (
-        "tangram-train tokens=tangram2 sim.motion=slide agent.lookahead=engine",
-        "agent.lookahead=engine is for play, an evaluator would be silent for minutes: leave it",
+        "tangram-train sim=silhouette agent=outline agent.lookahead=values agent.beam=8",
+        "agent.lookahead=values is for play, an evaluator would be silent for minutes: leave it",
     ),
     (
         "tangram-train sim.observe=silhouette",

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tangram_agent.foresight import EngineWorlds
 from tangram_sim.kinematics import wrap
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.sim.builders import SEVEN
@@ -70,7 +69,6 @@ def test_the_oracle_ends_on_its_target_in_every_world(
 def test_worlds_that_are_tried_in_have_no_camera() -> None:
     seen = {"observe": "pictures", "pixels": 64, "picture_noise": 8.0}
     made = setup(SQUARE, backend="physics", damping=0.1, **seen)
-    EngineWorlds(made.layout, made.sim)
     with closing(FixedTests(made, 2, 2)) as tests:
         assert tests.play(playing(Told(oracle_policy), tests.env)).camera is not None
 

@@ -4,14 +4,12 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from PIL import Image
 from rich.console import Console
 
-from tangram_agent import contacts
 from tangram_sim.errors import ConfigError, RunError
 from tests.agent.builders import PAIR, SQUARE
 from tests.worker.builders import write_run
@@ -191,35 +189,6 @@ def test_settings_of_the_agents_play_are_played_and_written_down(tmp_path: Path,
     assert [one["coverage"] for one in plain["puzzles"]] != [
         one["coverage"] for one in listed["puzzles"]
     ]
-
-
-def test_a_look_ahead_stands_beside_the_same_agent_without_and_a_formula_with(
-    tmp_path: Path, two: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    sim = SIM | {"backend": "physics", "motion": "slide"}
-    write_run(tmp_path / "run", GAME, sim=sim, agent={"reapply": 0})
-    ahead = {"agent": {"lookahead": "engine", "beam": 1}}
-    report = evaluated(tmp_path, episodes=2, changes=ahead)
-    compared = report["baselines"]
-    assert set(compared) == {"lookahead=none", "exact+lookahead", "exact", "random"}
-    alone = evaluated(tmp_path, episodes=2)
-    assert compared["lookahead=none"]["coverage_each"] == alone["coverage_each"]
-    assert compared["exact+lookahead"]["coverage"] > compared["exact"]["coverage"]
-    for one in (report, *compared.values()):
-        whole = 1e3 * one["seconds_per_puzzle"] / report["actions_used"]
-        assert one["ms_per_decision"] == pytest.approx(whole)
-        assert whole > 0.0
-        assert one["ms_slowest"] > 0.0
-    assert "ms_slowest" not in alone
-    learned = {"agent": {"lookahead": "learned", "beam": 1}}
-    read = Mock(wraps=contacts.read_agent)
-    monkeypatch.setattr(contacts, "read_agent", read)
-    report = evaluated(tmp_path, puzzle=(two, "my_cat"), changes=learned)
-    assert read.call_count == 1
-    assert set(report["baselines"]) == set(compared)
-    found = report["baselines"]["exact+lookahead"]
-    assert found["coverage"] > report["baselines"]["exact"]["coverage"]
-    assert found["ms_slowest"] > 0.0
 
 
 def test_random_targets_of_several_tokens_get_the_same_scores(tmp_path: Path) -> None:

@@ -11,11 +11,11 @@ from PIL import Image
 
 import worker.film as film_module
 from conf.cli import composed
-from tangram_agent.lookahead import Lookahead
+from tangram_agent.filler import Filler, Step
 from tangram_agent.process import VARIABLE
 from tangram_agent.runs import load_changed, load_run
 from tangram_agent.setup import Setup
-from tangram_sim.arrays import Floats, Ints
+from tangram_sim.arrays import Floats
 from tangram_sim.errors import ConfigError, RunError, TangramError
 from tangram_sim.geometry import outlines, pairs_overlap
 from tests.agent.builders import PAIR, SQUARE, setup
@@ -192,17 +192,17 @@ def test_without_pyav_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatc
 def test_what_looks_ahead_plays_one_by_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
-    def stays(own: Lookahead, corners: Floats, *_: object) -> tuple[Ints, Floats]:
+    def stays(_: Filler, corners: Floats, *_more: object) -> Step:
         asked.append(len(corners))
-        return np.zeros(len(corners), np.int64), own._layout.poses(corners)[:, 0]
+        none = np.zeros(len(corners), np.int64)
+        return Step(none, none > 0, np.zeros((len(corners), 3), np.float32))
 
-    monkeypatch.setattr(Lookahead, "choose", stays)
-    puzzles = str(write_puzzles(tmp_path / "mine.json", drawn("cat"), drawn("fish")))
-    write_run(tmp_path / "run", GAME, sim=SIM | {"backend": "physics", "motion": "slide"})
-    run = load_changed(tmp_path / "run", {"agent": {"lookahead": "learned"}})
-    for what in ({"episodes": 2}, {"puzzle": (puzzles,)}):
+    monkeypatch.setattr(Filler, "choose", stays)
+    run = load_run("pretrained/tangram7_silhouette")
+    assert run.setup.agent.lookahead == "values"
+    for what in ({"episodes": 2}, {"puzzle": ("cat", "heart")}):
         make_show(run, PlayConfig(str(run.folder), **what))
-    assert asked == [1] * len(asked) == [1] * 4 * run.setup.horizon
+    assert asked == [1] * 4 * run.setup.horizon
 
 
 def test_puzzles_by_name_start_beside_their_figures_and_elsewhere_with_another_seed(
