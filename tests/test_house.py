@@ -1,9 +1,7 @@
 """The rules of the house: arrows, packaging, tiers of tests."""
 
-import json
 import os
 import re
-import shlex
 import shutil
 import subprocess
 import sys
@@ -193,24 +191,3 @@ def test_the_evidence_has_every_experiment_and_each_in_one_study() -> None:
     assert sorted(name for names in chosen for name in names.split(",")) == every
     studies = re.findall(r"tangram-report runs=runs/evidence/(\w+) out=docs/results/\1\n", commands)
     assert len(studies) == len({*studies}) == len(chosen) + 1  # the paper at its own size
-
-
-def test_the_reports_are_of_the_commands_of_evidence() -> None:
-    """No seed, training or test was left out where the data tell of it themselves."""
-    commands = run(["make", "--dry-run", "evidence"]).stdout
-    asked = [*map(_words, re.findall(r"tangram-experiment (.*) &&", commands.replace("\\\n", "")))]
-    for path in (ROOT / "docs" / "results").glob("*/data.json"):
-        words = _words(json.loads(path.read_text())["plan"]["command"].partition(" ")[2])
-        assert words in asked, path
-
-
-def _words(arguments: str) -> set[str]:
-    """What a study is made of, without where and how many at a time."""
-    words = set[str]()
-    for word in shlex.split(arguments):
-        name, _, value = word.partition("=")
-        if name == "experiment":
-            words |= {*value.strip("[]").split(",")}
-        elif name not in ("run_dir", "keep", "jobs"):
-            words.add(word)
-    return words
