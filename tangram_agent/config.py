@@ -216,13 +216,6 @@ class AgentConfig(Settings, section="agent"):
         only={"readout": "pair"},
         part=LEARNING,
     )
-    push_weight: float = setting(
-        1.0,
-        "several tokens that slide: weight of what later ones push away of what is set down now",
-        low=0,
-        high=1,
-        only={"readout": "pair"},
-    )
     lookahead: str = setting(
         "none",
         "exploration off: lay all tokens in thought, by the values of what would be left",

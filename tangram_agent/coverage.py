@@ -93,13 +93,6 @@ def newly_covered(token: Lying, piece: Lying, covered: Floats, layout: Layout) -
     return value
 
 
-def pushed_share(before: Lying, after: Lying, layout: Layout) -> Floats:
-    """(M,) share of tokens' areas that does not lie where it lay before."""
-    kept = shared_area(before.outlines(layout), after.outlines(layout))
-    share: Floats = np.clip(1.0 - kept / layout.areas[before.index], 0.0, 1.0)
-    return share
-
-
 def _fitted(corners: Corners, layout: Layout) -> Floats:
     """Outlines (B, K, C, 2) of the exact pieces that fit corners (B, V, 2) best."""
     seen = np.asarray(corners, np.float64)

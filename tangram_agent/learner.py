@@ -2,8 +2,7 @@
 
 One learner for whole scenes and for pairs of a token and a piece: it sees a batch as `Steps`. With
 several tokens what an action is worth falls apart into what it covers of each piece, and hindsight
-knows the geometry: so a pair's value is known at once, and nothing is bootstrapped. What tokens
-that slide push away is learned beside it, for each pair of tokens (see `planning`).
+knows the geometry: so a pair's value is known at once, and nothing is bootstrapped.
 
 Legend: M views, K tokens.
 """
@@ -23,13 +22,9 @@ from tangram_agent.compiling import Compiled
 from tangram_agent.config import AgentConfig
 from tangram_agent.motion import Fit, MotionModel, Motions
 from tangram_agent.networks import VELOCITY, Networks, initialise, parameter_count
-from tangram_agent.relabelling import (
-    make_pairs,
-    with_contacts,
-    with_scenes,
-)
+from tangram_agent.relabelling import make_pairs, with_scenes
 from tangram_agent.setup import Setup
-from tangram_agent.steps import Batch, Meeting, Stepping, Steps, Sums
+from tangram_agent.steps import Batch, Stepping, Steps, Sums
 from tangram_agent.types import Transitions, Weights
 from tangram_agent.weights import load_arrays, to_arrays, under
 from tangram_sim.errors import RunError
@@ -164,9 +159,7 @@ class Learner:
         pairs = make_pairs(batch, self._setup, generator)
         if self._setup.credits_scenes:
             return with_scenes(pairs, batch, self._layout, generator)
-        return (
-            with_contacts(pairs, batch, self._layout, generator) if self._setup.contacts else pairs
-        )
+        return pairs
 
     def update(
         self, batch: Batch, progress: float = 0.0, motions: Motions | None = None
@@ -214,8 +207,6 @@ class Learner:
             loss, q = self.critic_loss(steps, features)
         else:
             loss, q = self.scene_loss(steps.scenes)
-        if steps.meeting is not None:
-            loss = loss + self.push_loss(steps.meeting)
         norm = self._step("critic", loss, rates.critic)
         value_loss, penalty = self.actor_loss(steps, features)
         total = value_loss + self.config.saturation_penalty * penalty
@@ -252,11 +243,6 @@ class Learner:
         each = (error[:, :2].square().sum(-1) + turn) * reached
         penalty = saturation(raw, self.config.saturation_limit)
         return each.sum() / reached.sum().clamp(min=1.0), penalty
-
-    def push_loss(self, meeting: Meeting) -> Tensor:
-        """Mean squared error of what tokens that slide push away."""
-        share = self.critic.pushed(meeting.pairs, meeting.to)
-        return (share - meeting.pushed).square().mean()
 
     def scene_loss(self, scenes: Sums) -> tuple[Tensor, Tensor]:
         """Mean squared error of the reward as a sum over all pairs of a scene, and the sums (B,).

@@ -27,7 +27,6 @@ from tangram_agent.values import OutlineValue
 View = Scenes | Pairs
 
 VELOCITY = 3
-MOTION = 4  # shift in x and y, and the turn as a cosine and a sine
 
 
 class Head(nn.Module):
@@ -46,7 +45,6 @@ class Head(nn.Module):
         *,
         at_base: bool,
         action: int = 0,
-        told: int = 0,
     ) -> None:
         """Make the layers.
 
@@ -56,35 +54,31 @@ class Head(nn.Module):
             outputs: numbers for each view.
             at_base: read at the token that moves.
             action: numbers that `forward` appends to the moving token's base node.
-            told: numbers that it tells to every node.
         """
         super().__init__()
         self.graph, self.attends, self.at_base = graph, net.kind == "mha", at_base
         if self.attends:
-            self.encoder = GraphEncoder(graph.features + action + told, net)
+            self.encoder = GraphEncoder(graph.features + action, net)
             self.context = nn.Linear(net.width, net.width, bias=False)
             self.readout = nn.Linear((1 + at_base) * net.width, outputs)
         else:
             groups = graph.tokens if at_base else 1
-            inputs = graph.inputs + action + told
-            self.layers = perceptron(inputs, net.hidden, outputs * groups)
+            self.layers = perceptron(graph.inputs + action, net.hidden, outputs * groups)
 
     def forward(
         self,
         view: View,
         action: Tensor | None = None,
-        told: Tensor | None = None,
         features: Tensor | None = None,
     ) -> Tensor:
-        """(M, outputs) of views, with an action (M, action) or what is told besides (M, told).
+        """(M, outputs) of views, with an action (M, action) for a head that takes one.
 
         Features, by `see`, may be handed in where they were made before.
         """
         seen = self.see(view) if features is None else features
-        extra = [part for part in (action, told) if part is not None]
         outputs: Tensor
         if not self.attends:
-            outputs = self.layers(torch.cat([seen, *extra], dim=-1) if extra else seen)
+            outputs = self.layers(seen if action is None else torch.cat([seen, action], dim=-1))
             return self._of_token(outputs, view)
         base = self.graph.base_node(view)
         rows = torch.arange(len(seen), device=seen.device)
@@ -93,8 +87,6 @@ class Head(nn.Module):
             appended = seen.new_zeros(*seen.shape[:2], action.shape[-1])
             appended[rows, base] = action
             seen = torch.cat([seen, appended], dim=-1)
-        if told is not None:
-            seen = torch.cat([seen, told[:, None].expand(-1, seen.shape[1], -1)], dim=-1)
         nodes, mean = self.encoder(seen, self.graph.adjacency)
         read = self.context(mean)
         outputs = self.readout(torch.cat([nodes[rows, base], read], -1) if self.at_base else read)
@@ -154,13 +146,10 @@ class Critic(nn.Module):
     """Q(s, g, a): what a velocity of the token that is to move is worth.
 
     An afterstate critic sees the graph as the velocity would leave it, a known rigid motion,
-    instead of the velocity itself. Where tokens push each other a second head tells how far a token
-    that slides to a pose pushes another one out of its place.
+    instead of the velocity itself.
     """
 
-    def __init__(
-        self, graph: Graph, agent: AgentConfig, net: NetConfig, contacts: bool = False
-    ) -> None:
+    def __init__(self, graph: Graph, agent: AgentConfig, net: NetConfig) -> None:
         super().__init__()
         self.graph, self.afterstate = graph, agent.afterstate
         self._of_the_rest = agent.credit == "reward"
@@ -168,7 +157,6 @@ class Critic(nn.Module):
         # The paper's value is read off the whole graph; a pair's also at its token.
         at_base = isinstance(graph, PairGraph)
         self.head = Head(graph, net, 1, at_base=at_base, action=action)
-        self.push_head = Head(graph, net, 1, at_base=True, told=MOTION) if contacts else None
 
     def forward(
         self,
@@ -198,17 +186,6 @@ class Critic(nn.Module):
     def _value(self, outputs: Tensor) -> Tensor:
         return outputs.squeeze(-1)
 
-    def pushed(self, pairs: Pairs, to: Tensor) -> Tensor:
-        """(M,) share of the other token's area that is pushed away from where it lies.
-
-        Args:
-            pairs: a token where it is, and the other one in the place of the piece.
-            to: (M, 3) pose that the token slides to.
-        """
-        if self.push_head is None or not isinstance(self.graph, PairGraph):
-            return to.new_zeros(len(to))
-        return self._value(self.push_head(pairs, told=self.graph.motion(pairs, to)))
-
 
 class Networks(nn.Module):
     """Actor and critic of a setup, on the graph that its agent sees."""
@@ -217,9 +194,8 @@ class Networks(nn.Module):
         super().__init__()
         seen = setup.layout, setup.sim.arena, setup.agent
         graph: Graph = PairGraph(*seen) if setup.pairs else SceneGraph(*seen)
-        contacts = setup.pairs and setup.contacts
         self.actor = Actor(graph, setup.agent, setup.net)
-        self.critic = Critic(graph, setup.agent, setup.net, contacts)
+        self.critic = Critic(graph, setup.agent, setup.net)
         self.motion = MotionModel() if setup.learns_motion else None
         # Of pairs the critic chooses among what the actor proposes: both play.
         self._both_play = setup.pairs

@@ -129,11 +129,6 @@ class PairGraph(nn.Module):
         angle = angle + pairs.flipped * (1.0 - chiral) * self.mirror[pairs.piece]
         return place, angle, chiral * (pairs.flipped - pairs.goal_flipped).abs()
 
-    def motion(self, pairs: Pairs, to: Tensor) -> Tensor:
-        """The way to poses (M, 3) as tokens see it: (M, 4), shift, cosine and sine of the turn."""
-        shift, angle = self._seen(pairs, to)
-        return torch.cat([shift, unit(angle)], dim=-1)
-
     def _seen(self, pairs: Pairs, to: Tensor) -> tuple[Tensor, Tensor]:
         """The shift (M, 2) and the turn (M,) to poses (M, 3) as tokens see them.
 

@@ -1,10 +1,10 @@
 """Choosing among proposals: a pose for every pair of a token and a piece, and the best one played.
 
 The critic values each proposal for its own piece; the best few are then valued for all pieces of
-the target, as an action is worth the sum of what it covers, less what sliding there costs.
+the target, as an action is worth the sum of what it covers.
 
 Legend: B environments, K tokens, V corners, M candidates (pairs of all environments, row after
-row), N meetings of a token with another.
+row).
 """
 
 import zlib
@@ -17,7 +17,7 @@ from torch import Tensor
 from tangram_agent.adam import Adam
 from tangram_agent.coverage import covered_share, covering, worths
 from tangram_agent.motion import Belief, motions_of
-from tangram_agent.networks import Critic, Networks
+from tangram_agent.networks import Networks
 from tangram_agent.pairs import PairGraph, Pairs
 from tangram_agent.setup import Setup
 from tangram_agent.types import Past
@@ -102,21 +102,6 @@ class Scene:
         """Whether each environment has one candidate, so that nobody need say which is better."""
         return len(candidates.row) == len(self.pose)
 
-    def meetings(self, movers: Candidates, other: Candidates, where: Tensor) -> Pairs:
-        """Pairs (M,) of tokens that move and of others that lie at poses (M, 3) in the same rows.
-
-        Where tokens meet, the other one has the place of a piece that nothing covers.
-        """
-        return Pairs(
-            pose=self.pose[movers.row, movers.token],
-            flipped=self._side(movers),
-            token=movers.token,
-            goal=where,
-            goal_flipped=self._side(other),
-            piece=other.token,
-            covered=torch.zeros(len(where)),
-        )
-
     def _side(self, c: Candidates) -> Tensor:
         return (self.flipped[c.row, c.token] - c.flip).abs()
 
@@ -145,7 +130,6 @@ class Planner:
         self._networks, self._layout, self._agent = networks, setup.layout, setup.agent
         self._motion, self._sim = networks.motion, setup.sim
         self._graph = PairGraph(setup.layout, setup.sim.arena, setup.agent)
-        self._contacts = setup.contacts
         self._turns_over = setup.layout.chiral & setup.sim.allow_flip
 
     def choose(
@@ -288,11 +272,8 @@ class Planner:
         if scene.leaves_no_choice(candidates):
             return torch.arange(len(pose))
         # What a token covers already it gives up.
-        total = self._total(scene, candidates, pose) - scene.worth[candidates.row, candidates.token]
-        if self._contacts:
-            critic, weight = self._networks.critic, self._agent.push_weight
-            total = total - damage(critic, weight, scene, candidates, pose, total)
-        return candidates.best(total, 1)
+        given_up = scene.worth[candidates.row, candidates.token]
+        return candidates.best(self._total(scene, candidates, pose) - given_up, 1)
 
     def _total(self, scene: Scene, candidates: Candidates, pose: Tensor) -> Tensor:
         """(M,) values of poses (M, 3) over all pieces of the target."""
@@ -312,71 +293,6 @@ class Planner:
                 gradients = torch.autograd.grad(loss, [moved])
                 optimiser.step(gradients, self._agent.refine_rate)
         return moved.detach()
-
-
-def damage(
-    critic: Critic,
-    weight: float,
-    scene: Scene,
-    candidates: Candidates,
-    pose: Tensor,
-    value: Tensor,
-) -> Tensor:
-    """(M,) what sliding to poses (M, 3) costs.
-
-    Now: each other token's worth, times the share that it is pushed away. Later, with a
-    weight: the candidate's own value (M,), times the share that every token which is still to come
-    pushes it away on the way to the best pose known for it. So what lies in the way of others is
-    placed after them. A token without a candidate is not counted.
-    """
-    now = _pushed_now(critic, scene, candidates, pose)
-    if weight == 0.0:
-        return now
-    return now + weight * value * _pushed_later(critic, scene, candidates, pose, value)
-
-
-def _pushed_now(critic: Critic, scene: Scene, candidates: Candidates, pose: Tensor) -> Tensor:
-    """(M,) sum over other tokens of the share that each is pushed away times its worth."""
-    index, token = torch.nonzero(scene.worth[candidates.row] > 0.0, as_tuple=True)
-    apart = candidates.token[index] != token
-    index, token = index[apart], token[apart]
-    movers = candidates.at(index)
-    lying = replace(movers, token=token, flip=torch.zeros(len(token)))
-    where = scene.pose[movers.row, token]
-    share = _pushed(critic, scene, movers, pose[index], lying, where)
-    cost = share * scene.worth[movers.row, token]
-    return torch.zeros(len(pose)).index_add(0, index, cost)
-
-
-def _pushed_later(
-    critic: Critic, scene: Scene, candidates: Candidates, pose: Tensor, value: Tensor
-) -> Tensor:
-    """(M,) sum over the tokens to come of the share that each pushes a candidate away."""
-    same = candidates.row[:, None] == candidates.row
-    apart = candidates.token[:, None] != candidates.token
-    index, mover = torch.nonzero(same & apart & _leaders(candidates, value), as_tuple=True)
-    movers, lying = candidates.at(mover), candidates.at(index)
-    share = _pushed(critic, scene, movers, pose[mover], lying, pose[index])
-    return torch.zeros(len(pose)).index_add(0, index, share)
-
-
-def _pushed(
-    critic: Critic,
-    scene: Scene,
-    movers: Candidates,
-    to: Tensor,
-    lying: Candidates,
-    where: Tensor,
-) -> Tensor:
-    """(N,) shares that tokens which slide to poses (N, 3) push others, at poses (N, 3), away."""
-    return critic.pushed(scene.meetings(movers, lying, where), to).clamp(0.0, 1.0)
-
-
-def _leaders(candidates: Candidates, value: Tensor) -> Tensor:
-    """(M,) which candidate is the best one of its token in its row, by a value (M,)."""
-    key = candidates.row * (int(candidates.token.max()) + 1) + candidates.token
-    best = torch.full((int(key.max()) + 1,), -torch.inf).scatter_reduce(0, key, value, "amax")
-    return value >= best[key]
 
 
 def _ranks(order: str, layout: Layout, goals: Floats) -> Floats:

@@ -13,14 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tangram_agent.config import AgentConfig, RelabelConfig
-from tangram_agent.coverage import (
-    Lying,
-    covered_share,
-    covering,
-    lying,
-    newly_covered,
-    pushed_share,
-)
+from tangram_agent.coverage import Lying, covered_share, covering, lying, newly_covered
 from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes, Flags, Transitions
 from tangram_sim.actions import chosen_tokens, flips, velocities
@@ -161,23 +154,6 @@ class PairBatch:
 
 
 @dataclass(frozen=True, eq=False)
-class ContactBatch(PairBatch):
-    """Pairs of tokens that slide, with another token of the same scene for each.
-
-    Attributes:
-        other: (M,) its index.
-        other_pose: (M, 3) where it lay before the action.
-        other_flipped: (M,) on which side.
-        pushed: (M,) share of its area that the action pushed away from there.
-    """
-
-    other: Ints
-    other_pose: Floats
-    other_flipped: Bools
-    pushed: Floats
-
-
-@dataclass(frozen=True, eq=False)
 class SceneBatch(PairBatch):
     """Pairs for the actor, and the whole scenes that the environment rewarded for the critic.
 
@@ -246,23 +222,6 @@ def make_pairs(batch: Transitions, setup: Setup, generator: np.random.Generator)
         start_confidence=np.where(again, sure_after, sure),
         reward=reward,
         done=done,
-    )
-
-
-def with_contacts(
-    pairs: PairBatch, batch: Transitions, layout: Layout, generator: np.random.Generator
-) -> ContactBatch:
-    """The same pairs, with what their action did to another token, drawn uniformly."""
-    rows = np.repeat(np.arange(batch.count), len(pairs.token) // batch.count)
-    other = (pairs.token + generator.integers(1, layout.tokens, len(rows))) % layout.tokens
-    before = lying(batch.state, layout, rows, other)
-    after = lying(batch.next_state, layout, rows, other)
-    return ContactBatch(
-        **vars(pairs),
-        other=other,
-        other_pose=before.pose,
-        other_flipped=before.flipped,
-        pushed=pushed_share(before, after, layout),
     )
 
 

@@ -21,7 +21,7 @@ from tangram_sim.targets import check_targets
 Settings = TypeVar("Settings")
 
 # Settings of the agent that have no effect but on pairs of several tokens.
-_SEVERAL_ONLY = (*("order", "credit", "pairs_per_transition", "push_weight", "confidence"),)
+_SEVERAL_ONLY = ("order", "credit", "pairs_per_transition", "confidence")
 # Those that have none on outlines.
 _NOT_OF_OUTLINES = (
     *("egocentric", "offsets", "orientation", "edges", "afterstate", "angle_head", "squash"),
@@ -64,9 +64,6 @@ class Setup:
             self._refuse(_SEVERAL_ONLY, "one token", "take a set of several")
         if self.fills:
             self._check_fills()
-        elif not self.contacts:
-            slide = "train with sim.motion=slide"
-            self._refuse(("push_weight",), "tokens that do not push each other", slide)
         if self.pairs and not one:
             self._check_credit(f"{self.layout.tokens} tokens on pairs")
 
@@ -186,11 +183,6 @@ class Setup:
                 f"reward.name={self.reward.name} is no sum over tokens and pieces, as which "
                 f"agent.credit=reward learns it: {whole}"
             )
-        elif self.contacts:
-            raise ConfigError(
-                "agent.credit=reward does not learn what sliding tokens push away: set "
-                "sim.motion=lift, or agent.credit=piece"
-            )
 
     def _refuse(self, names: Iterable[str], because: str, remedy: str) -> None:
         """Refuse settings of the agent that are not the default."""
@@ -272,11 +264,6 @@ class Setup:
         """
         sim = self.sim
         return sim.observe == "pictures" and self.layout.tokens > 1 and not sim.inexact
-
-    @property
-    def contacts(self) -> bool:
-        """Whether tokens push each other out of their places."""
-        return self.sim.motion == "slide"
 
     @property
     def action_size(self) -> int:

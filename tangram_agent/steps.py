@@ -3,7 +3,7 @@
 Legend: M views, B scenes, K tokens.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from tangram_agent.networks import VELOCITY, View
 from tangram_agent.pairs import Pairs
-from tangram_agent.relabelling import ContactBatch, PairBatch, SceneBatch
+from tangram_agent.relabelling import PairBatch, SceneBatch
 from tangram_agent.scenes import Scenes, next_token
 from tangram_agent.setup import Setup
 from tangram_agent.types import Transitions
@@ -38,7 +38,6 @@ class Steps:
             None where nothing follows on any of them.
         seen_after: that too where an afterstate critic is to see it as it was, else it sees the
             exact motion.
-        meeting: what tokens that slide push away, where that is learned.
         scenes: all pairs of whole scenes, where the critic learns their reward.
     """
 
@@ -49,23 +48,7 @@ class Steps:
     start: View
     follow: View | None
     seen_after: View | None = None
-    meeting: "Meeting | None" = None
     scenes: "Sums | None" = None
-
-
-@dataclass(frozen=True, eq=False)
-class Meeting:
-    """What tokens that slide push away.
-
-    Attributes:
-        pairs: a token, and the other one that it meets in the place of a piece.
-        to: (M, 3) where the token slides to.
-        pushed: (M,) share of the other one that is pushed away.
-    """
-
-    pairs: Pairs
-    to: Tensor
-    pushed: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +111,6 @@ class Stepping:
             start=self._pairs(batch, batch.start, batch.start_flipped, start),
             follow=self._if_any_follows(batch.done, after),
             seen_after=after,
-            meeting=self._meeting(batch) if isinstance(batch, ContactBatch) else None,
             scenes=self._sums(batch) if isinstance(batch, SceneBatch) else None,
         )
 
@@ -150,18 +132,6 @@ class Stepping:
             covered=self._tensor(batch.covered),
             confidence=confidence,
         )
-
-    def _meeting(self, batch: ContactBatch) -> Meeting:
-        before = self._pairs(batch, batch.before, batch.before_flipped)
-        # Where tokens meet, the other one has the place of a piece that nothing covers.
-        pairs = replace(
-            before,
-            goal=self._tensor(batch.other_pose),
-            goal_flipped=self._tensor(batch.other_flipped),
-            piece=self._index(batch.other),
-            covered=torch.zeros_like(before.covered),
-        )
-        return Meeting(pairs, self._tensor(batch.after), self._tensor(batch.pushed))
 
     def _sums(self, batch: SceneBatch) -> Sums:
         count, tokens = batch.poses.shape[:2]

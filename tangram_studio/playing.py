@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from tangram_agent.runs import Run, load_run
+from tangram_agent.runs import Run, load_changed
 from tangram_agent.types import Past
 from tangram_sim.actions import chosen_tokens
 from tangram_sim.arrays import Bools, Floats, Singles
@@ -24,7 +24,8 @@ from tangram_sim.world import World, make_world
 from worker.metrics import iou
 from worker.pairing import paired
 
-AGENTS = {"lift": "pretrained/tangram7", "slide": "pretrained/tangram7_slide"}
+AGENT = "pretrained/tangram7"
+SIM = {"lift": {}, "slide": {"motion": "slide", "actions_per_token": 2}}
 PARTS = 20  # of a push, as it is shown
 _NEAR, _STRAIGHT = 0.01, 0.03  # arena units and radians: what lies in its piece
 _STILL = 1e-3  # what moved less has not moved
@@ -79,7 +80,7 @@ class _Player:
 
     def __init__(self, motion: str) -> None:
         torch.set_num_threads(1)  # more are slower for so little, above all beside other work
-        self.run: Run = load_run(AGENTS[motion])
+        self.run: Run = load_changed(AGENT, {"sim": SIM[motion]})
         setup = self.run.setup
         self.layout, self.motion = setup.layout, motion
         sim = replace(setup.sim.blind, starts="outside")

@@ -160,7 +160,6 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "agent.credit": (SEVERAL, "reward"),
     "agent.pairs_per_transition": (SEVERAL, 2),
     "agent.gamma": (PAPER, 0.5),
-    "agent.push_weight": (SLIDE, 0.0),
     "agent.polyak": (PAPER, 0.5),
     "agent.acting_average": (ONE, 0.0),
     "agent.actor_lr": (ONE, 1e-2),

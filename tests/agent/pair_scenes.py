@@ -83,13 +83,12 @@ def transitions(made: Setup, count: int, seed: int = 0, placed: float = 0.4) -> 
 
 @dataclass
 class PerfectCritic:
-    """Knows the exact geometry; what slides push away is a constant table (K, K).
+    """Knows the exact geometry.
 
     It may like some tokens less: values count as much as (K,) says.
     """
 
     layout: Layout
-    pushes: Floats | None = None
     likes: Floats | None = None
 
     def __call__(self, before: Pairs, velocity: Tensor, pairs: Pairs) -> Tensor:
@@ -104,12 +103,6 @@ class PerfectCritic:
         wanted = Lying(piece, parts["goal"], parts["goal_flipped"] > 0.5)
         value = newly_covered(own, wanted, parts["covered"], self.layout)
         return as_tensor(value if self.likes is None else value * self.likes[token])
-
-    def pushed(self, pairs: Pairs, to: Tensor) -> Tensor:
-        """Whatever the poses, the table's share for the token that moves and the one that lies."""
-        if self.pushes is None:
-            return torch.zeros(len(to))
-        return as_tensor(self.pushes)[pairs.token, pairs.piece]
 
 
 @dataclass

@@ -165,7 +165,7 @@ def chosen(made: Setup, confidence: Singles, placed: np.ndarray, likes: Floats) 
     rng = np.random.default_rng(2)
     corners, goals = (made.layout.corners(*random_scene(made.layout, rng, 6)) for _ in range(2))
     graph = PairGraph(made.layout, made.sim.arena, made.agent)
-    networks = PerfectNetworks(PerfectCritic(made.layout, None, likes), graph)
+    networks = PerfectNetworks(PerfectCritic(made.layout, likes), graph)
     closed = placed | (confidence < 0.5)
     closed = np.where(closed.all(axis=1, keepdims=True), placed, closed)  # as `BatchedEnv.closed`
     past = seen(confidence, placed)

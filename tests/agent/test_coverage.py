@@ -13,7 +13,6 @@ from tangram_agent.coverage import (
     covering,
     lying,
     newly_covered,
-    pushed_share,
     worths,
 )
 from tangram_sim.layout import TokensConfig, make_layout
@@ -176,20 +175,3 @@ def test_values_against_shapely_stay_between_0_and_1() -> None:
     np.testing.assert_allclose(found, np.minimum(shared, left) / larger, atol=1e-9)
     assert found.min() >= 0.0
     assert 0.5 < found.max() <= 1.0
-
-
-@pytest.mark.parametrize(
-    ("after", "expected"),
-    [
-        ((0.0, 0.0, 0.0), 0.0),
-        ((0.0, 0.0, np.pi / 2), 0.0),
-        ((0.25, 0.0, 0.0), 0.25),
-        ((0.5, 0.5, 0.0), 0.75),
-        ((7.0, 0.0, 0.0), 1.0),
-    ],
-)
-def test_the_share_that_is_pushed_away(after: tuple[float, ...], expected: float) -> None:
-    side = 0.6 * np.sqrt(2.0) / 4.0
-    where = (after[0] * side, after[1] * side, after[2])
-    found = pushed_share(at(SQUARE, (0, 0, 0)), at(SQUARE, where), LAYOUT)
-    assert found[0] == pytest.approx(expected, abs=1e-9)

@@ -50,7 +50,7 @@ def test_an_update_stays_on_its_device(case: tuple[str, str], done: int | None) 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", [("ddpg", "paper"), ("ddpg", "several"), ("pairs", "slide")])
+@pytest.mark.parametrize("case", [("ddpg", "paper"), ("ddpg", "several"), ("pairs", "mlp")])
 def test_a_traced_update_stays_on_its_device(
     case: tuple[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -34,7 +34,6 @@ TARGETS = ("target_actor", "target_critic")
 MLP = {"kind": "mlp"}
 NEAR = {"strategy": "near", "position": 0.1, "angle": 0.5}
 TWINS = {"hindsight": [{"strategy": "final"}, NEAR], "pairs_per_transition": 4}
-SLIDE = {"backend": "physics", "motion": "slide"}
 # File of golden values, and name there -> setup.
 CASES: dict[tuple[str, str], Callable[[], Setup]] = {
     ("ddpg", "tangram"): lambda: setup(agent=SCENE),
@@ -43,7 +42,6 @@ CASES: dict[tuple[str, str], Callable[[], Setup]] = {
     ("ddpg", "several"): lambda: setup(PAIR, SCENE | {"gamma": 0.9}),
     ("pairs", "mha"): lambda: seven(TWINS),
     ("pairs", "mlp"): lambda: seven(TWINS, PERCEPTRON),
-    ("pairs", "slide"): lambda: seven(TWINS, PERCEPTRON, **SLIDE),
 }
 
 
@@ -239,7 +237,7 @@ def test_an_update_moves_each_network_and_drags_the_averages() -> None:
     assert learner.updates == after["updates"][0] == 1001
 
 
-@pytest.mark.parametrize("case", [("ddpg", "tangram"), ("pairs", "slide")])
+@pytest.mark.parametrize("case", [("ddpg", "tangram"), ("pairs", "mlp")])
 def test_the_actor_step_leaves_the_critic_alone(case: tuple[str, str]) -> None:
     """The critic's own step uses the critic's loss only: spoil the actor, the critic agrees."""
     made = CASES[case]()

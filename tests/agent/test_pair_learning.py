@@ -11,7 +11,7 @@ import torch
 from tangram_agent.learner import Learner
 from tangram_agent.pairs import Pairs
 from tangram_agent.policy import Policy
-from tangram_agent.relabelling import ContactBatch, PairBatch, SceneBatch
+from tangram_agent.relabelling import PairBatch, SceneBatch
 from tangram_agent.setup import Setup
 from tangram_agent.types import Transitions
 from tangram_sim.batch import BatchedEnv
@@ -33,11 +33,9 @@ pytestmark = pytest.mark.fast
 TWINS = [{"strategy": "final"}, {"strategy": "near", "position": 0.1, "angle": 0.5}]
 AGENT = {"hindsight": TWINS, "pairs_per_transition": 4}
 UPDATES = 120
-SLIDE = {"backend": "physics", "motion": "slide"}
 CASES: dict[str, dict[str, Any]] = {
     "mha": {"agent": AGENT},
     "mlp": {"agent": AGENT, "net": PERCEPTRON},
-    "slide": {"agent": AGENT, "net": PERCEPTRON, **SLIDE},
 }
 
 
@@ -55,7 +53,7 @@ def test_the_losses_by_hand(case: str) -> None:
     batch = learner.prepared(transitions(made, 8, 0), np.random.default_rng(0))
     assert isinstance(batch, PairBatch)
     t = {name: torch.from_numpy(np.asarray(c, np.float32)) for name, c in vars(batch).items()}
-    for name in {"token", "piece", "other"} & t.keys():
+    for name in ("token", "piece"):
         t[name] = t[name].long()
     steps, own, still = learner.steps(batch), learner.acting, torch.zeros(32, 3)
 
@@ -73,35 +71,6 @@ def test_the_losses_by_hand(case: str) -> None:
     gain, penalty = learner.actor_loss(steps)
     assert gain.item() == pytest.approx(-own.critic(start, velocity).mean().item(), rel=1e-5)
     assert penalty.item() == pytest.approx(torch.relu(raw.abs() - 1.0).square().mean().item())
-    assert isinstance(batch, ContactBatch) == made.contacts
-    if isinstance(batch, ContactBatch):
-        meeting = replace(
-            pairs_of("before"),
-            goal=t["other_pose"],
-            goal_flipped=t["other_flipped"],
-            piece=t["other"],
-            covered=torch.zeros(32),
-        )
-        pushed = own.critic.pushed(meeting, t["after"])
-        expected = (pushed - t["pushed"]).square().mean().item()
-        steps = learner.steps(batch)
-        assert steps.meeting is not None
-        assert learner.push_loss(steps.meeting).item() == pytest.approx(expected, rel=1e-6)
-
-
-@pytest.mark.parametrize(("case", "moves"), [("mlp", {"head"}), ("slide", {"head", "push_head"})])
-def test_the_critic_learns_what_is_pushed_where_tokens_push(case: str, moves: set[str]) -> None:
-    made = seven(**CASES[case])
-    learner = Learner(made, 0)
-    before = learner.state()
-    updated(learner, made)
-    after = learner.state()
-    found = {
-        name.split(".")[1]
-        for name in after
-        if name.startswith("critic.") and not np.array_equal(before[name], after[name])
-    }
-    assert found == moves
 
 
 def test_with_several_tokens_nothing_is_bootstrapped() -> None:

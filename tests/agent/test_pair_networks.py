@@ -1,6 +1,5 @@
 """Actor and critic of pairs: what turning and mirroring a scene does to them."""
 
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -24,12 +23,11 @@ pytestmark = pytest.mark.fast
 
 LAYOUT = seven().layout
 NETS = {"mha": SMALL, "mlp": PERCEPTRON}
-SLIDE = {"backend": "physics", "motion": "slide"}
 PARALLELOGRAM = 6
 
 
-def networks(kind: str, contacts: bool = True, seed: int = 0, **agent: Any) -> Networks:
-    made = Networks(seven(agent, NETS[kind], **(SLIDE if contacts else {})))
+def networks(kind: str, seed: int = 0, **agent: Any) -> Networks:
+    made = Networks(seven(agent, NETS[kind]))
     initialise(made, torch.Generator().manual_seed(seed))
     return made.requires_grad_(False)
 
@@ -68,8 +66,6 @@ def test_proposals_turn_with_the_scene(kind: str) -> None:
     assert near.float().mean() > 0.9
     np.testing.assert_allclose(turned[near], as_tensor(moved(pose.numpy()))[near], atol=1e-4)
     np.testing.assert_allclose(value_of(made, image), value_of(made, plain), atol=1e-5)
-    pushed = [made.critic.pushed(one, to) for one, to in ((plain, pose), (image, turned))]
-    np.testing.assert_allclose(pushed[0][near], pushed[1][near], atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", NETS)
@@ -113,28 +109,6 @@ def test_the_critic_knows_how_much_is_covered_and_which_side_it_is(kind: str) ->
     changed = (value - flipped).abs() > 0.0
     # Only a parallelogram has two sides.
     assert changed.tolist() == (pairs.piece == PARALLELOGRAM).tolist()
-
-
-@pytest.mark.parametrize("kind", NETS)
-def test_what_is_pushed_depends_on_where_the_token_slides(kind: str) -> None:
-    pairs = random_pairs(LAYOUT, 0)
-    here, there = pairs.pose, pairs.pose + 0.1
-    made = networks(kind)
-    assert (made.critic.pushed(pairs, here) - made.critic.pushed(pairs, there)).abs().min() > 0.0
-    alone = networks(kind, contacts=False)
-    assert not alone.critic.pushed(pairs, there).any()
-    own = dict(alone.named_parameters())
-    more = set(dict(made.named_parameters())) - set(own)
-    assert {name.split(".")[1] for name in more} == {"push_head"}
-
-
-@pytest.mark.parametrize(("token", "most"), [(0, math.pi), (5, math.pi / 4), (6, math.pi / 2)])
-def test_a_turn_is_no_longer_than_symmetry_needs(token: int, most: float) -> None:
-    own = {"token": torch.full((49,), token), "flipped": torch.zeros(49)}
-    made, pairs = networks("mlp"), replace(random_pairs(LAYOUT, 0), **own)
-    outputs = made.actor.head(pairs)
-    expected = torch.atan2(outputs[:, 3], outputs[:, 2]) * most / math.pi
-    np.testing.assert_allclose(made.actor(pairs)[0][:, 2] * math.pi, expected, atol=1e-6)
 
 
 # Option -> whether actor and critic stay the same.

@@ -1,14 +1,13 @@
 """Pairs out of transitions: which goals they have, and that their labels are exact."""
 
 from dataclasses import replace
-from itertools import permutations
 from typing import Any
 
 import numpy as np
 import pytest
 
 from tangram_agent.coverage import Lying, covered_share, covering, newly_covered
-from tangram_agent.relabelling import PairBatch, make_pairs, with_contacts
+from tangram_agent.relabelling import PairBatch, make_pairs
 from tangram_agent.types import Transitions
 from tangram_sim.actions import chosen_tokens
 from tangram_sim.layout import Layout
@@ -152,31 +151,6 @@ def test_the_same_generator_gives_the_same_pairs_and_the_transitions_stay() -> N
     assert not np.array_equal(one.goal, other.goal)
     for name, column in BATCH.arrays.items():
         np.testing.assert_array_equal(column, before[name])
-
-
-def test_contacts_name_another_token_and_what_it_lost() -> None:
-    """Every square is pushed along x by so many tenths of its side as its number says."""
-    made = setup({"shapes": ["square"] * 4, "scale": 1.0}, {"pairs_per_transition": PAIRS})
-    layout, side = made.layout, np.sqrt(2.0) / 4.0
-    before = np.column_stack([np.arange(4.0), np.zeros(4), np.full(4, 0.2)])
-    way = 0.1 * side * np.arange(4)[:, None] * (np.cos(0.2), np.sin(0.2))
-    after = before + np.column_stack([way, np.zeros(4)])
-    drawn = transitions(made, COUNT)
-    batch = replace(
-        drawn,
-        state=np.tile(layout.corners(before), (COUNT, 1, 1)).astype(np.float32),
-        next_state=np.tile(layout.corners(after), (COUNT, 1, 1)).astype(np.float32),
-    )
-    pairs = make_pairs(batch, made, np.random.default_rng(0))
-    found = with_contacts(pairs, batch, layout, np.random.default_rng(1))
-    assert (found.other != found.token).all()
-    met = set(zip(found.token.tolist(), found.other.tolist(), strict=True))
-    assert met == set(permutations(range(4), 2))
-    np.testing.assert_allclose(found.pushed, found.other / 10.0, atol=1e-5)
-    np.testing.assert_allclose(found.other_pose, before[found.other], atol=1e-6)
-    assert not found.other_flipped.any()
-    for name, column in vars(pairs).items():
-        assert vars(found)[name] is column
 
 
 def test_a_quarter_of_the_pairs_is_asked_from_where_the_action_ended() -> None:

@@ -31,7 +31,6 @@ from tests.agent.pair_scenes import (
 pytestmark = pytest.mark.fast
 
 COUNT = 6
-SLIDE = {"backend": "physics", "motion": "slide"}
 
 
 def scenes(made: Setup, count: int = COUNT, seed: int = 0) -> tuple[np.ndarray, ...]:
@@ -50,11 +49,9 @@ def random_networks(made: Setup, seed: int = 0) -> Networks:
     return networks.requires_grad_(False)
 
 
-def perfect(
-    made: Setup, pushes: np.ndarray | None = None, likes: np.ndarray | None = None
-) -> Planner:
+def perfect(made: Setup) -> Planner:
     graph = PairGraph(made.layout, made.sim.arena, made.agent)
-    networks = PerfectNetworks(PerfectCritic(made.layout, pushes, likes), graph)
+    networks = PerfectNetworks(PerfectCritic(made.layout), graph)
     return Planner(cast("Networks", networks), made)
 
 
@@ -124,10 +121,9 @@ def test_the_best_of_all_is_played(
         np.testing.assert_allclose(choice.velocity[row], way.clip(-1.0, 1.0), atol=1e-5)
 
 
-@pytest.mark.parametrize("sim", [{}, {"allow_flip": True}, SLIDE])
+@pytest.mark.parametrize("sim", [{}, {"allow_flip": True}])
 def test_a_choice_does_not_depend_on_the_others_of_the_batch(sim: dict[str, Any]) -> None:
-    pushes = {"push_weight": 0.5} if sim == SLIDE else {}
-    made = seven({"reapply": 1, "refine_steps": 2} | pushes, **sim)
+    made = seven({"reapply": 1, "refine_steps": 2}, **sim)
     chooser = Planner(random_networks(made), made)
     corners, placed, goals = scenes(made, COUNT)
     placed[3] = True
@@ -252,53 +248,3 @@ def test_without_flips_no_token_is_turned_over() -> None:
     corners, placed, goals = scenes(made, 20)
     placed[:] = [True] * 6 + [False]
     assert not perfect(made).choose(corners, placed, goals).flip.any()
-
-
-# Tokens that push each other
-
-
-LIKES = np.array([1.0, 1.0, 0.9])  # of tokens that cover as much, the second
-GOALS, STARTS = ((0, 0), (0.5, 0), (0.6, 0.6)), ((0, 0), (-0.5, 0), (-0.8, -0.8))
-
-
-def named(pushes: dict[tuple[int, int], float], first: Any = (0, 0), **settings: Any) -> int:
-    """Which of two squares is played while the first one lies somewhere and is placed."""
-    agent = {"push_weight": settings.pop("weight")} if "weight" in settings else {}
-    made = setup({"shapes": ["square"] * 3, "scale": 0.8}, agent, PERCEPTRON, **settings)
-    table = np.zeros((3, 3))
-    for (token, other), share in pushes.items():
-        table[token, other] = share
-    corners, goals = (
-        made.layout.corners(np.array([(*centre, 0.0) for centre in centres]))[None]
-        for centres in ((first, *STARTS[1:]), GOALS)
-    )
-    placed = np.array([[True, False, False]])
-    return int(perfect(made, table, LIKES).choose(corners, placed, goals).token[0])
-
-
-HARMFUL = {(1, 0): 0.9}
-HARDLY = (-0.9 * 0.8 * 2**0.5 / 4, 0)  # on a tenth of its piece
-
-
-@pytest.mark.parametrize(
-    ("pushes", "first", "weight", "expected"),
-    [
-        (HARMFUL, (0, 0), 1.0, 2),  # what is placed well would be pushed away
-        (HARMFUL, (0, 0), 0.0, 2),
-        ({(1, 2): 0.9, (2, 1): 0.9}, (0, 0), 1.0, 1),  # what is still to come may be pushed
-        ({(1, 2): 0.9, (2, 1): 0.9}, (0, 0), 0.0, 1),
-        (HARMFUL, (-0.8, 0.8), 1.0, 1),  # and what lies beside the target
-        (HARMFUL, HARDLY, 1.0, 1),  # which costs a tenth of what it would
-        ({(2, 1): 0.8}, (0, 0), 0.0, 1),
-        ({(2, 1): 0.8}, (0, 0), 1.0, 2),  # what lies in the way of others comes after them
-    ],
-)
-def test_a_token_is_played_where_it_pushes_none_off_the_target(
-    pushes: dict[tuple[int, int], float], first: Any, weight: float, expected: int
-) -> None:
-    assert named(pushes, first, weight=weight, **SLIDE) == expected
-
-
-def test_where_tokens_are_lifted_nothing_is_pushed() -> None:
-    """Not what would speak against token 1, now and later."""
-    assert named({(1, 0): 1.0, (2, 1): 1.0}) == 1

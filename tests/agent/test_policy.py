@@ -380,16 +380,6 @@ def test_settings_that_a_trained_run_cannot_play_with_are_refused(
         run_of(seven({}, PERCEPTRON)).with_settings({section: {name: value}})
 
 
-@pytest.mark.parametrize(
-    ("was", "now", "learned"), [("lift", "slide", "never learned"), ("slide", "lift", "learned")]
-)
-def test_what_tokens_push_away_is_learned_or_not(was: str, now: str, learned: str) -> None:
-    run = run_of(seven({}, PERCEPTRON, backend="physics", motion=was))
-    trained = f"sim.motion={now} does not fit .*trained with sim.motion={was} and {learned} what"
-    with pytest.raises(ConfigError, match=f"{trained} tokens push away: leave it out, or train"):
-        run.with_settings({"sim": {"motion": now}})
-
-
 def test_settings_of_the_world_are_those_that_are_played_in() -> None:
     run = run_of(seven({}, PERCEPTRON))
     other = run.with_settings({"sim": {"allow_flip": True, "corner_noise": 0.01}})

@@ -153,17 +153,6 @@ def test_sizes_follow_from_tokens_and_actions(
 
 
 @pytest.mark.parametrize(
-    ("shapes", "motion", "contacts"),
-    [(["square"] * 2, "lift", False), (["square"] * 2, "slide", True)],
-)
-def test_tokens_push_each_other_where_several_slide(
-    shapes: list[str], motion: str, contacts: bool
-) -> None:
-    config = changed("tokens", shapes=shapes) | {"sim": {"motion": motion}}
-    assert make_setup(config).contacts == contacts
-
-
-@pytest.mark.parametrize(
     ("name", "value", "reason"),
     [
         ("port", 65536, "service.port must be between 0 and 65535, got 65536"),
@@ -216,11 +205,9 @@ REWARD = {"credit": "reward"}
         (SEVERAL, {"reward": {"name": "pose"}}, "set agent.credit=reward, which learns what"),
         (SEVERAL, {"agent": {"gamma": 0.9}}, "agent.gamma=0.9 .*readout=token, which values the"),
         (SEVERAL, {"agent": REWARD, "reward": {"name": "pose"}}, "reward.name=pose is no sum over"),
-        (SEVERAL, {"agent": REWARD, "sim": {"motion": "slide"}}, "set sim.motion=lift, or agent"),
         (SEVERAL, {"agent": REWARD | {"afterstate": False}}, "agent.credit=reward changes nothing"),
         (ONE, {"agent": REWARD}, "agent.credit=reward changes nothing with one token"),
         (SEVERAL, {"agent": {"hindsight": FUTURE}}, "strategy=future changes nothing"),
-        (SEVERAL, {"agent": {"push_weight": 0.5}}, "agent.push_weight=0.5 .* sim.motion=slide"),
         (SEVERAL, {"agent": {"readout": "token", "order": "size"}}, "agent.order=size changes"),
         (ONE, {"agent": {"order": "size"}}, "agent.order=size changes nothing with one token"),
         (ONE, {"agent": {"pairs_per_transition": 2}}, "changes nothing with one token"),
@@ -259,7 +246,6 @@ def test_what_would_change_nothing_is_refused(
     [
         (SEVERAL, {"reward": {"name": "dense"}, "agent": {"readout": "token"}}),
         (SEVERAL, {"agent": {"readout": "token", "gamma": 0.9, "hindsight": FUTURE}}),
-        (SEVERAL, {"agent": {"push_weight": 0.5}, "sim": {"motion": "slide"}}),
         (SEVERAL, {"agent": {"order": "size", "reapply": 0, "pairs_per_transition": 2}}),
         (ONE, {"reward": {"name": "dense"}, "agent": {"gamma": 0.9, "polyak": 0.9}}),
         (ONE, {"reward": {"name": "pose"}, "agent": {"reapply": 0}}),
