@@ -23,30 +23,20 @@ examples:
 """
 RATES = {
     "sim": "the simulation, also where tokens are seen in pictures, against a bare PyBullet loop",
-    "acting": "the policy in batches, against one at a time",
     "wire": "worker to master, against bare ROUTER-DEALER sockets",
-    "replay": "the replay buffer, against numpy alone",
-    "learner": "updates, against a plain per-head attention and Stable-Baselines3",
+    "learner": "updates, compiled or not, against Stable-Baselines3",
     "train": "a whole training, against Stable-Baselines3 (minutes=)",
-    "soon": "whole trainings that play well, from the command to their scores (seeds=)",
-    "peers": "piece by piece, against Stable-Baselines3",
     "scaling": "more workers, and 64 synthetic ones",
-    "growth": "what grows with tokens, replay and width, and how",
     "gpu": "updates on a GPU, against single operations there and one core",
-    "profile": "where an update's and an episode's time goes",
 }
 TRIALS = {
     "chaos": ("random faults over a real training", 20.0),
     "attack": ("every attack that is known, on trainings that run; what held", None),
     "fuzz": ("mutated messages against decoder and master", None),
-    "pixels": ("DDPG on pixels, no tokens looked for: how far it gets", 60.0),
     "silhouettes": ("silhouettes filled with seven tans: how many, how fast", None),
-    "nearest": ("drawings that seven tans do not fill: how near they come", None),
-    "outlines": ("outlines filled by an agent, and by who learned nothing", None),
     "seeing": ("tokens found in pictures: how exactly, how surely, how fast", None),
     "soak": ("memory and open files of a long training, drawn", 60.0),
 }
-OUTLINES = "runs/outlines"
 # Option -> its bounds.
 BOUNDS = {
     "runs": (1, 10_000),
@@ -67,14 +57,14 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     kinds = parser.add_subparsers(dest="kind", required=True)
-    for name, text in {"all": "everything below down to growth", **RATES}.items():
+    for name, text in {"all": "everything below down to scaling", **RATES}.items():
         one = kinds.add_parser(name, help=text, description=text)
         one.add_argument("--runs", type=int, default=5, help="measurements of each rate (5)")
         one.add_argument("--out", type=Path, help="JSON file of the results")
         if name in ("all", "train"):
             limit = "that a rival's training may last (5)"
             one.add_argument("--minutes", type=float, default=5.0, help=limit)
-        if name in ("all", "train", "soon"):
+        if name in ("all", "train"):
             one.add_argument("--seeds", type=int, default=3, help="trainings of each (3)")
     for name, (text, minutes) in TRIALS.items():
         one = kinds.add_parser(name, help=text, description=text)
@@ -83,10 +73,8 @@ def _parser() -> argparse.ArgumentParser:
         elif name == "fuzz":
             one.add_argument("--messages", type=int, default=1_000_000, help="for the decoder")
             one.add_argument("--live", type=int, default=100_000, help="for a live master")
-        elif name in ("nearest", "outlines", "seeing", "silhouettes"):
+        elif name in ("seeing", "silhouettes"):
             one.add_argument("--scenes", type=int, default=200, help="of each kind (200)")
-        if name == "outlines":
-            one.add_argument("--run_dir", default=OUTLINES, help=f"of agent=outline ({OUTLINES})")
         if name != "attack":
             one.add_argument("--seed", type=int, default=0, help="of everything random (0)")
         one.add_argument("--out", type=Path, help="JSON file of the results")
@@ -128,20 +116,13 @@ def _run(arguments: argparse.Namespace) -> int:
     from tangram_lab.benchmarks.attack import run_attack
     from tangram_lab.benchmarks.chaos import run_chaos
     from tangram_lab.benchmarks.fuzz_wire import run_fuzz
-    from tangram_lab.benchmarks.nearest import run_nearest
-    from tangram_lab.benchmarks.outlines import run_outlines
-    from tangram_lab.benchmarks.pixels import run_pixels
     from tangram_lab.benchmarks.seeing import run_seeing
     from tangram_lab.benchmarks.silhouettes import run_silhouettes
     from tangram_lab.benchmarks.soak import run_soak
 
-    of_scenes = {"nearest": run_nearest, "seeing": run_seeing, "silhouettes": run_silhouettes}
+    of_scenes = {"seeing": run_seeing, "silhouettes": run_silhouettes}
     if arguments.kind in of_scenes:
         return of_scenes[arguments.kind](arguments.scenes, arguments.seed, arguments.out)
-    if arguments.kind == "outlines":
-        return run_outlines(arguments.run_dir, arguments.scenes, arguments.seed, arguments.out)
-    if arguments.kind == "pixels":
-        return run_pixels(arguments.minutes, arguments.seed, arguments.out)
     with tempfile.TemporaryDirectory(prefix="tangram-") as folder:
         if arguments.kind == "attack":
             return run_attack(arguments.out, Path(folder))

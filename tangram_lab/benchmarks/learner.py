@@ -1,36 +1,25 @@
-"""Updates: against a plain per-head attention, and against Stable-Baselines3's on the same MLP."""
+"""Updates: compiled, on a GPU, and against Stable-Baselines3's on the same perceptron."""
 
-import copy
-import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
 
-from tangram_agent.attention import EncoderLayer
-from tangram_agent.learner import Learner, critic_target
-from tangram_agent.motion import Motions
+from tangram_agent.learner import Learner
 from tangram_agent.setup import Setup
-from tangram_agent.steps import Steps
+from tangram_agent.types import Transitions
 from tangram_lab.benchmarks.measure import Bound, Row, Work, compare, compared, rates
-from tangram_lab.benchmarks.peers import compare_updates
-from tangram_lab.benchmarks.replay import random_transitions
-from tangram_lab.benchmarks.setups import preset, several, with_agent
+from tangram_lab.benchmarks.sb3 import Rival, label, make_model
+from tangram_lab.benchmarks.setups import preset, random_transitions, several, with_agent, with_sim
 from tangram_sim.errors import ConfigError
 
 BATCHES = (64, 256)
 
 
 def measure_learner(runs: int) -> list[Row]:
-    """Updates per second on one core."""
-    rows = _compiled(runs)
-    bound = Bound(least=3.0)
-    for name, setup in (("paper's MHA", preset("paper")), ("ours", preset()), ("7", several(7))):
-        for size in BATCHES if name != "7" else BATCHES[:1]:
-            case = f"{name if name != '7' else 'ours, 7 tokens'}, batch {size}"
-            rows.append(_against_plain(case, with_agent(setup, batch_size=size), runs, bound))
-    return rows + compare_updates("learner", runs)
+    """Updates per second on one core: compiled, and beside Stable-Baselines3's."""
+    return _compiled(runs) + _beside_theirs(runs)
 
 
 def _compiled(runs: int) -> list[Row]:
@@ -78,11 +67,6 @@ def gpu_cases() -> dict[str, Setup]:
     }
 
 
-def _against_plain(case: str, setup: Setup, runs: int, bound: Bound) -> Row:
-    theirs = ("a plain per-head attention", updates(setup, PlainLearner(setup, 0)))
-    return compare(("learner", case, "updates/s"), updates(setup), theirs, runs, bound)
-
-
 def updates(setup: Setup, learner: Learner | None = None) -> Work:
     """Updates on one batch; of the project's own learner if none is given."""
     learner = learner or Learner(setup, 0)
@@ -96,82 +80,58 @@ def updates(setup: Setup, learner: Learner | None = None) -> Work:
     return work
 
 
-# A plain per-head attention, and a learner with it
+# Against Stable-Baselines3
 
 
-GAMMA = 0.99
+BATCH, FILLED, STEPS = 256, 4096, 16
 
 
-class HeadByHead(nn.Module):
-    """Eqs. 9-12, one small matrix for each head's keys, queries and values."""
+def _beside_theirs(runs: int) -> list[Row]:
+    """Of the same perceptron: ours leaves out target networks that decide nothing.
 
-    def __init__(self, width: int, heads: int, scale: float) -> None:
-        super().__init__()
-        key_width = width // heads
-        self.scale = scale
-        self.query, self.key, self.value = (
-            nn.ModuleList(nn.Linear(width, key_width, bias=False) for _ in range(heads))
-            for _ in range(3)
-        )
-        self.combine = nn.ModuleList(nn.Linear(key_width, width, bias=False) for _ in range(heads))
-
-    def forward(self, nodes: Tensor, edges: Tensor) -> Tensor:
-        """Messages (B, N, W) from nodes (B, N, W) along edges (N, N)."""
-        message = torch.zeros_like(nodes)
-        every: Any = zip(self.query, self.key, self.value, self.combine, strict=True)
-        for query, key, value, combine in every:
-            scores = query(nodes) @ key(nodes).transpose(1, 2) * self.scale
-            weights = torch.softmax(scores.masked_fill(~edges, -math.inf), dim=-1)
-            message = message + combine(weights @ value(nodes))
-        return message
-
-
-class PlainLearner(Learner):
-    """Head by head, with both target networks asked and moved in every update."""
-
-    def __init__(self, setup: Setup, seed: int) -> None:
-        super().__init__(setup, seed)
-        for part in (self.actor, self.critic, self.acting):
-            for layer in part.modules():
-                if isinstance(layer, EncoderLayer):
-                    _take_apart(layer)
-        self.target_actor, self.target_critic = map(copy.deepcopy, (self.actor, self.critic))
-        self._lists = self.parameter_lists()
-        rates = {"actor": self.config.actor_lr, "critic": self.config.critic_lr}
-        self._plain = {
-            part: torch.optim.Adam(getattr(self, part).parameters(), lr=rate, foreach=False)
-            for part, rate in rates.items()
-        }
-
-    def update(
-        self, batch: Any, progress: float = 0.0, motions: Motions | None = None
-    ) -> dict[str, float]:
-        """See `Learner`; the targets follow parameter by parameter."""
-        losses = super().update(batch, progress, motions)
-        pairs = ((self.target_actor, self.actor), (self.target_critic, self.critic))
-        with torch.no_grad():
-            for target, source in pairs:
-                for old, new in zip(target.parameters(), source.parameters(), strict=True):
-                    old.mul_(self.config.polyak).add_(new, alpha=1.0 - self.config.polyak)
-        return losses
-
-    def _step(self, part: str, loss: Tensor, _: float | Tensor) -> Tensor:
-        optimiser = self._plain[part]
-        optimiser.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        norm = nn.utils.clip_grad_norm_(getattr(self, part).parameters(), math.inf)
-        optimiser.step()
-        return norm
-
-    def _target(self, steps: Steps) -> Tensor:
-        follow = steps.follow or steps.view
-        velocity, _ = self.target_actor(follow)
-        value = self.target_critic(follow, velocity)
-        return critic_target(steps.reward, steps.done, value, GAMMA)
+    Once every transition is final, and once every second one: theirs always asks its targets.
+    """
+    model = make_model(Rival(envs=STEPS, batch=BATCH, starts=FILLED))
+    model.learn(FILLED)  # fills its replay with random play
+    setup, rows = with_agent(preset("mlp"), batch_size=BATCH), []
+    final, theirs = random_transitions(setup, BATCH), model.replay_buffer.sample(BATCH)
+    half = np.arange(BATCH, dtype=np.uint8) % 2
+    dones = theirs.dones.clone()
+    dones[::2] = 0.0
+    cases: list[tuple[str, Setup, Transitions, Any]] = [
+        ("every transition final", setup, final, theirs),
+        (
+            "half of them",
+            with_sim(setup, actions_per_token=2),
+            replace(final, done=half),
+            theirs._replace(dones=dones),
+        ),
+    ]
+    for compiled in (False, True):
+        for name, made, batch, drawn in cases:
+            how = f"{name}, compiled" if compiled else name
+            labels = "learner", f"perceptron [64, 64], batch {BATCH}, {how}", "updates/s"
+            bound = Bound(least=2.0 if compiled else 1.5) if name.startswith("every") else None
+            ours = _on_batch(Learner(made, 0, compiled=compiled), batch)
+            rows.append(compare(labels, ours, (label(), _theirs(model, drawn)), runs, bound))
+    return rows
 
 
-def _take_apart(layer: EncoderLayer) -> None:
-    joint = layer.attention
-    width = joint.combine.in_features
-    apart: Any = HeadByHead(width, joint.heads, joint.scale)
-    layer.attention = apart
+def _on_batch(learner: Learner, batch: Transitions) -> Work:
+    def update() -> float:
+        learner.update(batch)
+        return 1.0
+
+    return update
+
+
+def _theirs(model: Any, batch: Any) -> Work:
+    """As many updates in one call as environments step at a time, as in a training."""
+
+    def update() -> float:
+        drawn, model.replay_buffer.sample = model.replay_buffer.sample, lambda *_, **__: batch
+        model.train(gradient_steps=STEPS, batch_size=BATCH)
+        model.replay_buffer.sample = drawn
+        return float(STEPS)
+
+    return update

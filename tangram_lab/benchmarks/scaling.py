@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 import zmq
 
-from tangram_lab.benchmarks.costs import measure_costs
 from tangram_lab.benchmarks.measure import Bound, Row, compared, single
 from tangram_lab.benchmarks.players import players, read_ages
 from tangram_lab.benchmarks.setups import played, preset
@@ -120,11 +119,11 @@ class Run:
 
 
 def measure_scaling(runs: int) -> list[Row]:
-    """Real workers, synthetic ones, and what a message costs the master."""
+    """Real workers, and synthetic ones."""
     with tempfile.TemporaryDirectory(prefix="tangram-") as folder:
         real = list(_real(runs, Path(folder)))
         fed = [row for count in SYNTHETIC for row in _synthetic(runs, Path(folder), count)]
-        return [*real, *fed, *measure_costs(runs)]
+        return [*real, *fed]
 
 
 def _real(runs: int, folder: Path) -> Iterator[Row]:

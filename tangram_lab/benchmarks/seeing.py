@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from tangram_lab.benchmarks.measure import show, write
-from tangram_lab.benchmarks.square_seeing import square_rows
 from tangram_sim.arrays import Bools, Floats, Pixels
 from tangram_sim.config import SimConfig
 from tangram_sim.connected import sample_piles
@@ -24,7 +23,6 @@ from tangram_sim.world import World, make_world
 from tangram_vision.seeing import Seen, see
 
 SCALE, ARENA = 0.6, 2.0  # as in the game
-SINGLE = 0.4 * 2.0**1.5  # of `tokens=square`: side 0.4
 SEVEN = (
     *("large_triangle", "large_triangle", "medium_triangle", "small_triangle"),
     *("small_triangle", "square", "parallelogram"),
@@ -89,10 +87,7 @@ def run_seeing(scenes: int, seed: int, out: Path | None) -> int:
     show("tokens found in the engine's pictures, one core", rows)
     disturbed = _disturbed(scenes, seed)
     show("one token in grey pictures of 128 px that are disturbed", disturbed)
-    square = [row for camera in CAMERAS for row in _square(camera, scenes, seed)]
-    show("a square by simpler ways: what one exact action to where it is seen scores", square)
-    found = {"rows": rows, "disturbed": disturbed, "square": square}
-    write(out, {"scenes": scenes, "seed": seed, **found})
+    write(out, {"scenes": scenes, "seed": seed, "rows": rows, "disturbed": disturbed})
     return 0
 
 
@@ -130,12 +125,6 @@ def _disturbed(scenes: int, seed: int) -> list[dict[str, Any]]:
             parts.append(_looks(layout, sim, _anywhere(layout, sim, 0.0), each, seed))
         rows.append(_joined(parts).row(what, "128 grey"))
     return rows
-
-
-def _square(camera: tuple[int, str], scenes: int, seed: int) -> Iterator[dict[str, Any]]:
-    pixels, picture = camera
-    sim = SimConfig(arena=ARENA, pixels=pixels, picture=picture)
-    return square_rows(SINGLE, sim, scenes, seed)
 
 
 def _joined(parts: Sequence[Looks]) -> Looks:

@@ -11,7 +11,7 @@ import yaml
 
 import conf
 from tangram_agent.setup import SECTIONS, Setup, make_setup
-from tangram_agent.types import Episodes, Past
+from tangram_agent.types import Episodes, Past, Transitions
 from tangram_sim.arrays import Bools, Floats, Singles
 from tangram_sim.assembly import COUNTS
 from tangram_sim.batch import BatchedEnv
@@ -61,7 +61,7 @@ def with_agent(setup: Setup, **values: Any) -> Setup:
     return replace(setup, agent=replace(setup.agent, **values))
 
 
-# Episodes that were played with them
+# Episodes and transitions of them
 
 
 ENVS = 32
@@ -84,3 +84,20 @@ def played(setup: Setup, count: int) -> Episodes:
     with closing(BatchedEnv(setup.layout, sim, setup.reward, ENVS)) as env:
         rollout = Rollout(env, 0, "player", 0, 0)
         return rollout.play(choose, count // ENVS)
+
+
+def random_transitions(setup: Setup, count: int) -> Transitions:
+    """Transitions of the right shapes; nothing moves as it would."""
+    rng, layout = np.random.default_rng(0), setup.layout
+    corners, tokens = layout.corner_count, layout.tokens
+    state, after, goal = rng.uniform(-1, 1, (3, count, corners, 2)).astype(np.float32)
+    return Transitions(
+        state=state,
+        placed=np.zeros((count, tokens), np.uint8),
+        action=rng.uniform(-1, 1, (count, setup.action_size)).astype(np.float32),
+        reward=rng.uniform(-1, 1, count).astype(np.float32),
+        next_state=after,
+        next_placed=np.ones((count, tokens), np.uint8),
+        done=np.ones(count, np.uint8),
+        goal=goal,
+    )

@@ -2,7 +2,7 @@
 
 Figures are the library's test split at eight angles, the 13 convex ones, and random gluings; the
 search knows none of them. A figure counts as filled where tokens and figure have an IoU of 0.95, on
-exact polygons. Some are given to general optimisation, too, for as long, and photographed aslant.
+exact polygons.
 """
 
 import time
@@ -17,11 +17,8 @@ import numpy as np
 from rich.progress import track
 from shapely import Polygon
 
-from tangram_lab.benchmarks.covering import Attempt, Board
 from tangram_lab.benchmarks.measure import show, write
-from tangram_lab.benchmarks.rivals import RIVALS, Rival
 from tangram_lab.benchmarks.seeing import ARENA, SCALE, SEVEN
-from tangram_lab.benchmarks.tilted import tilted_rows
 from tangram_sim.areas import Area, grown, overlap
 from tangram_sim.arrays import Complex
 from tangram_sim.config import SimConfig
@@ -37,18 +34,8 @@ from tangram_vision.silhouettes import SOLVED, Filled, Method, covered, fill_out
 from worker.methods import method_of
 
 SECONDS = 5.0  # of processor time for each figure
-RIVAL_SECONDS = SECONDS  # the same for rivals
 TURNS = 8
-EACH = 13  # figures of each kind for what takes seconds each: as many as there are convex ones
-BY_SIZE = "beam, largest first"  # the beam of who learned nothing
-# Pixels, picture, and who fills what it shows; see `worker.methods`.
-CAMERAS = (
-    (256, "binary", ("together",)),
-    (128, "grey", ("together", "beam", BY_SIZE, "agent")),
-    (128, "binary", ("together",)),
-    (64, "grey", ("together", "solver", "beam", BY_SIZE)),
-    (64, "binary", ("together", "solver")),
-)
+CAMERAS = tuple(product((256, 128, 64), ("grey", "binary")))
 _SEAM = 2e-3  # arena units: gaps between pieces that are drawn by hand
 
 
@@ -66,25 +53,17 @@ def run_silhouettes(scenes: int, seed: int, out: Path | None) -> int:
     figures = list(figures_of(layout, scenes, seed))
     outlined = list(_outlined(layout, figures))
     rows = [row_of("exact outline", layout, figures, outlined)]
-    for pixels, picture, players in CAMERAS:
+    method = method_of("together", layout)
+    for pixels, picture in CAMERAS:
+        title = f"{pixels} px {picture}"
         sim = SimConfig(arena=ARENA, pixels=pixels, picture=picture)
-        for name in players:
-            method = Method(search=False) if name == BY_SIZE else method_of(name, layout)
-            title = f"{pixels} px {picture}, {name}"
-            found = list(pictured(layout, figures, sim, method, title))
-            rows.append(row_of(title, layout, figures, found))
+        rows.append(
+            row_of(title, layout, figures, list(_pictured(layout, figures, sim, method, title)))
+        )
     show("silhouettes filled with seven tans, one core", rows)
     convex = [_convex_row(layout)]
     show("convex figures of the area of seven tans", convex)
-    drawn = _drawn(figures, seed)
-    rivals = list(
-        _rival_rows(layout, [figures[i] for i in drawn], [outlined[i] for i in drawn], seed)
-    )
-    show("exact outlines by general optimisation, a step is a state that is evaluated", rivals)
-    tilted = list(tilted_rows(layout, [area_of(layout, figures[i]) for i in drawn], seed))
-    show("pictures taken aslant, 512 px grey", tilted)
-    tables = {"rows": rows, "convex": convex, "rivals": rivals, "tilted": tilted}
-    write(out, {"scenes": scenes, "seed": seed, **tables})
+    write(out, {"scenes": scenes, "seed": seed, "rows": rows, "convex": convex})
     return 0
 
 
@@ -181,44 +160,7 @@ def _outlined(layout: Layout, figures: list[Shape]) -> Iterator[Filled]:
         yield replace(filled, seconds=time.process_time() - begin)
 
 
-def _drawn(figures: list[Shape], seed: int) -> list[int]:
-    """Numbers of so many figures of each kind, by chance."""
-    generator, kinds = np.random.default_rng(seed), np.array([one.kind for one in figures])
-    return [
-        int(number)
-        for kind in dict.fromkeys(kinds.tolist())
-        for number in generator.permutation(np.flatnonzero(kinds == kind))[:EACH]
-    ]
-
-
-def _rival_rows(
-    layout: Layout, figures: list[Shape], searched: list[Filled], seed: int
-) -> Iterator[dict[str, Any]]:
-    """A row for the search, and one for each rival on the same figures."""
-    yield _rival_row("the search", layout, figures, searched)
-    for name, rival in RIVALS.items():
-        found = [
-            _attempted(rival, layout, figure, [seed, number])
-            for number, figure in enumerate(track(figures, name))
-        ]
-        yield _rival_row(name, layout, figures, found)
-
-
-def _attempted(rival: Rival, layout: Layout, figure: Shape, seed: list[int]) -> Filled:
-    board = Board(area_of(layout, figure), layout)
-    return rival(Attempt(board, RIVAL_SECONDS), np.random.default_rng(seed))
-
-
-def _rival_row(
-    name: str, layout: Layout, figures: list[Shape], found: list[Filled]
-) -> dict[str, Any]:
-    row = row_of(name, layout, figures, found)
-    seconds = sum(one.seconds for one in found)
-    rate = sum(one.nodes for one in found) / seconds
-    return {"by": row.pop("silhouette"), **row, "steps in a s": rate}
-
-
-def pictured(
+def _pictured(
     layout: Layout, figures: list[Shape], sim: SimConfig, method: Method, title: str
 ) -> Iterator[Filled]:
     """What the camera shows of figures, filled one after the other."""

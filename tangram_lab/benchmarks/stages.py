@@ -6,29 +6,18 @@ from collections.abc import Callable, Sequence
 import torch
 
 from tangram_agent.process import keep_memory
-from tangram_lab.benchmarks.acting import measure_acting
-from tangram_lab.benchmarks.growth import draw_growth, measure_growth
 from tangram_lab.benchmarks.learner import measure_gpu, measure_learner
 from tangram_lab.benchmarks.measure import Row, page, show, write
-from tangram_lab.benchmarks.peers import measure_peers
-from tangram_lab.benchmarks.profile import show_profile
-from tangram_lab.benchmarks.replay import measure_replay
 from tangram_lab.benchmarks.scaling import measure_scaling
 from tangram_lab.benchmarks.sim import measure_sim
-from tangram_lab.benchmarks.soon import measure_soon
 from tangram_lab.benchmarks.train import measure_train
 from tangram_lab.benchmarks.wire import measure_wire
 
 STAGES: dict[str, Callable[[argparse.Namespace], Sequence[Row]]] = {
     "sim": lambda given: measure_sim(given.runs),
-    "acting": lambda given: measure_acting(given.runs),
     "wire": lambda given: measure_wire(given.runs),
-    "replay": lambda given: measure_replay(given.runs),
     "learner": lambda given: measure_learner(given.runs),
-    "peers": lambda given: measure_peers(given.runs),
     "scaling": lambda given: measure_scaling(given.runs),
-    "growth": lambda given: measure_growth(given.runs),
-    "soon": lambda given: measure_soon(given.seeds),
     "train": lambda given: measure_train(given.seeds, given.minutes),
     "gpu": lambda given: measure_gpu(given.runs),
 }
@@ -37,13 +26,10 @@ STAGES: dict[str, Callable[[argparse.Namespace], Sequence[Row]]] = {
 def run_stages(given: argparse.Namespace) -> int:
     """Measure one stage or all; the exit status is 0 whatever was found.
 
-    With `out` the table goes into a Markdown file beside the JSON, and growth is drawn there.
+    With `out` the table goes into a Markdown file beside the JSON.
     """
     torch.set_num_threads(1)  # both as masters and workers do
     keep_memory()
-    if given.kind == "profile":
-        show_profile(given.out)
-        return 0
     names = [name for name in STAGES if name != "gpu"] if given.kind == "all" else [given.kind]
     rows = [row for name in names for row in STAGES[name](given)]
     title, cells = f"{given.kind}: medians, one thread each", [cells_of(row) for row in rows]
@@ -51,12 +37,9 @@ def run_stages(given: argparse.Namespace) -> int:
     missed = [f"{row.stage}: {row.case}" for row in rows if row.held is False]
     if missed:
         print("short of the target:", *missed, sep="\n  ")
-    grown = [row for row in rows if row.stage == "growth"]
     if given.out is not None:
         given.out.parent.mkdir(parents=True, exist_ok=True)
         given.out.with_suffix(".md").write_text(page(title, cells))
-        if grown:
-            draw_growth(grown, given.out.with_name("growth.png"))
     settings = {name: value for name, value in vars(given).items() if name != "out"}
     if given.kind == "gpu":
         settings["card"] = torch.cuda.get_device_name()

@@ -6,7 +6,6 @@ import shapely
 from PIL import Image, ImageDraw
 from shapely import Polygon
 
-from tangram_lab.benchmarks.tilted import photographed
 from tangram_sim.areas import Area, overlap
 from tangram_sim.arrays import Singles
 from tangram_sim.config import SimConfig
@@ -18,6 +17,7 @@ from tangram_vision.silhouette_pictures import fill_picture
 from tangram_vision.silhouettes import covered
 from tangram_vision.tilts import from_above, mapped
 from tests.sim.builders import SEVEN, layout_of
+from tests.vision.aslant import photographed
 
 pytestmark = pytest.mark.fast
 

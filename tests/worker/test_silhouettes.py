@@ -11,7 +11,6 @@ import shapely
 from PIL import Image, ImageDraw
 
 from tangram_agent.runs import load_run
-from tangram_lab.benchmarks.tilted import photographed
 from tangram_sim.errors import ConfigError
 from tangram_sim.puzzles import PACKAGED, load_puzzle
 from tangram_sim.rings import covered_area
@@ -19,6 +18,7 @@ from tangram_vision.silhouette_files import Silhouette, fill_silhouette
 from tests.agent.outlines import AGENT as FILLER
 from tests.agent.outlines import SIM as OUTLINES
 from tests.sim.builders import SEVEN
+from tests.vision.aslant import photographed
 from tests.worker.builders import write_run
 from worker.cli import with_absolute_paths
 from worker.config import PlayConfig
