@@ -168,26 +168,3 @@ def test_make_refuses_a_variable_that_it_would_drop(given: str, refused: bool) -
     assert (result.returncode != 0) == refused
     name = given.partition("=")[0]
     assert (f'make knows no {name}=...: settings go into ARGS="..."' in result.stderr) == refused
-
-
-def test_make_refuses_a_keep_that_is_neither_yes_nor_no() -> None:
-    result = run(["make", "--dry-run", "evidence", "KEEP=Yes"])
-    assert result.returncode != 0
-    assert "KEEP must be yes or no, got Yes" in result.stderr
-
-
-@pytest.mark.parametrize("keep", ["yes", "no"])
-def test_evidence_that_keeps_what_has_not_changed(keep: str) -> None:
-    commands = run(["make", "--dry-run", "evidence", f"KEEP={keep}"]).stdout
-    found = re.findall(r"run_dir=runs/evidence/(\w+) keep=docs/results/(\w+) ", commands)
-    there = [path.parent.name for path in (ROOT / "docs" / "results").glob("*/data.json")]
-    assert sorted(found) == (sorted(zip(there, there, strict=True)) if keep == "yes" else [])
-
-
-def test_the_evidence_has_every_experiment_and_each_in_one_study() -> None:
-    commands = run(["make", "--dry-run", "evidence"]).stdout
-    chosen = re.findall(r'"experiment=\[([^\]]*)\]" budget=laptop', commands)
-    every = sorted(path.stem for path in (ROOT / "conf" / "experiment").glob("*.yaml"))
-    assert sorted(name for names in chosen for name in names.split(",")) == every
-    studies = re.findall(r"tangram-report runs=runs/evidence/(\w+) out=docs/results/\1\n", commands)
-    assert len(studies) == len({*studies}) == len(chosen) + 1  # the paper at its own size
