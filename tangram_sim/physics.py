@@ -19,7 +19,6 @@ from tangram_sim.layout import Layout
 from tangram_sim.pictures import BACKGROUND, TOKEN_GRAY, averaged, taken_pixels
 from tangram_sim.prisms import ENGINE_ARENA, inset, prism, thickness
 from tangram_sim.shapes import Shape
-from tangram_sim.window import Window
 
 _HALF_HEIGHT = 0.01  # of a token as it is drawn
 # Of a token as it collides, where there are others: so tall that the shortest way out of another
@@ -303,12 +302,3 @@ class PhysicsWorld:
         # q and -q are one rotation: with cosine >= 0 the angle lies in (-pi, pi].
         half = math.atan2(sine, cosine) if cosine >= 0.0 else math.atan2(-sine, -cosine)
         return x, y, 2.0 * half
-
-
-def open_window(layout: Layout, arena: float, colours: Sequence[Sequence[float]]) -> Window:
-    """A window of the engine; see `Window`.
-
-    Raises:
-        TangramError: no display.
-    """
-    return Window(pybullet, layout, arena, colours)

@@ -5,7 +5,7 @@ from conf.commands import Plain
 
 
 def studio() -> int:
-    """tangram-studio: a page to play on and to watch from."""
+    """tangram-studio: a page to play on."""
     return entry("studio", _studio)
 
 

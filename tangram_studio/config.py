@@ -7,7 +7,7 @@ from tangram_sim.settings import Settings, setting
 
 @dataclass(frozen=True)
 class StudioConfig(Settings):
-    """A page to play on and to watch from (tangram-studio)."""
+    """A page to play on (tangram-studio)."""
 
     port: int = setting(
         8765, "where it listens, on this machine alone; 0 for any free port", low=0, high=65535

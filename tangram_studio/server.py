@@ -14,9 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import uvicorn
-from anyio import to_thread
 from starlette.applications import Starlette
-from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers, QueryParams
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, PlainTextResponse, RedirectResponse, Response
@@ -26,7 +24,6 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from tangram_sim.errors import ConfigError, TangramError
-from tangram_studio import watching
 from tangram_studio.config import StudioConfig
 from tangram_studio.filling import fill_file, tans
 from tangram_studio.jobs import Jobs
@@ -65,7 +62,6 @@ SHUT = 4403
 NO_BYTES = 1003
 UPLOADS = 8  # at once
 UPLOAD_S = 60.0  # that one may take to come
-WATCH_S = 10.0  # that a run may take to be read
 OPEN = 512  # connections at once
 HEAD_S = 10.0  # that the head of a request may take to come
 
@@ -291,33 +287,6 @@ async def _told(page: WebSocket, text: str) -> None:
         await page.send_text(text)
 
 
-async def _watch(request: Request) -> Response:
-    return await _answered(watching.view, request)
-
-
-async def _episodes(request: Request) -> Response:
-    return await _answered(watching.episodes_picture, request)
-
-
-async def _runs(_: Request) -> Response:
-    found = await run_in_threadpool(watching.recent_runs, Path("runs"))
-    return JSONResponse({"runs": found})
-
-
-async def _answered(task: Any, request: Request) -> Response:
-    try:
-        run = request.query_params.get("run", "")
-        reading = to_thread.run_sync(task, run, abandon_on_cancel=True)
-        found = await asyncio.wait_for(reading, WATCH_S)
-    except TimeoutError:
-        return _refused(f"it could not be read within {WATCH_S:g} s: is its disk there?", 400)
-    except TangramError as error:
-        return _refused(str(error), 400)
-    if isinstance(found, bytes):
-        return Response(found, media_type="image/png")
-    return JSONResponse(found)
-
-
 async def _file(request: Request) -> Response:
     name = request.path_params.get("name", "index.html")
     known = {one.name: one for one in STATIC.iterdir()}
@@ -337,9 +306,6 @@ def make_app(token: str, port: int) -> ASGIApp:
         Route("/", _file),
         Route("/api/figures", studio.figures),
         Route("/api/drop", studio.drop, methods=["POST"]),
-        Route("/api/runs", _runs),
-        Route("/api/watch", _watch),
-        Route("/api/episodes", _episodes),
         WebSocketRoute("/api/play", studio.play),
         Route("/{name}", _file),
     ]

@@ -110,11 +110,8 @@ def _play(settings: Plain) -> int:
 
     check_compare(settings.get("compare"))  # before a text is taken for a list of letters
     paths = with_absolute_paths(settings)
-    if settings["out"] == PlayConfig.out:
-        paths["out"] = PlayConfig.out  # not given: nothing to refuse beside live=true
     config = from_mapping(PlayConfig, with_changes(paths))
-    if not config.live:
-        check_writable("out", Path(config.out).absolute())
+    check_writable("out", Path(config.out).absolute())
     _check_drawings(config)
     setups = _check_played(config.run_dirs, config)
     if config.tokens is not None and config.run_dir is not None:
@@ -127,7 +124,7 @@ def _play(settings: Plain) -> int:
     if config.silhouette is not None:
         from worker.silhouettes import read_silhouette
 
-        given = (config.silhouette, setups[0], config.solutions, config.solve, config.attempt)
+        given = (config.silhouette, setups[0], config.solutions, config.solve, Path(config.out))
         filled = read_silhouette(*given)
     tell(f"loads and plays {', '.join(config.run_dirs)}")
 

@@ -245,9 +245,7 @@ class PlayConfig(Settings):
         "folder of the run, or an agent that comes with tangram-rl: pretrained/square",
         only={"compare": None},
     )
-    out: str = setting(
-        "play.gif", ".gif or .mp4 for an animation, .png for one picture", only={"live": False}
-    )
+    out: str = setting("play.gif", ".gif or .mp4 for an animation, .png for one picture")
     episodes: int = setting(
         12,
         "episodes shown side by side",
@@ -282,15 +280,11 @@ class PlayConfig(Settings):
         "draw so many different ways to fill the silhouette, if there are; the first is laid",
         low=1,
         high=MAX_SOLUTIONS,
-        only={"live": False},
         unless={"silhouette": None},
     )
     solve: str = setting(TOGETHER, SOLVE_HELP, choices=SOLVERS, unless={"silhouette": None})
     turns: int = setting(1, TURNS_HELP, low=1, high=MAX_TURNS, unless={"puzzle": None})
     skip_invalid: bool = setting(False, SKIP_HELP, unless={"puzzle": None})
-    live: bool = setting(
-        False, "play in a window instead of writing a file", only={"compare": None}
-    )
     changes: Changes = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -311,23 +305,16 @@ class PlayConfig(Settings):
             _refuse(self.changes, (*OF_TARGETS, "starts"), "puzzle", "leave puzzle out")
         if self.target is not None:
             _refuse(self.changes, OF_TARGETS, "target", "leave target out")
-            if not self.live:
-                _check_kept(self.out, "target", self.target)
+            _check_kept(self.out, "target", self.target)
         if self.silhouette is not None:
             _refuse(self.changes, (*OF_TARGETS, "starts"), "silhouette", "leave silhouette out")
-            if not self.live:
-                _check_kept(self.out, "silhouette", self.silhouette)
+            _check_kept(self.out, "silhouette", self.silhouette)
 
     @property
     def run_dirs(self) -> tuple[str, ...]:
         """The runs to show, one or several."""
         named = f"{PREFIX}/{self.tokens}" if self.tokens is not None else game_run()
         return self.compare or (self.run_dir or named,)
-
-    @property
-    def attempt(self) -> Path | None:
-        """Beside which file a silhouette that cannot be filled is drawn."""
-        return None if self.live else Path(self.out)
 
     def _check_one_of_both(self) -> None:
         if self.run_dir is not None:

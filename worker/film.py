@@ -1,12 +1,8 @@
 """Episodes of several tokens as a film: one token after the other is taken, carried and set down.
 
-The film is drawn picture by picture, or shown in a window.
-
 Legend: E episodes, T steps, K tokens, V corners.
 """
 
-import time
-from contextlib import closing
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,20 +13,14 @@ from tangram_agent.setup import Setup
 from tangram_sim.actions import chosen_tokens, flips, velocities
 from tangram_sim.arrays import Bools, Floats, Ints
 from tangram_sim.drawing import contact_sheet
-from tangram_sim.errors import ConfigError
 from tangram_sim.game_drawing import Held, captions, draw_game, tiles
 from tangram_sim.kinematics import wrap
 from tangram_sim.layout import Layout
-from tangram_sim.strokes import SILHOUETTE, colour_of
-from tangram_sim.window import Window
 from worker.rollout import Played
 
 FRAMES_PER_ACTION = 20
 MAX_FRAMES = 100  # of motion; more actions get fewer each
 WIDTH = 960  # pixels across a film, about
-FRAME_S = 0.04  # of a window
-PAUSE_S = 1.5  # before and after each scene in it
-CARRIED = 0.25  # height of a carried token in a window, half arenas
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,54 +171,3 @@ def _held(frame: Frame, episode: int) -> Held | None:
     if token < 0:
         return None
     return Held(token, frame.height, bool(frame.stopped[episode]))
-
-
-def show_live(show: Show) -> None:
-    """Play the episodes one after the other in a window, until the last ends or it is closed.
-
-    Raises:
-        TangramError: no display.
-        ConfigError: no engine to open a window.
-    """
-    try:
-        # Only here: other pictures need no engine.
-        from tangram_sim.physics import open_window  # noqa: PLC0415
-    except ModuleNotFoundError as error:
-        raise ConfigError(
-            f"live=true needs PyBullet ({error}): install pybullet, or leave live out"
-        ) from None
-    layout, played = show.setup.layout, show.played
-    colours = [_unit(colour_of(k)) for k in range(layout.tokens)]
-    frames = film(show.setup, played)
-    colours.append(_unit(SILHOUETTE))
-    with closing(open_window(layout, show.setup.sim.arena, colours)) as window:
-        for e in range(len(played.ends)):
-            if not window.is_open:
-                return
-            window.show_target(layout.poses(played.goals[e]), layout.flipped(played.goals[e]))
-            _play_scene(window, frames, e)
-
-
-def _play_scene(window: Window, frames: list[Frame], episode: int) -> None:
-    """One episode at its pace: a slow machine leaves frames out."""
-    _put(window, frames[0], episode)
-    time.sleep(PAUSE_S)
-    began = time.monotonic()
-    for i, frame in enumerate(frames):
-        early = began + i * FRAME_S - time.monotonic()
-        if not window.is_open:
-            return
-        if early > -FRAME_S or frame is frames[-1]:
-            _put(window, frame, episode)
-            time.sleep(max(early, 0.0))
-    time.sleep(PAUSE_S)
-
-
-def _put(window: Window, frame: Frame, episode: int) -> None:
-    held = np.arange(frame.poses.shape[1]) == frame.held[episode]
-    heights = np.where(held, CARRIED * frame.height, 0.0)
-    window.show(frame.poses[episode], frame.rolls[episode], heights)
-
-
-def _unit(colour: tuple[int, int, int]) -> tuple[float, ...]:
-    return tuple(channel / 255.0 for channel in colour)

@@ -24,7 +24,7 @@ from tangram_sim.kinematics import wrap
 from tangram_sim.layout import Layout
 from tangram_sim.settings import told
 from worker.config import MAX_SHOWN, PlayConfig, source_and_names
-from worker.film import WIDTH, Show, film_pictures, frames_per_action, show_live
+from worker.film import WIDTH, Show, film_pictures, frames_per_action
 from worker.metrics import SOLVED, assembled
 from worker.photographs import draw_photograph, read_photograph
 from worker.puzzles import find_figures, play_figures
@@ -61,14 +61,10 @@ def play_run(config: PlayConfig, silhouette: Shown | None = None) -> int:
     Raises:
         RunError: a folder or a checkpoint that is missing or corrupt, or `out` is not writable.
         ConfigError: puzzles that the run cannot play.
-        TangramError: `live` without a display.
     """
     torch.set_num_threads(1)
     (run_dir,) = config.run_dirs
     show = make_show(load_changed(run_dir, config.changes), config, silhouette)
-    if config.live:
-        show_live(show)
-        return 0
     save_picture(config.out, _frames(show, config.out))
     Console(highlight=False).print(f"{config.out}: {show.told()}", markup=False, soft_wrap=True)
     return 0
@@ -85,7 +81,7 @@ def make_show(run: Run, config: PlayConfig, silhouette: Shown | None = None) -> 
     if config.target is not None:
         return photograph_show(run, config, config.target)
     if config.silhouette is not None:
-        given = (config.silhouette, run.setup, config.solutions, config.solve, config.attempt)
+        given = (config.silhouette, run.setup, config.solutions, config.solve, Path(config.out))
         return silhouette_show(run, config, silhouette or read_silhouette(*given))
     titles = [f"target {i + 1}" for i in range(config.episodes)]
     return Show(run.setup, play_episodes(run, config), titles, "episode")

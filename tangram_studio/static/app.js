@@ -2,7 +2,6 @@
 
 import { Board, make, pathOf, tray } from "./board.js";
 import { Pen } from "./draw.js";
-import { startWatch } from "./watch.js";
 
 const $ = (id) => document.getElementById(id);
 const LIMIT = 10e6; // bytes of a file
@@ -72,7 +71,7 @@ class Studio {
       return;
     }
     // Whoever is refused at the door sees no more than a failed connection: ask in plain HTTP.
-    const door = await fetch("api/runs").catch(() => null);
+    const door = await fetch("api/figures").catch(() => null);
     if (code === SHUT || door?.status === 403) {
       this.banner("tangram-studio was started anew: open the address that it printed now.");
       return;
@@ -384,27 +383,6 @@ class Studio {
     });
   }
 }
-
-const tabs = ["play", "watch"];
-const show = (name) => {
-  for (const one of tabs) {
-    $(one).hidden = one !== name;
-    $(`tab-${one}`).setAttribute("aria-selected", one === name);
-    $(`tab-${one}`).tabIndex = one === name ? 0 : -1;
-  }
-  history.replaceState(null, "", `#${name}`);
-};
-for (const one of tabs) {
-  $(`tab-${one}`).addEventListener("click", () => show(one));
-  $(`tab-${one}`).addEventListener("keydown", (event) => {
-    if (event.key !== "ArrowLeft" && event.key !== "ArrowRight") return;
-    const other = tabs[1 - tabs.indexOf(one)];
-    show(other);
-    $(`tab-${other}`).focus();
-  });
-}
-startWatch($("watch"));
-if (location.hash === "#watch") show("watch");
 
 const begin = async () => {
   const answer = await fetch("api/figures").catch(() => null);

@@ -20,7 +20,6 @@ from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 from tangram_sim.assembly import PuzzleRules
 from tangram_sim.puzzles import read_puzzles
-from tests.cluster.processes import BIN, ended, started
 from tests.cluster.test_studio import SVG, Running, studio
 from tests.conftest import NO_BROWSER
 
@@ -563,13 +562,7 @@ def test_what_is_laid_goes_on_while_another_way_is_looked_at(page: Page) -> None
 
 
 @pytest.mark.check
-def test_tabs_and_figures_are_reached_by_keys(page: Page) -> None:
-    page.locator("#tab-play").focus()
-    page.keyboard.press("ArrowRight")
-    expect(page.locator("#watch")).to_be_visible()
-    expect(page.locator("#tab-watch")).to_be_focused()
-    page.keyboard.press("ArrowLeft")
-    expect(page.locator("#play")).to_be_visible()
+def test_figures_are_reached_by_keys(page: Page) -> None:
     page.locator("[data-figure=cat]").focus()
     page.keyboard.press("Enter")
     moving(page)
@@ -627,51 +620,6 @@ def test_a_drawing_in_which_tans_leave_room_is_still_told(page: Page, tmp_path: 
         "Seven tans do not fill it. The nearest figure that was found"
     )
     moving(page)
-
-
-# Watching
-
-
-def watched(page: Page, run: Path | str) -> None:
-    page.locator("#tab-watch").click()
-    page.locator("#watch input").first.fill(str(run))
-    page.keyboard.press("Enter")
-
-
-@pytest.mark.check
-def test_runs_are_watched_while_they_train_and_side_by_side(page: Page, tmp_path: Path) -> None:
-    settings = ("agent=quick", "sim=kinematic", "max_updates=100000", "service.eval_seconds=1")
-    old = ended(
-        BIN / "tangram-train", "agent=quick", "sim=kinematic", "max_updates=40", "run_dir=old",
-        cwd=tmp_path,
-    )  # fmt: skip
-    assert old.returncode == 0, old.stderr
-    with started("tangram-train", *settings, "run_dir=new", cwd=tmp_path) as process:
-        while not (tmp_path / "new/connection.json").exists():
-            assert process.poll() is None
-            time.sleep(0.1)
-        watched(page, tmp_path / "new")
-        expect(page.locator("#watch")).to_contain_text("worker 0")
-        page.get_by_role("button", name=re.compile("compare", re.IGNORECASE)).click()
-        second = page.locator("#watch input").nth(1)
-        second.fill(str(tmp_path / "old"))
-        second.press("Enter")
-        expect(page.locator("#watch")).to_contain_text("max_updates=40")
-        expect(page.locator("#watch svg[role=img]")).to_be_visible()
-        page.wait_for_timeout(3_000)
-        shot(page, "watch")
-        process.terminate()
-        process.wait(60)
-    expect(page.locator("#watch")).to_contain_text("SIGTERM")
-
-
-@pytest.mark.check
-@pytest.mark.parametrize(
-    ("run", "why"), [("nowhere", "there is no nowhere"), ("/etc/passwd", "is no connection file")]
-)
-def test_a_wrong_run_has_its_words(page: Page, run: str, why: str) -> None:
-    watched(page, run)
-    expect(page.locator("#watch")).to_contain_text(why)
 
 
 # In motion

@@ -65,7 +65,6 @@ WRONG = {
         ({"turns": 2}, "turns=2 changes nothing with puzzle=null"),
         ({"skip_invalid": True}, "skip_invalid=true changes nothing with puzzle=null"),
         ({"puzzle": ("cat",), "episodes": 5}, "episodes=5 changes nothing with puzzle=[cat]"),
-        ({"live": True, "out": "a.gif"}, "out=a.gif changes nothing with live=true: leave it at"),
         *[
             (
                 {"puzzle": ("cat",), "changes": {"sim": {name: 1}}},
@@ -87,7 +86,6 @@ WRONG = {
             for name, value, shown in (
                 ("tokens", "square", "square"),
                 ("puzzle", ("cat",), "[cat]"),
-                ("live", True, "true"),
             )
         ],
     ],

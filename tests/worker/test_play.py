@@ -10,18 +10,15 @@ import pytest
 from PIL import Image
 
 import worker.film as film_module
-from conf.cli import composed
 from tangram_agent.filler import Filler, Step
-from tangram_agent.process import VARIABLE
 from tangram_agent.runs import load_changed, load_run
 from tangram_agent.setup import Setup
 from tangram_sim.arrays import Floats
-from tangram_sim.errors import ConfigError, RunError, TangramError
+from tangram_sim.errors import ConfigError, RunError
 from tangram_sim.geometry import outlines, pairs_overlap
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.worker.builders import write_run
 from tests.worker.puzzle_files import GAME, SIM, drawn, write_puzzles
-from worker.cli import _play
 from worker.config import PlayConfig
 from worker.film import Show, film_pictures
 from worker.play import (
@@ -258,76 +255,6 @@ def test_a_film_has_a_picture_for_each_frame(
     pictures = film_pictures(show)
     assert len(pictures) == 1 + 14 + 1
     assert all((np.asarray(a) != np.asarray(b)).any() for a, b in pairwise(pictures))
-
-
-class StandIn:
-    """A window that notes what it is shown."""
-
-    def __init__(self, closes_after: int) -> None:
-        self.shown: list[np.ndarray] = []
-        self.targets, self.left, self.closed = 0, closes_after, False
-
-    @property
-    def is_open(self) -> bool:
-        return len(self.shown) < self.left
-
-    def show(self, poses: np.ndarray, rolls: np.ndarray, heights: np.ndarray) -> None:
-        assert (poses.shape, rolls.shape, heights.shape) == ((7, 3), (7,), (7,))
-        self.shown.append(heights)
-
-    def show_target(self, poses: np.ndarray, flipped: np.ndarray) -> None:
-        self.targets += 1
-
-    def close(self) -> None:
-        self.closed = True
-
-
-@pytest.mark.parametrize(("left", "targets"), [(10**6, 2), (5, 1)])
-def test_a_window_shows_one_puzzle_after_the_other_until_it_is_closed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left: int, targets: int
-) -> None:
-    window, clock = StandIn(left), iter(range(10**6))
-    for name in ("FRAME_S", "PAUSE_S"):
-        monkeypatch.setattr(film_module, name, 0.0)
-    monkeypatch.setattr(film_module.time, "monotonic", lambda: -next(clock))
-    monkeypatch.setattr(film_module.time, "sleep", lambda _: None)
-    monkeypatch.setattr("tangram_sim.physics.open_window", lambda *_: window)
-    assert play_run(of_game(tmp_path, puzzle=("cat", "dog"), live=True)) == 0
-    assert (window.targets, window.closed) == (targets, True)
-    assert len(window.shown) == min(left, 2 * (1 + 1 + 7 * 6 + 1))
-    assert max(heights.max() for heights in window.shown) <= film_module.CARRIED
-
-
-@pytest.mark.parametrize("display", [None, ":399"])
-def test_no_window_without_a_display(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, display: str | None
-) -> None:
-    """The engine would end the process."""
-    monkeypatch.setattr("pybullet.connect", lambda *_, **__: pytest.fail("a window is opened"))
-    monkeypatch.delenv("DISPLAY", raising=False)
-    if display is not None:
-        monkeypatch.setenv("DISPLAY", display)
-    with pytest.raises(TangramError, match="live=true needs a display .*write a film"):
-        play_run(of_game(tmp_path, puzzle=("cat",), live=True))
-
-
-def test_a_window_needs_no_out(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    shown: list[PlayConfig] = []
-    monkeypatch.setattr("worker.play.play_run", lambda config, _: shown.append(config) or 0)
-    given = ["run_dir=pretrained/square", "live=true"]
-    assert _play(composed("play", given)) == 0
-    assert [config.live for config in shown] == [True]
-    with pytest.raises(ConfigError, match="out=.*a.gif changes nothing with live=true"):
-        _play(composed("play", [*given, "out=a.gif"]))
-    assert capsys.readouterr().err == ""
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
-    assert _play(composed("play", given)) == 0
-    assert capsys.readouterr().err == "loads and plays pretrained/square\n"
-    monkeypatch.setenv(VARIABLE, "3")  # a child's
-    assert _play(composed("play", given)) == 0
-    assert capsys.readouterr().err == ""
 
 
 # Runs side by side

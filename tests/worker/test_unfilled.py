@@ -136,11 +136,6 @@ def test_an_attempt_that_cannot_be_written_leaves_the_line(
     )
 
 
-def test_a_window_draws_no_attempt(tmp_path: Path) -> None:
-    assert PlayConfig(silhouette="cat", live=True).attempt is None
-    assert PlayConfig(silhouette="cat", out="a/b.gif").attempt == Path("a/b.gif")
-
-
 @pytest.mark.parametrize("fails", [False, True])
 def test_the_command_searches_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fails: bool
@@ -193,7 +188,6 @@ def test_all_dissections_are_shown_and_the_first_is_played(
     ("settings", "message"),
     [
         ({"solutions": 5}, "^solutions=5 changes nothing with silhouette=null: "),
-        ({"solutions": 5, "silhouette": "cat", "live": True}, "changes nothing with live=true"),
         ({"solutions": 0, "silhouette": "cat"}, "solutions must be between 1 and 20, got 0"),
         ({"solutions": 21, "silhouette": "cat"}, "solutions must be between 1 and 20, got 21"),
     ],
