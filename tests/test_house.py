@@ -53,11 +53,6 @@ def lint_imports(folder: Path) -> subprocess.CompletedProcess[str]:
     return run([str(tool), "--no-cache", "--no-logo"], cwd=folder)
 
 
-def test_import_contracts_hold() -> None:
-    result = lint_imports(ROOT)
-    assert result.returncode == 0, result.stdout + result.stderr
-
-
 def test_import_contracts_catch_every_wrong_arrow(tmp_path: Path) -> None:
     for name in PACKAGES:
         shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("*.pyc"))

@@ -24,7 +24,7 @@ pytestmark = pytest.mark.fast
 LAYOUT = layout_of(*SEVEN, scale=0.6)
 LEANING = layout_of("parallelogram")
 LONG = 1000.0  # seconds: more than all steps take
-STEPS = 150
+STEPS = 60
 
 
 @pytest.fixture

@@ -108,17 +108,13 @@ def test_a_beam_ends_within_a_depth() -> None:
 
 
 def test_a_wider_beam_fills_more() -> None:
+    """A beam of one fills none of these."""
+    methods = [Method(search=False, width=width) for width in (1, 12)]
     solved = [
-        sum(
-            fill_outline(gluing(seed), LAYOUT, 60.0, method=Method(search=False, width=width))[
-                0
-            ].solved
-            for seed in range(12)
-        )
-        for width in (1, 12)
+        [fill_outline(gluing(seed), LAYOUT, 60.0, method=method)[0].solved for seed in (1, 6, 7)]
+        for method in methods
     ]
-    assert solved[0] < solved[1]
-    assert solved[1] >= 10
+    assert sum(solved[0]) + 1 < sum(solved[1])
 
 
 def test_who_filled_it_is_told() -> None:

@@ -63,7 +63,7 @@ def test_a_picture_of_something_else_is_not_filled() -> None:
     y, x = np.mgrid[:128, :128] - 63.5
     radius = 128 / ARENA * np.sqrt(0.36 / np.pi)
     disc = np.clip(radius - np.hypot(x, y) + 0.5, 0.0, 1.0).astype(np.float32)
-    filled = fill_picture(disc, LAYOUT, ARENA, 3.0)
+    filled = fill_picture(disc, LAYOUT, ARENA, 0.5)
     assert filled.found is None or filled.iou < 0.95
 
 

@@ -179,7 +179,10 @@ def test_a_file_is_named_from_where_the_command_was_started(
         assert with_absolute_paths({"silhouette": given})["silhouette"] == meant
 
 
-def test_a_picture_of_something_else_is_refused(tmp_path: Path) -> None:
+def test_a_picture_of_something_else_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("worker.silhouettes.SECONDS", 0.5)
     canvas = Image.new("L", (200, 200), 235)
     ImageDraw.Draw(canvas).ellipse((40, 40, 160, 160), 30)
     canvas.save(tmp_path / "disc.png")

@@ -67,7 +67,7 @@ def test_a_picture_that_is_not_filled_tells_the_best(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A disc: no tans come near to it."""
-    monkeypatch.setattr("worker.silhouettes.SECONDS", 2.0)
+    monkeypatch.setattr("worker.silhouettes.SECONDS", 0.5)
     canvas = Image.new("L", (400, 400), 235)
     ImageDraw.Draw(canvas).ellipse([(100, 100), (300, 300)], 30)
     canvas.save(tmp_path / "it.png")
