@@ -3,6 +3,7 @@
 A comment on the line before a block tells it, and is not seen where the page is read:
 
     <!-- run: quick -->             runs in the gate, pasted as it stands into an empty folder
+    <!-- run: check -->             the same by make check: it takes many seconds
     <!-- run: on request -->        the same, but only with python -m tests.blocks
     <!-- run: on request, in a clone -->    in one clone of this repository, in the page's order
     <!-- run: on request, in terminals -->  each line beside the ones before; the last when they end
@@ -45,7 +46,7 @@ FENCED = re.compile(
     re.MULTILINE,
 )
 TAG = re.compile(
-    r"run: (?P<when>quick|on request)(?:, in (?P<place>a clone|terminals))?"
+    r"run: (?P<when>quick|check|on request)(?:, in (?P<place>a clone|terminals))?"
     r"(?:, with (?P<run>runs/\w+))?|run: never, \S.*|file: (?P<file>[\w.]+)"
 )
 SHORT = ("max_updates=800", "service.eval_seconds=3")  # a training of some 25 s

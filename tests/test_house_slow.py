@@ -157,10 +157,8 @@ def try_install(
 @pytest.mark.parametrize(
     ("extras", "changed", "told"),
     [
-        ("", None, "installing into"),
         ("more", None, "installing into"),
         ("", "pip", "DO NOT MATCH THE HASHES"),
-        ("", "setuptools", "DO NOT MATCH THE HASHES"),
         ("", "run", "DO NOT MATCH THE HASHES"),
         ("more", "extra", "DO NOT MATCH THE HASHES"),
         ("more", "nothing", "must have their versions pinned"),

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-import torch._inductor
 
 from tangram_agent.filling_learner import FillLearner
 from tangram_agent.filling_replay import FillReplay
@@ -50,11 +49,11 @@ def test_an_update_stays_on_its_device(case: tuple[str, str], done: int | None) 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", [("ddpg", "paper"), ("ddpg", "several"), ("pairs", "mlp")])
+@pytest.mark.parametrize("case", [("ddpg", "paper"), ("pairs", "mlp")])
 def test_a_traced_update_stays_on_its_device(
     case: tuple[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(torch._inductor, "standalone_compile", lambda graph, *_, **__: graph)
+    monkeypatch.setattr("torch._inductor.standalone_compile", lambda graph, *_, **__: graph)
     made = CASES[case]()
     learner = Learner(made, 0, META, compiled=True)
     numbers = learner._step_all(steps_of(learner, made, None), learner.rates(0.5))

@@ -25,7 +25,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "tangram-train",
         f"run_dir={folder}",
         f"max_updates={UPDATES}",
-        "service.eval_seconds=3",
+        "service.eval_seconds=10",
         cwd=folder.parent,
     )
     return folder

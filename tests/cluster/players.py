@@ -107,6 +107,8 @@ def until(players: list[Player], done: Callable[[], Any]) -> None:
         assert time.monotonic() < end, [player.acknowledged for player in players]
         for player in players:
             player.step()
+        if not players:
+            time.sleep(0.02)  # whoever is waited for needs the processor
 
 
 def finish(players: list[Player], process: "subprocess.Popen[bytes]") -> None:

@@ -1,4 +1,4 @@
-"""The quick blocks of README and docs, pasted as they stand; every block says whether it runs."""
+"""Blocks of README and docs, pasted as they stand; every block says whether it runs."""
 
 import re
 from pathlib import Path
@@ -11,16 +11,21 @@ from tests.blocks import Block, all_blocks, blocks_of, prepare, run
 
 pytestmark = pytest.mark.slow
 
-QUICK = [
-    # Those that need the session's training run where it is.
-    pytest.param(block, id=block.name, marks=[pytest.mark.xdist_group("trained")] * needs)
+
+def _marks(block: Block) -> list[pytest.MarkDecorator]:
+    """Those that need the session's training run where it is."""
+    trained = [pytest.mark.xdist_group("trained")] * (block.says("run") is not None)
+    return trained + [pytest.mark.check] * (block.says("when") == "check")
+
+
+PASTED = [
+    pytest.param(block, id=block.name, marks=_marks(block))
     for block in all_blocks()
-    if block.says("when") == "quick"
-    for needs in (block.says("run") is not None,)
+    if block.says("when") in ("quick", "check")
 ]
 
 
-@pytest.mark.parametrize("block", QUICK)
+@pytest.mark.parametrize("block", PASTED)
 def test_it_runs_without_a_warning(
     block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
@@ -60,6 +65,7 @@ def test_every_block_says_what_becomes_of_it() -> None:
         ("", "text", False),
         ("<!-- run: quick -->", "bash", False),
         ("<!-- run: quick -->\n", "bash", True),  # not on the line before
+        ("<!-- run: check -->", "bash", False),
         ("<!-- run: often -->", "bash", True),
         ("<!-- run: never -->", "bash", True),  # and why?
         ("<!-- run: never, needs Docker -->", "bash", False),

@@ -16,7 +16,7 @@ from worker.status import ask_status
 
 pytestmark = pytest.mark.cluster
 
-UPDATES = 400  # a quick machine makes a hundred between two looks at them
+UPDATES = 150
 STEP = (
     "service.mode=lockstep",
     "workers=2",

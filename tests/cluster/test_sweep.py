@@ -14,6 +14,7 @@ SWEEP = ("--multirun", "hydra/launcher=submitit_local", "hydra.launcher.timeout_
 TINY = ("sim=kinematic", "max_updates=2", "service.eval_episodes=4", "agent.learning_starts=32")
 
 
+@pytest.mark.check
 def test_each_job_of_a_sweep_leaves_a_run_of_its_own(tmp_path: Path) -> None:
     seeds = ("seed=3,4", "run_dir=sweep", "agent.batch_size=8")
     run("tangram-train", *SWEEP, *seeds, *TINY, cwd=tmp_path)

@@ -23,7 +23,7 @@ from tests.cluster.processes import (
 # The session's training runs inside the first of these tests.
 pytestmark = pytest.mark.slow
 
-QUICK = ("sim=kinematic", "service.eval_seconds=1")
+QUICK = ("sim=kinematic", "service.eval_seconds=1000", "service.eval_episodes=4")
 
 
 def test_a_short_training_learns_position_and_angle_and_leaves_a_whole_run(trained: Path) -> None:
@@ -97,7 +97,7 @@ def test_a_reward_of_ones_own_is_named_by_every_process_and_command(tmp_path: Pa
         "def near(achieved, desired, layout): return -abs(achieved - desired).mean(axis=(1, 2))"
     )
     code = f"reward.name={tmp_path}/own.py:near"
-    arguments = ("run_dir=own", "max_updates=3", "reward.name=own.py:near", *QUICK)
+    arguments = ("run_dir=own", "max_updates=3", "reward.name=own.py:near", "net=mlp", *QUICK)
     assert code in run("tangram-train", *arguments, cwd=tmp_path)  # with what shows it at play
     assert json.loads((tmp_path / "own/result.json").read_text())["updates"] == 3
     assert f"add {code} if" in refused("tangram-eval", "run_dir=own", "episodes=1", cwd=tmp_path)
@@ -131,17 +131,17 @@ def test_a_run_begins_with_anothers_networks_once_and_is_extended(trained: Path)
     """The folder is named as seen from where the command is given, and shapes may differ."""
     folder = trained.parent / "warm"
     arguments = (f"run_dir={folder}", *QUICK, "tokens=large_triangle", f"warm_start={trained.name}")
-    told = run("tangram-train", *arguments, "max_updates=40", cwd=trained.parent)
+    told = run("tangram-train", *arguments, "max_updates=10", cwd=trained.parent)
     updates = json.loads((trained / "result.json").read_text())["updates"]
     assert f"begins with the networks of {trained} after {updates} updates" in told
     first = json.loads((folder / "result.json").read_text())
     # Up to service.lag_updates of them are owed already; the rest needs new episodes.
-    more = ("max_updates=200", "resume=auto", "service.log_format=json")
+    more = ("max_updates=40", "service.lag_updates=8", "resume=auto", "service.log_format=json")
     printed = run("tangram-train", *arguments, *more, cwd=trained.parent)
     assert "begins with the networks" not in printed
-    assert "goes on after 40 updates" in printed
+    assert "goes on after 10 updates" in printed
     second = json.loads((folder / "result.json").read_text())
-    assert (first["updates"], second["updates"]) == (40, 200)
+    assert (first["updates"], second["updates"]) == (10, 40)
     lines = [json.loads(line) for line in printed.splitlines()]
     assert {"note", "status", "result"} <= {line["event"] for line in lines}
     assert lines[-1].items() >= second.items()
