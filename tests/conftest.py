@@ -34,6 +34,14 @@ TIERS = ("fast", "cluster", "slow", "slurm")
 # Fixtures that take many seconds and are made once for all tests that look at what they made.
 SHARED = ("trained", "study", "straight", "made")
 
+# Whoever takes longest comes first, so that no worker of xdist is left with it at the end. Seconds on
+# two cores where nothing else ran; the first of a group stands for all of it.
+SECONDS = {
+    "cluster/test_lockstep.py::test_the_same_numbers_come_twice": 40,
+    "cluster/test_training.py::test_a_short_training_learns": 30,
+    "cluster/test_faults.py::test_a_worker_that_is_killed_while_it_plays": 20,
+}
+
 NO_BROWSER = "no chromium"  # begins the reason of those that are skipped
 
 
@@ -42,7 +50,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Refuse a test without its tier: it would run nowhere or everywhere, by accident.
 
     Tests that share a fixture go to one worker of --dist=loadgroup, all others wherever one is
-    free. What is marked `check` runs only where -m names it, whatever else is asked for.
+    free, the longest first. What is marked `check` runs only where -m names it, whatever else is
+    asked for.
     """
     for item in items:
         for name in SHARED:
@@ -57,6 +66,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if "check" not in config.option.markexpr:
         config.hook.pytest_deselected(items=[item for item in items if is_long(item)])
         items[:] = [item for item in items if not is_long(item)]
+    items.sort(key=seconds, reverse=True)
+
+
+def seconds(item: pytest.Item) -> int:
+    """From the table."""
+    return next((taken for name, taken in SECONDS.items() if name in item.nodeid), 0)
 
 
 def is_long(item: pytest.Item) -> bool:

@@ -406,11 +406,17 @@ def golden(made: Setup) -> dict[str, float]:
     return result
 
 
+# Processors add in different orders. A sum of n products is off by n roundings at most: of 64 x 64
+# where a layer meets its gradient, in each of two updates; and of 64 where it all but cancels out.
+ROUNDING = float(np.finfo(np.float32).eps)
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_golden_values_of_two_updates(case: tuple[str, str]) -> None:
     """Rewrite them with `python -m tests.agent.test_learner` when a change is meant."""
     expected = json.loads((GOLDEN / f"{case[0]}.json").read_text())[case[1]]
-    assert golden(CASES[case]()) == pytest.approx(expected, rel=1e-3, abs=1e-5)
+    near = pytest.approx(expected, rel=2 * 64 * 64 * ROUNDING, abs=64 * ROUNDING)
+    assert golden(CASES[case]()) == near
 
 
 if __name__ == "__main__":

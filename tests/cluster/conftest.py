@@ -6,7 +6,7 @@ import pytest
 
 from tests.cluster.processes import LIMIT_S, run
 
-UPDATES = 800
+UPDATES = 400
 
 
 @pytest.hookimpl(tryfirst=True)

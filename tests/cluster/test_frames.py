@@ -11,8 +11,6 @@ import pytest
 import zmq
 
 from tangram_agent.messages import Alive, Heartbeat, Hello, Welcome, decode_from_master
-from tangram_sim.errors import TangramError
-from tests.agent.no_reward import NOTHING
 from tests.cluster.mangler import KINDS, Mangler
 from tests.cluster.players import (
     Player,
@@ -25,7 +23,6 @@ from tests.cluster.players import (
     tags_in_replay,
     until,
 )
-from tests.cluster.processes import started
 from worker.status import ask_status
 
 pytestmark = pytest.mark.cluster
@@ -113,33 +110,3 @@ def named(context: "zmq.Context[zmq.Socket[bytes]]", folder: Path) -> Iterator[A
 def heard(end: Any) -> object:
     assert end.poll(20_000)
     return decode_from_master(end.recv_multipart(), None)
-
-
-def test_strangers_with_stale_or_foreign_keys_are_turned_away(tmp_path: Path) -> None:
-    """Two encrypted runs; a file with the address of the one and the keys of the other."""
-    one, other = tmp_path / "one", tmp_path / "other"
-    for path in (one, other):
-        path.mkdir()
-    with master(one, "service.bind=127.0.0.1") as process:
-        with master(other, "service.bind=127.0.0.1") as second:
-            keys = json.loads((other / "connection.json").read_text())
-            finish([], second)
-        mine = json.loads((one / "connection.json").read_text())
-        stale = tmp_path / "stale.json"
-        stale.write_text(json.dumps(mine | {"keys": keys["keys"]}))
-        with players(setup_of(one), one) as made:
-            more_acknowledged(made, 3)
-            line = f"wrong or stale connection file: what answers at {mine['endpoint']} does not"
-            said = tmp_path / "said"
-            given = f"connect={stale}", f"reward.name={NOTHING}"
-            with started("tangram-worker", *given, cwd=tmp_path, err=said) as who:
-                until(made, lambda: line in said.read_text())
-                assert who.poll() is None  # it waits for the file to become right
-                stale.write_text(json.dumps(mine))
-                until(made, lambda: "joined run" in said.read_text())
-            with zmq.Context() as context, pytest.raises(TangramError, match="wants keys"):
-                ask_status(mine["endpoint"], context)
-            more_acknowledged(made, 3)
-            assert numbers(one)["hub/refused_keys"] > 0
-            finish(made, process)
-        assert sum(tags_in_replay(one).values()) >= 3 * made[0].acknowledged

