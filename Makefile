@@ -5,7 +5,7 @@ BIN := .venv/bin
 ARGS ?=
 BUDGET ?= laptop
 KEEP ?= no
-SCRIPTS := .ci/browser .ci/install .ci/run $(shell find docker slurm studio -name "*.sh" -o -name "*.sbatch" 2>/dev/null)
+SCRIPTS := .ci/browser .ci/install .ci/mutate .ci/run $(shell find docker slurm studio -name "*.sh" -o -name "*.sbatch" 2>/dev/null)
 
 # make takes name=value for a variable of its own and drops what it does not know.
 KNOWN := ARGS BUDGET KEEP
@@ -24,7 +24,7 @@ unexport PYTHONDONTWRITEBYTECODE
 export PIP_NO_COMPILE := 0
 
 .DEFAULT_GOAL := help
-.PHONY: help train studio test check lint settings format paper evidence bench docs lock sbom clean
+.PHONY: help train studio test check mutation lint settings format paper evidence bench docs lock sbom clean
 
 help:  ## list these commands
 	@sed -nE 's/^([a-z]+):.*## (.*)/  make \1\t\2/p' Makefile | expand -t 16
@@ -39,6 +39,9 @@ test: lint .venv/.installed-browser  ## lint, then the tests, a short training t
 
 check: lint .venv/.installed-browser  ## lint, then the tests that are too long for make test
 	@$(PYTEST) -m check $(ARGS)
+
+mutation: .venv/.installed-mutation  ## change master or worker in one place at a time: does a test turn red? ARGS="master/journal.py"
+	@.ci/mutate $(ARGS)
 
 lint: .venv/.installed-dev  ## ruff, mypy, import-linter, hadolint and shellcheck; changes nothing
 	$(BIN)/ruff check .
@@ -125,4 +128,8 @@ clean:  ## remove caches and build products; .venv and runs/ stay
 
 .venv/.installed-browser: .venv/.installed-dev
 	@.ci/browser
+	@touch $@
+
+.venv/.installed-mutation: .venv/.installed-dev
+	@.ci/install .venv dev,mutation
 	@touch $@

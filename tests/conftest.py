@@ -34,7 +34,7 @@ TIERS = ("fast", "cluster", "slow", "slurm")
 # Fixtures that take many seconds and are made once for all tests that look at what they made.
 SHARED = ("trained", "study", "straight", "made")
 
-# Whoever takes longest comes first, so that no worker of xdist is left with it at the end. Seconds on
+# The longest come first, so that no worker of xdist is left with one of them at the end. Seconds on
 # two cores where nothing else ran; the first of a group stands for all of it.
 SECONDS = {
     "cluster/test_lockstep.py::test_the_same_numbers_come_twice": 40,

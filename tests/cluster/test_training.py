@@ -136,12 +136,12 @@ def test_a_run_begins_with_anothers_networks_once_and_is_extended(trained: Path)
     assert f"begins with the networks of {trained} after {updates} updates" in told
     first = json.loads((folder / "result.json").read_text())
     # Up to service.lag_updates of them are owed already; the rest needs new episodes.
-    more = ("max_updates=40", "service.lag_updates=8", "resume=auto", "service.log_format=json")
+    more = ("max_updates=120", "resume=auto", "service.log_format=json")
     printed = run("tangram-train", *arguments, *more, cwd=trained.parent)
     assert "begins with the networks" not in printed
     assert "goes on after 10 updates" in printed
     second = json.loads((folder / "result.json").read_text())
-    assert (first["updates"], second["updates"]) == (10, 40)
+    assert (first["updates"], second["updates"]) == (10, 120)
     lines = [json.loads(line) for line in printed.splitlines()]
     assert {"note", "status", "result"} <= {line["event"] for line in lines}
     assert lines[-1].items() >= second.items()

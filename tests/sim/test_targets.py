@@ -238,16 +238,16 @@ def test_starts_lie_on_the_target_where_there_is_no_other_room() -> None:
 
 @pytest.mark.parametrize("settings", [{}, {"mirrored": 1.0}, {"allow_flip": True}])
 def test_starts_in_piles_lie_on_any_side_that_can_be_played(settings: dict[str, Any]) -> None:
-    sim, generators = SimConfig(starts="piles", **settings), evaluation_generators(24)
+    sim, generators = SimConfig(starts="piles", **settings), evaluation_generators(8)
     targets = sample_targets(GAME, sim, sim.task, generators)
-    done = np.zeros((24, GAME.tokens), dtype=np.bool_)
+    done = np.zeros((8, GAME.tokens), dtype=np.bool_)
     poses, flipped = sample_starts(GAME, sim, targets, done, generators)
     for pose, own in zip(poses, flipped, strict=True):
         assert largest_overlap(GAME, pose, own) < 1e-8
         together = shapely.union_all([piece.buffer(1e-6) for piece in pieces(GAME, pose, own)])
         assert 3 <= len(shapely.get_parts(together)) < GAME.tokens
     if sim.allow_flip:
-        assert 0 < flipped.any(axis=1).sum() < 24
+        assert 0 < flipped.sum() < flipped.size
     else:
         np.testing.assert_array_equal(flipped, targets[1])
 

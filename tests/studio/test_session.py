@@ -106,6 +106,7 @@ def test_it_goes_on_from_where_a_token_was_taken() -> None:
         ("{", "the page's message is not understood"),
         ('{"ask": "fill", "number": 1}', "a puzzle, a drawing or pieces are to be filled"),
         ('{"ask": "fill", "number": 1, "puzzle": "unicorn"}', "unknown puzzle 'unicorn'"),
+        ('{"ask": "fill", "number": 1, "puzzle": "/etc/passwd"}', "unknown puzzle"),  # no file
     ],
 )
 def test_what_cannot_be_done_is_told(message: str, why: str) -> None:

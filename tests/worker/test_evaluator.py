@@ -104,9 +104,9 @@ TIMELINES = {
 @pytest.mark.parametrize("timeline", TIMELINES.values(), ids=TIMELINES)
 def test_schedule(timeline: list[tuple[float, int, int]]) -> None:
     schedule = Schedule(interval=10.0, still=2.0)
-    made = setup()
+    some = weights(setup(), 1)
     for now, arrives, expected in timeline:
-        schedule.offer(replace(weights(made, 1), version=arrives) if arrives else None, now)
+        schedule.offer(replace(some, version=arrives) if arrives else None, now)
         due = schedule.due(now)
         assert (due.version if due else 0) == expected, f"at {now} s"
 
@@ -114,8 +114,8 @@ def test_schedule(timeline: list[tuple[float, int, int]]) -> None:
 @pytest.mark.fast
 def test_weights_that_come_in_bursts_wait_for_as_long_as_scoring_takes() -> None:
     schedule = Schedule(interval=60.0, still=2.0)
-    made = setup()
-    versions = [replace(weights(made, 1), version=version) for version in (1, 2, 3)]
+    some = weights(setup(), 1)
+    versions = [replace(some, version=version) for version in (1, 2, 3)]
     schedule.offer(versions[0], 0.0)
     assert schedule.due(0.0) is versions[0]
     schedule.scored(20.0)
