@@ -49,7 +49,7 @@ TAG = re.compile(
     r"run: (?P<when>quick|check|on request)(?:, in (?P<place>a clone|terminals))?"
     r"(?:, with (?P<run>runs/\w+))?|run: never, \S.*|file: (?P<file>[\w.]+)"
 )
-SHORT = ("max_updates=400", "service.eval_seconds=10")  # a training of some 15 s
+SHORT = ("max_updates=800", "service.eval_seconds=10")  # a training of some 25 s
 
 
 @dataclass(frozen=True)

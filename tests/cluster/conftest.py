@@ -6,7 +6,7 @@ import pytest
 
 from tests.cluster.processes import LIMIT_S, run
 
-UPDATES = 400
+UPDATES = 800
 
 
 @pytest.hookimpl(tryfirst=True)
