@@ -34,12 +34,29 @@ TIERS = ("fast", "cluster", "slow", "slurm")
 # Fixtures that take many seconds and are made once for all tests that look at what they made.
 SHARED = ("trained", "study", "straight", "made")
 
-# The longest come first, so that no worker of xdist is left with one of them at the end. Seconds on
-# two cores where nothing else ran; the first of a group stands for all of it.
+# The longest come first, so that no worker of xdist is left with one of them at the end. Seconds
+# on two cores with other work beside them. Groups come before these, the largest first.
 SECONDS = {
-    "cluster/test_lockstep.py::test_the_same_numbers_come_twice": 40,
-    "cluster/test_training.py::test_a_short_training_learns": 30,
-    "cluster/test_faults.py::test_a_worker_that_is_killed_while_it_plays": 20,
+    "test_lockstep.py::test_the_same_numbers_come_twice": 80,
+    "test_delivery.py::test_acknowledged_batches_survive": 31,
+    "test_faults.py::test_a_worker_that_is_killed": 29,
+    "test_training.py::test_a_reward_of_ones_own": 28,
+    "test_faults.py::test_two_runs_on_one_machine": 22,
+    "test_faults.py::test_no_process_is_left": 20,
+    "test_faults.py::test_a_network_that_swallows": 19,
+    "test_faults.py::test_what_is_deleted": 19,
+    "test_cli.py::test_every_process_is_started": 15,
+    "test_faults.py::test_a_full_disk": 15,
+    "test_frames.py::test_repeated_swapped_and_damaged": 14,
+    "test_strangers.py::test_1000": 14,
+    "test_faults.py::test_a_frozen": 14,
+    "test_frames.py::test_the_newest_of_two": 12,
+    "test_frames.py::test_a_connection_that_takes": 10,
+    "test_compiling.py": 8,
+    "test_agents.py::test_an_agent_of_the_package": 7,
+    "test_history.py": 6,
+    "test_sb3.py": 6,
+    "test_player.py": 5,
 }
 
 NO_BROWSER = "no chromium"  # begins the reason of those that are skipped

@@ -20,7 +20,12 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from tests.blocks import PAGES
-from tests.conftest import NO_BROWSER, pytest_collection_modifyitems, pytest_terminal_summary
+from tests.conftest import (
+    NO_BROWSER,
+    SECONDS,
+    pytest_collection_modifyitems,
+    pytest_terminal_summary,
+)
 from tests.test_house import ROOT, locked, run, run_python
 
 pytestmark = pytest.mark.slow
@@ -97,6 +102,19 @@ def test_each_test_carries_one_tier(tiers: set[str], has: str) -> None:
 )
 def test_what_is_too_long_for_the_gate_runs_by_its_name(expression: str, run: list[str]) -> None:
     assert collected(expression, {"fast"}, {"fast", "check"}) == run
+
+
+def test_the_longest_tests_are_there_and_come_first() -> None:
+    for name in SECONDS:
+        file, _, test = name.partition("::")
+        texts = [path.read_text() for path in (ROOT / "tests").rglob(file)]
+        assert any(f"def {test}" in text for text in texts), name
+    items: list[Any] = [
+        mock.Mock(nodeid=name, fixturenames=(), get_closest_marker={"slow"}.__contains__)
+        for name in ("other", *reversed(SECONDS))
+    ]
+    pytest_collection_modifyitems(mock.Mock(**{"option.markexpr": ""}), items)
+    assert [item.nodeid for item in items[:1] + items[-1:]] == [next(iter(SECONDS)), "other"]
 
 
 def test_what_was_not_run_in_a_browser_is_told() -> None:
