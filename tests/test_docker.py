@@ -4,6 +4,7 @@ import ast
 import re
 import sys
 import tomllib
+from functools import cache
 from importlib.metadata import packages_distributions
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ DOCKER = ROOT / "docker"
 COMPOSE: dict[str, Any] = yaml.safe_load((DOCKER / "docker-compose.yml").read_text())
 # Neither plays nor learns: the gymnasium environment, and the figures of reports.
 LEFT_OUT = {"gymnasium", "matplotlib"}
+DISTRIBUTIONS = cache(packages_distributions)  # of all that is installed: a second
 EXTRAS = {"av", "PIL"}  # of films and pictures, which no container makes
 
 
@@ -62,7 +64,7 @@ def test_images_have_all_that_the_project_needs_and_nothing_else() -> None:
 @pytest.mark.parametrize("image", ["master", "worker"])
 def test_what_an_image_imports_is_in_it(image: str) -> None:
     """Of tangram_sim each image has what it uses: the tests of the house look at that."""
-    distributions, lacking = packages_distributions(), set()
+    distributions, lacking = DISTRIBUTIONS(), set()
     for path in (path for name in (image, "tangram_agent") for path in (ROOT / name).glob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
             names = [one.name for one in node.names] if isinstance(node, ast.Import) else []
