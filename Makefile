@@ -40,7 +40,7 @@ test: lint .venv/.installed-browser  ## lint, then the tests, a short training t
 check: lint .venv/.installed-browser  ## lint, then the tests that are too long for make test
 	@$(PYTEST) -m check $(ARGS)
 
-mutation: .venv/.installed-mutation  ## change master or worker in one place at a time: does a test turn red? ARGS="master/journal.py"
+mutation: .venv/.installed-dev  ## change master or worker in one place at a time: does a test turn red? ARGS="master/journal.py"
 	@.ci/mutate $(ARGS)
 
 lint: .venv/.installed-dev  ## ruff, mypy, import-linter, hadolint and shellcheck; changes nothing
@@ -128,8 +128,4 @@ clean:  ## remove caches and build products; .venv and runs/ stay
 
 .venv/.installed-browser: .venv/.installed-dev
 	@.ci/browser
-	@touch $@
-
-.venv/.installed-mutation: .venv/.installed-dev
-	@.ci/install .venv dev,mutation
 	@touch $@
