@@ -1,4 +1,6 @@
-"""One move after the other: the agent chooses a token and a motion, the engine moves it.
+"""One move after the other: a player chooses a token and a motion, the engine moves it.
+
+What is carried is moved by the agent, what is pushed by a rule that learned nothing.
 
 Nothing is kept between two moves but what is given, so a page may change the scene at any time.
 "Placed" is what lies in its piece: what was dragged or pushed away is moved again.
@@ -23,6 +25,8 @@ from tangram_sim.geometry import overlap_share
 from tangram_sim.world import World, make_world
 from worker.metrics import iou
 from worker.pairing import paired
+from worker.sweeps import sweep_policy
+from worker.test_set import greedy
 
 AGENT = "pretrained/tangram7"
 SIM = {"lift": {}, "slide": {"motion": "slide", "actions_per_token": 2}}
@@ -76,7 +80,7 @@ class Move:
 
 
 class _Player:
-    """An agent and its arena."""
+    """Who moves tokens, and the arena."""
 
     def __init__(self, motion: str) -> None:
         torch.set_num_threads(1)  # more are slower for so little, above all beside other work
@@ -85,7 +89,9 @@ class _Player:
         self.layout, self.motion = setup.layout, motion
         sim = replace(setup.sim.blind, starts="outside")
         self.env = BatchedEnv(self.layout, sim, RewardConfig(), 1)
-        self._shown: World | None = make_world(self.layout, sim) if motion == "slide" else None
+        slides = motion == "slide"
+        self.choose = sweep_policy(self.layout, sim) if slides else greedy(self.run.policy)
+        self._shown: World | None = make_world(self.layout, sim) if slides else None
 
     def frames(self, before: Floats, after: Floats, flipped: Bools, token: int) -> Floats:
         """(F, K, 3) of a move: what is carried goes straight, a push is played again in parts."""
@@ -103,7 +109,7 @@ class _Player:
 
 @lru_cache(maxsize=2)
 def player(motion: str) -> _Player:
-    """The agent that carries tokens, or the one that pushes them."""
+    """Who carries tokens, or pushes them."""
     return _Player(motion)
 
 
@@ -126,7 +132,7 @@ def _nothing_done() -> Round:
 
 
 def next_move(scene: Sides, goal: Sides, motion: str, done: Round | None) -> Move:
-    """The agent's next move.
+    """The next move.
 
     Args:
         scene: the tokens as they lie.
@@ -151,7 +157,7 @@ def next_move(scene: Sides, goal: Sides, motion: str, done: Round | None) -> Mov
         before = layout.poses(env.corners)[0]
         past = Past(done.corners[None], done.actions[None])
         here = env.corners.astype(np.float32)
-        actions = own.run.policy.act(env.seen, env.closed, env.seen_goals, past=past)
+        actions = own.choose(env.seen, env.closed, env.seen_goals, [], past)
         result = env.step(actions.astype(np.float64))
         done = Round(np.concatenate([done.corners, here]), np.concatenate([done.actions, actions]))
         after = layout.poses(env.corners)[0]

@@ -47,6 +47,7 @@ from worker.scores import (
     score_pictured,
     score_puzzles,
 )
+from worker.sweeps import MAX_TOKENS, sweep_policy
 from worker.test_set import FixedTests, greedy
 
 MAX_PICTURES = 100  # on a sheet
@@ -100,7 +101,8 @@ def evaluate_run(config: EvalConfig) -> int:
 
     Policies that learned nothing play the same episodes, to compare with: `exact` moves every
     token exactly onto its target, `position only` one token onto its centre and never turns it,
-    `random` is chance. Where a world moves tokens otherwise than actions say, or several noisy
+    `random` is chance. Where tokens slide, `sweep rule` is `exact` in the order that pushes the
+    least out of place. Where a world moves tokens otherwise than actions say, or several noisy
     looks at them can be put together, `fitted` is `exact` by a model of motion that has seen some
     random commands, and `oracle` knows that world and its noise. A run that learned
     which token is next also plays fixed orders.
@@ -140,6 +142,8 @@ def policies(run: Run) -> dict[str, Player]:
         other = run.with_settings({"agent": {"order": name}})
         result[f"order={name}"] = greedy(other.policy)
     result["exact"] = exact_policy(layout, sim)
+    if sim.motion == "slide" and layout.tokens <= MAX_TOKENS:
+        result["sweep rule"] = sweep_policy(layout, sim)
     if sim.inexact or (sim.corner_noise and run.setup.horizon > 1):
         result |= {"fitted": Told(fitted_policy), "oracle": Told(oracle_policy)}
     if layout.tokens == 1:

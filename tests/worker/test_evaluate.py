@@ -187,6 +187,14 @@ def test_settings_of_the_agents_play_are_played_and_written_down(tmp_path: Path,
     ]
 
 
+def test_where_tokens_slide_a_rule_stands_beside_the_agent(tmp_path: Path) -> None:
+    sim = SIM | {"backend": "physics", "motion": "slide"}
+    write_run(tmp_path / "run", GAME, sim=sim, agent={"reapply": 0})
+    compared = evaluated(tmp_path, episodes=3)["baselines"]
+    assert set(compared) == ORDERS | {"exact", "sweep rule", "random"}
+    assert compared["sweep rule"]["coverage"] > compared["exact"]["coverage"]
+
+
 def test_random_targets_of_several_tokens_get_the_same_scores(tmp_path: Path) -> None:
     report = evaluated(tmp_path, episodes=3)
     assert set(report) >= MEANS | {"mean_reward", "mean_reward_camera", "episodes"}
