@@ -19,7 +19,7 @@ from tangram_vision.approximations import _apart, _Canvas, _direction, nearest_f
 from tangram_vision.silhouettes import covered, silhouette
 from tests.sim.builders import SEVEN, layout_of
 
-pytestmark = pytest.mark.fast
+pytestmark = pytest.mark.slow
 
 LAYOUT = layout_of(*SEVEN, scale=0.6)
 LEANING = layout_of("parallelogram")

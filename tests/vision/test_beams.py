@@ -17,7 +17,7 @@ from tangram_vision.beams import Beam, State, Values
 from tangram_vision.silhouettes import Method, covered, fill_outline
 from tests.sim.builders import SEVEN, layout_of
 
-pytestmark = pytest.mark.fast
+pytestmark = pytest.mark.slow
 
 LAYOUT = layout_of(*SEVEN, scale=1.0)
 TOKENS = Tokens(LAYOUT)

@@ -19,7 +19,7 @@ from tangram_vision.tilts import from_above, mapped
 from tests.sim.builders import SEVEN, layout_of
 from tests.vision.aslant import photographed
 
-pytestmark = pytest.mark.fast
+pytestmark = pytest.mark.slow
 
 LAYOUT = layout_of(*SEVEN, scale=0.6)
 # Eight sides on one grid: a house with a step.

@@ -17,7 +17,7 @@ from worker.fitted import fitted_policy
 from worker.oracle import oracle_policy
 from worker.test_set import FixedTests
 
-pytestmark = pytest.mark.fast
+pytestmark = pytest.mark.slow
 
 GAME = {"shapes": list(SEVEN), "scale": 0.6}
 SHAPES = ("square", "small_triangle", "parallelogram")

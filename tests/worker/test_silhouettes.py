@@ -25,7 +25,7 @@ from worker.config import PlayConfig
 from worker.play import play_run
 from worker.silhouettes import read_silhouette
 
-pytestmark = pytest.mark.fast
+pytestmark = pytest.mark.slow
 
 SQUARE = '<path d="M 1 1 H 9 V 9 H 1 Z"/>'
 

@@ -21,7 +21,7 @@ from worker.cli import _play
 from worker.config import PlayConfig
 from worker.silhouettes import RED, read_silhouette
 
-pytestmark = pytest.mark.fast
+pytestmark = pytest.mark.slow
 
 SQUARE = [[0, 0], [1, 0], [1, 1], [0, 1]]
 STRIP = [[0, 0], [4, 0], [4, 0.25], [0, 0.25]]
