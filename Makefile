@@ -4,18 +4,14 @@ SHELL := /bin/bash
 BIN := .venv/bin
 ARGS ?=
 BUDGET ?= laptop
-KEEP ?= no
 SCRIPTS := .ci/browser .ci/install .ci/mutate .ci/run $(shell find docker slurm studio -name "*.sh" -o -name "*.sbatch" 2>/dev/null)
 
 # make takes name=value for a variable of its own and drops what it does not know.
-KNOWN := ARGS BUDGET KEEP
+KNOWN := ARGS BUDGET
 GIVEN := $(foreach name,$(.VARIABLES),$(if $(filter command,$(origin $(name))),$(name)))
 STRAY := $(sort $(filter-out $(KNOWN),$(GIVEN)))
-ifneq ($(filter-out yes no,$(KEEP)),)
-$(error KEEP must be yes or no, got $(KEEP))
-endif
 ifneq ($(STRAY),)
-$(error make knows no $(firstword $(STRAY))=...: settings go into ARGS="...", as in make train ARGS="seed=1 tokens=parallelogram"; BUDGET=... is for make paper, KEEP=yes for make evidence)
+$(error make knows no $(firstword $(STRAY))=...: settings go into ARGS="...", as in make train ARGS="seed=1 tokens=parallelogram"; BUDGET=... is for make paper)
 endif
 
 # Processes start sooner where Python keeps what it compiled, and the tests start many. Python compiles
@@ -63,30 +59,18 @@ studio: .venv/.installed-studio  ## a page to play on; settings go into ARGS="op
 
 paper: .venv/.installed-run  ## all figures and tables of the paper: BUDGET=smoke, laptop or paper
 	@$(BIN)/tangram-experiment budget=$(BUDGET) $(ARGS)
-	@$(BIN)/tangram-report runs=runs/experiments/$(BUDGET) out=runs/experiments/$(BUDGET)/report
+	@$(BIN)/tangram-report runs=runs/experiments/$(BUDGET)
 
-# Each study is some hours on two cores, and has its runs and a report of its own. Given again, it
-# goes on. Ten seeds for what README shows, three for the rest. KEEP=yes keeps what this code would
-# make alike.
-ONE_TOKEN := fig4 table1 table2 fig5 fig6 shapes method imitation perceptron parts
-ABLATIONS := plateau ablation_paper ablation_tangram readings noise actions pose warm_start
-GAME := game game_method game_figures game_parts game_refinement game_slide
-WORLDS := worlds robustness motion_parts
-PICTURES := pictures disturbances doubts outlines hidden
-LAPTOP = budget=laptop "budget.main_seeds=[0,1,2,3,4,5,6,7,8,9]"
-AT_ITS_SIZE = budget=paper "experiments.fig4.trainings=[paper,mlp]" "experiments.table1.trainings=[paper,mlp]"
-# Of a name, experiments and a budget.
-study = $(BIN)/tangram-experiment "experiment=[$(shell echo $(2) | tr ' ' ',')]" $(3) run_dir=runs/evidence/$(1) $(kept) $(ARGS) \
-	&& $(BIN)/tangram-report runs=runs/evidence/$(1) out=docs/results/$(1)
-kept = $(and $(filter yes,$(KEEP)),$(wildcard docs/results/$(1)/data.json),keep=docs/results/$(1))
-evidence: .venv/.installed-dev  ## everything that README and docs show of trainings, anew: a day on two cores; or with KEEP=yes what has changed
-	@$(call study,one_token,$(ONE_TOKEN),$(LAPTOP))
-	@$(call study,paper_size,fig4 table1,$(AT_ITS_SIZE))
-	@$(call study,raw,raw,$(LAPTOP))
-	@$(call study,ablations,$(ABLATIONS),$(LAPTOP))
-	@$(call study,game,$(GAME),$(LAPTOP))
-	@$(call study,worlds,$(WORLDS),$(LAPTOP))
-	@$(call study,pictures,$(PICTURES),$(LAPTOP))
+# Given again, it goes on; what has its rows in docs/results is not made again: delete what you want anew.
+study = $(BIN)/tangram-experiment study=$(1) budget=$(2) seeds=10 run_dir=runs/evidence out=docs/results $(ARGS)
+evidence: .venv/.installed-dev  ## what README and docs show of trainings and docs/results lacks: all of it takes a day
+	@$(call study,paper,laptop)
+	@$(call study,paper_size,paper)
+	@$(call study,parts,laptop)
+	@$(call study,game,laptop)
+	@$(call study,worlds,laptop)
+	@$(call study,pictures,laptop)
+	@$(BIN)/tangram-report runs=docs/results
 	@$(BIN)/tangram-report check
 
 bench: .venv/.installed-dev  ## measure speed against what else one could do; options go into ARGS="runs=9"
@@ -123,7 +107,7 @@ clean:  ## remove caches and build products; .venv and runs/ stay
 	@touch .venv/.installed-run $@
 
 .venv/.installed-dev: pyproject.toml lock.txt
-	@.ci/install .venv dev,docs,human,peers,slurm,statistics,studio,video
+	@.ci/install .venv dev,docs,human,peers,slurm,studio,video
 	@touch .venv/.installed-run .venv/.installed-docs .venv/.installed-studio $@
 
 .venv/.installed-browser: .venv/.installed-dev

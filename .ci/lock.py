@@ -20,10 +20,10 @@ TITLE = "# Exact versions that the tests ran with. Written by make lock: .ci/loc
 Pins = dict[str, list[str]]
 
 # Building a package to look at it would run what no hash vouches for yet. hydra's
-# antlr4-python3-runtime and rliable come as source only.
+# antlr4-python3-runtime comes as source only.
 ARGUMENTS = """pip compile pyproject.toml --all-extras --universal --python-version=3.11
     --constraints=constraints.txt --generate-hashes --no-annotate --no-header --quiet
-    --only-binary=:all: --no-binary=antlr4-python3-runtime --no-binary=rliable
+    --only-binary=:all: --no-binary=antlr4-python3-runtime
     --no-emit-package=cffi --no-emit-package=pycparser"""  # these two: PyPy only
 
 

@@ -11,7 +11,7 @@ from tangram_sim.errors import ConfigError
 CFG_KINDS = ("job", "hydra", "all")
 FLAGS = ("--cfg", *SWEEP)
 OWN_PRESETS = ("--config-dir", "-cd")
-PRESET_GROUPS = (*GROUPS, "experiment", "budget")
+PRESET_GROUPS = tuple(GROUPS)
 
 
 def without_own_presets(arguments: Sequence[str]) -> tuple[str | None, list[str]]:

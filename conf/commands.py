@@ -34,10 +34,6 @@ RUN: dict[str, str | list[str]] = {
     "service": "local",
     "tokens": "square",
 }
-STUDY: dict[str, str | list[str]] = {
-    "experiment": ["fig4", "table1", "table2", "fig5", "fig6"],
-    "budget": "laptop",
-}
 OVER = ("sim", "reward", "agent")
 NEW_RUN = "runs/${now:%Y-%m-%d_%H-%M-%S}"
 
@@ -266,29 +262,26 @@ tans fill it and lays it, while you may take tans away. Or watch a run, or two s
     "experiments": Command(
         "tangram-experiment",
         """\
-Runs experiments: every training of them over all seeds, then their tests. What is done is
-skipped, what was cut goes on from its checkpoint, so the same command can be given again
-and again. tangram-report draws the figures and tables of what is there.""",
+Runs a study of conf/studies.yaml: every training over its seeds, then its tests. Each test adds
+rows to STUDY.csv; what has its rows is skipped, and what was cut goes on from its checkpoint, so
+the same command can be given again and again. tangram-report draws what is there.""",
         (
             "tangram-experiment dry=true",
-            "tangram-experiment experiment=[fig4,table2] budget=smoke",
-            "tangram-experiment experiment=[ablation_tangram] budget=laptop jobs=8",
+            "tangram-experiment study=paper budget=smoke",
+            "tangram-experiment study=game seeds=3 jobs=8",
         ),
-        ("tangram_lab.experiments.plan:StudyConfig",),
-        STUDY,
-        plain=("catalogue",),
-        given={"run_dir": "runs/experiments/${budget.name}"},
+        ("tangram_lab.experiments.studies:StudyConfig",),
+        given={"run_dir": "runs/experiments/${budget}"},
     ),
     "report": Command(
         "tangram-report",
         """\
-Reports on a study. It reads the runs that tangram-experiment made, finished or not, and writes
-their curves and tables beside the paper's values, as Markdown, and data.json, which has all
-numbers. Of a folder whose folders are runs, such as a sweep's, it makes one table.""",
+Draws tables (Markdown) and figures (PNG) of every STUDY.csv of a folder, as tangram-experiment
+wrote it. Of a folder whose folders are runs, such as a sweep's, it makes one table.""",
         (
-            "tangram-report runs=runs/experiments/laptop out=report",
-            "tangram-report runs=runs/my_study out=runs/my_study/report",
-            "tangram-report check=true    # or: check. In a clone: pages, data and code",
+            "tangram-report runs=runs/experiments/laptop",
+            "tangram-report runs=runs/my_sweep out=report",
+            "tangram-report check=true    # or: check. In a clone: pages against results",
         ),
         ("tangram_lab.experiments.cli:ReportConfig",),
     ),

@@ -32,7 +32,7 @@ PACKAGES = ("conf", "master", "worker", *OURS)
 
 def run(command: list[str], cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
     """Without what `make test ARGS=...` would hand on to another make."""
-    handed = ("MAKE", "ARGS", "BUDGET", "KEEP")
+    handed = ("MAKE", "ARGS", "BUDGET")
     own = {name: value for name, value in os.environ.items() if not name.startswith(handed)}
     return subprocess.run(
         command, cwd=cwd, env=own, capture_output=True, text=True, check=False, timeout=60
@@ -60,7 +60,7 @@ def test_import_contracts_catch_every_wrong_arrow(tmp_path: Path) -> None:
     wrong = {
         "tangram_sim/wrong.py": "import torch, pybullet, cv2, zmq, omegaconf, tangram_sim.engine",
         "tangram_agent/wrong.py": "import worker.config, conf.help, tangram_vision.seeing",
-        "master/wrong.py": "import tangram_lab.experiments.plan, tangram_sim.wrong, uvicorn",
+        "master/wrong.py": "import tangram_lab.experiments.studies, tangram_sim.wrong, uvicorn",
     }
     for path, code in wrong.items():
         (tmp_path / path).write_text(code)
@@ -155,7 +155,6 @@ def test_every_file_of_conf_is_package_data() -> None:
         ("tokens.scale=2", True),
         ("ARGS=seed=7 tokens=square", False),
         ("BUDGET=smoke", False),
-        ("KEEP=yes", False),
     ],
 )
 def test_make_refuses_a_variable_that_it_would_drop(given: str, refused: bool) -> None:

@@ -10,7 +10,7 @@ import psutil
 
 from tangram_lab.benchmarks.measure import show, write
 from tangram_lab.benchmarks.trainings import processes_of, result_of, start_training, wait_for
-from tangram_lab.experiments.report.style import COLOURS, WIDTH_IN, drawing, empty_figure, save
+from tangram_lab.figures import COLOURS, WIDTH_IN, legend_below, new_figure, save
 
 SETTINGS = ("workers=2", "agent.replay_capacity=20000", "service.checkpoint_minutes=1")
 EVERY_S = 10.0
@@ -104,17 +104,14 @@ def _growth(hours: list[float], values: Sequence[float]) -> float:
 
 
 def _draw(samples: Samples, path: Path) -> None:
-    with drawing():
-        figure = empty_figure(WIDTH_IN, WIDTH_IN * 0.4)
-        panels = figure.subplots(1, 2)
-        for (name, points), colour in zip(sorted(samples.items()), COLOURS, strict=False):
-            minutes, memory, files = zip(*points, strict=True)
-            for panel, values in zip(panels, (memory, files), strict=True):
-                panel.plot(minutes, values, color=colour, label=name)
-        for panel, label in zip(panels, ("memory (MiB)", "open files"), strict=True):
-            panel.set_xlabel("minutes")
-            panel.set_ylabel(label)
-            panel.set_ylim(bottom=0)
-        handles, names = panels[0].get_legend_handles_labels()
-        figure.legend(handles, names, loc="outside lower center", ncols=len(names))
-        save(figure, path.parent, path.stem)
+    figure, panels = new_figure(WIDTH_IN * 0.4, 2)
+    for (name, points), colour in zip(sorted(samples.items()), COLOURS, strict=False):
+        minutes, memory, files = zip(*points, strict=True)
+        for panel, values in zip(panels, (memory, files), strict=True):
+            panel.plot(minutes, values, color=colour, label=name)
+    for panel, label in zip(panels, ("memory (MiB)", "open files"), strict=True):
+        panel.set_xlabel("minutes")
+        panel.set_ylabel(label)
+        panel.set_ylim(bottom=0)
+    legend_below(figure, panels[0], len(samples))
+    save(figure, path)

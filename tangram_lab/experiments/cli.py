@@ -7,15 +7,11 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from conf.cli import composed, entry, own_presets
+from conf.cli import composed, entry
 from conf.commands import Plain
 from tangram_sim.errors import ConfigError
 from tangram_sim.settings import Settings, setting
-
-if TYPE_CHECKING:
-    from tangram_lab.experiments.plan import StudyConfig
 
 ROOT = Path(__file__).parents[2]
 RESULTS = "docs/results"
@@ -23,91 +19,60 @@ GENERATED = ("settings.md",)  # pages that are written from declarations
 
 
 def experiment() -> int:
-    """tangram-experiment: runs the trainings and tests of experiments."""
+    """tangram-experiment: trains and tests what a study lacks."""
     return entry("experiments", _experiment)
 
 
 def _experiment(settings: Plain) -> int:
     from tangram_agent.setup import from_mapping
-    from tangram_lab.experiments.plan import StudyConfig
+    from tangram_lab.experiments.studies import StudyConfig, jobs_of, read_studies
 
-    if not isinstance(settings.get("experiments"), dict):
-        raise ConfigError("experiments are chosen by their presets: experiment=[fig4,table2]")
-    config = from_mapping(StudyConfig, _with_absolute(settings, "run_dir", "keep"))
-    resolved = {name: _resolved(name, config.command(name)) for name in config.wanted()}
-    tests = dict.fromkeys(test for name in resolved for test in config.tests_of(name))
-    asked = {name: _asked(name, config.test_command(name)) for name in tests}
+    config = from_mapping(StudyConfig, _with_absolute(settings, "run_dir", "out"))
+    jobs = list(jobs_of(config, read_studies()))
+    for name, told in dict.fromkeys((job.training, job.told) for job in jobs):
+        _check(name, told)
 
+    from master.console import sturdy_console
     from tangram_lab.experiments.runner import run_study
 
-    return run_study(config, resolved, asked, own_presets())
+    return run_study(config, jobs, sturdy_console(sys.stdout))
 
 
-def _resolved(name: str, overrides: list[str]) -> Plain:
-    """The whole config of a training, so that a wrong one is told before any of them starts."""
+def _check(name: str, told: Sequence[str]) -> None:
+    """Raise ConfigError where this code refuses a training, before any of them starts."""
     from tangram_agent.setup import make_setup
 
     try:
-        settings = _composed(overrides)
-        make_setup(settings)
+        make_setup(composed("train", ["run_dir=x", *told]))
     except ConfigError as error:
         raise ConfigError(f"training {name}: {error}") from None
-    return settings
-
-
-def _composed(overrides: Sequence[str]) -> Plain:
-    """The whole config that tangram-train makes of its arguments."""
-    return composed("train", ["run_dir=x", *overrides])
-
-
-def _asked(name: str, overrides: list[str]) -> Plain:
-    """What a test asks of tangram-eval, so that a wrong one is told before any training starts."""
-    from tangram_agent.setup import from_mapping
-    from worker.cli import with_absolute_paths, with_changes
-    from worker.config import EvalConfig
-
-    try:
-        settings = with_changes(with_absolute_paths(composed("eval", ["run_dir=x", *overrides])))
-        from_mapping(EvalConfig, settings)
-    except ConfigError as error:
-        raise ConfigError(f"test {name}: {error}") from None
-    given = {text.partition("=")[0] for text in overrides}
-    return {name: settings[name] for name in given & settings.keys()} | dict(settings["changes"])
 
 
 @dataclass(frozen=True)
 class ReportConfig(Settings):
-    """A study and where to report on it; files of the same names are replaced."""
+    """Rows of studies and where to report on them; files of the same names are replaced."""
 
     runs: str | None = setting(
         None,
-        "folder that tangram-experiment made, one whose folders are runs, or an earlier report",
+        "folder of CSV files that tangram-experiment wrote, or one whose folders are runs",
         unless={"check": True},
     )
-    out: str | None = setting(
-        None, "folder for tables.md, data.json and figures", unless={"check": True}
-    )
+    out: str | None = setting(None, "folder for tables and figures; null is runs")
     check: bool = setting(
-        False,
-        "in a clone: whether README and docs show what the reports in docs/results hold, and "
-        "whether this code still trains as the code that made them",
+        False, "in a clone: whether every score of README and docs is in the CSV files it links"
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.check:
-            _folder("runs", self.runs)
-            _folder("out", self.out)
-
-
-def _folder(name: str, value: str | None) -> Path:
-    if value is None or not value.strip():
-        raise ConfigError(f"{name} must name a folder, got '{value or ''}': set {name}=...")
-    return Path(value)
+        for name, value in (("runs", self.runs), ("out", self.out)):
+            if value is not None and not value.strip():
+                raise ConfigError(f"{name} must name a folder, got '{value}': set {name}=...")
+        if not self.check and self.runs is None:
+            raise ConfigError("runs must name a folder: set runs=...")
 
 
 def report() -> int:
-    """tangram-report: figures and tables of a study."""
+    """tangram-report: tables and figures of studies."""
     if sys.argv[1:2] == ["check"]:
         sys.argv[1] = "check=true"
     return entry("report", _report)
@@ -118,36 +83,24 @@ def _report(settings: Plain) -> int:
 
     config = from_mapping(ReportConfig, _with_absolute(settings, "runs", "out"))
     if config.check:
-        return _check()
+        return _check_pages()
 
-    from tangram_lab.experiments.report.page import write_report
+    from tangram_lab.experiments.report import write_report
 
-    runs, out = _folder("runs", config.runs), _folder("out", config.out)
-    for path in write_report(runs, out):
+    runs = Path(config.runs or "")
+    for path in write_report(runs, Path(config.out or runs)):
         print(f"written: {path}")
     return 0
 
 
-def _chosen(arguments: list[str]) -> "StudyConfig":
-    """The study that tangram-experiment makes of its arguments."""
-    from tangram_agent.setup import from_mapping
-    from tangram_lab.experiments.plan import StudyConfig
-
-    return from_mapping(StudyConfig, composed("experiments", arguments))
-
-
-def _check() -> int:
-    from tangram_lab.experiments.report.check import check
+def _check_pages() -> int:
+    from tangram_lab.experiments.check import check
 
     if not (ROOT / RESULTS).is_dir():
         raise ConfigError(f"check looks at {RESULTS} of a clone, which {ROOT} lacks: run it in one")
     pages = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-    shown = (page for page in pages if page.name not in GENERATED)
-    wrong = check(ROOT / RESULTS, shown, _composed, _chosen)
-    for line in wrong:
-        print(line)
-    fine = "every score of README and docs is in the data, or names the older commit that it is of"
-    print(f"{len(wrong)} wrong" if wrong else fine)
+    wrong = check(ROOT / RESULTS, [page for page in pages if page.name not in GENERATED])
+    print("\n".join(wrong) or "every score of README and docs is in the files that it links")
     return 1 if wrong else 0
 
 

@@ -1,281 +1,139 @@
-"""Runs the jobs of a study, so many at a time; tells how far they are; goes on when one fails."""
+"""Runs what a study lacks: trains with real processes, tests with tangram-eval, adds rows."""
 
 import json
-import os
-import shlex
 import signal
-import sys
 import time
-from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
-from master.children import Child, describe
-from master.console import sturdy_console
-from master.result import commit, processor, versions
+from master.children import Child, command, describe, override
 from master.rundir import RunFolder
 from master.signals import handling
 from tangram_agent.files import write_whole
-from tangram_agent.outcome import duration
-from tangram_lab.experiments.fingerprints import (
-    UPDATES,
-    Fingerprint,
-    differences,
-    make_fingerprints,
-)
-from tangram_lab.experiments.jobs import Job, make_jobs, read_object
-from tangram_lab.experiments.plan import (
-    PLAN,
-    StudyConfig,
-    joined_plan,
-    plan_content,
-    training_folder,
-)
-from tangram_lab.experiments.report.kept import Runs, read_kept, runs_to_keep, write_kept
-from tangram_lab.experiments.report.study import Study
+from tangram_lab.experiments.rows import COLUMNS, CURVE, append, curve_rows, done, rows_of
+from tangram_lab.experiments.studies import Job, StudyConfig
 from tangram_sim.errors import ConfigError
 
-
-class StudyProgress:
-    """Bars on a terminal; elsewhere a line for each job that is done."""
-
-    def __init__(self, console: Console, total: int, done: int) -> None:
-        """Nothing is shown before it is entered.
-
-        Args:
-            console: where to.
-            total: number of jobs.
-            done: how many of them were done before.
-        """
-        self._console, self._total, self._done = console, total, done
-        self._bars = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.fields[count]}"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            console=console,
-            disable=not console.is_terminal,
-        )
-        # What was done before took no time now: the estimate is made from the rest.
-        self._all = self._bars.add_task("all jobs", total=total - done, count=f"{done}/{total}")
-        self._tasks: dict[Job, TaskID] = {}
-
-    def __enter__(self) -> "StudyProgress":
-        self._bars.start()
-        self.say(f"{self._done} of {self._total} jobs were done before")
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bars.stop()
-
-    def say(self, text: str) -> None:
-        """A line for the user."""
-        self._console.print(text, markup=False, highlight=False, soft_wrap=True)
-
-    def started(self, job: Job) -> None:
-        """A job runs."""
-        total = bound(job)[1]
-        self._tasks[job] = self._bars.add_task(f"  {job.name}", total=total, count="")
-
-    def look(self, running: Sequence[Job]) -> None:
-        """Show how far the running trainings are."""
-        if self._bars.disable:
-            return
-        for job in running:
-            last = _last_evaluation(job)
-            unit, total = bound(job)
-            if last and total is not None:
-                done = int(last[unit])
-                text = f"{done:,}/{total:,} {unit}, mean reward {last['mean_reward']:.3f}"
-                self._bars.update(self._tasks[job], completed=done, count=text)
-
-    def finished(self, job: Job, result: Mapping[str, Any]) -> None:
-        """A job came to its end."""
-        self._done += 1
-        self._bars.update(self._all, advance=1, count=f"{self._done}/{self._total}")
-        self.say(f"[{self._done}/{self._total}] {job.name}: {_outcome(result)}")
-
-    def ended(self, job: Job) -> None:
-        """A job runs no longer."""
-        self._bars.remove_task(self._tasks.pop(job))
-
-
-def bound(job: Job) -> tuple[str, int | None]:
-    """What ends a training, updates or episodes, and after how many; None for a test."""
-    for unit in ("updates", "episodes"):
-        limit = job.settings.get(f"max_{unit}", 0) if job.trains else 0
-        if isinstance(limit, int) and limit:
-            return unit, limit
-    return "updates", None
-
-
-def _last_evaluation(job: Job) -> dict[str, Any]:
-    """The last line of a training's curve; empty where there is none."""
-    try:
-        text = (job.run_dir / "curve.jsonl").read_text(encoding="utf-8")
-        last = json.loads(text.splitlines()[-1])
-        return last if {"updates", "episodes", "mean_reward"} <= set(last) else {}
-    except (OSError, ValueError, IndexError, TypeError, RecursionError):
-        return {}
-
-
-def _outcome(result: Mapping[str, Any]) -> str:
-    shown = {
-        "mean_reward": "mean reward {:.3f}",
-        "coverage": "coverage {:.3f}",
-        "angle_error_deg_median": "angle error {:.2f} deg",
-    }
-    found = [text.format(result[key]) for key, text in shown.items() if result.get(key) is not None]
-    seconds = result.get("train_s")
-    if found and seconds is not None:
-        found.append(f"{duration(seconds)} of training")
-    return ", ".join(found) or "done, without scores"
-
-
-# The runner
-
-
+TOLD = "told.json"
 LOOK_S = 0.5
-# A training that is asked to end writes its checkpoint first.
-STOP_S = 60.0
-FAILED_STATUS = 1
-INTERRUPT_STATUS = 130
+STOP_S = 60.0  # a training that is asked to end writes its checkpoint first
+FAILED_STATUS, INTERRUPT_STATUS = 1, 130
+BUDGET = ("max_updates", "max_episodes", "max_hours")  # how a training ends that is whole
 
 
-def run_study(
-    config: StudyConfig,
-    resolved: Mapping[str, Mapping[str, Any]],
-    asked: Mapping[str, Mapping[str, Any]],
-    presets: str | None,
-) -> int:
-    """Do everything that is missing.
+class Work:
+    """One training with one seed, then its tests, as one process after another."""
 
-    Args:
-        config: the study.
-        resolved: the whole config of each training that is wanted.
-        asked: the settings of each test of them.
-        presets: the folder of the user's own presets, None where there is none.
+    def __init__(self, job: Job, run_dir: Path, missing: Sequence[str]) -> None:
+        self.job, self.run_dir, self.missing = job, run_dir, list(missing)
+        self.failed = ""
+
+    @property
+    def trained(self) -> bool:
+        """Whether the run used up its budget."""
+        return str(read_json(self.run_dir / "result.json").get("ended_by")).startswith(BUDGET)
+
+    def scores(self, test: str) -> Path:
+        """The file that a test leaves."""
+        return self.run_dir / "tests" / f"{test}.json"
+
+    def check(self) -> None:
+        """Raise ConfigError if the run was begun with other settings."""
+        told = read_json(self.run_dir / TOLD).get("told", list(self.job.told))
+        if told != list(self.job.told):
+            raise ConfigError(
+                f"{self.run_dir} was begun with {' '.join(told)}: remove it, or choose another "
+                "run_dir"
+            )
+
+    def next(self) -> Child | None:
+        """The process that comes next; None where all is done."""
+        if not self.trained:
+            told = ["train", override("run_dir", str(self.run_dir)), f"seed={self.job.seed}"]
+            return self._child([*told, "resume=auto", *self.job.told], "training.log")
+        for test in self.missing:
+            if not self.scores(test).exists():
+                self.scores(test).parent.mkdir(exist_ok=True)
+                told = ["eval", override("run_dir", str(self.run_dir))]
+                told += [override("out", str(self.scores(test))), *self.job.tests[test]]
+                return self._child(told, "tests.log")
+        return None
+
+    def _child(self, told: list[str], log: str) -> Child:
+        write_whole(self.run_dir / TOLD, json.dumps({"told": self.job.told}).encode())
+        name, *rest = told
+        return Child(self.job.name, [*command(name), *rest], self.run_dir / log)
+
+    def write(self, folder: Path, study: str) -> str:
+        """Add the rows of all tests, and of a curve that is drawn; returns what to tell."""
+        job, result = self.job, read_json(self.run_dir / "result.json")
+        lines = (self.run_dir / "curve.jsonl").read_text(encoding="utf-8").splitlines()
+        curve = [json.loads(line) for line in lines]
+        rows: list[dict[str, Any]] = []
+        for test in self.missing:
+            scores = read_json(self.scores(test))
+            rows += rows_of(job.training, job.label, job.seed, test, result, scores, curve)
+        if job.drawn:
+            points = curve_rows(job.training, job.seed, curve)
+            append(folder / f"{study}_curves.csv", CURVE, points)
+        append(folder / f"{study}.csv", COLUMNS, rows)
+        reward = result.get("mean_reward")
+        return "done" if reward is None else f"mean reward {reward:.3f}"
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object; empty where the file is missing or cannot be read."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def run_study(config: StudyConfig, jobs: Sequence[Job], console: Console) -> int:
+    """Do what is missing.
 
     Returns:
-        Exit status: 0 when all is done, 1 when a job failed, 130 after a signal.
+        Exit status: 0 when all is done, 1 when something failed, 130 after a signal.
 
     Raises:
-        ConfigError: the folder holds trainings with other settings or budget, or of code that
-            trained otherwise, or is in use.
+        ConfigError: the folder is in use, or cannot be made.
     """
-    study, jobs = RunFolder(config.run_dir), make_jobs(config, resolved, asked, presets)
-    if not next(path for path in (study.path, *study.path.parents) if path.exists()).is_dir():
-        raise ConfigError(
-            f"run_dir {study.path} cannot be made (a file is in its way): choose another run_dir"
-        )
+    root, out = Path(config.run_dir), Path(config.out or config.run_dir)
+    there = done(out / f"{config.study}.csv")
+    wanted = []
     for job in jobs:
-        job.check()
-    content = plan_content(config, _source(), resolved)
-    earlier = None if config.keep is None else read_kept(Path(config.keep), content["budget"])
-    console = sturdy_console(sys.stdout)
+        missing = [test for test in job.tests if (job.training, job.seed, test) not in there]
+        if missing:
+            run_dir = root / config.study / job.training / f"seed_{job.seed}"
+            wanted.append(Work(job, run_dir, missing))
+            wanted[-1].check()
+    console.print(f"{len(jobs) - len(wanted)} of {len(jobs)} runs are in {config.study}.csv")
     if config.dry:
-        plan = joined_plan(study.path / PLAN, content)
-        kept = {} if earlier is None else _kept(plan, earlier, jobs, resolved, study.path, console)
-        missing = [job for job in jobs if not job.done and job.run_dir not in kept]
-        for job in missing:
-            console.print(job.name, highlight=False, soft_wrap=True)
-        told = f"{len(missing)} of {len(jobs)} jobs to do in {study.path}"
-        console.print(told, highlight=False, soft_wrap=True)
+        for work in wanted:
+            console.print(f"{work.job.name}: {', '.join(work.missing)}", highlight=False)
         return 0
-    study.prepare("auto")
-    with study.lock():
-        plan = joined_plan(study.path / PLAN, content)
-        kept = _kept(plan, earlier, jobs, resolved, study.path, console)
-        write_whole(study.path / PLAN, _json(plan))
-        write_kept(kept, jobs)
-        missing = [job for job in jobs if not job.done]
-        with StudyProgress(console, len(jobs), len(jobs) - len(missing)) as progress:
-            return Runner(missing, config.jobs, progress).run()
-
-
-def _kept(
-    plan: dict[str, Any],
-    earlier: Study | None,
-    jobs: Sequence[Job],
-    resolved: Mapping[str, Mapping[str, Any]],
-    study: Path,
-    console: Console,
-) -> Runs:
-    """The runs of an earlier report that are kept; the plan gets the fingerprints of this code.
-
-    Raises:
-        ConfigError: runs that are there are of code that trained otherwise.
-    """
-    wanted = (job.training for job in jobs if job.trains and (earlier is not None or not job.done))
-    configs = {name: resolved[name] for name in wanted}
-    if configs:
-        told = f"a fingerprint of this code first: {UPDATES} updates of each of {len(configs)}"
-        console.print(f"{told} trainings", highlight=False)
-    plan["fingerprints"] |= _fingerprints(plan["fingerprints"], configs, study)
-    if earlier is None:
-        return {}
-    kept = runs_to_keep(earlier, plan, jobs, study)
-    console.print(f"{len(kept)} runs are kept of the earlier report", highlight=False)
-    return kept
-
-
-def _fingerprints(
-    before: Mapping[str, Fingerprint], configs: Mapping[str, Mapping[str, Any]], study: Path
-) -> dict[str, Fingerprint]:
-    """Training -> the fingerprint of this code.
-
-    Raises:
-        ConfigError: runs that are there are of code that trained otherwise.
-    """
-    found = make_fingerprints(configs)
-    there = {name: training_folder(study, name) for name in before.keys() & found}
-    others = {
-        there[name]: differences(before[name], found[name])
-        for name in sorted(there)
-        if there[name].exists()
-    }
-    changed = [folder for folder, numbers in others.items() if numbers]
-    if changed:
-        raise ConfigError(
-            f"{changed[0]} is of code that trained otherwise: after {UPDATES} updates "
-            f"{others[changed[0]][0]}: remove {', '.join(map(str, changed))}, or choose another "
-            "run_dir"
-        )
-    return found
-
-
-def _source() -> dict[str, object]:
-    """Where the numbers of a study come from."""
-    return {
-        "command": shlex.join(["tangram-experiment", *sys.argv[1:]]),
-        "commit": commit(),
-        "processor": processor(),
-        "cores": len(os.sched_getaffinity(0)),
-        "versions": versions(),
-    }
+    folder = RunFolder(root)
+    folder.prepare("auto")
+    with folder.lock():
+        return Runner(wanted, config, out, console).run()
 
 
 class Runner:
-    """Starts jobs as places become free."""
+    """Keeps so many trainings going, until nothing is left or a signal comes."""
 
-    def __init__(self, jobs: Sequence[Job], at_once: int, progress: StudyProgress) -> None:
-        self._waiting, self._at_once, self._progress = deque(jobs), at_once, progress
-        self._running: dict[Child, Job] = {}
+    def __init__(
+        self, wanted: Sequence[Work], config: StudyConfig, out: Path, console: Console
+    ) -> None:
+        self._waiting, self._config, self._out = list(wanted), config, out
+        self._count, self._console = len(wanted), console
+        self._running: dict[Child, Work] = {}
         self._events: SimpleQueue[Child | signal.Signals] = SimpleQueue()
-        self._failed: list[Job] = []
+        self._ready, self._failed = 0, list[Work]()
         self._stop_s: float | None = None
 
     def run(self) -> int:
@@ -286,64 +144,51 @@ class Runner:
             finally:
                 self._signal(signal.SIGTERM)  # nobody is left, unless this failed
         if self._stop_s is not None:
-            self._progress.say("stopped: give the same command again to go on")
+            self._console.print("stopped: give the same command again to go on")
             return INTERRUPT_STATUS
-        for job in self._waiting:
-            self._progress.say(f"{job.name}: not done, what it needs is missing")
-        for job in self._failed:
-            self._progress.say(f"{job.name}: failed, see {job.log}")
-        return FAILED_STATUS if self._failed or self._waiting else 0
+        return FAILED_STATUS if self._failed else 0
 
     def _work(self) -> None:
-        while self._start_ready() or self._running:
-            self._take(self._next())
-            self._progress.look(list(self._running.values()))
-            if self._stop_s is not None and time.monotonic() >= self._stop_s:
-                self._signal(signal.SIGKILL)
+        while True:
+            while self._stop_s is None and self._waiting and len(self._running) < self._config.jobs:
+                self._go_on(self._waiting.pop(0))
+            if not self._running:
+                return
+            try:
+                self._take(self._events.get(timeout=LOOK_S))
+            except Empty:
+                if self._stop_s is not None and time.monotonic() >= self._stop_s:
+                    self._signal(signal.SIGKILL)
 
-    def _start_ready(self) -> bool:
-        """Start what there is room for; whether anything was started."""
-        started = False
-        for job in list(self._waiting):
-            if self._stop_s is not None or len(self._running) >= self._at_once:
-                break
-            if job.ready:
-                self._waiting.remove(job)
-                self._start(job)
-                started = True
-        return started
+    def _go_on(self, work: Work) -> None:
+        child = work.next()
+        if child is None:
+            told = work.write(self._out, self._config.study)
+            self._ready += 1
+            self._tell(work, told)
+        else:
+            child.start(self._events.put)
+            self._running[child] = work
 
-    def _start(self, job: Job) -> None:
-        job.prepare()
-        child = Child(job.name, job.arguments, job.log)
-        child.start(self._events.put)
-        self._running[child] = job
-        self._progress.started(job)
-
-    def _next(self) -> "Child | signal.Signals | None":
-        try:
-            return self._events.get(timeout=LOOK_S)
-        except Empty:
-            return None
-
-    def _take(self, event: "Child | signal.Signals | None") -> None:
+    def _take(self, event: Child | signal.Signals) -> None:
         if isinstance(event, signal.Signals):
             # The first wish ends the trainings with a checkpoint, a later one at once.
             self._signal(signal.SIGTERM if self._stop_s is None else signal.SIGKILL)
             self._stop_s = self._stop_s or time.monotonic() + STOP_S
-        elif event is not None:
-            status, job = event.clear(), self._running.pop(event)
-            if job.done:
-                self._progress.finished(job, read_object(job.leaves))
-            elif self._stop_s is None:
-                self._failed.append(job)
-                self._progress.say(f"{job.name} ended with {describe(status)}\n{event.tail()}")
-            self._progress.ended(job)
+            return
+        status, work = event.clear(), self._running.pop(event)
+        if self._stop_s is not None:
+            return
+        if status:
+            self._failed.append(work)
+            self._tell(work, f"ended with {describe(status)}, see {event.log}\n{event.tail()}")
+        else:
+            self._go_on(work)
+
+    def _tell(self, work: Work, text: str) -> None:
+        line = f"[{self._ready + len(self._failed)}/{self._count}] {work.job.name}: {text}"
+        self._console.print(line, markup=False, highlight=False, soft_wrap=True)
 
     def _signal(self, number: signal.Signals) -> None:
         for child in self._running:
             child.signal(number)
-
-
-def _json(content: dict[str, object]) -> bytes:
-    return (json.dumps(content, indent=1) + "\n").encode()

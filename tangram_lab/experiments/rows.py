@@ -1,0 +1,163 @@
+"""The rows of a study as CSV: one for each test of each run, and for each rival that it had.
+
+A rival learned nothing and plays the same tests; it has no seed where it scored the same beside
+every seed.
+"""
+
+import csv
+import io
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pandas as pd
+
+from tangram_sim.errors import RunError
+
+AGENT = "agent"
+KEY = ("training", "seed", "test", "policy")
+# Column -> name in the files of tangram-eval.
+SCORES = {
+    "mean_reward": "mean_reward",
+    "mean_reward_dense": "mean_reward_dense",
+    "coverage": "coverage",
+    "share_solved": "share_solved",
+    "share_solved_iou": "share_solved_iou",
+    "iou": "iou",
+    "filled": "filled",
+    "angle_error_deg": "angle_error_deg_median",
+    "position_error": "position_error_median",
+    "wrong": "wrong",
+    "doubly_used": "doubly_used",
+    "blocked": "blocked",
+}
+RUN = ("updates", "episodes", "parameters", "train_seconds")  # of the training
+LEVELS = {"reached_0.70": 0.70, "reached_0.75": 0.75}  # that the paper tells of
+COLUMNS = (
+    *("training", "label", "seed", "test", "policy", "commit", "tests"),
+    *(*SCORES, "seconds_per_puzzle", *RUN, *LEVELS),
+)
+CURVE = ("training", "seed", "episodes", "updates", "train_seconds", *list(SCORES)[:2])
+POINTS = 30  # of a curve
+DIGITS = 6
+
+Row = Mapping[str, Any]
+
+
+class Spread(NamedTuple):
+    """Of the seeds of a training in a test."""
+
+    median: float
+    least: float
+    most: float
+
+
+def read_rows(path: Path) -> pd.DataFrame:
+    """All rows of a CSV.
+
+    Raises:
+        RunError: it cannot be read, or is none of a study.
+    """
+    try:
+        found = pd.read_csv(path, dtype={"training": str, "test": str, "commit": str})
+    except (OSError, ValueError) as error:
+        raise RunError(f"{path}: cannot be read ({error}): restore it, or delete it") from None
+    return found
+
+
+def of_a_study(rows: pd.DataFrame) -> bool:
+    """Whether these are rows of runs."""
+    return {"training", "test", "policy"} <= {*rows.columns}
+
+
+def spreads(rows: pd.DataFrame, measure: str) -> dict[tuple[str, str, str], Spread]:
+    """(training, test, policy) -> median, least and most of the seeds, where there are any."""
+    known = rows.dropna(subset=[measure])
+    groups = known.groupby(["training", "test", "policy"], sort=False)[measure]
+    found = groups.agg(["median", "min", "max"])
+    return {
+        key: Spread(*map(float, values))
+        for key, values in zip(found.index, found.to_numpy(), strict=True)
+    }
+
+
+def rows_of(
+    training: str, label: str, seed: int, test: str, result: Row, scores: Row, curve: Iterable[Row]
+) -> list[dict[str, Any]]:
+    """The rows of one test of one run: the agent's, and those of its rivals.
+
+    Args:
+        training, label, seed, test: what was done.
+        result: result.json of the run.
+        scores: what tangram-eval wrote.
+        curve: the run's evaluations while it learned.
+    """
+    points = list(curve)
+    tests = scores.get("episodes") or len(scores.get("puzzles", ())) * (scores.get("turns") or 1)
+    same = {"training": training, "label": label, "seed": seed, "test": test}
+    same |= {"commit": (result.get("commit") or "")[:7], "tests": tests}
+    agent = same | {"policy": AGENT} | {name: scores.get(key) for name, key in SCORES.items()}
+    agent |= {"seconds_per_puzzle": scores.get("seconds_per_puzzle")}
+    agent |= {name: result.get(name) for name in RUN} | {"train_seconds": result.get("train_s")}
+    agent |= {name: _reached(points, level) for name, level in LEVELS.items()}
+    rivals = [
+        same | {"policy": name} | {column: row.get(key) for column, key in SCORES.items()}
+        for name, row in scores.get("baselines", {}).items()
+    ]
+    return [agent, *rivals]
+
+
+def _reached(curve: list[Row], level: float) -> str:
+    """Between which episodes a mean reward was first reached; nobody looked between."""
+    before = 0
+    for point in curve:
+        score = point.get("mean_reward")
+        if score is not None and score >= level:
+            return f"{before} to {int(point['episodes'])}"
+        before = int(point["episodes"])
+    return ""
+
+
+def curve_rows(training: str, seed: int, curve: list[Row]) -> list[dict[str, Any]]:
+    """At most 30 points of a curve, evenly picked, the first and the last among them."""
+    last = len(curve) - 1
+    count = min(len(curve), POINTS)
+    picked = sorted({round(step * last / max(count - 1, 1)) for step in range(count)})
+    same = {"training": training, "seed": seed}
+    return [
+        same | {name: curve[one].get("train_s" if name == "train_seconds" else name)
+                for name in CURVE[2:]}
+        for one in picked
+    ]  # fmt: skip
+
+
+def append(path: Path, columns: Iterable[str], rows: Iterable[Row]) -> None:
+    """Add rows at a CSV's end, at once; its head first where it is new."""
+    head = list(columns)
+    if path.exists():
+        with path.open(encoding="utf-8", newline="") as file:
+            head = next(csv.reader(file), head)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, head, restval="", extrasaction="ignore", lineterminator="\n")
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        writer.writeheader()
+    writer.writerows({name: _written(value) for name, value in row.items()} for row in rows)
+    with path.open("a", encoding="utf-8") as file:
+        file.write(text.getvalue())
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _written(value: object) -> object:
+    return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
+
+
+def done(path: Path) -> set[tuple[str, int, str]]:
+    """(training, seed, test) of the agent's rows that a CSV has."""
+    if not path.exists():
+        return set()
+    rows = read_rows(path)
+    own = rows[rows["policy"] == AGENT]
+    return {(t, int(s), k) for t, s, k in own[["training", "seed", "test"]].to_numpy()}
