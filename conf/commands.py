@@ -57,7 +57,6 @@ class Command:
         examples: three lines.
         settings: the dataclasses that declare its own settings, as `module:Class`.
         groups: config group -> presets that are taken by default.
-        plain: configs that are no groups of presets, merged before them.
         given: own setting -> default that hydra fills in.
         over: sections of a trained run, of which any setting can be laid over the run's.
     """
@@ -67,7 +66,6 @@ class Command:
     examples: tuple[str, ...]
     settings: tuple[str, ...]
     groups: Mapping[str, str | list[str]] = field(default_factory=dict)
-    plain: tuple[str, ...] = ()
     given: Mapping[str, str] = field(default_factory=dict)
     over: tuple[str, ...] = ()
 
@@ -97,7 +95,7 @@ class Command:
         """What hydra is told: defaults list, declared defaults, and its own behaviour."""
         chosen = [{group: preset} for group, preset in self.groups.items()]
         return {
-            "defaults": ["_self_", *self.plain, *chosen],
+            "defaults": ["_self_", *chosen],
             **self.defaults(),
             **self.sections(),
             "hydra": _quiet(),

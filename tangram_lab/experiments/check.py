@@ -15,17 +15,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tangram_lab.experiments.rows import SCORES, of_a_study, read_rows, spreads
+from tangram_lab.experiments.rows import of_a_study, read_rows, spreads
 from tangram_sim.arrays import Floats
 from tangram_sim.errors import RunError
 
 NUMBER = r"[-\N{MINUS SIGN}]?\d*\.(?:\d+\s?%|\d{3,})"
 SCORE = re.compile(rf"(?<![\w.,/])(?P<score>{NUMBER})(?![\w.]*\d)")
-SPREAD = re.compile(rf"(?P<median>{NUMBER}) \((?P<least>{NUMBER}) to (?P<most>{NUMBER})\)")
+SPREAD = re.compile(rf"({NUMBER})\s+\(({NUMBER})\s+to\s+({NUMBER})\)")
+RANGE = re.compile(rf"({NUMBER})\s+to\s+({NUMBER})")
 LINK = re.compile(r"\]\((?P<file>[^)#\s]+\.(?:csv|md|json))(?:#[^)]*)?\)")
 CODE = re.compile(r"^```.*?^```[ \t]*$|`[^`\n]*`|\]\([^)]*\)", re.MULTILINE | re.DOTALL)
 HEADING = re.compile(r"^#+ .*$", re.MULTILINE)
 EVERYWHERE = "published.csv"  # what others report, the paper above all
+SCORED = (
+    *("mean_reward", "mean_reward_dense", "coverage"),
+    *("share_solved", "share_solved_iou", "filled"),
+)
 SLACK = 0.500001  # of the last digit: as it is, or halfway between two
 
 
@@ -61,16 +66,16 @@ def check_page(results: Path, page: Path) -> Iterator[str]:
     text = page.read_text(encoding="utf-8")
     starts = [0, *(found.start() for found in HEADING.finditer(text)), len(text)]
     sections = [text[one:other] for one, other in pairwise(starts)]
-    every = list(_linked(results, page, text))
+    every = list(dict.fromkeys(_linked(results, page, text)))
     for section in sections:
         scores = dict.fromkeys(_scores(section))
         if not scores:
             continue
-        files = list(_linked(results, page, section)) or every
+        files = list(dict.fromkeys(_linked(results, page, section))) or every
         if not files:
             yield f"{section.splitlines()[0]}: it has scores and links no file of results"
             continue
-        known = _together(tuple(dict.fromkeys([*files, results / EVERYWHERE])))
+        known = _together((*files, results / EVERYWHERE))
         for score in scores:
             if not _stands(score, known):
                 names = ", ".join(one.name for one in files)
@@ -78,16 +83,16 @@ def check_page(results: Path, page: Path) -> Iterator[str]:
 
 
 def _scores(section: str) -> Iterator[tuple[str, ...]]:
-    """Every spread as three numbers, every other score as one, as they are written."""
+    """Every spread as three numbers, every range as two, every other score as one."""
     bare = CODE.sub("", section)
-    for found in SPREAD.finditer(bare):
-        yield found.groups()
-    for found in SCORE.finditer(SPREAD.sub("", bare)):
-        yield (found["score"],)
+    for pattern in (SPREAD, RANGE, SCORE):
+        for found in pattern.finditer(bare):
+            yield found.groups()
+        bare = pattern.sub("", bare)
 
 
 def _told(score: tuple[str, ...]) -> str:
-    return score[0] if len(score) == 1 else f"{score[0]} ({score[1]} to {score[2]})"
+    return f"{score[0]} ({score[1]} to {score[2]})" if len(score) == 3 else " to ".join(score)
 
 
 def _linked(results: Path, page: Path, text: str) -> Iterator[Path]:
@@ -123,9 +128,9 @@ def read_known(path: Path) -> Known:
     if not of_a_study(rows):
         cells = rows.select_dtypes("number").to_numpy(float).ravel()
         return Known(cells, none, cells)
-    groups = [spreads(rows, name).values() for name in SCORES if name in rows]
+    groups = [spreads(rows, name).values() for name in SCORED if name in rows]
     three = np.array([one for group in groups for one in group], float).reshape(-1, 3)
-    return Known(three.ravel(), three, empty)
+    return Known(three[:, 0], three, empty)
 
 
 def _numbers(content: Any) -> Iterator[float]:
@@ -139,9 +144,15 @@ def _numbers(content: Any) -> Iterator[float]:
 
 
 def _stands(score: tuple[str, ...], known: Known) -> bool:
-    """Whether a number, or three as median, least and most, is one of those that are known."""
+    """Whether a number, a least and a most, or a median with both, are among those that are known.
+
+    A least and a most may be of two trainings.
+    """
     if len(score) == 1:
         return bool(_near(known.single, score[0]).any())
+    if len(score) == 2:
+        ends = zip(known.spreads.T[1:], score, strict=True)
+        return all(_near(column, text).any() for column, text in ends)
     near = [_near(column, text) for column, text in zip(known.spreads.T, score, strict=True)]
     loose = all(_near(known.cells, text).any() for text in score)
     return loose or bool(np.logical_and.reduce(near).any())

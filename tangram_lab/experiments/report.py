@@ -171,7 +171,9 @@ def _seeds(
         )
     panel.set_yticks(range(len(names)), [labels[name] for name in names])
     panel.invert_yaxis()
-    panel.set(xlabel=f"{LABELS[figure.measure]} (diamond: a formula that never turns)")
+    turns = bool((here["policy"] == "position only").any())
+    diamond = " (diamond: a formula that never turns)" * turns
+    panel.set(xlabel=f"{LABELS[figure.measure]}{diamond}")
     return canvas
 
 

@@ -20,7 +20,7 @@ from tangram_lab.experiments.rows import (
 )
 from tangram_lab.experiments.studies import StudyConfig, jobs_of, read_studies
 from tangram_sim.errors import ConfigError, RunError
-from tests.test_docs import unknown
+from tests.test_docs import ROOT, unknown
 
 pytestmark = pytest.mark.fast
 
@@ -111,6 +111,20 @@ def test_every_setting_of_every_study_is_known(budget: str) -> None:
             for told in job.tests.values():
                 wrong += [one for one in told if unknown(["tangram-eval", one])]
     assert wrong == []
+
+
+def test_no_seed_and_no_test_of_a_study_is_left_out_of_its_rows() -> None:
+    known = read_studies()
+    missing = list[str]()
+    for name in known.studies:
+        budget = "paper" if name == "paper_size" else "laptop"
+        there = done(ROOT / "docs" / "results" / f"{name}.csv")
+        config = StudyConfig(run_dir="x", study=name, budget=budget, seeds=10)
+        for job in jobs_of(config, known):
+            missing += [
+                f"{job.name}, {t}" for t in job.tests if (job.training, job.seed, t) not in there
+            ]
+    assert missing == []
 
 
 def test_a_test_leaves_a_row_of_the_agent_and_one_of_each_rival() -> None:
