@@ -24,7 +24,7 @@ pytestmark = pytest.mark.slow
 LAYOUT = layout_of(*SEVEN, scale=0.6)
 LEANING = layout_of("parallelogram")
 LONG = 1000.0  # seconds: more than all steps take
-STEPS = 60
+STEPS = 150  # of 60 a last bit decides whether 0.82 is reached: annealing takes other turns
 
 
 @pytest.fixture
