@@ -25,7 +25,6 @@ from tangram_agent.policy import Policy
 from tangram_agent.pretrained import CARD, CARD_TEXT, CONFIG, FORMAT, PREFIX, WEIGHTS
 from tangram_agent.runs import Run, load_run
 from tangram_agent.setup import Setup
-from tangram_sim.config import SILHOUETTES, SimConfig
 from tangram_sim.errors import ConfigError, RunError, TangramError
 from tangram_sim.settings import told
 from tangram_sim.targets import has_all_tans
@@ -87,7 +86,7 @@ def publish(
     weights = _weights(chosen.run)
     config = EvalConfig(str(chosen.run.folder), episodes=tests, seed=TEST_SEED)
     scores = score_policies(chosen.run.setup, policies(chosen.run), config)
-    card = make_card(name, chosen, seeds, scores)
+    card = make_card(name, chosen, seeds)
     card |= {"tests": {"episodes": tests, "seed": TEST_SEED, "scores": scores}}
     setup = chosen.run.setup
     if has_all_tans(setup.layout) and setup.sim.observe != "pictures":  # of pieces that touch
@@ -174,10 +173,9 @@ def _weights(run: Run) -> bytes:
     return data
 
 
-# The card: what the agent is, what made it, what it can do
+# The card: what made the agent, and what it can do
 
-
-Scores = Mapping[str, float]
+Scores = Mapping[str, Any]
 
 # What result.json says of a run's effort, for the card.
 _BUDGET = ("updates", "train_s", "wall_s", "cores", "processor", "device", "workers")
@@ -185,279 +183,101 @@ _BUDGET = ("updates", "train_s", "wall_s", "cores", "processor", "device", "work
 # Scores of the card's tables: name -> label, digits.
 _ROWS = {
     "mean_reward": ("mean reward, exact polygons, -1 to 1", 4),
-    "mean_reward_camera": ("mean reward, camera's pixels, -1 to 1", 4),
-    "raw_overlap": ("raw overlap, 0 to 1", 4),
-    "raw_overlap_p10": ("raw overlap, 10th percentile", 4),
+    "raw_overlap": ("coverage, 0 to 1", 4),
+    "raw_overlap_p10": ("coverage, 10th percentile", 4),
     "share_solved": ("share of targets covered by 0.95 or more", 3),
     "share_solved_iou": ("share with an intersection over union of 0.95 or more", 3),
     "iou": ("intersection over union", 4),
-    "wrong": ("pieces under a token of another shape", 2),
-    "blocked": ("placements blocked by other tokens", 2),
     "angle_error_deg_median": ("angle error, median, degrees", 3),
-    "angle_error_deg_p90": ("angle error, 90th percentile", 3),
     "position_error_median": ("position error, median, arena units", 4),
-    "position_error_p90": ("position error, 90th percentile", 4),
 }
 
 
-def make_card(
-    name: str, chosen: Candidate, seeds: Sequence[Candidate], tested: Mapping[str, Scores]
-) -> dict[str, Any]:
+def make_card(name: str, chosen: Candidate, seeds: Sequence[Candidate]) -> dict[str, Any]:
     """The content of card.json but for the tests, the puzzles and the checksum.
 
     Args:
         name: of the agent.
         chosen: the run that ships.
         seeds: all runs, by seed.
-        tested: scores of the shipped weights and of the policies to compare with.
     """
     setup, result = chosen.run.setup, chosen.result
     acting = sum(parameter.numel() for parameter in Policy(setup).network.parameters())
-    world = "".join(f", {name} {told(value)}" for name, value in setup.sim.inexact.items())
-    learned = next(one for one in seeds if one.result["seed"] == result["seed"]).run.setup.sim
-    seen = f", {_pictures(learned)}" * learned.looks
-    drawn = ", outlines of the train split among them" * (setup.sim.targets == "touching")
-    source = (
-        f"simulated by this project ({setup.sim.backend}{world}{seen}), random starts and targets"
-        f"{drawn}"
-    )
-    # Where any dissection counts, no piece lies in a wrong place.
-    told_of = [name for name in _ROWS if not (setup.fills and "error" in name)]
     return {
         "format": FORMAT,
         "name": name,
         "licence": "MIT",
-        "task": _task(setup),
+        "tokens": [shape.name for shape in setup.layout.shapes],
+        "scale": setup.tokens.scale,
         "agent": setup.agent.name,
         "net": setup.net.kind,
-        "targets": setup.sim.targets,
+        "sim": {key: told(value) for key, value in asdict(setup.sim).items()},
         "parameters": {"acting": acting, "trained": result["parameters"]},
-        "data": {"source": source, **_picked(result, "episodes", "transitions")},
         "budget": _picked(result, *_BUDGET),
-        **_picked(result, "updates", "seed"),
+        **_picked(result, "updates", "seed", "episodes", "transitions", "test_episodes"),
         "selection": "median of the seeds by final mean_reward (the lower one of two)",
-        "scores": {score: result.get(score) for score in told_of},
-        "test_episodes": result["test_episodes"],
         "seeds": [
-            {key: one.result.get(key) for key in ("seed", "train_s", "episodes", *told_of)}
-            for one in seeds
+            {key: one.result.get(key) for key in ("seed", "train_s", *_ROWS)} for one in seeds
         ],
-        "limits": _limits(setup, tested[RUN]),
         **_picked(result, "commit", "versions"),
     }
-
-
-def _pictures(sim: SimConfig) -> str:
-    return f"{sim.picture} pictures of {sim.pixels} px"
 
 
 def _picked(result: Mapping[str, Any], *names: str) -> dict[str, Any]:
     return {name: result[name] for name in names}
 
 
-def _task(setup: Setup) -> dict[str, Any]:
-    return {
-        "tokens": [shape.name for shape in setup.layout.shapes],
-        "token_areas": setup.layout.areas.round(9).tolist(),
-        "scale": setup.tokens.scale,
-        "arena": setup.sim.arena,
-        "actions_per_token": setup.sim.actions_per_token,
-        "backend": setup.sim.backend,
-        "observe": setup.sim.observe,
-    }
-
-
-def _limits(setup: Setup, scores: Scores) -> list[str]:
-    if setup.fills:
-        return _limits_of_outlines(setup, scores)
-    sim, one = setup.sim, setup.layout.tokens == 1
-    pieces = "One token of this shape and size" if one else "This token set and size"
-    if sim.looks:
-        seen = (
-            f"Trained from {sim.picture} pictures of {sim.pixels} pixels of one straight camera; "
-            "docs/pictures.md tells which others it can use."
-        )
-        known = "Tokens and target lie on even ground, and no more than three of them touch."
-        target = "The target's pieces must show: a silhouette of all of them is not enough."
-    else:
-        seen = (
-            f"Corners with noise of {sim.corner_noise:g} of the arena, as in training."
-            if sim.corner_noise
-            else "Exact corners only: it was trained without noise and never saw a wrong corner."
-        )
-        known = (
-            "Each corner must be known by its number: the target's corners come in the token's "
-            "order."
-        )
-        target = (
-            "The target's pieces must be known, each by its corners: a silhouette is not enough."
-        )
-    several = [
-        {
-            "lift": "Tokens are lifted and set down: it knows nothing of pushes along the table.",
-            "slide": "Tokens slide, and push others by the simulation's friction.",
-        }[sim.motion],
-        target,
-    ]
-    motion = {
-        "exact": "Model-based: it takes every motion to be exact, and in a world that does not do "
-        "what it is told it is no better than the formula.",
-        "learned": "What a command comes to was learned in this world: in others it watches its "
-        "first actions and goes on from there.",
-    }
-    return [
-        f"{pieces}, in an arena of this width: another task needs another training.",
-        motion[setup.agent.motion],
-        seen,
-        known,
-        *(["Nothing stops a token at the arena's edge."] if one else several),
-        f"One of ten tests ends below a raw overlap of {scores['raw_overlap_p10']:.4f}.",
-    ]
-
-
-def _limits_of_outlines(setup: Setup, scores: Scores) -> list[str]:
-    sim = setup.sim
-    return [
-        "This token set and size, in an arena of this width: another task needs another training.",
-        f"Pictures of one straight camera: it learned from coarser ones than the {_pictures(sim)} "
-        "that it is tested and ships with."
-        if setup.traces
-        else "Exact outlines, without noise: what is found in a picture was never learned from.",
-        "Model-based: it takes tokens exactly to places at the outline's corners, which are given "
-        "by geometry; which of them to take is all that it learned.",
-        f"It thinks {setup.agent.beam} fillings ahead at a time (agent.lookahead=values); without, "
-        "it fills far fewer outlines. A search that goes back where it is stuck needs nothing "
-        "learned, see docs/silhouettes.md.",
-        "Tokens are lifted and set down: it knows nothing of pushes along the table.",
-        f"{1.0 - scores['share_solved_iou']:.1%} of the tests are not filled.",
-    ]
-
-
 def card_text(card: Mapping[str, Any]) -> str:
     """card.md: the same for people."""
-    name, data, budget = card["name"], card["data"], card["budget"]
-    versions = ", ".join(f"{package} {number}" for package, number in card["versions"].items())
-    seeds, tests = card["seeds"], card["tests"]
+    name, budget, seeds, tests = card["name"], card["budget"], card["seeds"], card["tests"]
     names = [f"seed {one['seed']}{' (this one)' * (one['seed'] == card['seed'])}" for one in seeds]
     compared = {"this agent" if one == RUN else one: s for one, s in tests["scores"].items()}
-    limits = "\n".join(f"- {limit}" for limit in card["limits"])
+    figures = {f"{split} split": one["scores"] for split, one in card.get("puzzles", {}).items()}
+    puzzles = f"\nOn the figures of tangram_sim/puzzles:\n\n{_table(figures)}\n" if figures else ""
     return f"""\
 # {PREFIX}/{name}
 
-{_about(card)} Agent `{card["agent"]}`, network `{card["net"]}` with \
-{card["parameters"]["acting"]:,} parameters. Licence: {card["licence"]}.
-
-## How to use it
+An agent for {", ".join(card["tokens"])} (full square of side {card["scale"]:g}). Agent \
+`{card["agent"]}`, network `{card["net"]}` with {card["parameters"]["acting"]:,} parameters. \
+Licence: {card["licence"]}. \
+`config.yaml` has the world that it was trained in; another task needs another training.
 
 ```bash
-tangram-eval run_dir={PREFIX}/{name} episodes=400 seed=1
+tangram-eval run_dir={PREFIX}/{name} episodes={tests["episodes"]} seed={tests["seed"]}
 tangram-play run_dir={PREFIX}/{name} out={name}.gif
-```
-
-```python
-from tangram_agent.runs import load_run
-
-run = load_run("{PREFIX}/{name}")
-actions = run.policy.act(corners, placed, goals)  # see docs/inference.md{_goals(card)}
 ```
 
 ## Training
 
-- Data: {data["episodes"]:,} episodes with {data["transitions"]:,} transitions, \
-{data["source"]}; nothing else.
-- Budget: {budget["updates"]:,} updates in {budget["train_s"]:.0f} s, {budget["wall_s"]:.0f} s \
-in all, on {budget["cores"]} cores ({budget["processor"]}), device {budget["device"]}, \
-{budget["workers"]} worker{"s" * (budget["workers"] != 1)}.
-- Code: commit {card["commit"] or "unknown"}; {versions}.
+- {card["episodes"]:,} episodes with {card["transitions"]:,} transitions, simulated here.
+- {budget["updates"]:,} updates in {budget["train_s"]:.0f} s, {budget["wall_s"]:.0f} s in all, on \
+{budget["cores"]} cores ({budget["processor"]}), device {budget["device"]}, \
+workers {budget["workers"]}.
+- Commit {card["commit"] or "unknown"}; \
+{", ".join(f"{package} {number}" for package, number in card["versions"].items())}.
 
 ## Evaluation
 
-All seeds after their last update, on the {card["test_episodes"]:.0f} fixed tests of the \
-training{_played_by(card)}; the {card["selection"]} ships.
+All seeds on the {card["test_episodes"]:.0f} fixed tests of the training; what ships is the \
+{card["selection"]}.
 
 {_table(dict(zip(names, seeds, strict=True)))}
 
-This agent on {tests["episodes"]} other tests (seed {tests["seed"]}), by which no run was \
-chosen, beside {_beside(card)}:
+This agent on {tests["episodes"]} other tests (seed {tests["seed"]}), beside policies that \
+learned nothing:
 
 {_table(compared)}
-
-{_puzzles(card)}## Limits
-
-{limits}
-"""
+{puzzles}"""
 
 
-def _about(card: Mapping[str, Any]) -> str:
-    task = card["task"]
-    tokens, count = ", ".join(task["tokens"]), task["actions_per_token"]
-    arena, actions = f"{task['arena']:g}", f"{count} action{'s' * (count > 1)}"
-    if task.get("observe") in SILHOUETTES:
-        what = "outlines" if task["observe"] == "silhouette" else "silhouettes in pictures"
-        return (
-            f"An agent that fills {what} with {len(task['tokens'])} tangram tokens ({tokens}; "
-            f"full square of side {task['scale']:g}) and is told of no piece, in a square arena of "
-            f"width {arena}."
-        )
-    if len(task["tokens"]) > 1:
-        return (
-            f"An agent that assembles {len(task['tokens'])} tangram tokens ({tokens}; full square "
-            f"of side {task['scale']:g}) in an order of its own, each with {actions}, in a square "
-            f"arena of width {arena}."
-        )
-    areas = ", ".join(f"{area:g}" for area in task["token_areas"])
-    return (
-        f"An agent that moves a tangram token ({tokens}; area {areas}) from anywhere in a square "
-        f"arena of width {arena} onto its target, position and angle, in {actions}."
-    )
-
-
-def _puzzles(card: Mapping[str, Any]) -> str:
-    """Scores on the figures of the library, where the tokens are all seven tans."""
-    found = card.get("puzzles")
-    if not found:
-        return ""
-    turns = next(iter(found.values()))["turns"]
-    return f"""\
-On the figures of tangram_sim/puzzles, each at {turns} angles; {_trained_on(card)}:
-
-{_table({f"{name} split": one["scores"] for name, one in found.items()})}
-
-"""
-
-
-def _played_by(card: Mapping[str, Any]) -> str:
-    if "lookahead=none" not in card["tests"]["scores"]:
-        return ""
-    return ", without looking ahead"
-
-
-def _goals(card: Mapping[str, Any]) -> str:
-    return "; goals are outlines" if card["task"].get("observe") in SILHOUETTES else ""
-
-
-def _beside(card: Mapping[str, Any]) -> str:
-    alone = "itself without looking ahead and " * ("lookahead=none" in card["tests"]["scores"])
-    return f"{alone}policies that learned nothing"
-
-
-def _trained_on(card: Mapping[str, Any]) -> str:
-    if card["targets"] in ("figures", "touching"):
-        return (
-            "it trained on outlines of the train split, among others, and never on the test split"
-        )
-    return "it trained on random targets only, so that neither split was seen"
-
-
-def _table(columns: Mapping[str, Mapping[str, Any]]) -> str:
+def _table(columns: Mapping[str, Scores]) -> str:
     """Markdown: a row for each score, a column for each name."""
     lines = ["| | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
     for key, (label, digits) in _ROWS.items():
         values = [scores.get(key) for scores in columns.values()]
-        if all(value is None for value in values):
-            continue
-        shown = ["-" if value is None else f"{value:.{digits}f}" for value in values]
-        lines.append(f"| {label} | " + " | ".join(shown) + " |")
+        if any(value is not None for value in values):
+            shown = ["-" if value is None else f"{value:.{digits}f}" for value in values]
+            lines.append(f"| {label} | " + " | ".join(shown) + " |")
     return "\n".join(lines)
 
 
