@@ -100,8 +100,8 @@ class DivergenceGuard:
         if self._in_a_row >= self._limit:
             raise RunError(
                 f"{error}; {self._in_a_row} times in a row, so the run ends. The last batch is in "
-                f"{self._write_batch()}: lower agent.actor_lr and agent.critic_lr or set "
-                "agent.grad_clip=1, and go on from the last checkpoint with resume=auto"
+                f"{self._write_batch()}: lower agent.actor_lr and "
+                "agent.critic_lr, and go on from the last checkpoint with resume=auto"
             )
         self.trainer.go_back(self._good)
 

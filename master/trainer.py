@@ -65,7 +65,6 @@ class Trainer:
                 layout.corner_count,
                 layout.tokens,
                 setup.action_size,
-                setup.sim.looks,
             )
         self.rate_limiter = RateLimiter(
             agent.updates_per_transition, agent.learning_starts, lag_updates
@@ -105,7 +104,7 @@ class Trainer:
     def insert(self, episodes: Episodes) -> None:
         """Take in episodes as they were played, and relabelled."""
         generator = self._generators["hindsight"]
-        seen = episodes.learnable(self.setup.agent.confidence)
+        seen = episodes.learnable()
         learned_from = seen.transitions
         if isinstance(self.replay, FillReplay):
             learned_from = self.replay.insert(seen, generator)

@@ -20,7 +20,6 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from tangram_agent.setup import Setup
-from tangram_agent.types import AWAY
 from tangram_sim.arrays import Singles
 from tangram_sim.errors import ConfigError, WireError
 from tangram_sim.rewards import MAX_REWARD, reward_bounds
@@ -196,17 +195,14 @@ class EpisodeSpec:
 def _columns(spec: EpisodeSpec, count: int) -> tuple[Column, ...]:
     e, t, v, k = count, spec.horizon, spec.corners, spec.tokens
     reach, one, rows = spec.bound * (1 + ROUNDING), 1 + ROUNDING, spec.goal_rows or v
-    confidence = (
-        Column("confidence", "<f4", (e, t + 1, k), AWAY, 1),
-        Column("goals_confidence", "<f4", (e, k), 0, 1),
-    )
+    seen = Column("seen", "u1", (e, t + 1, k), 0, 1), Column("goals_seen", "u1", (e, k), 0, 1)
     return (
         Column("corners", "<f4", (e, t + 1, v, 2), -reach, reach),
         Column("placed", "u1", (e, t + 1, k), 0, 1),
         Column("actions", "<f4", (e, t, spec.action_size), -one, one),
         Column("rewards", "<f4", (e, t), *(bound * one for bound in spec.rewards)),
         Column("goals", "<f4", (e, rows, 2), -reach, reach),
-        *(confidence if spec.observed else ()),
+        *(seen if spec.observed else ()),
         *((Column("achieved", "<f4", (e, rows, 2), -reach, reach),) if spec.traced else ()),
     )
 

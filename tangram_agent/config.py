@@ -7,7 +7,6 @@ from tangram_agent.process import FORMATS
 from tangram_sim.errors import ConfigError
 from tangram_sim.settings import LEARNING, NETWORK, Settings, declared, setting
 
-ORDERS = ("learned", "listed", "size", "random")
 STRATEGIES = ("final", "future", "near")
 ON_SOCKETS: dict[str, object] = {"bind": LOCAL}
 
@@ -95,71 +94,21 @@ class RelabelConfig(Settings, section="agent.hindsight"):
 
 @dataclass(frozen=True)
 class AgentConfig(Settings, section="agent"):
-    """DDPG, hindsight and the ways in which an agent may see the graph."""
+    """DDPG, hindsight and what an agent sees: `readout`."""
 
     name: str = setting("tangram", "the preset's name, for reports", part=LEARNING)
-    egocentric: bool = setting(
-        True, "coordinates relative to the moving token, in its own orientation", part=NETWORK
-    )
-    offsets: bool = setting(
-        True, "each corner's displacement from its token's centre as node features", part=NETWORK
-    )
-    orientation: bool = setting(
-        True, "(cos k*theta, sin k*theta) of each target relative to the moving token", part=NETWORK
-    )
-    confidence: bool = setting(
-        False,
-        "with sim.observe=pictures: tell the agent how surely each token is seen. It may then move "
-        "one that could lie otherwise as well; without it, it moves the others first",
-        only={"readout": "pair", "credit": "piece"},
-        part=NETWORK,
-    )
-    edges: str = setting(
-        "paper",
-        "of the graph: paper (Sec. IV-A) or complete (every node sees every other); or inputs: a "
-        "perceptron of whole scenes is told the paper's, as a matrix beside the features",
-        choices=("paper", "complete", "inputs"),
-        part=NETWORK,
-    )
-    afterstate: bool = setting(
-        True, "the critic sees the graph as the action would leave it", part=NETWORK
-    )
     motion: str = setting(
         "learned",
         "what a command comes to: learned from the replay, and watched in each episode; or the "
         "exact rigid motion, which makes the agent model-based",
         choices=("learned", "exact"),
         only={"readout": "pair"},
-        unless={"afterstate": False},
         part=NETWORK,
-    )
-    angle_head: str = setting(
-        "kfold",
-        "one output, or two with angle = atan2 / k",
-        choices=("plain", "kfold"),
-        part=NETWORK,
-    )
-    squash: str = setting(
-        "clamp", "of the actor's outputs", choices=("tanh", "clamp"), part=NETWORK
-    )
-    imitates: bool = setting(
-        False,
-        "the actor copies those actions of a batch that came to what was asked, as hindsight's "
-        "did, and does not climb the critic: the method without policy gradients",
-        unless={"credit": "reward"},  # which tells of no single action what it came to
-        part=LEARNING,
     )
     saturation_penalty: float = setting(
         1.0,
-        "weight of mean(relu(|z| - saturation_limit)^2) in the actor's loss",
+        "weight in the actor's loss of squared pre-activations; of an agent of pairs, beyond 1",
         low=0,
-        part=LEARNING,
-    )
-    saturation_limit: float = setting(
-        1.0,
-        "pre-activation beyond which the penalty starts",
-        low=0,
-        unless={"saturation_penalty": 0.0},
         part=LEARNING,
     )
     readout: str = setting(
@@ -170,51 +119,12 @@ class AgentConfig(Settings, section="agent"):
         choices=("pair", "token", "outline"),
         part=NETWORK,
     )
-    order: str = setting(
-        "learned",
-        "which token is next: that of the best value, the first as listed, the largest, or any",
-        choices=ORDERS,
-        only={"readout": "pair"},
-    )
     reapply: int = setting(
         2,
         "times that the actor is applied again to what it proposed",
         low=0,
         high=100,
         only={"readout": "pair"},
-    )
-    refine_steps: int = setting(
-        0,
-        "gradient steps uphill on the critic before a pose is played, exploration off",
-        low=0,
-        high=10_000,
-        only={"readout": "pair"},
-    )
-    refine_rate: float = setting(
-        0.004,
-        "length of the first of these steps",
-        low=1e-9,
-        high=1,
-        unit="arena units and rad",
-        only={"readout": "pair"},
-        unless={"refine_steps": 0},
-    )
-    credit: str = setting(
-        "piece",
-        "several tokens: what the critic of pairs learns from: piece, labels for each pair, from "
-        "the exact geometry; or reward, what the environment returns, as a sum over all pairs",
-        choices=("piece", "reward"),
-        only={"readout": "pair"},
-        unless={"afterstate": False},
-        part=NETWORK,
-    )
-    pairs_per_transition: int = setting(
-        8,
-        "several tokens: pairs that a transition gives in one update",
-        low=1,
-        high=1024,
-        only={"readout": "pair"},
-        part=LEARNING,
     )
     lookahead: str = setting(
         "none",
@@ -263,9 +173,6 @@ class AgentConfig(Settings, section="agent"):
         low=0,
         high=1,
         part=LEARNING,
-    )
-    grad_clip: float = setting(
-        0.0, "largest norm of a gradient; 0 is no clipping", low=0, part=LEARNING
     )
     batch_size: int = setting(64, "transitions in one update", low=1, part=LEARNING)
     replay_capacity: int = setting(

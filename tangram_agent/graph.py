@@ -1,8 +1,8 @@
 """What actor and critic ask of a graph (Sec. IV-A), and the turns that its features are made of.
 
 `SceneGraph` has all tokens and the whole target, as the paper has it. `PairGraph` has one token and
-one piece of the target: with one token that is the whole scene too. Both take the same options
-(`agent.egocentric`, `offsets`, `orientation`, `edges`), so the same actor and critic work on both.
+one piece of the target: with one token that is the whole scene too. The same
+actor and critic work on both.
 
 Legend here, in `scenes.py` and in `pairs.py`: M views, K tokens and V corners of a view, C corners
 of the largest token, N nodes, F features. Node order: token corners, bases, target corners. A turn
@@ -22,7 +22,7 @@ class Graph(Protocol):
     Attributes:
         tokens: K, in view.
         adjacency: (N, N) edges.
-        features: F, with the options that are switched on.
+        features: F.
         inputs: numbers that a perceptron sees of a view.
     """
 
@@ -46,17 +46,8 @@ class Graph(Protocol):
     def slot(self, view: Any, /) -> Tensor:
         """(M,) which of the tokens in view moves."""
 
-    def symmetry_of(self, view: Any, /) -> Tensor:
-        """(M,) symmetry order of the token that moves."""
-
     def velocity(self, view: Any, shift: Tensor, angle: Tensor, /) -> Tensor:
         """The velocity (M, 3) of a shift (M, 2), as the token sees it, and a turn (M,) over pi."""
-
-    def as_seen(self, view: Any, velocity: Tensor, /) -> Tensor:
-        """A velocity (M, 3) as the token sees it."""
-
-    def moved(self, view: Any, velocity: Tensor, /) -> Any:
-        """The views after the exact rigid motion of a velocity (M, 3), as the simulation has it."""
 
 
 def unit(angle: Tensor) -> Tensor:
@@ -76,8 +67,3 @@ def turn_back(vectors: Tensor, by: Tensor) -> Tensor:
     x, y = vectors.unbind(-1)
     cos, sin = by.unbind(-1)
     return torch.stack([x * cos + y * sin, y * cos - x * sin], dim=-1)
-
-
-def edges(paper: Tensor, edges: str) -> Tensor:
-    """(N, N) flags: the edges of Sec. IV-A, or all but those of a node to itself."""
-    return ~torch.eye(len(paper), dtype=torch.bool) if edges == "complete" else paper

@@ -21,10 +21,10 @@ from tangram_agent.adam import Adam
 from tangram_agent.compiling import Compiled
 from tangram_agent.config import AgentConfig
 from tangram_agent.motion import Fit, MotionModel, Motions
-from tangram_agent.networks import VELOCITY, Networks, initialise, parameter_count
-from tangram_agent.relabelling import make_pairs, with_scenes
+from tangram_agent.networks import Networks, initialise, parameter_count
+from tangram_agent.relabelling import make_pairs
 from tangram_agent.setup import Setup
-from tangram_agent.steps import Batch, Stepping, Steps, Sums
+from tangram_agent.steps import Batch, Stepping, Steps
 from tangram_agent.types import Transitions, Weights
 from tangram_agent.weights import load_arrays, to_arrays, under
 from tangram_sim.errors import RunError
@@ -87,7 +87,7 @@ class Rates(NamedTuple):
     kept: float | Tensor
 
 
-REACHED = 0.99  # reward of an action that came to what was asked
+BOUND = 1.0  # of an agent of pairs: pre-activations beyond it are clamped, and pay a penalty
 NUMBERS = ("critic_loss", "q", "critic_gradient", "actor_loss", "saturation", "actor_gradient")
 
 
@@ -156,10 +156,7 @@ class Learner:
         """What `update` takes, from a batch of transitions: pairs, where the agent sees such."""
         if not self._setup.pairs:
             return batch
-        pairs = make_pairs(batch, self._setup, generator)
-        if self._setup.credits_scenes:
-            return with_scenes(pairs, batch, self._layout, generator)
-        return pairs
+        return make_pairs(batch, self._setup, generator)
 
     def update(
         self, batch: Batch, progress: float = 0.0, motions: Motions | None = None
@@ -199,14 +196,10 @@ class Learner:
 
     def _all_steps(self, steps: Steps, rates: Rates) -> Tensor:
         """All steps of one update, on the device alone; its `NUMBERS`."""
-        # Made once where critic and actor see the same: as it stands, from the same token.
-        features = None
-        if not self.config.afterstate and steps.start is steps.view:
-            features = self.actor.head.see(steps.view)
-        if steps.scenes is None:
-            loss, q = self.critic_loss(steps, features)
-        else:
-            loss, q = self.scene_loss(steps.scenes)
+        # Made once where critic and actor see the same: a whole scene as it stands.
+        once = not self._setup.pairs and steps.start is steps.view
+        features = self.actor.head.see(steps.view) if once else None
+        loss, q = self.critic_loss(steps, features)
         norm = self._step("critic", loss, rates.critic)
         value_loss, penalty = self.actor_loss(steps, features)
         total = value_loss + self.config.saturation_penalty * penalty
@@ -224,36 +217,9 @@ class Learner:
 
     def actor_loss(self, steps: Steps, features: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Minus the value of the actor's own actions (Eq. 6), and the saturation penalty."""
-        if self.config.imitates:
-            return self.imitation_loss(steps, features)
         velocity, raw = self.actor(steps.start, features)
         q = self.critic(steps.start, velocity, None, features)
-        return -q.mean(), saturation(raw, self.config.saturation_limit)
-
-    def imitation_loss(self, steps: Steps, features: Tensor | None) -> tuple[Tensor, Tensor]:
-        """How far the actor is from the actions that came to what was asked, and the penalty.
-
-        The shift's squared error and 1 - cos of the turn's, modulo the symmetry, over the actions
-        of reward `REACHED` and more: goal-conditioned supervised learning (Ghosh et al. 2021).
-        """
-        velocity, raw = self.actor(steps.view, features)
-        error = velocity - steps.velocity
-        turn = 1.0 - torch.cos(math.pi * self.actor.graph.symmetry_of(steps.view) * error[:, 2])
-        reached = (steps.reward >= REACHED).to(error.dtype)
-        each = (error[:, :2].square().sum(-1) + turn) * reached
-        penalty = saturation(raw, self.config.saturation_limit)
-        return each.sum() / reached.sum().clamp(min=1.0), penalty
-
-    def scene_loss(self, scenes: Sums) -> tuple[Tensor, Tensor]:
-        """Mean squared error of the reward as a sum over all pairs of a scene, and the sums (B,).
-
-        As in value decomposition networks (Sunehag et al. 2018): nobody says which pair earned it.
-        """
-        still = scenes.pairs.pose.new_zeros(len(scenes.pairs.pose), VELOCITY)
-        values = self.critic(scenes.pairs, still, scenes.pairs)
-        share = values.view(len(scenes.reward), -1) @ scenes.weights
-        error = 2.0 * share - 1.0 - scenes.reward
-        return error.square().mean(), share
+        return -q.mean(), saturation(raw, BOUND if self._setup.pairs else 0.0)
 
     def _target(self, steps: Steps) -> Tensor:
         """Eq. 5; the target networks are not asked where no transition goes on."""
@@ -275,9 +241,6 @@ class Learner:
         """One step of one network, whatever else the loss depends on; its gradient's norm."""
         gradients = torch.autograd.grad(loss, self._lists[part])
         norm = gradient_norm(gradients, traced=isinstance(rate, Tensor))
-        if self.config.grad_clip > 0.0:
-            share = (self.config.grad_clip / (norm + 1e-6)).clamp(max=1.0)
-            torch._foreach_mul_(gradients, share)
         self.optimisers[part].step(gradients, rate)
         return norm
 

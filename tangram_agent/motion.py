@@ -23,7 +23,6 @@ from tangram_sim.arrays import Floats
 from tangram_sim.config import SimConfig
 from tangram_sim.errors import RunError
 from tangram_sim.layout import Layout
-from tangram_sim.sight import PILED
 
 _FEATURES = 26
 _SPREAD, _NOISE = 0.1, 0.02  # deviations of entries of K and of a way, at the start
@@ -100,11 +99,10 @@ def motions_of(past: Past, now: Floats, layout: Layout, sim: SimConfig) -> Motio
         shifted = np.abs(ways[..., :2]).max(axis=-1, initial=0.0) > still
         np.put_along_axis(shifted, token[..., 0], False, axis=2)
         moved &= ~shifted.any(axis=2)
-    if past.confidence is not None and layout.tokens > 1:
-        # What touches others may be seen wrongly, and one wrong way spoils what is believed.
-        sure = past.confidence[:, -1 - way.shape[1] :] > PILED
-        named = np.take_along_axis(sure[:, :-1] & sure[:, 1:], token[..., 0], axis=2)[..., 0]
-        moved &= named
+    if past.seen is not None and layout.tokens > 1:
+        # One wrong way spoils what is believed.
+        found = past.seen[:, -1 - way.shape[1] :] > 0
+        moved &= np.take_along_axis(found[:, :-1] & found[:, 1:], token[..., 0], axis=2)[..., 0]
     command = actions[:, -3:].reshape(count, steps, 3).clip(-1.0, 1.0)
     return Motions(*(torch.from_numpy(part.astype(np.float64)) for part in (command, way, moved)))
 

@@ -7,13 +7,12 @@ that it came from. A critic values a view and a velocity (M, 3).
 """
 
 import math
-from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
 
 from tangram_agent.attention import GraphEncoder
-from tangram_agent.config import AgentConfig, NetConfig
+from tangram_agent.config import NetConfig
 from tangram_agent.crops import CropValue
 from tangram_agent.filling import Filling
 from tangram_agent.graph import Graph
@@ -108,55 +107,45 @@ class Head(nn.Module):
 
 
 class Actor(nn.Module):
-    """pi(s, g): which velocity to give to the token that is to move."""
+    """pi(s, g): which velocity to give to the token that is to move.
 
-    def __init__(self, graph: Graph, agent: AgentConfig, net: NetConfig) -> None:
+    On whole scenes tanh bounds three outputs, as is usual. On pairs the shift is clamped, and two
+    outputs give the turn by their angle over the token's symmetry k: it needs no more than 1/k of a
+    half turn either way, and has no seam where two equally good turns meet.
+    """
+
+    def __init__(self, graph: Graph, net: NetConfig) -> None:
         super().__init__()
-        self.graph = graph
-        self.kfold, self.clamp = agent.angle_head == "kfold", agent.squash == "clamp"
+        self.graph, self.kfold = graph, isinstance(graph, PairGraph)
         self.head = Head(graph, net, VELOCITY + self.kfold, at_base=True)
 
     def forward(self, view: View, features: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Velocity (M, 3) in [-1, 1] in the arena's axes, and what of the outputs is squashed.
+        """Velocity (M, 3) in [-1, 1] in the arena's axes, and what of the outputs is bounded.
 
-        Those are pre-activations (M, 3), or of the shift (M, 2) with the k-fold head, whose turn
-        has no bound to run into. Features are as for `Head`.
+        Those are pre-activations (M, 3), or (M, 2) of the shift on pairs, whose turn has no bound.
+        Features are as for `Head`.
         """
         raw = self.head(view, features=features)
-        shift, angle = self._squash(raw[:, :2]), self._angle(raw[:, 2:], view)
-        velocity = self.graph.velocity(view, shift, angle)
-        return velocity, raw[:, :2] if self.kfold else raw
-
-    def _squash(self, raw: Tensor) -> Tensor:
-        return raw.clamp(-1.0, 1.0) if self.clamp else torch.tanh(raw)
-
-    def _angle(self, raw: Tensor, view: View) -> Tensor:
-        """The turn as a share of pi, (M,).
-
-        The k-fold head needs no more than 1/k of a half turn either way, and has no seam where
-        two equally good turns meet.
-        """
-        if not self.kfold:
-            return self._squash(raw)[:, 0]
-        symmetry = self.graph.symmetry_of(view)
-        return torch.atan2(raw[:, 1], raw[:, 0]) / symmetry / math.pi
+        if not isinstance(view, Pairs) or not isinstance(self.graph, PairGraph):
+            bounded = torch.tanh(raw)
+            return self.graph.velocity(view, bounded[:, :2], bounded[:, 2]), raw
+        angle = torch.atan2(raw[:, 3], raw[:, 2]) / self.graph.symmetry_of(view) / math.pi
+        return self.graph.velocity(view, raw[:, :2].clamp(-1.0, 1.0), angle), raw[:, :2]
 
 
 class Critic(nn.Module):
     """Q(s, g, a): what a velocity of the token that is to move is worth.
 
-    An afterstate critic sees the graph as the velocity would leave it, a known rigid motion,
-    instead of the velocity itself.
+    On whole scenes it sees the state and the velocity (Eq. 3). On pairs it sees the graph as the
+    velocity would leave it, a known rigid motion, instead of the velocity itself: the afterstate.
     """
 
-    def __init__(self, graph: Graph, agent: AgentConfig, net: NetConfig) -> None:
+    def __init__(self, graph: Graph, net: NetConfig) -> None:
         super().__init__()
-        self.graph, self.afterstate = graph, agent.afterstate
-        self._of_the_rest = agent.credit == "reward"
-        action = 0 if agent.afterstate else VELOCITY
+        self.graph = graph
         # The paper's value is read off the whole graph; a pair's also at its token.
-        at_base = isinstance(graph, PairGraph)
-        self.head = Head(graph, net, 1, at_base=at_base, action=action)
+        pairs = isinstance(graph, PairGraph)
+        self.head = Head(graph, net, 1, at_base=pairs, action=0 if pairs else VELOCITY)
 
     def forward(
         self,
@@ -171,20 +160,14 @@ class Critic(nn.Module):
             view: what the token is moved in.
             velocity: (M, 3) in the arena's axes.
             after: what it came to, where that is known better than by the exact motion.
-            features: of the view, as for `Head`; an afterstate critic makes its own.
+            features: of a whole scene, as for `Head`; of an afterstate they are made here.
         """
-        if not self.afterstate:
-            seen = self.graph.as_seen(view, velocity)
-            return self._value(self.head(view, action=seen, features=features))
-        moved = self.graph.moved(view, velocity) if after is None else after
-        if not self._of_the_rest or not isinstance(moved, Pairs):
-            return self._value(self.head(moved))
-        # What is covered cannot be covered anew, which scenes of disjoint tokens do not teach.
-        bare = replace(moved, covered=torch.zeros_like(moved.covered))
-        return self._value(self.head(bare)) * (1.0 - moved.covered)
-
-    def _value(self, outputs: Tensor) -> Tensor:
-        return outputs.squeeze(-1)
+        if not isinstance(view, Pairs) or not isinstance(self.graph, PairGraph):
+            outputs = self.head(view, action=velocity, features=features)
+        else:
+            outputs = self.head(self.graph.moved(view, velocity) if after is None else after)
+        value: Tensor = outputs.squeeze(-1)
+        return value
 
 
 class Networks(nn.Module):
@@ -192,10 +175,9 @@ class Networks(nn.Module):
 
     def __init__(self, setup: Setup) -> None:
         super().__init__()
-        seen = setup.layout, setup.sim.arena, setup.agent
-        graph: Graph = PairGraph(*seen) if setup.pairs else SceneGraph(*seen)
-        self.actor = Actor(graph, setup.agent, setup.net)
-        self.critic = Critic(graph, setup.agent, setup.net)
+        layout = setup.layout
+        graph: Graph = PairGraph(layout, setup.sim.arena) if setup.pairs else SceneGraph(layout)
+        self.actor, self.critic = Actor(graph, setup.net), Critic(graph, setup.net)
         self.motion = MotionModel() if setup.learns_motion else None
         # Of pairs the critic chooses among what the actor proposes: both play.
         self._both_play = setup.pairs
@@ -216,10 +198,7 @@ def outline_network(setup: Setup) -> nn.Module:
 
 
 def travels(name: str, setup: Setup) -> bool:
-    """Whether workers need a parameter of `Networks.playing`, of this name, to play.
-
-    Who plays a finished run may set `agent.refine_steps`, so that a checkpoint keeps all of them.
-    """
+    """Whether workers need a parameter of `Networks.playing`, of this name, to play."""
     return setup.critic_plays or not name.startswith("critic.")
 
 

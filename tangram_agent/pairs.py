@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
-from tangram_agent.config import AgentConfig
-from tangram_agent.graph import edges, turn, turn_back, unit
+from tangram_agent.graph import turn, turn_back, unit
 from tangram_sim.fitting import KINDS, kind_of
 from tangram_sim.layout import Layout
 
@@ -33,7 +32,6 @@ class Pairs:
         goal_flipped: (M,) 1 where that lies on its other side.
         piece: (M,) its index.
         covered: (M,) share of the piece that other tokens cover already.
-        confidence: (M,) how surely the token is seen; None: it surely is.
     """
 
     pose: Tensor
@@ -43,7 +41,6 @@ class Pairs:
     goal_flipped: Tensor
     piece: Tensor
     covered: Tensor
-    confidence: Tensor | None = None
 
     def at(self, pose: Tensor) -> "Pairs":
         """The same pairs with their tokens elsewhere."""
@@ -53,9 +50,9 @@ class Pairs:
 class PairGraph(nn.Module):
     """The graph of a pair: the token's corners, its base, the target piece's corners.
 
-    The edges are those of Sec. IV-A. Shapes of fewer corners repeat their last one. Every node also
-    knows both shapes, what of the piece is covered and, with `agent.confidence`, how surely the
-    token is seen.
+    The edges are those of Sec. IV-A. Shapes of fewer corners repeat their last one. Coordinates are
+    relative to the token, in its own orientation. Every node also knows its displacement from its
+    centre, the angle, both shapes and what of the piece is covered.
     """
 
     tokens = 1  # in view
@@ -69,11 +66,9 @@ class PairGraph(nn.Module):
     adjacency: Tensor
     target_flag: Tensor
 
-    def __init__(self, layout: Layout, arena: float, agent: AgentConfig) -> None:
+    def __init__(self, layout: Layout, arena: float) -> None:
         super().__init__()
         self.arena = arena
-        self.egocentric, self.offsets = agent.egocentric, agent.offsets
-        self.orientation, self.confidence = agent.orientation, agent.confidence
         self.corners = int(layout.padded_corners.shape[1])
         self.nodes = 2 * self.corners + 1
         constants = {
@@ -84,7 +79,7 @@ class PairGraph(nn.Module):
             "kind": _kinds(layout),
             "mirror": torch.tensor([shape.mirror or 0.0 for shape in layout.shapes]).float(),
             "chiral": torch.as_tensor(layout.chiral).float(),
-            "adjacency": edges(_pair_adjacency(self.corners), agent.edges),
+            "adjacency": _pair_adjacency(self.corners),
             "target_flag": (torch.arange(self.nodes) > self.corners).float()[:, None],
         }
         for name, value in constants.items():
@@ -92,17 +87,13 @@ class PairGraph(nn.Module):
 
     @property
     def features(self) -> int:
-        """F, with the options that are switched on."""
-        own = 2 * self.offsets + _ANGLES * self.orientation + self.confidence
-        return 3 + own + 2 * _KINDS + 4
+        """F."""
+        return 9 + _ANGLES + 2 * _KINDS
 
     @property
     def inputs(self) -> int:
         """Numbers that a perceptron sees of a pair."""
-        placed = 1 if self.egocentric else 2  # in its own frame a token lies at the centre
-        own = 2 * self.corners * self.offsets + self.confidence
-        positions = placed * 2 * (1 + self.corners)
-        return positions + _ANGLES * self.orientation + own + 2 * _KINDS + 4
+        return 2 * (1 + 2 * self.corners) + _ANGLES + 2 * _KINDS + 4
 
     def base_node(self, pairs: Pairs) -> Tensor:
         """Node index (M,) of the token's base."""
@@ -147,16 +138,8 @@ class PairGraph(nn.Module):
 
     def velocity(self, pairs: Pairs, shift: Tensor, angle: Tensor) -> Tensor:
         """The velocity (M, 3) of a shift (M, 2), as the token sees it, and a turn (M,) over pi."""
-        if self.egocentric:
-            shift, angle = self._to_arena(pairs, shift), _signs(pairs.flipped) * angle
+        shift, angle = self._to_arena(pairs, shift), _signs(pairs.flipped) * angle
         return torch.cat([shift, angle[:, None]], dim=-1).clamp(-1.0, 1.0)
-
-    def as_seen(self, pairs: Pairs, velocity: Tensor) -> Tensor:
-        """A velocity (M, 3) as the token sees it."""
-        if not self.egocentric:
-            return velocity
-        shift, angle = self._seen(pairs, pairs.pose + velocity)
-        return torch.cat([shift, angle[:, None]], dim=-1)
 
     def moved(self, pairs: Pairs, velocity: Tensor) -> Pairs:
         """The pairs after the exact rigid motion of a velocity (M, 3), as the simulation has it."""
@@ -178,20 +161,14 @@ class PairGraph(nn.Module):
         radius = self.radius[pairs.token][:, None, None]
         own, offset = self._bodies(pairs, angle, other_side)
         ratio, near = self._sizes(pairs, place)
-        centres, corners = place[:, None], offset + place[:, None]
-        if not self.egocentric:
-            own, offset = self._to_arena(pairs, own), self._to_arena(pairs, offset)
-            centres = torch.stack([pairs.pose[:, :2], pairs.goal[:, :2]], dim=1)
-            corners = torch.cat([own + centres[:, :1], offset + centres[:, 1:]], dim=1)
         parts = [
-            centres.flatten(1),
-            *([self._angles(pairs, angle)] if self.orientation else []),
-            (corners / radius * _CORNER_SCALE).flatten(1),
-            *([(own / radius).flatten(1)] if self.offsets else []),
+            place,
+            self._angles(pairs, angle),
+            ((offset + place[:, None]) / radius * _CORNER_SCALE).flatten(1),
+            (own / radius).flatten(1),
             self.kind[pairs.token],
             self.kind[pairs.piece],
             torch.stack([other_side, pairs.covered, ratio, near], dim=-1),
-            *self._confidence(pairs),
         ]
         return torch.cat(parts, dim=-1)
 
@@ -202,33 +179,21 @@ class PairGraph(nn.Module):
         base = torch.zeros_like(own[:, :1])
         positions = torch.cat([own, base, offset + place[:, None]], dim=1)
         offsets = torch.cat([own, base, offset], dim=1) / self.radius[pairs.token][:, None, None]
-        if not self.egocentric:
-            positions = self._to_arena(pairs, positions) + pairs.pose[:, None, :2]
-            offsets = self._to_arena(pairs, offsets)
         ratio, near = self._sizes(pairs, place)
         of_pair = [
-            *([self._angles(pairs, angle)] if self.orientation else []),
+            self._angles(pairs, angle),
             self.kind[pairs.token],
             self.kind[pairs.piece],
             torch.stack([ratio, near, pairs.covered, other_side], dim=-1),
-            *self._confidence(pairs),
         ]
         everywhere = torch.cat(of_pair, dim=-1)[:, None].expand(-1, self.nodes, -1)
         target = self.target_flag.expand(len(own), -1, -1)
-        parts = [positions, *([offsets] if self.offsets else []), target, everywhere]
-        return torch.cat(parts, dim=-1)
+        return torch.cat([positions, offsets, target, everywhere], dim=-1)
 
     def _bodies(self, pairs: Pairs, angle: Tensor, other_side: Tensor) -> tuple[Tensor, Tensor]:
         """Displacements (M, C, 2) of the token's corners and of the piece's, from their centres."""
         body = _mirrored(self.body[pairs.piece], _signs(other_side)[:, None])
         return self.body[pairs.token], turn(body, unit(angle)[:, None])
-
-    def _confidence(self, pairs: Pairs) -> list[Tensor]:
-        """(M, 1), for agents that know it."""
-        if not self.confidence:
-            return []
-        sure = torch.ones_like(pairs.covered) if pairs.confidence is None else pairs.confidence
-        return [sure[:, None]]
 
     def _sizes(self, pairs: Pairs, place: Tensor) -> tuple[Tensor, Tensor]:
         """(M,) how much larger the piece is, and (M,) how near, 1 where both centres are one."""

@@ -7,14 +7,12 @@ Legend: B environments, K tokens, V corners, M candidates (pairs of all environm
 row).
 """
 
-import zlib
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tangram_agent.adam import Adam
 from tangram_agent.coverage import covered_share, covering, worths
 from tangram_agent.motion import Belief, motions_of
 from tangram_agent.networks import Networks
@@ -23,7 +21,6 @@ from tangram_agent.setup import Setup
 from tangram_agent.types import Past
 from tangram_sim.actions import velocities_of
 from tangram_sim.arrays import Bools, Floats, Ints, Singles
-from tangram_sim.layout import Layout
 
 _SHORT_LIST = 8  # proposals of an environment that are valued for all pieces
 
@@ -74,7 +71,6 @@ class Scene:
         goal_flipped: (B, K) their sides.
         covered: (B, K, K) share of the second, a piece, that tokens other than the first cover.
         worth: (B, K) sum of the values of what each token covers.
-        confidence: (B, K) how surely each token is seen.
     """
 
     pose: Tensor
@@ -83,7 +79,6 @@ class Scene:
     goal_flipped: Tensor
     covered: Tensor
     worth: Tensor
-    confidence: Tensor
 
     def pairs(self, c: Candidates) -> Pairs:
         """The pairs (M,) of candidates; a token that is turned over has changed its side."""
@@ -95,7 +90,6 @@ class Scene:
             goal_flipped=self.goal_flipped[c.row, c.piece],
             piece=c.piece,
             covered=self.covered[c.row, c.token, c.piece],
-            confidence=self.confidence[c.row, c.token],
         )
 
     def leaves_no_choice(self, candidates: Candidates) -> bool:
@@ -129,7 +123,7 @@ class Planner:
     def __init__(self, networks: Networks, setup: Setup) -> None:
         self._networks, self._layout, self._agent = networks, setup.layout, setup.agent
         self._motion, self._sim = networks.motion, setup.sim
-        self._graph = PairGraph(setup.layout, setup.sim.arena, setup.agent)
+        self._graph = PairGraph(setup.layout, setup.sim.arena)
         self._turns_over = setup.layout.chiral & setup.sim.allow_flip
 
     def choose(
@@ -137,7 +131,6 @@ class Planner:
         corners: Floats,
         placed: Bools,
         goals: Floats,
-        refine: bool = True,
         past: Past | None = None,
     ) -> Choice:
         """What to play; where all tokens are placed, some action of the first one.
@@ -146,23 +139,17 @@ class Planner:
             corners: (B, V, 2) of the tokens.
             placed: (B, K) which tokens are placed.
             goals: (B, V, 2) of the target.
-            refine: take the gradient steps, as the agent is configured.
             past: what was seen of these episodes before, if anything.
         """
         with torch.no_grad():
             belief = self._belief(corners, past)
             if self._motion is not None and belief is not None and past is not None:
                 corners = self._motion.ahead(belief, corners, past, self._layout, self._sim)
-            closed, sure = self._seen(placed, past)
-            scene = self._scene(corners, goals, sure)
-            candidates, pose = self._short_list(scene, self._open(closed, goals))
+            scene = self._scene(corners, goals)
+            candidates, pose = self._short_list(scene, _open(placed))
             velocity, reached = self._reached(scene, candidates, pose, belief)
             best = self._best(scene, candidates, reached)
         chosen, pose, velocity = candidates.at(best), pose[best], velocity[best]
-        if refine and self._agent.refine_steps:
-            pose = self._refined(scene, chosen, pose)
-            with torch.no_grad():
-                velocity, _ = self._reached(scene, chosen, pose, belief)
         return Choice(
             token=chosen.token.numpy(),
             flip=chosen.flip.numpy() > 0.5,
@@ -202,20 +189,7 @@ class Planner:
         command = self._motion.command(own, way)
         return command, self._graph.moved(pairs, self._motion.predict(own, command)[0]).pose
 
-    def _seen(self, placed: Bools, past: Past | None) -> tuple[Bools, Floats]:
-        """(B, K) tokens that no action should name, and how surely each is seen.
-
-        Of tokens that are not surely seen the agent judges for itself, where it knows that.
-        """
-        if past is None or past.confidence is None or past.placed is None:
-            return placed, np.ones(placed.shape)
-        sure = np.maximum(past.confidence[:, -1].astype(np.float64), 0.0)
-        if not self._agent.confidence:
-            return placed, sure
-        gone = np.asarray((past.placed > 0) | (sure == 0.0))
-        return np.where(gone.all(axis=1, keepdims=True), placed, gone), sure
-
-    def _scene(self, corners: Floats, goals: Floats, confidence: Floats) -> Scene:
+    def _scene(self, corners: Floats, goals: Floats) -> Scene:
         layout = self._layout
         covered = covering(corners, goals, layout)
         return Scene(
@@ -225,18 +199,7 @@ class Planner:
             goal_flipped=as_tensor(layout.flipped(goals)),
             covered=as_tensor(covered_share(covered, layout)),
             worth=as_tensor(worths(covered, layout)),
-            confidence=as_tensor(confidence),
         )
-
-    def _open(self, placed: Bools, goals: Floats) -> Bools:
-        """(B, K) tokens that may be next, at least one in each row."""
-        is_open: Bools = ~np.asarray(placed, np.bool_)
-        is_open[~is_open.any(axis=1), 0] = True
-        if self._agent.order == "learned":
-            return is_open
-        # The first one that is left, by rank.
-        rank = np.where(is_open, _ranks(self._agent.order, self._layout, goals), np.inf)
-        return np.asarray(np.arange(rank.shape[1]) == rank.argmin(axis=1)[:, None])
 
     def _short_list(self, scene: Scene, is_open: Bools) -> tuple[Candidates, Tensor]:
         """The best few of all pairs that may be played, by their own piece's value, and poses.
@@ -283,31 +246,12 @@ class Planner:
         values = self._valued(pairs, pose.repeat_interleave(count, dim=0))
         return values.view(-1, count).sum(dim=1)
 
-    def _refined(self, scene: Scene, chosen: Candidates, pose: Tensor) -> Tensor:
-        """Poses (B, 3) after gradient steps uphill on what the critic says they cover."""
-        with torch.enable_grad():
-            moved = pose.clone().requires_grad_(True)
-            optimiser = Adam([moved])
-            for _ in range(self._agent.refine_steps):
-                loss = -self._total(scene, chosen, moved).sum()
-                gradients = torch.autograd.grad(loss, [moved])
-                optimiser.step(gradients, self._agent.refine_rate)
-        return moved.detach()
 
-
-def _ranks(order: str, layout: Layout, goals: Floats) -> Floats:
-    """(B, K) which token comes first, by a rule that was not learned."""
-    count = layout.tokens
-    if order == "size":
-        # Equal areas stay in the set's order, whatever their rounding.
-        size = np.round(layout.areas / layout.areas.max(), 9)
-        rank = np.argsort(np.argsort(-size, kind="stable"))
-        return np.broadcast_to(rank, (len(goals), count))
-    if order == "random":
-        # By the target, which stays for the whole episode: a policy has no memory.
-        seeds = [zlib.crc32(np.asarray(goal, np.float32).tobytes()) for goal in goals]
-        return np.stack([np.random.default_rng(seed).permutation(count) for seed in seeds])
-    return np.broadcast_to(np.arange(count), (len(goals), count))
+def _open(placed: Bools) -> Bools:
+    """(B, K) tokens that may be next, at least one in each row."""
+    is_open: Bools = ~np.asarray(placed, np.bool_)
+    is_open[~is_open.any(axis=1), 0] = True
+    return is_open
 
 
 def as_tensor(array: Floats | Bools) -> Tensor:

@@ -83,7 +83,6 @@ class Policy:
         corners: Floats | Singles,
         placed: Flags,
         goals: Floats | Singles,
-        refine: bool = True,
         past: Past | None = None,
     ) -> Singles:
         """Actions (B, A) in [-1, 1], noise off.
@@ -92,7 +91,6 @@ class Policy:
             corners: (B, V, 2) of the tokens.
             placed: (B, K) which tokens are placed.
             goals: (B, V, 2) corners of the targets, or (B, G, 2) rows of their outlines.
-            refine: take the steps of `agent.refine_steps`, where the agent has such.
             past: what was seen of these episodes before, if anything: an agent that learns what a
                 command comes to corrects itself by it.
         """
@@ -105,7 +103,7 @@ class Policy:
             exact = np.asarray(corners, np.float64)
             wanted = np.asarray(goals, np.float64)
             flags = np.asarray(placed, np.bool_)
-            choice = self._planner.choose(exact, flags, wanted, refine, past)
+            choice = self._planner.choose(exact, flags, wanted, past)
             token, flip, velocity = choice.token, choice.flip, choice.velocity
         return make_actions(token, velocity, flip, self.tokens, self.sim)
 
@@ -150,7 +148,7 @@ class Policy:
         """
         if self._filler is not None:
             return self._filling(self._filler, corners, placed, goals, generators)
-        actions = self.act(corners, placed, goals, refine=False, past=past)
+        actions = self.act(corners, placed, goals, past)
         for i, (action, generator) in enumerate(zip(actions, generators, strict=True)):
             velocity = action[-3:]
             if generator.random() < self.config.uniform_share:

@@ -16,14 +16,14 @@ from tangram_agent.config import AgentConfig, RelabelConfig
 from tangram_agent.coverage import Lying, covered_share, covering, lying, newly_covered
 from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes, Flags, Transitions
-from tangram_sim.actions import chosen_tokens, flips, velocities
+from tangram_sim.actions import chosen_tokens
 from tangram_sim.arrays import Bools, Floats, Ints, Singles
 from tangram_sim.layout import Layout
-from tangram_sim.sight import SURE
 
 # (achieved corners (B, V, 2), desired corners (B, V, 2)) -> rewards (B,)
 RewardFunction = Callable[[Floats, Floats], Floats]
 
+_PAIRS = 8  # of a transition of several tokens in one update
 _CORRECTED = 0.25  # share of pairs that begin where the action ended
 _OTHER_SHAPE = 0.15  # share of hindsight pieces that have any shape, not the token's
 _OTHER_SIDE = 0.1  # share of hindsight pieces on the other side than the token
@@ -91,7 +91,7 @@ def _goals(
 
 def _transitions(episodes: Episodes, goals: Singles, rewards: Singles) -> Transitions:
     count, steps = episodes.count, episodes.steps
-    size, sure = count * steps, episodes.confidence
+    size = count * steps
     return Transitions(
         state=episodes.corners[:, :-1].reshape(size, *episodes.corners.shape[2:]),
         placed=episodes.placed[:, :-1].reshape(size, -1),
@@ -101,8 +101,6 @@ def _transitions(episodes: Episodes, goals: Singles, rewards: Singles) -> Transi
         next_placed=episodes.placed[:, 1:].reshape(size, -1),
         done=episodes.placed[:, 1:].all(axis=-1).astype(np.uint8).reshape(size),
         goal=goals,
-        confidence=None if sure is None else sure[:, :-1].reshape(size, -1),
-        next_confidence=None if sure is None else sure[:, 1:].reshape(size, -1),
     )
 
 
@@ -116,8 +114,7 @@ class PairBatch:
     """M pairs as they were before and after an action, and what that is worth.
 
     Attributes:
-        before, after: (M, 3) poses of the token; of one that was not surely seen before, after is
-            where it was told to go, which is all that is known when an action is chosen.
+        before, after: (M, 3) poses of the token.
         start: (M, 3) where the actor is asked from: mostly before, else where it came to, to mend
             what it proposed itself: nobody plays that, as starts are far from targets.
         before_flipped, after_flipped, start_flipped: (M,) whether it lay on its other side.
@@ -127,11 +124,8 @@ class PairBatch:
         goal_flipped: (M,) its side.
         piece: (M,) its index.
         covered: (M,) share of the piece that was covered before the action.
-        confidence: (M,) how surely the token was seen before the action.
-        start_confidence: (M,) how surely it is seen where the actor is asked from.
         reward: (M,) what the action is worth: with several tokens what the token covers newly of
-            the piece, over the larger of both areas, or 0 where whole scenes teach that; with one
-            the environment's reward.
+            the piece, over the larger of both areas; with one the environment's reward.
         done: (M,) 1 where nothing follows.
     """
 
@@ -147,27 +141,8 @@ class PairBatch:
     goal_flipped: Bools
     piece: Ints
     covered: Floats
-    confidence: Floats
-    start_confidence: Floats
     reward: Floats
     done: Flags
-
-
-@dataclass(frozen=True, eq=False)
-class SceneBatch(PairBatch):
-    """Pairs for the actor, and the whole scenes that the environment rewarded for the critic.
-
-    Attributes:
-        poses, goals: (B, K, 3) of all tokens after the action, and of the target's pieces.
-        flips, goal_flips: (B, K) on which sides.
-        returned: (B,) the environment's reward.
-    """
-
-    poses: Floats
-    flips: Bools
-    goals: Floats
-    goal_flips: Bools
-    returned: Singles
 
 
 def make_pairs(batch: Transitions, setup: Setup, generator: np.random.Generator) -> PairBatch:
@@ -175,12 +150,12 @@ def make_pairs(batch: Transitions, setup: Setup, generator: np.random.Generator)
 
     One token and its piece are the whole scene: each transition is a pair, with the goal that it
     has in the replay and the environment's reward for that. With several tokens each transition
-    gives `pairs_per_transition`, of the token that moved and any piece, a share of them with the
+    gives `_PAIRS`, of the token that moved and any piece, a share of them with the
     goals that were played, the rest with those of hindsight: as many parts as there are copies.
     """
     layout, agent = setup.layout, setup.agent
     several = layout.tokens > 1
-    each = agent.pairs_per_transition if several else 1
+    each = _PAIRS if several else 1
     rows = np.repeat(np.arange(batch.count), each)
     token = chosen_tokens(batch.action.astype(np.float64), layout.tokens)[rows]
     before = lying(batch.state, layout, rows, token)
@@ -189,9 +164,7 @@ def make_pairs(batch: Transitions, setup: Setup, generator: np.random.Generator)
         strategy = _strategies(agent, len(rows), generator)
         piece, covered = _played(batch, layout, rows, token, generator)
         _Relabelled(agent, layout, generator).replace(piece, covered, after, strategy)
-        reward, done = np.zeros(len(rows)), np.ones(len(rows), np.uint8)
-        if setup.credits_pieces:
-            reward = newly_covered(after, piece, covered, layout)
+        reward, done = newly_covered(after, piece, covered, layout), np.ones(len(rows), np.uint8)
     else:
         piece, covered = lying(batch.goal, layout, rows, token), np.zeros(len(rows))
         # Most goals are where the token came to lie: else it would know them by its own turn.
@@ -199,18 +172,12 @@ def make_pairs(batch: Transitions, setup: Setup, generator: np.random.Generator)
         reward, done = batch.reward.astype(np.float64), batch.done
     again = generator.random(len(rows)) < _CORRECTED
     start = after.instead(before, ~again)
-    seen, sure, sure_after = after, np.ones(len(rows)), np.ones(len(rows))
-    if agent.confidence and batch.confidence is not None and batch.next_confidence is not None:
-        both = batch.confidence, batch.next_confidence
-        # One that left the picture has less than none.
-        sure, sure_after = (np.maximum(part[rows, token].astype(np.float64), 0.0) for part in both)
-        seen = _told(batch, setup, rows, before).instead(after, sure >= SURE)
     return PairBatch(
         before=before.pose,
-        after=seen.pose,
+        after=after.pose,
         start=start.pose,
         before_flipped=before.flipped,
-        after_flipped=seen.flipped,
+        after_flipped=after.flipped,
         start_flipped=start.flipped,
         velocity=batch.action[rows, -3:],
         token=token,
@@ -218,29 +185,8 @@ def make_pairs(batch: Transitions, setup: Setup, generator: np.random.Generator)
         goal_flipped=piece.flipped,
         piece=piece.index,
         covered=covered,
-        confidence=sure,
-        start_confidence=np.where(again, sure_after, sure),
         reward=reward,
         done=done,
-    )
-
-
-def with_scenes(
-    pairs: PairBatch, batch: Transitions, layout: Layout, generator: np.random.Generator
-) -> SceneBatch:
-    """The same pairs, with the scenes of their batch as the actions left them."""
-    after, goal = batch.next_state.astype(np.float64), batch.goal.astype(np.float64)
-    goals = layout.poses(goal)
-    # As in `make_pairs`: a goal of hindsight has the token's own turn, and others look the same.
-    every = np.broadcast_to(np.arange(layout.tokens), goals.shape[:2])
-    goals[..., 2] += _alike(every, layout, generator)
-    return SceneBatch(
-        **vars(pairs),
-        poses=layout.poses(after),
-        flips=layout.flipped(after),
-        goals=goals,
-        goal_flips=layout.flipped(goal),
-        returned=batch.reward,
     )
 
 
@@ -249,14 +195,6 @@ def _alike(piece: Ints, layout: Layout, generator: np.random.Generator) -> Float
     order = np.array([shape.symmetry for shape in layout.shapes])[piece]
     turn: Floats = 2.0 * np.pi / order * generator.integers(order)
     return turn
-
-
-def _told(batch: Transitions, setup: Setup, rows: Ints, before: Lying) -> Lying:
-    """Where tokens (M,) were told to go."""
-    action = batch.action.astype(np.float64)
-    way, turned = velocities(action, setup.sim), flips(action, setup.layout, setup.sim)
-    pose = np.asarray(before.pose + way[rows])
-    return Lying(before.index, pose, before.flipped ^ turned[rows])
 
 
 def _strategies(agent: AgentConfig, count: int, generator: np.random.Generator) -> Ints:

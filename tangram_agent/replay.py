@@ -25,7 +25,6 @@ class ReplayBuffer:
         corners: int,
         tokens: int,
         action_size: int,
-        confidence: bool = False,
     ) -> None:
         """Allocate everything at once.
 
@@ -34,7 +33,6 @@ class ReplayBuffer:
             corners: V.
             tokens: K.
             action_size: A.
-            confidence: whether transitions tell how surely tokens were seen.
         """
         self.capacity, self.added = capacity, 0
         self._first = 0  # number of the first row that was ever kept here
@@ -49,8 +47,6 @@ class ReplayBuffer:
             "done": np.zeros(capacity, np.uint8),
             "goal": np.zeros(points, np.float32),
         }
-        for name in ("confidence", "next_confidence") if confidence else ():
-            self._columns[name] = np.zeros(flags, np.float32)
 
     def __len__(self) -> int:
         return min(self.added - self._first, self.capacity)
@@ -105,11 +101,7 @@ class ReplayBuffer:
         state, action, following = (
             self._columns[name] for name in ("state", "action", "next_state")
         )
-        sure = None
-        if "confidence" in self._columns:
-            now = self._columns["next_confidence"][rows[:, -1:]]
-            sure = np.concatenate([self._columns["confidence"][rows], now], axis=1)
-        past = Past(state[rows].astype(np.float32), action[rows].astype(np.float32), sure)
+        past = Past(state[rows].astype(np.float32), action[rows].astype(np.float32))
         return past, following[rows[:, -1]].astype(np.float32)
 
     def check_valid(self) -> None:

@@ -155,7 +155,7 @@ class Run:
         return replace(self, policy=_policy(self.setup, none))
 
     def with_settings(self, changes: Changes) -> "Run":
-        """The same weights, played with other settings: `{"agent": {"refine_steps": 20}}`.
+        """The same weights, played with other settings: `{"agent": {"reapply": 1}}`.
 
         Raises:
             ConfigError: a setting that the weights were trained for or that was for learning only,
@@ -219,9 +219,6 @@ def _parse_config(text: str, path: Path) -> dict[str, Any]:
     content = load_settings(text, str(path))
     if not isinstance(content, dict):
         raise RunError(f"{path} holds no settings: it must be a mapping of sections")
-    agent = content.get("agent")
-    if isinstance(agent, dict) and agent.get("readout") == "pair" and agent.get("afterstate"):
-        agent.setdefault("motion", "exact")  # trained before there was a choice
     return content
 
 

@@ -20,13 +20,8 @@ from tangram_sim.targets import check_targets
 
 Settings = TypeVar("Settings")
 
-# Settings of the agent that have no effect but on pairs of several tokens.
-_SEVERAL_ONLY = ("order", "credit", "pairs_per_transition", "confidence")
 # Those that have none on outlines.
-_NOT_OF_OUTLINES = (
-    *("egocentric", "offsets", "orientation", "edges", "afterstate", "angle_head", "squash"),
-    *("imitates", "saturation_penalty", "saturation_limit", "actor_lr", "noise"),
-)
+_NOT_OF_OUTLINES = ("saturation_penalty", "actor_lr", "noise")
 MAX_HALVED = 5  # times that a crop of 32 pixels is halved to one
 SECTIONS = ("tokens", "sim", "reward", "agent", "net")
 
@@ -60,8 +55,6 @@ class Setup:
                 f"got {agent.replay_capacity}"
             )
         self._check_net()
-        if one:
-            self._refuse(_SEVERAL_ONLY, "one token", "take a set of several")
         if self.fills:
             self._check_fills()
         if self.pairs and not one:
@@ -83,25 +76,9 @@ class Setup:
                     "where it sees them, and learns nothing where the camera stands elsewhere: set "
                     f"sim.{name}=0"
                 )
-        if not self.agent.confidence:
-            return
-        if sim.observe != "pictures":
-            where, remedy = f"sim.observe={sim.observe}", "set sim.observe=pictures"
-            refuse_ignored("agent.confidence=true", where, remedy, False)
-        if sim.inexact:
-            raise ConfigError(
-                "agent.confidence=true learns from where a token should have come to, which nobody "
-                f"knows with {', '.join(f'sim.{name}' for name in sim.inexact)} as set: leave that "
-                "out, or set agent.confidence=false"
-            )
 
     def _check_net(self) -> None:
         """Refuse a kind of network that does not see what the agent sees."""
-        edges, scenes = self.agent.edges, self.net.kind == "mlp" and not self.pairs
-        if self.net.kind == "mlp" and not (scenes and edges == "inputs"):
-            self._refuse(("edges",), "net.kind=mlp", "set net.kind=mha")
-        if self.net.kind == "mha" and edges == "inputs":
-            refuse_ignored("agent.edges=inputs", "net.kind=mha", "set agent=mlp", "paper")
         if self.net.kind == "crops" and len(self.net.hidden) > MAX_HALVED:
             raise ConfigError(
                 f"net.hidden={told(self.net.hidden)}: each of the convolutions of net.kind=crops "
@@ -172,17 +149,10 @@ class Setup:
         agent, whole = self.agent, "set agent.readout=token, which values the whole scene"
         if agent.gamma > 0.0:
             refuse_ignored(f"agent.gamma={told(agent.gamma)}", several, whole)
-        if self.credits_pieces:
-            learn = "set agent.credit=reward, which learns what the environment returns"
-            for name, value in _changed(self.reward).items():
-                refuse_ignored(f"reward.{name}={told(value)}", several, learn)
-            if any(relabel.strategy == "future" for relabel in agent.hindsight):
-                refuse_ignored("agent.hindsight.strategy=future", several, "use final")
-        elif self.reward.name != "overlap":
-            raise ConfigError(
-                f"reward.name={self.reward.name} is no sum over tokens and pieces, as which "
-                f"agent.credit=reward learns it: {whole}"
-            )
+        for name, value in _changed(self.reward).items():
+            refuse_ignored(f"reward.{name}={told(value)}", several, whole)
+        if any(relabel.strategy == "future" for relabel in agent.hindsight):
+            refuse_ignored("agent.hindsight.strategy=future", several, "use final")
 
     def _refuse(self, names: Iterable[str], because: str, remedy: str) -> None:
         """Refuse settings of the agent that are not the default."""
@@ -229,7 +199,7 @@ class Setup:
         Of one token that stays on its side there is one proposal, and nothing to choose.
         """
         one = self.layout.tokens == 1 and not self.sim.allow_flip
-        return self.pairs and not (one and self.agent.refine_steps == 0)
+        return self.pairs and not one
 
     @property
     def credits_pieces(self) -> bool:
@@ -237,12 +207,7 @@ class Setup:
 
         Else it learns the environment's reward.
         """
-        return self.pairs and self.layout.tokens > 1 and self.agent.credit == "piece"
-
-    @property
-    def credits_scenes(self) -> bool:
-        """Whether the critic of pairs learns the reward of scenes, as a sum over all pairs."""
-        return self.pairs and self.layout.tokens > 1 and self.agent.credit == "reward"
+        return self.pairs and self.layout.tokens > 1
 
     @property
     def bootstraps(self) -> bool:
@@ -252,8 +217,7 @@ class Setup:
     @property
     def learns_motion(self) -> bool:
         """Whether the agent learns what a command comes to: with a critic that sees afterstates."""
-        agent = self.agent
-        return self.pairs and agent.afterstate and agent.motion == "learned"
+        return self.pairs and self.agent.motion == "learned"
 
     @property
     def screens_motions(self) -> bool:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from tangram_agent.networks import VELOCITY, View
 from tangram_agent.pairs import Pairs
-from tangram_agent.relabelling import PairBatch, SceneBatch
+from tangram_agent.relabelling import PairBatch
 from tangram_agent.scenes import Scenes, next_token
 from tangram_agent.setup import Setup
 from tangram_agent.types import Transitions
@@ -38,7 +38,6 @@ class Steps:
             None where nothing follows on any of them.
         seen_after: that too where an afterstate critic is to see it as it was, else it sees the
             exact motion.
-        scenes: all pairs of whole scenes, where the critic learns their reward.
     """
 
     view: View
@@ -48,22 +47,6 @@ class Steps:
     start: View
     follow: View | None
     seen_after: View | None = None
-    scenes: "Sums | None" = None
-
-
-@dataclass(frozen=True, eq=False)
-class Sums:
-    """Rewards of B scenes as sums over all pairs of a token and a piece.
-
-    Attributes:
-        pairs: (B K K) of all scenes.
-        weights: (K K) of the pairs of one.
-        reward: (B,) that the environment returned.
-    """
-
-    pairs: Pairs
-    weights: Tensor
-    reward: Tensor
 
 
 class Stepping:
@@ -100,27 +83,22 @@ class Stepping:
         )
 
     def _of_pairs(self, batch: PairBatch) -> Steps:
-        sure = self._tensor(batch.confidence)
-        after = self._pairs(batch, batch.after, batch.after_flipped, sure)
-        start = self._tensor(batch.start_confidence)
+        after = self._pairs(batch, batch.after, batch.after_flipped)
         return Steps(
-            view=self._pairs(batch, batch.before, batch.before_flipped, sure),
+            view=self._pairs(batch, batch.before, batch.before_flipped),
             velocity=self._tensor(batch.velocity),
             reward=self._tensor(batch.reward),
             done=self._tensor(batch.done),
-            start=self._pairs(batch, batch.start, batch.start_flipped, start),
+            start=self._pairs(batch, batch.start, batch.start_flipped),
             follow=self._if_any_follows(batch.done, after),
             seen_after=after,
-            scenes=self._sums(batch) if isinstance(batch, SceneBatch) else None,
         )
 
     def _if_any_follows(self, done: Array, follow: View) -> View | None:
         """What follows, where a target network is to be asked of it."""
         return follow if self._bootstraps and not done.all() else None
 
-    def _pairs(
-        self, batch: PairBatch, pose: Floats, flipped: Bools, confidence: Tensor | None = None
-    ) -> Pairs:
+    def _pairs(self, batch: PairBatch, pose: Floats, flipped: Bools) -> Pairs:
         """The pairs (M,) with their tokens where they lay at some time."""
         return Pairs(
             pose=self._tensor(pose),
@@ -130,24 +108,7 @@ class Stepping:
             goal_flipped=self._tensor(batch.goal_flipped),
             piece=self._index(batch.piece),
             covered=self._tensor(batch.covered),
-            confidence=confidence,
         )
-
-    def _sums(self, batch: SceneBatch) -> Sums:
-        count, tokens = batch.poses.shape[:2]
-        token, piece = (part.reshape(-1) for part in np.indices((tokens, tokens)))
-        pairs = Pairs(
-            pose=self._tensor(batch.poses[:, token].reshape(-1, 3)),
-            flipped=self._tensor(batch.flips[:, token].reshape(-1)),
-            token=self._index(np.tile(token, count)),
-            goal=self._tensor(batch.goals[:, piece].reshape(-1, 3)),
-            goal_flipped=self._tensor(batch.goal_flips[:, piece].reshape(-1)),
-            piece=self._index(np.tile(piece, count)),
-            covered=torch.zeros(count * tokens * tokens, device=self._device),
-        )
-        areas = self._layout.areas
-        weights = self._tensor(np.maximum(areas[token], areas[piece]) / areas.sum())
-        return Sums(pairs, weights, self._tensor(batch.returned))
 
     def _tensor(self, column: Array) -> Tensor:
         return torch.from_numpy(np.asarray(column, np.float32)).to(self._device)

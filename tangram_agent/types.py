@@ -11,12 +11,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tangram_sim.actions import chosen_tokens
 from tangram_sim.arrays import Singles
-from tangram_sim.sight import SURE
 
 Flags = npt.NDArray[np.uint8]
-AWAY = -1.0  # confidence of a token that should have left the picture
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,9 +26,9 @@ class Episodes:
         actions: (E, T, A) float32 in [-1, 1].
         rewards: (E, T) float32 of the goal that was played.
         goals: (E, V, 2) float32, target corners, or (E, G, 2) rows of its outline.
-        confidence: (E, T + 1, K) float32 in [0, 1], how surely tokens were seen in a picture, see
-            `tangram_sim.sight.Look`, or `AWAY`; None where pictures are not what is observed.
-        goals_confidence: (E, K) float32 in [0, 1], the same of the target's pieces; 1 of outlines.
+        seen: (E, T + 1, K) uint8, 1 where a token was found in the picture, or should have left
+            that of several tokens; None where pictures are not what is observed.
+        goals_seen: (E, K) uint8, the same of the target's pieces; 1 of outlines.
         achieved: (E, G, 2) rows of the outline of what tokens came to cover, as it was traced in
             the camera's picture of it; None where targets are not traced.
     """
@@ -41,8 +38,8 @@ class Episodes:
     actions: Singles
     rewards: Singles
     goals: Singles
-    confidence: Singles | None = None
-    goals_confidence: Singles | None = None
+    seen: Flags | None = None
+    goals_seen: Flags | None = None
     achieved: Singles | None = None
 
     @property
@@ -50,37 +47,16 @@ class Episodes:
         """Those that there are, by name."""
         return {name: array for name, array in vars(self).items() if array is not None}
 
-    def learnable(self, doubts: bool) -> "Episodes":
-        """Those that show what their actions did; of several tokens some may have left the picture.
+    def learnable(self) -> "Episodes":
+        """Those in which all tokens and pieces were seen at all times.
 
-        Where those lie is only known by what they were told, but to lose an episode of many actions
-        for one that left is worse.
-
-        Args:
-            doubts: whether the agent knows how surely it sees a token. Else all tokens are to be
-                surely seen at all times; with it those that an action named, after that.
+        To lose an episode of many actions for one token that left the picture would be worse than
+        to learn from where it was told to go.
         """
-        if self.confidence is None or self.goals_confidence is None:
+        if self.seen is None or self.goals_seen is None:
             return self
-        several = self.confidence.shape[2] > 1
-        gone = (self.confidence < SURE) & ((self.confidence != AWAY) | (not several))
-        if doubts:
-            named = chosen_tokens(
-                self.actions.reshape(self.transitions, self.actions.shape[2]).astype(np.float64),
-                gone.shape[2],
-            )
-            index = named.reshape(self.count, self.steps, 1)
-            gone = np.take_along_axis(gone[:, 1:], index, axis=2)
-        whole = ~(gone.any(axis=(1, 2)) | (self.goals_confidence < SURE).any(axis=1))
-        return Episodes(
-            corners=self.corners[whole],
-            placed=self.placed[whole],
-            actions=self.actions[whole],
-            rewards=self.rewards[whole],
-            goals=self.goals[whole],
-            confidence=self.confidence[whole],
-            achieved=None if self.achieved is None else self.achieved[whole],
-        )
+        whole = self.seen.all(axis=(1, 2)) & self.goals_seen.all(axis=1)
+        return Episodes(**{name: array[whole] for name, array in self.arrays.items()})
 
     @property
     def count(self) -> int:
@@ -105,15 +81,12 @@ class Past:
     Attributes:
         corners: (B, T, V, 2) of the tokens before each action.
         actions: (B, T, A).
-        confidence: (B, T + 1, K) how surely tokens were seen before each action, and now; None:
-            all were.
-        placed: (B, K) which are placed now, where some are not surely seen.
+        seen: (B, T + 1, K) which tokens were seen before each action, and now; None: all were.
     """
 
     corners: Singles
     actions: Singles
-    confidence: Singles | None = None
-    placed: Flags | None = None
+    seen: Flags | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,8 +100,6 @@ class Transitions:
         reward: (B,) float32.
         done: (B,) uint8, 1 where next_state is terminal; a time limit is not.
         goal: (B, V, 2) float32 target corners.
-        confidence, next_confidence: (B, K) float32, how surely tokens were seen, where pictures are
-            what is observed.
     """
 
     state: Singles
@@ -139,8 +110,6 @@ class Transitions:
     next_placed: Flags
     done: Flags
     goal: Singles
-    confidence: Singles | None = None
-    next_confidence: Singles | None = None
 
     @property
     def arrays(self) -> dict[str, npt.NDArray[Any]]:

@@ -124,7 +124,7 @@ def test_crops_are_for_the_agent_of_outlines() -> None:
 def test_where_the_paper_is_silent_its_presets_follow_the_hindsight_paper(name: str) -> None:
     """Values of the appendix of [16]."""
     agent = make_setup(compose("train", f"agent={name}")).agent
-    assert (agent.saturation_penalty, agent.saturation_limit) == (1.0, 0.0)
+    assert agent.saturation_penalty == 1.0
     assert (agent.noise, agent.uniform_share) == (0.1, 0.2)
     assert (agent.gamma, agent.polyak, agent.batch_size) == (0.98, 0.95, 128)
     assert agent.actor_lr == agent.critic_lr == 1e-3
@@ -133,9 +133,7 @@ def test_where_the_paper_is_silent_its_presets_follow_the_hindsight_paper(name: 
 @pytest.mark.parametrize("name", ["paper", "mlp"])
 def test_paper_presets_add_nothing_to_the_text(name: str) -> None:
     agent = make_setup(compose("train", f"agent={name}")).agent
-    assert not any((agent.egocentric, agent.offsets, agent.orientation, agent.afterstate))
-    assert (agent.angle_head, agent.squash, agent.lr_final) == ("plain", "tanh", 1.0)
-    assert (agent.edges, agent.grad_clip, agent.acting_average) == ("paper", 0.0, 0.0)
+    assert (agent.lr_final, agent.acting_average) == (1.0, 0.0)
     assert [relabel.strategy for relabel in agent.hindsight] == ["final"]
 
 
@@ -274,9 +272,9 @@ def test_help_of_what_is_laid_over_a_run_has_what_it_may_be_played_with(group: s
 
 
 def test_settings_are_laid_over_a_run_one_by_one() -> None:
-    made = compose("eval", "run_dir=x", "sim.corner_noise=0.01", "agent.order=size")
+    made = compose("eval", "run_dir=x", "sim.corner_noise=0.01", "agent.reapply=1")
     given = {f"{s}.{n}": v for s in OVER for n, v in made[s].items() if v is not None}
-    assert given == {"sim.corner_noise": 0.01, "agent.order": "size"}
+    assert given == {"sim.corner_noise": 0.01, "agent.reapply": 1}
     with pytest.raises(ConfigError, match="did you mean 'sim.corner_noise'"):
         compose("eval", "run_dir=x", "sim.corner_nois=0.01")
 

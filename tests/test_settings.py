@@ -54,9 +54,7 @@ def over(base: Config, **sections: dict[str, Any]) -> Config:
     return base | {name: base[name] | values for name, values in sections.items()}
 
 
-PAPER = over(
-    ONE, agent={"squash": "tanh", "afterstate": False, "gamma": 0.9}, sim={"actions_per_token": 2}
-)
+PAPER = over(ONE, agent={"gamma": 0.9}, sim={"actions_per_token": 2})
 MLP = ONE | {"net": {"kind": "mlp", "hidden": [8]}}
 PHYSICS = over(ONE, sim={"backend": "physics"})
 GAUSSIAN = over(SEVERAL, sim={"targets": "gaussian"})
@@ -74,7 +72,6 @@ SEEN = over(ONE, sim={"pixels": 16, "arena": 1.2})
 CAMERA = over(SEEN, reward={"source": "camera"})
 UNPUNISHED = over(ONE, agent={"saturation_penalty": 0.0})
 DENSE = over(ONE, reward={"name": "dense"})
-REFINED = over(SEVERAL, agent={"refine_steps": 1, "refine_rate": 0.01})
 NEAR = {"strategy": "near", "copies": 1, "position": 0.1, "angle": 0.1}
 FINAL_TWICE = over(ONE, sim={"actions_per_token": 2}, agent={"hindsight": [{"strategy": "final"}]})
 NEAR_ONE = over(ONE, agent={"hindsight": [NEAR]})
@@ -140,32 +137,16 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "net.heads": (ONE, 1),
     "net.feed_forward": (ONE, 9),
     "net.scale": (ONE, "sqrt_d"),
-    "agent.egocentric": (ONE, False),
-    "agent.offsets": (ONE, False),
-    "agent.orientation": (ONE, False),
-    "agent.edges": (ONE, "complete"),
-    "agent.confidence": (over(SEVERAL, sim={"pixels": 64, "observe": "pictures"}), True),
-    "agent.afterstate": (ONE, False),
     "agent.motion": (ONE, "exact"),
-    "agent.angle_head": (ONE, "plain"),
-    "agent.squash": (ONE, "tanh"),
-    "agent.imitates": (ONE, True),
-    "agent.saturation_penalty": (over(ONE, agent={"saturation_limit": 0.0}), 9.0),
-    "agent.saturation_limit": (over(ONE, agent={"saturation_limit": 0.0}), 0.01),
+    "agent.saturation_penalty": (over(ONE, agent={"readout": "token"}), 9.0),
     "agent.readout": (SEVERAL, "token"),
-    "agent.order": (SEVERAL, "listed"),
     "agent.reapply": (SEVERAL, 0),
-    "agent.refine_steps": (REFINED, 2),
-    "agent.refine_rate": (REFINED, 0.02),
-    "agent.credit": (SEVERAL, "reward"),
-    "agent.pairs_per_transition": (SEVERAL, 2),
     "agent.gamma": (PAPER, 0.5),
     "agent.polyak": (PAPER, 0.5),
     "agent.acting_average": (ONE, 0.0),
     "agent.actor_lr": (ONE, 1e-2),
     "agent.critic_lr": (ONE, 1e-2),
     "agent.lr_final": (ONE, 0.5),
-    "agent.grad_clip": (ONE, 1e-3),
     "agent.batch_size": (ONE, 5),
     "agent.replay_capacity": (ONE, 8),
     "agent.updates_per_transition": (ONE, 0.25),
@@ -316,15 +297,9 @@ def test_every_setting_of_a_command_is_read() -> None:
         (ONE, "sim.max_overlap", 0.1, "one token"),
         (PHYSICS, "sim.motion", "slide", "one token"),
         (ONE, "sim.mirrored", 0.5, "tokens that are their own mirror images"),
-        (SEVERAL, "agent.refine_rate", 0.01, "agent.refine_steps=0"),
         (ONE, "agent.beam", 8, "agent.lookahead=none"),
         (SEVERAL, "agent.lookahead", "values", "agent.readout=pair"),
-        (UNPUNISHED, "agent.saturation_limit", 0.5, "agent.saturation_penalty=0"),
-        (over(SEVERAL, agent={"credit": "reward"}), "agent.imitates", True, "agent.credit=reward"),
         (ONE, "agent.polyak", 0.5, "agent.gamma=0"),
-        (MLP, "agent.edges", "complete", "net.kind=mlp"),
-        (MLP, "agent.edges", "inputs", "net.kind=mlp"),
-        (ONE, "agent.edges", "inputs", "net.kind=mha"),
         (FINAL_TWICE, "agent.hindsight.position", 0.1, "agent.hindsight.strategy=final"),
         (FINAL_TWICE, "agent.hindsight.angle", 0.1, "agent.hindsight.strategy=final"),
         (ONE, "sim.spread", 0.1, "sim.targets=uniform"),

@@ -13,7 +13,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from tangram_agent.config import ORDERS, AgentConfig
+from tangram_agent.config import AgentConfig
 from tangram_agent.files import write_whole
 from tangram_agent.outcome import plural
 from tangram_agent.runs import Run, load_changed
@@ -104,8 +104,7 @@ def evaluate_run(config: EvalConfig) -> int:
     `random` is chance. Where tokens slide, `sweep rule` is `exact` in the order that pushes the
     least out of place. Where a world moves tokens otherwise than actions say, or several noisy
     looks at them can be put together, `fitted` is `exact` by a model of motion that has seen some
-    random commands, and `oracle` knows that world and its noise. A run that learned
-    which token is next also plays fixed orders.
+    random commands, and `oracle` knows that world and its noise.
 
     Returns:
         Exit status 0.
@@ -128,8 +127,6 @@ def evaluate_run(config: EvalConfig) -> int:
 def policies(run: Run) -> dict[str, Player]:
     """The run, and those to compare it with, by their names in tables and files."""
     layout, sim = run.setup.layout, run.setup.sim
-    fixed = [order for order in ORDERS if order not in ("learned", run.setup.agent.order)]
-    fixed = fixed if run.setup.pairs and layout.tokens > 1 else []
     result: dict[str, Player] = {RUN: greedy(run.policy)}
     if run.setup.fills:
         if run.setup.agent.lookahead == "values":
@@ -138,9 +135,6 @@ def policies(run: Run) -> dict[str, Player]:
         # Of places that are worth the same the first is taken: that of the largest token.
         nothing = greedy(run.unlearned().policy)
         return result | {"largest first": nothing, "random": random_policy(layout, sim)}
-    for name in fixed:
-        other = run.with_settings({"agent": {"order": name}})
-        result[f"order={name}"] = greedy(other.policy)
     result["exact"] = exact_policy(layout, sim)
     if sim.motion == "slide" and layout.tokens <= MAX_TOKENS:
         result["sweep rule"] = sweep_policy(layout, sim)

@@ -50,7 +50,7 @@ def _fitted(env: BatchedEnv) -> MotionModel:
 
     chance = random_policy(env.layout, env.sim)
     seen = play(env, chance, generator, -(-COMMANDS // env.horizon)).episodes
-    past = Past(seen.corners[:, :-1], seen.actions, seen.confidence)
+    past = Past(seen.corners[:, :-1], seen.actions, seen.seen)
     motions = motions_of(past, seen.corners[:, -1].astype(np.float64), env.layout, env.sim)
     model = MotionModel()
     fit = Fit(model)

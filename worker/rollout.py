@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 
 from tangram_agent.setup import Setup
-from tangram_agent.types import AWAY, Episodes, Past
+from tangram_agent.types import Episodes, Past
 from tangram_sim.arrays import Bools, Floats, Pixels, Singles
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.lens import View
 from tangram_sim.seeding import episode_generator
+from tangram_sim.sight import SURE
 from tangram_sim.targets import Sides
 
 AT_ONCE = 32
@@ -83,8 +84,8 @@ class Played:
             pictures = np.empty((count, steps + 1, side, side), np.uint8)
             seen = replace(
                 seen,
-                confidence=np.empty((count, steps + 1, tokens), np.float32),
-                goals_confidence=np.empty((count, tokens), np.float32),
+                seen=np.empty((count, steps + 1, tokens), np.uint8),
+                goals_seen=np.empty((count, tokens), np.uint8),
                 achieved=np.empty_like(seen.goals) if env.traces else None,
             )
         return Played(
@@ -173,15 +174,15 @@ def _play_group(
     """The episode in every environment, into the rows from `first` on; False if told to end."""
     rows, seen = slice(first, first + env.count), played.episodes
     seen.goals[rows], played.goals[rows] = env.seen_goals, env.goals
-    if env.sight is not None and seen.goals_confidence is not None:
-        seen.goals_confidence[rows] = env.sight.goals_confidence
+    if env.sight is not None and seen.goals_seen is not None:
+        seen.goals_seen[rows] = env.sight.goals_confidence >= SURE
     began = time.perf_counter()
     for t in range(env.horizon):
         if not go_on():
             return False
         _look(env, played, rows, t)
-        sure = None if seen.confidence is None else seen.confidence[rows, : t + 1]
-        past = Past(seen.corners[rows, :t], seen.actions[rows, :t], sure, seen.placed[rows, t])
+        found = None if seen.seen is None else seen.seen[rows, : t + 1]
+        past = Past(seen.corners[rows, :t], seen.actions[rows, :t], found)
         asked = time.process_time()
         actions = choose(env.seen, env.closed, env.seen_goals, generators, past)
         spent = time.process_time() - asked
@@ -202,9 +203,10 @@ def _play_group(
 def _look(env: BatchedEnv, played: Played, rows: slice, t: int) -> None:
     played.corners[rows, t], played.episodes.corners[rows, t] = env.corners, env.seen
     played.episodes.placed[rows, t] = env.placed
-    sight, confidence = env.sight, played.episodes.confidence
-    if sight is not None and confidence is not None and played.pictures is not None:
-        confidence[rows, t] = np.where(sight.away, AWAY, sight.confidence)
+    sight, seen = env.sight, played.episodes.seen
+    if sight is not None and seen is not None and played.pictures is not None:
+        # Of several tokens one may have left the picture; alone it would be all that is to be seen.
+        seen[rows, t] = ~sight.missing | (sight.away & (env.layout.tokens > 1))
         played.pictures[rows, t] = env.pictures
 
 

@@ -13,7 +13,6 @@ from tangram_agent.setup import Setup
 from tangram_sim.arrays import Bools, Floats
 from tangram_sim.drawing import contact_sheet
 from tangram_sim.layout import Layout
-from tangram_sim.sight import SURE
 from tangram_sim.strokes import FRAME, PAPER, SAMPLES, Point, colour_of, draw_outline, shown
 from worker.rollout import Played
 
@@ -55,15 +54,15 @@ def camera_sheets(setup: Setup, played: Played, columns: int, size: int) -> list
         columns: pictures in a row.
         size: side of one in pixels.
     """
-    pictures, confidence = played.pictures, played.episodes.confidence
-    if pictures is None or confidence is None:
+    pictures, seen = played.pictures, played.episodes.seen
+    if pictures is None or seen is None:
         return []
     layout, side = setup.layout, pictures.shape[-1]
     unit = side / setup.sim.arena
     corners = played.episodes.corners.astype(np.float64) * (unit, -unit) + side / 2.0
     sheets = []
     for t in range(pictures.shape[1]):
-        found = confidence[:, t] >= SURE
+        found = seen[:, t] > 0
         scenes = [
             outlined(Image.fromarray(one).convert("RGB"), layout, *rest)
             for one, *rest in zip(

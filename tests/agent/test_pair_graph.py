@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from tangram_agent.config import AgentConfig
 from tangram_agent.pairs import PairGraph, Pairs
 from tangram_sim.fitting import KINDS
 from tangram_sim.layout import Layout, TokensConfig, make_layout
@@ -16,7 +15,7 @@ from tests.agent.pair_scenes import SEVEN, every_pair, random_pairs, random_scen
 pytestmark = pytest.mark.fast
 
 LAYOUT = make_layout(TokensConfig(**SEVEN))
-GRAPH = PairGraph(LAYOUT, 2.0, AgentConfig())
+GRAPH = PairGraph(LAYOUT, 2.0)
 SEEDS = range(3)
 PARALLELOGRAM, SQUARE, TRIANGLE = 6, 5, 0
 MIRROR = np.array([shape.mirror or 0.0 for shape in LAYOUT.shapes])
@@ -144,19 +143,15 @@ def same_points(found: np.ndarray, expected: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("egocentric", [True, False])
-def test_nodes_lie_at_the_corners_that_the_layout_gives(seed: int, egocentric: bool) -> None:
-    """In the token's frame, straight from its definition, or in the arena's."""
+def test_nodes_lie_at_the_corners_that_the_layout_gives(seed: int) -> None:
+    """In the token's frame, straight from its definition."""
     rng = np.random.default_rng(seed)
     (own, sides), (goals, goal_sides) = random_scene(LAYOUT, rng), random_scene(LAYOUT, rng)
     pairs = every_pair(own, sides, goals, goal_sides)
-    graph = PairGraph(LAYOUT, 2.0, AgentConfig(egocentric=egocentric))
-    nodes = graph.node_features(pairs).numpy()
+    nodes = GRAPH.node_features(pairs).numpy()
     mine, corners = LAYOUT.corners(own, sides), LAYOUT.corners(goals, goal_sides)
 
     def seen(points: np.ndarray, token: int) -> np.ndarray:
-        if not egocentric:
-            return points @ (1.0, 1j)
         away = ((points - own[token, :2]) @ (1.0, 1j)) * np.exp(-1j * own[token, 2])
         return away.conj() if sides[token] else away
 
@@ -174,21 +169,13 @@ def test_nodes_lie_at_the_corners_that_the_layout_gives(seed: int, egocentric: b
     assert (nodes[..., 4] == [0, 0, 0, 0, 0, 1, 1, 1, 1]).all()
 
 
-def test_in_the_arenas_frame_a_velocity_is_as_it_is_seen() -> None:
-    pairs, shift, angle = random_pairs(LAYOUT, 0), torch.rand(49, 2), torch.rand(49)
-    graph = PairGraph(LAYOUT, 2.0, AgentConfig(egocentric=False))
-    velocity = graph.velocity(pairs, shift, angle)
-    assert torch.equal(velocity, torch.column_stack([shift, angle]))
-    assert torch.equal(graph.as_seen(pairs, velocity), velocity)
-
-
 def test_the_numbers_of_a_pair_without_nodes() -> None:
     """Two squares of side 1, the piece at (1, 0) and turned by 0.2, a third of it covered."""
     side = layout_of("square").shapes[0].corners
     layout = make_layout(TokensConfig(("square",), 1.0 / np.ptp(side[:, 0]) * 0.6))
     pairs = one_pair(0, 0, (0.0, 0.0, 0.0), (1.0, 0.0, 0.2))
     pairs.covered[:] = 1 / 3
-    found = PairGraph(layout, 2.0, AgentConfig()).vectors(pairs)[0].numpy()
+    found = PairGraph(layout, 2.0).vectors(pairs)[0].numpy()
     radius = math.sqrt(0.5)
     body = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
     corners = (body @ (1.0, 1j)) * np.exp(0.2j) + 1.0
@@ -205,21 +192,13 @@ def test_the_numbers_of_a_pair_without_nodes() -> None:
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
-@pytest.mark.parametrize("offsets", [True, False])
-@pytest.mark.parametrize("orientation", [True, False])
-@pytest.mark.parametrize("egocentric", [True, False])
-def test_a_row_of_a_pair_tells_where_the_piece_lies_and_how_both_are_turned(
-    egocentric: bool, orientation: bool, offsets: bool
-) -> None:
+def test_a_row_of_a_pair_tells_where_the_piece_lies_and_how_both_are_turned() -> None:
     """Place and turns, in the frame of the positions, are linear functions of the row."""
-    options = {"egocentric": egocentric, "orientation": orientation, "offsets": offsets}
     pairs = one_shape_pairs(PARALLELOGRAM, 200)
-    rows = PairGraph(LAYOUT, 2.0, AgentConfig(**options)).vectors(pairs).numpy()
+    rows = PairGraph(LAYOUT, 2.0).vectors(pairs).numpy()
     heading, goal_heading = (np.exp(1j * poses[:, 2].numpy()) for poses in (pairs.pose, pairs.goal))
     place = (pairs.goal - pairs.pose)[:, :2].numpy() @ (1.0, 1j)
     wanted = [place * heading.conj(), goal_heading * heading.conj()]
-    if not egocentric:
-        wanted = [place, heading, goal_heading]
     for numbers in wanted:
         told = np.column_stack([numbers.real, numbers.imag])
         plane = np.linalg.lstsq(np.column_stack([rows, np.ones(len(rows))]), told, rcond=None)[0]
@@ -277,33 +256,13 @@ def test_a_pair_tells_how_aligned_it_is_with_a_cusp_where_it_is(
     ],
 )
 def test_a_tan_has_its_number_in_every_set(shape: Any, number: int) -> None:
-    graph = PairGraph(layout_of("square", shape), 2.0, AgentConfig())
+    graph = PairGraph(layout_of("square", shape), 2.0)
     assert graph.kind[1].argmax() == number
     assert graph.kind.sum(dim=1).tolist() == [1.0, 1.0]
 
 
-def test_edges_are_those_of_the_paper_or_complete() -> None:
+def test_edges_are_those_of_the_paper() -> None:
     """Three corners of the token, its base, three of the piece."""
     rows = ["0111000", "1011000", "1101000", "1110111", "0001011", "0001101", "0001110"]
-    found = PairGraph(layout_of("small_triangle"), 2.0, AgentConfig()).adjacency.int().tolist()
+    found = PairGraph(layout_of("small_triangle"), 2.0).adjacency.int().tolist()
     assert ["".join(map(str, row)) for row in found] == rows
-    complete = PairGraph(LAYOUT, 2.0, AgentConfig(edges="complete")).adjacency
-    np.testing.assert_array_equal(complete, ~np.eye(9, dtype=bool))
-
-
-@pytest.mark.parametrize(("option", "less"), [("offsets", 2), ("orientation", 5)])
-def test_an_option_that_is_off_takes_its_features_away(option: str, less: int) -> None:
-    graph = PairGraph(LAYOUT, 2.0, AgentConfig(**{option: False}))
-    pairs = random_pairs(LAYOUT, 0)
-    assert graph.node_features(pairs).shape[-1] == graph.features == GRAPH.features - less
-    assert graph.vectors(pairs).shape[-1] == graph.inputs < GRAPH.inputs
-
-
-def test_without_the_orientation_no_pair_tells_an_angle() -> None:
-    """A turned square piece whose corners are not told apart: only the corners' places differ."""
-    graph = PairGraph(LAYOUT, 2.0, AgentConfig(orientation=False))
-    one, other = (
-        graph.node_features(one_pair(SQUARE, SQUARE, (0, 0, 0), (0.3, 0.1, angle)))[0, 0, 5:]
-        for angle in (0.0, 0.4)
-    )
-    assert torch.equal(one, other)

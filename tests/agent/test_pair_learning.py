@@ -11,19 +11,13 @@ import torch
 from tangram_agent.learner import Learner
 from tangram_agent.pairs import Pairs
 from tangram_agent.policy import Policy
-from tangram_agent.relabelling import PairBatch, SceneBatch
+from tangram_agent.relabelling import PairBatch
 from tangram_agent.setup import Setup
-from tangram_agent.types import Transitions
 from tangram_sim.batch import BatchedEnv
-from tangram_sim.geometry import overlap_share
-from tangram_sim.rewards import scaled_overlap
-from tangram_sim.targets import sample_targets
 from tests.agent.builders import setup
 from tests.agent.pair_scenes import (
     PERCEPTRON,
     TWO,
-    PerfectCritic,
-    random_pairs,
     seven,
     transitions,
 )
@@ -31,7 +25,7 @@ from tests.agent.pair_scenes import (
 pytestmark = pytest.mark.fast
 
 TWINS = [{"strategy": "final"}, {"strategy": "near", "position": 0.1, "angle": 0.5}]
-AGENT = {"hindsight": TWINS, "pairs_per_transition": 4}
+AGENT = {"hindsight": TWINS}
 UPDATES = 120
 CASES: dict[str, dict[str, Any]] = {
     "mha": {"agent": AGENT},
@@ -55,7 +49,7 @@ def test_the_losses_by_hand(case: str) -> None:
     t = {name: torch.from_numpy(np.asarray(c, np.float32)) for name, c in vars(batch).items()}
     for name in ("token", "piece"):
         t[name] = t[name].long()
-    steps, own, still = learner.steps(batch), learner.acting, torch.zeros(32, 3)
+    steps, own, still = learner.steps(batch), learner.acting, torch.zeros(64, 3)
 
     def pairs_of(when: str) -> Pairs:
         columns = ("token", "goal", "goal_flipped", "piece", "covered")
@@ -92,50 +86,6 @@ def test_what_plays_is_the_average_of_both_networks() -> None:
         np.testing.assert_allclose(average, (before[name] + own[name]) / 2.0, atol=1e-6)
 
 
-def beside(made: Setup, count: int, seed: int, each: float = 0.0) -> Transitions:
-    """Scenes with each token near its piece, and what the environment gives for them.
-
-    All are shifted together, so that they lie apart, and each is moved by up to so much more.
-    """
-    rng = np.random.default_rng(seed)
-    rngs = [np.random.default_rng([seed, i]) for i in range(count)]
-    poses, sides = sample_targets(made.layout, made.sim, made.sim.task, rngs)
-    goals = made.layout.corners(poses, sides)
-    corners = made.layout.corners(poses + each * rng.uniform(-1, 1, poses.shape), sides)
-    corners += rng.uniform(-0.2, 0.2, (count, 1, 2))
-    reward = scaled_overlap(overlap_share(corners, goals, made.layout))
-    return replace(
-        transitions(made, count, seed),
-        next_state=corners.astype(np.float32),
-        goal=goals.astype(np.float32),
-        reward=reward.astype(np.float32),
-    )
-
-
-def test_a_reward_is_the_sum_over_all_pairs() -> None:
-    """By a critic that knows the geometry, whatever turns that look alike the pieces have."""
-    made = seven(AGENT | {"credit": "reward"}, PERCEPTRON, mirrored=0.5)
-    learner, batch = Learner(made, 0), beside(made, 8, 0)
-    scenes = learner.prepared(batch, np.random.default_rng(0))
-    assert isinstance(scenes, SceneBatch)
-    assert not np.allclose(scenes.goals[..., 2], made.layout.poses(batch.goal)[..., 2])
-    learner.critic = PerfectCritic(made.layout)
-    steps = learner.steps(scenes)
-    assert steps.scenes is not None
-    loss, share = learner.scene_loss(steps.scenes)
-    assert loss.item() < 1e-9
-    np.testing.assert_allclose(2.0 * share - 1.0, batch.reward, atol=1e-5)
-    assert np.ptp(batch.reward) > 0.2
-
-
-def test_of_a_covered_piece_nothing_is_left_where_scenes_teach() -> None:
-    critic = Learner(seven(AGENT | {"credit": "reward"}, PERCEPTRON), 0).critic
-    pairs = replace(random_pairs(seven().layout, 0), covered=torch.ones(49))
-    assert not critic(pairs, torch.zeros(49, 3), pairs).any()
-    pairs = replace(pairs, covered=torch.zeros(49))
-    assert critic(pairs, torch.zeros(49, 3), pairs).all()
-
-
 def test_noise_on_the_corners_does_no_harm() -> None:
     made = seven(**CASES["mlp"])
     learner, batch = Learner(made, 0), transitions(made, 64)
@@ -161,24 +111,20 @@ def coverage(learner: Learner, made: Setup, episodes: int) -> float:
     return float(result.overlap.mean())
 
 
-@pytest.mark.parametrize("credit", ["piece", "reward"])
-def test_it_learns_to_assemble_two_tokens(credit: str) -> None:
+def test_it_learns_to_assemble_two_tokens() -> None:
     """From random scenes and hindsight alone; without learning next to nothing is covered."""
     agent = {
         "hindsight": [*TWINS, {"strategy": "near", "position": 0.02, "angle": 0.1}],
         "actor_lr": 5e-3,
         "critic_lr": 5e-3,
         "reapply": 1,
-        "credit": credit,
     }
     net = {"kind": "mlp", "hidden": [64, 64]}
     made = setup(TWO, agent, net, starts="outside", mirrored=0.5)
     learner = Learner(made, seed=1)
     before = coverage(learner, made, 30)
     for i in range(UPDATES):
-        scenes = (
-            transitions(made, 48, i) if credit == "piece" else beside(made, 48, i, 1.0 * (i % 2))
-        )
+        scenes = transitions(made, 48, i)
         learner.update(learner.prepared(scenes, np.random.default_rng(i)), i / UPDATES)
     assert before < 0.2
     assert coverage(learner, made, 30) > 0.6

@@ -120,32 +120,3 @@ OPTIONS: dict[tuple[str, object], tuple[bool, bool]] = {
     ("squash", "tanh"): (False, True),
     ("angle_head", "plain"): (False, True),
 }
-
-
-@pytest.mark.parametrize(
-    ("kind", "option", "same"),
-    [
-        *((kind, option, same) for kind in NETS for option, same in OPTIONS.items()),
-        ("mha", ("edges", "complete"), (False, False)),
-    ],
-)
-def test_every_option_changes_what_pairs_give(
-    kind: str, option: tuple[str, object], same: tuple[bool, bool]
-) -> None:
-    pairs, way = random_pairs(LAYOUT, 0), torch.full((49, 3), 0.1)
-    plain, other = networks(kind), networks(kind, **dict([option]))
-    own = dict(plain.named_parameters())
-    for name, parameter in other.named_parameters():
-        if own[name].shape == parameter.shape:
-            parameter.copy_(own[name])
-    same_actor = torch.allclose(plain.actor(pairs)[0], other.actor(pairs)[0])
-    assert (same_actor, torch.allclose(plain.critic(pairs, way), other.critic(pairs, way))) == same
-
-
-@pytest.mark.parametrize("afterstate", [True, False])
-def test_the_value_of_an_action_without_the_afterstate_is_of_the_action(afterstate: bool) -> None:
-    made = networks("mha", afterstate=afterstate)
-    pairs, way = random_pairs(LAYOUT, 0), torch.full((49, 3), 0.1)
-    moved = made.critic.graph.moved(pairs, way)
-    same = torch.allclose(made.critic(pairs, way), value_of(made, moved), atol=1e-6)
-    assert same == afterstate

@@ -32,7 +32,7 @@ SYMMETRY = np.array([shape.symmetry for shape in LAYOUT.shapes])
 
 
 def made_pairs(hindsight: list[dict[str, Any]], seed: int = 0) -> PairBatch:
-    made = seven({"hindsight": hindsight, "pairs_per_transition": PAIRS})
+    made = seven({"hindsight": hindsight})
     return make_pairs(BATCH, made, np.random.default_rng(seed))
 
 

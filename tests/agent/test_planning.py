@@ -50,7 +50,7 @@ def random_networks(made: Setup, seed: int = 0) -> Networks:
 
 
 def perfect(made: Setup) -> Planner:
-    graph = PairGraph(made.layout, made.sim.arena, made.agent)
+    graph = PairGraph(made.layout, made.sim.arena)
     networks = PerfectNetworks(PerfectCritic(made.layout), graph)
     return Planner(cast("Networks", networks), made)
 
@@ -80,7 +80,7 @@ def total(
         goal = as_tensor([wanted[index]]), as_tensor([sides[index]]), torch.tensor([index])
         return Pairs(*own, *goal, as_tensor([share[index]]))
 
-    graph = PairGraph(layout, made.sim.arena, made.agent)
+    graph = PairGraph(layout, made.sim.arena)
 
     def proposed(pairs: Pairs) -> np.ndarray:
         place: np.ndarray = graph.moved(pairs, networks.actor(pairs)[0]).pose[0].numpy()
@@ -123,7 +123,7 @@ def test_the_best_of_all_is_played(
 
 @pytest.mark.parametrize("sim", [{}, {"allow_flip": True}])
 def test_a_choice_does_not_depend_on_the_others_of_the_batch(sim: dict[str, Any]) -> None:
-    made = seven({"reapply": 1, "refine_steps": 2}, **sim)
+    made = seven({"reapply": 1}, **sim)
     chooser = Planner(random_networks(made), made)
     corners, placed, goals = scenes(made, COUNT)
     placed[3] = True
@@ -135,9 +135,8 @@ def test_a_choice_does_not_depend_on_the_others_of_the_batch(sim: dict[str, Any]
             np.testing.assert_allclose(column[0], vars(together)[name][row], atol=1e-5)
 
 
-@pytest.mark.parametrize("order", ["learned", "listed", "size", "random"])
-def test_no_placed_token_is_named_while_others_are_left(order: str) -> None:
-    made = seven({"order": order})
+def test_no_placed_token_is_named_while_others_are_left() -> None:
+    made = seven()
     corners, placed, goals = scenes(made, 40)
     token = Planner(random_networks(made), made).choose(corners, placed, goals).token
     assert not placed[np.arange(40), token].any()
@@ -146,62 +145,7 @@ def test_no_placed_token_is_named_while_others_are_left(order: str) -> None:
     assert not nothing.token.any()
 
 
-@pytest.mark.parametrize(
-    ("order", "expected"),
-    # In the set: parallelogram, small, large, square, large.
-    [("listed", [0, 1, 2, 3, 4]), ("size", [2, 4, 0, 3, 1])],
-)
-def test_orders_that_are_not_learned(order: str, expected: list[int]) -> None:
-    shapes = ["parallelogram", "small_triangle", "large_triangle", "square", "large_triangle"]
-    made = setup({"shapes": shapes, "scale": 0.5}, {"order": order})
-    assert named_in_turn(made, 0) == expected
-
-
-def named_in_turn(made: Setup, goal: int) -> list[int]:
-    """The tokens of a whole episode, as they are named."""
-    chooser = perfect(made)
-    corners, _, goals = scenes(made, 8)
-    placed = np.zeros((1, made.layout.tokens), np.bool_)
-    named: list[int] = []
-    for step in range(made.layout.tokens):
-        # The tokens lie elsewhere at every step, the goal stays.
-        choice = chooser.choose(corners[step : step + 1], placed, goals[goal : goal + 1])
-        named.append(int(choice.token[0]))
-        placed[0, named[-1]] = True
-    return named
-
-
-def test_a_random_order_is_one_for_each_target() -> None:
-    made = seven({"order": "random"})
-    orders = [named_in_turn(made, goal) for goal in range(8)]
-    assert all(sorted(order) == list(range(7)) for order in orders)
-    assert len({tuple(order) for order in orders}) == 8
-    # At every step the first one that is left of an order that does not change.
-    assert orders == [named_in_turn(made, goal) for goal in range(8)]
-    chooser, (corners, placed, goals) = perfect(made), scenes(made, 8)
-    for token, order, flags in zip(
-        chooser.choose(corners, placed, goals).token, orders, placed, strict=True
-    ):
-        assert token == next(one for one in order if not flags[one])
-
-
 # Refinement
-
-
-@pytest.mark.parametrize("net", [SMALL, PERCEPTRON])
-def test_refinement_goes_uphill_on_what_the_critic_says_of_all_pieces(net: dict[str, Any]) -> None:
-    plain, refined = (seven({"refine_steps": n}, net) for n in (0, 20))
-    networks = random_networks(plain)
-    scene = scenes(plain)
-    one, two = (Planner(networks, made).choose(*scene) for made in (plain, refined))
-    off = Planner(networks, refined).choose(*scene, refine=False)
-    np.testing.assert_array_equal(one.pose, off.pose)
-    np.testing.assert_array_equal(one.token, two.token)
-    for row in range(COUNT):
-        own = tuple(part[row] for part in scene), int(one.token[row]), False
-        values = [total(plain, networks, *own, choice.pose[row])[0] for choice in (one, two)]
-        assert values[1] > values[0]
-    assert not any(parameter.requires_grad for parameter in networks.parameters())
 
 
 # With networks that know everything
@@ -225,9 +169,8 @@ def assembled(made: Setup, chooser: Planner, episodes: int) -> tuple[np.ndarray,
 @pytest.mark.parametrize(
     "sim", [{}, {"mirrored": 0.5}, {"mirrored": 0.5, "allow_flip": True}, {"targets": "connected"}]
 )
-@pytest.mark.parametrize("order", ["learned", "random"])
-def test_perfect_networks_assemble_everything(sim: dict[str, Any], order: str) -> None:
-    made = seven({"order": order}, starts="outside", **sim)
+def test_perfect_networks_assemble_everything(sim: dict[str, Any]) -> None:
+    made = seven(starts="outside", **sim)
     overlap, _ = assembled(made, perfect(made), 12)
     assert overlap.min() > 0.999
 

@@ -85,9 +85,7 @@ HAS_A_SAY = [
     (setup(ONE), False),
     (setup(ONE, mirrored=0.5), False),
     (setup(ONE, allow_flip=True), True),
-    (setup(agent={"refine_steps": 2}), True),
     (setup(PAIR), True),
-    (setup(PAIR, {"order": "size"}), True),  # which piece is to be chosen
 ]
 
 
@@ -169,15 +167,6 @@ def test_an_action_takes_its_token_to_the_pose_that_was_chosen(flip: bool) -> No
     np.testing.assert_allclose(np.exp(1j * (found - choice.pose)[:, 2]), 1.0, atol=1e-5)
     # By the shorter turn: no entry is cut off.
     assert np.abs(actions).max() <= 1.0
-
-
-def test_refinement_is_for_acting_and_not_for_exploring() -> None:
-    agent = {"refine_steps": 5, "noise": 0.0, "uniform_share": 0.0}
-    made = seven(agent, PERCEPTRON)
-    policy, scene = policy_of(made), scene_of(transitions(made, 8))
-    refined, plain = policy.act(*scene), policy.act(*scene, refine=False)
-    assert not np.allclose(refined, plain, atol=1e-4)
-    np.testing.assert_array_equal(policy.explore(*scene, generators(8)), plain)
 
 
 NOISE = {"noise": 0.05, "uniform_share": 0.0}
@@ -352,19 +341,17 @@ def test_an_observation_of_another_form_is_refused(observation: Any, reason: str
 def test_a_run_plays_on_with_other_settings_of_the_agent() -> None:
     run = run_of(seven({}, PERCEPTRON))
     scene = scene_of(transitions(run.setup, 8))
-    other = run.with_settings({"agent": {"refine_steps": 20, "order": "listed"}})
-    assert (other.setup.agent.refine_steps, run.setup.agent.refine_steps) == (20, 0)
+    other = run.with_settings({"agent": {"reapply": 3}})
+    assert (other.setup.agent.reapply, run.setup.agent.reapply) == (3, 0)
     assert other.policy.version == 7
-    left = [int(np.argmin(flags)) for flags in scene[1]]
-    assert chosen_tokens(other.policy.act(*scene), 7).tolist() == left
     assert not np.allclose(other.policy.act(*scene), run.policy.act(*scene), atol=1e-3)
 
 
 @pytest.mark.parametrize(
     ("section", "name", "value", "reason"),
     [
-        ("agent", "order", "x", "run with agent.order=x: agent.order must be one of learned,"),
-        ("agent", "order", 1, "wrong config: .*agent.order"),
+        ("agent", "reapply", -1, "run with agent.reapply=-1: agent.reapply must be between 0 and"),
+        ("agent", "reapply", "x", "wrong config: .*agent.reapply"),
         ("agent", "odd", 1, "wrong config: .*odd"),
         ("agent", "batch_size", 9, "agent.batch_size=9 changes nothing with a trained run, which"),
         ("sim", "stages", (), "changes nothing with a trained run, which only plays: leave it out"),

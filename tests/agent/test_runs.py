@@ -75,7 +75,7 @@ def test_a_broken_run_is_refused_in_clear_words(run_dir: Path, harm: Any, reason
     ("section", "content"),
     [
         ("tokens", {"shapes": ["parallelogram"], "scale": 1.0}),
-        ("agent", {"egocentric": False, "reapply": 0}),
+        ("agent", {"motion": "exact", "reapply": 0}),
         ("net", {**SMALL, "heads": 1}),
     ],
 )

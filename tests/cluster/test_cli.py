@@ -140,7 +140,7 @@ WRONG = [
     ("tangram-play", "say which run: run_dir=runs/..."),
     ("tangram-eval run_dir=pretrained/square puzzle=test", "puzzle 'trapezoid' has the pieces"),
     ("tangram-eval run_dir=pretrained/square puzzle=nowhere.json", "nowhere.json"),
-    ("tangram-eval run_dir=pretrained/square agent.order=size", "nothing with one token"),
+    ("tangram-eval run_dir=pretrained/square sim.mirrored=0.5", "sim.mirrored"),
     ("tangram-eval run_dir=pretrained/square out=..", "cannot be written (it is a folder): name"),
     ("tangram-eval run_dir=pretrained/square out=/proc/no/a.json", "out=/proc/no/a.json cannot be"),
     ("tangram-play run_dir=pretrained/square out=/proc/a.gif", "out=/proc/a.gif cannot be written"),

@@ -27,7 +27,7 @@ TOLD = [
 
 
 def made_setup(agent: dict[str, Any] | None = None, **sim: Any) -> Setup:
-    return seven(AGENT | {"pairs_per_transition": 2} | (agent or {}), PERCEPTRON, **sim)
+    return seven(AGENT | (agent or {}), PERCEPTRON, **sim)
 
 
 def test_replay_holds_what_was_played_and_nothing_relabelled() -> None:
@@ -50,13 +50,8 @@ def test_workers_take_the_weights_of_the_master() -> None:
     assert policy.version == master.updates > 0
 
 
-@pytest.mark.parametrize("refine_steps", [0, 1])
-def test_a_critic_without_a_say_stays_with_the_master_and_in_checkpoints(refine_steps: int) -> None:
-    made = setup(
-        agent=AGENT
-        | {"readout": "pair", "motion": "learned", "gamma": 0.0}
-        | {"refine_steps": refine_steps}
-    )
+def test_a_critic_without_a_say_stays_with_the_master_and_in_checkpoints() -> None:
+    made = setup(agent=AGENT | {"readout": "pair", "motion": "learned", "gamma": 0.0})
     master, policy = trainer(made), Policy(made)
     play_on(master, 1)
     arrays, _ = master.state()
@@ -66,7 +61,7 @@ def test_a_critic_without_a_say_stays_with_the_master_and_in_checkpoints(refine_
         {name.partition(".")[0] for name in one}
         for one in (master.weights().tensors, arrays[ACTING])
     ]
-    assert parts == [{"actor", "motion", *["critic"] * refine_steps}, {"actor", "critic", "motion"}]
+    assert parts == [{"actor", "motion"}, {"actor", "critic", "motion"}]
 
 
 @pytest.mark.parametrize(("stages", "expected"), [(STAGES, TOLD), ([], [])])

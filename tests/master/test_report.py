@@ -100,8 +100,8 @@ def test_what_is_waited_for(
 def test_it_is_told_where_nothing_can_be_learned_from(tmp_path: Path) -> None:
     made = loop(tmp_path, MADE, FakeHub(MADE, roles=["player"]))
     episodes = arrival(MADE, 1).episodes
-    gone = np.zeros((4, MADE.horizon + 1, 1), np.float32)
-    made.guard.trainer.insert(replace(episodes, confidence=gone, goals_confidence=gone[:, 0]))
+    gone = np.zeros((4, MADE.horizon + 1, 1), np.uint8)
+    made.guard.trainer.insert(replace(episodes, seen=gone, goals_seen=gone[:, 0]))
     said = "waiting for an episode in which pictures show all tokens: larger sim.pixels help"
     assert made.reporter.flush(0).texts["activity"] == said
     made.guard.trainer.insert(episodes)

@@ -31,7 +31,6 @@ MEANS = {
     *("actions_used", "seconds_per_puzzle", "coverage_each"),
     *("position_error_median", "angle_error_deg_median"),
 }
-ORDERS = {"order=listed", "order=size", "order=random"}
 
 
 def evaluated(folder: Path, tokens: dict[str, Any] = GAME, **settings: Any) -> dict[str, Any]:
@@ -155,7 +154,7 @@ def test_puzzles_of_a_file_are_scored_together_and_one_by_one(
 ) -> None:
     report = evaluated(tmp_path, puzzle=(two,), turns=2)
     assert set(report) >= MEANS | {"sim", "agent"}
-    assert set(report["baselines"]) == ORDERS | {"exact", "random"}
+    assert set(report["baselines"]) == {"exact", "random"}
     assert [(one["name"], one["degrees"]) for one in report["puzzles"]] == [
         (name, degrees) for name in ("my_cat", "my_fish") for degrees in (0.0, 180.0)
     ]
@@ -174,16 +173,11 @@ def test_puzzles_of_a_file_are_scored_together_and_one_by_one(
 def test_settings_of_the_agents_play_are_played_and_written_down(tmp_path: Path, two: str) -> None:
     write_run(tmp_path / "run", GAME, sim=SIM, agent={"reapply": 0})
     trained = evaluated(tmp_path, puzzle=(two,))
-    asked = {"order": "listed", "reapply": 1, "refine_steps": 2}
-    listed = evaluated(tmp_path, puzzle=(two,), changes={"agent": asked})
-    assert [trained["agent"][name] for name in asked] == ["learned", 0, 0]
-    assert [listed["agent"][name] for name in asked] == ["listed", 1, 2]
-    assert set(listed["baselines"]) == {"order=size", "order=random", "exact", "random"}
-    plain = evaluated(tmp_path, puzzle=(two,), changes={"agent": {"order": "listed"}})
-    assert plain["coverage"] == trained["baselines"]["order=listed"]["coverage"]
+    again = evaluated(tmp_path, puzzle=(two,), changes={"agent": {"reapply": 1}})
+    assert (trained["agent"]["reapply"], again["agent"]["reapply"]) == (0, 1)
     assert evaluated(tmp_path, puzzle=(two,), seed=1)["coverage"] != trained["coverage"]
-    assert [one["coverage"] for one in plain["puzzles"]] != [
-        one["coverage"] for one in listed["puzzles"]
+    assert [one["coverage"] for one in trained["puzzles"]] != [
+        one["coverage"] for one in again["puzzles"]
     ]
 
 
@@ -199,7 +193,7 @@ def test_random_targets_of_several_tokens_get_the_same_scores(tmp_path: Path) ->
     report = evaluated(tmp_path, episodes=3)
     assert set(report) >= MEANS | {"mean_reward", "mean_reward_camera", "episodes"}
     assert report["coverage"] == pytest.approx(report["raw_overlap"])
-    assert set(report["baselines"]) == ORDERS | {"exact", "random"}
+    assert set(report["baselines"]) == {"exact", "random"}
     assert "puzzles" not in report
     for scores in (report, *report["baselines"].values()):
         assert len(scores["coverage_each"]) == 3
@@ -229,11 +223,3 @@ def test_puzzles_that_were_left_out_are_told(
     report = evaluated(tmp_path, puzzle=(str(path),), skip_invalid=True)
     assert len(report["puzzles"]) == len(report["skipped"]) == 1
     assert "left out: puzzle 'my_fish' has the pieces" in capsys.readouterr().out
-
-
-def test_an_agent_without_a_choice_of_order(tmp_path: Path, two: str) -> None:
-    write_run(tmp_path / "run", GAME, sim=SIM, agent={"readout": "token"})
-    assert set(evaluated(tmp_path, puzzle=(two,))["baselines"]) == {"exact", "random"}
-    reason = "run with agent.order=size: agent.order=size changes nothing with agent.readout=token"
-    with pytest.raises(ConfigError, match=reason):
-        evaluated(tmp_path, puzzle=(two,), changes={"agent": {"order": "size"}})

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from master.trainer import Trainer
 from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.messages import EpisodeBatch, decode_from_worker
 from tangram_agent.policy import Policy
@@ -15,7 +14,7 @@ from tangram_agent.setup import Setup, make_setup
 from tangram_agent.types import Episodes
 from tangram_sim.arrays import Singles
 from tangram_sim.batch import BatchedEnv
-from tangram_sim.errors import ConfigError, RunError
+from tangram_sim.errors import ConfigError
 from tangram_sim.kinematics import KinematicWorld
 from tangram_sim.sight import SURE
 from worker.looking import environments
@@ -69,7 +68,7 @@ def test_nothing_exact_leaks(monkeypatch: pytest.MonkeyPatch, shapes: tuple[str,
     whole = played(task, policy)
     noisy(monkeypatch)
     other = played(task, policy)
-    assert other.arrays.keys() == whole.arrays.keys() > {"confidence", "goals_confidence"}
+    assert other.arrays.keys() == whole.arrays.keys() > {"seen", "goals_seen"}
     for name, column in whole.arrays.items():
         np.testing.assert_array_equal(column, getattr(other, name), err_msg=name)
 
@@ -154,8 +153,8 @@ def test_what_no_picture_shows_ends_no_worker(sim: dict[str, Any]) -> None:
 
     with closing(environments(task, 4)) as env:
         episodes = Rollout(env, 0, "player", 0, 0).play(far, 24)
-    seen = episodes.confidence if "gain" in sim else episodes.goals_confidence
-    assert (np.asarray(seen) < SURE).any()
+    seen = episodes.seen if "gain" in sim else episodes.goals_seen
+    assert not np.asarray(seen).all()
     spec = EpisodeSpec.of(task)
     assert EpisodeBatch(1, 0, episodes).encode(spec)
 
@@ -166,35 +165,12 @@ def test_what_is_missing_travels_and_is_not_learned_from() -> None:
     spec = EpisodeSpec.of(task)
     frames = EpisodeBatch(1, 0, episodes).encode(spec)
     arrived = decode_from_worker(frames, spec).episodes
-    np.testing.assert_array_equal(arrived.confidence, episodes.confidence)
-    gone = (np.asarray(episodes.confidence) < SURE).any(axis=(1, 2))
+    np.testing.assert_array_equal(arrived.seen, episodes.seen)
+    gone = ~np.asarray(episodes.seen).all(axis=(1, 2))
     assert 0 < gone.sum() < len(gone)  # random actions leave the picture
-    seen = arrived.learnable(False)
+    seen = arrived.learnable()
     np.testing.assert_array_equal(seen.corners, episodes.corners[~gone])
-    assert replace(episodes, confidence=None).learnable(False).count == len(gone)
-
-
-def piled(**agent: Any) -> Setup:
-    """Three tokens that begin in piles, which pictures do not always tell apart."""
-    made = at_random(setup("small_triangle", "medium_triangle", "parallelogram", starts="piles"))
-    return replace(made, agent=replace(made.agent, learning_starts=8, batch_size=8, **agent))
-
-
-def test_who_knows_its_doubts_learns_from_more_episodes_and_goes_on_as_before() -> None:
-    knows, other = piled(confidence=True), piled()
-    trainer, plain = Trainer(knows, 0, "cpu"), Trainer(other, 0, "cpu")
-    episodes = played(knows, Policy(knows), 6)
-    doubtful = np.asarray((episodes.confidence > 0.0) & (episodes.confidence < SURE))
-    assert doubtful.any()
-    for one in (trainer, plain):
-        one.insert(episodes)
-    assert 0 < len(plain.replay) < len(trainer.replay)
-    arrays, counters = trainer.state()
-    again = Trainer(knows, 1, "cpu")
-    again.load_state(arrays, counters)
-    assert trainer.update(0.0) == again.update(0.0)
-    with pytest.raises(RunError):
-        again.load_state(*plain.state())
+    assert replace(episodes, seen=None).learnable().count == len(gone)
 
 
 def test_without_an_eye_pictures_are_refused() -> None:

@@ -45,7 +45,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 ANYWHERE = SIM | {"starts": "anywhere"}  # a run may have trained with other starts
-PLAIN_AGENT = {"egocentric": False, "angle_head": "plain"}
+PLAIN_AGENT = {"reapply": 2}
 
 
 def of_square(folder: Path, run_of: dict[str, Any] = SQUARE, **settings: Any) -> PlayConfig:
@@ -90,11 +90,11 @@ def test_only_what_was_found_is_drawn_over_the_cameras_view(tmp_path: Path) -> N
         red, _, blue = np.asarray(first, np.int64).transpose(2, 0, 1)
         return np.count_nonzero(blue > red + 30)
 
-    both, confidence = coloured(), played.episodes.confidence
+    both, confidence = coloured(), played.episodes.seen
     assert confidence is not None
-    confidence[1] = 0.4
+    confidence[1] = 0
     one = coloured()
-    confidence[0] = 0.0
+    confidence[0] = 0
     assert both > one > coloured() == 0
     assert camera_sheets(run.setup, replace(played, pictures=None), 1, 60) == []
 

@@ -78,7 +78,7 @@ def test_the_same_pictures_give_the_same_episodes(monkeypatch: pytest.MonkeyPatc
     )
     monkeypatch.setattr(BatchedEnv, "_covered", lambda env, _: noise.uniform(0, 1, env.count))
     other = played(task)
-    assert whole.arrays.keys() == other.arrays.keys() > {"achieved", "confidence"}
+    assert whole.arrays.keys() == other.arrays.keys() > {"achieved", "seen"}
     for name, column in whole.arrays.items():
         np.testing.assert_array_equal(column, getattr(other, name), err_msg=name)
 
@@ -92,8 +92,8 @@ def test_what_tokens_came_to_cover_is_traced_and_travels() -> None:
     spec = EpisodeSpec.of(task)
     arrived = decode_from_worker(EpisodeBatch(1, 0, episodes).encode(spec), spec).episodes
     np.testing.assert_array_equal(arrived.achieved, episodes.achieved)
-    assert arrived.goals_confidence is not None
-    assert (arrived.goals_confidence == 1.0).all()
+    assert arrived.goals_seen is not None
+    assert (arrived.goals_seen == 1).all()
     assert [one.name for one in spec.columns(1)][-1] == "achieved"
     assert "achieved" not in {one.name for one in EpisodeSpec.of(outline_setup()).columns(1)}
 
