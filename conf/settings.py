@@ -32,12 +32,15 @@ the defaults: `tangram-train --config-dir my_presets tokens=mine`."""
 
 def page() -> str:
     """The text of docs/settings.md."""
-    parts = [INTRODUCTION]
+    parts, told = [INTRODUCTION], dict[str, str]()  # row -> the command that has it first
     for command in COMMANDS.values():
         rows = [_row(own, own.name, command.defaults()[own.name]) for own in command.fields()]
         groups = ", ".join(command.groups)
         taken = [f"Groups: {groups}."] if groups else []
-        parts += [f"## {command.name}", *taken, *_laid_over(command), _table(rows)]
+        parts += [f"## {command.name}", *taken, *_laid_over(command), *_as_above(rows, told)]
+        new = [row for row in rows if row not in told]
+        parts += [_table(new)] if new else []
+        told |= dict.fromkeys(new, command.name)
     for group, name in (GROUPS | NESTED).items():
         fields = declared_fields(load(name))
         rows = [_row(own, f"{group}.{own.name}", plain_default(own)) for own in fields]
@@ -46,6 +49,14 @@ def page() -> str:
         else:
             parts += [f"## Entries of {group}", _table(rows)]
     return "\n\n".join(parts) + "\n"
+
+
+def _as_above(rows: list[str], told: dict[str, str]) -> Iterator[str]:
+    """Which settings a command shares with those before it."""
+    for first in dict.fromkeys(told.values()):
+        names = [row.split("|")[1].strip() for row in rows if told.get(row) == first]
+        if names:
+            yield f"As `{first}`: {', '.join(names)}."
 
 
 def _laid_over(command: Command) -> Iterator[str]:

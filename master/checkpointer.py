@@ -39,6 +39,7 @@ from tangram_sim.errors import RunError
 
 MINUTE_S = 60.0
 RETRY_S = 1.0
+KEPT = 2  # newest checkpoints: the one before, if the newest is damaged
 WAIT = "until then nothing is acknowledged, and workers keep what they played"
 MAKE_ROOM = f"make room there; {WAIT}"
 PUT_BACK = f"put it back, or make an empty folder there; {WAIT}"
@@ -68,7 +69,7 @@ class Checkpointer:
         """Write nothing yet.
 
         Args:
-            service: how often, and how many checkpoints are kept.
+            service: how often.
             claim: of the run's folder.
             guard: of the trainer; only what is finite is saved.
             hub: its table of duplicates is saved with the rest.
@@ -78,7 +79,6 @@ class Checkpointer:
         self._claim, self._guard, self._hub, self._journal = claim, guard, hub, journal
         self._folder, self._clock = claim.run.checkpoints, clock
         self._newest = next(reversed(list_checkpoints(self._folder)), None)
-        self._keep_checkpoints = service.keep_checkpoints
         self._checkpoint = Every(service.checkpoint_minutes * MINUTE_S)
         self.failing = self.homeless = False
         self._look = Every(max(service.journal_sync_seconds, RETRY_S))
@@ -125,7 +125,7 @@ class Checkpointer:
         self._guard.check()
         self._claim.check()
         rest = Restored(self._clock.read(), self._hub.state(), self._journal.rotate())
-        self._newest = save_run(self._folder, self._guard.trainer, rest, self._keep_checkpoints)
+        self._newest = save_run(self._folder, self._guard.trainer, rest, KEPT)
         self._journal.exposed = False
         self._journal.drop_before(first_needed(self._folder))
         self._saved_s = time.monotonic()

@@ -18,7 +18,7 @@ from master.rundir import RunFolder, code_of
 from master.security import listening_place
 from master.signals import SAME_WISH_S, handling, show_cursor, stop_notice
 from tangram_agent.messages import TAKEN_OVER
-from tangram_agent.process import Every, watch_parent
+from tangram_agent.process import WATCHDOG_S, Every, watch_parent
 
 # While the master starts, its connection file is looked for this often.
 LOOK_S = 0.1
@@ -83,7 +83,7 @@ class Launcher:
         self._evaluator = worker_child(folder, "evaluator", -1)
         for child in (self._master, *self._workers):
             child.arguments = [*child.arguments, *(override(*own) for own in code.items())]
-            child.patience_s = config.service.watchdog_seconds
+            child.patience_s = WATCHDOG_S
         self._look = Every(IDLE_S)
         self._stop_s: float | None = None
         self._signalled_s: float | None = None

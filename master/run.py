@@ -39,7 +39,7 @@ from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.compiling import cache_folder
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import OPEN, WINDOW
-from tangram_agent.process import Watchdog, keep_memory, watch_parent
+from tangram_agent.process import WATCHDOG_S, Watchdog, keep_memory, watch_parent
 from tangram_agent.setup import Setup
 
 # A clean end after the parent's death; a large replay takes seconds to write.
@@ -77,7 +77,7 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
         folder.prepare(config.resume)
         claim = opened.enter_context(folder.lock())
         signals = opened.enter_context(StopSignals())
-        watchdog = opened.enter_context(Watchdog(config.service.watchdog_seconds))
+        watchdog = opened.enter_context(Watchdog(WATCHDOG_S))
         code, evaluator = code_of(resolved), ""
         join = {"connect": folder.path, **code}
         if not launched:  # the launcher did it, with settings of its own

@@ -8,7 +8,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from tangram_agent.config import NetConfig
+from tangram_agent.config import HEADS, NetConfig
 
 # Added to the score of two nodes without an edge: its exponential is exactly zero, and finite.
 NO_EDGE = -1e30
@@ -69,7 +69,7 @@ class EncoderLayer(nn.Module):
 
     def __init__(self, config: NetConfig) -> None:
         super().__init__()
-        self.attention = GraphAttention(config.width, config.heads, config.scale)
+        self.attention = GraphAttention(config.width, HEADS, config.scale)
         if config.feed_forward:
             self.transform = nn.Sequential(
                 nn.Linear(config.width, config.feed_forward),

@@ -7,6 +7,7 @@ from tangram_agent.process import FORMATS
 from tangram_sim.errors import ConfigError
 from tangram_sim.settings import LEARNING, NETWORK, Settings, declared, setting
 
+HEADS = 4  # M in Eq. 12, each of the key width d = width / M
 STRATEGIES = ("final", "future", "near")
 ON_SOCKETS: dict[str, object] = {"bind": LOCAL}
 
@@ -17,27 +18,18 @@ class NetConfig(Settings, section="net"):
 
     kind: str = setting(
         "mha",
-        "attention network (Eqs. 8-13) or perceptron; or, of an agent of outlines, convolutions "
-        "over a small picture of what is left, its crop",
-        choices=("mha", "mlp", "crops"),
+        "attention network (Eqs. 8-13) or perceptron",
+        choices=("mha", "mlp"),
     )
     hidden: tuple[int, ...] = setting(
         (64, 64),
-        "widths of the hidden layers; of crops the channels of the convolutions, each of which "
-        "halves the picture",
+        "widths of the hidden layers",
         low=1,
         high=65536,
-        only={"kind": ("mlp", "crops")},
+        only={"kind": "mlp"},
     )
     width: int = setting(64, "size of a node's embedding", low=1, high=4096, only={"kind": "mha"})
     layers: int = setting(3, "rounds of message passing", low=1, high=64, only={"kind": "mha"})
-    heads: int = setting(
-        4,
-        "M in Eq. 12, each of the key width d = width / heads",
-        low=1,
-        high=64,
-        only={"kind": "mha"},
-    )
     feed_forward: int = setting(
         512,
         "hidden width of g in Eq. 13; 0: the single layer of Eq. 8",
@@ -56,10 +48,8 @@ class NetConfig(Settings, section="net"):
         if not self.hidden:
             raise ConfigError("net.hidden must name at least one layer, got []")
         super().__post_init__()
-        if self.width % self.heads:
-            raise ConfigError(
-                f"net.width must be a multiple of net.heads, got {self.width} and {self.heads}"
-            )
+        if self.width % HEADS:
+            raise ConfigError(f"net.width must be a multiple of {HEADS}, got {self.width}")
 
 
 @dataclass(frozen=True)
@@ -268,20 +258,12 @@ class ServiceConfig(Settings, section="service"):
         "text", "of the lines that processes write: for people or for programs", choices=FORMATS
     )
     checkpoint_minutes: float = setting(5.0, "time between two checkpoints", low=1e-3, unit="min")
-    keep_checkpoints: int = setting(2, "newest checkpoints kept", low=1, high=1000)
     journal_sync_seconds: float = setting(
         1.0, "time between two syncs of the journal to disk; 0: with each batch", low=0, unit="s"
     )
     # Heartbeats come every two seconds.
     silence_seconds: float = setting(
         30.0, "after which the master forgets a worker that says nothing", low=3, unit="s"
-    )
-    watchdog_seconds: float = setting(
-        300.0,
-        "a process without progress for so long ends with its stack; 0: never",
-        low=0,
-        high=1e6,
-        unit="s",
     )
     device: str = setting("auto", "of the learner", choices=("auto", "cpu", "cuda"))
     threads: int = setting(1, "torch threads of the master", low=1, high=1024)

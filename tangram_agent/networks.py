@@ -13,7 +13,6 @@ from torch import Tensor, nn
 
 from tangram_agent.attention import GraphEncoder
 from tangram_agent.config import NetConfig
-from tangram_agent.crops import CropValue
 from tangram_agent.filling import Filling
 from tangram_agent.graph import Graph
 from tangram_agent.motion import MotionModel
@@ -192,9 +191,8 @@ class Networks(nn.Module):
 
 
 def outline_network(setup: Setup) -> nn.Module:
-    """What an agent of outlines learns: logits (M,) of what is left, by its corners or its crop."""
-    kind = CropValue if setup.net.kind == "crops" else OutlineValue
-    return kind(Filling(setup.layout).shapes, setup.net)
+    """What an agent of outlines learns: logits (M,) of what is left, by its corners."""
+    return OutlineValue(Filling(setup.layout).shapes, setup.net)
 
 
 def travels(name: str, setup: Setup) -> bool:
@@ -221,7 +219,7 @@ def initialise(module: nn.Module, generator: torch.Generator) -> None:
     """Uniform weights and biases within 1/sqrt(inputs), from an explicit generator."""
     with torch.no_grad():
         for layer in module.modules():
-            if isinstance(layer, nn.Linear | nn.Conv2d):
+            if isinstance(layer, nn.Linear):
                 bound = 1.0 / math.sqrt(layer.weight[0].numel())
                 layer.weight.uniform_(-bound, bound, generator=generator)
                 if layer.bias is not None:

@@ -110,6 +110,9 @@ def _wait(handle: int, on_line: Callable[[str], None] | None, grace_s: float) ->
     os._exit(1)
 
 
+WATCHDOG_S = 300.0  # without progress: longer than a large checkpoint on a slow disk
+
+
 class Watchdog:
     """Ends a process that lives but makes no progress, with the stacks of all threads on stderr.
 

@@ -22,7 +22,6 @@ Settings = TypeVar("Settings")
 
 # Those that have none on outlines.
 _NOT_OF_OUTLINES = ("saturation_penalty", "actor_lr", "noise")
-MAX_HALVED = 5  # times that a crop of 32 pixels is halved to one
 SECTIONS = ("tokens", "sim", "reward", "agent", "net")
 
 
@@ -54,7 +53,6 @@ class Setup:
                 f"agent.replay_capacity must hold an episode, {self.horizon} actions, "
                 f"got {agent.replay_capacity}"
             )
-        self._check_net()
         if self.fills:
             self._check_fills()
         if self.pairs and not one:
@@ -77,20 +75,6 @@ class Setup:
                     f"sim.{name}=0"
                 )
 
-    def _check_net(self) -> None:
-        """Refuse a kind of network that does not see what the agent sees."""
-        if self.net.kind == "crops" and len(self.net.hidden) > MAX_HALVED:
-            raise ConfigError(
-                f"net.hidden={told(self.net.hidden)}: each of the convolutions of net.kind=crops "
-                f"halves 32 pixels, so there may be {MAX_HALVED}, got {len(self.net.hidden)}"
-            )
-        if self.net.kind == "crops" and not self.fills:
-            raise ConfigError(
-                "net.kind=crops sees what is left to fill of an outline, which an agent of "
-                f"agent.readout={self.agent.readout} is not shown: set sim=silhouette "
-                "agent=outline, or net=mha"
-            )
-
     def _check_fills(self) -> None:
         """Refuse what an agent of outlines cannot use, or outlines that no agent sees."""
         agent, sim = self.agent, self.sim
@@ -100,7 +84,7 @@ class Setup:
                 "sim=silhouette or sim=silhouette_pictures, or another agent"
             )
         if self.net.kind == "mlp":
-            refuse_ignored("net.kind=mlp", "outlines", "set net.kind=mha or crops")
+            refuse_ignored("net.kind=mlp", "outlines", "set net.kind=mha")
         self._refuse(_NOT_OF_OUTLINES, "outlines", "take another agent")
         if agent.lookahead == "values" and agent.beam == 1:
             refuse_ignored("agent.lookahead=values", "agent.beam=1", "set agent.beam=12")

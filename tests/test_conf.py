@@ -100,7 +100,6 @@ def test_presets_of_more_and_of_own_shapes() -> None:
         (("agent=mlp",), "mlp"),
         (("agent=mlp", "net=mlp_large"), "mlp_large"),
         (("net=mlp_large", "agent=paper"), "mlp_large"),
-        (("sim=silhouette", "agent=outline", "net=crops"), "crops"),
     ],
 )
 @pytest.mark.parametrize("primary", WITH_GROUPS)
@@ -109,15 +108,6 @@ def test_net_is_the_agents_unless_it_is_chosen(
 ) -> None:
     expected = yaml.safe_load((files("conf") / "net" / f"{net}.yaml").read_text("utf-8"))
     assert compose(primary, *overrides)["net"] == COMMANDS["train"].sections()["net"] | expected
-
-
-def test_crops_are_for_the_agent_of_outlines() -> None:
-    made = make_setup(compose("train", "tokens=tangram7", "sim=silhouette", "agent=outline"))
-    assert made.net.kind == "mha"
-    told = ("tokens=tangram7", "sim=silhouette", "agent=outline", "net=crops")
-    assert make_setup(compose("train", *told)).net.kind == "crops"
-    with pytest.raises(ConfigError, match=r"net.kind=crops sees"):
-        make_setup(compose("train", "tokens=tangram7", "net=crops"))
 
 
 @pytest.mark.parametrize("name", ["paper", "mlp"])

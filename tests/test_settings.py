@@ -42,7 +42,7 @@ ONE: Config = {
     "sim": {"backend": "kinematic"},
     "reward": {},
     "agent": AGENT,
-    "net": {"width": 8, "layers": 1, "heads": 2, "feed_forward": 8},
+    "net": {"width": 8, "layers": 1, "feed_forward": 8},
 }
 SEVERAL: Config = ONE | {
     "tokens": {"shapes": ["large_triangle", "parallelogram"], "scale": 0.8},
@@ -134,7 +134,6 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "net.hidden": (MLP, [9]),
     "net.width": (ONE, 16),
     "net.layers": (ONE, 2),
-    "net.heads": (ONE, 1),
     "net.feed_forward": (ONE, 9),
     "net.scale": (ONE, "sqrt_d"),
     "agent.motion": (ONE, "exact"),
@@ -285,7 +284,6 @@ def test_every_setting_of_a_command_is_read() -> None:
         (ONE, "net.hidden", [8], "net.kind=mha"),
         (MLP, "net.width", 32, "net.kind=mlp"),
         (MLP, "net.layers", 2, "net.kind=mlp"),
-        (MLP, "net.heads", 2, "net.kind=mlp"),
         (MLP, "net.feed_forward", 8, "net.kind=mlp"),
         (MLP, "net.scale", "sqrt_d", "net.kind=mlp"),
         (ONE, "sim.substeps", 16, "sim.backend=kinematic"),

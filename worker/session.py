@@ -14,7 +14,7 @@ import torch
 from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.messages import TAKEN_OVER
 from tangram_agent.policy import Policy
-from tangram_agent.process import Watchdog, formatter, keep_memory, watch_parent
+from tangram_agent.process import WATCHDOG_S, Watchdog, formatter, keep_memory, watch_parent
 from tangram_agent.setup import Setup
 from tangram_sim.errors import TangramError
 from worker.client import Client
@@ -53,7 +53,7 @@ def joined(config: WorkerConfig, setup: Setup, policy: Policy) -> Iterator[Clien
     service = config.service
     log_as(config.role, service.log_format)
     spec = EpisodeSpec.of(setup)
-    watchdog = Watchdog(service.watchdog_seconds)
+    watchdog = Watchdog(WATCHDOG_S)
     client = Client(
         config.connect,
         config.role,

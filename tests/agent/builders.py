@@ -27,7 +27,7 @@ PAPER = {
 PLAIN: dict[str, Any] = {"hindsight": [{"strategy": "final"}]}
 PROPOSAL = {"reapply": 0, "motion": "exact"}
 SCENE = {"readout": "token"}
-SMALL = {"width": 16, "layers": 2, "heads": 2, "feed_forward": 32}
+SMALL = {"width": 16, "layers": 2, "feed_forward": 32}
 
 
 def setup(

@@ -14,7 +14,6 @@ from tests.sim.builders import SEVEN
 TWO = {"shapes": ["small_triangle", "small_triangle"], "scale": 1.0}
 ALL = {"shapes": list(SEVEN), "scale": 0.6}
 AGENT = {"readout": "outline", "gamma": 1.0, "hindsight": [{"strategy": "final", "copies": 3}]}
-CROPS: dict[str, Any] = {"kind": "crops", "hidden": [8, 16]}
 SIM = {"observe": "silhouette", "starts": "outside", "targets": "connected"}
 
 

@@ -51,7 +51,7 @@ def test_attention_equals_the_loop_of_the_equations(scale: str, d: float) -> Non
 @pytest.mark.parametrize("feed_forward", [0, 20])
 def test_encoder_equals_the_loop_of_the_equations(feed_forward: int) -> None:
     """Eq. 13 with both readings of g, over two rounds."""
-    config = NetConfig(width=WIDTH, heads=HEADS, layers=2, feed_forward=feed_forward)
+    config = NetConfig(width=WIDTH, layers=2, feed_forward=feed_forward)
     encoder = GraphEncoder(4, config)
     initialise(encoder, torch.Generator().manual_seed(1))
     edges = setup().layout.adjacency

@@ -19,7 +19,7 @@ from tangram_agent.steps import Steps
 from tests.agent.builders import random_transitions
 from tests.agent.outlines import outline_setup
 from tests.agent.pair_scenes import transitions
-from tests.agent.test_filling_learning import KINDS, episode
+from tests.agent.test_filling_learning import episode
 from tests.agent.test_learner import CASES
 from tests.agent.test_motion import commands, seen
 
@@ -65,9 +65,8 @@ def test_the_fit_of_a_motion_stays_on_its_device() -> None:
 
 
 @pytest.mark.fast
-@KINDS
-def test_learning_what_can_be_filled_stays_on_its_device(net: dict[str, Any] | None) -> None:
-    made = outline_setup(agent={"replay_capacity": 8, "batch_size": 8}, net=net)
+def test_learning_what_can_be_filled_stays_on_its_device() -> None:
+    made = outline_setup(agent={"replay_capacity": 8, "batch_size": 8})
     replay, generator = FillReplay(made), np.random.default_rng(0)
     replay.insert(episode([9.0, 9.0, 0.0]), generator)
     learner = FillLearner(made, 0, META)

@@ -16,13 +16,12 @@ from tangram_agent.learner import NotFiniteError
 from tangram_agent.types import Episodes
 from tangram_agent.values import Corners, features
 from tangram_sim.errors import RunError
-from tests.agent.outlines import CROPS, TWO, outline_setup, played_in
+from tests.agent.outlines import TWO, outline_setup, played_in
 
 pytestmark = pytest.mark.fast
 
 MADE = outline_setup(agent={"replay_capacity": 8, "batch_size": 8})
 LEG = float(np.sqrt(2.0 * MADE.layout.areas[0]))
-KINDS = pytest.mark.parametrize("net", [None, CROPS], ids=["corners", "crops"])
 FAR = [9.0, 9.0, 0.0]
 # Two triangles, back to back: they make a square.
 HALF = [0.0, 0.0, 0.0]
@@ -162,8 +161,8 @@ def test_an_empty_replay_cannot_be_sampled() -> None:
         FillReplay(MADE).sample(4, np.random.default_rng(0))
 
 
-def learned(net: dict[str, Any] | None = None) -> tuple[FillLearner, FillReplay]:
-    made = outline_setup(agent={"replay_capacity": 8, "batch_size": 8}, net=net)
+def learned() -> tuple[FillLearner, FillReplay]:
+    made = outline_setup(agent={"replay_capacity": 8, "batch_size": 8})
     replay = FillReplay(made)
     replay.insert(episode(other_half()), np.random.default_rng(0))
     replay.insert(episode([5.0, 5.0, 0.0]), np.random.default_rng(0))
@@ -190,9 +189,8 @@ def test_a_state_is_worth_the_best_that_it_can_go_on_to() -> None:
     assert {0.0, 1.0} < set(targets.tolist())
 
 
-@KINDS
-def test_updates_go_on_from_a_state_bit_by_bit(net: dict[str, Any] | None) -> None:
-    (one, replay), (other, _) = learned(net), learned(net)
+def test_updates_go_on_from_a_state_bit_by_bit() -> None:
+    (one, replay), (other, _) = learned(), learned()
     generator = np.random.default_rng(3)
     batches = [replay.sample(8, generator) for _ in range(6)]
     for batch in batches[:3]:
@@ -205,10 +203,9 @@ def test_updates_go_on_from_a_state_bit_by_bit(net: dict[str, Any] | None) -> No
         assert (other.state()[name] == value).all(), name
 
 
-@KINDS
-def test_it_learns_what_can_be_filled(net: dict[str, Any] | None) -> None:
+def test_it_learns_what_can_be_filled() -> None:
     """A square and its half can be, a square with one triangle left, or a strip, cannot."""
-    learner, replay = learned(net)
+    learner, replay = learned()
     generator = np.random.default_rng(4)
     strip = np.zeros((1, 8), np.uint8)
     filling = Filling(outline_setup(TWO).layout)

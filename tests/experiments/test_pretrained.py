@@ -136,7 +136,7 @@ def test_an_agent_is_evaluated_like_a_run(tmp_path: Path) -> None:
 
 def other_net(run: Path) -> None:
     shutil.rmtree(run)
-    write_run(run, net={"width": 8, "layers": 1, "heads": 1, "feed_forward": 8})
+    write_run(run, net={"width": 8, "layers": 1, "feed_forward": 8})
     (run / "result.json").write_text(json.dumps(RESULT | {"seed": 1, "mean_reward": 0.1}))
 
 
@@ -165,7 +165,7 @@ def test_runs_that_make_no_agent_are_refused(tmp_path: Path, spoil: object, mess
 
 def test_weights_that_are_too_large_are_refused(tmp_path: Path) -> None:
     run = tmp_path / "run"
-    write_run(run, net={"width": 256, "layers": 2, "heads": 1, "feed_forward": 256})
+    write_run(run, net={"width": 256, "layers": 2, "feed_forward": 256})
     (run / "result.json").write_text(json.dumps(RESULT | {"seed": 0, "mean_reward": 0.1}))
     with pytest.raises(RunError, match="more than 1,000,000: publish an agent with a smaller net"):
         publish([run], "square", tmp_path / "out", TESTS)

@@ -215,7 +215,7 @@ def test_weights_that_are_not_finite_are_neither_sent_nor_kept(tmp_path: Path, o
 
 def test_checkpoints_come_on_their_interval(tmp_path: Path) -> None:
     hub = FakeHub(MADE, batches(3))
-    service = {"checkpoint_minutes": 1e-3, "keep_checkpoints": 1, "publish_seconds": 1000.0}
+    service = {"checkpoint_minutes": 1e-3, "publish_seconds": 1000.0}
     made = loop(tmp_path, MADE, hub, service, max_updates=6)
     made.checkpointer._checkpoint = Every(0.0)
     made.run()

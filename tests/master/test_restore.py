@@ -254,6 +254,6 @@ def test_a_warm_start_that_cannot_be_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RunError, match=f"warm_start={tmp_path}: no checkpoint in"):
         warm_start(tmp_path, trainer(MADE))
     saved(tmp_path, trainer(MADE))
-    wider = trainer(setup(agent=AGENT, net={"width": 16, "heads": 2, "layers": 1}))
+    wider = trainer(setup(agent=AGENT, net={"width": 16, "layers": 1}))
     with pytest.raises(RunError, match=f"warm_start={tmp_path}: weights of another"):
         warm_start(tmp_path, wider)

@@ -30,7 +30,7 @@ def setup(*shapes: str, **sim: Any) -> Setup:
             "sim": {"backend": "kinematic", "pixels": 64, "observe": "pictures", **sim},
             "reward": {},
             "agent": {"uniform_share": 0.25},
-            "net": {"width": 8, "layers": 1, "heads": 2, "feed_forward": 8},
+            "net": {"width": 8, "layers": 1, "feed_forward": 8},
         }
     )
 
