@@ -20,6 +20,7 @@ from tangram_agent.values import Corners
 from tangram_sim.actions import velocities_of
 from tangram_sim.areas import Area, polygons
 from tangram_sim.arrays import Bools, Floats, Ints, Singles
+from tangram_sim.config import MAX_OVERLAP
 from tangram_sim.dissections import Laid, Place
 from tangram_sim.errors import ConfigError
 from tangram_sim.geometry import outlines
@@ -208,6 +209,6 @@ class Filler:
         covered = shapely.area(shapely.intersection(bodies, rest))
         others = covered_area(corners, self._layout, placed) if placed.any() else Polygon()
         over = shapely.area(shapely.intersection(bodies, others))
-        covered[over > _FREE * self._sim.max_overlap * self._layout.areas[tokens]] = 0.0
+        covered[over > _FREE * MAX_OVERLAP * self._layout.areas[tokens]] = 0.0
         best = int(covered.argmax())
         return laid[best] if covered[best] > 0.0 else None

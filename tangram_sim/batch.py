@@ -21,7 +21,7 @@ from tangram_sim.actions import (
 )
 from tangram_sim.actuation import Actuation, Command
 from tangram_sim.arrays import Bools, Floats, Ints, Pixels
-from tangram_sim.config import SILHOUETTES, RewardConfig, SimConfig
+from tangram_sim.config import MAX_OVERLAP, SILHOUETTES, RewardConfig, SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.geometry import outlines, overlap_share, shared_area
 from tangram_sim.layout import Layout
@@ -83,7 +83,7 @@ class BatchedEnv:
     `actions_per_token` actions is placed, and once all are the episode is over for good. A lone
     token that has several actions is never placed: a time limit ends its episode, and it could as
     well go on. An action that names a placed token is refused: it moves nothing, but uses up its
-    step. One that would set a lifted token down on others by more than `sim.max_overlap` of its
+    step. One that would set a lifted token down on others by more than `MAX_OVERLAP` of its
     area moves nothing either, and is one of the token's actions. What is made of an action before a
     token moves is told in actuation.py.
 
@@ -288,7 +288,7 @@ class BatchedEnv:
         velocity, flip = velocities(actions, self.sim), flips(actions, self.layout, self.sim)
         command = self.actuation.carry_out(Command(tokens, velocity, flip, refused))
         covered = self._covered(command)
-        blocked = (covered > self.sim.max_overlap) & ~command.idle
+        blocked = (covered > MAX_OVERLAP) & ~command.idle
         camera = self._move(command, command.idle | blocked)
         if self.sight is not None:
             told = named, np.where(refused[:, None], 0.0, velocity)

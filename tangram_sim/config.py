@@ -40,6 +40,9 @@ UNKNOWN = (
     *("damping", "damping_spread"),
 )
 MOTIONS = ("lift", "slide")
+# Share of a token that may come to lie on others where it is set down: the engine pushes such
+# tokens apart by a little, and with more it would move what is placed.
+MAX_OVERLAP = 0.2
 STARTS = ("anywhere", "outside", "piles")
 TARGETS = ("uniform", "gaussian", "connected", "figures", "touching", "mixed")
 
@@ -94,13 +97,6 @@ class SimConfig(Settings, section="sim"):
         low=0,
         high=1,
         only={"backend": "physics", "motion": "lift"},
-    )
-    friction: float = setting(
-        0.2,
-        "of the edges of tokens that slide along each other; the engine multiplies both",
-        low=0,
-        high=10,
-        only={"motion": "slide"},
     )
     gain: tuple[float, ...] = setting(
         (1.0, 1.0, 1.0),
@@ -173,13 +169,6 @@ class SimConfig(Settings, section="sim"):
         "lift",
         "carried above the others and set down, or pushed along the table and others with it",
         choices=MOTIONS,
-    )
-    max_overlap: float = setting(
-        0.2,
-        "lift: share of a token that may come to lie on others; a placement beyond it is blocked",
-        low=0,
-        high=1,
-        only={"motion": "lift"},
     )
     targets: str = setting(
         "uniform",

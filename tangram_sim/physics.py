@@ -29,6 +29,9 @@ _LIFTED = 3.0 * _WALL
 # smaller by it on every side, so that pieces that only touch leave each other alone.
 _MARGIN = 1e-4
 _UPRIGHT = 1e4  # inertia about x and y, far more than a token's: none tips over
+# Of the edges of tokens that slide along each other, which the engine multiplies: 0.04 for two, so
+# that they glide and do not drag each other along.
+_FRICTION = 0.2
 _GRIP = 1e3  # mass of the token that is pushed along the table, as a multiple of its own
 _STRIDE = 0.02  # longest way of any of its points in one step
 _THIN = 0.5  # the same as a share of the thinnest token's thickness, which is not to be jumped over
@@ -55,7 +58,7 @@ class PhysicsWorld:
                 "close environments, or use fewer of them"
             )
         self._finalizer = weakref.finalize(self, pybullet.disconnect, self._client)
-        self._substeps, self._friction = sim.substeps, sim.friction
+        self._substeps = sim.substeps
         self._slides, self._alone = sim.motion == "slide", layout.tokens == 1
         self._radius = (layout.radii * self._unit).tolist()
         thin = min(thickness(shape.corners) for shape in layout.shapes) * self._unit
@@ -251,7 +254,7 @@ class PhysicsWorld:
             body,
             -1,
             collisionMargin=margin,
-            lateralFriction=self._friction,
+            lateralFriction=_FRICTION,
             physicsClientId=self._client,
         )
         if self._alone:

@@ -11,7 +11,7 @@ from tangram_sim.actions import chosen_tokens
 from tangram_sim.actions import horizon as steps_of
 from tangram_sim.arrays import Bools, Floats, Ints, Pixels
 from tangram_sim.batch import BatchedEnv, StepResult
-from tangram_sim.config import RewardConfig, SimConfig
+from tangram_sim.config import MAX_OVERLAP, RewardConfig, SimConfig
 from tangram_sim.drawing import draw_scene
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import TokensConfig, make_layout
@@ -107,8 +107,8 @@ class Table:
         if result.blocked[row]:
             info["blocked"] = (
                 f"token {result.tokens[row]} would lie on others by {result.covered[row]:.3%} of "
-                f"its area, at most {sim.max_overlap:.3%} allowed: set it down where there is "
-                "room, or raise max_overlap"
+                f"its area, at most {MAX_OVERLAP:.3%} allowed: set it down where there is "
+                "room"
             )
         return info
 

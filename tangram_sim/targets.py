@@ -121,10 +121,9 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
     if sim.mirrored and not layout.any_chiral:
         alike, chiral = "tokens that are their own mirror images", "take a set with a parallelogram"
         refuse_ignored(f"sim.mirrored={told(sim.mirrored)}", alike, chiral, 0.0)
-    for name in ("max_overlap", "motion"):
-        value, usual = getattr(sim, name), getattr(SimConfig, name)
-        if value != usual and layout.tokens == 1:
-            refuse_ignored(f"sim.{name}={told(value)}", "one token", "take a set of several", usual)
+    if sim.motion != SimConfig.motion and layout.tokens == 1:
+        given, usual = f"sim.motion={sim.motion}", SimConfig.motion
+        refuse_ignored(given, "one token", "take a set of several", usual)
     _check_thick(layout, sim)
     _check_world(layout, sim)
     _check_piles(layout, sim)

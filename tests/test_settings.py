@@ -58,7 +58,6 @@ PAPER = over(ONE, agent={"gamma": 0.9}, sim={"actions_per_token": 2})
 MLP = ONE | {"net": {"kind": "mlp", "hidden": [8]}}
 PHYSICS = over(ONE, sim={"backend": "physics"})
 GAUSSIAN = over(SEVERAL, sim={"targets": "gaussian"})
-CROWDED = over(SEVERAL, sim={"arena": 1.2})
 # So crowded that nearly every order pushes something away.
 SLIDE = over(
     SEVERAL,
@@ -97,7 +96,6 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "sim.substeps": (PHYSICS, 1),
     "sim.damping": (PHYSICS, 0.5),
     "sim.damping_spread": (PHYSICS, 0.5),
-    "sim.friction": (SLIDE, 10.0),
     "sim.gain": (ONE, [0.9, 1.0, 1.0]),
     "sim.gain_spread": (ONE, 1.1),
     "sim.bias": (ONE, [0.0, 0.0, 0.1]),
@@ -108,7 +106,6 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "sim.delay": (over(ONE, sim={"actions_per_token": 2}), True),
     "sim.corner_noise": (ONE, 0.01),
     "sim.motion": (over(SEVERAL, sim={"backend": "physics"}), "slide"),
-    "sim.max_overlap": (over(CROWDED, sim={"max_overlap": 1.0}), 0.0),
     "sim.targets": (SEVERAL, "connected"),
     "sim.spread": (GAUSSIAN, 0.05),
     "sim.starts": (SEVERAL, "outside"),
@@ -291,8 +288,6 @@ def test_every_setting_of_a_command_is_read() -> None:
         (ONE, "sim.damping_spread", 0.04, "sim.backend=kinematic"),
         (SLIDE, "sim.damping", 0.04, "sim.motion=slide"),
         (SLIDE, "sim.damping_spread", 0.04, "sim.motion=slide"),
-        (PHYSICS, "sim.friction", 0.5, "sim.motion=lift"),
-        (ONE, "sim.max_overlap", 0.1, "one token"),
         (PHYSICS, "sim.motion", "slide", "one token"),
         (ONE, "sim.mirrored", 0.5, "tokens that are their own mirror images"),
         (ONE, "agent.beam", 8, "agent.lookahead=none"),
@@ -310,7 +305,6 @@ def test_every_setting_of_a_command_is_read() -> None:
             0.01,
             "sim.observe=silhouette_pictures",
         ),
-        (SLIDE, "sim.max_overlap", 0.1, "sim.motion=slide"),
         (ONE, "reward.sharpness", 10.0, "reward.name=overlap"),
     ],
 )

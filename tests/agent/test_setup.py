@@ -199,7 +199,6 @@ FUTURE = [{"strategy": "future"}]
             {"agent": {"hindsight": [{"strategy": "final", "angle": 0.1}]}},
             "agent.hindsight.angle=0.1 changes nothing with agent.hindsight.strategy=final",
         ),
-        (ONE, {"sim": {"max_overlap": 0.1}}, "sim.max_overlap=0.1 changes nothing with one token"),
         (ONE, {"sim": {"mirrored": 0.5}}, "sim.mirrored=0.5 .* take a set with a parallelogram"),
     ],
 )

@@ -117,15 +117,16 @@ def test_what_is_drawn_lies_within_its_spread_and_differs_between_episodes() -> 
 
 
 @pytest.mark.parametrize("backend", ["kinematic", "physics"])
-def test_the_same_generators_play_the_same_whoever_plays_beside_them(backend: str) -> None:
+def test_the_same_generators_play_the_same_whoever_plays_beside_them(
+    backend: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As lockstep and the fixed tests ask for."""
+    monkeypatch.setattr("tangram_sim.batch.MAX_OVERLAP", 1.0)
     more = {"damping_spread": 0.05} if backend == "physics" else {}
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (6, 5, 4))
     ends, worlds = [], []
     for count in (5, 5, 2):
-        with closing(
-            begun(THREE, count, backend=backend, max_overlap=1.0, **VARIES, **more)
-        ) as env:
+        with closing(begun(THREE, count, backend=backend, **VARIES, **more)) as env:
             for _ in range(2):  # nothing is left of the episode before
                 env.reset(evaluation_generators(count))
                 rows = [env.step(step[:count]).rewards[:2] for step in actions]
@@ -223,14 +224,16 @@ def worlds() -> Iterator[tuple[int, SimConfig]]:
                 drift=extreme(-1.0, 1.0),
                 drift_spread=extreme(0.0, 1.0),
                 action_noise=extreme(0.0, 0.2),
-                max_overlap=0.2 if motion == "slide" else 1.0,
             ),
         )
 
 
 @pytest.mark.parametrize(("seed", "sim"), list(worlds()))
-def test_no_world_leaves_the_bound(seed: int, sim: SimConfig) -> None:
+def test_no_world_leaves_the_bound(
+    seed: int, sim: SimConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Messages are checked against it; and no shift is longer than `reach` says."""
+    monkeypatch.setattr("tangram_sim.batch.MAX_OVERLAP", 1.0)
     layout = layout_of("square", "large_triangle", scale=0.2 * sim.arena)
     rng = np.random.default_rng(seed)
     check_targets(layout, sim)

@@ -234,9 +234,10 @@ def put_first_at(env: BatchedEnv, *places: float) -> StepResult:
 
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.5, 1.0])
 @BOTH
-def test_the_bound_is_exact(share: float, backend: str) -> None:
+def test_the_bound_is_exact(share: float, backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Squares side by side: what is shared is as wide as the way that is too short."""
-    env = lying(SQUARES, [BESIDE] * 3, max_overlap=share, backend=backend)
+    monkeypatch.setattr("tangram_sim.batch.MAX_OVERLAP", share)
+    env = lying(SQUARES, [BESIDE] * 3, backend=backend)
     off = 1e-4 if share < 1.0 else 0.0
     wanted, before = np.array([share - off, share, share + off]), env.corners
     result = put_first_at(env, *(SIDE * (wanted - 1.0) - [0.0, 1e-9, 0.0]))
@@ -276,19 +277,22 @@ def test_what_lies_on_several_tokens_adds_up(starts: list[list[float]], covered:
     assert result.blocked.tolist() == [covered > 0.2]
 
 
-def test_the_side_that_it_would_lie_on_counts() -> None:
+def test_the_side_that_it_would_lie_on_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tangram_sim.batch.MAX_OVERLAP", 0.0)
     layout = layout_of("parallelogram", "square", scale=1.0)
     corner = np.array([0.375, 0.125]) + layout.shapes[1].radius * 0.5
     starts = [[[0.0, 0.0, 0.0], [corner[0], -corner[1], 0.0]]] * 2
-    env = lying(layout, starts, arena=2.0, max_overlap=0.0, allow_flip=True)
+    env = lying(layout, starts, arena=2.0, allow_flip=True)
     result = env.step(np.array([[-1.0, flip, 0.0, 0.0, 0.0] for flip in (-1.0, 1.0)]))
     assert (result.covered > 0.0).tolist() == result.blocked.tolist() == [False, True]
 
 
-def test_both_worlds_play_the_same_episodes_while_no_overlap_is_allowed() -> None:
+def test_both_worlds_play_the_same_episodes_while_no_overlap_is_allowed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("tangram_sim.batch.MAX_OVERLAP", 0.0)
     rng, blocked, refused = np.random.default_rng(0), 0, 0
-    settings = {"max_overlap": 0.0, "actions_per_token": 2}
-    envs = [begun(GAME, 12, backend=name, **settings) for name in ("physics", "kinematic")]
+    envs = [begun(GAME, 12, backend=name, actions_per_token=2) for name in ("physics", "kinematic")]
     for _ in range(10):
         actions = rng.uniform(-0.6, 0.6, (12, 4))
         one, two = (env.step(actions) for env in envs)

@@ -84,7 +84,6 @@ REFUSED = [
     (SimConfig, {"motion": "fly"}, "sim.motion must be one of lift, slide, got 'fly'"),
     (SimConfig, {"motion": "slide", "backend": "kinematic"}, "needs .* got sim.backend=kinematic"),
     (SimConfig, {"motion": "slide", "allow_flip": True}, "allow_flip=true needs sim.motion=lift"),
-    (SimConfig, {"max_overlap": 1.1}, "sim.max_overlap must be between 0 and 1, got 1.1"),
     (SimConfig, {"targets": "x"}, "sim.targets must be one of uniform, .* mixed, got 'x'"),
     (SimConfig, {"spread": 0.0}, "sim.spread must be between 0.001 and 1, got 0"),
     (SimConfig, {"starts": "x"}, "sim.starts must be one of anywhere, outside, piles, got 'x'"),

@@ -160,8 +160,11 @@ def test_equal_tokens_take_the_nearer_places() -> None:
 
 
 @pytest.mark.parametrize("allow_flip", [False, True])
-def test_chance_names_tokens_that_are_left_and_stays_in_the_arena(allow_flip: bool) -> None:
-    made = setup(GAME, allow_flip=allow_flip, max_overlap=1.0, pixels=16)
+def test_chance_names_tokens_that_are_left_and_stays_in_the_arena(
+    allow_flip: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tangram_sim.batch.MAX_OVERLAP", 1.0)
+    made = setup(GAME, allow_flip=allow_flip, pixels=16)
     with closing(FixedTests(made, 20, 20)) as tests:
         played = tests.play(random_policy(made.layout, made.sim))
     assert not played.refused.any()

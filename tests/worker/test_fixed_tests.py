@@ -87,9 +87,11 @@ def test_the_trained_reward_is_reported_where_it_is_another(reward: dict, own: b
 
 
 @pytest.mark.parametrize(("tokens", "actions"), [(SQUARE, 1), (SQUARE, 3), (PAIR, 1), (PAIR, 2)])
-def test_the_position_policy_solves_position_and_nothing_else(tokens: dict, actions: int) -> None:
-    several = {"max_overlap": 1.0} if tokens is PAIR else {}
-    made = setup(tokens, pixels=32, actions_per_token=actions, **several)
+def test_the_position_policy_solves_position_and_nothing_else(
+    tokens: dict, actions: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tangram_sim.batch.MAX_OVERLAP", 1.0)
+    made = setup(tokens, pixels=32, actions_per_token=actions)
     with closing(FixedTests(made, 10, 10)) as tests:
         found = tests.play(position_policy(made.layout, made.sim))
     centres = made.layout.bases(found.ends), made.layout.bases(found.goals)

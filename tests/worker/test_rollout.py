@@ -81,10 +81,12 @@ def rolled_out(made: Setup, envs: int, count: int) -> Episodes:
 
 
 @pytest.mark.parametrize(("tokens", "actions"), [(SQUARE, 1), (SQUARE, 3), (PAIR, 2)])
-def test_episodes_equal_a_naive_loop_however_they_are_batched(tokens: dict, actions: int) -> None:
+def test_episodes_equal_a_naive_loop_however_they_are_batched(
+    tokens: dict, actions: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     # The naive loop sets tokens down wherever they are told to.
-    several = {"max_overlap": 1.0} if tokens is PAIR else {}
-    made = setup(tokens, CURIOUS, actions_per_token=actions, **several)
+    monkeypatch.setattr("tangram_sim.batch.MAX_OVERLAP", 1.0)
+    made = setup(tokens, CURIOUS, actions_per_token=actions)
     acting = policy(made)
     naive = [naive_episode(made, acting, episode_generator(*IDENTITY, n)) for n in range(16)]
     for envs in (1, 8):
