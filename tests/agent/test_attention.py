@@ -11,7 +11,7 @@ from tests.agent.builders import setup
 
 pytestmark = pytest.mark.fast
 
-WIDTH, HEADS, NODES = 12, 3, 9
+WIDTH, HEADS, NODES = 16, 4, 9
 
 
 def attention(scale: str = "d") -> GraphAttention:
