@@ -76,7 +76,7 @@ def test_a_broken_run_is_refused_in_clear_words(run_dir: Path, harm: Any, reason
     [
         ("tokens", {"shapes": ["parallelogram"], "scale": 1.0}),
         ("agent", {"motion": "exact", "reapply": 0}),
-        ("net", {**SMALL}),
+        ("net", {**SMALL, "scale": "sqrt_d"}),
     ],
 )
 def test_a_config_that_was_changed_after_the_training_is_refused(
