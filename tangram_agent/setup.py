@@ -67,13 +67,12 @@ class Setup:
             ConfigError: names the setting and the remedy.
         """
         sim = self.sim
-        for name in ("camera_turn", "camera_shift") if self.traces else ():
-            if getattr(sim, name):
-                raise ConfigError(
-                    f"sim.{name}={told(getattr(sim, name))}: an agent of outlines takes tokens to "
-                    "where it sees them, and learns nothing where the camera stands elsewhere: set "
-                    f"sim.{name}=0"
-                )
+        if self.traces and sim.disturbance:
+            raise ConfigError(
+                f"sim.disturbance={told(sim.disturbance)}: an agent of outlines takes tokens to "
+                "where it sees them, and learns nothing where the camera stands elsewhere: set "
+                "sim.disturbance=0"
+            )
 
     def _check_fills(self) -> None:
         """Refuse what an agent of outlines cannot use, or outlines that no agent sees."""

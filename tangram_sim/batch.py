@@ -338,7 +338,7 @@ class BatchedEnv:
         pictures = []
         views = self._lens.begin(self._generators) if known is None else self._lens.stand(known)
         for b, world in enumerate(self._worlds):
-            if self._lens.moves:
+            if self._lens.disturbs:
                 world.aim(views[b].x, views[b].y, views[b].turn)
             if self.sim.pixels:
                 world.place(targets[0][b], targets[1][b])

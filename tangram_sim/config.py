@@ -22,14 +22,8 @@ SILHOUETTES = ("silhouette", "silhouette_pictures")
 OBSERVED = ("corners", "pictures", *SILHOUETTES)
 LOOKED_AT = ("pictures", "silhouette_pictures")
 # The settings of the camera.
-CAMERA = (
-    *("pixels", "picture", "picture_noise", "picture_blur"),
-    *("light_gradient", "camera_turn", "camera_shift"),
-)
+CAMERA = ("pixels", "picture", "disturbance")
 NO_PICTURES: dict[str, object] = {"pixels": 0}
-# From one corner to the other light falls off by sqrt(2) times as much: beyond this, ground in the
-# shade is as dark as half a token, and counts as one in Eq. 14.
-MAX_LIGHT_GRADIENT = 0.24
 # A fifth of the arena is a whole token: nothing is left to see beyond.
 MAX_CORNER_NOISE = 0.2
 # What an action says is told a token otherwise by at most this much; see SimConfig.
@@ -218,44 +212,14 @@ class SimConfig(Settings, section="sim"):
         choices=PICTURES,
         unless=NO_PICTURES,
     )
-    picture_noise: float = setting(
+    disturbance: float = setting(
         0.0,
-        "deviation of the Gaussian noise on each pixel",
+        "strength of what disturbs the camera; at 1 each pixel has a noise of 8 of 255 levels, "
+        "pictures are blurred by 1 pixel, light falls off by a fifth across them, and the camera "
+        "is turned by 1 degree and shifted by 2 pixels, each way as each episode draws; targets "
+        "and tokens are seen by the same camera",
         low=0,
-        high=64,
-        unit="of 255 levels",
-        unless=NO_PICTURES,
-    )
-    picture_blur: float = setting(
-        0.0,
-        "deviation of the Gaussian that pictures are blurred with",
-        low=0,
-        high=8,
-        unit="pixels",
-        unless=NO_PICTURES,
-    )
-    light_gradient: float = setting(
-        0.0,
-        "share by which light falls off across a picture, in a direction that each episode draws",
-        low=0,
-        high=MAX_LIGHT_GRADIENT,
-        unless=NO_PICTURES,
-    )
-    camera_turn: float = setting(
-        0.0,
-        "the camera is turned by so much, either way as each episode draws; targets and tokens are "
-        "seen by the same camera",
-        low=0,
-        high=45,
-        unit="degrees",
-        unless=NO_PICTURES,
-    )
-    camera_shift: float = setting(
-        0.0,
-        "the camera is shifted by so much, in a direction that each episode draws",
-        low=0,
-        high=64,
-        unit="pixels",
+        high=1,
         unless=NO_PICTURES,
     )
 
@@ -342,7 +306,7 @@ class SimConfig(Settings, section="sim"):
             )
         if self.corner_noise:
             given = f"sim.corner_noise={told(self.corner_noise)}"
-            remedy = "set sim.picture_noise"
+            remedy = "set sim.disturbance"
             because = f"sim.observe={self.observe}"
             refuse_ignored(given, because, remedy, SimConfig.corner_noise)
 

@@ -4,7 +4,7 @@ Legend: B environments, P pixels along a side.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 
@@ -32,22 +32,47 @@ class View:
     light: Floats
 
 
-class Lens:
-    """The disturbances of `SimConfig`; without any, nothing is drawn and pictures stay as they are.
+@dataclass(frozen=True)
+class Disturbance:
+    """What is other than it should be where a camera takes pictures.
 
     Attributes:
-        moves: whether the camera does not always stand where it should.
+        noise: deviation of the Gaussian noise on each pixel, levels of 255.
+        blur: deviation of the Gaussian that pictures are blurred with, pixels.
+        light: share by which light falls off across a picture, in a direction that is drawn.
+        turn: of the camera, degrees, either way as is drawn.
+        shift: of the camera, pixels, in a direction that is drawn.
+    """
+
+    noise: float = 0.0
+    blur: float = 0.0
+    light: float = 0.0
+    turn: float = 0.0
+    shift: float = 0.0
+
+    def times(self, strength: float) -> "Disturbance":
+        """So many times as much of everything."""
+        return Disturbance(*(strength * value for value in astuple(self)))
+
+
+# At a strength of 1. From one corner to the other light falls off by sqrt(2) times as much as is
+# said: with 0.25, ground in the shade would be as dark as half a token, and count as one in Eq. 14.
+FULL = Disturbance(noise=8.0, blur=1.0, light=0.2, turn=1.0, shift=2.0)
+
+
+class Lens:
+    """The camera's disturbance; without any, nothing is drawn and pictures stay as they are.
+
+    Attributes:
         disturbs: whether anything is other than it should be.
         views: B, how the episodes are seen.
     """
 
     def __init__(self, sim: SimConfig) -> None:
-        self._sim = sim
+        self._off = FULL.times(sim.disturbance)
+        self._pixel = sim.arena / sim.pixels if sim.pixels else 0.0  # arena units
         self.views: list[View] = []
-        self.moves = bool(sim.camera_turn or sim.camera_shift)
-        self.disturbs = self.moves or bool(
-            sim.picture_noise or sim.picture_blur or sim.light_gradient
-        )
+        self.disturbs = sim.disturbance > 0.0
 
     def begin(self, generators: Generators) -> list[View]:
         """Draw how each of B episodes is seen."""
@@ -60,28 +85,22 @@ class Lens:
         return self.views
 
     def _view(self, generator: np.random.Generator) -> View:
-        sim = self._sim
-        way = _direction(generator) if sim.camera_shift else np.zeros(2)
-        x, y = way * sim.camera_shift * sim.arena / sim.pixels if sim.pixels else way
-        turn = np.radians(sim.camera_turn) * generator.choice((-1, 1)) if sim.camera_turn else 0.0
-        light = sim.light_gradient * _direction(generator) if sim.light_gradient else np.zeros(2)
-        return View(float(x), float(y), float(turn), light)
+        if not self.disturbs:
+            return View(0.0, 0.0, 0.0, np.zeros(2))
+        x, y = self._off.shift * self._pixel * _direction(generator)
+        turn = np.radians(self._off.turn) * generator.choice((-1, 1))
+        return View(float(x), float(y), float(turn), self._off.light * _direction(generator))
 
     def taken(self, episode: int, picture: Pixels, generator: np.random.Generator) -> Pixels:
         """A picture (P, P) of an episode as it comes out."""
-        sim, light = self._sim, self.views[episode].light
-        if not (light.any() or sim.picture_blur or sim.picture_noise):
+        if not self.disturbs:
             return picture
-        levels = picture.astype(np.float64)
-        if light.any():
-            # Nowhere is more light than in the picture of even light: levels would be cut.
-            side = (np.arange(len(picture)) + 0.5) / len(picture) - 0.5
-            lit = light[0] * side - light[1] * side[:, None]
-            levels *= 1.0 + lit - lit.max()
-        if sim.picture_blur:
-            levels = _blurred(levels, sim.picture_blur)
-        if sim.picture_noise:
-            levels += sim.picture_noise * generator.standard_normal(levels.shape)
+        light = self.views[episode].light
+        # Nowhere is more light than in the picture of even light: levels would be cut.
+        side = (np.arange(len(picture)) + 0.5) / len(picture) - 0.5
+        lit = light[0] * side - light[1] * side[:, None]
+        levels = _blurred(picture * (1.0 + lit - lit.max()), self._off.blur)
+        levels += self._off.noise * generator.standard_normal(levels.shape)
         return np.clip(np.round(levels), 0, 255).astype(np.uint8)
 
 
@@ -93,6 +112,8 @@ def _direction(generator: np.random.Generator) -> Floats:
 def _blurred(levels: Floats, deviation: float) -> Floats:
     """A picture (P, P) after a Gaussian; beyond its edges it goes on as it ends."""
     reach = int(np.ceil(_CUT * deviation))
+    if not reach:
+        return levels
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / deviation) ** 2)
     weights /= weights.sum()
     for _ in range(2):

@@ -77,15 +77,6 @@ NEAR_ONE = over(ONE, agent={"hindsight": [NEAR]})
 STAGE = {"updates": 2, "tokens": 1, "targets": "gaussian", "spread": 0.2}
 STAGES = over(SEVERAL, sim={"stages": [STAGE]})
 
-DISTURBED: dict[str, object] = {
-    "picture": "grey",
-    "picture_noise": 8.0,
-    "picture_blur": 1.0,
-    "light_gradient": 0.2,
-    "camera_turn": 1.0,
-    "camera_shift": 2.0,
-}
-
 # Setting -> a run in which it has an effect, and another value.
 SHOWS: dict[str, tuple[Config, object]] = {
     "tokens.shapes": (ONE, ["square"]),
@@ -114,11 +105,7 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "sim.stages": (SEVERAL, [STAGE]),
     "sim.pixels": (CAMERA, 32),
     "sim.picture": (CAMERA, "grey"),
-    "sim.picture_noise": (CAMERA, 64.0),
-    "sim.picture_blur": (CAMERA, 2.0),
-    "sim.light_gradient": (CAMERA, 0.24),
-    "sim.camera_turn": (CAMERA, 20.0),
-    "sim.camera_shift": (CAMERA, 3.0),
+    "sim.disturbance": (CAMERA, 1.0),
     "sim.observe": (SEEN, "pictures"),
     "sim.stages.updates": (STAGES, 100),
     "sim.stages.tokens": (STAGES, 2),
@@ -296,7 +283,8 @@ def test_every_setting_of_a_command_is_read() -> None:
         (FINAL_TWICE, "agent.hindsight.position", 0.1, "agent.hindsight.strategy=final"),
         (FINAL_TWICE, "agent.hindsight.angle", 0.1, "agent.hindsight.strategy=final"),
         (ONE, "sim.spread", 0.1, "sim.targets=uniform"),
-        *((ONE, f"sim.{name}", value, "sim.pixels=0") for name, value in DISTURBED.items()),
+        (ONE, "sim.picture", "grey", "sim.pixels=0"),
+        (ONE, "sim.disturbance", 1.0, "sim.pixels=0"),
         (over(SEEN, sim={"observe": "pictures"}), "sim.corner_noise", 0.01, "sim.observe=pictures"),
         (over(ONE, sim={"observe": "silhouette"}), "sim.pixels", 64, "sim.observe=silhouette"),
         (

@@ -79,8 +79,11 @@ REFUSED = [
     ),
     (SimConfig, {"observe": "silhouette_pictures"}, "^sim.observe=silhouette_pictures needs pict"),
     (SimConfig, {"pixels": 64, "picture": "x"}, "^sim.picture must be one of binary, grey, got"),
-    (SimConfig, {"pixels": 64, "light_gradient": 0.25}, "between 0 and 0.24, got 0.25$"),
-    (SimConfig, {"pixels": 64, "camera_turn": 90.0}, "^sim.camera_turn must be between 0 and 45"),
+    (
+        SimConfig,
+        {"pixels": 64, "disturbance": 1.1},
+        "^sim.disturbance must be between 0 and 1, got",
+    ),
     (SimConfig, {"motion": "fly"}, "sim.motion must be one of lift, slide, got 'fly'"),
     (SimConfig, {"motion": "slide", "backend": "kinematic"}, "needs .* got sim.backend=kinematic"),
     (SimConfig, {"motion": "slide", "allow_flip": True}, "allow_flip=true needs sim.motion=lift"),

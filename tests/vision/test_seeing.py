@@ -10,7 +10,7 @@ from tangram_sim.arrays import Floats, Pixels
 from tangram_sim.config import SimConfig
 from tangram_sim.connected import sample_connected
 from tangram_sim.layout import Layout
-from tangram_sim.lens import Lens
+from tangram_sim.lens import Disturbance, Lens
 from tangram_sim.pictures import rasterise
 from tangram_sim.puzzles import library
 from tangram_sim.sampling import sample_batch
@@ -277,10 +277,13 @@ def test_specks_as_large_as_a_token_end_nothing_however_many() -> None:
     assert see(np.tile(speck, (40, 40)), layout, ARENA).blobs < 40 * 40
 
 
-def test_a_small_token_that_is_blurred_is_as_large_as_it_is() -> None:
+def test_a_small_token_that_is_blurred_is_as_large_as_it_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The blur reaches its middle, from which its level is told."""
+    monkeypatch.setattr("tangram_sim.lens.FULL", Disturbance(blur=1.0))
     layout, rng = layout_of("small_triangle", scale=0.6), np.random.default_rng(6)
-    lens = Lens(SimConfig(pixels=128, picture_blur=1.0))
+    lens = Lens(SimConfig(pixels=128, disturbance=1.0))
     for _ in range(6):
         poses, flipped = scene(layout, rng, 0.0)
         lens.begin([rng])

@@ -67,7 +67,7 @@ def test_the_oracle_ends_on_its_target_in_every_world(
 
 
 def test_worlds_that_are_tried_in_have_no_camera() -> None:
-    seen = {"observe": "pictures", "pixels": 64, "picture_noise": 8.0}
+    seen = {"observe": "pictures", "pixels": 64, "disturbance": 1.0}
     made = setup(SQUARE, backend="physics", damping=0.1, **seen)
     with closing(FixedTests(made, 2, 2)) as tests:
         assert tests.play(playing(Told(oracle_policy), tests.env)).camera is not None

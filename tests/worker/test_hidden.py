@@ -20,6 +20,7 @@ from tangram_sim.config import RewardConfig
 from tangram_sim.dissections import Dissection
 from tangram_sim.errors import ConfigError
 from tangram_sim.geometry import overlap_share
+from tangram_sim.lens import Disturbance
 from tangram_vision import silhouettes
 from tangram_vision.silhouettes import Filled, covered, fill_outline
 from tests.agent.builders import setup
@@ -126,9 +127,10 @@ def test_gaps_between_drawn_pieces_do_not_show_them() -> None:
     assert len(area.interiors) == 0
 
 
-def test_tokens_and_target_are_seen_by_the_same_camera() -> None:
+def test_tokens_and_target_are_seen_by_the_same_camera(monkeypatch: pytest.MonkeyPatch) -> None:
     """What was found lies as far off as the tokens are seen, so it is laid where it should be."""
-    made = game(PICTURE | {"camera_shift": 12.0})
+    monkeypatch.setattr("tangram_sim.lens.FULL", Disturbance(shift=12.0))
+    made = game(PICTURE | {"disturbance": 1.0})
     hidden = hide(made, [square()], seed=0)
     off = hidden.searches[0].laid.poses[:, :2].mean(axis=0) - square().poses[:, :2].mean(axis=0)
     assert np.linalg.norm(off) > 0.1

@@ -16,6 +16,7 @@ from tangram_sim.arrays import Singles
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.errors import ConfigError
 from tangram_sim.kinematics import KinematicWorld
+from tangram_sim.lens import Disturbance
 from tangram_sim.sight import SURE
 from worker.looking import environments
 from worker.rollout import Rollout
@@ -136,15 +137,18 @@ def test_in_a_stage_the_tokens_that_lie_on_their_targets_are_those_that_are_plac
 
 
 @pytest.mark.parametrize(
-    "sim",
+    ("sim", "full"),
     [
-        {"gain": [0.4, 0.4, 1.0]},  # told to go further than it goes
-        {"camera_shift": 32.0},
-        {"picture_blur": 8.0},
+        ({"gain": [0.4, 0.4, 1.0]}, {}),  # told to go further than it goes
+        ({"disturbance": 1.0}, {"shift": 32.0}),
+        ({"disturbance": 1.0}, {"blur": 8.0}),
     ],
     ids=str,
 )
-def test_what_no_picture_shows_ends_no_worker(sim: dict[str, Any]) -> None:
+def test_what_no_picture_shows_ends_no_worker(
+    sim: dict[str, Any], full: dict[str, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tangram_sim.lens.FULL", Disturbance(**full))
     task = setup("square", **sim)
 
     def far(*scene: Any) -> Singles:
