@@ -21,7 +21,7 @@ OURS = {"conf", "master", "tangram_agent", "tangram_sim", "tangram_vision", "wor
 DOCKER = ROOT / "docker"
 COMPOSE: dict[str, Any] = yaml.safe_load((DOCKER / "docker-compose.yml").read_text())
 # Neither plays nor learns: the gymnasium environment, and the figures of reports.
-LEFT_OUT = {"gymnasium", "matplotlib"}
+LEFT_OUT = {"gymnasium", "matplotlib", "pandas"}
 DISTRIBUTIONS = cache(packages_distributions)  # of all that is installed: a second
 EXTRAS = {"av", "PIL"}  # of films and pictures, which no container makes
 
@@ -33,7 +33,7 @@ def requirements(name: str) -> set[str]:
         if line.startswith("-r "):
             found |= requirements(line.removeprefix("-r "))
         elif line and not line.startswith("#"):
-            found.add(line)
+            found.add(line.partition(" ;")[0])
     return found
 
 

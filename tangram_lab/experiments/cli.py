@@ -24,10 +24,13 @@ def experiment() -> int:
 
 
 def _experiment(settings: Plain) -> int:
+    from tangram_agent.files import check_writable
     from tangram_agent.setup import from_mapping
     from tangram_lab.experiments.studies import StudyConfig, jobs_of, read_studies
 
     config = from_mapping(StudyConfig, _with_absolute(settings, "run_dir", "out"))
+    rows = Path(config.out or config.run_dir) / f"{config.study}.csv"
+    check_writable("out" if config.out else "run_dir", rows)
     jobs = list(jobs_of(config, read_studies()))
     for name, told in dict.fromkeys((job.training, job.told) for job in jobs):
         _check(name, told)

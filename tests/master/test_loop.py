@@ -219,7 +219,7 @@ def test_checkpoints_come_on_their_interval(tmp_path: Path) -> None:
     made = loop(tmp_path, MADE, hub, service, max_updates=6)
     made.checkpointer._checkpoint = Every(0.0)
     made.run()
-    (path,) = list_checkpoints(tmp_path / "checkpoints")
+    _, path = list_checkpoints(tmp_path / "checkpoints")
     counters = load_checkpoint(path, []).counters
     assert counters["hub"]["player/0"]["sequence"] == counters["episodes"] // BATCH
 
