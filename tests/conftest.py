@@ -29,7 +29,7 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("gate")
 
-TIERS = ("fast", "cluster", "slow", "slurm")
+TIERS = ("fast", "cluster", "slow")
 
 # Fixtures that take many seconds and are made once for all tests that look at what they made.
 SHARED = ("trained", "study", "straight", "made")
@@ -41,17 +41,13 @@ SECONDS = {
     "test_delivery.py::test_acknowledged_batches_survive": 31,
     "test_faults.py::test_a_worker_that_is_killed": 29,
     "test_training.py::test_a_reward_of_ones_own": 28,
-    "test_faults.py::test_two_runs_on_one_machine": 22,
-    "test_faults.py::test_no_process_is_left": 20,
+    "test_faults.py::test_no_process_is_left": 10,
     "test_faults.py::test_a_network_that_swallows": 19,
     "test_faults.py::test_what_is_deleted": 19,
-    "test_cli.py::test_every_process_is_started": 15,
     "test_faults.py::test_a_full_disk": 15,
     "test_frames.py::test_repeated_swapped_and_damaged": 14,
     "test_strangers.py::test_1000": 14,
-    "test_faults.py::test_a_frozen": 14,
-    "test_frames.py::test_the_newest_of_two": 12,
-    "test_frames.py::test_a_connection_that_takes": 10,
+    "test_faults.py::test_who_is_frozen": 14,
     "test_compiling.py": 8,
     "test_agents.py::test_an_agent_of_the_package": 7,
     "test_history.py": 6,

@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import pytest
 from shapely.geometry import Polygon
-from shapely.ops import unary_union
 
 from tangram_agent.coverage import (
     Lying,
@@ -73,21 +72,6 @@ def test_covering_shares_and_worths_against_shapely(seed: int) -> None:
         assert share[b, mover, j] == pytest.approx(min(others / AREAS[j], 1.0), abs=1e-7)
 
 
-def test_the_share_of_tokens_that_do_not_overlap_is_that_of_their_union() -> None:
-    rng = np.random.default_rng(0)
-    poses, sides = random_scene(LAYOUT, rng)
-    poses[:, :2] = np.column_stack([np.arange(7) - 3.0, np.zeros(7)])  # apart from each other
-    goals, goal_sides = random_scene(LAYOUT, rng)
-    goals[:, :2] *= (5.0, 0.2)
-    corners, wanted = LAYOUT.corners(poses, sides), LAYOUT.corners(goals, goal_sides)
-    union = unary_union(polygons(LAYOUT, corners))
-    expected = [piece.intersection(union).area / piece.area for piece in polygons(LAYOUT, wanted)]
-    found = covering(corners[None], wanted[None], LAYOUT)
-    assert max(expected) > 0.3
-    own = found[0] / AREAS
-    np.testing.assert_allclose(covered_share(found, LAYOUT)[0] + own, [expected] * 7, atol=1e-9)
-
-
 def test_a_piece_is_covered_once_and_by_others_than_the_token_that_is_to_move() -> None:
     heap, row = np.tile([0.1, 0.2, 0.3], (7, 1)), np.zeros((7, 3))
     row[:, 0] = np.arange(7) - 3.0
@@ -136,25 +120,6 @@ def test_values_of_tokens_on_the_spot(
     own, wanted = at(token, (0.2, -0.1, 0.4)), at(piece, (0.2, -0.1, 0.4))
     found = newly_covered(own, wanted, np.array([covered]), LAYOUT)
     assert found[0] == pytest.approx(expected, abs=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("shift", "expected"), [((0.0, 0.0), 1.0), ((0.5, 0.0), 0.5), ((0.5, 0.5), 0.25), ((1, 0), 0.0)]
-)
-def test_a_square_beside_its_piece(shift: tuple[float, float], expected: float) -> None:
-    side = 0.6 * np.sqrt(2.0) / 4.0
-    own = at(SQUARE, (shift[0] * side, shift[1] * side, 0.0))
-    found = newly_covered(own, at(SQUARE, (0, 0, 0)), np.zeros(1), LAYOUT)
-    assert found[0] == pytest.approx(expected, abs=1e-9)
-
-
-def test_the_other_side_of_a_parallelogram_is_another_shape() -> None:
-    upright, over = at(PARALLELOGRAM, (0, 0, 0.3)), at(PARALLELOGRAM, (0, 0, 0.3), flipped=True)
-    one, other = (Polygon(lying.outlines(LAYOUT)[0]) for lying in (upright, over))
-    crossed = one.intersection(other).area / AREAS[PARALLELOGRAM]
-    assert crossed < 0.9
-    for own, wanted, value in ((upright, upright, 1), (over, over, 1), (upright, over, crossed)):
-        assert newly_covered(own, wanted, np.zeros(1), LAYOUT)[0] == pytest.approx(value)
 
 
 def test_values_against_shapely_stay_between_0_and_1() -> None:

@@ -105,13 +105,6 @@ def test_a_young_average_forgets_its_start(rho: float, updates: int, expected: f
     assert average_so_far(rho, updates) == pytest.approx(expected)
 
 
-def test_after_the_first_update_the_actor_itself_plays() -> None:
-    learner = Learner(setup(agent=SCENE | {"acting_average": 0.99}), seed=0)
-    learner.update(random_transitions(setup(), 16, done=None))
-    pairs = zip(learner.acting.parameters(), learner.actor.parameters(), strict=True)
-    assert all(torch.equal(average, own) for average, own in pairs)
-
-
 def test_saturation_counts_what_lies_beyond_the_limit() -> None:
     raw = torch.tensor([[0.0, 2.0], [-3.0, 4.0]])
     assert saturation(raw, 2.0).item() == pytest.approx((1 + 4) / 4)
@@ -233,19 +226,6 @@ def test_the_penalty_counts_by_its_weight() -> None:
         norms.append(learner._all_steps(steps, Rates(0.0, 0.0, 0.0))[-1].item())
     assert norms[1] == pytest.approx(2.0 * norms[0], rel=1e-5)
     assert norms[0] > 0.0
-
-
-def test_the_penalty_pulls_a_saturated_actor_back() -> None:
-    made = setup(agent=SCENE)
-    learner = Learner(made, seed=0)
-    with torch.no_grad():
-        learner.actor.head.readout.bias.fill_(6.0)
-    batch = random_transitions(made, 32)
-    first = learner.update(batch)["saturation"]
-    for _ in range(60):
-        last = learner.update(batch)["saturation"]
-    assert first > 1.0
-    assert last < 0.5 * first
 
 
 DECAY = {0.0: 1.0, 0.5: 0.505, 1.0: 0.01, 2.0: 0.01, -1.0: 1.0}

@@ -390,13 +390,6 @@ def test_reasons_are_cut_to_what_is_received(kind: type[Bye]) -> None:
     assert ROLES == ("player", "evaluator")
 
 
-@given(st.lists(st.binary(max_size=100), max_size=7))
-def test_random_frames_raise_nothing_but_wire_errors(frames: list[bytes]) -> None:
-    for kind in ("hello", "welcome"):
-        with pytest.raises(WireError):
-            decode(frames, kind)
-
-
 @given(st.sampled_from(sorted(EXAMPLES)), st.booleans(), st.data())
 def test_mutated_messages_raise_nothing_but_wire_errors(
     kind: str, sealed: bool, data: st.DataObject

@@ -192,27 +192,6 @@ def test_the_numbers_of_a_pair_without_nodes() -> None:
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
-def test_a_row_of_a_pair_tells_where_the_piece_lies_and_how_both_are_turned() -> None:
-    """Place and turns, in the frame of the positions, are linear functions of the row."""
-    pairs = one_shape_pairs(PARALLELOGRAM, 200)
-    rows = PairGraph(LAYOUT, 2.0).vectors(pairs).numpy()
-    heading, goal_heading = (np.exp(1j * poses[:, 2].numpy()) for poses in (pairs.pose, pairs.goal))
-    place = (pairs.goal - pairs.pose)[:, :2].numpy() @ (1.0, 1j)
-    wanted = [place * heading.conj(), goal_heading * heading.conj()]
-    for numbers in wanted:
-        told = np.column_stack([numbers.real, numbers.imag])
-        plane = np.linalg.lstsq(np.column_stack([rows, np.ones(len(rows))]), told, rcond=None)[0]
-        np.testing.assert_allclose(rows @ plane[:-1] + plane[-1], told, atol=1e-4)
-
-
-def one_shape_pairs(token: int, count: int) -> Pairs:
-    """Of a token and its own piece, both anywhere in the arena."""
-    rng = np.random.default_rng(0)
-    poses = torch.from_numpy(rng.uniform(-1.0, 1.0, (2, count, 3)) * (1.0, 1.0, math.pi)).float()
-    which, nothing = torch.full((count,), token), torch.zeros(count)
-    return Pairs(poses[0], nothing, which, poses[1], nothing, which, nothing)
-
-
 def test_what_all_nodes_of_a_pair_are_told() -> None:
     """A small triangle and, a fifth away, a square of twice its area; nine tenths are covered."""
     pairs = one_pair(3, SQUARE, (0.1, 0.1, 0.0), (0.3, 0.1, 0.1))

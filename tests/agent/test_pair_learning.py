@@ -33,12 +33,6 @@ CASES: dict[str, dict[str, Any]] = {
 }
 
 
-def updated(learner: Learner, made: Setup) -> Learner:
-    """After one update."""
-    learner.update(learner.prepared(transitions(made, 16, 0), np.random.default_rng(0)), 0.25)
-    return learner
-
-
 @pytest.mark.parametrize("case", CASES)
 def test_the_losses_by_hand(case: str) -> None:
     """Before the first update the acting networks are the learner's own."""
@@ -71,19 +65,6 @@ def test_with_several_tokens_nothing_is_bootstrapped() -> None:
     learner = Learner(seven(**CASES["mlp"]), 0)
     assert not learner.bootstraps
     assert set(learner.parts) == {"actor", "critic", "acting"}
-
-
-def test_what_plays_is_the_average_of_both_networks() -> None:
-    made = seven(AGENT | {"acting_average": 0.5}, PERCEPTRON)
-    learner = Learner(made, 0)
-    learner.updates = 1000  # the average is no longer young
-    before = learner.acting_weights(0).tensors
-    updated(learner, made)
-    after = learner.acting_weights(1).tensors
-    own = learner.state()
-    assert {name.split(".")[0] for name in after} == {"actor", "critic"}
-    for name, average in after.items():
-        np.testing.assert_allclose(average, (before[name] + own[name]) / 2.0, atol=1e-6)
 
 
 def test_noise_on_the_corners_does_no_harm() -> None:

@@ -112,11 +112,3 @@ def test_the_critic_knows_how_much_is_covered_and_which_side_it_is(kind: str) ->
 
 
 # Option -> whether actor and critic stay the same.
-OPTIONS: dict[tuple[str, object], tuple[bool, bool]] = {
-    ("egocentric", False): (False, False),
-    ("offsets", False): (False, False),
-    ("orientation", False): (False, False),
-    ("afterstate", False): (True, False),
-    ("squash", "tanh"): (False, True),
-    ("angle_head", "plain"): (False, True),
-}

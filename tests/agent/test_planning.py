@@ -145,9 +145,6 @@ def test_no_placed_token_is_named_while_others_are_left() -> None:
     assert not nothing.token.any()
 
 
-# Refinement
-
-
 # With networks that know everything
 
 
@@ -184,10 +181,3 @@ def test_a_token_is_turned_over_just_where_its_piece_lies_on_the_other_side() ->
     choice = perfect(made).choose(corners, np.zeros((40, 1), np.bool_), goals)
     np.testing.assert_array_equal(choice.flip, (own[1] ^ wanted[1])[:, 0])
     assert 5 < choice.flip.sum() < 35
-
-
-def test_without_flips_no_token_is_turned_over() -> None:
-    made = seven(mirrored=0.5)
-    corners, placed, goals = scenes(made, 20)
-    placed[:] = [True] * 6 + [False]
-    assert not perfect(made).choose(corners, placed, goals).flip.any()

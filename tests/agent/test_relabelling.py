@@ -120,13 +120,6 @@ def test_copies_and_kinds_stand_one_after_the_other() -> None:
     assert [row[7] for row in found[9:]] == ["?"] * 3
 
 
-def test_rewards_are_those_of_the_given_function() -> None:
-    """The played reward stays, whatever the function says; for another goal it is computed anew."""
-    half, kinds = (lambda achieved, _: np.full(len(achieved), 0.5)), [RelabelConfig("final")]
-    batch = with_relabelled(EPISODE, kinds, LAYOUT, half, np.random.default_rng(0))
-    np.testing.assert_allclose(batch.reward, [-0.9, -0.8, -0.7, 0.5, 0.5, 0.5])
-
-
 def test_near_goals_lie_on_the_side_that_was_reached() -> None:
     made = setup({"shapes": ["parallelogram"], "scale": 1.0}, actions_per_token=STEPS)
     layout = made.layout

@@ -79,15 +79,6 @@ def test_samples_every_kept_transition_alike_and_no_other(added: int, kept: rang
     assert counts.max() < 2200
 
 
-def test_a_smaller_buffer_takes_over_the_newest() -> None:
-    large, small = buffer(8), buffer(3)
-    large.add(numbered(0, 13))
-    small.load_state(large.state())
-    assert rewards(small) == [10, 11, 12]
-    small.add(numbered(13, 1))
-    assert rewards(small) == [11, 12, 13]
-
-
 @pytest.mark.parametrize(
     ("name", "value", "reason"),
     [

@@ -1,10 +1,12 @@
-"""One real, short training that several tests look at."""
+"""What several tests look at: one real, short training, and one studio."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.cluster.processes import LIMIT_S, run
+from tests.cluster.studios import Running, studio
 
 UPDATES = 800
 
@@ -37,3 +39,9 @@ def folder(tmp_path: Path) -> Path:
     path = tmp_path / "run"
     path.mkdir()
     return path
+
+
+@pytest.fixture(scope="session")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    with studio(tmp_path_factory.mktemp("studio")) as found:
+        yield found

@@ -38,13 +38,11 @@ TCP = ("service.bind=127.0.0.1", "service.auth=off")  # for those who know its a
 
 
 @contextmanager
-def master(
-    folder: Path, *more: str, files: int | None = None
-) -> Iterator["subprocess.Popen[bytes]"]:
-    """A real master that can be reached, which may open so many files."""
+def master(folder: Path, *more: str) -> Iterator["subprocess.Popen[bytes]"]:
+    """A real master that can be reached."""
     (folder / "connection.json").unlink(missing_ok=True)
     settings = f"run_dir={folder}", *MASTER, *more
-    with started("tangram-master", *settings, cwd=folder, files=files) as process:
+    with started("tangram-master", *settings, cwd=folder) as process:
         wait_for_file(folder / "connection.json", process)
         yield process
 

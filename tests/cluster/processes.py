@@ -72,29 +72,15 @@ def refused(command: str, *arguments: str, cwd: Path) -> str:
 
 
 @contextmanager
-def started(
-    command: str, *arguments: str, cwd: Path, err: Path | None = None, files: int | None = None
-) -> Iterator[subprocess.Popen[bytes]]:
-    """A running command in a session of its own, killed at the end if it still runs.
-
-    Args:
-        command: of the product.
-        arguments: its own.
-        cwd: where it runs.
-        err: file for what it says.
-        files: that it may open, soft and hard.
-    """
-    bounded = ("sh", "-c", f'ulimit -n {files}; exec "$0" "$@"') if files else ()
-    with (
-        (err or Path(os.devnull)).open("wb") as said,
-        subprocess.Popen(
-            [*bounded, BIN / command, *arguments],
-            cwd=cwd,
-            stdout=subprocess.DEVNULL,
-            stderr=said,
-            start_new_session=True,
-        ) as process,
-    ):
+def started(command: str, *arguments: str, cwd: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """A running command in a session of its own, killed at the end if it still runs."""
+    with subprocess.Popen(
+        [BIN / command, *arguments],
+        cwd=cwd,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    ) as process:
         try:
             yield process
         finally:

@@ -2,25 +2,19 @@
 
 import json
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 import zmq
 
-from tangram_agent.messages import Alive, Heartbeat, Hello, Welcome, decode_from_master
 from tests.cluster.mangler import KINDS, Mangler
 from tests.cluster.players import (
-    Player,
     assert_exactly_once,
     finish,
     master,
     more_acknowledged,
     players,
     setup_of,
-    tags_in_replay,
     until,
 )
 from worker.status import ask_status
@@ -61,52 +55,3 @@ def test_repeated_swapped_and_damaged_messages_change_nothing(folder: Path, seed
         assert beside.client.counters.keys().isdisjoint({"reconnects", "malformed", "rejected"})
         finish(made, process)
     assert_exactly_once(folder, made)
-
-
-def test_the_newest_of_two_processes_with_one_index_goes_on(folder: Path) -> None:
-    with master(folder) as process:
-        setup = setup_of(folder)
-        with players(setup, folder) as (older,):
-            more_acknowledged([older], 5)
-            newer = Player(folder, older.index, setup, tag_index=1)
-            with newer.client:
-                assert newer.client.join()
-                until([older, newer], lambda: older.client.stopped)
-                assert older.client.stop_reason.startswith(
-                    "player 0 was taken over by a newer process"
-                )
-                more_acknowledged([newer], 5)
-                finish([newer], process)
-    found = tags_in_replay(folder)
-    for player in (older, newer):
-        player.assert_exactly_once(found)
-    assert len(found) >= older.acknowledged + newer.acknowledged
-
-
-def test_a_connection_that_takes_anothers_name_is_not_heard(folder: Path) -> None:
-    """ZeroMQ lets peers choose the name of their connection: the first one keeps it."""
-    with master(folder) as process, zmq.Context() as context:
-        with named(context, folder) as first:
-            hello = Hello("player", 0, 0, "one", 1, setup_of(folder).fingerprints(), "")
-            first.send_multipart(hello.encode())
-            assert isinstance(heard(first), Welcome)
-            with named(context, folder) as second:
-                second.send_multipart(Heartbeat({}).encode())
-                first.send_multipart(Heartbeat({}).encode())
-                assert isinstance(heard(first), Alive)
-                assert second.poll(500) == 0
-        finish([], process)
-
-
-@contextmanager
-def named(context: "zmq.Context[zmq.Socket[bytes]]", folder: Path) -> Iterator[Any]:
-    with context.socket(zmq.DEALER) as end:
-        end.setsockopt(zmq.LINGER, 0)
-        end.setsockopt(zmq.IDENTITY, b"the same")
-        end.connect(endpoint_of(folder))
-        yield end
-
-
-def heard(end: Any) -> object:
-    assert end.poll(20_000)
-    return decode_from_master(end.recv_multipart(), None)

@@ -1,7 +1,9 @@
 """The whole product: real processes, real sockets, PyBullet, and what a run leaves behind."""
 
 import json
+import os
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -12,8 +14,10 @@ from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
 from tangram_agent.setup import make_setup
+from tangram_cli.commands import COMMON_NAMES
 from tests.cluster.conftest import UPDATES
 from tests.cluster.processes import (
+    ended,
     pids_of,
     refused,
     run,
@@ -23,6 +27,7 @@ from tests.cluster.processes import (
 # The session's training runs inside the first of these tests.
 pytestmark = pytest.mark.slow
 
+ROOT = Path(__file__).parents[2]
 QUICK = ("sim=kinematic", "service.eval_seconds=1000", "service.eval_episodes=4")
 
 
@@ -54,7 +59,7 @@ def test_the_page_of_tensorboard_has_every_tag_of_a_run_and_a_run_every_tag_of_t
     trained: Path,
 ) -> None:
     """Without those that the page says are not always there."""
-    text = (Path(__file__).parents[2] / "docs" / "tensorboard.md").read_text()
+    text = (ROOT / "docs" / "tensorboard.md").read_text()
     sometimes = text.partition("**Messages, where it happens.**")[2]
     rows = [row for row in text.splitlines() if row.startswith("| `")]
     explained = {tag: row for row in rows for tag in re.findall(r"`([\w/]+)`", row.split("|")[1])}
@@ -91,14 +96,25 @@ def test_eval_repeats_the_scores_of_the_run_and_applies_several_actions(
         assert scores["mean_reward"] > 0.8
 
 
-def test_a_reward_of_ones_own_is_named_by_every_process_and_command(tmp_path: Path) -> None:
-    """From a file that the processes know by its whole path, and by its content."""
+def test_a_reward_of_ones_own_is_named_by_every_process_and_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From a file that the processes know by its whole path, and by its content.
+
+    A user's own master.py, worker.py and conf.py, in the current folder and on PYTHONPATH, are
+    none of the processes' packages.
+    """
+    for name in COMMON_NAMES:
+        (tmp_path / f"{name}.py").write_text("raise RuntimeError('the own file of a user')\n")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), str(ROOT)]))
     (tmp_path / "own.py").write_text(
         "def near(achieved, desired, layout): return -abs(achieved - desired).mean(axis=(1, 2))"
     )
     code = f"reward.name={tmp_path}/own.py:near"
     arguments = ("run_dir=own", "max_updates=3", "reward.name=own.py:near", "net=mlp", *QUICK)
-    assert code in run("tangram-train", *arguments, cwd=tmp_path)  # with what shows it at play
+    done = ended(sys.executable, "-m", "tangram_cli", "train", *arguments, cwd=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert code in done.stdout  # with what shows it at play
     assert json.loads((tmp_path / "own/result.json").read_text())["updates"] == 3
     assert f"add {code} if" in refused("tangram-eval", "run_dir=own", "episodes=1", cwd=tmp_path)
     for given in (code, "reward.name=overlap"):
@@ -135,13 +151,13 @@ def test_a_run_begins_with_anothers_networks_once_and_is_extended(trained: Path)
     updates = json.loads((trained / "result.json").read_text())["updates"]
     assert f"begins with the networks of {trained} after {updates} updates" in told
     first = json.loads((folder / "result.json").read_text())
-    # Up to service.lag_updates of them are owed already; the rest needs new episodes.
-    more = ("max_updates=120", "resume=auto", "service.log_format=json")
+    # Some 70 of them are owed already; the rest needs new episodes.
+    more = ("max_updates=100", "resume=auto", "service.log_format=json")
     printed = run("tangram-train", *arguments, *more, cwd=trained.parent)
     assert "begins with the networks" not in printed
     assert "goes on after 10 updates" in printed
     second = json.loads((folder / "result.json").read_text())
-    assert (first["updates"], second["updates"]) == (10, 120)
+    assert (first["updates"], second["updates"]) == (10, 100)
     lines = [json.loads(line) for line in printed.splitlines()]
     assert {"note", "status", "result"} <= {line["event"] for line in lines}
     assert lines[-1].items() >= second.items()

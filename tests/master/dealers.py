@@ -34,9 +34,12 @@ class Stage:
         self._sockets: list[zmq.Socket[bytes]] = []
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
 
-    def dealer(self) -> "Dealer":
-        """Another connection."""
-        return Dealer(self, self._open(zmq.DEALER))
+    def dealer(self, name: bytes = b"") -> "Dealer":
+        """Another connection, perhaps with a name of its own choice."""
+        socket = self._open(zmq.DEALER)
+        if name:
+            socket.setsockopt(zmq.IDENTITY, name)
+        return Dealer(self, socket)
 
     def subscriber(self) -> zmq.Socket[bytes]:
         """A connection to the broadcasts."""

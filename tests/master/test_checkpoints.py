@@ -68,16 +68,6 @@ def test_only_the_named_files_are_read(tmp_path: Path) -> None:
     assert set(load_checkpoint(path, ["weights"]).arrays) == {"weights"}
 
 
-@pytest.mark.parametrize(
-    ("keep", "kept"),
-    [(1, ["00000003"]), (2, ["00000002", "00000003"]), (9, [f"0000000{i}" for i in range(4)])],
-)
-def test_the_newest_are_kept(tmp_path: Path, keep: int, kept: list[str]) -> None:
-    for updates in range(4):
-        save(tmp_path, updates, keep)
-    assert names(tmp_path) == kept
-
-
 def test_names_are_ordered_as_numbers(tmp_path: Path) -> None:
     for updates in (999_999_999, 100_000_000_0, 7, 7, 7):
         save(tmp_path, updates, keep=9)

@@ -291,10 +291,9 @@ def test_a_number_that_is_another_connection_by_now_is_left_alone() -> None:
 
 
 @pytest.mark.cluster
-@pytest.mark.parametrize("encrypted", [True, False])
-def test_200_at_once_are_all_let_in(encrypted: bool) -> None:
+def test_200_at_once_are_all_let_in() -> None:
     """Those who are ended in their handshake come again by themselves."""
-    with door(make_keys() if encrypted else None) as made:
+    with door(make_keys()) as made:
         dealers = [made.dealer() for _ in range(200)]
         waiting = set(dealers)
 

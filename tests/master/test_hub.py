@@ -24,7 +24,6 @@ from tangram_agent.messages import (
     WantWeights,
     WeightsMessage,
     Welcome,
-    decode_weights,
 )
 from tangram_agent.schema import PROTOCOL
 from tangram_agent.types import Weights
@@ -210,25 +209,6 @@ def test_weights_come_again_for_those_who_got_them_and_late_for_others(
         assert asked(1) == []
         now = 70.0
         assert asked(1) == [2]
-
-
-def test_weights_are_broadcast_as_one_frame(stage: Stage) -> None:
-    subscriber, version = stage.subscriber(), 0
-    with pytest.raises(WireError, match="is not finite"):
-        stage.hub.publish(weights(value=float("nan")))
-
-    def heard() -> int:
-        nonlocal version
-        version += 1
-        stage.hub.publish(weights(version))
-        return subscriber.poll(10)
-
-    stage.until(heard)
-    [frame] = subscriber.recv_multipart()
-    epoch, received = decode_weights(frame, SHAPES)
-    assert epoch == stage.hub.epoch
-    assert 1 <= received.version <= version
-    assert stage.hub.counters["published"] == version
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import pytest
 
 from tangram_agent.messages import Ack, Alive, Bye, Go, Reject, Stop, Welcome
 from tangram_agent.types import Episodes
-from tangram_sim.errors import RunError
 from tests.agent.messages import SPEC, batch, hello, with_checksum, with_header
 from tests.master.dealers import INFO, WINDOW, Dealer, Stage, staged
 
@@ -221,22 +220,3 @@ def test_what_the_disk_lost_is_told_when_its_worker_comes_back(
         "losses (number 1): player 0 says that 3 of its batches were acknowledged which are not in "
         "the replay: the disk has lost them, if it is right"
     ]
-
-
-def test_after_a_restart_duplicates_are_known_and_the_rest_is_taken(
-    stage: Stage, player: Dealer
-) -> None:
-    player.send(1, 2)
-    stage.counted("batches", 2)
-    stage.hub.acknowledge(stage.batches()[0])
-    with staged() as again:
-        again.hub.load_state(stage.hub.state())
-        assert again.hub.epoch != stage.hub.epoch
-        dealer = again.dealer()
-        assert dealer.join(index=0, incarnation=1, first=1).incarnation == 1
-        dealer.send(1, 2)
-        assert dealer.hear() == Ack(1, duplicate=True)
-        again.counted("batches")
-        assert again.batches()[0].sequence == 2
-        with pytest.raises(RunError, match="unknown key"):
-            again.hub.load_state({"x": {}})

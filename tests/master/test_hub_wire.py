@@ -17,6 +17,7 @@ from master.report import _workers
 from master.sockets import MAX_COMMAND
 from tangram_agent.arrays import MAX_FRAMES
 from tangram_agent.messages import (
+    Alive,
     AskStatus,
     Bye,
     Greet,
@@ -87,6 +88,17 @@ def test_a_message_of_too_many_frames_is_not_decoded(stage: Stage, player: Deale
     answer = player.ask([*hello().encode(), *[b""] * MAX_FRAMES, b""])
     assert isinstance(answer, Reject)
     assert answer.reason == f"the message has {MAX_FRAMES + 2} frames, at most {MAX_FRAMES + 1}"
+
+
+def test_a_connection_that_takes_anothers_name_is_not_heard(stage: Stage) -> None:
+    """ZeroMQ lets peers choose the name of their connection: the first one keeps it."""
+    first = stage.dealer(b"the same")
+    first.join()
+    second = stage.dealer(b"the same")
+    second.say(Heartbeat({}))
+    with pytest.raises(TimeoutError):
+        stage.until_within(0.5, lambda: second.socket.poll(0) or stage.hub.counters["strangers"])
+    assert first.beat() == [Alive(-1)]
 
 
 def test_who_vanished_is_unreachable_and_nobody_waits(stage: Stage, player: Dealer) -> None:

@@ -459,14 +459,6 @@ def test_a_forged_record_is_left_out_and_no_reason_to_throw_the_others_away(
     assert warnings[0].endswith("): 1 batch is lost")
 
 
-def test_the_frames_are_kept_as_they_came(tmp_path: Path) -> None:
-    one = arrival(MADE, 1)
-    journal(tmp_path, MADE).append(one)
-    content = segments(tmp_path)[1].read_bytes()
-    assert all(frame in content for frame in one.frames)
-    assert list(read(tmp_path)[0].frames) == list(one.frames)
-
-
 @pytest.fixture
 def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
     return Disk(monkeypatch)

@@ -113,14 +113,6 @@ def test_the_bounds_end_it(
     assert (made.guard.trainer.episodes, made.guard.trainer.updates) == (episodes, updates)
 
 
-def test_episodes_beyond_the_bound_are_not_taken(tmp_path: Path) -> None:
-    hub = FakeHub(MADE, [[arrival(MADE, i, BATCH) for i in range(1, 6)]])
-    made = loop(tmp_path, MADE, hub, lag_updates=64, max_episodes=8)
-    made.run()
-    assert hub.values("acknowledge") == [1, 2]
-    assert made.guard.trainer.updates == 4
-
-
 def test_hours_end_it(tmp_path: Path) -> None:
     made = loop(tmp_path, MADE, FakeHub(MADE), max_hours=1.0)
     made.clock.record.loop_s = 3599.99
@@ -272,14 +264,6 @@ def test_a_run_whose_folder_is_gone_ends_with_one_line_and_makes_none(
     made.dismiss("the end")
     made.reporter._metrics.close()
     assert not folder.exists()
-
-
-def test_test_episodes_are_drawn_while_it_learns(tmp_path: Path) -> None:
-    made = loop(tmp_path, MADE, FakeHub(MADE, batches(1)))
-    assert not made.folder.picture.exists()
-    made.reporter.scored(scores(MADE, 0).scores)
-    with Image.open(made.folder.picture) as picture:
-        assert picture.format == "PNG"
 
 
 @pytest.mark.parametrize(

@@ -42,14 +42,6 @@ def test_replay_holds_what_was_played_and_nothing_relabelled() -> None:
     assert made.batch.count == made.setup.agent.batch_size
 
 
-def test_workers_take_the_weights_of_the_master() -> None:
-    made = made_setup(mirrored=0.5)
-    master, policy = trainer(made), Policy(made)
-    play_on(master, 1, count=2)
-    policy.follow(master.weights())
-    assert policy.version == master.updates > 0
-
-
 def test_a_critic_without_a_say_stays_with_the_master_and_in_checkpoints() -> None:
     made = setup(agent=AGENT | {"readout": "pair", "motion": "learned", "gamma": 0.0})
     master, policy = trainer(made), Policy(made)

@@ -210,15 +210,15 @@ def test_on_one_machine_sockets_of_the_user_alone_are_the_same_in_each_life(
     sockets, found = tmp_path / "t", []
     sockets.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(sockets))
-    for _ in range(2):
-        with opened_run(tmp_path / "run") as (made, connection):
+    for name in ("run", "run", "another"):
+        with opened_run(tmp_path / name) as (made, connection):
             assert made.reporter.flush(0).numbers["open_to_all"] == 0.0
             found.append(connection["endpoint"])
             path = Path(connection["endpoint"].removeprefix("ipc://"))
             assert path.is_socket()
             assert path.parent.stat().st_mode & 0o777 == 0o700
         assert list(path.parent.iterdir()) == []
-    assert found[0] == found[1]
+    assert found[0] == found[1] != found[2]
     assert not (tmp_path / "run" / "keys.json").exists()
 
 

@@ -11,11 +11,9 @@ from tangram_sim.batch import BatchedEnv, StepResult
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.env import TangramEnv
 from tangram_sim.errors import ConfigError
-from tangram_sim.geometry import overlap_share
 from tangram_sim.layout import Layout
-from tangram_sim.sampling import sample_batch
 from tangram_sim.seeding import evaluation_generators
-from tests.sim.builders import SEVEN, TRIO, layout_of
+from tests.sim.builders import SEVEN, layout_of
 
 pytestmark = pytest.mark.fast
 
@@ -99,40 +97,6 @@ def test_an_episode_of_two_tokens() -> None:
         assert (result.done, result.refused.tolist()) == (axis == 1, refused)
         assert env.placed.tolist() == placed
         np.testing.assert_allclose((env.corners - before)[..., axis] / 0.2, moved, atol=1e-9)
-
-
-def test_several_actions_for_each_token() -> None:
-    env, flags = begun(PAIR, 1, actions_per_token=2), []
-    for _ in range(env.horizon):
-        result = env.step(np.array([[-1.0, 0.1, 0, 0]]))
-        flags.append((*env.placed[0].tolist(), bool(result.refused[0]), result.done))
-    assert flags == [(0, 0, 0, 0), (1, 0, 0, 0), (1, 0, 1, 0), (1, 0, 1, 1)]
-
-
-def test_each_episode_begins_anew_and_comes_from_the_generators() -> None:
-    env, generators = begun(PAIR), evaluation_generators(4)
-    targets, starts = (PAIR.corners(sample_batch(PAIR, env.sim, generators)) for _ in range(2))
-    assert np.abs(starts - targets).max() > 0.1
-    for _ in range(2):
-        assert env.steps_done == 0
-        assert not env.placed.any()
-        np.testing.assert_allclose(env.goals, targets)
-        np.testing.assert_allclose(env.corners, starts)
-        for _ in range(env.horizon):
-            env.step(np.full((4, 4), -1.0))
-        env.reset(evaluation_generators(4))
-
-
-@pytest.mark.parametrize("reward", ["overlap", "dense", "pose"])
-def test_rewards_are_those_of_the_reward_function(reward: str) -> None:
-    env = begun(layout_of(*TRIO), 16, reward=reward)
-    rng = np.random.default_rng(0)
-    for _ in range(env.horizon):
-        result = env.step(rng.uniform(-0.3, 0.3, (16, 4)))
-        np.testing.assert_array_equal(result.rewards, env.reward_fn(env.corners, env.goals))
-        share = overlap_share(env.corners, env.goals, env.layout)
-        np.testing.assert_array_equal(result.overlap, share)
-        assert result.camera_rewards is None
 
 
 @BOTH

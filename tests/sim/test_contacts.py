@@ -164,18 +164,6 @@ def test_settling_ends_soon(make: Make, monkeypatch: pytest.MonkeyPatch) -> None
     assert 2 < len(steps) < 30
 
 
-@pytest.mark.parametrize("motion", ["lift", "slide"])
-def test_contacts_of_an_episode_end_with_it(make: Make, motion: str) -> None:
-    """The same two side by side again, but the other way round: what touched is now far apart."""
-    world = make(layout_of("square", "square", "small_triangle"), motion)
-    world.place(np.array([[-0.3, 0, 0], [0.2, 0, 0], [0, 0.8, 0]]))
-    world.move(0, np.array([0.15, 0.0, 0.0]))
-    after = np.array([[0.205, 0, 0], [-0.205, 0, 0], [0, 0.8, 0]])
-    world.place(after)
-    world.move(2, np.array([0.1, 0.0, 0.0]))
-    np.testing.assert_allclose(world.poses()[:2], after[:2], atol=1e-9)
-
-
 def pushed(world: PhysicsWorld, start: Sequence[Sequence[float]], way: Sequence[float]) -> Floats:
     """Poses after token 0 went its way."""
     world.place(np.array(start))

@@ -12,7 +12,7 @@ from tangram_sim.areas import Area, straightened
 from tangram_sim.arrays import Floats
 from tangram_sim.config import SimConfig
 from tangram_sim.connected import sample_connected
-from tangram_sim.dissections import Budget, Dissection, Laid, Search, Tokens, dissection
+from tangram_sim.dissections import Budget, Dissection, Laid, Search, Tokens
 from tangram_sim.layout import Layout, TokensConfig, make_layout
 from tangram_vision.silhouettes import (
     TOGETHER,
@@ -136,15 +136,6 @@ def test_corners_of_tokens_are_told_once_for_each_turn_that_looks_alike() -> Non
     assert tokens.unit == pytest.approx(1.0)
 
 
-def test_laid_tokens_are_where_their_corners_were_put() -> None:
-    area = whole(gluing(1))
-    tokens = Tokens(LAYOUT)
-    laid = next(Search(tokens, 0.004, Budget(time.thread_time() + 30.0)).run(area))
-    found = dissection(tokens, laid)
-    assert sorted(one.shape for one in laid) == [0, 0, 1, 2, 2, 3, 4]
-    assert covered(LAYOUT, found).area == pytest.approx(1.0, abs=1e-3)
-
-
 def test_corners_within_a_side_are_none() -> None:
     ring = np.array([0.0, 0.5 + 0.001j, 1.0, 1.0 + 1e-4j, 1.0 + 1.0j, 1.0j])
     assert straightened(ring, 0.004) == pytest.approx(
@@ -165,14 +156,6 @@ def test_what_nothing_fills_keeps_the_tokens_that_could_be_laid() -> None:
     assert laid.difference(strip).area < 0.1 * laid.area
     (late,) = fill_outline(strip, LAYOUT, 0.0)
     assert (late.attempt, late.iou) == (None, 0.0)
-
-
-def test_a_search_remembers_the_most_that_it_laid() -> None:
-    search = Search(Tokens(LAYOUT), 0.004, Budget(time.thread_time() + 30.0))
-    assert list(search.run(polygon(convex_outlines(1.0)[-1]))) == []
-    assert 0 < len(search.best) < 7
-    laid = next(search.run(whole(gluing(1))))
-    assert search.best == laid
 
 
 def test_tokens_that_lie_on_each_other_are_no_better_attempt() -> None:

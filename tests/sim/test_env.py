@@ -135,27 +135,6 @@ def test_the_time_limit_of_an_id_is_its_horizon(name: str, made: list[Any]) -> N
     assert ends == [False] * (3 * horizon - 1) + [True]
 
 
-def test_a_seed_fixes_whole_episodes_and_those_that_follow(made: list[Any]) -> None:
-    def play(seed: int) -> list[float]:
-        env = TangramEnv(TRIO, 0.8)
-        made.append(env)
-        env.action_space.seed(seed)
-        numbers: list[float] = []
-        observation, _ = env.reset(seed=seed)
-        for _ in range(3):
-            done = False
-            while not done:
-                numbers += [*observation["observation"], *observation["desired_goal"]]
-                observation, reward, *ends, info = env.step(env.action_space.sample())
-                done = any(ends)
-                numbers += [reward, info["overlap"]]
-            observation, _ = env.reset()
-        return numbers
-
-    assert play(5) == play(5)
-    assert play(5) != play(6)
-
-
 def test_observation() -> None:
     env = kinematic(shapes=("square", "small_triangle"))
     observation, info = env.reset(seed=0)

@@ -203,11 +203,6 @@ def test_tasks_that_tokens_cannot_play(
         check_targets(layout, SimConfig(**settings))
 
 
-def test_the_game_can_be_played_in_every_way() -> None:
-    stages = (StageConfig(tokens=7),)
-    check_targets(GAME, SimConfig(targets="figures", allow_flip=True, stages=stages))
-
-
 def starts_of(sim: SimConfig, layout: Layout, count: int) -> tuple[np.ndarray, np.ndarray]:
     """(B, K, 3) starts, and (B,) the area of them that lies on the target."""
     generators = evaluation_generators(count)
@@ -316,13 +311,6 @@ def test_tokens_to_move_start_clear_of_those_that_lie() -> None:
         assert largest_overlap(GAME, poses, sides) < 1e-8
 
 
-@pytest.mark.parametrize("tokens", [7, 9])
-def test_all_tokens_or_more_are_the_whole_task(tokens: int) -> None:
-    env, whole = begun(StageConfig(tokens=tokens)), begun(StageConfig())
-    assert not env.placed.any()
-    np.testing.assert_array_equal(env.corners, whole.corners)
-
-
 def test_what_lies_on_its_target_is_refused_and_the_rest_fills_the_episode() -> None:
     env = begun(StageConfig(tokens=1), count=4)
     placed = env.placed.argmax(axis=1)
@@ -336,13 +324,6 @@ def test_what_lies_on_its_target_is_refused_and_the_rest_fills_the_episode() -> 
     assert not result.refused.any()
     assert env.placed.all()
     assert not result.done
-
-
-def test_the_next_episode_is_that_of_the_task() -> None:
-    env = begun(StageConfig(tokens=2))
-    env.task = env.sim.task
-    env.reset(evaluation_generators(12))
-    assert not env.placed.any()
 
 
 def test_given_targets_are_played() -> None:

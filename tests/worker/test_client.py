@@ -94,17 +94,6 @@ def test_a_master_that_does_not_fit_ends_a_worker(
             master.until(client, lambda: False)
 
 
-def test_a_stale_connection_file_is_told(stage: Stage, tmp_path: Path) -> None:
-    with make_client(tmp_path) as client:
-        write_connection(tmp_path, stage.hub.endpoint, "an older run")
-        with pytest.raises(TangramError) as caught:
-            served(stage, client.join)
-        assert str(caught.value) == (
-            f"the master at {stage.hub.endpoint} refused this player: this master runs 'run', not "
-            "'an older run': the connection file is stale, take the one of a master that is running"
-        )
-
-
 def test_a_master_of_another_run_gets_nothing(master: StandIn, tmp_path: Path) -> None:
     """One that took the port of a master that is gone, and says yes to everybody."""
     write_connection(tmp_path, master.endpoint, "mine")

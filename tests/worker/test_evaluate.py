@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from tangram_sim.errors import ConfigError, RunError
+from tangram_sim.errors import RunError
 from tests.agent.builders import PAIR, SQUARE
 from tests.worker.builders import write_run
 from tests.worker.puzzle_files import GAME, SIM, drawn, write_puzzles
@@ -109,33 +109,12 @@ USES: dict[str, Callable[[str, str], int]] = {
 }
 
 
-def emptied(run: Path) -> None:
-    (run / "checkpoints" / "00000007" / "weights.safetensors").write_bytes(b"")
-
-
-def widened(run: Path) -> None:
-    path = run / "config.yaml"
-    path.write_text(path.read_text().replace("width: 16", "width: 32"))
-
-
 @pytest.mark.parametrize("command", USES)
-@pytest.mark.parametrize(
-    ("spoil", "reason"),
-    [
-        (lambda run: run.rename(run.with_name("gone")), "no run folder"),
-        (lambda run: (run / "config.yaml").unlink(), "is this a run folder"),
-        (lambda run: (run / "checkpoints" / "00000007").rename(run / "x"), "no checkpoint"),
-        (emptied, "is corrupt"),
-        (widened, "another"),
-    ],
-)
-def test_a_run_that_cannot_be_used(
-    tmp_path: Path, command: str, spoil: Callable, reason: str
-) -> None:
+def test_a_run_that_cannot_be_used(tmp_path: Path, command: str) -> None:
     run = tmp_path / "run"
     write_run(run)
-    spoil(run)
-    with pytest.raises((RunError, ConfigError), match=reason):
+    (run / "checkpoints" / "00000007" / "weights.safetensors").write_bytes(b"")
+    with pytest.raises(RunError, match="is corrupt"):
         USES[command](str(run), str(tmp_path / "out.gif"))
     assert list(tmp_path.glob("out*")) == []
 

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +30,6 @@ from tests.worker.builders import policy, sent, write_run
 from tests.worker.conversation import LIMIT_S, QUICK, collect, open_hub, with_master
 from worker.client import Client
 from worker.config import WorkerConfig
-from worker.evaluator import run_evaluator
 from worker.player import run_player
 from worker.session import keep_part
 
@@ -287,18 +286,6 @@ def test_a_process_whose_parent_is_gone_takes_its_leave(tmp_path: Path) -> None:
                 assert process.wait(LIMIT_S) == 0
             finally:
                 process.kill()
-
-
-@pytest.mark.parametrize("run", [run_player, run_evaluator])
-def test_a_worker_with_other_settings_is_refused(run: Callable[..., int]) -> None:
-    hub, other = open_hub(greedy_setup()), setup(agent={"noise": 0.1})
-    role = "player" if run is run_player else "evaluator"
-
-    def script(hub: Hub) -> None:
-        collect(hub, lambda _: hub.counters["refused_settings"] == 1)
-
-    with pytest.raises(TangramError, match="agent"):
-        with_master(hub, script, lambda: run(config(hub, role=role), other))
 
 
 def test_what_is_too_large_for_a_message_is_split(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -36,7 +36,7 @@ from tangram_lab.benchmarks.intruder import NOBODY, knock
 from tangram_sim.errors import RunError, TangramError
 from tests.agent.builders import random_episodes
 from tests.agent.messages import episodes, hello, weights
-from tests.master.dealers import INFO, Stage, staged
+from tests.master.dealers import Stage, staged
 from tests.master.test_run import MADE, opened_run
 from tests.worker.conversation import (
     QUICK,
@@ -173,26 +173,6 @@ def test_a_master_that_gets_the_right_keys_is_joined_without_waiting_for_silence
             stage.hub.close()
             with staged(port=port, keys=keys) as again:
                 both(again, client, lambda: client.joined)
-
-
-def test_a_stranger_without_keys_is_not_heard_at_all() -> None:
-    """No reason is given to those who are not authenticated, whatever they say."""
-    with staged(keys=make_keys()) as stage, zmq.Context() as context:
-        socket = context.socket(zmq.DEALER)
-        socket.setsockopt(zmq.LINGER, 0)
-        socket.connect(stage.hub.endpoint)
-        for _ in range(3):
-            socket.send_multipart(hello().encode())
-        with pytest.raises(TimeoutError):
-            stage.until_within(0.5, lambda: socket.poll(0) or stage.hub.counters)
-        socket.close()
-
-
-def test_the_port_of_an_encrypted_hub_is_free_after_it_is_closed() -> None:
-    first = Hub("127.0.0.1", 0, INFO, keys=make_keys())
-    port = int(first.endpoint.rpartition(":")[2])
-    first.close()
-    Hub("127.0.0.1", port, INFO, keys=make_keys()).close()
 
 
 def test_a_connection_that_is_lost_in_the_handshake_is_no_wrong_key(
