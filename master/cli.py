@@ -53,7 +53,6 @@ def _train(settings: Plain) -> int:
     setup = _task(settings)
     check_shown(setup.sim, setup.fills)
     check_compiling(config.service, setup.fills)
-    setup.check_learnable()
     check_world(setup.layout, setup.sim)
     tell(f"starts in {config.run_dir}")
 
@@ -77,7 +76,6 @@ def _master(settings: Plain) -> int:
     setup = _task(settings)
     check_shown(setup.sim, setup.fills)
     check_compiling(config.service, setup.fills)
-    setup.check_learnable()
     check_room(setup.layout, setup.sim)
     tell(f"starts in {config.run_dir}")
 

@@ -130,7 +130,6 @@ class EpisodeSpec:
         bound: largest |coordinate| that a corner can reach.
         observed: whether pictures are what is observed: then some of it is not surely seen.
         goal_rows: G, corners of a target; 0: V.
-        traced: whether targets are outlines that were traced in pictures.
         rewards: least and largest one.
     """
 
@@ -141,7 +140,6 @@ class EpisodeSpec:
     bound: float
     observed: bool = False
     goal_rows: int = 0
-    traced: bool = False
     rewards: tuple[float, float] = (-MAX_REWARD, MAX_REWARD)
 
     def __post_init__(self) -> None:
@@ -162,7 +160,6 @@ class EpisodeSpec:
             setup.bound,
             setup.sim.looks,
             setup.goal_rows if setup.fills else 0,
-            setup.traces,
             reward_bounds(setup.reward, setup.sim, setup.bound),
         )
 
@@ -203,7 +200,6 @@ def _columns(spec: EpisodeSpec, count: int) -> tuple[Column, ...]:
         Column("rewards", "<f4", (e, t), *(bound * one for bound in spec.rewards)),
         Column("goals", "<f4", (e, rows, 2), -reach, reach),
         *(seen if spec.observed else ()),
-        *((Column("achieved", "<f4", (e, rows, 2), -reach, reach),) if spec.traced else ()),
     )
 
 

@@ -75,7 +75,7 @@ class Filler:
     def __init__(self, value: nn.Module, setup: Setup) -> None:
         self._fillable, self._layout = Fillable(value, setup.layout), setup.layout
         self._sim = setup.sim
-        self._filling, self._rows = Filling(setup.layout, setup.traces), setup.goal_rows
+        self._filling, self._rows = Filling(setup.layout), setup.goal_rows
         self._beam = setup.agent.beam if setup.agent.lookahead == "values" else 1
 
     def choose(
@@ -157,7 +157,6 @@ class Filler:
         states = [_State(b, (one,)) for b, places in enumerate(every) for one in places]
         while states:
             values = self.values([state.places[-1] for state in states])
-            values -= [sum(place.cost for place in state.places) for state in states]
             kept: list[_State] = []
             for b in {state.row for state in states}:
                 own = [i for i, state in enumerate(states) if state.row == b]

@@ -1,8 +1,7 @@
 """Filling an outline token by token: what is left of it, what may be laid next, and what then is.
 
 Nothing here is learned: tokens may lie where the search of `tangram_sim.dissections` has them, and
-an action takes one there exactly. Outlines that were traced in pictures may be wrong: in these they
-lie where `tangram_sim.loose` has them. What is learned is which of these states can be filled.
+an action takes one there exactly. What is learned is which of these states can be filled.
 
 Legend: K tokens, V corners, G rows of an outline, N corners of what is left, S different shapes.
 """
@@ -13,29 +12,17 @@ import numpy as np
 import shapely
 
 from tangram_agent.types import Flags
-from tangram_sim.areas import Area, opened, overlap, rings
+from tangram_sim.areas import Area, opened, rings
 from tangram_sim.arrays import AnyArray, Bools, Ints, Singles
-from tangram_sim.dissections import (
-    Budget,
-    Place,
-    Search,
-    Tokens,
-    less,
-    without,
-)
+from tangram_sim.dissections import Budget, Place, Search, Tokens, without
 from tangram_sim.geometry import outlines
 from tangram_sim.layout import Layout
-from tangram_sim.loose import LoosePlace, LoosePlaces
 from tangram_sim.rings import as_area, covered_area
 
 TOLERANCE = 0.004  # of the root of all tokens' area, see `Search`
-LOOSE = 0.035  # of it, see `LoosePlaces`
-SOLVED = 0.95  # IoU from which an outline that was traced counts as filled
 MOST_PLACES = 8  # that are learned from, of a state
 UNUSED = 255  # part of a row that holds no corner
 _INSIDE = 0.9  # share of a laid token that lies in the outline
-_LOOSELY = 0.5  # the same, where the outline may be wrong
-_OWN = 0.8  # IoU of tokens and what others leave of the outline that was traced of all of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,19 +100,10 @@ class Filling:
         shapes: S.
     """
 
-    def __init__(self, layout: Layout, traced: bool = False) -> None:
-        """The game of a layout's tokens.
-
-        Args:
-            layout: the tokens.
-            traced: whether outlines were traced in pictures, and may be wrong.
-        """
-        self._layout, self._tokens, self._traced = layout, Tokens(layout), traced
-        self._tolerance = (LOOSE if traced else TOLERANCE) * self._tokens.unit
-        self._straight = TOLERANCE * self._tokens.unit
+    def __init__(self, layout: Layout) -> None:
+        self._layout, self._tokens = layout, Tokens(layout)
+        self._tolerance = TOLERANCE * self._tokens.unit
         self._search = Search(self._tokens, self._tolerance, Budget(np.inf))
-        self._loose = LoosePlaces(self._tokens, self._tolerance)
-        self._open = (1.0 - SOLVED) * self._tokens.unit**2  # area that may be left open
         self._shape: Ints = np.zeros(layout.tokens, np.int64)
         for shape, tokens in enumerate(self._tokens.own):
             self._shape[list(tokens)] = shape
@@ -149,7 +127,7 @@ class Filling:
         area = as_area(outline)
         own = outlines(np.asarray(corners, np.float64)[None], self._layout)[0]
         shared = shapely.area(shapely.intersection(shapely.polygons(own), area))
-        return np.asarray(shared >= (_LOOSELY if self._traced else _INSIDE) * self._layout.areas)
+        return np.asarray(shared >= _INSIDE * self._layout.areas)
 
     def rest(self, outline: AnyArray, corners: AnyArray, laid: Bools) -> Area:
         """What laid tokens (K,), with all tokens' corners (V, 2), leave of an outline (G, 2)."""
@@ -159,57 +137,33 @@ class Filling:
         covered = covered_area(np.asarray(corners), self._layout, laid)
         return without(area, covered, self._tolerance, self._tokens.unit)
 
-    def hindsight(self, corners: AnyArray, tokens: Bools, outline: AnyArray | None) -> Rests | None:
+    def hindsight(self, corners: AnyArray, tokens: Bools) -> Rests | None:
         """What tokens (K,) came to cover, as something that they fill; None if they lie on others.
 
         Args:
             corners: (V, 2) of all tokens.
             tokens: some of them.
-            outline: (G, 2) of all tokens as it was traced, where that is what is seen.
         """
         covered = covered_area(np.asarray(corners), self._layout, tokens)
-        if outline is None:
-            own = opened(covered, self._tolerance)
-            fills = self._search.fits(own, self.left(tokens))
-        else:
-            own = self.rest(outline, corners, ~tokens)
-            fills = self._apart(covered, tokens) and overlap(own, covered) >= _OWN
-        seen = self.seen(own, self.left(tokens))
-        return seen if fills and bool(seen.known.all()) else None
-
-    def _apart(self, covered: Area, tokens: Bools) -> bool:
-        """Whether what tokens (K,) cover is as much as they can, all but for a little."""
-        return bool(covered.area >= SOLVED * self._layout.areas[tokens].sum())
+        own, left = opened(covered, self._tolerance), self.left(tokens)
+        seen = self.seen(own, left)
+        return seen if self._search.fits(own, left) and bool(seen.known.all()) else None
 
     def solved(self, outline: AnyArray, corners: AnyArray, laid: Bools) -> bool:
         """Whether laid tokens (K,), all of them, fill an outline (G, 2)."""
         if not laid.all():
             return False
-        if self._traced:
-            covered = covered_area(np.asarray(corners), self._layout)
-            return self._apart(covered, laid) and overlap(as_area(outline), covered) >= SOLVED
         return self._search.fits(self.rest(outline, corners, laid), self.left(~laid))
 
     def places(self, rest: Area, left: tuple[int, ...]) -> list[Place]:
-        """What may be laid next, see `Search.places`; also what need not fit, see `LoosePlaces`."""
-        if self._traced:
-            return [self._place(rest, left, one) for one in self._loose(rest, left)]
+        """What may be laid next, see `Search.places`."""
         return self._search.places(rest, left)
-
-    def _place(self, rest: Area, left: tuple[int, ...], one: LoosePlace) -> Place:
-        """A place and what comes of it; a last token that leaves too much open leads nowhere."""
-        now = less(left, one.laid)
-        gone = without(rest, one.polygon, self._tolerance, self._tokens.unit)
-        last = not any(now)
-        filled = last and shapely.difference(rest, one.polygon).area <= self._open
-        cost = one.over / float(self._tokens.areas.min())
-        return Place(one.laid, gone, now, filled, dead=last and not filled, cost=cost)
 
     def seen(self, rest: Area, left: tuple[int, ...]) -> Rests:
         """One state; empty where it has too many corners."""
         found = Rests.empty(1, self.corners, self.shapes)
         found.left[0] = left
-        every = rings(rest, self._straight)
+        every = rings(rest, self._tolerance)
         if not every or sum(len(z) for z, _, _ in every) > self.corners:
             return found
         z = np.concatenate([ring for ring, _, _ in every])

@@ -56,7 +56,7 @@ class FillReplay:
     def __init__(self, setup: Setup) -> None:
         """Allocate everything at once."""
         self.capacity = setup.agent.replay_capacity
-        self._filling = Filling(setup.layout, setup.traces)
+        self._filling = Filling(setup.layout)
         self._copies = sum(one.copies for one in setup.agent.hindsight)
         size = self._filling.corners, self._filling.shapes
         self._played = Rests.empty(self.capacity, *size)
@@ -75,24 +75,18 @@ class FillReplay:
             How many transitions there are in those that something is learned from.
         """
         used = 0
-        traced = episodes.achieved if episodes.achieved is not None else [None] * episodes.count
-        for corners, placed, goal, achieved in zip(
-            episodes.corners, episodes.placed, episodes.goals, traced, strict=True
+        for corners, placed, goal in zip(
+            episodes.corners, episodes.placed, episodes.goals, strict=True
         ):
             # Corners are no worker's invention where it plays by the rules; where not, no geometry
             # that a library trips over may end the run.
             with suppress(GEOSException):
-                if self._insert(corners, placed.astype(np.bool_), goal, achieved, generator):
+                if self._insert(corners, placed.astype(np.bool_), goal, generator):
                     used += len(corners) - 1
         return used
 
     def _insert(
-        self,
-        corners: Array,
-        placed: Bools,
-        goal: Array,
-        achieved: Array | None,
-        generator: np.random.Generator,
+        self, corners: Array, placed: Bools, goal: Array, generator: np.random.Generator
     ) -> bool:
         """One episode: corners (T + 1, V, 2), placed (T + 1, K) and outlines (G, 2).
 
@@ -101,7 +95,7 @@ class FillReplay:
         """
         filling, inside = self._filling, self._filling.inside(corners[-1], goal)
         own = np.flatnonzero(placed[-1] & inside)
-        filled = self._hindsight(corners[-1], own, achieved, generator)
+        filled = self._hindsight(corners[-1], own, generator)
         if not filled:
             return False
         solved = filling.solved(goal, corners[-1], placed[-1])
@@ -116,15 +110,13 @@ class FillReplay:
             self._added[1] += 1
         return True
 
-    def _hindsight(
-        self, corners: Array, own: Ints, achieved: Array | None, generator: np.random.Generator
-    ) -> list[Rests]:
+    def _hindsight(self, corners: Array, own: Ints, generator: np.random.Generator) -> list[Rests]:
         """What some of their own tokens (n,) cover; nothing where they lie on each other."""
         filling, found = self._filling, list[Rests]()
         for _ in range(self._copies if len(own) else 0):
             chosen = np.zeros(filling.tokens, np.bool_)
             chosen[generator.permutation(own)[: generator.integers(1, len(own) + 1)]] = True
-            seen = filling.hindsight(corners, chosen, achieved)
+            seen = filling.hindsight(corners, chosen)
             if seen is not None:
                 found.append(seen)
         return found

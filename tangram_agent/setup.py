@@ -58,29 +58,13 @@ class Setup:
         if self.pairs and not one:
             self._check_credit(f"{self.layout.tokens} tokens on pairs")
 
-    def check_learnable(self) -> None:
-        """Refuse to learn how far to trust pictures where none are seen, or motions not foreseen.
-
-        An agent that learned it may play there.
-
-        Raises:
-            ConfigError: names the setting and the remedy.
-        """
-        sim = self.sim
-        if self.traces and sim.disturbance:
-            raise ConfigError(
-                f"sim.disturbance={told(sim.disturbance)}: an agent of outlines takes tokens to "
-                "where it sees them, and learns nothing where the camera stands elsewhere: set "
-                "sim.disturbance=0"
-            )
-
     def _check_fills(self) -> None:
         """Refuse what an agent of outlines cannot use, or outlines that no agent sees."""
         agent, sim = self.agent, self.sim
         if sim.observe not in SILHOUETTES:
             raise ConfigError(
                 f"agent.readout=outline needs sim.observe=silhouette, got {sim.observe}: set "
-                "sim=silhouette or sim=silhouette_pictures, or another agent"
+                "sim=silhouette, or another agent"
             )
         if self.net.kind == "mlp":
             refuse_ignored("net.kind=mlp", "outlines", "set net.kind=mha")
@@ -164,11 +148,6 @@ class Setup:
     def fills(self) -> bool:
         """Whether the agent fills outlines: it is told of no piece of the target."""
         return self.agent.readout == "outline"
-
-    @property
-    def traces(self) -> bool:
-        """Whether outlines are traced in the camera's pictures, and may be wrong."""
-        return self.fills and self.sim.observe == "silhouette_pictures"
 
     @property
     def goal_rows(self) -> int:

@@ -28,9 +28,7 @@ class Episodes:
         goals: (E, V, 2) float32, target corners, or (E, G, 2) rows of its outline.
         seen: (E, T + 1, K) uint8, 1 where a token was found in the picture, or should have left
             that of several tokens; None where pictures are not what is observed.
-        goals_seen: (E, K) uint8, the same of the target's pieces; 1 of outlines.
-        achieved: (E, G, 2) rows of the outline of what tokens came to cover, as it was traced in
-            the camera's picture of it; None where targets are not traced.
+        goals_seen: (E, K) uint8, the same of the target's pieces.
     """
 
     corners: Singles
@@ -40,7 +38,6 @@ class Episodes:
     goals: Singles
     seen: Flags | None = None
     goals_seen: Flags | None = None
-    achieved: Singles | None = None
 
     @property
     def arrays(self) -> dict[str, npt.NDArray[Any]]:

@@ -50,12 +50,11 @@ def corner_bound(tokens: int, sim: SimConfig) -> float:
 def goal_rows(layout: Layout, sim: SimConfig) -> int:
     """G, the corners of a target as agents see it: its pieces', or rows of their outline.
 
-    An outline has no more corners than its pieces, and each ring one row more, see `rings`; one
-    that was traced in a picture may have others.
+    An outline has no more corners than its pieces, and each ring one row more, see `rings`.
     """
     if sim.observe not in SILHOUETTES:
         return layout.corner_count
-    return (layout.corner_count + layout.tokens) * (2 if sim.looks else 1)
+    return layout.corner_count + layout.tokens
 
 
 def chosen_tokens(actions: Floats, tokens: int) -> Ints:

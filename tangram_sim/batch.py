@@ -21,14 +21,14 @@ from tangram_sim.actions import (
 )
 from tangram_sim.actuation import Actuation, Command
 from tangram_sim.arrays import Bools, Floats, Ints, Pixels
-from tangram_sim.config import MAX_OVERLAP, SILHOUETTES, RewardConfig, SimConfig
+from tangram_sim.config import MAX_OVERLAP, RewardConfig, SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.geometry import outlines, overlap_share, shared_area
 from tangram_sim.layout import Layout
 from tangram_sim.lens import Lens, View
 from tangram_sim.observation_noise import see
 from tangram_sim.rewards import TargetPictures, make_reward, scaled_overlap
-from tangram_sim.sight import Eye, Sight, Tracer
+from tangram_sim.sight import Eye, Sight
 from tangram_sim.targets import Sides, sample_starts, sample_targets
 from tangram_sim.world import check_shown, make_world
 
@@ -102,7 +102,7 @@ class BatchedEnv:
         seen: `corners` as an agent sees them, new noise at every step if there is any, or as they
             are found in pictures.
         seen_goals: (B, G, 2) `goals` as an agent sees them, with one noise for the whole episode,
-            or rows of their outlines, see `rings`, exact or as they are traced in pictures.
+            or exact rows of their outlines, see `rings`.
         sight: what is found in pictures, where these are the agent's only source, else None.
         pictures: (B, P, P) of the tokens, as the camera had them last.
     """
@@ -115,7 +115,6 @@ class BatchedEnv:
         count: int = 1,
         eye: Eye | None = None,
         outlines: bool = False,
-        tracer: Tracer | None = None,
     ) -> None:
         """Open `count` worlds.
 
@@ -125,9 +124,8 @@ class BatchedEnv:
             reward: what an action is worth.
             count: B.
             eye: finds tokens in pictures, where these are what is observed.
-            outlines: whether who plays takes rows of outlines for goals, with `sim.observe` one of
-                `SILHOUETTES`.
-            tracer: finds these in pictures, for `sim.observe=silhouette_pictures`.
+            outlines: whether who plays takes rows of outlines for goals, for
+                `sim.observe=silhouette`.
 
         Raises:
             ConfigError: pictures are to be observed, and there is no eye; or silhouettes are.
@@ -135,7 +133,7 @@ class BatchedEnv:
         if count < 1:
             raise ValueError(f"count must be at least 1, got {count}")
         check_shown(sim, outlines)
-        if sim.looks and (eye is None or (outlines and tracer is None)):
+        if sim.looks and eye is None:
             raise ConfigError(
                 f"sim.observe={sim.observe} is for tangram-train, tangram-worker and tangram-eval, "
                 "which look at pictures: set sim.observe=corners"
@@ -155,7 +153,6 @@ class BatchedEnv:
         self.actuation = Actuation(sim, count)
         self._lens = Lens(sim)
         observed = eye if sim.looks else None
-        self._tracer = tracer if sim.looks else None
         self.sight = None if observed is None else Sight(layout, observed, count, sim.arena)
         self._targets: TargetPictures | None = None
         self._late = np.zeros(count, np.int64), np.zeros((count, 3))  # what was told a step before
@@ -213,8 +210,8 @@ class BatchedEnv:
         self._generators = generators
         self._late = np.zeros(self.count, np.int64), np.zeros((self.count, 3))
         self._begin(targets, starts, views)
-        if self.sim.observe in SILHOUETTES:
-            self.seen_goals = self._outlined(self.goals)
+        if self.sim.observe == "silhouette":
+            self.seen_goals = self._outlined()
         elif self.sight is None:
             self.seen_goals = see(self.goals, self.sim, generators)
         else:
@@ -227,30 +224,13 @@ class BatchedEnv:
         self._moves[:] = self.sim.actions_per_token * self._named(starts.placed)
         self.steps_done = 0
 
-    @property
-    def traces(self) -> bool:
-        """Whether outlines are traced in pictures."""
-        return self._tracer is not None
-
-    @property
-    def achieved(self) -> Floats:
-        """(B, G, 2) rows of the outline of what tokens cover, traced in another picture of it."""
-        return self._outlined(self.corners)
-
-    def _outlined(self, corners: Floats) -> Floats:
-        """(B, G, 2) rows of the outlines of what pieces with corners (B, V, 2) cover."""
+    def _outlined(self) -> Floats:
+        """(B, G, 2) rows of the targets' outlines."""
         # Only here: most runs need no shapely.
         from tangram_sim.rings import as_rows, covered_area  # noqa: PLC0415
 
-        areas = [covered_area(own, self.layout) for own in corners]
-        if self._tracer is None:
-            return np.stack([as_rows(area, self.layout, self.goal_rows) for area in areas])
-        rows = []
-        for b, (area, generator) in enumerate(zip(areas, self._generators, strict=True)):
-            picture = self._tracer.portrait(area, self._lens.views[b])
-            taken = self._lens.taken(b, picture, generator)
-            rows.append(self._tracer.trace(taken, generator))
-        return np.stack(rows)
+        areas = [covered_area(own, self.layout) for own in self.goals]
+        return np.stack([as_rows(area, self.layout, self.goal_rows) for area in areas])
 
     def _done(self, generators: Sequence[np.random.Generator]) -> Bools:
         """(B, K) tokens that lie on their targets already: in a stage with fewer to move."""
@@ -348,7 +328,7 @@ class BatchedEnv:
             self._targets = TargetPictures(np.stack(pictures), self._lens.disturbs)
         if self.sight is not None:
             self.pictures = np.stack([self._picture(b) for b in range(self.count)])
-            goals = None if known is None and self._tracer is None else self.goals
+            goals = None if known is None else self.goals
             self.sight.begin(np.stack(pictures), self.pictures, goals)
 
     def _picture(self, b: int) -> Pixels:

@@ -156,7 +156,8 @@ class SimConfig(Settings, section="sim"):
         "what agents see: corners as they are, or what is found in the camera's pictures; then "
         "Eq. 14 is measured on pictures, too, and scores are exact polygons all the same; "
         "silhouette: of the target only its outline, which agent=outline fills itself and others "
-        "have filled by a search; silhouette_pictures: the same, but only in the camera's pictures",
+        "have filled by a search; silhouette_pictures: the camera's picture of that, in "
+        "tangram-eval puzzle= alone",
         choices=OBSERVED,
     )
     motion: str = setting(

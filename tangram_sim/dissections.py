@@ -55,7 +55,6 @@ class Place(NamedTuple):
         left: how many tokens are left of each shape.
         filled: whether all is filled, and no token left.
         dead: whether what is left has parts of which no tokens have the areas.
-        cost: area by which the token reaches out of what was left, in smallest tokens.
     """
 
     laid: Laid
@@ -63,7 +62,6 @@ class Place(NamedTuple):
     left: tuple[int, ...]
     filled: bool
     dead: bool
-    cost: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,16 +10,12 @@ Legend: B environments, K tokens, V corners, P pixels along a side of a picture.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from tangram_sim.arrays import Bools, Floats, Ints, Pixels
 from tangram_sim.layout import Layout
-from tangram_sim.lens import View
-
-if TYPE_CHECKING:  # most runs need no shapely
-    from tangram_sim.areas import Area
 
 SURE = 0.5  # confidence from which a token counts as seen
 PILED = 0.7  # most confidence in one that touches others: their edges are lost
@@ -56,16 +52,6 @@ class Eye(Protocol):
     """Finds tokens in a picture (P, P), told where those lay before that should not have moved."""
 
     def __call__(self, picture: Pixels, before: Look | None = None, /) -> Look: ...  # noqa: D102
-
-
-class Tracer(Protocol):
-    """Shows an outline to the camera, and finds it again in what that takes."""
-
-    def portrait(self, area: "Area", view: View) -> Pixels:
-        """Picture (P, P) of an area in arena units, before light, blur and noise."""
-
-    def trace(self, picture: Pixels, generator: np.random.Generator) -> Floats:
-        """(G, 2) rows of the outline that a picture shows; of nothing where it is too rugged."""
 
 
 class Sight:

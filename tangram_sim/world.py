@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 
 from tangram_sim.arrays import Bools, Floats, Pixels
-from tangram_sim.config import SILHOUETTES, SimConfig
+from tangram_sim.config import SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.kinematics import KinematicWorld
 from tangram_sim.layout import Layout
@@ -101,11 +101,17 @@ def check_shown(sim: SimConfig, outlines: bool) -> None:
     Raises:
         ConfigError: says who takes them.
     """
-    if sim.observe in SILHOUETTES and not outlines:
+    if sim.observe == "silhouette" and not outlines:
         raise ConfigError(
-            f"sim.observe={sim.observe} is for an agent of outlines: train one with "
-            f"sim={sim.observe} agent=outline; tangram-eval puzzle= fills what it shows to others "
-            "by a search, and tangram-play silhouette= too; set sim.observe=corners"
+            "sim.observe=silhouette is for an agent of outlines: train one with sim=silhouette "
+            "agent=outline; tangram-eval puzzle= fills what it shows to others by a search, and "
+            "tangram-play silhouette= too; set sim.observe=corners"
+        )
+    if sim.observe == "silhouette_pictures":
+        raise ConfigError(
+            "sim.observe=silhouette_pictures is for tangram-eval puzzle=, which fills what a "
+            "picture shows before a token is moved; no agent trains so: set sim.observe=silhouette "
+            "with agent=outline, else sim.observe=corners"
         )
 
 

@@ -4,21 +4,14 @@ from tangram_agent.setup import Setup
 from tangram_sim.arrays import Pixels
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.config import RewardConfig
-from tangram_sim.sight import Eye, Look, Tracer
+from tangram_sim.sight import Eye, Look
 from tangram_sim.world import no_opencv
 
 
 def environments(setup: Setup, count: int, reward: RewardConfig | None = None) -> BatchedEnv:
     """So many environments of a run, to be closed by whoever asked; perhaps with another reward."""
-    return BatchedEnv(
-        setup.layout,
-        setup.sim,
-        reward or setup.reward,
-        count,
-        make_eye(setup),
-        setup.fills,
-        make_tracer(setup),
-    )
+    paid = reward or setup.reward
+    return BatchedEnv(setup.layout, setup.sim, paid, count, make_eye(setup), setup.fills)
 
 
 def make_eye(setup: Setup) -> Eye | None:
@@ -40,18 +33,3 @@ def make_eye(setup: Setup) -> Eye | None:
         return see(picture, layout, arena, before)
 
     return look
-
-
-def make_tracer(setup: Setup) -> Tracer | None:
-    """What finds outlines in pictures, where these are to be filled; None elsewhere.
-
-    Raises:
-        ConfigError: OpenCV is not installed.
-    """
-    if not setup.traces:
-        return None
-    try:
-        from tangram_vision.tracing import PictureTracer  # noqa: PLC0415
-    except ImportError as error:
-        raise no_opencv(str(error)) from error
-    return PictureTracer(setup.layout, setup.sim, setup.goal_rows)

@@ -133,10 +133,9 @@ def silhouette_show(run: Run, config: PlayConfig, found: Shown) -> Show:
     the outline of what was found, which is the silhouette's within the search's tolerance.
     """
     setup, fills = _beside(run.setup), run.setup.fills
-    shown = f"the agent sees a picture of it, {setup.sim.pixels} px" if setup.traces else SHOWN
     played = play_figures(setup, [found.figure], greedy(run.policy), config.seed)
     width = WIDTH if _is_still(config.out) else WIDTH // 2
-    seen = draw_silhouette(found, setup.layout, width, bare=shown * fills)
+    seen = draw_silhouette(found, setup.layout, width, bare=SHOWN * fills)
     told = found.told
     if fills:
         solved = assembled(setup.layout, played).iou[0] >= SOLVED

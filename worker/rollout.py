@@ -86,7 +86,6 @@ class Played:
                 seen,
                 seen=np.empty((count, steps + 1, tokens), np.uint8),
                 goals_seen=np.empty((count, tokens), np.uint8),
-                achieved=np.empty_like(seen.goals) if env.traces else None,
             )
         return Played(
             episodes=seen,
@@ -191,8 +190,6 @@ def _play_group(
         seen.actions[rows, t], seen.rewards[rows, t] = actions, result.rewards
         played.refused[rows, t], played.blocked[rows, t] = result.refused, result.blocked
     _look(env, played, rows, env.horizon)
-    if seen.achieved is not None:
-        seen.achieved[rows] = env.achieved
     played.seconds[rows] = (time.perf_counter() - began) / env.count
     played.overlap[rows] = result.overlap
     if played.camera is not None:

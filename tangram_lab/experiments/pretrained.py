@@ -31,7 +31,7 @@ from tangram_sim.targets import has_all_tans
 from worker.config import EvalConfig
 from worker.evaluate import policies, score_policies
 from worker.puzzles import find_figures
-from worker.scores import RUN, score_outlines, score_pictured, score_puzzles
+from worker.scores import RUN, score_outlines, score_puzzles
 from worker.test_set import greedy
 
 PACKAGE = Path(__file__).resolve().parents[2] / "tangram_agent" / "pretrained"
@@ -42,8 +42,6 @@ TESTS, TEST_SEED = 400, 1  # tests that no choice was made on: training is score
 AHEAD: dict[str, dict[str, Any]] = {
     "agent": {"lookahead": "values", "beam": 12}
 }  # as an agent of outlines ships
-# And one of pictures: in finer ones than it learned from it lays tokens more exactly.
-FINER: dict[str, dict[str, Any]] = {**AHEAD, "sim": {"pixels": 128}}
 
 
 class Candidate(NamedTuple):
@@ -103,19 +101,14 @@ def publish(
 
 def _shipped(setup: Setup) -> dict[str, dict[str, Any]]:
     """What an agent ships with beside what it was trained with."""
-    if not setup.fills:
-        return {}
-    return FINER if setup.traces else AHEAD
+    return AHEAD if setup.fills else {}
 
 
 def _on_figures(run: Run, split: str) -> dict[str, Any]:
     """Scores of a run on the figures of a split."""
     figures = find_figures(split, run.setup, None, TURNS, False).figures
-    if run.setup.traces:
-        scored = score_pictured(run, figures, TEST_SEED)
-    else:
-        score = score_outlines if run.setup.fills else score_puzzles
-        scored = score(run.setup, figures, {RUN: greedy(run.policy)}, TEST_SEED)
+    score = score_outlines if run.setup.fills else score_puzzles
+    scored = score(run.setup, figures, {RUN: greedy(run.policy)}, TEST_SEED)
     return {"turns": TURNS, "scores": scored.means[RUN]}
 
 

@@ -186,24 +186,3 @@ def test_values_are_for_outlines_alone() -> None:
     corners = replace(made.sim, observe="corners")
     with pytest.raises(ConfigError, match="agent.lookahead=values"):
         replace(made, sim=corners, agent=AgentConfig(lookahead="values"))
-
-
-def test_a_token_that_reaches_out_is_taken_last() -> None:
-    """The more it does, in smallest tokens, the less it is worth; the sum of all counts."""
-    made = outline_setup(observe="silhouette_pictures", pixels=64)
-    filler, filling = Filler(Indifferent(), made), Filling(made.layout, traced=True)
-    leg = float(np.sqrt(2.0 * made.layout.areas[0]))
-    places = filling.places(shapely.box(0, 0, leg, leg), (2,))
-    costs = [0.3, 0.1, 0.2]
-    given = [place._replace(cost=cost) for place, cost in zip(places * 3, costs, strict=False)]
-    (plan,) = filler._plans([given], 1, 1)
-    assert [place.cost for place in plan] == [0.1]
-    # What reached out before counts as what does now: 0.3 and 0 against 0 and 0.2.
-    rest = shapely.box(0, 0, leg, leg)
-    first, second = (places[0]._replace(cost=cost, rest=rest, left=(2,)) for cost in (0.3, 0.0))
-    next_costs = {id(first.rest): 0.0}
-    second = second._replace(rest=shapely.box(0, 0, leg, leg))
-    next_costs[id(second.rest)] = 0.2
-    filler._live = lambda gone, _: [places[0]._replace(cost=next_costs[id(gone)], left=(1,))]  # type: ignore[method-assign]
-    (plan,) = filler._plans([[first, second]], 2, 2)
-    assert [place.cost for place in plan] == [0.0, 0.2]

@@ -1,6 +1,5 @@
 """What an agent of outlines learns from, and how."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -261,48 +260,3 @@ def test_a_state_in_a_mirror_or_turned_is_as_large_and_its_corners_as_sharp() ->
         assert after[..., column] == pytest.approx(before[..., column].numpy(), abs=1e-5)
     sides = (rows[..., 6:8].sum(dim=(1, 2)) for rows in (before, after))
     assert next(sides) == pytest.approx(next(sides).numpy(), abs=1e-5)
-
-
-TRACED = outline_setup(
-    agent={"replay_capacity": 8, "batch_size": 8},
-    observe="silhouette_pictures",
-    pixels=64,
-)
-
-
-def traced(size: float = 1.01) -> Episodes:
-    """Both triangles in their places, in outlines that were traced a little too large."""
-    ways = [np.array([FAR, FAR]), np.array([HALF, FAR]), np.array(GOAL)]
-    own = played_in(TRACED, ways, GOAL)
-    middle = own.goals.mean(axis=1, keepdims=True)
-    rows = middle + size * (own.goals - middle)
-    return replace(own, goals=rows, achieved=rows.copy())
-
-
-def test_of_pictures_what_was_traced_is_learned() -> None:
-    """Also by hindsight: all of it is larger than the tokens, and filled all the same."""
-    replay = FillReplay(TRACED)
-    assert replay.insert(traced(), np.random.default_rng(0)) == 2
-    state = rows(replay)
-    assert state["counters"].tolist() == [2, 3]
-    assert (state["ends"] == FILLED).any(axis=1).all()
-    exact = FillReplay(MADE)
-    exact.insert(episode(other_half()), np.random.default_rng(0))
-    own = rows(exact)
-    for name in ("played_points", "filled_points"):
-        both = [np.abs(one[name]).max(axis=(1, 2)) for one in (state, own)]
-        assert both[0] == pytest.approx(1.01 * both[1], rel=0.004), name
-
-
-def test_what_was_traced_too_large_was_not_filled() -> None:
-    replay = FillReplay(TRACED)
-    replay.insert(traced(1.06), np.random.default_rng(0))
-    assert (rows(replay)["ends"] != FILLED).all()
-
-
-def test_an_outline_that_could_not_be_traced_teaches_nothing() -> None:
-    blank = traced()
-    nothing = replace(blank, goals=np.zeros_like(blank.goals))
-    assert FillReplay(TRACED).insert(nothing, np.random.default_rng(0)) == 0
-    unseen = replace(blank, achieved=np.zeros_like(blank.goals))
-    assert FillReplay(TRACED).insert(unseen, np.random.default_rng(0)) == 0

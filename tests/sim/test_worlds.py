@@ -303,14 +303,22 @@ def test_a_missing_engine_is_named_also_before_a_world_is_made(
         check_world(layout_of("square"), seen)
 
 
-@pytest.mark.parametrize("observe", ["silhouette", "silhouette_pictures"])
-def test_silhouettes_are_shown_to_who_knows_outlines(observe: str) -> None:
+def test_silhouettes_are_shown_to_who_knows_outlines() -> None:
     """A master asks before it starts, an environment when it is made."""
-    pixels = 64 if observe == "silhouette_pictures" else 0
-    shown = SimConfig(backend="kinematic", observe=observe, pixels=pixels)
-    reason = f"^sim.observe={observe} is for an agent of outlines: .*corners$"
+    shown = SimConfig(backend="kinematic", observe="silhouette")
+    reason = "^sim.observe=silhouette is for an agent of outlines: .*corners$"
     with pytest.raises(ConfigError, match=reason):
         check_shown(shown, outlines=False)
     with pytest.raises(ConfigError, match=reason):
         BatchedEnv(layout_of("square"), shown, RewardConfig(), 1)
     check_shown(shown, outlines=True)
+
+
+@pytest.mark.parametrize("outlines", [False, True])
+def test_pictures_of_silhouettes_are_for_evaluations_alone(outlines: bool) -> None:
+    shown = SimConfig(backend="kinematic", observe="silhouette_pictures", pixels=64)
+    reason = "^sim.observe=silhouette_pictures is for tangram-eval puzzle=, .*corners$"
+    with pytest.raises(ConfigError, match=reason):
+        check_shown(shown, outlines)
+    with pytest.raises(ConfigError, match=reason):
+        BatchedEnv(layout_of("square"), shown, RewardConfig(), 1, outlines=outlines)

@@ -284,12 +284,13 @@ def test_pictures_are_told(
 
 
 def test_elsewhere_silhouettes_are_refused() -> None:
-    reason = "^sim.observe=silhouette(_pictures)? is for an agent of outlines: .*corners$"
-    for sim in (OUTLINE, PICTURE):
+    reason = "^sim.observe=silhouette is for an agent of outlines: .*corners$"
+    other = "^sim.observe=silhouette_pictures is for tangram-eval puzzle=, .*corners$"
+    for sim, told in (OUTLINE, reason), (PICTURE, other):
         made = game(sim)
-        with pytest.raises(ConfigError, match=reason):
+        with pytest.raises(ConfigError, match=told):
             BatchedEnv(made.layout, made.sim, RewardConfig())
-        with pytest.raises(ConfigError, match=reason):
+        with pytest.raises(ConfigError, match=told):
             play_figures(made, [square()], random_policy(made.layout, made.sim), 0)
     with pytest.raises(ConfigError, match=reason):
         gymnasium.make("Tangram-v0", observe="silhouette")
