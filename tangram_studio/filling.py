@@ -8,7 +8,7 @@ Legend: K tokens, V corners, N rings.
 
 import base64
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
@@ -31,7 +31,7 @@ from tangram_vision.approximations import nearest_figure
 from tangram_vision.outline_files import FORMAT, VERSION
 from tangram_vision.silhouette_files import PICTURES, Silhouette, fill_silhouette
 from tangram_vision.silhouettes import Method, silhouette
-from worker.methods import method_of
+from worker.methods import together
 from worker.puzzles import reach_beyond
 from worker.silhouettes import why_unfilled
 
@@ -168,8 +168,8 @@ def _filled(name: str, source: str, who: str, free: bool = False) -> Answer:
 
 @lru_cache(maxsize=2)
 def _method(who: str) -> Method:
-    # The agent alone looks ahead, as it ships.
-    return method_of("beam" if who == "agent" else who, player("lift").layout)
+    method = together(player("lift").layout)
+    return replace(method, search=False) if who == "agent" else method
 
 
 def _called(who: str, by: str) -> str:

@@ -27,7 +27,7 @@ from tangram_vision.outline_files import Drawn, read_outline
 from tangram_vision.photos import Shade, find_silhouette
 from tangram_vision.picture_files import read_picture
 from tangram_vision.silhouette_pictures import fill_picture
-from tangram_vision.silhouettes import TOGETHER, Filled, Method, attempt_outline, fill_outline
+from tangram_vision.silhouettes import UNLEARNED, Filled, Method, attempt_outline, fill_outline
 from tangram_vision.tilts import mapped, shift
 
 _DRAWN = 640  # pixels along the longer side of an outline that is drawn
@@ -69,7 +69,7 @@ def fill_silhouette(
     scale: float,
     seconds: float,
     count: int = 1,
-    method: Method = TOGETHER,
+    method: Method = UNLEARNED,
 ) -> Silhouette:
     """Read a silhouette and fill it.
 

@@ -27,8 +27,8 @@ from tangram_vision.ramps import fitted, ramps
 from tangram_vision.samples import binary
 from tangram_vision.silhouettes import (
     SOLVED,
-    TOGETHER,
     TOLERANCES,
+    UNLEARNED,
     Filled,
     Method,
     nearest_fill,
@@ -66,7 +66,7 @@ class _Explained:
 
 
 def fill_picture(
-    cover: Singles, layout: Layout, view: float, seconds: float, method: Method = TOGETHER
+    cover: Singles, layout: Layout, view: float, seconds: float, method: Method = UNLEARNED
 ) -> Filled:
     """The dissection that explains a picture's coverage (P, P) best.
 

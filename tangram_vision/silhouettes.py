@@ -47,7 +47,7 @@ class Method:
     values: Values | None = None
 
 
-TOGETHER = Method()
+UNLEARNED = Method()  # the search, then a beam of the largest tokens
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +115,7 @@ def silhouette(layout: Layout, laid: Dissection) -> Area:
 
 
 def fill_outline(
-    area: Area, layout: Layout, seconds: float, count: int = 1, method: Method = TOGETHER
+    area: Area, layout: Layout, seconds: float, count: int = 1, method: Method = UNLEARNED
 ) -> list[Filled]:
     """Up to `count` different dissections of an outline of the tokens' area, or one that failed.
 
@@ -161,7 +161,7 @@ def attempt_outline(area: Area, layout: Layout, seconds: float) -> Filled:
     """The tokens that could be laid in an outline whose area is not theirs."""
     begin = time.thread_time()
     budget = Budget(begin + seconds)
-    laid, iou = nearest_fill(area, layout, budget, (), TOGETHER)
+    laid, iou = nearest_fill(area, layout, budget, (), UNLEARNED)
     return Filled(None, iou, time.thread_time() - begin, budget.taken, False, laid)
 
 

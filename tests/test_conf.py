@@ -378,7 +378,6 @@ def test_entry_hands_over_plain_settings(entered: Entered) -> None:
     assert type(settings) is dict
     assert settings == (
         {"run_dir": "x", "episodes": 100, "seed": 3, "turns": 1, "skip_invalid": False}
-        | {"solve": "together"}
         | dict.fromkeys(("out", "puzzle", "sheet"))
         | {s: dict.fromkeys(own) for s, own in COMMANDS["train"].sections().items() if s in OVER}
     )

@@ -124,8 +124,8 @@ def _play(settings: Plain) -> int:
     if config.silhouette is not None:
         from worker.silhouettes import read_silhouette
 
-        given = (config.silhouette, setups[0], config.solutions, config.solve, Path(config.out))
-        filled = read_silhouette(*given)
+        out = Path(config.out)
+        filled = read_silhouette(config.silhouette, setups[0], config.solutions, out)
     tell(f"loads and plays {', '.join(config.run_dirs)}")
 
     if config.compare is not None:

@@ -33,14 +33,6 @@ PUZZLE_HELP = (
 )
 TURNS_HELP = "each puzzle at so many angles, evenly spread; 1 is as drawn"
 SKIP_HELP = "leave out puzzles that cannot be played"
-TOGETHER = "together"
-BY_BEAM = ("beam", "agent")
-SOLVERS = (TOGETHER, "solver", *BY_BEAM)
-SOLVE_HELP = (
-    "who finds how silhouettes are filled: solver is a search and, in pictures, a beam, not "
-    "learned; beam is guided by pretrained/tangram7_silhouette, agent is that without any search; "
-    "together is the search first, then the agent's beam"
-)
 
 
 def game_run() -> str:
@@ -148,7 +140,6 @@ class EvalConfig(Settings):
     sheet: str | None = setting(
         None, "PNG file, a picture of every puzzle's end", unless={"puzzle": None}
     )
-    solve: str = setting(TOGETHER, SOLVE_HELP, choices=SOLVERS, unless={"puzzle": None})
     changes: Changes = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -166,12 +157,6 @@ class EvalConfig(Settings):
         if self.puzzle is None and observe in SILHOUETTES:
             raise ConfigError(
                 f"sim.observe={observe} hides the pieces of puzzles, got none: add puzzle=test"
-            )
-        if self.solve != TOGETHER and observe not in SILHOUETTES:
-            refuse_ignored(
-                f"solve={self.solve}",
-                "pieces that are shown, or with a run that fills outlines itself",
-                f"add sim.observe={SILHOUETTES[0]} or sim.observe={SILHOUETTES[1]}",
             )
 
     @property
@@ -282,7 +267,6 @@ class PlayConfig(Settings):
         high=MAX_SOLUTIONS,
         unless={"silhouette": None},
     )
-    solve: str = setting(TOGETHER, SOLVE_HELP, choices=SOLVERS, unless={"silhouette": None})
     turns: int = setting(1, TURNS_HELP, low=1, high=MAX_TURNS, unless={"puzzle": None})
     skip_invalid: bool = setting(False, SKIP_HELP, unless={"puzzle": None})
     changes: Changes = field(default_factory=dict)

@@ -20,7 +20,7 @@ from tangram_agent.runs import Run, load_changed
 from tangram_agent.setup import Setup
 from tangram_sim.config import SILHOUETTES, SimConfig
 from tangram_sim.game_drawing import figure_sheet
-from tangram_sim.settings import refuse_ignored, told
+from tangram_sim.settings import told
 from worker.baselines import (
     Player,
     Told,
@@ -29,7 +29,7 @@ from worker.baselines import (
     position_policy,
     random_policy,
 )
-from worker.config import TOGETHER, EvalConfig, source_and_names
+from worker.config import EvalConfig, source_and_names
 from worker.fitted import fitted_policy
 from worker.oracle import oracle_policy
 from worker.puzzles import find_figures
@@ -175,17 +175,13 @@ def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
     source, names = source_and_names(config.puzzle or ())
     setup = run.setup
     found = find_figures(source, setup, names, config.turns, config.skip_invalid)
-    if setup.fills and config.solve != TOGETHER:
-        refuse_ignored(
-            f"solve={config.solve}", "a run that fills outlines itself", "name another run"
-        )
     given = setup, found.figures, policies(run), config.seed
     if setup.fills and setup.sim.observe == "silhouette_pictures":
         scored = score_pictured(run, found.figures, config.seed)
     elif setup.fills:
         scored = score_outlines(*given)
     elif setup.sim.observe in SILHOUETTES:
-        scored = score_hidden(*given, config.solve)
+        scored = score_hidden(*given)
     else:
         scored = score_puzzles(*given)
     scores, lines = scored.means, scored.puzzles

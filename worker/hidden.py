@@ -27,7 +27,7 @@ from tangram_sim.rewards import scaled_overlap
 from tangram_vision.levels import coverage
 from tangram_vision.portraits import portrait
 from tangram_vision.silhouette_pictures import fill_picture
-from tangram_vision.silhouettes import TOGETHER, Filled, Method, fill_outline, silhouette
+from tangram_vision.silhouettes import UNLEARNED, Filled, Method, fill_outline, silhouette
 from worker.baselines import Player
 from worker.metrics import SOLVED, iou
 from worker.puzzles import Figure, figure_generator, play_figures
@@ -136,7 +136,7 @@ class Laid:
         return np.asarray(self.iou >= SOLVED)
 
 
-def hide(setup: Setup, figures: Sequence[Figure], seed: int, method: Method = TOGETHER) -> Hidden:
+def hide(setup: Setup, figures: Sequence[Figure], seed: int, method: Method = UNLEARNED) -> Hidden:
     """Search how a run's tokens fill puzzles of which only the silhouettes are shown.
 
     Args:

@@ -1,8 +1,4 @@
-"""Who finds how a silhouette is filled: `solve`.
-
-The agent of outlines that comes with the package judges states for the beam, where a run's tokens
-are those that it learned with, of any size.
-"""
+"""How a silhouette is filled: by a search, and by a beam whose states an agent judges."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -12,10 +8,8 @@ from tangram_agent.pretrained import PREFIX
 from tangram_agent.runs import Run, load_run, read_changed
 from tangram_sim.areas import Area
 from tangram_sim.arrays import Floats
-from tangram_sim.errors import ConfigError
 from tangram_sim.layout import Layout
 from tangram_vision.silhouettes import Method
-from worker.config import BY_BEAM, TOGETHER
 
 if TYPE_CHECKING:  # needs torch
     from tangram_agent.filler import Fillable
@@ -44,30 +38,15 @@ class Learned:
         return Fillable(load_run(JUDGE).policy.network, self._layout)
 
 
-def method_of(solve: str, layout: Layout) -> Method:
-    """How silhouettes are filled.
+def together(layout: Layout) -> Method:
+    """By the search, then by the beam of the agent of outlines that comes with the package.
 
-    Args:
-        solve: one of `worker.config.SOLVERS`.
-        layout: the tokens.
-
-    Raises:
-        ConfigError: no agent learned to fill outlines with these tokens.
+    Of other tokens than those that it learned with, of any size, those in which the largest tokens
+    lie are followed.
     """
     learned = [shape.name for shape in read_changed(JUDGE, {}).setup.layout.shapes]
     known = [shape.name for shape in layout.shapes] == learned
-    values = Learned(layout) if known else None
-    if solve in BY_BEAM and values is None:
-        raise ConfigError(
-            f"solve={solve} needs an agent that learned to fill outlines with these tokens, and "
-            f"{JUDGE} learned it with seven tans: set solve=solver"
-        )
-    return {
-        TOGETHER: Method(values=values),
-        "solver": Method(),
-        "beam": Method(search=False, values=values),
-        "agent": Method(search=False, width=1, values=values),
-    }[solve]
+    return Method(values=Learned(layout) if known else None)
 
 
 def learned_method(run: Run) -> Method:

@@ -81,7 +81,7 @@ def make_show(run: Run, config: PlayConfig, silhouette: Shown | None = None) -> 
     if config.target is not None:
         return photograph_show(run, config, config.target)
     if config.silhouette is not None:
-        given = (config.silhouette, run.setup, config.solutions, config.solve, Path(config.out))
+        given = (config.silhouette, run.setup, config.solutions, Path(config.out))
         return silhouette_show(run, config, silhouette or read_silhouette(*given))
     titles = [f"target {i + 1}" for i in range(config.episodes)]
     return Show(run.setup, play_episodes(run, config), titles, "episode")

@@ -15,7 +15,6 @@ from tangram_sim.arrays import Floats
 from tangram_sim.errors import ConfigError
 from tangram_sim.rewards import scaled_overlap
 from worker.baselines import Player, exact_policy
-from worker.config import TOGETHER
 from worker.metrics import SOLVED, assembled, pose_errors, summarise
 from worker.puzzles import Figure, play_figures
 from worker.rollout import Played, at_once
@@ -107,11 +106,7 @@ def of_outlines(setup: Setup, played: Played) -> Scores:
 
 
 def score_hidden(
-    setup: Setup,
-    figures: Sequence[Figure],
-    players: Mapping[str, Player],
-    seed: int,
-    solve: str = TOGETHER,
+    setup: Setup, figures: Sequence[Figure], players: Mapping[str, Player], seed: int
 ) -> Scored:
     """Scores of each policy that lays what was found in the silhouettes.
 
@@ -121,10 +116,10 @@ def score_hidden(
     try:
         # Only here and below: other puzzles need neither.
         from worker.hidden import hide, play_hidden  # noqa: PLC0415
-        from worker.methods import method_of  # noqa: PLC0415
+        from worker.methods import together  # noqa: PLC0415
     except ImportError as error:
         raise _no_library(setup, error) from error
-    hidden = hide(setup, figures, seed, method_of(solve, setup.layout))
+    hidden = hide(setup, figures, seed, together(setup.layout))
     laid = {name: play_hidden(hidden, player, seed) for name, player in players.items()}
     return _of_hidden({name: (hidden, own) for name, own in laid.items()})
 
@@ -139,16 +134,13 @@ def score_pictured(run: Run, figures: Sequence[Figure], seed: int) -> Scored:
     """
     setup = run.setup
     try:
+        from tangram_vision.silhouettes import UNLEARNED  # noqa: PLC0415
         from worker.hidden import hide, play_hidden  # noqa: PLC0415
-        from worker.methods import learned_method, method_of  # noqa: PLC0415
+        from worker.methods import learned_method  # noqa: PLC0415
     except ImportError as error:
         raise _no_library(setup, error) from error
     own, player = learned_method(run), exact_policy(setup.layout, setup.sim)
-    methods = {
-        RUN: own,
-        "largest first": replace(own, values=None),
-        "solver": method_of("solver", setup.layout),
-    }
+    methods = {RUN: own, "largest first": replace(own, values=None), "search": UNLEARNED}
     every = {name: hide(setup, figures, seed, method) for name, method in methods.items()}
     return _of_hidden(
         {name: (hidden, play_hidden(hidden, player, seed)) for name, hidden in every.items()}

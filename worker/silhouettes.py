@@ -24,7 +24,6 @@ from tangram_sim.game_drawing import tiles
 from tangram_sim.layout import Layout
 from tangram_sim.settings import refuse_ignored
 from tangram_sim.targets import has_all_tans, turned_figure
-from worker.config import BY_BEAM, TOGETHER
 from worker.puzzles import Figure, reach_beyond
 from worker.views import outlined
 
@@ -55,16 +54,13 @@ class Shown:
     told: str
 
 
-def read_silhouette(
-    name: str, setup: Setup, count: int = 1, solve: str = TOGETHER, out: Path | None = None
-) -> Shown:
+def read_silhouette(name: str, setup: Setup, count: int = 1, out: Path | None = None) -> Shown:
     """A silhouette, filled with a run's tokens.
 
     Args:
         name: of a file, or of a puzzle of the library.
         setup: the run.
         count: of different ways to fill it, at most.
-        solve: who finds them, see `worker.config.SOLVERS`.
         out: a PNG file for the best attempt where nothing fills it; None is none.
 
     Raises:
@@ -74,7 +70,7 @@ def read_silhouette(
     try:
         # Only here: other targets need neither.
         from tangram_vision.silhouette_files import fill_silhouette  # noqa: PLC0415
-        from worker.methods import method_of  # noqa: PLC0415
+        from worker.methods import together  # noqa: PLC0415
     except ImportError as error:
         raise ConfigError(
             f"silhouette needs OpenCV and shapely ({error}): install opencv-python-headless and "
@@ -83,9 +79,7 @@ def read_silhouette(
     source, layout = f"silhouette={name}", setup.layout
     if setup.fills and count > 1:
         refuse_ignored(f"solutions={count}", "an agent of outlines", "name another run")
-    if solve in BY_BEAM and count > 1:
-        refuse_ignored(f"solutions={count}", f"solve={solve}, which finds one", "set solve=solver")
-    method = method_of(solve, layout)
+    method = together(layout)
     drawn = fill_silhouette(name, source, layout, setup.tokens.scale, SECONDS, count, method)
     laid = [one.found for one in drawn.filled if one.found is not None and one.solved]
     if not laid:

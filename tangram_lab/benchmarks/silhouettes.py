@@ -31,7 +31,7 @@ from tangram_sim.world import World, make_world
 from tangram_vision.levels import coverage
 from tangram_vision.silhouette_pictures import fill_picture
 from tangram_vision.silhouettes import SOLVED, Filled, Method, covered, fill_outline
-from worker.methods import method_of
+from worker.methods import together
 
 SECONDS = 5.0  # of processor time for each figure
 TURNS = 8
@@ -53,7 +53,7 @@ def run_silhouettes(scenes: int, seed: int, out: Path | None) -> int:
     figures = list(figures_of(layout, scenes, seed))
     outlined = list(_outlined(layout, figures))
     rows = [row_of("exact outline", layout, figures, outlined)]
-    method = method_of("together", layout)
+    method = together(layout)
     for pixels, picture in CAMERAS:
         title = f"{pixels} px {picture}"
         sim = SimConfig(arena=ARENA, pixels=pixels, picture=picture)

@@ -15,7 +15,7 @@ from tangram_sim.connected import sample_connected
 from tangram_sim.dissections import Budget, Dissection, Laid, Search, Tokens
 from tangram_sim.layout import Layout, TokensConfig, make_layout
 from tangram_vision.silhouettes import (
-    TOGETHER,
+    UNLEARNED,
     _alike,
     attempt_outline,
     covered,
@@ -165,11 +165,11 @@ def test_tokens_that_lie_on_each_other_are_no_better_attempt() -> None:
     one = [Laid(large, False, np.zeros(3))]
     two = [*one, Laid(large, False, np.array([0.05, 0.0, 0.0]))]
     for tried in ([one, two], [two, one]):
-        found, iou = nearest_fill(side, LAYOUT, Budget(0.0), tried, TOGETHER)
+        found, iou = nearest_fill(side, LAYOUT, Budget(0.0), tried, UNLEARNED)
         assert found is not None
         assert len(found.laid) == 1
         assert iou == pytest.approx(0.25, abs=0.01)
-    both, more = nearest_fill(side, LAYOUT, Budget(0.0), [two], TOGETHER)
+    both, more = nearest_fill(side, LAYOUT, Budget(0.0), [two], UNLEARNED)
     assert both is not None
     assert more > 0.26
 

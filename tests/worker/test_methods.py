@@ -1,6 +1,7 @@
-"""Who finds how silhouettes are filled."""
+"""How silhouettes are filled, and by whom."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,6 @@ from tangram_agent.config import AgentConfig
 from tangram_agent.runs import load_run
 from tangram_sim.areas import Area
 from tangram_sim.dissections import Budget, Search, Tokens
-from tangram_sim.errors import ConfigError
 from tangram_sim.puzzles import library
 from tangram_sim.rings import covered_area
 from tangram_sim.targets import placement
@@ -19,9 +19,9 @@ from tangram_vision.silhouettes import Method
 from tests.sim.builders import SEVEN, TRIO, layout_of
 from tests.worker.test_hidden import OUTLINE, game
 from worker.baselines import exact_policy
-from worker.config import EvalConfig, PlayConfig
+from worker.config import EvalConfig
 from worker.evaluate import evaluate_run
-from worker.methods import Learned, learned_method, method_of
+from worker.methods import Learned, learned_method, together
 from worker.puzzles import find_figures
 from worker.scores import RUN, score_hidden
 from worker.silhouettes import read_silhouette
@@ -32,23 +32,9 @@ def told(method: Method) -> tuple[bool, int, bool]:
 
 
 @pytest.mark.fast
-@pytest.mark.parametrize(
-    ("solve", "seven", "three"),
-    [
-        ("together", (True, 12, True), (True, 12, False)),
-        ("solver", (True, 12, False), (True, 12, False)),
-        ("beam", (False, 12, True), None),
-        ("agent", (False, 1, True), None),
-    ],
-)
-def test_methods(solve: str, seven: Any, three: Any) -> None:
-    """Tokens that nobody learned to fill with are laid by size."""
-    assert told(method_of(solve, layout_of(*SEVEN, scale=1.7))) == seven
-    if three is not None:
-        assert told(method_of(solve, layout_of(*TRIO, scale=1.0))) == three
-        return
-    with pytest.raises(ConfigError, match=f"^solve={solve} needs an agent .* set solve=solver"):
-        method_of(solve, layout_of(*TRIO, scale=1.0))
+def test_tokens_that_nobody_learned_to_fill_with_are_laid_by_size() -> None:
+    assert told(together(layout_of(*SEVEN, scale=1.7))) == (True, 12, True)
+    assert told(together(layout_of(*TRIO, scale=1.0))) == (True, 12, False)
 
 
 @pytest.mark.fast
@@ -71,24 +57,21 @@ def test_values_are_those_of_the_agent_whatever_the_scale() -> None:
 
 
 @pytest.mark.fast
-@pytest.mark.parametrize(("solve", "by"), [("together", "search"), ("beam", "beam")])
-def test_it_is_told_who_filled_what(solve: str, by: str) -> None:
+@pytest.mark.parametrize(("searches", "by"), [(True, "search"), (False, "beam")])
+def test_it_is_told_who_filled_what(
+    searches: bool, by: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    method = replace(together(game(OUTLINE).layout), search=searches)
+    monkeypatch.setattr("worker.methods.together", lambda _: method)
     made = game(OUTLINE)
     figures = find_figures("test", made, ["heart", "swan"]).figures
     formula = exact_policy(made.layout, made.sim)
-    scored = score_hidden(made, figures, {RUN: formula}, 0, solve)
+    scored = score_hidden(made, figures, {RUN: formula}, 0)
     assert scored.means[RUN]["filled_by"] == {"search": 0, "beam": 0} | {by: 2}
     assert [one["filled_by"] for one in scored.puzzles] == [by, by]
     assert scored.means[RUN]["share_solved_iou"] == 1.0
-
-
-@pytest.mark.fast
-def test_a_drawing_is_filled_by_who_is_named() -> None:
-    setup = load_run("pretrained/tangram7").setup
-    assert read_silhouette("swan", setup, solve="beam").told.startswith("filled by the beam in ")
-    assert read_silhouette("swan", setup, solve="solver").told.startswith("filled by the search ")
-    with pytest.raises(ConfigError, match=r"solutions=2 changes nothing with solve=beam, which"):
-        read_silhouette("swan", setup, 2, solve="beam")
+    shown = read_silhouette("swan", load_run("pretrained/tangram7").setup)
+    assert shown.told.startswith(f"filled by the {by} in ")
 
 
 FILLER = "pretrained/tangram7_silhouette"
@@ -104,10 +87,10 @@ def test_an_agent_of_outlines_fills_pictures_itself(tmp_path: Path) -> None:
     report = json.loads(out.read_text())
     assert report["filled_by"] == {"search": 0, "beam": 2}
     assert report["share_solved_iou"] == 1.0
-    largest, solver = (report["baselines"][name] for name in ("largest first", "solver"))
+    largest, search = (report["baselines"][name] for name in ("largest first", "search"))
     assert largest["filled_by"]["search"] == 0
     assert largest["search_seconds"] != report["search_seconds"]
-    assert solver["filled_by"] == {"search": 2, "beam": 0}
+    assert search["filled_by"] == {"search": 2, "beam": 0}
 
 
 @pytest.mark.fast
@@ -137,29 +120,3 @@ def test_a_run_fills_by_as_wide_a_beam_as_it_looks_ahead(settings: Any, width: i
     run = load_run(FILLER)
     method = learned_method(run.with_settings({"agent": settings}) if settings else run)
     assert told(method) == (False, width, True)
-
-
-@pytest.mark.fast
-def test_a_run_that_fills_outlines_asks_nobody() -> None:
-    config = EvalConfig(FILLER, puzzle=("heart",), solve="beam", changes=SHOWN)
-    with pytest.raises(ConfigError, match="^solve=beam changes nothing with a run that fills "):
-        evaluate_run(config)
-
-
-@pytest.mark.fast
-@pytest.mark.parametrize(
-    ("kind", "settings", "message"),
-    [
-        (EvalConfig, {"solve": "beam"}, "^solve=beam changes nothing with puzzle=null"),
-        (
-            EvalConfig,
-            {"solve": "solver", "puzzle": ("cat",)},
-            "^solve=solver changes nothing with pieces that are shown, .* sim.observe=silhouette",
-        ),
-        (PlayConfig, {"solve": "beam"}, "^solve=beam changes nothing with silhouette=null"),
-        (PlayConfig, {"solve": "me", "silhouette": "cat"}, "solve must be one of together, solver"),
-    ],
-)
-def test_it_is_said_where_nobody_is_asked(kind: Any, settings: Any, message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        kind(run_dir="pretrained/tangram7", **settings)
