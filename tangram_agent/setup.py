@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from functools import cached_property
 from typing import Any, TypeVar, cast, get_origin, get_type_hints
@@ -68,7 +68,11 @@ class Setup:
             )
         if self.net.kind == "mlp":
             refuse_ignored("net.kind=mlp", "outlines", "set net.kind=mha")
-        self._refuse(_NOT_OF_OUTLINES, "outlines", "take another agent")
+        changed = _changed(agent)
+        for name in _NOT_OF_OUTLINES:
+            if name in changed:
+                given, usual = f"agent.{name}={told(changed[name])}", getattr(AgentConfig, name)
+                refuse_ignored(given, "outlines", "take another agent", usual)
         if agent.lookahead == "values" and agent.beam == 1:
             refuse_ignored("agent.lookahead=values", "agent.beam=1", "set agent.beam=12")
         for name, value in _changed(self.reward).items():
@@ -120,14 +124,6 @@ class Setup:
             refuse_ignored(f"reward.{name}={told(value)}", several, whole)
         if any(relabel.strategy == "future" for relabel in agent.hindsight):
             refuse_ignored("agent.hindsight.strategy=future", several, "use final")
-
-    def _refuse(self, names: Iterable[str], because: str, remedy: str) -> None:
-        """Refuse settings of the agent that are not the default."""
-        changed = _changed(self.agent)
-        for name in names:
-            if name in changed:
-                usual = getattr(AgentConfig, name)
-                refuse_ignored(f"agent.{name}={told(changed[name])}", because, remedy, usual)
 
     @cached_property
     def layout(self) -> Layout:

@@ -12,7 +12,6 @@ from tangram_sim.layout import Layout
 
 # Pairs of pieces that are looked at together: more no longer fit into a core's cache.
 _MAX_PAIRS = 8192
-_NO_EDGE = 1e-9  # length, of corners that are repeated
 
 
 def area(polygons: Floats) -> Floats:
@@ -218,22 +217,3 @@ def outlines_at(body: Floats, poses: Floats, flipped: Bools) -> Floats:
     turned = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
     moved: Floats = turned + poses[:, None, :2]
     return moved
-
-
-def separations(first: Floats, second: Floats) -> tuple[Floats, Complex]:
-    """The shortest ways by which the second ones of convex polygons (B, C, 2) come apart.
-
-    Returns:
-        How deep they overlap, (B,), 0 where they do not; directions, (B,) of length 1.
-    """
-    # Corners before rows: numpy is several times slower along short axes.
-    both = [np.ascontiguousarray(_complex(polygons).T) for polygons in (first, second)]
-    edges = np.concatenate([np.roll(corners, -1, axis=0) - corners for corners in both])
-    length = np.abs(edges)
-    along = edges / np.maximum(length, _NO_EDGE)
-    one, other = ((along.conj()[:, None] * corners).imag for corners in both)
-    gaps = one.max(axis=1) - other.min(axis=1), other.max(axis=1) - one.min(axis=1)
-    gap = np.where(np.tile(length, (2, 1)) > _NO_EDGE, np.concatenate(gaps), np.inf)
-    best, rows = gap.argmin(axis=0), np.arange(len(first))
-    direction = 1j * np.concatenate([along, -along])[best, rows]
-    return np.maximum(gap[best, rows], 0.0), direction

@@ -17,8 +17,6 @@ import numpy as np
 from tangram_sim.arrays import Bools, Floats, Ints, Pixels
 from tangram_sim.layout import Layout
 
-SURE = 0.5  # confidence from which a token counts as seen
-PILED = 0.7  # most confidence in one that touches others: their edges are lost
 _STILL = 0.03  # radians, and share of a token's radius, up to which nothing moved
 
 
@@ -29,23 +27,14 @@ class Look:
     Attributes:
         poses: (K, 3) x, y and angle of the tokens, alike ones in any order.
         flipped: (K,) which lie on their other side.
-        confidence: (K,) in [0, 1]: 0 of those of which nothing is known, whose poses say nothing,
-            and from `SURE` on of those that surely lie there.
+        known: (K,) which lie there, or could lie otherwise as well; poses of others say nothing.
+        sure: (K,) those of them that surely lie there.
     """
 
     poses: Floats
     flipped: Bools
-    confidence: Floats
-
-    @property
-    def known(self) -> Bools:
-        """(K,) tokens that lie there, or could lie otherwise as well."""
-        return np.asarray(self.confidence > 0.0)
-
-    @property
-    def sure(self) -> Bools:
-        """(K,) tokens that surely lie there."""
-        return np.asarray(self.confidence >= SURE)
+    known: Bools
+    sure: Bools
 
 
 class Eye(Protocol):
@@ -60,11 +49,11 @@ class Sight:
     Attributes:
         corners: (B, V, 2) of the tokens; of one that is missing where it lay last, or was told to
             go, and before it was ever found in the middle of the arena.
-        confidence: (B, K) how surely tokens are seen, see `Look`.
+        missing: (B, K) tokens that are not found, or not surely.
         away: (B, K) tokens not surely seen that should have left the picture by what they were
             told.
         goals: (B, V, 2) of the target; a piece that is not found lies where its token began.
-        goals_confidence: (B, K) how surely its pieces are seen.
+        goals_sure: (B, K) which of its pieces are surely seen.
     """
 
     def __init__(self, layout: Layout, eye: Eye, count: int, arena: float) -> None:
@@ -76,15 +65,10 @@ class Sight:
         ]
         self._poses: Floats = np.zeros((count, layout.tokens, 3))
         self._flipped: Bools = np.zeros((count, layout.tokens), np.bool_)
-        self.confidence: Floats = np.zeros((count, layout.tokens))
+        self.missing: Bools = np.ones_like(self._flipped)
         self.away: Bools = np.zeros_like(self._flipped)
         self.corners: Floats = layout.corners(self._poses)
-        self.goals, self.goals_confidence = self.corners, self.confidence
-
-    @property
-    def missing(self) -> Bools:
-        """(B, K) tokens that are not found, or not surely."""
-        return np.asarray(self.confidence < SURE)
+        self.goals, self.goals_sure = self.corners, ~self.missing
 
     def begin(self, targets: Pixels, states: Pixels, goals: Floats | None = None) -> None:
         """Look at pictures (B, P, P) of targets and starts, or of starts where goals are known.
@@ -95,19 +79,19 @@ class Sight:
             goals: (B, V, 2) as a look before has found them.
         """
         self._poses[:], self._flipped[:] = 0.0, False
-        self.confidence = np.zeros_like(self.confidence)
+        self.missing = np.ones_like(self.missing)
         count = len(self._poses)
         self.follow(states, np.zeros(count, np.int64), np.zeros((count, 3)))
         if goals is not None:
-            self.goals, self.goals_confidence = goals, np.ones_like(self.confidence)
+            self.goals, self.goals_sure = goals, np.ones_like(self.missing)
             return
-        poses, flipped, sure = self._poses.copy(), self._flipped.copy(), self.confidence.copy()
+        poses, flipped, sure = self._poses.copy(), self._flipped.copy(), ~self.missing
         for b, target in enumerate(targets):
             look = self._eye(target)
             known = look.known  # a piece that could lie otherwise as well is covered there, too
             poses[b, known], flipped[b, known] = look.poses[known], look.flipped[known]
-            sure[b] = look.confidence
-        self.goals, self.goals_confidence = self._layout.corners(poses, flipped), sure
+            sure[b] = look.sure
+        self.goals, self.goals_sure = self._layout.corners(poses, flipped), sure
 
     def follow(self, states: Pixels, moved: Ints, ways: Floats) -> None:
         """Look at pictures (B, P, P) after tokens have moved.
@@ -118,11 +102,11 @@ class Sight:
             ways: (B, 3) that they were told to go: x, y and turn.
         """
         # What was given away before stays as it is.
-        self.confidence = self.confidence.copy()
+        self.missing = self.missing.copy()
         for b, (state, token) in enumerate(zip(states, moved.tolist(), strict=True)):
             stayed = ~self.missing[b]
             stayed[token] &= not ways[b].any()
-            before = Look(self._poses[b], self._flipped[b], stayed.astype(float))
+            before = Look(self._poses[b], self._flipped[b], stayed, stayed)
             self._take(b, self._eye(state, before), token, ways[b])
         self.corners = self._layout.corners(self._poses, self._flipped)
         beyond = np.abs(self.corners).max(axis=2) > self._half
@@ -147,7 +131,7 @@ class Sight:
 
     def _take(self, b: int, look: Look, moved: int, way: Floats) -> None:
         """Take over what was seen of an environment, after a token was told to go a way (3,)."""
-        confidence, gone = np.zeros_like(self.confidence[b]), self.missing[b]
+        missing, gone = np.ones_like(self.missing[b]), self.missing[b]
         for alike in self._alike:
             shown = alike[look.known[alike]]
             # Those that did not move say which one did.
@@ -159,10 +143,10 @@ class Sight:
                     told = float(way[2]) if token == moved else 0.0
                     self._poses[b, token] = self._near(b, token, look.poses[one], told)
                     self._flipped[b, token] = look.flipped[one]
-                    confidence[token] = look.confidence[one]
+                    missing[token] = not look.sure[one]
                 elif token == moved:
                     self._poses[b, token] += way
-        self.confidence[b] = confidence
+        self.missing[b] = missing
 
     def _near(self, b: int, token: int, pose: Floats, told: float) -> Floats:
         """A pose (3,) of a token at that of the turns that look alike which it made."""

@@ -1,7 +1,7 @@
 """A rough outline -> tokens that nearly fill it, by a beam: corners of it may be wrong, or lost.
 
-Tokens lie where `tangram_sim.loose` has them, and nothing is searched through: the states that are
-worth most are followed.
+Tokens lie where `tangram_vision.loose` has them, and nothing is searched through: the states that
+are worth most are followed.
 
 Legend: n states, S different shapes.
 """
@@ -14,7 +14,7 @@ import numpy as np
 from tangram_sim.areas import Area, valid
 from tangram_sim.arrays import Floats
 from tangram_sim.dissections import Budget, Laid, Tokens, less, without
-from tangram_sim.loose import LoosePlaces
+from tangram_vision.loose import LoosePlaces
 
 # (what is left to fill, and how many tokens of each shape, of n states) -> (n,) how surely these
 # fill that, as logits.

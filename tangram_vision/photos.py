@@ -30,6 +30,7 @@ _SMALL = 6.0  # pixels: the root of the smallest token's area that is enough
 _SPOTS = 200  # areas that are looked at
 _DIRT = 0.4  # of the smallest token's share of all
 _MARGIN = 8  # pixels around the tokens
+_AROUND = 3  # pixels around one area
 _MANY = 40  # areas whose shapes are told
 _SIZE = 1.6  # times that an area may be larger or smaller than the token that it looks like
 _LIKE = 0.25  # moments nearer than this make an area look like a token
@@ -100,16 +101,13 @@ class Shade:
     back: Floats
 
 
-def find_silhouette(
-    picture: Image.Image, layout: Layout, source: str, tilted: bool = True
-) -> Shade:
+def find_silhouette(picture: Image.Image, layout: Layout, source: str) -> Shade:
     """The silhouette that a photograph shows, of one part or of several.
 
     Args:
         picture: the photograph.
         layout: the tokens that are to fill it.
         source: what errors call the photograph.
-        tilted: whether the camera may have looked aslant, which is then corrected.
 
     Raises:
         ConfigError: it shows none.
@@ -117,7 +115,7 @@ def find_silhouette(
     cover = _coverage(np.asarray(picture.convert("L")))
     spots = _spots(cover, layout, source)
     part, corner = spots.cut_out()
-    above, back = from_above(part) if tilted else (part, np.eye(3))
+    above, back = from_above(part)
     size = np.diag([len(above), len(above), 1.0])
     return Shade(_smaller(above, _PIXELS[0]), shift(*corner) @ back @ size)
 
@@ -141,7 +139,7 @@ def _seen(cover: Singles, layout: Layout, view: float) -> Seen | None:
         small = _smaller(cover, pixels)
         levels = np.round(_GROUND + (_TOKEN - _GROUND) * small).astype(np.uint8)
         seen = see(levels, layout, view)
-        if np.all(seen.confidence > 0.0):
+        if seen.known.all():
             return seen
     return None
 
@@ -242,10 +240,10 @@ def _surface(y: Floats, x: Floats) -> Floats:
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
 
 
-def _window(stats: Ints, shape: tuple[int, ...], margin: int = 3) -> tuple[slice, slice]:
+def _window(stats: Ints, shape: tuple[int, ...]) -> tuple[slice, slice]:
     left, top, width, height = (int(stats[i]) for i in range(4))
-    rows = slice(max(0, top - margin), min(shape[0], top + height + margin))
-    return rows, slice(max(0, left - margin), min(shape[1], left + width + margin))
+    rows = slice(max(0, top - _AROUND), min(shape[0], top + height + _AROUND))
+    return rows, slice(max(0, left - _AROUND), min(shape[1], left + width + _AROUND))
 
 
 @dataclass(frozen=True, eq=False)

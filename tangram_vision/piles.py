@@ -157,13 +157,13 @@ class _Search:
         near = [
             k
             for k, kind in enumerate(self._kinds)
-            if left[kind.shape] and far[0, k] < 0.22 and self._is_area(area, k, 2.0)
+            if left[kind.shape] and far[0, k] < 0.22 and self._is_area(area, k)
         ]
         near.sort(key=lambda k: float(far[0, k]))
         return [(k, np.array([centre.real, centre.imag, turn[0, k]])) for k in near[:2]]
 
-    def _is_area(self, area: float, kind: int, times: float = 1.0) -> bool:
-        return abs(area - self._kinds[kind].area) < times * _AREA * self._kinds[kind].perimeter
+    def _is_area(self, area: float, kind: int) -> bool:
+        return abs(area - self._kinds[kind].area) < 2.0 * _AREA * self._kinds[kind].perimeter
 
     def _sums(self, area: float, left: tuple[int, ...], most: int) -> bool:
         """Whether an area may be that of two tokens that are left, or of a few more."""

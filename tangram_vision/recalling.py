@@ -37,7 +37,7 @@ def recalled(
         next(n for n, kind in enumerate(kinds) if token in kind.tokens and kind.flipped == side)
         for token, side in enumerate(before.flipped.tolist())
     ]
-    stay = before.known & before.sure & _covers([kinds[n] for n in names], poses, piles)
+    stay = before.sure & _covers([kinds[n] for n in names], poses, piles)
     return [names[token] for token in np.flatnonzero(stay)], poses[stay]
 
 

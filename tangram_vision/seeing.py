@@ -1,4 +1,4 @@
-"""One picture -> where each token of a known set lies, on which side, and how sure that is.
+"""One picture -> where each token of a known set lies, on which side, and whether that is sure.
 
 Blobs that look like one token are fitted at once; the others are searched for tokens that touch.
 All tokens are known, so what explains one blob leaves less for the others: all are explained
@@ -17,7 +17,7 @@ import numpy as np
 from tangram_sim.arrays import Complex, Floats, Ints, Pixels, Singles
 from tangram_sim.connected import MAX_PILE
 from tangram_sim.layout import Layout
-from tangram_sim.sight import PILED, SURE, Look
+from tangram_sim.sight import Look
 from tangram_vision.blobs import Blobs, find_blobs, likeness
 from tangram_vision.edges import refined
 from tangram_vision.kinds import Kind, kinds_of
@@ -27,7 +27,6 @@ from tangram_vision.ramps import fitted, ramps
 from tangram_vision.recalling import recalled
 from tangram_vision.samples import binary, settled
 
-_DOUBTFUL = 0.4  # of tokens that could as well lie otherwise
 _SMALLEST = 0.4  # of the smallest token: less is dirt
 _CLOSE = 0.15  # moments nearer than this to the nearest are compared by their edges
 _ROUGH = 0.7  # pixels that the edges of a token may be off, in the mean
@@ -54,12 +53,10 @@ class _Explained:
 
     Attributes:
         laid: its tokens.
-        sure: of all of them.
         doubtful: whether they could as well lie otherwise.
     """
 
     laid: Laid
-    sure: float
     doubtful: bool = False
 
 
@@ -76,7 +73,7 @@ def see(picture: Pixels, layout: Layout, arena: float, before: Look | None = Non
     kinds = kinds_of(layout, arena, pixels)
     cover = coverage(picture)
     poses, flipped = np.zeros((layout.tokens, 3)), np.zeros(layout.tokens, np.bool_)
-    confidence, count = np.zeros(layout.tokens), 0
+    known, sure, count = np.zeros_like(flipped), np.zeros_like(flipped), 0
     if cover is not None:
         puzzle = _puzzle(cover, kinds, Counter({kind.shape: len(kind.tokens) for kind in kinds}))
         count = len(puzzle.blobs)
@@ -86,11 +83,11 @@ def see(picture: Pixels, layout: Layout, arena: float, before: Look | None = Non
             for number, pose in zip(one.laid.kinds, one.laid.poses, strict=True):
                 token = left[kinds[number].shape].pop(0)
                 poses[token], flipped[token] = pose, kinds[number].flipped
-                confidence[token] = _DOUBTFUL if one.doubtful else one.sure
-    unit, seen = arena / pixels, confidence > 0.0
-    poses[seen, :2] = (poses[seen, :2] + (-pixels / 2.0, pixels / 2.0)) * unit
+                known[token], sure[token] = True, not one.doubtful
+    unit = arena / pixels
+    poses[known, :2] = (poses[known, :2] + (-pixels / 2.0, pixels / 2.0)) * unit
     poses[:, 2] = np.angle(np.exp(1j * poses[:, 2]))
-    return Seen(poses, flipped, confidence, count)
+    return Seen(poses, flipped, known, sure, count)
 
 
 def _puzzle(cover: Singles, kinds: Sequence[Kind], left: Counter[int]) -> "_Puzzle":
@@ -126,7 +123,7 @@ def _stayed(
     poses, differs = fitted([kinds[name] for name in names], poses, piles)
     if differs >= _DIFFERS:
         return None
-    return [*alone, _Explained(Laid(tuple(names), poses, differs), _sureness(differs))]
+    return [*alone, _Explained(Laid(tuple(names), poses, differs))]
 
 
 def _levels_at(cover: Singles, poses: Floats) -> Floats:
@@ -134,11 +131,6 @@ def _levels_at(cover: Singles, poses: Floats) -> Floats:
     column, row = poses[:, 0].astype(np.int64), (-poses[:, 1]).astype(np.int64)
     most = len(cover) - 1
     return cover[np.clip(row, 0, most), np.clip(column, 0, most)].astype(np.float64)
-
-
-def _sureness(differs: float) -> float:
-    """Of a pile that is explained but for such a share of it."""
-    return PILED - (PILED - SURE) * differs / _DIFFERS
 
 
 @dataclass
@@ -249,7 +241,6 @@ class _Puzzle:
         options = [
             _Explained(
                 best[0],
-                _sureness(best[0].differs),
                 len(best) > 1 and best[1].differs < best[0].differs + _ALIKE,
             )
             for best in sets.values()
@@ -286,10 +277,7 @@ class _Puzzle:
             own = [shapes[row] for row in best.tolist()]
             poses[best] = settled(own, poses[best], blobs.cover, blobs.base[blob[best]])
         return {
-            int(blob[row]): _Explained(
-                Laid((int(kind[row]),), poses[row : row + 1], 0.0),
-                float(1.0 - 0.5 * (spread[row] / _ROUGH) ** 2),
-            )
+            int(blob[row]): _Explained(Laid((int(kind[row]),), poses[row : row + 1], 0.0))
             for row in best.tolist()
         }
 

@@ -175,15 +175,12 @@ def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
     source, names = source_and_names(config.puzzle or ())
     setup = run.setup
     found = find_figures(source, setup, names, config.turns, config.skip_invalid)
-    given = setup, found.figures, policies(run), config.seed
     if setup.fills and setup.sim.observe == "silhouette_pictures":
         scored = score_pictured(run, found.figures, config.seed)
-    elif setup.fills:
-        scored = score_outlines(*given)
-    elif setup.sim.observe in SILHOUETTES:
-        scored = score_hidden(*given)
     else:
-        scored = score_puzzles(*given)
+        shown = score_hidden if setup.sim.observe in SILHOUETTES else score_puzzles
+        score = score_outlines if setup.fills else shown
+        scored = score(setup, found.figures, policies(run), config.seed)
     scores, lines = scored.means, scored.puzzles
     console = Console(highlight=False)
     count = len(found.figures)

@@ -17,7 +17,6 @@ from tangram_sim.arrays import Bools, Floats, Pixels, Singles
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.lens import View
 from tangram_sim.seeding import episode_generator
-from tangram_sim.sight import SURE
 from tangram_sim.targets import Sides
 
 AT_ONCE = 32
@@ -174,7 +173,7 @@ def _play_group(
     rows, seen = slice(first, first + env.count), played.episodes
     seen.goals[rows], played.goals[rows] = env.seen_goals, env.goals
     if env.sight is not None and seen.goals_seen is not None:
-        seen.goals_seen[rows] = env.sight.goals_confidence >= SURE
+        seen.goals_seen[rows] = env.sight.goals_sure
     began = time.perf_counter()
     for t in range(env.horizon):
         if not go_on():

@@ -105,12 +105,6 @@ def ask_status(
     )
 
 
-def ask_alone(connect: str, patience_s: float = PATIENCE_S) -> RunStatus:
-    """As `ask_status`, for who has no context of sockets."""
-    with zmq.Context() as context:
-        return ask_status(connect, context, patience_s)
-
-
 def status_rows(status: RunStatus) -> list[tuple[str, str]]:
     """What people want to know of a run that goes on, as names and texts."""
     numbers = defaultdict(lambda: UNKNOWN, status.numbers)

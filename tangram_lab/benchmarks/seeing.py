@@ -158,7 +158,7 @@ def _world(layout: Layout, sim: SimConfig) -> Iterator[World]:
 
 def _same(world: World, seen: Seen, picture: Pixels) -> bool:
     """Whether all tokens, where they were seen, give the same picture."""
-    if (seen.confidence == 0.0).any():
+    if not seen.known.all():
         return False
     world.place(seen.poses, seen.flipped)
     ground = picture.max().astype(float)

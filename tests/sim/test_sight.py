@@ -22,8 +22,7 @@ def look(poses: Iterable[tuple[float, float, float] | None], doubtful: int | Non
     every = list(poses)
     known = np.array([pose is not None for pose in every])
     there = np.array([pose or (0.0, 0.0, 0.0) for pose in every])
-    confidence = np.where(np.arange(3) == doubtful, 0.4, 1.0) * known
-    return Look(there, np.zeros(3, np.bool_), confidence)
+    return Look(there, np.zeros(3, np.bool_), known, known & (np.arange(3) != doubtful))
 
 
 def sight(*looks: Look) -> Sight:
@@ -75,14 +74,14 @@ def test_a_piece_of_the_target_that_is_missing_lies_where_its_token_begins() -> 
     seen = sight(look(START), look([*GOAL[:2], None]))
     seen.begin(PICTURES, PICTURES)
     assert places(seen.goals[0]) == [*[[x, y] for x, y, _ in GOAL[:2]], [0.5, -0.5]]
-    assert seen.goals_confidence.tolist() == [[1.0, 1.0, 0.0]]
+    assert seen.goals_sure.tolist() == [[True, True, False]]
 
 
 def test_a_piece_of_the_target_that_could_lie_otherwise_is_covered_where_it_was_seen() -> None:
     seen = sight(look(START), look(GOAL, doubtful=0))
     seen.begin(PICTURES, PICTURES)
     assert places(seen.goals[0]) == [[x, y] for x, y, _ in GOAL]
-    assert seen.goals_confidence.tolist() == [[0.4, 1.0, 1.0]]
+    assert seen.goals_sure.tolist() == [[False, True, True]]
 
 
 def test_a_hand_takes_the_token_that_lies_where_one_is_seen() -> None:

@@ -112,7 +112,7 @@ def test_tokens_that_touch_are_seen(names: tuple[str, ...]) -> None:
         seen = see(grey(layout.corners(poses), layout, 128), layout, ARENA)
         assert seen.blobs == 1
         off = errors(layout, poses, sides, seen)
-        # What could as well lie otherwise is told with low confidence.
+        # What could as well lie otherwise is not told as sure.
         every.append((off < (0.01, 2.0)).all() or not seen.sure.all())
         assert np.isinf(off).any() or (off < (0.01, 2.0)).all()
     assert all(every)
@@ -124,7 +124,7 @@ def test_what_has_two_explanations_is_doubtful() -> None:
     other = layout_of("square", scale=0.6)
     picture = grey(other.corners(np.array([[0.1, 0.2, 0.5]])), other, 128)
     seen = see(picture, layout, ARENA)
-    assert (seen.confidence > 0.0).all()
+    assert seen.known.all()
     assert not seen.sure.any()
 
 
@@ -134,7 +134,7 @@ def test_which_of_two_blobs_is_a_pile_is_doubtful() -> None:
     other = layout_of("medium_triangle", "medium_triangle", scale=0.6)
     places = np.array([[0.4, 0.2, 0.5], [-0.4, 0.2, 2.0]])
     seen = see(grey(other.corners(places), other, 128), layout, ARENA)
-    assert (seen.confidence > 0.0).all()
+    assert seen.known.all()
     assert not seen.sure.any()
 
 
@@ -172,7 +172,7 @@ def before(poses: Floats, flipped: Any, *moved: int) -> Look:
     """Of tokens that moved nothing is known: they are said to lie in the middle of the others."""
     stayed = ~np.isin(np.arange(7), moved)
     told = np.where(stayed[:, None], poses, poses[stayed].mean(axis=0))
-    return Look(told, flipped, stayed.astype(float))
+    return Look(told, flipped, stayed, stayed)
 
 
 @pytest.mark.parametrize("moved", [0, 2, 4, 5, 6])
@@ -203,7 +203,8 @@ def test_what_was_known_and_is_wrong_is_forgotten() -> None:
     poses, flipped = lying("swan")
     picture = grey(SEVEN_TANS.corners(poses, flipped), SEVEN_TANS, 128)
     seen = see(picture, SEVEN_TANS, ARENA, before(*lying("heart")))
-    np.testing.assert_array_equal(seen.confidence, see(picture, SEVEN_TANS, ARENA).confidence)
+    alone = see(picture, SEVEN_TANS, ARENA)
+    np.testing.assert_array_equal((seen.known, seen.sure), (alone.known, alone.sure))
 
 
 def test_what_lies_alone_is_seen_alike_whatever_was_known() -> None:
@@ -227,7 +228,7 @@ def test_what_is_not_to_be_seen_is_missing(shown: str) -> None:
     }
     seen = see(pictures[shown], layout, ARENA)
     assert not seen.sure.any()
-    assert seen.confidence[0] == 0.0
+    assert not seen.known[0]
 
 
 @pytest.mark.parametrize("beyond", [1.0, 3.0])

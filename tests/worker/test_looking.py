@@ -17,7 +17,6 @@ from tangram_sim.batch import BatchedEnv
 from tangram_sim.errors import ConfigError
 from tangram_sim.kinematics import KinematicWorld
 from tangram_sim.lens import Disturbance
-from tangram_sim.sight import SURE
 from worker.looking import environments
 from worker.rollout import Rollout
 
@@ -131,7 +130,7 @@ def test_in_a_stage_the_tokens_that_lie_on_their_targets_are_those_that_are_plac
         env.reset([np.random.default_rng(i) for i in range(8)])
         seen, goals = task.layout.bases(env.seen), task.layout.bases(env.seen_goals)
         gap = np.linalg.norm(seen[:, :, None] - goals[:, None], axis=-1).min(axis=2)
-        sure = ~(env.sight.missing | (env.sight.goals_confidence < SURE).any(axis=1, keepdims=True))
+        sure = ~env.sight.missing & env.sight.goals_sure.all(axis=1, keepdims=True)
         assert sure.sum() > 16
         np.testing.assert_array_equal((gap < 0.02)[sure], env.placed[sure])
 

@@ -5,7 +5,7 @@ import pytest
 from shapely import Polygon
 
 from tangram_sim.dissections import Budget, Search, Tokens
-from tangram_sim.loose import LoosePlaces
+from tangram_vision.loose import LoosePlaces
 from tests.sim.builders import SEVEN, layout_of
 
 pytestmark = pytest.mark.fast
