@@ -16,10 +16,11 @@ from torch import nn
 
 from tangram_agent.filling import Filling, Rests
 from tangram_agent.setup import Setup
+from tangram_agent.types import Choice
 from tangram_agent.values import Corners
 from tangram_sim.actions import velocities_of
 from tangram_sim.areas import Area, polygons
-from tangram_sim.arrays import Bools, Floats, Ints, Singles
+from tangram_sim.arrays import Bools, Floats
 from tangram_sim.config import MAX_OVERLAP
 from tangram_sim.dissections import Laid, Place
 from tangram_sim.errors import ConfigError
@@ -29,15 +30,6 @@ from tangram_sim.rings import covered_area
 
 _ANGLES = 8  # that a token is tried at where nothing fits
 _FREE = 0.5  # of what a token may cover of others
-
-
-@dataclass(frozen=True, eq=False)
-class Step:
-    """What B environments play: tokens (B,), whether to turn them over (B,), velocities (B, 3)."""
-
-    token: Ints
-    flip: Bools
-    velocity: Singles
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +77,7 @@ class Filler:
         goals: Floats,
         anything: Bools,
         generators: Sequence[np.random.Generator] = (),
-    ) -> Step:
+    ) -> Choice:
         """What to play.
 
         Args:
@@ -124,7 +116,7 @@ class Filler:
             flip[b] = laid is not None and bool(sides[b, token[b]] != laid.flipped)
         way = wanted - here[np.arange(count), token]
         velocity = np.clip(velocities_of(way, self._sim), -1.0, 1.0).astype(np.float32)
-        return Step(token, flip, velocity)
+        return Choice(token, flip, velocity)
 
     def _live(self, rest: Area, left: tuple[int, ...]) -> list[Place]:
         return [place for place in self._filling.places(rest, left) if not place.dead]

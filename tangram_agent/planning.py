@@ -18,9 +18,9 @@ from tangram_agent.motion import Belief, motions_of
 from tangram_agent.networks import Networks
 from tangram_agent.pairs import PairGraph, Pairs
 from tangram_agent.setup import Setup
-from tangram_agent.types import Past
+from tangram_agent.types import Choice, Past
 from tangram_sim.actions import velocities_of
-from tangram_sim.arrays import Bools, Floats, Ints, Singles
+from tangram_sim.arrays import Bools, Floats, Singles
 
 _SHORT_LIST = 8  # proposals of an environment that are valued for all pieces
 
@@ -100,23 +100,6 @@ class Scene:
         return (self.flipped[c.row, c.token] - c.flip).abs()
 
 
-@dataclass(frozen=True, eq=False)
-class Choice:
-    """What B environments play.
-
-    Attributes:
-        token: (B,) which token.
-        flip: (B,) whether it is turned over.
-        pose: (B, 3) where it is to go.
-        velocity: (B, 3) in [-1, 1], the command that takes it there.
-    """
-
-    token: Ints
-    flip: Bools
-    pose: Floats
-    velocity: Singles
-
-
 class Planner:
     """Chooses token, side and pose."""
 
@@ -149,13 +132,8 @@ class Planner:
             candidates, pose = self._short_list(scene, _open(placed))
             velocity, reached = self._reached(scene, candidates, pose, belief)
             best = self._best(scene, candidates, reached)
-        chosen, pose, velocity = candidates.at(best), pose[best], velocity[best]
-        return Choice(
-            token=chosen.token.numpy(),
-            flip=chosen.flip.numpy() > 0.5,
-            pose=pose.numpy().astype(np.float64),
-            velocity=velocity.numpy(),
-        )
+        chosen = candidates.at(best)
+        return Choice(chosen.token.numpy(), chosen.flip.numpy() > 0.5, velocity[best].numpy())
 
     def velocity_to(self, pose: Floats, wanted: Floats) -> Singles:
         """Commands (B, 3) that take tokens from poses (B, 3) to others, in worlds not yet seen."""

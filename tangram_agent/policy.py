@@ -15,7 +15,7 @@ from tangram_agent.networks import Networks, outline_network, travels
 from tangram_agent.planning import Planner
 from tangram_agent.scenes import Scenes, next_token
 from tangram_agent.setup import Setup
-from tangram_agent.types import Past, Weights
+from tangram_agent.types import Choice, Past, Weights
 from tangram_agent.weights import load_arrays, to_arrays
 from tangram_sim.actions import make_actions
 from tangram_sim.arrays import Floats, Singles
@@ -97,15 +97,10 @@ class Policy:
         if self._filler is not None:
             return self._filling(self._filler, corners, placed, goals)
         if self._planner is None:
-            token, velocity = self._velocity(corners, placed, goals)
-            flip = np.zeros(len(token), dtype=np.bool_)
-        else:
-            exact = np.asarray(corners, np.float64)
-            wanted = np.asarray(goals, np.float64)
-            flags = np.asarray(placed, np.bool_)
-            choice = self._planner.choose(exact, flags, wanted, past)
-            token, flip, velocity = choice.token, choice.flip, choice.velocity
-        return make_actions(token, velocity, flip, self.tokens, self.sim)
+            return self._actions(self._next(corners, placed, goals))
+        exact, flags = np.asarray(corners, np.float64), np.asarray(placed, np.bool_)
+        wanted = np.asarray(goals, np.float64)
+        return self._actions(self._planner.choose(exact, flags, wanted, past))
 
     def _filling(
         self,
@@ -120,19 +115,21 @@ class Policy:
         drawn = [generator.random() < share for generator in generators]
         anything = np.array(drawn) if drawn else np.zeros(len(corners), np.bool_)
         exact = np.asarray(corners, np.float64), np.asarray(placed, np.bool_)
-        step = filler.choose(*exact, np.asarray(outlines, np.float64), anything, generators)
-        return make_actions(step.token, step.velocity, step.flip, self.tokens, self.sim)
+        wanted = np.asarray(outlines, np.float64)
+        return self._actions(filler.choose(*exact, wanted, anything, generators))
 
-    def _velocity(
-        self, corners: Floats | Singles, placed: Flags, goals: Floats | Singles
-    ) -> tuple[npt.NDArray[np.int64], Singles]:
-        """The next token (B,) in the set's order, and its velocity (B, 3)."""
+    def _actions(self, choice: Choice) -> Singles:
+        """Actions (B, A) of what is chosen."""
+        return make_actions(choice.token, choice.velocity, choice.flip, self.tokens, self.sim)
+
+    def _next(self, corners: Floats | Singles, placed: Flags, goals: Floats | Singles) -> Choice:
+        """The next token in the set's order."""
         flags = _tensor(placed)
         token = next_token(flags)
         with torch.inference_mode():
             scenes = Scenes(_tensor(corners), flags, _tensor(goals), token)
             velocity, _ = self.network(scenes)
-        return token.numpy(), velocity.numpy()
+        return Choice(token.numpy(), np.zeros(len(token), np.bool_), velocity.numpy())
 
     def explore(
         self,
@@ -179,8 +176,7 @@ class Policy:
         wanted = generator.uniform(-1.0, 1.0, 3) * reach
         flip = self.sim.allow_flip and generator.choice((-1.0, 1.0)) > 0.0
         velocity = planner.velocity_to(here[None, token], wanted[None])
-        named, turned = np.array([token]), np.array([flip])
-        action: Singles = make_actions(named, velocity, turned, self.tokens, self.sim)[0]
+        action: Singles = self._actions(Choice(np.array([token]), np.array([flip]), velocity))[0]
         return action
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tangram_sim.arrays import Singles
+from tangram_sim.arrays import Bools, Ints, Singles
 
 Flags = npt.NDArray[np.uint8]
 
@@ -84,6 +84,21 @@ class Past:
     corners: Singles
     actions: Singles
     seen: Flags | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """What B environments play.
+
+    Attributes:
+        token: (B,) which token.
+        flip: (B,) whether it is turned over.
+        velocity: (B, 3) in [-1, 1], the command that takes it where it is to go.
+    """
+
+    token: Ints
+    flip: Bools
+    velocity: Singles
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,7 @@ Scores = dict[str, Any]  # numbers, and `coverage_each` of the episodes
 
 # What is told of filled outlines: nothing of where a piece should lie.
 OF_AREAS = (
-    *("mean_reward", "mean_reward_camera", "raw_overlap", "raw_overlap_p10"),
+    *("mean_reward", "raw_overlap", "raw_overlap_p10"),
     *("coverage", "iou", "blocked", "refused", "actions_used"),
 )
 _COUNTS = ("wrong", "doubly_used", "refused", "blocked", "actions_used")

@@ -116,7 +116,6 @@ def test_the_best_of_all_is_played(
         ]
         _, pose, token, turned = max(every, key=lambda one: one[0])
         assert (choice.token[row], choice.flip[row]) == (token, turned)
-        np.testing.assert_allclose(choice.pose[row], pose, atol=1e-5)
         way = velocities_of((pose - made.layout.poses(corners[row])[token])[None], made.sim)[0]
         np.testing.assert_allclose(choice.velocity[row], way.clip(-1.0, 1.0), atol=1e-5)
 

@@ -10,9 +10,10 @@ import pytest
 from PIL import Image
 
 import worker.film as film_module
-from tangram_agent.filler import Filler, Step
+from tangram_agent.filler import Filler
 from tangram_agent.runs import load_changed, load_run
 from tangram_agent.setup import Setup
+from tangram_agent.types import Choice
 from tangram_sim.arrays import Floats
 from tangram_sim.errors import ConfigError, RunError
 from tangram_sim.geometry import outlines, pairs_overlap
@@ -189,10 +190,10 @@ def test_without_pyav_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatc
 def test_what_looks_ahead_plays_one_by_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
-    def stays(_: Filler, corners: Floats, *_more: object) -> Step:
+    def stays(_: Filler, corners: Floats, *_more: object) -> Choice:
         asked.append(len(corners))
         none = np.zeros(len(corners), np.int64)
-        return Step(none, none > 0, np.zeros((len(corners), 3), np.float32))
+        return Choice(none, none > 0, np.zeros((len(corners), 3), np.float32))
 
     monkeypatch.setattr(Filler, "choose", stays)
     run = load_run("pretrained/tangram7_silhouette")
