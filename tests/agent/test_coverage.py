@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 from shapely.geometry import Polygon
 
-from tangram_agent.coverage import (
-    Lying,
-    covered_share,
-    covering,
-    lying,
-    newly_covered,
-    worths,
-)
+from tangram_agent.coverage import Lying, covered_share, covering, lying, newly_covered, worths
 from tangram_sim.layout import TokensConfig, make_layout
 from tests.agent.pair_scenes import SEVEN, random_scene
 from tests.sim.builders import polygons

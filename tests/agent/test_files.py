@@ -8,7 +8,6 @@ import pytest
 
 from tangram_agent.files import check_writable, make_folders, write_whole
 from tangram_sim.errors import ConfigError, RunError
-from tests.agent.builders import watched_disk
 
 pytestmark = pytest.mark.fast
 
@@ -30,29 +29,6 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(
     assert list(target.parent.iterdir()) == [target]
     write_whole(target, b"new")
     assert target.read_bytes() == b"new"
-
-
-def test_bytes_are_on_the_disk_before_the_name_and_the_name_before_the_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A rename is durable only when its folder is synced."""
-    events = watched_disk(monkeypatch)
-    write_whole(tmp_path / "result.json", b"new")
-    file = (tmp_path / "result.json").stat().st_ino
-    assert events[1:] == [file, "renamed", tmp_path.stat().st_ino]
-
-
-@pytest.mark.parametrize("there", [0, 1, 2, 3])
-def test_a_new_folder_has_its_name_on_the_disk_and_so_have_those_above_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, there: int
-) -> None:
-    """Also one that is there: a kill may have come between making and syncing it."""
-    chain = [tmp_path, tmp_path / "a", tmp_path / "a" / "b", tmp_path / "a" / "b" / "c"]
-    chain[there].mkdir(parents=True, exist_ok=True)
-    events = watched_disk(monkeypatch)
-    make_folders(chain[-1])
-    assert chain[-1].is_dir()
-    assert events == [path.stat().st_ino for path in chain[min(there, 2) : 3]]
 
 
 def test_a_folder_above_that_was_deleted_is_not_made_again_where_this_is_not_asked_for(

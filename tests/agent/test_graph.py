@@ -26,3 +26,10 @@ def test_paper_features_equal_those_of_the_layout(tokens: dict[str, object]) -> 
     )
     expected = made.layout.node_features(batch.state, placed, batch.goal)
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-6)
+
+
+def test_constants_are_no_weights() -> None:
+    graph = graph_of(setup(agent=PAPER))
+    np.testing.assert_array_equal(graph.adjacency, setup().layout.adjacency)
+    assert graph.state_dict() == {}
+    assert list(graph.parameters()) == []

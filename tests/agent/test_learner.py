@@ -105,6 +105,13 @@ def test_a_young_average_forgets_its_start(rho: float, updates: int, expected: f
     assert average_so_far(rho, updates) == pytest.approx(expected)
 
 
+def test_after_the_first_update_the_actor_itself_plays() -> None:
+    learner = Learner(setup(agent=SCENE | {"acting_average": 0.99}), seed=0)
+    learner.update(random_transitions(setup(), 16, done=None))
+    pairs = zip(learner.acting.parameters(), learner.actor.parameters(), strict=True)
+    assert all(torch.equal(average, own) for average, own in pairs)
+
+
 def test_saturation_counts_what_lies_beyond_the_limit() -> None:
     raw = torch.tensor([[0.0, 2.0], [-3.0, 4.0]])
     assert saturation(raw, 2.0).item() == pytest.approx((1 + 4) / 4)
@@ -234,10 +241,7 @@ UNDECAYED = {"lr_final": 1.0}
 
 @pytest.mark.parametrize(
     ("options", "progress", "share"),
-    [
-        *(({}, progress, share) for progress, share in DECAY.items()),
-        (UNDECAYED, 0.9, 1.0),
-    ],
+    [*(({}, progress, share) for progress, share in DECAY.items()), (UNDECAYED, 0.9, 1.0)],
 )
 def test_cosine_decay_of_the_learning_rate(
     options: dict[str, Any], progress: float, share: float

@@ -15,12 +15,7 @@ from tangram_agent.relabelling import PairBatch
 from tangram_agent.setup import Setup
 from tangram_sim.batch import BatchedEnv
 from tests.agent.builders import setup
-from tests.agent.pair_scenes import (
-    PERCEPTRON,
-    TWO,
-    seven,
-    transitions,
-)
+from tests.agent.pair_scenes import PERCEPTRON, TWO, seven, transitions
 
 pytestmark = pytest.mark.fast
 

@@ -70,8 +70,7 @@ def test_the_token_that_moved_before_and_after() -> None:
 
 
 @pytest.mark.parametrize(
-    ("hindsight", "share"),
-    [([], 1.0), ([FINAL], 1 / 2), ([FINAL, NEAR], 1 / 4)],
+    ("hindsight", "share"), [([], 1.0), ([FINAL], 1 / 2), ([FINAL, NEAR], 1 / 4)]
 )
 def test_the_share_of_goals_that_were_played(hindsight: list[Any], share: float) -> None:
     assert is_played(made_pairs(hindsight)).mean() == pytest.approx(share, abs=0.05)

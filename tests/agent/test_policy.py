@@ -59,12 +59,7 @@ def explored(made: Setup, count: int = COUNT) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize(
-    "made",
-    [
-        setup(agent=SCENE),
-        seven({}, SMALL),
-        seven({}, PERCEPTRON, **SLIDE),
-    ],
+    "made", [setup(agent=SCENE), seven({}, SMALL), seven({}, PERCEPTRON, **SLIDE)]
 )
 def test_weights_travel_to_workers(made: Setup) -> None:
     weights, policy = Learner(made, 0).acting_weights(7), Policy(made)
@@ -138,14 +133,6 @@ def test_acting_is_the_acting_network_of_the_learner() -> None:
     policy.load(learner.acting_weights(1))
     expected = learner.acting(learner.steps(batch).view)[0].detach().numpy()
     np.testing.assert_allclose(policy.act(*scene_of(batch)), expected, atol=1e-6)
-
-
-def test_with_several_tokens_the_next_one_is_named() -> None:
-    made = setup(PAIR, agent=SCENE)
-    batch = random_transitions(made, 2)
-    actions = policy_of(made).act(batch.state, np.array([[0, 0], [1, 0]]), batch.goal)
-    assert actions.shape == (2, 4)
-    assert actions[:, 0].tolist() == [-0.5, 0.5]
 
 
 @pytest.mark.parametrize("flip", [False, True])

@@ -128,8 +128,7 @@ def test_the_packages_own_agents_are_whole_small_and_good(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "agent"),
-    [("Tangram-v0", "pretrained/square"), ("Tangram7-v0", "pretrained/tangram7")],
+    ("name", "agent"), [("Tangram-v0", "pretrained/square"), ("Tangram7-v0", "pretrained/tangram7")]
 )
 def test_an_id_is_what_its_agent_was_trained_on(name: str, agent: str) -> None:
     setup = load_run(agent).setup

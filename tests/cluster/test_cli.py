@@ -85,10 +85,7 @@ WRONG = [
         "tangram-train tokens=tangram7 sim=silhouette agent=outline agent.lookahead=values",
         "agent.lookahead=values is for play, an evaluator would be silent for minutes: leave it",
     ),
-    (
-        "tangram-train sim.observe=silhouette",
-        "is for an agent of outlines: train one",
-    ),
+    ("tangram-train sim.observe=silhouette", "is for an agent of outlines: train one"),
     ("tangram-train +~zzz", "cannot read '+~zzz'"),
     ("tangram-train zzz=1", "unknown setting 'zzz' (--help and --cfg job list them)"),
     ("tangram-train --seed=1", "unknown option '--seed=1': settings carry no dashes, as in seed=1"),
@@ -116,10 +113,7 @@ WRONG = [
     ),
     (f"tangram-play run_dir={'x/' * 2000}", "run_dir must be a path of at most 3840 bytes"),
     ("tangram-train service.bind=", "without scheme and port, got '': set service.bind=127.0.0.1"),
-    (
-        "tangram-train service.port=5555",
-        "service.port=5555 changes nothing with service.bind=",
-    ),
+    ("tangram-train service.port=5555", "service.port=5555 changes nothing with service.bind="),
     ("tangram-master +sim.colour=1", 'can not match "colour"'),
     ("tangram-master from_config=nowhere.yaml", "from_config=nowhere.yaml: No such file"),
     ("tangram-worker connect=tcp://127.0.0.1:1 reward.name=own.py:none", "cannot read 'own.py' on"),

@@ -511,18 +511,6 @@ def test_what_is_laid_goes_on_while_another_way_is_looked_at(page: Page) -> None
 
 
 @pytest.mark.check
-def test_figures_are_reached_by_keys(page: Page) -> None:
-    page.locator("[data-figure=cat]").focus()
-    page.keyboard.press("Enter")
-    moving(page)
-    tan = page.get_by_role("button", name="square", exact=True).first
-    tan.focus()
-    page.keyboard.press("ArrowUp")
-    status(page).to_contain_text("the agent goes on from here")
-    status(page).to_have_text(LAID)
-
-
-@pytest.mark.check
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_it_fits_a_phone_in_light_and_dark(browser: Browser, running: Running, scheme: Any) -> None:
     context = browser.new_context(
@@ -621,27 +609,3 @@ def test_twenty_browsers_at_once_lay_their_figures(browser: Browser, running: Ru
     print(json.dumps(told))
     for one in pages:
         one.context.close()
-
-
-@pytest.mark.check
-@pytest.mark.skipif(not TRIED, reason="measured by studio/try.sh, where nothing else runs")
-def test_the_first_move_comes_for_each_figure(page: Page) -> None:
-    """How long, for each figure of the library drawn as an outline; told, and kept in a file."""
-    content = page.evaluate("fetch('api/figures').then((answer) => answer.json())")
-    seconds = dict[str, float]()
-    for one in content["figures"]:
-        seconds[one["name"]] = page.evaluate(
-            """(outlines) => new Promise((done) => {
-                const before = studio.board.onMove;
-                const began = performance.now();
-                studio.board.onMove = (move) => {
-                    studio.board.onMove = before;
-                    done((performance.now() - began) / 1000);
-                };
-                studio.fill({ outlines, free: false });
-            })""",
-            one["outline"],
-        )
-    ranked = sorted(seconds.values())
-    told = {"figures": len(ranked), "median_s": ranked[len(ranked) // 2], "slowest_s": ranked[-1]}
-    print(json.dumps(told))

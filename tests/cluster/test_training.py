@@ -16,13 +16,7 @@ from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
 from tangram_agent.setup import make_setup
 from tangram_cli.commands import COMMON_NAMES
 from tests.cluster.conftest import UPDATES
-from tests.cluster.processes import (
-    ended,
-    pids_of,
-    refused,
-    run,
-    run_here,
-)
+from tests.cluster.processes import ended, pids_of, refused, run, run_here
 
 # The session's training runs inside the first of these tests.
 pytestmark = pytest.mark.slow

@@ -95,16 +95,3 @@ def test_what_the_paper_reports_may_stand_everywhere(page: Path) -> None:
 def test_scores_without_a_link_are_told(page: Path) -> None:
     page.write_text("# Page\n\nIt has 0.500.\n")
     assert told(page) == ["page.md: # Page: it has scores and links no file of results"]
-
-
-def test_a_changed_score_of_the_results_is_told(tmp_path: Path) -> None:
-    text = (ROOT / "docs" / "results.md").read_text()
-    assert "0.752 (0.724 to 0.766)" in text
-    docs = tmp_path / "docs"
-    docs.mkdir()
-    (docs / "results").symlink_to(ROOT / "docs" / "results")
-    (docs / "results.md").write_text(text.replace("0.752 (0.724", "0.753 (0.724"))
-    read_known.cache_clear()
-    found = check(docs / "results", [docs / "results.md"])
-    assert found
-    assert all("0.753 (0.724 to 0.766) is not in" in line for line in found)

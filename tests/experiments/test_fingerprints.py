@@ -114,8 +114,7 @@ def derived(setup: Setup) -> dict[str, dict[str, float]]:
         name: {
             "value": value,
             "tolerance": max(
-                MARGIN * max(abs(one[name] - value) for one in others),
-                UPDATES * STEP * abs(value),
+                MARGIN * max(abs(one[name] - value) for one in others), UPDATES * STEP * abs(value)
             ),
         }
         for name, value in now.items()

@@ -45,10 +45,7 @@ AGENT: dict[str, Any] = {
     "replay_capacity": 64,
     "learning_starts": 4,
     "updates_per_transition": 0.5,
-    "hindsight": [
-        {"strategy": "final"},
-        {"strategy": "near", "position": 0.1, "angle": 0.5},
-    ],
+    "hindsight": [{"strategy": "final"}, {"strategy": "near", "position": 0.1, "angle": 0.5}],
 }
 
 

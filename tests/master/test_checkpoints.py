@@ -103,19 +103,6 @@ def test_a_crash_before_the_rename_leaves_the_old_one_valid(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["00000005", "00000006"]
 
 
-def test_all_bytes_and_names_are_on_the_disk_in_the_order_that_a_power_cut_asks_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Files and their folder before the name that counts, the folder with that name after it."""
-    events = watched_disk(monkeypatch)
-    path = save(tmp_path)
-    content = {file.stat().st_ino for file in path.iterdir()}
-    assert len(content) == 3
-    assert events[0] == tmp_path.parent.stat().st_ino
-    assert set(events[1:4]) == content
-    assert events[4:] == [path.stat().st_ino, "renamed", tmp_path.stat().st_ino]
-
-
 def test_a_half_written_folder_is_no_checkpoint(tmp_path: Path) -> None:
     (tmp_path / ".writing-00000009").mkdir()
     (tmp_path / "00000009.corrupt").mkdir()

@@ -104,6 +104,19 @@ def test_the_users_own_number_of_threads_wins(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.cluster
+def test_a_child_ends_with_its_parent() -> None:
+    code = "import signal, tangram_agent.process as own; own.watch_parent(); signal.pause()"
+    made = Child("worker", ["-c", code])
+    ended: SimpleQueue[Child] = SimpleQueue()
+    made.start(ended.put)
+    try:
+        made._lifeline.cut()  # as the system does when this process dies
+        assert ended.get(timeout=LIMIT_S) is made
+    finally:
+        made.signal(signal.SIGKILL)
+
+
+@pytest.mark.cluster
 def test_a_process_that_is_stopped_for_a_while_is_left_alone() -> None:
     made = Child("worker", ["-c", "import signal; signal.pause()"], patience_s=10.0)
     made.start(lambda _: None)

@@ -110,11 +110,7 @@ DIFFERS = (
         ),
     ],
 )
-def test_who_does_not_fit_is_told_why(
-    changes: dict[str, Any],
-    counter: str,
-    reason: str,
-) -> None:
+def test_who_does_not_fit_is_told_why(changes: dict[str, Any], counter: str, reason: str) -> None:
     with staged(room=NO_ROOM) as stage:
         assert stage.dealer().ask(with_header(hello().encode(), **changes)) == Refused(reason)
         assert (stage.hub.counters[counter], stage.hub.peers) == (1, [])

@@ -21,13 +21,7 @@ from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
 from tangram_agent.messages import Go
 from tangram_agent.process import Every
 from tangram_sim.errors import RunError
-from tests.master.builders import (
-    FakeHub,
-    arrival,
-    loop,
-    scores,
-    small_setup,
-)
+from tests.master.builders import FakeHub, arrival, loop, scores, small_setup
 
 pytestmark = pytest.mark.fast
 
@@ -62,6 +56,18 @@ def test_a_batch_is_acknowledged_after_its_insert(tmp_path: Path) -> None:
     assert inserted == [4, 8, 12]
     twins = len(MADE.agent.hindsight) + 1
     assert made.guard.trainer.replay.added == 12 * twins
+
+
+def test_what_the_disk_does_not_take_is_not_acknowledged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hub = FakeHub(MADE, batches(1))
+    made, kept = loop(tmp_path, MADE, hub), iter([False, True])
+    monkeypatch.setattr(made.checkpointer, "keep", lambda _: next(kept))
+    made.receive(0.0)
+    for acknowledged in ([], [1]):
+        made.insert()
+        assert hub.values("acknowledge") == acknowledged
 
 
 def test_batches_wait_unacknowledged_while_the_learner_is_behind(tmp_path: Path) -> None:
@@ -111,6 +117,14 @@ def test_the_bounds_end_it(
     made = loop(tmp_path, MADE, hub, **bounds)
     assert made.run() == reason
     assert (made.guard.trainer.episodes, made.guard.trainer.updates) == (episodes, updates)
+
+
+def test_episodes_beyond_the_bound_are_not_taken(tmp_path: Path) -> None:
+    hub = FakeHub(MADE, [[arrival(MADE, i, BATCH) for i in range(1, 6)]])
+    made = loop(tmp_path, MADE, hub, lag_updates=64, max_episodes=8)
+    made.run()
+    assert hub.values("acknowledge") == [1, 2]
+    assert made.guard.trainer.updates == 4
 
 
 def test_hours_end_it(tmp_path: Path) -> None:
@@ -264,6 +278,14 @@ def test_a_run_whose_folder_is_gone_ends_with_one_line_and_makes_none(
     made.dismiss("the end")
     made.reporter._metrics.close()
     assert not folder.exists()
+
+
+def test_test_episodes_are_drawn_while_it_learns(tmp_path: Path) -> None:
+    made = loop(tmp_path, MADE, FakeHub(MADE, batches(1)))
+    assert not made.folder.picture.exists()
+    made.reporter.scored(scores(MADE, 0).scores)
+    with Image.open(made.folder.picture) as picture:
+        assert picture.format == "PNG"
 
 
 @pytest.mark.parametrize(

@@ -14,15 +14,8 @@ pytestmark = pytest.mark.fast
 
 
 @pytest.mark.parametrize(
-    (
-        "settings",
-        "transitions",
-        "updates",
-        "lag",
-        "may_update",
-        "may_insert",
-    ),  # rate, starts, limit
-    [
+    ("settings", "transitions", "updates", "lag", "may_update", "may_insert"),
+    [  # settings: rate, starts, limit
         # Nothing is due before learning starts; with the last of them all is.
         ((0.5, 10, 4), 0, 0, 0, False, True),
         ((0.5, 10, 4), 9, 0, 0, False, True),

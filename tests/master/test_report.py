@@ -9,14 +9,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from master.result import SCORES, make_result
 from tangram_agent.process import Every
-from tests.master.builders import (
-    FakeHub,
-    arrival,
-    loop,
-    scores,
-    shown,
-    small_setup,
-)
+from tests.master.builders import FakeHub, arrival, loop, scores, shown, small_setup
 
 pytestmark = pytest.mark.fast
 

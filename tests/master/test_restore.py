@@ -149,15 +149,9 @@ def test_a_checkpoint_that_lacks_a_part_is_refused(tmp_path: Path, lost: str) ->
         ({"episodes": 1e400}, "not that of a run .OverflowError"),
         ({"record": Record().state() | {"loop_s": "x"}}, "Expected `float`, got `str` - at"),
         ({"record": {}}, "record lacks .*: start a new run"),
-        (
-            {"record": Record().state() | {"scores": []}},
-            "Expected `object`, got `array`",
-        ),
+        ({"record": Record().state() | {"scores": []}}, "Expected `object`, got `array`"),
         ({"journal": {"segment": 2**63 - 1}}, "its place in the journal .*<= 9007199254740992"),
-        (
-            {"journal": -1},
-            "its place in the journal cannot be read .* delete it to use",
-        ),
+        ({"journal": -1}, "its place in the journal cannot be read .* delete it to use"),
         ({"journal": {"number": True}}, "its place in the journal .*Expected `int`, got `bool`"),
     ],
 )

@@ -24,23 +24,13 @@ from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import OPEN
 from tangram_agent.process import Every, Watchdog
 from tangram_sim.errors import ConfigError, RunError
-from tests.master.builders import (
-    ShownProgress,
-    arrival,
-    journal,
-    small_setup,
-    trainer,
-)
+from tests.master.builders import ShownProgress, arrival, journal, small_setup, trainer
 
 pytestmark = pytest.mark.cluster
 
 MADE = small_setup()
 BATCH = 4
-STEP: dict[str, Any] = {
-    "mode": "lockstep",
-    "envs": BATCH,
-    "batch_episodes": BATCH,
-}
+STEP: dict[str, Any] = {"mode": "lockstep", "envs": BATCH, "batch_episodes": BATCH}
 
 
 Told = Callable[[], list[str]]

@@ -17,15 +17,7 @@ from master.audit import Audit
 from master.config import KeysConfig
 from master.giving import NEEDLESS, STALE, change_keys
 from master.rundir import RunFolder
-from master.security import (
-    Given,
-    Pair,
-    listening_place,
-    make_keys,
-    make_pair,
-    needs_keys,
-    run_keys,
-)
+from master.security import Given, Pair, listening_place, make_keys, make_pair, needs_keys, run_keys
 from tangram_agent.config import ServiceConfig
 from tangram_sim.errors import ConfigError, RunError
 

@@ -24,7 +24,7 @@ from tangram_vision.silhouettes import (
     overlap,
     pieces,
 )
-from tests.sim.builders import SEVEN, TRIO, layout_of
+from tests.sim.builders import SEVEN, layout_of
 
 pytestmark = pytest.mark.fast
 
@@ -120,14 +120,6 @@ def test_a_corner_that_no_tokens_make_ends_the_search_at_once() -> None:
     assert budget.taken == 1
 
 
-def test_other_token_sets_fill_what_they_cover() -> None:
-    layout = layout_of(*TRIO, scale=1.0)
-    poses = sample_connected(layout, SimConfig(arena=4.0), np.random.default_rng(5))
-    (filled,) = fill_outline(whole(poses, layout=layout), layout, 30.0)
-    assert filled.found is not None
-    assert filled.iou > 0.999
-
-
 def test_corners_of_tokens_are_told_once_for_each_turn_that_looks_alike() -> None:
     tokens = Tokens(LAYOUT)
     assert tokens.counts == (2, 1, 2, 1, 1)
@@ -156,6 +148,14 @@ def test_what_nothing_fills_keeps_the_tokens_that_could_be_laid() -> None:
     assert laid.difference(strip).area < 0.1 * laid.area
     (late,) = fill_outline(strip, LAYOUT, 0.0)
     assert (late.attempt, late.iou) == (None, 0.0)
+
+
+def test_a_search_remembers_the_most_that_it_laid() -> None:
+    search = Search(Tokens(LAYOUT), 0.004, Budget(time.thread_time() + 30.0))
+    assert list(search.run(polygon(convex_outlines(1.0)[-1]))) == []
+    assert 0 < len(search.best) < 7
+    laid = next(search.run(whole(gluing(1))))
+    assert search.best == laid
 
 
 def test_tokens_that_lie_on_each_other_are_no_better_attempt() -> None:

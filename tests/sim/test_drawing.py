@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image, ImageDraw
 
-from tangram_sim.drawing import contact_sheet, draw_scene, episode_sheet, save_gif, with_legend
-from tangram_sim.game_drawing import Held, captions, draw_game, figure_sheet, tiles
+from tangram_sim.drawing import contact_sheet, draw_scene, save_gif, with_legend
+from tangram_sim.game_drawing import Held, captions, draw_game, tiles
 from tangram_sim.strokes import TARGET
 from tests.sim.builders import SEVEN, layout_of
 
@@ -72,15 +72,6 @@ def test_contact_sheet_of_twelve() -> None:
     assert np.array_equal(np.asarray(sheet.crop((8, 8, 248, 248))), np.asarray(scene(240)))
 
 
-def test_refused_sheets_and_films(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="at least one picture"):
-        contact_sheet([])
-    with pytest.raises(ValueError, match="1 captions for 2 pictures"):
-        contact_sheet([scene(), scene()], captions=["one"])
-    with pytest.raises(ValueError, match="at least one picture"):
-        save_gif([], tmp_path / "film.gif")
-
-
 def test_gif_keeps_pictures_and_pace(tmp_path: Path) -> None:
     path = tmp_path / "film.gif"
     frames = [scene(), scene(active=0), scene(active=1)]
@@ -102,14 +93,6 @@ def test_where_a_token_started_is_a_pale_ghost_with_a_way() -> None:
     assert 200 < min(at(shown, -0.6, 0.05)) < 255
     changed = np.nonzero((np.asarray(plain) != np.asarray(shown)).any(axis=-1))
     assert changed[1].max() > 120  # the way goes on towards the end
-
-
-def test_an_episode_sheet_says_how_much_is_covered() -> None:
-    ends = SQUARE.corners(np.array([[[0.0, 0.0, 0.0]], [[0.5, 0.5, 0.3]]]))
-    sheet = episode_sheet(SQUARE, 2.0, ends[::-1], ends, ends, columns=2, size=120)
-    plain = contact_sheet([draw_scene(SQUARE, 2.0, e, e, 120) for e in ends], columns=2)
-    assert sheet.width == plain.width
-    assert sheet.height > plain.height  # captions
 
 
 @pytest.mark.parametrize(("width", "lines"), [(600, 1), (200, 3), (20, 4)])
@@ -185,12 +168,3 @@ def test_captions_tell_name_and_share() -> None:
     ends = np.stack([GOAL, PAIR.corners(np.array([[0.2, -0.5, 0.0], [0.2, -0.5, 0.0]]))])
     told = captions(PAIR, ends, np.stack([GOAL, GOAL]), ["cat", "dog"])
     assert told == ["cat   100.0 %", "dog   50.0 %"]
-
-
-def test_a_sheet_has_a_picture_for_every_figure() -> None:
-    ends = np.stack([GOAL] * 3)
-    sheet = figure_sheet(PAIR, 2.0, ends, ends, ["a", "b", "c"])
-    assert 1200 < sheet.width < 1400
-    shown, tile = np.asarray(sheet), (sheet.width - 13) // 3
-    # The same figure three times: what is a tile further on is the same picture.
-    np.testing.assert_array_equal(shown[:400, 13:413], shown[:400, 13 + tile : 413 + tile])

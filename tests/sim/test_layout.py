@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import TokensConfig, make_layout
-from tangram_sim.shapes import polygon_centroid
-from tests.sim.builders import LOPSIDED, SEVEN, TRIO, angle_gap, layout_of, random_poses
+from tests.sim.builders import LOPSIDED, TRIO, angle_gap, layout_of
 
 pytestmark = pytest.mark.fast
 
@@ -90,23 +89,6 @@ def test_poses_sides_and_corners_round_trip(tokens: list[tuple[float, float, flo
     assert angle_gap(back[:, 2], poses[:, 2]).max() < 1e-9
     np.testing.assert_array_equal(layout.flipped(corners), sides)
     np.testing.assert_allclose(layout.bases(corners), poses[:, :2], atol=1e-9)
-
-
-def test_base_is_the_centre_of_area_also_where_the_mean_of_the_corners_is_not() -> None:
-    layout = layout_of(LOPSIDED, "small_triangle", scale=0.1)
-    body = layout.shapes[0].corners
-    assert np.linalg.norm(body.mean(axis=0)) > 0.01
-    corners = layout.corners(random_poses(np.random.default_rng(0), 1, 2, 1.0))[0]
-    centres = [polygon_centroid(corners[layout.corners_of(k)]) for k in range(2)]
-    np.testing.assert_allclose(layout.bases(corners), centres, atol=1e-12)
-
-
-def test_corners_are_stacked_token_after_token() -> None:
-    layout = layout_of(*SEVEN, scale=1.0)
-    assert layout.starts.tolist() == [0, 3, 6, 9, 12, 15, 19, 23]
-    own = np.repeat(np.arange(7), [3, 3, 3, 3, 3, 4, 4])
-    np.testing.assert_array_equal(layout.token_of_corner, own)
-    assert layout.nodes == 2 * 23 + 7
 
 
 def test_fingerprint_tells_layouts_apart() -> None:

@@ -55,8 +55,7 @@ def test_overlap_at_an_angle_error(shape: str, shares: dict[int, float]) -> None
 
 
 @pytest.mark.parametrize(
-    ("shape", "expected"),
-    [("square", 0.765), ("small_triangle", 0.376), ("parallelogram", 0.264)],
+    ("shape", "expected"), [("square", 0.765), ("small_triangle", 0.376), ("parallelogram", 0.264)]
 )
 def test_mean_overlap_of_a_right_place_at_any_angle(shape: str, expected: float) -> None:
     """What an agent gets that solves position only: the plateaus of the paper's figures."""
@@ -246,8 +245,7 @@ def test_a_file_of_the_users_own_holds_in_every_folder(
 
 @pytest.mark.usefixtures("own")
 @pytest.mark.parametrize(
-    "use",
-    [pinned, reward_identity, lambda reward: check_reward(reward, layout_of("square"), SIM)],
+    "use", [pinned, reward_identity, lambda reward: check_reward(reward, layout_of("square"), SIM)]
 )
 def test_another_file_than_the_one_that_was_written_down_is_refused(
     use: Callable[[RewardConfig], Any],

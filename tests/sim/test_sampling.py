@@ -129,16 +129,6 @@ def test_tokens_that_lie_already_stay_and_are_kept_clear_of() -> None:
     assert max(largest_overlap(layout, one) for one in poses) < 1e-8
 
 
-def test_tokens_on_their_other_side_lie_apart_too() -> None:
-    layout, sim = layout_of("parallelogram", LOPSIDED, "square", scale=0.25), SimConfig(arena=1.4)
-    sides = np.random.default_rng(0).random((60, 3)) < 0.5
-    sides[:, 2] = False
-    poses = sample_batch(layout, sim, evaluation_generators(60), sides)
-    apart = [largest_overlap(layout, *pair) for pair in zip(poses, sides, strict=True)]
-    unaware = [largest_overlap(layout, one) for one in poses]
-    assert max(apart) < 1e-8 < max(unaware)
-
-
 GAME = layout_of(*SEVEN, scale=0.6)
 LAYOUTS = [
     (GAME, 2.0),

@@ -12,14 +12,7 @@ from hypothesis import strategies as st
 
 from tangram_sim.errors import ConfigError
 from tangram_sim.prisms import inset, prism, thickness
-from tangram_sim.shapes import (
-    SHAPE_NAMES,
-    Shape,
-    polygon,
-    polygon_area,
-    polygon_centroid,
-    tan,
-)
+from tangram_sim.shapes import SHAPE_NAMES, Shape, polygon, polygon_area, polygon_centroid, tan
 from tests.sim.builders import SEVEN
 
 pytestmark = pytest.mark.fast

@@ -67,17 +67,6 @@ def test_same_episodes_in_the_same_words(
     assert ends >= 1
 
 
-def test_seven_tokens_through_the_engine(made: list[Any]) -> None:
-    pair(GAME_ID, "NextStep", made)
-    told = [env.reset(seed=0) for env in made]
-    for action in np.linspace(-1.0, 1.0, 8):
-        assert data_equivalence(*told)
-        actions = np.full((3, 4), (action, 0.1, -0.1, 0.2), dtype=np.float32)
-        told = [env.step(actions) for env in made]
-    assert data_equivalence(*told)
-    assert not told[0][3].any()  # the eighth step resets
-
-
 def test_what_it_gives_is_the_readers_own(made: list[Any]) -> None:
     ours, _ = pair(ENV_ID, "NextStep", made)
     first, _ = ours.reset(seed=0)

@@ -2,11 +2,10 @@
 
 import json
 
-import numpy as np
 import pytest
 
 from tangram_sim.errors import ConfigError
-from tangram_studio.messages import MAX_POINTS, Fill, Next, Play, Save, read, write
+from tangram_studio.messages import MAX_POINTS, Fill, Next, Play, Save, read
 
 pytestmark = pytest.mark.fast
 
@@ -30,13 +29,6 @@ SAVE = {"ask": "save", "kind": "gif", "tokens": TOKENS}
 )
 def test_what_a_page_asks_for_is_read(message: dict[str, object], kind: type) -> None:
     assert isinstance(read(json.dumps(message)), kind)
-
-
-def test_tokens_become_arrays() -> None:
-    asked = read(json.dumps(PLAY))
-    assert isinstance(asked, Play)
-    poses, flipped = asked.goal.sides
-    assert (poses.shape, poses.dtype, flipped.dtype) == ((7, 3), np.float64, np.bool_)
 
 
 @pytest.mark.parametrize(
@@ -72,7 +64,3 @@ def test_tokens_become_arrays() -> None:
 def test_what_no_page_asks_for_is_refused_in_one_line(text: str) -> None:
     with pytest.raises(ConfigError, match="the page's message is not understood .*: load it anew"):
         read(text)
-
-
-def test_what_is_told_is_json() -> None:
-    assert json.loads(write("wait", ahead=2)) == {"told": "wait", "ahead": 2}

@@ -1,6 +1,5 @@
 """Files of what was played are what other commands read."""
 
-import json
 from io import BytesIO
 
 import numpy as np
@@ -61,14 +60,3 @@ def test_a_gif_has_all_moves_up_to_a_number(monkeypatch: pytest.MonkeyPatch) -> 
         assert 2 * FRAMES <= getattr(film, "n_frames", 1) <= 2 * FRAMES + 30
     monkeypatch.setattr(saving, "MOVES", 1)
     assert gif([first, second], goal) == gif([second], goal)
-
-
-def test_nothing_played_is_no_gif() -> None:
-    with pytest.raises(ConfigError, match="nothing was played yet"):
-        gif([], figure("cat"))
-
-
-def test_a_puzzle_file_is_json_of_the_known_format() -> None:
-    content = json.loads(puzzle_file(figure("cat"), "cat"))
-    assert content["format"] == "tangram-puzzles"
-    assert len(content["puzzles"][0]["pieces"]) == 7

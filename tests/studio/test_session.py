@@ -7,7 +7,6 @@ from typing import Any, cast
 
 import pytest
 
-from tangram_sim.errors import TangramError
 from tangram_studio import filling, playing, saving
 from tangram_studio.jobs import Jobs
 from tangram_studio.session import Session
@@ -255,22 +254,5 @@ def test_a_file_has_no_move_that_was_not_shown() -> None:
         assert len(page.session._played) == 4
         await page.ask("play", number=4, goal=goal)
         assert len(page.session._played) == 1  # another game
-
-    asyncio.run(talk())
-
-
-def test_an_error_of_a_task_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refused(*_: object) -> None:
-        raise TangramError("no room: make it smaller")
-
-    monkeypatch.setattr(playing, "begin", refused)
-
-    async def talk() -> None:
-        told = await Page().ask("play", number=9, goal=plain("cat"))
-        assert (told["told"], told["number"], told["why"]) == (
-            "refused",
-            9,
-            "no room: make it smaller",
-        )
 
     asyncio.run(talk())

@@ -115,11 +115,3 @@ def test_a_wider_beam_fills_more() -> None:
         for method in methods
     ]
     assert sum(solved[0]) + 1 < sum(solved[1])
-
-
-def test_who_filled_it_is_told() -> None:
-    (by_search,) = fill_outline(gluing(1), LAYOUT, 60.0)
-    (by_beam,) = fill_outline(gluing(1), LAYOUT, 60.0, method=Method(search=False))
-    assert (by_search.by, by_beam.by) == ("search", "beam")
-    assert not by_beam.complete
-    assert min(by_search.iou, by_beam.iou) > 0.95

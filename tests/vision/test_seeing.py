@@ -215,6 +215,15 @@ def test_what_lies_alone_is_seen_alike_whatever_was_known() -> None:
     np.testing.assert_array_equal(told.poses, alone.poses)
 
 
+def test_light_tokens_on_dark_ground_are_seen() -> None:
+    layout, rng = layout_of("parallelogram", scale=0.6), np.random.default_rng(4)
+    poses, flipped = scene(layout, rng, 0.0)
+    picture = 255 - grey(layout.corners(poses, flipped), layout, 128)
+    [[distance, turn]] = errors(layout, poses, flipped, see(picture, layout, ARENA))
+    assert distance < 0.003
+    assert turn < 1.0
+
+
 @pytest.mark.parametrize("shown", ["nothing", "noise", "half of it", "another shape"])
 def test_what_is_not_to_be_seen_is_missing(shown: str) -> None:
     layout, rng = layout_of("square", scale=0.6), np.random.default_rng(5)

@@ -42,12 +42,7 @@ Result = TypeVar("Result")
 LIMIT_S = 100.0
 # What a test does not wait for comes too late for it: after LIMIT_S.
 QUICK = Timing(
-    join_s=3600.0,
-    retry_s=0.05,
-    heartbeat_s=0.05,
-    resend_s=3600.0,
-    silence_s=3600.0,
-    lost_s=36000.0,
+    join_s=3600.0, retry_s=0.05, heartbeat_s=0.05, resend_s=3600.0, silence_s=3600.0, lost_s=36000.0
 )
 
 

@@ -9,7 +9,7 @@ from tangram_agent.setup import Setup
 from tests.agent.builders import setup
 from tests.sim.builders import layout_of
 from tests.worker.builders import ended
-from worker.film import Frame, film, frames_per_action
+from worker.film import film, frames_per_action
 from worker.rollout import Played
 
 pytestmark = pytest.mark.fast
@@ -115,10 +115,3 @@ def test_a_token_that_is_turned_over_gets_narrow_and_wide_again() -> None:
 @pytest.mark.parametrize(("horizon", "count"), [(1, 20), (5, 20), (6, 16), (50, 2), (500, 1)])
 def test_long_episodes_get_fewer_frames_for_each_action(horizon: int, count: int) -> None:
     assert frames_per_action(horizon) == count
-
-
-def test_a_frame_knows_who_is_held() -> None:
-    off = np.zeros(1, dtype=np.bool_)
-    frame = Frame(np.zeros((1, 7, 3)), np.zeros((1, 7)), np.array([3]), 0.5, off, 2)
-    rested = frame.at_rest()
-    assert (rested.held.tolist(), rested.height, rested.done) == ([-1], 0.0, 2)

@@ -71,15 +71,6 @@ def test_a_figure_that_is_made_up_exactly() -> None:
         assert (found.wrong[0], found.doubly_used[0]) == (0, 0)
 
 
-def test_tokens_in_one_heap_do_not_fill_the_figure_by_their_number() -> None:
-    poses = np.zeros((7, 3))
-    poses[:, :2] = CAT.poses[0, :2]
-    found = scored(poses)
-    assert found.coverage[0] < 0.5
-    assert found.iou[0] < found.coverage[0]
-    assert not found.solved[0]
-
-
 # target piece that is uncovered or covered by what, -> wrong, doubly used
 NAMES = {name: SEVEN.index(name) for name in SEVEN}
 
@@ -192,15 +183,12 @@ def at(layout: Layout, *poses: tuple[float, float, float]) -> np.ndarray:
 
 # shape, angle of the end, angle of the goal, error: all in degrees
 TURNS = [
-    ("square", 0, 0, 0),
     ("square", 30, 0, 30),
     ("square", 45, 0, 45),
-    ("square", 60, 0, 30),
     ("square", 90, 0, 0),
     ("square", 185, 0, 5),
     ("square", -170, 179, 11),
     ("parallelogram", 90, 0, 90),
-    ("parallelogram", 170, 0, 10),
     ("parallelogram", 180, 0, 0),
     ("parallelogram", -100, 100, 20),
     ("large_triangle", 180, 0, 180),

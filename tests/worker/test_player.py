@@ -192,9 +192,7 @@ def survivable_signals() -> Iterator[dict[int, object]]:
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGUSR1])
 def test_a_signal_ends_a_player_with_a_goodbye(
-    number: signal.Signals,
-    survivable_signals: dict[int, object],
-    capfd: pytest.CaptureFixture[str],
+    number: signal.Signals, survivable_signals: dict[int, object], capfd: pytest.CaptureFixture[str]
 ) -> None:
     made = greedy_setup()
 

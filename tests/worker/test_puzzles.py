@@ -10,7 +10,7 @@ from tangram_sim.arrays import Floats
 from tangram_sim.errors import ConfigError
 from tangram_sim.geometry import overlap_share
 from tangram_sim.puzzles import library, load_puzzle
-from tests.agent.builders import PAIR, setup
+from tests.agent.builders import setup
 from tests.worker.puzzle_files import GAME, SIM, drawn, write_puzzles
 from worker.baselines import exact_policy, random_policy
 from worker.puzzles import find_figures, play_figures
@@ -73,13 +73,6 @@ def test_what_cannot_be_played_is_refused_by_name(
     path = write_puzzles(tmp_path / "mine.json", *puzzles)
     with pytest.raises(ConfigError, match=message):
         find_figures(str(path), game(), names)
-
-
-def test_a_run_of_other_tokens_is_named() -> None:
-    with pytest.raises(
-        ConfigError, match="puzzle 'square' .* the run moves square, large_triangle"
-    ):
-        find_figures("train", setup(PAIR))
 
 
 def test_a_figure_that_does_not_fit_into_the_arena_is_refused() -> None:

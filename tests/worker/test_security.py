@@ -136,10 +136,7 @@ def test_other_keys_are_turned_away_and_the_worker_names_its_file(
 def test_a_file_of_another_role_says_what_to_add() -> None:
     key = "k" * 40
     given = MasterAddress("tcp://h:1", "r", key, {"evaluator": (key, key)})
-    with (
-        zmq.Context() as context,
-        pytest.raises(RunError, match="only: add role=evaluator"),
-    ):
+    with zmq.Context() as context, pytest.raises(RunError, match="only: add role=evaluator"):
         Sockets(context, given, "player")
 
 

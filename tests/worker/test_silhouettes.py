@@ -203,10 +203,7 @@ def test_what_fills_a_picture_badly_is_not_played(
     ],
 )
 def test_settings_that_a_silhouette_has_no_use_for_are_refused(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    settings: dict[str, object],
-    message: str,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, settings: dict[str, object], message: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
     picture(tmp_path / "cat.png")
