@@ -14,10 +14,7 @@ from tangram_sim.settings import KEY, Declaration, declared_fields, told, values
 
 PAGE = Path(__file__).parents[1] / "docs" / "settings.md"
 # Lists of settings inside of a setting.
-NESTED = {
-    "sim.stages": "tangram_sim.config:StageConfig",
-    "agent.hindsight": "tangram_agent.config:RelabelConfig",
-}
+NESTED = {"agent.hindsight": "tangram_agent.config:RelabelConfig"}
 INTRODUCTION = """\
 # Settings
 

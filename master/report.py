@@ -209,19 +209,12 @@ class Reporter:
         self._path = picture
         self._published: OrderedDict[int, Sent] = OrderedDict()
         self._latest: Scores | None = None
-        self._stage = -1
 
     def published(self, version: int) -> None:
         """Note when weights were sent, and which episodes they had learned from."""
         self._published.setdefault(version, self._now())
         while len(self._published) > REMEMBERED_VERSIONS:
             self._published.popitem(last=False)
-        # The curriculum goes on with the weights: workers play by those that they get.
-        sim = self._trainer.setup.sim
-        stage = sim.stage(version)
-        if sim.stages and stage != self._stage:
-            log.info("%s, from update %s on", sim.told(stage), f"{version:,}")
-        self._stage = stage
 
     def updated(self, losses: Mapping[str, float]) -> None:
         """Note one update."""

@@ -4,8 +4,8 @@ A command c (x, y and turn, shares of full scale) moves a token by a way d, in t
 model is a Bayesian linear regression on given features, d = K phi(c) + noise. What entries of K
 are usual, how much they differ between episodes, and the noise are fitted to whole episodes in
 closed form; every action that is seen tells the model more of the world at hand. It starts as the
-exact rigid motion, d = c, and knows how sure it is. Where actions come late (`sim.delay`) it knows
-so much, and takes the command before for the cause.
+exact rigid motion, d = c, and knows how sure it is. Where actions come late (`sim.world=delayed`)
+it knows so much, and takes the command before for the cause.
 
 Legend: B episodes, T actions of each, F features; a command and a way have 3 entries.
 """
@@ -81,7 +81,9 @@ def motions_of(past: Past, now: Floats, layout: Layout, sim: SimConfig) -> Motio
     corners = np.concatenate([past.corners, now[:, None]], axis=1).astype(np.float64)
     poses = layout.poses(corners)
     count, steps, size = past.actions.shape
-    if sim.delay:  # nothing is carried out in the first step, and what is told last not at all
+    if (
+        sim.dynamics.delayed
+    ):  # nothing is carried out in the first step, and what is told last not at all
         poses, steps = poses[:, 1:], max(steps - 1, 0)
     actions = past.actions[:, :steps].reshape(count * steps, size).astype(np.float64)
     token = chosen_tokens(actions, layout.tokens).reshape(count, steps, 1, 1)
@@ -209,7 +211,7 @@ class MotionModel(nn.Module):
         self, belief: Belief, corners: Floats, past: Past, layout: Layout, sim: SimConfig
     ) -> Floats:
         """Corners (B, V, 2) once what was told last, and comes late, is carried out."""
-        if not sim.delay or not past.actions.shape[1]:
+        if not sim.dynamics.delayed or not past.actions.shape[1]:
             return corners
         last = past.actions[:, -1].astype(np.float64)
         token, rows = chosen_tokens(last, layout.tokens), np.arange(len(last))

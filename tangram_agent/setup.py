@@ -99,8 +99,7 @@ class Setup:
             "actions_per_token": 1,
             "allow_flip": flips or sim.allow_flip,
             "corner_noise": 0.0,
-            "action_noise": 0.0,
-            **{name: getattr(SimConfig, name) for name in sim.inexact},
+            "world": "plain",
         }
         if self.agent.gamma != 1.0:
             raise ConfigError(

@@ -1,7 +1,7 @@
 """The world between an action and its token: what a token is told where an action says something.
 
-Everything that is not the engine's own stands here, for every backend alike: gain, bias, drift,
-noise and delay. What is fixed comes from `SimConfig`, what varies each episode draws for itself.
+Everything that is not the engine's own stands here, for every backend alike: gain, bias and delay.
+See `Dynamics`; what varies each episode draws for itself.
 
 Legend: B environments. Entries are x, y and turn; full scale is the arena's width and half a turn.
 """
@@ -13,7 +13,6 @@ import numpy as np
 
 from tangram_sim.arrays import Bools, Floats, Ints
 from tangram_sim.config import SimConfig
-from tangram_sim.observation_noise import CUT
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,72 +36,51 @@ class Actuation:
     """What the episodes that are being played have drawn, and what it makes of actions.
 
     Attributes:
-        gain: (B, 3), see `SimConfig`, as all of these.
+        gain: (B, 3), see `Dynamics`, as all of these.
         bias: (B, 3).
-        drift: (B,).
         damping: (B,).
-        pending: with `sim.delay` what the next step carries out; None: nothing.
+        pending: in a delayed world what the next step carries out; None: nothing.
         carried: what the last step carried out, as it was commanded; None before the first.
     """
 
     def __init__(self, sim: SimConfig, count: int) -> None:
-        self._sim = sim
+        self._dynamics = sim.dynamics
         self._scale = full_scale(sim)
-        self._generators: Sequence[np.random.Generator] = ()
-        self.gain: Floats = np.tile(np.array(sim.gain, np.float64), (count, 1))
-        self.bias: Floats = np.tile(np.array(sim.bias, np.float64), (count, 1))
-        self.drift: Floats = np.full(count, sim.drift)
-        self.damping: Floats = np.full(count, sim.damping)
+        self.gain: Floats = np.ones((count, 3))
+        self.bias: Floats = np.zeros((count, 3))
+        self.damping: Floats = np.full(count, self._dynamics.damping)
         self.pending: Command | None = None
         self.carried: Command | None = None
 
     def begin(self, generators: Sequence[np.random.Generator]) -> None:
         """Draw what varies, for one episode each; what does not draws nothing."""
-        sim, self._generators, self.pending, self.carried = self._sim, generators, None, None
-        if sim.gain_spread > 1.0:
-            self.gain = np.array(sim.gain) * sim.gain_spread ** self._uniform(3)
-        if sim.bias_spread:
-            self.bias = np.array(sim.bias) + sim.bias_spread * self._uniform(3)
-        if sim.drift_spread:
-            self.drift = sim.drift + sim.drift_spread * self._uniform(1)[:, 0]
-        if sim.damping_spread:
-            share = (1.0 + self._uniform(1)[:, 0]) / 2.0
-            self.damping = sim.damping + sim.damping_spread * share
+        world, self.pending, self.carried = self._dynamics, None, None
+        if world.gain_spread > 1.0:
+            self.gain = world.gain_spread ** _uniform(generators, 3)
+        if world.bias_spread:
+            self.bias = world.bias_spread * _uniform(generators, 3)
+        if world.damping_spread:
+            share = (1.0 + _uniform(generators, 1)[:, 0]) / 2.0
+            self.damping = world.damping + world.damping_spread * share
 
     def carry_out(self, command: Command) -> Command:
         """What this step carries out of what it was told, or of what the one before was."""
-        if self._sim.delay:
+        if self._dynamics.delayed:
             command, self.pending = self.pending or _nothing(command), command
         self.carried = command
-        noise: Floats = np.zeros_like(command.velocity)
-        if self._sim.action_noise:
-            drawn = np.stack([generator.standard_normal(3) for generator in self._generators])
-            noise = np.clip(drawn, -CUT, CUT) * self._sim.action_noise
-        return replace(command, velocity=self.told(command.velocity, noise))
+        return replace(command, velocity=self.told(command.velocity))
 
-    def told(self, velocity: Floats, noise: Floats | float = 0.0) -> Floats:
+    def told(self, velocity: Floats) -> Floats:
         """What tokens are told, (B, 3), where actions say velocities (B, 3), both a second.
 
-        Args:
-            velocity: in arena units and radians.
-            noise: (B, 3) on the entries, full scales.
+        Arena units and radians.
         """
-        given: Floats = self.gain * velocity + (self.bias + noise) * self._scale
-        given[:, 2] += np.pi * self.drift * np.hypot(given[:, 0], given[:, 1]) / self._sim.arena
+        given: Floats = self.gain * velocity + self.bias * self._scale
         return given
 
     def commands(self, wanted: Floats) -> Floats:
         """The entries of actions, (B, 3) in [-1, 1], by which tokens are told what is nearest."""
-        share = (wanted / self._scale - self.bias) / self.gain
-        share[:, :2] = np.clip(share[:, :2], -1.0, 1.0)
-        # The turn makes up for the drift of the shift that can be made.
-        share[:, 2] = 0.0
-        share[:, 2] = (wanted - self.told(share * self._scale))[:, 2] / np.pi / self.gain[:, 2]
-        return np.clip(share, -1.0, 1.0)
-
-    def _uniform(self, size: int) -> Floats:
-        """(B, size) in [-1, 1)."""
-        return np.stack([generator.uniform(-1.0, 1.0, size) for generator in self._generators])
+        return np.clip((wanted / self._scale - self.bias) / self.gain, -1.0, 1.0)
 
 
 def full_scale(sim: SimConfig) -> Floats:
@@ -112,11 +90,12 @@ def full_scale(sim: SimConfig) -> Floats:
 
 def reach(sim: SimConfig) -> Floats:
     """(3,) the most that a token can be told in an action, full scales."""
-    noise = CUT * sim.action_noise
-    most = np.array(sim.gain) * sim.gain_spread + np.abs(sim.bias) + sim.bias_spread + noise
-    most[2] += (abs(sim.drift) + sim.drift_spread) * np.hypot(most[0], most[1])
-    bound: Floats = most
-    return bound
+    return np.full(3, sim.dynamics.gain_spread + sim.dynamics.bias_spread)
+
+
+def _uniform(generators: Sequence[np.random.Generator], size: int) -> Floats:
+    """(B, size) in [-1, 1)."""
+    return np.stack([generator.uniform(-1.0, 1.0, size) for generator in generators])
 
 
 def _nothing(command: Command) -> Command:

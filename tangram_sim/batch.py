@@ -43,7 +43,7 @@ class StepResult:
         camera_rewards: (B,) Eq. 14 from the pictures, or None with the camera off.
         refused: (B,) where the action named a placed token: nothing moved.
         blocked: (B,) where a lifted token could not be set down on others: nothing moved.
-        tokens: (B,) which token moved, or would have: with `sim.delay` the one that was named a
+        tokens: (B,) which token moved, or would have: in a delayed world the one that was named a
             step before.
         covered: (B,) share of its area by which a lifted token was, or would have been, set down on
             others; 0 for one that slides.
@@ -90,7 +90,6 @@ class BatchedEnv:
     Attributes:
         count: B.
         horizon: steps of an episode, K * actions_per_token.
-        task: what is played from the next `reset` on.
         action_size: A.
         bound: largest |coordinate| that a corner can reach, arena units.
         goal_rows: G, corners of a target as agents see it.
@@ -147,7 +146,6 @@ class BatchedEnv:
         self.action_size = action_size(layout.tokens, sim)
         self.bound = corner_bound(layout.tokens, sim)
         self.goal_rows = goal_rows(layout, sim)
-        self.task = sim.task
         self._ends_by_placing = layout.tokens > 1 or sim.actions_per_token == 1
         self._worlds = [make_world(layout, sim) for _ in range(count)]
         self.actuation = Actuation(sim, count)
@@ -201,12 +199,11 @@ class BatchedEnv:
         if len(generators) != self.count:
             raise ValueError(f"need {self.count} generators, got {len(generators)}")
         if targets is None:
-            targets = sample_targets(self.layout, self.sim, self.task, generators)
+            targets = sample_targets(self.layout, self.sim, generators)
         self.goals = self.layout.corners(*targets)
         if starts is None:
-            done = self._done(generators)
-            sides = sample_starts(self.layout, self.sim, targets, done, generators)
-            starts = Starts(*sides, done)
+            none = np.zeros((self.count, self.layout.tokens), np.bool_)
+            starts = Starts(*sample_starts(self.layout, self.sim, targets, generators), none)
         self._generators = generators
         self._late = np.zeros(self.count, np.int64), np.zeros((self.count, 3))
         self._begin(targets, starts, views)
@@ -218,7 +215,7 @@ class BatchedEnv:
             self.seen_goals = self.sight.goals
         self._look()
         self.actuation.begin(generators)
-        if self.sim.damping_spread:
+        if self.sim.dynamics.damping_spread:
             for world, damping in zip(self._worlds, self.actuation.damping, strict=True):
                 world.damp(float(damping))
         self._moves[:] = self.sim.actions_per_token * self._named(starts.placed)
@@ -231,14 +228,6 @@ class BatchedEnv:
 
         areas = [covered_area(own, self.layout) for own in self.goals]
         return np.stack([as_rows(area, self.layout, self.goal_rows) for area in areas])
-
-    def _done(self, generators: Sequence[np.random.Generator]) -> Bools:
-        """(B, K) tokens that lie on their targets already: in a stage with fewer to move."""
-        done = np.zeros((self.count, self.layout.tokens), dtype=np.bool_)
-        if 0 < self.task.tokens < self.layout.tokens:
-            for row, generator in zip(done, generators, strict=True):
-                row[generator.permutation(len(row))[self.task.tokens :]] = True
-        return done
 
     def _named(self, flags: Bools) -> Bools:
         """(B, K) flags of the world's tokens, as the agent names these."""
@@ -272,7 +261,7 @@ class BatchedEnv:
         camera = self._move(command, command.idle | blocked)
         if self.sight is not None:
             told = named, np.where(refused[:, None], 0.0, velocity)
-            self.sight.follow(self.pictures, *(self._late if self.sim.delay else told))
+            self.sight.follow(self.pictures, *(self._late if self.sim.dynamics.delayed else told))
             self._late = told
         self._look()
         self.steps_done += 1
@@ -299,7 +288,7 @@ class BatchedEnv:
         if layout.tokens == 1 or self.sim.motion != "lift":
             return np.zeros(self.count)
         poses, sides = self._poses.copy(), self._flipped.copy()
-        if self.sim.falls_short:
+        if self.sim.dynamics.falls_short:
             told = zip(self._worlds, tokens.tolist(), command.velocity, command.flip, strict=True)
             poses[rows, tokens] = [world.landing(*one) for world, *one in told]
         else:

@@ -5,16 +5,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from tangram_sim.dynamics import WORLDS, Dynamics
 from tangram_sim.errors import ConfigError
-from tangram_sim.layout import MAX_TOKENS
-from tangram_sim.settings import LEARNING, NETWORK, Settings, refuse_ignored, setting, told
+from tangram_sim.settings import NETWORK, Settings, refuse_ignored, setting, told
 
 BACKENDS = ("physics", "kinematic")
-REWARDS = ("overlap", "dense", "pose")
+REWARDS = ("overlap", "dense")
 SOURCES = ("polygon", "camera")
-# A step of Bullet is exact up to a turn of pi / 4 and turns too little beyond, so a half turn
-# needs four.
-EXACT_SUBSTEPS = 4
 MIN_PIXELS = 16
 PICTURES = ("binary", "grey")
 # What the target looks like without its pieces.
@@ -26,36 +23,12 @@ CAMERA = ("pixels", "picture", "disturbance")
 NO_PICTURES: dict[str, object] = {"pixels": 0}
 # A fifth of the arena is a whole token: nothing is left to see beyond.
 MAX_CORNER_NOISE = 0.2
-# What an action says is told a token otherwise by at most this much; see SimConfig.
-MAX_GAIN, MAX_BIAS, MAX_ACTION_NOISE = 2.0, 1.0, 0.2
-# Without another of these a token goes exactly where an action takes it, but for noise.
-UNKNOWN = (
-    *("gain", "gain_spread", "bias", "bias_spread", "drift", "drift_spread", "delay"),
-    *("damping", "damping_spread"),
-)
 MOTIONS = ("lift", "slide")
 # Share of a token that may come to lie on others where it is set down: the engine pushes such
 # tokens apart by a little, and with more it would move what is placed.
 MAX_OVERLAP = 0.2
 STARTS = ("anywhere", "outside", "piles")
-TARGETS = ("uniform", "gaussian", "connected", "figures", "touching", "mixed")
-
-
-@dataclass(frozen=True)
-class StageConfig(Settings, section="sim.stages"):
-    """What is played from some update on: a step of a curriculum."""
-
-    updates: int = setting(0, "the stage begins with the weights of so many updates", low=0)
-    tokens: int = setting(
-        0,
-        "how many are to be moved, the others lie on their targets from the start; 0: all",
-        low=0,
-        high=MAX_TOKENS,
-    )
-    targets: str = setting("uniform", "see sim.targets", choices=TARGETS)
-    spread: float = setting(
-        0.2, "see sim.spread", low=1e-3, high=1, unit="arenas", only={"targets": "gaussian"}
-    )
+TARGETS = ("uniform", "connected", "figures", "touching")
 
 
 @dataclass(frozen=True)
@@ -69,80 +42,13 @@ class SimConfig(Settings, section="sim"):
         2.0, "side of the square arena", low=1e-3, high=1e3, unit="as the tokens", part=NETWORK
     )
     actions_per_token: int = setting(1, "actions that each token has", low=1, high=100)
-    substeps: int = setting(
-        8,
-        "least simulation steps in one action of one second; with fewer than 4 a lifted token "
-        "turns less than it is told",
-        low=1,
-        high=1000,
-        only={"backend": "physics"},
-    )
-    damping: float = setting(
-        0.0,
-        "linear and angular; above 0 a lifted token stops short of where it is told to go; "
-        "Bullet's own default is 0.04",
-        low=0,
-        high=1,
-        only={"backend": "physics", "motion": "lift"},
-    )
-    damping_spread: float = setting(
-        0.0,
-        "each episode draws its damping between damping and so much more",
-        low=0,
-        high=1,
-        only={"backend": "physics", "motion": "lift"},
-    )
-    gain: tuple[float, ...] = setting(
-        (1.0, 1.0, 1.0),
-        "of x, y and turn: a token is told so many times what an action says",
-        low=0.1,
-        high=MAX_GAIN,
-    )
-    gain_spread: float = setting(
-        1.0,
-        "each episode draws each gain between gain / gain_spread and gain * gain_spread, "
-        "uniform in the logarithm",
-        low=1,
-        high=MAX_GAIN,
-    )
-    bias: tuple[float, ...] = setting(
-        (0.0, 0.0, 0.0),
-        "of x, y and turn: added to what a token is told",
-        low=-MAX_BIAS,
-        high=MAX_BIAS,
-        unit="full scales",
-    )
-    bias_spread: float = setting(
-        0.0,
-        "each episode draws each bias at most so far from bias",
-        low=0,
-        high=MAX_BIAS,
-        unit="full scales",
-    )
-    drift: float = setting(
-        0.0,
-        "turn that goes along with a shift of one full scale, whatever its direction",
-        low=-1,
-        high=1,
-        unit="half turns",
-    )
-    drift_spread: float = setting(
-        0.0,
-        "each episode draws its drift at most so far from drift",
-        low=0,
-        high=1,
-        unit="half turns",
-    )
-    action_noise: float = setting(
-        0.0,
-        "deviation of the Gaussian noise on x, y and turn of every action as it is carried out",
-        low=0,
-        high=MAX_ACTION_NOISE,
-        unit="full scales",
-    )
-    delay: bool = setting(
-        False,
-        "an action is carried out one step late: the first moves nothing, the last has no effect",
+    world: str = setting(
+        "plain",
+        "what becomes of an action: plain: what it says; bullet: PyBullet by its own defaults, one "
+        "step and a damping of 0.04, stops lifted tokens short; drawn: each episode draws gains of "
+        "x, y and turn from 0.8 to 1.25, biases up to 0.05 full scales and, lifted by the engine, "
+        "a damping up to 0.1; delayed: each action comes one step late",
+        choices=tuple(WORLDS),
     )
     corner_noise: float = setting(
         0.0,
@@ -167,18 +73,9 @@ class SimConfig(Settings, section="sim"):
     )
     targets: str = setting(
         "uniform",
-        "uniform: pieces apart, anywhere; gaussian: apart, around the arena's centre; connected: "
-        "edge to edge; figures: puzzles of the train split; touching: connected or figures by "
-        "chance; mixed: uniform or connected by chance",
+        "uniform: pieces apart, anywhere; connected: edge to edge; figures: puzzles of the train "
+        "split; touching: connected or figures by chance",
         choices=TARGETS,
-    )
-    spread: float = setting(
-        0.2,
-        "gaussian: deviation of the centres",
-        low=1e-3,
-        high=1,
-        unit="arenas",
-        only={"targets": "gaussian"},
     )
     starts: str = setting(
         "anywhere",
@@ -193,11 +90,6 @@ class SimConfig(Settings, section="sim"):
     )
     allow_flip: bool = setting(
         False, "starts on any side; an action may turn its token over (lift only)"
-    )
-    stages: tuple[StageConfig, ...] = setting(
-        (),
-        "a curriculum, as in [{updates:0,tokens:2},{updates:500}]; tests are the whole task",
-        part=LEARNING,
     )
     pixels: int = setting(
         0,
@@ -230,57 +122,25 @@ class SimConfig(Settings, section="sim"):
         return self.observe in LOOKED_AT
 
     @property
-    def task(self) -> StageConfig:
-        """What is played without a curriculum and before its first stage, and what tests are."""
-        return StageConfig(targets=self.targets, spread=self.spread)
-
-    def stage(self, updates: int) -> int:
-        """The number of the stage that weights of so many updates play, 0 before the first."""
-        return sum(stage.updates <= updates for stage in self.stages)
-
-    def told(self, stage: int) -> str:
-        """A stage in words, for logs."""
-        task = self.stage_task(stage)
-        count = f"{task.tokens} token{'s' * (task.tokens > 1)}" if task.tokens else "all tokens"
-        moved = f"{count} to move"
-        return f"stage {stage} of {len(self.stages)}: {moved}, targets {task.targets}" + (
-            f" with spread {task.spread:g}" if task.targets == "gaussian" else ""
-        )
-
-    def stage_task(self, stage: int) -> StageConfig:
-        """What is played in a stage."""
-        return self.stages[stage - 1] if stage else self.task
-
-    @property
     def blind(self) -> "SimConfig":
         """The same world without a camera, and so without what disturbs one."""
         usual = {name: getattr(SimConfig, name) for name in (*CAMERA, "observe")}
         return replace(self, **usual)
 
     @property
-    def inexact(self) -> dict[str, object]:
-        """The settings by which a token that is alone does not go where an action takes it.
-
-        Noise is not among them: nobody could know it.
-        """
-        few = self.backend == "physics" and self.motion == "lift" and self.substeps < EXACT_SUBSTEPS
-        values = {name: getattr(self, name) for name in ("substeps",) * few + UNKNOWN}
-        return {name: v for name, v in values.items() if v != getattr(SimConfig, name)}
+    def dynamics(self) -> Dynamics:
+        """What the world makes of actions; only the engine damps, and only what it carries."""
+        dynamics = WORLDS[self.world]
+        if self.backend == "physics" and self.motion == "lift":
+            return dynamics
+        return replace(dynamics, damping=0.0, damping_spread=0.0)
 
     @property
-    def falls_short(self) -> bool:
-        """Whether the engine itself takes a token less far than it is told."""
-        return not self.inexact.keys().isdisjoint(("substeps", "damping", "damping_spread"))
+    def inexact(self) -> bool:
+        """Whether a token that is alone does not go where an action takes it."""
+        return self.world != "plain"
 
     def __post_init__(self) -> None:
-        self._check_stages()
-        for name in ("gain", "bias"):
-            value = getattr(self, name)
-            if not isinstance(value, tuple) or len(value) != 3:
-                raise ConfigError(
-                    f"sim.{name} must be three numbers, of x, y and turn, as in "
-                    f"sim.{name}={told(getattr(SimConfig, name))}, got {told(value)}"
-                )
         if self.looks:
             self._check_observed()
         super().__post_init__()
@@ -288,6 +148,11 @@ class SimConfig(Settings, section="sim"):
             raise ConfigError(
                 "sim.motion=slide needs the engine's contacts, got sim.backend=kinematic: set "
                 "sim.backend=physics, or sim.motion=lift"
+            )
+        if self.world == "bullet" and not self.dynamics.falls_short:
+            raise ConfigError(
+                "sim.world=bullet needs sim.backend=physics and sim.motion=lift, got "
+                f"{self.backend} and {self.motion}: set them, or another sim.world"
             )
         if self.motion == "slide" and self.allow_flip:
             raise ConfigError(
@@ -310,18 +175,6 @@ class SimConfig(Settings, section="sim"):
             remedy = "set sim.disturbance"
             because = f"sim.observe={self.observe}"
             refuse_ignored(given, because, remedy, SimConfig.corner_noise)
-
-    def _check_stages(self) -> None:
-        entries: tuple[object, ...] = tuple(self.stages)
-        wrong = [entry for entry in entries if not isinstance(entry, StageConfig)]
-        if wrong:
-            raise ConfigError(f"sim.stages must list stages, got {wrong[0]!r}")
-        begins = [stage.updates for stage in self.stages]
-        if begins != sorted(set(begins)):
-            raise ConfigError(
-                f"sim.stages must begin one after the other, got updates {begins}: sort them, and "
-                "name each number once"
-            )
 
 
 def own_code(name: str) -> tuple[Path, str] | None:
@@ -356,8 +209,7 @@ class RewardConfig(Settings, section="reward"):
 
     name: str = setting(
         "overlap",
-        "overlap (Eq. 14), dense (Eq. 15), pose (corner distances modulo the symmetry), or "
-        "path/to/file.py:function for one of your own",
+        "overlap (Eq. 14), dense (Eq. 15), or path/to/file.py:function for one of your own",
     )
     source: str = setting(
         "polygon",
@@ -369,7 +221,7 @@ class RewardConfig(Settings, section="reward"):
         "how steep the logarithm is near the target; larger is steeper",
         low=1e-6,
         high=1e9,
-        only={"name": ("dense", "pose")},
+        only={"name": "dense"},
     )
     sha256: str | None = setting(
         None, "of your own file, as a run writes it down: a file with another content is refused"

@@ -58,7 +58,7 @@ class PhysicsWorld:
                 "close environments, or use fewer of them"
             )
         self._finalizer = weakref.finalize(self, pybullet.disconnect, self._client)
-        self._substeps = sim.substeps
+        self._substeps = sim.dynamics.substeps
         self._slides, self._alone = sim.motion == "slide", layout.tokens == 1
         self._radius = (layout.radii * self._unit).tolist()
         thin = min(thickness(shape.corners) for shape in layout.shapes) * self._unit
@@ -69,7 +69,7 @@ class PhysicsWorld:
         for token in range(layout.tokens):
             self._weigh(token, 1.0)
         # Bullet damps by 0.04 unless told otherwise: tokens would stop short.
-        self.damp(sim.damping)
+        self.damp(sim.dynamics.damping)
         self._play_at_once()
         if sim.pixels:
             self._pixels = sim.pixels

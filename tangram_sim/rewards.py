@@ -49,9 +49,7 @@ def make_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> RewardF
         return lambda achieved, desired: _checked(config.name, function, achieved, desired, layout)
     if config.name == "overlap":
         return lambda achieved, desired: overlap(achieved, desired, layout)
-    if config.name == "dense":
-        return lambda achieved, desired: dense(achieved, desired, layout, reach, config.sharpness)
-    return lambda achieved, desired: pose(achieved, desired, layout, reach, config.sharpness)
+    return lambda achieved, desired: dense(achieved, desired, layout, reach, config.sharpness)
 
 
 def check_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> None:
@@ -125,25 +123,6 @@ def dense(
     return mean
 
 
-def pose(
-    achieved: Floats, desired: Floats, layout: Layout, reach: float, sharpness: float
-) -> Floats:
-    """The reward with emphasis on orientation that Sec. VIII asks for: corner distances.
-
-    For each token the mean distance of its corners from the target's, at the best of the turns
-    that map the shape onto itself, as `closeness`. A turn by t moves a corner at radius r by
-    2 r sin(t / 2), nearly r t, which counts exactly as much as shifting the token that far: so a
-    wrong angle costs as much as the wrong position that is as visible. Eq. 14 is blind there: a
-    square on its target's centre, turned by 45 degrees, still scores 0.66.
-    """
-    rewards = [
-        closeness(_corner_distance(achieved, desired, layout, token), reach, sharpness)
-        for token in range(layout.tokens)
-    ]
-    mean: Floats = np.mean(rewards, axis=0)
-    return mean
-
-
 def closeness(distance: Floats, reach: float, sharpness: float) -> Floats:
     """+1 at distance 0, -1 at `reach`: r = 1 - 2 log(1 + s d / reach) / log(1 + s).
 
@@ -169,20 +148,6 @@ def reward_bounds(config: RewardConfig, sim: SimConfig, bound: float) -> tuple[f
     farthest = np.array(2.0 * np.sqrt(2.0) * bound)
     least = closeness(farthest, sim.arena * np.sqrt(2.0), config.sharpness)
     return min(-1.0, float(least)), 1.0
-
-
-def _corner_distance(achieved: Floats, desired: Floats, layout: Layout, token: int) -> Floats:
-    """(B,) mean corner distance at the best of the symmetric turns."""
-    own = layout.corners_of(token)
-    here, there = achieved[:, own], desired[:, own]
-    shape = layout.shapes[token]
-    step = len(shape.corners) // shape.symmetry
-    means = [
-        np.linalg.norm(here - np.roll(there, turn * step, axis=1), axis=-1).mean(axis=-1)
-        for turn in range(shape.symmetry)
-    ]
-    best: Floats = np.min(means, axis=0)
-    return best
 
 
 def reward_identity(config: RewardConfig) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Layouts without overlap, token after token: uniform or around one place.
+"""Layouts without overlap, token after token.
 
 Tokens are placed one after the other, the largest first, each over the poses that those before it
 leave free. Drawing whole layouts and rejecting those with an overlap would be uniform over
@@ -16,13 +16,12 @@ import numpy as np
 from tangram_sim.arrays import Bools, Floats, Ints
 from tangram_sim.config import SimConfig
 from tangram_sim.errors import SamplingError
-from tangram_sim.geometry import outlines, outlines_at, pairs_overlap
+from tangram_sim.geometry import outlines_at, pairs_overlap
 from tangram_sim.layout import Layout
 
 MAX_TRIES = 1000  # random poses tried for one token before sampling gives up
 _CHUNK = 4  # poses drawn at once when some may overlap: fewer, larger checks
 _CLEAR_TRIES = 64  # outside of what is only to be avoided; then anywhere
-_WIDENING = 1.02  # of a Gaussian with every pose that was blocked: there is room in the end
 
 
 def sample_poses(layout: Layout, sim: SimConfig, rng: np.random.Generator) -> Floats:
@@ -37,8 +36,6 @@ def sample_batch(
     generators: Sequence[np.random.Generator],
     flipped: Bools | None = None,
     avoid: Floats | None = None,
-    spread: float | None = None,
-    laid: tuple[Bools, Floats] | None = None,
 ) -> Floats:
     """One layout per generator: (B, K, 3) of x, y (arena units) and angle in (-pi, pi].
 
@@ -51,8 +48,6 @@ def sample_batch(
         generators: one for each of B environments.
         flipped: (B, K) tokens that lie on their other side; None: none does.
         avoid: (B, M, C, 2) outlines that tokens keep clear of where there is room.
-        laid: (B, K) tokens that lie already, and poses (B, K, 3) of which theirs are taken.
-        spread: deviation of Gaussian centres (Sec. VIII), as a share of the arena; None: uniform.
 
     Raises:
         SamplingError: a token does not fit into the arena, or `MAX_TRIES` poses for one all
@@ -61,19 +56,13 @@ def sample_batch(
     reach = check_fits(layout, sim)
     poses = np.empty((len(generators), layout.tokens, 3))
     sides = np.zeros(poses.shape[:2], np.bool_) if flipped is None else flipped
-    lies = np.zeros(poses.shape[:2], np.bool_)
     order = np.argsort(-layout.areas, kind="stable").tolist()
     bodies = layout.body[layout.padded_corners]
     placed: Floats = np.empty((len(generators), 0, *bodies.shape[1:]))
-    if laid is not None:
-        lies, poses = laid[0], laid[1].copy()
-        # Outlines without an area are in nobody's way.
-        known = outlines(layout.corners(poses, sides), layout)
-        placed = known * lies[..., None, None]
-    draw = _Draw(sim, generators, spread)
+    draw = _Draw(sim, generators)
     for token in order:
         piece = _Piece(layout.shapes[token].name, bodies[token], reach[token], sides[:, token])
-        _place(piece, placed, avoid, draw, poses[:, token], np.flatnonzero(~lies[:, token]))
+        _place(piece, placed, avoid, draw, poses[:, token])
         outline = outlines_at(piece.body, poses[:, token], sides[:, token])
         placed = np.concatenate([placed, outline[:, None]], axis=1)
     return poses
@@ -102,19 +91,12 @@ class _Draw:
 
     sim: SimConfig
     generators: Sequence[np.random.Generator]
-    spread: float | None
 
-    def __call__(self, row: int, size: int, tries: int, reach: float) -> Floats:
-        """Draw (size, 3) poses for one environment, after `tries` poses that were blocked."""
+    def __call__(self, row: int, size: int, reach: float) -> Floats:
+        """Draw (size, 3) poses for one environment."""
         rng = self.generators[row]
         unit: Floats = 1.0 - 2.0 * rng.random((size, 3))  # in (-1, 1]
         poses: Floats = unit * np.array([reach, reach, np.pi])
-        if self.spread is not None:
-            deviation = self.spread * self.sim.arena * _WIDENING**tries
-            centres = rng.standard_normal((size, 2)) * deviation
-            # What falls outside is drawn uniformly: a bound on the Gaussian, and always an end.
-            inside = (np.abs(centres) <= reach).all(axis=1)
-            poses[inside, :2] = centres[inside]
         return poses
 
 
@@ -124,9 +106,9 @@ def _place(
     avoid: Floats | None,
     draw: _Draw,
     poses: Floats,
-    open_rows: Ints,
 ) -> None:
-    """Fill the open rows of poses (B, 3) of one token, clear of those placed (B, k, C, 2)."""
+    """Fill the poses (B, 3) of one token, clear of those placed (B, k, C, 2)."""
+    open_rows = np.arange(len(poses))
     if avoid is not None:
         both = np.concatenate([placed, avoid], axis=1)
         open_rows = _try(piece, both, draw, poses, open_rows, _CLEAR_TRIES)
@@ -143,7 +125,7 @@ def _try(
     tries = 0
     while len(open_rows) and tries < limit:
         size = min(chunk, limit - tries)
-        drawn = np.stack([draw(b, size, tries, piece.reach) for b in open_rows.tolist()])
+        drawn = np.stack([draw(b, size, piece.reach) for b in open_rows.tolist()])
         blocked = _blocked(piece, drawn, obstacles[open_rows], piece.flipped[open_rows])
         first = np.argmin(blocked, axis=1)
         free = ~blocked[np.arange(len(open_rows)), first]

@@ -4,7 +4,6 @@ Legend: B environments, K tokens. A layout is poses (B, K, 3) and sides (B, K): 
 their other side.
 """
 
-import math
 from collections.abc import Sequence
 from functools import lru_cache
 from itertools import combinations
@@ -12,17 +11,16 @@ from itertools import combinations
 import numpy as np
 
 from tangram_sim.actions import horizon
-from tangram_sim.actuation import reach
 from tangram_sim.arrays import Bools, Floats
 from tangram_sim.assembly import COUNTS, Puzzle, PuzzleRules
-from tangram_sim.config import SimConfig, StageConfig
+from tangram_sim.config import SimConfig
 from tangram_sim.connected import MAX_PILE, sample_connected, sample_piles
 from tangram_sim.errors import ConfigError
 from tangram_sim.fitting import kind_of
 from tangram_sim.geometry import outlines
 from tangram_sim.kinematics import wrap
 from tangram_sim.layout import Layout
-from tangram_sim.prisms import ENGINE_ARENA, thickness
+from tangram_sim.prisms import thickness
 from tangram_sim.puzzles import library
 from tangram_sim.sampling import sample_batch
 from tangram_sim.settings import refuse_ignored, told
@@ -30,29 +28,24 @@ from tangram_sim.shapes import Shape, mirror_image, tan, turn_onto
 
 Generators = Sequence[np.random.Generator]
 Sides = tuple[Floats, Bools]
-_BY_CHANCE = {"touching": ("connected", "figures"), "mixed": ("uniform", "connected")}
-_TOGETHER = "connected", "figures", "touching", "mixed"  # with pieces that touch
 _NO_TURN = 1e-6  # radians
 MIN_THICKNESS = 1e-3  # of a token, arenas
 
 
-def sample_targets(
-    layout: Layout, sim: SimConfig, task: StageConfig, generators: Generators
-) -> Sides:
+def sample_targets(layout: Layout, sim: SimConfig, generators: Generators) -> Sides:
     """One target per generator.
 
     Raises:
         SamplingError: no room.
         ConfigError: figures, and the tokens are not all seven tans.
     """
-    kinds = [_kind(task, rng) for rng in generators]
+    kinds = [_kind(sim, rng) for rng in generators]
     flipped = _sides(layout, sim, generators)
     poses = np.empty((len(generators), layout.tokens, 3))
-    apart = [b for b, kind in enumerate(kinds) if kind in ("uniform", "gaussian")]
+    apart = [b for b, kind in enumerate(kinds) if kind == "uniform"]
     if apart:
-        spread = task.spread if task.targets == "gaussian" else None
         rngs = [generators[b] for b in apart]
-        poses[apart] = sample_batch(layout, sim, rngs, flipped[apart], spread=spread)
+        poses[apart] = sample_batch(layout, sim, rngs, flipped[apart])
     for b, kind in enumerate(kinds):
         if kind == "connected":
             one = sample_connected(layout, sim, generators[b])
@@ -63,31 +56,27 @@ def sample_targets(
     return poses, flipped
 
 
-def sample_starts(
-    layout: Layout, sim: SimConfig, targets: Sides, done: Bools, generators: Generators
-) -> Sides:
+def sample_starts(layout: Layout, sim: SimConfig, targets: Sides, generators: Generators) -> Sides:
     """One start per generator: on the target's sides, or on any with `allow_flip`.
 
     Args:
         layout: the tokens.
         sim: says whether starts keep clear of the target, or are piles.
         targets: see `sample_targets`.
-        done: (B, K) tokens that lie on their targets already; the others keep clear of them.
         generators: one for each environment.
 
     Raises:
         SamplingError: no room.
     """
-    poses, flipped = targets
+    flipped = targets[1]
     if sim.starts == "piles":
         return _piles(layout, sim, targets, generators)
     if sim.allow_flip:
         drawn = [rng.random(layout.tokens) < 0.5 for rng in generators]
-        flipped = np.where(done, flipped, np.stack(drawn) & layout.chiral)
+        flipped = np.stack(drawn) & layout.chiral
     goals = layout.corners(*targets)
     avoid = outlines(goals, layout) if sim.starts == "outside" else None
-    laid = (done, poses) if done.any() else None
-    return sample_batch(layout, sim, generators, flipped, avoid, laid=laid), flipped
+    return sample_batch(layout, sim, generators, flipped, avoid), flipped
 
 
 def _piles(layout: Layout, sim: SimConfig, targets: Sides, generators: Generators) -> Sides:
@@ -110,8 +99,8 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
     Raises:
         ConfigError: figures of tokens that are not all seven tans or too large for the arena, flips
             or other sides of tokens that look the same on both, what one token does to others,
-            piles of one token or of some, a token too thin for the arena, a world in which none
-            could move, or a stage that moves more than there are.
+            piles of one token, a token too thin for the arena, or a world in which none could
+            move.
     """
     if sim.allow_flip and not layout.any_chiral:
         raise ConfigError(
@@ -125,39 +114,18 @@ def check_targets(layout: Layout, sim: SimConfig) -> None:
         given, usual = f"sim.motion={sim.motion}", SimConfig.motion
         refuse_ignored(given, "one token", "take a set of several", usual)
     _check_thick(layout, sim)
-    _check_world(layout, sim)
-    _check_piles(layout, sim)
-    for stage in sim.stages:
-        if stage.tokens > layout.tokens:
-            raise ConfigError(
-                f"sim.stages: tokens must be at most the {layout.tokens} that there are, got "
-                f"{stage.tokens} (in the stage from update {stage.updates}); 0 moves all"
-            )
+    _check_delay(layout, sim)
+    if sim.starts == "piles" and layout.tokens == 1:
+        refuse_ignored("sim.starts=piles", "one token", "take a set of several")
     if sim.looks:
         _check_names(layout, sim.observe)
-    together = [t for t in (sim.task, *sim.stages) if t.targets in _TOGETHER]
-    if sim.observe == "pictures" and together and layout.tokens > MAX_PILE:
+    if sim.observe == "pictures" and sim.targets != "uniform" and layout.tokens > MAX_PILE:
         raise ConfigError(
             f"sim.observe=pictures tells at most {MAX_PILE} tokens that touch from each other, got "
-            f"{layout.tokens} in sim.targets={together[0].targets}: set sim.targets=uniform, or "
+            f"{layout.tokens} in sim.targets={sim.targets}: set sim.targets=uniform, or "
             "sim.observe=corners"
         )
-    for task in (sim.task, *sim.stages):
-        _check_figures(layout, sim, task.targets)
-
-
-def _check_piles(layout: Layout, sim: SimConfig) -> None:
-    if sim.starts != "piles":
-        return
-    if layout.tokens == 1:
-        refuse_ignored("sim.starts=piles", "one token", "take a set of several")
-    for stage in sim.stages:
-        if 0 < stage.tokens < layout.tokens:
-            raise ConfigError(
-                f"sim.starts=piles has all {layout.tokens} tokens in piles, and a stage of "
-                f"sim.stages leaves all but {stage.tokens} on the target: give it tokens:0, or set "
-                "sim.starts=anywhere"
-            )
+    _check_figures(layout, sim)
 
 
 def _check_names(layout: Layout, observe: str) -> None:
@@ -177,22 +145,11 @@ def _check_names(layout: Layout, observe: str) -> None:
             )
 
 
-def _check_world(layout: Layout, sim: SimConfig) -> None:
-    if sim.delay and horizon(layout.tokens, sim) == 1:
+def _check_delay(layout: Layout, sim: SimConfig) -> None:
+    if sim.dynamics.delayed and horizon(layout.tokens, sim) == 1:
         raise ConfigError(
-            "sim.delay=true moves nothing in an episode of one action: raise "
-            "sim.actions_per_token to at least 2, or set sim.delay=false"
-        )
-    # In one step the engine takes damping * (1 + speed) of a speed, and more than all of it would
-    # throw a token back.
-    x, y, turn = reach(sim)
-    fastest = max(ENGINE_ARENA * math.hypot(x, y), math.pi * turn)
-    damping = sim.damping + sim.damping_spread
-    if damping * (1.0 + fastest) > sim.substeps:
-        raise ConfigError(
-            f"sim.substeps must be at least {math.ceil(damping * (1.0 + fastest))} with a damping "
-            f"of {damping:g}, got {sim.substeps}: the engine would throw fast tokens back; raise "
-            "it, or lower sim.damping or sim.damping_spread"
+            "sim.world=delayed moves nothing in an episode of one action: raise "
+            "sim.actions_per_token to at least 2, or set sim.world=plain"
         )
 
 
@@ -251,9 +208,10 @@ def _is_piece(puzzle: Puzzle, piece: int, shape: Shape) -> bool:
     )
 
 
-def _kind(task: StageConfig, rng: np.random.Generator) -> str:
-    kinds = _BY_CHANCE.get(task.targets)
-    return task.targets if kinds is None else kinds[int(rng.random() < 0.5)]
+def _kind(sim: SimConfig, rng: np.random.Generator) -> str:
+    if sim.targets != "touching":
+        return sim.targets
+    return "figures" if rng.random() < 0.5 else "connected"
 
 
 def _sides(layout: Layout, sim: SimConfig, generators: Generators) -> Bools:
@@ -298,19 +256,19 @@ def _scale(layout: Layout) -> float:
     return float(np.sqrt(shape.area / tan(shape.name).area))
 
 
-def _check_figures(layout: Layout, sim: SimConfig, targets: str) -> None:
+def _check_figures(layout: Layout, sim: SimConfig) -> None:
     """Raise unless every figure is one of the tokens and fits into the arena at any angle."""
-    if targets not in ("figures", "touching"):
+    if sim.targets not in ("figures", "touching"):
         return
     if not has_all_tans(layout):
         raise ConfigError(
-            f"sim.targets={targets} needs all seven tans, got tokens {', '.join(_tans(layout))}: "
-            "set tokens=tangram7, or another kind of targets"
+            f"sim.targets={sim.targets} needs all seven tans, got tokens "
+            f"{', '.join(_tans(layout))}: set tokens=tangram7, or another kind of targets"
         )
     extent = PuzzleRules().max_extent * _scale(layout)
     if extent > sim.arena:
         raise ConfigError(
-            f"sim.targets={targets} needs an arena of width {extent:g} for tokens.scale="
+            f"sim.targets={sim.targets} needs an arena of width {extent:g} for tokens.scale="
             f"{_scale(layout):g}, got {sim.arena:g}: raise sim.arena, or lower tokens.scale"
         )
 

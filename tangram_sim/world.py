@@ -44,7 +44,7 @@ class World(Protocol):
         """(3,) the pose at which `move` would set a lifted token down; nothing is moved."""
 
     def damp(self, damping: float) -> None:
-        """Damp every motion by so much from now on, in place of `sim.damping`; the engine does."""
+        """Damp every motion by so much from now on, the engine does."""
 
     def poses(self) -> Floats:
         """(K, 3) x, y and angle in (-pi, pi]."""
@@ -84,11 +84,8 @@ def check_room(layout: Layout, sim: SimConfig) -> None:
         ConfigError: see `check_targets`.
     """
     check_targets(layout, sim)
-    done = np.zeros((1, layout.tokens), dtype=np.bool_)
-    for task in (sim.task, *sim.stages):
-        generators = [np.random.default_rng(0)]
-        targets = sample_targets(layout, sim, task, generators)
-        sample_starts(layout, sim, targets, done, generators)
+    generators = [np.random.default_rng(0)]
+    sample_starts(layout, sim, sample_targets(layout, sim, generators), generators)
 
 
 def check_shown(sim: SimConfig, outlines: bool) -> None:

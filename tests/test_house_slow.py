@@ -49,8 +49,7 @@ def test_the_launcher_needs_no_torch() -> None:
 @pytest.mark.parametrize(
     "line",
     [
-        "eval episodes=3 sim.damping=3",
-        "play sim.gain=0",
+        "eval episodes=3 sim.world=moon",
         "play puzzle=nowhere.json",
         "play target=nowhere.png",
         "play silhouette=nowhere.png",

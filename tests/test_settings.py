@@ -57,7 +57,6 @@ def over(base: Config, **sections: dict[str, Any]) -> Config:
 PAPER = over(ONE, agent={"gamma": 0.9}, sim={"actions_per_token": 2})
 MLP = ONE | {"net": {"kind": "mlp", "hidden": [8]}}
 PHYSICS = over(ONE, sim={"backend": "physics"})
-GAUSSIAN = over(SEVERAL, sim={"targets": "gaussian"})
 # So crowded that nearly every order pushes something away.
 SLIDE = over(
     SEVERAL,
@@ -74,8 +73,6 @@ DENSE = over(ONE, reward={"name": "dense"})
 NEAR = {"strategy": "near", "copies": 1, "position": 0.1, "angle": 0.1}
 FINAL_TWICE = over(ONE, sim={"actions_per_token": 2}, agent={"hindsight": [{"strategy": "final"}]})
 NEAR_ONE = over(ONE, agent={"hindsight": [NEAR]})
-STAGE = {"updates": 2, "tokens": 1, "targets": "gaussian", "spread": 0.2}
-STAGES = over(SEVERAL, sim={"stages": [STAGE]})
 
 # Setting -> a run in which it has an effect, and another value.
 SHOWS: dict[str, tuple[Config, object]] = {
@@ -84,34 +81,18 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "sim.backend": (SEVERAL, "physics"),
     "sim.arena": (ONE, 2.5),
     "sim.actions_per_token": (ONE, 2),
-    "sim.substeps": (PHYSICS, 1),
-    "sim.damping": (PHYSICS, 0.5),
-    "sim.damping_spread": (PHYSICS, 0.5),
-    "sim.gain": (ONE, [0.9, 1.0, 1.0]),
-    "sim.gain_spread": (ONE, 1.1),
-    "sim.bias": (ONE, [0.0, 0.0, 0.1]),
-    "sim.bias_spread": (ONE, 0.1),
-    "sim.drift": (ONE, -0.1),
-    "sim.drift_spread": (ONE, 0.1),
-    "sim.action_noise": (ONE, 0.01),
-    "sim.delay": (over(ONE, sim={"actions_per_token": 2}), True),
+    "sim.world": (ONE, "drawn"),
     "sim.corner_noise": (ONE, 0.01),
     "sim.motion": (over(SEVERAL, sim={"backend": "physics"}), "slide"),
     "sim.targets": (SEVERAL, "connected"),
-    "sim.spread": (GAUSSIAN, 0.05),
     "sim.starts": (SEVERAL, "outside"),
     "sim.mirrored": (SEVERAL, 1.0),
     "sim.allow_flip": (SEVERAL, True),
-    "sim.stages": (SEVERAL, [STAGE]),
     "sim.pixels": (CAMERA, 32),
     "sim.picture": (CAMERA, "grey"),
     "sim.disturbance": (CAMERA, 1.0),
     "sim.observe": (SEEN, "pictures"),
-    "sim.stages.updates": (STAGES, 100),
-    "sim.stages.tokens": (STAGES, 2),
-    "sim.stages.targets": (over(STAGES, sim={"stages": [STAGE | {"spread": 0.2}]}), "connected"),
-    "sim.stages.spread": (STAGES, 0.02),
-    "reward.name": (ONE, "pose"),
+    "reward.name": (ONE, "dense"),
     "reward.source": (SEEN, "camera"),
     "reward.sharpness": (DENSE, 10.0),
     "net.kind": (ONE | {"net": {}}, "mlp"),
@@ -172,7 +153,6 @@ def steps_of(setup: Setup) -> Iterator[str]:
         rollout = Rollout(env, 0, "player", 0, 0)
         for turn in range(TURNS):
             policy.follow(trainer.weights())
-            rollout.follow(trainer.updates)
             played = rollout.play(policy.explore)
             yield digest(played.corners, played.actions, played.rewards, played.goals)
             trainer.insert(played)
@@ -270,11 +250,6 @@ def test_every_setting_of_a_command_is_read() -> None:
         (MLP, "net.layers", 2, "net.kind=mlp"),
         (MLP, "net.feed_forward", 8, "net.kind=mlp"),
         (MLP, "net.scale", "sqrt_d", "net.kind=mlp"),
-        (ONE, "sim.substeps", 16, "sim.backend=kinematic"),
-        (ONE, "sim.damping", 0.04, "sim.backend=kinematic"),
-        (ONE, "sim.damping_spread", 0.04, "sim.backend=kinematic"),
-        (SLIDE, "sim.damping", 0.04, "sim.motion=slide"),
-        (SLIDE, "sim.damping_spread", 0.04, "sim.motion=slide"),
         (PHYSICS, "sim.motion", "slide", "one token"),
         (ONE, "sim.mirrored", 0.5, "tokens that are their own mirror images"),
         (ONE, "agent.beam", 8, "agent.lookahead=none"),
@@ -282,7 +257,6 @@ def test_every_setting_of_a_command_is_read() -> None:
         (ONE, "agent.polyak", 0.5, "agent.gamma=0"),
         (FINAL_TWICE, "agent.hindsight.position", 0.1, "agent.hindsight.strategy=final"),
         (FINAL_TWICE, "agent.hindsight.angle", 0.1, "agent.hindsight.strategy=final"),
-        (ONE, "sim.spread", 0.1, "sim.targets=uniform"),
         (ONE, "sim.picture", "grey", "sim.pixels=0"),
         (ONE, "sim.disturbance", 1.0, "sim.pixels=0"),
         (over(SEEN, sim={"observe": "pictures"}), "sim.corner_noise", 0.01, "sim.observe=pictures"),

@@ -17,7 +17,7 @@ from tangram_sim.settings import Settings, check_folder, declared, refuse_ignore
 from worker.discovery import as_address, find_master
 
 Changes = dict[str, dict[str, Any]]  # section -> setting -> value: of a run that was trained
-OF_TARGETS = ("targets", "spread", "mirrored")  # settings of sim that say nothing of a puzzle
+OF_TARGETS = ("targets", "mirrored")  # settings of sim that say nothing of a puzzle
 MAX_EPISODES = 1_000_000
 MAX_SHOWN = 100
 MAX_TURNS = 360

@@ -20,7 +20,6 @@ from tangram_agent.runs import Run, load_changed
 from tangram_agent.setup import Setup
 from tangram_sim.config import SILHOUETTES, SimConfig
 from tangram_sim.game_drawing import figure_sheet
-from tangram_sim.settings import told
 from worker.baselines import (
     Player,
     Told,
@@ -228,9 +227,7 @@ def _told(setup: Setup) -> str:
         _observed(sim),
         sim.backend if setup.layout.tokens == 1 else f"{sim.backend}, {sim.motion}",
     ]
-    parts += [f"{name} {told(value)}" for name, value in sim.inexact.items()]
-    if sim.action_noise:
-        parts.append(f"actions with noise {sim.action_noise:g}")
+    parts += [f"world {sim.world}"] if sim.inexact else []
     return ", ".join(parts)
 
 

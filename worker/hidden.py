@@ -156,8 +156,7 @@ def hide(setup: Setup, figures: Sequence[Figure], seed: int, method: Method = UN
 
 def _seeing(setup: Setup, observe: str) -> Setup:
     """The task of who sees what was found; which targets training drew does not matter."""
-    usual = {name: getattr(SimConfig, name) for name in ("targets", "spread", "stages")}
-    sim = replace(setup.sim, observe=observe, **usual)
+    sim = replace(setup.sim, observe=observe, targets=SimConfig.targets)
     if setup.fills:  # who lays it sees pieces
         return replace(setup, sim=sim, agent=AgentConfig(), net=NetConfig())
     return replace(setup, sim=sim)

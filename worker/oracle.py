@@ -22,16 +22,13 @@ _SURPRISE = 5.0  # deviations beyond which something else has moved a token
 
 
 def oracle_policy(env: BatchedEnv) -> Choose:
-    """As `exact_policy`, told the world that each episode has: gain, bias, drift, damping, noise.
+    """As `exact_policy`, told the world that each episode has: gain, bias, damping.
 
     Each action gives the command that ends nearest to the piece, also the long way round where the
     world turns further that way. With a delay it is chosen for where the action before will have
     taken the tokens. What the engine makes of a command is tried once for each damping.
 
-    With noise on corners it goes by where the tokens are most likely to be, see `_Filter`. Noise on
-    actions comes with every action alike, however small it is, and an episode has as many as it
-    has: so each action makes good all that is known to be missing, and what the last one adds is
-    the world's. None is spared by naming a token that is placed.
+    With noise on corners it goes by where the tokens are most likely to be, see `_Filter`.
     """
     layout, sim, world, engine = env.layout, env.sim, env.actuation, _Engine(env)
     tracker = _Filter(env, engine)
@@ -68,7 +65,7 @@ def oracle_policy(env: BatchedEnv) -> Choose:
 
 
 def _carry(env: BatchedEnv, engine: "_Engine", command: Command, poses: Floats) -> None:
-    """Move poses (B, K, 3) as a command does, but for noise and what meets."""
+    """Move poses (B, K, 3) as a command does, but for what meets."""
     way = engine(env.actuation.told(command.velocity), env.actuation.damping)
     rows = np.flatnonzero(~command.idle)
     poses[rows, command.tokens[rows]] += way[rows]
@@ -89,9 +86,8 @@ class _Filter:
         noise = sim.corner_noise * sim.arena
         centre = (layout.base_weights**2).sum(axis=1)
         turn = 1.0 / np.add.reduceat((layout.body**2).sum(axis=1), layout.starts[:-1])
-        # Variances (K, 3) of what is seen, and (3,) of what an action adds.
+        # Variances (K, 3) of what is seen.
         self._seen = noise**2 * np.column_stack([centre, centre, turn])
-        self._added = (sim.action_noise * full_scale(sim)) ** 2
         self._poses: Floats = np.zeros((env.count, layout.tokens, 3))
         self._variance = self._poses
 
@@ -101,11 +97,9 @@ class _Filter:
         if env.sim.corner_noise == 0.0:
             return shown
         fresh = np.full(shown.shape[:2], last is None)
-        poses, variance = self._poses.copy(), self._variance.copy()
+        poses, variance = self._poses.copy(), self._variance
         if last is not None:
             _carry(env, self._engine, last, poses)
-            rows = np.flatnonzero(~last.idle)
-            variance[rows, last.tokens[rows]] += self._added
         off = shown - poses
         off[..., 2] = wrap(off[..., 2])
         both = variance + self._seen

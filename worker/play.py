@@ -43,7 +43,7 @@ COMPARED = 1080  # pixels across, about, of all runs together
 HEADER = 44  # pixels above a run's episodes
 TITLE, SCORE = 18, 13  # pixels of the header's two lines
 GAP = 24  # pixels between runs
-OF_STARTS = ("targets", "spread", "mirrored", "starts")
+OF_STARTS = ("targets", "mirrored", "starts")
 _DRAWN_BY = f"sim.arena, {', '.join(OF_STARTS)}"
 PAPER, TEXT, FAINT, RULE = (250, 250, 247), (31, 41, 55), (107, 114, 128), (214, 214, 208)
 

@@ -103,5 +103,4 @@ def _play(rollout: Rollout, policy: Policy, client: Client, groups: int) -> Epis
         client.poll()
         return not client.stopped
 
-    rollout.follow(policy.version)
     return rollout.play(policy.explore, groups, go_on)

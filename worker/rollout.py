@@ -223,11 +223,6 @@ class Rollout:
         """Episodes that are played at a time."""
         return self._env.count
 
-    def follow(self, updates: int) -> None:
-        """Play what the curriculum has for weights of so many updates, from the next episode on."""
-        sim = self._env.sim
-        self._env.task = sim.stage_task(sim.stage(updates))
-
     def play(
         self, choose: Choose, groups: int = 1, go_on: Callable[[], bool] = lambda: True
     ) -> Episodes:

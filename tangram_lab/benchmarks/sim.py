@@ -36,7 +36,7 @@ class BareLoop:
     def __init__(self, layout: Layout, sim: SimConfig, horizon: int) -> None:
         self.client = pybullet.connect(pybullet.DIRECT)
         pybullet.setPhysicsEngineParameter(
-            fixedTimeStep=1.0, numSubSteps=sim.substeps, physicsClientId=self.client
+            fixedTimeStep=1.0, numSubSteps=sim.dynamics.substeps, physicsClientId=self.client
         )
         unit = 2.0 / sim.arena
         self.bodies = [self._body(shape.corners * unit) for shape in layout.shapes]

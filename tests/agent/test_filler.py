@@ -159,8 +159,7 @@ def test_filled_is_surer_than_any_value() -> None:
         ({"lookahead": "values", "beam": 1}, {}, "agent.lookahead=values changes nothing with"),
         ({}, {"starts": "anywhere"}, r"sim.starts=anywhere: .* set sim.starts=outside"),
         ({}, {"actions_per_token": 2}, r"actions_per_token=2: .* set sim.actions_per_token=1"),
-        ({}, {"gain": [1.1, 1.0, 1.0]}, r"sim.gain=.*: .* set sim.gain=\[1,1,1\]"),
-        ({}, {"action_noise": 0.01}, r"action_noise=0.01: .* set sim.action_noise=0"),
+        ({}, {"world": "drawn"}, "sim.world=drawn: .* set sim.world=plain"),
         ({}, {"corner_noise": 0.01}, "sim.corner_noise"),
     ],
 )

@@ -196,7 +196,7 @@ def test_sums_of_another_model_are_refused() -> None:
 @pytest.mark.parametrize("delay", [False, True])
 @pytest.mark.parametrize("tokens", [SQUARE, PAIR])
 def test_motions_are_those_of_the_token_that_each_action_named(tokens: dict, delay: bool) -> None:
-    made = setup(tokens, actions_per_token=2, delay=delay)
+    made = setup(tokens, actions_per_token=2, world="delayed" if delay else "plain")
     layout = made.layout
     poses = np.zeros((1, 3, layout.tokens, 3))
     poses[0, :, -1] = [[0.1, 0.2, 3.0], [0.3, 0.1, -3.0], [0.3, 0.1, -3.0]]
@@ -249,7 +249,7 @@ def test_noise_on_the_corners_of_small_tokens_is_no_contact() -> None:
         (PAIR, {}, True),
         (SQUARE, {}, False),  # it meets nothing
         (PAIR, {"observe": "corners"}, False),
-        (PAIR, {"gain_spread": 1.5}, False),  # far from usual may be what that world does
+        (PAIR, {"world": "drawn"}, False),  # far from usual may be what that world does
     ],
 )
 def test_motions_are_screened_only_where_the_world_is_exact_and_seen(
@@ -319,7 +319,7 @@ def test_an_agent_corrects_itself_by_what_it_has_seen() -> None:
 
 def test_with_a_delay_it_plays_for_where_the_action_before_will_have_taken_the_token() -> None:
     """Told the same again where the token seems not to have moved, it would go twice as far."""
-    made = setup(agent=LEARNED, actions_per_token=3, delay=True)
+    made = setup(agent=LEARNED, actions_per_token=3, world="delayed")
     policy = Policy(made)
     learner = Learner(made, 0)
     policy.load(learner.acting_weights(1))

@@ -340,7 +340,6 @@ def test_a_run_plays_on_with_other_settings_of_the_agent() -> None:
         ("agent", "reapply", "x", "wrong config: .*agent.reapply"),
         ("agent", "odd", 1, "wrong config: .*odd"),
         ("agent", "batch_size", 9, "agent.batch_size=9 changes nothing with a trained run, which"),
-        ("sim", "stages", (), "changes nothing with a trained run, which only plays: leave it out"),
         ("agent", "readout", "token", "agent.readout=token does not fit this run, whose weights"),
         ("sim", "arena", 3.0, "trained with sim.arena=2: leave it out, or train a run with it"),
         ("sim", "motion", "slide", "run with sim.motion=slide: .* needs the engine's contacts"),

@@ -7,7 +7,6 @@ import pytest
 
 from tangram_agent.config import ServiceConfig
 from tangram_agent.setup import from_mapping, make_setup
-from tangram_sim.config import StageConfig
 from tangram_sim.errors import ConfigError
 
 pytestmark = pytest.mark.fast
@@ -37,13 +36,9 @@ def changed(section: str, **values: Any) -> dict[str, dict[str, Any]]:
             changed("tokens", shapes=[{"name": "x", "corners": [[0, 0], [1e200, 0], [0, 1e200]]}]),
             "corners must be finite and within",
         ),
-        (changed("sim", substeps=0), "sim.substeps must be between 1 and 1000, got 0"),
+        (changed("sim", pixels=-1), "sim.pixels must be between 0 and 1024, got -1"),
         (changed("sim", arena="wide"), 'wrong value type for field "sim.arena"'),
         (changed("sim", speed=1), '"speed"'),
-        (changed("sim", stages={"updates": 0}), "stages must be a list, as in stages=.* got"),
-        (changed("sim", stages=[{"update": 0}]), '"update"'),
-        (changed("sim", stages=[3]), 'wrong value type for field "sim.stages"'),
-        (changed("sim", stages=[{"tokens": 1.5}]), 'wrong value .* "sim.stages.tokens"'),
         (changed("agent", gamma=1.5), "agent.gamma must be between 0 and 1, got 1.5"),
         (changed("agent", batch_size=0), "agent.batch_size must be at least 1, got 0"),
         (
@@ -164,21 +159,6 @@ def test_wrong_service_settings_are_refused(name: str, value: object, reason: st
         from_mapping(ServiceConfig, {"bind": "::1", name: value})
 
 
-def test_stages_are_read_from_mappings() -> None:
-    stages = [
-        {"updates": 0, "tokens": 1, "targets": "gaussian", "spread": 1},
-        {"updates": 10, "targets": "connected"},
-    ]
-    read = make_setup(changed("sim", stages=stages)).sim
-    assert read.stages == (
-        StageConfig(tokens=1, targets="gaussian", spread=1.0),
-        StageConfig(updates=10, targets="connected"),
-    )
-    assert read.stage(9) == 1
-    one, other = (make_setup(changed("sim", stages=s)).fingerprints() for s in (stages, []))
-    assert one["sim"] != other["sim"]
-
-
 SEVERAL = {"shapes": ["square", "square"]}
 ONE = {"shapes": ["square"]}
 FUTURE = [{"strategy": "future"}]
@@ -189,7 +169,7 @@ FUTURE = [{"strategy": "future"}]
     [
         (SEVERAL, {"reward": {"name": "dense"}}, "reward.name=dense changes nothing with 2 tokens"),
         (SEVERAL, {"reward": {"source": "camera"}}, "reward.source=camera changes nothing"),
-        (SEVERAL, {"reward": {"name": "pose"}}, "set agent.readout=token, which values the"),
+        (SEVERAL, {"reward": {"name": "dense"}}, "set agent.readout=token, which values the"),
         (SEVERAL, {"agent": {"gamma": 0.9}}, "agent.gamma=0.9 .*readout=token, which values the"),
         (SEVERAL, {"agent": {"hindsight": FUTURE}}, "strategy=future changes nothing"),
         (ONE, {"agent": {"readout": "token", "reapply": 0}}, "agent.reapply=0 changes nothing"),
@@ -216,7 +196,7 @@ def test_what_would_change_nothing_is_refused(
         (SEVERAL, {"reward": {"name": "dense"}, "agent": {"readout": "token"}}),
         (SEVERAL, {"agent": {"readout": "token", "gamma": 0.9, "hindsight": FUTURE}}),
         (ONE, {"reward": {"name": "dense"}, "agent": {"gamma": 0.9, "polyak": 0.9}}),
-        (ONE, {"reward": {"name": "pose"}, "agent": {"reapply": 0}}),
+        (ONE, {"reward": {"name": "dense"}, "agent": {"reapply": 0}}),
     ],
 )
 def test_what_has_an_effect_is_taken(tokens: dict[str, Any], sections: dict[str, Any]) -> None:

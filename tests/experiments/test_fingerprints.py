@@ -89,7 +89,6 @@ def fingerprint(setup: Setup, moved_by: int | None = None) -> dict[str, float]:
         while trainer.updates < UPDATES:
             newest = trainer.weights()
             policy.follow(newest)
-            rollout.follow(newest.version)
             trainer.insert(rollout.play(policy.explore, BATCH_EPISODES // ENVS))
             while trainer.rate_limiter.may_update() and trainer.updates < UPDATES:
                 for name, loss in trainer.update(trainer.updates / UPDATES).items():

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from tangram_sim.config import EXACT_SUBSTEPS, RewardConfig, SimConfig, StageConfig
+from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.settings import Settings, declared, setting
 
@@ -38,8 +38,6 @@ UNUSED = (
     "noise.kind=gaussian or wide$"
 )
 BLURRED = "leave it at 0, or give noise.share another value$"
-UNSORTED = (StageConfig(updates=5), StageConfig(updates=1))
-TWICE = (StageConfig(updates=5), StageConfig(updates=5))
 REFUSED = [
     (NoiseConfig, {"seed": -1}, "^noise.seed must be between 0 and 9, got -1$"),
     (NoiseConfig, {"seed": 10}, "^noise.seed must be between 0 and 9, got 10$"),
@@ -67,8 +65,6 @@ REFUSED = [
     (SimConfig, {"backend": "x"}, "sim.backend must be one of physics, kinematic, got 'x'"),
     (SimConfig, {"arena": 0.0}, "sim.arena must be between 0.001 and 1000"),
     (SimConfig, {"actions_per_token": 0}, "sim.actions_per_token must be between 1 and 100, got 0"),
-    (SimConfig, {"substeps": 0}, "sim.substeps must be between 1 and 1000, got 0"),
-    (SimConfig, {"damping": 1.5}, "sim.damping must be between 0 and 1, got 1.5"),
     (SimConfig, {"corner_noise": 0.3}, "sim.corner_noise must be between 0 and 0.2, got 0.3"),
     (SimConfig, {"pixels": 15}, "sim.pixels must be 0 or at least 16, got 15"),
     (SimConfig, {"observe": "pictures"}, "^sim.observe=pictures needs .*: set sim.pixels=128$"),
@@ -84,21 +80,16 @@ REFUSED = [
         {"pixels": 64, "disturbance": 1.1},
         "^sim.disturbance must be between 0 and 1, got",
     ),
+    (SimConfig, {"world": "moon"}, "sim.world must be one of plain, bullet, drawn, delayed, got"),
+    (SimConfig, {"world": "bullet", "backend": "kinematic"}, "bullet needs .* got kinematic and l"),
+    (SimConfig, {"world": "bullet", "motion": "slide"}, "bullet needs .* got physics and slide"),
     (SimConfig, {"motion": "fly"}, "sim.motion must be one of lift, slide, got 'fly'"),
     (SimConfig, {"motion": "slide", "backend": "kinematic"}, "needs .* got sim.backend=kinematic"),
     (SimConfig, {"motion": "slide", "allow_flip": True}, "allow_flip=true needs sim.motion=lift"),
-    (SimConfig, {"targets": "x"}, "sim.targets must be one of uniform, .* mixed, got 'x'"),
-    (SimConfig, {"spread": 0.0}, "sim.spread must be between 0.001 and 1, got 0"),
+    (SimConfig, {"targets": "x"}, "sim.targets must be one of uniform, .* touching, got 'x'"),
     (SimConfig, {"starts": "x"}, "sim.starts must be one of anywhere, outside, piles, got 'x'"),
     (SimConfig, {"mirrored": 2.0}, "sim.mirrored must be between 0 and 1, got 2"),
-    (SimConfig, {"stages": UNSORTED}, "must begin one after the other, got updates .5, 1.: sort"),
-    (SimConfig, {"stages": TWICE}, "must begin one after the other, got updates .5, 5.: sort them"),
-    (SimConfig, {"stages": ({"updates": 0},)}, "must list stages, got {'updates': 0}"),
-    (StageConfig, {"updates": -1}, "sim.stages.updates must be at least 0, got -1"),
-    (StageConfig, {"tokens": 17}, "sim.stages.tokens must be between 0 and 16, got 17"),
-    (StageConfig, {"targets": "x"}, "sim.stages.targets must be one of uniform"),
-    (StageConfig, {"spread": 1.5}, "sim.stages.spread must be between 0.001 and 1, got 1.5"),
-    (RewardConfig, {"name": "x"}, "overlap, dense, pose or path/to/file.py:function, got 'x'"),
+    (RewardConfig, {"name": "x"}, "overlap, dense or path/to/file.py:function, got 'x'"),
     (RewardConfig, {"name": ":function"}, "got ':function'"),
     (RewardConfig, {"name": "file.py:"}, "got 'file.py:'"),
     (RewardConfig, {"name": "file.py:two words"}, "got 'file.py:two words'"),
@@ -122,4 +113,3 @@ def test_bounds_and_what_is_not_given_are_taken() -> None:
     assert (made.width, made.sizes, made.share) == (0.0, (), 0.0)
     assert NoiseConfig(0).width == 0.1
     assert NoiseConfig(0, share=0.5, blur=0.5).blur == 0.5
-    assert SimConfig().substeps >= EXACT_SUBSTEPS

@@ -118,17 +118,6 @@ def test_avoiding_gives_up_after_its_own_tries() -> None:
     np.testing.assert_array_equal(poses[0], sample_poses(layout, sim, twin))
 
 
-def test_tokens_that_lie_already_stay_and_are_kept_clear_of() -> None:
-    layout, sim = layout_of(*SEVEN, scale=0.8), SimConfig()
-    known = sample_batch(layout, sim, evaluation_generators(20))
-    lies = np.random.default_rng(0).random((20, 7)) < 0.5
-    generators = [np.random.default_rng(b) for b in range(20)]
-    poses = sample_batch(layout, sim, generators, laid=(lies, known))
-    np.testing.assert_array_equal(poses[lies], known[lies])
-    assert (np.abs(poses - known).max(axis=2) > 1e-3)[~lies].all()
-    assert max(largest_overlap(layout, one) for one in poses) < 1e-8
-
-
 GAME = layout_of(*SEVEN, scale=0.6)
 LAYOUTS = [
     (GAME, 2.0),

@@ -10,7 +10,7 @@ import pytest
 from tangram_sim import world as world_module
 from tangram_sim.arrays import Floats
 from tangram_sim.batch import BatchedEnv
-from tangram_sim.config import RewardConfig, SimConfig, StageConfig
+from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.errors import ConfigError, SamplingError
 from tangram_sim.geometry import area, clip, overlap_share
 from tangram_sim.layout import Layout
@@ -73,22 +73,10 @@ def test_commanded_pose_is_reached_in_every_unit(
     assert angle < 1e-3
 
 
-@pytest.mark.parametrize(
-    ("substeps", "least", "most"),
-    [(1, 60, 360), (2, 20, 360), (3, 5, 360), (4, 0, 1e-3), (5, 0, 1e-3), (32, 0, 1e-3)],
-)
-def test_how_much_of_a_turn_is_missing(substeps: int, least: float, most: float) -> None:
-    """Why `SimConfig` refuses less than 4: a step of Bullet is exact up to 45 degrees."""
-    world = make_world(layout_of("square"), SimConfig(substeps=substeps))
-    assert least <= errors(world, 2.0)[1] < most
-    world.close()
-
-
-@pytest.mark.parametrize(("substeps", "way", "turn"), [(8, 0.967, 0.957), (1, 0.94, 0.903)])
-def test_damping_makes_tokens_fall_short(substeps: int, way: float, turn: float) -> None:
+@pytest.mark.parametrize(("name", "way", "turn"), [("plain", 1.0, 1.0), ("bullet", 0.94, 0.903)])
+def test_damping_makes_tokens_fall_short(name: str, way: float, turn: float) -> None:
     """With Bullet's own 0.04 a tenth of a turn is missing, and more of a faster one."""
-    sim = SimConfig(damping=0.04, substeps=substeps)
-    world = make_world(layout_of("square"), sim)
+    world = make_world(layout_of("square"), SimConfig(world=name))
     world.place(np.zeros((1, 3)))
     world.move(0, np.array([0.5, 0.0, 1.0]))
     np.testing.assert_allclose(world.poses()[0], [0.5 * way, 0.0, turn], atol=2e-3)
@@ -274,15 +262,14 @@ def test_a_token_that_does_not_fit_is_refused_before_a_world_is_made() -> None:
         check_world(layout_of(*["square"] * 16, scale=1.8), SimConfig())
 
 
-def test_every_stage_is_tried_before_a_world_is_made() -> None:
-    layout, stage = layout_of("square", "square", scale=2.0**0.5), StageConfig(targets="connected")
-    check_world(layout, SimConfig(arena=1.5, stages=(stage,)))
+def test_targets_are_tried_before_a_world_is_made() -> None:
+    layout = layout_of("square", "square", scale=2.0**0.5)
     with pytest.raises(SamplingError, match="no connected target within an arena of width 0.75"):
         check_world(layout, SimConfig(arena=0.75, targets="connected"))
     with pytest.raises(SamplingError, match="no room for token"):
-        check_world(layout, SimConfig(arena=0.75, stages=(stage,)))
+        check_world(layout, SimConfig(arena=0.75))
     with pytest.raises(ConfigError, match="sim.targets=figures needs all seven tans"):
-        check_world(layout, SimConfig(stages=(StageConfig(targets="figures"),)))
+        check_world(layout, SimConfig(targets="figures"))
 
 
 def test_a_missing_engine_is_named_also_before_a_world_is_made(

@@ -37,17 +37,10 @@ def test_the_exact_policy_scores_one(backend: str, tokens: dict, actions: int) -
 
 # Worlds that are not plain, and so few actions in them that the formula repeated does not arrive.
 WORLDS: list[tuple[dict[str, Any], int]] = [
-    ({"gain": (0.8, 1.25, 0.9)}, 2),
-    ({"bias": (0.05, -0.03, 0.04)}, 2),
-    ({"drift": 0.2}, 1),
-    ({"gain_spread": 1.25, "bias_spread": 0.05, "drift_spread": 0.1}, 2),
-    ({"delay": True}, 3),
-    ({"delay": True, "gain_spread": 1.25, "bias_spread": 0.05, "drift_spread": 0.1}, 4),
-    ({"backend": "physics", "damping": 0.1}, 2),
-    ({"backend": "physics", "damping_spread": 0.1}, 2),
-    ({"backend": "physics", "damping": 0.04, "substeps": 1}, 2),
-    ({"backend": "physics", "damping_spread": 0.1, "substeps": 1, "gain_spread": 1.25}, 3),
-    ({"backend": "physics", "damping": 0.04, "arena": 5.0, "delay": True, "bias_spread": 0.1}, 3),
+    ({"backend": "physics", "world": "bullet"}, 2),
+    ({"backend": "physics", "world": "drawn"}, 2),
+    ({"world": "drawn", "arena": 5.0}, 2),
+    ({"world": "delayed"}, 3),
 ]
 
 
@@ -68,12 +61,12 @@ def test_the_oracle_ends_on_its_target_in_every_world(
 
 def test_worlds_that_are_tried_in_have_no_camera() -> None:
     seen = {"observe": "pictures", "pixels": 64, "disturbance": 1.0}
-    made = setup(SQUARE, backend="physics", damping=0.1, **seen)
+    made = setup(SQUARE, backend="physics", world="bullet", **seen)
     with closing(FixedTests(made, 2, 2)) as tests:
         assert tests.play(playing(Told(oracle_policy), tests.env)).camera is not None
 
 
-@pytest.mark.parametrize(("sim", "actions"), [WORLDS[i] for i in (0, 2)])
+@pytest.mark.parametrize(("sim", "actions"), [({"world": "delayed"}, 2), WORLDS[0]])
 def test_a_fitted_model_of_motion_serves_the_formula(sim: dict[str, Any], actions: int) -> None:
     made = setup(SQUARE, **sim, actions_per_token=actions)
     with closing(FixedTests(made, 16, 8)) as tests:
@@ -81,7 +74,7 @@ def test_a_fitted_model_of_motion_serves_the_formula(sim: dict[str, Any], action
     assert fitted["mean_reward"] > 0.995
 
 
-@pytest.mark.parametrize("sim", [{}, {"delay": True}, {"gain_spread": 1.25, "action_noise": 5e-4}])
+@pytest.mark.parametrize("sim", [{}, {"world": "delayed"}, {"world": "drawn"}])
 @pytest.mark.parametrize("tokens", [SQUARE, PAIR], ids=["one", "two"])
 def test_the_oracle_puts_noisy_looks_together(tokens: dict, sim: dict[str, Any]) -> None:
     """The look at the target is one: its noise is left, and of eight looks at a token a third."""
@@ -96,12 +89,11 @@ def test_the_oracle_puts_noisy_looks_together(tokens: dict, sim: dict[str, Any])
     assert found[0] < 0.7 * found[1]
 
 
-@pytest.mark.parametrize("sim", [{}, {"delay": True}, {"allow_flip": True}])
+@pytest.mark.parametrize("sim", [{}, {"allow_flip": True}])
 def test_the_oracle_plays_several_tokens(sim: dict[str, Any]) -> None:
     sim = sim | {"backend": "physics", "starts": "outside", "arena": 3.0}
-    varies = {"gain_spread": 1.2, "bias_spread": 0.02, "damping_spread": 0.1, "substeps": 1}
     tokens = {"shapes": ["square", "parallelogram"], "scale": 0.6}
-    made = setup(tokens, **sim, **varies, actions_per_token=3)
+    made = setup(tokens, **sim, world="drawn", actions_per_token=3)
     with closing(FixedTests(made, 8, 8)) as tests:
         oracle = tests.scores(tests.play(playing(Told(oracle_policy), tests.env)))
         formula = tests.scores(tests.play(exact_policy(made.layout, made.sim)))

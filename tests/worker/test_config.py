@@ -51,7 +51,7 @@ WRONG = {
         ],
         *[
             (TESTED | {"changes": {"sim": {name: 1}}}, f"sim.{name}=1 changes nothing with puzzle:")
-            for name in ("targets", "spread", "mirrored")
+            for name in ("targets", "mirrored")
         ],
     ],
     PlayConfig: [
@@ -70,7 +70,7 @@ WRONG = {
                 {"puzzle": ("cat",), "changes": {"sim": {name: 1}}},
                 f"sim.{name}=1 changes nothing with puzzle: leave it out, or leave puzzle out",
             )
-            for name in ("targets", "spread", "mirrored", "starts")
+            for name in ("targets", "mirrored", "starts")
         ],
         ({"run_dir": " "}, "run_dir must name"),
         *[

@@ -72,7 +72,6 @@ def test_the_camera_is_on_though_training_has_none() -> None:
     [
         ({}, False),
         ({"name": "dense"}, True),
-        ({"name": "pose"}, True),
         ({"source": "camera"}, True),
     ],
 )

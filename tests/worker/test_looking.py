@@ -122,23 +122,9 @@ def test_alike_tokens_are_moved_where_they_are_seen() -> None:
         np.testing.assert_allclose(moved[sure, 0], 0.0, atol=0.02)
 
 
-def test_in_a_stage_the_tokens_that_lie_on_their_targets_are_those_that_are_placed() -> None:
-    """As the agent names them: alike tokens have no names in pictures."""
-    task = setup(*["small_triangle"] * 3, pixels=128, stages=[{"updates": 0, "tokens": 1}])
-    with closing(environments(task, 8)) as env:
-        env.task = task.sim.stage_task(task.sim.stage(0))
-        env.reset([np.random.default_rng(i) for i in range(8)])
-        seen, goals = task.layout.bases(env.seen), task.layout.bases(env.seen_goals)
-        gap = np.linalg.norm(seen[:, :, None] - goals[:, None], axis=-1).min(axis=2)
-        sure = ~env.sight.missing & env.sight.goals_sure.all(axis=1, keepdims=True)
-        assert sure.sum() > 16
-        np.testing.assert_array_equal((gap < 0.02)[sure], env.placed[sure])
-
-
 @pytest.mark.parametrize(
     ("sim", "full"),
     [
-        ({"gain": [0.4, 0.4, 1.0]}, {}),  # told to go further than it goes
         ({"disturbance": 1.0}, {"shift": 32.0}),
         ({"disturbance": 1.0}, {"blur": 8.0}),
     ],
@@ -156,7 +142,7 @@ def test_what_no_picture_shows_ends_no_worker(
 
     with closing(environments(task, 4)) as env:
         episodes = Rollout(env, 0, "player", 0, 0).play(far, 24)
-    seen = episodes.seen if "gain" in sim else episodes.goals_seen
+    seen = episodes.goals_seen
     assert not np.asarray(seen).all()
     spec = EpisodeSpec.of(task)
     assert EpisodeBatch(1, 0, episodes).encode(spec)

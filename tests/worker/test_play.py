@@ -303,8 +303,8 @@ def own(side: float) -> dict[str, Any]:
         ({}, {"sim": {"backend": "kinematic", "arena": 3.0}}, "sim.arena is 3 here and 2 there"),
         (
             {},
-            {"sim": {"backend": "kinematic", "targets": "gaussian"}},
-            "sim.targets is gaussian here and uniform there; the same starts need",
+            {"sim": {"backend": "kinematic", "targets": "connected"}},
+            "sim.targets is connected here and uniform there; the same starts need",
         ),
         (own(0.3), own(0.4), "their tokens have other corners"),
     ],

@@ -15,7 +15,6 @@ from tangram_sim.geometry import overlap_share
 from tangram_sim.sampling import sample_poses
 from tangram_sim.seeding import episode_generator
 from tests.agent.builders import PAIR, SQUARE, setup
-from tests.agent.pair_scenes import PERCEPTRON, seven
 from tests.worker.builders import policy
 from worker.rollout import Rollout, parts, play
 
@@ -163,47 +162,3 @@ def test_the_policy_sees_noise_and_that_is_what_travels() -> None:
     np.testing.assert_array_equal(episodes.goals, seen[1].astype(np.float32))
     for noisy, exact in ((episodes.corners, played.corners), (episodes.goals, played.goals)):
         assert 0.02 < np.abs(noisy - exact).max() <= 4 * 0.02 * made.sim.arena + 1e-6
-
-
-# The curriculum, by the number of updates of the weights that play
-
-STAGES = [
-    {"updates": 0, "tokens": 1, "targets": "gaussian", "spread": 0.3},
-    {"updates": 10, "tokens": 4},
-    {"updates": 20},
-]
-
-
-def first_tokens(_corners: Any, placed: np.ndarray, *_others: Any) -> np.ndarray:
-    """Actions that name the first token that is left, and leave it where it is."""
-    token = np.argmin(placed, axis=1)
-    still = np.zeros((len(placed), 3))
-    return np.column_stack([(2.0 * token + 1.0) / 7 - 1.0, still]).astype(np.float32)
-
-
-@pytest.mark.parametrize(
-    ("updates", "moved"), [(0, 1), (9, 1), (10, 4), (19, 4), (20, 7), (10_000, 7)]
-)
-def test_so_many_tokens_are_to_be_moved(updates: int, moved: int) -> None:
-    made = seven({}, PERCEPTRON, stages=STAGES)
-    with environment(made, 3) as env:
-        rollout = Rollout(env, *IDENTITY)
-        rollout.follow(updates)
-        for _ in range(2):  # a stage lasts until other weights come
-            episodes = rollout.play(first_tokens)
-            assert (episodes.placed[:, 0].sum(axis=1) == 7 - moved).all()
-        rollout.follow(0)
-        assert (rollout.play(first_tokens).placed[:, 0].sum(axis=1) == 6).all()
-    # Those lie on their targets already.
-    gap = np.abs(episodes.corners[:, 0] - episodes.goals).max(axis=2)
-    done = episodes.placed[:, 0][:, made.layout.token_of_corner].astype(np.bool_)
-    assert gap[done].max(initial=0.0) < 1e-6
-    assert gap[~done].min() > 0.0
-
-
-def test_without_stages_the_whole_task_is_played() -> None:
-    made = seven({}, PERCEPTRON)
-    with environment(made) as env:
-        before = env.task
-        Rollout(env, *IDENTITY).follow(1000)
-        assert env.task == before == made.sim.task
