@@ -29,17 +29,18 @@ hypothesis.settings.load_profile("gate")
 TIERS = ("fast", "cluster", "slow")
 
 # Fixtures that take many seconds and are made once for all tests that look at what they made.
-SHARED = ("trained", "study", "straight", "made")
+SHARED = ("trained",)
 
 # The longest come first, so that no worker of xdist is left with one of them at the end. Seconds
 # on two cores with other work beside them. Groups come before these, the largest first.
 SECONDS = {
     "test_lockstep.py::test_the_same_numbers_come_twice": 80,
-    "test_delivery.py::test_acknowledged_batches_survive": 31,
+    "test_experiments.py::test_a_study_is_stopped": 60,
     "test_training.py::test_a_reward_of_ones_own": 28,
-    "test_faults.py::test_no_process_is_left": 10,
+    "test_delivery.py::test_acknowledged_batches_survive": 27,
     "test_faults.py::test_a_network_that_swallows": 19,
     "test_faults.py::test_who_is_frozen": 14,
+    "test_faults.py::test_no_process_is_left": 10,
     "test_compiling.py": 8,
     "test_agents.py::test_an_agent_of_the_package": 7,
     "test_history.py": 6,

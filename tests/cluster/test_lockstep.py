@@ -29,14 +29,6 @@ STEP = (
 )
 
 
-@pytest.fixture(scope="module")
-def straight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a run that nothing disturbed."""
-    folder = tmp_path_factory.mktemp("lockstep") / "straight"
-    run("tangram-train", f"run_dir={folder}", *STEP, cwd=folder.parent)
-    return folder
-
-
 def until_updates(folder: Path, updates: int) -> None:
     """Wait until a run that goes on has made so many updates."""
     end, done = time.monotonic() + LIMIT_S, -1.0
@@ -64,10 +56,11 @@ def assert_same(one: Path, other: Path) -> None:
 
 
 def test_the_same_numbers_come_twice_and_stops_and_kills_in_the_middle_change_nothing(
-    straight: Path, tmp_path: Path
+    tmp_path: Path,
 ) -> None:
     """tangram-train starts them again; a master learns again what its checkpoint had not seen."""
-    folder = tmp_path / "stopped"
+    straight, folder = tmp_path / "straight", tmp_path / "stopped"
+    run("tangram-train", f"run_dir={straight}", *STEP, cwd=tmp_path)
     settings = (f"run_dir={folder}", *STEP, "service.checkpoint_minutes=0.01")
     with started("tangram-train", *settings, cwd=tmp_path) as process:
         until_updates(folder, 10)

@@ -26,7 +26,7 @@ QUICK = ("sim=kinematic", "service.eval_seconds=1000", "service.eval_episodes=4"
 
 
 def test_a_short_training_learns_position_and_angle_and_leaves_a_whole_run(trained: Path) -> None:
-    """The paper's plateau is 0.758 with no angle learned; this is far above after 800 updates."""
+    """The paper's plateau is 0.758 with no angle learned; this is far above, after few updates."""
     result = json.loads((trained / "result.json").read_text())
     assert result["mean_reward"] > 0.88
     assert result["angle_error_deg_median"] < 2.0

@@ -68,15 +68,6 @@ def test_the_newest_process_of_an_index_wins_also_after_a_restart(registry: Regi
     assert admitted(restored(registry), "c", index=3).incarnation == 3  # none is repeated
 
 
-def test_two_processes_never_share_an_incarnation(registry: Registry) -> None:
-    """Both were given the same by masters that did not know of each other's."""
-    first = admitted(registry, "a", index=0, incarnation=1)
-    first.ledger.take(1, WINDOW)
-    registry.leave(first)
-    with pytest.raises(RefusedError, match="taken over"):
-        admitted(registry, "b", index=0, incarnation=1)
-
-
 def test_an_index_without_batches_leaves_nothing(registry: Registry) -> None:
     """A stranger who says HELLO and BYE for each index would fill the memory."""
     for index in range(9):

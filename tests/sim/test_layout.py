@@ -66,14 +66,6 @@ def test_state_matrix_of_the_square() -> None:
     np.testing.assert_array_equal(state[:, 4:], layout.adjacency)
 
 
-def test_placed_flag_belongs_to_the_tokens_corners_and_base() -> None:
-    layout = layout_of("small_triangle", "square")
-    corners = layout.corners(np.zeros((1, 2, 3)))
-    features = layout.node_features(corners, np.array([[False, True]]), corners)
-    assert features[0, :, 3].tolist() == [0, 0, 0, 1, 1, 1, 1, 0, 1, 1, 1, 1, 1, 1, 1, 1]
-    assert features[0, :, 2].tolist() == [0] * 9 + [1] * 7
-
-
 coordinate = st.floats(-10.0, 10.0)
 pose = st.tuples(coordinate, coordinate, st.floats(-math.pi, math.pi), st.booleans())
 

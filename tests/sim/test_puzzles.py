@@ -85,18 +85,6 @@ def test_figures_to_train_on_hang_together_without_holes(name: str) -> None:
     assert not [hole for hole in whole.geoms[0].interiors if Polygon(hole).area > 1e-6]
 
 
-def test_figures_to_test_on_have_holes_and_several_areas() -> None:
-    holes, areas = [], []
-    for puzzle in library("test"):
-        whole = silhouette(puzzle)
-        if len(whole.geoms) > 1:
-            areas.append(puzzle.name)
-        if any(Polygon(hole).area > 1e-3 for part in whole.geoms for hole in part.interiors):
-            holes.append(puzzle.name)
-    assert holes == ["hut", "lantern"]
-    assert areas == ["exclamation_mark", "sun_over_mountains", "two_squares"]
-
-
 def test_no_two_figures_are_the_same() -> None:
     shapes = {name: silhouette(load_puzzle(name)) for name in GAME}
     for (one, first), (other, second) in combinations(shapes.items(), 2):

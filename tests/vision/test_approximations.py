@@ -163,12 +163,6 @@ def test_without_time_all_tokens_are_laid_once(laid: list[int]) -> None:
     assert laid == [7]
 
 
-def test_with_time_all_steps_are_taken(laid: list[int], short: None) -> None:
-    nearest_figure(sized(shapely.box(0, 0, 1, 1)), LAYOUT, LONG)
-    assert len(laid) == STEPS + 1
-    assert set(laid[1:]) == {1, 2, 3, 4}
-
-
 def test_the_best_of_all_runs_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
     truth = figure("cat")
     area, off = silhouette(LAYOUT, truth), np.array([0.05, 0.0, 0.0])
