@@ -54,7 +54,7 @@ format: .venv/.installed-dev  ## sort and lay out the code
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-studio: .venv/.installed-studio  ## a page to play on; settings go into ARGS="open=true"
+studio: .venv/.installed-studio  ## a page to play on; settings go into ARGS="port=8080"
 	@$(BIN)/tangram-studio $(ARGS)
 
 paper: .venv/.installed-run  ## all figures and tables of the paper: BUDGET=smoke, laptop or paper

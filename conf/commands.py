@@ -238,7 +238,7 @@ With silhouette=cat.png it finds how tokens fill an outline first, see docs/silh
 With compare=[...] several runs play the same episodes side by side.""",
         (
             "tangram-play run_dir=runs/my_run out=tests.png episodes=20",
-            "tangram-play tokens=tangram7 puzzle=cat out=cat.gif",
+            "tangram-play puzzle=cat out=cat.gif",
             "tangram-play compare=[runs/my_run,pretrained/square] out=both.gif episodes=4",
         ),
         ("worker.config:PlayConfig",),
@@ -247,12 +247,11 @@ With compare=[...] several runs play the same episodes side by side.""",
     "studio": Command(
         "tangram-studio",
         """\
-Serves a page to play on and to watch from, on this machine alone, and prints its address,
-which has a token in it. Choose, lay out, draw or drop a figure: the agent says how seven
-tans fill it and lays it, while you may take tans away. Or watch a run, or two side by side.""",
+Serves a page to play on, on this machine alone, and prints its address, which has a token
+in it. Choose, lay out, draw or drop a figure: the agent says how seven tans fill it and lays
+it, while you may take tans away.""",
         (
             "tangram-studio",
-            "tangram-studio open=true",
             "tangram-studio port=0    # any free one",
         ),
         ("tangram_studio.config:StudioConfig",),
@@ -264,7 +263,6 @@ Runs a study of conf/studies.yaml: every training over its seeds, then its tests
 rows to STUDY.csv; what has its rows is skipped, and what was cut goes on from its checkpoint, so
 the same command can be given again and again. tangram-report draws what is there.""",
         (
-            "tangram-experiment dry=true",
             "tangram-experiment study=paper budget=smoke",
             "tangram-experiment study=game seeds=3 jobs=8",
         ),

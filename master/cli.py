@@ -95,9 +95,9 @@ def _task(settings: Plain) -> "Setup":
     from tangram_sim.rewards import check_reward, pinned
 
     setup = make_setup(settings)
-    if setup.agent.lookahead != "none":
+    if setup.agent.beam > 1:
         raise ConfigError(
-            f"agent.lookahead={setup.agent.lookahead} is for play, an evaluator would be silent "
+            f"agent.beam={setup.agent.beam} is for play, an evaluator would be silent "
             "for minutes: leave it out, and give it to tangram-eval or tangram-play"
         )
     setup = replace(setup, reward=pinned(setup.reward))

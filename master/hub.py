@@ -75,7 +75,6 @@ class Hub:
         info: WelcomeInfo,
         silence_s: float = 30.0,
         keys: Keys | None = None,
-        weights_port: int = 0,
         room: Room = AMPLE,
         audit: Audit | None = None,
     ) -> None:
@@ -83,11 +82,10 @@ class Hub:
 
         Args:
             bind: address to listen on.
-            port: of the ROUTER, 0 for any.
+            port: of the ROUTER, and the next one of the PUB; 0 for any.
             info: what joiners are told, and must agree with.
             silence_s: after which a peer is forgotten.
             keys: for encrypted sockets, None for plain ones.
-            weights_port: of the PUB, 0 for any.
             room: for those who take part.
             audit: of who joins, leaves and is refused.
         """
@@ -103,7 +101,7 @@ class Hub:
         self.counters = Counters()
         self._caller, self._address = Holder(), ""
         audit = audit or Audit()
-        self._sockets = Sockets(bind, port, self.counters, keys, weights_port, room, audit)
+        self._sockets = Sockets(bind, port, self.counters, keys, room, audit)
         self._admission = Admission(info, silence_s, room, self._sockets, self.counters, audit)
         self._registry = self._admission.registry
         self.endpoint = self._sockets.endpoint

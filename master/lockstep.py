@@ -11,7 +11,6 @@ from master.delivery import EpisodesArrived
 from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import Go
-from tangram_sim.errors import ConfigError
 
 
 class Lockstep:
@@ -37,15 +36,10 @@ class Lockstep:
         """The lockstep of the settings, None in any other mode.
 
         Raises:
-            ConfigError: batches are no whole groups, or too large for one message.
+            ConfigError: batches that are too large for one message.
         """
         if service.mode != "lockstep":
             return None
-        if service.batch_episodes % service.envs:
-            raise ConfigError(
-                f"service.batch_episodes={service.batch_episodes} must be a multiple of "
-                f"service.envs={service.envs} in lockstep: set one of them"
-            )
         spec.check_batch_size(service.batch_episodes)
         return Lockstep(workers, service.batch_episodes)
 

@@ -237,7 +237,7 @@ def _open_hub(config: MasterConfig, setup: Setup, run_id: str, keys: Keys | None
     )
     bind = listening_place(service.bind, Path(config.run_dir))
     patience_s, audit = service.silence_seconds, Audit(RunFolder(config.run_dir).audit)
-    return Hub(bind, service.port, info, patience_s, keys, service.weights_port, Room.here(), audit)
+    return Hub(bind, service.port, info, patience_s, keys, Room.here(), audit)
 
 
 def _keys(service: ServiceConfig, folder: RunFolder) -> Keys | None:

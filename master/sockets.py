@@ -61,7 +61,6 @@ class Sockets:
         port: int,
         counters: Counters,
         keys: Keys | None = None,
-        weights_port: int = 0,
         room: Room = AMPLE,
         audit: Audit | None = None,
     ) -> None:
@@ -72,8 +71,8 @@ class Sockets:
         if keys is not None:
             self._authenticator = Authenticator(self._context, keys, counters, audit or Audit())
         try:
-            self._router = self._open(zmq.ROUTER, bind, port, "service.port")
-            self._pub = self._open(zmq.PUB, bind, weights_port, "service.weights_port")
+            self._router = self._open(zmq.ROUTER, bind, port)
+            self._pub = self._open(zmq.PUB, bind, port + 1 if port else 0)
         except ConfigError:
             self._close(0)
             raise
@@ -179,7 +178,7 @@ class Sockets:
             self._authenticator.close()
         self._context.destroy(linger=linger_ms)
 
-    def _open(self, kind: int, bind: str, port: int, setting: str) -> zmq.Socket[bytes]:
+    def _open(self, kind: int, bind: str, port: int) -> zmq.Socket[bytes]:
         socket = self._context.socket(kind)
         socket.setsockopt(zmq.LINGER, LINGER_MS)
         socket.setsockopt(zmq.SNDHWM, HIGH_WATER)
@@ -208,12 +207,12 @@ class Sockets:
                 ) from None
             if error.errno == zmq.EADDRINUSE:
                 raise ConfigError(
-                    f"port {port} of {bind} is in use: choose another with {setting}=..., "
-                    "or 0 for any free one"
+                    f"port {port} of {bind} is in use: choose another with "
+                    "service.port=..., whose next one is free too, or 0 for any"
                 ) from None
             raise ConfigError(
                 f"cannot listen on {bind}, port {port} ({error.strerror}): set service.bind to an "
-                f"address of this machine, such as 127.0.0.1, and {setting} to one you may use"
+                f"address of this machine, such as 127.0.0.1, and service.port to one you may use"
             ) from None
         return socket
 

@@ -173,8 +173,8 @@ class EpisodeSpec:
         if count > self.max_count:
             raise ConfigError(
                 f"{count} episodes of {self.horizon} steps with {self.corners} corners are too "
-                f"many for one message, at most {self.max_count}: lower service.batch_episodes "
-                "or sim.actions_per_token"
+                f"many for one message, at most {self.max_count}: lower service.envs or "
+                "sim.actions_per_token"
             )
 
     def columns(self, count: int) -> tuple[Column, ...]:

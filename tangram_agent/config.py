@@ -116,18 +116,13 @@ class AgentConfig(Settings, section="agent"):
         high=100,
         only={"readout": "pair"},
     )
-    lookahead: str = setting(
-        "none",
-        "exploration off: lay all tokens in thought, by the values of what would be left",
-        choices=("none", "values"),
-        only={"readout": "outline"},
-    )
     beam: int = setting(
-        4,
-        "fillings of each depth that a look ahead follows",
+        1,
+        "exploration off: lay all tokens in thought first, and follow so many fillings of each "
+        "depth, by the values of what would be left; 1: play what is best now",
         low=1,
         high=32,
-        unless={"lookahead": "none"},
+        only={"readout": "outline"},
     )
     gamma: float = setting(
         0.0,
@@ -213,10 +208,11 @@ class ServiceConfig(Settings, section="service"):
         "on its machine",
     )
     port: int = setting(
-        0, "of the master's ROUTER socket, 0 for any free one", low=0, high=65535, unless=ON_SOCKETS
-    )
-    weights_port: int = setting(
-        0, "of its PUB socket, 0 for any free one", low=0, high=65535, unless=ON_SOCKETS
+        0,
+        "of the master's ROUTER socket; the next one is its PUB socket's; 0: any two free ones",
+        low=0,
+        high=65534,
+        unless=ON_SOCKETS,
     )
     host: str = setting(
         "",
@@ -248,9 +244,12 @@ class ServiceConfig(Settings, section="service"):
         unit="s",
         only={"mode": "async"},
     )
-    envs: int = setting(16, "environments that one worker plays at a time", low=1, high=512)
-    batch_episodes: int = setting(
-        32, "episodes in one message, split where they are too large for it", low=1, high=4096
+    envs: int = setting(
+        16,
+        "environments that one worker plays at a time; a message holds two episodes of each, fewer "
+        "where they are too large for it",
+        low=1,
+        high=512,
     )
     eval_seconds: float = setting(10.0, "least time between two evaluations", low=0, unit="s")
     eval_episodes: int = setting(100, "fixed test episodes of one evaluation", low=1, high=100_000)
@@ -272,6 +271,11 @@ class ServiceConfig(Settings, section="service"):
         "whether an update is compiled as a whole: up to a minute at first and seconds later, then "
         "an update is 1.1 to 2.5 times as fast, on a GPU 6 to 13; needs g++ or clang++",
     )
+
+    @property
+    def batch_episodes(self) -> int:
+        """Episodes in one message, where they are not too large for it."""
+        return 2 * self.envs
 
     def __post_init__(self) -> None:
         super().__post_init__()

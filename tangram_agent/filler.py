@@ -68,7 +68,7 @@ class Filler:
         self._fillable, self._layout = Fillable(value, setup.layout), setup.layout
         self._sim = setup.sim
         self._filling, self._rows = Filling(setup.layout), setup.goal_rows
-        self._beam = setup.agent.beam if setup.agent.lookahead == "values" else 1
+        self._beam = setup.agent.beam
 
     def choose(
         self,

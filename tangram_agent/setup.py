@@ -73,8 +73,6 @@ class Setup:
             if name in changed:
                 given, usual = f"agent.{name}={told(changed[name])}", getattr(AgentConfig, name)
                 refuse_ignored(given, "outlines", "take another agent", usual)
-        if agent.lookahead == "values" and agent.beam == 1:
-            refuse_ignored("agent.lookahead=values", "agent.beam=1", "set agent.beam=12")
         for name, value in _changed(self.reward).items():
             refuse_ignored(
                 f"reward.{name}={told(value)}",

@@ -216,13 +216,6 @@ class RewardConfig(Settings, section="reward"):
         "what Eq. 14 is measured on while playing: exact polygons or the camera's pictures",
         choices=SOURCES,
     )
-    sharpness: float = setting(
-        100.0,
-        "how steep the logarithm is near the target; larger is steeper",
-        low=1e-6,
-        high=1e9,
-        only={"name": "dense"},
-    )
     sha256: str | None = setting(
         None, "of your own file, as a run writes it down: a file with another content is refused"
     )

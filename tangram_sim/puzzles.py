@@ -6,7 +6,6 @@ stay as they are drawn.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
@@ -22,65 +21,43 @@ SPLITS = ("train", "test", "paper")
 _MAX_TOLD = 20  # faults in one message
 
 
-@dataclass(frozen=True, eq=False)
-class PuzzleFile:
-    """What a file held.
-
-    Attributes:
-        puzzles: in the file's order.
-        faults: of the puzzles that were left out.
-    """
-
-    puzzles: tuple[Puzzle, ...]
-    faults: tuple[str, ...]
-
-
-def read_puzzles(
-    path: Path, rules: PuzzleRules | None = None, skip_invalid: bool = False
-) -> PuzzleFile:
+def read_puzzles(path: Path, rules: PuzzleRules | None = None) -> tuple[Puzzle, ...]:
     """The puzzles of a file: one if its name ends in .svg, JSON otherwise.
 
     Args:
         path: of the file.
         rules: the full set of tans by default.
-        skip_invalid: leave faulty puzzles out instead of raising.
 
     Raises:
         ConfigError: the file cannot be used, or has faults; all of them are named.
     """
     text = read_text(path)
     if path.suffix.lower() == ".svg":
-        return parse_svg_puzzle(text, path.stem, rules, skip_invalid)
-    return parse_puzzles(text, f"puzzle file {path.name}", rules, skip_invalid)
+        return parse_svg_puzzle(text, path.stem, rules)
+    return parse_puzzles(text, f"puzzle file {path.name}", rules)
 
 
-def parse_puzzles(
-    text: str, source: str, rules: PuzzleRules | None = None, skip_invalid: bool = False
-) -> PuzzleFile:
+def parse_puzzles(text: str, source: str, rules: PuzzleRules | None = None) -> tuple[Puzzle, ...]:
     """The puzzles of a JSON text; see `read_puzzles`.
 
     Args:
         text: JSON.
         source: what errors call the file.
     """
-    return _built(parse_sketches(text, source), rules or PuzzleRules(), skip_invalid)
+    return _built(parse_sketches(text, source), rules or PuzzleRules())
 
 
-def parse_svg_puzzle(
-    text: str, name: str, rules: PuzzleRules | None = None, skip_invalid: bool = False
-) -> PuzzleFile:
+def parse_svg_puzzle(text: str, name: str, rules: PuzzleRules | None = None) -> tuple[Puzzle, ...]:
     """The one puzzle of an SVG text; see `read_puzzles`."""
     sketch: Sketch | list[str]
     try:
         sketch = parse_svg(text, name)
     except FaultError as fault:
         sketch = [str(fault)]
-    return _built([sketch], rules or PuzzleRules(), skip_invalid)
+    return _built([sketch], rules or PuzzleRules())
 
 
-def _built(
-    sketches: Sequence[Sketch | list[str]], rules: PuzzleRules, skip_invalid: bool
-) -> PuzzleFile:
+def _built(sketches: Sequence[Sketch | list[str]], rules: PuzzleRules) -> tuple[Puzzle, ...]:
     puzzles, faults = list[Puzzle](), list[str]()
     for sketch in sketches:
         puzzle, wrong = (
@@ -88,11 +65,11 @@ def _built(
         )
         faults += wrong
         puzzles += [puzzle] if puzzle else []
-    if faults and not skip_invalid:
+    if faults:
         told = "; ".join(faults[:_MAX_TOLD])
         more = len(faults) - _MAX_TOLD
         raise ConfigError(told + (f"; and {more} more" if more > 0 else ""))
-    return PuzzleFile(tuple(puzzles), tuple(faults))
+    return tuple(puzzles)
 
 
 def load_puzzle(name: str, scale: float = 0.6) -> Puzzle:
@@ -124,4 +101,4 @@ def library(split: str | None = None, scale: float = 0.6) -> tuple[Puzzle, ...]:
         raise ConfigError(f"unknown split '{split}': choose from {', '.join(SPLITS)}")
     text = (PACKAGED / f"{split}.json").read_text(encoding="utf-8")
     rules = PuzzleRules(scale, subset=split == "paper")
-    return parse_puzzles(text, f"{split}.json", rules).puzzles
+    return parse_puzzles(text, f"{split}.json", rules)

@@ -22,6 +22,7 @@ from tangram_sim.layout import Layout
 from tangram_sim.pictures import token_pixels
 
 MAX_REWARD = 1e6  # of a user's own function
+SHARPNESS = 100.0  # s: how steep the logarithm is near the target
 RewardFn = Callable[[Floats, Floats], Floats]
 UserReward = Callable[[Floats, Floats, Layout], Any]
 
@@ -49,7 +50,7 @@ def make_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> RewardF
         return lambda achieved, desired: _checked(config.name, function, achieved, desired, layout)
     if config.name == "overlap":
         return lambda achieved, desired: overlap(achieved, desired, layout)
-    return lambda achieved, desired: dense(achieved, desired, layout, reach, config.sharpness)
+    return lambda achieved, desired: dense(achieved, desired, layout, reach)
 
 
 def check_reward(config: RewardConfig, layout: Layout, sim: SimConfig) -> None:
@@ -109,9 +110,7 @@ class TargetPictures:
         return rewards
 
 
-def dense(
-    achieved: Floats, desired: Floats, layout: Layout, reach: float, sharpness: float
-) -> Floats:
+def dense(achieved: Floats, desired: Floats, layout: Layout, reach: float) -> Floats:
     """Eq. 15: the distance of each token's centre from its target's, as `closeness`.
 
     The paper scales the distance "across all possible distances" and gives no constants. Here the
@@ -119,20 +118,20 @@ def dense(
     far away does not flatten the slope for one that is near.
     """
     gap = layout.bases(achieved) - layout.bases(desired)
-    mean: Floats = closeness(np.linalg.norm(gap, axis=-1), reach, sharpness).mean(axis=-1)
+    mean: Floats = closeness(np.linalg.norm(gap, axis=-1), reach).mean(axis=-1)
     return mean
 
 
-def closeness(distance: Floats, reach: float, sharpness: float) -> Floats:
+def closeness(distance: Floats, reach: float) -> Floats:
     """+1 at distance 0, -1 at `reach`: r = 1 - 2 log(1 + s d / reach) / log(1 + s).
 
     The slope at the target is s / log(1 + s) times that of a straight line, and the reward is 0
-    at about reach / sqrt(s). With the default s = 100 half of the scale is spent on the nearest
+    at about reach / sqrt(s). With s = 100 half of the scale is spent on the nearest
     tenth of the arena's diagonal, about the size of a token, and the slope at the target is 22
     times the straight line's. Beyond `reach`, outside the arena, the logarithm goes on below -1,
     so that a token that left still has a way back.
     """
-    scaled: Floats = 1.0 - 2.0 * np.log1p(sharpness * distance / reach) / np.log1p(sharpness)
+    scaled: Floats = 1.0 - 2.0 * np.log1p(SHARPNESS * distance / reach) / np.log1p(SHARPNESS)
     return scaled
 
 
@@ -146,7 +145,7 @@ def reward_bounds(config: RewardConfig, sim: SimConfig, bound: float) -> tuple[f
     if config.name == "overlap":
         return -1.0, 1.0
     farthest = np.array(2.0 * np.sqrt(2.0) * bound)
-    least = closeness(farthest, sim.arena * np.sqrt(2.0), config.sharpness)
+    least = closeness(farthest, sim.arena * np.sqrt(2.0))
     return min(-1.0, float(least)), 1.0
 
 

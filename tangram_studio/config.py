@@ -12,4 +12,3 @@ class StudioConfig(Settings):
     port: int = setting(
         8765, "where it listens, on this machine alone; 0 for any free port", low=0, high=65535
     )
-    open: bool = setting(False, "show the page in this machine's browser at once")

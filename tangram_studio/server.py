@@ -5,7 +5,6 @@ import logging
 import os
 import secrets
 import socket
-import webbrowser
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, suppress
 from functools import partial
@@ -341,8 +340,6 @@ def serve(config: StudioConfig) -> int:
         "same address there. Ctrl-C ends it.",
         flush=True,
     )
-    if config.open:
-        webbrowser.open(address)
     logging.basicConfig(format="%(asctime)s tangram-studio: %(message)s", datefmt="%H:%M:%S")
     server = uvicorn.Server(
         uvicorn.Config(

@@ -80,7 +80,7 @@ def read_outline(name: str, source: str) -> Drawn:
 
 
 def _only(text: str, source: str) -> Puzzle:
-    found = parse_puzzles(text, source, PuzzleRules(1.0, subset=True)).puzzles
+    found = parse_puzzles(text, source, PuzzleRules(1.0, subset=True))
     if len(found) != 1:
         raise ConfigError(
             f"{source} has {len(found)} puzzles, and one silhouette is filled: take a file of one"

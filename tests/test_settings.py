@@ -94,7 +94,6 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "sim.observe": (SEEN, "pictures"),
     "reward.name": (ONE, "dense"),
     "reward.source": (SEEN, "camera"),
-    "reward.sharpness": (DENSE, 10.0),
     "net.kind": (ONE | {"net": {}}, "mlp"),
     "net.hidden": (MLP, [9]),
     "net.width": (ONE, 16),
@@ -126,8 +125,7 @@ SHOWS: dict[str, tuple[Config, object]] = {
 # What shows elsewhere, and where.
 ELSEWHERE = {
     "agent.name": "the label of a run in reports",
-    "agent.lookahead": "tests/agent/test_filler.py: a beam finds what values do not tell",
-    "agent.beam": "the same",
+    "agent.beam": "tests/agent/test_filler.py: a beam finds what values do not tell",
     "reward.sha256": "tests/sim/test_rewards.py: another file is refused",
 }
 
@@ -252,8 +250,7 @@ def test_every_setting_of_a_command_is_read() -> None:
         (MLP, "net.scale", "sqrt_d", "net.kind=mlp"),
         (PHYSICS, "sim.motion", "slide", "one token"),
         (ONE, "sim.mirrored", 0.5, "tokens that are their own mirror images"),
-        (ONE, "agent.beam", 8, "agent.lookahead=none"),
-        (SEVERAL, "agent.lookahead", "values", "agent.readout=pair"),
+        (SEVERAL, "agent.beam", 12, "agent.readout=pair"),
         (ONE, "agent.polyak", 0.5, "agent.gamma=0"),
         (FINAL_TWICE, "agent.hindsight.position", 0.1, "agent.hindsight.strategy=final"),
         (FINAL_TWICE, "agent.hindsight.angle", 0.1, "agent.hindsight.strategy=final"),
@@ -267,7 +264,6 @@ def test_every_setting_of_a_command_is_read() -> None:
             0.01,
             "sim.observe=silhouette_pictures",
         ),
-        (ONE, "reward.sharpness", 10.0, "reward.name=overlap"),
     ],
 )
 def test_a_setting_without_effect_is_refused(
@@ -283,7 +279,6 @@ def test_a_setting_without_effect_is_refused(
         ({"http_bind": "::1", "http_port": -1}, "http_bind", "http_port=-1"),
         ({"publish_seconds": 1.0, "mode": "lockstep"}, "publish_seconds", "mode=lockstep"),
         ({"port": 5555}, "port", "bind=local"),
-        ({"weights_port": 5556}, "weights_port", "bind=local"),
         ({"host": "learner"}, "host", "bind=local"),
         ({"auth": "off"}, "auth", "bind=local"),
     ],

@@ -9,12 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from conf.cli import composed, entry, tell
+from conf.cli import entry, tell
 from conf.commands import Plain
 
 if TYPE_CHECKING:
     from tangram_agent.setup import Setup
-    from tangram_sim.layout import Layout
     from worker.config import EvalConfig, PlayConfig
 
 
@@ -114,8 +113,6 @@ def _play(settings: Plain) -> int:
     check_writable("out", Path(config.out).absolute())
     _check_drawings(config)
     setups = _check_played(config.run_dirs, config)
-    if config.tokens is not None and config.run_dir is not None:
-        _check_tokens(config.tokens, config.run_dir, setups[0].layout)
     if config.target is not None:
         from worker.photographs import read_photograph
 
@@ -147,7 +144,7 @@ def _check_played(run_dirs: Sequence[str], config: "EvalConfig | PlayConfig") ->
         from worker.puzzles import find_figures
 
         source, names = source_and_names(config.puzzle)
-        find_figures(source, setups[0], names, skip_invalid=config.skip_invalid)
+        find_figures(source, setups[0], names)
     return setups
 
 
@@ -159,23 +156,6 @@ def _check_drawings(config: "PlayConfig") -> None:
         # A silhouette may be the name of a puzzle.
         if path is not None and (name == "target" or Path(path).suffix):
             check_file(Path(path), f"{name}={path}")
-
-
-def _check_tokens(name: str, run_dir: str, moved: "Layout") -> None:
-    """Refuse a run that moves other tokens than those of a preset."""
-    from tangram_agent.setup import from_mapping
-    from tangram_sim.errors import ConfigError
-    from tangram_sim.layout import TokensConfig, make_layout
-
-    preset = make_layout(
-        from_mapping(TokensConfig, composed("worker", [f"tokens={name}"])["tokens"])
-    )
-    if moved.fingerprint() != preset.fingerprint():
-        shapes = ", ".join(shape.name for shape in moved.shapes)
-        raise ConfigError(
-            f"tokens={name} and run_dir={run_dir} do not agree: the run moves {shapes}; leave one "
-            "of both out"
-        )
 
 
 def with_changes(settings: Plain) -> Plain:

@@ -32,7 +32,6 @@ PUZZLE_HELP = (
     "test or paper, or a JSON or SVG file of your own; [mine.json,cat] is one of a file"
 )
 TURNS_HELP = "each puzzle at so many angles, evenly spread; 1 is as drawn"
-SKIP_HELP = "leave out puzzles that cannot be played"
 
 
 def game_run() -> str:
@@ -136,7 +135,6 @@ class EvalConfig(Settings):
     out: str | None = setting(None, "JSON file for the scores; they are printed anyway")
     puzzle: tuple[str, ...] | None = setting(None, PUZZLE_HELP)
     turns: int = setting(1, TURNS_HELP, low=1, high=MAX_TURNS, unless={"puzzle": None})
-    skip_invalid: bool = setting(False, SKIP_HELP, unless={"puzzle": None})
     sheet: str | None = setting(
         None, "PNG file, a picture of every puzzle's end", unless={"puzzle": None}
     )
@@ -242,11 +240,6 @@ class PlayConfig(Settings):
     compare: tuple[str, ...] | None = setting(
         None, "folders of 2 to 4 runs, as in [runs/a,runs/b]: all on the same starts"
     )
-    tokens: str | None = setting(
-        None,
-        "instead of run_dir the agent that comes with tangram-rl for these tokens: square",
-        only={"compare": None},
-    )
     puzzle: tuple[str, ...] | None = setting(None, PUZZLE_HELP, only={"compare": None})
     target: str | None = setting(
         None,
@@ -268,7 +261,6 @@ class PlayConfig(Settings):
         unless={"silhouette": None},
     )
     turns: int = setting(1, TURNS_HELP, low=1, high=MAX_TURNS, unless={"puzzle": None})
-    skip_invalid: bool = setting(False, SKIP_HELP, unless={"puzzle": None})
     changes: Changes = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -297,16 +289,13 @@ class PlayConfig(Settings):
     @property
     def run_dirs(self) -> tuple[str, ...]:
         """The runs to show, one or several."""
-        named = f"{PREFIX}/{self.tokens}" if self.tokens is not None else game_run()
-        return self.compare or (self.run_dir or named,)
+        return self.compare or (self.run_dir or game_run(),)
 
     def _check_one_of_both(self) -> None:
         if self.run_dir is not None:
             check_folder("run_dir", self.run_dir)
-        elif (
-            self.compare is None
-            and self.tokens is None
-            and not ((self.puzzle or self.target or self.silhouette) and GAME in agent_names())
+        elif self.compare is None and not (
+            (self.puzzle or self.target or self.silhouette) and GAME in agent_names()
         ):
             raise ConfigError(
                 "say which run: run_dir=runs/..., or which ones: compare=[runs/a,runs/b]"

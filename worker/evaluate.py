@@ -13,7 +13,6 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from tangram_agent.config import AgentConfig
 from tangram_agent.files import write_whole
 from tangram_agent.outcome import plural
 from tangram_agent.runs import Run, load_changed
@@ -128,9 +127,8 @@ def policies(run: Run) -> dict[str, Player]:
     layout, sim = run.setup.layout, run.setup.sim
     result: dict[str, Player] = {RUN: greedy(run.policy)}
     if run.setup.fills:
-        if run.setup.agent.lookahead == "values":
-            alone = {"lookahead": "none", "beam": AgentConfig.beam}
-            result["lookahead=none"] = greedy(run.with_settings({"agent": alone}).policy)
+        if run.setup.agent.beam > 1:
+            result["beam=1"] = greedy(run.with_settings({"agent": {"beam": 1}}).policy)
         # Of places that are worth the same the first is taken: that of the largest token.
         nothing = greedy(run.unlearned().policy)
         return result | {"largest first": nothing, "random": random_policy(layout, sim)}
@@ -173,28 +171,26 @@ def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
     """Assemble the puzzles, print the scores and draw the sheet; the file's content."""
     source, names = source_and_names(config.puzzle or ())
     setup = run.setup
-    found = find_figures(source, setup, names, config.turns, config.skip_invalid)
+    figures = find_figures(source, setup, names, config.turns)
     if setup.fills and setup.sim.observe == "silhouette_pictures":
-        scored = score_pictured(run, found.figures, config.seed)
+        scored = score_pictured(run, figures, config.seed)
     else:
         shown = score_hidden if setup.sim.observe in SILHOUETTES else score_puzzles
         score = score_outlines if setup.fills else shown
-        scored = score(setup, found.figures, policies(run), config.seed)
+        scored = score(setup, figures, policies(run), config.seed)
     scores, lines = scored.means, scored.puzzles
     console = Console(highlight=False)
-    count = len(found.figures)
+    count = len(figures)
     which = f"{plural(count, 'puzzle')} of {Path(source or 'the library').name}"
     caption = f"{which}, {_told(setup)}; {scored.told}"
     console.print(scores_table(_title(run), caption, scores))
     console.print(puzzles_table(lines, full=config.out))
-    print_faults(console, found.faults)
     if config.sheet is not None:
         write_sheet(config.sheet, setup, scored)
         console.print(f"written: {config.sheet}", markup=False, soft_wrap=True)
     return _report(run, config, scores) | {
         "puzzle": list(config.puzzle or ()),
         "turns": config.turns,
-        "skipped": list(found.faults),
         "puzzles": lines,
     }
 
@@ -291,11 +287,3 @@ def puzzles_table(puzzles: Sequence[Mapping[str, Any]], full: str | None) -> Tab
         end = "solved" if one["solved"] else unfilled
         table.add_row(name, *shares, *(str(one[count]) for count in counts), end)
     return table
-
-
-def print_faults(console: Console, faults: Sequence[str]) -> None:
-    """One line for each puzzle that was left out."""
-    for fault in faults[:MAX_LINES]:
-        console.print(f"left out: {fault}", markup=False, soft_wrap=True)
-    if len(faults) > MAX_LINES:
-        console.print(f"left out: {len(faults) - MAX_LINES:,} more", markup=False)

@@ -54,5 +54,5 @@ def learned_method(run: Run) -> Method:
     from tangram_agent.filler import Fillable  # noqa: PLC0415  # needs torch
 
     agent = run.setup.agent
-    width = agent.beam if agent.lookahead == "values" else 1
+    width = agent.beam
     return Method(search=False, width=width, values=Fillable(run.policy.network, run.setup.layout))

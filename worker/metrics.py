@@ -48,7 +48,7 @@ def summarise(layout: Layout, sim: SimConfig, played: Played, own_reward: bool) 
 
     Returns:
         mean_reward (Eq. 14 of exact polygons, in [-1, 1], whatever is trained on),
-        mean_reward_dense (Eq. 15 at the default sharpness), raw_overlap and its 10th percentile,
+        mean_reward_dense (Eq. 15), raw_overlap and its 10th percentile,
         medians and 90th percentiles of the errors over all tokens, episodes; mean_reward_camera
         and mean_train_reward where they exist; with several tokens the means of `Assembled`.
     """

@@ -103,14 +103,14 @@ def puzzle_show(run: Run, config: PlayConfig) -> Show:
     """
     setup = _beside(run.setup)
     source, names = source_and_names(config.puzzle or ())
-    found = find_figures(source, setup, names, config.turns, config.skip_invalid)
-    if len(found.figures) > MAX_SHOWN:
+    figures = find_figures(source, setup, names, config.turns)
+    if len(figures) > MAX_SHOWN:
         raise ConfigError(
-            f"there are {len(found.figures)} puzzles, at most {MAX_SHOWN} are shown: name some, as "
-            f"in puzzle=[{found.figures[0].name}]"
+            f"there are {len(figures)} puzzles, at most {MAX_SHOWN} are shown: name some, as "
+            f"in puzzle=[{figures[0].name}]"
         )
-    played = play_figures(setup, found.figures, greedy(run.policy), config.seed)
-    return Show(setup, played, found.titles, "puzzle")
+    played = play_figures(setup, figures, greedy(run.policy), config.seed)
+    return Show(setup, played, [one.title for one in figures], "puzzle")
 
 
 def photograph_show(run: Run, config: PlayConfig, target: str) -> Show:

@@ -16,7 +16,7 @@ from tangram_sim.assembly import Puzzle, PuzzleRules
 from tangram_sim.config import SILHOUETTES, RewardConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.lens import View
-from tangram_sim.puzzles import SPLITS, PuzzleFile, library, read_puzzles
+from tangram_sim.puzzles import SPLITS, library, read_puzzles
 from tangram_sim.seeding import episode_generator
 from tangram_sim.targets import placement, turned_figure
 from worker.baselines import Player, playing
@@ -49,31 +49,12 @@ class Figure:
         return f"{name} {self.degrees:g}°" if self.degrees else name
 
 
-@dataclass(frozen=True, eq=False)
-class Figures:
-    """What is to be played.
-
-    Attributes:
-        figures: at least one, puzzle after puzzle, each at all its angles.
-        faults: why others of the file were left out.
-    """
-
-    figures: tuple[Figure, ...]
-    faults: tuple[str, ...] = ()
-
-    @property
-    def titles(self) -> list[str]:
-        """What the figures are called."""
-        return [figure.title for figure in self.figures]
-
-
 def find_figures(
     source: str | None,
     setup: Setup,
     names: Sequence[str] | None = None,
     turns: int = 1,
-    skip_invalid: bool = False,
-) -> Figures:
+) -> tuple[Figure, ...]:
     """The puzzles of a file or of the library as targets of a run.
 
     Args:
@@ -81,24 +62,15 @@ def find_figures(
         setup: whose tokens are to be moved.
         names: of the puzzles wanted; None is all that there are.
         turns: at so many angles each, evenly spread from the one that it is drawn at.
-        skip_invalid: leave out what is faulty or does not fit the tokens instead of raising.
 
     Raises:
         ConfigError: a file that cannot be used, an unknown name, or pieces that are not the tokens.
     """
-    found = _read(source, setup.tokens.scale, skip_invalid)
-    figures, faults = list[Figure](), list(found.faults)
-    for puzzle in _named(found.puzzles, names, source):
-        try:
-            figures += _turns(puzzle, setup, turns)
-        except ConfigError as error:
-            if not skip_invalid:
-                raise
-            faults.append(str(error))
+    puzzles = _named(_read(source, setup.tokens.scale), names, source)
+    figures = tuple(figure for puzzle in puzzles for figure in _turns(puzzle, setup, turns))
     if not figures:
-        why = f": {faults[0]}" if faults else ""
-        raise ConfigError(f"{source or 'the library'} has no puzzle to play{why}")
-    return Figures(tuple(figures), tuple(faults))
+        raise ConfigError(f"{source or 'the library'} has no puzzle to play")
+    return figures
 
 
 def play_figures(
@@ -147,10 +119,10 @@ def figure_generator(figure: Figure, seed: int, what: str = "puzzle") -> np.rand
     return episode_generator(seed, f"{what} {figure.name}", 0, 0, round(figure.degrees * 1000))
 
 
-def _read(source: str | None, scale: float, skip_invalid: bool) -> PuzzleFile:
+def _read(source: str | None, scale: float) -> tuple[Puzzle, ...]:
     if source is None or source in SPLITS:
-        return PuzzleFile(library(source, scale), ())
-    return read_puzzles(Path(source), PuzzleRules(scale, subset=True), skip_invalid)
+        return library(source, scale)
+    return read_puzzles(Path(source), PuzzleRules(scale, subset=True))
 
 
 def _named(

@@ -123,7 +123,7 @@ def at_once(setup: Setup) -> int:
 
     One of an agent that looks ahead: plans of many take gigabytes, and save a tenth of the time.
     """
-    return AT_ONCE if setup.agent.lookahead == "none" else 1
+    return AT_ONCE if setup.agent.beam == 1 else 1
 
 
 def play(

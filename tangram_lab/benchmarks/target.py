@@ -30,7 +30,7 @@ Attack = tuple[str, str, str, Callable[[Any], Seen]]  # row, what, how much, and
 Rows = list[dict[str, Any]]
 OFTEN = "service.checkpoint_minutes=0.05"
 # Whoever sends a batch waits until the learner has taken in those before: small ones.
-OURS = (*SETTINGS, "service.envs=8", "service.batch_episodes=8")
+OURS = (*SETTINGS, "service.envs=4")
 ROOM_MIB = 64.0  # that the memory of a master may grow by under any attack
 ENDS_S = 60.0
 LOOK_S = 0.1

@@ -39,9 +39,7 @@ RESULT = "result.json"
 MAX_BYTES = 1_000_000  # of the weights: they travel with every installation
 FIGURES, TURNS = ("test", "train"), 4  # splits of the library, and angles of each figure
 TESTS, TEST_SEED = 400, 1  # tests that no choice was made on: training is scored on seed 0
-AHEAD: dict[str, dict[str, Any]] = {
-    "agent": {"lookahead": "values", "beam": 12}
-}  # as an agent of outlines ships
+AHEAD: dict[str, dict[str, Any]] = {"agent": {"beam": 12}}  # as an agent of outlines ships
 
 
 class Candidate(NamedTuple):
@@ -106,7 +104,7 @@ def _shipped(setup: Setup) -> dict[str, dict[str, Any]]:
 
 def _on_figures(run: Run, split: str) -> dict[str, Any]:
     """Scores of a run on the figures of a split."""
-    figures = find_figures(split, run.setup, None, TURNS, False).figures
+    figures = find_figures(split, run.setup, None, TURNS)
     score = score_outlines if run.setup.fills else score_puzzles
     scored = score(run.setup, figures, {RUN: greedy(run.policy)}, TEST_SEED)
     return {"turns": TURNS, "scores": scored.means[RUN]}

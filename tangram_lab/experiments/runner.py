@@ -113,10 +113,6 @@ def run_study(config: StudyConfig, jobs: Sequence[Job], console: Console) -> int
             wanted.append(Work(job, run_dir, missing))
             wanted[-1].check()
     console.print(f"{len(jobs) - len(wanted)} of {len(jobs)} runs are in {config.study}.csv")
-    if config.dry:
-        for work in wanted:
-            console.print(f"{work.job.name}: {', '.join(work.missing)}", highlight=False)
-        return 0
     folder = RunFolder(root)
     folder.prepare("auto")
     with folder.lock():

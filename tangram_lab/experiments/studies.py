@@ -128,7 +128,6 @@ class StudyConfig(Settings):
         None, "folder of STUDY.csv; rows that are there are not made again; null is run_dir"
     )
     jobs: int = setting(2, "trainings at a time; a learner keeps one core busy", low=1, high=1024)
-    dry: bool = setting(False, "only list what would be done")
 
     def __post_init__(self) -> None:
         super().__post_init__()

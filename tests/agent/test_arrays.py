@@ -185,7 +185,7 @@ def test_a_batch_holds_a_bounded_number_of_episodes() -> None:
     long.check_batch_size(7)
     message = (
         "8 episodes of 500 steps with 64 corners are too many for one message, at most 7: "
-        "lower service.batch_episodes or sim.actions_per_token"
+        "lower service.envs or sim.actions_per_token"
     )
     with pytest.raises(ConfigError, match=f"^{message}$"):
         long.check_batch_size(8)

@@ -42,7 +42,7 @@ class Wrong(nn.Module):
 
 
 def beam_of(made: Setup, width: int) -> Setup:
-    return replace(made, agent=replace(made.agent, lookahead="values", beam=width))
+    return replace(made, agent=replace(made.agent, beam=width))
 
 
 def overlaps(made: Setup, value: nn.Module, targets: Any = None, count: int = 6) -> np.ndarray:
@@ -156,7 +156,6 @@ def test_filled_is_surer_than_any_value() -> None:
         ({"hindsight": []}, {}, "without a filled one"),
         ({"hindsight": [{"strategy": "near", "position": 0.1}]}, {}, "hindsight.strategy"),
         ({"gamma": 0.9}, {}, r"agent.gamma=0.9: .* set agent.gamma=1"),
-        ({"lookahead": "values", "beam": 1}, {}, "agent.lookahead=values changes nothing with"),
         ({}, {"starts": "anywhere"}, r"sim.starts=anywhere: .* set sim.starts=outside"),
         ({}, {"actions_per_token": 2}, r"actions_per_token=2: .* set sim.actions_per_token=1"),
         ({}, {"world": "drawn"}, "sim.world=drawn: .* set sim.world=plain"),
@@ -183,5 +182,5 @@ def test_a_lone_token_a_perceptron_and_one_side_are_refused() -> None:
 def test_values_are_for_outlines_alone() -> None:
     made = outline_setup()
     corners = replace(made.sim, observe="corners")
-    with pytest.raises(ConfigError, match="agent.lookahead=values"):
-        replace(made, sim=corners, agent=AgentConfig(lookahead="values"))
+    with pytest.raises(ConfigError, match="agent.beam=4"):
+        replace(made, sim=corners, agent=AgentConfig(beam=4))

@@ -151,12 +151,12 @@ def test_a_small_token_that_lies_elsewhere_gives_another_picture() -> None:
     poses = np.array(
         [[(token % 3) * 0.6 - 0.6, (token // 3) * 0.6 - 0.6, 0.0] for token in range(7)]
     )
-    sides, sure = np.zeros(7, np.bool_), np.ones(7)
+    sides, sure = np.zeros(7, np.bool_), np.ones(7, np.bool_)
     with closing(make_world(layout, sim)) as world:
         world.place(poses, sides)
         picture = world.picture()
         off = poses + np.array([(1.5 * NEAR * (token == 4), 0.0, 0.0) for token in range(7)])
-        same = [_same(world, Seen(lying, sides, sure, 7), picture) for lying in (poses, off)]
+        same = [_same(world, Seen(lying, sides, sure, sure, 7), picture) for lying in (poses, off)]
     assert same == [True, False]
 
 

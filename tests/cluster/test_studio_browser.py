@@ -152,7 +152,7 @@ def test_a_figure_is_seen_laid_and_saved(page: Page, tmp_path: Path) -> None:
         saved.value.save_as(path)
         assert path.read_bytes().startswith(begins)
     for kind in ("svg", "json"):
-        (puzzle,) = read_puzzles(tmp_path / f"cat.{kind}", PuzzleRules(0.6)).puzzles
+        (puzzle,) = read_puzzles(tmp_path / f"cat.{kind}", PuzzleRules(0.6))
         assert puzzle.name == "cat"
     with Image.open(tmp_path / "cat.gif") as film:
         assert getattr(film, "n_frames", 1) > 60
@@ -422,7 +422,7 @@ def test_a_file_is_saved_while_it_plays_on(page: Page, tmp_path: Path) -> None:
     with page.expect_download() as saved:  # the figure, not the tans in mid-move
         page.locator("#save-json").click()
     saved.value.save_as(tmp_path / "cat.json")
-    (puzzle,) = read_puzzles(tmp_path / "cat.json", PuzzleRules(0.6)).puzzles
+    (puzzle,) = read_puzzles(tmp_path / "cat.json", PuzzleRules(0.6))
     assert puzzle.name == "cat"
     after(page, 7)
 

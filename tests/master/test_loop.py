@@ -371,7 +371,7 @@ def test_the_learning_rate_follows_the_budget(tmp_path: Path) -> None:
     assert seen == pytest.approx([i / 10 for i in range(10)])
 
 
-IN_STEP = {"mode": "lockstep", "envs": BATCH, "batch_episodes": BATCH}
+IN_STEP = {"mode": "lockstep", "envs": BATCH // 2}
 
 
 def played(index: int, sequence: int) -> EpisodesArrived:

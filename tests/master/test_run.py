@@ -5,7 +5,7 @@ import shutil
 import socket
 import stat
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.cluster
 
 MADE = small_setup()
 BATCH = 4
-STEP: dict[str, Any] = {"mode": "lockstep", "envs": BATCH, "batch_episodes": BATCH}
+STEP: dict[str, Any] = {"mode": "lockstep", "envs": BATCH // 2}
 
 
 Told = Callable[[], list[str]]
@@ -166,22 +166,22 @@ def test_the_connection_names_a_host_that_others_reach(
     assert connection["http"].startswith(f"http://{http_host}:")
 
 
-def test_both_ports_can_be_fixed_and_the_wrong_one_is_named(tmp_path: Path) -> None:
-    with (
-        socket.create_server(("127.0.0.1", 0)) as one,
-        socket.create_server(("127.0.0.1", 0)) as two,
-    ):
-        ports = {"port": one.getsockname()[1], "weights_port": two.getsockname()[1]}
-    with opened_run(tmp_path / "a", bind="127.0.0.1", **ports) as (made, _):
+def test_the_ports_can_be_fixed_and_a_taken_one_is_named(tmp_path: Path) -> None:
+    with ExitStack() as opened:
+        while True:  # two free ones, one after the other
+            first = opened.enter_context(socket.create_server(("127.0.0.1", 0)))
+            port = first.getsockname()[1]
+            with suppress(OSError):
+                opened.enter_context(socket.create_server(("127.0.0.1", port + 1)))
+                break
+    with opened_run(tmp_path / "a", bind="127.0.0.1", port=port) as (made, _):
         found = (made.hub.endpoint, made.hub.weights_endpoint)
-        assert [int(endpoint.rpartition(":")[2]) for endpoint in found] == list(ports.values())
-        for name, port in ports.items():
-            remedy = (
-                rf"port {port} of .* is in use: choose another with service\.{name}=.*, or 0 for"
-            )
+        assert [int(endpoint.rpartition(":")[2]) for endpoint in found] == [port, port + 1]
+        for taken, asked in ((port, port), (port, port - 1)):
+            remedy = rf"port {taken} of .* is in use: choose another with service\.port="
             with (
                 pytest.raises(ConfigError, match=remedy),
-                opened_run(tmp_path / name, bind="127.0.0.1", **{name: port}),
+                opened_run(tmp_path / str(asked), bind="127.0.0.1", port=asked),
             ):
                 pass
 

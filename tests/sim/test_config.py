@@ -95,7 +95,6 @@ REFUSED = [
     (RewardConfig, {"name": "file.py:two words"}, "got 'file.py:two words'"),
     (RewardConfig, {"name": "module:function"}, "got 'module:function'"),
     (RewardConfig, {"source": "eyes"}, "reward.source must be one of polygon, camera"),
-    (RewardConfig, {"sharpness": 0.0}, "reward.sharpness must be between"),
     (RewardConfig, {"name": "dense", "source": "camera"}, "set reward.source=polygon"),
 ]
 

@@ -133,7 +133,7 @@ def test_any_hand_drawn_figure_of_the_library_loads_close_to_the_true_one(
 ) -> None:
     entry = figure(name)
     redrawn(entry, angle, shift, seed, noise)
-    (loaded,) = parse_puzzles(json.dumps(file_of(entry)), "my.json").puzzles
+    (loaded,) = parse_puzzles(json.dumps(file_of(entry)), "my.json")
     true = load_puzzle(name)
     assert loaded.pieces == true.pieces
     assert largest_overlap(loaded.layout, loaded.poses) < 1e-8
@@ -250,7 +250,7 @@ def test_pieces_are_counted_and_a_subset_is_allowed_only_when_asked_for() -> Non
     assert refused(file_of(cat)) == f"puzzle 'cat': {missing}: {told}"
     cat["pieces"] = own[:3]
     assert told in refused(file_of(cat))
-    (puzzle,) = parse_puzzles(json.dumps(file_of(cat)), "my.json", rules).puzzles
+    (puzzle,) = parse_puzzles(json.dumps(file_of(cat)), "my.json", rules)
     assert len(puzzle.pieces) == 3
     cat["pieces"] = [square] * 2
     assert refused(file_of(cat), rules) == (
@@ -260,7 +260,7 @@ def test_pieces_are_counted_and_a_subset_is_allowed_only_when_asked_for() -> Non
 
 def test_rules_may_be_wider_within_their_range() -> None:
     wide = json.dumps(changed({6: (1.0, 0.0, 3.0)}))
-    assert parse_puzzles(wide, "my.json", PuzzleRules(max_extent=10.0)).puzzles
+    assert parse_puzzles(wide, "my.json", PuzzleRules(max_extent=10.0))
     for rule, value, low in (
         ("scale", 0.0, 0.001),
         ("scale", math.nan, 0.001),

@@ -33,8 +33,8 @@ SIM = SimConfig(backend="kinematic")
 REACH = 2.0 * math.sqrt(2.0)
 
 
-def reward_of(name: str, layout: Layout, sharpness: float = 100.0) -> RewardFn:
-    return make_reward(RewardConfig(name=name, sharpness=sharpness), layout, SIM)
+def reward_of(name: str, layout: Layout) -> RewardFn:
+    return make_reward(RewardConfig(name=name), layout, SIM)
 
 
 @pytest.mark.parametrize(
@@ -85,17 +85,17 @@ def test_no_reward_is_beyond_its_bounds(name: str, seed: int) -> None:
     assert low - 1e-9 <= found.min() <= found.max() <= high + 1e-9
 
 
-@pytest.mark.parametrize(
-    ("sharpness", "expected"),  # at shares of the reach
-    [
-        (100.0, {0: 1, 0.001: 0.958696, 0.01: 0.699619, ZERO: 0, 0.1: -0.039147, 1: -1}),
-        (100.0, {1.5: -1.174280}),
-        (1.0, {0: 1, 0.5: -0.169925, 1: -1}),
-        (1e4, {0.1: -0.500201}),
-    ],
-)
-def test_closeness(sharpness: float, expected: dict[float, float]) -> None:
-    got = closeness(3.0 * np.array(list(expected)), 3.0, sharpness)
+def test_closeness() -> None:
+    expected = {
+        0: 1,
+        0.001: 0.958696,
+        0.01: 0.699619,
+        ZERO: 0,
+        0.1: -0.039147,
+        1: -1,
+        1.5: -1.174280,
+    }
+    got = closeness(3.0 * np.array(list(expected)), 3.0)
     np.testing.assert_allclose(got, list(expected.values()), atol=1e-6)
 
 
@@ -103,7 +103,7 @@ def test_dense_is_the_mean_over_tokens_and_blind_to_the_angle() -> None:
     layout = layout_of("square", "small_triangle")
     goal, state = layout.corners(np.array([[[0, 0, 0], [0, 0, 0]], [[0.5, 0, 1.0], [0, 0, 2.0]]]))
     got = reward_of("dense", layout)(state[None], goal[None])[0]
-    assert got == pytest.approx((closeness(np.array(0.5), REACH, 100.0) + 1.0) / 2.0)
+    assert got == pytest.approx((closeness(np.array(0.5), REACH) + 1.0) / 2.0)
 
 
 def test_picture_reward() -> None:

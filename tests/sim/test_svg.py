@@ -47,7 +47,7 @@ def whole(name: str) -> str:
 
 
 def check_drawn(text: str, name: str) -> None:
-    (puzzle,) = parse_svg_puzzle(text, name).puzzles
+    (puzzle,) = parse_svg_puzzle(text, name)
     assert (puzzle.name, puzzle.pieces) == (name, load_puzzle(name).pieces)
     assert distance(puzzle.corners, load_puzzle(name), 0.0) < 1e-6
 
@@ -89,7 +89,7 @@ def test_transforms_of_elements_and_groups_apply_from_the_inside_out() -> None:
 
 def test_a_mirroring_transform_turns_the_parallelogram_over() -> None:
     text = drawing(f'<g transform="scale(-1 1)">{whole("cat")}</g>')
-    (puzzle,) = parse_svg_puzzle(text, "cat").puzzles
+    (puzzle,) = parse_svg_puzzle(text, "cat")
     assert {*puzzle.pieces, *load_puzzle("cat").pieces} >= {"parallelogram_mirrored"}
     assert puzzle.pieces[-1] != load_puzzle("cat").pieces[-1]
 
@@ -121,10 +121,10 @@ def test_what_is_not_drawn_or_no_polygon_does_not_count(tmp_path: Path) -> None:
     other += '<rect width="100%" height="100%"/><circle r="9"/>'
     path = tmp_path / "cat.SVG"
     path.write_text(drawing(named, hidden, other, whole("cat")))
-    assert [puzzle.name for puzzle in read_puzzles(path).puzzles] == ["cat"]
+    assert [puzzle.name for puzzle in read_puzzles(path)] == ["cat"]
     sized = whole("cat").replace('viewBox="0 0 600 400"', 'width="600px" height="400px"')
     path.write_text(sized.replace("</svg>", '<rect width="600" height="400"/></svg>'))
-    assert [puzzle.name for puzzle in read_puzzles(path).puzzles] == ["cat"]
+    assert [puzzle.name for puzzle in read_puzzles(path)] == ["cat"]
 
 
 # Refusals
@@ -164,12 +164,6 @@ def test_a_drawing_that_is_no_puzzle_is_refused(text: str, message: str) -> None
         parse_svg_puzzle(text, "it")
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_skip_invalid_returns_the_faults_of_a_drawing() -> None:
-    loaded = parse_svg_puzzle(drawing(TRIANGLE * 6), "cat", skip_invalid=True)
-    assert loaded.puzzles == ()
-    assert loaded.faults == ("puzzle 'cat': must draw 7 polygons or paths, got 6",)
 
 
 def test_a_declared_encoding_cannot_hide_a_doctype(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ def test_a_puzzle_file_and_an_svg_have_the_tokens_where_they_lie(name: str) -> N
     saved = parse_puzzles(puzzle_file(goal, "mine").decode(), "saved", PuzzleRules(0.6))
     drawn = parse_svg_puzzle(svg(goal).decode(), "mine", PuzzleRules(0.6))
     for found in (saved, drawn):
-        (puzzle,) = found.puzzles
+        (puzzle,) = found
         poses, flipped = placement(puzzle, layout)
         assert puzzle.name == "mine"
         corners = layout.corners(poses, flipped)

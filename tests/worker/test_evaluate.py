@@ -191,12 +191,3 @@ def test_a_long_list_is_cut_on_the_screen_only_and_the_sheet_shows_every_puzzle(
         assert picture.format == "PNG"
         assert 1000 < picture.width < 1400
         assert 600 < picture.height < picture.width
-
-
-def test_puzzles_that_were_left_out_are_told(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = write_puzzles(tmp_path / "mine.json", drawn("cat"), drawn("fish", [0, 1]))
-    report = evaluated(tmp_path, puzzle=(str(path),), skip_invalid=True)
-    assert len(report["puzzles"]) == len(report["skipped"]) == 1
-    assert "left out: puzzle 'my_fish' has the pieces" in capsys.readouterr().out

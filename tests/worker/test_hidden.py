@@ -54,7 +54,7 @@ def game(sim: dict[str, Any]) -> Setup:
 def square(mirrored: bool = False) -> Figure:
     """The square of the library; its mirror image is another dissection of the same outline."""
     made = game(OUTLINE)
-    (figure,) = find_figures("train", made, ["square"]).figures
+    (figure,) = find_figures("train", made, ["square"])
     if not mirrored:
         return figure
     poses, flipped = made.layout.mirrored(figure.poses, figure.flipped)
@@ -89,7 +89,7 @@ def test_hidden_pieces_do_not_reach_the_player(sim: dict[str, Any]) -> None:
 def test_what_was_found_reaches_the_player(sim: dict[str, Any]) -> None:
     made = game(sim)
     names = ["hut", "two_squares"] if sim is OUTLINE else ["heart"]  # seeing takes its time
-    hidden = hide(made, find_figures("test", made, names).figures, seed=0)
+    hidden = hide(made, find_figures("test", made, names), seed=0)
     played = lay(hidden, exact(hidden), seed=0)
     laid = [made.layout.corners(one.laid.poses, one.laid.flipped) for one in hidden.searches]
     np.testing.assert_allclose(played.episodes.goals, laid, atol=1e-6)
@@ -110,7 +110,7 @@ def test_an_outline_does_not_depend_on_the_pieces() -> None:
         ("hut", 1, 1, 13),
         ("two_squares", 2, 0, 8),
     ):
-        (figure,) = find_figures("test", game(OUTLINE), [name]).figures
+        (figure,) = find_figures("test", game(OUTLINE), [name])
         laid = Dissection(figure.poses, figure.flipped)
         area = silhouettes.silhouette(layout, laid)
         every = getattr(area, "geoms", [area])
@@ -144,7 +144,7 @@ def test_tokens_and_target_are_seen_by_the_same_camera(monkeypatch: pytest.Monke
 def test_scores_compare_areas() -> None:
     """The exact union of tokens and figure, whatever lies where."""
     made = game(OUTLINE | {"starts": "anywhere"})
-    hidden = hide(made, find_figures("test", made, ["heart", "swan", "hut"]).figures, seed=0)
+    hidden = hide(made, find_figures("test", made, ["heart", "swan", "hut"]), seed=0)
     chance = play_hidden(hidden, random_policy(made.layout, hidden.setup.sim), seed=0)
     assert 0.0 < chance.iou.max() < 0.95
     for e, figure in enumerate(hidden.figures):
@@ -180,7 +180,7 @@ def not_found(monkeypatch: pytest.MonkeyPatch, *which: int) -> None:
 def test_what_was_not_filled_counts_as_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     not_found(monkeypatch, 1)
     made = game(OUTLINE)
-    hidden = hide(made, find_figures("test", made, ["heart", "swan", "hut"]).figures, seed=0)
+    hidden = hide(made, find_figures("test", made, ["heart", "swan", "hut"]), seed=0)
     laid = play_hidden(hidden, exact(hidden), seed=0)
     assert (laid.iou[1], laid.coverage[1], laid.actions_used[1]) == (0.0, 0.0, 0)
     assert laid.seconds[1] == 0.25

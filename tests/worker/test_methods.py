@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tangram_agent.config import AgentConfig
 from tangram_agent.runs import load_run
 from tangram_sim.areas import Area
 from tangram_sim.dissections import Budget, Search, Tokens
@@ -64,7 +63,7 @@ def test_it_is_told_who_filled_what(
     method = replace(together(game(OUTLINE).layout), search=searches)
     monkeypatch.setattr("worker.methods.together", lambda _: method)
     made = game(OUTLINE)
-    figures = find_figures("test", made, ["heart", "swan"]).figures
+    figures = find_figures("test", made, ["heart", "swan"])
     formula = exact_policy(made.layout, made.sim)
     scored = score_hidden(made, figures, {RUN: formula}, 0)
     assert scored.means[RUN]["filled_by"] == {"search": 0, "beam": 0} | {by: 2}
@@ -113,9 +112,7 @@ def test_a_report_takes_the_scores_of_an_agent_of_outlines(
 
 
 @pytest.mark.fast
-@pytest.mark.parametrize(
-    ("settings", "width"), [({}, 12), ({"lookahead": "none", "beam": AgentConfig.beam}, 1)]
-)
+@pytest.mark.parametrize(("settings", "width"), [({}, 12), ({"beam": 1}, 1)])
 def test_a_run_fills_by_as_wide_a_beam_as_it_looks_ahead(settings: Any, width: int) -> None:
     run = load_run(FILLER)
     method = learned_method(run.with_settings({"agent": settings}) if settings else run)

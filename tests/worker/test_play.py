@@ -197,7 +197,7 @@ def test_what_looks_ahead_plays_one_by_one(tmp_path: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(Filler, "choose", stays)
     run = load_run("pretrained/tangram7_silhouette")
-    assert run.setup.agent.lookahead == "values"
+    assert run.setup.agent.beam == 12
     for what in ({"episodes": 2}, {"puzzle": ("cat", "heart")}):
         make_show(run, PlayConfig(str(run.folder), **what))
     assert asked == [1] * 4 * run.setup.horizon

@@ -42,7 +42,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("worker.client.Timing", lambda: QUICK)
 
 
-SERVICE = ServiceConfig(envs=4, batch_episodes=6)
+SERVICE = ServiceConfig(envs=4)
 
 
 def config(hub: Hub, service: ServiceConfig = SERVICE, **more: object) -> WorkerConfig:
@@ -71,8 +71,8 @@ def assert_episodes(
 def test_weights_change_between_batches_only_and_batches_tell_which() -> None:
     made = greedy_setup(actions_per_token=3)
 
-    # 32 groups to a batch, and new weights all the time: most come in the middle of one.
-    service = replace(SERVICE, envs=1, batch_episodes=32)
+    # New weights come all the time, also in the middle of a batch.
+    service = replace(SERVICE, envs=8)
     sets = [sent(made, i) for i in range(5)]
 
     def script(hub: Hub) -> list[EpisodesArrived]:
@@ -102,8 +102,11 @@ def test_weights_change_between_batches_only_and_batches_tell_which() -> None:
             np.testing.assert_allclose(played["actions"][:, t], expected, atol=1e-4)
 
 
-def test_messages_hold_the_episodes_of_this_worker_in_order() -> None:
+def test_messages_hold_the_episodes_of_this_worker_in_order(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Two groups of 4 fill a message of 6; the rest follows at once, with the same weights."""
+    monkeypatch.setattr("tangram_agent.arrays.MAX_EPISODES", 6)
     made = greedy_setup()
 
     def script(hub: Hub) -> list[EpisodesArrived]:
@@ -126,7 +129,7 @@ def test_messages_hold_the_episodes_of_this_worker_in_order() -> None:
 def test_nothing_is_played_ahead_while_the_window_is_full() -> None:
     """After a pause play goes on with the weights of now, not with those from before it."""
     made = greedy_setup()
-    service = replace(SERVICE, batch_episodes=4)
+    service = replace(SERVICE, envs=2)
 
     def script(hub: Hub) -> list[EpisodesArrived]:
         hub.publish(sent(made, 1))
