@@ -102,7 +102,7 @@ def read_studies(path: Path = FILE) -> Studies:
     """
     try:
         found = msgspec.convert(yaml.safe_load(path.read_text(encoding="utf-8")), Studies)
-    except (OSError, ValueError, yaml.YAMLError) as error:
+    except (OSError, ValueError, msgspec.ValidationError, yaml.YAMLError) as error:
         raise ConfigError(f"cannot read the studies of {path}: {error}") from None
     for name, study in found.studies.items():
         for key, training in study.trainings.items():
