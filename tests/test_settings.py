@@ -78,7 +78,7 @@ NEAR_ONE = over(ONE, agent={"hindsight": [NEAR]})
 SHOWS: dict[str, tuple[Config, object]] = {
     "tokens.shapes": (ONE, ["square"]),
     "tokens.scale": (ONE, 0.7),
-    "sim.backend": (SEVERAL, "physics"),
+    "sim.backend": (over(SEVERAL, sim={"world": "drawn"}), "physics"),
     "sim.arena": (ONE, 2.5),
     "sim.actions_per_token": (ONE, 2),
     "sim.world": (ONE, "drawn"),
