@@ -252,6 +252,7 @@ in it. Choose, lay out, draw or drop a figure: the agent says how seven tans fil
 it, while you may take tans away.""",
         (
             "tangram-studio",
+            "tangram-studio port=9000",
             "tangram-studio port=0    # any free one",
         ),
         ("tangram_studio.config:StudioConfig",),
@@ -263,7 +264,8 @@ Runs a study of conf/studies.yaml: every training over its seeds, then its tests
 rows to STUDY.csv; what has its rows is skipped, and what was cut goes on from its checkpoint, so
 the same command can be given again and again. tangram-report draws what is there.""",
         (
-            "tangram-experiment study=paper budget=smoke",
+            "tangram-experiment budget=smoke",
+            "tangram-experiment study=paper_size budget=paper jobs=4",
             "tangram-experiment study=game seeds=3 jobs=8",
         ),
         ("tangram_lab.experiments.studies:StudyConfig",),

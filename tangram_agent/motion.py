@@ -81,9 +81,8 @@ def motions_of(past: Past, now: Floats, layout: Layout, sim: SimConfig) -> Motio
     corners = np.concatenate([past.corners, now[:, None]], axis=1).astype(np.float64)
     poses = layout.poses(corners)
     count, steps, size = past.actions.shape
-    if (
-        sim.dynamics.delayed
-    ):  # nothing is carried out in the first step, and what is told last not at all
+    # Late, nothing is carried out in the first step, and what is told last not at all.
+    if sim.dynamics.delayed:
         poses, steps = poses[:, 1:], max(steps - 1, 0)
     actions = past.actions[:, :steps].reshape(count * steps, size).astype(np.float64)
     token = chosen_tokens(actions, layout.tokens).reshape(count, steps, 1, 1)

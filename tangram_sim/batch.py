@@ -191,7 +191,8 @@ class BatchedEnv:
             targets: poses (B, K, 3) and sides (B, K) to assemble; None: they are drawn.
             views: how targets that are given were seen before; then they are known as they were
                 seen, and in the camera's pictures only the tokens are looked for.
-            starts: where tokens lie, and which are placed already; None: they are drawn.
+            starts: where tokens lie, and which are placed already, but in pictures, where alike
+                tokens have no names; None: they are drawn, and none is placed.
 
         Raises:
             SamplingError: no layout without overlap was found.
@@ -218,7 +219,7 @@ class BatchedEnv:
         if self.sim.dynamics.damping_spread:
             for world, damping in zip(self._worlds, self.actuation.damping, strict=True):
                 world.damp(float(damping))
-        self._moves[:] = self.sim.actions_per_token * self._named(starts.placed)
+        self._moves[:] = self.sim.actions_per_token * starts.placed
         self.steps_done = 0
 
     def _outlined(self) -> Floats:
@@ -228,14 +229,6 @@ class BatchedEnv:
 
         areas = [covered_area(own, self.layout) for own in self.goals]
         return np.stack([as_rows(area, self.layout, self.goal_rows) for area in areas])
-
-    def _named(self, flags: Bools) -> Bools:
-        """(B, K) flags of the world's tokens, as the agent names these."""
-        if self.sight is None or not flags.any():
-            return flags
-        every = (np.full(self.count, token) for token in range(self.layout.tokens))
-        hands = np.stack([self.sight.hands(token, self.corners) for token in every], axis=1)
-        return np.take_along_axis(flags, hands, axis=1)
 
     def step(self, actions: Floats) -> StepResult:
         """Play one action in every environment.

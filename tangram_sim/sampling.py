@@ -24,12 +24,6 @@ _CHUNK = 4  # poses drawn at once when some may overlap: fewer, larger checks
 _CLEAR_TRIES = 64  # outside of what is only to be avoided; then anywhere
 
 
-def sample_poses(layout: Layout, sim: SimConfig, rng: np.random.Generator) -> Floats:
-    """One layout (K, 3): x, y and angle; see `sample_batch`."""
-    poses: Floats = sample_batch(layout, sim, [rng])[0]
-    return poses
-
-
 def sample_batch(
     layout: Layout,
     sim: SimConfig,

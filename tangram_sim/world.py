@@ -44,7 +44,7 @@ class World(Protocol):
         """(3,) the pose at which `move` would set a lifted token down; nothing is moved."""
 
     def damp(self, damping: float) -> None:
-        """Damp every motion by so much from now on, the engine does."""
+        """Damp every motion by so much from now on; only the engine does."""
 
     def poses(self) -> Floats:
         """(K, 3) x, y and angle in (-pi, pi]."""

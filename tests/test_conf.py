@@ -225,7 +225,7 @@ def test_help_explains_every_setting_and_its_examples_compose(primary: str) -> N
         shlex.split(line, comments=True)
         for line in text.partition("Examples:")[2].strip().splitlines()
     ]
-    assert len(examples) in (2, 3)
+    assert len(examples) == 3
     for command, *overrides in examples:
         assert command == text.split()[0]
         compose(primary, *overrides)

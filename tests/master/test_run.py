@@ -166,14 +166,20 @@ def test_the_connection_names_a_host_that_others_reach(
     assert connection["http"].startswith(f"http://{http_host}:")
 
 
-def test_the_ports_can_be_fixed_and_a_taken_one_is_named(tmp_path: Path) -> None:
-    with ExitStack() as opened:
-        while True:  # two free ones, one after the other
+def free_ports(count: int) -> int:
+    """The first of so many in a row that nobody listens on."""
+    while True:
+        with ExitStack() as opened:
             first = opened.enter_context(socket.create_server(("127.0.0.1", 0)))
-            port = first.getsockname()[1]
+            port: int = first.getsockname()[1]
             with suppress(OSError):
-                opened.enter_context(socket.create_server(("127.0.0.1", port + 1)))
-                break
+                for more in range(1, count):
+                    opened.enter_context(socket.create_server(("127.0.0.1", port + more)))
+                return port
+
+
+def test_the_ports_can_be_fixed_and_a_taken_one_is_named(tmp_path: Path) -> None:
+    port = free_ports(3) + 1  # the one before is asked for, too
     with opened_run(tmp_path / "a", bind="127.0.0.1", port=port) as (made, _):
         found = (made.hub.endpoint, made.hub.weights_endpoint)
         assert [int(endpoint.rpartition(":")[2]) for endpoint in found] == [port, port + 1]

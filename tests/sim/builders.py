@@ -6,7 +6,9 @@ import numpy as np
 import shapely
 
 from tangram_sim.arrays import Floats
+from tangram_sim.config import SimConfig
 from tangram_sim.layout import Layout, TokensConfig, make_layout
+from tangram_sim.sampling import sample_batch
 
 SQUARE_SCALE = 0.8 * 2.0**0.5  # the square's side is then 0.4
 SEVEN = (
@@ -25,6 +27,12 @@ LOPSIDED = {"name": "lopsided", "corners": [[0, 0], [4, 0], [3, 1], [0, 2]]}
 
 def layout_of(*shapes: Any, scale: float = SQUARE_SCALE) -> Layout:
     return make_layout(TokensConfig(shapes, scale))
+
+
+def sample_poses(layout: Layout, sim: SimConfig, rng: np.random.Generator) -> Floats:
+    """(K, 3) of tokens that lie apart."""
+    poses: Floats = sample_batch(layout, sim, [rng])[0]
+    return poses
 
 
 def random_poses(rng: np.random.Generator, size: int, tokens: int, spread: float) -> Floats:

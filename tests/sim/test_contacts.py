@@ -13,9 +13,8 @@ from tangram_sim.batch import BatchedEnv
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.layout import Layout
 from tangram_sim.physics import PhysicsWorld
-from tangram_sim.sampling import sample_poses
 from tangram_sim.seeding import evaluation_generators
-from tests.sim.builders import SEVEN, angle_gap, largest_overlap, layout_of
+from tests.sim.builders import SEVEN, angle_gap, largest_overlap, layout_of, sample_poses
 
 pytestmark = pytest.mark.fast
 

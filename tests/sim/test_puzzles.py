@@ -19,9 +19,8 @@ from tangram_sim.config import SimConfig
 from tangram_sim.errors import ConfigError
 from tangram_sim.fitting import VARIANTS, fit_piece, overlap_depths, separate
 from tangram_sim.puzzles import SPLITS, library, load_puzzle, parse_puzzles
-from tangram_sim.sampling import sample_poses
 from tangram_sim.shapes import SHAPE_NAMES, polygon_area, tan
-from tests.sim.builders import largest_overlap
+from tests.sim.builders import largest_overlap, sample_poses
 from tests.sim.drawings import FIGURES, distance, figure, file_of, moved, same_corners
 
 pytestmark = pytest.mark.fast

@@ -10,7 +10,7 @@ from tangram_sim.config import SimConfig
 from tangram_sim.connected import MAX_PILE, PILES_APART, sample_connected, sample_piles
 from tangram_sim.errors import SamplingError
 from tangram_sim.layout import Layout
-from tangram_sim.sampling import sample_batch, sample_poses
+from tangram_sim.sampling import sample_batch
 from tangram_sim.seeding import episode_generator, evaluation_generators
 from tests.sim.builders import (
     LOPSIDED,
@@ -20,6 +20,7 @@ from tests.sim.builders import (
     largest_overlap,
     layout_of,
     pieces,
+    sample_poses,
 )
 
 pytestmark = pytest.mark.fast

@@ -23,9 +23,9 @@ from tangram_agent.messages import Go
 from tangram_agent.process import Lifeline
 from tangram_agent.setup import Setup
 from tangram_sim.errors import TangramError
-from tangram_sim.sampling import sample_poses
 from tangram_sim.seeding import episode_generator
 from tests.agent.builders import setup
+from tests.sim.builders import sample_poses
 from tests.worker.builders import policy, sent, write_run
 from tests.worker.conversation import LIMIT_S, QUICK, collect, open_hub, with_master
 from worker.client import Client

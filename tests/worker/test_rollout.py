@@ -12,9 +12,9 @@ from tangram_agent.setup import Setup
 from tangram_agent.types import Episodes, Past
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.geometry import overlap_share
-from tangram_sim.sampling import sample_poses
 from tangram_sim.seeding import episode_generator
 from tests.agent.builders import PAIR, SQUARE, setup
+from tests.sim.builders import sample_poses
 from tests.worker.builders import policy
 from worker.rollout import Rollout, parts, play
 
