@@ -8,7 +8,7 @@ import pytest
 from tests.cluster.processes import LIMIT_S, run
 from tests.cluster.studios import Running, studio
 
-UPDATES = 600
+UPDATES = 400
 
 
 @pytest.hookimpl(tryfirst=True)

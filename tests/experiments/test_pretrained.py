@@ -20,6 +20,7 @@ from tests.sim.builders import SEVEN
 from tests.worker.builders import write_run
 from worker.config import EvalConfig
 from worker.evaluate import evaluate_run
+from worker.puzzles import find_figures
 
 pytestmark = pytest.mark.fast
 
@@ -113,7 +114,9 @@ def test_an_agent_of_outlines_ships_with_its_beam_and_is_told_as_such(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pretrained, "FIGURES", ("test",))
-    monkeypatch.setattr(pretrained, "TURNS", 1)
+    monkeypatch.setattr(  # all figures of a split take long
+        pretrained, "find_figures", lambda split, run, *_: find_figures(split, run, ["heart"])
+    )
     run, seven = finished(tmp_path, 0, 0.5), {"shapes": list(SEVEN), "scale": 0.6}
     sim = {"backend": "kinematic", "arena": 2.0, "allow_flip": True}
     write_run(run, tokens=seven, sim=OUTLINES | sim | {"targets": "touching"}, agent=FILLER)

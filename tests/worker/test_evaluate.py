@@ -89,7 +89,6 @@ def test_in_another_world_there_is_an_oracle(
     for told_more in ("fitted", "oracle"):
         assert baselines[told_more]["coverage"] > baselines["exact"]["coverage"]
     assert "world drawn" in " ".join(capsys.readouterr().out.split())
-    assert evaluated(tmp_path, PAIR, episodes=2)["baselines"].keys().isdisjoint({"oracle"})
 
 
 def test_all_policies_of_one_token_fit_into_80_columns(capsys: pytest.CaptureFixture[str]) -> None:
