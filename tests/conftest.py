@@ -36,7 +36,7 @@ SHARED = ("trained",)
 SECONDS = {
     "test_lockstep.py::test_the_same_numbers_come_twice": 80,
     "test_experiments.py::test_a_study_is_stopped": 60,
-    "test_training.py::test_a_reward_of_ones_own": 28,
+    "test_training.py::test_a_run_begins_with_anothers_networks": 30,
     "test_delivery.py::test_acknowledged_batches_survive": 27,
     "test_faults.py::test_a_network_that_swallows": 19,
     "test_faults.py::test_who_is_frozen": 14,

@@ -174,7 +174,7 @@ def try_install(
 @pytest.mark.parametrize(
     ("extras", "changed", "told"),
     [
-        ("more", None, "installing into"),
+        pytest.param("more", None, "installing into", marks=pytest.mark.check),
         pytest.param("", "pip", "DO NOT MATCH THE HASHES", marks=pytest.mark.check),
         ("", "run", "DO NOT MATCH THE HASHES"),
         pytest.param("more", "extra", "DO NOT MATCH THE HASHES", marks=pytest.mark.check),
@@ -196,7 +196,9 @@ def test_install_refuses_a_file_with_another_hash(
     assert (result.returncode == 0) == told.startswith("installing"), result.stderr
 
 
-@pytest.mark.parametrize("offered", ["wheel", "source", "not"])
+@pytest.mark.parametrize(
+    "offered", ["wheel", "source", pytest.param("not", marks=pytest.mark.check)]
+)
 def test_install_takes_the_cpu_build_where_it_is_offered(tmp_path: Path, offered: str) -> None:
     """Of the build whose hash an index tells pip thinks more, which is the one with CUDA.
 

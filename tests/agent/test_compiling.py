@@ -23,7 +23,8 @@ from tests.agent.test_learner import CASES, changed, copied, play
 
 # Agents whose updates differ in their parts: bootstrapping, several tokens, pairs.
 FEW = {"kind": "mlp", "hidden": [4]}  # what is traced soon
-TRACED = [("ddpg", "paper"), ("ddpg", "several"), ("pairs", "mlp")]
+SEVERAL = pytest.param(("ddpg", "several"), marks=pytest.mark.check)
+TRACED = [("ddpg", "paper"), SEVERAL, ("pairs", "mlp")]
 
 
 @pytest.fixture
