@@ -61,7 +61,7 @@ paper: .venv/.installed-run  ## all figures and tables of the paper: BUDGET=smok
 	@$(BIN)/tangram-experiment budget=$(BUDGET) $(ARGS)
 	@$(BIN)/tangram-report runs=runs/experiments/$(BUDGET)
 
-# Given again, it goes on; what has its rows in docs/results is not made again: delete what you want anew.
+# Given again, it goes on; what has its rows in docs/results is not made again: what conf/studies.yaml has may be deleted and made anew.
 study = $(BIN)/tangram-experiment study=$(1) budget=$(2) seeds=10 run_dir=runs/evidence out=docs/results $(ARGS)
 evidence: .venv/.installed-dev  ## what README and docs show of trainings and docs/results lacks: all of it takes a day
 	@$(call study,paper,laptop)
