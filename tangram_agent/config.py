@@ -90,7 +90,7 @@ class AgentConfig(Settings, section="agent"):
     motion: str = setting(
         "learned",
         "what a command comes to: learned from the replay, and watched in each episode; or the "
-        "exact rigid motion, which makes the agent model-based",
+        "exact rigid motion",
         choices=("learned", "exact"),
         only={"readout": "pair"},
         part=NETWORK,
