@@ -201,8 +201,8 @@ class Launcher:
         self._sent_home = status == 0
         if status not in (0, 2):  # 2: it has told what is wrong
             self._say(
-                f"the master ended with {describe(status)}; resume=auto goes on from its "
-                "last checkpoint"
+                f"the master ended with {describe(status)}; the same command with resume=auto "
+                "goes on from what it kept"
             )
         if self._failed:
             return FAILED_STATUS

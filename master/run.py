@@ -263,6 +263,8 @@ def _make_trainer(
     device = choose_device(service.device)
     trainer = Trainer(setup, config.seed, device, compiled=service.compile)
     found = restore_run(folder.checkpoints, trainer) if config.resume == "auto" else None
+    if found is None:
+        folder.check_has_all()
     if found is None and config.warm_start is not None:
         warm_start(Path(config.warm_start), trainer)
     if service.compile:

@@ -100,6 +100,19 @@ class RunFolder:
         kept = bool(list_checkpoints(self.checkpoints)) or bool(segments(self.journal))
         return self.result.exists() or kept
 
+    def check_has_all(self) -> None:
+        """Whether a run without a checkpoint has never had one.
+
+        Raises:
+            RunError: it had; what it learned and was scored would be overwritten.
+        """
+        first = min(segments(self.journal), default=0)
+        if first > 1 or (first == 0 and self.result.exists()):
+            raise RunError(
+                f"run_dir {self.path} has lost its checkpoints: put them back into "
+                f"{self.checkpoints}, or begin anew in another run_dir"
+            )
+
     def has_finished(self, config: MasterConfig) -> bool:
         """Whether a bound that this config does not raise has ended the run, scores included."""
         if config.resume != "auto" or not self.result.exists():

@@ -277,7 +277,7 @@ def from_mapping(kind: type[Settings], mapping: Mapping[str, Any]) -> Settings:
     Raises:
         ConfigError: names the key and what is wrong with it.
     """
-    _check_lists(kind, mapping)
+    _check_names(kind, mapping)
     rules = dacite.Config(strict=True, cast=[tuple], type_hooks={float: _as_float})
     try:
         return dacite.from_dict(kind, mapping, rules)
@@ -285,16 +285,23 @@ def from_mapping(kind: type[Settings], mapping: Mapping[str, Any]) -> Settings:
         raise ConfigError(f"wrong config: {error}") from None
 
 
-def _check_lists(kind: type[Any], mapping: Mapping[str, Any]) -> None:
-    """Refuse what is no list where one is expected: a text would be taken letter by letter."""
-    for name, hint in get_type_hints(kind).items():
-        value = mapping.get(name)
-        if name not in mapping:
-            continue
-        if get_origin(hint) is tuple and not isinstance(value, list | tuple):
-            raise ConfigError(f"{name} must be a list, as in {name}=[...], got {value!r}")
-        if is_dataclass(hint) and isinstance(value, Mapping):
-            _check_lists(cast("type[Any]", hint), value)
+def _check_names(kind: type[Any], mapping: Mapping[str, Any], group: str = "") -> None:
+    """Refuse unknown names, and what is no list where one is expected.
+
+    A text would be taken letter by letter.
+    """
+    hints = get_type_hints(kind)
+    for name, value in mapping.items():
+        if name not in hints:
+            raise ConfigError(
+                f"there is no setting {group}{name}: delete it; a config may have it of an older "
+                "version (CHANGELOG.md)"
+            )
+        if get_origin(hints[name]) is tuple and not isinstance(value, list | tuple):
+            full = f"{group}{name}"
+            raise ConfigError(f"{full} must be a list, as in {full}=[...], got {value!r}")
+        if is_dataclass(hints[name]) and isinstance(value, Mapping):
+            _check_names(cast("type[Any]", hints[name]), value, f"{group}{name}.")
 
 
 def _as_float(value: object) -> object:

@@ -207,7 +207,7 @@ def _load(config: RewardConfig, path: Path, attribute: str) -> UserReward:
     sys.modules[module.__name__] = module
     try:
         exec(compile(source, path, "exec"), module.__dict__)  # noqa: S102
-    except Exception as error:  # it is the user's code: anything may go wrong
+    except (Exception, SystemExit) as error:  # it is the user's code: anything may go wrong
         raise ConfigError(
             f"reward.name={name}: cannot load '{path}' ({type(error).__name__}: {error}): it must "
             "be one file that needs nothing but installed packages"
@@ -226,16 +226,22 @@ def _load(config: RewardConfig, path: Path, attribute: str) -> UserReward:
 def _checked(
     name: str, function: UserReward, achieved: Floats, desired: Floats, layout: Layout
 ) -> Floats:
-    """What the user's function returns, if it is one finite number per row."""
+    """What the user's function returns, if it is one number within the bounds per row."""
+    given = achieved.view(), desired.view()
+    for one in given:  # else `achieved -= desired` would change what is scored and learned from
+        one.flags.writeable = False
     try:
-        rewards = np.asarray(function(achieved, desired, layout), dtype=np.float64)
-    except Exception as error:  # it is the user's code: anything may go wrong
+        rewards = np.asarray(function(*given, layout), dtype=np.float64)
+    except (Exception, SystemExit) as error:  # it is the user's code: anything may go wrong
         raise ConfigError(f"reward.name={name} failed: {type(error).__name__}: {error}") from error
     if rewards.shape != (len(achieved),):
         raise ConfigError(
             f"reward.name={name} must return one number per row, shape ({len(achieved)},), "
             f"got shape {rewards.shape}"
         )
-    if not np.isfinite(rewards).all():
-        raise ConfigError(f"reward.name={name} must return finite numbers, got {rewards}")
+    if not (np.abs(rewards) <= MAX_REWARD).all():
+        raise ConfigError(
+            f"reward.name={name} must return numbers between {-MAX_REWARD:g} and {MAX_REWARD:g}, "
+            f"got {rewards}"
+        )
     return rewards

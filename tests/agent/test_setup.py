@@ -28,7 +28,7 @@ def changed(section: str, **values: Any) -> dict[str, dict[str, Any]]:
     ("config", "reason"),
     [
         (changed("tokens", shapes=["pentagon"]), "unknown shape 'pentagon': choose from large_tri"),
-        (changed("tokens", shapes="square"), "shapes must be a list, .* got 'square'"),
+        (changed("tokens", shapes="square"), "tokens.shapes must be a list, .* got 'square'"),
         (changed("tokens", shapes=None), "shapes must be a list"),
         (changed("net", hidden=3), "hidden must be a list, .* got 3"),
         (changed("agent", hindsight="final"), "hindsight must be a list"),
@@ -38,7 +38,7 @@ def changed(section: str, **values: Any) -> dict[str, dict[str, Any]]:
         ),
         (changed("sim", pixels=-1), "sim.pixels must be between 0 and 1024, got -1"),
         (changed("sim", arena="wide"), 'wrong value type for field "sim.arena"'),
-        (changed("sim", speed=1), '"speed"'),
+        (changed("sim", speed=1), r"no setting sim\.speed: delete it; .* older version"),
         (changed("agent", gamma=1.5), "agent.gamma must be between 0 and 1, got 1.5"),
         (changed("agent", batch_size=0), "agent.batch_size must be at least 1, got 0"),
         (

@@ -197,7 +197,9 @@ def test_everything_ends_with_the_master(
     assert result == status
     tries = [f"({i} of {MAX_RESTARTS})" for i in range(1, MAX_RESTARTS + 1)]
     expected = [f"the master ended with {said}: it goes on from what it left {t}" for t in tries]
-    expected.append(f"the master ended with {said}; resume=auto goes on from its last checkpoint")
+    expected.append(
+        f"the master ended with {said}; the same command with resume=auto goes on from what it kept"
+    )
     assert told.splitlines() == (expected if said else [])
 
 

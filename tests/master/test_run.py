@@ -5,7 +5,7 @@ import shutil
 import socket
 import stat
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from tangram_agent.messages import OPEN
 from tangram_agent.process import Every, Watchdog
 from tangram_sim.errors import ConfigError, RunError
 from tests.master.builders import ShownProgress, arrival, journal, small_setup, trainer
+from tests.ports import free_ports
 
 pytestmark = pytest.mark.cluster
 
@@ -164,18 +165,6 @@ def test_the_connection_names_a_host_that_others_reach(
     assert connection["weights_endpoint"] == f"tcp://{host}:{ports[1]}"
     http_host = host if settings["bind"] == EVERYWHERE else "127.0.0.1"
     assert connection["http"].startswith(f"http://{http_host}:")
-
-
-def free_ports(count: int) -> int:
-    """The first of so many in a row that nobody listens on."""
-    while True:
-        with ExitStack() as opened:
-            first = opened.enter_context(socket.create_server(("127.0.0.1", 0)))
-            port: int = first.getsockname()[1]
-            with suppress(OSError):
-                for more in range(1, count):
-                    opened.enter_context(socket.create_server(("127.0.0.1", port + more)))
-                return port
 
 
 def test_the_ports_can_be_fixed_and_a_taken_one_is_named(tmp_path: Path) -> None:

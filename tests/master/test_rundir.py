@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 import yaml
 
+from master.journal import segment_path
 from master.rundir import RunFolder
 from tangram_agent.checkpoints import save_checkpoint
 from tangram_agent.files import write_whole
-from tangram_sim.errors import ConfigError
+from tangram_sim.errors import ConfigError, RunError
 
 pytestmark = pytest.mark.fast
 
@@ -34,6 +35,19 @@ def test_a_folder_with_a_run_is_refused_unless_resumed(tmp_path: Path, left: str
     with pytest.raises(ConfigError, match=r"holds a run already: choose another .* resume=auto"):
         folder.prepare("none")
     folder.prepare("auto")
+
+
+def test_a_run_that_lost_its_checkpoints_is_not_begun_anew(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    folder.check_has_all()
+    folder.write_result({})
+    with pytest.raises(RunError, match=r"has lost its checkpoints: put them back .* anew in anoth"):
+        folder.check_has_all()
+    write_whole(segment_path(folder.journal, 1), b"")  # killed before it had any
+    folder.check_has_all()
+    segment_path(folder.journal, 1).rename(segment_path(folder.journal, 2))
+    with pytest.raises(RunError, match="has lost its checkpoints"):
+        folder.check_has_all()
 
 
 def test_a_new_folder_is_made_and_one_of_a_launcher_is_used(tmp_path: Path) -> None:

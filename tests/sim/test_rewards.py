@@ -140,6 +140,16 @@ def text(achieved, desired, layout):
 
 def lost(achieved, desired, layout):
     return np.full(len(achieved), np.nan)
+
+def large(achieved, desired, layout):
+    return np.full(len(achieved), -1.1e6)
+
+def writing(achieved, desired, layout):
+    achieved -= desired
+    return achieved[:, 0, 0]
+
+def leaving(achieved, desired, layout):
+    raise SystemExit(3)
 """
 
 
@@ -168,7 +178,10 @@ def test_a_reward_of_the_users_own() -> None:
     [
         ("table", r"one number per row, shape \(2,\), got shape \(2, 1\)"),
         ("text", "failed: ValueError: could not convert string"),
-        ("lost", "must return finite numbers"),
+        ("lost", "must return numbers between -1e.06 and 1e.06, got"),
+        ("large", "must return numbers between -1e.06 and 1e.06, got"),
+        ("writing", "failed: ValueError: output array is read-only"),
+        ("leaving", "failed: SystemExit: 3"),
     ],
 )
 def test_what_the_users_own_returns_is_checked_also_before_anything_starts(

@@ -83,11 +83,6 @@ def both(stage: Stage, client: Client, done: Callable[[], Any]) -> None:
     stage.until(step)
 
 
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        return int(probe.getsockname()[1])
-
-
 def write_connection(folder: Path, endpoint: str, run_id: str = "run", machine: str = "") -> Path:
     """As a master writes it, of this machine unless another is named."""
     aside = folder / "aside"

@@ -15,12 +15,12 @@ from tangram_agent.messages import Alive, Greet, Hello
 from tangram_sim.errors import TangramError
 from tests.agent.messages import SHAPES, episodes, weights
 from tests.master.dealers import staged
+from tests.ports import free_ports
 from tests.worker.conversation import (
     LIMIT_S,
     QUICK,
     StandIn,
     both,
-    free_port,
     joined,
     make_client,
     served,
@@ -34,7 +34,7 @@ pytestmark = pytest.mark.cluster
 
 
 def test_a_restarted_master_gets_all_that_was_not_acknowledged() -> None:
-    port = free_port()
+    port = free_ports(1)
     with staged(port=port) as stage, make_client(stage.hub.endpoint, shapes=SHAPES) as client:
         assert served(stage, client.join)
         stage.hub.publish(weights(version=8))
@@ -129,7 +129,7 @@ def test_another_run_at_the_same_address_is_an_error(master: StandIn) -> None:
 
 
 def test_closing_is_bounded_when_nobody_listens(tmp_path: Path) -> None:
-    for connect in (f"tcp://127.0.0.1:{free_port()}", tmp_path):
+    for connect in (f"tcp://127.0.0.1:{free_ports(1)}", tmp_path):
         client = make_client(connect)
         client.poll()
         client.close()
@@ -152,7 +152,7 @@ def test_a_waiting_client_says_what_it_waits_for(
 
     with make_client(tmp_path) as client:
         until_said(client, client.join, f"waits for the connection file {tmp_path} since 0 s")
-    nobody = f"tcp://127.0.0.1:{free_port()}"
+    nobody = f"tcp://127.0.0.1:{free_ports(1)}"
     with make_client(nobody) as client:
         until_said(client, client.join, f"waits for an answer of the master at {nobody}")
     with welcomed(master, window=1) as client:
@@ -180,7 +180,7 @@ def test_a_host_that_dns_does_not_know_is_told_once_and_looked_up_again(
 def test_a_silent_master_is_told_and_its_return_too(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     timing = replace(QUICK, silence_s=0.3)
-    port = free_port()
+    port = free_ports(1)
     with staged(port=port) as stage, joined(stage, timing=timing) as client:
         endpoint = stage.hub.endpoint
 

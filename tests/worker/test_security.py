@@ -38,10 +38,10 @@ from tests.agent.builders import random_episodes
 from tests.agent.messages import episodes, hello, weights
 from tests.master.dealers import Stage, staged
 from tests.master.test_run import MADE, opened_run
+from tests.ports import free_ports
 from tests.worker.conversation import (
     QUICK,
     both,
-    free_port,
     make_client,
     served,
     standing_in,
@@ -161,7 +161,7 @@ def test_a_master_that_gets_the_right_keys_is_joined_without_waiting_for_silence
     tmp_path: Path,
 ) -> None:
     """ZeroMQ itself never connects again after it was refused."""
-    keys, other, port = make_keys(), make_keys(), free_port()
+    keys, other, port = make_keys(), make_keys(), free_ports(1)
     others = replace(keys, player=other.player)
     with staged(port=port, keys=others) as stage:
         path = write_file(tmp_path, stage.hub, keys)
@@ -232,7 +232,7 @@ def test_an_impostor_on_a_dead_masters_port_gets_no_batch(
 ) -> None:
     """It has heard the run's id, and says what the master would say."""
     monkeypatch.setattr(Loop, "dismiss", lambda *_: None)  # who was killed says nothing
-    folder, port = RunFolder(tmp_path / "run"), free_port()
+    folder, port = RunFolder(tmp_path / "run"), free_ports(1)
     with opened_run(folder.path, bind="127.0.0.1", port=port) as (loop, connection):
         folder.connection.write_text(json.dumps(connection))
         spec = EpisodeSpec.of(MADE)
