@@ -299,8 +299,9 @@ def _trained(folder: Path, checkpoint: str | None, reward: str | None) -> Stored
     content = load_checkpoint(path, [ACTING])
     setup = make_setup(config)
     # Where it plays may change: another backend or another reward does not change the policy.
-    trained = setup.differences(content.counters.get(SETUP, {}))
-    odd = [name for name in trained if name in POLICY_SECTIONS]
+    known = content.counters.get(SETUP, {})
+    odd = [name for name in setup.differences(known) if name in POLICY_SECTIONS]
+    odd += setup.meant_otherwise(known, "sim")
     if odd:
         raise RunError(
             f"{folder / CONFIG} is not what {path.name} was trained with: its {', '.join(odd)} "

@@ -231,17 +231,18 @@ class Setup:
         known = own | contents if isinstance(contents, dict) else {}
         return sorted(name for name in own if not _agree(own[name], known.get(name)))
 
-    def meant_otherwise(self, contents: object) -> list[str]:
-        """The agent's settings by which networks of another setup are not networks of this one.
+    def meant_otherwise(self, contents: object, section: str = "agent") -> list[str]:
+        """The settings by which networks of another setup are not networks of this one.
 
         They may have the same shapes: what they see, give and learn from is another thing.
         """
-        agent = contents.get("agent") if isinstance(contents, dict) else None
-        own = self.contents()["agent"]
-        known = own | agent if isinstance(agent, dict) else own
-        parts = {one.name: one.metadata[KEY].part for one in declared_fields(AgentConfig)}
+        other = contents.get(section) if isinstance(contents, dict) else None
+        own = self.contents()[section]
+        known = own | other if isinstance(other, dict) else own
+        declared = declared_fields(type(getattr(self, section)))
+        parts = {one.name: one.metadata[KEY].part for one in declared}
         names = [name for name in own if parts[name] == NETWORK]
-        return [f"agent.{name}" for name in names if own[name] != known[name]]
+        return [f"{section}.{name}" for name in names if own[name] != known[name]]
 
 
 def _changed(config: RewardConfig | AgentConfig) -> dict[str, Any]:
