@@ -266,14 +266,6 @@ def composed(config_name: str, overrides: Sequence[str]) -> Plain:
         raise ConfigError(_explain(error, config_name)) from error
 
 
-def own_presets() -> str | None:
-    """The folder that --config-dir named; only inside of a task."""
-    from hydra.core.hydra_config import HydraConfig
-
-    sources = HydraConfig.get().runtime.config_sources
-    return next((str(one.path) for one in sources if one.provider == "command-line"), None)
-
-
 def _register(config_name: str) -> None:
     """Tell hydra of a command: its defaults list, and the defaults that its settings declare."""
     from hydra.core.config_store import ConfigStore

@@ -68,8 +68,6 @@ SLIDE = over(
 )
 SEEN = over(ONE, sim={"pixels": 16, "arena": 1.2})
 CAMERA = over(SEEN, reward={"source": "camera"})
-UNPUNISHED = over(ONE, agent={"saturation_penalty": 0.0})
-DENSE = over(ONE, reward={"name": "dense"})
 NEAR = {"strategy": "near", "copies": 1, "position": 0.1, "angle": 0.1}
 FINAL_TWICE = over(ONE, sim={"actions_per_token": 2}, agent={"hindsight": [{"strategy": "final"}]})
 NEAR_ONE = over(ONE, agent={"hindsight": [NEAR]})

@@ -15,7 +15,7 @@ from tangram_agent.policy import Policy
 from tangram_agent.pretrained import CARD, CONFIG, FORMAT, WEIGHTS, agent_names, is_name
 from tangram_agent.runs import load_run
 from tangram_sim.env import TangramEnv
-from tangram_sim.errors import RunError, TangramError
+from tangram_sim.errors import ConfigError, RunError, TangramError
 from tangram_sim.register import KWARGS
 from tests.agent.builders import (
     BFLOAT,
@@ -137,3 +137,8 @@ def test_an_id_is_what_its_agent_was_trained_on(name: str, agent: str) -> None:
     assert env.sim == setup.sim
     assert setup.reward.name == "overlap"
     env.close()
+
+
+def test_an_agent_of_outlines_says_that_no_observation_has_them() -> None:
+    with pytest.raises(ConfigError, match=r"silhouette fills outlines, .* call policy\.act"):
+        load_run("pretrained/tangram7_silhouette").predict({})

@@ -44,6 +44,7 @@ def test_a_run_keeps_its_keys_and_only_the_user_reads_them(tmp_path: Path) -> No
         {"given": {"alice": {"role": "master", "public": make_pair().public}}},
         {"given": {"player": {"role": "player", "public": make_pair().public}}},
         {"given": {"a/b": {"role": "player", "public": make_pair().public}}},
+        {"given": {"alice": {"role": "player", "public": make_pair().public[:-5]}}},
         "",
         "[" * 100_000,
         "[]",
