@@ -338,7 +338,7 @@ def test_a_run_plays_on_with_other_settings_of_the_agent() -> None:
     [
         ("agent", "reapply", -1, "run with agent.reapply=-1: agent.reapply must be between 0 and"),
         ("agent", "reapply", "x", "wrong config: .*agent.reapply"),
-        ("agent", "odd", 1, "wrong config: .*odd"),
+        ("agent", "odd", 1, "there is no setting agent.odd"),
         ("agent", "batch_size", 9, "agent.batch_size=9 changes nothing with a trained run, which"),
         ("agent", "readout", "token", "agent.readout=token does not fit this run, whose weights"),
         ("sim", "arena", 3.0, "trained with sim.arena=2: leave it out, or train a run with it"),

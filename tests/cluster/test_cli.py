@@ -114,7 +114,7 @@ WRONG = [
     (f"tangram-play run_dir={'x/' * 2000}", "run_dir must be a path of at most 3840 bytes"),
     ("tangram-train service.bind=", "without scheme and port, got '': set service.bind=127.0.0.1"),
     ("tangram-train service.port=5555", "service.port=5555 changes nothing with service.bind="),
-    ("tangram-master +sim.colour=1", 'can not match "colour"'),
+    ("tangram-master +sim.colour=1", "there is no setting sim.colour: delete it"),
     ("tangram-master from_config=nowhere.yaml", "from_config=nowhere.yaml: No such file"),
     ("tangram-worker connect=tcp://127.0.0.1:1 reward.name=own.py:none", "cannot read 'own.py' on"),
     ("tangram-train tokens.shapes=[square,square,square] tokens.scale=2.2", "no room for token"),

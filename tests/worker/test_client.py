@@ -24,11 +24,11 @@ from tangram_agent.messages import (
 from tangram_sim.errors import RunError, TangramError, WireError
 from tests.agent.messages import SHAPES, broadcast, episodes, scores, weights, with_header
 from tests.master.dealers import Stage
+from tests.ports import free_ports
 from tests.worker.conversation import (
     QUICK,
     StandIn,
     both,
-    free_port,
     joined,
     make_client,
     numbers,
@@ -60,7 +60,7 @@ def test_a_client_waits_for_the_connection_file_and_is_told_what_it_needs(
 
 @pytest.mark.parametrize("what", ["address", "file"])
 def test_no_master_in_time_says_where_none_is(tmp_path: Path, what: str) -> None:
-    endpoint = f"tcp://127.0.0.1:{free_port()}"
+    endpoint = f"tcp://127.0.0.1:{free_ports(1)}"
     connect, nobody = {
         "address": (endpoint, f"no master answers at {endpoint} after 0.2 s"),
         "file": (
