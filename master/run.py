@@ -264,9 +264,9 @@ def _make_trainer(
     trainer = Trainer(setup, config.seed, device, compiled=service.compile)
     found = restore_run(folder.checkpoints, trainer) if config.resume == "auto" else None
     if found is None:
-        folder.check_has_all()
-    if found is None and config.warm_start is not None:
-        warm_start(Path(config.warm_start), trainer)
+        folder.check_never_kept()
+        if config.warm_start is not None:
+            warm_start(Path(config.warm_start), trainer)
     if service.compile:
         kept = cache_folder()
         log.info("compiles its update: up to a minute at first, seconds once %s has it", kept)

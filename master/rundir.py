@@ -100,11 +100,14 @@ class RunFolder:
         kept = bool(list_checkpoints(self.checkpoints)) or bool(segments(self.journal))
         return self.result.exists() or kept
 
-    def check_has_all(self) -> None:
-        """Whether a run without a checkpoint has never had one.
+    def check_never_kept(self) -> None:
+        """Refuse to begin anew, for want of a checkpoint, where a run had one.
+
+        A checkpoint deletes the segments of the journal that it covers, and a result is written
+        after the last one.
 
         Raises:
-            RunError: it had; what it learned and was scored would be overwritten.
+            RunError: its scores would be written over.
         """
         first = min(segments(self.journal), default=0)
         if first > 1 or (first == 0 and self.result.exists()):

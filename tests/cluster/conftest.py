@@ -8,7 +8,7 @@ import pytest
 from tests.cluster.processes import LIMIT_S, run
 from tests.cluster.studios import Running, studio
 
-UPDATES = 400
+UPDATES = 600
 
 
 @pytest.hookimpl(tryfirst=True)

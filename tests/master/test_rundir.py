@@ -39,15 +39,15 @@ def test_a_folder_with_a_run_is_refused_unless_resumed(tmp_path: Path, left: str
 
 def test_a_run_that_lost_its_checkpoints_is_not_begun_anew(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
-    folder.check_has_all()
+    folder.check_never_kept()
     folder.write_result({})
     with pytest.raises(RunError, match=r"has lost its checkpoints: put them back .* anew in anoth"):
-        folder.check_has_all()
+        folder.check_never_kept()
     write_whole(segment_path(folder.journal, 1), b"")  # killed before it had any
-    folder.check_has_all()
+    folder.check_never_kept()
     segment_path(folder.journal, 1).rename(segment_path(folder.journal, 2))
     with pytest.raises(RunError, match="has lost its checkpoints"):
-        folder.check_has_all()
+        folder.check_never_kept()
 
 
 def test_a_new_folder_is_made_and_one_of_a_launcher_is_used(tmp_path: Path) -> None:
