@@ -1,0 +1,5 @@
+"""What master, workers, tasks and agents share: two interfaces, and how they speak and keep things.
+
+Start with `task.py` and `agent.py`: who implements them has the whole service. `spec.py` says what
+an episode is made of. May import numpy, and no other package of this project.
+"""

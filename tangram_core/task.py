@@ -1,0 +1,216 @@
+"""The interface of a task: what is played, what it is worth, and how it is scored.
+
+Legend: E episodes, B environments, T steps of an episode, A entries of an action, n goals.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from tangram_core.spec import Array, Arrays, Episodes, EpisodeSpec
+from tangram_sim.arrays import Bools, Floats, Pixels, Singles
+from tangram_sim.seeding import episode_generator
+from tangram_sim.settings import Settings
+
+Generators = Sequence[np.random.Generator]
+Purpose = Literal["play", "test"]
+Json = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Score:
+    """A number by which play is judged, as people are shown it.
+
+    Attributes:
+        name: in result.json, in TensorBoard and in files of scores.
+        label: of a few words, with the unit.
+        digits: after the point.
+        best: the largest value there is, if there is one: a bar is drawn up to it.
+        least: the least value; see `best`.
+    """
+
+    name: str
+    label: str
+    digits: int = 3
+    best: float | None = None
+    least: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What one step of B environments gave.
+
+    Attributes:
+        seen: what is observed now: the task's fields, one row for each environment.
+        rewards: (B,) for the goal that is played for.
+        terminated: (B,) where nothing that follows counts.
+    """
+
+    seen: Arrays
+    rewards: Floats
+    terminated: Bools
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """What was seen and done in B episodes so far, t steps in each.
+
+    Attributes:
+        seen: fields of each moment, (B, t + 1, ...): before each step that was made, and now.
+        actions: (B, t, A).
+    """
+
+    seen: Arrays
+    actions: Singles
+
+
+# What the fields show now (B rows each), what was before, a generator for each environment ->
+# actions (B, A).
+Chooser = Callable[[Arrays, History, Generators], Singles]
+
+
+@dataclass(frozen=True, eq=False)
+class Played:
+    """E whole episodes, and what only the environments know of them.
+
+    Attributes:
+        episodes: as the agent saw them.
+        facts: what `Env.facts` told, (E, T + 1, ...): after reset and after each step.
+        seconds: (E,) wall time of choosing and moving, an equal share for those played together.
+        slowest: (E,) processor time of the slowest choice, in seconds.
+    """
+
+    episodes: Episodes
+    facts: Arrays
+    seconds: Floats = field(default_factory=lambda: np.zeros(0))
+    slowest: Floats = field(default_factory=lambda: np.zeros(0))
+
+
+class Env(ABC):
+    """B environments that play in step, in one process.
+
+    All randomness of an episode comes from its own generator, so an episode does not depend on
+    those beside it. An episode always has `horizon` steps: one that terminates plays on.
+
+    Attributes:
+        count: B.
+    """
+
+    count: int
+
+    @abstractmethod
+    def reset(self, generators: Generators) -> Arrays:
+        """Begin an episode in every environment.
+
+        Args:
+            generators: B, one for each.
+
+        Returns:
+            What is observed: every field of the spec that is one of each moment or episode, (B,
+            *shape) and of its dtype.
+        """
+
+    @abstractmethod
+    def step(self, actions: Singles) -> Step:
+        """Play one action (B, A) of [-1, 1] in every environment."""
+
+    def facts(self) -> Arrays:
+        """What scores are made of and no agent sees, (B, ...) each, now; the same names always."""
+        return {}
+
+    def close(self) -> None:  # noqa: B027
+        """Let go of what it holds; calling it twice does no harm."""
+
+
+@dataclass(frozen=True)
+class Task(ABC):
+    """What is played, by any number of workers, and what it is worth.
+
+    A task is a frozen dataclass whose fields are the sections of its settings:
+
+        @dataclass(frozen=True)
+        class PointConfig(Settings, section="task"):
+            reach: float = setting(0.1, "distance at which the place is reached", low=0)
+
+        @dataclass(frozen=True)
+        class Point(Task):
+            sections: ClassVar = {"task": PointConfig}
+            task: PointConfig = PointConfig()
+
+    The master makes one too, and so does whoever shows a run: to make a task loads no engine.
+    `make` does, and only a worker calls it. So nothing heavy is imported at the top of its file.
+
+    What must be there: `spec`, `scores`, `rewards`, `make` and `score`. What may: `check`, `ended`,
+    `rivals` and `draw`.
+
+    **Goals.** Two fields of the spec hold goals of the same shape: what is achieved at each moment,
+    and what is desired in an episode. Hindsight asks `rewards` what the same step would have been
+    worth for any other goal, so it must be a function of both and nothing else. It is called with
+    thousands of rows at a time.
+
+    **Ends.** Every episode has `spec.horizon` steps. Where a task ends early (a place is reached,
+    something fell) the step is marked `terminated`, what follows does not count for it, and play
+    goes on. A time limit is no end.
+
+    **Scores.** `scores` declares what people are shown; the first one is the headline, by which
+    runs are compared. `score` computes them, of played test episodes. Beside a run `rivals` play
+    the same tests: what learned nothing, a formula, a rule or a planner.
+    """
+
+    sections: ClassVar[Mapping[str, type[Settings]]] = {}
+    scores: ClassVar[tuple[Score, ...]] = ()
+
+    @property
+    @abstractmethod
+    def spec(self) -> EpisodeSpec:
+        """What its episodes are made of; the same whenever it is asked."""
+
+    @abstractmethod
+    def rewards(self, achieved: Array, desired: Array) -> Floats:
+        """(n,) what n steps are worth that came to `achieved` (n, ...), for goals (n, ...)."""
+
+    @abstractmethod
+    def make(self, count: int, purpose: Purpose = "play") -> Env:
+        """So many environments; `test` also tells what scores need and play does not.
+
+        Raises:
+            ConfigError: a package that it needs is not installed, or settings that cannot work.
+        """
+
+    @abstractmethod
+    def score(self, played: Played) -> dict[str, float]:
+        """The numbers that `scores` declares, of episodes that were made to test."""
+
+    def ended(self, achieved: Array, desired: Array, recorded: Bools) -> Bools:  # noqa: ARG002
+        """(n,) whether n steps terminate for goals (n, ...), where `recorded` did for their own."""
+        return recorded
+
+    def check(self, *, plays: bool) -> None:  # noqa: B027
+        """Refuse what cannot be played, or with plays=False learned from, on this machine.
+
+        Raises:
+            ConfigError: names the setting and the remedy.
+        """
+
+    def rivals(self) -> Mapping[str, Callable[[Env], Chooser]]:
+        """What learned nothing, by its name in tables, made for environments that it plays in."""
+        return {}
+
+    def draw(self, played: Played) -> Pixels | None:  # noqa: ARG002
+        """A picture (H, W, 3) of a few test episodes; None: there is none to be drawn."""
+        return None
+
+    def tests(self, count: int, seed: int = 0) -> Generators:
+        """The fixed test set; the first tests of a larger one are those of a smaller one."""
+        return [episode_generator(seed, "evaluation", 0, 0, number) for number in range(count)]
+
+    def identity(self) -> Json:
+        """Section -> what it says: what master and workers must have alike to play one task."""
+        return {name: asdict(getattr(self, name)) for name in self.sections}
+
+    def facts(self) -> Json:
+        """What result.json tells of the task."""
+        return {}
