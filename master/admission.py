@@ -13,8 +13,8 @@ from master.gate import Room
 from master.registry import Peer, RefusedError, Registry
 from master.security import Holder
 from master.sockets import Sockets
-from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.messages import ROLES, TAKEN_OVER, Hello, Refused, Stop, Welcome
+from tangram_core.spec import EpisodeSpec
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from tangram_agent.messages import Ack, EpisodeBatch, Reject, Scores
-from tangram_agent.types import Episodes
+from tangram_core.spec import Episodes
 
 REMEMBERED_VERSIONS = 4096
 # Peers that have left and whose batches still wait.

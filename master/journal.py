@@ -38,7 +38,7 @@ from tangram_agent.process import Every
 from tangram_agent.schema import MAX_COUNT, Plain
 from tangram_sim.errors import RunError
 
-FORMAT = 3
+FORMAT = 4
 SUFFIX = ".log"
 DIGITS = 8
 MAGIC = b"\xf1TJ\n"

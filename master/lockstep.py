@@ -8,9 +8,10 @@ inserted says which round it is, so a run that was stopped goes on where it was.
 """
 
 from master.delivery import EpisodesArrived
-from tangram_agent.arrays import EpisodeSpec
+from tangram_agent.arrays import check_batch_size
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import Go
+from tangram_core.spec import EpisodeSpec
 
 
 class Lockstep:
@@ -40,7 +41,7 @@ class Lockstep:
         """
         if service.mode != "lockstep":
             return None
-        spec.check_batch_size(service.batch_episodes)
+        check_batch_size(spec, service.batch_episodes)
         return Lockstep(workers, service.batch_episodes)
 
     def begins_round(self, episodes: int) -> bool:

@@ -26,9 +26,10 @@ from master.journal import (
     segment_path,
     segments,
 )
-from tangram_agent.arrays import EpisodeSpec, split_frames
+from tangram_agent.arrays import split_frames
 from tangram_agent.messages import EpisodeBatch, decode_from_worker
 from tangram_agent.schema import ProtocolError, opened, read
+from tangram_core.spec import EpisodeSpec
 from tangram_sim.errors import RunError, WireError
 
 OLD_HEAD = struct.Struct("<II")  # of formats 1 and 2: length and CRC of the body

@@ -26,14 +26,10 @@ from master.trainer import Trainer
 from tangram_agent.files import write_whole
 from tangram_agent.messages import WORKER_COLUMNS, RunStatus, Scores
 from tangram_agent.process import Every
-from tangram_agent.setup import Setup
 from tangram_sim.arrays import Floats
-from tangram_sim.drawing import episode_sheet
 from tangram_sim.errors import RunError
 
 UNKNOWN = -1.0
-PICTURE_COLUMNS = 4
-CURVE_PIXELS, PICTURE_PIXELS = 120, 240
 PICTURE_S = 30.0
 TICK_S = 0.1
 LISTEN_S = 1.0
@@ -240,10 +236,10 @@ class Reporter:
         updates = scores.weights_version
         sent = self._published.get(updates, self._now())
         self._metrics.scores(values, updates, sent.episodes, sent.train_s)
-        # Drawing takes time from learning.
-        if len(scores.ends) and self._picture.due():
-            picture = scores_picture(scores, self._trainer.setup, CURVE_PIXELS)
-            self._metrics.picture(np.asarray(picture), updates)
+        # Writing it takes time from learning.
+        if len(scores.picture) and self._picture.due():
+            half = Image.fromarray(scores.picture).reduce(2)
+            self._metrics.picture(np.asarray(half), updates)
             with suppress(RunError):  # a disk that fails is told where the run needs it
                 self.draw()
 
@@ -288,21 +284,15 @@ class Reporter:
         self._metrics.hyperparameters(result)
 
     def draw(self) -> None:
-        """Draw the test episodes of the last evaluation, where there is one with pictures.
+        """Write the picture of the last evaluation, where there is one.
 
         Raises:
             RunError: the disk does not take it.
         """
-        if self._latest is not None and len(self._latest.ends):
+        if self._latest is not None and len(self._latest.picture):
             drawn = BytesIO()
-            scores_picture(self._latest, self._trainer.setup, PICTURE_PIXELS).save(drawn, "PNG")
+            Image.fromarray(self._latest.picture).save(drawn, "PNG")
             write_whole(self._path, drawn.getvalue(), above=False)
 
     def _now(self) -> Sent:
         return Sent(time.monotonic(), self._trainer.episodes, self._record.train_s)
-
-
-def scores_picture(scores: Scores, setup: Setup, pixels: int) -> Image.Image:
-    """The test episodes of an evaluation, each `pixels` wide, with its overlap."""
-    corners = (scores.starts, scores.ends, scores.goals)
-    return episode_sheet(setup.layout, setup.sim.arena, *corners, PICTURE_COLUMNS, pixels)

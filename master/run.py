@@ -35,7 +35,6 @@ from master.security import Keys, listening_place, needs_keys, run_keys, write_k
 from master.signals import StopSignals
 from master.trainer import Trainer, choose_device
 from tangram_agent.addresses import LOCAL, dns_error, reachable, with_host
-from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.compiling import cache_folder
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import OPEN, WINDOW
@@ -147,7 +146,7 @@ def open_run(
     run_id = rest.record.run_id
     guard = DivergenceGuard(trainer, folder.bad_batch)
     clock, budget = Clock(rest.record), Budget(config, trainer, rest.record)
-    lockstep = Lockstep.of(service, config.workers, EpisodeSpec.of(setup))
+    lockstep = Lockstep.of(service, config.workers, setup.spec)
     if not budget.bounded:
         log.warning(UNBOUNDED)
     keys = _keys(service, folder)
@@ -160,7 +159,7 @@ def open_run(
     if found is not None:
         hub.load_state(rest.hub)
     # What was acknowledged after the checkpoint.
-    digest, spec = setup.task_digest(), EpisodeSpec.of(setup)
+    digest, spec = setup.task_digest(), setup.spec
     batches = Reader(folder.journal, rest.place, run_id, digest, spec, log.warning)
     _insert_again(batches, hub, guard, budget, lockstep, watchdog)
     after = Place((rest.place or Place()).segment, batches.number)
@@ -231,7 +230,7 @@ def _open_hub(config: MasterConfig, setup: Setup, run_id: str, keys: Keys | None
         run_id=run_id,
         seed=config.seed,
         fingerprints=setup.fingerprints(),
-        spec=EpisodeSpec.of(setup),
+        spec=setup.spec,
         window=WINDOW,
         lockstep=service.mode == "lockstep",
     )

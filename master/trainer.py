@@ -15,10 +15,11 @@ from tangram_agent.filling_replay import FillReplay
 from tangram_agent.learner import Learner
 from tangram_agent.motion import Motions, motions_of
 from tangram_agent.networks import travelling
-from tangram_agent.relabelling import with_relabelled
+from tangram_agent.relabelling import learnable, with_relabelled
 from tangram_agent.replay import ReplayBuffer
 from tangram_agent.setup import Setup
-from tangram_agent.types import Episodes, Transitions, Weights
+from tangram_agent.types import Transitions, Weights
+from tangram_core.spec import Episodes
 from tangram_sim.errors import ConfigError, RunError
 from tangram_sim.rewards import make_reward
 
@@ -104,7 +105,7 @@ class Trainer:
     def insert(self, episodes: Episodes) -> None:
         """Take in episodes as they were played, and relabelled."""
         generator = self._generators["hindsight"]
-        seen = episodes.learnable()
+        seen = learnable(episodes)
         learned_from = seen.transitions
         if isinstance(self.replay, FillReplay):
             learned_from = self.replay.insert(seen, generator)

@@ -19,11 +19,9 @@ import numpy.typing as npt
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from tangram_agent.setup import Setup
+from tangram_core.spec import EpisodeSpec, Field
 from tangram_sim.arrays import Singles
 from tangram_sim.errors import ConfigError, WireError
-from tangram_sim.rewards import MAX_REWARD, reward_bounds
-from tangram_sim.settings import check_range
 
 WeightShapes = Mapping[str, tuple[int, ...]]
 
@@ -32,8 +30,8 @@ MAX_EPISODES = 4096
 MAX_FRAME_BYTES = 32 * 1024
 MAX_BATCH_BYTES = 2 * 2**20
 MAX_WEIGHTS_BYTES = 64 * 2**20
-# Corners and actions are computed in float64; their bounds may be passed by rounding to float32.
 ROUNDING = 1e-6
+_LITTLE = {"f4": "<f4", "u1": "u1"}
 LENGTH = struct.Struct("<I")
 MAX_FRAMES = MAX_BATCH_BYTES // MAX_FRAME_BYTES + 8  # of a message; one for each array is not full
 
@@ -118,89 +116,38 @@ class Column:
         )
 
 
-@dataclass(frozen=True)
-class EpisodeSpec:
-    """The task as the wire sees it: what the arrays of every message are checked against.
+@lru_cache
+def columns(spec: EpisodeSpec, count: int) -> tuple[Column, ...]:
+    """The frames of `count` episodes, in the order of the spec's fields."""
+    return tuple(_column(field, (count, *field.rows(spec.horizon))) for field in spec.every)
 
-    Attributes:
-        tokens: K.
-        corners: V.
-        horizon: T, steps of every episode.
-        action_size: A.
-        bound: largest |coordinate| that a corner can reach.
-        observed: whether pictures are what is observed: then some of it is not surely seen.
-        goal_rows: G, corners of a target; 0: V.
-        rewards: least and largest one.
-    """
 
-    tokens: int
-    corners: int
-    horizon: int
-    action_size: int
-    bound: float
-    observed: bool = False
-    goal_rows: int = 0
-    rewards: tuple[float, float] = (-MAX_REWARD, MAX_REWARD)
-
-    def __post_init__(self) -> None:
-        for name in ("tokens", "corners", "horizon", "action_size"):
-            check_range(name, getattr(self, name), 1)
-        check_range("bound", self.bound, 0.0, 1e9)
-        self.check_batch_size(1)
-
-    @staticmethod
-    def of(setup: Setup) -> "EpisodeSpec":
-        """The spec of a run's task."""
-        layout = setup.layout
-        return EpisodeSpec(
-            layout.tokens,
-            layout.corner_count,
-            setup.horizon,
-            setup.action_size,
-            setup.bound,
-            setup.sim.looks,
-            setup.goal_rows if setup.fills else 0,
-            reward_bounds(setup.reward, setup.sim, setup.bound),
-        )
-
-    @cached_property
-    def max_count(self) -> int:
-        """Most episodes in one message, bounded in number and in bytes."""
-        return min(MAX_EPISODES, MAX_BATCH_BYTES // sum(c.size for c in self.columns(1)))
-
-    def check_batch_size(self, count: int) -> None:
-        """Raise ConfigError if so many episodes cannot be sent in one message."""
-        if count > self.max_count:
-            raise ConfigError(
-                f"{count} episodes of {self.horizon} steps with {self.corners} corners are too "
-                f"many for one message, at most {self.max_count}: lower service.envs or "
-                "sim.actions_per_token"
-            )
-
-    def columns(self, count: int) -> tuple[Column, ...]:
-        """The frames of `count` episodes, in the order of the fields of Episodes."""
-        return _columns(self, count)
-
-    def pictures(self, count: int) -> tuple[Column, ...]:
-        """The frames of `count` test episodes: corners at the start, at the end and of the goal."""
-        reach = self.bound * (1 + ROUNDING)
-        names = ("starts", "ends", "goals")
-        return tuple(Column(n, "<f4", (count, self.corners, 2), -reach, reach) for n in names)
+def _column(field: Field, shape: tuple[int, ...]) -> Column:
+    # What is computed in float64 may pass its bounds by rounding to float32.
+    room = 0.0 if field.dtype == "u1" else ROUNDING
+    low, high = field.low - room * abs(field.low), field.high + room * abs(field.high)
+    return Column(field.name, _LITTLE[field.dtype], shape, low, high)
 
 
 @lru_cache
-def _columns(spec: EpisodeSpec, count: int) -> tuple[Column, ...]:
-    e, t, v, k = count, spec.horizon, spec.corners, spec.tokens
-    reach, one, rows = spec.bound * (1 + ROUNDING), 1 + ROUNDING, spec.goal_rows or v
-    seen = Column("seen", "u1", (e, t + 1, k), 0, 1), Column("goals_seen", "u1", (e, k), 0, 1)
-    return (
-        Column("corners", "<f4", (e, t + 1, v, 2), -reach, reach),
-        Column("placed", "u1", (e, t + 1, k), 0, 1),
-        Column("actions", "<f4", (e, t, spec.action_size), -one, one),
-        Column("rewards", "<f4", (e, t), *(bound * one for bound in spec.rewards)),
-        Column("goals", "<f4", (e, rows, 2), -reach, reach),
-        *(seen if spec.observed else ()),
-    )
+def most_episodes(spec: EpisodeSpec) -> int:
+    """Most episodes in one message, bounded in number and in bytes."""
+    return min(MAX_EPISODES, MAX_BATCH_BYTES // _bytes(spec))
+
+
+def _bytes(spec: EpisodeSpec) -> int:
+    """Of one episode."""
+    return sum(column.size for column in columns(spec, 1))
+
+
+def check_batch_size(spec: EpisodeSpec, count: int = 1) -> None:
+    """Raise ConfigError if so many episodes cannot be sent in one message."""
+    if count > most_episodes(spec):
+        raise ConfigError(
+            f"{count} episodes of {spec.horizon} steps, {_bytes(spec):,} bytes each, are too many "
+            f"for one message, at most {most_episodes(spec)}: lower service.envs, or shorten the "
+            "episodes"
+        )
 
 
 def encode_columns(

@@ -19,7 +19,8 @@ from shapely.errors import GEOSException
 
 from tangram_agent.filling import MOST_PLACES, UNUSED, Filling, Rests
 from tangram_agent.setup import Setup
-from tangram_agent.types import Episodes, Flags
+from tangram_agent.types import Flags
+from tangram_core.spec import Episodes
 from tangram_sim.areas import Area
 from tangram_sim.arrays import Bools, Ints
 from tangram_sim.errors import RunError
@@ -76,7 +77,7 @@ class FillReplay:
         """
         used = 0
         for corners, placed, goal in zip(
-            episodes.corners, episodes.placed, episodes.goals, strict=True
+            episodes["corners"], episodes["placed"], episodes["goals"], strict=True
         ):
             # Corners are no worker's invention where it plays by the rules; where not, no geometry
             # that a library trips over may end the run.

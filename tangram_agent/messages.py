@@ -16,10 +16,11 @@ import numpy as np
 from tangram_agent.arrays import (
     MAX_EPISODES,
     Column,
-    EpisodeSpec,
     WeightShapes,
+    columns,
     decode_tensors,
     encode_tensors,
+    most_episodes,
     split_frames,
 )
 from tangram_agent.schema import (
@@ -40,8 +41,9 @@ from tangram_agent.schema import (
     read,
     received,
 )
-from tangram_agent.types import Episodes, Weights
-from tangram_sim.arrays import Floats, Singles
+from tangram_agent.types import Weights
+from tangram_core.spec import Episodes, EpisodeSpec
+from tangram_sim.arrays import Floats, Pixels
 from tangram_sim.errors import WireError
 
 ROLES = ("player", "evaluator")
@@ -52,7 +54,7 @@ MAX_SEED = 2**63 - 1
 MAX_INDEX = 65_535
 WINDOW = 4  # messages of a worker that may be unacknowledged; a full window pauses play
 MAX_WINDOW = 1024
-MAX_PICTURES = 64
+PICTURE_WIDTH, PICTURE_HEIGHT = 1024, 768  # pixels: at most, they fill MAX_FRAMES
 MAX_ROWS = 4096
 # What an evaluator may report; see `worker.metrics`.
 SCORE_NAMES = (
@@ -189,15 +191,15 @@ class EpisodeBatch(OfTask):
     @classmethod
     def rows(cls, agreed: EpisodeSpec) -> Between:
         """Bounded in number and in bytes."""
-        return Between(1, agreed.max_count)
+        return Between(1, most_episodes(agreed))
 
     @classmethod
     def columns(cls, agreed: EpisodeSpec, count: int) -> Sequence[Column]:
-        """One for each field of Episodes."""
-        return agreed.columns(count)
+        """One for each field of the spec."""
+        return columns(agreed, count)
 
     def arrays(self) -> Mapping[str, Any]:
-        """The fields of the episodes."""
+        """Those of the episodes."""
         return self.episodes.arrays
 
     @classmethod
@@ -211,7 +213,7 @@ class EpisodeBatch(OfTask):
     @classmethod
     def filled(cls, values: dict[str, Any], arrays: dict[str, Any]) -> Self:
         """With the arrays as episodes."""
-        return cls(**values, episodes=Episodes(**arrays))
+        return cls(**values, episodes=Episodes(arrays))
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,25 +223,23 @@ class Scores(OfTask):
     Attributes:
         weights_version: of the weights that were tested.
         scalars: name -> value.
-        starts, ends, goals: (n, V, 2) float32 corners of n <= 64 test episodes, for pictures.
+        picture: (H, PICTURE_WIDTH, 3) of a few test episodes, H = 0 where none was drawn.
     """
 
     kind: ClassVar[str] = "scores"
     weights_version: Version
     scalars: Annotated[Mapping[str, float], Numbers(names=SCORE_NAMES)]
-    starts: Singles
-    ends: Singles
-    goals: Singles
+    picture: Pixels
 
     @classmethod
     def rows(cls, _agreed: EpisodeSpec) -> Between:
         """Enough to look at."""
-        return Between(0, MAX_PICTURES)
+        return Between(0, PICTURE_HEIGHT)
 
     @classmethod
-    def columns(cls, agreed: EpisodeSpec, count: int) -> Sequence[Column]:
-        """Corners at the start, at the end and of the goal."""
-        return agreed.pictures(count)
+    def columns(cls, _agreed: EpisodeSpec, count: int) -> Sequence[Column]:
+        """The picture, row by row."""
+        return [Column("picture", "u1", (count, PICTURE_WIDTH, 3), 0, 255)]
 
 
 @dataclass(frozen=True)

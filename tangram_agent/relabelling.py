@@ -15,7 +15,8 @@ import numpy as np
 from tangram_agent.config import AgentConfig, RelabelConfig
 from tangram_agent.coverage import Lying, covered_share, covering, lying, newly_covered
 from tangram_agent.setup import Setup
-from tangram_agent.types import Episodes, Flags, Transitions
+from tangram_agent.types import Flags, Transitions
+from tangram_core.spec import Episodes
 from tangram_sim.actions import chosen_tokens
 from tangram_sim.arrays import Bools, Floats, Ints, Singles
 from tangram_sim.layout import Layout
@@ -30,9 +31,21 @@ _OTHER_SIDE = 0.1  # share of hindsight pieces on the other side than the token
 _COVERED = 0.3  # share of hindsight pieces that are covered in part already
 
 
+def learnable(episodes: Episodes) -> Episodes:
+    """Those in which all tokens and pieces were seen at all times.
+
+    To lose an episode of many actions for one token that left the picture would be worse than to
+    learn from where it was told to go.
+    """
+    if "seen" not in episodes.arrays:
+        return episodes
+    whole = episodes["seen"].all(axis=(1, 2)) & episodes["goals_seen"].all(axis=1)
+    return episodes.at(whole)
+
+
 def flatten(episodes: Episodes) -> Transitions:
     """The transitions as they were played, episode after episode."""
-    goals = np.repeat(episodes.goals, episodes.steps, axis=0)
+    goals = np.repeat(episodes["goals"], episodes.steps, axis=0)
     return _transitions(episodes, goals, episodes.rewards.reshape(-1))
 
 
@@ -52,7 +65,7 @@ def with_relabelled(
     if not goals:
         return flatten(episodes)
     # The rewards for all goals at once: each call costs about as much as a hundred of them.
-    achieved = episodes.corners[:, 1:].reshape(goals[0].shape).astype(np.float64)
+    achieved = episodes["corners"][:, 1:].reshape(goals[0].shape).astype(np.float64)
     desired = np.concatenate(goals).astype(np.float64)
     rewards = reward(np.concatenate([achieved] * len(goals)), desired).astype(np.float32)
     parts = zip(goals, np.split(rewards, len(goals)), strict=True)
@@ -78,9 +91,9 @@ def _goals(
     if relabel.strategy == "future":
         step = np.arange(steps)
         later = generator.integers(step + 1, steps + 1, size=(count, steps))
-        chosen = episodes.corners[np.arange(count)[:, None], later]
+        chosen = episodes["corners"][np.arange(count)[:, None], later]
         return chosen.reshape(-1, *chosen.shape[2:])
-    final = np.repeat(episodes.corners[:, -1], steps, axis=0)
+    final = np.repeat(episodes["corners"][:, -1], steps, axis=0)
     if relabel.strategy == "final":
         return final
     exact = final.astype(np.float64)
@@ -93,13 +106,13 @@ def _transitions(episodes: Episodes, goals: Singles, rewards: Singles) -> Transi
     count, steps = episodes.count, episodes.steps
     size = count * steps
     return Transitions(
-        state=episodes.corners[:, :-1].reshape(size, *episodes.corners.shape[2:]),
-        placed=episodes.placed[:, :-1].reshape(size, -1),
+        state=episodes["corners"][:, :-1].reshape(size, *episodes["corners"].shape[2:]),
+        placed=episodes["placed"][:, :-1].reshape(size, -1),
         action=episodes.actions.reshape(size, -1),
         reward=rewards,
-        next_state=episodes.corners[:, 1:].reshape(size, *episodes.corners.shape[2:]),
-        next_placed=episodes.placed[:, 1:].reshape(size, -1),
-        done=episodes.placed[:, 1:].all(axis=-1).astype(np.uint8).reshape(size),
+        next_state=episodes["corners"][:, 1:].reshape(size, *episodes["corners"].shape[2:]),
+        next_placed=episodes["placed"][:, 1:].reshape(size, -1),
+        done=episodes.terminated.reshape(size),
         goal=goals,
     )
 

@@ -23,7 +23,7 @@ import msgpack
 from tangram_agent.arrays import Column, decode_columns, encode_columns
 from tangram_sim.errors import WireError
 
-PROTOCOL = 7
+PROTOCOL = 8
 MAX_HEADER = 16 * 1024
 MAX_KIND = 32
 MAX_TEXT = 1024

@@ -10,8 +10,10 @@ from typing import Any, TypeVar, cast, get_origin, get_type_hints
 import dacite
 
 from tangram_agent.config import AgentConfig, NetConfig
+from tangram_core.spec import EpisodeSpec
 from tangram_sim.actions import action_size, corner_bound, goal_rows, horizon
 from tangram_sim.config import SILHOUETTES, RewardConfig, SimConfig
+from tangram_sim.episodes import spec_of
 from tangram_sim.errors import ConfigError
 from tangram_sim.layout import Layout, TokensConfig, make_layout
 from tangram_sim.rewards import reward_identity
@@ -193,6 +195,11 @@ class Setup:
     def bound(self) -> float:
         """The largest |coordinate| that a corner can reach."""
         return corner_bound(self.layout.tokens, self.sim)
+
+    @cached_property
+    def spec(self) -> EpisodeSpec:
+        """What its episodes are made of."""
+        return spec_of(self.layout, self.sim, self.reward, self.fills)
 
     def fingerprints(self) -> dict[str, str]:
         """A digest of each section: two processes with the same ones play the same task."""

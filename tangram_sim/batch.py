@@ -22,6 +22,7 @@ from tangram_sim.actions import (
 from tangram_sim.actuation import Actuation, Command
 from tangram_sim.arrays import Bools, Floats, Ints, Pixels
 from tangram_sim.config import MAX_OVERLAP, RewardConfig, SimConfig
+from tangram_sim.episodes import spec_of
 from tangram_sim.errors import ConfigError
 from tangram_sim.geometry import outlines, overlap_share, shared_area
 from tangram_sim.layout import Layout
@@ -89,6 +90,7 @@ class BatchedEnv:
 
     Attributes:
         count: B.
+        spec: what its episodes are made of.
         horizon: steps of an episode, K * actions_per_token.
         action_size: A.
         bound: largest |coordinate| that a corner can reach, arena units.
@@ -139,6 +141,7 @@ class BatchedEnv:
             )
         self.layout = layout
         self.sim = sim
+        self.spec = spec_of(layout, sim, reward, outlines)
         self._reward = reward
         self.reward_fn = make_reward(reward, layout, sim)
         self.count = count

@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping
 from typing import Self
 
 from tangram_agent.addresses import host_of, reachable
-from tangram_agent.arrays import EpisodeSpec, WeightShapes
+from tangram_agent.arrays import WeightShapes
 from tangram_agent.messages import (
     WINDOW,
     Ack,
@@ -40,7 +40,8 @@ from tangram_agent.messages import (
     decode_from_master,
 )
 from tangram_agent.schema import Plain, ProtocolError
-from tangram_agent.types import Episodes, Weights
+from tangram_agent.types import Weights
+from tangram_core.spec import Episodes, EpisodeSpec
 from tangram_sim.errors import TangramError, WireError
 from worker.connection import Connection, Sockets, Timing
 from worker.outbox import NewestWeights, Outbox

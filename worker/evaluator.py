@@ -5,19 +5,22 @@ import time
 from contextlib import closing
 
 import numpy as np
+from PIL import Image
 
 from tangram_agent.config import ServiceConfig
-from tangram_agent.messages import Scores
+from tangram_agent.messages import PICTURE_HEIGHT, PICTURE_WIDTH, Scores
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
 from tangram_agent.types import Weights
+from tangram_sim.arrays import Pixels
+from tangram_sim.drawing import episode_sheet
 from worker.client import Client
 from worker.config import WorkerConfig
 from worker.rollout import Played
 from worker.session import joined
 from worker.test_set import FixedTests, greedy
 
-PICTURES = 12
+PICTURES, PICTURE_COLUMNS, PICTURE_PIXELS = 12, 4, 216
 POLL_S = 0.2
 # Weights that no newer ones follow for so long are probably the last: their score is waited for.
 STILL_S = 2.0
@@ -106,10 +109,21 @@ def _evaluate(tests: FixedTests, policy: Policy, client: Client) -> Scores | Non
         scalars["seconds"],
         extra={"event": "scored", "weights_version": policy.version} | scalars,
     )
-    return _message(policy.version, scalars, played)
+    return _message(tests.setup, policy.version, scalars, played)
 
 
-def _message(version: int, scalars: dict[str, float], played: Played) -> Scores:
+def _message(setup: Setup, version: int, scalars: dict[str, float], played: Played) -> Scores:
     shown = (played.starts, played.ends, played.goals)
-    starts, ends, goals = (corners[:PICTURES].astype(np.float32) for corners in shown)
-    return Scores(version, scalars, starts, ends, goals)
+    starts, ends, goals = (corners[:PICTURES] for corners in shown)
+    layout, arena = setup.layout, setup.sim.arena
+    sheet = episode_sheet(layout, arena, starts, ends, goals, PICTURE_COLUMNS, PICTURE_PIXELS)
+    return Scores(version, scalars, framed(np.asarray(sheet.convert("RGB"))))
+
+
+def framed(picture: Pixels) -> Pixels:
+    """A picture (H, W, 3) as a message takes it: smaller if need be, on white of its width."""
+    image = Image.fromarray(picture)
+    image.thumbnail((PICTURE_WIDTH, PICTURE_HEIGHT))
+    canvas = Image.new("RGB", (PICTURE_WIDTH, image.height), "white")
+    canvas.paste(image)
+    return np.asarray(canvas)

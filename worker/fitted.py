@@ -50,8 +50,8 @@ def _fitted(env: BatchedEnv) -> MotionModel:
 
     chance = random_policy(env.layout, env.sim)
     seen = play(env, chance, generator, -(-COMMANDS // env.horizon)).episodes
-    past = Past(seen.corners[:, :-1], seen.actions, seen.seen)
-    motions = motions_of(past, seen.corners[:, -1].astype(np.float64), env.layout, env.sim)
+    past = Past(seen["corners"][:, :-1], seen.actions, seen.arrays.get("seen"))
+    motions = motions_of(past, seen["corners"][:, -1].astype(np.float64), env.layout, env.sim)
     model = MotionModel()
     fit = Fit(model)
     for _ in range(_UPDATES):

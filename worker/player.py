@@ -3,11 +3,11 @@
 import math
 from contextlib import closing
 
-from tangram_agent.arrays import EpisodeSpec
+from tangram_agent.arrays import most_episodes
 from tangram_agent.messages import Go
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
-from tangram_agent.types import Episodes
+from tangram_core.spec import Episodes
 from tangram_sim.errors import TangramError
 from worker.client import Client
 from worker.config import WorkerConfig
@@ -27,7 +27,7 @@ def run_player(config: WorkerConfig, setup: Setup) -> int:
     """
     policy, report = Policy(setup), Report()
     # What is too large for a message is split.
-    size = min(config.service.batch_episodes, EpisodeSpec.of(setup).max_count)
+    size = min(config.service.batch_episodes, most_episodes(setup.spec))
     with (
         closing(environments(setup, config.service.envs)) as env,
         joined(config, setup, policy) as client,

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from tangram_agent.setup import Setup
-from tangram_agent.types import Episodes, Past
+from tangram_agent.types import Past
+from tangram_core.spec import Episodes
 from tangram_sim.arrays import Bools, Floats, Pixels, Singles
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.lens import View
@@ -69,25 +70,13 @@ class Played:
     @staticmethod
     def empty(env: BatchedEnv, count: int) -> "Played":
         """Room for so many episodes of an environment."""
-        steps, tokens, corners = env.horizon, env.layout.tokens, env.layout.corner_count
-        seen = Episodes(
-            corners=np.empty((count, steps + 1, corners, 2), np.float32),
-            placed=np.empty((count, steps + 1, tokens), np.uint8),
-            actions=np.empty((count, steps, env.action_size), np.float32),
-            rewards=np.empty((count, steps), np.float32),
-            goals=np.empty((count, env.goal_rows, 2), np.float32),
-        )
+        steps, corners = env.horizon, env.layout.corner_count
         pictures = None
         if env.sight is not None:
             side = env.sim.pixels
             pictures = np.empty((count, steps + 1, side, side), np.uint8)
-            seen = replace(
-                seen,
-                seen=np.empty((count, steps + 1, tokens), np.uint8),
-                goals_seen=np.empty((count, tokens), np.uint8),
-            )
         return Played(
-            episodes=seen,
+            episodes=env.spec.empty(count),
             corners=np.empty((count, steps + 1, corners, 2)),
             goals=np.empty((count, corners, 2)),
             overlap=np.empty(count),
@@ -104,18 +93,13 @@ class Played:
         cut: dict[str, Any] = {
             name: rows[:count] for name, rows in vars(self).items() if isinstance(rows, np.ndarray)
         }
-        return replace(self, episodes=_rows(self.episodes, 0, count), **cut)
+        return replace(self, episodes=self.episodes.at(slice(count)), **cut)
 
 
 def parts(episodes: Episodes, size: int) -> Iterator[Episodes]:
     """The same episodes, at most `size` at a time, nothing copied."""
     for first in range(0, episodes.count, size):
-        yield _rows(episodes, first, first + size)
-
-
-def _rows(episodes: Episodes, first: int, end: int) -> Episodes:
-    rows = {name: array[first:end] for name, array in episodes.arrays.items()}
-    return Episodes(**rows)
+        yield episodes.at(slice(first, first + size))
 
 
 def at_once(setup: Setup) -> int:
@@ -171,16 +155,16 @@ def _play_group(
 ) -> bool:
     """The episode in every environment, into the rows from `first` on; False if told to end."""
     rows, seen = slice(first, first + env.count), played.episodes
-    seen.goals[rows], played.goals[rows] = env.seen_goals, env.goals
-    if env.sight is not None and seen.goals_seen is not None:
-        seen.goals_seen[rows] = env.sight.goals_sure
+    seen["goals"][rows], played.goals[rows] = env.seen_goals, env.goals
+    if env.sight is not None:
+        seen["goals_seen"][rows] = env.sight.goals_sure
     began = time.perf_counter()
     for t in range(env.horizon):
         if not go_on():
             return False
         _look(env, played, rows, t)
-        found = None if seen.seen is None else seen.seen[rows, : t + 1]
-        past = Past(seen.corners[rows, :t], seen.actions[rows, :t], found)
+        found = None if env.sight is None else seen["seen"][rows, : t + 1]
+        past = Past(seen["corners"][rows, :t], seen.actions[rows, :t], found)
         asked = time.process_time()
         actions = choose(env.seen, env.closed, env.seen_goals, generators, past)
         spent = time.process_time() - asked
@@ -197,12 +181,14 @@ def _play_group(
 
 
 def _look(env: BatchedEnv, played: Played, rows: slice, t: int) -> None:
-    played.corners[rows, t], played.episodes.corners[rows, t] = env.corners, env.seen
-    played.episodes.placed[rows, t] = env.placed
-    sight, seen = env.sight, played.episodes.seen
-    if sight is not None and seen is not None and played.pictures is not None:
+    seen, sight = played.episodes, env.sight
+    played.corners[rows, t], seen["corners"][rows, t] = env.corners, env.seen
+    seen["placed"][rows, t] = env.placed
+    if t:
+        seen.terminated[rows, t - 1] = env.placed.all(axis=1)
+    if sight is not None and played.pictures is not None:
         # Of several tokens one may have left the picture; alone it would be all that is to be seen.
-        seen[rows, t] = ~sight.missing | (sight.away & (env.layout.tokens > 1))
+        seen["seen"][rows, t] = ~sight.missing | (sight.away & (env.layout.tokens > 1))
         played.pictures[rows, t] = env.pictures
 
 

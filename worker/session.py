@@ -11,7 +11,7 @@ from typing import TextIO
 
 import torch
 
-from tangram_agent.arrays import EpisodeSpec
+from tangram_agent.arrays import check_batch_size
 from tangram_agent.messages import TAKEN_OVER
 from tangram_agent.policy import Policy
 from tangram_agent.process import WATCHDOG_S, Watchdog, formatter, keep_memory, watch_parent
@@ -52,7 +52,8 @@ def joined(config: WorkerConfig, setup: Setup, policy: Policy) -> Iterator[Clien
     keep_memory()
     service = config.service
     log_as(config.role, service.log_format)
-    spec = EpisodeSpec.of(setup)
+    spec = setup.spec
+    check_batch_size(spec)
     watchdog = Watchdog(WATCHDOG_S)
     client = Client(
         config.connect,

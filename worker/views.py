@@ -54,12 +54,13 @@ def camera_sheets(setup: Setup, played: Played, columns: int, size: int) -> list
         columns: pictures in a row.
         size: side of one in pixels.
     """
-    pictures, seen = played.pictures, played.episodes.seen
-    if pictures is None or seen is None:
+    pictures = played.pictures
+    if pictures is None:
         return []
+    seen = played.episodes["seen"]
     layout, side = setup.layout, pictures.shape[-1]
     unit = side / setup.sim.arena
-    corners = played.episodes.corners.astype(np.float64) * (unit, -unit) + side / 2.0
+    corners = played.episodes["corners"].astype(np.float64) * (unit, -unit) + side / 2.0
     sheets = []
     for t in range(pictures.shape[1]):
         found = seen[:, t] > 0

@@ -22,7 +22,6 @@ import zmq
 from master.delivery import EpisodesArrived
 from master.journal import MAGIC, Journal, segments
 from master.recovery import Reader
-from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint, save_checkpoint
 from tangram_agent.messages import EpisodeBatch
 from tangram_agent.setup import Setup, make_setup
@@ -105,7 +104,7 @@ def bombs(_folder: Path) -> Seen:
 
 def written_journal(folder: Path, setup: Setup) -> tuple[Path, Callable[[], tuple[int, list[str]]]]:
     """A journal of three segments, and how many of its batches are read, with the losses told."""
-    path, spec, digest = folder / "journal", EpisodeSpec.of(setup), setup.task_digest()
+    path, spec, digest = folder / "journal", setup.spec, setup.task_digest()
     shutil.rmtree(path, ignore_errors=True)
     with closing(Journal(path, "run", digest, 0.0)) as journal:
         for number in range(1, BATCHES + 1):

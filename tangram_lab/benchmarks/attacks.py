@@ -19,8 +19,8 @@ import zmq
 
 from master.admission import WelcomeInfo
 from master.hub import Hub
-from tangram_agent.arrays import MAX_FRAME_BYTES, EpisodeSpec
-from tangram_agent.messages import EpisodeBatch, Heartbeat, Scores, WantWeights
+from tangram_agent.arrays import MAX_FRAME_BYTES
+from tangram_agent.messages import PICTURE_WIDTH, EpisodeBatch, Heartbeat, Scores, WantWeights
 from tangram_agent.schema import MAX_COUNT, opened, seal
 from tangram_lab.benchmarks.chaos import Witness
 from tangram_lab.benchmarks.fuzz_wire import fuzzed, resealed, valid_messages
@@ -181,7 +181,7 @@ def deaf_subscribers(target: Target) -> Seen:
 
 def degenerate_batches(target: Target) -> Seen:
     """Each is the next one of its sender, so that it would be taken if it were right."""
-    spec, episodes = EpisodeSpec.of(target.setup), episodes_of(target.setup, 4)
+    spec, episodes = target.setup.spec, episodes_of(target.setup, 4)
     frames = EpisodeBatch(1, 0, episodes).encode(spec)[1:]
     wrong = [[], frames[1:], [*frames, b""], [b"", *frames[1:]]]
     for place, frame in enumerate(frames):
@@ -239,9 +239,8 @@ def idle_connections(target: Target) -> Seen:
 
 
 def uninvited(target: Target, role: str = "") -> Seen:
-    setup, spec = target.setup, EpisodeSpec.of(target.setup)
-    corners = np.zeros((1, setup.layout.corner_count, 2), np.float32)
-    forged = Scores(1, {"mean_reward": 0.999}, corners, corners, corners).encode(spec)
+    none = np.zeros((0, PICTURE_WIDTH, 3), np.uint8)
+    forged = Scores(1, {"mean_reward": 0.999}, none).encode(target.setup.spec)
     evaluator = target.hello(role="evaluator", index=0)
     said = (evaluator, forged, Heartbeat({}).encode())
     roles = [role] if role else ["", "unknown"]
@@ -260,7 +259,7 @@ def player_as_evaluator(target: Target) -> Seen:
 
 def impostor(target: Target) -> Seen:
     setup, where = target.setup, target.where
-    info = WelcomeInfo(where["run_id"], 0, setup.fingerprints(), EpisodeSpec.of(setup))
+    info = WelcomeInfo(where["run_id"], 0, setup.fingerprints(), setup.spec)
     with Hub(HOST, 0, info) as hub:
         file = target.folder.parent / "impostor.json"
         file.write_text(json.dumps(where | {"endpoint": hub.endpoint}))

@@ -19,7 +19,6 @@ import numpy as np
 import yaml
 import zmq
 
-from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
 from tangram_agent.messages import WORKER_COLUMNS, RunStatus
 from tangram_agent.policy import Policy
@@ -82,7 +81,7 @@ class Witness(Thread):
             "player",
             INDEX,
             setup.fingerprints(),
-            EpisodeSpec.of(setup),
+            setup.spec,
             policy.shapes,
         )
         with closing(BatchedEnv(setup.layout, setup.sim, setup.reward, ENVS)) as env, client:
@@ -100,7 +99,7 @@ class Witness(Thread):
                 if newest is not None:
                     policy.follow(newest)
                 episodes = rollout.play(policy.explore)
-                self.sent.append(keys(episodes.corners[:, 0], episodes.actions[:, 0]))
+                self.sent.append(keys(episodes["corners"][:, 0], episodes.actions[:, 0]))
                 if not client.send(episodes, policy.version):
                     self.sent.pop()
             self._look(client)

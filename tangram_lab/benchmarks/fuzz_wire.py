@@ -11,8 +11,8 @@ import numpy as np
 import yaml
 import zmq
 
-from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.messages import (
+    PICTURE_WIDTH,
     AskStatus,
     Bye,
     EpisodeBatch,
@@ -24,7 +24,6 @@ from tangram_agent.messages import (
 )
 from tangram_agent.schema import CHECKSUM, DamagedError, checksum
 from tangram_agent.setup import Setup, make_setup
-from tangram_agent.types import Episodes
 from tangram_lab.benchmarks.measure import show, write
 from tangram_lab.benchmarks.trainings import start_training, wait_for
 from tangram_sim.errors import WireError
@@ -39,20 +38,12 @@ LOOK_S = 0.5
 
 def valid_messages(setup: Setup) -> list[list[bytes]]:
     """One of each kind that a worker sends, as frames."""
-    spec, layout, steps = EpisodeSpec.of(setup), setup.layout, setup.horizon
-    corners = np.zeros((4, steps + 1, layout.corner_count, 2), np.float32)
-    episodes = Episodes(
-        corners=corners,
-        placed=np.zeros((4, steps + 1, layout.tokens), np.uint8),
-        actions=np.zeros((4, steps, setup.action_size), np.float32),
-        rewards=np.zeros((4, steps), np.float32),
-        goals=corners[:, 0],
-    )
-    ends = corners[:, 0]
+    spec = setup.spec
+    picture = np.zeros((4, PICTURE_WIDTH, 3), np.uint8)
     return [
         Hello("player", 7, 0, "fuzz", 1, setup.fingerprints(), "").encode(),
-        EpisodeBatch(1, 0, episodes).encode(spec),
-        Scores(3, {"mean_reward": 0.5}, ends, ends, ends).encode(spec),
+        EpisodeBatch(1, 0, spec.empty(4)).encode(spec),
+        Scores(3, {"mean_reward": 0.5}, picture).encode(spec),
         WantWeights("epoch", 3).encode(),
         Heartbeat({"episodes": 5.0}).encode(),
         AskStatus().encode(),
@@ -108,7 +99,7 @@ def fuzzed(valid: Sequence[Sequence[bytes]], dice: random.Random) -> list[bytes]
 
 def fuzz_decoder(setup: Setup, count: int, seed: int) -> tuple[Counter[str], list[str]]:
     """How many messages were taken and refused, and what the decoder should never have raised."""
-    dice, spec = random.Random(seed), EpisodeSpec.of(setup)
+    dice, spec = random.Random(seed), setup.spec
     valid, ends, wrong = valid_messages(setup), Counter[str](), list[str]()
     for _ in range(count):
         frames = fuzzed(valid, dice)

@@ -10,7 +10,6 @@ import psutil
 
 from master.children import override
 from master.journal import segments
-from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.messages import EpisodeBatch
 from tangram_agent.schema import MAX_COUNT
 from tangram_lab.benchmarks.chaos import Witness, compare
@@ -67,7 +66,7 @@ def killed(target: Target) -> bool:
 def killed_after_huge_numbers(target: Target) -> Seen:
     """With a batch, so that the numbers would be in journal and checkpoint."""
     setup = target.setup
-    batch = EpisodeBatch(1, 0, episodes_of(setup, 1)).encode(EpisodeSpec.of(setup))
+    batch = EpisodeBatch(1, 0, episodes_of(setup, 1)).encode(setup.spec)
     for huge in (2**63 - 1, MAX_COUNT):
         target.ask(target.hello(incarnation=huge), batch)
         target.ask(target.hello(incarnation=1, first=huge, index=3001, process="other"))
@@ -135,7 +134,7 @@ OWN: list[Attack] = [
 
 def wrong_batch_in_lockstep(target: Target) -> Seen:
     setup = target.setup
-    spec, rounds = EpisodeSpec.of(setup), 0
+    spec, rounds = setup.spec, 0
     with Client(str(target.folder), "player", 0, setup.fingerprints(), spec) as client:
         late = Timer(20.0, client.stop, ["it takes too long"])
         late.start()

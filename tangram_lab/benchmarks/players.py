@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
 
-from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.setup import Setup
-from tangram_agent.types import Episodes
+from tangram_core.spec import Episodes
 from worker.client import Client
 
 PAUSE_S = 0.002  # between two rounds over all clients, or as long as a round took
@@ -77,7 +76,7 @@ def players(
 
 def play(connect: str, setup: Setup, episodes: Episodes, count: int, path: Path) -> None:
     """Let all players send whatever their windows take, until the master sends them home."""
-    spec, ages = EpisodeSpec.of(setup), Ages(path)
+    spec, ages = setup.spec, Ages(path)
     with ExitStack() as stack:
         clients = [
             stack.enter_context(Client(connect, "player", i, setup.fingerprints(), spec))

@@ -11,7 +11,8 @@ import yaml
 
 import conf
 from tangram_agent.setup import SECTIONS, Setup, make_setup
-from tangram_agent.types import Episodes, Past, Transitions
+from tangram_agent.types import Past, Transitions
+from tangram_core.spec import Episodes
 from tangram_sim.arrays import Bools, Floats, Singles
 from tangram_sim.assembly import COUNTS
 from tangram_sim.batch import BatchedEnv

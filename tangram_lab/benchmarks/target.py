@@ -15,12 +15,12 @@ import numpy as np
 import zmq
 
 from master.children import command
-from tangram_agent.arrays import EpisodeSpec
+from tangram_agent.arrays import columns
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
 from tangram_agent.messages import Hello
 from tangram_agent.schema import opened, seal
 from tangram_agent.setup import Setup
-from tangram_agent.types import Episodes
+from tangram_core.spec import Episodes
 from tangram_lab.benchmarks.chaos import SETTINGS
 from tangram_lab.benchmarks.trainings import Watched, start_training, wait_for
 from worker.discovery import find_master
@@ -133,9 +133,9 @@ def episodes_of(setup: Setup, count: int) -> Episodes:
     """Episodes of the right shapes; nobody has played them."""
     dice = np.random.default_rng(0)
     return Episodes(
-        **{
+        {
             one.name: dice.uniform(0.0, 0.4, one.shape).astype(one.dtype)
-            for one in EpisodeSpec.of(setup).columns(count)
+            for one in columns(setup.spec, count)
         }
     )
 

@@ -23,10 +23,9 @@ from master.delivery import EpisodesArrived
 from master.hub import Hub
 from master.security import Keys, make_keys
 from tangram_agent.addresses import IPC
-from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.messages import WINDOW, Ack, EpisodeBatch
 from tangram_agent.setup import Setup
-from tangram_agent.types import Episodes
+from tangram_core.spec import Episodes
 from tangram_lab.benchmarks.measure import Bound, Row, Work, compared, rates, single
 from tangram_lab.benchmarks.setups import played, several
 from tangram_sim.errors import TangramError
@@ -128,7 +127,7 @@ def connected(case: Case, setup: Setup, episodes: Episodes, workers: int = 1) ->
 @contextmanager
 def opened(way: str, setup: Setup, keys: Keys | None) -> Iterator[tuple[Hub, Path]]:
     """A Hub, and a folder that is there as long."""
-    info = WelcomeInfo("bench", 0, setup.fingerprints(), EpisodeSpec.of(setup), WINDOW)
+    info = WelcomeInfo("bench", 0, setup.fingerprints(), setup.spec, WINDOW)
     with tempfile.TemporaryDirectory() as folder:
         bind = f"{IPC}{folder}/hub" if way == UNIX else "127.0.0.1"
         with Hub(bind, 0, info, keys=keys) as hub:
@@ -145,7 +144,7 @@ def take_batches(hub: Hub) -> int:
 
 def send_batches(connect: str, setup: Setup, episodes: Episodes, workers: int) -> None:
     """Send the same batch through each Client in turn for ever; runs in a process of its own."""
-    timing, spec = Timing(lost_s=PATIENCE_S), EpisodeSpec.of(setup)
+    timing, spec = Timing(lost_s=PATIENCE_S), setup.spec
     with ExitStack() as stack:
         clients = [
             Client(connect, "player", i, setup.fingerprints(), spec, window=WINDOW, timing=timing)
@@ -172,7 +171,7 @@ def _connection(hub: Hub, keys: Keys | None) -> dict[str, Any]:
 @contextmanager
 def bare(case: Case, setup: Setup, episodes: Episodes) -> Iterator[Work]:
     """A ROUTER here that takes and answers what a DEALER in another process sends."""
-    frames = EpisodeBatch(SEQUENCE, 0, episodes).encode(EpisodeSpec.of(setup))
+    frames = EpisodeBatch(SEQUENCE, 0, episodes).encode(setup.spec)
     ack, keys = Ack(SEQUENCE, duplicate=False).encode()[0], case.keys
     with (
         tempfile.TemporaryDirectory() as folder,

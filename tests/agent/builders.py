@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ import pytest
 
 from tangram_agent.pretrained import CARD, WEIGHTS
 from tangram_agent.setup import Setup, make_setup
-from tangram_agent.types import Episodes, Transitions
+from tangram_agent.types import Transitions
+from tangram_core.spec import Episodes, EpisodeSpec
 
 SQUARE = {"shapes": ["square"], "scale": 1.131370849898476}  # side 0.4
 PAIR = {"shapes": ["square", "large_triangle"], "scale": 0.8}
@@ -80,12 +82,22 @@ def random_episodes(made: Setup, count: int, seed: int = 0) -> Episodes:
     placed = np.zeros((count, steps + 1, layout.tokens), np.uint8)
     placed[:, -1] = 1
     return Episodes(
-        corners=corners[:, : steps + 1],
-        placed=placed,
-        actions=actions.astype(np.float32),
-        rewards=rng.uniform(-1, 1, (count, steps)).astype(np.float32),
-        goals=corners[:, -1],
+        {
+            "corners": corners[:, : steps + 1],
+            "placed": placed,
+            "goals": corners[:, -1],
+            "actions": actions.astype(np.float32),
+            "rewards": rng.uniform(-1, 1, (count, steps)).astype(np.float32),
+            "terminated": placed[:, 1:].all(axis=2).astype(np.uint8),
+        }
     )
+
+
+def with_bound(spec: EpisodeSpec, bound: float) -> EpisodeSpec:
+    """The same episodes, with other bounds of what is observed."""
+    wide = {field: replace(field, low=-bound, high=bound) for field in spec.fields}
+    fields = (wide[field] if field.dtype == "f4" else field for field in spec.fields)
+    return replace(spec, fields=tuple(fields))
 
 
 def random_transitions(made: Setup, count: int, seed: int = 0, done: int | None = 1) -> Transitions:

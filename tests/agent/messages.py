@@ -2,20 +2,20 @@
 
 import zlib
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import msgpack
 import numpy as np
 
-from tangram_agent.arrays import EpisodeSpec, join_frames
-from tangram_agent.messages import EpisodeBatch, Hello, Scores, WeightsMessage
-from tangram_agent.types import Episodes, Weights
-from tests.agent.builders import PAIR, random_episodes, setup
+from tangram_agent.arrays import join_frames
+from tangram_agent.messages import PICTURE_WIDTH, EpisodeBatch, Hello, Scores, WeightsMessage
+from tangram_agent.types import Weights
+from tangram_core.spec import Episodes
+from tests.agent.builders import PAIR, random_episodes, setup, with_bound
 
 BOUND = 4.0
 TASK = setup(PAIR, actions_per_token=2)  # K 2, V 7, T 4, A 4
-SPEC = replace(EpisodeSpec.of(TASK), bound=BOUND)
+SPEC = with_bound(TASK.spec, BOUND)
 SHAPES = {"actor.weight": (3, 2), "actor.bias": (3,), "scale": ()}
 FINGERPRINTS = {"tokens": "aaaa", "sim": "bbbb"}
 
@@ -38,8 +38,8 @@ def broadcast(sent: Weights, epoch: str = "e") -> bytes:
 
 
 def scores(count: int = 2) -> Scores:
-    corners = np.zeros((count, SPEC.corners, 2), np.float32)
-    return Scores(7, {"mean_reward": 0.25, "raw_overlap": 0.5}, corners, corners + 1, corners - 1)
+    picture = np.arange(count * PICTURE_WIDTH * 3).astype(np.uint8).reshape(count, -1, 3)
+    return Scores(7, {"mean_reward": 0.25, "raw_overlap": 0.5}, picture)
 
 
 def hello(

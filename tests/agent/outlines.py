@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from tangram_agent.setup import Setup
-from tangram_agent.types import Episodes
+from tangram_core.spec import Episodes
 from tangram_sim.arrays import Floats
 from tangram_sim.rings import as_rows, covered_area
 from tests.agent.builders import SMALL, setup
@@ -42,9 +42,12 @@ def played_in(made: Setup, ways: list[Floats], goal: Floats) -> Episodes:
     placed = np.tril(np.ones((len(ways), layout.tokens), np.uint8), -1)[None]
     outline = covered_area(layout.corners(goal), layout)
     return Episodes(
-        corners=corners,
-        placed=placed,
-        actions=np.zeros((1, len(ways) - 1, made.action_size), np.float32),
-        rewards=np.zeros((1, len(ways) - 1), np.float32),
-        goals=as_rows(outline, layout, made.goal_rows)[None].astype(np.float32),
+        {
+            "corners": corners,
+            "placed": placed,
+            "goals": as_rows(outline, layout, made.goal_rows)[None].astype(np.float32),
+            "actions": np.zeros((1, len(ways) - 1, made.action_size), np.float32),
+            "rewards": np.zeros((1, len(ways) - 1), np.float32),
+            "terminated": placed[:, 1:].all(axis=2).astype(np.uint8),
+        }
     )

@@ -17,52 +17,58 @@ from tangram_agent.arrays import (
     MAX_EPISODES,
     MAX_FRAME_BYTES,
     MAX_FRAMES,
-    EpisodeSpec,
+    check_batch_size,
+    columns,
     decode_columns,
     decode_tensors,
     encode_columns,
     encode_tensors,
     join_frames,
+    most_episodes,
     split_frames,
 )
-from tangram_agent.types import Episodes
+from tangram_core.spec import Episodes, EpisodeSpec, Field
 from tangram_sim.config import RewardConfig
 from tangram_sim.errors import ConfigError, WireError
-from tangram_sim.rewards import MAX_REWARD
-from tests.agent.builders import BFLOAT, PAIR, one_tensor, setup
+from tests.agent.builders import BFLOAT, one_tensor, setup
 from tests.agent.messages import BOUND, SHAPES, SPEC, episodes, weights
 
 pytestmark = pytest.mark.fast
 
-NAMES = ("corners", "placed", "actions", "rewards", "goals")
+NAMES = ("corners", "placed", "goals", "actions", "rewards", "terminated")
 NAN, INF = float("nan"), float("inf")
 
 
 def encode_episodes(sent: Episodes, spec: EpisodeSpec) -> list[bytes]:
-    return encode_columns(vars(sent), spec.columns(sent.count))
+    return encode_columns(sent.arrays, columns(spec, sent.count))
 
 
 def decode_episodes(frames: list[bytes], count: int, spec: EpisodeSpec) -> Episodes:
-    return Episodes(**decode_columns(frames, spec.columns(count)))
+    return Episodes(decode_columns(frames, columns(spec, count)))
 
 
 def same(left: Episodes, right: Episodes) -> bool:
-    return all(np.array_equal(vars(left)[name], vars(right)[name]) for name in NAMES)
+    return all(np.array_equal(left[name], right[name]) for name in NAMES)
 
 
 @st.composite
 def tasks(draw: st.DrawFn) -> tuple[EpisodeSpec, Episodes]:
     """A task and episodes within its bounds."""
-    sizes = [draw(st.integers(1, 4)) for _ in range(4)]
-    spec, count = EpisodeSpec(*sizes, draw(st.floats(0.5, 100))), draw(st.integers(1, 3))
-    bounds = {"actions": 1.0, "rewards": MAX_REWARD}
+    horizon, size, rows = (draw(st.integers(1, 4)) for _ in range(3))
+    bound, count = draw(st.floats(0.5, 100)), draw(st.integers(1, 3))
+    fields = (
+        Field("corners", (rows, 2), -bound, bound),
+        Field("placed", (rows,), 0, 1, "moment", "u1"),
+        Field("goals", (rows, 2), -bound, bound, "episode"),
+    )
+    spec = EpisodeSpec(horizon, size, fields, "corners", "goals")
     arrays = {}
-    for column in spec.columns(count):
-        limit = float(np.float32(bounds.get(column.name, spec.bound)))
-        flags, numbers = st.integers(0, 1), st.floats(-limit, limit, width=32)
-        kind = (np.uint8, flags) if column.name == "placed" else (np.float32, numbers)
-        arrays[column.name] = draw(hnp.arrays(kind[0], column.shape, elements=kind[1]))
-    return spec, Episodes(**arrays)
+    for column in columns(spec, count):
+        low, high = column.bounds
+        flags, numbers = st.integers(0, 1), st.floats(low, high, width=32)
+        elements = flags if column.native == np.uint8 else numbers
+        arrays[column.name] = draw(hnp.arrays(column.native, column.shape, elements=elements))
+    return spec, Episodes(arrays)
 
 
 @given(tasks())
@@ -70,14 +76,16 @@ def test_episodes_come_back_as_they_were_sent(task: tuple[EpisodeSpec, Episodes]
     spec, sent = task
     received = decode_episodes(encode_episodes(sent, spec), sent.count, spec)
     assert same(sent, received)
-    assert [vars(received)[name].dtype.str for name in NAMES] == ["<f4", "|u1", *["<f4"] * 3]
+    kinds = ["<f4", "|u1", "<f4", "<f4", "<f4", "|u1"]
+    assert [received[name].dtype.str for name in NAMES] == kinds
 
 
 def test_frames_are_raw_little_endian_bytes_in_the_order_of_the_fields() -> None:
     sent = episodes(2)
     frames = encode_episodes(sent, SPEC)
-    assert [len(f) for f in frames] == [2 * 5 * 7 * 2 * 4, 2 * 5 * 2, 2 * 4 * 4 * 4, 2 * 4 * 4, 112]
-    assert frames == [getattr(sent, n).astype(getattr(sent, n).dtype).tobytes() for n in NAMES]
+    sizes = [2 * 5 * 7 * 2 * 4, 2 * 5 * 2, 2 * 7 * 2 * 4, 2 * 4 * 4 * 4, 2 * 4 * 4, 2 * 4]
+    assert [len(frame) for frame in frames] == sizes
+    assert frames == [sent[name].tobytes() for name in NAMES]
 
 
 def test_decoding_copies_nothing() -> None:
@@ -89,7 +97,8 @@ def test_decoding_copies_nothing() -> None:
 
 def test_other_memory_orders_and_dtypes_are_sent_as_what_they_mean() -> None:
     sent = episodes(2)
-    odd = replace(sent, corners=np.asfortranarray(sent.corners.astype(np.float64)))
+    wide = np.asfortranarray(sent["corners"].astype(np.float64))
+    odd = Episodes({**sent.arrays, "corners": wide})
     assert encode_episodes(odd, SPEC) == encode_episodes(sent, SPEC)
     matrix = np.arange(6, dtype=np.float32).reshape(2, 3)
     received = decode_tensors(encode_tensors({"a": matrix.T}), {"a": (3, 2)})
@@ -103,7 +112,7 @@ def test_each_frame_has_its_exact_size(name: str, change: int | None) -> None:
     number = NAMES.index(name)
     size = len(frames[number])
     frames[number] = b"" if change is None else (frames[number] + b"\0")[: size + change]
-    told = f"{name} must have {size} bytes for the shape {SPEC.columns(2)[number].shape}, got "
+    told = f"{name} must have {size} bytes for the shape {columns(SPEC, 2)[number].shape}, got "
     with pytest.raises(WireError, match=f"^{re.escape(told)}{len(frames[number])}$"):
         decode_episodes(frames, 2, SPEC)
 
@@ -120,9 +129,9 @@ BAD_VALUES = [(name, value) for name, (*_, values) in BOUNDED.items() for value 
 
 def spoiled(name: str, value: float) -> Episodes:
     sent = episodes(2)
-    array = getattr(sent, name).copy()
+    array = sent[name].copy()
     array[(1, *[0] * (array.ndim - 1))] = value
-    return replace(sent, **{name: array})
+    return Episodes({**sent.arrays, name: array})
 
 
 @pytest.mark.parametrize(("name", "value"), BAD_VALUES)
@@ -130,7 +139,7 @@ def test_values_out_of_bounds_are_named(name: str, value: float) -> None:
     bad, (place, bounds, _) = spoiled(name, value), BOUNDED[name]
     told = f"{name} holds {value:g} at {place}, must be finite and between {bounds}"
     with pytest.raises(WireError, match=f"^{re.escape(told)}"):
-        decode_episodes([vars(bad)[n].tobytes() for n in NAMES], 2, SPEC)
+        decode_episodes([bad[n].tobytes() for n in NAMES], 2, SPEC)
     with pytest.raises(WireError, match=f"^{re.escape(told)}"):
         encode_episodes(bad, SPEC)
 
@@ -147,8 +156,8 @@ def test_values_at_their_bounds_pass(name: str, value: float) -> None:
 @pytest.mark.parametrize("reward", ["overlap", "dense"])
 def test_a_run_takes_no_reward_that_its_own_cannot_be(reward: str) -> None:
     """Episodes of 1e6 among thousands spoilt for good what a critic had learned."""
-    spec = EpisodeSpec.of(replace(setup(), reward=RewardConfig(reward)))
-    (column,) = [one for one in spec.columns(1) if one.name == "rewards"]
+    spec = replace(setup(), reward=RewardConfig(reward)).spec
+    (column,) = [one for one in columns(spec, 1) if one.name == "rewards"]
     worst = np.full(column.shape, spec.rewards[0], np.float32)
     assert -1.5 < spec.rewards[0] <= -1.0
     for value in (worst, np.ones_like(worst)):
@@ -158,51 +167,49 @@ def test_a_run_takes_no_reward_that_its_own_cannot_be(reward: str) -> None:
             column.decode(value.tobytes())
 
 
+def spec_of(rows: int, horizon: int) -> EpisodeSpec:
+    """Of episodes with so many corners and steps."""
+    fields = (
+        Field("corners", (rows, 2), -BOUND, BOUND),
+        Field("goals", (rows, 2), -BOUND, BOUND, "episode"),
+    )
+    return EpisodeSpec(horizon, 4, fields, "corners", "goals")
+
+
 def test_large_arrays_are_cut_and_put_together_again() -> None:
-    large = EpisodeSpec(7, 28, 50, 5, BOUND)
+    large = spec_of(28, 50)
     rng = np.random.default_rng(0)
-    for count in (1, 2, 3, large.max_count):
+    for count in (1, 2, 3, most_episodes(large)):
         arrays = {
             c.name: rng.uniform(c.low, c.high, c.shape).astype(c.native)
-            for c in large.columns(count)
+            for c in columns(large, count)
         }
-        sent = Episodes(**arrays)
+        sent = Episodes(arrays)
         frames = encode_episodes(sent, large)
         assert max(map(len, frames)) <= MAX_FRAME_BYTES
         assert len(frames) <= MAX_FRAMES
         assert [len(f) for f in frames[: count // 3]] == [MAX_FRAME_BYTES] * (count // 3)
-        assert same(decode_episodes(frames, count, large), sent)
+        found = decode_episodes(frames, count, large)
+        assert all(np.array_equal(found[name], array) for name, array in arrays.items())
         for wrong in (frames[1:], [*frames, b""], [frames[0][:-1], *frames[1:]]):
             with pytest.raises(WireError):
                 decode_episodes(wrong, count, large)
 
 
 def test_a_batch_holds_a_bounded_number_of_episodes() -> None:
-    long = EpisodeSpec(16, 64, 500, 4, BOUND)
-    each = 4 * (501 * 128 + 500 * 5 + 128) + 501 * 16
-    assert long.max_count == MAX_BATCH_BYTES // each == 7
-    assert EpisodeSpec(1, 3, 1, 3, BOUND).max_count == MAX_EPISODES
-    long.check_batch_size(7)
+    long = spec_of(64, 500)
+    each = 4 * (501 * 128 + 500 * 5 + 128) + 500
+    assert most_episodes(long) == MAX_BATCH_BYTES // each == 7
+    assert most_episodes(spec_of(3, 1)) == MAX_EPISODES
+    check_batch_size(long, 7)
     message = (
-        "8 episodes of 500 steps with 64 corners are too many for one message, at most 7: "
-        "lower service.envs or sim.actions_per_token"
+        f"8 episodes of 500 steps, {each:,} bytes each, are too many for one message, at most 7: "
+        "lower service.envs, or shorten the episodes"
     )
     with pytest.raises(ConfigError, match=f"^{message}$"):
-        long.check_batch_size(8)
-    with pytest.raises(ConfigError, match=r"1 episodes of 100000 steps .* at most 0: lower"):
-        EpisodeSpec(16, 64, 100_000, 4, BOUND)
-
-
-def test_the_spec_of_a_setup() -> None:
-    made = setup(PAIR, actions_per_token=2)
-    assert EpisodeSpec.of(made) == EpisodeSpec(2, 7, 4, 4, made.bound, rewards=(-1.0, 1.0))
-    assert EpisodeSpec.of(setup()) == EpisodeSpec(1, 4, 1, 3, setup().bound, rewards=(-1.0, 1.0))
-
-
-@pytest.mark.parametrize("bound", [-1.0, NAN, INF])
-def test_the_spec_has_a_finite_bound(bound: float) -> None:
-    with pytest.raises(ConfigError, match="bound must be .*between 0 and 1e"):
-        EpisodeSpec(1, 4, 1, 3, bound)
+        check_batch_size(long, 8)
+    with pytest.raises(ConfigError, match=r"1 episodes of 100000 steps.* at most 0: lower"):
+        check_batch_size(spec_of(64, 100_000))
 
 
 names = st.text(min_size=1, max_size=8)

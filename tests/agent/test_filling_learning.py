@@ -12,8 +12,8 @@ from tangram_agent.filling import MOST_PLACES, UNUSED, Filling, Rests
 from tangram_agent.filling_learner import FillLearner
 from tangram_agent.filling_replay import FILLED, OPEN, FillReplay
 from tangram_agent.learner import NotFiniteError
-from tangram_agent.types import Episodes
 from tangram_agent.values import Corners, features
+from tangram_core.spec import Episodes
 from tangram_sim.errors import RunError
 from tests.agent.outlines import TWO, outline_setup, played_in
 

@@ -11,9 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tangram_agent.arrays import most_episodes
 from tangram_agent.messages import (
-    MAX_PICTURES,
     MAX_ROWS,
+    PICTURE_WIDTH,
     ROLES,
     SCORE_NAMES,
     WORKER_COLUMNS,
@@ -53,7 +54,7 @@ from tangram_agent.schema import (
     Texts,
     by_kind,
 )
-from tangram_agent.types import Episodes, Weights
+from tangram_agent.types import Weights
 from tangram_sim.errors import WireError
 from tests.agent.messages import (
     SHAPES,
@@ -124,7 +125,7 @@ KINDS = by_kind(ToMaster) | by_kind(ToWorker)
 
 def test_every_field_of_every_message_has_its_bound() -> None:
     assert {kind: dict(cls.bounds) for kind, cls in KINDS.items()} == BOUNDS
-    arrays = {"episodes", "starts", "ends", "goals", "weights", "workers"}
+    arrays = {"episodes", "picture", "weights", "workers"}
     for cls in KINDS.values():
         assert {f.name for f in fields(cls)} <= cls.bounds.keys() | arrays  # type: ignore[arg-type]
 
@@ -242,20 +243,19 @@ def test_batches_come_back_as_they_were_sent(
     assert isinstance(received, EpisodeBatch)
     assert (received.sequence, received.weights_version) == (sequence, version)
     for name, array in sent.episodes.arrays.items():
-        np.testing.assert_array_equal(vars(received.episodes)[name], array)
+        np.testing.assert_array_equal(received.episodes[name], array)
 
 
-@given(st.integers(0, MAX_PICTURES), values_of(Numbers(names=SCORE_NAMES)), st.integers(-1, BIG))
+@given(st.integers(0, 9), values_of(Numbers(names=SCORE_NAMES)), st.integers(-1, BIG))
 def test_scores_come_back_as_they_were_sent(
     count: int, scalars: dict[str, float], version: int
 ) -> None:
-    corners = np.random.default_rng(count).uniform(-1, 1, (3, count, SPEC.corners, 2))
-    sent = Scores(version, scalars, *corners.astype(np.float32))
+    drawn = np.random.default_rng(count).integers(0, 256, (count, PICTURE_WIDTH, 3))
+    sent = Scores(version, scalars, drawn.astype(np.uint8))
     received = decode_from_worker(sent.encode(SPEC), SPEC)
     assert isinstance(received, Scores)
     assert (received.weights_version, received.scalars) == (version, scalars)
-    for name in ("starts", "ends", "goals"):
-        np.testing.assert_array_equal(getattr(received, name), getattr(sent, name))
+    np.testing.assert_array_equal(received.picture, sent.picture)
 
 
 @pytest.mark.parametrize("rows", [0, 3])
@@ -325,20 +325,19 @@ EPISODES, SCORES, STATUS = (EXAMPLES[kind] for kind in ("episodes", "scores", "s
     ("frames", "reason"),
     [
         (with_header(EPISODES, count=2), "corners must have 560 bytes for the shape (2, 5, 7, 2)"),
-        (with_checksum(EPISODES[:-1]), "there must be 5 array frames, got 4"),
+        (with_checksum(EPISODES[:-1]), "there must be 6 array frames, got 5"),
         (
             with_header(SCORES, count=1),
-            "starts must have 56 bytes for the shape (1, 7, 2), got 112",
+            "picture must have 3072 bytes for the shape (1, 1024, 3), got 6144",
         ),
-        (with_last(SCORES, 1, NAN), "starts holds nan at [1, 6, 1]"),
-        (with_last(SCORES, 2, 4.5), "ends holds 4.5 at [1, 6, 1]"),
-        (with_last(SCORES, 3, -4.5), "goals holds -4.5 at [1, 6, 1]"),
+        (with_last(EPISODES, 1, NAN), "corners holds nan at [2, 4, 6, 1]"),
+        (with_last(EPISODES, 3, -4.5), "goals holds -4.5 at [2, 6, 1]"),
         (
             with_header(EPISODES, count=0),
-            f"episodes: count {INTEGER} 1 and {SPEC.max_count}, got 0",
+            f"episodes: count {INTEGER} 1 and {most_episodes(SPEC)}, got 0",
         ),
-        (with_header(EPISODES, count=SPEC.max_count + 1), f"episodes: count {INTEGER} 1 and"),
-        (with_header(SCORES, count=65), f"scores: count {INTEGER} 0 and 64, got 65"),
+        (with_header(EPISODES, count=most_episodes(SPEC) + 1), f"episodes: count {INTEGER} 1 and"),
+        (with_header(SCORES, count=769), f"scores: count {INTEGER} 0 and 768, got 769"),
         (with_header(STATUS, count=4097), f"status: count {INTEGER} 0 and 4096, got 4097"),
         (with_header(STATUS, count=4), "workers must have 288 bytes for the shape (4, "),
         (
@@ -365,14 +364,16 @@ def test_a_batch_without_a_number_is_no_batch(sequence: object) -> None:
 
 def test_what_a_receiver_would_refuse_is_not_sent() -> None:
     sent = scores()
-    with pytest.raises(WireError, match=f"scores: count {INTEGER} 0 and 64, got 65"):
-        scores(65).encode(SPEC)
+    with pytest.raises(WireError, match=f"scores: count {INTEGER} 0 and 768, got 769"):
+        scores(769).encode(SPEC)
     with pytest.raises(WireError, match=r"scores: scalars.iou must be a finite number, got nan"):
         replace(sent, scalars={"iou": NAN}).encode(SPEC)
-    with pytest.raises(WireError, match=r"ends must have the shape \(2, 7, 2\), got \(1, 7, 2\)"):
-        replace(sent, ends=sent.ends[:1]).encode(SPEC)
-    none = Episodes(*[array[:0] for array in episodes(1).arrays.values()])
-    with pytest.raises(WireError, match=f"episodes: count {INTEGER} 1 and {SPEC.max_count}, got 0"):
+    with pytest.raises(WireError, match=r"picture must have the shape \(2, 1024, 3\), got \(2, 9"):
+        replace(sent, picture=sent.picture[:, :9]).encode(SPEC)
+    none = episodes(1).at(slice(0))
+    with pytest.raises(
+        WireError, match=f"episodes: count {INTEGER} 1 and {most_episodes(SPEC)}, got 0"
+    ):
         EpisodeBatch(1, 0, none).encode(SPEC)
     with pytest.raises(WireError, match=f"episodes: sequence {INTEGER} 1 and {BIG}, got 0"):
         batch(0).encode(SPEC)

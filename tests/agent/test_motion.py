@@ -305,7 +305,7 @@ def test_an_agent_corrects_itself_by_what_it_has_seen() -> None:
     policy = Policy(made)
     policy.load(learner.acting_weights(1))
     episodes = random_episodes(made, 5)
-    start, goals, placed = episodes.corners[:, 0], episodes.goals, episodes.placed[:, 0]
+    start, goals, placed = episodes["corners"][:, 0], episodes["goals"], episodes["placed"][:, 0]
     first = policy.act(start, placed, goals)
     poses = made.layout.poses(start.astype(np.float64))
     poses[:, 0] += 0.5 * first * SCALE
@@ -324,7 +324,7 @@ def test_with_a_delay_it_plays_for_where_the_action_before_will_have_taken_the_t
     learner = Learner(made, 0)
     policy.load(learner.acting_weights(1))
     episodes = random_episodes(made, 5)
-    start, goals, placed = episodes.corners[:, 0], episodes.goals, episodes.placed[:, 0]
+    start, goals, placed = episodes["corners"][:, 0], episodes["goals"], episodes["placed"][:, 0]
     first = policy.act(start, placed, goals)
     poses = made.layout.poses(start.astype(np.float64))
     poses[:, 0] += first * SCALE

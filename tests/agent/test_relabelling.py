@@ -1,13 +1,12 @@
 """Tables: a trajectory in, the exact transitions out."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from tangram_agent.config import RelabelConfig
 from tangram_agent.relabelling import flatten, with_relabelled
-from tangram_agent.types import Episodes, Transitions
+from tangram_agent.types import Transitions
+from tangram_core.spec import Episodes
 from tests.agent.builders import random_episodes, setup
 
 pytestmark = pytest.mark.fast
@@ -20,11 +19,14 @@ S = LAYOUT.corners(np.array([[[0.1 * t, 0.0, 0.0]] for t in range(4)])).astype(n
 G = LAYOUT.corners(np.array([[0.0, 0.8, 0.0]])).astype(np.float32)
 A = np.array([[0.1, 0.0, 0.0], [0.2, 0.0, 0.0], [0.3, 0.0, 0.0]], np.float32)
 EPISODE = Episodes(
-    corners=S[None],
-    placed=np.array([[[0], [0], [0], [1]]], np.uint8),
-    actions=A[None],
-    rewards=np.array([[-0.9, -0.8, -0.7]], np.float32),
-    goals=G[None],
+    {
+        "corners": S[None],
+        "placed": np.array([[[0], [0], [0], [1]]], np.uint8),
+        "goals": G[None],
+        "actions": A[None],
+        "rewards": np.array([[-0.9, -0.8, -0.7]], np.float32),
+        "terminated": np.array([[0, 0, 1]], np.uint8),
+    }
 )
 
 
@@ -55,12 +57,10 @@ def rows(batch: Transitions) -> list[tuple[object, ...]]:
     ]
 
 
-def test_only_where_all_tokens_are_placed_does_nothing_follow() -> None:
-    played = flatten(replace(EPISODE, placed=np.zeros((1, 4, 1), np.uint8)))
-    assert played.done.tolist() == [0, 0, 0]  # a time limit
+def test_only_where_a_step_terminated_does_nothing_follow() -> None:
     assert flatten(EPISODE).done.tolist() == [0, 0, 1]
-    two = np.array([[[0, 0], [1, 0], [1, 1], [1, 1]]], np.uint8)
-    assert flatten(replace(EPISODE, placed=two)).done.tolist() == [0, 1, 1]
+    limited = Episodes({**EPISODE.arrays, "terminated": np.zeros((1, 3), np.uint8)})
+    assert flatten(limited).done.tolist() == [0, 0, 0]  # a time limit
 
 
 PLAYED = [
@@ -103,7 +103,7 @@ def test_near_goals_are_the_final_pose_moved_a_little() -> None:
     kind = RelabelConfig("near", position=0.05, angle=0.3)
     batch = with_relabelled(episodes, (kind,), LAYOUT, same, np.random.default_rng(1))
     goals = LAYOUT.poses(batch.goal[1200:].astype(np.float64))[:, 0]
-    finals = LAYOUT.poses(episodes.corners[:, -1].astype(np.float64))[:, 0]
+    finals = LAYOUT.poses(episodes["corners"][:, -1].astype(np.float64))[:, 0]
     gap = goals - np.repeat(finals, STEPS, axis=0)
     gap[:, 2] = (gap[:, 2] + np.pi) % (2 * np.pi) - np.pi
     np.testing.assert_allclose(gap.mean(axis=0), 0.0, atol=0.03)
@@ -125,7 +125,8 @@ def test_near_goals_lie_on_the_side_that_was_reached() -> None:
     layout = made.layout
     path = np.array([[[0.1 * t, 0.0, 0.0]] for t in range(4)])
     corners = layout.corners(path, np.ones((4, 1), dtype=bool)).astype(np.float32)
-    episode = Episodes(corners[None], EPISODE.placed, A[None], EPISODE.rewards, corners[None, 0])
+    there = {"corners": corners[None], "goals": corners[None, 0]}
+    episode = Episodes({**EPISODE.arrays, **there})
     kind = RelabelConfig("near", copies=20, position=0.01, angle=0.1)
     batch = with_relabelled(episode, [kind], layout, same, np.random.default_rng(0))
     assert layout.flipped(batch.goal.astype(np.float64)).all()

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
 from tangram_agent.setup import Setup, make_setup
+from tangram_core.spec import Episodes
 from tests.agent.builders import random_episodes
 from tests.agent.no_reward import NOTHING
 from tests.cluster.processes import LIMIT_S, started, wait_for_file
@@ -60,7 +60,7 @@ class Player:
     ) -> None:
         self._setup, self.index = setup, index
         self._first_tag = FIRST_TAG + 100_000.0 * (index if tag_index is None else tag_index)
-        spec = EpisodeSpec.of(setup)
+        spec = setup.spec
         self.client = Client(
             str(connect), "player", index, setup.fingerprints(), spec, None, 4, timing
         )
@@ -94,7 +94,7 @@ class Player:
             self.sent += 1
             episodes = random_episodes(self._setup, EPISODES, seed=self.sent)
             tags = np.full_like(episodes.rewards, self.tag(self.sent))
-            assert self.client.send(replace(episodes, rewards=tags), -1)
+            assert self.client.send(Episodes({**episodes.arrays, "rewards": tags}), -1)
         self.client.poll(0.002)
 
 

@@ -29,9 +29,8 @@ from master.report import Reporter, StatusCollector
 from master.rundir import Claim, Clock, Record, RunFolder
 from master.signals import StopSignals
 from master.trainer import Trainer
-from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.config import ServiceConfig
-from tangram_agent.messages import EpisodeBatch, Go, RunStatus, Scores
+from tangram_agent.messages import PICTURE_WIDTH, EpisodeBatch, Go, RunStatus, Scores
 from tangram_agent.process import Watchdog
 from tangram_agent.setup import Setup
 from tangram_agent.types import Weights
@@ -53,14 +52,14 @@ def arrival(made: Setup, sequence: int, count: int = 4, version: int = 0) -> Epi
     """A batch of random episodes from player 0."""
     episodes = random_episodes(made, count, seed=sequence)
     batch = EpisodeBatch(sequence, version, episodes)
-    return EpisodesArrived("player", 0, 1, batch, batch.encode(EpisodeSpec.of(made)))
+    return EpisodesArrived("player", 0, 1, batch, batch.encode(made.spec))
 
 
 def scores(made: Setup, version: int, reward: float = 0.5) -> ScoresArrived:
-    """An evaluation with two pictures."""
-    corners = random_episodes(made, 2).goals
+    """An evaluation with a picture."""
+    picture = np.full((120, PICTURE_WIDTH, 3), 200, np.uint8)
     scalars = {"mean_reward": reward, "raw_overlap": 0.75, "episodes": 100.0}
-    return ScoresArrived(0, 1, Scores(version, scalars, corners, corners, corners))
+    return ScoresArrived(0, 1, Scores(version, scalars, picture))
 
 
 _opened: list[Journal | Claim] = []
@@ -213,7 +212,7 @@ def loop(
         folder=run_folder,
         hub=hub,  # type: ignore[arg-type]
         guard=guard,
-        lockstep=Lockstep.of(service, settings.workers, EpisodeSpec.of(made)),
+        lockstep=Lockstep.of(service, settings.workers, made.spec),
         budget=budget,
         clock=clock,
         checkpointer=checkpointer,

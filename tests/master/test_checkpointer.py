@@ -17,7 +17,6 @@ from master.recovery import Reader
 from master.rundir import RunFolder
 from master.trainer import Trainer
 from tangram_agent import checkpoints as checkpoints_module
-from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.checkpoints import DiskError, list_checkpoints
 from tangram_agent.process import Every
 from tangram_sim.errors import ConfigError, RunError
@@ -138,7 +137,7 @@ def test_a_journal_that_cannot_be_synced_is_told(
 def inserted(stage: Stage) -> tuple[int, list[int]]:
     """Where a restart would begin, and the batches that it would insert then."""
     found = restore_run(stage.folder / "checkpoints", Trainer(MADE, 0, "cpu", 64))
-    place, spec = found.place if found else None, EpisodeSpec.of(MADE)
+    place, spec = found.place if found else None, MADE.spec
     journal = stage.folder / "journal"
     batches = Reader(journal, place, "run", MADE.task_digest(), spec, pytest.fail)
     return place.number if place else 0, [one.sequence for one in batches]

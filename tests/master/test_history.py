@@ -32,9 +32,9 @@ from master.rundir import RunFolder
 from master.security import Holder
 from master.signals import StopSignals
 from master.sockets import Received
-from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.config import ServiceConfig
 from tangram_agent.process import Watchdog
+from tangram_core.spec import Episodes
 from tangram_sim.config import RewardConfig
 from tangram_sim.errors import TangramError, WireError
 from tests.agent.builders import random_episodes
@@ -48,7 +48,7 @@ from worker.connection import Timing
 MADE = replace(
     small_setup(replay_capacity=4096, updates_per_transition=0.01), reward=RewardConfig(NOTHING)
 )
-SPEC = EpisodeSpec.of(MADE)
+SPEC = MADE.spec
 AT_ONCE = Timing(retry_s=0.0, resend_s=0.0, heartbeat_s=1000.0)
 FIRST_TAG = 2.0  # rewards of hindsight twins are 0
 WORKERS, ON_THE_WAY = 3, 12
@@ -139,7 +139,7 @@ class Worker:
         sequence = self.client.outbox.next
         episodes = random_episodes(MADE, 1, seed=sequence)
         rewards = np.full_like(episodes.rewards, self.tag(sequence))
-        self.client.send(replace(episodes, rewards=rewards), -1)
+        self.client.send(Episodes({**episodes.arrays, "rewards": rewards}), -1)
 
 
 class Torn(FileIO):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tangram_agent.messages import Ack, Alive, Bye, Go, Reject, Stop, Welcome
-from tangram_agent.types import Episodes
+from tangram_core.spec import Episodes
 from tests.agent.messages import SPEC, batch, hello, with_checksum, with_header
 from tests.master.dealers import INFO, WINDOW, Dealer, Stage, staged
 
@@ -156,7 +156,9 @@ def test_a_damaged_batch_is_no_batch_and_who_sends_nothing_else_must_end(
     assert (stage.hub.counters["damaged"], stage.arrivals) == (5, [])
     player.send(1)  # an intact one: counted from the beginning
     stage.counted("batches")
-    np.testing.assert_array_equal(stage.batches()[0].episodes.corners, batch(1).episodes.corners)
+    np.testing.assert_array_equal(
+        stage.batches()[0].episodes["corners"], batch(1).episodes["corners"]
+    )
     for _ in range(5):
         assert isinstance(player.ask(flipped(1)), Reject)
         assert player.beat() == [Alive(-1)]  # small messages may come through all the time

@@ -17,7 +17,7 @@ from master import journal as journal_module
 from master.delivery import EpisodesArrived
 from master.journal import FORMAT, HEAD, MAGIC, JournalError, Place, Title, _head, segments
 from master.recovery import Reader, journal_run_id
-from tangram_agent.arrays import EpisodeSpec, join_frames
+from tangram_agent.arrays import join_frames, most_episodes
 from tangram_agent.schema import opened, seal
 from tangram_agent.setup import Setup
 from tangram_sim.errors import RunError
@@ -37,12 +37,12 @@ def read(
     made: Setup = MADE,
 ) -> list[EpisodesArrived]:
     warn = pytest.fail if warnings is None else warnings.append
-    return list(Reader(folder, after, run_id, made.task_digest(), EpisodeSpec.of(made), warn))
+    return list(Reader(folder, after, run_id, made.task_digest(), made.spec, warn))
 
 
 def read_all(folder: Path, warnings: list[str]) -> Reader:
     """A reader at its end."""
-    reader = Reader(folder, None, "run", MADE.task_digest(), EpisodeSpec.of(MADE), warnings.append)
+    reader = Reader(folder, None, "run", MADE.task_digest(), MADE.spec, warnings.append)
     list(reader)
     return reader
 
@@ -54,8 +54,8 @@ def sequences(folder: Path, **more: Any) -> list[int]:
 def assert_same(one: EpisodesArrived, other: EpisodesArrived) -> None:
     for name in ("role", "index", "incarnation", "sequence", "weights_version"):
         assert getattr(one, name) == getattr(other, name), name
-    for name in ("corners", "placed", "actions", "rewards", "goals"):
-        ours, theirs = getattr(one.episodes, name), getattr(other.episodes, name)
+    for name, ours in one.episodes.arrays.items():
+        theirs = other.episodes[name]
         assert ours.dtype == theirs.dtype, name
         np.testing.assert_array_equal(ours, theirs, err_msg=name)
 
@@ -400,7 +400,7 @@ def test_one_of_another_version_or_format_is_refused(tmp_path: Path) -> None:
         journal_run_id(tmp_path)
     [later] = Title(FORMAT + 1, "run", MADE.task_digest()).encode()
     path.write_bytes(record(later))
-    with pytest.raises(RunError, match=r"is no segment of format 3: choose another run_dir"):
+    with pytest.raises(RunError, match=r"is no segment of format 4: choose another run_dir"):
         read(tmp_path)
     body = b"\x05\x00title"
     path.write_bytes(
@@ -517,8 +517,8 @@ def test_a_sync_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_a_journal_takes_what_the_wire_takes(tmp_path: Path) -> None:
     """The largest batch of a message fits a record."""
-    spec = EpisodeSpec.of(MADE)
+    spec = MADE.spec
     kept = journal(tmp_path, MADE)
-    kept.append(arrival(MADE, 1, count=spec.max_count))
+    kept.append(arrival(MADE, 1, count=most_episodes(spec)))
     (found,) = read(tmp_path)
-    assert found.episodes.count == spec.max_count
+    assert found.episodes.count == most_episodes(spec)

@@ -6,9 +6,9 @@ import pytest
 
 from master.delivery import EpisodesArrived
 from master.lockstep import Lockstep
-from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import EpisodeBatch, Go
+from tangram_core.spec import Field
 from tangram_sim.errors import ConfigError
 from tests.agent.builders import random_episodes
 from tests.master.builders import small_setup
@@ -59,9 +59,13 @@ def test_a_round_that_was_cut_goes_on_with_those_who_are_missing() -> None:
 
 
 def test_the_settings_must_fit() -> None:
-    spec = EpisodeSpec.of(MADE)
+    spec = MADE.spec
     assert Lockstep.of(ServiceConfig(), 2, spec) is None
     step = {"mode": "lockstep", "envs": 4}
     assert Lockstep.of(ServiceConfig(**step), 2, spec) is not None
     with pytest.raises(ConfigError, match="too many for one message, at most 1: lower service.e"):
-        Lockstep.of(ServiceConfig(**step), 2, replace(spec, corners=65536))
+        Lockstep.of(
+            ServiceConfig(**step),
+            2,
+            replace(spec, fields=(*spec.fields, Field("more", (200_000,), 0, 1))),
+        )

@@ -401,8 +401,8 @@ def test_in_lockstep_rounds_are_inserted_by_index_and_learned_before_the_next(
     ]
     goals = made.guard.trainer.replay.state()["goal"]
     own = len(MADE.agent.hindsight) + 1
-    np.testing.assert_array_equal(goals[0], played(0, 1).episodes.goals[0])
-    np.testing.assert_array_equal(goals[BATCH * own], played(1, 1).episodes.goals[0])
+    np.testing.assert_array_equal(goals[0], played(0, 1).episodes["goals"][0])
+    np.testing.assert_array_equal(goals[BATCH * own], played(1, 1).episodes["goals"][0])
 
 
 def test_in_lockstep_nothing_is_learned_from_half_a_round(tmp_path: Path) -> None:

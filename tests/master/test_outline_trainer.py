@@ -5,11 +5,10 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.messages import EpisodeBatch, decode_from_worker
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
-from tangram_agent.types import Episodes
+from tangram_core.spec import Episodes
 from tangram_sim.errors import RunError, WireError
 from tests.agent.outlines import outline_setup
 from tests.master.builders import trainer
@@ -33,7 +32,7 @@ def test_what_workers_play_is_learned_from() -> None:
     made = trainer(MADE)
     played = rolled_out(MADE)
     made.insert(played)
-    assert (played.goals.shape, made.transitions) == ((8, MADE.goal_rows, 2), 16)
+    assert (played["goals"].shape, made.transitions) == ((8, MADE.goal_rows, 2), 16)
     numbers = made.update(0.0)
     assert set(numbers) == {"critic_loss", "q", "critic_gradient"}
     assert made.updates == 1
@@ -45,7 +44,7 @@ def test_what_workers_play_is_learned_from() -> None:
 def test_a_worker_that_plays_nonsense_asks_for_no_update() -> None:
     """Nothing is placed, so hindsight has no state, and there is nothing to sample."""
     made, played = trainer(MADE), rolled_out(MADE)
-    played.placed[:] = 0
+    played["placed"][:] = 0
     for _ in range(20):
         made.insert(played)
     assert (len(made.replay), made.rate_limiter.may_update()) == (0, False)
@@ -81,13 +80,13 @@ def test_a_replay_of_another_size_is_refused() -> None:
 
 
 def test_outlines_travel_and_other_sizes_are_refused() -> None:
-    spec = EpisodeSpec.of(MADE)
+    spec = MADE.spec
     played = rolled_out(MADE, count=1)
     frames = EpisodeBatch(1, 0, played).encode(spec)
     got = decode_from_worker(frames, spec)
     assert isinstance(got, EpisodeBatch)
-    assert (got.episodes.goals == played.goals).all()
-    pieces = Episodes(**played.arrays | {"goals": played.corners[:, 0]})
+    assert (got.episodes["goals"] == played["goals"]).all()
+    pieces = Episodes({**played.arrays, "goals": played["corners"][:, 0]})
     with pytest.raises(WireError, match="goals must have the shape"):
         EpisodeBatch(1, 0, pieces).encode(spec)
 
@@ -97,12 +96,12 @@ def test_nonsense_that_keeps_its_bounds_harms_nobody() -> None:
     made, generator = trainer(MADE), np.random.default_rng(0)
     played = rolled_out(MADE)
     for high in (0.0, 1e-3, 0.5, MADE.bound):
-        noise = generator.uniform(-high, high, played.goals.shape).astype(np.float32)
-        corners = generator.uniform(-high, high, played.corners.shape).astype(np.float32)
-        made.insert(Episodes(**played.arrays | {"goals": noise}))
-        made.insert(Episodes(**played.arrays | {"corners": corners}))
-        made.insert(Episodes(**played.arrays | {"corners": corners, "goals": noise}))
-        flags = generator.integers(0, 2, played.placed.shape).astype(np.uint8)
-        made.insert(Episodes(**played.arrays | {"placed": flags}))
+        noise = generator.uniform(-high, high, played["goals"].shape).astype(np.float32)
+        corners = generator.uniform(-high, high, played["corners"].shape).astype(np.float32)
+        made.insert(Episodes({**played.arrays, "goals": noise}))
+        made.insert(Episodes({**played.arrays, "corners": corners}))
+        made.insert(Episodes({**played.arrays, "corners": corners, "goals": noise}))
+        flags = generator.integers(0, 2, played["placed"].shape).astype(np.uint8)
+        made.insert(Episodes({**played.arrays, "placed": flags}))
     assert np.isfinite(list(made.update(0.0).values())).all()
     made.replay.check_valid()

@@ -12,7 +12,6 @@ import pytest
 from master.journal import Journal, Place
 from master.recovery import Reader
 from master.rundir import RunFolder
-from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint, save_checkpoint
 from tangram_agent.files import write_whole
 from tests.master.builders import arrival, small_setup
@@ -24,7 +23,7 @@ pytestmark = [pytest.mark.fast, pytest.mark.filterwarnings(UNCLOSED)]
 
 MADE = small_setup()
 DIGEST = MADE.task_digest()
-SPEC = EpisodeSpec.of(MADE)
+SPEC = MADE.spec
 BATCHES = [arrival(MADE, number, count=1) for number in range(1, 6)]
 CHANCES = 12
 

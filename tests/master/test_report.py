@@ -1,6 +1,5 @@
 """How the run stands: collected once, the same everywhere, and never the end of the loop."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +8,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from master.result import SCORES, make_result
 from tangram_agent.process import Every
+from tangram_core.spec import Episodes
 from tests.master.builders import FakeHub, arrival, loop, scores, shown, small_setup
 
 pytestmark = pytest.mark.fast
@@ -94,7 +94,7 @@ def test_it_is_told_where_nothing_can_be_learned_from(tmp_path: Path) -> None:
     made = loop(tmp_path, MADE, FakeHub(MADE, roles=["player"]))
     episodes = arrival(MADE, 1).episodes
     gone = np.zeros((4, MADE.horizon + 1, 1), np.uint8)
-    made.guard.trainer.insert(replace(episodes, seen=gone, goals_seen=gone[:, 0]))
+    made.guard.trainer.insert(Episodes({**episodes.arrays, "seen": gone, "goals_seen": gone[:, 0]}))
     said = "waiting for an episode in which pictures show all tokens: larger sim.pixels help"
     assert made.reporter.flush(0).texts["activity"] == said
     made.guard.trainer.insert(episodes)

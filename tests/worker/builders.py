@@ -14,7 +14,8 @@ from tangram_agent.learner import Learner
 from tangram_agent.networks import travelling
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup, make_setup
-from tangram_agent.types import Episodes, Weights
+from tangram_agent.types import Weights
+from tangram_core.spec import Episodes
 from tangram_sim.arrays import Floats
 from tangram_sim.layout import Layout
 from tests.agent.builders import SMALL, SQUARE
@@ -70,6 +71,7 @@ def ended(layout: Layout, corners: Floats, goals: Floats, **more: Any) -> Played
         "actions": np.zeros((count, steps, 4), np.float32),
         "rewards": np.zeros((count, steps), np.float32),
         "goals": goals.astype(np.float32),
+        "terminated": np.zeros((count, steps), np.uint8),
     }
     known = {
         "overlap": np.zeros(count),
@@ -80,6 +82,6 @@ def ended(layout: Layout, corners: Floats, goals: Floats, **more: Any) -> Played
         "camera": None,
         "pictures": None,
     }
-    travels = Episodes(**{name: more.get(name, column) for name, column in seen.items()})
+    travels = Episodes({name: more.get(name, column) for name, column in seen.items()})
     rest: dict[str, Any] = {name: more.get(name, column) for name, column in known.items()}
     return Played(episodes=travels, corners=corners, goals=goals, **rest)

@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,7 +18,6 @@ import zmq
 from master.admission import WelcomeInfo
 from master.delivery import Arrival
 from master.hub import Hub
-from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.messages import (
     EpisodeBatch,
     Heartbeat,
@@ -31,6 +29,7 @@ from tangram_agent.messages import (
 )
 from tangram_agent.schema import Plain
 from tangram_agent.setup import Setup
+from tests.agent.builders import with_bound
 from tests.agent.messages import FINGERPRINTS, SPEC
 from tests.master.dealers import Stage
 from worker.client import Client
@@ -198,7 +197,7 @@ def standing_in(port: int | str = "*") -> Iterator[StandIn]:
 
 def open_hub(made: Setup, window: int = 4, seed: int = 11, lockstep: bool = False) -> Hub:
     """A master's hub on a free port."""
-    spec = replace(EpisodeSpec.of(made), bound=100.0)
+    spec = with_bound(made.spec, 100.0)
     info = WelcomeInfo("run", seed, made.fingerprints(), spec, window, lockstep)
     return Hub("127.0.0.1", 0, info)
 

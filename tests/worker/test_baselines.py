@@ -84,7 +84,10 @@ def test_the_oracle_puts_noisy_looks_together(tokens: dict, sim: dict[str, Any])
         for player in (Told(oracle_policy), exact_policy(made.layout, made.sim)):
             played = tests.play(playing(player, tests.env))
             # From where the target is seen: what no policy can know is no matter here.
-            ends, goals = made.layout.poses(played.ends), made.layout.poses(played.episodes.goals)
+            ends, goals = (
+                made.layout.poses(played.ends),
+                made.layout.poses(played.episodes["goals"]),
+            )
             found.append(np.median(np.abs(ends - goals)[..., :2]))
     assert found[0] < 0.7 * found[1]
 
@@ -160,7 +163,7 @@ def test_chance_names_tokens_that_are_left_and_stays_in_the_arena(
     with closing(FixedTests(made, 20, 20)) as tests:
         played = tests.play(random_policy(made.layout, made.sim))
     assert not played.refused.any()
-    assert played.episodes.placed[:, -1].all()
+    assert played.episodes["placed"][:, -1].all()
     centres = made.layout.poses(played.ends)[..., :2]
     assert 0.9 < np.abs(centres).max() <= 1.0 + 1e-6
     turned = made.layout.flipped(played.ends) != made.layout.flipped(played.starts)

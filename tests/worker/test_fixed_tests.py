@@ -52,7 +52,7 @@ def test_noise_is_off() -> None:
     acting = policy(made)
     with closing(FixedTests(made, 3, 3)) as tests:
         found = tests.play(greedy(acting))
-    expected = acting.act(found.starts, found.episodes.placed[:, 0], found.goals)
+    expected = acting.act(found.starts, found.episodes["placed"][:, 0], found.goals)
     np.testing.assert_array_equal(found.episodes.actions[:, 0], expected)
 
 
@@ -95,7 +95,7 @@ def test_the_position_policy_solves_position_and_nothing_else(
         found = tests.play(position_policy(made.layout, made.sim))
     centres = made.layout.bases(found.ends), made.layout.bases(found.goals)
     np.testing.assert_allclose(*centres, atol=1e-6)
-    assert found.episodes.placed[:, -1].all() == (tokens is PAIR or actions == 1)
+    assert found.episodes["placed"][:, -1].all() == (tokens is PAIR or actions == 1)
     angles = made.layout.poses(found.corners)[..., 2]
     np.testing.assert_allclose(angles[:, -1], angles[:, 0], atol=1e-9)
 

@@ -80,7 +80,7 @@ def test_hidden_pieces_do_not_reach_the_player(sim: dict[str, Any]) -> None:
         assert hidden.filled == 1
         played.append(lay(hidden, exact(hidden), seed=0))
     for name in ("corners", "goals", "actions"):
-        columns = [getattr(own.episodes, name) for own in played]
+        columns = [own.episodes[name] for own in played]
         np.testing.assert_array_equal(*columns, err_msg=name)
     np.testing.assert_array_equal(played[0].starts, played[1].starts)
 
@@ -92,7 +92,7 @@ def test_what_was_found_reaches_the_player(sim: dict[str, Any]) -> None:
     hidden = hide(made, find_figures("test", made, names), seed=0)
     played = lay(hidden, exact(hidden), seed=0)
     laid = [made.layout.corners(one.laid.poses, one.laid.flipped) for one in hidden.searches]
-    np.testing.assert_allclose(played.episodes.goals, laid, atol=1e-6)
+    np.testing.assert_allclose(played.episodes["goals"], laid, atol=1e-6)
     goals = [made.layout.corners(one.poses, one.flipped) for one in hidden.figures]
     assert overlap_share(np.stack(laid), np.stack(goals), made.layout).min() > 0.97
     assert overlap_share(played.ends, np.stack(goals), made.layout).min() > 0.97

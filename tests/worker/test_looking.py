@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.messages import EpisodeBatch, decode_from_worker
 from tangram_agent.policy import Policy
+from tangram_agent.relabelling import learnable
 from tangram_agent.setup import Setup, make_setup
-from tangram_agent.types import Episodes
+from tangram_core.spec import Episodes
 from tangram_sim.arrays import Singles
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.errors import ConfigError
@@ -70,7 +70,7 @@ def test_nothing_exact_leaks(monkeypatch: pytest.MonkeyPatch, shapes: tuple[str,
     other = played(task, policy)
     assert other.arrays.keys() == whole.arrays.keys() > {"seen", "goals_seen"}
     for name, column in whole.arrays.items():
-        np.testing.assert_array_equal(column, getattr(other, name), err_msg=name)
+        np.testing.assert_array_equal(column, other[name], err_msg=name)
 
 
 @pytest.mark.parametrize("shapes", [("square",), ("small_triangle", "small_triangle", "square")])
@@ -90,7 +90,7 @@ def test_the_same_pictures_give_the_same_episodes(
     monkeypatch.setattr(KinematicWorld, "poses", lie)
     other = played(task, policy)
     for name, column in whole.arrays.items():
-        np.testing.assert_array_equal(column, getattr(other, name), err_msg=name)
+        np.testing.assert_array_equal(column, other[name], err_msg=name)
 
 
 def test_what_is_seen_is_near_and_the_reward_is_that_of_pictures() -> None:
@@ -142,24 +142,25 @@ def test_what_no_picture_shows_ends_no_worker(
 
     with closing(environments(task, 4)) as env:
         episodes = Rollout(env, 0, "player", 0, 0).play(far, 24)
-    seen = episodes.goals_seen
+    seen = episodes["goals_seen"]
     assert not np.asarray(seen).all()
-    spec = EpisodeSpec.of(task)
+    spec = task.spec
     assert EpisodeBatch(1, 0, episodes).encode(spec)
 
 
 def test_what_is_missing_travels_and_is_not_learned_from() -> None:
     task = at_random(setup("square"))
     episodes = played(task, Policy(task), 4)
-    spec = EpisodeSpec.of(task)
+    spec = task.spec
     frames = EpisodeBatch(1, 0, episodes).encode(spec)
     arrived = decode_from_worker(frames, spec).episodes
-    np.testing.assert_array_equal(arrived.seen, episodes.seen)
-    gone = ~np.asarray(episodes.seen).all(axis=(1, 2))
+    np.testing.assert_array_equal(arrived["seen"], episodes["seen"])
+    gone = ~np.asarray(episodes["seen"]).all(axis=(1, 2))
     assert 0 < gone.sum() < len(gone)  # random actions leave the picture
-    seen = arrived.learnable()
-    np.testing.assert_array_equal(seen.corners, episodes.corners[~gone])
-    assert replace(episodes, seen=None).learnable().count == len(gone)
+    seen = learnable(arrived)
+    np.testing.assert_array_equal(seen["corners"], episodes["corners"][~gone])
+    exact = Episodes({n: a for n, a in episodes.arrays.items() if n != "seen"})
+    assert learnable(exact).count == len(gone)
 
 
 def test_without_an_eye_pictures_are_refused() -> None:

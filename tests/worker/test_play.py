@@ -91,8 +91,7 @@ def test_only_what_was_found_is_drawn_over_the_cameras_view(tmp_path: Path) -> N
         red, _, blue = np.asarray(first, np.int64).transpose(2, 0, 1)
         return np.count_nonzero(blue > red + 30)
 
-    both, confidence = coloured(), played.episodes.seen
-    assert confidence is not None
+    both, confidence = coloured(), played.episodes["seen"]
     confidence[1] = 0
     one = coloured()
     confidence[0] = 0

@@ -17,7 +17,6 @@ import zmq
 
 from master.delivery import EpisodesArrived
 from master.hub import Hub
-from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import Go
 from tangram_agent.process import Lifeline
@@ -61,7 +60,7 @@ def assert_episodes(
     numbers: Sequence[int],
 ) -> None:
     """The batches are these episodes, by their targets."""
-    goals = np.concatenate([batch.episodes.goals for batch in arrived])
+    goals = np.concatenate([batch.episodes["goals"] for batch in arrived])
     for number, goal in zip(numbers, goals, strict=True):
         rng = episode_generator(*identity, number)
         expected = made.layout.corners(sample_poses(made.layout, made.sim, rng))
@@ -229,7 +228,7 @@ def test_a_player_whose_index_is_taken_goes_on_if_it_asked_for_none(
     def script(hub: Hub) -> list[int]:
         hub.publish(sent(made, 1))
         [first, *_] = collect(hub, bool)
-        with Client(hub.endpoint, "player", 0, made.fingerprints(), EpisodeSpec.of(made)) as taker:
+        with Client(hub.endpoint, "player", 0, made.fingerprints(), made.spec) as taker:
             collect(hub, lambda _: taker.poll() or taker.joined)
             if index >= 0:
                 return [first.index]

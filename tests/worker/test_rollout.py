@@ -9,7 +9,8 @@ import pytest
 
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup
-from tangram_agent.types import Episodes, Past
+from tangram_agent.types import Past
+from tangram_core.spec import Episodes, joined
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.geometry import overlap_share
 from tangram_sim.seeding import episode_generator
@@ -59,6 +60,7 @@ def naive_episode(made: Setup, acting: Policy, rng: np.random.Generator) -> dict
         "placed": np.array(placed),
         "actions": np.array(actions),
         "rewards": np.array(rewards),
+        "terminated": np.array(placed)[1:].all(axis=1),
         "goals": goal,
     }
 
@@ -74,7 +76,7 @@ def rolled_out(made: Setup, envs: int, count: int) -> Episodes:
         rollout, acting = Rollout(env, *IDENTITY), policy(made)
         played = [rollout.play(acting.explore, groups) for groups in (1, count // envs - 1)]
         assert rollout.episode == count
-    return Episodes(**{n: np.concatenate([vars(p)[n] for p in played]) for n in played[0].arrays})
+    return joined(played)
 
 
 @pytest.mark.parametrize(("tokens", "actions"), [(SQUARE, 1), (SQUARE, 3), (PAIR, 2)])
@@ -90,14 +92,14 @@ def test_episodes_equal_a_naive_loop_however_they_are_batched(
         episodes = rolled_out(made, envs, 16)
         assert {name: column.dtype.name for name, column in episodes.arrays.items()} == {
             **dict.fromkeys(("corners", "actions", "rewards", "goals"), "float32"),
-            "placed": "uint8",
+            **dict.fromkeys(("placed", "terminated"), "uint8"),
         }
         assert (np.abs(episodes.actions) <= 1.0).all()
         for number, expected in enumerate(naive):
             for name, column in expected.items():
                 # Batches of other sizes round differently in the network's matrix products.
                 np.testing.assert_allclose(
-                    vars(episodes)[name][number], column, atol=2e-5, err_msg=f"{name} of {number}"
+                    episodes[name][number], column, atol=2e-5, err_msg=f"{name} of {number}"
                 )
 
 
@@ -108,8 +110,8 @@ def test_each_part_of_the_identity_gives_other_episodes(position: int) -> None:
     other[position] = "evaluator" if position == 1 else IDENTITY[position] + 1
     with environment(made) as env:
         one, two = (Rollout(env, *who).play(policy(made).explore) for who in (IDENTITY, other))
-    assert not np.isclose(one.goals, two.goals).any(axis=(1, 2)).all()
-    assert not np.isclose(one.corners[:, 0], two.corners[:, 0]).any(axis=(1, 2)).all()
+    assert not np.isclose(one["goals"], two["goals"]).any(axis=(1, 2)).all()
+    assert not np.isclose(one["corners"][:, 0], two["corners"][:, 0]).any(axis=(1, 2)).all()
 
 
 @pytest.mark.parametrize(("size", "counts"), [(5, [5, 5, 2]), (12, [12]), (40, [12]), (4, [4] * 3)])
@@ -118,7 +120,7 @@ def test_messages_are_parts_of_the_record_in_order(size: int, counts: list[int])
     found = list(parts(episodes, size))
     assert [part.count for part in found] == counts
     for name, column in episodes.arrays.items():
-        pieces = [vars(part)[name] for part in found]
+        pieces = [part[name] for part in found]
         np.testing.assert_array_equal(np.concatenate(pieces), column)
         assert all(np.shares_memory(piece, column) for piece in pieces)  # nothing is copied
 
@@ -158,7 +160,7 @@ def test_the_policy_sees_noise_and_that_is_what_travels() -> None:
     with environment(made) as env:
         played = play(env, choose, np.random.default_rng, 4)
     episodes = played.episodes
-    np.testing.assert_array_equal(episodes.corners[:, 0], seen[0].astype(np.float32))
-    np.testing.assert_array_equal(episodes.goals, seen[1].astype(np.float32))
-    for noisy, exact in ((episodes.corners, played.corners), (episodes.goals, played.goals)):
+    np.testing.assert_array_equal(episodes["corners"][:, 0], seen[0].astype(np.float32))
+    np.testing.assert_array_equal(episodes["goals"], seen[1].astype(np.float32))
+    for noisy, exact in ((episodes["corners"], played.corners), (episodes["goals"], played.goals)):
         assert 0.02 < np.abs(noisy - exact).max() <= 4 * 0.02 * made.sim.arena + 1e-6

@@ -21,8 +21,8 @@ from master.hub import Hub
 from master.loop import Loop
 from master.rundir import RunFolder
 from master.security import Given, Keys, Pair, make_keys, make_pair, read_keys, write_keys
-from tangram_agent.arrays import EpisodeSpec
 from tangram_agent.messages import (
+    PICTURE_WIDTH,
     Greet,
     Heartbeat,
     Refused,
@@ -217,10 +217,10 @@ def test_another_user_takes_no_index_and_forges_no_scores(
 ) -> None:
     """It knows all that a worker says, and where."""
     with opened_run(open_tmp / "run", **service) as (loop, connection):
-        hub, fingerprints, spec = loop.hub, MADE.fingerprints(), EpisodeSpec.of(MADE)
-        none = np.zeros((0, spec.corners, 2), np.float32)
+        hub, fingerprints, spec = loop.hub, MADE.fingerprints(), MADE.spec
+        none = np.zeros((0, PICTURE_WIDTH, 3), np.uint8)
         question = hello(role=role, process="nobody", fingerprints=fingerprints, index=0)
-        forged = Scores(7, {"mean_reward": 0.999}, *3 * [none]).encode(spec)
+        forged = Scores(7, {"mean_reward": 0.999}, none).encode(spec)
         stranger, arrivals = knock(connection["endpoint"], [question.encode(), forged]), list[Any]()
         while stranger.is_alive():
             arrivals += hub.poll(0.05)
@@ -235,7 +235,7 @@ def test_an_impostor_on_a_dead_masters_port_gets_no_batch(
     folder, port = RunFolder(tmp_path / "run"), free_ports(1)
     with opened_run(folder.path, bind="127.0.0.1", port=port) as (loop, connection):
         folder.connection.write_text(json.dumps(connection))
-        spec = EpisodeSpec.of(MADE)
+        spec = MADE.spec
         given = (str(folder.path), "player", 0, MADE.fingerprints(), spec, None, 4, QUICK)
         with closing(Stage(loop.hub)) as stage, Client(*given) as client:
             assert served(stage, client.join)
