@@ -33,7 +33,7 @@ from tangram_agent.checkpoints import (
     set_aside,
     was_set_aside,
 )
-from tangram_agent.config import ServiceConfig
+from tangram_core.service import ServiceConfig
 from tangram_agent.process import Every
 from tangram_sim.errors import RunError
 

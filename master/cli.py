@@ -11,7 +11,7 @@ from conf.cli import entry, tell
 from conf.commands import Plain
 
 if TYPE_CHECKING:
-    from tangram_agent.setup import Setup
+    from tangram_core.setup import Setup
 
 
 def train() -> int:
@@ -31,7 +31,7 @@ def keys() -> int:
 
 def _keys(settings: Plain) -> int:
     from master.config import KeysConfig
-    from tangram_agent.setup import from_mapping
+    from tangram_core.setup import from_mapping
 
     config = from_mapping(KeysConfig, settings)
 
@@ -43,7 +43,7 @@ def _keys(settings: Plain) -> int:
 
 def _train(settings: Plain) -> int:
     from master.config import MasterConfig, check_compiling
-    from tangram_agent.setup import SECTIONS, from_mapping
+    from tangram_core.setup import SECTIONS, from_mapping
     from tangram_sim.world import check_shown, check_world
 
     _make_absolute(settings)
@@ -63,7 +63,7 @@ def _train(settings: Plain) -> int:
 
 def _master(settings: Plain) -> int:
     from master.config import MasterConfig, check_compiling
-    from tangram_agent.setup import SECTIONS, from_mapping
+    from tangram_core.setup import SECTIONS, from_mapping
     from tangram_sim.settings import refuse_ignored
     from tangram_sim.world import check_room, check_shown
 
@@ -90,7 +90,7 @@ def _task(settings: Plain) -> "Setup":
     Raises:
         ConfigError: it cannot be trained.
     """
-    from tangram_agent.setup import make_setup
+    from tangram_core.setup import make_setup
     from tangram_sim.errors import ConfigError
     from tangram_sim.rewards import check_reward, pinned
 

@@ -4,7 +4,7 @@ import os
 import shutil
 from dataclasses import dataclass, field
 
-from tangram_agent.config import ServiceConfig
+from tangram_core.service import ServiceConfig
 from tangram_agent.messages import ROLES
 from tangram_sim.errors import ConfigError
 from tangram_sim.settings import Settings, check_folder, declared, refuse_ignored, setting

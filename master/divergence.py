@@ -11,7 +11,7 @@ import safetensors.numpy
 from master.counters import Counters
 from master.trainer import Trainer
 from tangram_agent.files import write_whole
-from tangram_agent.learner import NotFiniteError
+from tangram_core.agent import NotFiniteError
 from tangram_agent.process import Every
 from tangram_agent.types import Weights
 from tangram_sim.errors import RunError
@@ -100,13 +100,13 @@ class DivergenceGuard:
         if self._in_a_row >= self._limit:
             raise RunError(
                 f"{error}; {self._in_a_row} times in a row, so the run ends. The last batch is in "
-                f"{self._write_batch()}: lower agent.actor_lr and "
-                "agent.critic_lr, and go on from the last checkpoint with resume=auto"
+                f"{self._write_batch()}: {self.trainer.learner.advice}, and go on from the last "
+                "checkpoint with resume=auto"
             )
         self.trainer.go_back(self._good)
 
     def _write_batch(self) -> Path:
-        batch = {} if self.trainer.batch is None else self.trainer.batch.arrays
+        batch = {name: np.array(one) for name, one in self.trainer.learner.evidence().items()}
         write_whole(self._evidence, safetensors.numpy.save(batch), above=False)
         return self._evidence
 

@@ -100,8 +100,8 @@ class StatusCollector:
             "evaluators": self._hub.count("evaluator"),
             "lag_updates": trainer.rate_limiter.lag,
             "broadcast_s": self._hub.broadcast_s,
-            "replay": len(trainer.replay),
-            "replay_capacity": trainer.replay.capacity,
+            "replay": trainer.learner.kept,
+            "replay_capacity": trainer.learner.capacity,
             "undone_updates": self._guard.undone,
             "queue": queue,
             "checkpoint_age_s": self._checkpointer.age_s,
@@ -126,13 +126,13 @@ HOMELESS = "waiting for the run folder, which is gone or another one"
 
 def activity(trainer: Trainer, players: int) -> str:
     """What happens, or what is waited for."""
-    limiter, starts = trainer.rate_limiter, trainer.setup.agent.learning_starts
+    limiter, starts = trainer.rate_limiter, trainer.pace.learning_starts
     if limiter.may_update():
         return "learning, workers wait" if players and not limiter.may_insert() else "learning"
     if not players:
         return "waiting for workers to join"
     if trainer.episodes and not limiter.transitions:
-        return "waiting for an episode in which pictures show all tokens: larger sim.pixels help"
+        return f"waiting for an episode to learn from: {trainer.setup.task.waits}"
     if limiter.transitions < starts:
         return f"filling the replay, {limiter.transitions:,} of {starts:,}"
     return "waiting for episodes"

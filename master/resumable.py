@@ -14,7 +14,7 @@ from tangram_agent.checkpoints import (
     list_checkpoints,
     load_checkpoint,
 )
-from tangram_agent.setup import Setup, make_setup
+from tangram_core.setup import Setup, make_setup
 from tangram_sim.errors import RunError
 
 

@@ -36,10 +36,10 @@ from master.signals import StopSignals
 from master.trainer import Trainer, choose_device
 from tangram_agent.addresses import LOCAL, dns_error, reachable, with_host
 from tangram_agent.compiling import cache_folder
-from tangram_agent.config import ServiceConfig
+from tangram_core.service import ServiceConfig
 from tangram_agent.messages import OPEN, WINDOW
 from tangram_agent.process import WATCHDOG_S, Watchdog, keep_memory, watch_parent
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 
 # A clean end after the parent's death; a large replay takes seconds to write.
 GRACE_S = 30.0

@@ -20,7 +20,7 @@ from tangram_agent.checkpoints import list_checkpoints
 from tangram_agent.files import PUBLIC, is_same, make_folders, private, write_whole
 from tangram_agent.outcome import FILE_NAME as RESULT
 from tangram_agent.outcome import bound_of, read_outcome
-from tangram_agent.setup import SECTIONS
+from tangram_core.setup import SECTIONS
 from tangram_sim.config import own_code
 from tangram_sim.errors import ConfigError, RunError
 

@@ -1,7 +1,7 @@
-"""What learns, without sockets: networks, replay, hindsight, rate limiter, and their state."""
+"""What learns, without sockets: the agent's learner, the rate limiter, and their state."""
 
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -10,23 +10,13 @@ import torch
 from master.rate_limiter import LAG_UPDATES, RateLimiter
 from master.resumable import check_same_task
 from tangram_agent.checkpoints import ACTING, SETUP
-from tangram_agent.filling_learner import FillLearner
-from tangram_agent.filling_replay import FillReplay
-from tangram_agent.learner import Learner
-from tangram_agent.motion import Motions, motions_of
-from tangram_agent.networks import travelling
-from tangram_agent.relabelling import learnable, with_relabelled
-from tangram_agent.replay import ReplayBuffer
-from tangram_agent.setup import Setup
-from tangram_agent.types import Transitions, Weights
+from tangram_agent.types import Weights
+from tangram_core.setup import Setup
 from tangram_core.spec import Episodes
 from tangram_sim.errors import ConfigError, RunError
-from tangram_sim.rewards import make_reward
 
-STREAMS = ("replay", "hindsight", "motion")
-SEEN_MOTIONS = 256  # transitions of whole episodes that the motion model sees in an update
 COMPILED = "compiled"  # of a checkpoint's values: how its updates were made
-LEARNER = "learner"  # the checkpoint's file of networks and optimisers
+LEARNER, REPLAY = "learner", "replay"  # the checkpoint's files: networks and optimisers; experience
 
 Arrays = dict[str, dict[str, npt.NDArray[Any]]]
 
@@ -37,11 +27,9 @@ class Trainer:
     Attributes:
         setup: the task and the agent.
         compiled: whether updates are compiled; a run stays with what it began with.
-        learner: networks and optimisers.
-        replay: transitions played, and relabelled ones.
+        learner: the agent's.
         rate_limiter: decides whether to learn or to take in episodes.
         episodes: taken in since the run began.
-        batch: of the last update.
     """
 
     def __init__(
@@ -52,30 +40,16 @@ class Trainer:
         lag_updates: int = LAG_UPDATES,
         compiled: bool = False,
     ) -> None:
-        agent, layout = setup.agent, setup.layout
         self.setup, self.compiled = setup, compiled
-        self.reward = make_reward(setup.reward, layout, setup.sim)
-        self.learner: Learner | FillLearner
-        self.replay: ReplayBuffer | FillReplay
-        if setup.fills:
-            self.learner, self.replay = FillLearner(setup, seed, device), FillReplay(setup)
-        else:
-            self.learner = Learner(setup, seed, device, compiled)
-            self.replay = ReplayBuffer(
-                agent.replay_capacity,
-                layout.corner_count,
-                layout.tokens,
-                setup.action_size,
-            )
+        self.learner = setup.agent.learner(setup.task, seed, device, compiled=compiled)
+        self.pace = setup.agent.pace
         self.rate_limiter = RateLimiter(
-            agent.updates_per_transition, agent.learning_starts, lag_updates
+            self.pace.updates_per_transition, self.pace.learning_starts, lag_updates
         )
         self.episodes = 0
-        self.batch: Transitions | None = None
         self._generators = {
             name: np.random.default_rng([seed, stream])
-            for stream, name in enumerate(STREAMS)
-            if name != "motion" or setup.learns_motion
+            for stream, name in enumerate(self.learner.streams)
         }
 
     @property
@@ -86,62 +60,25 @@ class Trainer:
     @property
     def transitions(self) -> int:
         """Transitions played that were taken in, without relabelled ones."""
-        return self.episodes * self.setup.horizon
+        return self.episodes * self.setup.spec.horizon
 
     def facts(self) -> dict[str, Any]:
         """What a result tells of the task and the agent."""
-        setup = self.setup
-        return {
-            "agent": setup.agent.name,
-            "net": setup.net.kind,
-            "tokens": [shape.name for shape in setup.layout.shapes],
-            "actions_per_token": setup.sim.actions_per_token,
-            "reward": setup.reward.name,
-            "backend": setup.sim.backend,
-            "device": str(self.learner.device),
-            "parameters": self.learner.parameters,
-        }
+        learner = self.learner
+        own = {"device": learner.device, "parameters": learner.parameters}
+        return {**self.setup.agent.facts(), **self.setup.task.facts(), **own}
 
     def insert(self, episodes: Episodes) -> None:
-        """Take in episodes as they were played, and relabelled."""
-        generator = self._generators["hindsight"]
-        seen = learnable(episodes)
-        learned_from = seen.transitions
-        if isinstance(self.replay, FillReplay):
-            learned_from = self.replay.insert(seen, generator)
-        elif seen.count:
-            # What is credited piece by piece is relabelled anew for every update.
-            relabels = () if self.setup.credits_pieces else self.setup.agent.hindsight
-            self.replay.add(
-                with_relabelled(seen, relabels, self.setup.layout, self.reward, generator)
-            )
+        """Take in episodes as they were played."""
         # The pace is that of what can be learned from.
-        self.rate_limiter.inserted(learned_from)
+        self.rate_limiter.inserted(self.learner.insert(episodes, self._generators))
         self.episodes += episodes.count
 
     def update(self, share: float) -> dict[str, float]:
         """One update, at the used share of the budget; returns its losses."""
-        losses = self._learned(share)
+        losses = self.learner.update(share, self._generators)
         self.rate_limiter.updated()
         return losses
-
-    def _learned(self, share: float) -> dict[str, float]:
-        size, generator = self.setup.agent.batch_size, self._generators["replay"]
-        if isinstance(self.learner, FillLearner) and isinstance(self.replay, FillReplay):
-            return self.learner.learn(self.replay.sample(size, generator), share)
-        self.batch = cast("ReplayBuffer", self.replay).sample(size, generator)
-        prepared = self.learner.prepared(self.batch, self._generators["hindsight"])
-        return self.learner.update(prepared, share, self._motions())
-
-    def _motions(self) -> Motions | None:
-        """What whole episodes of the replay tell of the motion, where it is learned."""
-        if not self.setup.learns_motion:
-            return None
-        steps = self.setup.horizon
-        count = max(1, SEEN_MOTIONS // steps)
-        buffer = cast("ReplayBuffer", self.replay)
-        past, ends = buffer.sample_episodes(count, steps, self._generators["motion"])
-        return motions_of(past, ends.astype(np.float64), self.setup.layout, self.setup.sim)
 
     def go_back(self, state: dict[str, npt.NDArray[Any]]) -> None:
         """Take the learner back to a state of its own; the updates since are due again."""
@@ -151,18 +88,15 @@ class Trainer:
 
     def weights(self) -> Weights:
         """What workers need to play; its version is the number of updates."""
-        return travelling(self.learner.acting_weights(self.updates), self.setup)
+        return Weights(self.updates, self.learner.broadcast())
 
     def state(self) -> tuple[Arrays, dict[str, Any]]:
         """Arrays by file, and JSON values, for a checkpoint.
 
         The caller sees to it that they are finite, see `divergence`.
         """
-        arrays = {
-            ACTING: dict(self.learner.acting_weights(self.updates).tensors),
-            LEARNER: self.learner.state(),
-            "replay": self.replay.state(),
-        }
+        learner = self.learner
+        arrays = {ACTING: learner.export(), LEARNER: learner.state(), REPLAY: learner.memory()}
         generators = {name: g.bit_generator.state for name, g in self._generators.items()}
         counters = {
             "episodes": self.episodes,
@@ -188,7 +122,7 @@ class Trainer:
                 "numbers would not be the same otherwise: go on with that"
             )
         self.learner.load_state(arrays[LEARNER])
-        self.replay.load_state(arrays["replay"])
+        self.learner.load_memory(arrays[REPLAY])
         self.rate_limiter.load_state(counters["rate_limiter"])
         self.episodes = int(counters["episodes"])
         for name, generator in self._generators.items():

@@ -8,7 +8,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from tangram_agent.config import HEADS, NetConfig
+from tangram_agent.base.config import HEADS, NetConfig
 
 # Added to the score of two nodes without an edge: its exponential is exactly zero, and finite.
 NO_EDGE = -1e30

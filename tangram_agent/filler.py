@@ -15,7 +15,6 @@ from shapely import Polygon
 from torch import nn
 
 from tangram_agent.filling import Filling, Rests
-from tangram_agent.setup import Setup
 from tangram_agent.types import Choice
 from tangram_agent.values import Corners
 from tangram_sim.actions import velocities_of
@@ -27,6 +26,7 @@ from tangram_sim.errors import ConfigError
 from tangram_sim.geometry import outlines
 from tangram_sim.layout import Layout
 from tangram_sim.rings import covered_area
+from tangram_tasks.place import Place
 
 _ANGLES = 8  # that a token is tried at where nothing fits
 _FREE = 0.5  # of what a token may cover of others
@@ -64,11 +64,11 @@ class Fillable:
 class Filler:
     """Chooses where the next token goes."""
 
-    def __init__(self, value: nn.Module, setup: Setup) -> None:
-        self._fillable, self._layout = Fillable(value, setup.layout), setup.layout
-        self._sim = setup.sim
-        self._filling, self._rows = Filling(setup.layout), setup.goal_rows
-        self._beam = setup.agent.beam
+    def __init__(self, value: nn.Module, task: Place, beam: int) -> None:
+        self._fillable, self._layout = Fillable(value, task.layout), task.layout
+        self._sim = task.sim
+        self._filling, self._rows = Filling(task.layout), task.goal_rows
+        self._beam = beam
 
     def choose(
         self,

@@ -18,12 +18,12 @@ import numpy.typing as npt
 from shapely.errors import GEOSException
 
 from tangram_agent.filling import MOST_PLACES, UNUSED, Filling, Rests
-from tangram_agent.setup import Setup
 from tangram_agent.types import Flags
 from tangram_core.spec import Episodes
 from tangram_sim.areas import Area
 from tangram_sim.arrays import Bools, Ints
 from tangram_sim.errors import RunError
+from tangram_sim.layout import Layout
 
 Array = npt.NDArray[Any]
 OPEN, FILLED = 1, 2  # of a place; 0: there is none, or it is dead
@@ -54,11 +54,16 @@ class FillReplay:
         capacity: states kept of each.
     """
 
-    def __init__(self, setup: Setup) -> None:
-        """Allocate everything at once."""
-        self.capacity = setup.agent.replay_capacity
-        self._filling = Filling(setup.layout)
-        self._copies = sum(one.copies for one in setup.agent.hindsight)
+    def __init__(self, layout: Layout, capacity: int, copies: int) -> None:
+        """Allocate everything at once.
+
+        Args:
+            layout: the tokens.
+            capacity: states kept of each kind.
+            copies: states of hindsight for each episode.
+        """
+        self.capacity, self._copies = capacity, copies
+        self._filling = Filling(layout)
         size = self._filling.corners, self._filling.shapes
         self._played = Rests.empty(self.capacity, *size)
         self._places = Rests.empty(self.capacity * MOST_PLACES, *size)

@@ -15,12 +15,12 @@ from torch import Tensor
 
 from tangram_agent.coverage import covered_share, covering, worths
 from tangram_agent.motion import Belief, motions_of
-from tangram_agent.networks import Networks
+from tangram_agent.agents.pair.networks import Networks
 from tangram_agent.pairs import PairGraph, Pairs
-from tangram_agent.setup import Setup
 from tangram_agent.types import Choice, Past
 from tangram_sim.actions import velocities_of
 from tangram_sim.arrays import Bools, Floats, Singles
+from tangram_tasks.place import Place
 
 _SHORT_LIST = 8  # proposals of an environment that are valued for all pieces
 
@@ -103,11 +103,11 @@ class Scene:
 class Planner:
     """Chooses token, side and pose."""
 
-    def __init__(self, networks: Networks, setup: Setup) -> None:
-        self._networks, self._layout, self._agent = networks, setup.layout, setup.agent
-        self._motion, self._sim = networks.motion, setup.sim
-        self._graph = PairGraph(setup.layout, setup.sim.arena)
-        self._turns_over = setup.layout.chiral & setup.sim.allow_flip
+    def __init__(self, networks: Networks, task: Place, reapply: int) -> None:
+        self._networks, self._layout, self._reapply = networks, task.layout, reapply
+        self._motion, self._sim = networks.motion, task.sim
+        self._graph = PairGraph(task.layout, task.sim.arena)
+        self._turns_over = task.layout.chiral & task.sim.allow_flip
 
     def choose(
         self,
@@ -194,7 +194,7 @@ class Planner:
             best = candidates.best(self._valued(pairs, pose), _SHORT_LIST)
             candidates, pose = candidates.at(best), pose[best]
             pairs = scene.pairs(candidates)
-        for _ in range(self._agent.reapply):
+        for _ in range(self._reapply):
             pose = self._proposed(pairs.at(pose))
         return candidates, pose
 

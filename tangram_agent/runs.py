@@ -21,7 +21,7 @@ from tangram_agent.checkpoints import (
     newest_checkpoint,
 )
 from tangram_agent.pretrained import is_agent, is_name, packaged, read_agent
-from tangram_agent.setup import Setup, make_setup
+from tangram_core.setup import Setup, make_setup
 from tangram_agent.stored import load_settings
 from tangram_agent.types import Past, Weights
 from tangram_sim.arrays import Floats, Singles

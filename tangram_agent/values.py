@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from tangram_agent.attention import GraphEncoder
-from tangram_agent.config import NetConfig
+from tangram_agent.base.config import NetConfig
 from tangram_agent.filling import UNUSED, Rests
 
 _OWN = 13  # features of a corner, without the tokens that are left

@@ -1,6 +1,6 @@
 """A network's parameters as named arrays, and back."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ MOST = 1e6  # of a parameter's magnitude; what is learned stays far below
 
 
 def load_arrays(
-    module: nn.Module, arrays: dict[str, Array], names: Collection[str] | None = None
+    module: nn.Module, arrays: Mapping[str, Array], names: Collection[str] | None = None
 ) -> None:
     """Copy named arrays into a module's parameters.
 
@@ -57,6 +57,6 @@ def to_arrays(module: nn.Module) -> dict[str, Array]:
     return {name: p.detach().cpu().numpy().copy() for name, p in named}
 
 
-def under(prefix: str, state: dict[str, Array]) -> dict[str, Array]:
+def under(prefix: str, state: Mapping[str, Array]) -> dict[str, Array]:
     """The arrays whose names begin with a prefix, by the rest of their names."""
     return {name.removeprefix(prefix): v for name, v in state.items() if name.startswith(prefix)}

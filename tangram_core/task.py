@@ -161,6 +161,7 @@ class Task(ABC):
     """
 
     sections: ClassVar[Mapping[str, type[Settings]]] = {}
+    waits: ClassVar[str] = "none so far can be"  # what helps, where no episode can be learned from
     scores: ClassVar[tuple[Score, ...]] = ()
 
     @property

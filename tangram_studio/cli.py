@@ -12,7 +12,7 @@ def studio() -> int:
 def _studio(settings: Plain) -> int:
     from importlib.util import find_spec
 
-    from tangram_agent.setup import from_mapping
+    from tangram_core.setup import from_mapping
     from tangram_sim.errors import ConfigError
     from tangram_studio.config import StudioConfig
 

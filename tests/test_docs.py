@@ -12,7 +12,7 @@ import pytest
 
 from conf.commands import COMMANDS
 from conf.help import choices, setting_names
-from tangram_agent.setup import SECTIONS
+from tangram_core.setup import SECTIONS
 from tangram_lab.benchmarks.cli import _parser as bench_parser
 from tests.blocks import PAGES
 

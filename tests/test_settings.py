@@ -15,9 +15,9 @@ import pytest
 from conf.commands import COMMANDS, GROUPS, load
 from conf.settings import NESTED
 from master.trainer import Trainer
-from tangram_agent.config import ServiceConfig
+from tangram_core.service import ServiceConfig
 from tangram_agent.policy import Policy
-from tangram_agent.setup import Setup, make_setup
+from tangram_core.setup import Setup, make_setup
 from tangram_sim.errors import TangramError
 from tangram_sim.settings import declared_fields
 from worker.looking import environments

@@ -13,7 +13,7 @@ from conf.cli import entry, tell
 from conf.commands import Plain
 
 if TYPE_CHECKING:
-    from tangram_agent.setup import Setup
+    from tangram_core.setup import Setup
     from worker.config import EvalConfig, PlayConfig
 
 
@@ -51,7 +51,7 @@ def _of_the_run(settings: Plain) -> tuple[str, Plain] | None:
 
 
 def _worker(settings: Plain) -> int:
-    from tangram_agent.setup import SECTIONS, from_mapping, make_setup
+    from tangram_core.setup import SECTIONS, from_mapping, make_setup
     from tangram_sim.rewards import check_reward
     from tangram_sim.world import check_shown, check_world
     from worker.config import WorkerConfig
@@ -75,7 +75,7 @@ def _worker(settings: Plain) -> int:
 
 
 def _status(settings: Plain) -> int:
-    from tangram_agent.setup import from_mapping
+    from tangram_core.setup import from_mapping
     from worker.config import StatusConfig
 
     config = from_mapping(StatusConfig, settings)
@@ -87,7 +87,7 @@ def _status(settings: Plain) -> int:
 
 def _evaluate(settings: Plain) -> int:
     from tangram_agent.files import check_writable
-    from tangram_agent.setup import from_mapping
+    from tangram_core.setup import from_mapping
     from worker.config import EvalConfig
 
     config = from_mapping(EvalConfig, with_changes(with_absolute_paths(settings)))
@@ -104,7 +104,7 @@ def _evaluate(settings: Plain) -> int:
 
 def _play(settings: Plain) -> int:
     from tangram_agent.files import check_writable
-    from tangram_agent.setup import from_mapping
+    from tangram_core.setup import from_mapping
     from worker.config import PlayConfig, check_compare
 
     check_compare(settings.get("compare"))  # before a text is taken for a list of letters

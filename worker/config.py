@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from tangram_agent.config import ServiceConfig
+from tangram_core.service import ServiceConfig
 from tangram_agent.messages import MAX_INDEX, ROLES
 from tangram_agent.pretrained import PREFIX, agent_names
 from tangram_sim.config import SILHOUETTES

@@ -16,7 +16,7 @@ from rich.table import Table
 from tangram_agent.files import write_whole
 from tangram_agent.outcome import plural
 from tangram_agent.runs import Run, load_changed
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_sim.config import SILHOUETTES, SimConfig
 from tangram_sim.game_drawing import figure_sheet
 from worker.baselines import (

@@ -7,10 +7,10 @@ from contextlib import closing
 import numpy as np
 from PIL import Image
 
-from tangram_agent.config import ServiceConfig
+from tangram_core.service import ServiceConfig
 from tangram_agent.messages import PICTURE_HEIGHT, PICTURE_WIDTH, Scores
 from tangram_agent.policy import Policy
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_agent.types import Weights
 from tangram_sim.arrays import Pixels
 from tangram_sim.drawing import episode_sheet

@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from tangram_agent.outcome import plural
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_sim.actions import chosen_tokens, flips, velocities
 from tangram_sim.arrays import Bools, Floats, Ints
 from tangram_sim.drawing import contact_sheet

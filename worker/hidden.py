@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from tangram_agent.config import AgentConfig, NetConfig
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_sim.areas import Area
 from tangram_sim.arrays import Bools, Floats, Ints
 from tangram_sim.config import SimConfig

@@ -1,6 +1,6 @@
 """How a worker looks at pictures, where these are what its agent observes."""
 
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_sim.arrays import Pixels
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.config import RewardConfig

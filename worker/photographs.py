@@ -5,7 +5,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_sim.arrays import Floats
 from tangram_sim.drawing import contact_sheet
 from tangram_sim.errors import ConfigError

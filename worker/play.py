@@ -15,7 +15,7 @@ from rich.console import Console
 from tangram_agent.files import write_whole
 from tangram_agent.outcome import plural
 from tangram_agent.runs import Run, load_changed
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_sim.arrays import Floats
 from tangram_sim.drawing import episode_sheet, save_gif, save_mp4
 from tangram_sim.errors import ConfigError, RunError

@@ -6,7 +6,7 @@ from contextlib import closing
 from tangram_agent.arrays import most_episodes
 from tangram_agent.messages import Go
 from tangram_agent.policy import Policy
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_core.spec import Episodes
 from tangram_sim.errors import TangramError
 from worker.client import Client

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_sim.arrays import Bools, Floats
 from tangram_sim.assembly import Puzzle, PuzzleRules
 from tangram_sim.config import SILHOUETTES, RewardConfig

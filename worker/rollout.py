@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_agent.types import Past
 from tangram_core.spec import Episodes
 from tangram_sim.arrays import Bools, Floats, Pixels, Singles

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tangram_agent.runs import Run
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_sim.arrays import Floats
 from tangram_sim.errors import ConfigError
 from tangram_sim.rewards import scaled_overlap

@@ -15,7 +15,7 @@ from tangram_agent.arrays import check_batch_size
 from tangram_agent.messages import TAKEN_OVER
 from tangram_agent.policy import Policy
 from tangram_agent.process import WATCHDOG_S, Watchdog, formatter, keep_memory, watch_parent
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_sim.errors import TangramError
 from worker.client import Client
 from worker.config import WorkerConfig

@@ -16,7 +16,7 @@ from PIL.PngImagePlugin import PngInfo
 
 from tangram_agent.files import write_whole
 from tangram_agent.outcome import plural
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_sim.arrays import Bools, Floats
 from tangram_sim.drawing import contact_sheet
 from tangram_sim.errors import ConfigError, RunError

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from tangram_agent.policy import Policy
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_agent.types import Past
 from tangram_sim.arrays import Bools, Floats, Singles
 from tangram_sim.seeding import episode_generator

@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from tangram_agent.outcome import plural
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_sim.arrays import Bools, Floats
 from tangram_sim.drawing import contact_sheet
 from tangram_sim.layout import Layout

@@ -24,7 +24,7 @@ from master.journal import MAGIC, Journal, segments
 from master.recovery import Reader
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint, save_checkpoint
 from tangram_agent.messages import EpisodeBatch
-from tangram_agent.setup import Setup, make_setup
+from tangram_core.setup import Setup, make_setup
 from tangram_lab.benchmarks.attacks import BESIEGED, LIVE, OPEN_FILES
 from tangram_lab.benchmarks.harms import harmed
 from tangram_lab.benchmarks.measure import show, write

@@ -22,7 +22,7 @@ import zmq
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
 from tangram_agent.messages import WORKER_COLUMNS, RunStatus
 from tangram_agent.policy import Policy
-from tangram_agent.setup import Setup, make_setup
+from tangram_core.setup import Setup, make_setup
 from tangram_lab.benchmarks.measure import show, write
 from tangram_lab.benchmarks.proxy import DOWN, UP, Proxy
 from tangram_lab.benchmarks.trainings import (

@@ -23,7 +23,7 @@ from tangram_agent.messages import (
     decode_from_worker,
 )
 from tangram_agent.schema import CHECKSUM, DamagedError, checksum
-from tangram_agent.setup import Setup, make_setup
+from tangram_core.setup import Setup, make_setup
 from tangram_lab.benchmarks.measure import show, write
 from tangram_lab.benchmarks.trainings import start_training, wait_for
 from tangram_sim.errors import WireError

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from tangram_agent.learner import Learner
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_agent.types import Transitions
 from tangram_lab.benchmarks.measure import Bound, Row, Work, compare, compared, rates
 from tangram_lab.benchmarks.sb3 import Rival, label, make_model

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
 
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_core.spec import Episodes
 from worker.client import Client
 

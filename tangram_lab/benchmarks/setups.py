@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 
 import conf
-from tangram_agent.setup import SECTIONS, Setup, make_setup
+from tangram_core.setup import SECTIONS, Setup, make_setup
 from tangram_agent.types import Past, Transitions
 from tangram_core.spec import Episodes
 from tangram_sim.arrays import Bools, Floats, Singles

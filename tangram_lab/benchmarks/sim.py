@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from tangram_agent.config import ServiceConfig
-from tangram_agent.setup import Setup
+from tangram_core.service import ServiceConfig
+from tangram_core.setup import Setup
 from tangram_lab.benchmarks.measure import Bound, Row, compare
 from tangram_lab.benchmarks.setups import preset, several, with_sim
 from tangram_sim.arrays import Floats

@@ -19,7 +19,7 @@ from tangram_agent.arrays import columns
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
 from tangram_agent.messages import Hello
 from tangram_agent.schema import opened, seal
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_core.spec import Episodes
 from tangram_lab.benchmarks.chaos import SETTINGS
 from tangram_lab.benchmarks.trainings import Watched, start_training, wait_for

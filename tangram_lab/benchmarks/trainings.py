@@ -20,7 +20,7 @@ import zmq
 
 from master.children import command, override
 from tangram_agent.process import Lifeline
-from tangram_agent.setup import Setup, make_setup
+from tangram_core.setup import Setup, make_setup
 from tangram_sim.errors import TangramError
 from worker.status import ask_status
 

@@ -24,7 +24,7 @@ from master.hub import Hub
 from master.security import Keys, make_keys
 from tangram_agent.addresses import IPC
 from tangram_agent.messages import WINDOW, Ack, EpisodeBatch
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_core.spec import Episodes
 from tangram_lab.benchmarks.measure import Bound, Row, Work, compared, rates, single
 from tangram_lab.benchmarks.setups import played, several

@@ -25,7 +25,7 @@ def experiment() -> int:
 
 def _experiment(settings: Plain) -> int:
     from tangram_agent.files import check_writable
-    from tangram_agent.setup import from_mapping
+    from tangram_core.setup import from_mapping
     from tangram_lab.experiments.studies import StudyConfig, jobs_of, read_studies
 
     config = from_mapping(StudyConfig, _with_absolute(settings, "run_dir", "out"))
@@ -43,7 +43,7 @@ def _experiment(settings: Plain) -> int:
 
 def _check(name: str, told: Sequence[str]) -> None:
     """Raise ConfigError where this code refuses a training, before any of them starts."""
-    from tangram_agent.setup import make_setup
+    from tangram_core.setup import make_setup
 
     try:
         make_setup(composed("train", ["run_dir=x", *told]))
@@ -82,7 +82,7 @@ def report() -> int:
 
 
 def _report(settings: Plain) -> int:
-    from tangram_agent.setup import from_mapping
+    from tangram_core.setup import from_mapping
 
     config = from_mapping(ReportConfig, _with_absolute(settings, "runs", "out"))
     if config.check:

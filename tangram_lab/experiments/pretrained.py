@@ -24,7 +24,7 @@ from tangram_agent.files import check_writable, write_whole
 from tangram_agent.policy import Policy
 from tangram_agent.pretrained import CARD, CARD_TEXT, CONFIG, FORMAT, PREFIX, WEIGHTS
 from tangram_agent.runs import Run, load_run
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_sim.errors import ConfigError, RunError, TangramError
 from tangram_sim.settings import told
 from tangram_sim.targets import has_all_tans

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tangram_agent.pretrained import CARD, WEIGHTS
-from tangram_agent.setup import Setup, make_setup
+from tangram_core.setup import Setup, make_setup
 from tangram_agent.types import Transitions
 from tangram_core.spec import Episodes, EpisodeSpec
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_core.spec import Episodes
 from tangram_sim.arrays import Floats
 from tangram_sim.rings import as_rows, covered_area

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from tangram_agent.coverage import Lying, newly_covered
 from tangram_agent.pairs import PairGraph, Pairs
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_agent.types import Transitions
 from tangram_sim.arrays import Bools, Floats
 from tangram_sim.layout import Layout

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tangram_agent.attention import NO_EDGE, SHORT_ROW, GraphAttention, GraphEncoder, softmax_mean
-from tangram_agent.config import NetConfig
+from tangram_agent.base.config import NetConfig
 from tangram_agent.networks import initialise
 from tests.agent.builders import setup
 

@@ -14,7 +14,7 @@ from master.run import _make_trainer
 from master.rundir import RunFolder
 from master.trainer import Trainer
 from tangram_agent.compiling import Compiled, cache_folder
-from tangram_agent.config import ServiceConfig
+from tangram_core.service import ServiceConfig
 from tangram_agent.learner import Learner, Rates
 from tangram_agent.process import Watchdog
 from tangram_sim.errors import ConfigError, RunError

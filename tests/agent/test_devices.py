@@ -14,7 +14,7 @@ from tangram_agent.filling_learner import FillLearner
 from tangram_agent.filling_replay import FillReplay
 from tangram_agent.learner import NUMBERS, Learner
 from tangram_agent.motion import Fit, MotionModel
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_agent.steps import Steps
 from tests.agent.builders import random_transitions
 from tests.agent.outlines import outline_setup

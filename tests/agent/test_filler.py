@@ -15,7 +15,7 @@ from tangram_agent.config import AgentConfig, NetConfig
 from tangram_agent.filler import Filler
 from tangram_agent.filling import UNUSED, Filling
 from tangram_agent.policy import Policy
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_agent.values import Corners
 from tangram_sim.dissections import Place
 from tangram_sim.errors import ConfigError

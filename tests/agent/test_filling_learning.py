@@ -11,7 +11,7 @@ from shapely.errors import GEOSException
 from tangram_agent.filling import MOST_PLACES, UNUSED, Filling, Rests
 from tangram_agent.filling_learner import FillLearner
 from tangram_agent.filling_replay import FILLED, OPEN, FillReplay
-from tangram_agent.learner import NotFiniteError
+from tangram_core.agent import NotFiniteError
 from tangram_agent.values import Corners, features
 from tangram_core.spec import Episodes
 from tangram_sim.errors import RunError

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tangram_agent.scenes import SceneGraph, Scenes
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tests.agent.builders import PAIR, PAPER, SQUARE, random_transitions, setup
 
 pytestmark = pytest.mark.fast

@@ -21,7 +21,7 @@ from tangram_agent.learner import (
     saturation,
 )
 from tangram_agent.scenes import Scenes, next_token
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_sim.errors import RunError
 from tests.agent.builders import PAIR, PAPER, SCENE, SMALL, random_transitions, setup
 from tests.agent.pair_scenes import PERCEPTRON, TWO, seven, transitions

@@ -10,7 +10,7 @@ import torch
 
 from tangram_agent.networks import Actor, Critic, Networks, initialise, parameter_count
 from tangram_agent.scenes import SceneGraph, Scenes
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tests.agent.builders import PAIR, PAPER, SMALL, random_transitions, setup
 from tests.agent.pair_scenes import random_pairs
 

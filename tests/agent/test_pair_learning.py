@@ -12,7 +12,7 @@ from tangram_agent.learner import Learner
 from tangram_agent.pairs import Pairs
 from tangram_agent.policy import Policy
 from tangram_agent.relabelling import PairBatch
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_sim.batch import BatchedEnv
 from tests.agent.builders import setup
 from tests.agent.pair_scenes import PERCEPTRON, TWO, seven, transitions

@@ -14,7 +14,7 @@ from tangram_agent.networks import Networks, initialise
 from tangram_agent.pairs import PairGraph, Pairs
 from tangram_agent.planning import Planner
 from tangram_agent.policy import Policy
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_sim.actions import velocities_of
 from tangram_sim.batch import BatchedEnv
 from tests.agent.builders import SMALL, setup

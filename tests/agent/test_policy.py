@@ -12,7 +12,7 @@ from tangram_agent.messages import decode_weights
 from tangram_agent.networks import travelling
 from tangram_agent.policy import Policy
 from tangram_agent.runs import Run
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_agent.types import Past, Transitions, Weights
 from tangram_sim.actions import chosen_tokens, flips, velocities
 from tangram_sim.actuation import full_scale

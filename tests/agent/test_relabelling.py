@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tangram_agent.config import RelabelConfig
+from tangram_agent.base.config import RelabelConfig
 from tangram_agent.relabelling import flatten, with_relabelled
 from tangram_agent.types import Transitions
 from tangram_core.spec import Episodes

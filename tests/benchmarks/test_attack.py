@@ -15,7 +15,7 @@ from typing import Any, cast
 import pytest
 import zmq
 
-from tangram_agent.setup import make_setup
+from tangram_core.setup import make_setup
 from tangram_lab.benchmarks import attack, attacks, harms
 from tangram_lab.benchmarks.attack import FILES, TASK, beside
 from tangram_lab.benchmarks.attacks import (

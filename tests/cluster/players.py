@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
-from tangram_agent.setup import Setup, make_setup
+from tangram_core.setup import Setup, make_setup
 from tangram_core.spec import Episodes
 from tests.agent.builders import random_episodes
 from tests.agent.no_reward import NOTHING

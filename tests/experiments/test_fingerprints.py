@@ -23,7 +23,7 @@ import torch
 from conf.cli import composed
 from master.trainer import Trainer
 from tangram_agent.policy import Policy
-from tangram_agent.setup import Setup, make_setup
+from tangram_core.setup import Setup, make_setup
 from worker.looking import environments
 from worker.rollout import Rollout
 

@@ -29,10 +29,10 @@ from master.report import Reporter, StatusCollector
 from master.rundir import Claim, Clock, Record, RunFolder
 from master.signals import StopSignals
 from master.trainer import Trainer
-from tangram_agent.config import ServiceConfig
+from tangram_core.service import ServiceConfig
 from tangram_agent.messages import PICTURE_WIDTH, EpisodeBatch, Go, RunStatus, Scores
 from tangram_agent.process import Watchdog
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_agent.types import Weights
 from tests.agent.builders import random_episodes, setup
 

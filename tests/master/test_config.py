@@ -5,8 +5,8 @@ from typing import Any
 import pytest
 
 from master.config import MasterConfig
-from tangram_agent.config import ServiceConfig
-from tangram_agent.setup import from_mapping
+from tangram_core.service import ServiceConfig
+from tangram_core.setup import from_mapping
 from tangram_sim.errors import ConfigError
 
 pytestmark = pytest.mark.fast

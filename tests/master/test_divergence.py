@@ -13,7 +13,7 @@ from torch import nn
 from master import divergence as divergence_module
 from master.divergence import DivergenceGuard
 from master.trainer import Trainer
-from tangram_agent.learner import NotFiniteError
+from tangram_core.agent import NotFiniteError
 from tangram_sim.errors import RunError
 from tests.agent.builders import random_episodes, setup
 from tests.master.builders import AGENT, trainer

@@ -32,7 +32,7 @@ from master.rundir import RunFolder
 from master.security import Holder
 from master.signals import StopSignals
 from master.sockets import Received
-from tangram_agent.config import ServiceConfig
+from tangram_core.service import ServiceConfig
 from tangram_agent.process import Watchdog
 from tangram_core.spec import Episodes
 from tangram_sim.config import RewardConfig

@@ -19,7 +19,7 @@ from master.journal import FORMAT, HEAD, MAGIC, JournalError, Place, Title, _hea
 from master.recovery import Reader, journal_run_id
 from tangram_agent.arrays import join_frames, most_episodes
 from tangram_agent.schema import opened, seal
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_sim.errors import RunError
 from tests.agent.builders import PAIR, setup, watched_disk
 from tests.master.builders import Disk, arrival, close_journals, journal, small_setup

@@ -16,8 +16,8 @@ from master.config import MasterConfig
 from master.console import logging_to, sturdy_console
 from master.launch import Launcher, master_arguments, run_training
 from master.rundir import RunFolder
-from tangram_agent.config import ServiceConfig
-from tangram_agent.setup import from_mapping
+from tangram_core.service import ServiceConfig
+from tangram_core.setup import from_mapping
 from tangram_sim.errors import ConfigError
 
 LIMIT_S = 100.0

@@ -6,7 +6,7 @@ import pytest
 
 from master.delivery import EpisodesArrived
 from master.lockstep import Lockstep
-from tangram_agent.config import ServiceConfig
+from tangram_core.service import ServiceConfig
 from tangram_agent.messages import EpisodeBatch, Go
 from tangram_core.spec import Field
 from tangram_sim.errors import ConfigError

@@ -7,7 +7,7 @@ import pytest
 
 from tangram_agent.messages import EpisodeBatch, decode_from_worker
 from tangram_agent.policy import Policy
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_core.spec import Episodes
 from tangram_sim.errors import RunError, WireError
 from tests.agent.outlines import outline_setup

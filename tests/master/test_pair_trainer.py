@@ -6,7 +6,7 @@ import pytest
 
 from tangram_agent.checkpoints import ACTING
 from tangram_agent.policy import Policy
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_agent.types import Weights
 from tests.agent.builders import random_episodes, setup
 from tests.agent.pair_scenes import PERCEPTRON, seven

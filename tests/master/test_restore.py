@@ -14,7 +14,7 @@ from master.resumable import check_resumable, check_same_task
 from master.rundir import Record, RunFolder
 from master.trainer import Trainer, choose_device
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint, save_checkpoint
-from tangram_agent.setup import SECTIONS, Setup
+from tangram_core.setup import SECTIONS, Setup
 from tangram_sim.errors import ConfigError, RunError
 from tests.agent.builders import PAIR, setup
 from tests.agent.pair_scenes import PERCEPTRON, seven

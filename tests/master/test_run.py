@@ -20,7 +20,7 @@ from master.run import UNBOUNDED, open_run
 from master.rundir import Record, RunFolder
 from master.security import Given, make_pair, read_keys, write_keys
 from master.signals import StopSignals
-from tangram_agent.config import ServiceConfig
+from tangram_core.service import ServiceConfig
 from tangram_agent.messages import OPEN
 from tangram_agent.process import Every, Watchdog
 from tangram_sim.errors import ConfigError, RunError

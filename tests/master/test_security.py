@@ -18,7 +18,7 @@ from master.config import KeysConfig
 from master.giving import NEEDLESS, STALE, change_keys
 from master.rundir import RunFolder
 from master.security import Given, Pair, listening_place, make_keys, make_pair, needs_keys, run_keys
-from tangram_agent.config import ServiceConfig
+from tangram_core.service import ServiceConfig
 from tangram_sim.errors import ConfigError, RunError
 
 pytestmark = pytest.mark.fast

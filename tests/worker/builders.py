@@ -8,12 +8,12 @@ import numpy as np
 import yaml
 
 from tangram_agent.checkpoints import save_checkpoint
-from tangram_agent.config import ServiceConfig
+from tangram_core.service import ServiceConfig
 from tangram_agent.filling_learner import FillLearner
 from tangram_agent.learner import Learner
 from tangram_agent.networks import travelling
 from tangram_agent.policy import Policy
-from tangram_agent.setup import Setup, make_setup
+from tangram_core.setup import Setup, make_setup
 from tangram_agent.types import Weights
 from tangram_core.spec import Episodes
 from tangram_sim.arrays import Floats

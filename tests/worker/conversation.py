@@ -28,7 +28,7 @@ from tangram_agent.messages import (
     decode_from_worker,
 )
 from tangram_agent.schema import Plain
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tests.agent.builders import with_bound
 from tests.agent.messages import FINGERPRINTS, SPEC
 from tests.master.dealers import Stage

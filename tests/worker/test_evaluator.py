@@ -8,7 +8,7 @@ import pytest
 
 from master.delivery import Arrival, ScoresArrived
 from master.hub import Hub
-from tangram_agent.config import ServiceConfig
+from tangram_core.service import ServiceConfig
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.worker.builders import policy, sent, weights
 from tests.worker.conversation import QUICK, collect, open_hub, with_master

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tests.agent.builders import setup
 from tests.sim.builders import layout_of
 from tests.worker.builders import ended

@@ -13,7 +13,7 @@ import shapely
 from PIL import Image
 
 import tangram_sim  # noqa: F401  # registers the environments
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_sim.areas import overlap
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.config import RewardConfig

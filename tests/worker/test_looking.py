@@ -10,7 +10,7 @@ import pytest
 from tangram_agent.messages import EpisodeBatch, decode_from_worker
 from tangram_agent.policy import Policy
 from tangram_agent.relabelling import learnable
-from tangram_agent.setup import Setup, make_setup
+from tangram_core.setup import Setup, make_setup
 from tangram_core.spec import Episodes
 from tangram_sim.arrays import Singles
 from tangram_sim.batch import BatchedEnv

@@ -12,7 +12,7 @@ from PIL import Image
 import worker.film as film_module
 from tangram_agent.filler import Filler
 from tangram_agent.runs import load_changed, load_run
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_agent.types import Choice
 from tangram_sim.arrays import Floats
 from tangram_sim.errors import ConfigError, RunError

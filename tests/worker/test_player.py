@@ -17,10 +17,10 @@ import zmq
 
 from master.delivery import EpisodesArrived
 from master.hub import Hub
-from tangram_agent.config import ServiceConfig
+from tangram_core.service import ServiceConfig
 from tangram_agent.messages import Go
 from tangram_agent.process import Lifeline
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_sim.errors import TangramError
 from tangram_sim.seeding import episode_generator
 from tests.agent.builders import setup

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_sim.arrays import Floats
 from tangram_sim.errors import ConfigError
 from tangram_sim.geometry import overlap_share

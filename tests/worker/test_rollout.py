@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tangram_agent.policy import Policy
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_agent.types import Past
 from tangram_core.spec import Episodes, joined
 from tangram_sim.batch import BatchedEnv

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tangram_agent.setup import Setup
+from tangram_core.setup import Setup
 from tangram_sim.actions import chosen_tokens
 from tangram_sim.batch import BatchedEnv
 from tests.agent.builders import setup

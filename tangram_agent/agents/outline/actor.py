@@ -1,0 +1,39 @@
+"""Acting on outlines: the place whose rest is most surely filled.
+
+Legend: B environments, G rows of an outline.
+"""
+
+import numpy as np
+
+from tangram_agent.agents.outline.config import OutlineConfig
+from tangram_agent.base.acting import NetworkActor, closed
+from tangram_agent.base.config import NetConfig
+from tangram_agent.filler import Filler
+from tangram_agent.filling import Filling
+from tangram_agent.values import OutlineValue
+from tangram_core.spec import Arrays
+from tangram_core.task import Generators, History
+from tangram_sim.actions import make_actions
+from tangram_sim.arrays import Singles
+from tangram_tasks.fill import Fill
+
+
+class OutlineActor(NetworkActor):
+    """Chooses a token and its place by a `Filler`."""
+
+    def __init__(self, task: Fill, config: OutlineConfig, net: NetConfig) -> None:
+        super().__init__(OutlineValue(Filling(task.layout).shapes, net))
+        self._task, self._config = task, config
+        self._filler = Filler(self.network, task, config.beam)
+
+    def act(self, seen: Arrays, past: History, explore: Generators | None = None) -> Singles:  # noqa: ARG002
+        """Actions (B, A) on outlines (B, G, 2); where it explores a share of them goes anywhere."""
+        generators, share = explore or (), self._config.uniform_share
+        drawn = [generator.random() < share for generator in generators]
+        corners = np.asarray(seen["corners"], np.float64)
+        anything = np.array(drawn) if drawn else np.zeros(len(corners), np.bool_)
+        exact = corners, np.asarray(closed(seen), np.bool_)
+        wanted = np.asarray(seen["goals"], np.float64)
+        choice = self._filler.choose(*exact, wanted, anything, generators)
+        count, sim = self._task.layout.tokens, self._task.sim
+        return make_actions(choice.token, choice.velocity, choice.flip, count, sim)

@@ -1,0 +1,68 @@
+"""The agent of outlines: a value of what is left to fill, whose actions are exact."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, cast
+
+from tangram_agent.agents.outline.config import OutlineConfig
+from tangram_agent.base.checks import check_capacity
+from tangram_agent.base.config import NetConfig
+from tangram_core.agent import Agent, Pace
+from tangram_core.task import Json, Task
+from tangram_sim.errors import ConfigError
+from tangram_sim.settings import refuse_ignored
+from tangram_tasks.fill import Fill
+
+if TYPE_CHECKING:  # need torch
+    from tangram_agent.agents.outline.actor import OutlineActor
+    from tangram_agent.agents.outline.learner import FillLearner
+
+
+@dataclass(frozen=True)
+class Outline(Agent):
+    """It is told of no piece of the target."""
+
+    sections: ClassVar = {"agent": OutlineConfig, "net": NetConfig}
+
+    config: OutlineConfig
+    net: NetConfig
+
+    @property
+    def pace(self) -> Pace:
+        """As its settings say."""
+        return self.config.pace
+
+    def check(self, task: Task) -> None:
+        """It fills outlines, by attention."""
+        if not isinstance(task, Fill):
+            raise ConfigError("agent.kind=outline fills outlines: set task=fill, or another agent")
+        if self.net.kind == "mlp":
+            refuse_ignored("net.kind=mlp", "outlines", "set net.kind=mha")
+        check_capacity(task, self.config.replay_capacity)
+
+    def check_training(self) -> None:
+        """Refuse what is for play alone."""
+        if self.config.beam > 1:
+            raise ConfigError(
+                f"agent.beam={self.config.beam} is for play, an evaluator would be silent "
+                "for minutes: leave it out, and give it to tangram-eval or tangram-play"
+            )
+
+    def actor(self, task: Task) -> "OutlineActor":
+        """See `Agent.actor`."""
+        from tangram_agent.agents.outline.actor import OutlineActor  # noqa: PLC0415
+
+        return OutlineActor(cast("Fill", task), self.config, self.net)
+
+    def learner(
+        self, task: Task, seed: int, device: str = "cpu", *, compiled: bool = False
+    ) -> "FillLearner":
+        """See `Agent.learner`."""
+        from tangram_agent.agents.outline.learner import FillLearner  # noqa: PLC0415
+
+        if compiled:
+            refuse_ignored("service.compile=true", "agent.kind=outline", "leave it out", False)
+        return FillLearner(cast("Fill", task), self.config, self.net, seed, device)
+
+    def facts(self) -> Json:
+        """Its preset and its network."""
+        return {"agent": self.config.name, "net": self.net.kind}

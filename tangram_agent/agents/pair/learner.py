@@ -1,0 +1,170 @@
+"""Learning on pairs of a token and a piece of the target.
+
+With several tokens what an action is worth falls apart into what it covers of each piece, and
+hindsight knows the geometry: so a pair's value is known at once, and nothing is bootstrapped.
+
+Legend: M pairs.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from tangram_agent.agents.pair.actor import critic_plays
+from tangram_agent.agents.pair.batch import PairBatch, make_pairs
+from tangram_agent.agents.pair.config import PairConfig
+from tangram_agent.agents.pair.networks import Networks
+from tangram_agent.base.config import NetConfig
+from tangram_agent.base.ddpg import NUMBERS, Ddpg, Steps
+from tangram_agent.base.learning import read_slots, saved_slots
+from tangram_agent.motion import Fit, MotionModel, Motions, motions_of
+from tangram_agent.pairs import Pairs
+from tangram_agent.types import Transitions
+from tangram_agent.weights import under
+from tangram_core.agent import Streams, Tensors
+from tangram_core.spec import Array
+from tangram_sim.arrays import Bools, Floats
+from tangram_sim.errors import RunError
+from tangram_tasks.place import Place
+
+SEEN_MOTIONS = 256  # transitions of whole episodes that the motion model sees in an update
+
+
+class PairLearner(Ddpg):
+    """Actor, critic, and the model of motion.
+
+    Attributes:
+        motion: None where the motion is taken to be exact.
+    """
+
+    limit = 1.0  # pre-activations beyond it are clamped
+
+    def __init__(
+        self,
+        task: Place,
+        config: PairConfig,
+        net: NetConfig,
+        seed: int,
+        device: str = "cpu",
+        compiled: bool = False,
+    ) -> None:
+        learned = config.motion == "learned"
+        networks = Networks(task.layout, task.sim.arena, net, motion=learned)
+        self.motion = networks.motion
+        if self.motion is not None:
+            self.streams = (*Ddpg.streams, "motion")
+        every = networks.actor, networks.critic, networks
+        super().__init__(task, config, every, seed, device, compiled)
+        self._fit = None if self.motion is None else Fit(self.motion, screens_motions(task))
+
+    def _more_parts(self) -> dict[str, Any]:
+        motion = {} if self.motion is None else {"motion": self.motion}
+        return super()._more_parts() | motion
+
+    @property
+    def relabels(self) -> tuple[Any, ...]:
+        """None with several tokens: those are relabelled anew for every update."""
+        return () if self.task.layout.tokens > 1 else self.config.hindsight
+
+    def update(self, share: float, rng: Streams) -> dict[str, float]:
+        """As `Ddpg`, and one step of the model of motion.
+
+        Its numbers come with motion_error and motion_noise (shares of full scale).
+        """
+        self.batch = self.replay.sample(self.config.batch_size, rng["replay"])
+        steps = self.steps(self.batch, rng["hindsight"])
+        motions = None if self.motion is None else self._motions(rng["motion"])
+        return self.learn(steps, share, motions)
+
+    def learn(
+        self, steps: Steps, share: float = 0.0, motions: Motions | None = None
+    ) -> dict[str, float]:
+        """One step of all networks; see `Ddpg.learn`."""
+        values = {}
+        if self._fit is not None and motions is not None:
+            values = self._fit.step(motions.to(self.place))
+        found = self._step_all(steps, self.rates(share))
+        return self._counted(dict(zip(NUMBERS, found.unbind(), strict=True)) | values)
+
+    def _motions(self, generator: np.random.Generator) -> Motions:
+        """What whole episodes of the replay tell of the motion."""
+        task, steps = self.task, self.task.horizon
+        past, ends = self.replay.sample_episodes(max(1, SEEN_MOTIONS // steps), steps, generator)
+        return motions_of(past, ends.astype(np.float64), task.layout, task.sim)
+
+    def steps(self, batch: Transitions, generator: np.random.Generator) -> Steps:
+        """Pairs of a batch."""
+        return self.steps_of(make_pairs(batch, self.task.layout, self.config.hindsight, generator))
+
+    def steps_of(self, batch: PairBatch) -> Steps:
+        """Pairs as tensors."""
+        after = self._pairs(batch, batch.after, batch.after_flipped)
+        return Steps(
+            view=self._pairs(batch, batch.before, batch.before_flipped),
+            velocity=self.tensor(batch.velocity),
+            reward=self.tensor(batch.reward),
+            done=self.tensor(batch.done),
+            start=self._pairs(batch, batch.start, batch.start_flipped),
+            follow=self.if_any_follows(batch.done, after),
+            seen_after=after,
+        )
+
+    def _pairs(self, batch: PairBatch, pose: Floats, flipped: Bools) -> Pairs:
+        """The pairs (M,) with their tokens where they lay at some time."""
+        return Pairs(
+            pose=self.tensor(pose),
+            flipped=self.tensor(flipped),
+            token=self.index(batch.token),
+            goal=self.tensor(batch.goal),
+            goal_flipped=self.tensor(batch.goal_flipped),
+            piece=self.index(batch.piece),
+            covered=self.tensor(batch.covered),
+        )
+
+    def broadcast(self) -> Tensors:
+        """Not the critic, where it has no say in what is played."""
+        every = self.export()
+        if critic_plays(self.task):
+            return every
+        return {name: one for name, one in every.items() if not name.startswith("critic.")}
+
+    def state(self) -> dict[str, Array]:
+        """With what the model of motion has seen."""
+        fit = {} if self._fit is None else saved_slots("motion", self._fit.slots)
+        return super().state() | fit
+
+    def load_state(self, state: Mapping[str, Array]) -> None:
+        """Take over a state, the model of motion's too."""
+        super().load_state(state)
+        if self._fit is not None:
+            self._fit.load(read_slots("motion", state, self.place))
+
+    def load_networks(self, state: Mapping[str, Array]) -> None:
+        """Take over the networks of a state, and nothing else.
+
+        Raises:
+            RunError: tensors are missing or have other shapes.
+        """
+        if self.motion is not None and not under("motion.", state):
+            raise RunError(
+                "the checkpoint has no model of motion: set agent.motion=exact, as it was trained"
+            )
+        super().load_networks(state)
+
+    def begin_with(self, state: Mapping[str, Array]) -> None:
+        """Take over networks; the motion is learned anew: its world may be another."""
+        super().begin_with(state)
+        if self.motion is not None:
+            for model in (self.motion, self.acting.get_submodule("motion")):
+                model.load_state_dict(MotionModel().state_dict())
+
+
+def screens_motions(task: Place) -> bool:
+    """Whether a motion far beside what is usual tells nothing: of an exact world in pictures.
+
+    There it is that of a token which met others or was seen wrongly. Elsewhere it may be what that
+    world does.
+    """
+    sim = task.sim
+    return sim.observe == "pictures" and task.layout.tokens > 1 and not sim.inexact

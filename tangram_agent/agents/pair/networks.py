@@ -1,0 +1,75 @@
+"""Actor and critic of pairs of a token and a piece of the target.
+
+Legend: M pairs.
+"""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from tangram_agent.base.config import NetConfig
+from tangram_agent.base.networks import VELOCITY, Head
+from tangram_agent.motion import MotionModel
+from tangram_agent.pairs import PairGraph, Pairs
+from tangram_sim.layout import Layout
+
+
+class ActorNet(nn.Module):
+    """pi(s, g): which velocity takes the token onto the piece.
+
+    The shift is clamped, and two outputs give the turn by their angle over the token's symmetry k:
+    it needs no more than 1/k of a half turn either way, and has no seam where two equally good
+    turns meet.
+    """
+
+    def __init__(self, graph: PairGraph, net: NetConfig) -> None:
+        super().__init__()
+        self.graph = graph
+        self.head = Head(graph, net, VELOCITY + 1, at_base=True)
+
+    def forward(self, pairs: Pairs, features: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Velocity (M, 3) in [-1, 1] in the arena's axes, and (M, 2) the shift before its clamp.
+
+        Features are as for `Head`.
+        """
+        raw = self.head(pairs, features=features)
+        angle = torch.atan2(raw[:, 3], raw[:, 2]) / self.graph.symmetry_of(pairs) / math.pi
+        return self.graph.velocity(pairs, raw[:, :2].clamp(-1.0, 1.0), angle), raw[:, :2]
+
+
+class CriticNet(nn.Module):
+    """Q(s, g, a): what a velocity is worth, by the pair as it would leave it: the afterstate."""
+
+    def __init__(self, graph: PairGraph, net: NetConfig) -> None:
+        super().__init__()
+        self.graph = graph
+        self.head = Head(graph, net, 1, at_base=True)
+
+    def forward(
+        self,
+        pairs: Pairs,
+        velocity: Tensor,
+        after: Pairs | None = None,
+        _features: Tensor | None = None,
+    ) -> Tensor:
+        """Values (M,).
+
+        Args:
+            pairs: what the token is moved in.
+            velocity: (M, 3) in the arena's axes.
+            after: what it came to, where that is known better than by the exact motion.
+        """
+        seen = self.graph.moved(pairs, velocity) if after is None else after
+        value: Tensor = self.head(seen).squeeze(-1)
+        return value
+
+
+class Networks(nn.Module):
+    """All that plays: the critic chooses among what the actor proposes, by a model of motion."""
+
+    def __init__(self, layout: Layout, arena: float, net: NetConfig, *, motion: bool) -> None:
+        super().__init__()
+        graph = PairGraph(layout, arena)
+        self.actor, self.critic = ActorNet(graph, net), CriticNet(graph, net)
+        self.motion = MotionModel() if motion else None

@@ -1,0 +1,54 @@
+"""Learning on whole scenes, as the paper has it."""
+
+import numpy as np
+from torch import Tensor
+
+from tangram_agent.agents.scene.networks import ActorNet, CriticNet
+from tangram_agent.base.config import ActorCriticConfig, NetConfig
+from tangram_agent.base.ddpg import Ddpg, Steps
+from tangram_agent.base.networks import VELOCITY
+from tangram_agent.scenes import Scenes, next_token
+from tangram_agent.types import Transitions
+from tangram_sim.actions import chosen_tokens
+from tangram_tasks.place import Place
+
+
+class SceneLearner(Ddpg):
+    """The paper's actor and critic."""
+
+    actor: ActorNet
+
+    def __init__(
+        self,
+        task: Place,
+        config: ActorCriticConfig,
+        net: NetConfig,
+        seed: int,
+        device: str = "cpu",
+        compiled: bool = False,
+    ) -> None:
+        actor, critic = ActorNet(task.layout, net), CriticNet(task.layout, net)
+        super().__init__(task, config, (actor, critic, actor), seed, device, compiled)
+
+    def steps(self, batch: Transitions, generator: np.random.Generator) -> Steps:  # noqa: ARG002
+        """Scenes of a batch."""
+        tokens = self.task.layout.tokens
+        state, placed = self.tensor(batch.state), self.tensor(batch.placed)
+        goal, action = self.tensor(batch.goal), self.tensor(batch.action)
+        moved = self.index(chosen_tokens(batch.action.astype(np.float64), tokens))
+        taken = Scenes(state, placed, goal, moved)
+        start = taken if tokens == 1 else Scenes(state, placed, goal, next_token(placed))
+        following, flags = self.tensor(batch.next_state), self.tensor(batch.next_placed)
+        follow = Scenes(following, flags, goal, next_token(flags))
+        return Steps(
+            view=taken,
+            velocity=action[:, -VELOCITY:],
+            reward=self.tensor(batch.reward),
+            done=self.tensor(batch.done),
+            start=start,
+            follow=self.if_any_follows(batch.done, follow),
+        )
+
+    def features(self, steps: Steps) -> Tensor | None:
+        """Of a whole scene as it stands: one token is asked for where it was moved."""
+        return self.actor.head.see(steps.view) if steps.start is steps.view else None

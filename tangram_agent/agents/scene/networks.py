@@ -1,0 +1,46 @@
+"""Actor and critic of whole scenes (Sec. IV-A).
+
+Legend: M scenes.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from tangram_agent.base.config import NetConfig
+from tangram_agent.base.networks import VELOCITY, Head
+from tangram_agent.scenes import SceneGraph, Scenes
+from tangram_sim.layout import Layout
+
+
+class ActorNet(nn.Module):
+    """pi(s, g): which velocity to give to the token that is to move; tanh bounds it."""
+
+    def __init__(self, layout: Layout, net: NetConfig) -> None:
+        super().__init__()
+        self.graph = SceneGraph(layout)
+        self.head = Head(self.graph, net, VELOCITY, at_base=True)
+
+    def forward(self, scenes: Scenes, features: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Velocity (M, 3) in [-1, 1] in the arena's axes, and its pre-activations (M, 3).
+
+        Features are as for `Head`.
+        """
+        raw = self.head(scenes, features=features)
+        bounded = torch.tanh(raw)
+        return self.graph.velocity(scenes, bounded[:, :2], bounded[:, 2]), raw
+
+
+class CriticNet(nn.Module):
+    """Q(s, g, a): what a velocity of the token that is to move is worth (Eq. 3)."""
+
+    def __init__(self, layout: Layout, net: NetConfig) -> None:
+        super().__init__()
+        self.graph = SceneGraph(layout)
+        self.head = Head(self.graph, net, 1, at_base=False, action=VELOCITY)
+
+    def forward(
+        self, scenes: Scenes, velocity: Tensor, _after: object = None, features: Tensor | None = None
+    ) -> Tensor:
+        """Values (M,) of velocities (M, 3); features are as for `Head`."""
+        value: Tensor = self.head(scenes, action=velocity, features=features).squeeze(-1)
+        return value

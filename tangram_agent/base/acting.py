@@ -1,0 +1,48 @@
+"""What all actors of networks share: weights on the CPU, and the exploration of one velocity."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import nn
+
+from tangram_agent.weights import load_arrays
+from tangram_core.agent import Actor
+from tangram_core.spec import Array, Arrays
+from tangram_sim.arrays import Singles
+
+
+class NetworkActor(Actor):
+    """Acts with a network.
+
+    Attributes:
+        network: what the weights are of.
+    """
+
+    def __init__(self, network: nn.Module) -> None:
+        self.network = network.requires_grad_(False)
+
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Of all parameters that a broadcast brings."""
+        every = self.network.named_parameters()
+        return {name: tuple(p.shape) for name, p in every if self.needs(name)}
+
+    def needs(self, name: str) -> bool:  # noqa: ARG002
+        """Whether a parameter is needed to play."""
+        return True
+
+    def load(self, weights: Mapping[str, Singles]) -> None:
+        """Take over a broadcast, or all weights as a checkpoint keeps them."""
+        whole = len(weights) > len(self.shapes)
+        load_arrays(self.network, weights, None if whole else self.shapes)
+
+
+def tensor(array: object) -> torch.Tensor:
+    """A copy in single precision: arrays that came over the wire are read-only."""
+    return torch.from_numpy(np.array(array, np.float32))
+
+
+def closed(seen: Arrays) -> Array:
+    """(B, K) tokens that no action should name: placed, or not seen while others are."""
+    return seen.get("closed", seen["placed"])

@@ -1,0 +1,187 @@
+"""Settings that agents share: of their networks, and of how they learn."""
+
+from dataclasses import dataclass, field
+
+from tangram_core.agent import Pace
+from tangram_sim.errors import ConfigError
+from tangram_sim.settings import LEARNING, Settings, declared, setting
+
+HEADS = 4  # M in Eq. 12, each of the key width d = width / M
+STRATEGIES = ("final", "future", "near")
+
+
+@dataclass(frozen=True)
+class NetConfig(Settings, section="net"):
+    """Size and kind of the networks; the defaults are the paper's."""
+
+    kind: str = setting(
+        "mha",
+        "attention network (Eqs. 8-13) or perceptron",
+        choices=("mha", "mlp"),
+    )
+    hidden: tuple[int, ...] = setting(
+        (64, 64),
+        "widths of the hidden layers",
+        low=1,
+        high=65536,
+        only={"kind": "mlp"},
+    )
+    width: int = setting(64, "size of a node's embedding", low=1, high=4096, only={"kind": "mha"})
+    layers: int = setting(3, "rounds of message passing", low=1, high=64, only={"kind": "mha"})
+    feed_forward: int = setting(
+        512,
+        "hidden width of g in Eq. 13; 0: the single layer of Eq. 8",
+        low=0,
+        high=65536,
+        only={"kind": "mha"},
+    )
+    scale: str = setting(
+        "d",
+        "Eq. 10 divides the scores by d (the paper) or by sqrt_d (learn2assemble)",
+        choices=("d", "sqrt_d"),
+        only={"kind": "mha"},
+    )
+
+    def __post_init__(self) -> None:
+        if not self.hidden:
+            raise ConfigError("net.hidden must name at least one layer, got []")
+        super().__post_init__()
+        if self.width % HEADS:
+            raise ConfigError(f"net.width must be a multiple of {HEADS}, got {self.width}")
+
+
+@dataclass(frozen=True)
+class RelabelConfig(Settings, section="agent.hindsight"):
+    """One kind of other goal that transitions are learned with besides the one that was played."""
+
+    strategy: str = field(
+        metadata=declared(
+            "the goal: final, future or near (the final pose moved by Gaussian noise); "
+            "pairs of several tokens: where the token came to lie by its action is final",
+            choices=STRATEGIES,
+        )
+    )
+    copies: int = setting(1, "goals of this kind for each transition", low=1, high=64)
+    position: float = setting(
+        0.0,
+        "deviation of the goal's shift",
+        low=0,
+        high=1e3,
+        unit="arena units",
+        only={"strategy": "near"},
+    )
+    angle: float = setting(
+        0.0,
+        "deviation of the goal's turn",
+        low=0,
+        high=100,
+        unit="rad",
+        only={"strategy": "near"},
+    )
+
+
+@dataclass(frozen=True)
+class LearningConfig(Settings, section="agent"):
+    """What whoever learns from a replay by gradients is told."""
+
+    name: str = setting("tangram", "the preset's name, for reports", part=LEARNING)
+    motion: str = setting(
+        "learned",
+        "what a command comes to: learned from the replay, and watched in each episode; or the "
+        "exact rigid motion",
+        choices=("learned", "exact"),
+        only={"readout": "pair"},
+        part=NETWORK,
+    )
+    acting_average: float = setting(
+        0.99,
+        "Polyak average of the weights that play and are scored; 0: none",
+        low=0,
+        high=1,
+        part=LEARNING,
+    )
+    critic_lr: float = setting(
+        1e-3, "the critic's learning rate at the start", low=1e-9, high=1e3, part=LEARNING
+    )
+    lr_final: float = setting(
+        0.01,
+        "share of the learning rates that their cosine over the run's budget ends at; 1: no decay",
+        low=0,
+        high=1,
+        part=LEARNING,
+    )
+    batch_size: int = setting(64, "transitions in one update", low=1, part=LEARNING)
+    replay_capacity: int = setting(
+        200_000, "transitions kept", low=1, high=1_000_000_000, part=LEARNING
+    )
+    replay_capacity: int = setting(
+        200_000, "transitions kept", low=1, high=1_000_000_000, part=LEARNING
+    )
+    updates_per_transition: float = setting(
+        0.1, "updates for each transition played", low=1e-9, high=1e3, part=LEARNING
+    )
+    learning_starts: int = setting(
+        512,
+        "transitions played before the first update; relabelled ones do not count",
+        low=1,
+        part=LEARNING,
+    )
+    uniform_share: float = setting(
+        0.2, "share of actions drawn uniformly", low=0, high=1, part=LEARNING
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.batch_size > self.replay_capacity:
+            raise ConfigError(
+                f"agent.batch_size ({self.batch_size}) must not exceed "
+                f"agent.replay_capacity ({self.replay_capacity})"
+            )
+
+    @property
+    def pace(self) -> Pace:
+        """How much is learned from what is played."""
+        return Pace(self.updates_per_transition, self.learning_starts)
+
+
+@dataclass(frozen=True)
+class ActorCriticConfig(LearningConfig, section="agent"):
+    """DDPG and hindsight."""
+
+    saturation_penalty: float = setting(
+        1.0,
+        "weight in the actor's loss of squared pre-activations",
+        low=0,
+        part=LEARNING,
+    )
+    gamma: float = setting(
+        0.0,
+        "discount, Eq. 5; one action in an episode leaves nothing to discount",
+        low=0,
+        high=1,
+        part=LEARNING,
+    )
+    polyak: float = setting(
+        0.995,
+        "rho of the target networks, Eq. 4",
+        low=0,
+        unless={"gamma": 0.0},
+        high=1,
+        part=LEARNING,
+    )
+    actor_lr: float = setting(
+        1e-3, "the actor's learning rate at the start", low=1e-9, high=1e3, part=LEARNING
+    )
+    noise: float = setting(
+        0.05, "deviation of the Gaussian exploration noise on actions", low=0, part=LEARNING
+    )
+    # With one action every plain relabel scores +1, so only near misses teach the slope.
+    hindsight: tuple[RelabelConfig, ...] = setting(
+        (
+            RelabelConfig("final"),
+            RelabelConfig("near", position=0.1, angle=0.5),
+            RelabelConfig("near", position=0.02, angle=0.1),
+        ),
+        "the other goals that every transition is learned with; []: none",
+        part=LEARNING,
+    )

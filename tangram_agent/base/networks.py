@@ -1,0 +1,119 @@
+"""Layers that read a graph: multi-head attention or a multi-layer perceptron.
+
+Legend: M views, N nodes, F features, W width.
+"""
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from tangram_agent.attention import GraphEncoder
+from tangram_agent.base.config import NetConfig
+from tangram_agent.graph import Graph
+
+VELOCITY = 3
+
+
+class Head(nn.Module):
+    """Outputs (M, outputs) of views, by attention over the graph or by a perceptron.
+
+    Attention reads the mean of all nodes, projected, or (`at_base`) the embedding of the moving
+    token's base joined to it. The paper computes actions for all nodes and extracts the base's: the
+    same numbers. A perceptron has one group of outputs per token in view.
+    """
+
+    def __init__(
+        self,
+        graph: Graph,
+        net: NetConfig,
+        outputs: int,
+        *,
+        at_base: bool,
+        action: int = 0,
+    ) -> None:
+        """Make the layers.
+
+        Args:
+            graph: what is seen.
+            net: size and kind.
+            outputs: numbers for each view.
+            at_base: read at the token that moves.
+            action: numbers that `forward` appends to the moving token's base node.
+        """
+        super().__init__()
+        self.graph, self.attends, self.at_base = graph, net.kind == "mha", at_base
+        if self.attends:
+            self.encoder = GraphEncoder(graph.features + action, net)
+            self.context = nn.Linear(net.width, net.width, bias=False)
+            self.readout = nn.Linear((1 + at_base) * net.width, outputs)
+        else:
+            groups = graph.tokens if at_base else 1
+            self.layers = perceptron(graph.inputs + action, net.hidden, outputs * groups)
+
+    def forward(
+        self,
+        view: Any,
+        action: Tensor | None = None,
+        features: Tensor | None = None,
+    ) -> Tensor:
+        """(M, outputs) of views, with an action (M, action) for a head that takes one.
+
+        Features, by `see`, may be handed in where they were made before.
+        """
+        seen = self.see(view) if features is None else features
+        outputs: Tensor
+        if not self.attends:
+            outputs = self.layers(seen if action is None else torch.cat([seen, action], dim=-1))
+            return self._of_token(outputs, view)
+        base = self.graph.base_node(view)
+        rows = torch.arange(len(seen), device=seen.device)
+        if action is not None:
+            # Other nodes than the base carry zeros there.
+            appended = seen.new_zeros(*seen.shape[:2], action.shape[-1])
+            appended[rows, base] = action
+            seen = torch.cat([seen, appended], dim=-1)
+        nodes, mean = self.encoder(seen, self.graph.adjacency)
+        read = self.context(mean)
+        outputs = self.readout(torch.cat([nodes[rows, base], read], -1) if self.at_base else read)
+        return outputs
+
+    def see(self, view: Any) -> Tensor:
+        """What the layers take of views: features of nodes (M, N, F), or one row for each."""
+        seen = self.graph.node_features if self.attends else self.graph.vectors
+        return seen(view)
+
+    def _of_token(self, outputs: Tensor, view: Any) -> Tensor:
+        """The moving token's group of a perceptron's outputs."""
+        if not self.at_base or self.graph.tokens == 1:
+            return outputs
+        groups = outputs.view(len(outputs), self.graph.tokens, -1)
+        rows = torch.arange(len(groups), device=groups.device)
+        chosen: Tensor = groups[rows, self.graph.slot(view)]
+        return chosen
+
+
+def perceptron(inputs: int, hidden: tuple[int, ...], outputs: int) -> nn.Sequential:
+    """Linear layers with ReLU between."""
+    layers: list[nn.Module] = []
+    for size in hidden:
+        layers += [nn.Linear(inputs, size), nn.ReLU()]
+        inputs = size
+    return nn.Sequential(*layers, nn.Linear(inputs, outputs))
+
+
+def initialise(module: nn.Module, generator: torch.Generator) -> None:
+    """Uniform weights and biases within 1/sqrt(inputs), from an explicit generator."""
+    with torch.no_grad():
+        for layer in module.modules():
+            if isinstance(layer, nn.Linear):
+                bound = 1.0 / math.sqrt(layer.weight[0].numel())
+                layer.weight.uniform_(-bound, bound, generator=generator)
+                if layer.bias is not None:
+                    layer.bias.uniform_(-bound, bound, generator=generator)
+
+
+def parameter_count(*modules: nn.Module) -> int:
+    """Trainable numbers of all modules together (Table I)."""
+    return sum(p.numel() for module in modules for p in module.parameters() if p.requires_grad)

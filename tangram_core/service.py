@@ -1,0 +1,96 @@
+"""How the processes of a run work together."""
+
+from dataclasses import dataclass
+
+from tangram_agent.addresses import LOCAL, check_host
+from tangram_agent.process import FORMATS
+from tangram_sim.settings import Settings, setting
+
+ON_SOCKETS: dict[str, object] = {"bind": LOCAL}
+
+
+@dataclass(frozen=True)
+class ServiceConfig(Settings, section="service"):
+    """How the processes work together; the same values serve master and workers."""
+
+    bind: str = setting(
+        LOCAL,
+        "address that the master listens on; local: unix sockets, for processes of the same user "
+        "on its machine",
+    )
+    port: int = setting(
+        0,
+        "of the master's ROUTER socket; the next one is its PUB socket's; 0: any two free ones",
+        low=0,
+        high=65534,
+        unless=ON_SOCKETS,
+    )
+    host: str = setting(
+        "",
+        "name that workers find the master under; empty: bind, or this machine's name for 0.0.0.0",
+        unless=ON_SOCKETS,
+    )
+    mode: str = setting(
+        "async",
+        "nobody waits for anybody, or lockstep: slower, and the same seed gives the same weights",
+        choices=("async", "lockstep"),
+    )
+    auth: str = setting(
+        "on",
+        "workers need the connection file's keys; off, for tests: whoever reaches the port takes "
+        "part, unencrypted",
+        choices=("on", "off"),
+        unless=ON_SOCKETS,
+    )
+    http_bind: str = setting(
+        "127.0.0.1", "address of the master's /metrics and /healthz", unless={"http_port": -1}
+    )
+    http_port: int = setting(
+        0, "their port, 0 for any free one (see connection.json), -1 for none", low=-1, high=65535
+    )
+    publish_seconds: float = setting(
+        0.5,
+        "least time between two broadcasts of weights; 0: after every update, as the paper does",
+        low=0,
+        unit="s",
+        only={"mode": "async"},
+    )
+    envs: int = setting(
+        16,
+        "environments that one worker plays at a time; a message holds two episodes of each, fewer "
+        "where they are too large for it",
+        low=1,
+        high=512,
+    )
+    eval_seconds: float = setting(10.0, "least time between two evaluations", low=0, unit="s")
+    eval_episodes: int = setting(100, "fixed test episodes of one evaluation", low=1, high=100_000)
+    log_format: str = setting(
+        "text", "of the lines that processes write: for people or for programs", choices=FORMATS
+    )
+    checkpoint_minutes: float = setting(5.0, "time between two checkpoints", low=1e-3, unit="min")
+    journal_sync_seconds: float = setting(
+        1.0, "time between two syncs of the journal to disk; 0: with each batch", low=0, unit="s"
+    )
+    # Heartbeats come every two seconds.
+    silence_seconds: float = setting(
+        30.0, "after which the master forgets a worker that says nothing", low=3, unit="s"
+    )
+    device: str = setting("auto", "of the learner", choices=("auto", "cpu", "cuda"))
+    threads: int = setting(1, "torch threads of the master", low=1, high=1024)
+    compile: bool = setting(
+        False,
+        "whether an update is compiled as a whole: up to a minute at first and seconds later, then "
+        "an update is 1.1 to 2.5 times as fast, on a GPU 6 to 13; needs g++ or clang++",
+    )
+
+    @property
+    def batch_episodes(self) -> int:
+        """Episodes in one message, where they are not too large for it."""
+        return 2 * self.envs
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("bind", "http_bind"):
+            check_host(f"service.{name}", getattr(self, name))
+        if self.host:
+            check_host("service.host", self.host)

@@ -1,0 +1,54 @@
+"""Tokens fill an outline; which piece goes where is not told."""
+
+from dataclasses import dataclass, fields
+from typing import ClassVar
+
+from tangram_sim.config import SILHOUETTES, RewardConfig
+from tangram_sim.errors import ConfigError
+from tangram_sim.settings import refuse_ignored, told
+from tangram_tasks.place import Place
+
+
+@dataclass(frozen=True)
+class Fill(Place):
+    """A token goes where it is taken, once, from outside of the outline."""
+
+    outlines: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        """Refuse a game in which a token does not go where it is taken, once.
+
+        Raises:
+            ConfigError: names the setting and the remedy.
+        """
+        if self.layout.tokens == 1:  # before the set's own remedies, which lead here
+            raise ConfigError(
+                f"tokens={self.layout.shapes[0].name}: task=fill needs a set of several tokens: "
+                "set tokens=tangram7, or task=place"
+            )
+        super().__post_init__()
+        sim = self.sim
+        if sim.observe not in SILHOUETTES:
+            raise ConfigError(
+                f"task=fill shows outlines, got sim.observe={sim.observe}: set sim=silhouette, or "
+                "task=place"
+            )
+        wanted: dict[str, object] = {
+            "motion": "lift",
+            "starts": "outside",
+            "actions_per_token": 1,
+            "allow_flip": self.layout.any_chiral or sim.allow_flip,
+            "corner_noise": 0.0,
+            "world": "plain",
+        }
+        for name, value in wanted.items():
+            given = getattr(sim, name)
+            if given != value:
+                raise ConfigError(
+                    f"sim.{name}={told(given)}: in task=fill a token goes where it is taken, once, "
+                    f"from outside: set sim.{name}={told(value)}"
+                )
+        for own in fields(RewardConfig):
+            if getattr(self.reward, own.name) != own.default:
+                given = f"reward.{own.name}={told(getattr(self.reward, own.name))}"
+                refuse_ignored(given, "task=fill, which pays for what is covered", "set task=place")
