@@ -11,7 +11,6 @@ from tangram_sim.errors import ConfigError
 CFG_KINDS = ("job", "hydra", "all")
 FLAGS = ("--cfg", *SWEEP)
 OWN_PRESETS = ("--config-dir", "-cd")
-PRESET_GROUPS = tuple(GROUPS)
 
 
 def without_own_presets(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
@@ -30,7 +29,7 @@ def without_own_presets(arguments: Sequence[str]) -> tuple[str | None, list[str]
     folder = Path(rest[at[0] + 1]).expanduser().absolute()
     if not folder.is_dir():
         raise ConfigError(f"{OWN_PRESETS[0]}: there is no folder {folder}")
-    for group in PRESET_GROUPS:
+    for group in GROUPS:
         taken = {path.stem for path in (folder / group).glob("*.yaml")} & set(choices(group))
         if taken:
             raise ConfigError(

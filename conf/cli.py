@@ -18,13 +18,13 @@ import yaml
 
 from conf.arguments import (
     OWN_PRESETS,
-    PRESET_GROUPS,
     options_first,
     unreadable,
     without_own_presets,
 )
-from conf.commands import COMMANDS, Plain
+from conf.commands import COMMANDS, GROUPS, Plain
 from conf.help import choices, group_help, help_text, setting_names
+from conf.kinds import Kinds, kinds_of
 from conf.names import hidden, revealed
 from conf.sweep import LAUNCHER, check_launcher, refuse_lost_job
 from tangram_sim.errors import ConfigError, TangramError
@@ -66,18 +66,21 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
     try:
         folder, arguments = without_own_presets(arguments)
         if {"-h", "--help"} & set(arguments):
-            asked = [name for name in arguments if name in COMMANDS[config_name].sections()]
+            kinds = kinds_of(arguments, folder)
+            sections = COMMANDS[config_name].sections(kinds)
+            asked = [name for name in arguments if name in sections]
             print(
-                group_help(config_name, asked[0], folder)
+                group_help(config_name, asked[0], folder, kinds)
                 if asked
-                else help_text(config_name, folder)
+                else help_text(config_name, folder, kinds)
             )
             return 0
         options = [] if folder is None else [OWN_PRESETS[0], folder]
         _check_presets(folder)
         sys.argv[1:] = [*options, *hidden(options_first(arguments, config_name), config_name)]
         check_launcher(sys.argv[1:])
-        return _run(config_name, task, stored)
+        kinds = kinds_of(arguments, folder, _stored_kinds(arguments))
+        return _run(config_name, task, stored, kinds)
     except TangramError as error:
         # What a user gave may hold line breaks and the terminal's control characters.
         line = CONTROL.sub(lambda found: ascii(found[0])[1:-1], str(error))
@@ -107,7 +110,7 @@ def _check_presets(folder: str | None) -> None:
 
     from tangram_agent.stored import check_extent
 
-    for path in (path for group in PRESET_GROUPS for path in Path(folder, group).rglob("*.yaml")):
+    for path in (path for group in GROUPS for path in Path(folder, group).rglob("*.yaml")):
         try:
             check_extent(path.read_text(encoding="utf-8"), f"preset {path}")
             content = OmegaConf.to_container(OmegaConf.load(path))
@@ -124,7 +127,9 @@ def _check_presets(folder: str | None) -> None:
             raise ConfigError(f"preset {path} sets nothing: write settings as in name: value")
 
 
-def _run(config_name: str, task: Callable[[Plain], int], stored: Stored | None) -> int:
+def _run(
+    config_name: str, task: Callable[[Plain], int], stored: Stored | None, kinds: Kinds
+) -> int:
     """Hand over to hydra, so that its --multirun and --cfg work as everywhere."""
     import hydra
     from hydra.errors import HydraException
@@ -147,7 +152,7 @@ def _run(config_name: str, task: Callable[[Plain], int], stored: Stored | None) 
 
     # Without it hydra prints errors of the command line itself, over several lines.
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    _register(config_name)
+    _register(config_name, kinds)
     try:
         if any(_key(text).startswith(("-", "hydra")) for text in sys.argv[1:]):
             hydra.main(version_base="1.3", config_path="pkg://conf", config_name=config_name)(job)()
@@ -163,7 +168,7 @@ def _run(config_name: str, task: Callable[[Plain], int], stored: Stored | None) 
         RecursionError,
         yaml.YAMLError,
     ) as error:
-        raise ConfigError(_explain(error, config_name)) from error
+        raise ConfigError(_explain(error, config_name, kinds)) from error
     except SystemExit:
         if not errors:
             raise
@@ -255,7 +260,7 @@ def composed(config_name: str, overrides: Sequence[str]) -> Plain:
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    _register(config_name)
+    _register(config_name, kinds_of(overrides))
     alone = not GlobalHydra().is_initialized()
     try:
         with hydra.initialize_config_module("conf", version_base="1.3") if alone else nullcontext():
@@ -263,14 +268,14 @@ def composed(config_name: str, overrides: Sequence[str]) -> Plain:
         settings = _mapping(OmegaConf.to_container(config, resolve=True))
         return revealed(settings, config_name)
     except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(_explain(error, config_name)) from error
+        raise ConfigError(_explain(error, config_name, kinds_of(overrides))) from error
 
 
-def _register(config_name: str) -> None:
+def _register(config_name: str, kinds: Kinds) -> None:
     """Tell hydra of a command: its defaults list, and the defaults that its settings declare."""
     from hydra.core.config_store import ConfigStore
 
-    ConfigStore.instance().store(name=config_name, node=COMMANDS[config_name].node())
+    ConfigStore.instance().store(name=config_name, node=COMMANDS[config_name].node(kinds))
 
 
 def _mapping(container: object) -> Plain:
@@ -303,14 +308,11 @@ def with_run_config(
     if found is None:
         return settings
     source, content = found
-    sections = [name for name, value in settings.items() if isinstance(value, dict)]
-    lacking = [name for name in sections if name not in content]
-    if lacking:
-        raise ConfigError(f"{source} lacks {', '.join(lacking)}: it must come from a run")
-    content = {name: content[name] for name in sections}
+    content = _sections_of_a_run(content, source)
     chosen = OmegaConf.create(settings)
+    rest = {name: value for name, value in settings.items() if not isinstance(value, dict)}
     try:
-        result = OmegaConf.create({**settings, **content})
+        result = OmegaConf.create({**rest, **content})
     except RecursionError:
         raise ConfigError(f"{source} is nested too deeply: it must come from a run") from None
     for override in overrides:
@@ -325,6 +327,36 @@ def with_run_config(
             )
         OmegaConf.update(result, key, OmegaConf.select(chosen, key))
     return _mapping(OmegaConf.to_container(result))
+
+
+def _sections_of_a_run(content: Plain, source: str) -> Plain:
+    """Those that the run's task and agent have, and the service's.
+
+    Raises:
+        ConfigError: it is not a run's config.
+    """
+    from tangram_core.setup import section_names
+
+    try:
+        names = (*section_names(content), "service")
+    except ConfigError as error:
+        raise ConfigError(f"{source}: {error}") from None
+    lacking = [name for name in names if name not in content]
+    if lacking:
+        raise ConfigError(f"{source} lacks {', '.join(lacking)}: it must come from a run")
+    return {name: content[name] for name in names}
+
+
+def _stored_kinds(arguments: Sequence[str]) -> Plain | None:
+    """The config that the arguments name by `from_config`, if it can be read; else nothing yet."""
+    named = [text.partition("=")[2] for text in arguments if _key(text) == "from_config"]
+    if not named:
+        return None
+    try:
+        found = _from_config({"from_config": named[-1]})
+    except ConfigError:  # told later, with the rest of the command line
+        return None
+    return None if found is None else found[1]
 
 
 def with_named_code(settings: Plain, overrides: Sequence[str]) -> Plain:
@@ -368,7 +400,7 @@ def _from_config(settings: Plain) -> tuple[str, Plain] | None:
 # Errors of the command line in one line
 
 
-def _explain(error: Exception, config_name: str) -> str:
+def _explain(error: Exception, config_name: str, kinds: Kinds) -> str:
     """What is wrong with the command line and what to write instead."""
     from hydra.errors import MissingConfigException, OverrideParseException
 
@@ -389,7 +421,7 @@ def _explain(error: Exception, config_name: str) -> str:
     unknown = re.search(r"Could not override '([^']+)'|'([^']+)' does not exist", str(error))
     if unknown:
         name = unknown.group(1) or unknown.group(2)
-        return _unknown_setting(name, setting_names(config_name))
+        return _unknown_setting(name, setting_names(config_name, kinds))
     return _first_line(error)
 
 

@@ -10,23 +10,19 @@ from dataclasses import MISSING, Field, asdict, dataclass, field, is_dataclass
 from importlib import import_module
 from typing import Any
 
+from conf.kinds import Kinds, every_kind
+from tangram_core.registry import KIND
 from tangram_sim.settings import Settings, declared_fields, setting
 
 Plain = dict[str, Any]
+USUAL = Kinds()
 NEEDED = "???"  # hydra's word for a value that must be given
 
-# Config group -> the dataclass that declares its settings; in this order presets are merged. An
-# agent brings its own net, net=... on the command line wins; a set of several tokens comes last, as
-# it brings its starts.
-GROUPS = {
-    "sim": "tangram_sim.config:SimConfig",
-    "reward": "tangram_sim.config:RewardConfig",
-    "net": "tangram_agent.config:NetConfig",
-    "agent": "tangram_agent.config:AgentConfig",
-    "service": "tangram_agent.config:ServiceConfig",
-    "tokens": "tangram_sim.layout:TokensConfig",
-}
+# In this order presets are merged. A task brings its world; an agent brings its own net, net=... on
+# the command line wins; a set of several tokens comes last, as it brings its starts.
+GROUPS = ("task", "sim", "reward", "net", "agent", "service", "tokens")
 RUN: dict[str, str | list[str]] = {
+    "task": "place",
     "sim": "physics",
     "reward": "overlap",
     "net": "mha_narrow",
@@ -77,29 +73,47 @@ class Command:
         """Its own settings with their defaults."""
         return {own.name: self.given.get(own.name, plain_default(own)) for own in self.fields()}
 
-    def sections(self) -> dict[str, Plain]:
+    def chosen(self, kinds: Kinds) -> dict[str, str | list[str]]:
+        """Config group -> presets, of the groups that a task and an agent have."""
+        known = kinds.sections()
+        return {group: preset for group, preset in self.groups.items() if group in known}
+
+    def sections(self, kinds: Kinds = USUAL) -> dict[str, Plain]:
         """Group -> setting -> default, of the groups whose settings are declared.
 
         What is laid over a run has no default: null is as the run was trained.
         """
-        return {
-            group: {
-                own.name: None if group in self.over else plain_default(own)
-                for own in declared_fields(load(GROUPS[group]))
-            }
-            for group in (*self.groups, *self.over)
-            if group in GROUPS
+        known, named = kinds.sections(), kinds.named()
+        given = {
+            group: {KIND: named[group]} if group in named else {}
+            for group in known
+            if group in self.groups
         }
+        for group, section in given.items():
+            section |= {own.name: plain_default(own) for own in declared(known[group])}
+        over = {group: dict.fromkeys(laid_over(group)) for group in self.over}
+        return given | over
 
-    def node(self) -> Plain:
+    def node(self, kinds: Kinds = USUAL) -> Plain:
         """What hydra is told: defaults list, declared defaults, and its own behaviour."""
-        chosen = [{group: preset} for group, preset in self.groups.items()]
+        chosen = [{group: preset} for group, preset in self.chosen(kinds).items()]
         return {
             "defaults": ["_self_", *chosen],
             **self.defaults(),
-            **self.sections(),
+            **self.sections(kinds),
             "hydra": _quiet(),
         }
+
+
+def declared(section: type[Settings] | None) -> list["Field[Any]"]:
+    """The settings of a section, if it has any."""
+    return [] if section is None else declared_fields(section)
+
+
+def laid_over(group: str) -> dict[str, "Field[Any]"]:
+    """The settings that may be laid over a run's, of whatever kind it is, by their names."""
+    every = [kinds.sections()[group] for kinds in every_kind(group)]
+    return {own.name: own for section in every for own in declared(section)}
 
 
 def load(name: str) -> type[Settings]:
@@ -173,7 +187,7 @@ and broadcasts its weights. Where to join stands in connection.json in the run f
         """\
 Plays. It joins a master, plays episodes with the newest weights and sends them. A run's
 folder, or a copy of its connection.json, is all that it needs. An address alone is enough
-where the master has service.auth=off: then tokens, sim, reward, agent and net must be given
+where the master has service.auth=off: then task, tokens, sim, reward, agent and net must be given
 and be the master's, or it is refused and told what differs.""",
         (
             "tangram-worker connect=runs/shared",

@@ -10,28 +10,30 @@ from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
-from conf.commands import COMMANDS, GROUPS, Command, load, plain_default
-from tangram_sim.settings import KEY, PLAY, Declaration, declared_fields, told
+from conf.commands import COMMANDS, USUAL, Command, declared, laid_over, plain_default
+from conf.kinds import Kinds
+from tangram_sim.settings import KEY, PLAY, Declaration, told
 
 WIDTH = 96
 
 
-def help_text(config_name: str, folder: str | None = None) -> str:
+def help_text(config_name: str, folder: str | None = None, kinds: Kinds = USUAL) -> str:
     """What --help prints: purpose, groups, settings and examples.
 
     Args:
         config_name: of the command.
         folder: of the user's own presets.
+        kinds: of task and agent.
     """
     command = COMMANDS[config_name]
     choice = " | group=choice" if command.groups else ""
-    inside = ["  --help sim   the settings of a group"] if command.sections() else []
+    inside = ["  --help sim   the settings of a group"] if command.sections(kinds) else []
     return "\n".join(
         [
             f"{command.name} [setting=value{choice}] ...",
             "",
             command.about,
-            *_groups_text(command, folder),
+            *_groups_text(command, folder, kinds),
             "",
             "Settings (with their defaults):",
             *(f"  {line}" for line in _setting_lines(command)),
@@ -50,22 +52,24 @@ def help_text(config_name: str, folder: str | None = None) -> str:
     )
 
 
-def group_help(config_name: str, group: str, folder: str | None = None) -> str:
+def group_help(
+    config_name: str, group: str, folder: str | None = None, kinds: Kinds = USUAL
+) -> str:
     """What `--help GROUP` prints: its presets, and each of its settings that the command takes."""
     if group in COMMANDS[config_name].over:
         first = f"{group}.name=value: in place of what the run was trained with"
         lines = [_line(own, "null", group) for own in playable(group).values()]
     else:
         first = f"{group}={'|'.join(choices(group, folder))}"
-        declared = declared_fields(load(GROUPS[group]))
-        lines = [_line(own, told_default(plain_default(own)), group) for own in declared]
+        every = declared(kinds.sections()[group])
+        lines = [_line(own, told_default(plain_default(own)), group) for own in every]
     return "\n".join([first, "", *lines])
 
 
 def playable(group: str) -> dict[str, "Field[Any]"]:
     """The settings of a group that may be others when a trained run plays, by their whole names."""
-    declared = declared_fields(load(GROUPS[group]))
-    return {f"{group}.{own.name}": own for own in declared if own.metadata[KEY].part == PLAY}
+    every = laid_over(group).items()
+    return {f"{group}.{name}": own for name, own in every if own.metadata[KEY].part == PLAY}
 
 
 def choices(group: str, folder: str | None = None) -> list[str]:
@@ -80,17 +84,19 @@ def choices(group: str, folder: str | None = None) -> list[str]:
     return sorted(name.removesuffix(".yaml") for name in entries if name.endswith(".yaml"))
 
 
-def group_defaults(command: Command) -> dict[str, list[str]]:
+def group_defaults(command: Command, kinds: Kinds) -> dict[str, list[str]]:
     """Config group -> presets that a command takes by default."""
-    groups = command.groups.items()
+    groups = command.chosen(kinds).items()
     return {group: [name] if isinstance(name, str) else name for group, name in groups}
 
 
-def setting_names(config_name: str) -> list[str]:
+def setting_names(config_name: str, kinds: Kinds = USUAL) -> list[str]:
     """Dotted names of all settings and groups of a command."""
     command = COMMANDS[config_name]
-    names = [*command.defaults(), *command.groups]
-    names += [f"{group}.{key}" for group, section in command.sections().items() for key in section]
+    names = [*command.defaults(), *command.chosen(kinds)]
+    names += [
+        f"{group}.{key}" for group, section in command.sections(kinds).items() for key in section
+    ]
     return names
 
 
@@ -103,12 +109,12 @@ def told_default(value: Any) -> str:
     return told(value)
 
 
-def _groups_text(command: Command, folder: str | None) -> Iterator[str]:
+def _groups_text(command: Command, folder: str | None, kinds: Kinds) -> Iterator[str]:
     if not command.groups:
         return
     yield ""
     yield "Config groups (* is the default):"
-    for group, default in group_defaults(command).items():
+    for group, default in group_defaults(command, kinds).items():
         names = [f"{n}*" if n in default else n for n in choices(group, folder)]
         yield from wrap(
             f"{group:<8} {', '.join(names)}", WIDTH, initial_indent="  ", subsequent_indent=" " * 11

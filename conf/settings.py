@@ -8,13 +8,14 @@ from typing import Any
 
 import yaml
 
-from conf.commands import COMMANDS, GROUPS, Command, load, plain_default
+from conf.commands import COMMANDS, GROUPS, Command, declared, load, plain_default
 from conf.help import choices, playable, told_default
+from conf.kinds import Kinds, every_kind
 from tangram_sim.settings import KEY, Declaration, declared_fields, told, values_of
 
 PAGE = Path(__file__).parents[1] / "docs" / "settings.md"
 # Lists of settings inside of a setting.
-NESTED = {"agent.hindsight": "tangram_agent.config:RelabelConfig"}
+NESTED = {"agent.hindsight": "tangram_agent.base.config:RelabelConfig"}
 INTRODUCTION = """\
 # Settings
 
@@ -38,13 +39,22 @@ def page() -> str:
         new = [row for row in rows if row not in told]
         parts += [_table(new)] if new else []
         told |= dict.fromkeys(new, command.name)
-    for group, name in (GROUPS | NESTED).items():
-        fields = declared_fields(load(name))
-        rows = [_row(own, f"{group}.{own.name}", plain_default(own)) for own in fields]
-        if group in GROUPS:
-            parts += [f"## {group}", _presets(group), _table(rows)]
-        else:
-            parts += [f"## Entries of {group}", _table(rows)]
+    for group in GROUPS:
+        parts += [f"## {group}", _presets(group)]
+        known = set[str]()
+        for kinds in every_kind(group):
+            rows = [
+                _row(own, f"{group}.{own.name}", plain_default(own)) for own in _own(group, kinds)
+            ]
+            new, shared = [row for row in rows if row not in known], known & set(rows)
+            parts += [*_of_kind(group, kinds, shared), *([_table(new)] if new else [])]
+            known |= set(rows)
+    for group, name in NESTED.items():
+        rows = [
+            _row(own, f"{group}.{own.name}", plain_default(own))
+            for own in declared_fields(load(name))
+        ]
+        parts += [f"## Entries of {group}", _table(rows)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -66,11 +76,18 @@ def _laid_over(command: Command) -> Iterator[str]:
         )
 
 
-def count() -> int:
-    """How many settings are declared; what several commands share counts once."""
-    names = {name for command in COMMANDS.values() for name in command.settings}
-    declarations = names | {*GROUPS.values(), *NESTED.values()}
-    return sum(len(declared_fields(load(name))) for name in declarations)
+def _own(group: str, kinds: Kinds) -> list["Field[Any]"]:
+    return declared(kinds.sections()[group])
+
+
+def _of_kind(group: str, kinds: Kinds, shared: set[str]) -> Iterator[str]:
+    """Whose settings follow, where a group has several kinds."""
+    kind = kinds.named().get(group)
+    if kind is not None and _own(group, kinds):
+        names = sorted(row.split("|")[1].strip() for row in shared)
+        yield f"Of `{group}.kind={kind}`" + (
+            f", and, as above, {', '.join(names)}:" if names else ":"
+        )
 
 
 def _table(rows: list[str]) -> str:

@@ -33,8 +33,8 @@ from tangram_agent.checkpoints import (
     set_aside,
     was_set_aside,
 )
-from tangram_core.service import ServiceConfig
 from tangram_agent.process import Every
+from tangram_core.service import ServiceConfig
 from tangram_sim.errors import RunError
 
 MINUTE_S = 60.0

@@ -3,7 +3,7 @@
 Everything heavy is imported after the config was composed, so --help and wrong input are instant.
 """
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,6 +11,7 @@ from conf.cli import entry, tell
 from conf.commands import Plain
 
 if TYPE_CHECKING:
+    from master.config import MasterConfig
     from tangram_core.setup import Setup
 
 
@@ -42,18 +43,9 @@ def _keys(settings: Plain) -> int:
 
 
 def _train(settings: Plain) -> int:
-    from master.config import MasterConfig, check_compiling
-    from tangram_core.setup import SECTIONS, from_mapping
-    from tangram_sim.world import check_shown, check_world
-
     _make_absolute(settings)
-    rest = {name: value for name, value in settings.items() if name not in SECTIONS}
-    config = from_mapping(MasterConfig, rest)
     # The children check it again; a wrong task is refused before any of them starts.
-    setup = _task(settings)
-    check_shown(setup.sim, setup.fills)
-    check_compiling(config.service, setup.fills)
-    check_world(setup.layout, setup.sim)
+    config, _ = _checked(settings, plays=True)
     tell(f"starts in {config.run_dir}")
 
     from master.launch import run_training
@@ -62,21 +54,13 @@ def _train(settings: Plain) -> int:
 
 
 def _master(settings: Plain) -> int:
-    from master.config import MasterConfig, check_compiling
-    from tangram_core.setup import SECTIONS, from_mapping
     from tangram_sim.settings import refuse_ignored
-    from tangram_sim.world import check_room, check_shown
 
     _make_absolute(settings)
-    rest = {name: value for name, value in settings.items() if name not in SECTIONS}
-    config = from_mapping(MasterConfig, rest)
+    config, setup = _checked(settings, plays=False)
     if config.workers > 1 and config.service.mode == "async":
         given, alone = f"workers={config.workers}", "service.mode=async in tangram-master"
         refuse_ignored(given, alone, "start them with tangram-worker", 1)
-    setup = _task(settings)
-    check_shown(setup.sim, setup.fills)
-    check_compiling(config.service, setup.fills)
-    check_room(setup.layout, setup.sim)
     tell(f"starts in {config.run_dir}")
 
     from master.run import run_master
@@ -84,26 +68,28 @@ def _master(settings: Plain) -> int:
     return run_master(config, setup, settings)
 
 
-def _task(settings: Plain) -> "Setup":
-    """The task; its reward is written into the settings so that it holds for other processes.
+def _checked(settings: Plain, *, plays: bool) -> "tuple[MasterConfig, Setup]":
+    """What is to be trained; code of the user's own is written into the settings by its content.
 
     Raises:
         ConfigError: it cannot be trained.
     """
-    from tangram_core.setup import make_setup
-    from tangram_sim.errors import ConfigError
-    from tangram_sim.rewards import check_reward, pinned
+    from master.config import MasterConfig, check_compiling
+    from tangram_agent.arrays import check_batch_size
+    from tangram_core.setup import from_mapping, make_setup
 
     setup = make_setup(settings)
-    if setup.agent.beam > 1:
-        raise ConfigError(
-            f"agent.beam={setup.agent.beam} is for play, an evaluator would be silent "
-            "for minutes: leave it out, and give it to tangram-eval or tangram-play"
-        )
-    setup = replace(setup, reward=pinned(setup.reward))
-    check_reward(setup.reward, setup.layout, setup.sim)
-    settings["reward"] = asdict(setup.reward)
-    return setup
+    rest = {name: value for name, value in settings.items() if name not in setup.sections}
+    config = from_mapping(MasterConfig, rest)
+    setup.agent.check_training()
+    given, setup = setup.sections, replace(setup, task=setup.task.pinned())
+    setup.task.check(plays=plays)
+    check_batch_size(setup.spec)
+    check_compiling(config.service)
+    for name, section in setup.sections.items():
+        if section is not None and section != given[name]:  # it names code by its content now
+            settings[name] = settings[name] | vars(section)
+    return config, setup
 
 
 def _make_absolute(settings: Plain) -> None:

@@ -4,10 +4,10 @@ import os
 import shutil
 from dataclasses import dataclass, field
 
-from tangram_core.service import ServiceConfig
 from tangram_agent.messages import ROLES
+from tangram_core.service import ServiceConfig
 from tangram_sim.errors import ConfigError
-from tangram_sim.settings import Settings, check_folder, declared, refuse_ignored, setting
+from tangram_sim.settings import Settings, check_folder, declared, setting
 
 MAX_WORKERS = 1024
 COMPILERS = ("g++", "clang++")
@@ -30,20 +30,14 @@ class KeysConfig(Settings):
         check_folder("run_dir", self.run_dir)
 
 
-def check_compiling(service: ServiceConfig, fills: bool) -> None:
-    """Refuse to compile what is not compiled, or without a compiler.
-
-    Args:
-        service: the run's.
-        fills: whether the agent fills outlines.
+def check_compiling(service: ServiceConfig) -> None:
+    """Refuse to compile without a compiler.
 
     Raises:
         ConfigError: says what is missing.
     """
     if not service.compile:
         return
-    if fills:
-        refuse_ignored("service.compile=true", "an agent of outlines", "leave it out", False)
     named = os.environ.get("CXX")
     if not any(shutil.which(name) for name in ([named] if named else COMPILERS)):
         raise ConfigError(

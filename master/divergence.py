@@ -11,9 +11,9 @@ import safetensors.numpy
 from master.counters import Counters
 from master.trainer import Trainer
 from tangram_agent.files import write_whole
-from tangram_core.agent import NotFiniteError
 from tangram_agent.process import Every
 from tangram_agent.types import Weights
+from tangram_core.agent import NotFiniteError
 from tangram_sim.errors import RunError
 
 # Going back further costs updates, keeping more often costs time.

@@ -14,11 +14,12 @@ from master.config import MasterConfig
 from master.console import logging_to, sturdy_console
 from master.result import show_finished
 from master.resumable import check_resumable
-from master.rundir import RunFolder, code_of
+from master.rundir import RunFolder
 from master.security import listening_place
 from master.signals import SAME_WISH_S, handling, show_cursor, stop_notice
 from tangram_agent.messages import TAKEN_OVER
 from tangram_agent.process import WATCHDOG_S, Every, watch_parent
+from tangram_core.code import code_of
 
 # While the master starts, its connection file is looked for this often.
 LOOK_S = 0.1

@@ -9,8 +9,8 @@ inserted says which round it is, so a run that was stopped goes on where it was.
 
 from master.delivery import EpisodesArrived
 from tangram_agent.arrays import check_batch_size
-from tangram_core.service import ServiceConfig
 from tangram_agent.messages import Go
+from tangram_core.service import ServiceConfig
 from tangram_core.spec import EpisodeSpec
 
 

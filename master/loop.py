@@ -15,9 +15,9 @@ from master.lockstep import Lockstep
 from master.report import Reporter
 from master.rundir import Clock, FolderError, RunFolder
 from master.signals import StopSignals, stop_notice
-from tangram_core.service import ServiceConfig
 from tangram_agent.messages import RunStatus
 from tangram_agent.process import Every, Watchdog
+from tangram_core.service import ServiceConfig
 from tangram_sim.errors import RunError
 
 # Between two looks at the sockets: learning goes on for so long, or idleness lasts.

@@ -268,8 +268,7 @@ class Registry:
             "out, for connect=RUN_DIR brings the master's, or start both with the same overrides "
             f"of {listed}"
         )
-        counter = "refused_tokens" if "tokens" in odd else "refused_settings"
-        raise RefusedError(counter, Refused(reason))
+        raise RefusedError("refused_settings", Refused(reason))
 
     def _free_index(self, role: str, now: float) -> int:
         reserved = self._ledgers if now < self._reserved_until else {}

@@ -19,9 +19,10 @@ from rich.table import Table
 from master.children import override
 from master.config import MasterConfig
 from master.console import TEST, sturdy_console
-from master.rundir import RunFolder, code_of
+from master.rundir import RunFolder
 from tangram_agent.messages import RunStatus
 from tangram_agent.outcome import outcome_rows, read_outcome
+from tangram_core.code import code_of
 
 PLAIN = re.compile(r"[\w.]+=[\w./:-]+")
 ROOT = Path(__file__).resolve().parent.parent

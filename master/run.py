@@ -30,15 +30,16 @@ from master.recovery import Reader, journal_run_id
 from master.report import Reporter, StatusCollector
 from master.result import command_line, go_on_command, make_result, show_finished, show_result
 from master.resumable import check_resumable
-from master.rundir import Claim, Clock, Record, RunFolder, code_of
+from master.rundir import Claim, Clock, Record, RunFolder
 from master.security import Keys, listening_place, needs_keys, run_keys, write_keys
 from master.signals import StopSignals
 from master.trainer import Trainer, choose_device
 from tangram_agent.addresses import LOCAL, dns_error, reachable, with_host
 from tangram_agent.compiling import cache_folder
-from tangram_core.service import ServiceConfig
 from tangram_agent.messages import OPEN, WINDOW
 from tangram_agent.process import WATCHDOG_S, Watchdog, keep_memory, watch_parent
+from tangram_core.code import code_of
+from tangram_core.service import ServiceConfig
 from tangram_core.setup import Setup
 
 # A clean end after the parent's death; a large replay takes seconds to write.
@@ -269,9 +270,9 @@ def _make_trainer(
     if service.compile:
         kept = cache_folder()
         log.info("compiles its update: up to a minute at first, seconds once %s has it", kept)
-        trainer.learner.compile_ahead()
+        trainer.learner.prepare()
         watchdog.progress()
-    elif device == "cuda" and not setup.fills:
+    elif device == "cuda" and trainer.learner.compiles:
         log.info(
             "learns by single operations, which leave a GPU idle: a new run with "
             "service.compile=true is faster (needs g++ or clang++)"

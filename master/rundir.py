@@ -20,20 +20,11 @@ from tangram_agent.checkpoints import list_checkpoints
 from tangram_agent.files import PUBLIC, is_same, make_folders, private, write_whole
 from tangram_agent.outcome import FILE_NAME as RESULT
 from tangram_agent.outcome import bound_of, read_outcome
-from tangram_core.setup import SECTIONS
-from tangram_sim.config import own_code
+from tangram_core.setup import section_names
 from tangram_sim.errors import ConfigError, RunError
 
 PRIVATE = 0o600
 LOCK = ".lock"
-# What a worker must know of the config.
-SHARED = (*SECTIONS, "service")
-
-
-def code_of(resolved: Mapping[str, Any]) -> dict[str, str]:
-    """The reward of a run, where it is code, which each of its commands must name itself."""
-    name = resolved.get("reward", {}).get("name", "")
-    return {"reward.name": name} if own_code(name) else {}
 
 
 class RunFolder:
@@ -156,7 +147,8 @@ class RunFolder:
             connection: where the master is; the settings of the run are added to it.
         """
         config = self.read_config()
-        settings = {name: config[name] for name in SHARED if name in config}
+        shared = (*section_names(config), "service")
+        settings = {name: config[name] for name in shared if name in config}
         content = {**connection, "settings": settings}
         self._write(self.connection, json.dumps(content, indent=1).encode(), PRIVATE)
 

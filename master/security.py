@@ -28,10 +28,10 @@ from zmq.utils import z85
 from master.audit import Audit
 from master.counters import Counters
 from tangram_agent.addresses import IPC, LOCAL
-from tangram_core.service import ServiceConfig
 from tangram_agent.files import own_folder, write_whole
 from tangram_agent.messages import ROLES
 from tangram_agent.process import Every
+from tangram_core.service import ServiceConfig
 from tangram_sim.errors import ConfigError, RunError
 
 PRIVATE = 0o600

@@ -26,7 +26,7 @@ from tangram_sim.errors import ConfigError
 from tangram_sim.geometry import outlines
 from tangram_sim.layout import Layout
 from tangram_sim.rings import covered_area
-from tangram_tasks.place import Place
+from tangram_tasks.fill import Fill
 
 _ANGLES = 8  # that a token is tried at where nothing fits
 _FREE = 0.5  # of what a token may cover of others
@@ -64,7 +64,7 @@ class Fillable:
 class Filler:
     """Chooses where the next token goes."""
 
-    def __init__(self, value: nn.Module, task: Place, beam: int) -> None:
+    def __init__(self, value: nn.Module, task: Fill, beam: int) -> None:
         self._fillable, self._layout = Fillable(value, task.layout), task.layout
         self._sim = task.sim
         self._filling, self._rows = Filling(task.layout), task.goal_rows

@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tangram_agent.agents.pair.networks import Networks
 from tangram_agent.coverage import covered_share, covering, worths
 from tangram_agent.motion import Belief, motions_of
-from tangram_agent.agents.pair.networks import Networks
 from tangram_agent.pairs import PairGraph, Pairs
 from tangram_agent.types import Choice, Past
 from tangram_sim.actions import velocities_of

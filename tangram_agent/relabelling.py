@@ -8,17 +8,13 @@ Legend: E episodes, T steps, B = E * T transitions, P pairs of each, M = B * P, 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
-from tangram_agent.config import AgentConfig, RelabelConfig
-from tangram_agent.coverage import Lying, covered_share, covering, lying, newly_covered
-from tangram_core.setup import Setup
-from tangram_agent.types import Flags, Transitions
+from tangram_agent.base.config import RelabelConfig
+from tangram_agent.types import Transitions
 from tangram_core.spec import Episodes
-from tangram_sim.actions import chosen_tokens
-from tangram_sim.arrays import Bools, Floats, Ints, Singles
+from tangram_sim.arrays import Floats, Singles
 from tangram_sim.layout import Layout
 
 # (achieved corners (B, V, 2), desired corners (B, V, 2)) -> rewards (B,)

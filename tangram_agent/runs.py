@@ -21,9 +21,9 @@ from tangram_agent.checkpoints import (
     newest_checkpoint,
 )
 from tangram_agent.pretrained import is_agent, is_name, packaged, read_agent
-from tangram_core.setup import Setup, make_setup
 from tangram_agent.stored import load_settings
 from tangram_agent.types import Past, Weights
+from tangram_core.setup import Setup, make_setup
 from tangram_sim.arrays import Floats, Singles
 from tangram_sim.config import with_given_reward
 from tangram_sim.errors import ConfigError, RunError

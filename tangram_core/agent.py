@@ -79,6 +79,7 @@ class Learner(ABC):
         parameters: numbers that are learned.
         device: where, for reports.
         capacity: transitions that are kept, or states, at most.
+        compiles: whether its updates can be compiled.
     """
 
     streams: tuple[str, ...] = ("replay", "hindsight")
@@ -87,6 +88,7 @@ class Learner(ABC):
     parameters: int = 0
     device: str = "cpu"
     capacity: int = 0
+    compiles: bool = False
 
     @abstractmethod
     def insert(self, episodes: Episodes, rng: Streams) -> int:
@@ -171,13 +173,14 @@ class Agent(ABC):
         @dataclass(frozen=True)
         class TD3(Agent):
             sections: ClassVar = {"agent": TD3Config}
-            agent: TD3Config = TD3Config()
+            config: TD3Config = TD3Config()
 
     To make one loads nothing heavy: `actor` and `learner` import torch when they are called. A
     worker calls `actor`, the master `learner`. They agree on settings by `identity`, and on nothing
     else: what the learner broadcasts, the actor loads.
 
-    What must be there: `pace`, `actor` and `learner`. What may: `check` and `facts`.
+    What must be there: `pace`, `actor` and `learner`. What may: `check`, `check_training` and
+    `facts`.
     """
 
     sections: ClassVar[Mapping[str, type[Settings]]] = {}
@@ -205,6 +208,13 @@ class Agent(ABC):
             ConfigError: it cannot do it so.
         """
 
+    def check_training(self) -> None:  # noqa: B027
+        """Refuse settings that are for playing a finished run alone.
+
+        Raises:
+            ConfigError: names the setting.
+        """
+
     def check(self, task: Task) -> None:  # noqa: B027
         """Refuse a task that it cannot play, or settings that would change nothing with it.
 
@@ -214,7 +224,7 @@ class Agent(ABC):
 
     def identity(self) -> Json:
         """Section -> what it says: what master and workers must have alike."""
-        return {name: asdict(getattr(self, name)) for name in self.sections}
+        return {n: asdict(getattr(self, "config" if n == "agent" else n)) for n in self.sections}
 
     def facts(self) -> Json:
         """What result.json tells of the agent."""

@@ -6,14 +6,13 @@ Another package announces its own as entry points of the groups `tangram_rl.task
 
 from importlib import import_module
 from importlib.metadata import entry_points
-from typing import Literal, TypeVar
+from typing import Any, Literal
 
 from tangram_core.agent import Agent
 from tangram_core.task import Task
 from tangram_sim.errors import ConfigError
 
 Role = Literal["task", "agent"]
-Found = TypeVar("Found", Task, Agent)
 KIND = "kind"  # the setting that names it, in the section of its role
 OURS: dict[Role, dict[str, str]] = {
     "task": {
@@ -42,8 +41,8 @@ def find_agent(kind: str) -> type[Agent]:
     return _found("agent", kind, Agent)
 
 
-def _found(role: Role, kind: str, base: type[Found]) -> type[Found]:
-    place = OURS[role].get(kind)
+def _found(role: Role, kind: str, base: type[Any]) -> type[Any]:
+    place, others = OURS[role].get(kind), dict[str, str]()
     if place is None:
         others = {one.name: one.value for one in entry_points(group=f"tangram_rl.{role}s")}
         place = others.get(kind)

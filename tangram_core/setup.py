@@ -83,8 +83,9 @@ class Setup:
         other = contents.get(section) if isinstance(contents, dict) else None
         own, holds = self.contents().get(section, {}), self.sections.get(section)
         known = own | other if isinstance(other, dict) else own
-        parts = {} if holds is None else {f.name: f.metadata[KEY].part for f in declared_fields(type(holds))}
-        odd = [name for name in own if parts.get(name, NETWORK if name == KIND else "") == NETWORK]
+        declared = [] if holds is None else declared_fields(type(holds))
+        parts = {KIND: NETWORK} | {one.name: one.metadata[KEY].part for one in declared}
+        odd = [name for name in own if parts.get(name) == NETWORK]
         return [f"{section}.{name}" for name in odd if own[name] != known[name]]
 
 
@@ -171,7 +172,8 @@ def from_mapping(kind: type[Made], mapping: Mapping[str, Any], section: str = ""
     _check_names(kind, mapping, f"{section}." if section else "")
     rules = dacite.Config(strict=True, cast=[tuple], type_hooks={float: _as_float})
     try:
-        return dacite.from_dict(cast("Any", kind), mapping, rules)
+        made: Made = dacite.from_dict(cast("Any", kind), mapping, rules)
+        return made
     except dacite.DaciteError as error:
         where = f" of {section}" if section else ""
         raise ConfigError(f"wrong config{where}: {error}") from None

@@ -6,7 +6,7 @@ Legend: E episodes, B environments, T steps of an episode, A entries of an actio
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 
@@ -138,7 +138,9 @@ class Task(ABC):
         @dataclass(frozen=True)
         class Point(Task):
             sections: ClassVar = {"task": PointConfig}
-            task: PointConfig = PointConfig()
+            config: PointConfig = PointConfig()
+
+    The section of its role, `task`, is its `config`; others go by their names.
 
     The master makes one too, and so does whoever shows a run: to make a task loads no engine.
     `make` does, and only a worker calls it. So nothing heavy is imported at the top of its file.
@@ -208,9 +210,13 @@ class Task(ABC):
         """The fixed test set; the first tests of a larger one are those of a smaller one."""
         return [episode_generator(seed, "evaluation", 0, 0, number) for number in range(count)]
 
+    def pinned(self) -> Self:
+        """With whatever code of the user's own it loads named by its content."""
+        return self
+
     def identity(self) -> Json:
         """Section -> what it says: what master and workers must have alike to play one task."""
-        return {name: asdict(getattr(self, name)) for name in self.sections}
+        return {n: asdict(getattr(self, "config" if n == "task" else n)) for n in self.sections}
 
     def facts(self) -> Json:
         """What result.json tells of the task."""

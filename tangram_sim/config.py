@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from tangram_sim.dynamics import WORLDS, Dynamics
+from tangram_core.code import own_code
 from tangram_sim.errors import ConfigError
 from tangram_sim.settings import NETWORK, Settings, refuse_ignored, setting, told
 
@@ -175,13 +176,6 @@ class SimConfig(Settings, section="sim"):
             remedy = "set sim.disturbance"
             because = f"sim.observe={self.observe}"
             refuse_ignored(given, because, remedy, SimConfig.corner_noise)
-
-
-def own_code(name: str) -> tuple[Path, str] | None:
-    """File and function where a reward is code of the user's own."""
-    path, _, function = name.rpartition(":")
-    code = path.endswith(".py") and function.isidentifier()
-    return (Path(path).expanduser(), function) if code else None
 
 
 def with_given_reward(read: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from rich.text import Text
 from tangram_agent.messages import OPEN, WORKER_COLUMNS, AskStatus, RunStatus, decode_from_master
 from tangram_agent.outcome import FILE_NAME, duration, outcome_rows, read_outcome
 from tangram_agent.runs import CONFIG
-from tangram_sim.config import own_code
+from tangram_core.code import own_code
 from tangram_sim.errors import TangramError, WireError
 from worker.config import StatusConfig
 from worker.connection import Sockets

@@ -85,14 +85,6 @@ class LearningConfig(Settings, section="agent"):
     """What whoever learns from a replay by gradients is told."""
 
     name: str = setting("tangram", "the preset's name, for reports", part=LEARNING)
-    motion: str = setting(
-        "learned",
-        "what a command comes to: learned from the replay, and watched in each episode; or the "
-        "exact rigid motion",
-        choices=("learned", "exact"),
-        only={"readout": "pair"},
-        part=NETWORK,
-    )
     acting_average: float = setting(
         0.99,
         "Polyak average of the weights that play and are scored; 0: none",
@@ -111,9 +103,6 @@ class LearningConfig(Settings, section="agent"):
         part=LEARNING,
     )
     batch_size: int = setting(64, "transitions in one update", low=1, part=LEARNING)
-    replay_capacity: int = setting(
-        200_000, "transitions kept", low=1, high=1_000_000_000, part=LEARNING
-    )
     replay_capacity: int = setting(
         200_000, "transitions kept", low=1, high=1_000_000_000, part=LEARNING
     )

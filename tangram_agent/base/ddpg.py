@@ -62,10 +62,11 @@ class Ddpg(NetworkLearner):
         batch: of the last update.
     """
 
+    compiles = True
     advice = "lower agent.actor_lr and agent.critic_lr"
     limit = 0.0  # of pre-activations, beyond which they pay a penalty
 
-    def __init__(  # noqa: PLR0913
+    def __init__(
         self,
         task: Place,
         config: ActorCriticConfig,

@@ -17,9 +17,5 @@ class OutlineConfig(LearningConfig, section="agent"):
         low=1,
         high=32,
     )
-    polyak: float = setting(
-        0.99, "rho of the target network, Eq. 4", low=0, high=1, part=LEARNING
-    )
-    copies: int = setting(
-        6, "states of hindsight for each episode", low=1, high=64, part=LEARNING
-    )
+    polyak: float = setting(0.99, "rho of the target network, Eq. 4", low=0, high=1, part=LEARNING)
+    copies: int = setting(6, "states of hindsight for each episode", low=1, high=64, part=LEARNING)

@@ -70,7 +70,8 @@ class PairActor(NetworkActor):
         wanted = generator.uniform(-1.0, 1.0, 3) * (sim.arena / 2.0, sim.arena / 2.0, np.pi)
         flip = sim.allow_flip and generator.choice((-1.0, 1.0)) > 0.0
         velocity = self._planner.velocity_to(here[None, token], wanted[None])
-        return self._actions(Choice(np.array([token]), np.array([flip]), velocity))[0]
+        action: Singles = self._actions(Choice(np.array([token]), np.array([flip]), velocity))[0]
+        return action
 
 
 def critic_plays(task: Place) -> bool:

@@ -39,7 +39,11 @@ class CriticNet(nn.Module):
         self.head = Head(self.graph, net, 1, at_base=False, action=VELOCITY)
 
     def forward(
-        self, scenes: Scenes, velocity: Tensor, _after: object = None, features: Tensor | None = None
+        self,
+        scenes: Scenes,
+        velocity: Tensor,
+        _after: object = None,
+        features: Tensor | None = None,
     ) -> Tensor:
         """Values (M,) of velocities (M, 3); features are as for `Head`."""
         value: Tensor = self.head(scenes, action=velocity, features=features).squeeze(-1)

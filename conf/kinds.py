@@ -1,0 +1,111 @@
+"""Which task and which agent a command line means, and with them the sections of its settings.
+
+Known before hydra composes anything: a preset says `kind: NAME`, or goes out from one that does.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from tangram_core.registry import KIND, OURS, find_agent, find_task
+from tangram_core.service import ServiceConfig
+from tangram_core.setup import AGENT, TASK
+from tangram_sim.errors import ConfigError
+from tangram_sim.settings import Settings
+
+Sections = dict[str, type[Settings] | None]
+MAX_STEPS = 16  # from a preset to the one that it goes out from
+
+
+@dataclass(frozen=True)
+class Kinds:
+    """The names of a task and of an agent."""
+
+    task: str = "place"
+    agent: str = "pair"
+
+    def sections(self) -> Sections:
+        """Section -> the dataclass that declares its settings; None: it names the kind alone."""
+        task, agent = find_task(self.task).sections, find_agent(self.agent).sections
+        return {TASK: None, **task, AGENT: None, **agent, "service": ServiceConfig}
+
+    def named(self) -> dict[str, str]:
+        """Section -> the kind that stands in it."""
+        return {TASK: self.task, AGENT: self.agent}
+
+
+def every_kind(group: str) -> list[Kinds]:
+    """The kinds that come with the package, of the role that a group is of; else the usual ones."""
+    if group == TASK:
+        return [Kinds(task=kind) for kind in OURS["task"]]
+    return [Kinds(agent=kind) for kind in OURS["agent"]] if group == AGENT else [Kinds()]
+
+
+def kinds_of(
+    arguments: Sequence[str], folder: str | None = None, stored: dict[str, Any] | None = None
+) -> Kinds:
+    """What arguments of a command mean.
+
+    Args:
+        arguments: as they were given.
+        folder: of the user's own presets.
+        stored: the config of a run that they go out from.
+
+    Raises:
+        ConfigError: a sweep over presets of several kinds.
+    """
+    usual = Kinds()
+    found = {role: _chosen(role, arguments, folder, stored) for role in (TASK, AGENT)}
+    return Kinds(found[TASK] or usual.task, found[AGENT] or usual.agent)
+
+
+def _chosen(
+    role: str, arguments: Sequence[str], folder: str | None, stored: dict[str, Any] | None
+) -> str | None:
+    given = [a.partition("=") for a in arguments]
+    exact = [value for name, _, value in given if name.lstrip("+") == f"{role}.{KIND}"]
+    if exact:
+        return exact[-1]
+    presets = [value for name, _, value in given if name.lstrip("+") == role]
+    if presets:
+        kinds = {_kind(role, preset, folder) for preset in presets[-1].split(",")}
+        if len(kinds) > 1:
+            raise ConfigError(
+                f"{role}={presets[-1]}: a sweep is over presets of one kind: give a sweep for each"
+            )
+        return kinds.pop()
+    section = None if stored is None else stored.get(role)
+    kind = section.get(KIND) if isinstance(section, dict) else None
+    return kind if isinstance(kind, str) else None
+
+
+def _kind(role: str, preset: str, folder: str | None) -> str | None:
+    """The kind that a preset says, or one that it goes out from; None: nobody says it."""
+    for _ in range(MAX_STEPS):
+        content = _read(role, preset, folder)
+        if isinstance(content.get(KIND), str):
+            return str(content[KIND])
+        before = [one for one in content.get("defaults", []) if isinstance(one, str)]
+        before = [one for one in before if one != "_self_"]
+        if not before:
+            return None
+        preset = before[-1]
+    return None
+
+
+def _read(role: str, preset: str, folder: str | None) -> dict[str, Any]:
+    """A preset; nothing where it is missing or broken, which is told later."""
+    places = [files("conf") / role, *([] if folder is None else [Path(folder) / role])]
+    for place in places:
+        path = place / f"{preset}.yaml"
+        if path.is_file():
+            try:
+                content = yaml.safe_load(path.read_text("utf-8"))
+            except (yaml.YAMLError, ValueError, RecursionError):
+                return {}
+            return content if isinstance(content, dict) else {}
+    return {}
