@@ -12,7 +12,7 @@ from typing import Any
 
 from conf.kinds import Kinds, every_kind
 from tangram_core.registry import KIND
-from tangram_sim.settings import Settings, declared_fields, setting
+from tangram_core.settings import Settings, declared_fields, setting
 
 Plain = dict[str, Any]
 USUAL = Kinds()

@@ -12,7 +12,7 @@ from typing import Any
 
 from conf.commands import COMMANDS, USUAL, Command, declared, laid_over, plain_default
 from conf.kinds import Kinds
-from tangram_sim.settings import KEY, PLAY, Declaration, told
+from tangram_core.settings import KEY, PLAY, Declaration, told
 
 WIDTH = 96
 

@@ -36,7 +36,7 @@ def _keys(settings: Plain) -> int:
 
     config = from_mapping(KeysConfig, settings)
 
-    from master.giving import change_keys
+    from master.hub.giving import change_keys
 
     print("\n".join(change_keys(config)))
     return 0
@@ -54,7 +54,7 @@ def _train(settings: Plain) -> int:
 
 
 def _master(settings: Plain) -> int:
-    from tangram_sim.settings import refuse_ignored
+    from tangram_core.settings import refuse_ignored
 
     _make_absolute(settings)
     config, setup = _checked(settings, plays=False)

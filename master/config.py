@@ -5,9 +5,9 @@ import shutil
 from dataclasses import dataclass, field
 
 from tangram_agent.messages import ROLES
+from tangram_core.errors import ConfigError
 from tangram_core.service import ServiceConfig
-from tangram_sim.errors import ConfigError
-from tangram_sim.settings import Settings, check_folder, declared, setting
+from tangram_core.settings import Settings, check_folder, declared, setting
 
 MAX_WORKERS = 1024
 COMPILERS = ("g++", "clang++")

@@ -13,9 +13,9 @@ import numpy as np
 
 from tangram_agent.base.config import RelabelConfig
 from tangram_agent.types import Transitions
+from tangram_core.arrays import Floats, Singles
 from tangram_core.spec import Episodes
-from tangram_sim.arrays import Floats, Singles
-from tangram_sim.layout import Layout
+from tangram_sim.geometry.layout import Layout
 
 # (achieved corners (B, V, 2), desired corners (B, V, 2)) -> rewards (B,)
 RewardFunction = Callable[[Floats, Floats], Floats]

@@ -9,8 +9,8 @@ from importlib.metadata import entry_points
 from typing import Any, Literal
 
 from tangram_core.agent import Agent
+from tangram_core.errors import ConfigError
 from tangram_core.task import Task
-from tangram_sim.errors import ConfigError
 
 Role = Literal["task", "agent"]
 KIND = "kind"  # the setting that names it, in the section of its role

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-from tangram_agent.addresses import LOCAL, check_host
-from tangram_agent.process import FORMATS
-from tangram_sim.settings import Settings, setting
+from tangram_core.process import FORMATS
+from tangram_core.settings import Settings, setting
+from tangram_core.wire.addresses import LOCAL, check_host
 
 ON_SOCKETS: dict[str, object] = {"bind": LOCAL}
 

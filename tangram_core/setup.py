@@ -9,11 +9,11 @@ from typing import Any, TypeVar, cast, get_origin, get_type_hints
 import dacite
 
 from tangram_core.agent import Agent
+from tangram_core.errors import ConfigError
 from tangram_core.registry import KIND, find_agent, find_task
+from tangram_core.settings import KEY, NETWORK, Settings, declared_fields
 from tangram_core.spec import EpisodeSpec
 from tangram_core.task import Task
-from tangram_sim.errors import ConfigError
-from tangram_sim.settings import KEY, NETWORK, Settings, declared_fields
 
 Made = TypeVar("Made")
 TASK, AGENT = "task", "agent"  # the sections that every run has

@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from tangram_sim.dynamics import WORLDS, Dynamics
 from tangram_core.code import own_code
-from tangram_sim.errors import ConfigError
-from tangram_sim.settings import NETWORK, Settings, refuse_ignored, setting, told
+from tangram_core.errors import ConfigError
+from tangram_core.settings import NETWORK, Settings, refuse_ignored, setting, told
+from tangram_sim.dynamics import WORLDS, Dynamics
 
 BACKENDS = ("physics", "kinematic")
 REWARDS = ("overlap", "dense")

@@ -3,9 +3,9 @@
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
+from tangram_core.errors import ConfigError
+from tangram_core.settings import refuse_ignored, told
 from tangram_sim.config import SILHOUETTES, RewardConfig
-from tangram_sim.errors import ConfigError
-from tangram_sim.settings import refuse_ignored, told
 from tangram_tasks.place import Place
 
 

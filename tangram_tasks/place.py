@@ -9,16 +9,16 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from tangram_core.arrays import Floats
 from tangram_core.spec import Array, EpisodeSpec
 from tangram_core.task import Json, Task
-from tangram_sim.actions import action_size, corner_bound, goal_rows, horizon
-from tangram_sim.arrays import Floats
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.episodes import spec_of
-from tangram_sim.layout import Layout, TokensConfig, make_layout
+from tangram_sim.geometry.layout import Layout, TokensConfig, make_layout
+from tangram_sim.motion.actions import action_size, corner_bound, goal_rows, horizon
 from tangram_sim.rewards import RewardFn, check_reward, make_reward, pinned, reward_identity
-from tangram_sim.targets import check_targets
-from tangram_sim.world import check_room, check_shown, check_world
+from tangram_sim.tasks.targets import check_targets
+from tangram_sim.world.world import check_room, check_shown, check_world
 
 
 @dataclass(frozen=True)

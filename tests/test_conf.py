@@ -12,17 +12,17 @@ from unittest.mock import patch
 import pytest
 import yaml
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from tangram_agent.config import AgentConfig, NetConfig, ServiceConfig
 
 from conf.cli import composed, entry, with_run_config
 from conf.commands import COMMANDS, GROUPS, OVER, Plain, load
 from conf.help import choices, group_help, help_text, setting_names
 from conf.settings import PAGE, page
 from conf.sweep import check_launcher, refuse_lost_job
-from tangram_agent.config import AgentConfig, NetConfig, ServiceConfig
+from tangram_core.errors import ConfigError, TangramError
+from tangram_core.settings import KEY, PLAY, declared_fields
 from tangram_core.setup import Setup, from_mapping, make_setup
 from tangram_sim.config import RewardConfig, SimConfig
-from tangram_sim.errors import ConfigError, TangramError
-from tangram_sim.settings import KEY, PLAY, declared_fields
 
 pytestmark = pytest.mark.fast
 

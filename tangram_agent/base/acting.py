@@ -6,10 +6,10 @@ import numpy as np
 import torch
 from torch import nn
 
-from tangram_agent.weights import load_arrays
+from tangram_agent.base.weights import load_arrays
 from tangram_core.agent import Actor
+from tangram_core.arrays import Singles
 from tangram_core.spec import Array, Arrays
-from tangram_sim.arrays import Singles
 
 
 class NetworkActor(Actor):

@@ -1,7 +1,7 @@
 """What agents of tokens ask of a task."""
 
+from tangram_core.errors import ConfigError
 from tangram_core.task import Task
-from tangram_sim.errors import ConfigError
 from tangram_tasks.place import Place
 
 

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 
 from tangram_core.agent import Pace
-from tangram_sim.errors import ConfigError
-from tangram_sim.settings import LEARNING, Settings, declared, setting
+from tangram_core.errors import ConfigError
+from tangram_core.settings import LEARNING, Settings, declared, setting
 
 HEADS = 4  # M in Eq. 12, each of the key width d = width / M
 STRATEGIES = ("final", "future", "near")

@@ -13,15 +13,15 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from tangram_agent.base.compiling import Compiled
 from tangram_agent.base.config import ActorCriticConfig
 from tangram_agent.base.learning import NetworkLearner, Rates, frozen, polyak_update
-from tangram_agent.compiling import Compiled
 from tangram_agent.relabelling import learnable, with_relabelled
 from tangram_agent.replay import ReplayBuffer
 from tangram_agent.types import Transitions
 from tangram_core.agent import Streams
+from tangram_core.arrays import Ints
 from tangram_core.spec import Array, Arrays, Episodes
-from tangram_sim.arrays import Ints
 from tangram_tasks.place import Place
 
 NUMBERS = ("critic_loss", "q", "critic_gradient", "actor_loss", "saturation", "actor_gradient")

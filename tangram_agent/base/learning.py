@@ -10,13 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tangram_agent.adam import Adam
+from tangram_agent.base.adam import Adam
 from tangram_agent.base.config import LearningConfig
 from tangram_agent.base.networks import initialise, parameter_count
-from tangram_agent.weights import load_arrays, to_arrays, under
+from tangram_agent.base.weights import load_arrays, to_arrays, under
 from tangram_core.agent import Learner, NotFiniteError, Tensors
+from tangram_core.errors import RunError
 from tangram_core.spec import Array
-from tangram_sim.errors import RunError
 
 _COUNTER = "updates"
 

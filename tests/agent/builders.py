@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from tangram_agent.pretrained import CARD, WEIGHTS
-from tangram_core.setup import Setup, make_setup
 from tangram_agent.types import Transitions
+from tangram_core.setup import Setup, make_setup
 from tangram_core.spec import Episodes, EpisodeSpec
 
 SQUARE = {"shapes": ["square"], "scale": 1.131370849898476}  # side 0.4

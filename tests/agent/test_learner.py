@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-
-from tangram_agent.adam import Adam
 from tangram_agent.learner import (
     Learner,
     NotFiniteError,
@@ -20,11 +18,13 @@ from tangram_agent.learner import (
     polyak_update,
     saturation,
 )
-from tangram_agent.scenes import Scenes, next_token
+
+from tangram_agent.agents.scene.scenes import Scenes, next_token
+from tangram_agent.base.adam import Adam
+from tangram_core.errors import RunError
 from tangram_core.setup import Setup
-from tangram_sim.errors import RunError
+from tests.agent.agents.pair.pair_scenes import PERCEPTRON, TWO, seven, transitions
 from tests.agent.builders import PAIR, PAPER, SCENE, SMALL, random_transitions, setup
-from tests.agent.pair_scenes import PERCEPTRON, TWO, seven, transitions
 
 pytestmark = pytest.mark.fast
 

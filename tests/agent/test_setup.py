@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
+from tangram_core.errors import ConfigError
 from tangram_core.service import ServiceConfig
 from tangram_core.setup import from_mapping, make_setup
-from tangram_sim.errors import ConfigError
 
 pytestmark = pytest.mark.fast
 

@@ -13,8 +13,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
-from tangram_core.setup import make_setup
 from tangram_cli.commands import COMMON_NAMES
+from tangram_core.setup import make_setup
 from tests.cluster.conftest import UPDATES
 from tests.cluster.processes import ended, pids_of, refused, run, run_here
 

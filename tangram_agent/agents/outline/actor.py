@@ -6,15 +6,15 @@ Legend: B environments, G rows of an outline.
 import numpy as np
 
 from tangram_agent.agents.outline.config import OutlineConfig
+from tangram_agent.agents.outline.filler import Filler
+from tangram_agent.agents.outline.filling import Filling
+from tangram_agent.agents.outline.values import OutlineValue
 from tangram_agent.base.acting import NetworkActor, closed
 from tangram_agent.base.config import NetConfig
-from tangram_agent.filler import Filler
-from tangram_agent.filling import Filling
-from tangram_agent.values import OutlineValue
+from tangram_core.arrays import Singles
 from tangram_core.spec import Arrays
 from tangram_core.task import Generators, History
-from tangram_sim.actions import make_actions
-from tangram_sim.arrays import Singles
+from tangram_sim.motion.actions import make_actions
 from tangram_tasks.fill import Fill
 
 

@@ -7,9 +7,9 @@ from tangram_agent.agents.outline.config import OutlineConfig
 from tangram_agent.base.checks import check_capacity
 from tangram_agent.base.config import NetConfig
 from tangram_core.agent import Agent, Pace
+from tangram_core.errors import ConfigError
+from tangram_core.settings import refuse_ignored
 from tangram_core.task import Json, Task
-from tangram_sim.errors import ConfigError
-from tangram_sim.settings import refuse_ignored
 from tangram_tasks.fill import Fill
 
 if TYPE_CHECKING:  # need torch

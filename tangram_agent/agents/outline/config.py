@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from tangram_agent.base.config import LearningConfig
-from tangram_sim.settings import LEARNING, setting
+from tangram_core.settings import LEARNING, setting
 
 
 @dataclass(frozen=True)

@@ -14,12 +14,12 @@ import torch
 from torch import Tensor, nn
 
 from tangram_agent.agents.outline.config import OutlineConfig
+from tangram_agent.agents.outline.filling import Filling, Rests
+from tangram_agent.agents.outline.filling_replay import FILLED, OPEN, FillBatch, FillReplay
+from tangram_agent.agents.outline.values import Corners, OutlineValue
 from tangram_agent.base.config import NetConfig
 from tangram_agent.base.learning import NetworkLearner, Rates, frozen, polyak_update
-from tangram_agent.filling import Filling, Rests
-from tangram_agent.filling_replay import FILLED, OPEN, FillBatch, FillReplay
 from tangram_agent.relabelling import learnable
-from tangram_agent.values import Corners, OutlineValue
 from tangram_core.agent import Streams
 from tangram_core.spec import Array, Episodes
 from tangram_tasks.fill import Fill

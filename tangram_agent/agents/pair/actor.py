@@ -7,14 +7,14 @@ import numpy as np
 
 from tangram_agent.agents.pair.config import PairConfig
 from tangram_agent.agents.pair.networks import Networks
+from tangram_agent.agents.pair.planning import Planner
 from tangram_agent.base.acting import NetworkActor, closed
 from tangram_agent.base.config import NetConfig
-from tangram_agent.planning import Planner
 from tangram_agent.types import Choice, Past
+from tangram_core.arrays import Floats, Singles
 from tangram_core.spec import Array, Arrays
 from tangram_core.task import Generators, History
-from tangram_sim.actions import make_actions
-from tangram_sim.arrays import Floats, Singles
+from tangram_sim.motion.actions import make_actions
 from tangram_tasks.place import Place
 
 

@@ -7,9 +7,9 @@ from tangram_agent.agents.pair.config import PairConfig
 from tangram_agent.base.checks import check_capacity, seen_tokens
 from tangram_agent.base.config import NetConfig
 from tangram_core.agent import Agent, Pace
+from tangram_core.settings import refuse_ignored, told
 from tangram_core.task import Json, Task
 from tangram_sim.config import RewardConfig
-from tangram_sim.settings import refuse_ignored, told
 from tangram_tasks.place import Place
 
 if TYPE_CHECKING:  # need torch

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tangram_agent.agents.pair.coverage import Lying, covered_share, covering, lying, newly_covered
 from tangram_agent.base.config import RelabelConfig
-from tangram_agent.coverage import Lying, covered_share, covering, lying, newly_covered
 from tangram_agent.relabelling import spread
 from tangram_agent.types import Flags, Transitions
-from tangram_sim.actions import chosen_tokens
-from tangram_sim.arrays import Bools, Floats, Ints, Singles
-from tangram_sim.layout import Layout
+from tangram_core.arrays import Bools, Floats, Ints, Singles
+from tangram_sim.geometry.layout import Layout
+from tangram_sim.motion.actions import chosen_tokens
 
 _PAIRS = 8  # of a transition of several tokens in one update
 _CORRECTED = 0.25  # share of pairs that begin where the action ended

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from tangram_agent.base.config import ActorCriticConfig
-from tangram_sim.settings import NETWORK, setting
+from tangram_core.settings import NETWORK, setting
 
 
 @dataclass(frozen=True)

@@ -14,18 +14,18 @@ import numpy as np
 from tangram_agent.agents.pair.actor import critic_plays
 from tangram_agent.agents.pair.batch import PairBatch, make_pairs
 from tangram_agent.agents.pair.config import PairConfig
+from tangram_agent.agents.pair.motion import Fit, MotionModel, Motions, motions_of
 from tangram_agent.agents.pair.networks import Networks
+from tangram_agent.agents.pair.pairs import Pairs
 from tangram_agent.base.config import NetConfig
 from tangram_agent.base.ddpg import NUMBERS, Ddpg, Steps
 from tangram_agent.base.learning import read_slots, saved_slots
-from tangram_agent.motion import Fit, MotionModel, Motions, motions_of
-from tangram_agent.pairs import Pairs
+from tangram_agent.base.weights import under
 from tangram_agent.types import Transitions
-from tangram_agent.weights import under
 from tangram_core.agent import Streams, Tensors
+from tangram_core.arrays import Bools, Floats
+from tangram_core.errors import RunError
 from tangram_core.spec import Array
-from tangram_sim.arrays import Bools, Floats
-from tangram_sim.errors import RunError
 from tangram_tasks.place import Place
 
 SEEN_MOTIONS = 256  # transitions of whole episodes that the motion model sees in an update

@@ -8,11 +8,11 @@ import math
 import torch
 from torch import Tensor, nn
 
+from tangram_agent.agents.pair.motion import MotionModel
+from tangram_agent.agents.pair.pairs import PairGraph, Pairs
 from tangram_agent.base.config import NetConfig
 from tangram_agent.base.networks import VELOCITY, Head
-from tangram_agent.motion import MotionModel
-from tangram_agent.pairs import PairGraph, Pairs
-from tangram_sim.layout import Layout
+from tangram_sim.geometry.layout import Layout
 
 
 class ActorNet(nn.Module):

@@ -4,12 +4,12 @@ import numpy as np
 from torch import Tensor
 
 from tangram_agent.agents.scene.networks import ActorNet, CriticNet
+from tangram_agent.agents.scene.scenes import Scenes, next_token
 from tangram_agent.base.config import ActorCriticConfig, NetConfig
 from tangram_agent.base.ddpg import Ddpg, Steps
 from tangram_agent.base.networks import VELOCITY
-from tangram_agent.scenes import Scenes, next_token
 from tangram_agent.types import Transitions
-from tangram_sim.actions import chosen_tokens
+from tangram_sim.motion.actions import chosen_tokens
 from tangram_tasks.place import Place
 
 

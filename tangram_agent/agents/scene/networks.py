@@ -6,10 +6,10 @@ Legend: M scenes.
 import torch
 from torch import Tensor, nn
 
+from tangram_agent.agents.scene.scenes import SceneGraph, Scenes
 from tangram_agent.base.config import NetConfig
 from tangram_agent.base.networks import VELOCITY, Head
-from tangram_agent.scenes import SceneGraph, Scenes
-from tangram_sim.layout import Layout
+from tangram_sim.geometry.layout import Layout
 
 
 class ActorNet(nn.Module):
