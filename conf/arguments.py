@@ -6,7 +6,7 @@ from pathlib import Path
 from conf.commands import COMMANDS, GROUPS
 from conf.help import choices
 from conf.sweep import SWEEP
-from tangram_sim.errors import ConfigError
+from tangram_core.errors import ConfigError
 
 CFG_KINDS = ("job", "hydra", "all")
 FLAGS = ("--cfg", *SWEEP)

@@ -27,8 +27,8 @@ from conf.commands import COMMANDS, Plain
 from conf.help import choices, group_help, help_text, setting_names
 from conf.names import hidden, revealed
 from conf.sweep import LAUNCHER, check_launcher, refuse_lost_job
-from tangram_sim.errors import ConfigError, TangramError
-from tangram_sim.settings import CONTROL
+from tangram_core.errors import ConfigError, TangramError
+from tangram_core.settings import CONTROL
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -92,7 +92,7 @@ def tell(line: str) -> None:
 
     Not from a child, which shares the terminal with the process that started it.
     """
-    from tangram_agent.process import VARIABLE
+    from tangram_core.process import VARIABLE
 
     if sys.stderr.isatty() and VARIABLE not in os.environ:
         print(line, file=sys.stderr, flush=True)
@@ -105,7 +105,7 @@ def _check_presets(folder: str | None) -> None:
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    from tangram_agent.stored import check_extent
+    from tangram_core.store.stored import check_extent
 
     for path in (path for group in PRESET_GROUPS for path in Path(folder, group).rglob("*.yaml")):
         try:
@@ -353,7 +353,7 @@ def _from_config(settings: Plain) -> tuple[str, Plain] | None:
         return None
     if not isinstance(path, str):
         raise ConfigError(f"from_config must be the path of a run's config.yaml, got {path!r}")
-    from tangram_agent.stored import load_settings
+    from tangram_core.store.stored import load_settings
 
     source = f"from_config={path}"
     try:

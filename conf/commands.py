@@ -10,7 +10,7 @@ from dataclasses import MISSING, Field, asdict, dataclass, field, is_dataclass
 from importlib import import_module
 from typing import Any
 
-from tangram_sim.settings import Settings, declared_fields, setting
+from tangram_core.settings import Settings, declared_fields, setting
 
 Plain = dict[str, Any]
 NEEDED = "???"  # hydra's word for a value that must be given
@@ -24,7 +24,7 @@ GROUPS = {
     "net": "tangram_agent.config:NetConfig",
     "agent": "tangram_agent.config:AgentConfig",
     "service": "tangram_agent.config:ServiceConfig",
-    "tokens": "tangram_sim.layout:TokensConfig",
+    "tokens": "tangram_sim.geometry.layout:TokensConfig",
 }
 RUN: dict[str, str | list[str]] = {
     "sim": "physics",

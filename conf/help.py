@@ -11,7 +11,7 @@ from textwrap import wrap
 from typing import Any
 
 from conf.commands import COMMANDS, GROUPS, Command, load, plain_default
-from tangram_sim.settings import KEY, PLAY, Declaration, declared_fields, told
+from tangram_core.settings import KEY, PLAY, Declaration, declared_fields, told
 
 WIDTH = 96
 

@@ -10,7 +10,7 @@ import yaml
 
 from conf.commands import COMMANDS, GROUPS, Command, load, plain_default
 from conf.help import choices, playable, told_default
-from tangram_sim.settings import KEY, Declaration, declared_fields, told, values_of
+from tangram_core.settings import KEY, Declaration, declared_fields, told, values_of
 
 PAGE = Path(__file__).parents[1] / "docs" / "settings.md"
 # Lists of settings inside of a setting.

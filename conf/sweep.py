@@ -4,7 +4,7 @@ import shutil
 from collections.abc import Sequence
 from importlib.util import find_spec
 
-from tangram_sim.errors import ConfigError, TangramError
+from tangram_core.errors import ConfigError, TangramError
 
 LAUNCHER = "hydra/launcher"  # chooses where the jobs of a sweep run
 SWEEP = ("--multirun", "-m")

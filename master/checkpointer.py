@@ -15,12 +15,12 @@ from typing import Any
 
 import msgspec
 
-from master.delivery import EpisodesArrived
-from master.divergence import DivergenceGuard
-from master.hub import Hub
-from master.journal import Journal, JournalError, Place
-from master.rundir import Claim, Clock, FolderError, Record
-from master.trainer import LEARNER, Trainer
+from master.hub.hub import Hub
+from master.learn.divergence import DivergenceGuard
+from master.learn.trainer import LEARNER, Trainer
+from master.record.delivery import EpisodesArrived
+from master.record.journal import Journal, JournalError, Place
+from master.record.rundir import Claim, Clock, FolderError, Record
 from tangram_agent.checkpoints import (
     CHECKPOINTS,
     Checkpoint,
@@ -34,8 +34,8 @@ from tangram_agent.checkpoints import (
     was_set_aside,
 )
 from tangram_agent.config import ServiceConfig
-from tangram_agent.process import Every
-from tangram_sim.errors import RunError
+from tangram_core.errors import RunError
+from tangram_core.process import Every
 
 MINUTE_S = 60.0
 RETRY_S = 1.0

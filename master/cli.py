@@ -35,7 +35,7 @@ def _keys(settings: Plain) -> int:
 
     config = from_mapping(KeysConfig, settings)
 
-    from master.giving import change_keys
+    from master.hub.giving import change_keys
 
     print("\n".join(change_keys(config)))
     return 0
@@ -44,7 +44,7 @@ def _keys(settings: Plain) -> int:
 def _train(settings: Plain) -> int:
     from master.config import MasterConfig, check_compiling
     from tangram_agent.setup import SECTIONS, from_mapping
-    from tangram_sim.world import check_shown, check_world
+    from tangram_sim.world.world import check_shown, check_world
 
     _make_absolute(settings)
     rest = {name: value for name, value in settings.items() if name not in SECTIONS}
@@ -64,8 +64,8 @@ def _train(settings: Plain) -> int:
 def _master(settings: Plain) -> int:
     from master.config import MasterConfig, check_compiling
     from tangram_agent.setup import SECTIONS, from_mapping
-    from tangram_sim.settings import refuse_ignored
-    from tangram_sim.world import check_room, check_shown
+    from tangram_core.settings import refuse_ignored
+    from tangram_sim.world.world import check_room, check_shown
 
     _make_absolute(settings)
     rest = {name: value for name, value in settings.items() if name not in SECTIONS}
@@ -91,7 +91,7 @@ def _task(settings: Plain) -> "Setup":
         ConfigError: it cannot be trained.
     """
     from tangram_agent.setup import make_setup
-    from tangram_sim.errors import ConfigError
+    from tangram_core.errors import ConfigError
     from tangram_sim.rewards import check_reward, pinned
 
     setup = make_setup(settings)

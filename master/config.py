@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import ROLES
-from tangram_sim.errors import ConfigError
-from tangram_sim.settings import Settings, check_folder, declared, refuse_ignored, setting
+from tangram_core.errors import ConfigError
+from tangram_core.settings import Settings, check_folder, declared, refuse_ignored, setting
 
 MAX_WORKERS = 1024
 COMPILERS = ("g++", "clang++")

@@ -11,14 +11,14 @@ from typing import Any
 
 from master.children import MAX_RESTARTS, Child, command, describe, override
 from master.config import MasterConfig
-from master.console import logging_to, sturdy_console
-from master.result import show_finished
-from master.resumable import check_resumable
-from master.rundir import RunFolder, code_of
-from master.security import listening_place
+from master.hub.security import listening_place
+from master.record.resumable import check_resumable
+from master.record.rundir import RunFolder, code_of
 from master.signals import SAME_WISH_S, handling, show_cursor, stop_notice
+from master.watch.console import logging_to, sturdy_console
+from master.watch.result import show_finished
 from tangram_agent.messages import TAKEN_OVER
-from tangram_agent.process import WATCHDOG_S, Every, watch_parent
+from tangram_core.process import WATCHDOG_S, Every, watch_parent
 
 # While the master starts, its connection file is looked for this often.
 LOOK_S = 0.1

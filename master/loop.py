@@ -6,19 +6,19 @@ from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-from master.budget import Budget
 from master.checkpointer import Checkpointer
-from master.delivery import EpisodesArrived, ScoresArrived
-from master.divergence import DivergenceGuard
-from master.hub import Hub
-from master.lockstep import Lockstep
-from master.report import Reporter
-from master.rundir import Clock, FolderError, RunFolder
+from master.hub.hub import Hub
+from master.learn.budget import Budget
+from master.learn.divergence import DivergenceGuard
+from master.learn.lockstep import Lockstep
+from master.record.delivery import EpisodesArrived, ScoresArrived
+from master.record.rundir import Clock, FolderError, RunFolder
 from master.signals import StopSignals, stop_notice
+from master.watch.report import Reporter
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import RunStatus
-from tangram_agent.process import Every, Watchdog
-from tangram_sim.errors import RunError
+from tangram_core.errors import RunError
+from tangram_core.process import Every, Watchdog
 
 # Between two looks at the sockets: learning goes on for so long, or idleness lasts.
 LEARN_S = 0.05

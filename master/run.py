@@ -11,35 +11,35 @@ from typing import Any
 
 import torch
 
-from master.admission import WelcomeInfo
-from master.audit import Audit
-from master.budget import Budget
 from master.checkpointer import Checkpointer, Restored, restore_run, warm_start
 from master.config import MasterConfig
-from master.console import Progress, logging_to, make_progress, sturdy_console
-from master.delivery import EpisodesArrived
-from master.divergence import DivergenceGuard
-from master.gate import Room
-from master.health import OFF, Health
-from master.hub import Hub
-from master.journal import Journal, Place
-from master.lockstep import Lockstep
+from master.hub.admission import WelcomeInfo
+from master.hub.gate import Room
+from master.hub.hub import Hub
+from master.hub.security import Keys, listening_place, needs_keys, run_keys, write_keys
+from master.learn.budget import Budget
+from master.learn.divergence import DivergenceGuard
+from master.learn.lockstep import Lockstep
+from master.learn.trainer import Trainer, choose_device
 from master.loop import Loop
-from master.metrics import Metrics
-from master.recovery import Reader, journal_run_id
-from master.report import Reporter, StatusCollector
-from master.result import command_line, go_on_command, make_result, show_finished, show_result
-from master.resumable import check_resumable
-from master.rundir import Claim, Clock, Record, RunFolder, code_of
-from master.security import Keys, listening_place, needs_keys, run_keys, write_keys
+from master.record.audit import Audit
+from master.record.delivery import EpisodesArrived
+from master.record.journal import Journal, Place
+from master.record.recovery import Reader, journal_run_id
+from master.record.resumable import check_resumable
+from master.record.rundir import Claim, Clock, Record, RunFolder, code_of
 from master.signals import StopSignals
-from master.trainer import Trainer, choose_device
-from tangram_agent.addresses import LOCAL, dns_error, reachable, with_host
-from tangram_agent.compiling import cache_folder
+from master.watch.console import Progress, logging_to, make_progress, sturdy_console
+from master.watch.health import OFF, Health
+from master.watch.metrics import Metrics
+from master.watch.report import Reporter, StatusCollector
+from master.watch.result import command_line, go_on_command, make_result, show_finished, show_result
+from tangram_agent.base.compiling import cache_folder
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import OPEN, WINDOW
-from tangram_agent.process import WATCHDOG_S, Watchdog, keep_memory, watch_parent
 from tangram_agent.setup import Setup
+from tangram_core.process import WATCHDOG_S, Watchdog, keep_memory, watch_parent
+from tangram_core.wire.addresses import LOCAL, dns_error, reachable, with_host
 
 # A clean end after the parent's death; a large replay takes seconds to write.
 GRACE_S = 30.0

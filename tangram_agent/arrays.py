@@ -19,9 +19,9 @@ import numpy.typing as npt
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
+from tangram_core.arrays import Singles
+from tangram_core.errors import ConfigError, WireError
 from tangram_core.spec import EpisodeSpec, Field
-from tangram_sim.arrays import Singles
-from tangram_sim.errors import ConfigError, WireError
 
 WeightShapes = Mapping[str, tuple[int, ...]]
 

@@ -23,8 +23,8 @@ import numpy.typing as npt
 import safetensors.numpy
 
 from tangram_agent.arrays import load_tensors
-from tangram_agent.files import make_folders, sync_folder
-from tangram_sim.errors import RunError, WireError
+from tangram_core.errors import RunError, WireError
+from tangram_core.store.files import make_folders, sync_folder
 
 FORMAT_VERSION = 3
 MANIFEST = "manifest.json"

@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass, field
 
-from tangram_agent.addresses import LOCAL, check_host
-from tangram_agent.process import FORMATS
-from tangram_sim.errors import ConfigError
-from tangram_sim.settings import LEARNING, NETWORK, Settings, declared, setting
+from tangram_core.errors import ConfigError
+from tangram_core.process import FORMATS
+from tangram_core.settings import LEARNING, NETWORK, Settings, declared, setting
+from tangram_core.wire.addresses import LOCAL, check_host
 
 HEADS = 4  # M in Eq. 12, each of the key width d = width / M
 STRATEGIES = ("final", "future", "near")

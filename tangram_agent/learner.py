@@ -17,17 +17,17 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from tangram_agent.adam import Adam
-from tangram_agent.compiling import Compiled
+from tangram_agent.agents.pair.motion import Fit, MotionModel, Motions
+from tangram_agent.base.adam import Adam
+from tangram_agent.base.compiling import Compiled
+from tangram_agent.base.weights import load_arrays, to_arrays, under
 from tangram_agent.config import AgentConfig
-from tangram_agent.motion import Fit, MotionModel, Motions
 from tangram_agent.networks import Networks, initialise, parameter_count
 from tangram_agent.relabelling import make_pairs
 from tangram_agent.setup import Setup
 from tangram_agent.steps import Batch, Stepping, Steps
 from tangram_agent.types import Transitions, Weights
-from tangram_agent.weights import load_arrays, to_arrays, under
-from tangram_sim.errors import RunError
+from tangram_core.errors import RunError
 
 Array = npt.NDArray[Any]
 _COUNTER = "updates"

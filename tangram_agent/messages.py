@@ -42,9 +42,9 @@ from tangram_agent.schema import (
     received,
 )
 from tangram_agent.types import Weights
+from tangram_core.arrays import Floats, Pixels
+from tangram_core.errors import WireError
 from tangram_core.spec import Episodes, EpisodeSpec
-from tangram_sim.arrays import Floats, Pixels
-from tangram_sim.errors import WireError
 
 ROLES = ("player", "evaluator")
 MAX_ID = 64
@@ -56,7 +56,7 @@ WINDOW = 4  # messages of a worker that may be unacknowledged; a full window pau
 MAX_WINDOW = 1024
 PICTURE_WIDTH, PICTURE_HEIGHT = 1024, 768  # pixels: at most, they fill MAX_FRAMES
 MAX_ROWS = 4096
-# What an evaluator may report; see `worker.metrics`.
+# What an evaluator may report; see `worker.score.metrics`.
 SCORE_NAMES = (
     "mean_reward",
     "mean_reward_dense",

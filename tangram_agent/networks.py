@@ -11,16 +11,16 @@ import math
 import torch
 from torch import Tensor, nn
 
-from tangram_agent.attention import GraphEncoder
+from tangram_agent.agents.outline.filling import Filling
+from tangram_agent.agents.outline.values import OutlineValue
+from tangram_agent.agents.pair.motion import MotionModel
+from tangram_agent.agents.pair.pairs import PairGraph, Pairs
+from tangram_agent.agents.scene.scenes import SceneGraph, Scenes
+from tangram_agent.base.attention import GraphEncoder
+from tangram_agent.base.graph import Graph
 from tangram_agent.config import NetConfig
-from tangram_agent.filling import Filling
-from tangram_agent.graph import Graph
-from tangram_agent.motion import MotionModel
-from tangram_agent.pairs import PairGraph, Pairs
-from tangram_agent.scenes import SceneGraph, Scenes
 from tangram_agent.setup import Setup
 from tangram_agent.types import Weights
-from tangram_agent.values import OutlineValue
 
 View = Scenes | Pairs
 

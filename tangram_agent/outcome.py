@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from tangram_sim.errors import RunError
+from tangram_core.errors import RunError
 
 FILE_NAME = "result.json"
 BOUNDS = ("max_hours", "max_episodes", "max_updates")

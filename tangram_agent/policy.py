@@ -10,15 +10,15 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
-from tangram_agent.filler import Filler
+from tangram_agent.agents.outline.filler import Filler
+from tangram_agent.agents.pair.planning import Planner
+from tangram_agent.agents.scene.scenes import Scenes, next_token
+from tangram_agent.base.weights import load_arrays, to_arrays
 from tangram_agent.networks import Networks, outline_network, travels
-from tangram_agent.planning import Planner
-from tangram_agent.scenes import Scenes, next_token
 from tangram_agent.setup import Setup
 from tangram_agent.types import Choice, Past, Weights
-from tangram_agent.weights import load_arrays, to_arrays
-from tangram_sim.actions import make_actions
-from tangram_sim.arrays import Floats, Singles
+from tangram_core.arrays import Floats, Singles
+from tangram_sim.motion.actions import make_actions
 
 Flags = npt.NDArray[np.bool_] | npt.NDArray[np.uint8]
 

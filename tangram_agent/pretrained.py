@@ -15,7 +15,7 @@ from typing import Any
 
 from tangram_agent.arrays import decode_tensors
 from tangram_agent.types import Weights
-from tangram_sim.errors import RunError, WireError
+from tangram_core.errors import RunError, WireError
 
 PREFIX = "pretrained"
 CONFIG = "config.yaml"

@@ -12,14 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tangram_agent.agents.pair.coverage import Lying, covered_share, covering, lying, newly_covered
 from tangram_agent.config import AgentConfig, RelabelConfig
-from tangram_agent.coverage import Lying, covered_share, covering, lying, newly_covered
 from tangram_agent.setup import Setup
 from tangram_agent.types import Flags, Transitions
+from tangram_core.arrays import Bools, Floats, Ints, Singles
 from tangram_core.spec import Episodes
-from tangram_sim.actions import chosen_tokens
-from tangram_sim.arrays import Bools, Floats, Ints, Singles
-from tangram_sim.layout import Layout
+from tangram_sim.geometry.layout import Layout
+from tangram_sim.motion.actions import chosen_tokens
 
 # (achieved corners (B, V, 2), desired corners (B, V, 2)) -> rewards (B,)
 RewardFunction = Callable[[Floats, Floats], Floats]

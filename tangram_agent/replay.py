@@ -4,8 +4,8 @@ import numpy as np
 import numpy.typing as npt
 
 from tangram_agent.types import Past, Transitions
-from tangram_sim.arrays import Ints, Singles
-from tangram_sim.errors import RunError
+from tangram_core.arrays import Ints, Singles
+from tangram_core.errors import RunError
 
 Array = npt.NDArray[np.generic]
 _COUNTERS = "counters"

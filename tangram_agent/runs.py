@@ -22,12 +22,10 @@ from tangram_agent.checkpoints import (
 )
 from tangram_agent.pretrained import is_agent, is_name, packaged, read_agent
 from tangram_agent.setup import Setup, make_setup
-from tangram_agent.stored import load_settings
 from tangram_agent.types import Past, Weights
-from tangram_sim.arrays import Floats, Singles
-from tangram_sim.config import with_given_reward
-from tangram_sim.errors import ConfigError, RunError
-from tangram_sim.settings import (
+from tangram_core.arrays import Floats, Singles
+from tangram_core.errors import ConfigError, RunError
+from tangram_core.settings import (
     KEY,
     LEARNING,
     NETWORK,
@@ -37,7 +35,9 @@ from tangram_sim.settings import (
     setting_name,
     told,
 )
-from tangram_sim.shapes import MAX_COORDINATE
+from tangram_core.store.stored import load_settings
+from tangram_sim.config import with_given_reward
+from tangram_sim.geometry.shapes import MAX_COORDINATE
 
 if TYPE_CHECKING:
     from tangram_agent.policy import Policy
@@ -110,7 +110,7 @@ class Run:
         if self.setup.fills:
             raise ConfigError(
                 f"{self.folder} fills outlines, which no observation has: call policy.act with "
-                "goals that tangram_sim.rings.as_rows makes"
+                "goals that tangram_sim.geometry.rings.as_rows makes"
             )
         corners = 2 * self.setup.layout.corner_count
         wanted = {

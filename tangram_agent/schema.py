@@ -21,7 +21,7 @@ from typing import Any, ClassVar, Self, TypeVar, get_args, get_type_hints
 import msgpack
 
 from tangram_agent.arrays import Column, decode_columns, encode_columns
-from tangram_sim.errors import WireError
+from tangram_core.errors import WireError
 
 PROTOCOL = 8
 MAX_HEADER = 16 * 1024

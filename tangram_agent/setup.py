@@ -10,15 +10,15 @@ from typing import Any, TypeVar, cast, get_origin, get_type_hints
 import dacite
 
 from tangram_agent.config import AgentConfig, NetConfig
+from tangram_core.errors import ConfigError
+from tangram_core.settings import KEY, NETWORK, declared_fields, refuse_ignored, told
 from tangram_core.spec import EpisodeSpec
-from tangram_sim.actions import action_size, corner_bound, goal_rows, horizon
 from tangram_sim.config import SILHOUETTES, RewardConfig, SimConfig
 from tangram_sim.episodes import spec_of
-from tangram_sim.errors import ConfigError
-from tangram_sim.layout import Layout, TokensConfig, make_layout
+from tangram_sim.geometry.layout import Layout, TokensConfig, make_layout
+from tangram_sim.motion.actions import action_size, corner_bound, goal_rows, horizon
 from tangram_sim.rewards import reward_identity
-from tangram_sim.settings import KEY, NETWORK, declared_fields, refuse_ignored, told
-from tangram_sim.targets import check_targets
+from tangram_sim.tasks.targets import check_targets
 
 Settings = TypeVar("Settings")
 

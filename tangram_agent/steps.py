@@ -11,14 +11,14 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from tangram_agent.agents.pair.pairs import Pairs
+from tangram_agent.agents.scene.scenes import Scenes, next_token
 from tangram_agent.networks import VELOCITY, View
-from tangram_agent.pairs import Pairs
 from tangram_agent.relabelling import PairBatch
-from tangram_agent.scenes import Scenes, next_token
 from tangram_agent.setup import Setup
 from tangram_agent.types import Transitions
-from tangram_sim.actions import chosen_tokens
-from tangram_sim.arrays import Bools, Floats, Ints
+from tangram_core.arrays import Bools, Floats, Ints
+from tangram_sim.motion.actions import chosen_tokens
 
 Array = npt.NDArray[Any]
 Batch = Transitions | PairBatch

@@ -1,8 +1,8 @@
 """What travels between play and learning: small immutable tuples of arrays.
 
 Legend: E episodes, T steps of an episode, B batch, K tokens, V corners of all tokens together,
-A entries of an action (3 for one token: x, y and angular velocity; see `tangram_sim.actions`).
-Goals and states are corners in the order of `tangram_sim.layout.Layout`.
+A entries of an action (3 for one token: x, y and angular velocity; see `tangram_sim.motion.actions`).
+Goals and states are corners in the order of `tangram_sim.geometry.layout.Layout`.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tangram_sim.arrays import Bools, Ints, Singles
+from tangram_core.arrays import Bools, Ints, Singles
 
 Flags = npt.NDArray[np.uint8]
 

@@ -10,11 +10,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from tangram_core.arrays import Singles
+from tangram_core.errors import RunError
+from tangram_core.settings import Settings
 from tangram_core.spec import Array, Arrays, Episodes
 from tangram_core.task import Generators, History, Json, Task
-from tangram_sim.arrays import Singles
-from tangram_sim.errors import RunError
-from tangram_sim.settings import Settings
 
 Streams = Mapping[str, np.random.Generator]
 Tensors = dict[str, Singles]

@@ -12,8 +12,8 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from tangram_sim.arrays import Singles
-from tangram_sim.errors import ConfigError
+from tangram_core.arrays import Singles
+from tangram_core.errors import ConfigError
 
 Array = npt.NDArray[Any]
 Arrays = Mapping[str, Array]

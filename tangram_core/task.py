@@ -10,10 +10,10 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from tangram_core.arrays import Bools, Floats, Pixels, Singles
+from tangram_core.seeding import episode_generator
+from tangram_core.settings import Settings
 from tangram_core.spec import Array, Arrays, Episodes, EpisodeSpec
-from tangram_sim.arrays import Bools, Floats, Pixels, Singles
-from tangram_sim.seeding import episode_generator
-from tangram_sim.settings import Settings
 
 Generators = Sequence[np.random.Generator]
 Purpose = Literal["play", "test"]

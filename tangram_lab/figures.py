@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from tangram_agent.files import write_whole
+from tangram_core.store.files import write_whole
 
 DPI = 100
 WIDTH_IN = 9.0

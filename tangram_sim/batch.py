@@ -10,7 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tangram_sim.actions import (
+from tangram_core.arrays import Bools, Floats, Ints, Pixels
+from tangram_core.errors import ConfigError
+from tangram_sim.config import MAX_OVERLAP, RewardConfig, SimConfig
+from tangram_sim.episodes import spec_of
+from tangram_sim.geometry.layout import Layout
+from tangram_sim.geometry.overlap import outlines, overlap_share, shared_area
+from tangram_sim.motion.actions import (
     action_size,
     chosen_tokens,
     corner_bound,
@@ -19,19 +25,13 @@ from tangram_sim.actions import (
     horizon,
     velocities,
 )
-from tangram_sim.actuation import Actuation, Command
-from tangram_sim.arrays import Bools, Floats, Ints, Pixels
-from tangram_sim.config import MAX_OVERLAP, RewardConfig, SimConfig
-from tangram_sim.episodes import spec_of
-from tangram_sim.errors import ConfigError
-from tangram_sim.geometry import outlines, overlap_share, shared_area
-from tangram_sim.layout import Layout
-from tangram_sim.lens import Lens, View
-from tangram_sim.observation_noise import see
+from tangram_sim.motion.actuation import Actuation, Command
 from tangram_sim.rewards import TargetPictures, make_reward, scaled_overlap
-from tangram_sim.sight import Eye, Sight
-from tangram_sim.targets import Sides, sample_starts, sample_targets
-from tangram_sim.world import check_shown, make_world
+from tangram_sim.sight.lens import Lens, View
+from tangram_sim.sight.observation_noise import see
+from tangram_sim.sight.perception import Eye, Sight
+from tangram_sim.tasks.targets import Sides, sample_starts, sample_targets
+from tangram_sim.world.world import check_shown, make_world
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,7 +228,7 @@ class BatchedEnv:
     def _outlined(self) -> Floats:
         """(B, G, 2) rows of the targets' outlines."""
         # Only here: most runs need no shapely.
-        from tangram_sim.rings import as_rows, covered_area  # noqa: PLC0415
+        from tangram_sim.geometry.rings import as_rows, covered_area  # noqa: PLC0415
 
         areas = [covered_area(own, self.layout) for own in self.goals]
         return np.stack([as_rows(area, self.layout, self.goal_rows) for area in areas])

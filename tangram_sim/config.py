@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from tangram_core.errors import ConfigError
+from tangram_core.settings import NETWORK, Settings, refuse_ignored, setting, told
 from tangram_sim.dynamics import WORLDS, Dynamics
-from tangram_sim.errors import ConfigError
-from tangram_sim.settings import NETWORK, Settings, refuse_ignored, setting, told
 
 BACKENDS = ("physics", "kinematic")
 REWARDS = ("overlap", "dense")

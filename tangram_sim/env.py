@@ -7,9 +7,9 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from tangram_sim.arrays import Floats, Pixels
+from tangram_core.arrays import Floats, Pixels
+from tangram_core.errors import ConfigError
 from tangram_sim.config import RewardConfig
-from tangram_sim.errors import ConfigError
 from tangram_sim.screen import Screen
 from tangram_sim.table import SQUARE_SCALE, Observation, Table
 

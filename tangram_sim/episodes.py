@@ -1,9 +1,9 @@
 """What the episodes of tokens are made of, by the names under which they travel."""
 
 from tangram_core.spec import EpisodeSpec, Field
-from tangram_sim.actions import action_size, corner_bound, goal_rows, horizon
 from tangram_sim.config import RewardConfig, SimConfig
-from tangram_sim.layout import Layout
+from tangram_sim.geometry.layout import Layout
+from tangram_sim.motion.actions import action_size, corner_bound, goal_rows, horizon
 from tangram_sim.rewards import reward_bounds
 
 

@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from tangram_sim.arrays import Floats, Pixels
+from tangram_core.arrays import Floats, Pixels
+from tangram_core.errors import ConfigError
 from tangram_sim.config import RewardConfig, SimConfig
-from tangram_sim.errors import ConfigError
-from tangram_sim.geometry import overlap_share
-from tangram_sim.layout import Layout
-from tangram_sim.pictures import token_pixels
+from tangram_sim.geometry.layout import Layout
+from tangram_sim.geometry.overlap import overlap_share
+from tangram_sim.sight.pictures import token_pixels
 
 MAX_REWARD = 1e6  # of a user's own function
 SHARPNESS = 100.0  # s: how steep the logarithm is near the target

@@ -3,8 +3,8 @@
 import os
 from typing import Any
 
-from tangram_sim.arrays import Pixels
-from tangram_sim.errors import ConfigError
+from tangram_core.arrays import Pixels
+from tangram_core.errors import ConfigError
 
 _DRIVER = "SDL_VIDEODRIVER"
 _UNSEEN = ("dummy", "offscreen")  # what SDL takes where there is no display

@@ -7,16 +7,16 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from tangram_sim.actions import chosen_tokens
-from tangram_sim.actions import horizon as steps_of
-from tangram_sim.arrays import Bools, Floats, Ints, Pixels
+from tangram_core.arrays import Bools, Floats, Ints, Pixels
+from tangram_core.errors import ConfigError
+from tangram_core.settings import check_range
 from tangram_sim.batch import BatchedEnv, StepResult
 from tangram_sim.config import MAX_OVERLAP, RewardConfig, SimConfig
-from tangram_sim.drawing import draw_scene
-from tangram_sim.errors import ConfigError
-from tangram_sim.layout import TokensConfig, make_layout
-from tangram_sim.settings import check_range
-from tangram_sim.targets import check_targets
+from tangram_sim.drawing.scenes import draw_scene
+from tangram_sim.geometry.layout import TokensConfig, make_layout
+from tangram_sim.motion.actions import chosen_tokens
+from tangram_sim.motion.actions import horizon as steps_of
+from tangram_sim.tasks.targets import check_targets
 
 Observation = dict[str, Any]  # of float64 vectors
 

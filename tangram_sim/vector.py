@@ -9,10 +9,10 @@ import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from tangram_sim.arrays import Bools, Floats, Pixels
+from tangram_core.arrays import Bools, Floats, Pixels
+from tangram_core.errors import ConfigError
+from tangram_core.settings import check_range
 from tangram_sim.env import TangramEnv, check_render_mode
-from tangram_sim.errors import ConfigError
-from tangram_sim.settings import check_range
 from tangram_sim.table import Observation, Table
 
 MAX_ENVS = 4096

@@ -13,7 +13,7 @@ def _studio(settings: Plain) -> int:
     from importlib.util import find_spec
 
     from tangram_agent.setup import from_mapping
-    from tangram_sim.errors import ConfigError
+    from tangram_core.errors import ConfigError
     from tangram_studio.config import StudioConfig
 
     config = from_mapping(StudioConfig, settings)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from tangram_sim.settings import Settings, setting
+from tangram_core.settings import Settings, setting
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """What a page shows -> how the seven tans fill it, or which figure of them comes nearest.
 
 A drawing goes the way of a file: it is written down and read without trust, see
-`tangram_vision.silhouette_files`. What no tans fill is told why, and approached.
+`tangram_vision.given.silhouette_files`. What no tans fill is told why, and approached.
 
 Legend: K tokens, V corners, N rings.
 """
@@ -18,22 +18,22 @@ import numpy as np
 import shapely
 from PIL import Image
 
-from tangram_sim.areas import Area, polygons
-from tangram_sim.arrays import Floats
-from tangram_sim.dissections import Dissection
-from tangram_sim.errors import ConfigError
-from tangram_sim.puzzles import library, load_puzzle
-from tangram_sim.strokes import colour_of
-from tangram_sim.targets import placement, turned_figure
+from tangram_core.arrays import Floats
+from tangram_core.errors import ConfigError
+from tangram_game.figures.methods import together
+from tangram_game.figures.puzzles import reach_beyond
+from tangram_game.figures.silhouettes import why_unfilled
+from tangram_sim.drawing.strokes import colour_of
+from tangram_sim.geometry.areas import Area, polygons
+from tangram_sim.geometry.dissections import Dissection
+from tangram_sim.puzzles.figures import library, load_puzzle
+from tangram_sim.tasks.targets import placement, turned_figure
 from tangram_studio.messages import Fill
 from tangram_studio.playing import Sides, player
-from tangram_vision.approximations import nearest_figure
-from tangram_vision.outline_files import FORMAT, VERSION
-from tangram_vision.silhouette_files import PICTURES, Silhouette, fill_silhouette
-from tangram_vision.silhouettes import Method, silhouette
-from worker.methods import together
-from worker.puzzles import reach_beyond
-from worker.silhouettes import why_unfilled
+from tangram_vision.given.outline_files import FORMAT, VERSION
+from tangram_vision.given.silhouette_files import PICTURES, Silhouette, fill_silhouette
+from tangram_vision.silhouettes.approximations import nearest_figure
+from tangram_vision.silhouettes.silhouettes import Method, silhouette
 
 SUFFIXES = (*PICTURES, ".svg", ".json")
 SECONDS = 5.0  # of a search,

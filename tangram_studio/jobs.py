@@ -15,7 +15,7 @@ from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import wait
 from typing import Any, TypeVar
 
-from tangram_sim.errors import TangramError
+from tangram_core.errors import TangramError
 
 Given = TypeVar("Given")
 Waits = Callable[[int], Awaitable[None]]  # told how many tasks come first, when that changes

@@ -9,8 +9,8 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
-from tangram_sim.arrays import Bools, Floats
-from tangram_sim.errors import ConfigError
+from tangram_core.arrays import Bools, Floats
+from tangram_core.errors import ConfigError
 
 TANS = 7
 MAX_BYTES = 2**18  # of a message

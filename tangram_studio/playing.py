@@ -17,16 +17,16 @@ import torch
 
 from tangram_agent.runs import Run, load_changed
 from tangram_agent.types import Past
-from tangram_sim.actions import chosen_tokens
-from tangram_sim.arrays import Bools, Floats, Singles
+from tangram_core.arrays import Bools, Floats, Singles
+from tangram_game.rivals.sweeps import sweep_policy
 from tangram_sim.batch import BatchedEnv, Starts
 from tangram_sim.config import RewardConfig
-from tangram_sim.geometry import overlap_share
-from tangram_sim.world import World, make_world
-from worker.metrics import iou
-from worker.pairing import paired
-from worker.sweeps import sweep_policy
-from worker.test_set import greedy
+from tangram_sim.geometry.overlap import overlap_share
+from tangram_sim.motion.actions import chosen_tokens
+from tangram_sim.world.world import World, make_world
+from worker.score.metrics import iou
+from worker.score.pairing import paired
+from worker.score.test_set import greedy
 
 AGENT = "pretrained/tangram7"
 SIM = {"lift": {}, "slide": {"motion": "slide", "actions_per_token": 2}}

@@ -9,15 +9,15 @@ from io import BytesIO
 
 import numpy as np
 
-from tangram_sim.arrays import Floats
-from tangram_sim.drawing import save_gif
-from tangram_sim.errors import ConfigError
-from tangram_sim.game_drawing import Held, draw_game
-from tangram_sim.kinematics import wrap
-from tangram_sim.layout import Layout
-from tangram_sim.puzzles import parse_puzzles
-from tangram_sim.sketches import FORMAT, VERSION
-from tangram_sim.strokes import colour_of
+from tangram_core.arrays import Floats
+from tangram_core.errors import ConfigError
+from tangram_sim.drawing.game_drawing import Held, draw_game
+from tangram_sim.drawing.scenes import save_gif
+from tangram_sim.drawing.strokes import colour_of
+from tangram_sim.geometry.layout import Layout
+from tangram_sim.motion.kinematics import wrap
+from tangram_sim.puzzles.figures import parse_puzzles
+from tangram_sim.puzzles.sketches import FORMAT, VERSION
 from tangram_studio.playing import Move, Sides, player
 
 FRAMES = 10  # of a move: a GIF shows 20 in a second, and twice as fast as the page

@@ -22,7 +22,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from tangram_sim.errors import ConfigError, TangramError
+from tangram_core.errors import ConfigError, TangramError
 from tangram_studio.config import StudioConfig
 from tangram_studio.filling import fill_file, tans
 from tangram_studio.jobs import Jobs

@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from tangram_sim.errors import TangramError
+from tangram_core.errors import TangramError
 from tangram_studio import filling, playing, saving
 from tangram_studio.filling import Answer
 from tangram_studio.jobs import Jobs

@@ -20,9 +20,9 @@ from conf.settings import PAGE, page
 from conf.sweep import check_launcher, refuse_lost_job
 from tangram_agent.config import AgentConfig, NetConfig, ServiceConfig
 from tangram_agent.setup import Setup, from_mapping, make_setup
+from tangram_core.errors import ConfigError, TangramError
+from tangram_core.settings import KEY, PLAY, declared_fields
 from tangram_sim.config import RewardConfig, SimConfig
-from tangram_sim.errors import ConfigError, TangramError
-from tangram_sim.settings import KEY, PLAY, declared_fields
 
 pytestmark = pytest.mark.fast
 

@@ -58,8 +58,8 @@ def test_import_contracts_catch_every_wrong_arrow(tmp_path: Path) -> None:
         shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("*.pyc"))
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
     wrong = {
-        "tangram_sim/wrong.py": "import torch, pybullet, cv2, zmq, omegaconf, tangram_sim.engine",
-        "tangram_agent/wrong.py": "import worker.config, conf.help, tangram_vision.seeing",
+        "tangram_sim/wrong.py": "import torch, pybullet, cv2, zmq, omegaconf, tangram_sim.world.engine",
+        "tangram_agent/wrong.py": "import worker.config, conf.help, tangram_vision.pictures.seeing",
         "master/wrong.py": "import tangram_lab.experiments.studies, tangram_sim.wrong, uvicorn",
     }
     for path, code in wrong.items():

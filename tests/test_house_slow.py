@@ -42,7 +42,7 @@ def test_master_and_registration_never_load_the_engine() -> None:
 
 def test_the_launcher_needs_no_torch() -> None:
     """It would start the master two seconds later, and hold 200 MB for as long as that trains."""
-    needs = "master.launch, tangram_agent.setup, tangram_sim.rewards, tangram_sim.world"
+    needs = "master.launch, tangram_agent.setup, tangram_sim.rewards, tangram_sim.world.world"
     assert run_python(f"import sys, {needs}\nprint('torch' in sys.modules)") == "False"
 
 

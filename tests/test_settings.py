@@ -14,14 +14,14 @@ import pytest
 
 from conf.commands import COMMANDS, GROUPS, load
 from conf.settings import NESTED
-from master.trainer import Trainer
+from master.learn.trainer import Trainer
 from tangram_agent.config import ServiceConfig
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup, make_setup
-from tangram_sim.errors import TangramError
-from tangram_sim.settings import declared_fields
-from worker.looking import environments
-from worker.rollout import Rollout
+from tangram_core.errors import TangramError
+from tangram_core.settings import declared_fields
+from worker.play.looking import environments
+from worker.play.rollout import Rollout
 
 pytestmark = pytest.mark.fast
 
@@ -123,7 +123,7 @@ SHOWS: dict[str, tuple[Config, object]] = {
 # What shows elsewhere, and where.
 ELSEWHERE = {
     "agent.name": "the label of a run in reports",
-    "agent.beam": "tests/agent/test_filler.py: a beam finds what values do not tell",
+    "agent.beam": "tests/agent/agents/outline/test_filler.py: a beam finds what values do not tell",
     "reward.sha256": "tests/sim/test_rewards.py: another file is refused",
 }
 

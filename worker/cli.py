@@ -39,8 +39,8 @@ def play() -> int:
 
 def _of_the_run(settings: Plain) -> tuple[str, Plain] | None:
     """What the connection file says of the run; nothing where only an address is given."""
-    from tangram_agent.process import watch_parent
-    from worker.discovery import as_address, await_master
+    from tangram_core.process import watch_parent
+    from worker.talk.discovery import as_address, await_master
 
     watch_parent()  # already here: a parent may end while the file is waited for
     connect = settings.get("connect")
@@ -53,7 +53,7 @@ def _of_the_run(settings: Plain) -> tuple[str, Plain] | None:
 def _worker(settings: Plain) -> int:
     from tangram_agent.setup import SECTIONS, from_mapping, make_setup
     from tangram_sim.rewards import check_reward
-    from tangram_sim.world import check_shown, check_world
+    from tangram_sim.world.world import check_shown, check_world
     from worker.config import WorkerConfig
 
     rest = {name: value for name, value in settings.items() if name not in SECTIONS}
@@ -63,13 +63,13 @@ def _worker(settings: Plain) -> int:
     check_world(setup.layout, setup.sim)
     check_reward(setup.reward, setup.layout, setup.sim)
 
-    from worker.session import keep_part
+    from worker.play.session import keep_part
 
     if config.role == "evaluator":
-        from worker.evaluator import run_evaluator
+        from worker.score.evaluator import run_evaluator
 
         return keep_part(run_evaluator, config, setup)
-    from worker.player import run_player
+    from worker.play.player import run_player
 
     return keep_part(run_player, config, setup)
 
@@ -86,8 +86,8 @@ def _status(settings: Plain) -> int:
 
 
 def _evaluate(settings: Plain) -> int:
-    from tangram_agent.files import check_writable
     from tangram_agent.setup import from_mapping
+    from tangram_core.store.files import check_writable
     from worker.config import EvalConfig
 
     config = from_mapping(EvalConfig, with_changes(with_absolute_paths(settings)))
@@ -97,14 +97,14 @@ def _evaluate(settings: Plain) -> int:
     _check_played([config.run], config)
     tell(f"loads and plays {config.run}")
 
-    from worker.evaluate import evaluate_run
+    from tangram_game.evaluate import evaluate_run
 
     return evaluate_run(config)
 
 
 def _play(settings: Plain) -> int:
-    from tangram_agent.files import check_writable
     from tangram_agent.setup import from_mapping
+    from tangram_core.store.files import check_writable
     from worker.config import PlayConfig, check_compare
 
     check_compare(settings.get("compare"))  # before a text is taken for a list of letters
@@ -114,22 +114,22 @@ def _play(settings: Plain) -> int:
     _check_drawings(config)
     setups = _check_played(config.run_dirs, config)
     if config.target is not None:
-        from worker.photographs import read_photograph
+        from tangram_game.figures.photographs import read_photograph
 
         read_photograph(config.target, setups[0])
     filled = None
     if config.silhouette is not None:
-        from worker.silhouettes import read_silhouette
+        from tangram_game.figures.silhouettes import read_silhouette
 
         out = Path(config.out)
         filled = read_silhouette(config.silhouette, setups[0], config.solutions, out)
     tell(f"loads and plays {', '.join(config.run_dirs)}")
 
     if config.compare is not None:
-        from worker.play import compare_runs
+        from tangram_game.play import compare_runs
 
         return compare_runs(config)
-    from worker.play import play_run
+    from tangram_game.play import play_run
 
     return play_run(config, filled)
 
@@ -140,8 +140,8 @@ def _check_played(run_dirs: Sequence[str], config: "EvalConfig | PlayConfig") ->
 
     setups = [read_changed(run_dir, config.changes).setup for run_dir in run_dirs]
     if config.puzzle is not None:
+        from tangram_game.figures.puzzles import find_figures
         from worker.config import source_and_names
-        from worker.puzzles import find_figures
 
         source, names = source_and_names(config.puzzle)
         find_figures(source, setups[0], names)
@@ -150,7 +150,7 @@ def _check_played(run_dirs: Sequence[str], config: "EvalConfig | PlayConfig") ->
 
 def _check_drawings(config: "PlayConfig") -> None:
     """Refuse a drawing that is not there before what reads drawings is loaded."""
-    from tangram_sim.sketches import check_file
+    from tangram_sim.puzzles.sketches import check_file
 
     for name, path in (("target", config.target), ("silhouette", config.silhouette)):
         # A silhouette may be the name of a puzzle.
@@ -171,7 +171,7 @@ def with_absolute_paths(settings: Plain) -> Plain:
 
     Puzzles and splits of the library stay names.
     """
-    from tangram_sim.puzzles import SPLITS
+    from tangram_sim.puzzles.figures import SPLITS
     from worker.config import check_puzzle, is_puzzle_source
 
     result = dict(settings)

@@ -10,11 +10,11 @@ from typing import Any
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import MAX_INDEX, ROLES
 from tangram_agent.pretrained import PREFIX, agent_names
+from tangram_core.errors import ConfigError
+from tangram_core.settings import Settings, check_folder, declared, refuse_ignored, setting, told
 from tangram_sim.config import SILHOUETTES
-from tangram_sim.errors import ConfigError
-from tangram_sim.puzzles import SPLITS
-from tangram_sim.settings import Settings, check_folder, declared, refuse_ignored, setting, told
-from worker.discovery import as_address, find_master
+from tangram_sim.puzzles.figures import SPLITS
+from worker.talk.discovery import as_address, find_master
 
 Changes = dict[str, dict[str, Any]]  # section -> setting -> value: of a run that was trained
 OF_TARGETS = ("targets", "mirrored")  # settings of sim that say nothing of a puzzle

@@ -16,11 +16,11 @@ from rich.text import Text
 from tangram_agent.messages import OPEN, WORKER_COLUMNS, AskStatus, RunStatus, decode_from_master
 from tangram_agent.outcome import FILE_NAME, duration, outcome_rows, read_outcome
 from tangram_agent.runs import CONFIG
+from tangram_core.errors import TangramError, WireError
 from tangram_sim.config import own_code
-from tangram_sim.errors import TangramError, WireError
 from worker.config import StatusConfig
-from worker.connection import Sockets
-from worker.discovery import find_master, host_error, keys_error
+from worker.talk.connection import Sockets
+from worker.talk.discovery import find_master, host_error, keys_error
 
 PATIENCE_S = 10.0
 ASK_AGAIN_S = 1.0

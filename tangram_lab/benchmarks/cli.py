@@ -7,9 +7,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-from tangram_agent.files import check_writable
-from tangram_sim.errors import TangramError
-from tangram_sim.settings import check_range
+from tangram_core.errors import TangramError
+from tangram_core.settings import check_range
+from tangram_core.store.files import check_writable
 
 EPILOG = """\
 Options may be written as elsewhere in this project: runs=9 for --runs 9.
@@ -113,12 +113,12 @@ def _run(arguments: argparse.Namespace) -> int:
         from tangram_lab.benchmarks.stages import run_stages
 
         return run_stages(arguments)
-    from tangram_lab.benchmarks.attack import run_attack
-    from tangram_lab.benchmarks.chaos import run_chaos
-    from tangram_lab.benchmarks.fuzz_wire import run_fuzz
-    from tangram_lab.benchmarks.seeing import run_seeing
-    from tangram_lab.benchmarks.silhouettes import run_silhouettes
-    from tangram_lab.benchmarks.soak import run_soak
+    from tangram_lab.benchmarks.sight.seeing import run_seeing
+    from tangram_lab.benchmarks.sight.silhouettes import run_silhouettes
+    from tangram_lab.benchmarks.trials.attack import run_attack
+    from tangram_lab.benchmarks.trials.chaos import run_chaos
+    from tangram_lab.benchmarks.trials.fuzz_wire import run_fuzz
+    from tangram_lab.benchmarks.trials.soak import run_soak
 
     of_scenes = {"seeing": run_seeing, "silhouettes": run_silhouettes}
     if arguments.kind in of_scenes:

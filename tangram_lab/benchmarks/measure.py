@@ -14,7 +14,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from master.result import commit, processor, versions
+from master.watch.result import commit, processor, versions
 
 SPAN_S = 0.5
 # Does some of the work; returns how much of the unit that was.

@@ -12,12 +12,12 @@ import yaml
 import conf
 from tangram_agent.setup import SECTIONS, Setup, make_setup
 from tangram_agent.types import Past, Transitions
+from tangram_core.arrays import Bools, Floats, Singles
 from tangram_core.spec import Episodes
-from tangram_sim.arrays import Bools, Floats, Singles
-from tangram_sim.assembly import COUNTS
 from tangram_sim.batch import BatchedEnv
-from tangram_sim.layout import TokensConfig
-from worker.rollout import Rollout
+from tangram_sim.geometry.layout import TokensConfig
+from tangram_sim.puzzles.assembly import COUNTS
+from worker.play.rollout import Rollout
 
 
 def preset(agent: str = "tangram", tokens: str = "square") -> Setup:

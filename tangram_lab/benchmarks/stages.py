@@ -5,13 +5,13 @@ from collections.abc import Callable, Sequence
 
 import torch
 
-from tangram_agent.process import keep_memory
-from tangram_lab.benchmarks.learner import measure_gpu, measure_learner
+from tangram_core.process import keep_memory
 from tangram_lab.benchmarks.measure import Row, page, show, write
-from tangram_lab.benchmarks.scaling import measure_scaling
-from tangram_lab.benchmarks.sim import measure_sim
-from tangram_lab.benchmarks.train import measure_train
-from tangram_lab.benchmarks.wire import measure_wire
+from tangram_lab.benchmarks.speed.learner import measure_gpu, measure_learner
+from tangram_lab.benchmarks.speed.scaling import measure_scaling
+from tangram_lab.benchmarks.speed.sim import measure_sim
+from tangram_lab.benchmarks.speed.train import measure_train
+from tangram_lab.benchmarks.speed.wire import measure_wire
 
 STAGES: dict[str, Callable[[argparse.Namespace], Sequence[Row]]] = {
     "sim": lambda given: measure_sim(given.runs),

@@ -19,9 +19,9 @@ import yaml
 import zmq
 
 from master.children import command, override
-from tangram_agent.process import Lifeline
 from tangram_agent.setup import Setup, make_setup
-from tangram_sim.errors import TangramError
+from tangram_core.errors import TangramError
+from tangram_core.process import Lifeline
 from worker.status import ask_status
 
 LOOK_S = 0.3

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tangram_core.arrays import Floats
+from tangram_core.errors import RunError
 from tangram_lab.experiments.rows import of_a_study, read_rows, spreads
-from tangram_sim.arrays import Floats
-from tangram_sim.errors import RunError
 
 NUMBER = r"[-\N{MINUS SIGN}]?\d*\.(?:\d+\s?%|\d{3,})"
 SCORE = re.compile(rf"(?<![\w.,/])(?P<score>{NUMBER})(?![\w.]*\d)")

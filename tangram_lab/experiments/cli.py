@@ -10,8 +10,8 @@ from pathlib import Path
 
 from conf.cli import composed, entry
 from conf.commands import Plain
-from tangram_sim.errors import ConfigError
-from tangram_sim.settings import Settings, setting
+from tangram_core.errors import ConfigError
+from tangram_core.settings import Settings, setting
 
 ROOT = Path(__file__).parents[2]
 RESULTS = "docs/results"
@@ -24,8 +24,8 @@ def experiment() -> int:
 
 
 def _experiment(settings: Plain) -> int:
-    from tangram_agent.files import check_writable
     from tangram_agent.setup import from_mapping
+    from tangram_core.store.files import check_writable
     from tangram_lab.experiments.studies import StudyConfig, jobs_of, read_studies
 
     config = from_mapping(StudyConfig, _with_absolute(settings, "run_dir", "out"))
@@ -35,7 +35,7 @@ def _experiment(settings: Plain) -> int:
     for name, told in dict.fromkeys((job.training, job.told) for job in jobs):
         _check(name, told)
 
-    from master.console import sturdy_console
+    from master.watch.console import sturdy_console
     from tangram_lab.experiments.runner import run_study
 
     return run_study(config, jobs, sturdy_console(sys.stdout))

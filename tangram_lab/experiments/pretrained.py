@@ -20,19 +20,19 @@ import torch
 import yaml
 
 from tangram_agent.checkpoints import ACTING, CHECKPOINTS, load_checkpoint, newest_checkpoint
-from tangram_agent.files import check_writable, write_whole
 from tangram_agent.policy import Policy
 from tangram_agent.pretrained import CARD, CARD_TEXT, CONFIG, FORMAT, PREFIX, WEIGHTS
 from tangram_agent.runs import Run, load_run
 from tangram_agent.setup import Setup
-from tangram_sim.errors import ConfigError, RunError, TangramError
-from tangram_sim.settings import told
-from tangram_sim.targets import has_all_tans
+from tangram_core.errors import ConfigError, RunError, TangramError
+from tangram_core.settings import told
+from tangram_core.store.files import check_writable, write_whole
+from tangram_game.evaluate import policies, score_policies
+from tangram_game.figures.puzzles import find_figures
+from tangram_game.scores import RUN, score_outlines, score_puzzles
+from tangram_sim.tasks.targets import has_all_tans
 from worker.config import EvalConfig
-from worker.evaluate import policies, score_policies
-from worker.puzzles import find_figures
-from worker.scores import RUN, score_outlines, score_puzzles
-from worker.test_set import greedy
+from worker.score.test_set import greedy
 
 PACKAGE = Path(__file__).resolve().parents[2] / "tangram_agent" / "pretrained"
 RESULT = "result.json"

@@ -8,13 +8,13 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure as Canvas
 
-from tangram_agent.files import write_whole
 from tangram_agent.runs import CONFIG, read_config
+from tangram_core.errors import RunError
+from tangram_core.store.files import write_whole
 from tangram_lab.experiments.rows import AGENT, RUN, SCORES, Spread, of_a_study, read_rows, spreads
 from tangram_lab.experiments.runner import read_json
 from tangram_lab.experiments.studies import Figure, Study, read_studies
 from tangram_lab.figures import COLOURS, legend_below, new_figure, save
-from tangram_sim.errors import RunError
 
 GRID = 200  # points of a curve of several seeds
 LABELS = {

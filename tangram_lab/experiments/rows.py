@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from tangram_sim.errors import RunError
+from tangram_core.errors import RunError
 
 AGENT = "agent"
 KEY = ("training", "seed", "test", "policy")

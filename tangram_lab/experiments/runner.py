@@ -11,12 +11,12 @@ from typing import Any
 from rich.console import Console
 
 from master.children import Child, command, describe, override
-from master.rundir import RunFolder
+from master.record.rundir import RunFolder
 from master.signals import handling
-from tangram_agent.files import write_whole
+from tangram_core.errors import ConfigError
+from tangram_core.store.files import write_whole
 from tangram_lab.experiments.rows import COLUMNS, CURVE, append, curve_rows, done, rows_of
 from tangram_lab.experiments.studies import Job, StudyConfig
-from tangram_sim.errors import ConfigError
 
 TOLD = "told.json"
 LOOK_S = 0.5

@@ -8,8 +8,8 @@ from typing import Literal
 import msgspec
 import yaml
 
-from tangram_sim.errors import ConfigError
-from tangram_sim.settings import Settings, check_choice, check_folder, declared, setting
+from tangram_core.errors import ConfigError
+from tangram_core.settings import Settings, check_choice, check_folder, declared, setting
 
 FILE = Path(__file__).parents[2] / "conf" / "studies.yaml"
 Overrides = tuple[str, ...]

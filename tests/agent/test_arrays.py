@@ -27,9 +27,9 @@ from tangram_agent.arrays import (
     most_episodes,
     split_frames,
 )
+from tangram_core.errors import ConfigError, WireError
 from tangram_core.spec import Episodes, EpisodeSpec, Field
 from tangram_sim.config import RewardConfig
-from tangram_sim.errors import ConfigError, WireError
 from tests.agent.builders import BFLOAT, one_tensor, setup
 from tests.agent.messages import BOUND, SHAPES, SPEC, episodes, weights
 

@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 import torch
 
-from tangram_agent.filling_learner import FillLearner
-from tangram_agent.filling_replay import FillReplay
+from tangram_agent.agents.outline.filling_learner import FillLearner
+from tangram_agent.agents.outline.filling_replay import FillReplay
+from tangram_agent.agents.pair.motion import Fit, MotionModel
 from tangram_agent.learner import NUMBERS, Learner
-from tangram_agent.motion import Fit, MotionModel
 from tangram_agent.setup import Setup
 from tangram_agent.steps import Steps
+from tests.agent.agents.outline.outlines import outline_setup
+from tests.agent.agents.outline.test_filling_learning import episode
+from tests.agent.agents.pair.pair_scenes import transitions
+from tests.agent.agents.pair.test_motion import commands, seen
 from tests.agent.builders import random_transitions
-from tests.agent.outlines import outline_setup
-from tests.agent.pair_scenes import transitions
-from tests.agent.test_filling_learning import episode
 from tests.agent.test_learner import CASES
-from tests.agent.test_motion import commands, seen
 
 META = "meta"
 REFUSED = (NotImplementedError, RuntimeError)

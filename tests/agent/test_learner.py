@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from tangram_agent.adam import Adam
+from tangram_agent.agents.scene.scenes import Scenes, next_token
+from tangram_agent.base.adam import Adam
 from tangram_agent.learner import (
     Learner,
     NotFiniteError,
@@ -20,11 +21,10 @@ from tangram_agent.learner import (
     polyak_update,
     saturation,
 )
-from tangram_agent.scenes import Scenes, next_token
 from tangram_agent.setup import Setup
-from tangram_sim.errors import RunError
+from tangram_core.errors import RunError
+from tests.agent.agents.pair.pair_scenes import PERCEPTRON, TWO, seven, transitions
 from tests.agent.builders import PAIR, PAPER, SCENE, SMALL, random_transitions, setup
-from tests.agent.pair_scenes import PERCEPTRON, TWO, seven, transitions
 
 pytestmark = pytest.mark.fast
 

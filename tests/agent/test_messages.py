@@ -55,7 +55,7 @@ from tangram_agent.schema import (
     by_kind,
 )
 from tangram_agent.types import Weights
-from tangram_sim.errors import WireError
+from tangram_core.errors import WireError
 from tests.agent.messages import (
     SHAPES,
     SPEC,

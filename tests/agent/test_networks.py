@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from tangram_agent.agents.scene.scenes import SceneGraph, Scenes
 from tangram_agent.networks import Actor, Critic, Networks, initialise, parameter_count
-from tangram_agent.scenes import SceneGraph, Scenes
 from tangram_agent.setup import Setup
+from tests.agent.agents.pair.pair_scenes import random_pairs
 from tests.agent.builders import PAIR, PAPER, SMALL, random_transitions, setup
-from tests.agent.pair_scenes import random_pairs
 
 pytestmark = pytest.mark.fast
 

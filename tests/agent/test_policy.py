@@ -14,15 +14,15 @@ from tangram_agent.policy import Policy
 from tangram_agent.runs import Run
 from tangram_agent.setup import Setup
 from tangram_agent.types import Past, Transitions, Weights
-from tangram_sim.actions import chosen_tokens, flips, velocities
-from tangram_sim.actuation import full_scale
+from tangram_core.errors import ConfigError, RunError
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.env import TangramEnv
-from tangram_sim.errors import ConfigError, RunError
+from tangram_sim.motion.actions import chosen_tokens, flips, velocities
+from tangram_sim.motion.actuation import full_scale
 from tangram_sim.vector import TangramVectorEnv
+from tests.agent.agents.pair.pair_scenes import PERCEPTRON, SEVEN, TWO, seven, transitions
 from tests.agent.builders import PAIR, PAPER, SCENE, SMALL, random_transitions, setup
 from tests.agent.messages import broadcast
-from tests.agent.pair_scenes import PERCEPTRON, SEVEN, TWO, seven, transitions
 
 pytestmark = pytest.mark.fast
 

@@ -14,8 +14,8 @@ from tangram_agent.learner import Learner
 from tangram_agent.policy import Policy
 from tangram_agent.pretrained import CARD, CONFIG, FORMAT, WEIGHTS, agent_names, is_name
 from tangram_agent.runs import load_run
+from tangram_core.errors import ConfigError, RunError, TangramError
 from tangram_sim.env import TangramEnv
-from tangram_sim.errors import ConfigError, RunError, TangramError
 from tangram_sim.register import KWARGS
 from tests.agent.builders import (
     BFLOAT,

@@ -7,7 +7,7 @@ import pytest
 
 from tangram_agent.replay import ReplayBuffer
 from tangram_agent.types import Transitions
-from tangram_sim.errors import RunError
+from tangram_core.errors import RunError
 from tests.agent.builders import PAIR, random_transitions, setup
 
 pytestmark = pytest.mark.fast

@@ -11,8 +11,8 @@ from tangram_agent.checkpoints import save_checkpoint
 from tangram_agent.learner import Learner
 from tangram_agent.policy import Policy
 from tangram_agent.runs import load_changed, load_run
+from tangram_core.errors import ConfigError, RunError, TangramError
 from tangram_sim.config import RewardConfig
-from tangram_sim.errors import ConfigError, RunError, TangramError
 from tests.agent.builders import PLAIN, PROPOSAL, SMALL, SQUARE, random_transitions, setup
 
 pytestmark = pytest.mark.fast

@@ -29,7 +29,7 @@ from tangram_agent.schema import (
     read,
     seal,
 )
-from tangram_sim.errors import WireError
+from tangram_core.errors import WireError
 from tests.agent.messages import with_checksum
 
 pytestmark = pytest.mark.fast

@@ -16,9 +16,10 @@ import pytest
 import zmq
 
 from tangram_agent.setup import make_setup
-from tangram_lab.benchmarks import attack, attacks, harms
-from tangram_lab.benchmarks.attack import FILES, TASK, beside
-from tangram_lab.benchmarks.attacks import (
+from tangram_lab.benchmarks.trainings import Growth
+from tangram_lab.benchmarks.trials import attack, attacks, harms
+from tangram_lab.benchmarks.trials.attack import FILES, TASK, beside
+from tangram_lab.benchmarks.trials.attacks import (
     BESIEGED,
     LIVE,
     degenerate_batches,
@@ -26,10 +27,9 @@ from tangram_lab.benchmarks.attacks import (
     thousand_strangers,
     uninvited,
 )
-from tangram_lab.benchmarks.chaos import Witness
-from tangram_lab.benchmarks.harms import LOCKSTEP, OWN, acknowledged_again
-from tangram_lab.benchmarks.target import Attack, Seen, Target, tried
-from tangram_lab.benchmarks.trainings import Growth
+from tangram_lab.benchmarks.trials.chaos import Witness
+from tangram_lab.benchmarks.trials.harms import LOCKSTEP, OWN, acknowledged_again
+from tangram_lab.benchmarks.trials.target import Attack, Seen, Target, tried
 
 pytestmark = pytest.mark.slow
 

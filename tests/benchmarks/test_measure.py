@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tangram_core.errors import ConfigError
 from tangram_lab.benchmarks.cli import main
-from tangram_lab.benchmarks.learner import measure_gpu
 from tangram_lab.benchmarks.measure import Bound, compared, rates, single
-from tangram_lab.benchmarks.seeing import NEAR, SCALE, _same
-from tangram_lab.benchmarks.silhouettes import convex_outlines
+from tangram_lab.benchmarks.sight.seeing import NEAR, SCALE, _same
+from tangram_lab.benchmarks.sight.silhouettes import convex_outlines
+from tangram_lab.benchmarks.speed.learner import measure_gpu
 from tangram_lab.benchmarks.stages import STAGES, run_stages
 from tangram_sim.config import SimConfig
-from tangram_sim.errors import ConfigError
-from tangram_sim.world import make_world
-from tangram_vision.seeing import Seen
+from tangram_sim.world.world import make_world
+from tangram_vision.pictures.seeing import Seen
 from tests.sim.builders import SEVEN, layout_of
 
 LABELS = ("stage", "case", "unit")
@@ -164,11 +164,11 @@ def test_a_small_token_that_lies_elsewhere_gives_another_picture() -> None:
 @pytest.mark.slow
 def test_silhouettes_are_counted_by_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "silhouettes.json"
-    monkeypatch.setattr("tangram_lab.benchmarks.silhouettes.TURNS", 1)
-    monkeypatch.setattr("tangram_lab.benchmarks.silhouettes.CAMERAS", ((128, "grey"),))
-    # All of them are searched through in tests/sim/test_dissections.py.
+    monkeypatch.setattr("tangram_lab.benchmarks.sight.silhouettes.TURNS", 1)
+    monkeypatch.setattr("tangram_lab.benchmarks.sight.silhouettes.CAMERAS", ((128, "grey"),))
+    # All of them are searched through in tests/sim/geometry/test_dissections.py.
     few = convex_outlines(float(np.sqrt(layout_of(*SEVEN, scale=SCALE).areas.sum())))[2:6]
-    monkeypatch.setattr("tangram_lab.benchmarks.silhouettes.convex_outlines", lambda _: few)
+    monkeypatch.setattr("tangram_lab.benchmarks.sight.silhouettes.convex_outlines", lambda _: few)
     monkeypatch.setattr(sys, "argv", ["tangram-bench", "silhouettes", "scenes=2", f"out={out}"])
     assert main() == 0
     content = json.loads(out.read_text())

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from tangram_lab.benchmarks.setups import preset, several, with_sim
-from tangram_lab.benchmarks.sim import BareLoop
-from tangram_sim.physics import PhysicsWorld
+from tangram_lab.benchmarks.speed.sim import BareLoop
+from tangram_sim.world.physics import PhysicsWorld
 
 pytestmark = pytest.mark.fast
 

@@ -17,8 +17,8 @@ from tangram_core.spec import Episodes
 from tests.agent.builders import random_episodes
 from tests.agent.no_reward import NOTHING
 from tests.cluster.processes import LIMIT_S, started, wait_for_file
-from worker.client import Client
-from worker.connection import Timing
+from worker.talk.client import Client
+from worker.talk.connection import Timing
 
 EPISODES = 3  # in each batch
 FIRST_TAG = 2.0  # rewards of hindsight twins are 0

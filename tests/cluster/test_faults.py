@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import zmq
 
-from tangram_lab.benchmarks.proxy import DOWN, UP, Proxy
+from tangram_lab.benchmarks.trials.proxy import DOWN, UP, Proxy
 from tests.cluster.players import (
     LIMIT_S,
     TCP,

@@ -10,7 +10,7 @@ import pytest
 import zmq
 
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
-from tangram_sim.errors import TangramError
+from tangram_core.errors import TangramError
 from tests.cluster.processes import LIMIT_S, pids_of, refused, run, started
 from worker.status import ask_status
 

@@ -18,8 +18,8 @@ import pytest
 from PIL import Image, ImageDraw
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
-from tangram_sim.assembly import PuzzleRules
-from tangram_sim.puzzles import read_puzzles
+from tangram_sim.puzzles.assembly import PuzzleRules
+from tangram_sim.puzzles.figures import read_puzzles
 from tests.cluster.studios import Running, studio
 from tests.conftest import NO_BROWSER
 

@@ -21,11 +21,11 @@ import pytest
 import torch
 
 from conf.cli import composed
-from master.trainer import Trainer
+from master.learn.trainer import Trainer
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup, make_setup
-from worker.looking import environments
-from worker.rollout import Rollout
+from worker.play.looking import environments
+from worker.play.rollout import Rollout
 
 FILE = Path(__file__).parents[1] / "golden" / "fingerprints.json"
 UPDATES = 20

@@ -10,17 +10,17 @@ import pytest
 import yaml
 
 from tangram_agent.runs import load_run
+from tangram_core.errors import ConfigError, RunError
+from tangram_game.evaluate import evaluate_run
+from tangram_game.figures.puzzles import find_figures
 from tangram_lab.experiments import pretrained
 from tangram_lab.experiments.pretrained import main, publish
-from tangram_sim.errors import ConfigError, RunError
+from tests.agent.agents.outline.outlines import AGENT as FILLER
+from tests.agent.agents.outline.outlines import SIM as OUTLINES
 from tests.agent.builders import random_transitions, setup
-from tests.agent.outlines import AGENT as FILLER
-from tests.agent.outlines import SIM as OUTLINES
 from tests.sim.builders import SEVEN
 from tests.worker.builders import write_run
 from worker.config import EvalConfig
-from worker.evaluate import evaluate_run
-from worker.puzzles import find_figures
 
 pytestmark = pytest.mark.fast
 

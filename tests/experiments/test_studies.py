@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 from PIL import Image
 
+from tangram_core.errors import ConfigError, RunError
 from tangram_lab.experiments.report import write_report, write_runs
 from tangram_lab.experiments.rows import (
     COLUMNS,
@@ -19,7 +20,6 @@ from tangram_lab.experiments.rows import (
     spreads,
 )
 from tangram_lab.experiments.studies import StudyConfig, jobs_of, read_studies
-from tangram_sim.errors import ConfigError, RunError
 from tests.test_docs import ROOT, unknown
 
 pytestmark = pytest.mark.fast

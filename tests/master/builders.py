@@ -14,26 +14,26 @@ import pytest
 import torch
 from rich.console import Console
 
-from master import journal as journal_module
-from master.budget import Budget
 from master.checkpointer import Checkpointer
 from master.config import MasterConfig
-from master.delivery import EpisodesArrived, Ledger, ScoresArrived
-from master.divergence import DivergenceGuard
-from master.journal import Journal, Place
-from master.lockstep import Lockstep
+from master.hub.registry import Peer
+from master.learn.budget import Budget
+from master.learn.divergence import DivergenceGuard
+from master.learn.lockstep import Lockstep
+from master.learn.trainer import Trainer
 from master.loop import Loop
-from master.metrics import Metrics
-from master.registry import Peer
-from master.report import Reporter, StatusCollector
-from master.rundir import Claim, Clock, Record, RunFolder
+from master.record import journal as journal_module
+from master.record.delivery import EpisodesArrived, Ledger, ScoresArrived
+from master.record.journal import Journal, Place
+from master.record.rundir import Claim, Clock, Record, RunFolder
 from master.signals import StopSignals
-from master.trainer import Trainer
+from master.watch.metrics import Metrics
+from master.watch.report import Reporter, StatusCollector
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import PICTURE_WIDTH, EpisodeBatch, Go, RunStatus, Scores
-from tangram_agent.process import Watchdog
 from tangram_agent.setup import Setup
 from tangram_agent.types import Weights
+from tangram_core.process import Watchdog
 from tests.agent.builders import random_episodes, setup
 
 # Small tensors on several threads wait for cores that others use, a hundred times longer.

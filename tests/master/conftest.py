@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pytest
 
 from tests.master.builders import close_journals
-from tests.master.dealers import Dealer, Stage, staged
+from tests.master.hub.dealers import Dealer, Stage, staged
 
 
 @pytest.fixture(autouse=True)

@@ -12,14 +12,14 @@ import pytest
 import torch
 
 from master.checkpointer import AT_ONCE, MAKE_ROOM, WAIT, restore_run
-from master.journal import JournalError, segments
-from master.recovery import Reader
-from master.rundir import RunFolder
-from master.trainer import Trainer
+from master.learn.trainer import Trainer
+from master.record.journal import JournalError, segments
+from master.record.recovery import Reader
+from master.record.rundir import RunFolder
 from tangram_agent import checkpoints as checkpoints_module
 from tangram_agent.checkpoints import DiskError, list_checkpoints
-from tangram_agent.process import Every
-from tangram_sim.errors import ConfigError, RunError
+from tangram_core.errors import ConfigError, RunError
+from tangram_core.process import Every
 from tests.master.builders import Disk, FakeHub, arrival, loop, small_setup
 
 pytestmark = pytest.mark.fast

@@ -7,7 +7,7 @@ import pytest
 from master.config import MasterConfig
 from tangram_agent.config import ServiceConfig
 from tangram_agent.setup import from_mapping
-from tangram_sim.errors import ConfigError
+from tangram_core.errors import ConfigError
 
 pytestmark = pytest.mark.fast
 

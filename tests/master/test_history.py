@@ -20,30 +20,30 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from master import hub as hub_module
-from master import journal as journal_module
 from master import run as run_module
-from master import sockets as sockets_module
 from master.config import MasterConfig
-from master.counters import Counters
+from master.hub import hub as hub_module
+from master.hub import sockets as sockets_module
+from master.hub.security import Holder
+from master.hub.sockets import Received
 from master.loop import Loop
+from master.record import journal as journal_module
+from master.record.counters import Counters
+from master.record.rundir import RunFolder
 from master.run import open_run
-from master.rundir import RunFolder
-from master.security import Holder
 from master.signals import StopSignals
-from master.sockets import Received
 from tangram_agent.config import ServiceConfig
-from tangram_agent.process import Watchdog
+from tangram_core.errors import TangramError, WireError
+from tangram_core.process import Watchdog
 from tangram_core.spec import Episodes
 from tangram_sim.config import RewardConfig
-from tangram_sim.errors import TangramError, WireError
 from tests.agent.builders import random_episodes
 from tests.agent.no_reward import NOTHING
 from tests.master.builders import ShownProgress, small_setup
-from tests.master.power import Machine, PowerCutError
-from worker import client as client_module
-from worker.client import Client
-from worker.connection import Timing
+from tests.master.record.power import Machine, PowerCutError
+from worker.talk import client as client_module
+from worker.talk.client import Client
+from worker.talk.connection import Timing
 
 MADE = replace(
     small_setup(replay_capacity=4096, updates_per_transition=0.01), reward=RewardConfig(NOTHING)

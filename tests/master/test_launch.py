@@ -13,12 +13,12 @@ from master import children as children_module
 from master import launch as launch_module
 from master.children import MAX_RESTARTS, Child
 from master.config import MasterConfig
-from master.console import logging_to, sturdy_console
 from master.launch import Launcher, master_arguments, run_training
-from master.rundir import RunFolder
+from master.record.rundir import RunFolder
+from master.watch.console import logging_to, sturdy_console
 from tangram_agent.config import ServiceConfig
 from tangram_agent.setup import from_mapping
-from tangram_sim.errors import ConfigError
+from tangram_core.errors import ConfigError
 
 LIMIT_S = 100.0
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
@@ -72,7 +72,7 @@ def test_a_folder_in_use_is_left_alone(tmp_path: Path) -> None:
 MASTER = """
 import os, signal, sys, threading
 from pathlib import Path
-from tangram_agent.process import watch_parent
+from tangram_core.process import watch_parent
 folder = Path({folder!r})
 news = open(folder / "news", "w")
 heard = threading.Event()
@@ -97,7 +97,7 @@ while {condition}:
 """
 WORKER = """
 import signal
-from tangram_agent.process import watch_parent
+from tangram_core.process import watch_parent
 watch_parent()
 signal.pause()
 """
@@ -422,7 +422,7 @@ def test_a_signal_that_comes_again_at_once_cuts_nobody_short(
     monkeypatch.setattr(launch_module, "LEAVE_S", LIMIT_S)
     leaving = """
 import signal, sys, time
-from tangram_agent.process import watch_parent
+from tangram_core.process import watch_parent
 watch_parent()
 def leave(*_):
     time.sleep(0.3)

@@ -13,14 +13,14 @@ import torch
 from PIL import Image
 
 from master import loop as loop_module
-from master import metrics as metrics_module
-from master.delivery import EpisodesArrived
-from master.result import make_result
-from tangram_agent import process as process_module
+from master.record.delivery import EpisodesArrived
+from master.watch import metrics as metrics_module
+from master.watch.result import make_result
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
 from tangram_agent.messages import Go
-from tangram_agent.process import Every
-from tangram_sim.errors import RunError
+from tangram_core import process as process_module
+from tangram_core.errors import RunError
+from tangram_core.process import Every
 from tests.master.builders import FakeHub, arrival, loop, scores, small_setup
 
 pytestmark = pytest.mark.fast

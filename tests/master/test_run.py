@@ -14,16 +14,16 @@ import pytest
 
 from master.checkpointer import Restored, save_run
 from master.config import MasterConfig
-from master.journal import segments
+from master.hub.security import Given, make_pair, read_keys, write_keys
 from master.loop import Loop
+from master.record.journal import segments
+from master.record.rundir import Record, RunFolder
 from master.run import UNBOUNDED, open_run
-from master.rundir import Record, RunFolder
-from master.security import Given, make_pair, read_keys, write_keys
 from master.signals import StopSignals
 from tangram_agent.config import ServiceConfig
 from tangram_agent.messages import OPEN
-from tangram_agent.process import Every, Watchdog
-from tangram_sim.errors import ConfigError, RunError
+from tangram_core.errors import ConfigError, RunError
+from tangram_core.process import Every, Watchdog
 from tests.master.builders import ShownProgress, arrival, journal, small_setup, trainer
 from tests.ports import free_ports
 
@@ -210,7 +210,7 @@ def test_on_one_machine_sockets_of_the_user_alone_are_the_same_in_each_life(
 def test_keys_that_were_given_meanwhile_come_back_with_a_folder_that_was_made_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("master.security.LOOK_S", 0.0)
+    monkeypatch.setattr("master.hub.security.LOOK_S", 0.0)
     folder = RunFolder(tmp_path / "run")
     with opened_run(folder.path, bind="127.0.0.1") as (made, _):
         given = {"alice": Given("player", make_pair().public)}

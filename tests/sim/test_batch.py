@@ -5,14 +5,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tangram_sim.actions import chosen_tokens, velocities
-from tangram_sim.arrays import Floats
+from tangram_core.arrays import Floats
+from tangram_core.errors import ConfigError
+from tangram_core.seeding import evaluation_generators
 from tangram_sim.batch import BatchedEnv, StepResult
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.env import TangramEnv
-from tangram_sim.errors import ConfigError
-from tangram_sim.layout import Layout
-from tangram_sim.seeding import evaluation_generators
+from tangram_sim.geometry.layout import Layout
+from tangram_sim.motion.actions import chosen_tokens, velocities
 from tests.sim.builders import SEVEN, layout_of
 
 pytestmark = pytest.mark.fast

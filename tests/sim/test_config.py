@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
+from tangram_core.errors import ConfigError
+from tangram_core.settings import Settings, declared, setting
 from tangram_sim.config import RewardConfig, SimConfig
-from tangram_sim.errors import ConfigError
-from tangram_sim.settings import Settings, declared, setting
 
 pytestmark = pytest.mark.fast
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+from tangram_core.errors import ConfigError
 from tangram_sim.config import RewardConfig
 from tangram_sim.env import TangramEnv
-from tangram_sim.errors import ConfigError
 from tangram_sim.register import ENV_ID, KWARGS
 from tests.sim.builders import SEVEN, TRIO
 

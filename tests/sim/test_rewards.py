@@ -11,10 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tangram_core.errors import ConfigError
 from tangram_sim.config import RewardConfig, SimConfig
-from tangram_sim.errors import ConfigError
-from tangram_sim.layout import Layout
-from tangram_sim.pictures import BACKGROUND, TOKEN_GRAY, token_pixels
+from tangram_sim.geometry.layout import Layout
 from tangram_sim.rewards import (
     RewardFn,
     TargetPictures,
@@ -25,6 +24,7 @@ from tangram_sim.rewards import (
     reward_bounds,
     reward_identity,
 )
+from tangram_sim.sight.pictures import BACKGROUND, TOKEN_GRAY, token_pixels
 from tests.sim.builders import TRIO, layout_of, random_poses
 
 pytestmark = pytest.mark.fast

@@ -9,7 +9,7 @@ import pytest
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode
 
-from tangram_sim.errors import ConfigError
+from tangram_core.errors import ConfigError
 from tangram_sim.register import ENV_ID, GAME_ID
 from tangram_sim.vector import TangramVectorEnv
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tangram_sim.errors import TangramError
+from tangram_core.errors import TangramError
 from tangram_studio.jobs import Jobs
 
 pytestmark = pytest.mark.cluster

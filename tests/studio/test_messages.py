@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from tangram_sim.errors import ConfigError
+from tangram_core.errors import ConfigError
 from tangram_studio.messages import MAX_POINTS, Fill, Next, Play, Save, read
 
 pytestmark = pytest.mark.fast

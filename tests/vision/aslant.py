@@ -6,8 +6,8 @@ import numpy as np
 import shapely
 from PIL import Image, ImageDraw
 
-from tangram_sim.areas import Area
-from tangram_sim.arrays import Floats
+from tangram_core.arrays import Floats
+from tangram_sim.geometry.areas import Area
 
 PIXELS = 512
 _WIDTH = 0.6  # of the picture that a figure takes

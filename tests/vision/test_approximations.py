@@ -7,16 +7,16 @@ import pytest
 import shapely
 from shapely import LineString, Polygon
 
-import tangram_vision.approximations as room
-from tangram_sim.areas import Area, overlap, valid
-from tangram_sim.arrays import Floats
-from tangram_sim.dissections import Dissection
-from tangram_sim.geometry import outlines, shared_areas
-from tangram_sim.layout import Layout
-from tangram_sim.puzzles import load_puzzle
-from tangram_sim.targets import placement
-from tangram_vision.approximations import _apart, _Canvas, _direction, nearest_figure
-from tangram_vision.silhouettes import covered, silhouette
+import tangram_vision.silhouettes.approximations as room
+from tangram_core.arrays import Floats
+from tangram_sim.geometry.areas import Area, overlap, valid
+from tangram_sim.geometry.dissections import Dissection
+from tangram_sim.geometry.layout import Layout
+from tangram_sim.geometry.overlap import outlines, shared_areas
+from tangram_sim.puzzles.figures import load_puzzle
+from tangram_sim.tasks.targets import placement
+from tangram_vision.silhouettes.approximations import _apart, _Canvas, _direction, nearest_figure
+from tangram_vision.silhouettes.silhouettes import covered, silhouette
 from tests.sim.builders import SEVEN, layout_of
 
 pytestmark = pytest.mark.slow

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from tangram_sim.arrays import Floats
-from tangram_vision.contacts import Contact, closing, touching
-from tangram_vision.kinds import Kind, kinds_of
-from tangram_vision.ramps import fitted, ramps
+from tangram_core.arrays import Floats
+from tangram_vision.pictures.contacts import Contact, closing, touching
+from tangram_vision.pictures.kinds import Kind, kinds_of
+from tangram_vision.pictures.ramps import fitted, ramps
 from tests.sim.builders import layout_of
 
 pytestmark = pytest.mark.fast

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from shapely import Polygon
 
-from tangram_sim.dissections import Budget, Search, Tokens
-from tangram_vision.loose import LoosePlaces
+from tangram_sim.geometry.dissections import Budget, Search, Tokens
+from tangram_vision.silhouettes.loose import LoosePlaces
 from tests.sim.builders import SEVEN, layout_of
 
 pytestmark = pytest.mark.fast

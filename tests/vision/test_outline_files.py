@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tangram_sim.arrays import Floats
-from tangram_sim.errors import ConfigError
-from tangram_vision.outline_files import MAX_MEETINGS, _meetings, read_outline
-from tangram_vision.silhouette_files import Silhouette, _traced, fill_silhouette
+from tangram_core.arrays import Floats
+from tangram_core.errors import ConfigError
+from tangram_vision.given.outline_files import MAX_MEETINGS, _meetings, read_outline
+from tangram_vision.given.silhouette_files import Silhouette, _traced, fill_silhouette
 from tests.sim.builders import SEVEN, layout_of
 
 pytestmark = pytest.mark.fast

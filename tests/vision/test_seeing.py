@@ -6,17 +6,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tangram_sim.arrays import Floats, Pixels
+from tangram_core.arrays import Floats, Pixels
 from tangram_sim.config import SimConfig
-from tangram_sim.connected import sample_connected
-from tangram_sim.layout import Layout
-from tangram_sim.lens import Disturbance, Lens
-from tangram_sim.pictures import rasterise
-from tangram_sim.puzzles import library
-from tangram_sim.sampling import sample_batch
-from tangram_sim.sight import Look
-from tangram_sim.targets import placement
-from tangram_vision.seeing import Seen, see
+from tangram_sim.geometry.layout import Layout
+from tangram_sim.puzzles.figures import library
+from tangram_sim.sight.lens import Disturbance, Lens
+from tangram_sim.sight.perception import Look
+from tangram_sim.sight.pictures import rasterise
+from tangram_sim.tasks.connected import sample_connected
+from tangram_sim.tasks.sampling import sample_batch
+from tangram_sim.tasks.targets import placement
+from tangram_vision.pictures.seeing import Seen, see
 from tests.sim.builders import LOPSIDED, SEVEN, layout_of, pieces
 
 pytestmark = pytest.mark.fast
@@ -266,7 +266,7 @@ def test_a_small_token_that_is_blurred_is_as_large_as_it_is(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The blur reaches its middle, from which its level is told."""
-    monkeypatch.setattr("tangram_sim.lens.FULL", Disturbance(blur=1.0))
+    monkeypatch.setattr("tangram_sim.sight.lens.FULL", Disturbance(blur=1.0))
     layout, rng = layout_of("small_triangle", scale=0.6), np.random.default_rng(6)
     lens = Lens(SimConfig(pixels=128, disturbance=1.0))
     for _ in range(6):

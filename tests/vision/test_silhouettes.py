@@ -9,19 +9,19 @@ import pytest
 import shapely
 from shapely import Polygon
 
-from tangram_sim.areas import Area, overlap
-from tangram_sim.arrays import Singles
+from tangram_core.arrays import Singles
 from tangram_sim.config import SimConfig
-from tangram_sim.connected import sample_connected
-from tangram_sim.dissections import Dissection, Laid
-from tangram_sim.puzzles import load_puzzle
-from tangram_sim.targets import placement, turned_figure
-from tangram_sim.world import make_world
-from tangram_vision.kinds import kinds_of
-from tangram_vision.levels import coverage
-from tangram_vision.outlines import BINARY_WAYS, GREY_WAYS, outline
-from tangram_vision.silhouette_pictures import _cropped, _Explainer, fill_picture
-from tangram_vision.silhouettes import Filled, Method, covered
+from tangram_sim.geometry.areas import Area, overlap
+from tangram_sim.geometry.dissections import Dissection, Laid
+from tangram_sim.puzzles.figures import load_puzzle
+from tangram_sim.tasks.connected import sample_connected
+from tangram_sim.tasks.targets import placement, turned_figure
+from tangram_sim.world.world import make_world
+from tangram_vision.pictures.kinds import kinds_of
+from tangram_vision.pictures.levels import coverage
+from tangram_vision.silhouettes.outlines import BINARY_WAYS, GREY_WAYS, outline
+from tangram_vision.silhouettes.silhouette_pictures import _cropped, _Explainer, fill_picture
+from tangram_vision.silhouettes.silhouettes import Filled, Method, covered
 from tests.sim.builders import SEVEN, layout_of
 
 pytestmark = pytest.mark.fast
@@ -132,7 +132,7 @@ def test_tokens_that_lie_wrong_are_laid_anew(monkeypatch: pytest.MonkeyPatch) ->
 
     monkeypatch.setattr(_Explainer, "_lay", offered)
     for tried in (0, 12):
-        monkeypatch.setattr("tangram_vision.silhouette_pictures._TRIED", tried)
+        monkeypatch.setattr("tangram_vision.silhouettes.silhouette_pictures._TRIED", tried)
         iou.append(fill_picture(cover, LAYOUT, ARENA, 20.0, Method(search=False)).iou)
     assert iou[0] < 0.95
     assert iou[1] > 0.97
@@ -150,5 +150,5 @@ def test_what_explains_a_picture_worse_is_forgotten(monkeypatch: pytest.MonkeyPa
         assert explainer._offer(laid, "beam") is alike
     assert explainer.best is not None
     assert explainer.best.differs < 0.02
-    monkeypatch.setattr("tangram_vision.silhouette_pictures._overlap", lambda *_: 0.94)
+    monkeypatch.setattr("tangram_vision.silhouettes.silhouette_pictures._overlap", lambda *_: 0.94)
     assert explainer._offer(laid, "beam") is False

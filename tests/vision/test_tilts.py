@@ -6,16 +6,16 @@ import shapely
 from PIL import Image, ImageDraw
 from shapely import Polygon
 
-from tangram_sim.areas import Area, overlap
-from tangram_sim.arrays import Singles
+from tangram_core.arrays import Singles
 from tangram_sim.config import SimConfig
-from tangram_sim.connected import sample_connected
-from tangram_sim.dissections import Dissection
-from tangram_vision.outlines import Way, outline
-from tangram_vision.photos import find_silhouette
-from tangram_vision.silhouette_pictures import fill_picture
-from tangram_vision.silhouettes import covered
-from tangram_vision.tilts import from_above, mapped
+from tangram_sim.geometry.areas import Area, overlap
+from tangram_sim.geometry.dissections import Dissection
+from tangram_sim.tasks.connected import sample_connected
+from tangram_vision.given.photos import find_silhouette
+from tangram_vision.silhouettes.outlines import Way, outline
+from tangram_vision.silhouettes.silhouette_pictures import fill_picture
+from tangram_vision.silhouettes.silhouettes import covered
+from tangram_vision.silhouettes.tilts import from_above, mapped
 from tests.sim.builders import SEVEN, layout_of
 from tests.vision.aslant import photographed
 
@@ -123,7 +123,7 @@ def test_a_photograph_taken_aslant_is_filled_as_if_from_above(
     picture = photographed(gluing(1), 12.0, 77.0)
     iou = []
     for straightened, seconds in ((lambda part: (part, np.eye(3)), 2.0), (from_above, 30.0)):
-        monkeypatch.setattr("tangram_vision.photos.from_above", straightened)
+        monkeypatch.setattr("tangram_vision.given.photos.from_above", straightened)
         cover = find_silhouette(picture, LAYOUT, "it").cover
         view = float(np.sqrt(LAYOUT.areas.sum() / cover.mean()))
         iou.append(fill_picture(cover, LAYOUT, view, seconds).iou)

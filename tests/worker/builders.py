@@ -7,19 +7,19 @@ from typing import Any
 import numpy as np
 import yaml
 
+from tangram_agent.agents.outline.filling_learner import FillLearner
 from tangram_agent.checkpoints import save_checkpoint
 from tangram_agent.config import ServiceConfig
-from tangram_agent.filling_learner import FillLearner
 from tangram_agent.learner import Learner
 from tangram_agent.networks import travelling
 from tangram_agent.policy import Policy
 from tangram_agent.setup import Setup, make_setup
 from tangram_agent.types import Weights
+from tangram_core.arrays import Floats
 from tangram_core.spec import Episodes
-from tangram_sim.arrays import Floats
-from tangram_sim.layout import Layout
+from tangram_sim.geometry.layout import Layout
 from tests.agent.builders import SMALL, SQUARE
-from worker.rollout import Played
+from worker.play.rollout import Played
 
 
 def weights(made: Setup, version: int) -> Weights:

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.master.dealers import Stage, staged
-from tests.worker.conversation import StandIn, standing_in
+from tests.master.hub.dealers import Stage, staged
+from tests.worker.talk.conversation import StandIn, standing_in
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tangram_sim.errors import ConfigError
+from tangram_core.errors import ConfigError
 from worker.cli import with_absolute_paths, with_changes
 from worker.config import (
     EvalConfig,

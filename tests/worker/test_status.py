@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 import zmq
 
-from master.security import make_keys, make_pair
+from master.hub.security import make_keys, make_pair
 from tangram_agent.messages import RunStatus
-from tangram_sim.errors import RunError, TangramError
-from tests.master.dealers import Stage, staged
-from tests.master.test_health import STATUS
-from tests.master.test_result import RESULT
-from tests.worker.conversation import served
-from tests.worker.test_security import write_file
+from tangram_core.errors import RunError, TangramError
+from tests.master.hub.dealers import Stage, staged
+from tests.master.watch.test_health import STATUS
+from tests.master.watch.test_result import RESULT
+from tests.worker.talk.conversation import served
+from tests.worker.talk.test_security import write_file
 from worker.config import StatusConfig
 from worker.status import _evaluator, _lines, ask_status, show_status
 

@@ -1,0 +1,173 @@
+"""Admission: who may take part, with which key and settings, and the audit of who did.
+
+Whoever has no key of the run gets no further than the sockets (`security`, `gate`). Indices and
+incarnations are the registry's.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from master.hub.gate import Room
+from master.hub.registry import Peer, RefusedError, Registry
+from master.hub.security import Holder
+from master.hub.sockets import Sockets
+from master.record.audit import Audit
+from master.record.counters import Counters
+from tangram_agent.messages import ROLES, TAKEN_OVER, Hello, Refused, Stop, Welcome
+from tangram_core.spec import EpisodeSpec
+
+
+@dataclass(frozen=True)
+class WelcomeInfo:
+    """What the master tells, and asks of, a process that joins.
+
+    Attributes:
+        run_id: of the run.
+        seed: of the run.
+        fingerprints: section of the settings -> digest; a worker's must be equal.
+        spec: the task that arrays are checked against.
+        window: most unacknowledged batches of one peer.
+        lockstep: players wait for orders.
+    """
+
+    run_id: str
+    seed: int
+    fingerprints: Mapping[str, str]
+    spec: EpisodeSpec
+    window: int = 4
+    lockstep: bool = False
+
+
+class Admission:
+    """Lets processes in and out, answers them, and writes it down.
+
+    Attributes:
+        registry: those who take part.
+    """
+
+    def __init__(
+        self,
+        info: WelcomeInfo,
+        silence_s: float,
+        room: Room,
+        sockets: Sockets,
+        counters: Counters,
+        audit: Audit,
+    ) -> None:
+        """Nobody takes part yet.
+
+        Args:
+            info: what joiners are told, and must agree with.
+            silence_s: after which a peer is forgotten.
+            room: for peers.
+            sockets: for the answers.
+            counters: of those who joined and were refused.
+            audit: of who joins, leaves and is refused.
+        """
+        self.registry = Registry(info.fingerprints, silence_s, room)
+        self._info, self._silence_s = info, silence_s
+        self._sockets, self._counters, self._audit = sockets, counters, audit
+
+    def find(self, identity: bytes, caller: Holder) -> Peer | None:
+        """The peer of a connection, by its key: the name of a connection is no proof."""
+        peer = self.registry.find(identity)
+        return peer if peer is not None and peer.holder == caller.name else None
+
+    def hello(
+        self, identity: bytes, hello: Hello, caller: Holder, address: str, epoch: str, now: float
+    ) -> Peer | None:
+        """Welcome a process, or tell it why it may not take part; returns who may."""
+        try:
+            self._check(hello, caller)
+            peer, older = self.registry.admit(identity, hello, now)
+        except RefusedError as error:
+            who = {"role": hello.role, "index": hello.index, "process": hello.process}
+            where = {"key": caller.name, "address": address, "reason": error.answer.reason}
+            self._audit.note("refused", **who, **where)
+            self._sockets.refuse(identity, error.counter, error.answer)
+            return None
+        if older is not None:
+            reason = f"{peer.name} {TAKEN_OVER}"
+            self._tell_of("superseded", older, reason)
+            self._sockets.refuse(older.identity, "superseded", Stop(reason))
+        before, peer.address, peer.holder = peer.address, address, caller.name
+        if before is None:
+            self._tell_of("joined", peer)
+        self._counters["welcomed"] += 1
+        self._tell_losses(peer)
+        self._sockets.answer(identity, self._welcome(peer, epoch))
+        return peer
+
+    def leave(self, peer: Peer, reason: str) -> None:
+        """Of its own will."""
+        self.registry.leave(peer)
+        self._tell_of("left", peer, reason)
+
+    def drop_silent(self, now: float) -> None:
+        """Forget those who were not heard of for so long."""
+        for peer in self.registry.drop_silent(now, self._silence_s):
+            reason = f"{peer.name} was silent for {self._silence_s:g} s"
+            self._counters.note("lost_peers", reason)
+            self._tell_of("lost", peer, reason)
+
+    def drop_revoked(self) -> None:
+        """End those whose keys were revoked since."""
+        for holder in self._sockets.revoked():
+            for peer in [one for one in self.registry.peers if one.holder == holder.name]:
+                self.revoke(peer.identity, holder.name)
+
+    def revoke(self, identity: bytes, key: str) -> None:
+        """End a connection whose key was revoked, whoever it is of."""
+        peer, reason = self.registry.find(identity), f"the key {key} was revoked"
+        if peer is not None:
+            self.registry.leave(peer)
+            self._tell_of("refused", peer, reason)
+        self._sockets.refuse(identity, "revoked", Stop(reason))
+
+    def _check(self, hello: Hello, caller: Holder) -> None:
+        """RefusedError for another run, or for a key that does not let it take part like this."""
+        if hello.run_id not in ("", self._info.run_id):
+            reason = (
+                f"this master runs '{self._info.run_id}', not '{hello.run_id}': the connection "
+                "file is stale, take the one of a master that is running"
+            )
+            raise RefusedError("refused_run", Refused(reason))
+        if caller.role not in ("", hello.role):
+            reason = f"the key '{caller.name}' is one for role={caller.role}, not for role="
+            raise RefusedError("refused_keys", Refused(reason + hello.role))
+        for peer in self.registry.peers:
+            its = peer.process == hello.process or peer.key == (hello.role, hello.index)
+            # What the run starts itself has its place: a key that was given away gets another.
+            if its and peer.holder != caller.name and caller.name not in ROLES:
+                reason = (
+                    f"{peer.name} takes part with another key: leave index out, or choose another"
+                )
+                raise RefusedError("refused_keys", Refused(reason))
+
+    def _tell_losses(self, peer: Peer) -> None:
+        lost = self.registry.lost_batches - self._counters["lost_batches"]
+        self._counters["lost_batches"] += lost
+        if lost:
+            reason = (
+                f"{peer.name} says that {lost:,} of its batches were acknowledged which are not in "
+                "the replay: the disk has lost them, if it is right"
+            )
+            self._counters.note("losses", reason)
+
+    def _welcome(self, peer: Peer, epoch: str) -> Welcome:
+        return Welcome(
+            epoch=epoch,
+            run_id=self._info.run_id,
+            seed=self._info.seed,
+            index=peer.index,
+            incarnation=peer.incarnation,
+            weights_endpoint=self._sockets.weights_endpoint,
+            window=self._info.window,
+            lockstep=self._info.lockstep,
+        )
+
+    def _tell_of(self, event: str, peer: Peer, reason: str = "") -> None:
+        """One line of the audit."""
+        who = {"role": peer.role, "index": peer.index, "incarnation": peer.incarnation}
+        where = {"process": peer.process, "key": peer.holder, "address": peer.address}
+        self._audit.note(event, **who, **where, **({"reason": reason} if reason else {}))

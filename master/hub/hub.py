@@ -1,0 +1,392 @@
+"""The master's sockets: ROUTER for episodes, scores and control, PUB for weights.
+
+Whatever a peer sends, `poll` does not raise: what is wrong is answered with a reason, counted by
+name, and forgotten. A peer that does not read its answers loses them and nobody waits for it: the
+worker asks again.
+
+Delivery: see `delivery`. A batch is acknowledged only by `acknowledge`, after it was
+journalled and inserted, and the unacknowledged batches of one peer are bounded by `window`.
+"""
+
+import secrets
+import time
+from collections.abc import Mapping, Sequence
+from typing import Self
+
+from master.hub.admission import Admission, WelcomeInfo
+from master.hub.gate import AMPLE, Room
+from master.hub.registry import Askers, Peer
+from master.hub.security import Holder, Keys
+from master.hub.sockets import Received, Sockets
+from master.record.audit import Audit
+from master.record.counters import Counters
+from master.record.delivery import Arrival, EpisodesArrived, Exams, ScoresArrived, Verdict, Waiting
+from tangram_agent.arrays import MAX_FRAMES, join_frames
+from tangram_agent.messages import (
+    Ack,
+    Alive,
+    AskStatus,
+    BatchError,
+    Bye,
+    EpisodeBatch,
+    Go,
+    Greet,
+    Heartbeat,
+    Hello,
+    Refused,
+    Reject,
+    RunStatus,
+    Scores,
+    Stop,
+    ToMaster,
+    WantWeights,
+    WeightsMessage,
+    decode_from_worker,
+)
+from tangram_agent.schema import DamagedError, ProtocolError
+from tangram_agent.types import Weights
+from tangram_core.errors import WireError
+from tangram_core.wire.addresses import IPC
+
+# Most messages taken in one poll, so that the loop gets its turn under any load.
+MAX_DRAIN = 256
+# Damaged messages of one peer without an intact batch between them: then it must end.
+MAX_DAMAGED = 100
+# Of broadcasts to all workers together: half of a gigabit line, and what a fifteenth of a core
+# encrypts. Many workers have somewhat older weights rather than a slower learner.
+BROADCAST_BYTES_S = 60e6
+
+
+class Hub:
+    """The master's end of all conversations.
+
+    Attributes:
+        endpoint: of the ROUTER socket, as bound.
+        weights_endpoint: of the PUB socket, as bound.
+        epoch: random id of this life of the master.
+        counters: traffic and refusals by name.
+        open_to_all: whoever reaches the port may take part.
+    """
+
+    def __init__(
+        self,
+        bind: str,
+        port: int,
+        info: WelcomeInfo,
+        silence_s: float = 30.0,
+        keys: Keys | None = None,
+        room: Room = AMPLE,
+        audit: Audit | None = None,
+    ) -> None:
+        """Open the sockets.
+
+        Args:
+            bind: address to listen on.
+            port: of the ROUTER, and the next one of the PUB; 0 for any.
+            info: what joiners are told, and must agree with.
+            silence_s: after which a peer is forgotten.
+            keys: for encrypted sockets, None for plain ones.
+            room: for those who take part.
+            audit: of who joins, leaves and is refused.
+        """
+        self.epoch = secrets.token_hex(8)
+        self._info = info
+        self._weights: list[bytes] | None = None
+        self._version, self._exams = -1, Exams()
+        self._stop_reason: str | None = None
+        self._status: list[bytes] | None = None
+        self._askers = Askers()
+        self._orders: dict[int, Go] = {}
+        self._waiting = Waiting(info.window)
+        self.counters = Counters()
+        self._caller, self._address = Holder(), ""
+        audit = audit or Audit()
+        self._sockets = Sockets(bind, port, self.counters, keys, room, audit)
+        self._admission = Admission(info, silence_s, room, self._sockets, self.counters, audit)
+        self._registry = self._admission.registry
+        self.endpoint = self._sockets.endpoint
+        self.weights_endpoint = self._sockets.weights_endpoint
+        self.open_to_all = keys is None and not self.endpoint.startswith(IPC)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def peers(self) -> list[Peer]:
+        """Processes that take part, by role and index."""
+        return self._registry.peers
+
+    def count(self, role: str) -> int:
+        """How many of a role take part."""
+        return self._registry.count(role)
+
+    @property
+    def keys(self) -> Keys | None:
+        """As their file has them by now; None on plain sockets."""
+        return self._sockets.keys
+
+    @property
+    def broadcast_s(self) -> float:
+        """How long the newest weights take to all who take part, at `BROADCAST_BYTES_S`."""
+        size = sum(map(len, self._weights or ()))
+        return size * len(self._registry) / BROADCAST_BYTES_S
+
+    def poll(self, timeout_s: float) -> list[Arrival]:
+        """Wait for a message, then take and answer what is there.
+
+        Returns:
+            New batches and scores, in the order of their arrival.
+        """
+        arrivals: list[Arrival] = []
+        self._sockets.listen_again()
+        self._admission.drop_revoked()  # first: a flood must not keep anybody in
+        if self._sockets.wait(timeout_s):
+            for _ in range(MAX_DRAIN):
+                received = self._sockets.receive()
+                if received is None:
+                    break
+                arrival = self._heard(received)
+                if arrival is not None:
+                    arrivals.append(arrival)
+            else:  # more is waiting, perhaps from those who seem silent
+                return arrivals
+        self._admission.drop_silent(time.monotonic())
+        return arrivals
+
+    def acknowledge(self, arrival: EpisodesArrived) -> None:
+        """Tell the worker that its batch is safe; once for each arrival, after its insert."""
+        key = (arrival.role, arrival.index)
+        self._waiting.done(key)
+        ledger = self._registry.ledger(key, arrival.incarnation)
+        if ledger is None or not ledger.release(arrival.sequence):
+            return  # a newer process has the index, or this was told before
+        peer = self._registry.at(key)
+        if peer is not None:
+            peer.inserted(arrival)
+            self._sockets.answer(peer.identity, Ack(arrival.sequence, duplicate=False))
+
+    def publish(self, weights: Weights) -> None:
+        """Broadcast weights, and keep them for those who join later.
+
+        Raises:
+            WireError: they are not finite or too large; nothing is sent.
+        """
+        self._weights = WeightsMessage(self.epoch, weights).encode()
+        self._version = weights.version
+        self._exams.published(weights.version)
+        self._sockets.publish(join_frames(self._weights))
+        self.counters["published"] += 1
+
+    def order(self, orders: Mapping[int, Go]) -> None:
+        """In lockstep: tell players what to play next, by index, until their batches come."""
+        self._orders = dict(orders)
+        for peer in self.peers:
+            self._remind(peer)
+
+    def tell(self, status: RunStatus) -> None:
+        """Answer with this whoever asks how the run stands."""
+        self._status = status.encode()
+
+    def stop(self, reason: str) -> None:
+        """Tell all peers to end, and from now on whoever says anything.
+
+        They leave with BYE: poll until `peers` is empty or your patience ends.
+        """
+        self._stop_reason = reason
+        for peer in self.peers:
+            self._sockets.answer(peer.identity, Stop(reason))
+
+    def state(self) -> dict[str, dict[str, int | str]]:
+        """The table of duplicates, for a checkpoint."""
+        return self._registry.state()
+
+    def load_state(self, state: Mapping[str, Mapping[str, int | str]]) -> None:
+        """Take the table of duplicates of a checkpoint, before the first poll.
+
+        Raises:
+            RunError: malformed.
+        """
+        self._registry.load_state(state, time.monotonic())
+
+    def recover(self, arrival: EpisodesArrived) -> bool:
+        """Note a batch of the journal, before the first poll; False if it was inserted before."""
+        key = (arrival.role, arrival.index)
+        sent = (arrival.incarnation, arrival.sequence)
+        return self._registry.recover(key, *sent, time.monotonic(), arrival.process)
+
+    def close(self) -> None:
+        """Close the sockets; answers that are on their way get a second."""
+        self._sockets.close()
+
+    def _heard(self, received: Received) -> Arrival | None:
+        """Read a message, if its sender still has a key; returns what is new."""
+        identity, frames, holder, self._address = received
+        if holder.revoked:
+            self._admission.revoke(identity, holder.name)
+            return None
+        self._caller = holder
+        return self._receive(identity, frames)
+
+    def _receive(self, identity: bytes, frames: Sequence[bytes]) -> Arrival | None:
+        """Read a message and answer it; returns what is new."""
+        message: ToMaster | BatchError
+        try:
+            if len(frames) > 1 + MAX_FRAMES:
+                raise WireError(f"the message has {len(frames)} frames, at most {1 + MAX_FRAMES}")
+            message = decode_from_worker(frames, self._info.spec)
+        except ProtocolError as error:
+            self._sockets.refuse(identity, "refused_protocol", Refused(str(error)))
+        except DamagedError as error:
+            self._damaged(identity, error)
+        except BatchError as error:
+            return self._dispatch(identity, error, frames)
+        except WireError as error:
+            self._sockets.refuse(identity, "malformed", Reject(str(error), sequence=0, final=True))
+        else:
+            return self._dispatch(identity, message, frames)
+        return None
+
+    def _dispatch(
+        self, identity: bytes, message: ToMaster | BatchError, frames: Sequence[bytes]
+    ) -> Arrival | None:
+        """Those who need not take part, and those who may not any more."""
+        peer = self._admission.find(identity, self._caller)
+        if isinstance(message, AskStatus):
+            if not self._askers.may_have(identity, time.monotonic()):
+                self.counters["status_asked_again"] += 1
+            elif self._status is not None:
+                self._sockets.send(identity, self._status)
+        elif isinstance(message, Bye):
+            self.counters["byes"] += 1
+            if peer is not None:
+                self._admission.leave(peer, message.reason)
+        elif self._stop_reason is not None:
+            # Batches, too, right and wrong ones: none is taken, so none may be refused for good.
+            self._sockets.answer(identity, Stop(self._stop_reason))
+        elif isinstance(message, Hello):
+            who = (self._caller, self._address, self.epoch)
+            joined = self._admission.hello(identity, message, *who, time.monotonic())
+            if joined is not None:
+                self._remind(joined)
+        elif peer is None:
+            self._sockets.refuse(identity, "strangers", Greet())
+        else:
+            peer.last_seen = time.monotonic()
+            return self._talk(peer, message, frames)
+        return None
+
+    def _talk(
+        self, peer: Peer, message: ToMaster | BatchError, frames: Sequence[bytes]
+    ) -> Arrival | None:
+        match message:
+            case EpisodeBatch(sequence) if peer.role != "player":
+                self._reject(peer, sequence, "episodes come from players only")
+            case EpisodeBatch():
+                return self._batch(peer, message, frames)
+            case BatchError():
+                self._broken(peer, message)
+            case Scores() if peer.role != "evaluator":
+                self._reject(peer, 0, "scores come from evaluators only")
+            case Scores():
+                return self._scores(peer, message)
+            case Heartbeat(stats):
+                self.counters["heartbeats"] += 1
+                peer.stats = dict(stats)
+                self._sockets.answer(peer.identity, Alive(self._version))
+                self._remind(peer)
+            case WantWeights(epoch, version):
+                shown = version if epoch == self.epoch else -1
+                if self._weights is None or shown == self._version:
+                    return None
+                if peer.may_have(self._version, shown):
+                    self._sockets.send(peer.identity, self._weights)
+                else:
+                    self.counters["weights_asked_again"] += 1
+        return None
+
+    def _scores(self, peer: Peer, scores: Scores) -> ScoresArrived | None:
+        """Scores, once for each of the published weights."""
+        peer.damaged = 0
+        if reason := self._exams.take(scores.weights_version, peer.index):
+            self._reject(peer, 0, reason, "excess_scores")
+            return None
+        self.counters["scores"] += 1
+        return ScoresArrived(peer.index, peer.incarnation, scores)
+
+    def _batch(
+        self, peer: Peer, batch: EpisodeBatch, frames: Sequence[bytes]
+    ) -> EpisodesArrived | None:
+        """The batch, if it is the next one; else what the worker must know is answered."""
+        peer.damaged = 0
+        if self._info.lockstep and not self._is_ordered(peer, batch):
+            return None
+        room = self._waiting.room(peer.key, peer.ledger, len(self._registry))
+        verdict = peer.ledger.take(batch.sequence, room)
+        if verdict is not Verdict.NEW:
+            self.counters[verdict.value] += 1
+            answer = peer.ledger.answer(verdict, batch.sequence)
+            if answer is not None:
+                self._sockets.answer(peer.identity, answer)
+            return None
+        peer.weights_version = batch.weights_version
+        self.counters["batches"] += 1
+        self.counters["episodes"] += batch.episodes.count
+        self._orders.pop(peer.index, None)
+        self._waiting.add(peer.key)
+        return EpisodesArrived(peer.role, peer.index, peer.incarnation, batch, frames, peer.process)
+
+    def _is_ordered(self, peer: Peer, batch: EpisodeBatch) -> bool:
+        """Whether a new batch is what the player was told to play; else it is told again."""
+        if peer.ledger.judge(batch.sequence, self._info.window) is not Verdict.NEW:
+            return True  # it was, when it was new
+        order, number = self._orders.get(peer.index), batch.sequence
+        if order is None:
+            # After a restart its order may come soon: it is not refused for good.
+            reason = f"batch {number}: nothing is ordered of it now"
+            self._reject(peer, number, reason, "not_ordered", final=False)
+            return False
+        if (batch.episodes.count, batch.weights_version) == (order.episodes, order.version):
+            return True
+        peer.ledger.consume(number)
+        reason = (
+            f"batch {number}: {batch.episodes.count} episodes with weights "
+            f"{batch.weights_version}, ordered were {order.episodes} with weights {order.version}"
+        )
+        self._reject(peer, number, reason, "not_ordered")
+        self._remind(peer)
+        return False
+
+    def _broken(self, peer: Peer, error: BatchError) -> None:
+        """A batch with wrong content: it must not come again, and those after it need not wait."""
+        final = peer.ledger.judge(error.sequence, self._info.window) is Verdict.NEW
+        if final:
+            peer.ledger.consume(error.sequence)
+        self._reject(peer, error.sequence, f"batch {error.sequence}: {error}", final=final)
+
+    def _damaged(self, identity: bytes, error: DamagedError) -> None:
+        """Told, so that what was meant comes again soon, unless that happens time after time."""
+        peer = self._registry.find(identity)
+        if peer is not None:
+            peer.damaged += 1
+            if peer.damaged >= MAX_DAMAGED:
+                reason = (
+                    f"{peer.damaged} messages of {peer.name} in a row were damaged on their way: "
+                    "look at the memory and the network of its machine"
+                )
+                self._sockets.refuse(identity, "damaged", Stop(reason))
+                return
+        self._sockets.refuse(identity, "damaged", Reject(str(error), sequence=0, final=False))
+
+    def _reject(
+        self, peer: Peer, sequence: int, reason: str, counter: str = "rejected", final: bool = True
+    ) -> None:
+        answer = Reject(f"{peer.name}: {reason}", sequence, final)
+        self._sockets.refuse(peer.identity, counter, answer)
+
+    def _remind(self, peer: Peer) -> None:
+        """In lockstep: tell a player, who may have missed it, what is still to play."""
+        if peer.role == "player" and peer.index in self._orders:
+            self._sockets.answer(peer.identity, self._orders[peer.index])

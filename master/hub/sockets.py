@@ -1,0 +1,228 @@
+"""The master's two sockets: bounded queues, bounded lingering, and sends that never wait."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import zmq
+
+from master.hub.gate import AMPLE, Gate, Room
+from master.hub.security import Authenticator, Holder, Keys
+from master.record.audit import Audit
+from master.record.counters import Counters
+from tangram_agent.arrays import MAX_FRAME_BYTES
+from tangram_agent.messages import Greet, Refused, Reject, Stop
+from tangram_agent.schema import Plain
+from tangram_core.errors import ConfigError, RunError
+from tangram_core.process import Every
+from tangram_core.store.files import own_folder
+from tangram_core.wire.addresses import IPC, KEEPALIVE
+
+LINGER_MS = 1000
+# Messages queued for each peer and direction; what a peer has no room for it must ask for again.
+HIGH_WATER = 64
+# A handshake takes milliseconds, seconds on a busy machine.
+HANDSHAKE_MS = 10_000
+# Connections that wait to be accepted, of many workers that start at once.
+BACKLOG = 1024
+# Of a subscription or a step of a handshake; more than encryption adds to a frame.
+MAX_COMMAND = 1024
+LOOK_S = 1.0  # between two looks at the files of unix sockets
+
+
+class Received(NamedTuple):
+    """A message, and who it is from.
+
+    Attributes:
+        identity: of the connection.
+        frames: of the message.
+        holder: of the key that the connection showed, which may be revoked since.
+        address: of the other side; of a unix socket `local` and the id of its process.
+    """
+
+    identity: bytes
+    frames: Sequence[bytes]
+    holder: Holder
+    address: str
+
+
+class Sockets:
+    """A bound ROUTER and a bound PUB.
+
+    Attributes:
+        endpoint: of the ROUTER.
+        weights_endpoint: of the PUB.
+    """
+
+    def __init__(
+        self,
+        bind: str,
+        port: int,
+        counters: Counters,
+        keys: Keys | None = None,
+        room: Room = AMPLE,
+        audit: Audit | None = None,
+    ) -> None:
+        self._counters = counters
+        self._context = zmq.Context()
+        self._gate: Gate | None = None
+        self._authenticator: Authenticator | None = None
+        if keys is not None:
+            self._authenticator = Authenticator(self._context, keys, counters, audit or Audit())
+        try:
+            self._router = self._open(zmq.ROUTER, bind, port)
+            self._pub = self._open(zmq.PUB, bind, port + 1 if port else 0)
+        except ConfigError:
+            self._close(0)
+            raise
+        self.endpoint = self._router.getsockopt_string(zmq.LAST_ENDPOINT)
+        self.weights_endpoint = self._pub.getsockopt_string(zmq.LAST_ENDPOINT)
+        self._gate = Gate((self._router, self._pub), room, keys is not None, counters)
+        self._look = Every(LOOK_S)
+
+    @property
+    def keys(self) -> Keys | None:
+        """As their file has them by now; None on plain sockets."""
+        return None if self._authenticator is None else self._authenticator.keys
+
+    def listen_again(self) -> None:
+        """Look, once in a second, whether a cleaner of TMPDIR took the files of unix sockets away.
+
+        Nobody could join any more. What is connected stays, and so does the socket without a name.
+        """
+        if not (self.endpoint.startswith(IPC) and self._look.due()):
+            return
+        ends = {self.endpoint: self._router, self.weights_endpoint: self._pub}
+        for endpoint, end in ends.items():
+            path = Path(endpoint.removeprefix(IPC))
+            if path.exists():
+                continue
+            try:
+                own_folder(path.parent)
+                end.bind(endpoint)
+                done = "it is made anew"
+            except (RunError, zmq.ZMQError) as error:
+                done = f"nobody can join before it is made anew, which fails ({error})"
+            self._counters.note(
+                "removed_sockets",
+                f"{path} was removed: {done}; keep what cleans {path.parent.parent} away from "
+                f"{path.parent}, or set TMPDIR to another folder",
+            )
+
+    def wait(self, timeout_s: float) -> bool:
+        """Whether a message came within this time."""
+        return bool(self._router.poll(math.ceil(max(0.0, timeout_s) * 1000)))
+
+    def receive(self) -> Received | None:
+        """The next message, None if there is none."""
+        try:
+            first = self._router.recv(zmq.NOBLOCK, copy=False)
+        except zmq.Again:
+            return None
+        frames = self._router.recv_multipart(zmq.NOBLOCK)
+        holder = Holder()
+        if self._authenticator is not None:
+            holder = self._authenticator.holder(_told(first, "User-Id"))
+        address = _told(first, "Peer-Address")
+        if address and self.endpoint.startswith(IPC):  # host:user:group:process
+            address = f"local, pid {address.rpartition(':')[2]}"
+        return Received(first.bytes, frames, holder, address)
+
+    def revoked(self) -> list[Holder]:
+        """Those whose keys were revoked since; none of them gets weights any more."""
+        gone = [] if self._authenticator is None else self._authenticator.revoked()
+        if gone and self._gate is not None:
+            # A PUB knows no subscribers: all must show their keys again.
+            self._gate.end_all(self.weights_endpoint)
+        return gone
+
+    def send(self, identity: bytes, frames: Sequence[bytes]) -> None:
+        """Send to a peer; if it is gone or does not read, count that and drop the message."""
+        try:
+            self._router.send_multipart([identity, *frames], zmq.NOBLOCK)
+        except zmq.Again:
+            self._counters["congested"] += 1
+        except zmq.ZMQError as error:
+            if error.errno != zmq.EHOSTUNREACH:
+                raise
+            self._counters["unreachable"] += 1
+
+    def answer(self, identity: bytes, answer: Plain) -> None:
+        """Send a message to a peer; see `send`."""
+        self.send(identity, answer.encode())
+
+    def refuse(
+        self, identity: bytes, counter: str, answer: Reject | Refused | Stop | Greet
+    ) -> None:
+        """Send a reason, count it and tell it."""
+        self._counters.note(counter, getattr(answer, "reason", "a connection without HELLO"))
+        self.answer(identity, answer)
+
+    def publish(self, frame: bytes) -> None:
+        """Send to all subscribers that have room."""
+        self._pub.send(frame, zmq.NOBLOCK)
+
+    def close(self) -> None:
+        """Close; what is on its way gets a second."""
+        self._close(LINGER_MS)
+        for endpoint in (self.endpoint, self.weights_endpoint):
+            if endpoint.startswith(IPC):
+                Path(endpoint.removeprefix(IPC)).unlink(missing_ok=True)
+
+    def _close(self, linger_ms: int) -> None:
+        if self._gate is not None:
+            self._gate.close()
+            self._gate = None
+        if self._authenticator is not None:
+            self._authenticator.close()
+        self._context.destroy(linger=linger_ms)
+
+    def _open(self, kind: int, bind: str, port: int) -> zmq.Socket[bytes]:
+        socket = self._context.socket(kind)
+        socket.setsockopt(zmq.LINGER, LINGER_MS)
+        socket.setsockopt(zmq.SNDHWM, HIGH_WATER)
+        socket.setsockopt(zmq.RCVHWM, HIGH_WATER)
+        socket.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
+        socket.setsockopt(zmq.BACKLOG, BACKLOG)
+        most = MAX_COMMAND + (MAX_FRAME_BYTES if kind == zmq.ROUTER else 0)
+        socket.setsockopt(zmq.MAXMSGSIZE, most)
+        for name, value in KEEPALIVE.items():
+            socket.setsockopt(getattr(zmq, name), value)
+        socket.setsockopt(zmq.IPV6, int(":" in bind))
+        if kind == zmq.ROUTER:
+            # Else answers to those who are gone vanish without a word.
+            socket.setsockopt(zmq.ROUTER_MANDATORY, 1)
+        if self._authenticator is not None:
+            self._authenticator.guard(socket)
+        host = f"[{bind}]" if ":" in bind else bind
+        local = f"{bind}.{'episodes' if kind == zmq.ROUTER else 'weights'}"
+        try:
+            socket.bind(local if bind.startswith(IPC) else f"tcp://{host}:{port or '*'}")
+        except zmq.ZMQError as error:
+            if bind.startswith(IPC):
+                raise ConfigError(
+                    f"cannot listen at {local} ({error.strerror}): set TMPDIR to a folder of a "
+                    "local disk"
+                ) from None
+            if error.errno == zmq.EADDRINUSE:
+                raise ConfigError(
+                    f"port {port} of {bind} is in use: choose another with "
+                    "service.port=..., whose next one is free too, or 0 for any"
+                ) from None
+            raise ConfigError(
+                f"cannot listen on {bind}, port {port} ({error.strerror}): set service.bind to an "
+                f"address of this machine, such as 127.0.0.1, and service.port to one you may use"
+            ) from None
+        return socket
+
+
+def _told(frame: zmq.Frame, name: str) -> str:
+    """What ZeroMQ knows of a frame's sender; empty where that is nothing.
+
+    Bytes that are no ZeroMQ at all are taken for its first version, which tells nothing.
+    """
+    try:
+        return str(frame.get(name))
+    except zmq.ZMQError:
+        return ""

@@ -1,0 +1,99 @@
+"""How much of a run's budget is used, and how fast it goes."""
+
+from collections import deque
+
+from master.config import MasterConfig
+from master.learn.trainer import Trainer
+from master.record.rundir import Record
+
+RATE_WINDOW_S = 10.0
+HOUR_S = 3600.0
+
+
+class Budget:
+    """The bounds of a run: hours, episodes and updates; the one used most decides.
+
+    Attributes:
+        bounded: there is a bound.
+    """
+
+    def __init__(self, config: MasterConfig, trainer: Trainer, record: Record) -> None:
+        """Count nothing: the counters are read where they are.
+
+        Args:
+            config: has the bounds.
+            trainer: counts episodes and updates.
+            record: counts the loop's seconds.
+        """
+        self._trainer, self._record = trainer, record
+        self.max_seconds = config.max_hours * HOUR_S
+        self.max_episodes = config.max_episodes
+        self.max_updates = config.max_updates
+        self.bounded = bool(self.max_seconds or self.max_episodes or self.max_updates)
+
+    @property
+    def share(self) -> float:
+        """The largest used share, in [0, 1]; 0 where nothing is bounded."""
+        pairs = (
+            (self._record.loop_s, self.max_seconds),
+            (self._trainer.episodes, self.max_episodes),
+            (self._trainer.updates, self.max_updates),
+        )
+        return min(max((used / bound for used, bound in pairs if bound), default=0.0), 1.0)
+
+    def takes_episodes(self) -> bool:
+        """Whether more episodes may enter the replay."""
+        return not self.max_episodes or self._trainer.episodes < self.max_episodes
+
+    def updates_spent(self) -> bool:
+        """Whether all updates are made."""
+        return bool(self.max_updates) and self._trainer.updates >= self.max_updates
+
+    def spent(self) -> str | None:
+        """The bound at which learning stops at once, or None."""
+        if self.updates_spent():
+            return f"max_updates={self.max_updates}"
+        if self.max_seconds and self._record.loop_s >= self.max_seconds:
+            return f"max_hours={self.max_seconds / HOUR_S:g}"
+        return None
+
+
+class Rates:
+    """Events per second over the last seconds, and the time left."""
+
+    def __init__(self, window_s: float = RATE_WINDOW_S) -> None:
+        self.window_s = window_s
+        self._marks: deque[tuple[float, int, int, float]] = deque()
+        self._first: tuple[float, float] | None = None
+
+    def mark(self, now_s: float, transitions: int, updates: int, share: float) -> None:
+        """Note the counters at a time of a steady clock."""
+        if self._first is None:
+            self._first = (now_s, share)
+        self._marks.append((now_s, transitions, updates, share))
+        while len(self._marks) > 2 and now_s - self._marks[1][0] >= self.window_s:
+            self._marks.popleft()
+
+    def transitions_per_s(self) -> float:
+        """Transitions that entered the replay, per second."""
+        return self._rate(1)
+
+    def updates_per_s(self) -> float:
+        """Updates per second."""
+        return self._rate(2)
+
+    def left_s(self) -> float | None:
+        """Seconds until the budget is used, at the pace since the start; None when unknown."""
+        if self._first is None:
+            return None
+        now_s, share = self._marks[-1][0], self._marks[-1][3]
+        gained = share - self._first[1]
+        if gained <= 0.0:
+            return None
+        return (now_s - self._first[0]) * (1.0 - share) / gained
+
+    def _rate(self, column: int) -> float:
+        if len(self._marks) < 2:
+            return 0.0
+        first, last = self._marks[0], self._marks[-1]
+        return float(last[column] - first[column]) / max(last[0] - first[0], 1e-9)

@@ -1,0 +1,317 @@
+"""The folder of one run, who may write there, and the record of what the run has been through."""
+
+import fcntl
+import json
+import os
+import secrets
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, fields
+from functools import partial
+from pathlib import Path
+from typing import IO, Any, Self
+
+import msgspec
+import yaml
+
+from master.config import MasterConfig
+from master.record.journal import segments
+from tangram_agent.checkpoints import list_checkpoints
+from tangram_agent.outcome import FILE_NAME as RESULT
+from tangram_agent.outcome import bound_of, read_outcome
+from tangram_agent.setup import SECTIONS
+from tangram_core.errors import ConfigError, RunError
+from tangram_core.store.files import PUBLIC, is_same, make_folders, private, write_whole
+from tangram_sim.config import own_code
+
+PRIVATE = 0o600
+LOCK = ".lock"
+# What a worker must know of the config.
+SHARED = (*SECTIONS, "service")
+
+
+def code_of(resolved: Mapping[str, Any]) -> dict[str, str]:
+    """The reward of a run, where it is code, which each of its commands must name itself."""
+    name = resolved.get("reward", {}).get("name", "")
+    return {"reward.name": name} if own_code(name) else {}
+
+
+class RunFolder:
+    """Paths of a run folder.
+
+    Attributes:
+        path: the folder.
+        config: the resolved config.
+        connection: where the master can be reached; there while it runs.
+        keys: of encrypted sockets.
+        checkpoints: folder of the checkpoints.
+        journal: folder of what came since.
+        tensorboard: folder of the curves.
+        logs: folder of the output of workers and evaluator.
+        curve: the scores of every evaluation.
+        audit: who joined, left and was refused.
+        result: the scores of the final weights.
+        bad_batch: what the learner could not learn from, where that ended the run.
+        picture: the test episodes of the newest evaluation, drawn now and then, and at the end.
+        again: path -> writes it again where the folder was made anew.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path).expanduser()
+        self.config = self.path / "config.yaml"
+        self.connection = self.path / "connection.json"
+        self.keys = self.path / "keys.json"
+        self.checkpoints = self.path / "checkpoints"
+        self.journal = self.path / "journal"
+        self.tensorboard = self.path / "tensorboard"
+        self.logs = self.path / "logs"
+        self.curve = self.path / "curve.jsonl"
+        self.audit = self.path / "audit.jsonl"
+        self.result = self.path / RESULT
+        self.bad_batch = self.path / "bad_batch.safetensors"
+        self.picture = self.path / "test_episodes.png"
+        self.again: dict[Path, Callable[[], object]] = {}
+
+    def prepare(self, resume: str) -> None:
+        """Make the folder.
+
+        Raises:
+            ConfigError: it holds a run and `resume` is none, or it cannot be made.
+        """
+        if resume == "none" and self.holds_run():
+            raise ConfigError(
+                f"run_dir {self.path} holds a run already: choose another run_dir, or go on with "
+                "resume=auto"
+            )
+        try:
+            make_folders(self.path)
+        except OSError as error:
+            raise ConfigError(
+                f"run_dir {self.path} cannot be made ({error.strerror}): choose another run_dir"
+            ) from None
+
+    def holds_run(self) -> bool:
+        """Whether a run has left something here that a new one would mix with."""
+        curves = self.tensorboard.is_dir() and any(self.tensorboard.iterdir())
+        return curves or self.holds_more()
+
+    def holds_more(self) -> bool:
+        """Whether that is more than curves, which a master may draw where its folder was."""
+        kept = bool(list_checkpoints(self.checkpoints)) or bool(segments(self.journal))
+        return self.result.exists() or kept
+
+    def check_never_kept(self) -> None:
+        """Refuse to begin anew, for want of a checkpoint, where a run had one.
+
+        A checkpoint deletes the segments of the journal that it covers, and a result is written
+        after the last one.
+
+        Raises:
+            RunError: its scores would be written over.
+        """
+        first = min(segments(self.journal), default=0)
+        if first > 1 or (first == 0 and self.result.exists()):
+            raise RunError(
+                f"run_dir {self.path} has lost its checkpoints: put them back into "
+                f"{self.checkpoints}, or begin anew in another run_dir"
+            )
+
+    def has_finished(self, config: MasterConfig) -> bool:
+        """Whether a bound that this config does not raise has ended the run, scores included."""
+        if config.resume != "auto" or not self.result.exists():
+            return False
+        result = read_outcome(self.result)
+        name, reached = bound_of(result)
+        spent = bool(name) and 0 < getattr(config, name) <= reached
+        return spent and result["scored_updates"] == result["updates"]
+
+    def lock(self) -> "Claim":
+        """Claim the folder for one process; the claim ends with the process or with `close`.
+
+        Raises:
+            ConfigError: another process works here.
+        """
+        return Claim(self)
+
+    def write_again(self) -> None:
+        """Write what is missing of what was written, or read, here: the folder is a new one."""
+        for path, write in self.again.items():
+            if not path.exists():
+                write()
+
+    def write_config(self, resolved: Mapping[str, Any]) -> None:
+        """Write the resolved config as plain YAML."""
+        self._write(self.config, yaml.safe_dump(dict(resolved), sort_keys=False).encode())
+
+    def read_config(self) -> dict[str, Any]:
+        """What `write_config` wrote."""
+        data = self.config.read_bytes()
+        self.again[self.config] = partial(write_whole, self.config, data, above=False)
+        return dict(yaml.safe_load(data))
+
+    def write_connection(self, connection: Mapping[str, Any]) -> None:
+        """Write what a worker needs to take part; only the user may read it.
+
+        Args:
+            connection: where the master is; the settings of the run are added to it.
+        """
+        config = self.read_config()
+        settings = {name: config[name] for name in SHARED if name in config}
+        content = {**connection, "settings": settings}
+        self._write(self.connection, json.dumps(content, indent=1).encode(), PRIVATE)
+
+    def write_result(self, result: Mapping[str, Any]) -> None:
+        """Write the scores of the run."""
+        self._write(self.result, (json.dumps(dict(result), indent=1) + "\n").encode())
+
+    def _write(self, path: Path, data: bytes, mode: int = PUBLIC) -> None:
+        write = partial(write_whole, path, data, mode, above=False)
+        write()  # not above: a folder that was deleted stays so
+        self.again[path] = write
+
+
+class FolderError(RunError):
+    """The run folder is gone, or is another one now: nothing may be acknowledged."""
+
+
+class Claim:
+    """A run folder in which no other process works, as long as it is the one that was claimed.
+
+    Attributes:
+        run: the folder.
+    """
+
+    def __init__(self, run: RunFolder) -> None:
+        """Claim a folder; ConfigError if another process works there."""
+        self.run = run
+        self._take()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def check(self) -> bool:
+        """Claim the folder anew if its lock was deleted, or if it is new and empty.
+
+        Returns:
+            Whether that was necessary.
+
+        Raises:
+            FolderError: it is gone, or another run's, or another process works there.
+        """
+        path = self.run.path
+        if is_same(self._lock.fileno(), path / LOCK):
+            return False
+        try:
+            if not path.is_dir():
+                raise FolderError(f"run_dir {path} is gone")
+            if not is_same(self._folder, path) and self.run.holds_more():
+                raise FolderError(f"run_dir {path} is another folder now, with a run in it")
+            before = self._lock, self._folder
+            self._take()
+        except (OSError, ConfigError) as error:
+            why = error.strerror if isinstance(error, OSError) else "another process works there"
+            raise FolderError(f"run_dir {path} cannot be claimed anew ({why})") from None
+        self._release(*before)
+        return True
+
+    def close(self) -> None:
+        """Give the folder back."""
+        self._release(self._lock, self._folder)
+
+    def _take(self) -> None:
+        # Whoever can open it can lock it.
+        lock = open(self.run.path / LOCK, "ab", opener=private)  # noqa: SIM115
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            lock.close()
+            raise ConfigError(
+                f"run_dir {self.run.path} is in use by another process: choose another run_dir, or "
+                "stop that one first"
+            ) from None
+        # Open, so that no folder which is made later has the same number.
+        self._lock, self._folder = lock, os.open(self.run.path, os.O_RDONLY)
+
+    def _release(self, lock: IO[bytes], folder: int) -> None:
+        lock.close()
+        os.close(folder)
+
+
+@dataclass
+class Record:
+    """Counters that no other part keeps; a checkpoint carries them on.
+
+    Attributes:
+        run_id: tells runs apart; stays when a run is resumed.
+        loop_s: seconds of the loop, waiting for workers included.
+        train_s: seconds of the loop since the first episodes arrived.
+        wall_s: seconds of whole processes.
+        workers: most players connected at a time.
+        scores: of the newest evaluation, by name.
+        scored_version: of the weights that they are of; -1 before the first.
+    """
+
+    run_id: str = field(default_factory=lambda: secrets.token_hex(8))
+    loop_s: float = 0.0
+    train_s: float = 0.0
+    wall_s: float = 0.0
+    workers: int = 0
+    scores: dict[str, float] = field(default_factory=dict)
+    scored_version: int = -1
+
+    def score(self, scores: Mapping[str, float], version: int) -> None:
+        """Note an evaluation."""
+        self.scores, self.scored_version = dict(scores), version
+
+    def state(self) -> dict[str, Any]:
+        """The record as JSON values."""
+        return asdict(self)
+
+    @staticmethod
+    def of(state: Mapping[str, Any]) -> "Record":
+        """The record in a checkpoint.
+
+        Raises:
+            RunError: it lacks a field, or one is of another type.
+        """
+        lacking = [f.name for f in fields(Record) if f.name not in state]
+        if lacking:
+            raise RunError(
+                f"the checkpoint's record lacks {', '.join(lacking)}: start a new run with "
+                "another run_dir"
+            )
+        try:
+            return msgspec.convert(dict(state), Record)
+        except msgspec.ValidationError as error:
+            raise RunError(
+                f"the checkpoint's record cannot be read ({error}): start a new run with another "
+                "run_dir"
+            ) from None
+
+
+class Clock:
+    """Adds the time of this process to a record.
+
+    Attributes:
+        record: of the run.
+    """
+
+    def __init__(self, record: Record) -> None:
+        self.record, self._wall_s = record, record.wall_s
+        self._begun_s = self._last_s = time.monotonic()
+
+    def advance(self, training: bool) -> None:
+        """Count the time since the last call as the loop's, and as training's if it is that."""
+        now_s = time.monotonic()
+        self.record.loop_s += now_s - self._last_s
+        if training:
+            self.record.train_s += now_s - self._last_s
+        self._last_s = now_s
+
+    def read(self) -> Record:
+        """The record, with the seconds of all processes of the run until now."""
+        self.record.wall_s = self._wall_s + time.monotonic() - self._begun_s
+        return self.record

@@ -1,0 +1,272 @@
+"""What the user sees while a run goes on: a live panel on a terminal, plain lines elsewhere.
+
+The console outlives its terminal: it falls silent instead of failing. Lines come through
+`logging`; with service.log_format=json each is one JSON object for programs.
+"""
+
+import logging
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, Protocol, TextIO, cast
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.panel import Panel
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from tangram_agent.messages import OPEN, RunStatus
+from tangram_agent.outcome import duration, plural
+from tangram_core.process import Every, formatter
+
+PANEL_S = 0.5
+LINE_S = 10.0
+PANEL_WIDTH = 76
+TEST = "test/"  # before the names of scores
+PLAYED = "play/reward"  # what the players got lately, exploration included
+
+log = logging.getLogger(__name__)
+
+
+class _Sturdy:
+    """A text file that turns into the null device when its reader is gone, and shows what it can.
+
+    A closed terminal or pipe must not end a run that goes on without anybody watching, nor a clean
+    end that has still to be written down.
+    """
+
+    def __init__(self, file: TextIO) -> None:
+        self._file = file
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+    def write(self, text: str) -> int:
+        try:
+            return self._file.write(text)
+        except UnicodeEncodeError:  # a terminal that knows fewer characters, such as LC_ALL=C
+            known = text.encode(self._file.encoding, "replace")
+            return self._file.write(known.decode(self._file.encoding))
+        except OSError:
+            return self._silence(text)
+
+    def flush(self) -> None:
+        try:
+            self._file.flush()
+        except OSError:
+            self._silence("")
+
+    def _silence(self, text: str) -> int:
+        null = os.open(os.devnull, os.O_WRONLY)
+        # Under the buffered file, whose rest is written at the interpreter's end at the latest.
+        os.dup2(null, self._file.fileno())
+        os.close(null)
+        return len(text)
+
+
+def sturdy_console(file: TextIO) -> Console:
+    """A console on stdout or stderr that falls silent instead of failing."""
+    return Console(file=cast(TextIO, _Sturdy(file)))
+
+
+# Log lines
+
+
+class _TextFormatter(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        line = record.getMessage()
+        return line if record.levelno <= logging.INFO else f"{record.levelname.lower()}: {line}"
+
+
+class _ConsoleHandler(logging.Handler):
+    """Lines as they are, however long; above a live panel on the same console."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__()
+        self._console = console
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._console.print(self.format(record), soft_wrap=True, markup=False, highlight=False)
+
+
+@contextmanager
+def logging_to(console: Console, log_format: str = "text", who: str = "master") -> Iterator[None]:
+    """Show the log lines of this room on a console.
+
+    Args:
+        console: where to.
+        log_format: text, or json.
+        who: name of the process in JSON.
+    """
+    logger, handler = logging.getLogger("master"), _ConsoleHandler(console)
+    handler.setFormatter(_TextFormatter() if log_format == "text" else formatter(log_format, who))
+    before = logger.level
+    logger.setLevel(logging.INFO)
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(before)
+
+
+# The state of the run
+
+
+class Progress(Protocol):
+    """Shows how a run stands until it is closed."""
+
+    def show(self, status: RunStatus) -> None:
+        """Show a status; cheap, and may be called as often as one likes."""
+
+    def close(self) -> None:
+        """Leave the terminal as it was found."""
+
+
+def make_progress(
+    console: Console, title: str, log_format: str = "text", evaluator: str = ""
+) -> Progress:
+    """A live panel where the console is a terminal; lines of the log elsewhere, and for JSON.
+
+    Args:
+        console: where to.
+        title: of the panel.
+        log_format: text, or json.
+        evaluator: command that starts one, shown while nobody scores; empty if one will come.
+    """
+    if console.is_terminal and log_format == "text":
+        return LivePanel(console, title, evaluator)
+    return StatusLines()
+
+
+class StatusLines:
+    """One log line now and then: for log files, pipes and batch systems."""
+
+    def __init__(self, interval_s: float = LINE_S) -> None:
+        self._due = Every(interval_s, at_once=True)
+
+    def show(self, status: RunStatus) -> None:
+        """Log the status if the last line is old enough; its numbers are for programs."""
+        if self._due.due():
+            fields = {"event": "status", **status.texts, **status.numbers}
+            log.info("%s", status_line(status), extra=fields)
+
+    def close(self) -> None:
+        """Nothing is left to do."""
+
+
+class LivePanel:
+    """A panel that is drawn again in place; log lines scroll above it."""
+
+    def __init__(
+        self, console: Console, title: str, evaluator: str = "", interval_s: float = PANEL_S
+    ) -> None:
+        self._title, self._evaluator = title, evaluator
+        self._due = Every(interval_s, at_once=True)
+        self._last: RunStatus | None = None
+        self._live = Live(console=console, auto_refresh=False, transient=False)
+        self._live.start()
+
+    def show(self, status: RunStatus) -> None:
+        """Draw the panel if the last drawing is old enough."""
+        self._last = status
+        if self._due.due():
+            self._draw(status)
+
+    def close(self) -> None:
+        """Leave the last status and go below it."""
+        if self._last is not None:
+            self._draw(self._last)
+        self._live.stop()
+
+    def _draw(self, status: RunStatus) -> None:
+        self._live.update(status_panel(status, self._title, self._evaluator), refresh=True)
+
+
+def status_line(status: RunStatus) -> str:
+    """One line for people and for grep."""
+    n = status.numbers
+    parts = [
+        duration(n["elapsed_s"]),
+        f"{n['share']:.0%}{_left(n)}" if n["share"] >= 0 else "",
+        plural(n["episodes"], "episode"),
+        plural(n["updates"], "update"),
+        f"{n['transitions_per_s']:,.0f} transitions/s",
+        f"{n['updates_per_s']:,.1f} updates/s",
+        _scores(n),
+        plural(n["players"], "worker"),
+        status.texts["activity"],
+        OPEN if n.get("open_to_all") else "",
+    ]
+    return " | ".join(part for part in parts if part)
+
+
+def status_panel(status: RunStatus, title: str, evaluator: str = "") -> Panel:
+    """The live panel: how far, how fast, how good, and what is waited for."""
+    n = status.numbers
+    grid = Table.grid(padding=(0, 3), expand=True)
+    for _ in range(2):
+        grid.add_column(style="dim", no_wrap=True)
+        grid.add_column(justify="right", no_wrap=True)
+    grid.add_row("episodes", f"{n['episodes']:,.0f}", "updates", f"{n['updates']:,.0f}")
+    rates = f"{n['transitions_per_s']:,.0f}", f"{n['updates_per_s']:,.1f}"
+    grid.add_row("transitions/s", rates[0], "updates/s", rates[1])
+    if PLAYED in n:
+        grid.add_row("players' reward", f"{n[PLAYED]:.3f}", "", "with exploration")
+    grid.add_row(
+        "mean reward",
+        Text(_score(n, "mean_reward", "{:.3f}"), style="bold green"),
+        "raw overlap",
+        _score(n, "raw_overlap", "{:.3f}"),
+    )
+    grid.add_row(
+        "angle error",
+        _score(n, "angle_error_deg_median", "{:.2f}°"),
+        "position error",
+        _score(n, "position_error_median", "{:.4f}"),
+    )
+    helpers = f"{plural(n['players'], 'worker')}, {plural(n['evaluators'], 'evaluator')}"
+    text = f"{helpers} · {status.texts['activity']}"
+    foot = Text(text, style="dim", no_wrap=True, overflow="ellipsis")
+    body = Group(_bar(n), Text(), grid, Text(), foot)
+    if n.get("open_to_all"):
+        body.renderables.append(Text(OPEN, style="bold red"))
+    if evaluator and not n["evaluators"]:
+        body.renderables.append(Text(f"no evaluator: start one with {evaluator}", overflow="fold"))
+    return Panel(body, title=title, title_align="left", width=PANEL_WIDTH, padding=(1, 2))
+
+
+def _bar(n: Mapping[str, float]) -> Table:
+    row = Table.grid(padding=(0, 2), expand=True)
+    row.add_column(ratio=1)
+    row.add_column(justify="right", no_wrap=True)
+    if n["share"] < 0:
+        row.add_row(Text("no bound: Ctrl-C ends the run", style="dim"), duration(n["elapsed_s"]))
+        return row
+    bar = ProgressBar(total=1.0, completed=n["share"], complete_style="cyan")
+    row.add_row(bar, f"{n['share']:4.0%}  {duration(n['elapsed_s'])}{_left(n)}")
+    return row
+
+
+def _left(n: Mapping[str, float]) -> str:
+    """How long it still takes, where that is known."""
+    return f", {duration(n['left_s'])} left" if n["left_s"] > 0 else ""
+
+
+def _scores(n: Mapping[str, float]) -> str:
+    """The scores that matter most, or nothing before the first evaluation."""
+    known = (
+        ("mean_reward", "reward {:.3f}"),
+        ("angle_error_deg_median", "angle {:.2f}°"),
+        ("position_error_median", "position {:.4f}"),
+    )
+    scores = [text.format(n[TEST + name]) for name, text in known if TEST + name in n]
+    if not scores and PLAYED in n:
+        scores = [f"players' reward {n[PLAYED]:.3f}"]
+    return ", ".join(scores)
+
+
+def _score(n: Mapping[str, float], name: str, pattern: str) -> str:
+    return pattern.format(n[TEST + name]) if TEST + name in n else "-"

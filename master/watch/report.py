@@ -1,0 +1,298 @@
+"""How the run stands, collected once, and told at bounded rates to everybody who shows it."""
+
+import logging
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from master.checkpointer import Checkpointer
+from master.hub.hub import Hub
+from master.hub.registry import Peer
+from master.learn.budget import Budget, Rates
+from master.learn.divergence import DivergenceGuard
+from master.learn.trainer import Trainer
+from master.record.delivery import REMEMBERED_VERSIONS, EpisodesArrived
+from master.record.rundir import Clock, Record
+from master.watch.console import PLAYED, TEST, Progress
+from master.watch.metrics import Means, Metrics
+from tangram_agent.messages import WORKER_COLUMNS, RunStatus, Scores
+from tangram_core.arrays import Floats
+from tangram_core.errors import RunError
+from tangram_core.process import Every
+from tangram_core.store.files import write_whole
+
+UNKNOWN = -1.0
+PICTURE_S = 30.0
+TICK_S = 0.1
+LISTEN_S = 1.0
+LOG_S = 2.0  # between two lines of progress, and of the curves
+
+log = logging.getLogger(__name__)
+
+
+class StatusCollector:
+    """Puts together how the run stands; whoever shows something of it reads it from there.
+
+    Attributes:
+        played: the reward of what was played lately, by its name.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        guard: DivergenceGuard,
+        hub: Hub,
+        budget: Budget,
+        clock: Clock,
+        checkpointer: Checkpointer,
+    ) -> None:
+        """Collect nothing yet.
+
+        Args:
+            name: of the run.
+            guard: of the trainer.
+            hub: counts messages, and knows who takes part.
+            budget: of the run.
+            clock: of the run, with its record.
+            checkpointer: knows how old the last checkpoint is.
+        """
+        self._name, self._guard, self._hub, self._budget = name, guard, hub, budget
+        self._clock, self._checkpointer = clock, checkpointer
+        self._rates = Rates()
+        self.played: dict[str, float] = {}
+
+    def mark(self) -> None:
+        """Note the counters, from which rates follow; a few times in a second."""
+        trainer, share = self._guard.trainer, self._budget.share
+        self._rates.mark(time.monotonic(), trainer.transitions, trainer.updates, share)
+
+    def collect(self, queue: int, each: bool = True) -> RunStatus:
+        """The present state.
+
+        Args:
+            queue: batches that have come and wait for their insert.
+            each: with a row for each worker, which takes milliseconds where there are many.
+        """
+        trainer, record, rates = self._guard.trainer, self._clock.read(), self._rates
+        players, left_s = self._hub.count("player"), rates.left_s()
+        bounded = self._budget.bounded
+        numbers = {
+            "episodes": trainer.episodes,
+            "transitions": trainer.transitions,
+            "updates": trainer.updates,
+            "elapsed_s": record.loop_s,
+            "train_s": record.train_s,
+            "wall_s": record.wall_s,
+            "share": self._budget.share if bounded else UNKNOWN,
+            "left_s": left_s if bounded and left_s is not None else UNKNOWN,
+            "transitions_per_s": rates.transitions_per_s(),
+            "updates_per_s": rates.updates_per_s(),
+            "players": players,
+            "most_players": record.workers,
+            "evaluators": self._hub.count("evaluator"),
+            "lag_updates": trainer.rate_limiter.lag,
+            "broadcast_s": self._hub.broadcast_s,
+            "replay": len(trainer.replay),
+            "replay_capacity": trainer.replay.capacity,
+            "undone_updates": self._guard.undone,
+            "queue": queue,
+            "checkpoint_age_s": self._checkpointer.age_s,
+            "disk_failing": self._checkpointer.failing,
+            "open_to_all": self._hub.open_to_all,
+            "scored_updates": record.scored_version,
+            **{TEST + name: value for name, value in record.scores.items()},
+            **self.played,
+            # Last: where there are more numbers than a status takes, these are left out.
+            **{f"hub/{name}": count for name, count in sorted(self._hub.counters.items())},
+        }
+        texts = {
+            "run": self._name,
+            "run_id": record.run_id,
+            "activity": HOMELESS if self._checkpointer.homeless else activity(trainer, players),
+        }
+        return RunStatus(numbers, texts, _workers(self._hub.peers if each else (), trainer.updates))
+
+
+HOMELESS = "waiting for the run folder, which is gone or another one"
+
+
+def activity(trainer: Trainer, players: int) -> str:
+    """What happens, or what is waited for."""
+    limiter, starts = trainer.rate_limiter, trainer.setup.agent.learning_starts
+    if limiter.may_update():
+        return "learning, workers wait" if players and not limiter.may_insert() else "learning"
+    if not players:
+        return "waiting for workers to join"
+    if trainer.episodes and not limiter.transitions:
+        return "waiting for an episode in which pictures show all tokens: larger sim.pixels help"
+    if limiter.transitions < starts:
+        return f"filling the replay, {limiter.transitions:,} of {starts:,}"
+    return "waiting for episodes"
+
+
+def _workers(peers: Sequence[Peer], updates: int) -> Floats:
+    rows = [_row(peer, time.monotonic(), updates) for peer in peers]
+    return np.array(rows, np.float64).reshape(-1, len(WORKER_COLUMNS))
+
+
+def _row(peer: Peer, now_s: float, updates: int) -> list[float]:
+    played = peer.weights_version
+    return [
+        peer.role == "evaluator",
+        peer.index,
+        peer.incarnation,
+        max(0.0, now_s - peer.last_seen),
+        UNKNOWN if played < 0 else max(0, updates - played),
+        peer.batches,
+        peer.episodes,
+        peer.transitions,
+        len(peer.ledger.held),
+    ]
+
+
+@dataclass(frozen=True)
+class Sent:
+    """The state of the run when weights were sent.
+
+    Attributes:
+        at_s: monotonic time.
+        episodes: taken in by then.
+        train_s: seconds of training by then.
+    """
+
+    at_s: float
+    episodes: int
+    train_s: float
+
+
+class Reporter:
+    """Collects what happens between two reports, and passes them on."""
+
+    def __init__(
+        self,
+        trainer: Trainer,
+        record: Record,
+        status: StatusCollector,
+        progress: Progress,
+        metrics: Metrics,
+        listeners: Sequence[Callable[[RunStatus], None]],
+        picture: Path,
+    ) -> None:
+        """Report nothing yet.
+
+        Args:
+            trainer: which learns.
+            record: takes the scores.
+            status: of the run.
+            progress: for the user.
+            metrics: the curves.
+            listeners: get the status about once in a second.
+            picture: where the newest test episodes are drawn.
+        """
+        self._trainer, self._record, self._status = trainer, record, status
+        self._progress, self._metrics, self._listeners = progress, metrics, listeners
+        self._losses, self._play = Means(), Means()
+        self._tick, self._listen = Every(TICK_S, at_once=True), Every(LISTEN_S, at_once=True)
+        self._log, self._picture = Every(LOG_S), Every(PICTURE_S, at_once=True)
+        self._path = picture
+        self._published: OrderedDict[int, Sent] = OrderedDict()
+        self._latest: Scores | None = None
+
+    def published(self, version: int) -> None:
+        """Note when weights were sent, and which episodes they had learned from."""
+        self._published.setdefault(version, self._now())
+        while len(self._published) > REMEMBERED_VERSIONS:
+            self._published.popitem(last=False)
+
+    def updated(self, losses: Mapping[str, float]) -> None:
+        """Note one update."""
+        self._losses.add(losses)
+
+    def inserted(self, arrival: EpisodesArrived) -> None:
+        """Note a batch that went into the replay."""
+        episodes = arrival.episodes
+        values = {
+            PLAYED: float(np.mean(episodes.rewards[:, -1])),
+            "weights/age_updates": float(self._trainer.updates - arrival.weights_version),
+        }
+        sent = self._published.get(arrival.weights_version)
+        if sent is not None:
+            values["weights/age_seconds"] = time.monotonic() - sent.at_s
+        self._play.add(values, episodes.count)
+
+    def scored(self, scores: Scores) -> None:
+        """An evaluation of weights that were sent a while ago: record, curves and a picture."""
+        self._record.score(scores.scalars, scores.weights_version)
+        self._latest = scores
+        values = {name: value for name, value in scores.scalars.items() if name != "episodes"}
+        updates = scores.weights_version
+        sent = self._published.get(updates, self._now())
+        self._metrics.scores(values, updates, sent.episodes, sent.train_s)
+        # Writing it takes time from learning.
+        if len(scores.picture) and self._picture.due():
+            half = Image.fromarray(scores.picture).reduce(2)
+            self._metrics.picture(np.asarray(half), updates)
+            with suppress(RunError):  # a disk that fails is told where the run needs it
+                self.draw()
+
+    def tick(self, queue: int) -> None:
+        """Tell how the run stands where it is time, and write the curves; see `collect`."""
+        if not self._tick.due():
+            return
+        self._status.mark()
+        if self._log.due():
+            self.flush(queue)
+            return
+        listened = self._listen.due()
+        status = self._status.collect(queue, each=listened)
+        self._progress.show(status)
+        if listened:
+            for listen in self._listeners:
+                listen(status)
+
+    def flush(self, queue: int) -> RunStatus:
+        """Tell it now, whatever the time, and return what was told."""
+        played = self._play.take()
+        if PLAYED in played:
+            self._status.played = {PLAYED: played[PLAYED]}
+        status = self._status.collect(queue)
+        self._progress.show(status)
+        for listen in self._listeners:
+            listen(status)
+        values = {f"train/{name}": value for name, value in self._losses.take().items()}
+        values |= played
+        for name, value in status.numbers.items():
+            if not name.startswith((TEST, PLAYED)):  # those are written when they come
+                values[name if "/" in name else f"run/{name}"] = value
+        self._metrics.scalars(values, self._trainer.updates)
+        return status
+
+    def settings(self, resolved: Mapping[str, Any]) -> None:
+        """Write the whole config beside the curves."""
+        self._metrics.settings(resolved)
+
+    def hyperparameters(self, result: Mapping[str, Any]) -> None:
+        """Write what runs are compared by."""
+        self._metrics.hyperparameters(result)
+
+    def draw(self) -> None:
+        """Write the picture of the last evaluation, where there is one.
+
+        Raises:
+            RunError: the disk does not take it.
+        """
+        if self._latest is not None and len(self._latest.picture):
+            drawn = BytesIO()
+            Image.fromarray(self._latest.picture).save(drawn, "PNG")
+            write_whole(self._path, drawn.getvalue(), above=False)
+
+    def _now(self) -> Sent:
+        return Sent(time.monotonic(), self._trainer.episodes, self._record.train_s)

@@ -1,0 +1,194 @@
+"""What a run has come to: result.json and the last words to the user."""
+
+import logging
+import os
+import platform
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from shutil import which
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from master.children import override
+from master.config import MasterConfig
+from master.record.rundir import RunFolder, code_of
+from master.watch.console import TEST, sturdy_console
+from tangram_agent.messages import RunStatus
+from tangram_agent.outcome import outcome_rows, read_outcome
+
+PLAIN = re.compile(r"[\w.]+=[\w./:-]+")
+ROOT = Path(__file__).resolve().parents[2]
+SCORES = (
+    "mean_reward",
+    "mean_reward_dense",
+    "mean_reward_camera",
+    "raw_overlap",
+    "raw_overlap_p10",
+    "angle_error_deg_median",
+    "angle_error_deg_p90",
+    "position_error_median",
+    "position_error_p90",
+)
+log = logging.getLogger(__name__)
+
+PACKAGES = ("tangram-rl", "torch", "numpy", "pyzmq", "pybullet")
+
+
+def make_result(
+    status: RunStatus, facts: Mapping[str, Any], seed: int, reason: str
+) -> dict[str, Any]:
+    """The content of result.json; scores are null where no evaluator sent any.
+
+    `scored_updates` tells which weights the scores are of: the final ones if it equals `updates`.
+
+    Args:
+        status: at the end of the run.
+        facts: of what has learned.
+        seed: of the run.
+        reason: of its end.
+    """
+    n = status.numbers
+    scored = int(n["scored_updates"])
+    return {
+        **{name: n.get(TEST + name) for name in SCORES},
+        "test_episodes": n.get(f"{TEST}episodes"),
+        "scored_updates": scored if scored >= 0 else None,
+        **{name: int(n[name]) for name in ("episodes", "transitions", "updates")},
+        **{name: round(n[name], 3) for name in ("wall_s", "train_s")},
+        "ended_by": reason,
+        "seed": seed,
+        **facts,
+        "workers": int(n["most_players"]),
+        "run_id": status.texts["run_id"],
+        "versions": versions(),
+        "commit": commit(),
+        "host": platform.node(),
+        "processor": processor(),
+        "cores": len(os.sched_getaffinity(0)),
+    }
+
+
+def show_result(
+    console: Console,
+    folder: RunFolder,
+    result: Mapping[str, Any],
+    code: Mapping[str, str],
+    go_on: str = "",
+) -> None:
+    """The final table, where everything lies, and what to do with it.
+
+    Args:
+        console: where to.
+        folder: of the run.
+        result: content of its result.json.
+        code: see `code_of`.
+        go_on: command that goes on with it; shown where a signal has ended it.
+    """
+    table = Table(show_header=False, box=None, padding=(0, 2))
+    table.add_column(style="dim", no_wrap=True)
+    table.add_column(no_wrap=True)
+    for name, text in outcome_rows(result):
+        table.add_row(name, text)
+    console.print()
+    console.print(table)
+    console.print()
+    paths = [("run folder", str(folder.path))]
+    if folder.picture.exists():
+        paths.append(("picture", str(folder.picture)))
+    curves, where = _installed("tensorboard"), shlex.quote(str(folder.tensorboard))
+    watch = {"run_dir": folder.path, "out": "play.gif", **code}
+    paths += [
+        ("curves", f"{curves} --logdir {where}"),
+        ("watch it play", command_line("tangram-play", watch)),
+    ]
+    if go_on and result["ended_by"].startswith("SIG"):
+        paths.append(("go on", go_on))
+    for name, text in paths:
+        # Long paths stay whole, so that they can be copied.
+        console.print(f"  {name:<15} {text}", soft_wrap=True, markup=False, highlight=False)
+
+
+def show_finished(folder: RunFolder, log_format: str, code: Mapping[str, str]) -> None:
+    """The result of a run that was to go on, and has nothing left to do."""
+    result = read_outcome(folder.result)
+    said = f"{folder.path} has finished ({result['ended_by']}): nothing is changed, a higher "
+    said += "bound goes on"
+    if log_format == "json":
+        log.info("%s", said, extra={"event": "result", **result})
+        return
+    console = sturdy_console(sys.stdout)
+    console.print(said, soft_wrap=True, markup=False, highlight=False)
+    show_result(console, folder, result, code)
+
+
+def command_line(name: str, settings: Mapping[str, object]) -> str:
+    """A command of this installation with settings, to be pasted into a shell."""
+    return " ".join([_installed(name), *(_argument(*pair) for pair in settings.items())])
+
+
+def go_on_command(folder: RunFolder, launched: bool) -> str:
+    """The command that goes on with a run, with all that `from_config` does not take.
+
+    A master that was launched is not told how many workers there are: config.yaml is.
+    """
+    given = folder.read_config()
+    names = ("seed", "max_hours", "max_episodes", "max_updates", "workers")
+    settings = {
+        "run_dir": folder.path,
+        "from_config": folder.config,
+        "resume": "auto",
+        **{name: given[name] for name in names if given[name] != getattr(MasterConfig, name)},
+        **code_of(given),
+    }
+    return command_line("tangram-train" if launched else "tangram-master", settings)
+
+
+def _installed(name: str) -> str:
+    """A command of this environment as a shell finds it, which may not have the environment on."""
+    return name if which(name) else shlex.quote(str(Path(sys.executable).with_name(name)))
+
+
+def _argument(name: str, value: object) -> str:
+    """A setting; quoted for the shell and for the config if needed."""
+    plain = f"{name}={value}"
+    return plain if PLAIN.fullmatch(plain) else shlex.quote(override(name, str(value)))
+
+
+def versions() -> dict[str, str]:
+    """Python and the packages that decide the numbers."""
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def commit(root: Path = ROOT) -> str | None:
+    """The commit of the source tree that runs, `-dirty` if it was changed; None elsewhere."""
+    if not (root / ".git").exists():
+        return None
+    command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=40"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() or None
+
+
+def processor() -> str:
+    """The processor's name, where the system tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor()

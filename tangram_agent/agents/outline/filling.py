@@ -1,0 +1,181 @@
+"""Filling an outline token by token: what is left of it, what may be laid next, and what then is.
+
+Nothing here is learned: tokens may lie where the search of `tangram_sim.geometry.dissections` has them, and
+an action takes one there exactly. What is learned is which of these states can be filled.
+
+Legend: K tokens, V corners, G rows of an outline, N corners of what is left, S different shapes.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+
+from tangram_agent.types import Flags
+from tangram_core.arrays import AnyArray, Bools, Ints, Singles
+from tangram_sim.geometry.areas import Area, opened, rings
+from tangram_sim.geometry.dissections import Budget, Place, Search, Tokens, without
+from tangram_sim.geometry.layout import Layout
+from tangram_sim.geometry.overlap import outlines
+from tangram_sim.geometry.rings import as_area, covered_area
+
+TOLERANCE = 0.004  # of the root of all tokens' area, see `Search`
+MOST_PLACES = 8  # that are learned from, of a state
+UNUSED = 255  # part of a row that holds no corner
+_INSIDE = 0.9  # share of a laid token that lies in the outline
+
+
+@dataclass(frozen=True, eq=False)
+class Rests:
+    """What is left to fill, of n states, as their corners see it.
+
+    In units of the root of all tokens' area, from the middle of what is left, its longest side
+    along the x axis: so a figure looks the same wherever it lies.
+
+    Attributes:
+        points: (n, N, 2) corners, ring after ring.
+        follow: (n, N) which corner is next on its ring.
+        part: (n, N) to which part it belongs, `UNUSED` where there is none.
+        left: (n, S) tokens that are left of each shape.
+    """
+
+    points: Singles
+    follow: Flags
+    part: Flags
+    left: Flags
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def known(self) -> Bools:
+        """(n,) states that have corners, and no more than are seen."""
+        return np.asarray((self.part != UNUSED).any(axis=1))
+
+    @staticmethod
+    def empty(count: int, corners: int, shapes: int) -> "Rests":
+        """States of no corners."""
+        return Rests(
+            np.zeros((count, corners, 2), np.float32),
+            np.tile(np.arange(corners, dtype=np.uint8), (count, 1)),
+            np.full((count, corners), UNUSED, np.uint8),
+            np.zeros((count, shapes), np.uint8),
+        )
+
+    @staticmethod
+    def joined(every: list["Rests"]) -> "Rests":
+        """States one after the other."""
+        return Rests(*(np.concatenate(parts) for parts in zip(*map(_parts, every), strict=True)))
+
+    def turned(self, generator: np.random.Generator) -> "Rests":
+        """The same states, each turned by some eighths and half of them seen in a mirror.
+
+        That changes nothing of what fills them where tokens may be turned over.
+        """
+        count = len(self)
+        z = self.points @ np.array([1.0, 1.0j], np.complex64)
+        z *= np.exp(0.25j * np.pi * generator.integers(8, size=(count, 1)))
+        mirrored = generator.random(count) < 0.5
+        z = np.where(mirrored[:, None], z.conj(), z)
+        points = np.stack([z.real, z.imag], axis=-1).astype(np.float32)
+        before = np.argsort(self.follow, axis=1).astype(np.uint8)
+        follow = np.where(mirrored[:, None], before, self.follow)
+        return Rests(points, follow, self.part, self.left)
+
+    def at(self, rows: Ints | Bools | slice) -> "Rests":
+        """Some of the states."""
+        return Rests(*(part[rows] for part in _parts(self)))
+
+
+def _parts(rests: Rests) -> tuple[AnyArray, ...]:
+    return rests.points, rests.follow, rests.part, rests.left
+
+
+class Filling:
+    """The game of one set of tokens.
+
+    Attributes:
+        tokens: K.
+        corners: N.
+        shapes: S.
+    """
+
+    def __init__(self, layout: Layout) -> None:
+        self._layout, self._tokens = layout, Tokens(layout)
+        self._tolerance = TOLERANCE * self._tokens.unit
+        self._search = Search(self._tokens, self._tolerance, Budget(np.inf))
+        self._shape: Ints = np.zeros(layout.tokens, np.int64)
+        for shape, tokens in enumerate(self._tokens.own):
+            self._shape[list(tokens)] = shape
+        self.tokens, self.shapes = layout.tokens, len(self._tokens.own)
+        self.corners = layout.corner_count + layout.tokens
+
+    def shape_of(self, token: int) -> int:
+        """The number of a token's shape."""
+        return int(self._shape[token])
+
+    def tokens_of(self, shape: int) -> tuple[int, ...]:
+        """The tokens of a shape."""
+        return self._tokens.own[shape]
+
+    def left(self, tokens: Bools) -> tuple[int, ...]:
+        """How many of each shape there are among tokens (K,)."""
+        return tuple(np.bincount(self._shape[tokens], minlength=self.shapes).tolist())
+
+    def inside(self, corners: AnyArray, outline: AnyArray) -> Bools:
+        """(K,) tokens with corners (V, 2) that lie in an outline (G, 2), all but for a little."""
+        area = as_area(outline)
+        own = outlines(np.asarray(corners, np.float64)[None], self._layout)[0]
+        shared = shapely.area(shapely.intersection(shapely.polygons(own), area))
+        return np.asarray(shared >= _INSIDE * self._layout.areas)
+
+    def rest(self, outline: AnyArray, corners: AnyArray, laid: Bools) -> Area:
+        """What laid tokens (K,), with all tokens' corners (V, 2), leave of an outline (G, 2)."""
+        area = as_area(outline)
+        if not laid.any():
+            return area
+        covered = covered_area(np.asarray(corners), self._layout, laid)
+        return without(area, covered, self._tolerance, self._tokens.unit)
+
+    def hindsight(self, corners: AnyArray, tokens: Bools) -> Rests | None:
+        """What tokens (K,) came to cover, as something that they fill; None if they lie on others.
+
+        Args:
+            corners: (V, 2) of all tokens.
+            tokens: some of them.
+        """
+        covered = covered_area(np.asarray(corners), self._layout, tokens)
+        own, left = opened(covered, self._tolerance), self.left(tokens)
+        seen = self.seen(own, left)
+        return seen if self._search.fits(own, left) and bool(seen.known.all()) else None
+
+    def solved(self, outline: AnyArray, corners: AnyArray, laid: Bools) -> bool:
+        """Whether laid tokens (K,), all of them, fill an outline (G, 2)."""
+        if not laid.all():
+            return False
+        return self._search.fits(self.rest(outline, corners, laid), self.left(~laid))
+
+    def places(self, rest: Area, left: tuple[int, ...]) -> list[Place]:
+        """What may be laid next, see `Search.places`."""
+        return self._search.places(rest, left)
+
+    def seen(self, rest: Area, left: tuple[int, ...]) -> Rests:
+        """One state; empty where it has too many corners."""
+        found = Rests.empty(1, self.corners, self.shapes)
+        found.left[0] = left
+        every = rings(rest, self._tolerance)
+        if not every or sum(len(z) for z, _, _ in every) > self.corners:
+            return found
+        z = np.concatenate([ring for ring, _, _ in every])
+        sides = np.concatenate([np.roll(ring, -1) - ring for ring, _, _ in every])
+        along = sides[np.abs(sides).argmax()]
+        middle = complex(rest.centroid.x, rest.centroid.y)
+        own = (z - middle) * np.abs(along) / along / self._tokens.unit
+        found.points[0, : len(z)] = np.column_stack([own.real, own.imag])
+        first = 0
+        for ring, part, _ in every:
+            own_rows = np.arange(first, first + len(ring))
+            found.follow[0, own_rows] = np.roll(own_rows, -1)
+            found.part[0, own_rows] = min(part, self.corners - 1)
+            first += len(ring)
+        return found

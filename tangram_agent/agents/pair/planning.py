@@ -1,0 +1,237 @@
+"""Choosing among proposals: a pose for every pair of a token and a piece, and the best one played.
+
+The critic values each proposal for its own piece; the best few are then valued for all pieces of
+the target, as an action is worth the sum of what it covers.
+
+Legend: B environments, K tokens, V corners, M candidates (pairs of all environments, row after
+row).
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tangram_agent.agents.pair.coverage import covered_share, covering, worths
+from tangram_agent.agents.pair.motion import Belief, motions_of
+from tangram_agent.agents.pair.pairs import PairGraph, Pairs
+from tangram_agent.networks import Networks
+from tangram_agent.setup import Setup
+from tangram_agent.types import Choice, Past
+from tangram_core.arrays import Bools, Floats, Singles
+from tangram_sim.motion.actions import velocities_of
+
+_SHORT_LIST = 8  # proposals of an environment that are valued for all pieces
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """M actions that may be played: each takes a token to a piece of the target.
+
+    Attributes:
+        row: (M,) environment, in order.
+        token: (M,) which token.
+        flip: (M,) 1 where it is turned over.
+        piece: (M,) which piece it is meant for.
+    """
+
+    row: Tensor
+    token: Tensor
+    flip: Tensor
+    piece: Tensor
+
+    def at(self, index: Tensor) -> "Candidates":
+        """The candidates at these indices."""
+        return Candidates(*(part[index] for part in vars(self).values()))
+
+    def best(self, value: Tensor, most: int) -> Tensor:
+        """Indices (M',) of the best of each row by a value (M,), row after row."""
+        table, first = self._table(value)
+        best = table.topk(min(most, table.shape[1]), dim=1)
+        return (best.indices + first[:, None])[best.values > -torch.inf]
+
+    def _table(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        """Values (M,) row by row, (B, L), filled up with -inf, and where each row begins, (B,)."""
+        counts = torch.bincount(self.row)
+        first = counts.cumsum(0) - counts
+        table = torch.full((len(counts), int(counts.max())), -torch.inf)
+        table[self.row, torch.arange(len(self.row)) - first[self.row]] = value
+        return table, first
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """B environments as tensors; sides are 1 where a token lies on its other one.
+
+    Attributes:
+        pose: (B, K, 3) of the tokens.
+        flipped: (B, K) their sides.
+        goal: (B, K, 3) of the target's pieces.
+        goal_flipped: (B, K) their sides.
+        covered: (B, K, K) share of the second, a piece, that tokens other than the first cover.
+        worth: (B, K) sum of the values of what each token covers.
+    """
+
+    pose: Tensor
+    flipped: Tensor
+    goal: Tensor
+    goal_flipped: Tensor
+    covered: Tensor
+    worth: Tensor
+
+    def pairs(self, c: Candidates) -> Pairs:
+        """The pairs (M,) of candidates; a token that is turned over has changed its side."""
+        return Pairs(
+            pose=self.pose[c.row, c.token],
+            flipped=self._side(c),
+            token=c.token,
+            goal=self.goal[c.row, c.piece],
+            goal_flipped=self.goal_flipped[c.row, c.piece],
+            piece=c.piece,
+            covered=self.covered[c.row, c.token, c.piece],
+        )
+
+    def leaves_no_choice(self, candidates: Candidates) -> bool:
+        """Whether each environment has one candidate, so that nobody need say which is better."""
+        return len(candidates.row) == len(self.pose)
+
+    def _side(self, c: Candidates) -> Tensor:
+        return (self.flipped[c.row, c.token] - c.flip).abs()
+
+
+class Planner:
+    """Chooses token, side and pose."""
+
+    def __init__(self, networks: Networks, setup: Setup) -> None:
+        self._networks, self._layout, self._agent = networks, setup.layout, setup.agent
+        self._motion, self._sim = networks.motion, setup.sim
+        self._graph = PairGraph(setup.layout, setup.sim.arena)
+        self._turns_over = setup.layout.chiral & setup.sim.allow_flip
+
+    def choose(
+        self,
+        corners: Floats,
+        placed: Bools,
+        goals: Floats,
+        past: Past | None = None,
+    ) -> Choice:
+        """What to play; where all tokens are placed, some action of the first one.
+
+        Args:
+            corners: (B, V, 2) of the tokens.
+            placed: (B, K) which tokens are placed.
+            goals: (B, V, 2) of the target.
+            past: what was seen of these episodes before, if anything.
+        """
+        with torch.no_grad():
+            belief = self._belief(corners, past)
+            if self._motion is not None and belief is not None and past is not None:
+                corners = self._motion.ahead(belief, corners, past, self._layout, self._sim)
+            scene = self._scene(corners, goals)
+            candidates, pose = self._short_list(scene, _open(placed))
+            velocity, reached = self._reached(scene, candidates, pose, belief)
+            best = self._best(scene, candidates, reached)
+        chosen = candidates.at(best)
+        return Choice(chosen.token.numpy(), chosen.flip.numpy() > 0.5, velocity[best].numpy())
+
+    def velocity_to(self, pose: Floats, wanted: Floats) -> Singles:
+        """Commands (B, 3) that take tokens from poses (B, 3) to others, in worlds not yet seen."""
+        way = torch.from_numpy(velocities_of(wanted - pose, self._sim).astype(np.float32))
+        with torch.no_grad():
+            prior = None if self._motion is None else self._motion.prior(len(way))
+            return self._command(way, prior).numpy()
+
+    def _belief(self, corners: Floats, past: Past | None) -> Belief | None:
+        """What is believed of the motion in each environment; None: it is taken to be exact."""
+        if self._motion is None:
+            return None
+        if past is None:
+            return self._motion.prior(len(corners))
+        return self._motion.belief(motions_of(past, corners, self._layout, self._sim))
+
+    def _command(self, way: Tensor, belief: Belief | None) -> Tensor:
+        if self._motion is None or belief is None:
+            return way.clamp(-1.0, 1.0)
+        return self._motion.command(belief, way)
+
+    def _reached(
+        self, scene: Scene, candidates: Candidates, pose: Tensor, belief: Belief | None
+    ) -> tuple[Tensor, Tensor]:
+        """Commands (M, 3) that take tokens to poses (M, 3), and the poses that they come to."""
+        pairs = scene.pairs(candidates)
+        way = self._graph.way(pairs, pose)
+        if self._motion is None or belief is None:
+            return way.clamp(-1.0, 1.0), pose
+        own = belief.at(candidates.row)
+        command = self._motion.command(own, way)
+        return command, self._graph.moved(pairs, self._motion.predict(own, command)[0]).pose
+
+    def _scene(self, corners: Floats, goals: Floats) -> Scene:
+        layout = self._layout
+        covered = covering(corners, goals, layout)
+        return Scene(
+            pose=as_tensor(layout.poses(corners)),
+            flipped=as_tensor(layout.flipped(corners)),
+            goal=as_tensor(layout.poses(goals)),
+            goal_flipped=as_tensor(layout.flipped(goals)),
+            covered=as_tensor(covered_share(covered, layout)),
+            worth=as_tensor(worths(covered, layout)),
+        )
+
+    def _short_list(self, scene: Scene, is_open: Bools) -> tuple[Candidates, Tensor]:
+        """The best few of all pairs that may be played, by their own piece's value, and poses.
+
+        The actor is applied again to its own proposals as often as it is configured.
+        """
+        sides = np.stack([is_open, is_open & self._turns_over], axis=-1)
+        every = np.broadcast_to(sides[..., None], (*sides.shape, self._layout.tokens))
+        row, token, flip, piece = map(torch.from_numpy, np.nonzero(every))
+        candidates = Candidates(row, token, flip.float(), piece)
+        pairs = scene.pairs(candidates)
+        pose = self._proposed(pairs)
+        if not scene.leaves_no_choice(candidates):
+            best = candidates.best(self._valued(pairs, pose), _SHORT_LIST)
+            candidates, pose = candidates.at(best), pose[best]
+            pairs = scene.pairs(candidates)
+        for _ in range(self._agent.reapply):
+            pose = self._proposed(pairs.at(pose))
+        return candidates, pose
+
+    def _proposed(self, pairs: Pairs) -> Tensor:
+        """Poses (M, 3) that the actor gives to the tokens of pairs."""
+        velocity, _ = self._networks.actor(pairs)
+        return self._graph.moved(pairs, velocity).pose
+
+    def _valued(self, pairs: Pairs, pose: Tensor) -> Tensor:
+        """Values (M,) of moving the tokens of pairs to poses (M, 3)."""
+        values: Tensor = self._networks.critic(pairs, self._graph.way(pairs, pose), pairs.at(pose))
+        return values
+
+    def _best(self, scene: Scene, candidates: Candidates, pose: Tensor) -> Tensor:
+        """Index (B,) of the best candidate of each row."""
+        if scene.leaves_no_choice(candidates):
+            return torch.arange(len(pose))
+        # What a token covers already it gives up.
+        given_up = scene.worth[candidates.row, candidates.token]
+        return candidates.best(self._total(scene, candidates, pose) - given_up, 1)
+
+    def _total(self, scene: Scene, candidates: Candidates, pose: Tensor) -> Tensor:
+        """(M,) values of poses (M, 3) over all pieces of the target."""
+        count = self._layout.tokens
+        every = candidates.at(torch.arange(len(pose)).repeat_interleave(count))
+        pairs = scene.pairs(replace(every, piece=torch.arange(count).repeat(len(pose))))
+        values = self._valued(pairs, pose.repeat_interleave(count, dim=0))
+        return values.view(-1, count).sum(dim=1)
+
+
+def _open(placed: Bools) -> Bools:
+    """(B, K) tokens that may be next, at least one in each row."""
+    is_open: Bools = ~np.asarray(placed, np.bool_)
+    is_open[~is_open.any(axis=1), 0] = True
+    return is_open
+
+
+def as_tensor(array: Floats | Bools) -> Tensor:
+    """A copy in single precision."""
+    return torch.from_numpy(np.array(array, np.float32))

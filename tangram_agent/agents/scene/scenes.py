@@ -1,0 +1,97 @@
+"""Whole scenes: all tokens and the whole target in one graph, as the paper has it (Sec. IV-A)."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from tangram_sim.geometry.layout import Layout
+
+PAPER_FEATURES = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Scenes:
+    """M whole scenes.
+
+    Attributes:
+        corners: (M, V, 2) of the tokens.
+        placed: (M, K) 1 where a token is placed.
+        goal: (M, V, 2) corners of the target.
+        token: (M,) which one is to move, or has just moved.
+    """
+
+    corners: Tensor
+    placed: Tensor
+    goal: Tensor
+    token: Tensor
+
+
+def next_token(placed: Tensor) -> Tensor:
+    """Which token moves, (B,): the first that is not placed (B, K); 0 where all are."""
+    return (placed == 0).int().argmax(dim=-1)
+
+
+class SceneGraph(nn.Module):
+    """The graph of Sec. IV-A: four features a node, in the arena's coordinates.
+
+    The edges are a constant of the layout (`adjacency`, (N, N)); only features depend on the state.
+    """
+
+    token_of_corner: Tensor
+    base_weights: Tensor
+    adjacency: Tensor
+    target_flag: Tensor
+
+    def __init__(self, layout: Layout) -> None:
+        super().__init__()
+        self.tokens, self.corner_count = layout.tokens, layout.corner_count
+        self.nodes = layout.nodes
+        target_flag = torch.zeros(layout.nodes)
+        target_flag[layout.corner_count + layout.tokens :] = 1.0
+        constants = {
+            "token_of_corner": torch.as_tensor(layout.token_of_corner),
+            "base_weights": torch.as_tensor(layout.base_weights, dtype=torch.float32),
+            "adjacency": torch.as_tensor(layout.adjacency),
+            "target_flag": target_flag,
+        }
+        for name, value in constants.items():
+            self.register_buffer(name, value, persistent=False)
+
+    @property
+    def features(self) -> int:
+        """F."""
+        return PAPER_FEATURES
+
+    @property
+    def inputs(self) -> int:
+        """Numbers that a perceptron sees of a scene."""
+        return self.nodes * PAPER_FEATURES
+
+    def base_node(self, scenes: Scenes) -> Tensor:
+        """Node index (M,) of the base of the token that moves."""
+        return self.corner_count + scenes.token
+
+    def slot(self, scenes: Scenes) -> Tensor:
+        """(M,) which of the K tokens in view moves."""
+        return scenes.token
+
+    def node_features(self, scenes: Scenes) -> Tensor:
+        """Features (M, N, F): position, whether it is the target's, whether it is placed."""
+        corners, goal = scenes.corners, scenes.goal
+        positions = torch.cat([corners, self.base_weights @ corners, goal], dim=1)
+        return torch.cat([positions, self._flags(scenes.placed)], dim=-1)
+
+    def vectors(self, scenes: Scenes) -> Tensor:
+        """(M, inputs): the features of all nodes in one row."""
+        return self.node_features(scenes).flatten(1)
+
+    def _flags(self, placed: Tensor) -> Tensor:
+        """Whether a node is the target's, and whether it is placed: (M, N, 2)."""
+        flags = torch.cat([placed[:, self.token_of_corner], placed], dim=1)
+        flags = nn.functional.pad(flags, (0, self.corner_count), value=1.0)
+        return torch.stack([self.target_flag.expand_as(flags), flags], dim=-1)
+
+    def velocity(self, _: Scenes, shift: Tensor, angle: Tensor) -> Tensor:
+        """The velocity (M, 3) of a shift (M, 2) and a turn (M,) over pi."""
+        return torch.cat([shift, angle[:, None]], dim=-1).clamp(-1.0, 1.0)

@@ -1,0 +1,153 @@
+"""Writing a file at once, and for good: a reader sees the old content or the new, never a part."""
+
+import os
+import stat
+from contextlib import suppress
+from pathlib import Path
+from tempfile import TemporaryFile
+
+from tangram_core.errors import ConfigError, RunError
+
+PUBLIC = 0o644
+
+
+def write_whole(path: Path, data: bytes, mode: int = PUBLIC, above: bool = True) -> None:
+    """Replace a file, or make it and its folders; nothing is left behind when that fails.
+
+    Args:
+        path: the file.
+        data: its whole content.
+        mode: its permissions.
+        above: make the folders that are missing.
+
+    Raises:
+        RunError: the disk is full or the folder cannot be written.
+    """
+    aside = _aside(path)
+    try:
+        if above:
+            make_folders(path.parent)
+        try:
+            aside.unlink(missing_ok=True)
+            handle = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+            with os.fdopen(handle, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(handle)
+            aside.replace(path)
+            sync_folder(path.parent)
+        finally:
+            aside.unlink(missing_ok=True)
+    except OSError as error:
+        raise RunError(
+            f"cannot write {path} ({error.strerror}): make room there or choose another folder"
+        ) from None
+
+
+def make_folders(folder: Path, above: bool = True) -> None:
+    """Make a folder where it is missing, with its name on the disk.
+
+    Args:
+        folder: the folder.
+        above: make those above it, too, where they are missing.
+
+    Raises:
+        OSError: it cannot be made, or a file is in the way.
+    """
+    try:
+        folder.mkdir(exist_ok=True)
+    except FileNotFoundError:
+        if not above or folder == folder.parent:
+            raise
+        make_folders(folder.parent)
+        folder.mkdir(exist_ok=True)
+    # Also where it is there: a kill may have come before the sync. One that may not be read was
+    # made by somebody else.
+    with suppress(PermissionError):
+        sync_folder(folder.parent)
+
+
+def private(path: str, flags: int) -> int:
+    """Opener of a file that only this user may open, also where it was made otherwise."""
+    handle = os.open(path, flags, 0o600)
+    os.fchmod(handle, 0o600)
+    return handle
+
+
+def check_writable(name: str, path: Path) -> None:
+    """Raise ConfigError unless `write_whole` could write a file there; nothing is left behind.
+
+    Args:
+        name: of the setting that names the file.
+        path: the file; folders that are missing would be made.
+    """
+    try:
+        if path.is_dir():
+            raise IsADirectoryError(0, "it is a folder")
+        _aside(path).exists()  # its name may be too long
+        with TemporaryFile(dir=next(folder for folder in path.parents if folder.exists())):
+            pass
+    except OSError as error:
+        raise ConfigError(
+            f"{name}={path} cannot be written ({error.strerror}): name a file in a folder that "
+            "you may write to"
+        ) from None
+
+
+def own_folder(path: Path) -> None:
+    """Make a folder that only this user may enter, or see that one is there.
+
+    Raises:
+        RunError: it is another user's, open to others, no folder, or cannot be made.
+    """
+    try:
+        with suppress(FileExistsError):
+            path.mkdir(mode=0o700)
+        check_own(path)
+    except OSError as error:
+        raise RunError(
+            f"{path} cannot be made ({error.strerror}): set TMPDIR to a folder that you may write "
+            "to, for the master and its workers"
+        ) from None
+
+
+def check_own(path: Path) -> None:
+    """See that a folder is one that only this user may enter.
+
+    Raises:
+        RunError: it is another user's, open to others, or no folder.
+        OSError: it is not there, or cannot be looked at.
+    """
+    found = path.lstat()
+    mine = stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid()
+    if not mine or found.st_mode & 0o077:
+        is_now = f"{stat.filemode(found.st_mode)} of user {found.st_uid}"
+        raise RunError(
+            f"{path} must be a folder that only this user may enter, it is {is_now}: remove it, or "
+            "set TMPDIR to a folder of your own"
+        )
+
+
+def _aside(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{os.getpid()}")
+
+
+def sync_folder(folder: Path) -> None:
+    """Wait until the names in a folder are on the disk: without this a power cut undoes a rename.
+
+    Raises:
+        OSError: the disk is broken or full.
+    """
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def is_same(handle: int, path: Path) -> bool:
+    """Whether an open file, or folder, still is what lies under its name."""
+    try:
+        return os.path.samestat(os.fstat(handle), path.stat())
+    except OSError:
+        return False

@@ -1,0 +1,260 @@
+"""Puzzles whose pieces are hidden: filled by a search, laid by a run, judged by the silhouette.
+
+A player gets what the search found in the place of the pieces, and nothing else of a puzzle. Any
+dissection counts: scores compare areas.
+
+Legend: E puzzles, F of them for which something was found, K tokens, V corners.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from tangram_agent.config import AgentConfig, NetConfig
+from tangram_agent.setup import Setup
+from tangram_core.arrays import Bools, Floats, Ints
+from tangram_game.figures.puzzles import Figure, figure_generator, play_figures
+from tangram_game.figures.silhouettes import SECONDS
+from tangram_game.rivals.baselines import Player
+from tangram_sim.config import SimConfig
+from tangram_sim.geometry.areas import Area
+from tangram_sim.geometry.dissections import Dissection
+from tangram_sim.geometry.layout import Layout
+from tangram_sim.geometry.overlap import overlap_share
+from tangram_sim.motion.kinematics import wrap
+from tangram_sim.rewards import scaled_overlap
+from tangram_sim.sight.lens import Lens, View
+from tangram_vision.pictures.levels import coverage
+from tangram_vision.silhouettes.portraits import portrait
+from tangram_vision.silhouettes.silhouette_pictures import fill_picture
+from tangram_vision.silhouettes.silhouettes import (
+    UNLEARNED,
+    Filled,
+    Method,
+    fill_outline,
+    silhouette,
+)
+from worker.play.rollout import Played
+from worker.score.metrics import SOLVED, iou
+
+_BEYOND = 10.0  # arenas from the middle: where tokens are drawn that nothing is to be laid of
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """What a search made of one silhouette.
+
+    Attributes:
+        laid: where the tokens are to be laid; None where nothing was found.
+        iou: of what was found with what was shown: an outline, or a picture's pixels.
+        seconds: that it took.
+        by: what found it, the search or the beam; empty where nothing was found.
+    """
+
+    laid: Figure | None
+    iou: float
+    seconds: float
+    by: str
+
+    @property
+    def filled(self) -> bool:
+        """Whether the search fills the silhouette, as far as it can tell."""
+        return self.laid is not None and self.iou >= SOLVED
+
+
+@dataclass(frozen=True, eq=False)
+class Hidden:
+    """Puzzles by their silhouettes.
+
+    Attributes:
+        setup: the task, as a player of what was found sees it.
+        figures: E, with the pieces that nobody is shown.
+        searches: E.
+        views: E, how the camera saw them; None where outlines were shown.
+    """
+
+    setup: Setup
+    figures: tuple[Figure, ...]
+    searches: tuple[Search, ...]
+    views: tuple[View, ...] | None
+
+    @property
+    def filled_by(self) -> dict[str, int]:
+        """How many the search fills, and how many the beam."""
+        return {
+            by: sum(search.filled and search.by == by for search in self.searches)
+            for by in ("search", "beam")
+        }
+
+    @property
+    def filled(self) -> int:
+        """How many are filled, as far as who looked for it can tell."""
+        return sum(self.filled_by.values())
+
+    @cached_property
+    def found(self) -> Ints:
+        """(F,) the puzzles for which something was found."""
+        return np.flatnonzero([search.laid is not None for search in self.searches])
+
+    @cached_property
+    def goals(self) -> Floats:
+        """(E, V, 2) corners of the pieces."""
+        layout = self.setup.layout
+        return np.stack([layout.corners(one.poses, one.flipped) for one in self.figures])
+
+    @property
+    def titles(self) -> list[str]:
+        """What the puzzles are called on a sheet."""
+        return [
+            figure.title if search.filled else f"{figure.title}, not filled"
+            for figure, search in zip(self.figures, self.searches, strict=True)
+        ]
+
+
+@dataclass(frozen=True, eq=False)
+class Laid:
+    """How E puzzles ended.
+
+    Attributes:
+        ends: (E, V, 2) corners of the tokens; outside of the arena where nothing was laid.
+        coverage: (E,) share of the silhouette that the tokens cover.
+        iou: (E,) area that tokens and silhouette share over the area of both together.
+        blocked: (E,) tokens that could not be set down because of others.
+        refused: (E,) actions that named a placed token.
+        actions_used: (E,) actions that were not refused.
+        seconds: (E,) of the search, and of choosing and moving.
+    """
+
+    ends: Floats
+    coverage: Floats
+    iou: Floats
+    blocked: Ints
+    refused: Ints
+    actions_used: Ints
+    seconds: Floats
+
+    @property
+    def solved(self) -> Bools:
+        """(E,) where the IoU is at least `SOLVED`."""
+        return np.asarray(self.iou >= SOLVED)
+
+
+def hide(setup: Setup, figures: Sequence[Figure], seed: int, method: Method = UNLEARNED) -> Hidden:
+    """Search how a run's tokens fill puzzles of which only the silhouettes are shown.
+
+    Args:
+        setup: with `sim.observe` one of `SILHOUETTES`.
+        figures: E puzzles.
+        seed: of what disturbs the camera.
+        method: how they are filled.
+    """
+    layout, sim, shown = setup.layout, setup.sim, tuple(figures)
+    if sim.observe == "silhouette":
+        searches = tuple(_outline_search(layout, figure, method) for figure in shown)
+        return Hidden(_seeing(setup, "corners"), shown, searches, None)
+    seen = [_picture_search(layout, sim, figure, seed, method) for figure in shown]
+    searches, views = (tuple(column) for column in zip(*seen, strict=True))
+    return Hidden(_seeing(setup, "pictures"), shown, searches, views)
+
+
+def _seeing(setup: Setup, observe: str) -> Setup:
+    """The task of who sees what was found; which targets training drew does not matter."""
+    sim = replace(setup.sim, observe=observe, targets=SimConfig.targets)
+    if setup.fills:  # who lays it sees pieces
+        return replace(setup, sim=sim, agent=AgentConfig(), net=NetConfig())
+    return replace(setup, sim=sim)
+
+
+def _outline_search(layout: Layout, figure: Figure, method: Method) -> Search:
+    (filled,) = fill_outline(_silhouette(layout, figure), layout, SECONDS, method=method)
+    return _search(figure, filled, np.zeros(3))
+
+
+def _picture_search(
+    layout: Layout, sim: SimConfig, figure: Figure, seed: int, method: Method
+) -> tuple[Search, View]:
+    lens, generator = Lens(sim), figure_generator(figure, seed, "portrait")
+    (view,) = lens.begin([generator])
+    picture = lens.taken(0, portrait(_silhouette(layout, figure), sim, view), generator)
+    cover = coverage(picture)
+    if cover is None:  # nothing is to be seen
+        return Search(None, 0.0, 0.0, ""), view
+    corner = np.array([-sim.arena / 2.0, sim.arena / 2.0, 0.0])  # from which it is measured
+    filled = fill_picture(cover, layout, sim.arena, SECONDS, method)
+    return _search(figure, filled, corner), view
+
+
+def _silhouette(layout: Layout, figure: Figure) -> Area:
+    return silhouette(layout, Dissection(figure.poses, figure.flipped))
+
+
+def _search(figure: Figure, filled: Filled, corner: Floats) -> Search:
+    """What was found, by the name that decides where tokens start."""
+    found, laid = filled.found, None
+    if found is not None:
+        poses = found.poses + corner
+        poses[:, 2] = wrap(poses[:, 2])
+        laid = Figure(figure.name, figure.degrees, poses, found.flipped)
+    return Search(laid, filled.iou, filled.seconds, filled.by if laid else "")
+
+
+def play_hidden(hidden: Hidden, player: Player, seed: int) -> Laid:
+    """Lay what was found and judge it by the silhouettes."""
+    layout, arena, count = hidden.setup.layout, hidden.setup.sim.arena, len(hidden.figures)
+    seconds = np.array([search.seconds for search in hidden.searches])
+    ends: Floats = hidden.goals + _BEYOND * arena
+    blocked, refused, used = (np.zeros(count, np.int64) for _ in range(3))
+    if len(hidden.found):
+        played, rows = lay(hidden, player, seed), hidden.found
+        ends[rows] = played.ends
+        blocked[rows], refused[rows] = played.blocked.sum(axis=1), played.refused.sum(axis=1)
+        used[rows] = played.refused.shape[1] - refused[rows]
+        seconds[rows] += played.seconds
+    coverage = overlap_share(ends, hidden.goals, layout)
+    return Laid(ends, coverage, iou(layout, ends, coverage), blocked, refused, used, seconds)
+
+
+def lay(hidden: Hidden, player: Player, seed: int) -> Played:
+    """Lay what was found, F episodes; the targets are what was found, too."""
+    laid = [search.laid for search in hidden.searches if search.laid is not None]
+    views = None if hidden.views is None else [hidden.views[e] for e in hidden.found]
+    return play_figures(hidden.setup, laid, player, seed, views=views)
+
+
+def means(hidden: Hidden, laid: Laid) -> dict[str, Any]:
+    """Scores of all puzzles, those that were not filled among them."""
+    names = ("coverage", "iou", "blocked", "refused", "actions_used")
+    return {
+        "mean_reward": float(np.mean(scaled_overlap(laid.coverage))),
+        **{name: float(np.mean(getattr(laid, name))) for name in names},
+        "share_solved_iou": float(np.mean(laid.solved)),
+        "filled": hidden.filled,
+        "filled_by": hidden.filled_by,
+        "not_filled": len(hidden.figures) - hidden.filled,
+        "search_seconds": float(np.mean([search.seconds for search in hidden.searches])),
+        "seconds_per_puzzle": float(np.mean(laid.seconds)),
+    }
+
+
+def one_by_one(hidden: Hidden, laid: Laid) -> list[dict[str, Any]]:
+    """Scores of each puzzle."""
+    return [
+        {
+            "name": figure.name,
+            "degrees": figure.degrees,
+            "coverage": float(laid.coverage[e]),
+            "iou": float(laid.iou[e]),
+            "solved": bool(laid.solved[e]),
+            "filled": search.filled,
+            "filled_by": search.by if search.filled else "",
+            "search_iou": search.iou,
+            **{name: int(getattr(laid, name)[e]) for name in ("blocked", "refused")},
+            "actions_used": int(laid.actions_used[e]),
+            "search_seconds": search.seconds,
+            "seconds": float(laid.seconds[e]),
+        }
+        for e, (figure, search) in enumerate(zip(hidden.figures, hidden.searches, strict=True))
+    ]

@@ -1,0 +1,69 @@
+"""A photograph as what a run is to assemble: its tokens are found, outlined and played."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import Image
+
+from tangram_agent.setup import Setup
+from tangram_core.arrays import Floats
+from tangram_core.errors import ConfigError
+from tangram_game.figures.puzzles import Figure, reach_beyond
+from tangram_game.show.views import outlined
+from tangram_sim.drawing.scenes import contact_sheet
+from tangram_sim.geometry.layout import Layout
+from tangram_sim.tasks.targets import turned_figure
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """What a photograph shows.
+
+    Attributes:
+        picture: in colour, upright.
+        outlines: (V, 2) corners of the tokens, pixels of the picture, y down.
+        figure: the tokens in the middle of a run's arena.
+    """
+
+    picture: Image.Image
+    outlines: Floats
+    figure: Figure
+
+
+def read_photograph(target: str, setup: Setup) -> Photograph:
+    """What a file shows of a run's tokens.
+
+    Raises:
+        ConfigError: says what was found instead, or that OpenCV is not installed.
+    """
+    try:
+        # Only here: other targets need no OpenCV.
+        from tangram_vision.given.photos import find_tokens  # noqa: PLC0415
+        from tangram_vision.given.picture_files import read_picture  # noqa: PLC0415
+    except ImportError as error:  # also a library that OpenCV needs in its turn
+        raise ConfigError(
+            f"target needs OpenCV ({error}): install opencv-python-headless, or leave target out"
+        ) from error
+    source, layout = f"target={target}", setup.layout
+    picture = read_picture(Path(target), source)
+    found = find_tokens(picture, layout, source)
+    poses = turned_figure(layout, (found.poses, found.flipped), 0.0)
+    _check_inside(source, setup, layout.corners(poses, found.flipped))
+    outlines = layout.corners(found.poses, found.flipped) * (found.unit, -found.unit)
+    return Photograph(picture, outlines, Figure(Path(target).stem, 0.0, poses, found.flipped))
+
+
+def draw_photograph(photograph: Photograph, layout: Layout, size: int) -> Image.Image:
+    """The photograph with the outlines of what was seen, and how much that was below."""
+    picture = outlined(photograph.picture, layout, photograph.outlines, size)
+    seen = f"{layout.tokens} tokens" if layout.tokens > 1 else layout.shapes[0].name
+    return contact_sheet([picture], 1, [f"seen: {seen.replace('_', ' ')}"])
+
+
+def _check_inside(source: str, setup: Setup, corners: Floats) -> None:
+    reach = reach_beyond(setup, corners)
+    if reach is not None:
+        raise ConfigError(
+            f"{source} shows tokens that reach {reach:.3g} from their middle at the run's scale, "
+            f"and its arena only {setup.sim.arena / 2.0:.3g}: lay them nearer together"
+        )

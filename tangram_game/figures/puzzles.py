@@ -1,0 +1,176 @@
+"""Puzzles as what a run is to assemble: found, checked against its tokens, turned and played.
+
+Legend: E episodes, K tokens.
+"""
+
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from tangram_agent.setup import Setup
+from tangram_core.arrays import Bools, Floats
+from tangram_core.errors import ConfigError
+from tangram_core.seeding import episode_generator
+from tangram_game.rivals.baselines import Player, playing
+from tangram_sim.config import SILHOUETTES, RewardConfig
+from tangram_sim.puzzles.assembly import Puzzle, PuzzleRules
+from tangram_sim.puzzles.figures import SPLITS, library, read_puzzles
+from tangram_sim.sight.lens import View
+from tangram_sim.tasks.targets import placement, turned_figure
+from worker.play.looking import environments
+from worker.play.rollout import Played, at_once, play
+
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Figure:
+    """A puzzle at one angle, as the target of a run's tokens.
+
+    Attributes:
+        name: of the puzzle.
+        degrees: by which it is turned from how it was drawn.
+        poses: (K, 3) of the tokens in it.
+        flipped: (K,) tokens that lie on their other side in it.
+    """
+
+    name: str
+    degrees: float
+    poses: Floats
+    flipped: Bools
+
+    @property
+    def title(self) -> str:
+        """The name for a picture, and by how much it is turned."""
+        name = self.name.replace("_", " ")
+        return f"{name} {self.degrees:g}°" if self.degrees else name
+
+
+def find_figures(
+    source: str | None,
+    setup: Setup,
+    names: Sequence[str] | None = None,
+    turns: int = 1,
+) -> tuple[Figure, ...]:
+    """The puzzles of a file or of the library as targets of a run.
+
+    Args:
+        source: a file, or a split of the library; None is all of the library.
+        setup: whose tokens are to be moved.
+        names: of the puzzles wanted; None is all that there are.
+        turns: at so many angles each, evenly spread from the one that it is drawn at.
+
+    Raises:
+        ConfigError: a file that cannot be used, an unknown name, or pieces that are not the tokens.
+    """
+    puzzles = _named(_read(source, setup.tokens.scale), names, source)
+    figures = tuple(figure for puzzle in puzzles for figure in _turns(puzzle, setup, turns))
+    if not figures:
+        raise ConfigError(f"{source or 'the library'} has no puzzle to play")
+    return figures
+
+
+def play_figures(
+    setup: Setup,
+    figures: Sequence[Figure],
+    player: Player,
+    seed: int,
+    touching: bool = True,
+    views: Sequence[View] | None = None,
+) -> Played:
+    """Assemble E figures, one episode each; where the tokens start is decided by seed and figure.
+
+    Args:
+        setup: whose tokens are moved.
+        figures: E.
+        player: moves them.
+        seed: of the starts.
+        touching: whether their pieces touch, so that no picture tells them apart.
+        views: E, how they were seen before, in pictures that told their pieces.
+
+    Raises:
+        ConfigError: pictures are to be observed, and pieces touch; or silhouettes are.
+        SamplingError: the tokens find no room to start.
+    """
+    looks = setup.sim.observe == "pictures"
+    if looks and touching and views is None:
+        raise ConfigError(
+            "sim.observe=pictures cannot tell the pieces of a puzzle apart, which touch: set "
+            "sim.observe=corners, or silhouette_pictures in tangram-eval"
+        )
+    shows = looks or setup.sim.observe in SILHOUETTES
+    sim = setup.sim if shows else setup.sim.blind
+    targets = (np.stack([f.poses for f in figures]), np.stack([f.flipped for f in figures]))
+    shown, envs = replace(setup, sim=sim), min(at_once(setup), len(figures))
+    with closing(environments(shown, envs, RewardConfig())) as env:
+        choose, count = playing(player, env), len(figures)
+
+        def generator(number: int) -> np.random.Generator:
+            return figure_generator(figures[number], seed)
+
+        return play(env, choose, generator, count, targets, views=views)
+
+
+def figure_generator(figure: Figure, seed: int, what: str = "puzzle") -> np.random.Generator:
+    """A figure's own, whatever else is in its file; `what` it is for."""
+    return episode_generator(seed, f"{what} {figure.name}", 0, 0, round(figure.degrees * 1000))
+
+
+def _read(source: str | None, scale: float) -> tuple[Puzzle, ...]:
+    if source is None or source in SPLITS:
+        return library(source, scale)
+    return read_puzzles(Path(source), PuzzleRules(scale, subset=True))
+
+
+def _named(
+    puzzles: Sequence[Puzzle], names: Sequence[str] | None, source: str | None
+) -> list[Puzzle]:
+    if names is None:
+        return list(puzzles)
+    found = {puzzle.name: puzzle for puzzle in puzzles}
+    for name in names:
+        if name not in found:
+            raise ConfigError(
+                f"no puzzle '{name}' in {source or 'the library'}: choose from "
+                f"{', '.join(found) or 'none'}"
+            )
+    return [found[name] for name in names]
+
+
+def _turns(puzzle: Puzzle, setup: Setup, turns: int) -> list[Figure]:
+    poses, flipped = _placed(puzzle, setup)
+    figures = []
+    for degrees in (360.0 * i / turns for i in range(turns)):
+        there = turned_figure(setup.layout, (poses, flipped), np.radians(degrees))
+        _check_inside(puzzle, setup, setup.layout.corners(there, flipped))
+        figures.append(Figure(puzzle.name, degrees, there, flipped))
+    return figures
+
+
+def _placed(puzzle: Puzzle, setup: Setup) -> tuple[Floats, Bools]:
+    try:
+        return placement(puzzle, setup.layout)
+    except ConfigError:
+        tokens = ", ".join(shape.name for shape in setup.layout.shapes)
+        raise ConfigError(
+            f"puzzle '{puzzle.name}' has the pieces {', '.join(puzzle.pieces)}, and the run moves "
+            f"{tokens} of scale {setup.tokens.scale:g}: name a run of the puzzle's pieces"
+        ) from None
+
+
+def reach_beyond(setup: Setup, corners: Floats) -> float | None:
+    """How far corners (V, 2) reach from the middle where a run's arena does not; else None."""
+    reach = float(np.abs(corners).max())
+    return reach if reach > setup.sim.arena / 2.0 + _ROUNDING else None
+
+
+def _check_inside(puzzle: Puzzle, setup: Setup, corners: Floats) -> None:
+    reach = reach_beyond(setup, corners)
+    if reach is not None:
+        raise ConfigError(
+            f"puzzle '{puzzle.name}' reaches {reach:.3g} from its middle, and the run's arena only "
+            f"{setup.sim.arena / 2.0:.3g}: name a run of a larger arena or of smaller tokens"
+        )

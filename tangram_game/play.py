@@ -1,0 +1,372 @@
+"""tangram-play: episodes of finished runs as an animation or as one picture."""
+
+import math
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import replace
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw, ImageFont, ImageOps
+from rich.console import Console
+
+from tangram_agent.outcome import plural
+from tangram_agent.runs import Run, load_changed
+from tangram_agent.setup import Setup
+from tangram_core.arrays import Floats
+from tangram_core.errors import ConfigError, RunError
+from tangram_core.settings import told
+from tangram_core.store.files import write_whole
+from tangram_game.figures.photographs import draw_photograph, read_photograph
+from tangram_game.figures.puzzles import find_figures, play_figures
+from tangram_game.figures.silhouettes import Shown, draw_silhouette, read_silhouette
+from tangram_game.show.film import WIDTH, Show, film_pictures, frames_per_action
+from tangram_game.show.views import beside, camera_sheets
+from tangram_sim.drawing.game_drawing import figure_sheet, tiles
+from tangram_sim.drawing.scenes import episode_sheet, save_gif, save_mp4
+from tangram_sim.geometry.layout import Layout
+from tangram_sim.motion.kinematics import wrap
+from worker.config import MAX_SHOWN, PlayConfig, source_and_names
+from worker.play.rollout import Played, at_once
+from worker.score.metrics import SOLVED, assembled
+from worker.score.test_set import FixedTests, greedy
+
+FRAME_MS = 50
+STILL_START, STILL_END = 10, 30  # frames
+SHOWN = "what the agent is shown"
+SEEN = 30  # frames of what was seen before a film
+SHEET = 720  # pixels across, about
+MIN_TILE, MAX_TILE = 64, 240
+COMPARED = 1080  # pixels across, about, of all runs together
+HEADER = 44  # pixels above a run's episodes
+TITLE, SCORE = 18, 13  # pixels of the header's two lines
+GAP = 24  # pixels between runs
+OF_STARTS = ("targets", "mirrored", "starts")
+_DRAWN_BY = f"sim.arena, {', '.join(OF_STARTS)}"
+PAPER, TEXT, FAINT, RULE = (250, 250, 247), (31, 41, 55), (107, 114, 128), (214, 214, 208)
+
+
+def play_run(config: PlayConfig, silhouette: Shown | None = None) -> int:
+    """Play puzzles, a photograph or random episodes, noise off, and draw them side by side.
+
+    Args:
+        config: the settings.
+        silhouette: what fills theirs, if that was searched before.
+
+    Returns:
+        Exit status 0.
+
+    Raises:
+        RunError: a folder or a checkpoint that is missing or corrupt, or `out` is not writable.
+        ConfigError: puzzles that the run cannot play.
+    """
+    torch.set_num_threads(1)
+    (run_dir,) = config.run_dirs
+    show = make_show(load_changed(run_dir, config.changes), config, silhouette)
+    save_picture(config.out, _frames(show, config.out))
+    Console(highlight=False).print(f"{config.out}: {show.told()}", markup=False, soft_wrap=True)
+    return 0
+
+
+def make_show(run: Run, config: PlayConfig, silhouette: Shown | None = None) -> Show:
+    """What the settings name, played by a run; see `play_run`.
+
+    Raises:
+        ConfigError: puzzles or a photograph that the run cannot play.
+    """
+    if config.puzzle is not None:
+        return puzzle_show(run, config)
+    if config.target is not None:
+        return photograph_show(run, config, config.target)
+    if config.silhouette is not None:
+        given = (config.silhouette, run.setup, config.solutions, Path(config.out))
+        return silhouette_show(run, config, silhouette or read_silhouette(*given))
+    titles = [f"target {i + 1}" for i in range(config.episodes)]
+    return Show(run.setup, play_episodes(run, config), titles, "episode")
+
+
+def play_episodes(run: Run, config: PlayConfig) -> Played:
+    """The episodes that the settings name, played by a run."""
+    with closing(
+        FixedTests(run.setup, config.episodes, at_once(run.setup), role="play", seed=config.seed)
+    ) as tests:
+        return tests.play(greedy(run.policy))
+
+
+def puzzle_show(run: Run, config: PlayConfig) -> Show:
+    """The puzzles that the settings name, their pieces laid out beside them at first.
+
+    Raises:
+        ConfigError: puzzles that the run cannot play, or too many of them.
+    """
+    setup = _beside(run.setup)
+    source, names = source_and_names(config.puzzle or ())
+    figures = find_figures(source, setup, names, config.turns)
+    if len(figures) > MAX_SHOWN:
+        raise ConfigError(
+            f"there are {len(figures)} puzzles, at most {MAX_SHOWN} are shown: name some, as "
+            f"in puzzle=[{figures[0].name}]"
+        )
+    played = play_figures(setup, figures, greedy(run.policy), config.seed)
+    return Show(setup, played, [one.title for one in figures], "puzzle")
+
+
+def photograph_show(run: Run, config: PlayConfig, target: str) -> Show:
+    """What a photograph shows, with the tokens anywhere at first.
+
+    Raises:
+        ConfigError: a photograph that does not show the run's tokens.
+    """
+    photograph = read_photograph(target, run.setup)
+    figure, player = photograph.figure, greedy(run.policy)
+    played = play_figures(run.setup, [figure], player, config.seed, touching=False)
+    seen = draw_photograph(photograph, run.setup.layout, tiles(1, WIDTH)[1])
+    return Show(run.setup, played, [figure.title], "photograph", seen)
+
+
+def silhouette_show(run: Run, config: PlayConfig, found: Shown) -> Show:
+    """A silhouette, with the tokens outside of it at first.
+
+    It is laid as it was found to be filled, or by an agent of outlines: that is shown no more than
+    the outline of what was found, which is the silhouette's within the search's tolerance.
+    """
+    setup, fills = _beside(run.setup), run.setup.fills
+    played = play_figures(setup, [found.figure], greedy(run.policy), config.seed)
+    width = WIDTH if _is_still(config.out) else WIDTH // 2
+    seen = draw_silhouette(found, setup.layout, width, bare=SHOWN * fills)
+    told = found.told
+    if fills:
+        solved = assembled(setup.layout, played).iou[0] >= SOLVED
+        told = "filled by the run itself" if solved else f"not filled by the run itself, but {told}"
+    return Show(setup, played, [found.figure.title], "silhouette", seen, told)
+
+
+def _beside(setup: Setup) -> Setup:
+    """The same task with all tokens beside the target at first."""
+    return replace(setup, sim=replace(setup.sim, starts="outside"))
+
+
+def end_picture(show: Show) -> Image.Image:
+    """The ends of all episodes."""
+    layout, arena, played = show.setup.layout, show.setup.sim.arena, show.played
+    return figure_sheet(layout, arena, played.ends, played.goals, show.titles)
+
+
+def _frames(show: Show, out: str) -> list[Image.Image]:
+    """One picture of the ends, or the film."""
+    setup, played = show.setup, show.played
+    still, game = _is_still(out), setup.layout.tokens > 1 or show.seen is not None
+    count = len(show.titles)
+    columns, size = tiles(count, WIDTH) if game else _tiles(count, SHEET)
+    sheets = camera_sheets(setup, played, columns, size)
+    if still:
+        end = end_picture(show) if game else draw_sheet(setup, played, played.ends)
+        return [side_by_side([*_before(show), end, *sheets[-1:]])]
+    frames = film_pictures(show) if game else draw_motion(setup, played)
+    if sheets:
+        pairs = zip(frames, beside(frames, sheets), strict=True)
+        frames = [side_by_side(pair) for pair in pairs]
+    before = [ImageOps.pad(one, frames[0].size, color=PAPER) for one in _before(show)]
+    return [one for one in before for _ in range(SEEN)] + with_stills(frames)
+
+
+def _is_still(out: str) -> bool:
+    return Path(out).suffix == ".png"
+
+
+def _before(show: Show) -> list[Image.Image]:
+    """What is shown before the film: a photograph of the target, if there is one."""
+    return [] if show.seen is None else [show.seen]
+
+
+def save_picture(out: str, frames: Sequence[Image.Image]) -> None:
+    """Write one frame as a PNG or all of them as a GIF or MP4, whole or not at all.
+
+    Raises:
+        RunError: `out` is not writable.
+    """
+    picture = BytesIO()
+    if _is_still(out):
+        frames[-1].save(picture, format="PNG")
+    else:
+        save = save_mp4 if Path(out).suffix == ".mp4" else save_gif
+        save(frames, picture, FRAME_MS)
+    write_whole(Path(out), picture.getvalue())
+
+
+def draw_sheet(setup: Setup, played: Played, corners: Floats, width: int = SHEET) -> Image.Image:
+    """One tile for each of E episodes while its tokens are at corners (E, V, 2).
+
+    Args:
+        width: of all tiles of a row together, about, in pixels.
+    """
+    columns, size = _tiles(len(corners), width)
+    scenes = (played.starts, corners, played.goals)
+    return episode_sheet(setup.layout, setup.sim.arena, *scenes, columns, size)
+
+
+def _tiles(count: int, width: int) -> tuple[int, int]:
+    """How many tiles stand in a row of so many pixels, and the side of each in pixels."""
+    columns = math.ceil(math.sqrt(count))
+    return columns, min(max(width // columns, MIN_TILE), MAX_TILE)
+
+
+def draw_motion(setup: Setup, played: Played) -> list[Image.Image]:
+    """The episodes' frames: start, every action as a motion at constant velocity, end."""
+    count = frames_per_action(played.episodes.actions.shape[1])
+    return [
+        draw_sheet(setup, played, corners)
+        for corners in motion(setup.layout, played.corners, count)
+    ]
+
+
+def with_stills(frames: list[Image.Image]) -> list[Image.Image]:
+    """The same film with a rest before and after."""
+    return [frames[0]] * STILL_START + frames + [frames[-1]] * STILL_END
+
+
+def motion(layout: Layout, corners: Floats, count: int) -> list[Floats]:
+    """Corners (E, V, 2) at the start and at `count` equal parts of each action.
+
+    An action turns a token by at most half a turn at constant velocity, so the pose in between is
+    that share of the way along the shorter turn, in either backend; nothing is simulated again.
+
+    Args:
+        corners: (E, T + 1, V, 2) before each action and after the last.
+    """
+    poses, flipped = layout.poses(corners), layout.flipped(corners)
+    way = np.diff(poses, axis=1)
+    way[..., 2] = wrap(way[..., 2])
+    shares = np.arange(1, count + 1) / count
+    between = [
+        layout.corners(poses[:, t] + share * way[:, t], flipped[:, t + 1])
+        for t in range(way.shape[1])
+        for share in shares
+    ]
+    return [corners[:, 0], *between]
+
+
+def compare_runs(config: PlayConfig) -> int:
+    """Play the same episodes with several runs, noise off, and draw each run's in a column.
+
+    Episodes stand at the same place in every column; a shorter one waits for the others.
+
+    Returns:
+        Exit status 0.
+
+    Raises:
+        RunError: a run that cannot be loaded or has other tokens or another arena than the
+            first, or `out` is not writable.
+    """
+    torch.set_num_threads(1)
+    runs = [load_changed(run_dir, config.changes) for run_dir in config.run_dirs]
+    check_same_task(runs)
+    shown = [(run.setup, play_episodes(run, config)) for run in runs]
+    labels = distinct_names([run.folder for run in runs])
+    scores = [f"mean raw overlap {played.overlap.mean():.3f}" for _, played in shown]
+    panels = [
+        [headed(frame, *text) for frame in frames]
+        for frames, *text in zip(_films(config, shown), labels, scores, strict=True)
+    ]
+    frames = [side_by_side(row) for row in zip(*panels, strict=True)]
+    save_picture(config.out, with_stills(frames))
+    line = "; ".join(f"{label}: {score}" for label, score in zip(labels, scores, strict=True))
+    Console(highlight=False).print(
+        f"{config.out}: {plural(config.episodes, 'episode')}; {line}", markup=False, soft_wrap=True
+    )
+    return 0
+
+
+def check_same_task(runs: Sequence[Run]) -> None:
+    """Refuse runs that cannot have the same starts; their agents may differ.
+
+    Raises:
+        RunError: names the run that differs from the first, and in what.
+    """
+    first = runs[0]
+    for run in runs[1:]:
+        here, there = (_drawn_by(one.setup) for one in (run, first))
+        for what, other in here.items():
+            if other != there[what]:
+                raise RunError(
+                    f"cannot compare {run.folder} with {first.folder}: {what} is {other} here and "
+                    f"{there[what]} there; the same starts need the same tokens and {_DRAWN_BY}"
+                )
+        if run.setup.layout.fingerprint() != first.setup.layout.fingerprint():
+            raise RunError(
+                f"cannot compare {run.folder} with {first.folder}: their tokens have other "
+                "corners; the same starts need the same tokens and arena"
+            )
+
+
+def _drawn_by(setup: Setup) -> dict[str, str]:
+    """What decides which episodes are drawn."""
+    sim = {f"sim.{name}": told(getattr(setup.sim, name)) for name in ("arena", *OF_STARTS)}
+    return {"tokens": _tokens(setup), **sim}
+
+
+def _tokens(setup: Setup) -> str:
+    names = ", ".join(shape.name for shape in setup.layout.shapes)
+    return f"[{names}] of scale {setup.tokens.scale:.6g}"
+
+
+def distinct_names(folders: Sequence[Path]) -> list[str]:
+    """The folders' names, with as many parents before them as tell all of them apart."""
+    longest = max(len(folder.parts) for folder in folders)
+    for depth in range(1, longest + 1):
+        names = ["/".join(folder.parts[-depth:]) for folder in folders]
+        if len(set(names)) == len(names):
+            return names
+    return [str(folder) for folder in folders]
+
+
+def _films(config: PlayConfig, shown: Sequence[tuple[Setup, Played]]) -> list[list[Image.Image]]:
+    """For each run its frames, equally many: only the last one for a PNG."""
+    if _is_still(config.out):
+        scenes = [[played.ends] for _, played in shown]
+    else:
+        scenes = equally_long(shown)
+    return [
+        [draw_sheet(setup, played, corners, COMPARED // len(shown)) for corners in film]
+        for (setup, played), film in zip(shown, scenes, strict=True)
+    ]
+
+
+def equally_long(shown: Sequence[tuple[Setup, Played]]) -> list[list[Floats]]:
+    """For each run the corners (E, V, 2) of every frame; a shorter film keeps its last one."""
+    count = frames_per_action(max(played.episodes.actions.shape[1] for _, played in shown))
+    films = [motion(setup.layout, played.corners, count) for setup, played in shown]
+    longest = max(map(len, films))
+    return [film + [film[-1]] * (longest - len(film)) for film in films]
+
+
+def headed(panel: Image.Image, title: str, score: str) -> Image.Image:
+    """A run's picture below its name and its score; a long name loses its beginning."""
+    canvas = Image.new("RGB", (panel.width, panel.height + HEADER), PAPER)
+    canvas.paste(panel, (0, HEADER))
+    draw = ImageDraw.Draw(canvas)
+    font = ImageFont.load_default(TITLE)
+    left = panel.width // 30
+    short = title
+    while len(short) > 1 and draw.textlength(short, font) > panel.width - 2 * left:
+        short = "…" + short.lstrip("…")[1:]
+    draw.text((left, 6), short, TEXT, font)
+    draw.text((left, 6 + TITLE + 4), score, FAINT, ImageFont.load_default(SCORE))
+    return canvas
+
+
+def side_by_side(panels: Sequence[Image.Image]) -> Image.Image:
+    """Pictures in a row, their tops in line, with a rule between them."""
+    height = max(panel.height for panel in panels)
+    width = sum(panel.width for panel in panels) + GAP * (len(panels) - 1)
+    canvas = Image.new("RGB", (width, height), PAPER)
+    draw = ImageDraw.Draw(canvas)
+    left = 0
+    for panel in panels:
+        if left:
+            draw.line((left - GAP // 2, 8, left - GAP // 2, height - 8), RULE)
+        canvas.paste(panel, (left, 0))
+        left += panel.width + GAP
+    return canvas

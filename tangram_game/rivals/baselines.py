@@ -1,0 +1,130 @@
+"""Three policies to compare with: chance, the position-only oracle and the exact oracle.
+
+Legend: B environments, K tokens, V corners, A entries of an action.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from tangram_agent.types import Past
+from tangram_core.arrays import Bools, Floats, Ints, Singles
+from tangram_sim.batch import BatchedEnv
+from tangram_sim.config import SimConfig
+from tangram_sim.geometry.layout import Layout
+from tangram_sim.geometry.overlap import outlines, shared_areas
+from tangram_sim.motion.actions import action_size, make_actions, velocities_of
+from worker.play.rollout import Choose, Generators
+from worker.score.pairing import Pairing, paired
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """A policy that is told the world: it is made for the environments in which it plays."""
+
+    of: Callable[[BatchedEnv], Choose]
+
+
+Player = Choose | Told
+
+
+def playing(player: Player, env: BatchedEnv) -> Choose:
+    """The policy, told the world if it asks for that."""
+    return player.of(env) if isinstance(player, Told) else player
+
+
+def random_policy(layout: Layout, sim: SimConfig) -> Choose:
+    """Chance: of one token every entry uniform in [-1, 1].
+
+    Of several, any that is left goes to any pose with its centre in the arena: uniform entries
+    would mostly name a placed token, or throw it out of the arena.
+    """
+    size = action_size(layout.tokens, sim)
+
+    def choose(
+        corners: Floats,
+        placed: Bools,
+        _goals: Floats,
+        generators: Generators,
+        _past: Past | None = None,
+    ) -> Singles:
+        drawn = np.array([generator.uniform(-1.0, 1.0, size) for generator in generators])
+        if layout.tokens == 1:
+            return drawn.astype(np.float32)
+        token = np.array([_any_left(row, rng) for row, rng in zip(placed, generators, strict=True)])
+        pose = drawn[:, -3:] * (sim.arena / 2.0, sim.arena / 2.0, np.pi)
+        way = pose - layout.poses(corners)[np.arange(len(token)), token]
+        flip = (drawn[:, -4] > 0.0) & layout.chiral[token]  # read with sim.allow_flip only
+        return _actions(sim, layout, token, way, flip)
+
+    return choose
+
+
+def position_policy(layout: Layout, sim: SimConfig) -> Choose:
+    """Token after token exactly onto the centre of its own target, and never turned.
+
+    A square moved so overlaps by 0.8825 on average: that is the plateau of the paper's Table II.
+    """
+
+    def choose(
+        corners: Floats,
+        placed: Bools,
+        goals: Floats,
+        _generators: Generators,
+        _past: Past | None = None,
+    ) -> Singles:
+        token = np.argmin(placed, axis=1)
+        way = (layout.poses(goals) - layout.poses(corners))[np.arange(len(token)), token]
+        way[:, 2] = 0.0
+        return _actions(sim, layout, token, way, np.zeros(len(token), dtype=np.bool_))
+
+    return choose
+
+
+def exact_policy(layout: Layout, sim: SimConfig) -> Choose:
+    """Each token exactly onto a piece of its shape as it is seen, by the smallest turn that fits.
+
+    Equal tokens share the pieces by the least way in all. Next is the one whose place is covered
+    least by others. What remains to a perfect score is the world's: places that cover each other in
+    a circle, float32 actions, and the engine's arithmetic.
+    """
+
+    def choose(
+        corners: Floats,
+        placed: Bools,
+        goals: Floats,
+        _generators: Generators,
+        _past: Past | None = None,
+    ) -> Singles:
+        pairing = paired(layout, corners, goals)
+        token = freest(layout, corners, placed, goals, pairing)
+        rows = np.arange(len(token))
+        way, flip = pairing.way[rows, token], pairing.other_side[rows, token]
+        return _actions(sim, layout, token, way, flip)
+
+    return choose
+
+
+def _any_left(placed: Bools, generator: np.random.Generator) -> int:
+    """One of the tokens that are not placed (K,), or any if all are."""
+    left = np.flatnonzero(~np.asarray(placed, dtype=np.bool_))
+    return int(generator.choice(left if len(left) else len(placed)))
+
+
+def freest(layout: Layout, corners: Floats, placed: Bools, goals: Floats, pairing: Pairing) -> Ints:
+    """(B,) the token left whose place the others cover least; the first of several."""
+    rows, every = np.arange(len(corners))[:, None], np.arange(layout.tokens)
+    places = outlines(goals, layout)[rows, pairing.target]
+    shared = shared_areas(places, outlines(corners, layout))
+    shared[:, every, every] = 0.0
+    covered = shared.sum(axis=2) / layout.areas
+    # Rounding must not decide between places that are free.
+    blocked = np.where(placed, np.inf, np.round(covered, 6))
+    freest: Ints = np.argmin(blocked, axis=1)
+    return freest
+
+
+def _actions(sim: SimConfig, layout: Layout, token: Ints, way: Floats, flip: Bools) -> Singles:
+    """Actions (B, A) that take tokens (B,) along ways (B, 3), turned over where flip (B,) says."""
+    return make_actions(token, velocities_of(way, sim), flip, layout.tokens, sim)

@@ -1,0 +1,59 @@
+"""The formula by a model of motion that was fitted to random commands: no actor, and no critic.
+
+Legend: B environments, K tokens, V corners.
+"""
+
+import numpy as np
+import torch
+
+from tangram_agent.agents.pair.motion import Fit, MotionModel, motions_of
+from tangram_agent.types import Past
+from tangram_core.arrays import Bools, Floats, Singles
+from tangram_core.seeding import episode_generator
+from tangram_game.rivals.baselines import freest, random_policy
+from tangram_sim.batch import BatchedEnv
+from tangram_sim.motion.actions import make_actions, velocities_of
+from worker.play.rollout import Choose, Generators, play
+from worker.score.pairing import paired
+
+COMMANDS = 2048  # that are tried
+_UPDATES = 100  # of the fit, each with all of them
+
+
+def fitted_policy(env: BatchedEnv) -> Choose:
+    """As `exact_policy`, by a model of motion that knows some random commands and the past.
+
+    What an agent that learns the motion scores beyond this is what actor and critic are worth.
+    """
+    layout, sim = env.layout, env.sim
+    model = _fitted(env)
+
+    def choose(
+        corners: Floats, placed: Bools, goals: Floats, _generators: Generators, past: Past
+    ) -> Singles:
+        belief = model.belief(motions_of(past, corners, layout, sim))
+        ahead = model.ahead(belief, corners, past, layout, sim)
+        pairing = paired(layout, ahead, goals)
+        token, rows = freest(layout, ahead, placed, goals, pairing), np.arange(len(ahead))
+        wanted = velocities_of(pairing.way[rows, token], sim).astype(np.float32)
+        command = model.command(belief, torch.from_numpy(wanted)).numpy()
+        return make_actions(token, command, pairing.other_side[rows, token], layout.tokens, sim)
+
+    return choose
+
+
+def _fitted(env: BatchedEnv) -> MotionModel:
+    """A model that has seen `COMMANDS` of the random policy."""
+
+    def generator(number: int) -> np.random.Generator:
+        return episode_generator(0, "fitted", 0, 0, number)
+
+    chance = random_policy(env.layout, env.sim)
+    seen = play(env, chance, generator, -(-COMMANDS // env.horizon)).episodes
+    past = Past(seen["corners"][:, :-1], seen.actions, seen.arrays.get("seen"))
+    motions = motions_of(past, seen["corners"][:, -1].astype(np.float64), env.layout, env.sim)
+    model = MotionModel()
+    fit = Fit(model)
+    for _ in range(_UPDATES):
+        fit.step(motions)
+    return model

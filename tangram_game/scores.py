@@ -1,0 +1,210 @@
+"""What a run scores on puzzles, and who learned nothing beside it.
+
+Legend: E puzzles, K tokens, V corners.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tangram_agent.runs import Run
+from tangram_agent.setup import Setup
+from tangram_core.arrays import Floats
+from tangram_core.errors import ConfigError
+from tangram_game.figures.puzzles import Figure, play_figures
+from tangram_game.rivals.baselines import Player, exact_policy
+from tangram_sim.rewards import scaled_overlap
+from worker.play.rollout import Played, at_once
+from worker.score.metrics import SOLVED, assembled, pose_errors, summarise
+
+if TYPE_CHECKING:  # needs OpenCV and shapely
+    from tangram_game.figures.hidden import Hidden, Laid
+
+RUN = "this run"
+Scores = dict[str, Any]  # numbers, and `coverage_each` of the episodes
+
+# What is told of filled outlines: nothing of where a piece should lie.
+OF_AREAS = (
+    *("mean_reward", "raw_overlap", "raw_overlap_p10"),
+    *("coverage", "iou", "blocked", "refused", "actions_used"),
+)
+_COUNTS = ("wrong", "doubly_used", "refused", "blocked", "actions_used")
+
+
+@dataclass(frozen=True, eq=False)
+class Scored:
+    """Scores of several policies on E puzzles.
+
+    Attributes:
+        means: over all puzzles, by the policies' names.
+        puzzles: what the run made of each.
+        titles: of the puzzles.
+        ends: (E, V, 2) corners of the tokens as the run left them.
+        goals: (E, V, 2) corners of the puzzles' pieces.
+        told: what is to be known of the scores.
+    """
+
+    means: dict[str, Scores]
+    puzzles: list[dict[str, Any]]
+    titles: list[str]
+    ends: Floats
+    goals: Floats
+    told: str
+
+
+def score_puzzles(
+    setup: Setup, figures: Sequence[Figure], players: Mapping[str, Player], seed: int
+) -> Scored:
+    """Scores of each policy on the same starts."""
+    scores, played = dict[str, Scores](), dict[str, Played]()
+    for name, player in players.items():
+        played[name] = play_figures(setup, figures, player, seed)
+        own = summarise(setup.layout, setup.sim, played[name], own_reward=False)
+        scores[name] = own | of_several(setup, played[name])
+    run, titles = played[RUN], [figure.title for figure in figures]
+    each = _one_by_one(setup, figures, run)
+    return Scored(scores, each, titles, run.ends, run.goals, "positions in arena units")
+
+
+def score_outlines(
+    setup: Setup, figures: Sequence[Figure], players: Mapping[str, Player], seed: int
+) -> Scored:
+    """Scores of each policy that sees the outlines of puzzles, and fills them itself."""
+    played = {name: play_figures(setup, figures, player, seed) for name, player in players.items()}
+    scores = {name: of_outlines(setup, own) for name, own in played.items()}
+    run, found = played[RUN], assembled(setup.layout, played[RUN])
+    each = [
+        {
+            "name": figure.name,
+            "degrees": figure.degrees,
+            "coverage": float(found.coverage[e]),
+            "iou": float(found.iou[e]),
+            "solved": bool(found.iou[e] >= SOLVED),
+            **{name: int(getattr(found, name)[e]) for name in ("blocked", "refused")},
+            "actions_used": int(found.actions_used[e]),
+            "seconds": float(run.seconds[e]),
+        }
+        for e, figure in enumerate(figures)
+    ]
+    titles = [figure.title for figure in figures]
+    told = "played by the run itself; any dissection counts, so no errors of position and angle"
+    return Scored(scores, each, titles, run.ends, run.goals, told)
+
+
+def of_outlines(setup: Setup, played: Played) -> Scores:
+    """Scores of filled outlines; any dissection counts, so none tells of single pieces."""
+    found = assembled(setup.layout, played)
+    means = {key: value for key, value in found.means().items() if key in OF_AREAS}
+    areas = {
+        "mean_reward": float(np.mean(scaled_overlap(found.coverage))),
+        "share_solved_iou": float(np.mean(found.iou >= SOLVED)),
+        "episodes": float(len(found.coverage)),
+    }
+    return means | areas | of_several(setup, played)
+
+
+def score_hidden(
+    setup: Setup, figures: Sequence[Figure], players: Mapping[str, Player], seed: int
+) -> Scored:
+    """Scores of each policy that lays what was found in the silhouettes.
+
+    Raises:
+        ConfigError: OpenCV or shapely is not installed.
+    """
+    try:
+        # Only here and below: other puzzles need neither.
+        from tangram_game.figures.hidden import hide, play_hidden  # noqa: PLC0415
+        from tangram_game.figures.methods import together  # noqa: PLC0415
+    except ImportError as error:
+        raise _no_library(setup, error) from error
+    hidden = hide(setup, figures, seed, together(setup.layout))
+    laid = {name: play_hidden(hidden, player, seed) for name, player in players.items()}
+    return _of_hidden({name: (hidden, own) for name, own in laid.items()})
+
+
+def score_pictured(run: Run, figures: Sequence[Figure], seed: int) -> Scored:
+    """Scores of an agent of outlines that is shown pictures, and of who fills them otherwise.
+
+    What each finds is laid alike, by the formula: the motion of tokens that are lifted is known.
+
+    Raises:
+        ConfigError: OpenCV or shapely is not installed.
+    """
+    setup = run.setup
+    try:
+        from tangram_game.figures.hidden import hide, play_hidden  # noqa: PLC0415
+        from tangram_game.figures.methods import learned_method  # noqa: PLC0415
+        from tangram_vision.silhouettes.silhouettes import UNLEARNED  # noqa: PLC0415
+    except ImportError as error:
+        raise _no_library(setup, error) from error
+    own, player = learned_method(run), exact_policy(setup.layout, setup.sim)
+    methods = {RUN: own, "largest first": replace(own, values=None), "search": UNLEARNED}
+    every = {name: hide(setup, figures, seed, method) for name, method in methods.items()}
+    return _of_hidden(
+        {name: (hidden, play_hidden(hidden, player, seed)) for name, hidden in every.items()}
+    )
+
+
+def _of_hidden(every: "Mapping[str, tuple[Hidden, Laid]]") -> Scored:
+    """Scores of what each policy laid."""
+    from tangram_game.figures.hidden import means, one_by_one  # noqa: PLC0415
+
+    hidden, laid = every[RUN]
+    told = (
+        f"{hidden.filled} of {len(hidden.figures)} filled ({_by(hidden.filled_by)}); any "
+        "dissection counts, so no errors of position and angle, and no pieces under others"
+    )
+    scores = {name: means(*own) for name, own in every.items()}
+    each = one_by_one(hidden, laid)
+    return Scored(scores, each, hidden.titles, laid.ends, hidden.goals, told)
+
+
+def _no_library(setup: Setup, error: ImportError) -> ConfigError:
+    return ConfigError(
+        f"sim.observe={setup.sim.observe} needs OpenCV and shapely ({error}): install "
+        "opencv-python-headless and shapely, or set sim.observe=corners"
+    )
+
+
+def _by(counts: Mapping[str, int]) -> str:
+    """Who filled how many, in words."""
+    return ", ".join(f"{count} by the {who}" for who, count in counts.items())
+
+
+def of_each(played: Played) -> Scores:
+    """Every coverage, for differences that are paired by episode."""
+    return {"coverage_each": np.round(played.overlap, 6).tolist()}
+
+
+def of_several(setup: Setup, played: Played) -> Scores:
+    """What only evaluations tell of several tokens: time, and every coverage."""
+    seconds = float(np.mean(played.seconds))
+    scores: Scores = {
+        "seconds_per_puzzle": seconds,
+        "ms_per_decision": 1e3 * seconds / played.refused.shape[1],
+        **of_each(played),
+    }
+    if at_once(setup) == 1:
+        scores["ms_slowest"] = 1e3 * float(played.slowest.max())
+    return scores
+
+
+def _one_by_one(setup: Setup, figures: Sequence[Figure], played: Played) -> list[dict[str, Any]]:
+    found = assembled(setup.layout, played)
+    position, angle = pose_errors(setup.layout, played.ends, played.goals)
+    return [
+        {
+            "name": figure.name,
+            "degrees": figure.degrees,
+            "coverage": float(found.coverage[e]),
+            "iou": float(found.iou[e]),
+            "solved": bool(found.solved[e]),
+            **{name: int(getattr(found, name)[e]) for name in _COUNTS},
+            "position_errors": position[e].tolist(),
+            "angle_errors_deg": angle[e].tolist(),
+            "seconds": float(played.seconds[e]),
+        }
+        for e, figure in enumerate(figures)
+    ]

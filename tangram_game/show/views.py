@@ -1,0 +1,91 @@
+"""What an agent was shown, drawn for people: pictures with what was found in them over them.
+
+Legend: E episodes, T steps, K tokens, V corners, P pixels along a side.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from tangram_agent.outcome import plural
+from tangram_agent.setup import Setup
+from tangram_core.arrays import Bools, Floats
+from tangram_sim.drawing.scenes import contact_sheet
+from tangram_sim.drawing.strokes import FRAME, PAPER, SAMPLES, Point, colour_of, draw_outline, shown
+from tangram_sim.geometry.layout import Layout
+from worker.play.rollout import Played
+
+
+def outlined(
+    picture: Image.Image, layout: Layout, outlines: Floats, size: int, found: Bools | None = None
+) -> Image.Image:
+    """A picture in a square, and the outlines of tokens over it.
+
+    Args:
+        picture: of any size.
+        layout: the tokens.
+        outlines: (V, 2) their corners, pixels of the picture, y down.
+        size: of the square, in pixels.
+        found: (K,) which are drawn; None is all.
+    """
+    share = size * SAMPLES / max(picture.size)
+    width, height = (round(side * share) for side in picture.size)
+    left, top = (size * SAMPLES - width) // 2, (size * SAMPLES - height) // 2
+    canvas = Image.new("RGB", (size * SAMPLES, size * SAMPLES), PAPER)
+    canvas.paste(picture.resize((width, height), Image.Resampling.BILINEAR), (left, top))
+    edge = (left, top, left + width - 1, top + height - 1)
+    ImageDraw.Draw(canvas).rectangle(edge, None, FRAME, SAMPLES)
+    for k in range(layout.tokens):
+        if found is None or found[k]:
+            own = outlines[layout.corners_of(k)] * share + (left, top)
+            points: list[Point] = [(float(x), float(y)) for x, y in own]
+            draw_outline(canvas, points, PAPER, 3.0)
+            draw_outline(canvas, points, colour_of(k), 2.0)
+    return shown(canvas)
+
+
+def camera_sheets(setup: Setup, played: Played, columns: int, size: int) -> list[Image.Image]:
+    """For each of T + 1 moments the pictures of all episodes; none where no pictures were observed.
+
+    Args:
+        setup: the task as it was played.
+        played: the episodes.
+        columns: pictures in a row.
+        size: side of one in pixels.
+    """
+    pictures = played.pictures
+    if pictures is None:
+        return []
+    seen = played.episodes["seen"]
+    layout, side = setup.layout, pictures.shape[-1]
+    unit = side / setup.sim.arena
+    corners = played.episodes["corners"].astype(np.float64) * (unit, -unit) + side / 2.0
+    sheets = []
+    for t in range(pictures.shape[1]):
+        found = seen[:, t] > 0
+        scenes = [
+            outlined(Image.fromarray(one).convert("RGB"), layout, *rest)
+            for one, *rest in zip(
+                pictures[:, t], corners[:, t], [size] * len(pictures), found, strict=True
+            )
+        ]
+        sheets.append(contact_sheet(scenes, columns, [_told(own) for own in found]))
+    return sheets
+
+
+def beside(frames: Sequence[Image.Image], sheets: Sequence[Image.Image]) -> list[Image.Image]:
+    """For each frame of a film the sheet of its moment.
+
+    A film has its start, equally many frames for each action and perhaps its end, see
+    `tangram_game.show.film.film`.
+    """
+    actions = len(sheets) - 1
+    each = (len(frames) - 1) // actions
+    return [sheets[min(number // each, actions)] for number in range(len(frames))]
+
+
+def _told(found: Bools) -> str:
+    """What a camera's picture is called."""
+    count = int(np.count_nonzero(found))
+    return "seen by the camera" if found.all() else f"{plural(count, 'token')} of {len(found)} seen"

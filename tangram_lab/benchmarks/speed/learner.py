@@ -1,0 +1,137 @@
+"""Updates: compiled, on a GPU, and against Stable-Baselines3's on the same perceptron."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from tangram_agent.learner import Learner
+from tangram_agent.setup import Setup
+from tangram_agent.types import Transitions
+from tangram_core.errors import ConfigError
+from tangram_lab.benchmarks.measure import Bound, Row, Work, compare, compared, rates
+from tangram_lab.benchmarks.setups import preset, random_transitions, several, with_agent, with_sim
+from tangram_lab.benchmarks.speed.sb3 import Rival, label, make_model
+
+BATCHES = (64, 256)
+
+
+def measure_learner(runs: int) -> list[Row]:
+    """Updates per second on one core: compiled, and beside Stable-Baselines3's."""
+    return _compiled(runs) + _beside_theirs(runs)
+
+
+def _compiled(runs: int) -> list[Row]:
+    """`service.compile=true` against single operations, which compute the same."""
+    cases = [("perceptron [64, 64]", preset("mlp"), 256, 2.3)]
+    cases += [("ours", preset(), size, 1.5) for size in BATCHES]
+    cases += [("ours, 7 tokens", several(7), BATCHES[0], 1.5)]
+    rows = []
+    for name, setup, size, least in cases:
+        made = with_agent(setup, batch_size=size)
+        whole = updates(made, Learner(made, 0, compiled=True))
+        given = ("learner", f"{name}, batch {size}, compiled", "updates/s"), whole
+        rows.append(compare(*given, ("single operations", updates(made)), runs, Bound(least)))
+    return rows
+
+
+def measure_gpu(runs: int) -> list[Row]:
+    """Updates per second on a GPU, against single operations there and one core, compiled.
+
+    Raises:
+        ConfigError: there is no GPU.
+    """
+    if not torch.cuda.is_available():
+        raise ConfigError("gpu needs a GPU, and none is visible: see tangram-bench learner")
+    rows = []
+    for name, made in gpu_cases().items():
+        ways = {
+            "ours": updates(made, Learner(made, 0, "cuda", compiled=True)),
+            "single operations on it": updates(made, Learner(made, 0, "cuda")),
+            "one core, compiled": updates(made, Learner(made, 0, compiled=True)),
+        }
+        found, labels = rates(ways, runs), ("gpu", f"{name}, compiled", "updates/s")
+        for against, bound in zip([*ways][1:], (Bound(5.0), None), strict=True):
+            rows.append(compared(labels, found["ours"], against, found[against], bound))
+    return rows
+
+
+def gpu_cases() -> dict[str, Setup]:
+    """What is measured on a GPU, from small to large."""
+    named = [("perceptron [64, 64]", preset("mlp"), 256), ("paper's MHA", preset("paper"), 64)]
+    named += [("ours, 7 tokens", several(7), BATCHES[0])]
+    named += [("ours", preset(), size) for size in (*BATCHES, 2048)]
+    return {
+        f"{name}, batch {size}": with_agent(made, batch_size=size) for name, made, size in named
+    }
+
+
+def updates(setup: Setup, learner: Learner | None = None) -> Work:
+    """Updates on one batch; of the project's own learner if none is given."""
+    learner = learner or Learner(setup, 0)
+    transitions = random_transitions(setup, setup.agent.batch_size)
+    batch = learner.prepared(transitions, np.random.default_rng(0))
+
+    def work() -> int:
+        learner.update(batch)
+        return 1
+
+    return work
+
+
+# Against Stable-Baselines3
+
+
+BATCH, FILLED, STEPS = 256, 4096, 16
+
+
+def _beside_theirs(runs: int) -> list[Row]:
+    """Of the same perceptron: ours leaves out target networks that decide nothing.
+
+    Once every transition is final, and once every second one: theirs always asks its targets.
+    """
+    model = make_model(Rival(envs=STEPS, batch=BATCH, starts=FILLED))
+    model.learn(FILLED)  # fills its replay with random play
+    setup, rows = with_agent(preset("mlp"), batch_size=BATCH), []
+    final, theirs = random_transitions(setup, BATCH), model.replay_buffer.sample(BATCH)
+    half = np.arange(BATCH, dtype=np.uint8) % 2
+    dones = theirs.dones.clone()
+    dones[::2] = 0.0
+    cases: list[tuple[str, Setup, Transitions, Any]] = [
+        ("every transition final", setup, final, theirs),
+        (
+            "half of them",
+            with_sim(setup, actions_per_token=2),
+            replace(final, done=half),
+            theirs._replace(dones=dones),
+        ),
+    ]
+    for compiled in (False, True):
+        for name, made, batch, drawn in cases:
+            how = f"{name}, compiled" if compiled else name
+            labels = "learner", f"perceptron [64, 64], batch {BATCH}, {how}", "updates/s"
+            bound = Bound(least=2.0 if compiled else 1.5) if name.startswith("every") else None
+            ours = _on_batch(Learner(made, 0, compiled=compiled), batch)
+            rows.append(compare(labels, ours, (label(), _theirs(model, drawn)), runs, bound))
+    return rows
+
+
+def _on_batch(learner: Learner, batch: Transitions) -> Work:
+    def update() -> float:
+        learner.update(batch)
+        return 1.0
+
+    return update
+
+
+def _theirs(model: Any, batch: Any) -> Work:
+    """As many updates in one call as environments step at a time, as in a training."""
+
+    def update() -> float:
+        drawn, model.replay_buffer.sample = model.replay_buffer.sample, lambda *_, **__: batch
+        model.train(gradient_steps=STEPS, batch_size=BATCH)
+        model.replay_buffer.sample = drawn
+        return float(STEPS)
+
+    return update

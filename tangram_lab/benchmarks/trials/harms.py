@@ -1,0 +1,187 @@
+"""Trainings that are harmed: their folders, disks and processes, and an order in lockstep."""
+
+import os
+import time
+from contextlib import suppress
+from pathlib import Path
+from threading import Timer
+
+import psutil
+
+from master.children import override
+from master.record.journal import segments
+from tangram_agent.messages import EpisodeBatch
+from tangram_agent.schema import MAX_COUNT
+from tangram_core.errors import TangramError
+from tangram_lab.benchmarks.trials.chaos import Witness, compare
+from tangram_lab.benchmarks.trials.intruder import NOBODY, knock
+from tangram_lab.benchmarks.trials.target import (
+    ENDS_S,
+    OFTEN,
+    OURS,
+    Attack,
+    Rows,
+    Seen,
+    Target,
+    episodes_of,
+    one_line,
+    training,
+    tried,
+)
+from worker.talk.client import Client
+
+LEARNS_LITTLE = "agent.updates_per_transition=0.1"  # nobody asks for its score
+
+
+def sockets_of_others(target: Target) -> Seen:
+    place = Path(target.where["endpoint"].removeprefix("ipc://"))
+    private = place.is_socket() and not place.parent.stat().st_mode & 0o077
+    stranger = knock(target.where["endpoint"], [target.hello(index=0)], NOBODY)
+    stranger.join(10.0)
+    answers = stranger.exitcode if os.geteuid() == 0 else 0
+    return private and answers == 0, f"{place.parent}: private {private}, {answers} answers"
+
+
+def second_master(target: Target) -> Seen:
+    arguments = (override("run_dir", str(target.folder)), "resume=auto", *OURS[1:])
+    held, seen = one_line("master", *arguments, cwd=target.folder.parent)
+    return held and "in use" in seen and target.goes_on(), seen
+
+
+def killed(target: Target) -> bool:
+    """Whether a training goes on after its master was killed, with batches in the journal alone."""
+    target.checkpoint()
+    target.goes_on(20.0)
+    master = target.master
+    master.kill()
+    until_s = time.monotonic() + ENDS_S
+    while time.monotonic() < until_s:
+        with suppress(TangramError, psutil.Error):
+            if target.master.pid != master.pid and target.goes_on(10.0):
+                return True
+        time.sleep(0.2)
+    return False
+
+
+def killed_after_huge_numbers(target: Target) -> Seen:
+    """With a batch, so that the numbers would be in journal and checkpoint."""
+    setup = target.setup
+    batch = EpisodeBatch(1, 0, episodes_of(setup, 1)).encode(setup.spec)
+    for huge in (2**63 - 1, MAX_COUNT):
+        target.ask(target.hello(incarnation=huge), batch)
+        target.ask(target.hello(incarnation=1, first=huge, index=3001, process="other"))
+    held = killed(target)
+    return held, "it goes on" if held else "it does not come back"
+
+
+def killed_after_unlink(target: Target) -> Seen:
+    """Just after a checkpoint, so that it is not the next one that begins another segment."""
+    journal = target.folder / "journal"
+    target.checkpoint()
+    for path in segments(journal).values():
+        path.unlink(missing_ok=True)
+    target.goes_on(20.0)
+    told, held = "has lost its newest segment" in target.told(), killed(target)
+    return told and held, f"told: {told}; killed after a checkpoint, it goes on: {held}"
+
+
+def folder_away(target: Target) -> Seen:
+    target.goes_on()
+    away = target.folder.with_name("away")
+    target.folder.rename(away)
+    time.sleep(3.0)
+    stopped = not target.folder.exists()
+    if stopped:
+        away.rename(target.folder)
+    held, told = stopped and target.goes_on(10.0), f"{target.folder} is gone" in target.told()
+    seen = f"made again by accident: {not stopped}; told: {told}; goes on when it is back: {held}"
+    return held and told, seen
+
+
+def full_disk(target: Target) -> Seen:
+    master = target.master
+    before = master.rlimit(psutil.RLIMIT_FSIZE)
+    master.rlimit(psutil.RLIMIT_FSIZE, (1, before[1]))  # what it says has no room either
+    until_s, taken, stands = time.monotonic() + 15.0, -1.0, False
+    while not stands and time.monotonic() < until_s:
+        stands, taken = target.numbers()["episodes"] == taken, target.numbers()["episodes"]
+        time.sleep(3.0)
+    master.rlimit(psutil.RLIMIT_FSIZE, before)
+    held = target.goes_on(10.0) and target.master.pid == master.pid
+    told = "batches are taken in" in target.told()
+    return stands and held, f"it stands: {stands}; with room again it goes on: {held}; told: {told}"
+
+
+def frozen(target: Target) -> Seen:
+    master = target.master
+    master.suspend()
+    time.sleep(8.0)
+    master.resume()
+    held = target.goes_on(10.0) and target.master.pid == master.pid
+    return held, "it goes on" if held else "it does not go on"
+
+
+OWN: list[Attack] = [
+    ("5", "another user at the sockets", "1", sockets_of_others),
+    ("held", "two masters on one folder", "1", second_master),
+    ("2", "the largest numbers, then kill -9", "1 kill", killed_after_huge_numbers),
+    ("8", "the journal unlinked, then kill -9", "1 kill", killed_after_unlink),
+    ("8", "the run folder taken away", "3 s", folder_away),
+    ("held", "a full disk", "until it stands", full_disk),
+    ("held", "SIGSTOP", "8 s", frozen),
+]
+
+
+def wrong_batch_in_lockstep(target: Target) -> Seen:
+    setup = target.setup
+    spec, rounds = setup.spec, 0
+    with Client(str(target.folder), "player", 0, setup.fingerprints(), spec) as client:
+        late = Timer(20.0, client.stop, ["it takes too long"])
+        late.start()
+        client.join()
+        order = client.wait_for_order(None)
+        if order is not None and client.send(episodes_of(setup, 2), order.version):
+            while rounds < 3 and (order := client.wait_for_order(order)) is not None:
+                client.send(episodes_of(setup, order.episodes), order.version)
+                rounds += 1
+        late.cancel()
+    return rounds == 3, f"{rounds} of 3 rounds after it"
+
+
+LOCKSTEP: list[Attack] = [("6", "another batch than was ordered", "1", wrong_batch_in_lockstep)]
+
+
+def harmed(folder: Path) -> Rows:
+    """What was done to trainings in a folder that harm nobody else, as rows."""
+    rows = witnessed(folder / "a=run of ü")
+    lockstep = ("service.mode=lockstep", "workers=1", "max_updates=0", "sim=kinematic")
+    with training(folder / "lockstep", *lockstep, name="master") as target:
+        return [*rows, *tried(LOCKSTEP, target)]
+
+
+def witnessed(folder: Path) -> Rows:
+    """What was done to a training of its own, with an independent witness; the folder is odd."""
+    with training(folder, "max_updates=0", *OURS, LEARNS_LITTLE, OFTEN) as target:
+        witness, rows = Witness(str(folder), target.setup), Rows()
+        witness.start()
+        target.goes_on(100.0)
+        after = 0  # so many it was acknowledged to
+        for attack in OWN:
+            rows += tried([attack], target)
+            after += acknowledged_again(witness)
+        witness.stop()
+        witness.join(ENDS_S)
+    counts = compare(folder, witness)
+    held = not (counts["lost"] or counts["doubled"] or witness.error) and after == len(OWN)
+    seen = ", ".join(f"{n} {counts[n]:,}" for n in ("acknowledged", "lost", "doubled"))
+    seen += f"; acknowledged again after {after} of {len(OWN)}"
+    what = "held: kill -9 with a witness, in an odd folder"
+    return [*rows, {"attack": what, "tried": "2 kills", "held": held, "seen": seen}]
+
+
+def acknowledged_again(witness: Witness) -> bool:
+    """Whether more of what a witness plays is acknowledged from now on."""
+    before, until_s = witness.acknowledged, time.monotonic() + ENDS_S
+    while witness.acknowledged == before and witness.is_alive() and time.monotonic() < until_s:
+        time.sleep(0.1)
+    return witness.acknowledged > before

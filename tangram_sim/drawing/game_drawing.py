@@ -1,0 +1,143 @@
+"""Pictures of the game: tokens over the silhouette of their target, perhaps one being moved."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFilter
+
+from tangram_core.arrays import Floats
+from tangram_sim.drawing.scenes import contact_sheet
+from tangram_sim.drawing.strokes import (
+    SAMPLES,
+    SILHOUETTE,
+    Point,
+    colour_of,
+    darker,
+    draw_outline,
+    empty_table,
+    fill,
+    shown,
+    to_outlines,
+    to_points,
+)
+from tangram_sim.geometry.layout import Layout
+from tangram_sim.geometry.overlap import overlap_share
+
+_EDGE = (168, 158, 138)
+_OPACITY = 0.9
+_INK = (31, 41, 55)
+_RED = (200, 40, 40)
+_NEARER = 0.12  # how much larger a piece in the hand looks
+_SHADOW = 0.35  # its opacity
+_SHADOW_WAY = (0.03, -0.05)  # of the arena, to the right and down
+_SHADOW_BLUR = 0.012  # of the picture's side
+_SHEET = 1200  # pixels across, about
+_MIN_TILE, _MAX_TILE = 120, 480
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """The token that is being moved.
+
+    Attributes:
+        token: its number.
+        height: 0 on the table to 1 in the air: drawn larger, with a shadow.
+        stopped: it cannot be set down: drawn with a red outline.
+    """
+
+    token: int
+    height: float = 0.0
+    stopped: bool = False
+
+
+def draw_game(
+    layout: Layout,
+    arena: float,
+    corners: Floats,
+    goal: Floats,
+    size: int = 320,
+    held: Held | None = None,
+) -> Image.Image:
+    """One square picture of the pieces over the silhouette of their target.
+
+    Args:
+        layout: which corners belong to which token.
+        arena: width of the arena, the same unit as the corners.
+        corners: (V, 2) of the tokens; what lies outside the arena is cut at the picture's edge.
+        goal: (V, 2) of the target.
+        size: side in pixels.
+        held: the piece that is moved, drawn above the others.
+    """
+    canvas = empty_table(size * SAMPLES)
+    _draw_silhouette(canvas, to_outlines(layout, arena, goal, canvas.width))
+    for k, piece in enumerate(to_outlines(layout, arena, corners, canvas.width)):
+        if held is None or k != held.token:
+            fill(canvas, piece, colour_of(k), _OPACITY)
+            draw_outline(canvas, piece, darker(colour_of(k)), 1.0)
+    if held is not None:
+        own = np.asarray(corners[layout.corners_of(held.token)], dtype=np.float64)
+        _draw_held(canvas, arena, held, own)
+    return shown(canvas)
+
+
+def figure_sheet(
+    layout: Layout, arena: float, ends: Floats, goals: Floats, titles: Sequence[str]
+) -> Image.Image:
+    """One picture for each of E figures, with its name and how much of it is covered below.
+
+    Args:
+        layout: which corners belong to which token.
+        arena: width of the arena.
+        ends, goals: (E, V, 2) corners of tokens and targets.
+        titles: E names.
+    """
+    columns, size = tiles(len(ends), _SHEET)
+    pictures = [
+        draw_game(layout, arena, end, goal, size) for end, goal in zip(ends, goals, strict=True)
+    ]
+    return contact_sheet(pictures, columns, captions(layout, ends, goals, titles))
+
+
+def captions(layout: Layout, ends: Floats, goals: Floats, titles: Sequence[str]) -> list[str]:
+    """Each figure's name and the share of it that is covered, in per cent."""
+    covered = overlap_share(ends, goals, layout)
+    return [f"{title}   {100 * share:.1f} %" for title, share in zip(titles, covered, strict=True)]
+
+
+def tiles(count: int, width: int) -> tuple[int, int]:
+    """How many pictures stand in a row of so many pixels, and the side of each in pixels."""
+    columns = min(math.ceil(math.sqrt(1.4 * count)), count)
+    return columns, min(max(width // columns, _MIN_TILE), _MAX_TILE)
+
+
+def _draw_silhouette(canvas: Image.Image, targets: Sequence[Sequence[Point]]) -> None:
+    """The target as one figure: its fill hides the inner half of every piece's edge."""
+    for target in targets:
+        draw_outline(canvas, target, _EDGE, 2.0)
+    for target in targets:
+        fill(canvas, target, SILHOUETTE, 1.0)
+
+
+def _draw_held(canvas: Image.Image, arena: float, held: Held, corners: Floats) -> None:
+    middle = corners.mean(axis=0)
+    nearer = middle + (corners - middle) * (1.0 + _NEARER * held.height)
+    if held.height > 0.0:
+        way = np.array(_SHADOW_WAY) * arena * held.height
+        _draw_shadow(canvas, to_points(arena, nearer + way, canvas.width), held.height)
+    piece = to_points(arena, nearer, canvas.width)
+    fill(canvas, piece, colour_of(held.token), 1.0)
+    draw_outline(canvas, piece, _RED if held.stopped else _INK, 2.0)
+
+
+def _draw_shadow(canvas: Image.Image, outline: Sequence[Point], height: float) -> None:
+    """A soft dark polygon: softer and paler the higher the piece hangs."""
+    blur = _SHADOW_BLUR * canvas.width * height
+    room = 3.0 * blur
+    low = np.floor(np.min(outline, axis=0) - room).astype(int)
+    size = np.ceil(np.max(outline, axis=0) + room).astype(int) - low
+    mask = Image.new("L", (int(size[0]), int(size[1])), 0)
+    inside = [(x - float(low[0]), y - float(low[1])) for x, y in outline]
+    ImageDraw.Draw(mask).polygon(inside, round(255 * _SHADOW))
+    canvas.paste(_INK, (int(low[0]), int(low[1])), mask.filter(ImageFilter.GaussianBlur(blur)))

@@ -1,0 +1,71 @@
+"""The exact rigid motion without an engine: for tests, oracles and machines without pybullet."""
+
+import numpy as np
+
+from tangram_core.arrays import Bools, Floats, Pixels
+from tangram_sim.config import SimConfig
+from tangram_sim.geometry.layout import Layout
+from tangram_sim.sight.pictures import averaged, rasterise, taken_pixels
+
+
+class KinematicWorld:
+    """Tokens that go exactly where their velocity takes them, lifted, without contacts.
+
+    See `World`.
+    """
+
+    def __init__(self, layout: Layout, sim: SimConfig) -> None:
+        self._layout = layout
+        self._sim = sim
+        self._poses: Floats = np.zeros((layout.tokens, 3))
+        self._flipped: Bools = np.zeros(layout.tokens, dtype=np.bool_)
+        self._camera: Floats = np.zeros(3)
+
+    def place(self, poses: Floats, flipped: Bools | None = None) -> None:
+        """See `World.place`."""
+        self._poses[:] = poses
+        self._poses[:, 2] = wrap(self._poses[:, 2])
+        self._flipped[:] = False if flipped is None else flipped
+
+    def move(self, token: int, velocity: Floats, flip: bool = False) -> None:
+        """See `World.move`."""
+        self._flipped[token] ^= flip
+        self._poses[token] += velocity
+        self._poses[token, 2] = wrap(self._poses[token, 2])
+
+    def landing(self, token: int, velocity: Floats, flip: bool = False) -> Floats:  # noqa: ARG002 - a side is no matter of the pose
+        """See `World.landing`."""
+        pose: Floats = self._poses[token] + velocity
+        return pose
+
+    def damp(self, damping: float) -> None:
+        """See `World.damp`: nothing damps the exact motion, and `SimConfig` asks for none."""
+
+    def poses(self) -> Floats:
+        """See `World.poses`."""
+        return self._poses.copy()
+
+    def flipped(self) -> Bools:
+        """See `World.flipped`."""
+        return self._flipped.copy()
+
+    def aim(self, x: float, y: float, turn: float) -> None:
+        """See `World.aim`."""
+        self._camera[:] = x, y, turn
+
+    def picture(self) -> Pixels:
+        """See `World.picture`."""
+        corners = self._layout.corners(self._poses, self._flipped) - self._camera[:2]
+        cos, sin = np.cos(self._camera[2]), np.sin(self._camera[2])
+        shown = corners @ np.array([[cos, -sin], [sin, cos]])  # turned against the camera
+        taken = rasterise(shown, self._layout, self._sim.arena, taken_pixels(self._sim))
+        return averaged(taken, self._sim.pixels)
+
+    def close(self) -> None:
+        """See `World.close`."""
+
+
+def wrap(angle: Floats) -> Floats:
+    """The same angle in (-pi, pi]."""
+    wrapped: Floats = np.pi - np.mod(np.pi - angle, 2.0 * np.pi)
+    return wrapped

@@ -1,0 +1,104 @@
+"""Puzzles that people know: figures of the seven tans, from files and from the package's library.
+
+A file is JSON (see `sketches`) or SVG (see `svg`) and drawn by hand to about a hundredth of a unit.
+Each piece becomes the exact tan that fits best. Pieces that overlap a little are pushed apart; gaps
+stay as they are drawn.
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from importlib.resources import files
+from importlib.resources.abc import Traversable
+from pathlib import Path
+
+from tangram_core.errors import ConfigError
+from tangram_sim.puzzles.assembly import Puzzle, PuzzleRules, build_puzzle
+from tangram_sim.puzzles.sketches import FaultError, Sketch, parse_sketches, read_text
+from tangram_sim.puzzles.svg import parse_svg
+
+PACKAGED: Traversable = files("tangram_sim") / "puzzles"
+SPLITS = ("train", "test", "paper")
+_MAX_TOLD = 20  # faults in one message
+
+
+def read_puzzles(path: Path, rules: PuzzleRules | None = None) -> tuple[Puzzle, ...]:
+    """The puzzles of a file: one if its name ends in .svg, JSON otherwise.
+
+    Args:
+        path: of the file.
+        rules: the full set of tans by default.
+
+    Raises:
+        ConfigError: the file cannot be used, or has faults; all of them are named.
+    """
+    text = read_text(path)
+    if path.suffix.lower() == ".svg":
+        return parse_svg_puzzle(text, path.stem, rules)
+    return parse_puzzles(text, f"puzzle file {path.name}", rules)
+
+
+def parse_puzzles(text: str, source: str, rules: PuzzleRules | None = None) -> tuple[Puzzle, ...]:
+    """The puzzles of a JSON text; see `read_puzzles`.
+
+    Args:
+        text: JSON.
+        source: what errors call the file.
+    """
+    return _built(parse_sketches(text, source), rules or PuzzleRules())
+
+
+def parse_svg_puzzle(text: str, name: str, rules: PuzzleRules | None = None) -> tuple[Puzzle, ...]:
+    """The one puzzle of an SVG text; see `read_puzzles`."""
+    sketch: Sketch | list[str]
+    try:
+        sketch = parse_svg(text, name)
+    except FaultError as fault:
+        sketch = [str(fault)]
+    return _built([sketch], rules or PuzzleRules())
+
+
+def _built(sketches: Sequence[Sketch | list[str]], rules: PuzzleRules) -> tuple[Puzzle, ...]:
+    puzzles, faults = list[Puzzle](), list[str]()
+    for sketch in sketches:
+        puzzle, wrong = (
+            build_puzzle(sketch, rules) if isinstance(sketch, Sketch) else (None, sketch)
+        )
+        faults += wrong
+        puzzles += [puzzle] if puzzle else []
+    if faults:
+        told = "; ".join(faults[:_MAX_TOLD])
+        more = len(faults) - _MAX_TOLD
+        raise ConfigError(told + (f"; and {more} more" if more > 0 else ""))
+    return tuple(puzzles)
+
+
+def load_puzzle(name: str, scale: float = 0.6) -> Puzzle:
+    """A puzzle of the package.
+
+    Raises:
+        ConfigError: no such puzzle.
+    """
+    found = {puzzle.name: puzzle for puzzle in library(None, scale)}
+    if name not in found:
+        raise ConfigError(f"unknown puzzle '{name}': choose from {', '.join(found)}")
+    return found[name]
+
+
+@lru_cache(maxsize=16)
+def library(split: str | None = None, scale: float = 0.6) -> tuple[Puzzle, ...]:
+    """The package's puzzles: train and test have all seven tans, paper has the paper's own.
+
+    Args:
+        split: one of `SPLITS`, or all of them.
+        scale: side of the full square, in arena units.
+
+    Raises:
+        ConfigError: an unknown split.
+    """
+    if split is None:
+        return tuple(puzzle for one in SPLITS for puzzle in library(one, scale))
+    if split not in SPLITS:
+        raise ConfigError(f"unknown split '{split}': choose from {', '.join(SPLITS)}")
+    text = (PACKAGED / f"{split}.json").read_text(encoding="utf-8")
+    rules = PuzzleRules(scale, subset=split == "paper")
+    return parse_puzzles(text, f"{split}.json", rules)

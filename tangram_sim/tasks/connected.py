@@ -1,0 +1,226 @@
+"""Pieces that hang together: each shares a part of an edge with one before it.
+
+Points and directions are complex numbers here. Legend: n candidates, k pieces laid before, C
+corners of a piece, filled up to those of the largest by repeating the last one, and edges alike.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tangram_core.arrays import Bools, Complex, Floats, Ints
+from tangram_core.errors import SamplingError
+from tangram_sim.config import SimConfig
+from tangram_sim.geometry.layout import Layout
+from tangram_sim.geometry.overlap import outlines, pairs_overlap
+from tangram_sim.motion.kinematics import wrap
+from tangram_sim.tasks.sampling import MAX_TRIES, check_fits
+
+_CHUNK = 16  # candidates that are checked together
+_ALIGNED = 0.7  # share of pieces that meet another corner to corner
+_TOUCHING = 1e-9  # depth of an overlap, as a share of the arena: rounding
+MAX_PILE = 3  # tokens that touch and can be found in a picture: more are searched for too long
+_CLEAR_TRIES = 64  # of a pile outside of what is only to be avoided; then as often anywhere
+PILES_APART = 1.0 / 64.0  # as a share of the arena
+
+
+def sample_connected(layout: Layout, sim: SimConfig, rng: np.random.Generator) -> Floats:
+    """One layout (K, 3) whose pieces hang together edge to edge, no token on its other side.
+
+    The pieces come in random order; each is laid with a random edge along a random edge of a
+    random one before it, mostly corner to corner. The whole is turned and moved by chance.
+
+    Raises:
+        SamplingError: a token does not fit into the arena, or no place was found for one in
+            `MAX_TRIES` tries.
+    """
+    check_fits(layout, sim)
+    order = rng.permutation(layout.tokens)
+    return _laid_out(layout, order, _chained(layout, order, sim, rng), sim, rng)
+
+
+def sample_piles(
+    layout: Layout, sim: SimConfig, rng: np.random.Generator, avoid: Floats | None = None
+) -> Floats:
+    """One layout (K, 3) of piles of one to three tokens edge to edge, at least one of several.
+
+    The piles lie at least `PILES_APART` of the arena apart: two pixels of a picture of 128. No
+    token lies on its other side.
+
+    Args:
+        layout: the tokens.
+        sim: the arena.
+        rng: draws it.
+        avoid: (M, C, 2) outlines that piles keep clear of where there is room.
+
+    Raises:
+        SamplingError: a token does not fit into the arena, or no layout was found in `MAX_TRIES`
+            tries.
+    """
+    check_fits(layout, sim)
+    for _ in range(MAX_TRIES // _CLEAR_TRIES):  # each tries as often for every pile
+        poses = _piles(layout, sim, rng, avoid)
+        if poses is not None:
+            return poses
+    raise SamplingError(
+        f"no piles within an arena of width {sim.arena:g} in {MAX_TRIES} tries: raise sim.arena, "
+        "lower tokens.scale, or set sim.starts=anywhere"
+    )
+
+
+def _piles(
+    layout: Layout, sim: SimConfig, rng: np.random.Generator, avoid: Floats | None
+) -> Floats | None:
+    """One try to lay piles; None where one finds no room."""
+    order, parts = rng.permutation(layout.tokens), list[Ints]()
+    while len(parts) in (0, layout.tokens):  # at least one is of several
+        sizes = rng.integers(1, MAX_PILE + 1, layout.tokens)
+        parts = [part for part in np.split(order, np.cumsum(sizes)) if len(part)]
+    bodies, poses, before = _bodies(layout), np.zeros((layout.tokens, 3)), order[:0]
+    for own in parts:
+        for number in range(2 * _CLEAR_TRIES):
+            pile = _laid_out(layout, own, _chained(layout, own, sim, rng), sim, rng)
+            laid, new = bodies.of(before).at(poses[before]), bodies.of(own).at(pile[own])
+            if not _apart(new, laid, -PILES_APART * sim.arena).all():
+                continue
+            if avoid is None or number >= _CLEAR_TRIES or _clear(layout, pile, own, avoid):
+                break
+        else:
+            return None
+        poses[own], before = pile[own], np.concatenate([before, own])
+    return poses
+
+
+def _clear(layout: Layout, poses: Floats, own: Ints, avoid: Floats) -> bool:
+    """Whether tokens of their own (n,) in poses (K, 3) overlap none of the outlines (M, C, 2)."""
+    pieces = outlines(layout.corners(poses)[None], layout)[0, own]
+    every = np.repeat(pieces, len(avoid), axis=0), np.tile(avoid, (len(own), 1, 1))
+    return not pairs_overlap(*every).any()
+
+
+def _chained(layout: Layout, order: Ints, sim: SimConfig, rng: np.random.Generator) -> Floats:
+    """Poses (K, 3) in which each token of an order (n,) touches one before it; 0 of the others."""
+    bodies = _bodies(layout)
+    turns, shifts = np.ones(layout.tokens, np.complex128), np.zeros(layout.tokens, np.complex128)
+    for number, token in enumerate(order[1:], 1):
+        before = order[:number]
+        laid = bodies.of(before).moved(turns[before, None], shifts[before, None])
+        turns[token], shifts[token] = _attached(bodies.of(token), laid, sim, rng)
+    return np.column_stack([shifts.real, shifts.imag, np.angle(turns)])
+
+
+@dataclass(frozen=True, eq=False)
+class _Outlines:
+    """Outlines of pieces as complex numbers x + iy.
+
+    Attributes:
+        corners: (..., C), counter-clockwise.
+        edges: (..., C) unit vectors along the edge behind each corner.
+        lengths: (..., C) of the edges.
+        count: (...,) how many corners there really are.
+    """
+
+    corners: Complex
+    edges: Complex
+    lengths: Floats
+    count: Ints
+
+    def of(self, which: Ints) -> "_Outlines":
+        """The outlines of these tokens."""
+        return _Outlines(
+            self.corners[which], self.edges[which], self.lengths[which], self.count[which]
+        )
+
+    def at(self, poses: Floats) -> "_Outlines":
+        """The outlines in poses (..., 3)."""
+        turn: Complex = np.exp(1j * poses[..., 2:])
+        shift: Complex = poses[..., :1] + 1j * poses[..., 1:2]
+        return self.moved(turn, shift)
+
+    def moved(self, turn: Complex, shift: Complex) -> "_Outlines":
+        """The outlines turned by a complex number of length 1, then shifted."""
+        corners = self.corners * turn + shift
+        return _Outlines(corners, self.edges * turn, self.lengths, self.count)
+
+
+def _bodies(layout: Layout) -> _Outlines:
+    corners: Complex = layout.body[:, 0] + 1j * layout.body[:, 1]
+    ahead = np.concatenate(
+        [np.roll(corners[layout.corners_of(k)], -1) for k in range(layout.tokens)]
+    )
+    edges, own = (ahead - corners)[layout.padded_corners], corners[layout.padded_corners]
+    lengths: Floats = np.abs(edges)
+    units = (edges / lengths).astype(np.complex128)
+    return _Outlines(own, units, lengths, np.diff(layout.starts))
+
+
+def _attached(
+    piece: _Outlines, laid: _Outlines, sim: SimConfig, rng: np.random.Generator
+) -> tuple[complex, complex]:
+    """Turn and shift of a piece that touches one of the others and overlaps none."""
+    for _ in range(-(-MAX_TRIES // _CHUNK)):
+        turn, shift = _candidates(piece, laid, rng)
+        moved = piece.moved(turn[:, None], shift[:, None])
+        free = _apart(moved, laid, _TOUCHING * sim.arena) & (_extent(moved, laid) < sim.arena)
+        if free.any():
+            first = int(np.argmax(free))
+            return complex(turn[first]), complex(shift[first])
+    raise SamplingError(
+        f"no connected target within an arena of width {sim.arena:g} in {MAX_TRIES} tries: "
+        "raise sim.arena, or lower tokens.scale"
+    )
+
+
+def _candidates(
+    piece: _Outlines, laid: _Outlines, rng: np.random.Generator
+) -> tuple[Complex, Complex]:
+    """Turns and shifts (n,): a random edge along a random edge of the others, back to back."""
+    drawn = rng.random((_CHUNK, 4))
+    other = (drawn[:, 0] * len(laid.corners)).astype(np.int64)
+    i = (drawn[:, 1] * laid.count[other]).astype(np.int64)
+    j = (drawn[:, 2] * piece.count).astype(np.int64)
+    along, length, own = laid.edges[other, i], laid.lengths[other, i], piece.lengths[j]
+    # The piece's edge ends so far from the other's start, and lies from there on beside it.
+    free = (drawn[:, 3] - _ALIGNED) / (1.0 - _ALIGNED)
+    anywhere = -0.8 * own + free * (length + 0.6 * own)
+    aligned = np.where(drawn[:, 3] < _ALIGNED / 2.0, 0.0, length - own)
+    ends = laid.corners[other, i] + along * np.where(free < 0.0, aligned, anywhere)
+    turn: Complex = -along / piece.edges[j]
+    return turn, ends - (piece.corners[j] + own * piece.edges[j]) * turn
+
+
+def _apart(pieces: _Outlines, laid: _Outlines, depth: float) -> Bools:
+    """(n,) whether a piece overlaps none of the others by more than a depth.
+
+    Two convex pieces lie apart where one has an edge that all of the other lies outside of.
+    """
+    outside = _outside(pieces, laid, depth) | _outside(laid, pieces, depth).T
+    return np.asarray(outside.all(axis=1))
+
+
+def _outside(pieces: _Outlines, others: _Outlines, depth: float) -> Bools:
+    """(n, k) whether a piece has an edge that all of the other lies outside of."""
+    gap = others.corners[None, :, None] - pieces.corners[:, None, :, None]
+    inwards = (pieces.edges.conj()[:, None, :, None] * gap).imag
+    return np.asarray((inwards <= depth).all(axis=-1).any(axis=-1))
+
+
+def _extent(pieces: _Outlines, laid: _Outlines) -> Floats:
+    """(n,) the largest distance between corners of each piece and of the others."""
+    gaps: Floats = np.abs(pieces.corners[:, :, None] - laid.corners.ravel()).max(axis=(1, 2))
+    return gaps
+
+
+def _laid_out(
+    layout: Layout, own: Ints, poses: Floats, sim: SimConfig, rng: np.random.Generator
+) -> Floats:
+    """The whole turned by any angle and moved to where all of its own tokens lie in the arena."""
+    turn = rng.uniform(-np.pi, np.pi)
+    centres = (poses[:, :2] @ (1.0, 1j)) * np.exp(1j * turn)
+    turned = np.column_stack([centres.real, centres.imag, poses[:, 2] + turn])
+    corners = layout.corners(turned)[np.isin(layout.token_of_corner, own)]
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    room = sim.arena - (high - low)
+    turned[:, :2] += room * rng.random(2) - sim.arena / 2.0 - low
+    turned[:, 2] = wrap(turned[:, 2])
+    return turned

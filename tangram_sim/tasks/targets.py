@@ -1,0 +1,283 @@
+"""What is to be assembled in an episode: targets by the kinds of `SimConfig.targets`, and starts.
+
+Legend: B environments, K tokens. A layout is poses (B, K, 3) and sides (B, K): which tokens lie on
+their other side.
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from itertools import combinations
+
+import numpy as np
+
+from tangram_core.arrays import Bools, Floats
+from tangram_core.errors import ConfigError
+from tangram_core.settings import refuse_ignored, told
+from tangram_sim.config import SimConfig
+from tangram_sim.geometry.fitting import kind_of
+from tangram_sim.geometry.layout import Layout
+from tangram_sim.geometry.overlap import outlines
+from tangram_sim.geometry.prisms import thickness
+from tangram_sim.geometry.shapes import Shape, mirror_image, tan, turn_onto
+from tangram_sim.motion.actions import horizon
+from tangram_sim.motion.kinematics import wrap
+from tangram_sim.puzzles.assembly import COUNTS, Puzzle, PuzzleRules
+from tangram_sim.puzzles.figures import library
+from tangram_sim.tasks.connected import MAX_PILE, sample_connected, sample_piles
+from tangram_sim.tasks.sampling import sample_batch
+
+Generators = Sequence[np.random.Generator]
+Sides = tuple[Floats, Bools]
+_NO_TURN = 1e-6  # radians
+MIN_THICKNESS = 1e-3  # of a token, arenas
+
+
+def sample_targets(layout: Layout, sim: SimConfig, generators: Generators) -> Sides:
+    """One target per generator.
+
+    Raises:
+        SamplingError: no room.
+        ConfigError: figures, and the tokens are not all seven tans.
+    """
+    kinds = [_kind(sim, rng) for rng in generators]
+    flipped = _sides(layout, sim, generators)
+    poses = np.empty((len(generators), layout.tokens, 3))
+    apart = [b for b, kind in enumerate(kinds) if kind == "uniform"]
+    if apart:
+        rngs = [generators[b] for b in apart]
+        poses[apart] = sample_batch(layout, sim, rngs, flipped[apart])
+    for b, kind in enumerate(kinds):
+        if kind == "connected":
+            one = sample_connected(layout, sim, generators[b])
+            sides = np.zeros(layout.tokens, dtype=np.bool_)
+            poses[b], flipped[b] = layout.mirrored(one, sides) if flipped[b].any() else (one, sides)
+        elif kind == "figures":
+            poses[b], flipped[b] = _figure(layout, bool(flipped[b].any()), generators[b])
+    return poses, flipped
+
+
+def sample_starts(layout: Layout, sim: SimConfig, targets: Sides, generators: Generators) -> Sides:
+    """One start per generator: on the target's sides, or on any with `allow_flip`.
+
+    Args:
+        layout: the tokens.
+        sim: says whether starts keep clear of the target, or are piles.
+        targets: see `sample_targets`.
+        generators: one for each environment.
+
+    Raises:
+        SamplingError: no room.
+    """
+    flipped = targets[1]
+    if sim.starts == "piles":
+        return _piles(layout, sim, targets, generators)
+    if sim.allow_flip:
+        drawn = [rng.random(layout.tokens) < 0.5 for rng in generators]
+        flipped = np.stack(drawn) & layout.chiral
+    goals = layout.corners(*targets)
+    avoid = outlines(goals, layout) if sim.starts == "outside" else None
+    return sample_batch(layout, sim, generators, flipped, avoid), flipped
+
+
+def _piles(layout: Layout, sim: SimConfig, targets: Sides, generators: Generators) -> Sides:
+    """Starts in piles, those with chiral tokens on their other side as a mirror shows them."""
+    starts, sides = [], np.zeros(layout.tokens, np.bool_)
+    flipped = np.asarray(targets[1].any(axis=1))
+    goals = outlines(layout.corners(*targets), layout)
+    for other_side, avoid, rng in zip(flipped.tolist(), goals, generators, strict=True):
+        mirrored = rng.random() < 0.5 if sim.allow_flip else other_side
+        # A mirror shows the target, too; its outlines then go round the other way.
+        kept = avoid[:, ::-1] * (1.0, -1.0) if mirrored else avoid
+        poses = sample_piles(layout, sim, rng, kept)
+        starts.append(layout.mirrored(poses, sides) if mirrored else (poses, sides))
+    return np.stack([poses for poses, _ in starts]), np.stack([own for _, own in starts])
+
+
+def check_targets(layout: Layout, sim: SimConfig) -> None:
+    """Refuse what these tokens cannot play.
+
+    Raises:
+        ConfigError: figures of tokens that are not all seven tans or too large for the arena, flips
+            or other sides of tokens that look the same on both, what one token does to others,
+            piles of one token, a token too thin for the arena, or a world in which none could
+            move.
+    """
+    if sim.allow_flip and not layout.any_chiral:
+        raise ConfigError(
+            "sim.allow_flip=true needs a token that is not its own mirror image, got tokens "
+            f"{', '.join(shape.name for shape in layout.shapes)}: set sim.allow_flip=false"
+        )
+    if sim.mirrored and not layout.any_chiral:
+        alike, chiral = "tokens that are their own mirror images", "take a set with a parallelogram"
+        refuse_ignored(f"sim.mirrored={told(sim.mirrored)}", alike, chiral, 0.0)
+    if sim.motion != SimConfig.motion and layout.tokens == 1:
+        given, usual = f"sim.motion={sim.motion}", SimConfig.motion
+        refuse_ignored(given, "one token", "take a set of several", usual)
+    _check_thick(layout, sim)
+    _check_delay(layout, sim)
+    if sim.starts == "piles" and layout.tokens == 1:
+        refuse_ignored("sim.starts=piles", "one token", "take a set of several")
+    if sim.looks:
+        _check_names(layout, sim.observe)
+    if sim.observe == "pictures" and sim.targets != "uniform" and layout.tokens > MAX_PILE:
+        raise ConfigError(
+            f"sim.observe=pictures tells at most {MAX_PILE} tokens that touch from each other, got "
+            f"{layout.tokens} in sim.targets={sim.targets}: set sim.targets=uniform, or "
+            "sim.observe=corners"
+        )
+    _check_figures(layout, sim)
+
+
+def _check_names(layout: Layout, observe: str) -> None:
+    """What is found in pictures has no name: tokens of one name must be equal, others unlike."""
+    for one, other in combinations(layout.shapes, 2):
+        turn = turn_onto(one.corners, other.corners)
+        if one.name == other.name:
+            if turn is None or abs(turn) > _NO_TURN:
+                raise ConfigError(
+                    f"sim.observe={observe} takes tokens of one name for equal, and two of "
+                    f"{one.name} have other corners: give them names of their own"
+                )
+        elif turn is not None or turn_onto(mirror_image(one.corners), other.corners) is not None:
+            raise ConfigError(
+                f"sim.observe={observe} cannot tell {one.name} from {other.name}, which may look "
+                "alike: take equal tokens of one name, or set sim.observe=corners"
+            )
+
+
+def _check_delay(layout: Layout, sim: SimConfig) -> None:
+    if sim.dynamics.delayed and horizon(layout.tokens, sim) == 1:
+        raise ConfigError(
+            "sim.world=delayed moves nothing in an episode of one action: raise "
+            "sim.actions_per_token to at least 2, or set sim.world=plain"
+        )
+
+
+def _check_thick(layout: Layout, sim: SimConfig) -> None:
+    """Refuse what is lost in its arena: a slide across takes thousands of steps of the engine."""
+    shape = min(layout.shapes, key=lambda one: thickness(one.corners))
+    thin = thickness(shape.corners)
+    if thin < MIN_THICKNESS * sim.arena:
+        raise ConfigError(
+            f"token '{shape.name}' must be at least {MIN_THICKNESS * sim.arena:g} thick (twice its "
+            f"area by its perimeter) in an arena of width {sim.arena:g}, got {thin:.3g}: raise "
+            "tokens.scale, or lower sim.arena"
+        )
+
+
+def placement(puzzle: Puzzle, layout: Layout) -> Sides:
+    """Poses (K, 3) and sides (K,) of a puzzle's pieces as tokens of a layout.
+
+    Equal pieces are taken in order. A mirrored parallelogram is one that lies on its other side.
+
+    Raises:
+        ConfigError: the layout's tokens are not the puzzle's pieces, or of another size.
+    """
+    left = list(range(len(puzzle.pieces)))
+    poses, flipped = np.empty((layout.tokens, 3)), np.zeros(layout.tokens, dtype=np.bool_)
+    for token, shape in enumerate(layout.shapes):
+        piece = next((k for k in left if _is_piece(puzzle, k, shape)), None)
+        if piece is None:
+            raise ConfigError(
+                f"puzzle '{puzzle.name}' has the pieces {', '.join(puzzle.pieces)} of scale "
+                f"{puzzle.scale:g}: it cannot be assembled from the tokens "
+                f"{', '.join(s.name for s in layout.shapes)}; set tokens=tangram7 "
+                f"tokens.scale={puzzle.scale:g}"
+            )
+        left.remove(piece)
+        own = puzzle.layout.shapes[piece]
+        turn = turn_onto(shape.corners, own.corners)
+        flipped[token] = turn is None
+        if turn is None:
+            turn = turn_onto(mirror_image(shape.corners), own.corners)
+        poses[token] = puzzle.poses[piece]
+        poses[token, 2] += turn or 0.0
+    if left:
+        raise ConfigError(
+            f"puzzle '{puzzle.name}' has {len(puzzle.pieces)} pieces, and there are "
+            f"{layout.tokens} tokens: set tokens=tangram7"
+        )
+    return poses, flipped
+
+
+def _is_piece(puzzle: Puzzle, piece: int, shape: Shape) -> bool:
+    own = puzzle.layout.shapes[piece].corners
+    return any(
+        turn_onto(corners, own) is not None
+        for corners in (shape.corners, mirror_image(shape.corners))
+    )
+
+
+def _kind(sim: SimConfig, rng: np.random.Generator) -> str:
+    if sim.targets != "touching":
+        return sim.targets
+    return "figures" if rng.random() < 0.5 else "connected"
+
+
+def _sides(layout: Layout, sim: SimConfig, generators: Generators) -> Bools:
+    """(B, K) sides: all chiral tokens on the other one in a share `mirrored` of the episodes."""
+    flipped = np.zeros((len(generators), layout.tokens), dtype=np.bool_)
+    if sim.mirrored > 0.0 and layout.any_chiral:
+        flipped[:] = np.array([rng.random() < sim.mirrored for rng in generators])[:, None]
+    return np.asarray(flipped & layout.chiral)
+
+
+def _figure(layout: Layout, mirrored: bool, rng: np.random.Generator) -> Sides:
+    """A figure of the train split at any angle, in the middle of the arena."""
+    figures = _figures(layout)
+    poses, flipped = figures[int(rng.integers(len(figures)))]
+    if mirrored:
+        poses, flipped = layout.mirrored(poses, flipped)
+    return turned_figure(layout, (poses, flipped), rng.uniform(-np.pi, np.pi)), flipped
+
+
+def turned_figure(layout: Layout, figure: Sides, angle: float) -> Floats:
+    """Poses (K, 3) of a figure turned by an angle, in the middle of the arena.
+
+    Angles are in (-pi, pi].
+    """
+    poses, flipped = figure
+    centres = (poses[:, :2] @ (1.0, 1j)) * np.exp(1j * angle)
+    turned = np.column_stack([centres.real, centres.imag, wrap(poses[:, 2] + angle)])
+    corners = layout.corners(turned, flipped)
+    turned[:, :2] -= (corners.min(axis=0) + corners.max(axis=0)) / 2.0
+    return turned
+
+
+@lru_cache(maxsize=4)
+def _figures(layout: Layout) -> list[Sides]:
+    scale = round(_scale(layout), 9)
+    return [placement(puzzle, layout) for puzzle in library("train", scale)]
+
+
+def _scale(layout: Layout) -> float:
+    """Side of the full square that tans are cut from."""
+    shape = layout.shapes[0]
+    return float(np.sqrt(shape.area / tan(shape.name).area))
+
+
+def _check_figures(layout: Layout, sim: SimConfig) -> None:
+    """Raise unless every figure is one of the tokens and fits into the arena at any angle."""
+    if sim.targets not in ("figures", "touching"):
+        return
+    if not has_all_tans(layout):
+        raise ConfigError(
+            f"sim.targets={sim.targets} needs all seven tans, got tokens "
+            f"{', '.join(_tans(layout))}: set tokens=tangram7, or another kind of targets"
+        )
+    extent = PuzzleRules().max_extent * _scale(layout)
+    if extent > sim.arena:
+        raise ConfigError(
+            f"sim.targets={sim.targets} needs an arena of width {extent:g} for tokens.scale="
+            f"{_scale(layout):g}, got {sim.arena:g}: raise sim.arena, or lower tokens.scale"
+        )
+
+
+def has_all_tans(layout: Layout) -> bool:
+    """Whether the tokens are the seven tans, which every figure has."""
+    return _tans(layout) == sorted(name for name, count in COUNTS.items() for _ in range(count))
+
+
+def _tans(layout: Layout) -> list[str]:
+    """Names of the tokens, sorted; on which side one lies does not matter."""
+    return sorted(kind_of(shape.name) for shape in layout.shapes)

@@ -1,0 +1,307 @@
+"""Tokens as rigid bodies in PyBullet: the only module, with camera.py, that knows the engine.
+
+The engine always sees an arena of width 2, whatever the arena's unit: its tolerances, its limit of
+100 units a second and the camera are made for bodies of about that size.
+"""
+
+import math
+import weakref
+from collections.abc import Sequence
+
+import numpy as np
+
+from tangram_core.arrays import Bools, Floats, Pixels
+from tangram_core.errors import TangramError
+from tangram_sim.config import SimConfig
+from tangram_sim.geometry.layout import Layout
+from tangram_sim.geometry.prisms import ENGINE_ARENA, inset, prism, thickness
+from tangram_sim.geometry.shapes import Shape
+from tangram_sim.sight.pictures import BACKGROUND, TOKEN_GRAY, averaged, taken_pixels
+from tangram_sim.world.camera import Camera
+from tangram_sim.world.engine import pybullet
+
+_HALF_HEIGHT = 0.01  # of a token as it is drawn
+# Of a token as it collides, where there are others: so tall that the shortest way out of another
+# is always sideways. Carried tokens pass above that.
+_WALL = 0.25
+_LIFTED = 3.0 * _WALL
+# Without a margin the engine misses one overlap in four and pushes upwards. What collides is
+# smaller by it on every side, so that pieces that only touch leave each other alone.
+_MARGIN = 1e-4
+_UPRIGHT = 1e4  # inertia about x and y, far more than a token's: none tips over
+# Of the edges of tokens that slide along each other, which the engine multiplies: 0.04 for two, so
+# that they glide and do not drag each other along.
+_FRICTION = 0.2
+_GRIP = 1e3  # mass of the token that is pushed along the table, as a multiple of its own
+_STRIDE = 0.02  # longest way of any of its points in one step
+_THIN = 0.5  # the same as a share of the thinnest token's thickness, which is not to be jumped over
+_RECOVERY = 0.5  # share of an overlap that one step removes while tokens settle
+_SETTLED = 1e-5  # deepest overlap that stays
+_SETTLE_STEPS, _SETTLE_S = 200, 1.0 / 240.0
+_DISTANCE = 8  # of two bodies, in what the engine tells of a contact
+
+_Command = tuple[float, float, float]
+
+
+class PhysicsWorld:
+    """Prisms in one PyBullet client of their own, in DIRECT mode. See `World`.
+
+    The bodies are made once and only moved: `resetSimulation` in a loop leaks memory.
+    """
+
+    def __init__(self, layout: Layout, sim: SimConfig) -> None:
+        self._unit = ENGINE_ARENA / sim.arena
+        self._client = pybullet.connect(pybullet.DIRECT)
+        if self._client < 0:
+            raise TangramError(
+                "PyBullet has no client left (it offers 1024 in one process): "
+                "close environments, or use fewer of them"
+            )
+        self._finalizer = weakref.finalize(self, pybullet.disconnect, self._client)
+        self._substeps = sim.dynamics.substeps
+        self._slides, self._alone = sim.motion == "slide", layout.tokens == 1
+        self._radius = (layout.radii * self._unit).tolist()
+        thin = min(thickness(shape.corners) for shape in layout.shapes) * self._unit
+        self._stride = min(_STRIDE, _THIN * thin)
+        self._flipped: Bools = np.zeros(layout.tokens, dtype=np.bool_)
+        self._bodies = [self._make_body(shape) for shape in layout.shapes]
+        self._masses = [self._mass(body) for body in self._bodies]
+        for token in range(layout.tokens):
+            self._weigh(token, 1.0)
+        # Bullet damps by 0.04 unless told otherwise: tokens would stop short.
+        self.damp(sim.dynamics.damping)
+        self._play_at_once()
+        if sim.pixels:
+            self._pixels = sim.pixels
+            self._camera = Camera(self._client, taken_pixels(sim), ENGINE_ARENA, _HALF_HEIGHT)
+
+    def place(self, poses: Floats, flipped: Bools | None = None) -> None:
+        """See `World.place`."""
+        self._flipped[:] = False if flipped is None else flipped
+        if not self._alone:
+            self._forget_contacts()
+        for token, (x, y, angle) in enumerate(np.asarray(poses).tolist()):
+            self._put(token, x * self._unit, y * self._unit, angle)
+
+    def move(self, token: int, velocity: Floats, flip: bool = False) -> None:
+        """See `World.move`."""
+        # Every body rests between calls: `place` relies on the stop at the end.
+        command = self._command(velocity)
+        if self._slides and not self._alone:
+            self._slide(token, command)
+        else:
+            self._lift(token, command, flip)
+
+    def landing(self, token: int, velocity: Floats, flip: bool = False) -> Floats:
+        """See `World.landing`."""
+        poses = [self._pose(other) for other in range(len(self._bodies))]
+        self._carry(token, self._command(velocity), flip, _LIFTED)
+        landing = np.array(self._pose(token))
+        self._flipped[token] ^= flip
+        self._put_all(poses)
+        landing[:2] /= self._unit
+        return landing
+
+    def damp(self, damping: float) -> None:
+        """See `World.damp`."""
+        for body in self._bodies:
+            pybullet.changeDynamics(
+                body,
+                -1,
+                linearDamping=damping,
+                angularDamping=damping,
+                physicsClientId=self._client,
+            )
+
+    def poses(self) -> Floats:
+        """See `World.poses`."""
+        poses = np.array([self._pose(token) for token in range(len(self._bodies))])
+        poses[:, :2] /= self._unit
+        return poses
+
+    def flipped(self) -> Bools:
+        """See `World.flipped`."""
+        return self._flipped.copy()
+
+    def aim(self, x: float, y: float, turn: float) -> None:
+        """See `World.aim`."""
+        self._camera.aim(x * self._unit, y * self._unit, turn)
+
+    def picture(self) -> Pixels:
+        """See `World.picture`."""
+        return averaged(self._camera.picture(), self._pixels)
+
+    def close(self) -> None:
+        """See `World.close`."""
+        self._finalizer()
+
+    def _command(self, velocity: Floats) -> _Command:
+        x, y, angular = np.asarray(velocity, dtype=np.float64).tolist()
+        return x * self._unit, y * self._unit, angular
+
+    def _lift(self, token: int, command: _Command, flip: bool) -> None:
+        """Carry a token above the others, set it down, and push apart what then overlaps."""
+        if self._alone:
+            self._carry(token, command, flip, 0.0)
+            return
+        poses = [self._pose(other) for other in range(len(self._bodies))]
+        self._carry(token, command, flip, _LIFTED)
+        # While one is carried the rest of a settled overlap would make others creep.
+        poses[token] = self._pose(token)
+        self._put_all(poses)
+        self._settle()
+
+    def _carry(self, token: int, command: _Command, flip: bool, height: float) -> None:
+        """Move a token at a height for one second, then stop all tokens."""
+        if flip or height:
+            pose = self._pose(token)
+            self._flipped[token] ^= flip
+            self._put(token, *pose, height=height)
+        self._set_velocity(token, *command)
+        pybullet.stepSimulation(physicsClientId=self._client)
+        self._stop_all()
+
+    def _slide(self, token: int, command: _Command) -> None:
+        """Push a token along the table; what is in its way does not slow it down.
+
+        The table's friction stops the others as soon as nothing pushes them.
+        """
+        start, way = np.array(self._pose(token)), np.array(command)
+        longest = math.hypot(*command[:2]) + abs(command[2]) * self._radius[token]
+        steps = max(self._substeps, math.ceil(longest / self._stride))
+        self._weigh(token, _GRIP)
+        self._play_steps_of(1.0 / steps)
+        for step in range(1, steps + 1):
+            self._set_velocity(token, *command)
+            pybullet.stepSimulation(physicsClientId=self._client)
+            self._stop_all()
+            # However heavy, it lost a little to what it pushes.
+            self._put(token, *(start + way * (step / steps)).tolist())
+        self._settle(pinned=token)
+        self._weigh(token, 1.0)
+
+    def _settle(self, pinned: int | None = None) -> None:
+        """Push overlapping tokens apart, without momentum; a pinned token stays where it is."""
+        pose = (0.0, 0.0, 0.0) if pinned is None else self._pose(pinned)
+        pybullet.performCollisionDetection(physicsClientId=self._client)
+        self._play_steps_of(_SETTLE_S)
+        for _ in range(_SETTLE_STEPS):
+            if self._depth() <= _SETTLED:
+                break
+            pybullet.stepSimulation(physicsClientId=self._client)
+            self._stop_all()
+            if pinned is not None:
+                self._put(pinned, *pose)
+        self._play_at_once()
+
+    def _forget_contacts(self) -> None:
+        """Clear the engine's contacts by putting every token at a height of its own.
+
+        The engine keeps the contacts of pairs that only move apart along the table.
+
+        Those of the last episode would throw tokens of the next through the arena.
+        """
+        for token in range(len(self._bodies)):
+            self._put(token, 0.0, 0.0, 0.0, height=(token + 1) * _LIFTED)
+        pybullet.performCollisionDetection(physicsClientId=self._client)
+
+    def _depth(self) -> float:
+        """The largest depth by which two tokens overlap, in engine units."""
+        contacts = pybullet.getContactPoints(physicsClientId=self._client)
+        return max((-contact[_DISTANCE] for contact in contacts), default=0.0)
+
+    def _stop_all(self) -> None:
+        for token in range(len(self._bodies)):
+            self._set_velocity(token, 0.0, 0.0, 0.0)
+
+    def _play_at_once(self) -> None:
+        """Let one call of stepSimulation play the second of an action, in `substeps` steps."""
+        pybullet.setPhysicsEngineParameter(
+            fixedTimeStep=1.0,
+            numSubSteps=self._substeps,
+            contactERP=_RECOVERY,
+            contactSlop=0.0,
+            deterministicOverlappingPairs=1,
+            physicsClientId=self._client,
+        )
+
+    def _play_steps_of(self, seconds: float) -> None:
+        """Let one call of stepSimulation play one step of `seconds`."""
+        pybullet.setPhysicsEngineParameter(
+            fixedTimeStep=seconds, numSubSteps=0, physicsClientId=self._client
+        )
+
+    def _make_body(self, shape: Shape) -> int:
+        corners = shape.corners * self._unit
+        margin = min(_MARGIN, 0.2 * thickness(corners))
+        collision = pybullet.createCollisionShape(
+            pybullet.GEOM_MESH,
+            vertices=prism(inset(corners, margin), _WALL)[0],
+            physicsClientId=self._client,
+        )
+        vertices, triangles = prism(corners, _HALF_HEIGHT)
+        gray = TOKEN_GRAY / BACKGROUND
+        visual = pybullet.createVisualShape(
+            pybullet.GEOM_MESH,
+            vertices=vertices,
+            indices=triangles,
+            rgbaColor=(gray, gray, gray, 1.0),
+            physicsClientId=self._client,
+        )
+        mass = shape.area * self._unit**2
+        body: int = pybullet.createMultiBody(mass, collision, visual, physicsClientId=self._client)
+        pybullet.changeDynamics(
+            body,
+            -1,
+            collisionMargin=margin,
+            lateralFriction=_FRICTION,
+            physicsClientId=self._client,
+        )
+        if self._alone:
+            pybullet.setCollisionFilterGroupMask(body, -1, 0, 0, physicsClientId=self._client)
+        return body
+
+    def _mass(self, body: int) -> tuple[float, float]:
+        """Mass, and inertia about the vertical."""
+        info = pybullet.getDynamicsInfo(body, -1, physicsClientId=self._client)
+        return info[0], info[2][2]
+
+    def _weigh(self, token: int, times: float) -> None:
+        """Set the mass and inertia of a token to `times` its own."""
+        mass, inertia = self._masses[token]
+        pybullet.changeDynamics(
+            self._bodies[token],
+            -1,
+            mass=mass * times,
+            localInertiaDiagonal=(_UPRIGHT * times, _UPRIGHT * times, inertia * times),
+            physicsClientId=self._client,
+        )
+
+    def _set_velocity(self, token: int, x: float, y: float, angular: float) -> None:
+        pybullet.resetBaseVelocity(
+            self._bodies[token], (x, y, 0.0), (0.0, 0.0, angular), physicsClientId=self._client
+        )
+
+    def _put(self, token: int, x: float, y: float, angle: float, height: float = 0.0) -> None:
+        """Set a token's pose, in engine units; it keeps the side that it lies on."""
+        cos, sin = math.cos(angle / 2.0), math.sin(angle / 2.0)
+        pybullet.resetBasePositionAndOrientation(
+            self._bodies[token],
+            (x, y, height),
+            (cos, sin, 0.0, 0.0) if self._flipped[token] else (0.0, 0.0, sin, cos),
+            physicsClientId=self._client,
+        )
+
+    def _put_all(self, poses: Sequence[tuple[float, float, float]]) -> None:
+        for other, pose in enumerate(poses):
+            self._put(other, *pose)
+
+    def _pose(self, token: int) -> tuple[float, float, float]:
+        """Position in engine units, and the angle in (-pi, pi]."""
+        (x, y, _), (a, b, c, d) = pybullet.getBasePositionAndOrientation(
+            self._bodies[token], physicsClientId=self._client
+        )
+        sine, cosine = (b, a) if self._flipped[token] else (c, d)
+        # q and -q are one rotation: with cosine >= 0 the angle lies in (-pi, pi].
+        half = math.atan2(sine, cosine) if cosine >= 0.0 else math.atan2(-sine, -cosine)
+        return x, y, 2.0 * half

@@ -1,0 +1,143 @@
+"""One arena with K tokens, whatever moves them."""
+
+from importlib.util import find_spec
+from typing import Protocol
+
+import numpy as np
+
+from tangram_core.arrays import Bools, Floats, Pixels
+from tangram_core.errors import ConfigError
+from tangram_sim.config import SimConfig
+from tangram_sim.geometry.layout import Layout
+from tangram_sim.motion.kinematics import KinematicWorld
+from tangram_sim.tasks.targets import check_targets, sample_starts, sample_targets
+
+
+class World(Protocol):
+    """K tokens on the plane, in a square arena around the origin.
+
+    Both backends keep this contract; one test module holds them to it. A lifted token is carried
+    above the others and set down; with the engine, tokens that are set down in one place then push
+    each other apart. A sliding one pushes what is in its way. Nothing stops one at the arena's
+    edge.
+    """
+
+    def place(self, poses: Floats, flipped: Bools | None = None) -> None:
+        """Put every token at rest at its pose: (K, 3) of x, y (arena units) and angle (rad).
+
+        Args:
+            poses: of the tokens.
+            flipped: (K,) which lie on their other side, see `Layout.corners`, chiral ones only;
+                None: none does.
+        """
+
+    def move(self, token: int, velocity: Floats, flip: bool = False) -> None:
+        """Move one token for one second, as `sim.motion` says, and stop it.
+
+        Args:
+            token: its index.
+            velocity: (3,) x, y in arena units a second; angular velocity about z in rad/s.
+            flip: turn it over in the air, about its body's x axis, before it moves; a chiral one.
+        """
+
+    def landing(self, token: int, velocity: Floats, flip: bool = False) -> Floats:
+        """(3,) the pose at which `move` would set a lifted token down; nothing is moved."""
+
+    def damp(self, damping: float) -> None:
+        """Damp every motion by so much from now on; only the engine does."""
+
+    def poses(self) -> Floats:
+        """(K, 3) x, y and angle in (-pi, pi]."""
+
+    def flipped(self) -> Bools:
+        """(K,) which tokens lie on their other side."""
+
+    def aim(self, x: float, y: float, turn: float) -> None:
+        """Let the camera look at another point (arena units), turned (rad), from now on."""
+
+    def picture(self) -> Pixels:
+        """(P, P) grayscale picture of the tokens as they lie; see pictures.py."""
+
+    def close(self) -> None:
+        """Free what the world holds; calling it twice does no harm."""
+
+
+def check_world(layout: Layout, sim: SimConfig) -> None:
+    """Refuse a task that no world could play, without making one.
+
+    Raises:
+        SamplingError: see `check_room`.
+        ConfigError: the engine or OpenCV is needed and not installed, or see `check_targets`.
+    """
+    check_room(layout, sim)
+    if sim.backend == "physics" and find_spec("pybullet") is None:
+        raise _no_engine("no module named 'pybullet'")
+    if sim.looks and find_spec("cv2") is None:
+        raise no_opencv("no module named 'cv2'")
+
+
+def check_room(layout: Layout, sim: SimConfig) -> None:
+    """Refuse a task whose tokens have no room, also where nothing is played.
+
+    Raises:
+        SamplingError: a token does not fit into the arena, or not all tokens do.
+        ConfigError: see `check_targets`.
+    """
+    check_targets(layout, sim)
+    generators = [np.random.default_rng(0)]
+    sample_starts(layout, sim, sample_targets(layout, sim, generators), generators)
+
+
+def check_shown(sim: SimConfig, outlines: bool) -> None:
+    """Refuse to show silhouettes to who knows nothing of them.
+
+    Args:
+        sim: the world.
+        outlines: whether outlines are known, see `rings`.
+
+    Raises:
+        ConfigError: says who takes them.
+    """
+    if sim.observe == "silhouette" and not outlines:
+        raise ConfigError(
+            "sim.observe=silhouette is for an agent of outlines: train one with sim=silhouette "
+            "agent=outline; tangram-eval puzzle= fills what it shows to others by a search, and "
+            "tangram-play silhouette= too; set sim.observe=corners"
+        )
+    if sim.observe == "silhouette_pictures":
+        raise ConfigError(
+            "sim.observe=silhouette_pictures is for tangram-eval puzzle=, which fills what a "
+            "picture shows before a token is moved; no agent trains so: set sim.observe=silhouette "
+            "with agent=outline, else sim.observe=corners"
+        )
+
+
+def make_world(layout: Layout, sim: SimConfig) -> World:
+    """A world of the configured backend.
+
+    Raises:
+        ConfigError: the engine is asked for and not installed.
+    """
+    if sim.backend == "kinematic":
+        return KinematicWorld(layout, sim)
+    try:
+        # Only here: the master and machines without an engine must never load it.
+        from tangram_sim.world.physics import PhysicsWorld  # noqa: PLC0415
+    except ModuleNotFoundError as error:
+        raise _no_engine(str(error)) from error
+    return PhysicsWorld(layout, sim)
+
+
+def no_opencv(why: str) -> ConfigError:
+    """What is raised where pictures are to be observed, and nothing can look at them."""
+    return ConfigError(
+        f"sim.observe=pictures needs OpenCV ({why}): install opencv-python-headless, or set "
+        "sim.observe=corners"
+    )
+
+
+def _no_engine(why: str) -> ConfigError:
+    return ConfigError(
+        f"sim.backend=physics needs PyBullet ({why}): install pybullet, or set "
+        "sim.backend=kinematic"
+    )

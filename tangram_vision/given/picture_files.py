@@ -1,0 +1,75 @@
+"""A picture file that a person gives, read without trust: PNG or JPEG -> a picture in colour."""
+
+import struct
+import warnings
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageOps, UnidentifiedImageError
+
+from tangram_core.errors import ConfigError
+from tangram_sim.puzzles.sketches import check_file
+
+FORMATS = ("PNG", "JPEG")
+MAX_MEGAPIXELS = 64
+MIN_SIDE = 32
+LONGEST = 1280  # pixels of the longer side that are looked at
+_PAPER = (255, 255, 255)  # behind what is transparent
+# What Pillow raises where a file is not what it says.
+_BROKEN = (OSError, SyntaxError, ValueError, EOFError, TypeError, LookupError, struct.error)
+
+
+def read_picture(path: Path, source: str) -> Image.Image:
+    """A file's picture in colour, upright, at most LONGEST pixels along its longer side.
+
+    Args:
+        path: of the file.
+        source: what errors call it.
+
+    Raises:
+        ConfigError: no file, not a PNG or JPEG that can be read, too large or too small.
+    """
+    check_file(path, source)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            with Image.open(path, formats=FORMATS) as image:
+                _check_size(image, source)
+                return _upright(image)
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning):
+        raise ConfigError(_too_large(source)) from None
+    except _BROKEN as error:
+        why = "" if isinstance(error, UnidentifiedImageError) else f" ({error})"
+        raise ConfigError(
+            f"{source} is no PNG or JPEG that can be read{why}: save it anew as PNG or JPEG"
+        ) from None
+
+
+def _too_large(source: str) -> str:
+    return f"{source} has more than {MAX_MEGAPIXELS} million pixels: make it smaller"
+
+
+def _check_size(image: Image.Image, source: str) -> None:
+    width, height = image.size
+    if width * height > MAX_MEGAPIXELS * 1_000_000:
+        raise ConfigError(_too_large(source))
+    if min(width, height) < MIN_SIDE:
+        raise ConfigError(
+            f"{source} has {width} x {height} pixels, and at least {MIN_SIDE} along each side are "
+            "needed: take a larger picture"
+        )
+
+
+def _upright(image: Image.Image) -> Image.Image:
+    if image.mode.startswith("I"):  # 16 bits of grey
+        levels = np.clip(np.asarray(image) >> 8, 0, 255)
+        image = Image.fromarray(levels.astype(np.uint8))
+    if image.mode in ("1", "P", "PA", "LA") or "transparency" in image.info:
+        image = image.convert("RGBA")
+    image.thumbnail((LONGEST, LONGEST), Image.Resampling.BOX)
+    image = ImageOps.exif_transpose(image)
+    if image.mode == "RGBA":
+        paper = Image.new("RGBA", image.size, _PAPER)
+        image = Image.alpha_composite(paper, image)
+    return image.convert("RGB")

@@ -1,0 +1,140 @@
+"""What a shape looks like: its moments, and how it covers short lines across its edges.
+
+Legend: as in levels.py; S kinds, F moments, M lines across edges, J samples on each. Everything
+here is in pixels, x to the right and y up, in the body frame of a shape.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+
+from tangram_core.arrays import Complex, Floats, Ints
+from tangram_sim.geometry.layout import Layout
+from tangram_sim.geometry.sides import Side, sides_of
+
+# Moments z^a conj(z)^b: a turn by t multiplies one by e^(i (a - b) t).
+POWERS = ((2, 0), (3, 0), (4, 0), (2, 1), (3, 1))
+ORDERS: Ints = np.array([a - b for a, b in POWERS])
+_STEP = 0.5  # pixels between samples of a line
+_CORNER = 1.0  # pixels of an edge beside a corner where no line crosses it
+_SHIFT = 0.25  # pixels, of the differences that tell how lines change with the pose
+_GRID = 24  # subdivisions of a triangle that moments are summed over
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """Lines across a shape's edges, each as long outside as inside.
+
+    Attributes:
+        x, y: (M, J) of their samples.
+        expected: (M,) pixels of each that the shape covers.
+        change: (M, 3) how that changes where the shape moves by x, y (pixels) and turns (rad), seen
+            in its body frame; the lines stay.
+        solve: (3, M) the least-squares move for a change.
+        edge: (M,) number of the edge that is crossed.
+    """
+
+    x: Floats
+    y: Floats
+    expected: Floats
+    change: Floats
+    solve: Floats
+    edge: Ints
+
+
+@dataclass(frozen=True, eq=False)
+class Kind(Side):
+    """A shape on one of its sides, in pixels.
+
+    Attributes:
+        moments: (F,) over area and its root to the moment's degree.
+    """
+
+    moments: Complex
+
+    @cached_property
+    def perimeter(self) -> float:
+        """Pixels."""
+        z = self.corners @ (1.0, 1j)
+        return float(np.abs(np.roll(z, -1) - z).sum())
+
+    def lines(self, reach: float) -> Lines:
+        """The lines that reach so many pixels in and out."""
+        return _lines(self, reach)
+
+
+@lru_cache(maxsize=8)
+def kinds_of(layout: Layout, arena: float, pixels: int) -> tuple[Kind, ...]:
+    """All different shapes of a layout as pictures show them, chiral ones on both sides."""
+    unit = pixels / arena
+    kinds = []
+    for side in sides_of(layout):
+        corners, area = side.corners * unit, side.area * unit**2
+        own = moments_of(*_filled(corners), area)
+        kinds.append(
+            Kind(side.shape, side.flipped, corners, side.different, area, side.tokens, own)
+        )
+    return tuple(kinds)
+
+
+def moments_of(z: Complex, weight: Floats, area: float) -> Complex:
+    """(F,) moments of points (M,) around their centre, of any size."""
+    return np.array(
+        [(weight * z**a * z.conj() ** b).sum() / area ** (1 + (a + b) / 2) for a, b in POWERS]
+    )
+
+
+def _filled(corners: Floats) -> tuple[Complex, Floats]:
+    """Points that fill a convex polygon, and the area that each stands for."""
+    points = corners @ (1.0, 1j)
+    ends = np.stack([points, np.roll(points, -1)])  # triangles from the origin
+    i, j = (grid.ravel() for grid in np.meshgrid(np.arange(_GRID), np.arange(_GRID)))
+    low, high = i + j < _GRID, i + j < _GRID - 1
+    u = np.concatenate([i[low] + 1 / 3, i[high] + 2 / 3]) / _GRID
+    v = np.concatenate([j[low] + 1 / 3, j[high] + 2 / 3]) / _GRID
+    z = (u[:, None] * ends[0] + v[:, None] * ends[1]).ravel()
+    areas = (ends[0].conj() * ends[1]).imag / 2.0 / _GRID**2
+    return z, np.broadcast_to(areas, (len(u), len(points))).ravel()
+
+
+@lru_cache(maxsize=64)
+def _lines(kind: Kind, reach: float) -> Lines:
+    offset = np.arange(-reach, reach + _STEP / 2, _STEP)
+    xs, ys, edges = [], [], []
+    for edge, (start, end) in enumerate(
+        zip(kind.corners, np.roll(kind.corners, -1, axis=0), strict=True)
+    ):
+        length = float(np.hypot(*(end - start)))
+        along, out = (end - start) / length, np.array([end[1] - start[1], start[0] - end[0]])
+        margin = min(_CORNER, length / 4.0)
+        count = max(2, int(np.ceil(length - 2.0 * margin)))
+        place = start + np.linspace(margin, length - margin, count)[:, None] * along
+        samples = place[:, None] + offset[:, None] * (out / length)
+        xs.append(samples[..., 0])
+        ys.append(samples[..., 1])
+        edges.append(np.full(count, edge))
+    x, y = np.concatenate(xs), np.concatenate(ys)
+    moves = np.array([(_SHIFT, 0, 0), (0, _SHIFT, 0), (0, 0, _SHIFT / 10.0)])
+    change = np.stack(
+        [
+            (_covered(kind.corners, x, y, move) - _covered(kind.corners, x, y, -move))
+            / (2.0 * move.max())
+            for move in moves
+        ],
+        axis=1,
+    )
+    expected = _covered(kind.corners, x, y, np.zeros(3))
+    return Lines(x, y, expected, change, np.linalg.pinv(change), np.concatenate(edges))
+
+
+def _covered(corners: Floats, x: Floats, y: Floats, move: Floats) -> Floats:
+    """(M,) pixels of lines that a polygon covers which is moved by x, y and turn."""
+    z = (x - move[0] + 1j * (y - move[1])) * np.exp(-1j * move[2])
+    level = np.ones(x.shape)
+    for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        edge = end - start
+        depth = (edge[0] * (z.imag - start[1]) - edge[1] * (z.real - start[0])) / np.hypot(*edge)
+        level = np.minimum(level, np.clip(0.5 + depth, 0.0, 1.0))
+    covered: Floats = level.sum(axis=-1) * _STEP
+    return covered

@@ -1,0 +1,317 @@
+"""Tokens that touch show one outline together: which tokens, and where, is searched.
+
+At a convex corner of an outline some token has a corner of its own, with an edge along a side of
+it. Each token, each of its corners and both sides are tried; those that stay inside and explain
+most of the outline are taken away, until what is left is a token itself. Then all poses together
+are fitted to all pixels, and what pixels still differ judges.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import cv2
+import numpy as np
+
+from tangram_core.arrays import Complex, Floats, Ints, Singles
+from tangram_sim.tasks.connected import MAX_PILE
+from tangram_vision.pictures.blobs import find_blobs, likeness
+from tangram_vision.pictures.edges import NARROW, WIDE, Outlines
+from tangram_vision.pictures.kinds import Kind
+from tangram_vision.pictures.ramps import fitted, ramps, unlike
+
+_TRIED = 120  # corner fits that are refined
+_BEAM = (10, 6, 4)  # of those followed, by the number of tokens laid before
+_LEAVES = 8  # whole arrangements that are compared
+_MOST_STEPS = 40  # outlines whose corners are tried
+_GOOD, _MORE_STEPS = 0.02, 4  # what differs in an arrangement after which few more are tried
+_UNLIKE = 0.5  # share of a pile's area that differs before its poses are fitted
+_OUTSIDE = 0.2  # share of a token that may lie outside of an outline, a third of it when refined
+_AREA = 0.3  # pixels along a perimeter by which an area may be wrong
+_FLAT = np.radians(165.0)
+_SLACK = np.radians(25.0)
+_RUGGED = 1.2  # pixels that an outline may leave its polygon
+_ROUNDS = (WIDE, WIDE, NARROW)
+_BEYOND = 40  # pixels around a picture in which a token that reaches out of it may lie
+_SHOWN = 0.6  # share of such a token that must be seen
+_FEW = 3  # of its fits that are compared
+
+
+@dataclass(frozen=True, eq=False)
+class Laid:
+    """Tokens that explain a pile.
+
+    Attributes:
+        kinds: numbers in the list of kinds.
+        poses: (n, 3), pixels from the picture's upper left corner, y up.
+        differs: share of the pile's area that they explain otherwise than the picture has it.
+    """
+
+    kinds: tuple[int, ...]
+    poses: Floats
+    differs: float
+
+
+def arrangements(cover: Singles, kinds: Sequence[Kind], left: Sequence[int]) -> list[Laid]:
+    """Different arrangements that explain a pile, the best first; empty if none was found.
+
+    Args:
+        cover: (P, P) coverage by the pile alone.
+        kinds: all of the layout.
+        left: how many tokens there are of each of their shapes.
+    """
+    rows, columns = (np.flatnonzero((cover > 0.5).any(axis=axis)) for axis in (1, 0))
+    top, begin = max(0, rows[0] - 5), max(0, columns[0] - 5)
+    crop = np.ascontiguousarray(cover[top : rows[-1] + 6, begin : columns[-1] + 6])
+    side = max(crop.shape)
+    crop = np.pad(crop, ((0, side - crop.shape[0]), (0, side - crop.shape[1])))
+    search, found, end = _Search(crop, kinds), list[Laid](), _MOST_STEPS
+    for names, rough in search.run(tuple(left)):
+        if search.steps > end:
+            break
+        own = [kinds[name] for name in names]
+        if unlike(own, rough, crop) > _UNLIKE:
+            continue
+        poses, differs = fitted(own, rough, crop)
+        if not any(search.same(names, poses, laid.kinds, laid.poses) for laid in found):
+            found.append(Laid(names, poses, differs))
+        if differs < _GOOD:
+            end = min(end, search.steps + _MORE_STEPS)
+        if len(found) == _LEAVES:
+            break
+    found.sort(key=lambda laid: laid.differs)
+    origin = np.array([begin, -top, 0.0])
+    return [replace(laid, poses=laid.poses + origin) for laid in found]
+
+
+def reaching_out(cover: Singles, kinds: Sequence[Kind], left: Sequence[int]) -> list[Laid]:
+    """Single tokens that explain what reaches beyond the picture, the best first.
+
+    Args:
+        cover: (P, P) coverage by it alone, the whole picture.
+        kinds: all of the layout.
+        left: how many tokens there are of each of their shapes.
+    """
+    search, found = _Search(cover, kinds, _BEYOND), list[Laid]()
+    for name, rough in search.corners(cover, float(cover.sum()) / _SHOWN, tuple(left))[:_FEW]:
+        poses, differs = fitted([kinds[name]], rough[None], cover)
+        if not any(search.same((name,), poses, laid.kinds, laid.poses) for laid in found):
+            found.append(Laid((name,), poses, differs))
+    return sorted(found, key=lambda laid: laid.differs)
+
+
+class _Search:
+    """Depth first, the best token next, over what is left of one pile (P, P).
+
+    Attributes:
+        steps: outlines whose corners were tried.
+    """
+
+    def __init__(self, cover: Singles, kinds: Sequence[Kind], beyond: int = 0) -> None:
+        """Search a pile.
+
+        Args:
+            cover: of it.
+            kinds: of which it is.
+            beyond: pixels around the picture in which it may go on.
+        """
+        self._cover, self._kinds, self._beyond = cover, kinds, beyond
+        self.steps = 0
+        self._smallest = min(kind.area for kind in kinds)
+
+    def run(self, left: tuple[int, ...]) -> Iterator[tuple[tuple[int, ...], Floats]]:
+        """Kinds and rough poses (n, 3) of whole arrangements."""
+        yield from self._rest(self._cover, left, (), np.zeros((0, 3)))
+
+    def _rest(
+        self, rest: Singles, left: tuple[int, ...], laid: tuple[int, ...], poses: Floats
+    ) -> Iterator[tuple[tuple[int, ...], Floats]]:
+        """Explain what is left of the pile, part after part."""
+        blobs = find_blobs(rest, 0.4 * self._smallest)
+        if not len(blobs):
+            yield laid, poses
+            return
+        if len(laid) + len(blobs) > MAX_PILE:
+            return
+        # The smallest part is explained first: it is mostly one token.
+        part = blobs.cover[blobs.base[-1] :][: len(rest)]
+        others = blobs.cover[: blobs.base[-1]].reshape(-1, *rest.shape).sum(axis=0)
+        area = float(blobs.area[-1])
+        single = [] if not laid else self._single(blobs.moments[-1:], blobs.centre[-1], area, left)
+        for kind, pose in single:
+            now = _without(left, self._kinds[kind].shape)
+            yield from self._rest(others, now, (*laid, kind), np.vstack([poses, pose]))
+        most = MAX_PILE - len(laid) - len(blobs) + 1
+        if not single and most > 1 and self._sums(area, left, most):
+            for kind, pose in self.corners(part, area, left, len(laid)):
+                here = ramps([self._kinds[kind]], pose[None], rest.shape[0])[0]
+                now = _without(left, self._kinds[kind].shape)
+                gone = np.clip(rest - here, 0.0, 1.0).astype(np.float32)
+                yield from self._rest(gone, now, (*laid, kind), np.vstack([poses, pose]))
+
+    def _single(
+        self, moments: Complex, centre: complex, area: float, left: tuple[int, ...]
+    ) -> list[tuple[int, Floats]]:
+        """Kinds that a part of the pile looks like, and poses."""
+        far, turn = likeness(moments, self._kinds)
+        near = [
+            k
+            for k, kind in enumerate(self._kinds)
+            if left[kind.shape] and far[0, k] < 0.22 and self._is_area(area, k)
+        ]
+        near.sort(key=lambda k: float(far[0, k]))
+        return [(k, np.array([centre.real, centre.imag, turn[0, k]])) for k in near[:2]]
+
+    def _is_area(self, area: float, kind: int) -> bool:
+        return abs(area - self._kinds[kind].area) < 2.0 * _AREA * self._kinds[kind].perimeter
+
+    def _sums(self, area: float, left: tuple[int, ...], most: int) -> bool:
+        """Whether an area may be that of two tokens that are left, or of a few more."""
+        areas = {kind.shape: kind.area for kind in self._kinds}
+        sizes = [areas[shape] for shape, count in enumerate(left) for _ in range(min(count, most))]
+        slack = 3.0 * _AREA * max(kind.perimeter for kind in self._kinds)
+        return any(
+            abs(sum(some) - area) < slack
+            for count in range(2, most + 1)
+            for some in combinations(sizes, count)
+        )
+
+    def corners(
+        self, part: Singles, area: float, left: tuple[int, ...], depth: int = 0
+    ) -> list[tuple[int, Floats]]:
+        """Tokens at the corners of a part, those first that explain most of its outline."""
+        self.steps += 1
+        names, poses = self._proposed(part, area, left)
+        if not len(names):
+            return []
+        # What lies beyond the picture may be a token.
+        part = np.pad(part, self._beyond, constant_values=1.0)
+        corner = np.array([self._beyond, -self._beyond, 0.0])
+        poses += corner
+        outside = self._outside(part, names, poses)
+        order = np.argsort(outside, kind="stable")[:_TRIED]
+        order = order[outside[order] < _OUTSIDE]
+        names, poses = names[order], poses[order]
+        if not len(names):
+            return []
+        poses, seen = self._refined(part, names, poses)
+        outside = self._outside(part, names, poses)
+        worth = seen - 40.0 * outside
+        order = np.argsort(-worth, kind="stable")
+        kept: list[tuple[int, Floats]] = []
+        for i in order[outside[order] < _OUTSIDE / 3.0].tolist():
+            if not any(self._alike(int(names[i]), poses[i], *other) for other in kept):
+                kept.append((int(names[i]), poses[i]))
+            if len(kept) == _BEAM[min(depth, 2)]:
+                break
+        return [(name, pose - corner) for name, pose in kept]
+
+    def _proposed(self, part: Singles, area: float, left: tuple[int, ...]) -> tuple[Ints, Floats]:
+        """Kinds (n,) and poses (n, 3) with a corner, and an edge, at a corner of the outline."""
+        names, poses = [], []
+        usable = [
+            (k, kind)
+            for k, kind in enumerate(self._kinds)
+            if left[kind.shape] and kind.area < area * 1.05
+        ]
+        for corner, before, after, inner in _convex(part):
+            for k, kind in usable:
+                body = kind.corners @ (1.0, 1j)
+                out, back = np.roll(body, -1) - body, np.roll(body, 1) - body
+                own = np.angle(back / out) % (2.0 * np.pi)
+                for c in np.flatnonzero(own[: kind.different] < inner + _SLACK).tolist():
+                    turns = {np.angle(after / out[c]), np.angle(before / back[c])}
+                    for turn in turns:
+                        place = corner - body[c] * np.exp(1j * turn)
+                        names.append(k)
+                        poses.append((place.real, place.imag, turn))
+        return np.array(names, np.int64), np.array(poses).reshape(-1, 3)
+
+    def _outside(self, part: Singles, names: Ints, poses: Floats) -> Floats:
+        """(n,) share of tokens that lies outside of a part."""
+        shares = np.empty(len(names))
+        for k in set(names.tolist()):
+            own = np.flatnonzero(names == k)
+            points = _inner_points(self._kinds[k])
+            z = points * np.exp(1j * poses[own, 2:]) + (poses[own, :1] + 1j * poses[own, 1:2])
+            shares[own] = 1.0 - np.minimum(2.0 * _levels(part, z), 1.0).mean(axis=1)
+        return shares
+
+    def _refined(self, part: Singles, names: Ints, poses: Floats) -> tuple[Floats, Floats]:
+        """Poses by the edges that are seen, and how many pixels of the outline they explain."""
+        base = np.zeros(len(names), np.int64)
+        kinds = [self._kinds[k] for k in names.tolist()]
+        every = {reach: Outlines(kinds, reach) for reach in set(_ROUNDS)}
+        for reach in _ROUNDS:
+            lines = every[reach]
+            off = lines.off(poses, part, base)
+            poses = lines.move_seen(poses, off, np.abs(off) < reach * 0.8)
+        lines = every[NARROW]
+        hit = np.abs(lines.off(poses, part, base)) < 0.6
+        return poses, np.bincount(lines.owner, hit, len(names)).astype(np.float64)
+
+    def same(
+        self, names: tuple[int, ...], poses: Floats, others: tuple[int, ...], those: Floats
+    ) -> bool:
+        """Whether two arrangements have every token in the same place."""
+        if sorted(names) != sorted(others):
+            return False
+        return all(
+            any(
+                self._alike(kind, pose, other, that)
+                for other, that in zip(others, those, strict=True)
+            )
+            for kind, pose in zip(names, poses, strict=True)
+        )
+
+    def _alike(self, kind: int, pose: Floats, other: int, that: Floats) -> bool:
+        """Whether two tokens are of one shape and lie in one place."""
+        if kind != other or np.hypot(*(pose - that)[:2]) > 1.0:
+            return False
+        body = self._kinds[kind].corners @ (1.0, 1j)
+        one, two = body * np.exp(1j * pose[2]), body * np.exp(1j * that[2])
+        return bool(np.abs(one[:, None] - two).min(axis=1).max() < 1.5)
+
+
+def _without(left: tuple[int, ...], shape: int) -> tuple[int, ...]:
+    return tuple(count - (number == shape) for number, count in enumerate(left))
+
+
+def _inner_points(kind: Kind) -> Complex:
+    """Points spread over a shape, none nearer than a little to its edges."""
+    corners = kind.corners @ (1.0, 1j)
+    rings = [corners * share for share in (0.9, 0.6, 0.3)]
+    middles = [(ring + np.roll(ring, -1)) / 2.0 for ring in rings]
+    quarters = [(3.0 * rings[0] + np.roll(rings[0], one)) / 4.0 for one in (1, -1)]
+    points: Complex = np.concatenate([*rings, *middles, *quarters, [0j]])
+    return points
+
+
+def _levels(cover: Singles, z: Complex) -> Floats:
+    """Coverage (n, m) at points (n, m)."""
+    side = len(cover) - 1
+    column, row = np.clip(z.real - 0.5, 0, side), np.clip(-z.imag - 0.5, 0, side)
+    level = cv2.remap(cover, column.astype(np.float32), row.astype(np.float32), cv2.INTER_LINEAR)
+    return np.asarray(level, np.float64).reshape(z.shape)
+
+
+def _convex(part: Singles) -> list[tuple[complex, complex, complex, float]]:
+    """Convex corners of an outline: place, ways to the corners before and after, inner angle."""
+    mask = (part > 0.5).astype(np.uint8)
+    found, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    outline = max(found, key=len)
+    polygon = cv2.approxPolyDP(outline, _RUGGED, closed=True)[:, 0].astype(np.float64)
+    z = (polygon[:, 0] + 0.5) - 1j * (polygon[:, 1] + 0.5)
+    if len(z) < 3:
+        return []
+    if (z.conj() * np.roll(z, -1)).imag.sum() < 0:
+        z = z[::-1]
+    corners = []
+    for corner, before, after in zip(z, np.roll(z, 1), np.roll(z, -1), strict=True):
+        back, ahead = before - corner, after - corner
+        inner = float(np.angle(back / ahead) % (2.0 * np.pi))
+        if inner < _FLAT:
+            # The outline runs through the centres of its pixels, half a pixel inside.
+            middle = np.exp(1j * (np.angle(ahead) + inner / 2.0))
+            corners.append((corner - 0.5 * middle, back, ahead, inner))
+    return corners

@@ -1,0 +1,308 @@
+"""One picture -> where each token of a known set lies, on which side, and whether that is sure.
+
+Blobs that look like one token are fitted at once; the others are searched for tokens that touch.
+All tokens are known, so what explains one blob leaves less for the others: all are explained
+together. Tokens that look alike come in any order. Who looked before need not find again what has
+not moved.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import combinations
+
+import numpy as np
+
+from tangram_core.arrays import Complex, Floats, Ints, Pixels, Singles
+from tangram_sim.geometry.layout import Layout
+from tangram_sim.sight.perception import Look
+from tangram_sim.tasks.connected import MAX_PILE
+from tangram_vision.pictures.blobs import Blobs, find_blobs, likeness
+from tangram_vision.pictures.edges import refined
+from tangram_vision.pictures.kinds import Kind, kinds_of
+from tangram_vision.pictures.levels import coverage
+from tangram_vision.pictures.piles import Laid, arrangements, reaching_out
+from tangram_vision.pictures.ramps import fitted, ramps
+from tangram_vision.pictures.recalling import recalled
+from tangram_vision.pictures.samples import binary, settled
+
+_SMALLEST = 0.4  # of the smallest token: less is dirt
+_CLOSE = 0.15  # moments nearer than this to the nearest are compared by their edges
+_ROUGH = 0.7  # pixels that the edges of a token may be off, in the mean
+_AREA = 0.35  # pixels along its perimeter by which its area may be wrong
+_DIFFERS = 0.08  # share of a pile that may be explained wrongly
+_ALIKE = 0.01  # so little more explains a pile as well
+_TRIES = 8  # piles that are searched for one picture
+
+
+@dataclass(frozen=True, eq=False)
+class Seen(Look):
+    """What was seen of K tokens.
+
+    Attributes:
+        blobs: connected areas that were found.
+    """
+
+    blobs: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Explained:
+    """What one blob is.
+
+    Attributes:
+        laid: its tokens.
+        doubtful: whether they could as well lie otherwise.
+    """
+
+    laid: Laid
+    doubtful: bool = False
+
+
+def see(picture: Pixels, layout: Layout, arena: float, before: Look | None = None) -> Seen:
+    """What a picture (P, P) of an arena shows of a layout's tokens.
+
+    Args:
+        picture: of all of them, and nothing else of their size.
+        layout: the tokens.
+        arena: width of the picture.
+        before: where those lay that are not told to have moved; None: nothing is known.
+    """
+    pixels = len(picture)
+    kinds = kinds_of(layout, arena, pixels)
+    cover = coverage(picture)
+    poses, flipped = np.zeros((layout.tokens, 3)), np.zeros(layout.tokens, np.bool_)
+    known, sure, count = np.zeros_like(flipped), np.zeros_like(flipped), 0
+    if cover is not None:
+        puzzle = _puzzle(cover, kinds, Counter({kind.shape: len(kind.tokens) for kind in kinds}))
+        count = len(puzzle.blobs)
+        left = {kind.shape: list(kind.tokens) for kind in kinds}
+        stayed = None if before is None else _stayed(puzzle, cover, before, arena)
+        for one in stayed or puzzle.explained():
+            for number, pose in zip(one.laid.kinds, one.laid.poses, strict=True):
+                token = left[kinds[number].shape].pop(0)
+                poses[token], flipped[token] = pose, kinds[number].flipped
+                known[token], sure[token] = True, not one.doubtful
+    unit = arena / pixels
+    poses[known, :2] = (poses[known, :2] + (-pixels / 2.0, pixels / 2.0)) * unit
+    poses[:, 2] = np.angle(np.exp(1j * poses[:, 2]))
+    return Seen(poses, flipped, known, sure, count)
+
+
+def _puzzle(cover: Singles, kinds: Sequence[Kind], left: Counter[int]) -> "_Puzzle":
+    """What coverage (P, P) by so many tokens of each shape shows."""
+    blobs = find_blobs(cover, _SMALLEST * min(kind.area for kind in kinds))
+    return _Puzzle(blobs, kinds, left, binary(cover))
+
+
+def _stayed(
+    puzzle: "_Puzzle", cover: Singles, before: Look, arena: float
+) -> list[_Explained] | None:
+    """What all blobs are, where piles have tokens that lie where they lay before.
+
+    Returns:
+        None where no pile has any, or where they and what else is found do not explain all piles.
+    """
+    kinds, side = puzzle.kinds, len(cover)
+    piles = puzzle.piles()
+    if piles is None:
+        return None
+    names, poses = recalled(kinds, before, arena, piles)
+    if not names:
+        return None
+    gone = ramps([kinds[name] for name in names], poses, side).sum(axis=0)
+    rest = np.clip(cover - gone, 0.0, None).astype(np.float32)
+    left = puzzle.left - Counter(kinds[name].shape for name in names)
+    alone = list[_Explained]()
+    for one in _puzzle(rest, kinds, left).explained():
+        if _levels_at(piles, one.laid.poses).max() < 0.5:
+            alone.append(one)
+        else:
+            names, poses = [*names, *one.laid.kinds], np.vstack([poses, one.laid.poses])
+    poses, differs = fitted([kinds[name] for name in names], poses, piles)
+    if differs >= _DIFFERS:
+        return None
+    return [*alone, _Explained(Laid(tuple(names), poses, differs))]
+
+
+def _levels_at(cover: Singles, poses: Floats) -> Floats:
+    """(n,) coverage (P, P) in the middle of tokens."""
+    column, row = poses[:, 0].astype(np.int64), (-poses[:, 1]).astype(np.int64)
+    most = len(cover) - 1
+    return cover[np.clip(row, 0, most), np.clip(column, 0, most)].astype(np.float64)
+
+
+@dataclass
+class _Puzzle:
+    """The blobs of a picture, to be explained together."""
+
+    blobs: Blobs
+    kinds: Sequence[Kind]
+    left: Counter[int]
+    sharp: bool
+    _known: dict[tuple[int, tuple[int, ...]], list[_Explained]] = field(default_factory=dict)
+    _tries: int = 0
+
+    @cached_property
+    def _sizes(self) -> dict[int, tuple[float, float]]:
+        """Area and perimeter of each shape."""
+        return {kind.shape: (kind.area, kind.perimeter) for kind in self.kinds}
+
+    def explained(self) -> list[_Explained]:
+        """What the blobs are, as many as can be explained with the tokens that there are."""
+        if not len(self.blobs):
+            return []
+        singles, left = self._singles, self.left
+        # Blobs that look like one token first: they cost nothing.
+        alone = Counter(self.kinds[one.laid.kinds[0]].shape for one in singles.values())
+        if len(singles) == len(self.blobs) and alone <= left:
+            return [singles[blob] for blob in sorted(singles, reverse=True)]
+        cut = self.blobs.cut.tolist()
+        shown = [blob for blob in range(len(cut)) if not cut[blob] or self._piles(blob, left)]
+        order = sorted(shown, key=lambda blob: (blob not in singles, -blob))
+        best: list[_Explained] = []
+        for whole in (True, False):
+            every = []
+            for found in self._whole(order, singles, left, [], whole):
+                every.append(found)
+                piles = any(len(one.laid.kinds) > 1 for one in found)
+                if self._tries >= _TRIES or (len(found) == len(order) and not (whole and piles)):
+                    break
+            best = max(every, key=_rank, default=best)
+            if len(best) == len(order):
+                return _doubted(best, every)
+            self._tries = 0
+        return best
+
+    def _whole(
+        self,
+        order: Sequence[int],
+        singles: dict[int, _Explained],
+        left: Counter[int],
+        found: list[_Explained],
+        whole: bool,
+    ) -> Iterator[list[_Explained]]:
+        """Explanations of blobs from some on, all of them where they are to be whole."""
+        if not order:
+            yield found
+            return
+        blob, rest = order[0], order[1:]
+        for one in self._options(blob, singles, left):
+            used = Counter(self.kinds[number].shape for number in one.laid.kinds)
+            if not whole or self._enough(rest, left - used):
+                yield from self._whole(rest, singles, left - used, [*found, one], whole)
+        if not whole:
+            # It stays unexplained.
+            yield from self._whole(rest, singles, left, found, whole)
+
+    def _enough(self, order: Sequence[int], left: Counter[int]) -> bool:
+        """Whether tokens that are left have the areas of blobs."""
+        if not order:
+            return True
+        blob, rest = order[0], order[1:]
+        area = float(self.blobs.area[blob])
+        return any(
+            self._enough(rest, left - Counter(some))
+            for count in range(1, MAX_PILE + 1)
+            for some in set(combinations(sorted(left.elements()), count))
+            if self.blobs.cut[blob] or self._area_off(area, some) < 1.0
+        )
+
+    def _area_off(self, area: float, shapes: Sequence[int]) -> float:
+        """How far an area is from that of tokens of these shapes, over what it may be."""
+        own = [self._sizes[shape] for shape in shapes]
+        return abs(area - sum(size for size, _ in own)) / (_AREA * sum(round_ for _, round_ in own))
+
+    def _options(
+        self, blob: int, singles: dict[int, _Explained], left: Counter[int]
+    ) -> Iterator[_Explained]:
+        """What a blob may be with the tokens that are left, the simplest first."""
+        single = singles.get(blob)
+        if single is not None and left[self.kinds[single.laid.kinds[0]].shape]:
+            yield single
+        if left.total() > 1 or self.blobs.cut[blob]:
+            yield from self._piles(blob, left)
+
+    def _piles(self, blob: int, left: Counter[int]) -> list[_Explained]:
+        """The pile's best arrangement with each of a few sets of tokens."""
+        counts = tuple(left[shape] for shape in range(1 + max(k.shape for k in self.kinds)))
+        key = (blob, counts)
+        if key in self._known or self._tries >= _TRIES:
+            return self._known.get(key, [])
+        side = self.blobs.cover.shape[1]
+        cover = self.blobs.cover[self.blobs.base[blob] :][:side]
+        self._tries += 1
+        search = reaching_out if self.blobs.cut[blob] else arrangements
+        found = [one for one in search(cover, self.kinds, counts) if one.differs < _DIFFERS]
+        sets: dict[tuple[int, ...], list[Laid]] = {}
+        for one in found:
+            sets.setdefault(tuple(sorted(self.kinds[k].shape for k in one.kinds)), []).append(one)
+        options = [
+            _Explained(
+                best[0],
+                len(best) > 1 and best[1].differs < best[0].differs + _ALIKE,
+            )
+            for best in sets.values()
+        ]
+        self._known[key] = options
+        return options
+
+    def piles(self) -> Singles | None:
+        """(P, P) coverage by what is whole and no single token; None if there is none."""
+        blobs = self.blobs
+        many = [b for b in range(len(blobs)) if b not in self._singles and not blobs.cut[b]]
+        side = blobs.cover.shape[1]
+        return blobs.cover.reshape(-1, side, side)[many].sum(axis=0) if many else None
+
+    @cached_property
+    def _singles(self) -> dict[int, _Explained]:
+        """The blobs that look like one token."""
+        blobs, kinds = self.blobs, self.kinds
+        far, turn = likeness(blobs.moments, kinds)
+        area = np.array([kind.area for kind in kinds])
+        slack = _AREA * np.array([kind.perimeter for kind in kinds])
+        fits = (np.abs(blobs.area[:, None] - area) < slack) & ~blobs.cut[:, None]
+        far = np.where(fits, far, np.inf)
+        near = far < np.minimum(far.min(axis=1, keepdims=True) + _CLOSE, 1.0)
+        blob, kind = np.nonzero(near)
+        if not len(blob):
+            return {}
+        rough = np.column_stack([_plane(blobs.centre[blob]), turn[blob, kind]])
+        shapes = [kinds[k] for k in kind.tolist()]
+        poses, spread = refined(shapes, rough, blobs.cover, blobs.base[blob])
+        best = _least(blob, spread)
+        best = best[spread[best] < _ROUGH]
+        if self.sharp and len(best):
+            own = [shapes[row] for row in best.tolist()]
+            poses[best] = settled(own, poses[best], blobs.cover, blobs.base[blob[best]])
+        return {
+            int(blob[row]): _Explained(Laid((int(kind[row]),), poses[row : row + 1], 0.0))
+            for row in best.tolist()
+        }
+
+
+def _doubted(best: Sequence[_Explained], every: Sequence[Sequence[_Explained]]) -> list[_Explained]:
+    """The best of every explanation, doubtful where others that are as good have other tokens."""
+    told = list(best)
+    for other in every:
+        if _rank(other) > (len(best), _rank(best)[1] - _ALIKE):
+            for i, (one, that) in enumerate(zip(best, other, strict=True)):
+                if sorted(one.laid.kinds) != sorted(that.laid.kinds):
+                    told[i] = replace(told[i], doubtful=True)
+    return told
+
+
+def _rank(found: Sequence[_Explained]) -> tuple[int, float]:
+    """More is better, then what differs least."""
+    return len(found), -max((one.laid.differs for one in found), default=0.0)
+
+
+def _plane(z: Complex) -> Floats:
+    return np.column_stack([z.real, z.imag])
+
+
+def _least(group: Ints, value: Floats) -> Ints:
+    """The row of the least value in each group."""
+    order = np.lexsort((value, group))
+    return order[np.unique(group[order], return_index=True)[1]]

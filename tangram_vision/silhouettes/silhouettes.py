@@ -1,0 +1,199 @@
+"""The outline of a silhouette -> where a layout's tokens lie that fill it.
+
+It is searched with rising tolerance. Where nothing fills it, a beam tells the tokens that could be
+laid. Legend: K tokens.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import shapely
+from shapely import Polygon
+
+from tangram_core.arrays import Complex, Floats
+from tangram_sim.geometry.areas import Area, overlap, straightened
+from tangram_sim.geometry.dissections import Budget, Dissection, Laid, Search, Tokens, dissection
+from tangram_sim.geometry.layout import Layout
+from tangram_sim.geometry.overlap import outlines
+from tangram_sim.geometry.rings import covered_area, unit_of
+from tangram_vision.silhouettes.beams import Beam, Values
+
+# Of the root of all tokens' area, the full square's side where they are the tans.
+TOLERANCES = (0.004, 0.008, 0.014, 0.022, 0.035, 0.05, 0.07, 0.09)
+SOLVED = 0.95  # IoU from which a silhouette counts as filled
+_ROUND = 1e-9  # of the tokens' size, to which corners are rounded
+# Of the root of all tokens' area: what a side of an outline may be off so that no corner of a piece
+# within it is left.
+_STRAIGHT, _GRID = 1e-4, 1e-6
+_SHARE = 0.9  # of the time, for the search; the rest is for the best attempt
+_LOOSE = (0.004, 0.022, 0.05)  # tolerances of a beam, for outlines
+_SAME = 0.9  # of a token's area, from which two lie at one place
+
+
+@dataclass(frozen=True, eq=False)
+class Method:
+    """How silhouettes are filled.
+
+    Attributes:
+        search: whether by a search, which goes back where it is stuck.
+        width: states that a beam follows where no search has found anything.
+        values: what ranks these; None: the area of the tokens that lie.
+    """
+
+    search: bool = True
+    width: int = 12
+    values: Values | None = None
+
+
+UNLEARNED = Method()  # the search, then a beam of the largest tokens
+
+
+@dataclass(frozen=True, eq=False)
+class Filled:
+    """How a silhouette was filled.
+
+    Attributes:
+        found: the dissection that fits best; None if none was found.
+        iou: intersection over union of its tokens and the outline, or the picture's pixels; of the
+            attempt where nothing was found.
+        seconds: that it took.
+        nodes: steps of the search.
+        complete: whether all of an outline was searched: no other dissection fills it.
+        attempt: where nothing was found, the tokens that could be laid; None if none could.
+        by: what found it, the search or the beam.
+    """
+
+    found: Dissection | None
+    iou: float
+    seconds: float
+    nodes: int
+    complete: bool
+    attempt: Dissection | None = None
+    by: str = "search"
+
+    @property
+    def solved(self) -> bool:
+        """Whether the silhouette counts as filled."""
+        return self.found is not None and self.iou >= SOLVED
+
+
+def pieces(layout: Layout, found: Dissection) -> list[Polygon]:
+    """The tokens of a dissection that were laid."""
+    corners = layout.corners(found.poses, found.flipped)
+    every = outlines(corners[None], layout)[0]
+    return [Polygon(every[token]) for token in found.laid.tolist()]
+
+
+def covered(layout: Layout, found: Dissection) -> Area:
+    """What the tokens of a dissection cover."""
+    size = _ROUND * float(np.sqrt(layout.areas.sum()))
+    return shapely.union_all(pieces(layout, found), grid_size=size)
+
+
+def silhouette(layout: Layout, laid: Dissection) -> Area:
+    """What tokens cover, by its outline alone: the same whatever pieces it is made of.
+
+    No seam is left and no corner of a piece within a straight side, and where a ring begins does
+    not depend on the pieces.
+    """
+    unit = unit_of(layout)
+    closed = covered_area(layout.corners(laid.poses, laid.flipped), layout)
+
+    def ring(points: Floats) -> Floats:
+        z: Complex = points[:-1] @ np.array([1.0, 1.0j])
+        z = straightened(z, _STRAIGHT * unit)
+        rounded: Floats = np.round(np.stack([z.real, z.imag], axis=-1) / (_GRID * unit))
+        return rounded * (_GRID * unit)
+
+    parts = []
+    for part in shapely.get_parts(closed).tolist():
+        outer, *holes = (ring(np.asarray(one.coords)) for one in (part.exterior, *part.interiors))
+        parts.append(Polygon(outer, holes))
+    return shapely.normalize(shapely.union_all(parts))
+
+
+def fill_outline(
+    area: Area, layout: Layout, seconds: float, count: int = 1, method: Method = UNLEARNED
+) -> list[Filled]:
+    """Up to `count` different dissections of an outline of the tokens' area, or one that failed.
+
+    The search is complete, so that what a beam lays after it is no more than an attempt.
+
+    Args:
+        area: in the units of the layout.
+        layout: its tokens.
+        seconds: for all of it.
+        count: at most so many; a beam finds one.
+        method: how.
+    """
+    tokens, begin = Tokens(layout), time.thread_time()
+    budget, tried = Budget(begin + _SHARE * seconds), list[list[Laid]]()
+    for tolerance in TOLERANCES if method.search else ():
+        search = Search(tokens, tolerance * tokens.unit, budget)
+        every: list[Filled] = []
+        for laid in search.run(area):
+            found = dissection(tokens, laid)
+            iou = overlap(covered(layout, found), area)
+            if iou >= SOLVED and not any(_alike(tokens, layout, found, one.found) for one in every):
+                passed = time.thread_time() - begin
+                every.append(Filled(found, iou, passed, budget.taken, False))
+            if len(every) == count:
+                return every
+        if every:
+            return [replace(one, complete=not budget.spent()) for one in every]
+        tried.append(search.best)
+        if budget.spent():
+            break
+    loose = Budget(begin + seconds)
+    nearest, iou = nearest_fill(area, layout, loose, tried, method)
+    passed = time.thread_time() - begin
+    if method.search:
+        complete = not budget.spent()
+        return [Filled(None, iou, passed, budget.taken, complete, nearest)]
+    if nearest is not None and nearest.lies is None and iou >= SOLVED:
+        return [Filled(nearest, iou, passed, loose.taken, False, by="beam")]
+    return [Filled(None, iou, passed, loose.taken, False, nearest)]
+
+
+def attempt_outline(area: Area, layout: Layout, seconds: float) -> Filled:
+    """The tokens that could be laid in an outline whose area is not theirs."""
+    begin = time.thread_time()
+    budget = Budget(begin + seconds)
+    laid, iou = nearest_fill(area, layout, budget, (), UNLEARNED)
+    return Filled(None, iou, time.thread_time() - begin, budget.taken, False, laid)
+
+
+def nearest_fill(
+    area: Area, layout: Layout, budget: Budget, tried: Sequence[list[Laid]], method: Method
+) -> tuple[Dissection | None, float]:
+    """What comes nearest to an outline, of what was tried and of beams; and its IoU."""
+    tokens, every = Tokens(layout), [*tried]
+    beam = Beam(tokens, method.width, method.values)
+    for tolerance in _LOOSE:
+        states = beam.run(area, tokens.counts, tolerance * tokens.unit, budget)
+        every += [list(state.laid) for state in states[:1]]
+    found = [dissection(tokens, laid) for laid in every if laid]
+    if not found:
+        return None, 0.0
+    shares = [overlap(covered(layout, one), area) for one in found]
+    # Tokens that lie on others cover nothing of their own.
+    twice = [
+        sum(piece.area for piece in pieces(layout, one)) - covered(layout, one).area
+        for one in found
+    ]
+    best = int(np.argmax(np.array(shares) - np.array(twice) / area.area))
+    return found[best], shares[best]
+
+
+def _alike(tokens: Tokens, layout: Layout, one: Dissection, other: Dissection | None) -> bool:
+    """Whether two dissections differ by nothing but which of equal tokens lies where."""
+    if other is None:
+        return False
+    mine, theirs = np.array(pieces(layout, one)), np.array(pieces(layout, other))
+    for own in map(list, tokens.own):
+        common = shapely.area(shapely.intersection(mine[own][:, None], theirs[own]))
+        if (common.max(axis=1) < _SAME * shapely.area(mine[own])).any():
+            return False
+    return True

@@ -1,0 +1,186 @@
+"""Acting on outlines: places are taken exactly, a beam sees further, the stuck do their best."""
+
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+import torch
+from torch import nn
+
+from tangram_agent.agents.outline.filler import Filler
+from tangram_agent.agents.outline.filling import UNUSED, Filling
+from tangram_agent.agents.outline.values import Corners
+from tangram_agent.config import AgentConfig, NetConfig
+from tangram_agent.policy import Policy
+from tangram_agent.setup import Setup
+from tangram_core.errors import ConfigError
+from tangram_sim.geometry.dissections import Place
+from tangram_sim.puzzles.figures import library
+from tangram_sim.tasks.targets import placement
+from tests.agent.agents.outline.outlines import ALL, TWO, outline_setup
+from worker.play.looking import environments
+
+pytestmark = pytest.mark.fast
+
+
+class Indifferent(nn.Module):
+    """Values every state alike, so the first place is taken."""
+
+    def forward(self, corners: Corners) -> torch.Tensor:
+        return torch.zeros(len(corners.points))
+
+
+class Wrong(nn.Module):
+    """Takes the states with the most corners for the best ones."""
+
+    def forward(self, corners: Corners) -> torch.Tensor:
+        return (corners.part != UNUSED).sum(dim=1).float()
+
+
+def beam_of(made: Setup, width: int) -> Setup:
+    return replace(made, agent=replace(made.agent, beam=width))
+
+
+def overlaps(made: Setup, value: nn.Module, targets: Any = None, count: int = 6) -> np.ndarray:
+    """Raw overlap of some episodes, played by these values."""
+    filler = Filler(value, made)
+    policy = Policy(made)
+    policy._filler = filler
+    with closing(environments(made, count)) as env:
+        env.reset([np.random.default_rng(i) for i in range(count)], targets)
+        for _ in range(env.horizon):
+            result = env.step(policy.act(env.seen, env.closed, env.seen_goals))
+            assert not result.blocked.any()
+            assert not result.refused.any()
+    return np.asarray(result.overlap)
+
+
+def test_a_beam_finds_what_values_do_not_tell() -> None:
+    """Two triangles, glued by chance: in some outlines one fits where the other then does not."""
+    made = outline_setup()
+    alone = [overlaps(made, value) for value in (Indifferent(), Wrong())]
+    assert (np.stack(alone) > 0.99).any(axis=1).all()
+    assert (np.stack(alone) < 0.9).any(axis=1).all()
+    for value in (Indifferent(), Wrong()):
+        assert overlaps(beam_of(made, 2), value) == pytest.approx(1.0, abs=1e-4)
+
+
+def test_seven_tans_are_laid_into_a_figure() -> None:
+    made = outline_setup(ALL, arena=2.0)
+    poses, flipped = placement(library("test", 0.6)[0], made.layout)
+    target = poses[None], flipped[None]
+    assert overlaps(beam_of(made, 12), Indifferent(), target, 1) == pytest.approx(1.0, abs=1e-4)
+
+
+def test_where_nothing_fits_a_token_still_covers_what_it_can() -> None:
+    """A strip of the area of two triangles has no corner for them."""
+    made = outline_setup()
+    filling, layout = Filling(made.layout), made.layout
+    leg = float(np.sqrt(2.0 * layout.areas[0]))
+    strip = np.array([[0, 0], [2 * leg, 0], [2 * leg, leg / 2], [0, leg / 2], [0, 0]])
+    rows = np.concatenate([strip, np.zeros((made.goal_rows - 5, 2))])[None]
+    corners = layout.corners(np.array([[0.9, 0.9, 0.0], [-0.9, 0.9, 0.0]]))[None]
+    placed = np.zeros((1, 2), np.bool_)
+    filler = Filler(Indifferent(), made)
+    assert filling.places(filling.rest(rows[0], corners[0], placed[0]), (2,)) == []
+    step = filler.choose(corners, placed, rows, np.zeros(1, np.bool_))
+    went = layout.poses(corners)[0, step.token[0], :2] + step.velocity[0, :2] * made.sim.arena
+    assert went == pytest.approx([leg, leg / 4], abs=1e-5)  # the strip's middle
+    # Exploring nothing is learned from where it lies, and it stays.
+    one = [np.random.default_rng(0)]
+    assert (filler.choose(corners, placed, rows, np.zeros(1, np.bool_), one).velocity == 0).all()
+
+
+def test_who_has_a_token_left_where_all_is_covered_lets_it_lie() -> None:
+    made = outline_setup()
+    corners = made.layout.corners(np.array([[0.3, 0.2, 0.0], [-0.9, 0.9, 0.0]]))[None]
+    first = corners[0, made.layout.corners_of(0)]
+    target = np.concatenate([first, first[:1]])
+    rows = np.concatenate([target, np.zeros((made.goal_rows - len(target), 2))])[None]
+    placed = np.array([[True, False]])
+    assert Filling(made.layout).rest(rows[0], corners[0], placed[0]).is_empty
+    step = Filler(Indifferent(), made).choose(corners, placed, rows, np.zeros(1, np.bool_))
+    assert step.token.tolist() == [1]
+    assert (step.velocity == 0).all()
+
+
+def test_exploring_takes_any_place_that_is_not_dead() -> None:
+    made = outline_setup(ALL, {"uniform_share": 1.0}, arena=2.0)
+    policy = Policy(made)
+    with closing(environments(made, 12)) as env:
+        figure = placement(library("test", 0.6)[0], made.layout)
+        targets = tuple(np.stack([part] * 12) for part in figure)
+        generators = [np.random.default_rng(i) for i in range(12)]
+        env.reset(generators, targets)
+        actions = policy.explore(env.seen, env.closed, env.seen_goals, generators)
+        tokens = {tuple(np.round(env.goals[0, 0] + action[1:3], 2)) for action in actions}
+        env.step(actions)
+        ends = Filling(made.layout)
+        inside = [ends.inside(env.corners[i], env.seen_goals[i]).sum() for i in range(12)]
+    assert len(tokens) > 1
+    assert min(inside) == 1
+
+
+def test_corners_of_pieces_are_no_outline() -> None:
+    made = outline_setup()
+    corners = made.layout.corners(np.zeros((1, 2, 3)))
+    with pytest.raises(ConfigError, match=r"got \(1, 6, 2\): give rows that .*as_rows makes"):
+        Policy(made).act(corners, np.zeros((1, 2)), corners)
+
+
+def test_filled_is_surer_than_any_value() -> None:
+    made = outline_setup()
+    filler = Filler(Indifferent(), made)
+    filling = Filling(made.layout)
+    leg = float(np.sqrt(2.0 * made.layout.areas[0]))
+    first: Sequence[Place] = filling.places(shapely.box(0, 0, leg, leg), (2,))
+    last = filling.places(first[0].rest, first[0].left)
+    assert filler.values([*first, *last]).tolist() == [0.0, 0.0, np.inf]
+    angles = np.linspace(0.0, 2.0 * np.pi, 101)[:-1]
+    star = (1.0 + 0.5 * (-1.0) ** np.arange(100)) * np.exp(1j * angles)
+    rugged = shapely.Polygon(np.column_stack([star.real, star.imag]))
+    assert filler.values([first[0]._replace(rest=rugged)]).tolist() == [-np.inf]
+
+
+@pytest.mark.parametrize(
+    ("agent", "sim", "reason"),
+    [
+        ({}, {"observe": "corners"}, "needs sim.observe=silhouette, got corners"),
+        ({"noise": 0.2}, {}, "agent.noise=0.2"),
+        ({"actor_lr": 0.1}, {}, "agent.actor_lr"),
+        ({"noise": 0.2}, {}, "agent.noise"),
+        ({"hindsight": []}, {}, "without a filled one"),
+        ({"hindsight": [{"strategy": "near", "position": 0.1}]}, {}, "hindsight.strategy"),
+        ({"gamma": 0.9}, {}, r"agent.gamma=0.9: .* set agent.gamma=1"),
+        ({}, {"starts": "anywhere"}, r"sim.starts=anywhere: .* set sim.starts=outside"),
+        ({}, {"actions_per_token": 2}, r"actions_per_token=2: .* set sim.actions_per_token=1"),
+        ({}, {"world": "drawn"}, "sim.world=drawn: .* set sim.world=plain"),
+        ({}, {"corner_noise": 0.01}, "sim.corner_noise"),
+    ],
+)
+def test_what_an_agent_of_outlines_cannot_use_is_refused(
+    agent: dict[str, Any], sim: dict[str, Any], reason: str
+) -> None:
+    with pytest.raises(ConfigError, match=reason):
+        outline_setup(TWO, agent, **sim)
+
+
+def test_a_lone_token_a_perceptron_and_one_side_are_refused() -> None:
+    with pytest.raises(ConfigError, match="a set of several tokens"):
+        outline_setup({"shapes": ["small_triangle"], "scale": 1.0})
+    made = outline_setup(ALL)
+    with pytest.raises(ConfigError, match="sim.allow_flip=true"):
+        replace(made, sim=replace(made.sim, allow_flip=False))
+    with pytest.raises(ConfigError, match="net.kind=mlp"):
+        replace(made, net=NetConfig(kind="mlp"))
+
+
+def test_values_are_for_outlines_alone() -> None:
+    made = outline_setup()
+    corners = replace(made.sim, observe="corners")
+    with pytest.raises(ConfigError, match="agent.beam=4"):
+        replace(made, sim=corners, agent=AgentConfig(beam=4))

@@ -1,0 +1,106 @@
+"""Learning from pairs: losses by hand, what gradients reach, and that it learns."""
+
+from contextlib import closing
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tangram_agent.agents.pair.pairs import Pairs
+from tangram_agent.learner import Learner
+from tangram_agent.policy import Policy
+from tangram_agent.relabelling import PairBatch
+from tangram_agent.setup import Setup
+from tangram_sim.batch import BatchedEnv
+from tests.agent.agents.pair.pair_scenes import PERCEPTRON, TWO, seven, transitions
+from tests.agent.builders import setup
+
+pytestmark = pytest.mark.fast
+
+TWINS = [{"strategy": "final"}, {"strategy": "near", "position": 0.1, "angle": 0.5}]
+AGENT = {"hindsight": TWINS}
+UPDATES = 120
+CASES: dict[str, dict[str, Any]] = {
+    "mha": {"agent": AGENT},
+    "mlp": {"agent": AGENT, "net": PERCEPTRON},
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_losses_by_hand(case: str) -> None:
+    """Before the first update the acting networks are the learner's own."""
+    made = seven(**CASES[case])
+    learner = Learner(made, 0)
+    batch = learner.prepared(transitions(made, 8, 0), np.random.default_rng(0))
+    assert isinstance(batch, PairBatch)
+    t = {name: torch.from_numpy(np.asarray(c, np.float32)) for name, c in vars(batch).items()}
+    for name in ("token", "piece"):
+        t[name] = t[name].long()
+    steps, own, still = learner.steps(batch), learner.acting, torch.zeros(64, 3)
+
+    def pairs_of(when: str) -> Pairs:
+        columns = ("token", "goal", "goal_flipped", "piece", "covered")
+        return Pairs(t[when], t[f"{when}_flipped"], *(t[name] for name in columns))
+
+    value = own.critic(pairs_of("after"), still)
+    loss, q = learner.critic_loss(steps)
+    expected = (value - t["reward"]).square().mean().item()
+    assert loss.item() == pytest.approx(expected, rel=1e-6)
+    np.testing.assert_allclose(q.detach(), value, atol=1e-6)
+    start = pairs_of("start")
+    velocity, raw = own.actor(start)
+    gain, penalty = learner.actor_loss(steps)
+    assert gain.item() == pytest.approx(-own.critic(start, velocity).mean().item(), rel=1e-5)
+    assert penalty.item() == pytest.approx(torch.relu(raw.abs() - 1.0).square().mean().item())
+
+
+def test_with_several_tokens_nothing_is_bootstrapped() -> None:
+    learner = Learner(seven(**CASES["mlp"]), 0)
+    assert not learner.bootstraps
+    assert set(learner.parts) == {"actor", "critic", "acting"}
+
+
+def test_noise_on_the_corners_does_no_harm() -> None:
+    made = seven(**CASES["mlp"])
+    learner, batch = Learner(made, 0), transitions(made, 64)
+    rng = np.random.default_rng(0)
+    names = ("state", "next_state", "goal")
+    noise = {name: 0.2 * rng.standard_normal(batch.state.shape) for name in names}
+    noisy = {name: (vars(batch)[name] + noise[name]).astype(np.float32) for name in names}
+    pairs = learner.prepared(replace(batch, **noisy), rng)
+    for share in (pairs.covered, pairs.reward):
+        assert 0.0 <= share.min() < share.max() <= 1.0
+    learner.update(pairs)
+
+
+def coverage(learner: Learner, made: Setup, episodes: int) -> float:
+    """Mean overlap of episodes that the acting weights play."""
+    policy = Policy(made)
+    policy.load(learner.acting_weights(0))
+    with closing(BatchedEnv(made.layout, made.sim, made.reward, episodes)) as env:
+        env.reset([np.random.default_rng([1, i]) for i in range(episodes)])
+        for _ in range(env.horizon):
+            actions = policy.act(env.corners, env.placed, env.goals)
+            result = env.step(actions.astype(np.float64))
+    return float(result.overlap.mean())
+
+
+def test_it_learns_to_assemble_two_tokens() -> None:
+    """From random scenes and hindsight alone; without learning next to nothing is covered."""
+    agent = {
+        "hindsight": [*TWINS, {"strategy": "near", "position": 0.02, "angle": 0.1}],
+        "actor_lr": 5e-3,
+        "critic_lr": 5e-3,
+        "reapply": 1,
+    }
+    net = {"kind": "mlp", "hidden": [64, 64]}
+    made = setup(TWO, agent, net, starts="outside", mirrored=0.5)
+    learner = Learner(made, seed=1)
+    before = coverage(learner, made, 30)
+    for i in range(UPDATES):
+        scenes = transitions(made, 48, i)
+        learner.update(learner.prepared(scenes, np.random.default_rng(i)), i / UPDATES)
+    assert before < 0.2
+    assert coverage(learner, made, 30) > 0.6

@@ -1,0 +1,110 @@
+"""The encoder against loops written from Eqs. 8-13, and what masks must do."""
+
+import numpy as np
+import pytest
+import torch
+
+from tangram_agent.base.attention import (
+    NO_EDGE,
+    SHORT_ROW,
+    GraphAttention,
+    GraphEncoder,
+    softmax_mean,
+)
+from tangram_agent.config import NetConfig
+from tangram_agent.networks import initialise
+from tests.agent.builders import setup
+
+pytestmark = pytest.mark.fast
+
+WIDTH, HEADS, NODES = 16, 4, 9
+
+
+def attention(scale: str = "d") -> GraphAttention:
+    layer = GraphAttention(WIDTH, HEADS, scale)
+    initialise(layer, torch.Generator().manual_seed(3))
+    return layer
+
+
+def slow_attention(layer: GraphAttention, nodes: np.ndarray, edges: np.ndarray, d: float):
+    """Eqs. 9-12 for one graph, node by node and head by head."""
+    count, width = nodes.shape
+    key_width = width // layer.heads
+    stacked = layer.query_key_value.weight.detach().numpy().astype(np.float64)
+    w_q, w_k, w_v = stacked.reshape(3, layer.heads, key_width, width)
+    w_m = layer.combine.weight.detach().numpy().astype(np.float64)
+    result = np.zeros((count, width))
+    for i in range(count):
+        for head in range(layer.heads):
+            seen, query = np.flatnonzero(edges[i]), w_q[head] @ nodes[i]
+            weights = np.exp([query @ (w_k[head] @ nodes[j]) / d for j in seen])
+            message = sum(w * (w_v[head] @ nodes[j]) for w, j in zip(weights, seen, strict=True))
+            columns = slice(head * key_width, (head + 1) * key_width)
+            result[i] += w_m[:, columns] @ message / weights.sum()
+    return result
+
+
+@pytest.mark.parametrize(("scale", "d"), [("d", 4.0), ("sqrt_d", 2.0)])
+def test_attention_equals_the_loop_of_the_equations(scale: str, d: float) -> None:
+    layer = attention(scale)
+    edges = setup().layout.adjacency
+    nodes = np.random.default_rng(0).standard_normal((5, NODES, WIDTH)).astype(np.float32)
+    fast = layer(torch.from_numpy(nodes), torch.from_numpy(edges)).detach().numpy()
+    for graph, expected in zip(nodes, fast, strict=True):
+        np.testing.assert_allclose(slow_attention(layer, graph, edges, d), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("feed_forward", [0, 20])
+def test_encoder_equals_the_loop_of_the_equations(feed_forward: int) -> None:
+    """Eq. 13 with both readings of g, over two rounds."""
+    config = NetConfig(width=WIDTH, layers=2, feed_forward=feed_forward)
+    encoder = GraphEncoder(4, config)
+    initialise(encoder, torch.Generator().manual_seed(1))
+    edges = setup().layout.adjacency
+    features = np.random.default_rng(1).standard_normal((1, NODES, 4)).astype(np.float32)
+    found, mean = encoder(torch.from_numpy(features), torch.from_numpy(edges))
+
+    nodes = features[0].astype(np.float64) @ encoder.embed.weight.detach().numpy().T
+    for layer in encoder.layers:
+        nodes = nodes + slow_attention(layer.attention, nodes, edges, 4.0)
+        hidden = nodes
+        for part in layer.transform:
+            if isinstance(part, torch.nn.Linear):
+                hidden = hidden @ part.weight.detach().numpy().T + part.bias.detach().numpy()
+            else:
+                hidden = np.maximum(hidden, 0.0)
+        nodes = nodes + hidden
+    np.testing.assert_allclose(found[0].detach().numpy(), nodes, atol=1e-5)
+    np.testing.assert_allclose(mean[0].detach().numpy(), nodes.mean(axis=0), atol=1e-5)
+
+
+def test_without_an_edge_there_is_no_influence() -> None:
+    """Eq. 10: where E(i, j) = 0, j sends nothing to i in one round; i's own query counts."""
+    layer, layout = attention(), setup().layout
+    edges = torch.from_numpy(layout.adjacency)
+    nodes = torch.randn(1, NODES, WIDTH, generator=torch.Generator().manual_seed(0))
+    before = layer(nodes, edges)[0]
+    for j in range(NODES):
+        changed = nodes.clone()
+        changed[0, j] += 1.0
+        moved = (layer(changed, edges)[0] - before).abs().sum(dim=-1) > 1e-6
+        expected = layout.adjacency[:, j].copy()
+        expected[j] = True
+        assert moved.tolist() == expected.tolist()
+    alone = edges.clone()
+    alone[2] = False  # no edges: no message
+    messages = layer(nodes, alone)[0]
+    assert torch.isfinite(messages).all()
+    assert [bool(message.any()) for message in messages] == [node != 2 for node in range(NODES)]
+
+
+@pytest.mark.parametrize("count", [1, 3, SHORT_ROW, SHORT_ROW + 1, 53])
+def test_the_mean_is_that_of_torchs_softmax(count: int) -> None:
+    """Also with scores whose exponentials overflow, and where edges are missing."""
+    generator = torch.Generator().manual_seed(count)
+    scores = 200.0 * torch.randn(4, count, count, generator=generator, dtype=torch.float32)
+    scores[:, :, 0].mul_(torch.tensor([1.0, 1.0, 0.0, 0.0])[:, None])
+    scores[2, :, 1:] = NO_EDGE
+    value = torch.randn(4, count, 5, generator=generator)
+    expected = torch.softmax(scores, dim=-1) @ value
+    torch.testing.assert_close(softmax_mean(scores, value), expected)

@@ -1,0 +1,119 @@
+"""How silhouettes are filled, and by whom."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tangram_agent.runs import load_run
+from tangram_game.evaluate import evaluate_run
+from tangram_game.figures.methods import Learned, learned_method, together
+from tangram_game.figures.puzzles import find_figures
+from tangram_game.figures.silhouettes import read_silhouette
+from tangram_game.rivals.baselines import exact_policy
+from tangram_game.scores import RUN, score_hidden
+from tangram_sim.geometry.areas import Area
+from tangram_sim.geometry.dissections import Budget, Search, Tokens
+from tangram_sim.geometry.rings import covered_area
+from tangram_sim.puzzles.figures import library
+from tangram_sim.tasks.targets import placement
+from tangram_vision.silhouettes.silhouettes import Method
+from tests.game.figures.test_hidden import OUTLINE, game
+from tests.sim.builders import SEVEN, TRIO, layout_of
+from worker.config import EvalConfig
+
+
+def told(method: Method) -> tuple[bool, int, bool]:
+    return method.search, method.width, method.values is not None
+
+
+@pytest.mark.fast
+def test_tokens_that_nobody_learned_to_fill_with_are_laid_by_size() -> None:
+    assert told(together(layout_of(*SEVEN, scale=1.7))) == (True, 12, True)
+    assert told(together(layout_of(*TRIO, scale=1.0))) == (True, 12, False)
+
+
+@pytest.mark.fast
+def test_values_are_those_of_the_agent_whatever_the_scale() -> None:
+    every = []
+    for scale in (0.6, 1.5):
+        layout = layout_of(*SEVEN, scale=scale)
+        tokens = Tokens(layout)
+        (puzzle,) = [one for one in library("test", scale) if one.name == "heart"]
+        poses, flipped = placement(puzzle, layout)
+        area: Area = covered_area(layout.corners(poses, flipped), layout)
+        search = Search(tokens, 0.004 * tokens.unit, Budget(np.inf))
+        places = search.places(area, tokens.counts)
+        given = [place.rest for place in places], [place.left for place in places]
+        values = Learned(layout)(*given)
+        assert len(set(np.round(values, 3).tolist())) > 1
+        every.append(values)
+    # Of sides that are all but equal another may be the longest, and is seen along another axis.
+    assert np.corrcoef(*every)[0, 1] > 0.95
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize(("searches", "by"), [(True, "search"), (False, "beam")])
+def test_it_is_told_who_filled_what(
+    searches: bool, by: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    method = replace(together(game(OUTLINE).layout), search=searches)
+    monkeypatch.setattr("tangram_game.figures.methods.together", lambda _: method)
+    made = game(OUTLINE)
+    figures = find_figures("test", made, ["heart", "swan"])
+    formula = exact_policy(made.layout, made.sim)
+    scored = score_hidden(made, figures, {RUN: formula}, 0)
+    assert scored.means[RUN]["filled_by"] == {"search": 0, "beam": 0} | {by: 2}
+    assert [one["filled_by"] for one in scored.puzzles] == [by, by]
+    assert scored.means[RUN]["share_solved_iou"] == 1.0
+    shown = read_silhouette("swan", load_run("pretrained/tangram7").setup)
+    assert shown.told.startswith(f"filled by the {by} in ")
+
+
+FILLER = "pretrained/tangram7_silhouette"
+SHOWN = {"sim": {"backend": "kinematic", "observe": "silhouette_pictures", "pixels": 64}}
+
+
+@pytest.mark.fast
+def test_an_agent_of_outlines_fills_pictures_itself(tmp_path: Path) -> None:
+    """By its own beam; what it finds is laid by the formula, as what others find is."""
+    out, grey = tmp_path / "scores.json", {"sim": SHOWN["sim"] | {"picture": "grey"}}
+    config = EvalConfig(FILLER, puzzle=("heart", "swan"), out=str(out), changes=grey)
+    assert evaluate_run(config) == 0
+    report = json.loads(out.read_text())
+    assert report["filled_by"] == {"search": 0, "beam": 2}
+    assert report["share_solved_iou"] == 1.0
+    largest, search = (report["baselines"][name] for name in ("largest first", "search"))
+    assert largest["filled_by"]["search"] == 0
+    assert largest["search_seconds"] != report["search_seconds"]
+    assert search["filled_by"] == {"search": 2, "beam": 0}
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize("puzzle", [("heart",), None])
+def test_a_report_takes_the_scores_of_an_agent_of_outlines(
+    tmp_path: Path, puzzle: tuple[str, ...] | None
+) -> None:
+    """The mean reward of several tokens is of what they cover; every episode is told."""
+    out = tmp_path / "scores.json"
+    sim = {"backend": "kinematic"}
+    few = {} if puzzle else {"episodes": 2}
+    config = EvalConfig(FILLER, puzzle=puzzle, out=str(out), changes={"sim": sim}, **few)
+    assert evaluate_run(config) == 0
+    report = json.loads(out.read_text())
+    for scores in (report, *report["baselines"].values()):
+        assert len(scores["coverage_each"]) == scores["episodes"] == (2 if puzzle is None else 1)
+        assert scores["mean_reward"] == pytest.approx(
+            2.0 * np.mean(scores["coverage_each"]) - 1.0, abs=1e-5
+        )
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize(("settings", "width"), [({}, 12), ({"beam": 1}, 1)])
+def test_a_run_fills_by_as_wide_a_beam_as_it_looks_ahead(settings: Any, width: int) -> None:
+    run = load_run(FILLER)
+    method = learned_method(run.with_settings({"agent": settings}) if settings else run)
+    assert told(method) == (False, width, True)

@@ -1,0 +1,211 @@
+"""tangram-play silhouette=: files of outlines and pictures, and such as cannot be filled."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+from PIL import Image, ImageDraw
+
+from tangram_agent.runs import load_run
+from tangram_core.errors import ConfigError
+from tangram_game.figures.silhouettes import read_silhouette
+from tangram_game.play import play_run
+from tangram_sim.geometry.rings import covered_area
+from tangram_sim.puzzles.figures import PACKAGED, load_puzzle
+from tangram_vision.given.silhouette_files import Silhouette, fill_silhouette
+from tests.agent.agents.outline.outlines import AGENT as FILLER
+from tests.agent.agents.outline.outlines import SIM as OUTLINES
+from tests.sim.builders import SEVEN
+from tests.vision.aslant import photographed
+from tests.worker.builders import write_run
+from worker.cli import with_absolute_paths
+from worker.config import PlayConfig
+
+pytestmark = pytest.mark.slow
+
+SQUARE = '<path d="M 1 1 H 9 V 9 H 1 Z"/>'
+
+
+@pytest.fixture(autouse=True)
+def _no_hurry(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock decides nothing where other work takes the processor."""
+    monkeypatch.setattr("tangram_game.figures.silhouettes.SECONDS", 60.0)
+
+
+def svg(path: Path, *content: str) -> str:
+    path.write_text(f'<svg xmlns="http://www.w3.org/2000/svg">{"".join(content)}</svg>')
+    return str(path)
+
+
+def picture(path: Path, ground: int = 235, ink: int = 40) -> str:
+    """The cat, turned, drawn large and averaged."""
+    puzzle, times = load_puzzle("cat", 1.0), 4
+    corners = puzzle.corners @ (1.0, 1j) * np.exp(0.4j) * 75.0 * times
+    canvas = Image.new("L", (400 * times, 300 * times), ground)
+    for k in range(7):
+        own = corners[puzzle.layout.corners_of(k)] + (200.0 - 150.0j) * times
+        ImageDraw.Draw(canvas).polygon([(float(z.real), float(-z.imag)) for z in own], ink)
+    canvas.reduce(times).save(path)
+    return str(path)
+
+
+def read(name: str) -> object:
+    return read_silhouette(name, load_run("pretrained/tangram7").setup)
+
+
+@pytest.mark.parametrize("name", ["cat", "cat.png", "dark.jpg", "square.svg", "pieces.svg"])
+def test_silhouettes_are_filled_whatever_they_come_from(tmp_path: Path, name: str) -> None:
+    picture(tmp_path / "cat.png")
+    picture(tmp_path / "dark.jpg", ground=30, ink=220)
+    svg(tmp_path / "square.svg", SQUARE)
+    svg(tmp_path / "pieces.svg", '<polygon points="0,0 8,0 8,8"/><polygon points="0,0 8,8 0,8"/>')
+    source = name if name == "cat" else str(tmp_path / name)
+    shown = read_silhouette(source, load_run("pretrained/tangram7").setup)
+    assert shown.told.startswith("filled by the search in ")
+    assert float(shown.told.split()[-1]) > 0.97
+    assert shown.figure.name == Path(name).stem
+    width, height = shown.picture.size
+    assert shown.outlines.min() >= 0.0
+    assert (shown.outlines <= (width, height)).all()
+
+
+def test_tokens_are_drawn_where_a_tilted_camera_saw_them(tmp_path: Path) -> None:
+    puzzle = load_puzzle("cat", 1.0)
+    area = covered_area(puzzle.corners, puzzle.layout)
+    photographed(area, 15.0, 120.0).save(tmp_path / "aslant.png")
+    setup = load_run("pretrained/tangram7").setup
+    shown = read_silhouette(str(tmp_path / "aslant.png"), setup)
+    tokens = covered_area(shown.outlines[0], setup.layout)
+    ink = np.asarray(shown.picture.convert("L")) < 128
+    side = np.arange(len(ink)) + 0.5
+    drawn = shapely.contains_xy(tokens, *np.meshgrid(side, side))
+    assert (drawn & ink).sum() > 0.96 * (drawn | ink).sum()
+
+
+def test_a_silhouette_is_played(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "cat.png"
+    config = PlayConfig(silhouette="cat", out=str(out), changes={"sim": {"backend": "kinematic"}})
+    assert play_run(config) == 0
+    printed = capsys.readouterr().out
+    assert "1 silhouette, coverage 0.99" in printed
+    with Image.open(out) as drawn:
+        assert drawn.width > drawn.height > 300
+
+
+@pytest.fixture
+def filler(tmp_path: Path) -> Path:
+    """A run of an agent of outlines that learned nothing."""
+    tokens, sim = {"shapes": list(SEVEN), "scale": 0.6}, {"backend": "kinematic", "arena": 2.0}
+    folder = tmp_path / "filler"
+    write_run(folder, tokens=tokens, sim=OUTLINES | sim | {"allow_flip": True}, agent=FILLER)
+    return folder
+
+
+def test_an_agent_of_outlines_is_shown_the_bare_silhouette(
+    filler: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its two halves are of few colours: those of the tokens are on the right side only."""
+    out, name = tmp_path / "square.png", svg(tmp_path / "square.svg", SQUARE)
+    play_run(PlayConfig(str(filler), silhouette=name, out=str(out)))
+    assert "; not filled by the run itself, but filled by the search in" in capsys.readouterr().out
+    with Image.open(out) as drawn:
+        left = drawn.convert("RGB").crop((0, 0, drawn.width // 2 - 40, drawn.height))
+        wide = np.ptp(np.asarray(left, np.int64), axis=-1)
+    assert wide.max() < 40  # nothing is of a token's colour
+
+
+def test_an_agent_of_outlines_fills_what_a_picture_shows(filler: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.png"
+    play_run(PlayConfig(str(filler), silhouette=picture(tmp_path / "it.png"), out=str(out)))
+    assert out.exists()
+
+
+def test_an_agent_of_outlines_has_one_solution(filler: Path) -> None:
+    with pytest.raises(ConfigError, match=r"solutions=3 changes nothing with an agent of outlines"):
+        read_silhouette("cat", load_run(filler).setup, 3)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (
+            ('<path d="M 1 1 H 9 V 3 H 1 Z"/>',),
+            r"cannot be filled with .*\(no dissection: all ways were tried, ",
+        ),
+        (('<path d="M 1 1 L 9 9 Z"/>',), "draws no polygon|nothing that has an area"),
+        ((), "draws no polygon"),
+        # A square within another is a hole; no tans make a frame of that width.
+        ((SQUARE, '<path d="M 2 2 H 8 V 8 H 2 Z"/>'), "cannot be filled"),
+        (('<path d="M 1 1 H 9 V 9 H 1 Z"/>' * 17,), "more than 16 polygons"),
+        (('<path d="M 1 1 C 9 9 9 9 1 1 Z"/>',), "M, L, H, V, Z"),
+    ],
+)
+def test_an_outline_that_cannot_be_filled_is_refused(
+    tmp_path: Path, content: tuple[str, ...], message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        read(svg(tmp_path / "it.svg", *content))
+
+
+def test_a_puzzle_file_of_one_is_filled_and_one_of_more_is_refused(tmp_path: Path) -> None:
+    content = json.loads((PACKAGED / "test.json").read_text())
+    for count in (1, 2):
+        some = content | {"puzzles": content["puzzles"][:count]}
+        (tmp_path / f"{count}.json").write_text(json.dumps(some))
+    shown = read_silhouette(str(tmp_path / "1.json"), load_run("pretrained/tangram7").setup)
+    assert float(shown.told.split()[-1]) > 0.97
+    with pytest.raises(ConfigError, match="has 2 puzzles, and one silhouette is filled"):
+        read(str(tmp_path / "2.json"))
+
+
+def test_a_file_is_named_from_where_the_command_was_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    for given, meant in (
+        ("it.svg", str(tmp_path / "it.svg")),
+        ("~/it.png", str(tmp_path / "home" / "it.png")),
+        ("cat", "cat"),
+    ):
+        assert with_absolute_paths({"silhouette": given})["silhouette"] == meant
+
+
+def test_a_picture_of_nothing_is_refused(tmp_path: Path) -> None:
+    Image.new("L", (200, 200), 235).save(tmp_path / "nothing.png")
+    with pytest.raises(ConfigError, match=r"nothing\.png shows nothing"):
+        read(str(tmp_path / "nothing.png"))
+
+
+def test_what_fills_a_picture_badly_is_not_played(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def worse(*given: Any) -> Silhouette:
+        drawn = fill_silhouette(*given)
+        return replace(drawn, filled=(replace(drawn.filled[0], iou=0.9),))
+
+    monkeypatch.setattr("tangram_vision.given.silhouette_files.fill_silhouette", worse)
+    with pytest.raises(ConfigError, match=r"best found: IoU 0\.90"):
+        read(picture(tmp_path / "cat.png"))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"puzzle": ("cat",)}, "silhouette"),
+        ({"target": "photo.png"}, "silhouette"),
+        ({"out": "cat.png", "silhouette": "cat.png"}, "written over silhouette"),
+        ({"changes": {"sim": {"targets": "uniform"}}}, "leave silhouette out"),
+    ],
+)
+def test_settings_that_a_silhouette_has_no_use_for_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, settings: dict[str, object], message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    picture(tmp_path / "cat.png")
+    with pytest.raises(ConfigError, match=message):
+        PlayConfig(**({"silhouette": "cat"} | settings))  # type: ignore[arg-type]

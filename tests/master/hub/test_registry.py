@@ -1,0 +1,235 @@
+"""Indices and incarnations: who gets which, who wins, and what a checkpoint keeps."""
+
+import json
+from typing import Any
+
+import pytest
+
+from master.hub.gate import DESCRIPTORS, HANDSHAKES, RESERVE, Room
+from master.hub.registry import Peer, RefusedError, Registry
+from tangram_agent.schema import MAX_COUNT
+from tangram_core.errors import RunError
+from tests.agent.messages import FINGERPRINTS, hello
+
+pytestmark = pytest.mark.fast
+
+GRACE_S = 30.0
+WINDOW = 4
+
+
+def admitted(registry: Registry, name: str, now: float = 0.0, **fields: Any) -> Peer:
+    """Admit a process whose connection has its own name."""
+    return registry.admit(name.encode(), hello(process=name, **fields), now)[0]
+
+
+def restored(registry: Registry, now: float = 0.0) -> Registry:
+    """The registry of a master that was restarted from its checkpoint."""
+    fresh = Registry(FINGERPRINTS, GRACE_S)
+    fresh.load_state(json.loads(json.dumps(registry.state())), now)
+    return fresh
+
+
+@pytest.fixture
+def registry() -> Registry:
+    return Registry(FINGERPRINTS, GRACE_S)
+
+
+def test_any_index_is_the_lowest_that_is_free_within_the_role(registry: Registry) -> None:
+    asked = [("a", -1), ("b", 2), ("c", -1), ("d", -1)]
+    assert [admitted(registry, n, index=i).index for n, i in asked] == [0, 2, 1, 3]
+    assert admitted(registry, "e", role="evaluator").index == 0
+    registry.peers[2].ledger.take(1, WINDOW)
+    registry.leave(registry.peers[2])  # player 1
+    fresh = admitted(registry, "f")
+    assert (fresh.index, fresh.incarnation) == (1, 2)
+    names = ["evaluator 0", "player 0", "player 1", "player 2", "player 3"]
+    assert [p.name for p in registry.peers] == names
+    counts = [registry.count(role) for role in ("player", "evaluator", "other")]
+    assert (len(registry), counts) == (5, [4, 1, 0])
+
+
+def test_the_newest_process_of_an_index_wins_also_after_a_restart(registry: Registry) -> None:
+    old = admitted(registry, "a", index=3)
+    assert registry.ledger(old.key, 1) is old.ledger
+    new, taken_from = registry.admit(b"b", hello(index=3, process="b"), 0.0)
+    assert taken_from is old
+    assert (new.incarnation, registry.peers) == (2, [new])
+    assert registry.find(b"a") is None
+    assert registry.ledger(old.key, 1) is None
+    assert registry.ledger(("player", 9), 1) is None
+    for one in (registry, restored(registry)):
+        with pytest.raises(RefusedError) as caught:
+            admitted(one, "a", index=3, incarnation=1)
+        assert str(caught.value) == (
+            "player 3 was taken over by a newer process (incarnation 2, this is 1)"
+        )
+    assert registry.peers == [new]
+    assert admitted(restored(registry), "b", index=3, incarnation=2).incarnation == 2
+    assert admitted(restored(registry), "c", index=3).incarnation == 3  # none is repeated
+
+
+def test_an_index_without_batches_leaves_nothing(registry: Registry) -> None:
+    """A stranger who says HELLO and BYE for each index would fill the memory."""
+    for index in range(9):
+        registry.leave(admitted(registry, f"a{index}", index=index))
+    assert registry.state() == {}
+    assert admitted(registry, "b", index=3).incarnation == 1
+    # Where there was one in an earlier incarnation the number must not come again.
+    used = admitted(registry, "c", index=5)
+    used.ledger.take(1, WINDOW)
+    for name, incarnation in (("d", 2), ("e", 3)):
+        registry.leave(used)
+        used = admitted(registry, name, index=5)
+        assert used.incarnation == incarnation
+
+
+def test_a_hello_again_changes_nothing_but_the_connection(registry: Registry) -> None:
+    first = admitted(registry, "a")
+    first.ledger.take(1, WINDOW)
+    again, taken_from = registry.admit(b"other", hello(process="a"), 9.0)
+    assert (again, taken_from, again.identity, again.last_seen) == (first, None, b"other", 9.0)
+    assert (registry.find(b"a"), registry.find(b"other")) == (None, first)
+    assert first.ledger.held == {1}
+    # A connection belongs to one process.
+    second, _ = registry.admit(b"other", hello(process="b"), 9.0)
+    assert (registry.peers, registry.find(b"other")) == ([second], second)
+
+
+def test_the_silent_are_forgotten_but_not_their_batches(registry: Registry) -> None:
+    peer = admitted(registry, "a", now=0.0)
+    peer.ledger.take(1, WINDOW)
+    busy = admitted(registry, "b", now=5.0)
+    assert registry.drop_silent(10.0, silence_s=10.0) == []
+    assert registry.drop_silent(10.1, silence_s=10.0) == [peer]
+    assert registry.peers == [busy]
+    back = admitted(registry, "a", index=0, incarnation=1)
+    assert (back.incarnation, back.ledger.held) == (1, {1})
+
+
+def test_a_checkpoint_keeps_incarnations_and_inserted_batches(registry: Registry) -> None:
+    peer = admitted(registry, "a", index=4)
+    for sequence in (1, 2, 3):
+        peer.ledger.take(sequence, WINDOW)
+    peer.ledger.held -= {1, 3}
+    admitted(registry, "e", role="evaluator")
+    assert registry.state() == {
+        "evaluator/0": {"incarnation": 1, "sequence": 0, "process": "e"},
+        "player/4": {"incarnation": 1, "sequence": 1, "process": "a"},
+    }
+    # The worker comes back and sends again what the checkpoint has not; of what it has not either
+    # nothing is waited for.
+    for first, received, lost in ((2, 1, 0), (5, 4, 3)):
+        after = restored(registry)
+        back = admitted(after, "a", index=4, incarnation=1, first=first)
+        assert (back.incarnation, back.ledger.received, back.ledger.held) == (1, received, set())
+        assert after.lost_batches == lost
+
+
+def test_after_a_restart_indices_wait_for_their_workers_for_a_while(registry: Registry) -> None:
+    admitted(registry, "a")
+    soon, late = restored(registry, now=100.0), restored(registry, now=100.0)
+    assert admitted(soon, "new", now=100.0 + GRACE_S - 1).index == 1
+    assert admitted(soon, "a", now=100.0 + GRACE_S - 1, index=0, incarnation=1).index == 0
+    assert admitted(late, "new", now=100.0 + GRACE_S).index == 0
+
+
+@pytest.mark.parametrize("named", [7, 2**31, MAX_COUNT])
+def test_an_incarnation_that_was_never_given_becomes_the_next(
+    registry: Registry, named: int
+) -> None:
+    """The disk lost it, or somebody made it up: it must not become the last one of its index."""
+    back = admitted(registry, "a", index=2, incarnation=named, first=12)
+    assert (back.incarnation, back.ledger.received, registry.lost_batches) == (1, 11, 0)
+    back.ledger.take(12, WINDOW)
+    assert admitted(registry, "b", index=2).incarnation == 2
+    assert admitted(registry, "c", index=2, incarnation=named, first=MAX_COUNT).incarnation == 3
+    assert admitted(registry, "d", index=2, first=MAX_COUNT).ledger.received == 0  # it sent none
+
+
+def test_incarnations_end_where_messages_could_not_tell_them(registry: Registry) -> None:
+    registry.load_state({"player/0": {"incarnation": MAX_COUNT - 1, "sequence": 0}}, -GRACE_S)
+    assert admitted(registry, "b", index=0).incarnation == MAX_COUNT
+    with pytest.raises(RefusedError, match="player 0 has no incarnation left: start with another"):
+        admitted(registry, "c", index=0)
+    assert admitted(registry, "c").incarnation == 1
+
+
+BAD = [(0, 0), (1, -1), ("1", 0), (MAX_COUNT + 1, 0), (1, MAX_COUNT + 1)]
+KEY = "the checkpoint's table of workers has the unknown key '{}'"
+ENTRY = "the checkpoint's entry of player/0 must hold an incarnation from 1 and a sequence from 0, "
+
+
+@pytest.mark.parametrize(
+    ("state", "reason"),
+    [
+        *(({key: {}}, KEY.format(key)) for key in ("player", "spy/1", "player/-1", "player/65536")),
+        ({"player/0": {"incarnation": 1}}, ENTRY),
+        ({"player/0": 3}, ENTRY),
+        *(
+            ({"player/0": {"incarnation": incarnation, "sequence": sequence}}, ENTRY)
+            for incarnation, sequence in BAD
+        ),
+    ],
+)
+def test_malformed_tables_are_refused(registry: Registry, state: Any, reason: str) -> None:
+    with pytest.raises(RunError) as caught:
+        registry.load_state(state, 0.0)
+    assert str(caught.value).startswith(reason)
+
+
+def test_the_last_tenth_of_the_room_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    files = RESERVE + HANDSHAKES + 10 * DESCRIPTORS
+    registry = Registry(FINGERPRINTS, GRACE_S, Room(files))
+    told = []
+    for name in "abcdefghij":
+        admitted(registry, name)
+        told.append(len(caplog.messages))
+    assert told == [0] * 8 + [1, 1]
+    bound = f"{files} open files allow: raise ulimit -n and start the master again"
+    assert caplog.messages == [f"9 processes take part, of at most 10 that {bound}"]
+    with pytest.raises(RefusedError, match=f"10 .* already, the most that {bound}"):
+        admitted(registry, "k")
+
+
+def test_batches_of_the_journal_are_new_once(registry: Registry) -> None:
+    registry.load_state({"player/0": {"incarnation": 2, "sequence": 5}}, 0.0)
+    known, new = ("player", 0), ("player", 1)
+    found = [
+        registry.recover(known, 1, 9, 0.0),  # of a process that was taken over: it waited then
+        registry.recover(known, 1, 9, 0.0),
+        registry.recover(known, 2, 5, 0.0),  # in the checkpoint
+        registry.recover(known, 2, 6, 0.0),
+        registry.recover(known, 2, 6, 0.0),
+        registry.recover(known, 2, 8, 0.0),  # 7 was refused for good, so the journal has it not
+        registry.recover(known, 3, 1, 0.0),
+        registry.recover(new, 1, 1, 0.0),
+    ]
+    assert found == [True, False, False, True, False, True, True, True]
+    assert registry.state() == {
+        "player/0": {"incarnation": 3, "sequence": 1},
+        "player/1": {"incarnation": 1, "sequence": 1},
+    }
+    # They wait for their workers like those of a checkpoint.
+    assert admitted(registry, "a", now=1.0).index == 2
+    again = admitted(registry, "b", now=1.0, index=1, incarnation=1, first=2)
+    assert (again.incarnation, again.ledger.inserted) == (1, 1)
+
+
+@pytest.mark.parametrize("kept", ["in the journal", "in a checkpoint"])
+def test_after_a_restart_an_incarnation_belongs_to_the_process_that_used_it(
+    registry: Registry, kept: str
+) -> None:
+    """It was given twice: before a kill to one that sent nothing yet, after it to another.
+
+    The first one's batches would have been acknowledged as those of the second.
+    """
+    if kept == "in the journal":
+        registry.recover(("player", 0), 1, 1, 0.0, "second")
+    else:
+        entry = {"incarnation": 1, "sequence": 1, "process": "second"}
+        registry.load_state({"player/0": entry}, 0.0)
+        assert registry.state() == {"player/0": entry}
+    with pytest.raises(RefusedError, match="player 0 was taken over by a newer process"):
+        admitted(registry, "first", index=0, incarnation=1)
+    again = admitted(registry, "second", index=0, incarnation=1)
+    assert (again.incarnation, again.ledger.inserted) == (1, 1)

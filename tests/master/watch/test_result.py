@@ -1,0 +1,88 @@
+"""What a run has come to: the final table, and commands that can be pasted."""
+
+import shlex
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+
+from master.record.rundir import RunFolder
+from master.watch.result import SCORES, go_on_command, show_result
+from tests.master.builders import screen, text
+
+pytestmark = pytest.mark.fast
+
+SCORED = {
+    "mean_reward": 0.9312,
+    "raw_overlap": 0.9656,
+    "angle_error_deg_median": 1.214,
+    "position_error_median": 0.01034,
+}
+
+
+RESULT = dict.fromkeys(SCORES) | {
+    "scored_updates": None,
+    "updates": 1234,
+    "episodes": 5678,
+    "train_s": 61.0,
+    "wall_s": 75.0,
+    "ended_by": "max_updates=1234",
+}
+
+
+@pytest.mark.parametrize(
+    ("change", "words", "without"),
+    [
+        ({}, ["none: no evaluator took part", "1:01 of training, 1:15 in all"], ["mean reward"]),
+        (
+            SCORED | {"scored_updates": 1234},
+            ["0.931 on exact polygons", "- in the camera's", "1.21° (median)", "1,234"],
+            ["weights after"],
+        ),
+        (SCORED | {"scored_updates": 1000}, ["weights after 1,000 updates"], ["go on"]),
+        ({"ended_by": "SIGINT"}, ["Ctrl-C (SIGINT)", "go on           tangram-train r"], []),
+    ],
+)
+def test_the_final_table(
+    tmp_path: Path, change: dict[str, Any], words: list[str], without: list[str]
+) -> None:
+    shown, folder = screen(), RunFolder(tmp_path / ("deep_" * 30))
+    show_result(shown, folder, RESULT | change, {}, "tangram-train r")
+    assert all(word in text(shown) for word in words)
+    assert not any(word in text(shown) for word in without)
+    assert f"tangram-play run_dir={folder.path} out=play.gif" in text(shown)
+    assert f"tensorboard --logdir {folder.path}/tensorboard" in text(shown)
+    assert "test_episodes.png" not in text(shown)
+
+
+@pytest.mark.parametrize(("launched", "name"), [(True, "tangram-train"), (False, "tangram-master")])
+def test_the_command_that_goes_on_has_the_workers_and_the_code_of_before(
+    tmp_path: Path, launched: bool, name: str
+) -> None:
+    folder = RunFolder(tmp_path)
+    bounds = {"max_hours": 0.0, "max_episodes": 0, "max_updates": 2000}
+    reward = {"reward": {"name": "/a/own.py:near"}}
+    folder.write_config({"seed": 3, **bounds, "workers": 2, **reward})
+    settings = f"run_dir={tmp_path} from_config={tmp_path}/config.yaml resume=auto seed=3 workers=2"
+    own = "reward.name=/a/own.py:near"
+    assert go_on_command(folder, launched).endswith(f"{name} {settings} {own}")
+
+
+@pytest.mark.parametrize("active", [True, False])
+def test_commands_that_are_shown_can_be_pasted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, active: bool
+) -> None:
+    """Whether the environment is on or not, as after `make train`."""
+    commands = Path(sys.executable).parent
+    monkeypatch.setenv("PATH", str(commands) if active else str(tmp_path))
+    shown, folder = screen(), RunFolder(tmp_path / "it's a=run")
+    show_result(shown, folder, RESULT, {})
+    curves, play = (shlex.split(line) for line in text(shown).splitlines()[-2:])
+    assert curves[-1] == str(folder.tensorboard)
+    for command in (curves[-3], play[-3]):
+        assert command == Path(command).name if active else Path(command).parent == commands
+        assert (commands / command).exists()
+    (parsed,) = OverridesParser.create().parse_overrides([play[-2]])
+    assert parsed.value() == str(folder.path)

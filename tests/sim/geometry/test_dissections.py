@@ -1,0 +1,209 @@
+"""Filling outlines: what can be filled is, what cannot is searched through."""
+
+import time
+
+import numpy as np
+import pytest
+import shapely
+from shapely import Polygon
+
+from tangram_core.arrays import Floats
+from tangram_lab.benchmarks.sight.silhouettes import convex_outlines
+from tangram_sim.config import SimConfig
+from tangram_sim.geometry.areas import Area, straightened
+from tangram_sim.geometry.dissections import Budget, Dissection, Laid, Search, Tokens
+from tangram_sim.geometry.layout import Layout, TokensConfig, make_layout
+from tangram_sim.tasks.connected import sample_connected
+from tangram_vision.silhouettes.silhouettes import (
+    UNLEARNED,
+    _alike,
+    attempt_outline,
+    covered,
+    fill_outline,
+    nearest_fill,
+    overlap,
+    pieces,
+)
+from tests.sim.builders import SEVEN, layout_of
+
+pytestmark = pytest.mark.fast
+
+LAYOUT = layout_of(*SEVEN, scale=1.0)
+
+
+def polygon(points: Floats) -> Polygon:
+    return Polygon(np.column_stack([points.real, points.imag]))
+
+
+def whole(poses: Floats, mirrored: bool = False, layout: Layout = LAYOUT) -> Area:
+    """What tokens cover, or the mirror image of that."""
+    sides = np.zeros(layout.tokens, np.bool_)
+    if mirrored:
+        poses, sides = layout.mirrored(poses, sides)
+    outlines = [layout.corners(poses, sides)[layout.corners_of(k)] for k in range(layout.tokens)]
+    return shapely.union_all([Polygon(one) for one in outlines], grid_size=1e-9)
+
+
+def gluing(seed: int) -> Floats:
+    return sample_connected(LAYOUT, SimConfig(arena=4.0), np.random.default_rng(seed))
+
+
+@pytest.mark.check
+def test_thirteen_of_the_twenty_convex_outlines_are_filled_and_seven_searched_through(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Wang and Hsiung, 1942: a proof by hand of what the complete search finds."""
+    monkeypatch.setattr(
+        "tangram_vision.silhouettes.silhouettes._LOOSE", ()
+    )  # no best attempt is asked for
+    every = convex_outlines(1.0)
+    assert len(every) == 20
+    assert all(polygon(z).area == pytest.approx(1.0) for z in every)
+    filled = [fill_outline(polygon(z * np.exp(0.3j)), LAYOUT, 60.0)[0] for z in every]
+    assert sum(one.found is not None for one in filled) == 13
+    assert [one.complete for one in filled if one.found is None] == [True] * 7
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_random_gluings_are_filled_at_any_angle(seed: int) -> None:
+    area = whole(gluing(seed), mirrored=seed % 2 == 1)
+    (filled,) = fill_outline(area, LAYOUT, 30.0)
+    assert filled.found is not None
+    assert filled.iou == pytest.approx(overlap(covered(LAYOUT, filled.found), area))
+    assert filled.iou > 0.999
+    assert filled.nodes >= 7
+
+
+def test_parts_that_meet_in_a_corner_holes_and_angles_off_the_grid_are_filled() -> None:
+    """A ring of tans around a hole, and one tan that touches it in a corner, turned freely."""
+    poses = gluing(3)
+    corners = LAYOUT.corners(poses)
+    tip = corners[int(corners[:, 0].argmax())]
+    square = SEVEN.index("square")
+    poses[square] = (*(tip + 0.25 * np.array([np.cos(0.2), np.sin(0.2)])), 0.2)
+    area = whole(poses)
+    (filled,) = fill_outline(area, LAYOUT, 30.0)
+    assert filled.found is not None
+    assert filled.iou > 0.99
+
+
+def test_dissections_of_one_outline_differ() -> None:
+    side = polygon(np.array([0.0, 1.0, 1.0 + 1.0j, 1.0j]))
+    every = fill_outline(side, LAYOUT, 30.0, count=5)
+    assert len(every) == 5
+    laid = {tuple(map(tuple, one.found.poses.round(3))) for one in every if one.found}
+    assert len(laid) == 5
+    assert all(one.iou > 0.999 for one in every)
+
+
+def test_a_budget_ends_the_search_and_nothing_is_claimed() -> None:
+    strip = polygon(np.array([0.0, 4.0, 4.0 + 0.25j, 0.25j]))
+    (filled,) = fill_outline(strip, LAYOUT, 30.0)
+    assert (filled.found, filled.complete) == (None, True)
+    unfilled = convex_outlines(1.0)[-1]
+    budget = Budget(time.thread_time() + 30.0, nodes=3)
+    assert list(Search(Tokens(LAYOUT), 0.004, budget).run(polygon(unfilled))) == []
+    assert budget.spent()
+    (late,) = fill_outline(polygon(unfilled), LAYOUT, 0.0)
+    assert (late.found, late.complete) == (None, False)
+
+
+def test_an_area_that_is_not_that_of_the_tokens_is_left_at_once() -> None:
+    (filled,) = fill_outline(whole(gluing(0)).buffer(0.05, join_style="mitre"), LAYOUT, 30.0)
+    assert (filled.found, filled.complete) == (None, True)
+    assert filled.nodes < 20
+
+
+def test_a_corner_that_no_tokens_make_ends_the_search_at_once() -> None:
+    side, way = (2.0 / np.sqrt(3.0)) ** 0.5, np.exp(1j * np.pi / 3.0)
+    rhombus = side * np.array([0.0, 1.0, 1.0 + way, way])  # 60 degrees, and the tokens' area
+    budget = Budget(time.thread_time() + 30.0)
+    assert list(Search(Tokens(LAYOUT), 0.004, budget).run(polygon(rhombus))) == []
+    assert budget.taken == 1
+
+
+def test_corners_of_tokens_are_told_once_for_each_turn_that_looks_alike() -> None:
+    tokens = Tokens(LAYOUT)
+    assert tokens.counts == (2, 1, 2, 1, 1)
+    assert len(tokens.corners) == 14
+    assert np.degrees(tokens.angles).round() == pytest.approx([45, 90, 90, 135, 135, 180, 180, 180])
+    assert tokens.unit == pytest.approx(1.0)
+
+
+def test_corners_within_a_side_are_none() -> None:
+    ring = np.array([0.0, 0.5 + 0.001j, 1.0, 1.0 + 1e-4j, 1.0 + 1.0j, 1.0j])
+    assert straightened(ring, 0.004) == pytest.approx(
+        [0.0, 1.0 + 1e-4j, 1.0 + 1.0j, 1.0j], abs=2e-4
+    )
+
+
+def test_what_nothing_fills_keeps_the_tokens_that_could_be_laid() -> None:
+    """Three tans fit into a strip as high as a small triangle, and a fourth may stand over."""
+    strip = polygon(np.array([0.0, 4.0, 4.0 + 0.25j, 0.25j]))
+    (filled,) = fill_outline(strip, LAYOUT, 30.0)
+    assert (filled.found, filled.complete) == (None, True)
+    assert filled.attempt is not None
+    laid = covered(LAYOUT, filled.attempt)
+    assert 3 <= len(filled.attempt.laid) < 7
+    assert filled.iou == pytest.approx(overlap(laid, strip))
+    assert 0.24 < filled.iou < 0.4
+    assert laid.difference(strip).area < 0.1 * laid.area
+    (late,) = fill_outline(strip, LAYOUT, 0.0)
+    assert (late.attempt, late.iou) == (None, 0.0)
+
+
+def test_a_search_remembers_the_most_that_it_laid() -> None:
+    search = Search(Tokens(LAYOUT), 0.004, Budget(time.thread_time() + 30.0))
+    assert list(search.run(polygon(convex_outlines(1.0)[-1]))) == []
+    assert 0 < len(search.best) < 7
+    laid = next(search.run(whole(gluing(1))))
+    assert search.best == laid
+
+
+def test_tokens_that_lie_on_each_other_are_no_better_attempt() -> None:
+    """Two large triangles, one all but on the other, cover a little more than one alone."""
+    tokens, side = Tokens(LAYOUT), polygon(np.array([0.0, 1.0, 1.0 + 1.0j, 1.0j]) - 0.5 - 0.5j)
+    large = int(tokens.areas.argmax())
+    one = [Laid(large, False, np.zeros(3))]
+    two = [*one, Laid(large, False, np.array([0.05, 0.0, 0.0]))]
+    for tried in ([one, two], [two, one]):
+        found, iou = nearest_fill(side, LAYOUT, Budget(0.0), tried, UNLEARNED)
+        assert found is not None
+        assert len(found.laid) == 1
+        assert iou == pytest.approx(0.25, abs=0.01)
+    both, more = nearest_fill(side, LAYOUT, Budget(0.0), [two], UNLEARNED)
+    assert both is not None
+    assert more > 0.26
+
+
+def test_an_attempt_says_what_was_laid() -> None:
+    filled = attempt_outline(polygon(np.array([0.0, 1.0, 1.0 + 0.83j, 0.83j])), LAYOUT, 30.0)
+    assert filled.attempt is not None
+    assert 4 <= len(pieces(LAYOUT, filled.attempt)) < 7
+    assert filled.iou > 0.8
+    assert not filled.solved
+
+
+def test_dissections_that_look_alike_are_one() -> None:
+    """A triangle whose sides are all but equal lies in its outline in three ways, to the eye one.
+
+    Turned off each other by a tenth of a percent, within the search's tolerance.
+    """
+    corners = ((0.0, 0.0), (1.0, 0.0), (0.5, 0.867))
+    layout = make_layout(TokensConfig(({"name": "even", "corners": corners},), 1.0))
+    every = fill_outline(Polygon(corners), layout, 30.0, count=5)
+    assert len(every) == 1
+    assert every[0].complete
+
+
+def test_equal_tokens_that_are_swapped_are_one_dissection() -> None:
+    (filled,) = fill_outline(whole(gluing(2)), LAYOUT, 30.0)
+    assert filled.found is not None
+    swapped = np.arange(7)
+    large = [k for k, name in enumerate(SEVEN) if name == "large_triangle"]
+    swapped[large] = large[::-1]
+    other = Dissection(filled.found.poses[swapped], filled.found.flipped[swapped])
+    moved = Dissection(filled.found.poses + (0.1, 0.0, 0.0), filled.found.flipped)
+    tokens = Tokens(LAYOUT)
+    assert _alike(tokens, LAYOUT, filled.found, other)
+    assert not _alike(tokens, LAYOUT, filled.found, moved)

@@ -1,0 +1,166 @@
+"""Play: what is recorded equals a naive loop, whatever is played side by side."""
+
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tangram_agent.policy import Policy
+from tangram_agent.setup import Setup
+from tangram_agent.types import Past
+from tangram_core.seeding import episode_generator
+from tangram_core.spec import Episodes, joined
+from tangram_sim.batch import BatchedEnv
+from tangram_sim.geometry.overlap import overlap_share
+from tests.agent.builders import PAIR, SQUARE, setup
+from tests.sim.builders import sample_poses
+from tests.worker.builders import policy
+from worker.play.rollout import Rollout, parts, play
+
+pytestmark = pytest.mark.fast
+
+# Explores a lot, so that a stream of random numbers that is out of step shows.
+CURIOUS = {"noise": 0.3, "uniform_share": 0.3}
+IDENTITY = (5, "player", 2, 3)
+
+
+def naive_episode(made: Setup, acting: Policy, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """One episode without any batch: pose arithmetic straight from the definition."""
+    layout, sim = made.layout, made.sim
+    goal = layout.corners(sample_poses(layout, sim, rng))
+    pose = sample_poses(layout, sim, rng).copy()
+    moves = np.zeros(layout.tokens, int)
+    corners, placed, actions, rewards = [layout.corners(pose)], [moves >= 1], [], []
+
+    def is_placed(moves: np.ndarray) -> np.ndarray:
+        limited = layout.tokens == 1 and sim.actions_per_token > 1
+        return (moves >= sim.actions_per_token) & (not limited)
+
+    for _ in range(made.horizon):
+        flags = is_placed(moves)
+        past = Past(
+            np.array(corners[:-1], np.float32).reshape(1, -1, layout.corner_count, 2),
+            np.array(actions, np.float32).reshape(1, -1, made.action_size),
+        )
+        action = acting.explore(corners[-1][None], flags[None], goal[None], [rng], past)[0]
+        token = 0
+        if layout.tokens > 1:
+            token = min(int((action[0] + 1.0) / 2.0 * layout.tokens), layout.tokens - 1)
+        if moves[token] < sim.actions_per_token:
+            pose[token] += action[-3:] * np.array([sim.arena, sim.arena, np.pi])
+            moves[token] += 1
+        corners.append(layout.corners(pose))
+        placed.append(is_placed(moves))
+        actions.append(action)
+        rewards.append(2.0 * overlap_share(corners[-1][None], goal[None], layout)[0] - 1.0)
+    return {
+        "corners": np.array(corners),
+        "placed": np.array(placed),
+        "actions": np.array(actions),
+        "rewards": np.array(rewards),
+        "terminated": np.array(placed)[1:].all(axis=1),
+        "goals": goal,
+    }
+
+
+@contextmanager
+def environment(made: Setup, count: int = 4) -> Iterator[BatchedEnv]:
+    with closing(BatchedEnv(made.layout, made.sim, made.reward, count)) as env:
+        yield env
+
+
+def rolled_out(made: Setup, envs: int, count: int) -> Episodes:
+    with environment(made, envs) as env:
+        rollout, acting = Rollout(env, *IDENTITY), policy(made)
+        played = [rollout.play(acting.explore, groups) for groups in (1, count // envs - 1)]
+        assert rollout.episode == count
+    return joined(played)
+
+
+@pytest.mark.parametrize(("tokens", "actions"), [(SQUARE, 1), (SQUARE, 3), (PAIR, 2)])
+def test_episodes_equal_a_naive_loop_however_they_are_batched(
+    tokens: dict, actions: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The naive loop sets tokens down wherever they are told to.
+    monkeypatch.setattr("tangram_sim.batch.MAX_OVERLAP", 1.0)
+    made = setup(tokens, CURIOUS, actions_per_token=actions)
+    acting = policy(made)
+    naive = [naive_episode(made, acting, episode_generator(*IDENTITY, n)) for n in range(16)]
+    for envs in (1, 8):
+        episodes = rolled_out(made, envs, 16)
+        assert {name: column.dtype.name for name, column in episodes.arrays.items()} == {
+            **dict.fromkeys(("corners", "actions", "rewards", "goals"), "float32"),
+            **dict.fromkeys(("placed", "terminated"), "uint8"),
+        }
+        assert (np.abs(episodes.actions) <= 1.0).all()
+        for number, expected in enumerate(naive):
+            for name, column in expected.items():
+                # Batches of other sizes round differently in the network's matrix products.
+                np.testing.assert_allclose(
+                    episodes[name][number], column, atol=2e-5, err_msg=f"{name} of {number}"
+                )
+
+
+@pytest.mark.parametrize("position", range(4))
+def test_each_part_of_the_identity_gives_other_episodes(position: int) -> None:
+    made = setup()
+    other = list(IDENTITY)
+    other[position] = "evaluator" if position == 1 else IDENTITY[position] + 1
+    with environment(made) as env:
+        one, two = (Rollout(env, *who).play(policy(made).explore) for who in (IDENTITY, other))
+    assert not np.isclose(one["goals"], two["goals"]).any(axis=(1, 2)).all()
+    assert not np.isclose(one["corners"][:, 0], two["corners"][:, 0]).any(axis=(1, 2)).all()
+
+
+@pytest.mark.parametrize(("size", "counts"), [(5, [5, 5, 2]), (12, [12]), (40, [12]), (4, [4] * 3)])
+def test_messages_are_parts_of_the_record_in_order(size: int, counts: list[int]) -> None:
+    episodes = rolled_out(setup(), envs=4, count=12)
+    found = list(parts(episodes, size))
+    assert [part.count for part in found] == counts
+    for name, column in episodes.arrays.items():
+        pieces = [part[name] for part in found]
+        np.testing.assert_array_equal(np.concatenate(pieces), column)
+        assert all(np.shares_memory(piece, column) for piece in pieces)  # nothing is copied
+
+
+@pytest.mark.parametrize("camera", [True, False])
+def test_as_many_episodes_as_asked_for_in_any_number_of_environments(camera: bool) -> None:
+    made = setup(pixels=32 * camera)
+    acting = policy(made)
+    with environment(made, 3) as env:
+        four = play(env, acting.explore, np.random.default_rng, 4)
+        six = play(env, acting.explore, np.random.default_rng, 6)
+    assert len(four.overlap) == len(four.starts) == four.episodes.count == 4
+    np.testing.assert_array_equal(four.corners, six.corners[:4])
+    np.testing.assert_array_equal(four.episodes.actions, six.episodes.actions[:4])
+    assert (four.camera is None) == (not camera)
+
+
+@pytest.mark.parametrize(("asked", "groups"), [(0, 0), (1, 0), (2, 1), (3, 1), (4, 2)])
+def test_play_ends_before_an_action_when_it_is_told_to(asked: int, groups: int) -> None:
+    """What was begun is left out: an episode of two actions is whole after two questions."""
+    made = setup(actions_per_token=2)
+    answers = iter([True] * asked + [False])
+    with environment(made, 3) as env:
+        rollout = Rollout(env, *IDENTITY)
+        episodes = rollout.play(policy(made).explore, 5, lambda: next(answers))
+    assert episodes.count == rollout.episode == 3 * groups
+
+
+def test_the_policy_sees_noise_and_that_is_what_travels() -> None:
+    made = setup(corner_noise=0.02)
+    seen: list[np.ndarray] = []
+
+    def choose(corners: np.ndarray, _placed: object, goals: np.ndarray, *_: object) -> Any:
+        seen.extend([corners.copy(), goals.copy()])
+        return np.zeros((4, 3), np.float32)
+
+    with environment(made) as env:
+        played = play(env, choose, np.random.default_rng, 4)
+    episodes = played.episodes
+    np.testing.assert_array_equal(episodes["corners"][:, 0], seen[0].astype(np.float32))
+    np.testing.assert_array_equal(episodes["goals"], seen[1].astype(np.float32))
+    for noisy, exact in ((episodes["corners"], played.corners), (episodes["goals"], played.goals)):
+        assert 0.02 < np.abs(noisy - exact).max() <= 4 * 0.02 * made.sim.arena + 1e-6

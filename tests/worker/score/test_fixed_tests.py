@@ -1,0 +1,137 @@
+"""The fixed test set, and the two policies to compare with."""
+
+from contextlib import closing
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tangram_core.seeding import evaluation_generators
+from tangram_game.rivals.baselines import position_policy, random_policy
+from tests.agent.builders import PAIR, SQUARE, setup
+from tests.worker.builders import policy
+from worker.play.rollout import Played
+from worker.score.test_set import FixedTests, greedy
+
+pytestmark = pytest.mark.fast
+
+
+def played(episodes: int, at_once: int, **more: object) -> Played:
+    made = setup(pixels=32)
+    with closing(FixedTests(made, episodes, at_once, **more)) as tests:
+        return tests.play(greedy(policy(made)))
+
+
+def test_the_set_does_not_depend_on_how_many_play_at_a_time() -> None:
+    expected = played(12, 4)
+    for episodes, at_once in ((7, 3), (7, 7), (7, 50), (1, 1)):
+        found = played(episodes, at_once)
+        assert len(found.overlap) == episodes
+        for name in ("corners", "goals", "overlap"):
+            column = vars(expected)[name][:episodes]
+            np.testing.assert_allclose(vars(found)[name], column, atol=1e-4, err_msg=name)
+        actions = expected.episodes.actions[:episodes]
+        np.testing.assert_allclose(found.episodes.actions, actions, atol=1e-4)
+
+
+def test_the_default_set_is_that_of_the_simulation() -> None:
+    made = setup(pixels=32)
+    with closing(FixedTests(made, 3, 3)) as tests:
+        goals = tests.play(greedy(policy(made))).goals
+        tests.env.reset(evaluation_generators(3))
+        np.testing.assert_array_equal(goals, tests.env.goals)
+
+
+@pytest.mark.parametrize("other", [{"seed": 1}, {"role": "play"}])
+def test_another_name_is_another_set(other: dict) -> None:
+    assert not np.isclose(played(4, 4).goals, played(4, 4, **other).goals).any()
+
+
+def test_noise_is_off() -> None:
+    made = setup(agent={"noise": 1.0, "uniform_share": 1.0}, pixels=32)
+    acting = policy(made)
+    with closing(FixedTests(made, 3, 3)) as tests:
+        found = tests.play(greedy(acting))
+    expected = acting.act(found.starts, found.episodes["placed"][:, 0], found.goals)
+    np.testing.assert_array_equal(found.episodes.actions[:, 0], expected)
+
+
+def test_the_camera_is_on_though_training_has_none() -> None:
+    made = setup()
+    assert not made.sim.pixels
+    with closing(FixedTests(made, 20, 10)) as tests:
+        found = tests.play(position_policy(made.layout, made.sim))
+        scores = tests.scores(found)
+    assert found.camera is not None
+    np.testing.assert_allclose(found.camera, 2.0 * found.overlap - 1.0, atol=0.1)
+    assert scores["mean_reward_camera"] == pytest.approx(scores["mean_reward"], abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("reward", "own"),
+    [
+        ({}, False),
+        ({"name": "dense"}, True),
+        ({"source": "camera"}, True),
+    ],
+)
+def test_the_trained_reward_is_reported_where_it_is_another(reward: dict, own: bool) -> None:
+    made = setup(pixels=32)
+    made = replace(made, reward=replace(made.reward, **reward))
+    with closing(FixedTests(made, 3, 3)) as tests:
+        found = tests.play(greedy(policy(made)))
+        scores = tests.scores(found)
+    assert scores["mean_reward"] == pytest.approx(float(np.mean(2.0 * found.overlap - 1.0)))
+    assert ("mean_train_reward" in scores) == own
+
+
+@pytest.mark.parametrize(("tokens", "actions"), [(SQUARE, 1), (SQUARE, 3), (PAIR, 1), (PAIR, 2)])
+def test_the_position_policy_solves_position_and_nothing_else(
+    tokens: dict, actions: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tangram_sim.batch.MAX_OVERLAP", 1.0)
+    made = setup(tokens, pixels=32, actions_per_token=actions)
+    with closing(FixedTests(made, 10, 10)) as tests:
+        found = tests.play(position_policy(made.layout, made.sim))
+    centres = made.layout.bases(found.ends), made.layout.bases(found.goals)
+    np.testing.assert_allclose(*centres, atol=1e-6)
+    assert found.episodes["placed"][:, -1].all() == (tokens is PAIR or actions == 1)
+    angles = made.layout.poses(found.corners)[..., 2]
+    np.testing.assert_allclose(angles[:, -1], angles[:, 0], atol=1e-9)
+
+
+def test_the_position_policy_reaches_the_plateau_of_the_paper() -> None:
+    """A square on its target's centre at a uniform angle: 0.8825 raw, 0.765 scaled."""
+    made = setup(pixels=16)
+    with closing(FixedTests(made, 500, 100)) as tests:
+        found = tests.play(position_policy(made.layout, made.sim))
+        assert tests.scores(found)["mean_reward"] == pytest.approx(0.765, abs=0.01)
+
+
+@pytest.mark.parametrize("flip", [False, True])
+def test_the_random_policy_fills_the_action_space_from_the_episodes_generators(flip: bool) -> None:
+    made = setup({"shapes": ["parallelogram"], "scale": 1.0}, allow_flip=flip)
+    choose = random_policy(made.layout, made.sim)
+    nothing = np.zeros((500, 1))
+    one, two = (choose(nothing, nothing, nothing, evaluation_generators(500)) for _ in range(2))
+    np.testing.assert_array_equal(one, two)
+    assert one.shape == (500, made.action_size)
+    np.testing.assert_allclose(one.min(axis=0), -1.0, atol=0.05)
+    np.testing.assert_allclose(one.max(axis=0), 1.0, atol=0.05)
+
+
+def test_the_number_of_actions_can_be_another_than_in_training() -> None:
+    with closing(FixedTests(setup(pixels=16, actions_per_token=5), 2, 2)) as tests:
+        assert tests.play(greedy(policy(setup()))).episodes.actions.shape == (2, 5, 3)
+
+
+def test_noise_on_the_corners_is_seen_and_not_scored() -> None:
+    scores = []
+    for noise in (0.0, 0.05):
+        made = setup(pixels=16, corner_noise=noise)
+        with closing(FixedTests(made, 50, 50)) as tests:
+            found = tests.play(position_policy(made.layout, made.sim))
+            scores.append(tests.scores(found)["position_error_median"])
+    assert scores[0] == pytest.approx(0.0, abs=1e-6)
+    # the mean of four corners, of token and target each: 0.1 * sqrt(2 / 4), in the plane
+    assert scores[1] == pytest.approx(0.1 * np.sqrt(0.5) * np.sqrt(2 * np.log(2)), rel=0.3)

@@ -1,0 +1,169 @@
+"""What player and evaluator share: joining a master, ending on a signal, and log lines."""
+
+import logging
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import TextIO
+
+import torch
+
+from tangram_agent.arrays import check_batch_size
+from tangram_agent.messages import TAKEN_OVER
+from tangram_agent.policy import Policy
+from tangram_agent.setup import Setup
+from tangram_core.errors import TangramError
+from tangram_core.process import WATCHDOG_S, Watchdog, formatter, keep_memory, watch_parent
+from worker.config import WorkerConfig
+from worker.talk.client import Client
+
+SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1, signal.SIGUSR2)
+REPORT_S = 30.0
+
+_log = logging.getLogger(__name__)
+
+
+class IndexTakenError(TangramError):
+    """The index that the master gave to this process, which asked for any, is another's now."""
+
+
+@contextmanager
+def joined(config: WorkerConfig, setup: Setup, policy: Policy) -> Iterator[Client]:
+    """A client to the master that has joined, or that was stopped while it tried.
+
+    On leaving, the master is told, after the batches that are on their way, and the signal handlers
+    are put back.
+
+    Args:
+        config: of this worker.
+        setup: the task, which the master must share.
+        policy: what the master's weights must fit.
+
+    Raises:
+        TangramError: the master refuses, or does not answer.
+        IndexTakenError: another process asked for the index that this one was given.
+    """
+    watch_parent()
+    # Several workers share one machine: more threads each would only get in each other's way.
+    torch.set_num_threads(1)
+    keep_memory()
+    service = config.service
+    log_as(config.role, service.log_format)
+    spec = setup.spec
+    check_batch_size(spec)
+    watchdog = Watchdog(WATCHDOG_S)
+    client = Client(
+        config.connect,
+        config.role,
+        config.index,
+        setup.fingerprints(),
+        spec,
+        policy.shapes,
+    )
+    client.on_progress = watchdog.progress
+    with client, stopped_by_signals(client), watchdog:
+        if client.join():
+            me = client.welcome
+            log_as(f"{config.role} {me.index}", service.log_format)
+            fields = {"event": "joined", "run_id": me.run_id, "incarnation": me.incarnation}
+            _log.info("joined run %s", me.run_id, extra=fields)
+        yield client
+        if config.index < 0 and TAKEN_OVER in client.stop_reason:
+            raise IndexTakenError(client.stop_reason)
+        _log.info("ends: %s", client.stop_reason, extra={"event": "ended"})
+
+
+def keep_part(run: Callable[[WorkerConfig, Setup], int], config: WorkerConfig, setup: Setup) -> int:
+    """Run a player or an evaluator, and again when another process takes the index it was given.
+
+    Returns:
+        Exit status 0.
+
+    Raises:
+        TangramError: as `run`.
+    """
+    while True:
+        try:
+            return run(config, setup)
+        except IndexTakenError as error:
+            fields = {"event": "index_taken"}
+            _log.info("%s: it goes on with an index that is free", error, extra=fields)
+
+
+@contextmanager
+def stopped_by_signals(client: Client) -> Iterator[None]:
+    """The signals stop the client instead of the process, so that it can say BYE."""
+
+    def handle(number: int, _frame: FrameType | None) -> None:
+        client.stop(signal.Signals(number).name)
+
+    before = {number: signal.signal(number, handle) for number in SIGNALS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def log_as(who: str, log_format: str) -> None:
+    """Write the log lines of this process to stderr, with the time and who writes them."""
+    logger = logging.getLogger("worker")
+    logger.setLevel(logging.INFO)
+    for former in [h for h in logger.handlers if isinstance(h, _Lines)]:
+        logger.removeHandler(former)
+    handler = _Lines(sys.stderr)
+    handler.setFormatter(formatter(log_format, who))
+    logger.addHandler(handler)
+
+
+class _Lines(logging.StreamHandler[TextIO]):
+    """The handler that `log_as` replaces."""
+
+
+class Report:
+    """What a player tells its log: that it waits, and every now and then how fast it plays."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._begin()
+
+    def _begin(self) -> None:
+        self._since = self._clock()
+        self._episodes = 0
+        self._waited = 0.0
+        self._told: set[str] = set()
+
+    @contextmanager
+    def waiting(self, why: str) -> Iterator[None]:
+        """Count the time inside as waiting; each reason is logged once between two reports."""
+        if why not in self._told:
+            _log.info("waits: %s", why, extra={"event": "waits"})
+            self._told.add(why)
+        start = self._clock()
+        try:
+            yield
+        finally:
+            self._waited += self._clock() - start
+
+    def played(self, episodes: int, version: int) -> None:
+        """Count episodes; a line when it is time."""
+        self._episodes += episodes
+        passed = self._clock() - self._since
+        if passed < REPORT_S:
+            return
+        values = {
+            "episodes": self._episodes,
+            "seconds": passed,
+            "episodes_per_s": self._episodes / passed,
+            "percent_waiting": 100.0 * self._waited / passed,
+            "weights_version": version,
+        }
+        _log.info(
+            "%d episodes in %.0f s (%.1f/s), %.0f %% of the time waiting, weights %d",
+            *values.values(),
+            extra={"event": "played", **values},
+        )
+        self._begin()

@@ -1,0 +1,159 @@
+"""What played episodes are worth: overlaps, errors of position and angle, how tokens make figures.
+
+Legend: E episodes, T steps, K tokens, V corners.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tangram_core.arrays import Bools, Floats, Ints
+from tangram_sim.config import RewardConfig, SimConfig
+from tangram_sim.geometry.layout import Layout
+from tangram_sim.geometry.overlap import outlines, overlap_share, shared_areas, union_area
+from tangram_sim.rewards import make_reward
+from worker.play.rollout import Played
+from worker.score.pairing import alike, paired
+
+SOLVED = 0.95  # of the target covered
+# Share of a piece that a token must cover to count: less is a neighbour that reaches over.
+TOUCHED = 0.05
+USED = 0.25
+_ROUNDING = 1e-9
+
+
+def pose_errors(layout: Layout, ends: Floats, goals: Floats) -> tuple[Floats, Floats]:
+    """How far each token is from its place in the target, both as corners (E, V, 2).
+
+    Equal tokens may change places: they are measured against the pieces that they are paired with.
+
+    Returns:
+        (E, K) distances of the centres of area, in arena units; (E, K) angles between the
+        orientations modulo the shape's symmetry, in degrees, from 0 to 180 / symmetry, which is
+        also the error of a token that lies on the wrong side.
+    """
+    pairing = paired(layout, ends, goals)
+    position: Floats = np.linalg.norm(pairing.way[..., :2], axis=-1)
+    largest = 180.0 / layout.symmetries
+    turn = np.degrees(np.abs(pairing.way[..., 2]))
+    return position, np.where(pairing.other_side, largest, turn)
+
+
+def summarise(layout: Layout, sim: SimConfig, played: Played, own_reward: bool) -> dict[str, float]:
+    """Scores of E episodes; percentiles look at the bad end of each distribution.
+
+    Args:
+        own_reward: report the mean of the last action's reward, too: training is not on Eq. 14 of
+            exact polygons.
+
+    Returns:
+        mean_reward (Eq. 14 of exact polygons, in [-1, 1], whatever is trained on),
+        mean_reward_dense (Eq. 15), raw_overlap and its 10th percentile,
+        medians and 90th percentiles of the errors over all tokens, episodes; mean_reward_camera
+        and mean_train_reward where they exist; with several tokens the means of `Assembled`.
+    """
+    position, angle = pose_errors(layout, played.ends, played.goals)
+    dense = make_reward(RewardConfig("dense"), layout, sim)
+    scores = {
+        "mean_reward": float(np.mean(2.0 * played.overlap - 1.0)),
+        "mean_reward_dense": float(np.mean(dense(played.ends, played.goals))),
+        "raw_overlap": float(np.mean(played.overlap)),
+        "raw_overlap_p10": float(np.percentile(played.overlap, 10)),
+        "angle_error_deg_median": float(np.median(angle)),
+        "angle_error_deg_p90": float(np.percentile(angle, 90)),
+        "position_error_median": float(np.median(position)),
+        "position_error_p90": float(np.percentile(position, 90)),
+        "episodes": float(len(played.overlap)),
+    }
+    if played.camera is not None:
+        scores["mean_reward_camera"] = float(np.mean(played.camera))
+    if own_reward:
+        scores["mean_train_reward"] = float(
+            np.mean(played.episodes.rewards[:, -1], dtype=np.float64)
+        )
+    if layout.tokens > 1:
+        scores |= assembled(layout, played).means()
+    return scores
+
+
+@dataclass(frozen=True, eq=False)
+class Assembled:
+    """Scores of E episodes.
+
+    Attributes:
+        coverage: (E,) share of the target that the tokens cover, in [0, 1].
+        iou: (E,) area that tokens and target share over the area of both together, in [0, 1].
+        wrong: (E,) pieces of the target that a token of another shape covers most, and by more
+            than `TOUCHED`; on its other side a chiral token has another shape.
+        doubly_used: (E,) pieces that two or more tokens cover by more than `USED` each.
+        refused: (E,) actions that named a placed token.
+        blocked: (E,) tokens that could not be set down because of others.
+        actions_used: (E,) actions that were not refused.
+    """
+
+    coverage: Floats
+    iou: Floats
+    wrong: Ints
+    doubly_used: Ints
+    refused: Ints
+    blocked: Ints
+    actions_used: Ints
+
+    @property
+    def solved(self) -> Bools:
+        """(E,) where at least `SOLVED` of the target is covered."""
+        solved: Bools = self.coverage >= SOLVED
+        return solved
+
+    def means(self) -> dict[str, float]:
+        """Each score's mean over the episodes; `solved` as `share_solved`."""
+        means = {name: float(np.mean(column)) for name, column in vars(self).items()}
+        return means | {"share_solved": float(np.mean(self.solved))}
+
+
+def assembled(layout: Layout, played: Played) -> Assembled:
+    """Scores of episodes as they ended."""
+    coverage = overlap_share(played.ends, played.goals, layout)
+    covered = covered_shares(layout, played.ends, played.goals)
+    refused = played.refused.sum(axis=1)
+    return Assembled(
+        coverage=coverage,
+        iou=iou(layout, played.ends, coverage),
+        wrong=_wrong(layout, played, covered),
+        doubly_used=((covered > USED + _ROUNDING).sum(axis=2) > 1).sum(axis=1),
+        refused=refused,
+        blocked=played.blocked.sum(axis=1),
+        actions_used=played.refused.shape[1] - refused,
+    )
+
+
+def covered_shares(layout: Layout, ends: Floats, goals: Floats) -> Floats:
+    """(E, K, K) the share of each piece of the target that each token covers.
+
+    Args:
+        layout: the tokens.
+        ends: (E, V, 2) corners of the tokens.
+        goals: (E, V, 2) corners of the target.
+    """
+    shared = shared_areas(outlines(goals, layout), outlines(ends, layout))
+    shares: Floats = shared / layout.areas[:, None]
+    return shares
+
+
+def iou(layout: Layout, ends: Floats, coverage: Floats) -> Floats:
+    """(E,) intersection over union of tokens at corners (E, V, 2) and targets covered so much."""
+    whole = layout.areas.sum()
+    common = coverage * whole
+    share: Floats = common / (whole + union_area(ends, layout) - common)
+    return share
+
+
+def _wrong(layout: Layout, played: Played, covered: Floats) -> Ints:
+    """(E,), see `Assembled`."""
+    sides = layout.flipped(played.goals)[:, :, None] == layout.flipped(played.ends)[:, None]
+    same = alike(layout) & sides
+    # A piece that two cover alike is right if one of them is.
+    right = np.where(same, covered, 0.0).max(axis=2)
+    other = np.where(same, 0.0, covered).max(axis=2)
+    wrong: Ints = ((other > right + _ROUNDING) & (other > TOUCHED)).sum(axis=1)
+    return wrong

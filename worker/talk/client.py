@@ -1,0 +1,416 @@
+"""A worker's end of the conversation with the master: batches out, weights in.
+
+Delivery: a batch is sent again, with all that are unacknowledged and in order, after each WELCOME
+(a new connection, a restarted master), when the master got one out of turn, and when no
+acknowledgement came for a while. The master drops what it has already.
+
+Nothing here waits without looking at `stopped` every STEP_S, so a signal handler that calls `stop`
+ends each wait.
+"""
+
+import logging
+import math
+import secrets
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from typing import Self
+
+from tangram_agent.arrays import WeightShapes
+from tangram_agent.messages import (
+    WINDOW,
+    Ack,
+    Alive,
+    Bye,
+    EpisodeBatch,
+    Go,
+    Greet,
+    Heartbeat,
+    Hello,
+    Refused,
+    Reject,
+    RunStatus,
+    Scores,
+    Stop,
+    ToWorker,
+    WantWeights,
+    WeightsMessage,
+    Welcome,
+    decode_from_master,
+)
+from tangram_agent.schema import Plain, ProtocolError
+from tangram_agent.types import Weights
+from tangram_core.errors import TangramError, WireError
+from tangram_core.spec import Episodes, EpisodeSpec
+from tangram_core.wire.addresses import host_of, reachable
+from worker.talk.connection import Connection, Sockets, Timing
+from worker.talk.outbox import NewestWeights, Outbox
+
+STEP_S = 0.1
+# Between two log lines of what is waited for.
+TELL_S = 60.0
+# Times `Timing.resend_s`: the longest that is waited before all is sent again.
+MOST_PATIENCE = 8.0
+
+log = logging.getLogger(__name__)
+
+
+class Client:
+    """One process's conversation; made without any I/O, `join` starts it.
+
+    Args:
+        connect: host:port, a connection file, or a run folder that holds one.
+        role: player or evaluator.
+        index: wanted within the role, -1 for any.
+        fingerprints: section of the settings -> digest, which the master compares.
+        spec: the task that arrays are checked against.
+        shapes: of the tensors that weights must have; None takes any.
+        window: most batches kept unacknowledged; the master's own bound holds as well.
+        timing: patience.
+
+    Attributes:
+        stats: numbers that the next heartbeats tell the master, to be set.
+        counters: what was sent again, refused, lost or not understood.
+        outbox: batches that the master has not acknowledged.
+        newest: the newest weights.
+        joined: the present connection is known to the master.
+        on_progress: called whenever the client is at work.
+    """
+
+    def __init__(
+        self,
+        connect: str,
+        role: str,
+        index: int,
+        fingerprints: Mapping[str, str],
+        spec: EpisodeSpec,
+        shapes: WeightShapes | None = None,
+        window: int = WINDOW,
+        timing: Timing | None = None,
+    ) -> None:
+        self.stats: dict[str, float] = {}
+        self.counters: Counter[str] = Counter()
+        self.outbox, self.newest = Outbox(window), NewestWeights(shapes)
+        self.joined = False
+        self.on_progress: Callable[[], None] = lambda: None
+        self._timing = timing or Timing()
+        self._connection = Connection(connect, self._timing, self.counters, role)
+        self._role, self._index, self._fingerprints = role, index, fingerprints
+        self._spec, self._shapes, self._window = spec, shapes, window
+        self._process = secrets.token_hex(16)
+        self._welcome: Welcome | None = None
+        self._order: Go | None = None
+        self._again = False
+        self._stop_reason = ""
+        # The master wants this process to end, and why.
+        self._dismissed, self._dismissal = False, ""
+        self._hello_at = self._heartbeat_at = self._resend_at = 0.0
+        self._patience_s = self._timing.resend_s
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def welcome(self) -> Welcome:
+        """The master's last WELCOME: seed, run_id, index, incarnation.
+
+        Raises:
+            TangramError: before `join`.
+        """
+        if self._welcome is None:
+            raise TangramError("the client has not joined a master yet: call join() first")
+        return self._welcome
+
+    @property
+    def acknowledged(self) -> int:
+        """Number of the last batch up to which all were acknowledged."""
+        return self.outbox.first - 1
+
+    @property
+    def stopped(self) -> bool:
+        """Whether this process must end."""
+        return bool(self._stop_reason) or self._dismissed
+
+    @property
+    def stop_reason(self) -> str:
+        """Why it must end, empty while it need not."""
+        return self._stop_reason or self._dismissal
+
+    @property
+    def window_free(self) -> int:
+        """Batches that can be sent without waiting."""
+        return self.outbox.free
+
+    def stop(self, reason: str) -> None:
+        """Ask all waits to end; safe in a signal handler."""
+        self._stop_reason = self._stop_reason or reason or "stopped"
+
+    def join(self) -> bool:
+        """Wait for the master and its WELCOME; False if `stop` was called meanwhile.
+
+        Raises:
+            TangramError: no master in time, or it refused; the reason is the master's.
+        """
+        patience = self._timing.join_s
+        log.info(
+            "joins %s, waits %g s at most for its master",
+            self._connection.place,
+            patience,
+            extra={"event": "joining"},
+        )
+        joined = self._wait(lambda: self.joined, "the master", self._timing.join_s)
+        if not joined and not self.stopped:
+            raise TangramError(self._connection.no_master(self._timing.join_s))
+        return joined
+
+    def poll(self, timeout_s: float = 0.0) -> None:
+        """Take what came, send what is due; waits at most so long for something to come.
+
+        Raises:
+            TangramError: the master refuses this process, is one of another run, or did not answer
+                for `lost_s`.
+        """
+        self.on_progress()
+        sockets = self._connection.sockets or self._open()
+        if sockets is None:  # nothing to wait for but the file
+            time.sleep(timeout_s)
+        else:
+            sockets.wait(timeout_s)
+            self._connection.watch(time.monotonic())
+            self._receive_weights(sockets)
+            for frames in sockets.messages():
+                self._receive(frames)
+            self._do_what_is_due(sockets, time.monotonic())
+        self._connection.check_lost(time.monotonic())
+
+    def send(self, episodes: Episodes, weights_version: int) -> bool:
+        """Send a batch when the window has room; False, and it is not sent, if stopped before.
+
+        Raises:
+            WireError: the batch breaks the task's bounds; names the field.
+        """
+        if not self.wait_for_window():
+            return False
+        frames = EpisodeBatch(self.outbox.next, weights_version, episodes).encode(self._spec)
+        if not self.outbox:
+            self._be_patient(time.monotonic())
+        self.outbox.add(frames)
+        self._post(frames)
+        self.poll()
+        return True
+
+    def wait_for_window(self) -> bool:
+        """Wait until a batch may be sent; False if stopped."""
+        return self._wait(lambda: self.outbox.free > 0, "the master to take what was played")
+
+    def send_scores(self, scores: Scores) -> None:
+        """Send the results of an evaluation, once; they are lost if no master is there.
+
+        Raises:
+            WireError: content that the master would refuse.
+        """
+        if not self._post(scores.encode(self._spec)):
+            self.counters["lost_scores"] += 1
+
+    def newest_weights(self) -> Weights | None:
+        """The newest weights that came, None if they were returned before."""
+        return self.newest.take()
+
+    def wait_for_weights(self) -> Weights | None:
+        """Wait for newer weights; None if stopped."""
+        waited = self._wait(lambda: self.newest.waits, "newer weights")
+        return self.newest.take() if waited else None
+
+    def wait_for_order(self, done: Go | None) -> Go | None:
+        """In lockstep: wait for what to play after an order that was done; None if stopped.
+
+        It is the same order again if what was played for it was refused.
+        """
+
+        def is_new() -> bool:
+            order = self._order
+            return order is not None and (self._again or order != done)
+
+        if not self._wait(is_new, "its turn"):
+            return None
+        self._again = False
+        return self._order
+
+    def close(self) -> None:
+        """Say BYE and close; takes a second at most, also when nobody listens."""
+        if self._connection.sockets is not None:
+            self._connection.sockets.send(Bye(self.stop_reason or "done").encode())
+        self._connection.close()
+
+    def _wait(self, done: Callable[[], bool], what: str, timeout_s: float = math.inf) -> bool:
+        begun = told = time.monotonic()
+        while not self.stopped:
+            if done():
+                return True
+            now = time.monotonic()
+            if now - begun >= timeout_s:
+                return False
+            if now - told >= TELL_S:
+                told = now
+                lacks = self._connection.lacks(self.joined) or what
+                log.info("waits for %s since %.0f s", lacks, now - begun, extra={"event": "waits"})
+            self.poll(min(STEP_S, timeout_s))
+        return False
+
+    # What is said, and when
+
+    def _open(self) -> Sockets | None:
+        if self._connection.open() and self._connection.sockets is not None:
+            self._say_hello(self._connection.sockets, time.monotonic())
+        return self._connection.sockets
+
+    def _do_what_is_due(self, sockets: Sockets, now: float) -> None:
+        if self._connection.is_dead(now, self._welcome is not None):
+            self.joined = False
+            self._connection.drop()
+            self._open()
+        elif not self.joined:
+            if now >= self._hello_at:
+                self._say_hello(sockets, now)
+        else:
+            if now >= self._heartbeat_at:
+                self._heartbeat_at = now + self._timing.heartbeat_s
+                self._ask(sockets, Heartbeat(self.stats), now)
+            if self.outbox and now >= self._resend_at:
+                self._resend(now)
+
+    def _say_hello(self, sockets: Sockets, now: float) -> None:
+        known = self._welcome
+        file = "" if self._connection.address is None else self._connection.address.run_id
+        hello = Hello(
+            role=self._role,
+            index=self._index if known is None else known.index,
+            incarnation=0 if known is None else known.incarnation,
+            process=self._process,
+            first=self.outbox.first,
+            fingerprints=self._fingerprints,
+            run_id=file if known is None else known.run_id,
+        )
+        self._hello_at = now + self._timing.retry_s
+        self._ask(sockets, hello, now)
+
+    def _ask(self, sockets: Sockets, question: Plain, now: float) -> None:
+        self._connection.asked(now)
+        sockets.send(question.encode())
+
+    def _post(self, frames: list[bytes]) -> bool:
+        """Send to a master that knows this connection; False if that was not possible."""
+        sockets = self._connection.sockets
+        return self.joined and sockets is not None and sockets.send(frames)
+
+    def _resend(self, now: float) -> None:
+        """Send all again, and next time later: a master that is behind has it already.
+
+        What was lost is sent again at once after a WELCOME, and soon after a REJECT.
+        """
+        self._patience_s = min(2.0 * self._patience_s, MOST_PATIENCE * self._timing.resend_s)
+        self._resend_at = now + self._patience_s
+        self._post_all()
+
+    def _post_all(self) -> None:
+        for frames in self.outbox.messages:
+            self.counters["resent"] += 1
+            self._post(frames)
+
+    def _be_patient(self, now: float) -> None:
+        """Count the time until all is sent again from now on, as in the beginning."""
+        self._patience_s = self._timing.resend_s
+        self._resend_at = now + self._patience_s
+
+    def _want_weights(self) -> None:
+        self._post(WantWeights(self.newest.epoch, self.newest.version).encode())
+
+    # What is heard
+
+    def _receive(self, frames: list[bytes]) -> None:
+        try:
+            message = decode_from_master(frames, self._shapes)
+        except ProtocolError:
+            raise
+        except WireError as error:
+            self.counters["malformed"] += 1
+            self._warn("malformed", "the master at %s sent what is not understood: %s", error)
+            return
+        self._connection.answered()
+        if not isinstance(message, RunStatus):  # nobody asked for one here
+            self._handle(message, time.monotonic())
+
+    def _receive_weights(self, sockets: Sockets) -> None:
+        frame = sockets.weights()
+        if frame is None:
+            return
+        try:
+            self.newest.offer_frame(frame)
+        except WireError as error:
+            self.counters["malformed"] += 1
+            self._warn("bad_weights", "weights from %s are refused: %s", error)
+
+    def _handle(self, message: ToWorker, now: float) -> None:
+        match message:
+            case Ack(sequence):
+                if self.outbox.remove(sequence):
+                    self._be_patient(now)
+            case Reject():
+                self._take_back(message, now)
+            case Go():
+                self._order = message
+            case Alive(version):
+                if self.newest.version < version:  # the broadcast was missed, or is on its way
+                    self._want_weights()
+            case WeightsMessage(epoch, weights):
+                self.newest.offer(epoch, weights)
+            case _:
+                self._handle_membership(message, now)
+
+    def _handle_membership(self, message: ToWorker, now: float) -> None:
+        """Handle an answer that says whether this process takes part."""
+        match message:
+            case Welcome():
+                self._take_part(message, now)
+            case Greet():
+                if self.joined:
+                    self.joined, self._hello_at = False, now
+            case Stop(reason):
+                self._dismissed, self._dismissal = True, reason
+            case Refused(reason):
+                raise TangramError(
+                    f"the master at {self._connection.place} refused this {self._role}: {reason}"
+                )
+
+    def _take_part(self, welcome: Welcome, now: float) -> None:
+        sockets, address = self._connection.sockets, self._connection.address
+        if self.joined or sockets is None or address is None:
+            return
+        wanted = address.run_id if self._welcome is None else self._welcome.run_id
+        if wanted and wanted != welcome.run_id:
+            raise TangramError(
+                f"the master at {address.endpoint} runs '{welcome.run_id}', not '{wanted}': the "
+                "connection file is stale, take the one of a master that is running"
+            )
+        self._welcome, self.joined, self._connection.keys_refused = welcome, True, False
+        self.outbox.window = min(self._window, welcome.window)
+        self.newest.begin(welcome.epoch)
+        sockets.subscribe(reachable(welcome.weights_endpoint, host_of(address.endpoint)))
+        self._want_weights()
+        self._heartbeat_at = now + self._timing.heartbeat_s
+        self._be_patient(now)
+        self._post_all()
+
+    def _take_back(self, reject: Reject, now: float) -> None:
+        self.counters["rejected" if reject.final else "out_of_turn"] += 1
+        self._warn("rejected", "the master at %s refused a message: %s", reject.reason)
+        if reject.final:
+            self._again = self.outbox.remove(reject.sequence) or self._again
+        else:
+            self._resend_at = min(self._resend_at, now + self._timing.retry_s)
+
+    def _warn(self, event: str, text: str, reason: object) -> None:
+        log.warning(text, self._connection.place, reason, extra={"event": event})

@@ -1,0 +1,344 @@
+"""The connection to the master: DEALER and SUB, made anew when it is silent or takes no keys."""
+
+import logging
+import math
+import secrets
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import zmq
+from zmq.utils.monitor import recv_monitor_message
+
+from tangram_agent.arrays import MAX_WEIGHTS_BYTES
+from tangram_agent.schema import MAX_HEADER
+from tangram_core.errors import RunError, TangramError
+from tangram_core.wire.addresses import KEEPALIVE
+from worker.talk.discovery import (
+    PATIENCE_S,
+    MasterAddress,
+    find_master,
+    host_error,
+    keys_error,
+    no_file_error,
+)
+
+LINGER_MS = 1000
+# More than any window, so that only heartbeats to a master that is away find no room.
+HIGH_WATER = 2048
+RECONNECT_MS = 100
+RECONNECT_MAX_MS = 2000
+SURE = 8  # handshakes in a row that failed without a reason: some fail when many come at once
+HANDSHAKES = (
+    zmq.EVENT_HANDSHAKE_FAILED_AUTH
+    | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+    | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+)
+
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Patience, in seconds.
+
+    Attributes:
+        join_s: to find the master at the start.
+        retry_s: between two HELLOs, and before a resend that the master asked for.
+        heartbeat_s: between two signs of life.
+        resend_s: without an acknowledgement before all is sent again, twice as long each time after
+            that, up to eight times.
+        silence_s: without an answer before the connection is made anew.
+        lost_s: without an answer, over all connections, before giving up.
+    """
+
+    join_s: float = PATIENCE_S
+    retry_s: float = 1.0
+    heartbeat_s: float = 2.0
+    resend_s: float = 10.0
+    silence_s: float = 30.0
+    lost_s: float = 600.0
+
+
+class Sockets:
+    """A DEALER for messages, and one SUB for weights that keeps the newest frame only.
+
+    Each DEALER has a new identity: a ROUTER ignores a second connection of an identity that it
+    believes alive.
+    """
+
+    def __init__(
+        self, context: zmq.Context[zmq.Socket[bytes]], address: MasterAddress, role: str = ""
+    ) -> None:
+        """Connect with the key of a role, or with any; RunError if there is none for it."""
+        self._context, self._address = context, address
+        self._key = _key_of(address, role)
+        self._sub: zmq.Socket[bytes] | None = None
+        self._weights_endpoint = ""
+        self._doubts = 0
+        self._poller = zmq.Poller()
+        self._ready: set[zmq.Socket[bytes]] = set()
+        self._dealer = self._open(zmq.DEALER)
+        # The first byte must not be zero.
+        self._dealer.setsockopt(zmq.IDENTITY, b"w" + secrets.token_bytes(16))
+        self._monitor = self._dealer.get_monitor_socket(HANDSHAKES)
+        self._poller.register(self._monitor, zmq.POLLIN)
+        self._connect(self._dealer, address.endpoint)
+
+    def subscribe(self, weights_endpoint: str) -> None:
+        """Subscribe to the weights of this address only."""
+        if weights_endpoint == self._weights_endpoint:
+            return
+        self._drop_sub()
+        self._sub = self._open(zmq.SUB)
+        self._sub.setsockopt(zmq.CONFLATE, 1)
+        self._sub.setsockopt(zmq.SUBSCRIBE, b"")
+        self._connect(self._sub, weights_endpoint)
+        self._weights_endpoint = weights_endpoint
+
+    def wait(self, timeout_s: float) -> None:
+        """Return when something came, or after this time; what came is looked at after this."""
+        events = self._poller.poll(math.ceil(max(0.0, timeout_s) * 1000))
+        self._ready = {socket for socket, _ in events}
+
+    def send(self, frames: Sequence[bytes]) -> bool:
+        """Queue a message; False if there is no room."""
+        try:
+            self._dealer.send_multipart(frames, zmq.NOBLOCK)
+        except zmq.Again:
+            return False
+        return True
+
+    def messages(self) -> Iterator[list[bytes]]:
+        """What the master had answered by the last `wait`, and what comes meanwhile."""
+        if self._dealer not in self._ready:
+            return
+        while True:
+            try:
+                frames = self._dealer.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            yield frames
+
+    def weights(self) -> bytes | None:
+        """The newest broadcast that was there at the last `wait`."""
+        if self._sub is None or self._sub not in self._ready:
+            return None
+        try:
+            return self._sub.recv(zmq.NOBLOCK)
+        except zmq.Again:
+            return None
+
+    def handshake_failed(self) -> bool:
+        """Whether the two sides do not agree on encryption and keys.
+
+        A wrong key of the master looks like a connection that was lost in the handshake: only
+        several of these count.
+        """
+        if self._monitor not in self._ready:
+            return False
+        while self._monitor.poll(0):
+            event = recv_monitor_message(self._monitor)["event"]
+            self._doubts += 1 if event == zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL else SURE
+        failed = self._doubts >= SURE
+        self._doubts = 0 if failed else self._doubts
+        return failed
+
+    def close(self, linger_ms: int = 0) -> None:
+        """Close both sockets; queued messages get this long to leave."""
+        self._drop_sub()
+        self._dealer.disable_monitor()
+        self._monitor.close(0)
+        self._dealer.close(linger_ms)
+
+    def _drop_sub(self) -> None:
+        if self._sub is not None:
+            self._poller.unregister(self._sub)
+            self._sub.close(0)
+            self._sub = None
+
+    def _open(self, kind: int) -> zmq.Socket[bytes]:
+        socket = self._context.socket(kind)
+        socket.setsockopt(zmq.SNDHWM, HIGH_WATER)
+        socket.setsockopt(zmq.RCVHWM, HIGH_WATER)
+        socket.setsockopt(zmq.MAXMSGSIZE, MAX_WEIGHTS_BYTES + MAX_HEADER)
+        for name, value in KEEPALIVE.items():
+            socket.setsockopt(getattr(zmq, name), value)
+        socket.setsockopt(zmq.RECONNECT_IVL, RECONNECT_MS)
+        socket.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MAX_MS)
+        if self._key is not None:
+            public, secret = self._key
+            socket.setsockopt(zmq.CURVE_SERVERKEY, self._address.server_key.encode())
+            socket.setsockopt(zmq.CURVE_PUBLICKEY, public.encode())
+            socket.setsockopt(zmq.CURVE_SECRETKEY, secret.encode())
+        self._poller.register(socket, zmq.POLLIN)
+        return socket
+
+    def _connect(self, socket: zmq.Socket[bytes], endpoint: str) -> None:
+        socket.setsockopt(zmq.IPV6, int("[" in endpoint))
+        try:
+            socket.connect(endpoint)
+        except zmq.ZMQError as error:
+            raise RunError(
+                f"cannot connect to {endpoint} ({error.strerror}): it must be tcp://host:port"
+            ) from None
+
+
+def _key_of(address: MasterAddress, role: str) -> tuple[str, str] | None:
+    """The key to show; None where none is wanted."""
+    if not address.keys:
+        return None
+    if role and role not in address.keys:
+        there = " and ".join(address.keys)
+        raise RunError(
+            f"the connection file of {address.endpoint} has a key for role={there} only: add "
+            f"role={there}, or ask for one for role={role} (tangram-keys)"
+        )
+    return address.keys[role] if role else next(iter(address.keys.values()))
+
+
+class Connection:
+    """One pair of sockets at a time; the next one may have another address.
+
+    Attributes:
+        sockets: the present ones, None before the address is known.
+        address: where they lead.
+        keys_refused: the last handshake failed, because keys do not fit.
+    """
+
+    def __init__(
+        self, connect: str, timing: Timing, counters: Counter[str], role: str = ""
+    ) -> None:
+        self.sockets: Sockets | None = None
+        self.address: MasterAddress | None = None
+        self.keys_refused = False
+        self._connect, self._timing, self._counters = connect, timing, counters
+        self._role = role
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        # Since when an answer is due on this connection, and on all since the last answer.
+        self._asked_at: float | None = None
+        self._lost_at: float | None = None
+        self._reopen_at, self._follow_at = math.inf, 0.0
+        self._unknown_host = ""
+
+    @property
+    def place(self) -> str:
+        """Where the master is, as far as known."""
+        return self.address.endpoint if self.address else self._connect
+
+    def lacks(self, joined: bool) -> str:
+        """What this process waits for, empty while the master answers one that has `joined`."""
+        if self.address is None:
+            return f"the connection file {self._connect}"
+        if not joined or self._lost_at is not None:
+            return f"an answer of the master at {self.place}"
+        return ""
+
+    def no_master(self, patience_s: float) -> str:
+        """The error that no master could be joined for this long, for the user."""
+        if self.keys_refused:
+            return keys_error(self._connect, self.place)
+        if self.address is None:
+            return no_file_error(self.place, patience_s)
+        if self._unknown_host:
+            return f"no master was found in {patience_s:g} s: {self._unknown_host}"
+        return (
+            f"no master answers at {self.place} after {patience_s:g} s: is tangram-master running "
+            "there?"
+        )
+
+    def open(self) -> bool:
+        """Connect to where the master is now; False while that is not known."""
+        before, self.address = self.address, find_master(self._connect)
+        if self.address is None:
+            return False
+        if self.address != before or self._unknown_host:
+            self._look_up(self.address.endpoint)
+        self.sockets = Sockets(self._context, self.address, self._role)
+        return True
+
+    def _look_up(self, endpoint: str) -> None:
+        """Warn of a host that DNS does not know, or not yet: ZeroMQ tries again without a word."""
+        before, self._unknown_host = self._unknown_host, host_error(endpoint, self._connect)
+        if self._unknown_host and not before:
+            log.warning("%s", self._unknown_host, extra={"event": "unknown_host"})
+
+    def drop(self) -> None:
+        """Close a connection that brings no answers."""
+        self._counters["reconnects"] += 1
+        if self._lost_at is None:
+            self._lost_at = self._asked_at
+        self._asked_at, self._reopen_at = None, math.inf
+        if self.sockets is not None:
+            self.sockets.close()
+            self.sockets = None
+
+    def asked(self, now: float) -> None:
+        """Note that a message was sent that asks for an answer."""
+        if self._asked_at is None:
+            self._asked_at = now
+
+    def answered(self) -> None:
+        """Note that a message came."""
+        if self._lost_at is not None:
+            log.info("the master at %s answers again", self.place, extra={"event": "found_again"})
+        self._asked_at = self._lost_at = None
+
+    def watch(self, now: float) -> None:
+        """Note a master that moved, and a handshake that failed: its file may change, too."""
+        self._follow(now)
+        if self.sockets is None or not self.sockets.handshake_failed():
+            return
+        self._counters["handshakes_failed"] += 1
+        if not self.keys_refused:
+            log.warning(
+                "%s", keys_error(self._connect, self.place), extra={"event": "keys_refused"}
+            )
+        self.keys_refused, self._reopen_at = True, now + self._timing.retry_s
+
+    def is_dead(self, now: float, joined_before: bool) -> bool:
+        """Whether to try another connection.
+
+        Args:
+            now: monotonic time.
+            joined_before: a master has answered, and its silence is news.
+        """
+        silent = self._asked_at is not None and now - self._asked_at > self._timing.silence_s
+        if silent and joined_before and self._lost_at is None and not self.keys_refused:
+            log.warning(
+                "the master at %s has not answered for %g s: tries again for %g s",
+                self.place,
+                self._timing.silence_s,
+                self._timing.lost_s - self._timing.silence_s,
+                extra={"event": "silent"},
+            )
+        return silent or now >= self._reopen_at
+
+    def _follow(self, now: float) -> None:
+        """A master that was started again writes its new address into the same file."""
+        if now < self._follow_at:
+            return
+        self._follow_at = now + self._timing.retry_s
+        try:
+            found = find_master(self._connect)
+        except RunError:
+            return  # by the next look it may be whole
+        if found is not None and found != self.address:
+            log.info("the master is at %s now", found.endpoint, extra={"event": "moved"})
+            self._reopen_at = now
+
+    def check_lost(self, now: float) -> None:
+        """Raise TangramError if no connection brought an answer for too long."""
+        if self._lost_at is not None and now - self._lost_at > self._timing.lost_s:
+            raise TangramError(
+                f"the master at {self.place} has not answered for {self._timing.lost_s:g} s: "
+                "is it still running?"
+            )
+
+    def close(self) -> None:
+        """Close; what is queued gets a second."""
+        if self.sockets is not None:
+            self.sockets.close(LINGER_MS)
+            self.sockets = None
+        self._context.destroy(linger=LINGER_MS)
