@@ -225,7 +225,7 @@ those that come with tangram-rl or your own, see docs/puzzles.md.""",
             "tangram-eval run_dir=runs/my_game puzzle=test turns=8 out=puzzles.json "
             "sheet=puzzles.png",
         ),
-        ("worker.config:EvalConfig",),
+        ("tangram_game.config:EvalConfig",),
         over=OVER,
     ),
     "play": Command(
@@ -241,7 +241,7 @@ With compare=[...] several runs play the same episodes side by side.""",
             "tangram-play puzzle=cat out=cat.gif",
             "tangram-play compare=[runs/my_run,pretrained/square] out=both.gif episodes=4",
         ),
-        ("worker.config:PlayConfig",),
+        ("tangram_game.config:PlayConfig",),
         over=OVER,
     ),
     "studio": Command(

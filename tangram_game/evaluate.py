@@ -17,6 +17,7 @@ from tangram_agent.outcome import plural
 from tangram_agent.runs import Run, load_changed
 from tangram_agent.setup import Setup
 from tangram_core.store.files import write_whole
+from tangram_game.config import EvalConfig, source_and_names
 from tangram_game.figures.puzzles import find_figures
 from tangram_game.rivals.baselines import (
     Player,
@@ -44,7 +45,6 @@ from tangram_game.scores import (
 )
 from tangram_sim.config import SILHOUETTES, SimConfig
 from tangram_sim.drawing.game_drawing import figure_sheet
-from worker.config import EvalConfig, source_and_names
 from worker.play.rollout import at_once
 from worker.score.test_set import FixedTests, greedy
 

@@ -19,6 +19,7 @@ from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError, RunError
 from tangram_core.settings import told
 from tangram_core.store.files import write_whole
+from tangram_game.config import MAX_SHOWN, PlayConfig, source_and_names
 from tangram_game.figures.photographs import draw_photograph, read_photograph
 from tangram_game.figures.puzzles import find_figures, play_figures
 from tangram_game.figures.silhouettes import Shown, draw_silhouette, read_silhouette
@@ -28,7 +29,6 @@ from tangram_sim.drawing.game_drawing import figure_sheet, tiles
 from tangram_sim.drawing.scenes import episode_sheet, save_gif, save_mp4
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.motion.kinematics import wrap
-from worker.config import MAX_SHOWN, PlayConfig, source_and_names
 from worker.play.rollout import Played, at_once
 from worker.score.metrics import SOLVED, assembled
 from worker.score.test_set import FixedTests, greedy

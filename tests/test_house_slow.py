@@ -59,7 +59,7 @@ def test_what_cannot_be_played_is_refused_without_torch_or_opencv(line: str) -> 
     given = [*line.split(), "run_dir=pretrained/tangram7"]
     told = run_python(
         "import sys\n"
-        "from worker.cli import evaluate, play\n"
+        "from tangram_game.cli import evaluate, play\n"
         f"command, *sys.argv[1:] = {given}\n"
         "print({'eval': evaluate, 'play': play}[command](), {'torch', 'cv2'} & set(sys.modules))"
     )

@@ -27,11 +27,11 @@ from tangram_agent.setup import Setup
 from tangram_core.errors import ConfigError, RunError, TangramError
 from tangram_core.settings import told
 from tangram_core.store.files import check_writable, write_whole
+from tangram_game.config import EvalConfig
 from tangram_game.evaluate import policies, score_policies
 from tangram_game.figures.puzzles import find_figures
 from tangram_game.scores import RUN, score_outlines, score_puzzles
 from tangram_sim.tasks.targets import has_all_tans
-from worker.config import EvalConfig
 from worker.score.test_set import greedy
 
 PACKAGE = Path(__file__).resolve().parents[2] / "tangram_agent" / "pretrained"

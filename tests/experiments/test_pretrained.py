@@ -11,6 +11,7 @@ import yaml
 
 from tangram_agent.runs import load_run
 from tangram_core.errors import ConfigError, RunError
+from tangram_game.config import EvalConfig
 from tangram_game.evaluate import evaluate_run
 from tangram_game.figures.puzzles import find_figures
 from tangram_lab.experiments import pretrained
@@ -20,7 +21,6 @@ from tests.agent.agents.outline.outlines import SIM as OUTLINES
 from tests.agent.builders import random_transitions, setup
 from tests.sim.builders import SEVEN
 from tests.worker.builders import write_run
-from worker.config import EvalConfig
 
 pytestmark = pytest.mark.fast
 

@@ -11,13 +11,13 @@ from PIL import Image
 from rich.console import Console
 
 from tangram_core.errors import RunError
+from tangram_game.config import EvalConfig, PlayConfig
 from tangram_game.evaluate import evaluate_run, scores_table
 from tangram_game.play import play_run
 from tangram_game.scores import RUN
 from tests.agent.builders import PAIR, SQUARE
 from tests.game.figures.puzzle_files import GAME, SIM, drawn, write_puzzles
 from tests.worker.builders import write_run
-from worker.config import EvalConfig, PlayConfig
 
 pytestmark = pytest.mark.fast
 

@@ -16,6 +16,7 @@ from tangram_agent.setup import Setup
 from tangram_agent.types import Choice
 from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError, RunError
+from tangram_game.config import PlayConfig
 from tangram_game.play import (
     compare_runs,
     distinct_names,
@@ -32,7 +33,6 @@ from tangram_sim.geometry.overlap import outlines, pairs_overlap
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.game.figures.puzzle_files import GAME, SIM, drawn, write_puzzles
 from tests.worker.builders import write_run
-from worker.config import PlayConfig
 from worker.play.rollout import Played
 
 pytestmark = pytest.mark.fast
@@ -178,7 +178,7 @@ def test_a_film_as_mp4_shows_the_same_for_as_long(tmp_path: Path) -> None:
 
 
 def test_without_pyav_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("worker.config.find_spec", lambda _: None)
+    monkeypatch.setattr("tangram_game.config.find_spec", lambda _: None)
     with pytest.raises(ConfigError, match=r"out=a.mp4 needs PyAV, .*: pip install 'tangram-rl.vid"):
         PlayConfig("run", out="a.mp4")
 

@@ -5,15 +5,15 @@ from pathlib import Path
 import pytest
 
 from tangram_core.errors import ConfigError
-from worker.cli import with_absolute_paths, with_changes
-from worker.config import (
+from tangram_game.cli import with_absolute_paths, with_changes
+from tangram_game.config import (
     EvalConfig,
     PlayConfig,
-    WorkerConfig,
     check_compare,
     check_puzzle,
     source_and_names,
 )
+from worker.config import WorkerConfig
 
 pytestmark = pytest.mark.fast
 
@@ -134,21 +134,21 @@ def test_what_names_no_puzzle_is_refused(value: object) -> None:
     ],
 )
 def test_which_run_is_played(monkeypatch: pytest.MonkeyPatch, settings: dict, run_dir: str) -> None:
-    monkeypatch.setattr("worker.config.agent_names", lambda: ["tangram7"])
+    monkeypatch.setattr("tangram_game.config.agent_names", lambda: ["tangram7"])
     assert PlayConfig(**settings).run_dirs == (run_dir,)
 
 
 def test_puzzles_are_for_the_agent_of_the_game_if_there_is_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("worker.config.agent_names", lambda: ["square", "tangram7"])
+    monkeypatch.setattr("tangram_game.config.agent_names", lambda: ["square", "tangram7"])
     assert EvalConfig(puzzle=("test",)).run == "pretrained/tangram7"
     with pytest.raises(ConfigError, match="^out=.* would be written over puzzle=.*: name another"):
         EvalConfig(puzzle=(__file__,), out=__file__)
     assert EvalConfig("runs/one", puzzle=("test",)).run == "runs/one"
     with pytest.raises(ConfigError, match="say which run: run_dir=runs/..."):
         EvalConfig()
-    monkeypatch.setattr("worker.config.agent_names", lambda: ["square"])
+    monkeypatch.setattr("tangram_game.config.agent_names", lambda: ["square"])
     for without in (lambda: EvalConfig(puzzle=("test",)), lambda: PlayConfig(puzzle=("cat",))):
         with pytest.raises(ConfigError, match="say which run"):
             without()

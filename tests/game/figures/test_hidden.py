@@ -15,6 +15,7 @@ from PIL import Image
 import tangram_sim  # noqa: F401  # registers the environments
 from tangram_agent.setup import Setup
 from tangram_core.errors import ConfigError
+from tangram_game.config import EvalConfig
 from tangram_game.evaluate import evaluate_run
 from tangram_game.figures.hidden import Hidden, hide, lay, means, one_by_one, play_hidden
 from tangram_game.figures.puzzles import Figure, find_figures, play_figures
@@ -31,7 +32,6 @@ from tangram_vision.silhouettes.silhouettes import Filled, covered, fill_outline
 from tests.agent.builders import setup
 from tests.game.figures.puzzle_files import GAME, SIM, drawn, write_puzzles
 from tests.worker.builders import write_run
-from worker.config import EvalConfig
 
 pytestmark = pytest.mark.fast
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tangram_agent.runs import load_run
+from tangram_game.config import EvalConfig
 from tangram_game.evaluate import evaluate_run
 from tangram_game.figures.methods import Learned, learned_method, together
 from tangram_game.figures.puzzles import find_figures
@@ -23,7 +24,6 @@ from tangram_sim.tasks.targets import placement
 from tangram_vision.silhouettes.silhouettes import Method
 from tests.game.figures.test_hidden import OUTLINE, game
 from tests.sim.builders import SEVEN, TRIO, layout_of
-from worker.config import EvalConfig
 
 
 def told(method: Method) -> tuple[bool, int, bool]:

@@ -13,6 +13,7 @@ from PIL import Image, ImageDraw
 from tangram_agent.runs import load_run
 from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError
+from tangram_game.config import PlayConfig
 from tangram_game.figures.photographs import read_photograph
 from tangram_game.play import play_run
 from tangram_sim.drawing.strokes import colour_of
@@ -20,7 +21,6 @@ from tangram_sim.geometry.layout import Layout
 from tangram_vision.given.photos import find_tokens
 from tangram_vision.given.picture_files import MAX_MEGAPIXELS, read_picture
 from tests.sim.builders import TRIO, layout_of
-from worker.config import PlayConfig
 
 pytestmark = pytest.mark.fast
 

@@ -12,6 +12,8 @@ from PIL import Image, ImageDraw
 
 from tangram_agent.runs import load_run
 from tangram_core.errors import ConfigError
+from tangram_game.cli import with_absolute_paths
+from tangram_game.config import PlayConfig
 from tangram_game.figures.silhouettes import read_silhouette
 from tangram_game.play import play_run
 from tangram_sim.geometry.rings import covered_area
@@ -22,8 +24,6 @@ from tests.agent.agents.outline.outlines import SIM as OUTLINES
 from tests.sim.builders import SEVEN
 from tests.vision.aslant import photographed
 from tests.worker.builders import write_run
-from worker.cli import with_absolute_paths
-from worker.config import PlayConfig
 
 pytestmark = pytest.mark.slow
 

@@ -15,11 +15,11 @@ from PIL import Image, ImageDraw
 from conf.cli import composed
 from tangram_agent.runs import load_run
 from tangram_core.errors import ConfigError, RunError
+from tangram_game.cli import _play
+from tangram_game.config import PlayConfig
 from tangram_game.figures.silhouettes import RED, read_silhouette
 from tangram_sim.puzzles.figures import PACKAGED
 from tangram_vision.given import silhouette_files
-from worker.cli import _play
-from worker.config import PlayConfig
 
 pytestmark = pytest.mark.slow
 

@@ -1,0 +1,142 @@
+"""The commands tangram-eval and tangram-play.
+
+Everything heavy is imported after the config was composed, so --help and wrong input are
+instant.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from conf.cli import entry, tell
+from conf.commands import Plain
+
+if TYPE_CHECKING:
+    from tangram_agent.setup import Setup
+    from tangram_game.config import EvalConfig, PlayConfig
+
+
+def evaluate() -> int:
+    """tangram-eval: scores a finished run."""
+    return entry("eval", _evaluate)
+
+
+def play() -> int:
+    """tangram-play: draws a finished run at play."""
+    return entry("play", _play)
+
+
+def _evaluate(settings: Plain) -> int:
+    from tangram_agent.setup import from_mapping
+    from tangram_core.store.files import check_writable
+    from tangram_game.config import EvalConfig
+
+    config = from_mapping(EvalConfig, with_changes(with_absolute_paths(settings)))
+    for name, path in (("out", config.out), ("sheet", config.sheet)):
+        if path is not None:
+            check_writable(name, Path(path))
+    _check_played([config.run], config)
+    tell(f"loads and plays {config.run}")
+
+    from tangram_game.evaluate import evaluate_run
+
+    return evaluate_run(config)
+
+
+def _play(settings: Plain) -> int:
+    from tangram_agent.setup import from_mapping
+    from tangram_core.store.files import check_writable
+    from tangram_game.config import PlayConfig, check_compare
+
+    check_compare(settings.get("compare"))  # before a text is taken for a list of letters
+    paths = with_absolute_paths(settings)
+    config = from_mapping(PlayConfig, with_changes(paths))
+    check_writable("out", Path(config.out).absolute())
+    _check_drawings(config)
+    setups = _check_played(config.run_dirs, config)
+    if config.target is not None:
+        from tangram_game.figures.photographs import read_photograph
+
+        read_photograph(config.target, setups[0])
+    filled = None
+    if config.silhouette is not None:
+        from tangram_game.figures.silhouettes import read_silhouette
+
+        out = Path(config.out)
+        filled = read_silhouette(config.silhouette, setups[0], config.solutions, out)
+    tell(f"loads and plays {', '.join(config.run_dirs)}")
+
+    if config.compare is not None:
+        from tangram_game.play import compare_runs
+
+        return compare_runs(config)
+    from tangram_game.play import play_run
+
+    return play_run(config, filled)
+
+
+def _check_played(run_dirs: Sequence[str], config: "EvalConfig | PlayConfig") -> list["Setup"]:
+    """Refuse what cannot be played before torch is loaded; returns what the runs play."""
+    from tangram_agent.runs import read_changed
+
+    setups = [read_changed(run_dir, config.changes).setup for run_dir in run_dirs]
+    if config.puzzle is not None:
+        from tangram_game.config import source_and_names
+        from tangram_game.figures.puzzles import find_figures
+
+        source, names = source_and_names(config.puzzle)
+        find_figures(source, setups[0], names)
+    return setups
+
+
+def _check_drawings(config: "PlayConfig") -> None:
+    """Refuse a drawing that is not there before what reads drawings is loaded."""
+    from tangram_sim.puzzles.sketches import check_file
+
+    for name, path in (("target", config.target), ("silhouette", config.silhouette)):
+        # A silhouette may be the name of a puzzle.
+        if path is not None and (name == "target" or Path(path).suffix):
+            check_file(Path(path), f"{name}={path}")
+
+
+def with_changes(settings: Plain) -> Plain:
+    """The settings that are laid over a run's, in one mapping; null is as the run was trained."""
+    laid = {name: values for name, values in settings.items() if isinstance(values, dict)}
+    given = {s: {n: v for n, v in own.items() if v is not None} for s, own in laid.items()}
+    rest = {name: value for name, value in settings.items() if name not in laid}
+    return rest | {"changes": {section: own for section, own in given.items() if own}}
+
+
+def with_absolute_paths(settings: Plain) -> Plain:
+    """Folders and files seen from where the command was started; what is no text is left alone.
+
+    Puzzles and splits of the library stay names.
+    """
+    from tangram_game.config import check_puzzle, is_puzzle_source
+    from tangram_sim.puzzles.figures import SPLITS
+
+    result = dict(settings)
+    for name in ("run_dir", "out", "sheet", "target"):
+        result[name] = _absolute(result.get(name), is_run=name == "run_dir")
+    silhouette = result.get("silhouette")
+    if isinstance(silhouette, str) and Path(silhouette).suffix:  # else a puzzle's name
+        result["silhouette"] = _absolute(silhouette, is_run=False)
+    puzzle = check_puzzle(result.get("puzzle"))
+    if puzzle is not None and is_puzzle_source(puzzle[0]) and puzzle[0] not in SPLITS:
+        puzzle = (str(_absolute(puzzle[0], is_run=False)), *puzzle[1:])
+    result["puzzle"] = puzzle
+    if isinstance(result.get("compare"), list):
+        result["compare"] = [_absolute(run, is_run=True) for run in result["compare"]]
+    return {name: value for name, value in result.items() if name in settings}
+
+
+def _absolute(value: object, is_run: bool) -> object:
+    """A path made absolute; `pretrained/<name>` stays a name unless a folder here is called so."""
+    from tangram_agent.pretrained import is_name
+
+    if not isinstance(value, str) or not value.strip():
+        return value
+    path = Path(value).expanduser()
+    if is_run and is_name(path) and not path.is_dir():
+        return str(path)
+    return str(path.absolute())

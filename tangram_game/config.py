@@ -1,0 +1,254 @@
+"""Settings of the tools that show what a run has learned: tangram-eval and tangram-play."""
+
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from tangram_agent.pretrained import PREFIX, agent_names
+from tangram_core.errors import ConfigError
+from tangram_core.settings import Settings, check_folder, refuse_ignored, setting, told
+from tangram_sim.config import SILHOUETTES
+from tangram_sim.puzzles.figures import SPLITS
+
+Changes = dict[str, dict[str, Any]]  # section -> setting -> value: of a run that was trained
+OF_TARGETS = ("targets", "mirrored")  # settings of sim that say nothing of a puzzle
+MAX_EPISODES = 1_000_000
+MAX_SHOWN = 100
+MAX_TURNS = 360
+MAX_SOLUTIONS = 20
+GAME = "tangram7"  # the agent that plays puzzles unless another is named
+PICTURES = (".gif", ".mp4", ".png")
+MIN_COMPARED, MAX_COMPARED = 2, 4
+MAX_SEED = 2**63 - 1
+PUZZLE_FILES = (".json", ".svg")
+PUZZLE_HELP = (
+    "instead of random targets: puzzles by name, as cat or [cat,dog], all of the library's train, "
+    "test or paper, or a JSON or SVG file of your own; [mine.json,cat] is one of a file"
+)
+TURNS_HELP = "each puzzle at so many angles, evenly spread; 1 is as drawn"
+
+
+def game_run() -> str:
+    """The run that plays puzzles unless another is named."""
+    return f"{PREFIX}/{GAME}"
+
+
+def _check_run(run_dir: str | None, puzzles: bool) -> None:
+    """Refuse no run where none can be meant."""
+    if run_dir is not None:
+        check_folder("run_dir", run_dir)
+    elif not (puzzles and GAME in agent_names()):
+        raise ConfigError("say which run: run_dir=runs/...")
+
+
+def _refuse(changes: Changes, names: Iterable[str], because: str, remedy: str) -> None:
+    """Refuse settings of sim that would change nothing here."""
+    for name in names:
+        if name in changes.get("sim", {}):
+            refuse_ignored(f"sim.{name}={told(changes['sim'][name])}", because, remedy)
+
+
+def _check_out(value: str) -> None:
+    if not Path(value).name:
+        raise ConfigError(f"out must name a file, got '{value}': set out=scores.json")
+
+
+def _check_kept(out: str, name: str, source: str | None) -> None:
+    """Refuse to write over what is read."""
+    with suppress(OSError):  # one of both is no file
+        if source is not None and Path(out).samefile(source):
+            raise ConfigError(f"out={out} would be written over {name}={source}: name another file")
+
+
+@dataclass(frozen=True)
+class EvalConfig(Settings):
+    """Scores of a finished run on the fixed test set, or on puzzles (tangram-eval).
+
+    Attributes:
+        changes: settings of sim and agent that are not to be as the run was trained with.
+    """
+
+    run_dir: str | None = setting(
+        None, "folder of the run, or pretrained/NAME; with puzzle= pretrained/tangram7 if not given"
+    )
+    episodes: int = setting(
+        100,
+        "test episodes, the same ones for every run",
+        low=1,
+        high=MAX_EPISODES,
+        only={"puzzle": None},
+    )
+    seed: int = setting(
+        0, "of the test episodes, and of the starts of puzzles", low=0, high=MAX_SEED
+    )
+    out: str | None = setting(None, "JSON file for the scores; they are printed anyway")
+    puzzle: tuple[str, ...] | None = setting(None, PUZZLE_HELP)
+    turns: int = setting(1, TURNS_HELP, low=1, high=MAX_TURNS, unless={"puzzle": None})
+    sheet: str | None = setting(
+        None, "PNG file, a picture of every puzzle's end", unless={"puzzle": None}
+    )
+    changes: Changes = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _check_run(self.run_dir, self.puzzle is not None)
+        super().__post_init__()
+        if self.out is not None:
+            _check_out(self.out)
+            source, _ = source_and_names(self.puzzle) if self.puzzle else (None, None)
+            _check_kept(self.out, "puzzle", source)
+        if self.sheet is not None and Path(self.sheet).suffix != ".png":
+            raise ConfigError(f"sheet must end with .png, got '{self.sheet}'")
+        if self.puzzle is not None:
+            _refuse(self.changes, OF_TARGETS, "puzzle", "leave puzzle out")
+        observe = self.changes.get("sim", {}).get("observe")
+        if self.puzzle is None and observe in SILHOUETTES:
+            raise ConfigError(
+                f"sim.observe={observe} hides the pieces of puzzles, got none: add puzzle=test"
+            )
+
+    @property
+    def run(self) -> str:
+        """The run to score."""
+        return self.run_dir or game_run()
+
+
+def check_compare(value: object) -> None:
+    """Refuse what is no list of a few different run folders; None is none.
+
+    Raises:
+        ConfigError: says how to write one.
+    """
+    if value is None:
+        return
+    runs = list(value) if isinstance(value, list | tuple) else []
+    named = all(isinstance(run, str) and run.strip() for run in runs)
+    if not (named and MIN_COMPARED <= len(runs) <= MAX_COMPARED):
+        raise ConfigError(
+            f"compare must list {MIN_COMPARED} to {MAX_COMPARED} folders of runs, got {value!r}: "
+            "set compare=[runs/a,runs/b]"
+        )
+    if len(set(runs)) < len(runs):
+        raise ConfigError(f"compare must list different runs, got {value!r}: name each one once")
+
+
+def check_puzzle(value: object) -> tuple[str, ...] | None:
+    """The names of puzzles, one or a list of some, perhaps behind their file; None is none.
+
+    Raises:
+        ConfigError: says how to write them.
+    """
+    if value is None:
+        return None
+    names = list(value) if isinstance(value, list | tuple) else [value]
+    # A puzzle may be called 8.
+    if not names or not all(isinstance(one, str | int | float) and str(one) for one in names):
+        raise ConfigError(
+            f"puzzle must name puzzles, got {value!r}: set puzzle=cat, puzzle=[cat,dog] or "
+            "puzzle=mine.json"
+        )
+    later = [str(one) for one in names[1:] if is_puzzle_source(str(one))]
+    if later:
+        raise ConfigError(f"puzzle takes one file or split, first in its list, got {later[0]}, too")
+    return tuple(str(name) for name in names)
+
+
+def is_puzzle_source(name: str) -> bool:
+    """Whether this is no puzzle's name but a file's, or a split of the library."""
+    return name in SPLITS or "/" in name or Path(name).suffix.lower() in PUZZLE_FILES
+
+
+def source_and_names(puzzle: tuple[str, ...]) -> tuple[str | None, tuple[str, ...] | None]:
+    """Where puzzles are, None for all of the library, and which of them are meant, None for all."""
+    if not is_puzzle_source(puzzle[0]):
+        return None, puzzle
+    return puzzle[0], puzzle[1:] or None
+
+
+@dataclass(frozen=True)
+class PlayConfig(Settings):
+    """Pictures of a run at play (tangram-play), or of several on the same starts.
+
+    Attributes:
+        changes: settings of sim and agent that are not to be as the runs were trained with.
+    """
+
+    run_dir: str | None = setting(
+        None,
+        "folder of the run, or an agent that comes with tangram-rl: pretrained/square",
+        only={"compare": None},
+    )
+    out: str = setting("play.gif", ".gif or .mp4 for an animation, .png for one picture")
+    episodes: int = setting(
+        12,
+        "episodes shown side by side",
+        low=1,
+        high=MAX_SHOWN,
+        only={"puzzle": None, "target": None, "silhouette": None},
+    )
+    seed: int = setting(0, "of the episodes, and of the starts of puzzles", low=0, high=MAX_SEED)
+    compare: tuple[str, ...] | None = setting(
+        None, "folders of 2 to 4 runs, as in [runs/a,runs/b]: all on the same starts"
+    )
+    puzzle: tuple[str, ...] | None = setting(None, PUZZLE_HELP, only={"compare": None})
+    target: str | None = setting(
+        None,
+        "instead of random targets: a photograph of all tokens of the run, PNG or JPEG, dark on "
+        "light ground or the reverse, at most three touching",
+        only={"compare": None, "puzzle": None},
+    )
+    silhouette: str | None = setting(
+        None,
+        "instead of random targets: an outline that tells no pieces, a PNG, JPEG, SVG or JSON, or "
+        "the name of a puzzle of the library; how the run's tokens fill it is searched first",
+        only={"compare": None, "puzzle": None, "target": None},
+    )
+    solutions: int = setting(
+        1,
+        "draw so many different ways to fill the silhouette, if there are; the first is laid",
+        low=1,
+        high=MAX_SOLUTIONS,
+        unless={"silhouette": None},
+    )
+    turns: int = setting(1, TURNS_HELP, low=1, high=MAX_TURNS, unless={"puzzle": None})
+    changes: Changes = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_compare(self.compare)
+        self._check_one_of_both()
+        if Path(self.out).suffix not in PICTURES:
+            raise ConfigError(
+                f"out must end with {', '.join(PICTURES)}, got '{self.out}': .gif and .mp4 move, "
+                ".png shows the ends"
+            )
+        if Path(self.out).suffix == ".mp4" and find_spec("av") is None:
+            raise ConfigError(
+                f"out={self.out} needs PyAV, which is missing: pip install 'tangram-rl[video]', or "
+                "write a .gif"
+            )
+        super().__post_init__()
+        if self.puzzle is not None:
+            _refuse(self.changes, (*OF_TARGETS, "starts"), "puzzle", "leave puzzle out")
+        if self.target is not None:
+            _refuse(self.changes, OF_TARGETS, "target", "leave target out")
+            _check_kept(self.out, "target", self.target)
+        if self.silhouette is not None:
+            _refuse(self.changes, (*OF_TARGETS, "starts"), "silhouette", "leave silhouette out")
+            _check_kept(self.out, "silhouette", self.silhouette)
+
+    @property
+    def run_dirs(self) -> tuple[str, ...]:
+        """The runs to show, one or several."""
+        return self.compare or (self.run_dir or game_run(),)
+
+    def _check_one_of_both(self) -> None:
+        if self.run_dir is not None:
+            check_folder("run_dir", self.run_dir)
+        elif self.compare is None and not (
+            (self.puzzle or self.target or self.silhouette) and GAME in agent_names()
+        ):
+            raise ConfigError(
+                "say which run: run_dir=runs/..., or which ones: compare=[runs/a,runs/b]"
+            )
