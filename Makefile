@@ -36,7 +36,7 @@ test: lint .venv/.installed-browser  ## lint, then the tests, a short training t
 check: lint .venv/.installed-browser  ## lint, then the tests that are too long for make test
 	@$(PYTEST) -m check $(ARGS)
 
-mutation: .venv/.installed-dev  ## change master or worker in one place at a time: does a test turn red? ARGS="master/record/journal.py"
+mutation: .venv/.installed-dev  ## change master, worker or game in one place at a time: does a test turn red? ARGS="master/record/journal.py"
 	@.ci/mutate $(ARGS)
 
 lint: .venv/.installed-dev  ## ruff, mypy, import-linter, hadolint and shellcheck; changes nothing

@@ -1,7 +1,7 @@
 """What travels between play and learning: small immutable tuples of arrays.
 
 Legend: E episodes, T steps of an episode, B batch, K tokens, V corners of all tokens together,
-A entries of an action (3 for one token: x, y and angular velocity; see `tangram_sim.motion.actions`).
+A entries of an action (3 for one token: x, y and angular velocity; `tangram_sim.motion.actions`).
 Goals and states are corners in the order of `tangram_sim.geometry.layout.Layout`.
 """
 

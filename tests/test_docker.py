@@ -17,7 +17,8 @@ from conf.cli import composed
 pytestmark = pytest.mark.fast
 
 ROOT = Path(__file__).parents[1]
-OURS = {"conf", "master", "tangram_agent", "tangram_sim", "tangram_vision", "worker"}
+OURS = {"conf", "master", "worker"}
+OURS |= {f"tangram_{name}" for name in ("agent", "core", "game", "sim", "vision")}
 DOCKER = ROOT / "docker"
 COMPOSE: dict[str, Any] = yaml.safe_load((DOCKER / "docker-compose.yml").read_text())
 # Neither plays nor learns: the gymnasium environment, and the figures of reports.
@@ -61,11 +62,14 @@ def test_images_have_all_that_the_project_needs_and_nothing_else() -> None:
     assert "pybullet" not in requirements("master.txt")
 
 
-@pytest.mark.parametrize("image", ["master", "worker"])
-def test_what_an_image_imports_is_in_it(image: str) -> None:
+@pytest.mark.parametrize(
+    ("image", "more"), [("master", []), ("worker", ["tangram_game", "tangram_vision"])]
+)
+def test_what_an_image_imports_is_in_it(image: str, more: list[str]) -> None:
     """Of tangram_sim each image has what it uses: the tests of the house look at that."""
     distributions, lacking = DISTRIBUTIONS(), set()
-    for path in (path for name in (image, "tangram_agent") for path in (ROOT / name).glob("*.py")):
+    packages = (image, "tangram_agent", "tangram_core", *more)
+    for path in (path for name in packages for path in (ROOT / name).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
             names = [one.name for one in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []

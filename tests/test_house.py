@@ -1,5 +1,6 @@
 """The rules of the house: arrows, packaging, tiers of tests."""
 
+import ast
 import os
 import re
 import shutil
@@ -13,6 +14,7 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+from setuptools import find_packages
 
 from tangram_cli.commands import COMMANDS
 
@@ -22,6 +24,8 @@ ROOT = Path(__file__).parents[1]
 OURS = (
     "tangram_agent",
     "tangram_cli",
+    "tangram_core",
+    "tangram_game",
     "tangram_lab",
     "tangram_sim",
     "tangram_studio",
@@ -58,9 +62,15 @@ def test_import_contracts_catch_every_wrong_arrow(tmp_path: Path) -> None:
         shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("*.pyc"))
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
     wrong = {
-        "tangram_sim/wrong.py": "import torch, pybullet, cv2, zmq, omegaconf, tangram_sim.world.engine",
+        "tangram_sim/wrong.py": "import torch, pybullet, cv2, zmq, omegaconf",
+        "tangram_sim/geometry/wrong.py": "import tangram_sim.world.engine",
         "tangram_agent/wrong.py": "import worker.config, conf.help, tangram_vision.pictures.seeing",
         "master/wrong.py": "import tangram_lab.experiments.studies, tangram_sim.wrong, uvicorn",
+        "master/record/wrong.py": "import master.hub.hub",
+        "worker/talk/wrong.py": "import worker.play.rollout",
+        "tangram_game/show/wrong.py": "import master.config, tangram_game.figures.puzzles",
+        "tangram_vision/pictures/wrong.py": "import tangram_vision.given.photos",
+        "tangram_lab/benchmarks/sight/wrong.py": "import tangram_lab.benchmarks.speed.sim",
     }
     for path, code in wrong.items():
         (tmp_path / path).write_text(code)
@@ -72,7 +82,7 @@ def test_import_contracts_catch_every_wrong_arrow(tmp_path: Path) -> None:
 def test_command_lines_load_nothing_heavy() -> None:
     loaded = run_python(
         "import master.cli, tangram_cli.commands, tangram_lab.benchmarks.cli, sys\n"
-        "import tangram_lab.experiments.cli, tangram_studio.cli, worker.cli\n"
+        "import tangram_game.cli, tangram_lab.experiments.cli, tangram_studio.cli, worker.cli\n"
         "print({'torch', 'numpy', 'hydra', 'zmq', 'gymnasium'} & set(sys.modules))"
     )
     assert loaded == "set()"
@@ -92,9 +102,25 @@ def test_console_scripts_come_through_the_door() -> None:
 
 def test_every_package_is_installed() -> None:
     tools = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]
-    roots = [path for name in PACKAGES for path in (ROOT / name).rglob("__init__.py")]
-    found = {".".join(path.parent.relative_to(ROOT).parts) for path in roots}
-    assert found == set(tools["setuptools"]["packages"])
+    how = tools["setuptools"]["packages"]["find"]
+    assert how.pop("namespaces") is False
+    code = {path.parent for name in PACKAGES for path in (ROOT / name).rglob("*.py")}
+    found = {".".join(path.relative_to(ROOT).parts) for path in code}
+    assert found == set(find_packages(str(ROOT), **how))
+
+
+# Folders
+
+GROWN = {"tangram_agent"}  # it is being taken apart
+
+
+def test_a_folder_has_at_most_twelve_files_and_says_what_is_in_it() -> None:
+    for folder in {path.parent for name in PACKAGES for path in (ROOT / name).rglob("*.py")}:
+        place = str(folder.relative_to(ROOT))
+        assert place in GROWN or len(list(folder.glob("*.py"))) <= 12, place
+        told = ast.get_docstring(ast.parse((folder / "__init__.py").read_text()))
+        assert told is not None, place
+        assert len(told.splitlines()) <= 10, place
 
 
 def locked() -> dict[str, list[str]]:

@@ -215,7 +215,14 @@ def test_every_setting_of_a_run_is_walked() -> None:
 def read_names() -> set[str]:
     """Every attribute and text in the packages, but where settings are declared."""
     names: set[str] = set()
-    for package in ("master", "worker", "tangram_agent", "tangram_lab"):
+    for package in (
+        "master",
+        "worker",
+        "tangram_agent",
+        "tangram_core",
+        "tangram_game",
+        "tangram_lab",
+    ):
         for path in (ROOT / package).rglob("*.py"):
             if path.name in ("config.py", "commands.py"):
                 continue

@@ -1,0 +1,5 @@
+"""What people and machines see of a run: console, TensorBoard, /metrics, result.json.
+
+Start with `report.py`, which collects once what all others show. May import the other folders of
+master; none of them imports this one.
+"""

@@ -1,7 +1,7 @@
 """A rough outline -> tokens that nearly fill it, by a beam: corners of it may be wrong, or lost.
 
-Tokens lie where `tangram_vision.silhouettes.loose` has them, and nothing is searched through: the states that
-are worth most are followed.
+Tokens lie where `tangram_vision.silhouettes.loose` has them, and nothing is searched through: the
+states that are worth most are followed.
 
 Legend: n states, S different shapes.
 """

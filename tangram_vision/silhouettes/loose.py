@@ -1,8 +1,8 @@
 """Places of tokens in an outline that may be wrong: they need not fit.
 
-As in `tangram_sim.geometry.dissections` a token has a corner at a convex one of what is left, with an edge
-along the side that leaves it. But it may reach out of what is left, and no part need have the area
-of tokens.
+As in `tangram_sim.geometry.dissections` a token has a corner at a convex one of what is left, with
+an edge along the side that leaves it. But it may reach out of what is left, and no part need have
+the area of tokens.
 """
 
 from typing import NamedTuple

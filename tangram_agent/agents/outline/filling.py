@@ -1,7 +1,7 @@
 """Filling an outline token by token: what is left of it, what may be laid next, and what then is.
 
-Nothing here is learned: tokens may lie where the search of `tangram_sim.geometry.dissections` has them, and
-an action takes one there exactly. What is learned is which of these states can be filled.
+Nothing here is learned: tokens may lie where the search of `tangram_sim.geometry.dissections` has
+them, and an action takes one there exactly. What is learned is which of these states can be filled.
 
 Legend: K tokens, V corners, G rows of an outline, N corners of what is left, S different shapes.
 """

@@ -1,0 +1,1 @@
+"""How exactly, surely and fast pictures and silhouettes are read. Start with `seeing.py`."""

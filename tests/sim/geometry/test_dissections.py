@@ -53,9 +53,8 @@ def test_thirteen_of_the_twenty_convex_outlines_are_filled_and_seven_searched_th
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Wang and Hsiung, 1942: a proof by hand of what the complete search finds."""
-    monkeypatch.setattr(
-        "tangram_vision.silhouettes.silhouettes._LOOSE", ()
-    )  # no best attempt is asked for
+    # No best attempt is asked for.
+    monkeypatch.setattr("tangram_vision.silhouettes.silhouettes._LOOSE", ())
     every = convex_outlines(1.0)
     assert len(every) == 20
     assert all(polygon(z).area == pytest.approx(1.0) for z in every)

@@ -277,7 +277,7 @@ def test_a_missing_engine_is_named_also_before_a_world_is_made(
 ) -> None:
     monkeypatch.setitem(sys.modules, "pybullet", None)
     for name in ("engine", "physics"):
-        monkeypatch.delitem(sys.modules, f"tangram_sim.{name}", raising=False)
+        monkeypatch.delitem(sys.modules, f"tangram_sim.world.{name}", raising=False)
     with pytest.raises(ConfigError, match=r"set\s+sim\.backend=kinematic"):
         make_world(layout_of("square"), SimConfig())
     monkeypatch.setattr(world_module, "find_spec", lambda name: None)
