@@ -1,7 +1,7 @@
 """Both ends of the conversation: real clients, a real hub, and a master that says what it is told.
 
-`staged` hubs (tests/master/hub/dealers.py) are served by the test's own thread; `with_master` serves a
-hub from another one, because signals belong to the main thread.
+`staged` hubs (tests/master/hub/dealers.py) are served by the test's own thread; `with_master`
+serves a hub from another one, because signals belong to the main thread.
 """
 
 import json
