@@ -105,8 +105,8 @@ def forged(standing: Standing, strike: Callable[[Target], Seen]) -> bool:
 @pytest.mark.parametrize(
     ("strike", "answers", "held"),
     [
-        (degenerate_batches, {"welcome": 1, "reject": 19}, True),
-        (degenerate_batches, {"welcome": 1, "reject": 18, "ack": 1}, False),
+        (degenerate_batches, {"welcome": 1, "reject": 22}, True),
+        (degenerate_batches, {"welcome": 1, "reject": 21, "ack": 1}, False),
         (uninvited, {}, True),
         (uninvited, {"welcome": 1}, False),
         (player_as_evaluator, {"refused": 1}, True),
