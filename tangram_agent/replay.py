@@ -3,9 +3,10 @@
 import numpy as np
 import numpy.typing as npt
 
-from tangram_agent.types import Past, Transitions
+from tangram_agent.types import Transitions
 from tangram_core.arrays import Ints, Singles
 from tangram_core.errors import RunError
+from tangram_tasks.played import Past
 
 Array = npt.NDArray[np.generic]
 _COUNTERS = "counters"

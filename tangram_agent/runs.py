@@ -1,15 +1,16 @@
-"""Loading a finished run: its config, its setup and the policy that it learned.
+"""Loading a finished run: its config, its setup and the actor that it learned.
 
 `load_run("runs/my-run").predict(observation)` gives actions for what gymnasium's environment shows,
-docs/gymnasium.md has whole examples; `policy.act` gives them for corners, see docs/inference.md.
+docs/gymnasium.md has whole examples; `Run.act` gives them for corners, see docs/inference.md.
 `load_run("pretrained/square")` gives one of the agents that come with the package.
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,7 +22,8 @@ from tangram_agent.checkpoints import (
     newest_checkpoint,
 )
 from tangram_agent.pretrained import is_agent, is_name, packaged, read_agent
-from tangram_agent.types import Past, Weights
+from tangram_agent.types import Weights
+from tangram_core.agent import Actor
 from tangram_core.arrays import Floats, Singles
 from tangram_core.errors import ConfigError, RunError
 from tangram_core.settings import (
@@ -35,12 +37,12 @@ from tangram_core.settings import (
     told,
 )
 from tangram_core.setup import Setup, make_setup
+from tangram_core.spec import Arrays, EpisodeSpec
 from tangram_core.store.stored import load_settings
+from tangram_core.task import History
 from tangram_sim.config import with_given_reward
 from tangram_sim.geometry.shapes import MAX_COORDINATE
-
-if TYPE_CHECKING:
-    from tangram_agent.policy import Policy
+from tangram_tasks.place import Place
 
 CONFIG = "config.yaml"
 POLICY_SECTIONS = ("tokens", "agent", "net")
@@ -50,17 +52,21 @@ Changes = Mapping[str, Mapping[str, Any]]  # section -> setting -> value
 
 
 class Stored(NamedTuple):
-    """What is read of a run, before its policy is made; see `Run`."""
+    """What is read of a run, before its actor is made; see `Run`."""
 
     folder: Path
     config: dict[str, Any]
     setup: Setup
     weights: Weights
 
+    @property
+    def task(self) -> Place:
+        """The task, which is one of tokens; ConfigError if it is not."""
+        return tokens_of(self.folder, self.setup)
+
     def made(self) -> "Run":
-        """The run with its policy."""
-        policy = _policy(self.setup, self.weights)
-        return Run(self.folder, self.config, self.setup, self.weights.version, policy)
+        """The run with its actor."""
+        return Run(self.folder, self.config, self.setup, self.weights)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,17 +78,47 @@ class Run:
         config: the resolved config that it was trained with; only what makes the setup for an
             agent of the package.
         setup: the task and the agent.
-        updates: of the weights that were loaded.
-        policy: acts with these weights; see `Policy.act` for shapes.
+        weights: as the checkpoint has them; their version is the number of updates.
     """
 
     folder: Path
     config: dict[str, Any]
     setup: Setup
-    updates: int
-    policy: "Policy"
+    weights: Weights
 
-    def predict(self, observation: Mapping[str, Any], past: Past | None = None) -> Singles:
+    @property
+    def updates(self) -> int:
+        """Of the weights that were loaded."""
+        return self.weights.version
+
+    @cached_property
+    def actor(self) -> Actor:
+        """Acts with these weights."""
+        actor = self.setup.agent.actor(self.setup.task)
+        actor.load(self.weights.tensors)
+        return actor
+
+    @property
+    def task(self) -> Place:
+        """The task, which is one of tokens.
+
+        Raises:
+            ConfigError: it is not.
+        """
+        return tokens_of(self.folder, self.setup)
+
+    def act(self, seen: Arrays, past: History | None = None) -> Singles:
+        """Actions (B, A) in [-1, 1], exploration off.
+
+        Args:
+            seen: the fields that the task's spec names, B rows each: of tokens their corners (B, V,
+                2), which are placed (B, K), and goals (B, V, 2), or (B, G, 2) rows of outlines.
+            past: what was seen of these episodes before, if anything: an agent that learns what a
+                command comes to corrects itself by it.
+        """
+        return self.actor.act(seen, past or beginning(self.setup.spec, seen))
+
+    def predict(self, observation: Mapping[str, Any], past: History | None = None) -> Singles:
         """What the agent does, noise off: the actions alone, as it keeps nothing in mind.
 
         Args:
@@ -96,25 +132,27 @@ class Run:
         Raises:
             ConfigError: an observation of another form, or of another set of tokens.
         """
-        shown, layout = self._checked(observation), self.setup.layout
+        shown, layout = self._checked(observation), self.task.layout
         corners, goals = (
             shown[name].reshape(-1, layout.corner_count, 2)
             for name in ("achieved_goal", "desired_goal")
         )
         flags = shown["observation"][..., -layout.tokens :].reshape(-1, layout.tokens)
-        actions = self.policy.act(corners, flags > 0.5, goals, past=past)
-        return actions if shown["observation"].ndim > 1 else actions[0]
+        actions = self.act({"corners": corners, "placed": flags > 0.5, "goals": goals}, past)
+        single: Singles = actions if shown["observation"].ndim > 1 else actions[0]
+        return single
 
     def _checked(self, observation: object) -> dict[str, Floats]:
         """The entries as arrays, all for as many rows."""
-        if self.setup.fills:
+        if self.task.outlines:
             raise ConfigError(
-                f"{self.folder} fills outlines, which no observation has: call policy.act with "
+                f"{self.folder} fills outlines, which no observation has: call act with "
                 "goals that tangram_sim.geometry.rings.as_rows makes"
             )
-        corners = 2 * self.setup.layout.corner_count
+        layout = self.task.layout
+        corners = 2 * layout.corner_count
         wanted = {
-            "observation": corners + self.setup.layout.tokens,
+            "observation": corners + layout.tokens,
             "achieved_goal": corners,
             "desired_goal": corners,
         }
@@ -150,9 +188,8 @@ class Run:
 
     def unlearned(self) -> "Run":
         """The same run with all weights 0, so that it values everything alike."""
-        weights = self.policy.weights()
-        none = replace(weights, tensors={k: np.zeros_like(v) for k, v in weights.tensors.items()})
-        return replace(self, policy=_policy(self.setup, none))
+        none = {name: np.zeros_like(one) for name, one in self.weights.tensors.items()}
+        return replace(self, weights=replace(self.weights, tensors=none))
 
     def with_settings(self, changes: Changes) -> "Run":
         """The same weights, played with other settings: `{"agent": {"reapply": 1}}`.
@@ -164,7 +201,7 @@ class Run:
         setup = _changed(self.folder, self.setup, changes)
         if setup is self.setup:
             return self
-        return replace(self, setup=setup, policy=_policy(setup, self.policy.weights()))
+        return replace(self, setup=setup)
 
 
 def _changed(folder: Path, trained: Setup, changes: Changes) -> Setup:
@@ -172,9 +209,12 @@ def _changed(folder: Path, trained: Setup, changes: Changes) -> Setup:
     given = [f"{s}.{name}={told(v)}" for s, own in changes.items() for name, v in own.items()]
     if not given:
         return trained
-    config = asdict(trained)
+    config = trained.config()
     for section, values in changes.items():
-        _check_playable(getattr(trained, section), values)
+        holds = trained.sections.get(section)
+        if holds is None:
+            raise ConfigError(f"{folder} has no settings of {section}: leave {given[0]} out")
+        _check_playable(holds, values)
         config[section] |= values
     try:
         return make_setup(config)
@@ -240,13 +280,23 @@ def load_run(run_dir: str | Path, checkpoint: str | None = None, reward: str | N
     return _read(Path(run_dir), checkpoint, reward).made()
 
 
-def _policy(setup: Setup, weights: Weights) -> "Policy":
-    # Late: torch takes seconds, and what is read before may be refused.
-    from tangram_agent.policy import Policy  # noqa: PLC0415
+def tokens_of(folder: Path, setup: Setup) -> Place:
+    """The task of a run, which is one of tokens.
 
-    policy = Policy(setup)
-    policy.load(weights)
-    return policy
+    Raises:
+        ConfigError: it is not.
+    """
+    if not isinstance(setup.task, Place):
+        raise ConfigError(f"{folder} plays task={setup.task_kind}, not tokens: name another run")
+    return setup.task
+
+
+def beginning(spec: EpisodeSpec, seen: Arrays) -> History:
+    """The history of B episodes that begin now."""
+    count = len(seen[spec.achieved])
+    now = {field.name: seen[field.name] for field in spec.fields if field.name in seen}
+    moments = {n: now[n][:, None] for n in now if spec.field(n).per == "moment"}
+    return History(moments, np.zeros((count, 0, spec.action_size), np.float32))
 
 
 def _read(folder: Path, checkpoint: str | None, reward: str | None) -> Stored:

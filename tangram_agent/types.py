@@ -17,21 +17,6 @@ Flags = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False)
-class Past:
-    """What was seen and done in B episodes so far, T actions in each.
-
-    Attributes:
-        corners: (B, T, V, 2) of the tokens before each action.
-        actions: (B, T, A).
-        seen: (B, T + 1, K) which tokens were seen before each action, and now; None: all were.
-    """
-
-    corners: Singles
-    actions: Singles
-    seen: Flags | None = None
-
-
-@dataclass(frozen=True, eq=False)
 class Choice:
     """What B environments play.
 

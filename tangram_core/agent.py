@@ -18,6 +18,7 @@ from tangram_core.task import Generators, History, Json, Task
 
 Streams = Mapping[str, np.random.Generator]
 Tensors = dict[str, Singles]
+AT_ONCE = 32
 
 
 class NotFiniteError(RunError):
@@ -38,7 +39,13 @@ class Pace:
 
 
 class Actor(ABC):
-    """Who acts in a worker: on the CPU, with one thread, for B environments at a time."""
+    """Who acts in a worker: on the CPU, with one thread, for B environments at a time.
+
+    Attributes:
+        at_once: environments that it plays at a time where it is shown or scored.
+    """
+
+    at_once: int = AT_ONCE
 
     @property
     @abstractmethod

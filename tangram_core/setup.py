@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, is_dataclass
+from dataclasses import asdict, dataclass, is_dataclass
 from typing import Any, TypeVar, cast, get_origin, get_type_hints
 
 import dacite
@@ -47,6 +47,14 @@ class Setup:
         """Section of the settings -> what it holds; nothing where it only names the kind."""
         own = {TASK: None, AGENT: None}
         return own | _sections(self.task) | _sections(self.agent)
+
+    def config(self) -> dict[str, Any]:
+        """The sections of a config that makes this setup."""
+        kinds = {TASK: {KIND: self.task_kind}, AGENT: {KIND: self.agent_kind}}
+        held = {
+            n: {} if one is None else asdict(cast("Any", one)) for n, one in self.sections.items()
+        }
+        return {name: kinds.get(name, {}) | held[name] for name in held}
 
     def fingerprints(self) -> dict[str, str]:
         """A digest of each section: two processes with the same ones play the same task."""

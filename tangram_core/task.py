@@ -28,15 +28,21 @@ class Score:
         name: in result.json, in TensorBoard and in files of scores.
         label: of a few words, with the unit.
         digits: after the point.
-        best: the largest value there is, if there is one: a bar is drawn up to it.
-        least: the least value; see `best`.
+        unit: written behind the number.
     """
 
     name: str
     label: str
     digits: int = 3
-    best: float | None = None
-    least: float = 0.0
+    unit: str = ""
+
+    def shown(self, value: float | None) -> str:
+        """The number as people read it."""
+        return "-" if value is None else f"{value:.{self.digits}f}{self.unit}"
+
+    def told(self, value: float) -> str:
+        """With its label."""
+        return f"{self.label} {self.shown(value)}"
 
 
 @dataclass(frozen=True, eq=False)

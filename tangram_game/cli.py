@@ -12,7 +12,8 @@ from conf.cli import entry, tell
 from conf.commands import Plain
 
 if TYPE_CHECKING:
-    from tangram_agent.setup import Setup
+    from tangram_agent.task import Place
+
     from tangram_game.config import EvalConfig, PlayConfig
 
 
@@ -27,7 +28,8 @@ def play() -> int:
 
 
 def _evaluate(settings: Plain) -> int:
-    from tangram_agent.setup import from_mapping
+    from tangram_agent.task import from_mapping
+
     from tangram_core.store.files import check_writable
     from tangram_game.config import EvalConfig
 
@@ -44,7 +46,8 @@ def _evaluate(settings: Plain) -> int:
 
 
 def _play(settings: Plain) -> int:
-    from tangram_agent.setup import from_mapping
+    from tangram_agent.task import from_mapping
+
     from tangram_core.store.files import check_writable
     from tangram_game.config import PlayConfig, check_compare
 
@@ -53,17 +56,17 @@ def _play(settings: Plain) -> int:
     config = from_mapping(PlayConfig, with_changes(paths))
     check_writable("out", Path(config.out).absolute())
     _check_drawings(config)
-    setups = _check_played(config.run_dirs, config)
+    tasks = _check_played(config.run_dirs, config)
     if config.target is not None:
         from tangram_game.figures.photographs import read_photograph
 
-        read_photograph(config.target, setups[0])
+        read_photograph(config.target, tasks[0])
     filled = None
     if config.silhouette is not None:
         from tangram_game.figures.silhouettes import read_silhouette
 
         out = Path(config.out)
-        filled = read_silhouette(config.silhouette, setups[0], config.solutions, out)
+        filled = read_silhouette(config.silhouette, tasks[0], config.solutions, out)
     tell(f"loads and plays {', '.join(config.run_dirs)}")
 
     if config.compare is not None:
@@ -75,18 +78,18 @@ def _play(settings: Plain) -> int:
     return play_run(config, filled)
 
 
-def _check_played(run_dirs: Sequence[str], config: "EvalConfig | PlayConfig") -> list["Setup"]:
+def _check_played(run_dirs: Sequence[str], config: "EvalConfig | PlayConfig") -> list["Place"]:
     """Refuse what cannot be played before torch is loaded; returns what the runs play."""
     from tangram_agent.runs import read_changed
 
-    setups = [read_changed(run_dir, config.changes).setup for run_dir in run_dirs]
+    tasks = [read_changed(run_dir, config.changes).task for run_dir in run_dirs]
     if config.puzzle is not None:
         from tangram_game.config import source_and_names
         from tangram_game.figures.puzzles import find_figures
 
         source, names = source_and_names(config.puzzle)
-        find_figures(source, setups[0], names)
-    return setups
+        find_figures(source, tasks[0], names)
+    return tasks
 
 
 def _check_drawings(config: "PlayConfig") -> None:

@@ -13,25 +13,16 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from tangram_agent.agents.outline.agent import Outline
 from tangram_agent.outcome import plural
 from tangram_agent.runs import Run, load_changed
-from tangram_core.setup import Setup
+from tangram_core.agent import AT_ONCE
 from tangram_core.store.files import write_whole
 from tangram_game.config import EvalConfig, source_and_names
 from tangram_game.figures.puzzles import find_figures
-from tangram_game.rivals.baselines import (
-    Player,
-    Told,
-    exact_policy,
-    playing,
-    position_policy,
-    random_policy,
-)
+from tangram_game.playing import Player, by
 from tangram_game.rivals.fitted import fitted_policy
-from tangram_game.rivals.oracle import oracle_policy
-from tangram_game.rivals.sweeps import MAX_TOKENS, sweep_policy
 from tangram_game.scores import (
-    OF_AREAS,
     RUN,
     Scored,
     Scores,
@@ -45,8 +36,9 @@ from tangram_game.scores import (
 )
 from tangram_sim.config import SILHOUETTES, SimConfig
 from tangram_sim.drawing.game_drawing import figure_sheet
-from worker.play.rollout import at_once
-from worker.score.test_set import FixedTests, greedy
+from tangram_tasks.place import Place
+from tangram_tasks.played import Played, told
+from worker.score.test_set import FixedTests
 
 MAX_PICTURES = 100  # on a sheet
 MAX_PADDED = 5  # policies in a table
@@ -124,45 +116,44 @@ def evaluate_run(config: EvalConfig) -> int:
 
 def policies(run: Run) -> dict[str, Player]:
     """The run, and those to compare it with, by their names in tables and files."""
-    layout, sim = run.setup.layout, run.setup.sim
-    result: dict[str, Player] = {RUN: greedy(run.policy)}
-    if run.setup.fills:
-        if run.setup.agent.beam > 1:
-            result["beam=1"] = greedy(run.with_settings({"agent": {"beam": 1}}).policy)
+    result, rivals = {RUN: by(run.actor)}, dict(run.task.rivals())
+    agent, task = run.setup.agent, run.task
+    if isinstance(agent, Outline):
+        if agent.config.beam > 1:
+            result["beam=1"] = by(run.with_settings({"agent": {"beam": 1}}).actor)
         # Of places that are worth the same the first is taken: that of the largest token.
-        nothing = greedy(run.unlearned().policy)
-        return result | {"largest first": nothing, "random": random_policy(layout, sim)}
-    result["exact"] = exact_policy(layout, sim)
-    if sim.motion == "slide" and layout.tokens <= MAX_TOKENS:
-        result["sweep rule"] = sweep_policy(layout, sim)
-    if sim.inexact or (sim.corner_noise and run.setup.horizon > 1):
-        result |= {"fitted": Told(fitted_policy), "oracle": Told(oracle_policy)}
-    if layout.tokens == 1:
-        result["position only"] = position_policy(layout, sim)
-    return result | {"random": random_policy(layout, sim)}
+        return {**result, "largest first": by(run.unlearned().actor), **rivals}
+    first = {name: rivals.pop(name) for name in ("exact", "sweep rule") if name in rivals}
+    if task.sim.inexact or (task.sim.corner_noise and task.horizon > 1):
+        first["fitted"] = told(fitted_policy)
+    return {**result, **first, **rivals}
 
 
 def score_policies(
-    setup: Setup, players: Mapping[str, Player], config: EvalConfig
+    task: Place, players: Mapping[str, Player], config: EvalConfig, at_once: int = AT_ONCE
 ) -> dict[str, Scores]:
     """Scores of each policy, on the same episodes."""
-    with closing(FixedTests(setup, config.episodes, at_once(setup), seed=config.seed)) as tests:
-        return {name: _scored(tests, player) for name, player in players.items()}
+    with closing(FixedTests(task, config.episodes, at_once, seed=config.seed)) as tests:
+        return {name: _scored(tests, player, at_once) for name, player in players.items()}
 
 
-def _scored(tests: FixedTests, player: Player) -> Scores:
-    played, setup = tests.play(playing(player, tests.env)), tests.setup
-    scores: Scores = dict(tests.scores(played))
-    if setup.fills:
-        return {key: scores[key] for key in OF_AREAS if key in scores} | of_outlines(setup, played)
-    return scores | (of_several(setup, played) if setup.layout.tokens > 1 else of_each(played))
+def _scored(tests: FixedTests, player: Player, at_once: int) -> Scores:
+    whole, task = tests.play(player(tests.env)), tests.task
+    played = Played.of(whole)
+    scores: Scores = {**task.score(whole), "episodes": float(whole.episodes.count)}
+    if not isinstance(task, Place):
+        return scores
+    if task.outlines:
+        return scores | of_outlines(task, played, at_once)
+    several = task.layout.tokens > 1
+    return scores | (of_several(played, at_once) if several else of_each(played))
 
 
 def _episodes(run: Run, config: EvalConfig) -> dict[str, Any]:
     """Play the test episodes and print the scores; the file's content."""
-    scores = score_policies(run.setup, policies(run), config)
+    scores = score_policies(run.task, policies(run), config, run.actor.at_once)
     tests = "fixed tests" if config.seed == 0 else f"tests of seed {config.seed}"
-    caption = f"{config.episodes:,} {tests}, {_told(run.setup)}; positions in arena units"
+    caption = f"{config.episodes:,} {tests}, {_told(run.task)}; positions in arena units"
     Console(highlight=False).print(scores_table(_title(run), caption, scores))
     return {**_report(run, config, scores), "episodes": config.episodes}
 
@@ -170,23 +161,23 @@ def _episodes(run: Run, config: EvalConfig) -> dict[str, Any]:
 def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
     """Assemble the puzzles, print the scores and draw the sheet; the file's content."""
     source, names = source_and_names(config.puzzle or ())
-    setup = run.setup
-    figures = find_figures(source, setup, names, config.turns)
-    if setup.fills and setup.sim.observe == "silhouette_pictures":
+    task = run.task
+    figures = find_figures(source, task, names, config.turns)
+    if task.outlines and task.sim.observe == "silhouette_pictures":
         scored = score_pictured(run, figures, config.seed)
     else:
-        shown = score_hidden if setup.sim.observe in SILHOUETTES else score_puzzles
-        score = score_outlines if setup.fills else shown
-        scored = score(setup, figures, policies(run), config.seed)
+        shown = score_hidden if task.sim.observe in SILHOUETTES else score_puzzles
+        score = score_outlines if task.outlines else shown
+        scored = score(task, figures, policies(run), config.seed, run.actor.at_once)
     scores, lines = scored.means, scored.puzzles
     console = Console(highlight=False)
     count = len(figures)
     which = f"{plural(count, 'puzzle')} of {Path(source or 'the library').name}"
-    caption = f"{which}, {_told(setup)}; {scored.told}"
+    caption = f"{which}, {_told(task)}; {scored.told}"
     console.print(scores_table(_title(run), caption, scores))
     console.print(puzzles_table(lines, full=config.out))
     if config.sheet is not None:
-        write_sheet(config.sheet, setup, scored)
+        write_sheet(config.sheet, task, scored)
         console.print(f"written: {config.sheet}", markup=False, soft_wrap=True)
     return _report(run, config, scores) | {
         "puzzle": list(config.puzzle or ()),
@@ -197,15 +188,15 @@ def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
 
 def _report(run: Run, config: EvalConfig, scores: Mapping[str, Scores]) -> dict[str, Any]:
     """The file's content: the run's scores on top, by the same names as in result.json."""
-    setup = run.setup
+    task = run.task
     return {
         **scores[RUN],
         "test_seed": config.seed,
         "run_dir": str(run.folder),
         "updates": run.updates,
-        "tokens": [shape.name for shape in setup.layout.shapes],
-        "sim": asdict(setup.sim),
-        "agent": asdict(setup.agent),
+        "tokens": [shape.name for shape in task.layout.shapes],
+        "sim": asdict(task.sim),
+        "agent": asdict(run.setup.agent.config),
         "baselines": {name: values for name, values in scores.items() if name != RUN},
     }
 
@@ -214,14 +205,14 @@ def _title(run: Run) -> str:
     return f"{run.folder.name} after {plural(run.updates, 'update')}"
 
 
-def _told(setup: Setup) -> str:
+def _told(task: Place) -> str:
     """The settings of the test, in words."""
-    sim = setup.sim
+    sim = task.sim
     parts = [
         f"{sim.actions_per_token} action{'s' * (sim.actions_per_token > 1)} a token",
         "exploration off",
         _observed(sim),
-        sim.backend if setup.layout.tokens == 1 else f"{sim.backend}, {sim.motion}",
+        sim.backend if task.layout.tokens == 1 else f"{sim.backend}, {sim.motion}",
     ]
     parts += [f"world {sim.world}"] if sim.inexact else []
     return ", ".join(parts)
@@ -238,7 +229,7 @@ def _observed(sim: SimConfig) -> str:
     return f"corners with noise {sim.corner_noise:g}" if sim.corner_noise else "exact corners"
 
 
-def write_sheet(path: str, setup: Setup, scored: Scored) -> None:
+def write_sheet(path: str, task: Place, scored: Scored) -> None:
     """Write a picture of every figure's end, of at most `MAX_PICTURES`.
 
     Raises:
@@ -246,7 +237,7 @@ def write_sheet(path: str, setup: Setup, scored: Scored) -> None:
     """
     picture = BytesIO()
     ends, goals = scored.ends[:MAX_PICTURES], scored.goals[:MAX_PICTURES]
-    sheet = figure_sheet(setup.layout, setup.sim.arena, ends, goals, scored.titles[:MAX_PICTURES])
+    sheet = figure_sheet(task.layout, task.sim.arena, ends, goals, scored.titles[:MAX_PICTURES])
     sheet.save(picture, format="PNG")
     write_whole(Path(path), picture.getvalue())
 

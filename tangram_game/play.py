@@ -17,21 +17,22 @@ from tangram_agent.runs import Run, load_changed
 from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError, RunError
 from tangram_core.settings import told
-from tangram_core.setup import Setup
 from tangram_core.store.files import write_whole
 from tangram_game.config import MAX_SHOWN, PlayConfig, source_and_names
 from tangram_game.figures.photographs import draw_photograph, read_photograph
 from tangram_game.figures.puzzles import find_figures, play_figures
 from tangram_game.figures.silhouettes import Shown, draw_silhouette, read_silhouette
+from tangram_game.playing import by, play_tests
 from tangram_game.show.film import WIDTH, Show, film_pictures, frames_per_action
 from tangram_game.show.views import beside, camera_sheets
 from tangram_sim.drawing.game_drawing import figure_sheet, tiles
 from tangram_sim.drawing.scenes import episode_sheet, save_gif, save_mp4
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.motion.kinematics import wrap
-from worker.play.rollout import Played, at_once
-from worker.score.metrics import SOLVED, assembled
-from worker.score.test_set import FixedTests, greedy
+from tangram_tasks.metrics import SOLVED, assembled
+from tangram_tasks.place import Place
+from tangram_tasks.played import Played
+from worker.score.test_set import FixedTests
 
 FRAME_MS = 50
 STILL_START, STILL_END = 10, 30  # frames
@@ -81,18 +82,18 @@ def make_show(run: Run, config: PlayConfig, silhouette: Shown | None = None) -> 
     if config.target is not None:
         return photograph_show(run, config, config.target)
     if config.silhouette is not None:
-        given = (config.silhouette, run.setup, config.solutions, Path(config.out))
+        given = (config.silhouette, run.task, config.solutions, Path(config.out))
         return silhouette_show(run, config, silhouette or read_silhouette(*given))
     titles = [f"target {i + 1}" for i in range(config.episodes)]
-    return Show(run.setup, play_episodes(run, config), titles, "episode")
+    return Show(run.task, play_episodes(run, config), titles, "episode")
 
 
 def play_episodes(run: Run, config: PlayConfig) -> Played:
     """The episodes that the settings name, played by a run."""
     with closing(
-        FixedTests(run.setup, config.episodes, at_once(run.setup), role="play", seed=config.seed)
+        FixedTests(run.task, config.episodes, run.actor.at_once, role="play", seed=config.seed)
     ) as tests:
-        return tests.play(greedy(run.policy))
+        return play_tests(tests, by(run.actor))
 
 
 def puzzle_show(run: Run, config: PlayConfig) -> Show:
@@ -101,16 +102,16 @@ def puzzle_show(run: Run, config: PlayConfig) -> Show:
     Raises:
         ConfigError: puzzles that the run cannot play, or too many of them.
     """
-    setup = _beside(run.setup)
+    task = _beside(run.task)
     source, names = source_and_names(config.puzzle or ())
-    figures = find_figures(source, setup, names, config.turns)
+    figures = find_figures(source, task, names, config.turns)
     if len(figures) > MAX_SHOWN:
         raise ConfigError(
             f"there are {len(figures)} puzzles, at most {MAX_SHOWN} are shown: name some, as "
             f"in puzzle=[{figures[0].name}]"
         )
-    played = play_figures(setup, figures, greedy(run.policy), config.seed)
-    return Show(setup, played, [one.title for one in figures], "puzzle")
+    played = play_figures(task, figures, by(run.actor), config.seed, at_once=run.actor.at_once)
+    return Show(task, played, [one.title for one in figures], "puzzle")
 
 
 def photograph_show(run: Run, config: PlayConfig, target: str) -> Show:
@@ -119,11 +120,11 @@ def photograph_show(run: Run, config: PlayConfig, target: str) -> Show:
     Raises:
         ConfigError: a photograph that does not show the run's tokens.
     """
-    photograph = read_photograph(target, run.setup)
-    figure, player = photograph.figure, greedy(run.policy)
-    played = play_figures(run.setup, [figure], player, config.seed, touching=False)
-    seen = draw_photograph(photograph, run.setup.layout, tiles(1, WIDTH)[1])
-    return Show(run.setup, played, [figure.title], "photograph", seen)
+    photograph = read_photograph(target, run.task)
+    figure, player = photograph.figure, by(run.actor)
+    played = play_figures(run.task, [figure], player, config.seed, touching=False)
+    seen = draw_photograph(photograph, run.task.layout, tiles(1, WIDTH)[1])
+    return Show(run.task, played, [figure.title], "photograph", seen)
 
 
 def silhouette_show(run: Run, config: PlayConfig, found: Shown) -> Show:
@@ -132,39 +133,39 @@ def silhouette_show(run: Run, config: PlayConfig, found: Shown) -> Show:
     It is laid as it was found to be filled, or by an agent of outlines: that is shown no more than
     the outline of what was found, which is the silhouette's within the search's tolerance.
     """
-    setup, fills = _beside(run.setup), run.setup.fills
-    played = play_figures(setup, [found.figure], greedy(run.policy), config.seed)
+    task, fills = _beside(run.task), run.task.outlines
+    played = play_figures(task, [found.figure], by(run.actor), config.seed)
     width = WIDTH if _is_still(config.out) else WIDTH // 2
-    seen = draw_silhouette(found, setup.layout, width, bare=SHOWN * fills)
+    seen = draw_silhouette(found, task.layout, width, bare=SHOWN * fills)
     told = found.told
     if fills:
-        solved = assembled(setup.layout, played).iou[0] >= SOLVED
+        solved = assembled(task.layout, played).iou[0] >= SOLVED
         told = "filled by the run itself" if solved else f"not filled by the run itself, but {told}"
-    return Show(setup, played, [found.figure.title], "silhouette", seen, told)
+    return Show(task, played, [found.figure.title], "silhouette", seen, told)
 
 
-def _beside(setup: Setup) -> Setup:
+def _beside(task: Place) -> Place:
     """The same task with all tokens beside the target at first."""
-    return replace(setup, sim=replace(setup.sim, starts="outside"))
+    return replace(task, sim=replace(task.sim, starts="outside"))
 
 
 def end_picture(show: Show) -> Image.Image:
     """The ends of all episodes."""
-    layout, arena, played = show.setup.layout, show.setup.sim.arena, show.played
+    layout, arena, played = show.task.layout, show.task.sim.arena, show.played
     return figure_sheet(layout, arena, played.ends, played.goals, show.titles)
 
 
 def _frames(show: Show, out: str) -> list[Image.Image]:
     """One picture of the ends, or the film."""
-    setup, played = show.setup, show.played
-    still, game = _is_still(out), setup.layout.tokens > 1 or show.seen is not None
+    task, played = show.task, show.played
+    still, game = _is_still(out), task.layout.tokens > 1 or show.seen is not None
     count = len(show.titles)
     columns, size = tiles(count, WIDTH) if game else _tiles(count, SHEET)
-    sheets = camera_sheets(setup, played, columns, size)
+    sheets = camera_sheets(task, played, columns, size)
     if still:
-        end = end_picture(show) if game else draw_sheet(setup, played, played.ends)
+        end = end_picture(show) if game else draw_sheet(task, played, played.ends)
         return [side_by_side([*_before(show), end, *sheets[-1:]])]
-    frames = film_pictures(show) if game else draw_motion(setup, played)
+    frames = film_pictures(show) if game else draw_motion(task, played)
     if sheets:
         pairs = zip(frames, beside(frames, sheets), strict=True)
         frames = [side_by_side(pair) for pair in pairs]
@@ -196,7 +197,7 @@ def save_picture(out: str, frames: Sequence[Image.Image]) -> None:
     write_whole(Path(out), picture.getvalue())
 
 
-def draw_sheet(setup: Setup, played: Played, corners: Floats, width: int = SHEET) -> Image.Image:
+def draw_sheet(task: Place, played: Played, corners: Floats, width: int = SHEET) -> Image.Image:
     """One tile for each of E episodes while its tokens are at corners (E, V, 2).
 
     Args:
@@ -204,7 +205,7 @@ def draw_sheet(setup: Setup, played: Played, corners: Floats, width: int = SHEET
     """
     columns, size = _tiles(len(corners), width)
     scenes = (played.starts, corners, played.goals)
-    return episode_sheet(setup.layout, setup.sim.arena, *scenes, columns, size)
+    return episode_sheet(task.layout, task.sim.arena, *scenes, columns, size)
 
 
 def _tiles(count: int, width: int) -> tuple[int, int]:
@@ -213,12 +214,11 @@ def _tiles(count: int, width: int) -> tuple[int, int]:
     return columns, min(max(width // columns, MIN_TILE), MAX_TILE)
 
 
-def draw_motion(setup: Setup, played: Played) -> list[Image.Image]:
+def draw_motion(task: Place, played: Played) -> list[Image.Image]:
     """The episodes' frames: start, every action as a motion at constant velocity, end."""
     count = frames_per_action(played.episodes.actions.shape[1])
     return [
-        draw_sheet(setup, played, corners)
-        for corners in motion(setup.layout, played.corners, count)
+        draw_sheet(task, played, corners) for corners in motion(task.layout, played.corners, count)
     ]
 
 
@@ -263,7 +263,7 @@ def compare_runs(config: PlayConfig) -> int:
     torch.set_num_threads(1)
     runs = [load_changed(run_dir, config.changes) for run_dir in config.run_dirs]
     check_same_task(runs)
-    shown = [(run.setup, play_episodes(run, config)) for run in runs]
+    shown = [(run.task, play_episodes(run, config)) for run in runs]
     labels = distinct_names([run.folder for run in runs])
     scores = [f"mean raw overlap {played.overlap.mean():.3f}" for _, played in shown]
     panels = [
@@ -287,29 +287,29 @@ def check_same_task(runs: Sequence[Run]) -> None:
     """
     first = runs[0]
     for run in runs[1:]:
-        here, there = (_drawn_by(one.setup) for one in (run, first))
+        here, there = (_drawn_by(one.task) for one in (run, first))
         for what, other in here.items():
             if other != there[what]:
                 raise RunError(
                     f"cannot compare {run.folder} with {first.folder}: {what} is {other} here and "
                     f"{there[what]} there; the same starts need the same tokens and {_DRAWN_BY}"
                 )
-        if run.setup.layout.fingerprint() != first.setup.layout.fingerprint():
+        if run.task.layout.fingerprint() != first.task.layout.fingerprint():
             raise RunError(
                 f"cannot compare {run.folder} with {first.folder}: their tokens have other "
                 "corners; the same starts need the same tokens and arena"
             )
 
 
-def _drawn_by(setup: Setup) -> dict[str, str]:
+def _drawn_by(task: Place) -> dict[str, str]:
     """What decides which episodes are drawn."""
-    sim = {f"sim.{name}": told(getattr(setup.sim, name)) for name in ("arena", *OF_STARTS)}
-    return {"tokens": _tokens(setup), **sim}
+    sim = {f"sim.{name}": told(getattr(task.sim, name)) for name in ("arena", *OF_STARTS)}
+    return {"tokens": _tokens(task), **sim}
 
 
-def _tokens(setup: Setup) -> str:
-    names = ", ".join(shape.name for shape in setup.layout.shapes)
-    return f"[{names}] of scale {setup.tokens.scale:.6g}"
+def _tokens(task: Place) -> str:
+    names = ", ".join(shape.name for shape in task.layout.shapes)
+    return f"[{names}] of scale {task.tokens.scale:.6g}"
 
 
 def distinct_names(folders: Sequence[Path]) -> list[str]:
@@ -322,22 +322,22 @@ def distinct_names(folders: Sequence[Path]) -> list[str]:
     return [str(folder) for folder in folders]
 
 
-def _films(config: PlayConfig, shown: Sequence[tuple[Setup, Played]]) -> list[list[Image.Image]]:
+def _films(config: PlayConfig, shown: Sequence[tuple[Place, Played]]) -> list[list[Image.Image]]:
     """For each run its frames, equally many: only the last one for a PNG."""
     if _is_still(config.out):
         scenes = [[played.ends] for _, played in shown]
     else:
         scenes = equally_long(shown)
     return [
-        [draw_sheet(setup, played, corners, COMPARED // len(shown)) for corners in film]
-        for (setup, played), film in zip(shown, scenes, strict=True)
+        [draw_sheet(task, played, corners, COMPARED // len(shown)) for corners in film]
+        for (task, played), film in zip(shown, scenes, strict=True)
     ]
 
 
-def equally_long(shown: Sequence[tuple[Setup, Played]]) -> list[list[Floats]]:
+def equally_long(shown: Sequence[tuple[Place, Played]]) -> list[list[Floats]]:
     """For each run the corners (E, V, 2) of every frame; a shorter film keeps its last one."""
     count = frames_per_action(max(played.episodes.actions.shape[1] for _, played in shown))
-    films = [motion(setup.layout, played.corners, count) for setup, played in shown]
+    films = [motion(task.layout, played.corners, count) for task, played in shown]
     longest = max(map(len, films))
     return [film + [film[-1]] * (longest - len(film)) for film in films]
 

@@ -10,14 +10,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tangram_agent.runs import Run
+from tangram_core.agent import AT_ONCE
 from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError
-from tangram_core.setup import Setup
 from tangram_game.figures.puzzles import Figure, play_figures
-from tangram_game.rivals.baselines import Player, exact_policy
+from tangram_game.playing import Player
 from tangram_sim.rewards import scaled_overlap
-from worker.play.rollout import Played, at_once
-from worker.score.metrics import SOLVED, assembled, pose_errors, summarise
+from tangram_tasks.metrics import SOLVED, assembled, pose_errors, summarise
+from tangram_tasks.place import Place
+from tangram_tasks.played import Played, plain
+from tangram_tasks.rivals.baselines import exact_policy
 
 if TYPE_CHECKING:  # needs OpenCV and shapely
     from tangram_game.figures.hidden import Hidden, Laid
@@ -55,26 +57,37 @@ class Scored:
 
 
 def score_puzzles(
-    setup: Setup, figures: Sequence[Figure], players: Mapping[str, Player], seed: int
+    task: Place,
+    figures: Sequence[Figure],
+    players: Mapping[str, Player],
+    seed: int,
+    at_once: int = AT_ONCE,
 ) -> Scored:
     """Scores of each policy on the same starts."""
     scores, played = dict[str, Scores](), dict[str, Played]()
     for name, player in players.items():
-        played[name] = play_figures(setup, figures, player, seed)
-        own = summarise(setup.layout, setup.sim, played[name], own_reward=False)
-        scores[name] = own | of_several(setup, played[name])
+        played[name] = play_figures(task, figures, player, seed, at_once=at_once)
+        own = summarise(task.layout, task.sim, played[name], own_reward=False)
+        scores[name] = own | of_several(played[name], at_once)
     run, titles = played[RUN], [figure.title for figure in figures]
-    each = _one_by_one(setup, figures, run)
+    each = _one_by_one(task, figures, run)
     return Scored(scores, each, titles, run.ends, run.goals, "positions in arena units")
 
 
 def score_outlines(
-    setup: Setup, figures: Sequence[Figure], players: Mapping[str, Player], seed: int
+    task: Place,
+    figures: Sequence[Figure],
+    players: Mapping[str, Player],
+    seed: int,
+    at_once: int = AT_ONCE,
 ) -> Scored:
     """Scores of each policy that sees the outlines of puzzles, and fills them itself."""
-    played = {name: play_figures(setup, figures, player, seed) for name, player in players.items()}
-    scores = {name: of_outlines(setup, own) for name, own in played.items()}
-    run, found = played[RUN], assembled(setup.layout, played[RUN])
+    played = {
+        name: play_figures(task, figures, player, seed, at_once=at_once)
+        for name, player in players.items()
+    }
+    scores = {name: of_outlines(task, own, at_once) for name, own in played.items()}
+    run, found = played[RUN], assembled(task.layout, played[RUN])
     each = [
         {
             "name": figure.name,
@@ -93,20 +106,24 @@ def score_outlines(
     return Scored(scores, each, titles, run.ends, run.goals, told)
 
 
-def of_outlines(setup: Setup, played: Played) -> Scores:
+def of_outlines(task: Place, played: Played, at_once: int) -> Scores:
     """Scores of filled outlines; any dissection counts, so none tells of single pieces."""
-    found = assembled(setup.layout, played)
+    found = assembled(task.layout, played)
     means = {key: value for key, value in found.means().items() if key in OF_AREAS}
     areas = {
         "mean_reward": float(np.mean(scaled_overlap(found.coverage))),
         "share_solved_iou": float(np.mean(found.iou >= SOLVED)),
         "episodes": float(len(found.coverage)),
     }
-    return means | areas | of_several(setup, played)
+    return means | areas | of_several(played, at_once)
 
 
 def score_hidden(
-    setup: Setup, figures: Sequence[Figure], players: Mapping[str, Player], seed: int
+    task: Place,
+    figures: Sequence[Figure],
+    players: Mapping[str, Player],
+    seed: int,
+    at_once: int = AT_ONCE,
 ) -> Scored:
     """Scores of each policy that lays what was found in the silhouettes.
 
@@ -118,8 +135,8 @@ def score_hidden(
         from tangram_game.figures.hidden import hide, play_hidden  # noqa: PLC0415
         from tangram_game.figures.methods import together  # noqa: PLC0415
     except ImportError as error:
-        raise _no_library(setup, error) from error
-    hidden = hide(setup, figures, seed, together(setup.layout))
+        raise _no_library(task, error) from error
+    hidden = hide(task, figures, seed, together(task.layout))
     laid = {name: play_hidden(hidden, player, seed) for name, player in players.items()}
     return _of_hidden({name: (hidden, own) for name, own in laid.items()})
 
@@ -132,16 +149,16 @@ def score_pictured(run: Run, figures: Sequence[Figure], seed: int) -> Scored:
     Raises:
         ConfigError: OpenCV or shapely is not installed.
     """
-    setup = run.setup
+    task = run.task
     try:
         from tangram_game.figures.hidden import hide, play_hidden  # noqa: PLC0415
         from tangram_game.figures.methods import learned_method  # noqa: PLC0415
         from tangram_vision.silhouettes.silhouettes import UNLEARNED  # noqa: PLC0415
     except ImportError as error:
-        raise _no_library(setup, error) from error
-    own, player = learned_method(run), exact_policy(setup.layout, setup.sim)
+        raise _no_library(task, error) from error
+    own, player = learned_method(run), plain(exact_policy(task.layout, task.sim))
     methods = {RUN: own, "largest first": replace(own, values=None), "search": UNLEARNED}
-    every = {name: hide(setup, figures, seed, method) for name, method in methods.items()}
+    every = {name: hide(task, figures, seed, method) for name, method in methods.items()}
     return _of_hidden(
         {name: (hidden, play_hidden(hidden, player, seed)) for name, hidden in every.items()}
     )
@@ -161,9 +178,9 @@ def _of_hidden(every: "Mapping[str, tuple[Hidden, Laid]]") -> Scored:
     return Scored(scores, each, hidden.titles, laid.ends, hidden.goals, told)
 
 
-def _no_library(setup: Setup, error: ImportError) -> ConfigError:
+def _no_library(task: Place, error: ImportError) -> ConfigError:
     return ConfigError(
-        f"sim.observe={setup.sim.observe} needs OpenCV and shapely ({error}): install "
+        f"sim.observe={task.sim.observe} needs OpenCV and shapely ({error}): install "
         "opencv-python-headless and shapely, or set sim.observe=corners"
     )
 
@@ -178,7 +195,7 @@ def of_each(played: Played) -> Scores:
     return {"coverage_each": np.round(played.overlap, 6).tolist()}
 
 
-def of_several(setup: Setup, played: Played) -> Scores:
+def of_several(played: Played, at_once: int) -> Scores:
     """What only evaluations tell of several tokens: time, and every coverage."""
     seconds = float(np.mean(played.seconds))
     scores: Scores = {
@@ -186,14 +203,14 @@ def of_several(setup: Setup, played: Played) -> Scores:
         "ms_per_decision": 1e3 * seconds / played.refused.shape[1],
         **of_each(played),
     }
-    if at_once(setup) == 1:
+    if at_once == 1:
         scores["ms_slowest"] = 1e3 * float(played.slowest.max())
     return scores
 
 
-def _one_by_one(setup: Setup, figures: Sequence[Figure], played: Played) -> list[dict[str, Any]]:
-    found = assembled(setup.layout, played)
-    position, angle = pose_errors(setup.layout, played.ends, played.goals)
+def _one_by_one(task: Place, figures: Sequence[Figure], played: Played) -> list[dict[str, Any]]:
+    found = assembled(task.layout, played)
+    position, angle = pose_errors(task.layout, played.ends, played.goals)
     return [
         {
             "name": figure.name,

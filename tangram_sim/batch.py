@@ -30,7 +30,7 @@ from tangram_sim.rewards import TargetPictures, make_reward, scaled_overlap
 from tangram_sim.sight.lens import Lens, View
 from tangram_sim.sight.observation_noise import see
 from tangram_sim.sight.perception import Eye, Sight
-from tangram_sim.tasks.targets import Sides, sample_starts, sample_targets
+from tangram_sim.targets.targets import Sides, sample_starts, sample_targets
 from tangram_sim.world.world import check_shown, make_world
 
 

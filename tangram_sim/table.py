@@ -16,7 +16,7 @@ from tangram_sim.drawing.scenes import draw_scene
 from tangram_sim.geometry.layout import TokensConfig, make_layout
 from tangram_sim.motion.actions import chosen_tokens
 from tangram_sim.motion.actions import horizon as steps_of
-from tangram_sim.tasks.targets import check_targets
+from tangram_sim.targets.targets import check_targets
 
 Observation = dict[str, Any]  # of float64 vectors
 

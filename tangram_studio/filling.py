@@ -27,7 +27,7 @@ from tangram_sim.drawing.strokes import colour_of
 from tangram_sim.geometry.areas import Area, polygons
 from tangram_sim.geometry.dissections import Dissection
 from tangram_sim.puzzles.figures import library, load_puzzle
-from tangram_sim.tasks.targets import placement, turned_figure
+from tangram_sim.targets.targets import placement, turned_figure
 from tangram_studio.messages import Fill
 from tangram_studio.playing import Sides, player
 from tangram_vision.given.outline_files import FORMAT, VERSION
@@ -79,7 +79,7 @@ def fill(asked: Fill) -> Answer:
     """
     if sum(one is not None for one in (asked.puzzle, asked.outlines, asked.pieces)) != 1:
         raise ConfigError("a puzzle, a drawing or pieces are to be filled, one of them")
-    layout, scale = player("lift").layout, player("lift").run.setup.tokens.scale
+    layout, scale = player("lift").layout, player("lift").run.task.tokens.scale
     if asked.puzzle is not None:
         load_puzzle(asked.puzzle)  # a name of the library, not of a file
         return _filled(asked.puzzle, "the puzzle", asked.who)
@@ -122,7 +122,7 @@ def fill_file(name: str, data: bytes, who: str) -> Answer:
 def tans() -> dict[str, object]:
     """What a page is told at first: the tokens, their full square's side and area, the library."""
     own = player("lift")
-    layout, scale = own.layout, own.run.setup.tokens.scale
+    layout, scale = own.layout, own.run.task.tokens.scale
     chiral = layout.chiral.tolist()
     tokens = [
         {
@@ -147,10 +147,10 @@ def tans() -> dict[str, object]:
 
 
 def _filled(name: str, source: str, who: str, free: bool = False) -> Answer:
-    setup = player("lift").run.setup
-    layout = setup.layout
+    task = player("lift").run.task
+    layout = task.layout
     seconds = FREE_SECONDS if free else SECONDS
-    drawn = fill_silhouette(name, source, layout, setup.tokens.scale, seconds, method=_method(who))
+    drawn = fill_silhouette(name, source, layout, task.tokens.scale, seconds, method=_method(who))
     first = drawn.filled[0]
     if first.found is not None and first.solved:
         how = f"filled by the {_called(who, first.by)} in {first.seconds:.2f} s"
@@ -177,14 +177,14 @@ def _called(who: str, by: str) -> str:
 
 
 def _answer(drawn: Silhouette, found: Dissection, exact: bool, iou: float, how: str) -> Answer:
-    setup = player("lift").run.setup
-    layout = setup.layout
+    task = player("lift").run.task
+    layout = task.layout
     poses = turned_figure(layout, (found.poses, found.flipped), 0.0)
-    reach = reach_beyond(setup, layout.corners(poses, found.flipped))
+    reach = reach_beyond(task, layout.corners(poses, found.flipped))
     if reach is not None:
         raise ConfigError(
             f"the figure reaches {reach:.2f} from its middle and the table only "
-            f"{setup.sim.arena / 2.0:g}: draw it less long"
+            f"{task.sim.arena / 2.0:g}: draw it less long"
         )
     seen, share = _seen(drawn)
     corners = drawn.corners(layout, found) * share

@@ -16,16 +16,16 @@ import numpy as np
 import torch
 
 from tangram_agent.runs import Run, load_changed
-from tangram_agent.types import Past
 from tangram_core.arrays import Bools, Floats, Singles
-from tangram_game.rivals.sweeps import sweep_policy
 from tangram_sim.batch import BatchedEnv, Starts
 from tangram_sim.config import RewardConfig
 from tangram_sim.geometry.overlap import overlap_share
 from tangram_sim.motion.actions import chosen_tokens
 from tangram_sim.world.world import World, make_world
-from worker.score.metrics import iou
-from worker.score.pairing import paired
+from tangram_tasks.metrics import iou
+from tangram_tasks.pairing import paired
+from tangram_tasks.played import Past
+from tangram_tasks.rivals.sweeps import sweep_policy
 from worker.score.test_set import greedy
 
 AGENT = "pretrained/tangram7"
@@ -85,9 +85,9 @@ class _Player:
     def __init__(self, motion: str) -> None:
         torch.set_num_threads(1)  # more are slower for so little, above all beside other work
         self.run: Run = load_changed(AGENT, {"sim": SIM[motion]})
-        setup = self.run.setup
-        self.layout, self.motion = setup.layout, motion
-        sim = replace(setup.sim.blind, starts="outside")
+        task = self.run.task
+        self.layout, self.motion = task.layout, motion
+        sim = replace(task.sim.blind, starts="outside")
         self.env = BatchedEnv(self.layout, sim, RewardConfig(), 1)
         slides = motion == "slide"
         self.choose = sweep_policy(self.layout, sim) if slides else greedy(self.run.policy)

@@ -37,7 +37,7 @@ def gif(moves: Sequence[Move], goal: Sides) -> bytes:
     if not moves:
         raise ConfigError("nothing was played yet: let the agent lay a figure first")
     own = player("lift")
-    layout, arena = own.layout, own.run.setup.sim.arena
+    layout, arena = own.layout, own.run.task.sim.arena
     target = layout.corners(*goal)
     pictures = [
         draw_game(layout, arena, layout.corners(poses, goal.flipped), target, _PIXELS, held)
@@ -69,7 +69,7 @@ def _shown(move: Move) -> list[tuple[Floats, Held | None]]:
 def svg(tokens: Sides) -> bytes:
     """The tokens as they lie, a polygon each, y down."""
     own = player("lift")
-    layout, half = own.layout, own.run.setup.sim.arena / 2.0
+    layout, half = own.layout, own.run.task.sim.arena / 2.0
     lines = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{-half:g} {-half:g} {2 * half:g} '
         f'{2 * half:g}" width="{_SVG}" height="{_SVG}">'
@@ -88,7 +88,7 @@ def puzzle_file(tokens: Sides, name: str) -> bytes:
         ConfigError: they are no figure, as where they lie on each other.
     """
     own = player("lift")
-    layout, scale = own.layout, own.run.setup.tokens.scale
+    layout, scale = own.layout, own.run.task.tokens.scale
     pieces = [
         {"shape": shape.name, "corners": (corners / scale).round(_DIGITS).tolist()}
         for shape, corners in zip(layout.shapes, _each(layout, tokens), strict=True)

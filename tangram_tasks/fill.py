@@ -1,12 +1,19 @@
 """Tokens fill an outline; which piece goes where is not told."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
 from tangram_core.errors import ConfigError
 from tangram_core.settings import refuse_ignored, told
+from tangram_core.task import Chooser, Env, Played, Score
 from tangram_sim.config import SILHOUETTES, RewardConfig
-from tangram_tasks.place import Place
+from tangram_tasks.place import SEVERAL, Place
+
+_AREAS = (
+    *("mean_reward", "coverage", "iou", "raw_overlap", "raw_overlap_p10"),
+    *("blocked", "refused", "actions_used"),
+)
 
 
 @dataclass(frozen=True)
@@ -14,6 +21,19 @@ class Fill(Place):
     """A token goes where it is taken, once, from outside of the outline."""
 
     outlines: ClassVar[bool] = True
+
+    @property
+    def scores(self) -> tuple[Score, ...]:  # type: ignore[override]
+        """Nothing of where a piece should lie: any dissection counts."""
+        return tuple(score for score in SEVERAL if score.name in _AREAS)
+
+    def score(self, played: Played) -> dict[str, float]:
+        """Those of areas."""
+        return {name: one for name, one in super().score(played).items() if name in _AREAS}
+
+    def rivals(self) -> Mapping[str, Callable[[Env], Chooser]]:
+        """Chance; where no piece is told, no formula knows where to go."""
+        return {"random": super().rivals()["random"]}
 
     def __post_init__(self) -> None:
         """Refuse a game in which a token does not go where it is taken, once.

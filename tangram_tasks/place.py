@@ -3,22 +3,56 @@
 Legend: K tokens, V corners.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
-from tangram_core.arrays import Floats
+from tangram_core.arrays import Floats, Pixels
 from tangram_core.spec import Array, EpisodeSpec
-from tangram_core.task import Json, Task
+from tangram_core.task import Chooser, Env, Json, Played, Purpose, Score, Task
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.episodes import spec_of
 from tangram_sim.geometry.layout import Layout, TokensConfig, make_layout
 from tangram_sim.motion.actions import action_size, corner_bound, goal_rows, horizon
 from tangram_sim.rewards import RewardFn, check_reward, make_reward, pinned, reward_identity
-from tangram_sim.tasks.targets import check_targets
+from tangram_sim.targets.targets import check_targets
 from tangram_sim.world.world import check_room, check_shown, check_world
+
+if TYPE_CHECKING:
+    from tangram_tasks.env import PlaceEnv
+
+PICTURES, PIXELS = 12, 216  # test episodes on a sheet, and the side of each
+_REWARD = Score("mean_reward", "mean reward")
+_ERRORS = (
+    Score("angle_error_deg_median", "angle error (median)", 2, "°"),
+    Score("position_error_median", "position error (median)", 4),
+    Score("angle_error_deg_p90", "angle error (90th percentile)", 2, "°"),
+    Score("position_error_p90", "position error (90th percentile)", 4),
+)
+_MORE = (
+    Score("mean_reward_camera", "mean reward in the camera's pictures"),
+    Score("mean_reward_dense", "mean reward of Eq. 15"),
+    Score("mean_train_reward", "mean reward as trained on"),
+    Score("raw_overlap_p10", "raw overlap (10th percentile)"),
+)
+ONE_TOKEN = (_REWARD, Score("raw_overlap", "raw overlap"), *_ERRORS, *_MORE)
+SEVERAL = (
+    _REWARD,
+    Score("coverage", "covered"),
+    Score("share_solved", "solved (95 % covered)"),
+    Score("iou", "IoU"),
+    *_ERRORS,
+    Score("raw_overlap", "raw overlap"),
+    *_MORE,
+    Score("wrong", "pieces under another shape", 2),
+    Score("doubly_used", "pieces under two tokens", 2),
+    Score("refused", "actions refused", 2),
+    Score("blocked", "tokens blocked", 2),
+    Score("actions_used", "actions", 2),
+)
 
 
 @dataclass(frozen=True)
@@ -79,6 +113,41 @@ class Place(Task):
     def spec(self) -> EpisodeSpec:
         """What its episodes are made of."""
         return spec_of(self.layout, self.sim, self.reward, self.outlines)
+
+    def make(self, count: int, purpose: Purpose = "play") -> "PlaceEnv":
+        """So many worlds; see `PlaceEnv`."""
+        from tangram_tasks.env import PlaceEnv  # noqa: PLC0415
+
+        return PlaceEnv(self, count, purpose)
+
+    @property
+    def scores(self) -> tuple[Score, ...]:  # type: ignore[override]
+        """Of one token its pose, of several how much of the target they cover."""
+        return ONE_TOKEN if self.layout.tokens == 1 else SEVERAL
+
+    def score(self, played: Played) -> dict[str, float]:
+        """See `metrics.summarise`."""
+        from tangram_tasks.metrics import summarise  # noqa: PLC0415  # scipy, for who scores alone
+        from tangram_tasks.played import Played as PlayedTokens  # noqa: PLC0415
+
+        own = (self.reward.name, self.reward.source) != ("overlap", "polygon")
+        return summarise(self.layout, self.sim, PlayedTokens.of(played), own)
+
+    def draw(self, played: Played) -> Pixels:
+        """The first episodes, each with its overlap."""
+        from tangram_sim.drawing.scenes import episode_sheet  # noqa: PLC0415
+        from tangram_tasks.played import Played as PlayedTokens  # noqa: PLC0415
+
+        own = PlayedTokens.of(played)
+        starts, ends, goals = (c[:PICTURES] for c in (own.starts, own.ends, own.goals))
+        sheet = episode_sheet(self.layout, self.sim.arena, starts, ends, goals, 4, PIXELS)
+        return np.asarray(sheet.convert("RGB"))
+
+    def rivals(self) -> Mapping[str, Callable[[Env], Chooser]]:
+        """See `tangram_tasks.rivals.every`."""
+        from tangram_tasks.rivals.every import rivals_of  # noqa: PLC0415
+
+        return rivals_of(self.layout, self.sim)
 
     def identity(self) -> Json:
         """Tokens by what makes them, a reward of one's own by its content."""

@@ -34,17 +34,13 @@ def _of_the_run(settings: Plain) -> tuple[str, Plain] | None:
 
 
 def _worker(settings: Plain) -> int:
-    from tangram_agent.setup import SECTIONS, from_mapping, make_setup
-    from tangram_sim.rewards import check_reward
-    from tangram_sim.world.world import check_shown, check_world
+    from tangram_core.setup import from_mapping, make_setup
     from worker.config import WorkerConfig
 
-    rest = {name: value for name, value in settings.items() if name not in SECTIONS}
-    config = from_mapping(WorkerConfig, rest)
     setup = make_setup(settings)
-    check_shown(setup.sim, setup.fills)  # before anything is connected
-    check_world(setup.layout, setup.sim)
-    check_reward(setup.reward, setup.layout, setup.sim)
+    rest = {name: value for name, value in settings.items() if name not in setup.sections}
+    config = from_mapping(WorkerConfig, rest)
+    setup.task.check(plays=True)  # before anything is connected
 
     from worker.play.session import keep_part
 
@@ -58,7 +54,7 @@ def _worker(settings: Plain) -> int:
 
 
 def _status(settings: Plain) -> int:
-    from tangram_agent.setup import from_mapping
+    from tangram_core.setup import from_mapping
     from worker.config import StatusConfig
 
     config = from_mapping(StatusConfig, settings)

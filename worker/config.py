@@ -4,6 +4,8 @@ from dataclasses import dataclass, field
 
 from tangram_agent.messages import MAX_INDEX, ROLES
 from tangram_core.errors import ConfigError
+from tangram_core.service import ServiceConfig
+from tangram_core.settings import Settings, declared, setting
 from worker.talk.discovery import as_address, find_master
 
 

@@ -9,7 +9,6 @@ from torch import nn
 from tangram_agent.base.weights import load_arrays
 from tangram_core.agent import Actor
 from tangram_core.arrays import Singles
-from tangram_core.spec import Array, Arrays
 
 
 class NetworkActor(Actor):
@@ -41,8 +40,3 @@ class NetworkActor(Actor):
 def tensor(array: object) -> torch.Tensor:
     """A copy in single precision: arrays that came over the wire are read-only."""
     return torch.from_numpy(np.array(array, np.float32))
-
-
-def closed(seen: Arrays) -> Array:
-    """(B, K) tokens that no action should name: placed, or not seen while others are."""
-    return seen.get("closed", seen["placed"])

@@ -12,13 +12,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from tangram_agent.config import AgentConfig, NetConfig
 
 from tangram_core.arrays import Bools, Floats, Ints
-from tangram_core.setup import Setup
 from tangram_game.figures.puzzles import Figure, figure_generator, play_figures
 from tangram_game.figures.silhouettes import SECONDS
-from tangram_game.rivals.baselines import Player
+from tangram_game.playing import Player
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.areas import Area
 from tangram_sim.geometry.dissections import Dissection
@@ -27,6 +25,9 @@ from tangram_sim.geometry.overlap import overlap_share
 from tangram_sim.motion.kinematics import wrap
 from tangram_sim.rewards import scaled_overlap
 from tangram_sim.sight.lens import Lens, View
+from tangram_tasks.metrics import SOLVED, iou
+from tangram_tasks.place import Place
+from tangram_tasks.played import Played
 from tangram_vision.pictures.levels import coverage
 from tangram_vision.silhouettes.portraits import portrait
 from tangram_vision.silhouettes.silhouette_pictures import fill_picture
@@ -37,8 +38,6 @@ from tangram_vision.silhouettes.silhouettes import (
     fill_outline,
     silhouette,
 )
-from worker.play.rollout import Played
-from worker.score.metrics import SOLVED, iou
 
 _BEYOND = 10.0  # arenas from the middle: where tokens are drawn that nothing is to be laid of
 
@@ -70,13 +69,13 @@ class Hidden:
     """Puzzles by their silhouettes.
 
     Attributes:
-        setup: the task, as a player of what was found sees it.
+        task: the task, as a player of what was found sees it.
         figures: E, with the pieces that nobody is shown.
         searches: E.
         views: E, how the camera saw them; None where outlines were shown.
     """
 
-    setup: Setup
+    task: Place
     figures: tuple[Figure, ...]
     searches: tuple[Search, ...]
     views: tuple[View, ...] | None
@@ -102,7 +101,7 @@ class Hidden:
     @cached_property
     def goals(self) -> Floats:
         """(E, V, 2) corners of the pieces."""
-        layout = self.setup.layout
+        layout = self.task.layout
         return np.stack([layout.corners(one.poses, one.flipped) for one in self.figures])
 
     @property
@@ -142,30 +141,30 @@ class Laid:
         return np.asarray(self.iou >= SOLVED)
 
 
-def hide(setup: Setup, figures: Sequence[Figure], seed: int, method: Method = UNLEARNED) -> Hidden:
+def hide(task: Place, figures: Sequence[Figure], seed: int, method: Method = UNLEARNED) -> Hidden:
     """Search how a run's tokens fill puzzles of which only the silhouettes are shown.
 
     Args:
-        setup: with `sim.observe` one of `SILHOUETTES`.
+        task: with `sim.observe` one of `SILHOUETTES`.
         figures: E puzzles.
         seed: of what disturbs the camera.
         method: how they are filled.
     """
-    layout, sim, shown = setup.layout, setup.sim, tuple(figures)
+    layout, sim, shown = task.layout, task.sim, tuple(figures)
     if sim.observe == "silhouette":
         searches = tuple(_outline_search(layout, figure, method) for figure in shown)
-        return Hidden(_seeing(setup, "corners"), shown, searches, None)
+        return Hidden(_seeing(task, "corners"), shown, searches, None)
     seen = [_picture_search(layout, sim, figure, seed, method) for figure in shown]
     searches, views = (tuple(column) for column in zip(*seen, strict=True))
-    return Hidden(_seeing(setup, "pictures"), shown, searches, views)
+    return Hidden(_seeing(task, "pictures"), shown, searches, views)
 
 
-def _seeing(setup: Setup, observe: str) -> Setup:
+def _seeing(task: Place, observe: str) -> Place:
     """The task of who sees what was found; which targets training drew does not matter."""
-    sim = replace(setup.sim, observe=observe, targets=SimConfig.targets)
-    if setup.fills:  # who lays it sees pieces
-        return replace(setup, sim=sim, agent=AgentConfig(), net=NetConfig())
-    return replace(setup, sim=sim)
+    sim = replace(task.sim, observe=observe, targets=SimConfig.targets)
+    if task.outlines:  # who lays it sees pieces
+        return Place(task.tokens, sim, task.reward)
+    return replace(task, sim=sim)
 
 
 def _outline_search(layout: Layout, figure: Figure, method: Method) -> Search:
@@ -203,7 +202,7 @@ def _search(figure: Figure, filled: Filled, corner: Floats) -> Search:
 
 def play_hidden(hidden: Hidden, player: Player, seed: int) -> Laid:
     """Lay what was found and judge it by the silhouettes."""
-    layout, arena, count = hidden.setup.layout, hidden.setup.sim.arena, len(hidden.figures)
+    layout, arena, count = hidden.task.layout, hidden.task.sim.arena, len(hidden.figures)
     seconds = np.array([search.seconds for search in hidden.searches])
     ends: Floats = hidden.goals + _BEYOND * arena
     blocked, refused, used = (np.zeros(count, np.int64) for _ in range(3))
@@ -221,7 +220,7 @@ def lay(hidden: Hidden, player: Player, seed: int) -> Played:
     """Lay what was found, F episodes; the targets are what was found, too."""
     laid = [search.laid for search in hidden.searches if search.laid is not None]
     views = None if hidden.views is None else [hidden.views[e] for e in hidden.found]
-    return play_figures(hidden.setup, laid, player, seed, views=views)
+    return play_figures(hidden.task, laid, player, seed, views=views)
 
 
 def means(hidden: Hidden, laid: Laid) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from tangram_agent.pretrained import PREFIX
 from tangram_agent.runs import Run, load_run, read_changed
@@ -12,6 +12,10 @@ from tangram_sim.geometry.layout import Layout
 from tangram_vision.silhouettes.silhouettes import Method
 
 if TYPE_CHECKING:  # needs torch
+    from torch import nn
+
+    from tangram_agent.agents.outline.actor import OutlineActor
+    from tangram_agent.agents.outline.agent import Outline
     from tangram_agent.agents.outline.filler import Fillable
 
 JUDGE = f"{PREFIX}/tangram7_silhouette"
@@ -35,7 +39,7 @@ class Learned:
         from tangram_agent.agents.outline.filler import Fillable  # noqa: PLC0415
 
         torch.set_num_threads(1)  # more are slower for so little, above all beside other work
-        return Fillable(load_run(JUDGE).policy.network, self._layout)
+        return Fillable(_network(load_run(JUDGE)), self._layout)
 
 
 def together(layout: Layout) -> Method:
@@ -44,7 +48,7 @@ def together(layout: Layout) -> Method:
     Of other tokens than those that it learned with, of any size, those in which the largest tokens
     lie are followed.
     """
-    learned = [shape.name for shape in read_changed(JUDGE, {}).setup.layout.shapes]
+    learned = [shape.name for shape in read_changed(JUDGE, {}).task.layout.shapes]
     known = [shape.name for shape in layout.shapes] == learned
     return Method(values=Learned(layout) if known else None)
 
@@ -53,6 +57,10 @@ def learned_method(run: Run) -> Method:
     """By the beam of an agent of outlines, as wide as that looks ahead, without a search."""
     from tangram_agent.agents.outline.filler import Fillable  # noqa: PLC0415  # needs torch
 
-    agent = run.setup.agent
-    width = agent.beam
-    return Method(search=False, width=width, values=Fillable(run.policy.network, run.setup.layout))
+    values, agent = Fillable(_network(run), run.task.layout), cast("Outline", run.setup.agent)
+    return Method(search=False, width=agent.config.beam, values=values)
+
+
+def _network(run: Run) -> "nn.Module":
+    """What an agent of outlines learned."""
+    return cast("OutlineActor", run.actor).network

@@ -7,12 +7,12 @@ from PIL import Image
 
 from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError
-from tangram_core.setup import Setup
 from tangram_game.figures.puzzles import Figure, reach_beyond
 from tangram_game.show.views import outlined
 from tangram_sim.drawing.scenes import contact_sheet
 from tangram_sim.geometry.layout import Layout
-from tangram_sim.tasks.targets import turned_figure
+from tangram_sim.targets.targets import turned_figure
+from tangram_tasks.place import Place
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,7 @@ class Photograph:
     figure: Figure
 
 
-def read_photograph(target: str, setup: Setup) -> Photograph:
+def read_photograph(target: str, task: Place) -> Photograph:
     """What a file shows of a run's tokens.
 
     Raises:
@@ -44,11 +44,11 @@ def read_photograph(target: str, setup: Setup) -> Photograph:
         raise ConfigError(
             f"target needs OpenCV ({error}): install opencv-python-headless, or leave target out"
         ) from error
-    source, layout = f"target={target}", setup.layout
+    source, layout = f"target={target}", task.layout
     picture = read_picture(Path(target), source)
     found = find_tokens(picture, layout, source)
     poses = turned_figure(layout, (found.poses, found.flipped), 0.0)
-    _check_inside(source, setup, layout.corners(poses, found.flipped))
+    _check_inside(source, task, layout.corners(poses, found.flipped))
     outlines = layout.corners(found.poses, found.flipped) * (found.unit, -found.unit)
     return Photograph(picture, outlines, Figure(Path(target).stem, 0.0, poses, found.flipped))
 
@@ -60,10 +60,10 @@ def draw_photograph(photograph: Photograph, layout: Layout, size: int) -> Image.
     return contact_sheet([picture], 1, [f"seen: {seen.replace('_', ' ')}"])
 
 
-def _check_inside(source: str, setup: Setup, corners: Floats) -> None:
-    reach = reach_beyond(setup, corners)
+def _check_inside(source: str, task: Place, corners: Floats) -> None:
+    reach = reach_beyond(task, corners)
     if reach is not None:
         raise ConfigError(
             f"{source} shows tokens that reach {reach:.3g} from their middle at the run's scale, "
-            f"and its arena only {setup.sim.arena / 2.0:.3g}: lay them nearer together"
+            f"and its arena only {task.sim.arena / 2.0:.3g}: lay them nearer together"
         )

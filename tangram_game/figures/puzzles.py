@@ -10,18 +10,18 @@ from pathlib import Path
 
 import numpy as np
 
+from tangram_core.agent import AT_ONCE
 from tangram_core.arrays import Bools, Floats
 from tangram_core.errors import ConfigError
 from tangram_core.seeding import episode_generator
-from tangram_core.setup import Setup
-from tangram_game.rivals.baselines import Player, playing
+from tangram_game.playing import Player, play_targets
 from tangram_sim.config import SILHOUETTES, RewardConfig
 from tangram_sim.puzzles.assembly import Puzzle, PuzzleRules
 from tangram_sim.puzzles.figures import SPLITS, library, read_puzzles
 from tangram_sim.sight.lens import View
-from tangram_sim.tasks.targets import placement, turned_figure
-from worker.play.looking import environments
-from worker.play.rollout import Played, at_once, play
+from tangram_sim.targets.targets import placement, turned_figure
+from tangram_tasks.place import Place
+from tangram_tasks.played import Played
 
 _ROUNDING = 1e-9
 
@@ -51,7 +51,7 @@ class Figure:
 
 def find_figures(
     source: str | None,
-    setup: Setup,
+    task: Place,
     names: Sequence[str] | None = None,
     turns: int = 1,
 ) -> tuple[Figure, ...]:
@@ -59,59 +59,61 @@ def find_figures(
 
     Args:
         source: a file, or a split of the library; None is all of the library.
-        setup: whose tokens are to be moved.
+        task: whose tokens are to be moved.
         names: of the puzzles wanted; None is all that there are.
         turns: at so many angles each, evenly spread from the one that it is drawn at.
 
     Raises:
         ConfigError: a file that cannot be used, an unknown name, or pieces that are not the tokens.
     """
-    puzzles = _named(_read(source, setup.tokens.scale), names, source)
-    figures = tuple(figure for puzzle in puzzles for figure in _turns(puzzle, setup, turns))
+    puzzles = _named(_read(source, task.tokens.scale), names, source)
+    figures = tuple(figure for puzzle in puzzles for figure in _turns(puzzle, task, turns))
     if not figures:
         raise ConfigError(f"{source or 'the library'} has no puzzle to play")
     return figures
 
 
 def play_figures(
-    setup: Setup,
+    task: Place,
     figures: Sequence[Figure],
     player: Player,
     seed: int,
     touching: bool = True,
     views: Sequence[View] | None = None,
+    at_once: int = AT_ONCE,
 ) -> Played:
     """Assemble E figures, one episode each; where the tokens start is decided by seed and figure.
 
     Args:
-        setup: whose tokens are moved.
+        task: whose tokens are moved.
         figures: E.
         player: moves them.
         seed: of the starts.
         touching: whether their pieces touch, so that no picture tells them apart.
         views: E, how they were seen before, in pictures that told their pieces.
+        at_once: most that are played at a time.
 
     Raises:
         ConfigError: pictures are to be observed, and pieces touch; or silhouettes are.
         SamplingError: the tokens find no room to start.
     """
-    looks = setup.sim.observe == "pictures"
+    looks = task.sim.observe == "pictures"
     if looks and touching and views is None:
         raise ConfigError(
             "sim.observe=pictures cannot tell the pieces of a puzzle apart, which touch: set "
             "sim.observe=corners, or silhouette_pictures in tangram-eval"
         )
-    shows = looks or setup.sim.observe in SILHOUETTES
-    sim = setup.sim if shows else setup.sim.blind
+    shows = looks or task.sim.observe in SILHOUETTES
+    sim = task.sim if shows else task.sim.blind
     targets = (np.stack([f.poses for f in figures]), np.stack([f.flipped for f in figures]))
-    shown, envs = replace(setup, sim=sim), min(at_once(setup), len(figures))
-    with closing(environments(shown, envs, RewardConfig())) as env:
-        choose, count = playing(player, env), len(figures)
+    shown = replace(task, sim=sim, reward=RewardConfig())
+    known = None if views is None else list(views)
+    with closing(shown.make(min(at_once, len(figures)))) as env:
 
         def generator(number: int) -> np.random.Generator:
             return figure_generator(figures[number], seed)
 
-        return play(env, choose, generator, count, targets, views=views)
+        return play_targets(shown, env, player, generator, targets, known)
 
 
 def figure_generator(figure: Figure, seed: int, what: str = "puzzle") -> np.random.Generator:
@@ -140,37 +142,37 @@ def _named(
     return [found[name] for name in names]
 
 
-def _turns(puzzle: Puzzle, setup: Setup, turns: int) -> list[Figure]:
-    poses, flipped = _placed(puzzle, setup)
+def _turns(puzzle: Puzzle, task: Place, turns: int) -> list[Figure]:
+    poses, flipped = _placed(puzzle, task)
     figures = []
     for degrees in (360.0 * i / turns for i in range(turns)):
-        there = turned_figure(setup.layout, (poses, flipped), np.radians(degrees))
-        _check_inside(puzzle, setup, setup.layout.corners(there, flipped))
+        there = turned_figure(task.layout, (poses, flipped), np.radians(degrees))
+        _check_inside(puzzle, task, task.layout.corners(there, flipped))
         figures.append(Figure(puzzle.name, degrees, there, flipped))
     return figures
 
 
-def _placed(puzzle: Puzzle, setup: Setup) -> tuple[Floats, Bools]:
+def _placed(puzzle: Puzzle, task: Place) -> tuple[Floats, Bools]:
     try:
-        return placement(puzzle, setup.layout)
+        return placement(puzzle, task.layout)
     except ConfigError:
-        tokens = ", ".join(shape.name for shape in setup.layout.shapes)
+        tokens = ", ".join(shape.name for shape in task.layout.shapes)
         raise ConfigError(
             f"puzzle '{puzzle.name}' has the pieces {', '.join(puzzle.pieces)}, and the run moves "
-            f"{tokens} of scale {setup.tokens.scale:g}: name a run of the puzzle's pieces"
+            f"{tokens} of scale {task.tokens.scale:g}: name a run of the puzzle's pieces"
         ) from None
 
 
-def reach_beyond(setup: Setup, corners: Floats) -> float | None:
+def reach_beyond(task: Place, corners: Floats) -> float | None:
     """How far corners (V, 2) reach from the middle where a run's arena does not; else None."""
     reach = float(np.abs(corners).max())
-    return reach if reach > setup.sim.arena / 2.0 + _ROUNDING else None
+    return reach if reach > task.sim.arena / 2.0 + _ROUNDING else None
 
 
-def _check_inside(puzzle: Puzzle, setup: Setup, corners: Floats) -> None:
-    reach = reach_beyond(setup, corners)
+def _check_inside(puzzle: Puzzle, task: Place, corners: Floats) -> None:
+    reach = reach_beyond(task, corners)
     if reach is not None:
         raise ConfigError(
             f"puzzle '{puzzle.name}' reaches {reach:.3g} from its middle, and the run's arena only "
-            f"{setup.sim.arena / 2.0:.3g}: name a run of a larger arena or of smaller tokens"
+            f"{task.sim.arena / 2.0:.3g}: name a run of a larger arena or of smaller tokens"
         )

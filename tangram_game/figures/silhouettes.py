@@ -18,14 +18,14 @@ from tangram_agent.outcome import plural
 from tangram_core.arrays import Bools, Floats
 from tangram_core.errors import ConfigError, RunError
 from tangram_core.settings import refuse_ignored
-from tangram_core.setup import Setup
 from tangram_core.store.files import write_whole
 from tangram_game.figures.puzzles import Figure, reach_beyond
 from tangram_game.show.views import outlined
 from tangram_sim.drawing.game_drawing import tiles
 from tangram_sim.drawing.scenes import contact_sheet
 from tangram_sim.geometry.layout import Layout
-from tangram_sim.tasks.targets import has_all_tans, turned_figure
+from tangram_sim.targets.targets import has_all_tans, turned_figure
+from tangram_tasks.place import Place
 
 if TYPE_CHECKING:  # they need OpenCV and shapely
     from tangram_vision.given.silhouette_files import Silhouette
@@ -54,12 +54,12 @@ class Shown:
     told: str
 
 
-def read_silhouette(name: str, setup: Setup, count: int = 1, out: Path | None = None) -> Shown:
+def read_silhouette(name: str, task: Place, count: int = 1, out: Path | None = None) -> Shown:
     """A silhouette, filled with a run's tokens.
 
     Args:
         name: of a file, or of a puzzle of the library.
-        setup: the run.
+        task: the run.
         count: of different ways to fill it, at most.
         out: a PNG file for the best attempt where nothing fills it; None is none.
 
@@ -76,21 +76,21 @@ def read_silhouette(name: str, setup: Setup, count: int = 1, out: Path | None = 
             f"silhouette needs OpenCV and shapely ({error}): install opencv-python-headless and "
             "shapely, or leave silhouette out"
         ) from error
-    source, layout = f"silhouette={name}", setup.layout
-    if setup.fills and count > 1:
+    source, layout = f"silhouette={name}", task.layout
+    if task.outlines and count > 1:
         refuse_ignored(f"solutions={count}", "an agent of outlines", "name another run")
     method = together(layout)
-    drawn = fill_silhouette(name, source, layout, setup.tokens.scale, SECONDS, count, method)
+    drawn = fill_silhouette(name, source, layout, task.tokens.scale, SECONDS, count, method)
     laid = [one.found for one in drawn.filled if one.found is not None and one.solved]
     if not laid:
         beside = "" if out is None else f"; {_kept(_draw_attempt(drawn, layout), out)}"
         raise ConfigError(f"{source} {why_unfilled(drawn, layout)}{beside}")
     poses = turned_figure(layout, (laid[0].poses, laid[0].flipped), 0.0)
-    reach = reach_beyond(setup, layout.corners(poses, laid[0].flipped))
+    reach = reach_beyond(task, layout.corners(poses, laid[0].flipped))
     if reach is not None:
         raise ConfigError(
             f"{source} reaches {reach:.3g} from its middle at the run's scale, and its arena only "
-            f"{setup.sim.arena / 2.0:.3g}: name a run of a larger arena"
+            f"{task.sim.arena / 2.0:.3g}: name a run of a larger arena"
         )
     outlines = np.stack([drawn.corners(layout, one) for one in laid])
     figure = Figure(Path(name).stem, 0.0, poses, laid[0].flipped)

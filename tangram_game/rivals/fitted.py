@@ -7,14 +7,15 @@ import numpy as np
 import torch
 
 from tangram_agent.agents.pair.motion import Fit, MotionModel, motions_of
-from tangram_agent.types import Past
 from tangram_core.arrays import Bools, Floats, Singles
 from tangram_core.seeding import episode_generator
-from tangram_game.rivals.baselines import freest, random_policy
+from tangram_core.task import Generators
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.motion.actions import make_actions, velocities_of
-from worker.play.rollout import Choose, Generators, play
-from worker.score.pairing import paired
+from tangram_tasks.pairing import paired
+from tangram_tasks.played import Choose, Past
+from tangram_tasks.rivals.baselines import freest, random_policy
+from worker.play.rollout import play
 
 COMMANDS = 2048  # that are tried
 _UPDATES = 100  # of the fit, each with all of them

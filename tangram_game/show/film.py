@@ -10,13 +10,13 @@ from PIL import Image
 
 from tangram_agent.outcome import plural
 from tangram_core.arrays import Bools, Floats, Ints
-from tangram_core.setup import Setup
 from tangram_sim.drawing.game_drawing import Held, captions, draw_game, tiles
 from tangram_sim.drawing.scenes import contact_sheet
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.motion.actions import chosen_tokens, flips, velocities
 from tangram_sim.motion.kinematics import wrap
-from worker.play.rollout import Played
+from tangram_tasks.place import Place
+from tangram_tasks.played import Played
 
 FRAMES_PER_ACTION = 20
 MAX_FRAMES = 100  # of motion; more actions get fewer each
@@ -28,7 +28,7 @@ class Show:
     """Episodes that were played to be looked at.
 
     Attributes:
-        setup: the task as it was played.
+        task: the task as it was played.
         played: E episodes.
         titles: what each is called.
         kind: what one is called.
@@ -36,7 +36,7 @@ class Show:
         note: what else is to be told.
     """
 
-    setup: Setup
+    task: Place
     played: Played
     titles: list[str]
     kind: str
@@ -92,10 +92,10 @@ class Frame:
         return replace(self, held=np.full_like(self.held, -1), height=0.0, stopped=stopped)
 
 
-def film(setup: Setup, played: Played) -> list[Frame]:
+def film(task: Place, played: Played) -> list[Frame]:
     """The start, equally many frames for each action, and the end."""
     count = frames_per_action(played.episodes.actions.shape[1])
-    moves = [_Move(setup, played, t) for t in range(played.episodes.actions.shape[1])]
+    moves = [_Move(task, played, t) for t in range(played.episodes.actions.shape[1])]
     frames = [move.at((i + 1) / count) for move in moves for i in range(count)]
     return [moves[0].start(), *frames, frames[-1].at_rest()]
 
@@ -103,8 +103,8 @@ def film(setup: Setup, played: Played) -> list[Frame]:
 class _Move:
     """One action in E scenes."""
 
-    def __init__(self, setup: Setup, played: Played, step: int) -> None:
-        layout, sim = setup.layout, setup.sim
+    def __init__(self, task: Place, played: Played, step: int) -> None:
+        layout, sim = task.layout, task.sim
         self._step, self._lifts = step, sim.motion == "lift"
         ends = played.corners[:, step : step + 2]
         poses, sides = layout.poses(ends), layout.flipped(ends)
@@ -147,16 +147,16 @@ class _Move:
 
 def film_pictures(show: Show) -> list[Image.Image]:
     """All episodes side by side, token after token."""
-    layout, played = show.setup.layout, show.played
+    layout, played = show.task.layout, show.played
     below = [
         captions(layout, played.corners[:, t], played.goals, show.titles)
         for t in range(played.corners.shape[1])
     ]
-    return [_picture(show, frame, below[frame.done]) for frame in film(show.setup, played)]
+    return [_picture(show, frame, below[frame.done]) for frame in film(show.task, played)]
 
 
 def _picture(show: Show, frame: Frame, below: list[str]) -> Image.Image:
-    layout, arena = show.setup.layout, show.setup.sim.arena
+    layout, arena = show.task.layout, show.task.sim.arena
     columns, size = tiles(len(below), WIDTH)
     corners = frame.corners(layout)
     scenes = [

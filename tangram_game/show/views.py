@@ -10,11 +10,11 @@ from PIL import Image, ImageDraw
 
 from tangram_agent.outcome import plural
 from tangram_core.arrays import Bools, Floats
-from tangram_core.setup import Setup
 from tangram_sim.drawing.scenes import contact_sheet
 from tangram_sim.drawing.strokes import FRAME, PAPER, SAMPLES, Point, colour_of, draw_outline, shown
 from tangram_sim.geometry.layout import Layout
-from worker.play.rollout import Played
+from tangram_tasks.place import Place
+from tangram_tasks.played import Played
 
 
 def outlined(
@@ -45,11 +45,11 @@ def outlined(
     return shown(canvas)
 
 
-def camera_sheets(setup: Setup, played: Played, columns: int, size: int) -> list[Image.Image]:
+def camera_sheets(task: Place, played: Played, columns: int, size: int) -> list[Image.Image]:
     """For each of T + 1 moments the pictures of all episodes; none where no pictures were observed.
 
     Args:
-        setup: the task as it was played.
+        task: the task as it was played.
         played: the episodes.
         columns: pictures in a row.
         size: side of one in pixels.
@@ -58,8 +58,8 @@ def camera_sheets(setup: Setup, played: Played, columns: int, size: int) -> list
     if pictures is None:
         return []
     seen = played.episodes["seen"]
-    layout, side = setup.layout, pictures.shape[-1]
-    unit = side / setup.sim.arena
+    layout, side = task.layout, pictures.shape[-1]
+    unit = side / task.sim.arena
     corners = played.episodes["corners"].astype(np.float64) * (unit, -unit) + side / 2.0
     sheets = []
     for t in range(pictures.shape[1]):

@@ -10,13 +10,14 @@ import numpy as np
 import yaml
 
 import conf
-from tangram_agent.types import Past, Transitions
+from tangram_agent.types import Transitions
 from tangram_core.arrays import Bools, Floats, Singles
 from tangram_core.setup import SECTIONS, Setup, make_setup
 from tangram_core.spec import Episodes
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.geometry.layout import TokensConfig
 from tangram_sim.puzzles.assembly import COUNTS
+from tangram_tasks.played import Past
 from worker.play.rollout import Rollout
 
 

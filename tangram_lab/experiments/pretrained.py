@@ -31,7 +31,7 @@ from tangram_game.config import EvalConfig
 from tangram_game.evaluate import policies, score_policies
 from tangram_game.figures.puzzles import find_figures
 from tangram_game.scores import RUN, score_outlines, score_puzzles
-from tangram_sim.tasks.targets import has_all_tans
+from tangram_sim.targets.targets import has_all_tans
 from worker.score.test_set import greedy
 
 PACKAGE = Path(__file__).resolve().parents[2] / "tangram_agent" / "pretrained"

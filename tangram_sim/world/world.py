@@ -10,7 +10,7 @@ from tangram_core.errors import ConfigError
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.motion.kinematics import KinematicWorld
-from tangram_sim.tasks.targets import check_targets, sample_starts, sample_targets
+from tangram_sim.targets.targets import check_targets, sample_starts, sample_targets
 
 
 class World(Protocol):

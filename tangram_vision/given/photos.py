@@ -17,7 +17,7 @@ from PIL import Image
 from tangram_core.arrays import Bools, Floats, Ints, Pixels, Singles
 from tangram_core.errors import ConfigError
 from tangram_sim.geometry.layout import Layout
-from tangram_sim.tasks.connected import MAX_PILE
+from tangram_sim.targets.connected import MAX_PILE
 from tangram_vision.pictures.blobs import find_blobs, likeness
 from tangram_vision.pictures.kinds import kinds_of
 from tangram_vision.pictures.levels import MIN_CONTRAST

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from tangram_core.arrays import Complex, Floats, Ints, Singles
-from tangram_sim.tasks.connected import MAX_PILE
+from tangram_sim.targets.connected import MAX_PILE
 from tangram_vision.pictures.blobs import find_blobs, likeness
 from tangram_vision.pictures.edges import NARROW, WIDE, Outlines
 from tangram_vision.pictures.kinds import Kind

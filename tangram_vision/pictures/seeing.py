@@ -17,7 +17,7 @@ import numpy as np
 from tangram_core.arrays import Complex, Floats, Ints, Pixels, Singles
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.sight.perception import Look
-from tangram_sim.tasks.connected import MAX_PILE
+from tangram_sim.targets.connected import MAX_PILE
 from tangram_vision.pictures.blobs import Blobs, find_blobs, likeness
 from tangram_vision.pictures.edges import refined
 from tangram_vision.pictures.kinds import Kind, kinds_of

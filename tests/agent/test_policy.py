@@ -12,7 +12,7 @@ from tangram_agent.policy import Policy
 
 from tangram_agent.messages import decode_weights
 from tangram_agent.runs import Run
-from tangram_agent.types import Past, Transitions, Weights
+from tangram_agent.types import Transitions, Weights
 from tangram_core.errors import ConfigError, RunError
 from tangram_core.setup import Setup
 from tangram_sim.batch import BatchedEnv
@@ -20,6 +20,7 @@ from tangram_sim.env import TangramEnv
 from tangram_sim.motion.actions import chosen_tokens, flips, velocities
 from tangram_sim.motion.actuation import full_scale
 from tangram_sim.vector import TangramVectorEnv
+from tangram_tasks.played import Past
 from tests.agent.agents.pair.pair_scenes import PERCEPTRON, SEVEN, TWO, seven, transitions
 from tests.agent.builders import PAIR, PAPER, SCENE, SMALL, random_transitions, setup
 from tests.agent.messages import broadcast

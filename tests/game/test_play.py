@@ -15,6 +15,8 @@ from tangram_agent.runs import load_changed, load_run
 from tangram_agent.types import Choice
 from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError, RunError
+from tangram_core.setup import Setup
+from tangram_game.config import PlayConfig
 from tangram_game.play import (
     compare_runs,
     distinct_names,

@@ -8,7 +8,7 @@ import shapely
 from tangram_core.arrays import Floats
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout, TokensConfig, make_layout
-from tangram_sim.tasks.sampling import sample_batch
+from tangram_sim.targets.sampling import sample_batch
 
 SQUARE_SCALE = 0.8 * 2.0**0.5  # the square's side is then 0.4
 SEVEN = (

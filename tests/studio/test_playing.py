@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tangram_sim.puzzles.figures import load_puzzle
-from tangram_sim.tasks.targets import placement, turned_figure
+from tangram_sim.targets.targets import placement, turned_figure
 from tangram_studio.playing import PARTS, Move, Round, Sides, begin, next_move, player
 
 pytestmark = pytest.mark.slow

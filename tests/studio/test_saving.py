@@ -9,7 +9,7 @@ from PIL import Image
 from tangram_core.errors import ConfigError
 from tangram_sim.puzzles.assembly import PuzzleRules
 from tangram_sim.puzzles.figures import parse_puzzles, parse_svg_puzzle
-from tangram_sim.tasks.targets import placement
+from tangram_sim.targets.targets import placement
 from tangram_studio import saving
 from tangram_studio.playing import Sides, begin, next_move, player
 from tangram_studio.saving import FRAMES, gif, puzzle_file, svg

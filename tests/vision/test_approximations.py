@@ -14,7 +14,7 @@ from tangram_sim.geometry.dissections import Dissection
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.overlap import outlines, shared_areas
 from tangram_sim.puzzles.figures import load_puzzle
-from tangram_sim.tasks.targets import placement
+from tangram_sim.targets.targets import placement
 from tangram_vision.silhouettes.approximations import _apart, _Canvas, _direction, nearest_figure
 from tangram_vision.silhouettes.silhouettes import covered, silhouette
 from tests.sim.builders import SEVEN, layout_of

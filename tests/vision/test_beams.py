@@ -12,7 +12,7 @@ from tangram_core.arrays import Floats
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.areas import Area, overlap
 from tangram_sim.geometry.dissections import Budget, Dissection, Search, Tokens, dissection
-from tangram_sim.tasks.connected import sample_connected
+from tangram_sim.targets.connected import sample_connected
 from tangram_vision.silhouettes.beams import Beam, State, Values
 from tangram_vision.silhouettes.silhouettes import Method, covered, fill_outline
 from tests.sim.builders import SEVEN, layout_of

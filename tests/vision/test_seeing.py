@@ -13,9 +13,9 @@ from tangram_sim.puzzles.figures import library
 from tangram_sim.sight.lens import Disturbance, Lens
 from tangram_sim.sight.perception import Look
 from tangram_sim.sight.pictures import rasterise
-from tangram_sim.tasks.connected import sample_connected
-from tangram_sim.tasks.sampling import sample_batch
-from tangram_sim.tasks.targets import placement
+from tangram_sim.targets.connected import sample_connected
+from tangram_sim.targets.sampling import sample_batch
+from tangram_sim.targets.targets import placement
 from tangram_vision.pictures.seeing import Seen, see
 from tests.sim.builders import LOPSIDED, SEVEN, layout_of, pieces
 

@@ -14,8 +14,8 @@ from tangram_sim.config import SimConfig
 from tangram_sim.geometry.areas import Area, overlap
 from tangram_sim.geometry.dissections import Dissection, Laid
 from tangram_sim.puzzles.figures import load_puzzle
-from tangram_sim.tasks.connected import sample_connected
-from tangram_sim.tasks.targets import placement, turned_figure
+from tangram_sim.targets.connected import sample_connected
+from tangram_sim.targets.targets import placement, turned_figure
 from tangram_sim.world.world import make_world
 from tangram_vision.pictures.kinds import kinds_of
 from tangram_vision.pictures.levels import coverage

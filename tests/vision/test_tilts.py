@@ -10,7 +10,7 @@ from tangram_core.arrays import Singles
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.areas import Area, overlap
 from tangram_sim.geometry.dissections import Dissection
-from tangram_sim.tasks.connected import sample_connected
+from tangram_sim.targets.connected import sample_connected
 from tangram_vision.given.photos import find_silhouette
 from tangram_vision.silhouettes.outlines import Way, outline
 from tangram_vision.silhouettes.silhouette_pictures import fill_picture

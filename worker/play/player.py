@@ -3,17 +3,14 @@
 import math
 from contextlib import closing
 
-from tangram_agent.policy import Policy
-
 from tangram_agent.arrays import most_episodes
 from tangram_agent.messages import Go
 from tangram_core.errors import TangramError
 from tangram_core.setup import Setup
 from tangram_core.spec import Episodes
 from worker.config import WorkerConfig
-from worker.play.looking import environments
-from worker.play.rollout import Rollout, parts
-from worker.play.session import Report, joined
+from worker.play.rollout import Rollout, exploring, parts
+from worker.play.session import Acting, Report, joined
 from worker.talk.client import Client
 
 
@@ -26,36 +23,37 @@ def run_player(config: WorkerConfig, setup: Setup) -> int:
     Raises:
         TangramError: a setting that cannot work, or a master that refuses or is gone for long.
     """
-    policy, report = Policy(setup), Report()
+    acting, report = Acting(setup.agent.actor(setup.task)), Report()
     # What is too large for a message is split.
     size = min(config.service.batch_episodes, most_episodes(setup.spec))
     with (
-        closing(environments(setup, config.service.envs)) as env,
-        joined(config, setup, policy) as client,
+        closing(setup.task.make(config.service.envs, "play")) as env,
+        joined(config, setup, acting.actor) as client,
     ):
-        if client.stopped or not _take_first_weights(client, policy, report):
+        if client.stopped or not _take_first_weights(client, acting, report):
             return 0
         me = client.welcome
         if me.lockstep:
             # Nothing may depend on how often a process was started.
-            _play_in_step(client, policy, Rollout(env, me.seed, config.role, me.index, 0), report)
+            alike = Rollout(env, setup.spec, me.seed, config.role, me.index, 0)
+            _play_in_step(client, acting, alike, report)
             return 0
-        rollout = Rollout(env, me.seed, config.role, me.index, me.incarnation)
+        rollout = Rollout(env, setup.spec, me.seed, config.role, me.index, me.incarnation)
         while _wait_for_room(client, report):
             # Weights change here and nowhere else: a batch is played with one version.
             newest = client.newest_weights()
             if newest is not None:
-                policy.follow(newest)
-            episodes = _play(rollout, policy, client, groups=math.ceil(size / env.count))
+                acting.follow(newest)
+            episodes = _play(rollout, acting, client, groups=math.ceil(size / env.count))
             for batch in parts(episodes, size):
-                if not client.send(batch, policy.version):
+                if not client.send(batch, acting.version):
                     break
             client.stats["episodes"] = float(rollout.episode)
-            report.played(episodes.count, policy.version)
+            report.played(episodes.count, acting.version)
     return 0
 
 
-def _play_in_step(client: Client, policy: Policy, rollout: Rollout, report: Report) -> None:
+def _play_in_step(client: Client, acting: Acting, rollout: Rollout, report: Report) -> None:
     """Play what is ordered, with the weights that are ordered, until the client is stopped."""
     done: Go | None = None
     while (order := client.wait_for_order(done)) is not None:
@@ -64,27 +62,27 @@ def _play_in_step(client: Client, policy: Policy, rollout: Rollout, report: Repo
                 f"the master's lockstep asks for {order.episodes} episodes, no multiple of "
                 f"service.envs={rollout.envs}: start this worker with the master's service settings"
             )
-        while policy.version != order.version:
+        while acting.version != order.version:
             with report.waiting("the weights of this round"):
                 newest = client.wait_for_weights()
             if newest is None:
                 return
-            policy.follow(newest)
+            acting.follow(newest)
         rollout.episode = order.first_episode
-        episodes = _play(rollout, policy, client, groups=order.episodes // rollout.envs)
-        if episodes.count < order.episodes or not client.send(episodes, policy.version):
+        episodes = _play(rollout, acting, client, groups=order.episodes // rollout.envs)
+        if episodes.count < order.episodes or not client.send(episodes, acting.version):
             return
-        report.played(episodes.count, policy.version)
+        report.played(episodes.count, acting.version)
         done = order
 
 
-def _take_first_weights(client: Client, policy: Policy, report: Report) -> bool:
+def _take_first_weights(client: Client, acting: Acting, report: Report) -> bool:
     """Load the first weights; False if the client was stopped before they came."""
     with report.waiting("no weights yet"):
         weights = client.wait_for_weights()
     if weights is None:
         return False
-    policy.follow(weights)
+    acting.follow(weights)
     return True
 
 
@@ -97,11 +95,11 @@ def _wait_for_room(client: Client, report: Report) -> bool:
         return client.wait_for_window()
 
 
-def _play(rollout: Rollout, policy: Policy, client: Client, groups: int) -> Episodes:
+def _play(rollout: Rollout, acting: Acting, client: Client, groups: int) -> Episodes:
     """So many groups of episodes, fewer if the client is stopped."""
 
     def go_on() -> bool:
         client.poll()
         return not client.stopped
 
-    return rollout.play(policy.explore, groups, go_on)
+    return rollout.play(exploring(acting.actor), groups, go_on)

@@ -1,99 +1,31 @@
 """Playing whole episodes, as many at a time as there are environments.
 
-Legend: E episodes, B environments, T steps of an episode, K tokens, V corners, A entries of an
-action.
+Legend: E episodes, B environments, T steps of an episode.
 """
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from tangram_agent.types import Past
-from tangram_core.arrays import Bools, Floats, Pixels, Singles
+from tangram_core.agent import Actor
+from tangram_core.arrays import Ints
 from tangram_core.seeding import episode_generator
-from tangram_core.setup import Setup
-from tangram_core.spec import Episodes
-from tangram_sim.batch import BatchedEnv
-from tangram_sim.sight.lens import View
-from tangram_sim.tasks.targets import Sides
+from tangram_core.spec import Array, Arrays, Episodes, EpisodeSpec
+from tangram_core.task import Chooser, Env, Generators, History, Played
 
-AT_ONCE = 32
-
-Generators = Sequence[np.random.Generator]
-# (corners (B, V, 2), placed (B, K), goals (B, V, 2), one generator each, what was seen and done
-# before) -> actions (B, A)
-Choose = Callable[[Floats, Bools, Floats, Generators, Past], Singles]
+# Numbers of episodes (B,), a generator for each -> what is observed as they begin.
+Begin = Callable[[Ints, Generators], Arrays]
 
 
-@dataclass(frozen=True, eq=False)
-class Played:
-    """E whole episodes: what travels of them, and what only the environments know.
+def greedy(actor: Actor) -> Chooser:
+    """The actor as well as it can."""
+    return lambda seen, past, _: actor.act(seen, past)
 
-    Attributes:
-        episodes: corners and goals as the policy saw them, its actions and their rewards.
-        corners: (E, T + 1, V, 2) as they are, before each step and after the last.
-        goals: (E, V, 2) corners of the targets as they are.
-        overlap: (E,) raw overlap of exact polygons after the last step.
-        refused: (E, T) where the action named a placed token.
-        blocked: (E, T) where a token could not be set down on others.
-        seconds: (E,) wall time of choosing and moving, an equal share for each of those that were
-            played together.
-        slowest: (E,) processor time of their slowest choice, in seconds.
-        camera: (E,) Eq. 14 of the pictures after the last step; None without a camera.
-        pictures: (E, T + 1, P, P) that were shown to the agent; None where it sees no pictures.
-    """
 
-    episodes: Episodes
-    corners: Floats
-    goals: Floats
-    overlap: Floats
-    refused: Bools
-    blocked: Bools
-    seconds: Floats
-    slowest: Floats
-    camera: Floats | None
-    pictures: Pixels | None
-
-    @property
-    def starts(self) -> Floats:
-        """(E, V, 2) corners of the tokens before the first action."""
-        return self.corners[:, 0]
-
-    @property
-    def ends(self) -> Floats:
-        """(E, V, 2) corners of the tokens after the last action."""
-        return self.corners[:, -1]
-
-    @staticmethod
-    def empty(env: BatchedEnv, count: int) -> "Played":
-        """Room for so many episodes of an environment."""
-        steps, corners = env.horizon, env.layout.corner_count
-        pictures = None
-        if env.sight is not None:
-            side = env.sim.pixels
-            pictures = np.empty((count, steps + 1, side, side), np.uint8)
-        return Played(
-            episodes=env.spec.empty(count),
-            corners=np.empty((count, steps + 1, corners, 2)),
-            goals=np.empty((count, corners, 2)),
-            overlap=np.empty(count),
-            refused=np.empty((count, steps), np.bool_),
-            blocked=np.empty((count, steps), np.bool_),
-            seconds=np.empty(count),
-            slowest=np.zeros(count),
-            camera=np.empty(count) if env.sim.pixels else None,
-            pictures=pictures,
-        )
-
-    def first(self, count: int) -> "Played":
-        """The first episodes, nothing copied."""
-        cut: dict[str, Any] = {
-            name: rows[:count] for name, rows in vars(self).items() if isinstance(rows, np.ndarray)
-        }
-        return replace(self, episodes=self.episodes.at(slice(count)), **cut)
+def exploring(actor: Actor) -> Chooser:
+    """The actor as it explores."""
+    return actor.act
 
 
 def parts(episodes: Episodes, size: int) -> Iterator[Episodes]:
@@ -102,94 +34,109 @@ def parts(episodes: Episodes, size: int) -> Iterator[Episodes]:
         yield episodes.at(slice(first, first + size))
 
 
-def at_once(setup: Setup) -> int:
-    """Most episodes to play at a time where they are shown or scored.
-
-    One of an agent that looks ahead: plans of many take gigabytes, and save a tenth of the time.
-    """
-    return AT_ONCE if setup.agent.beam == 1 else 1
-
-
 def play(
-    env: BatchedEnv,
-    choose: Choose,
+    env: Env,
+    spec: EpisodeSpec,
+    choose: Chooser,
     generator: Callable[[int], np.random.Generator],
     count: int,
-    targets: Sides | None = None,
+    *,
+    begin: Begin | None = None,
+    facts: bool = False,
     go_on: Callable[[], bool] = lambda: True,
-    views: Sequence[View] | None = None,
 ) -> Played:
     """So many episodes, as many at a time as there are environments.
 
     Args:
         env: where.
+        spec: of the task.
         choose: gives the actions.
-        generator: of the episode with this number, from 0: it makes the target, then the start,
-            then whatever `choose` draws, so an episode does not depend on those played beside it.
+        generator: of the episode with this number, from 0: it makes the episode, then whatever
+            `choose` draws, so an episode does not depend on those played beside it.
         count: of episodes; the environments that have none left at the end play the first again.
-        targets: poses (E, K, 3) and sides (E, K) to assemble instead of targets that are drawn.
+        begin: in place of the environment's own reset.
+        facts: whether what only the environments know is kept, too.
         go_on: asked before each action; if not, the episodes that are being played are left out
             of what is returned.
-        views: E, how these targets were seen before; see `BatchedEnv.reset`.
     """
     whole = -(-count // env.count) * env.count
-    played = Played.empty(env, whole)
+    room = _Room(spec, whole, facts)
     for first in range(0, whole, env.count):
         numbers = np.arange(first, first + env.count) % count
-        these = None if targets is None else (targets[0][numbers], targets[1][numbers])
-        seen = None if views is None else [views[i] for i in numbers.tolist()]
         generators = [generator(i) for i in numbers.tolist()]
-        env.reset(generators, these, seen)
-        if not _play_group(env, choose, generators, played, first, go_on):
-            return played.first(first)
-    return played.first(count)
+        seen = env.reset(generators) if begin is None else begin(numbers, generators)
+        if not _play_group(env, choose, generators, seen, room.at(first, env.count), go_on):
+            return room.played(first)
+    return room.played(count)
+
+
+class _Room:
+    """Room for whole episodes, and the rows of it that are being filled."""
+
+    def __init__(self, spec: EpisodeSpec, count: int, facts: bool) -> None:
+        self.spec, self.episodes = spec, spec.empty(count)
+        self.facts: dict[str, Array] | None = {} if facts else None
+        self.seconds, self.slowest = np.zeros(count), np.zeros(count)
+        self.rows = slice(0, 0)
+
+    def at(self, first: int, count: int) -> "_Room":
+        """The same, to be filled from there on."""
+        self.rows = slice(first, first + count)
+        return self
+
+    def look(self, seen: Arrays, env: Env, t: int) -> None:
+        """Keep what is observed at a moment, and what the environments know."""
+        for field in self.spec.fields:
+            if field.per == "moment":
+                self.episodes[field.name][self.rows, t] = seen[field.name]
+            elif t == 0:
+                self.episodes[field.name][self.rows] = seen[field.name]
+        if self.facts is None:
+            return
+        for name, value in env.facts().items():
+            if name not in self.facts:
+                shape = (len(self.seconds), self.spec.horizon + 1, *value.shape[1:])
+                self.facts[name] = np.zeros(shape, value.dtype)
+            self.facts[name][self.rows, t] = value
+
+    def history(self, t: int) -> History:
+        """What was until this moment."""
+        moments = [field.name for field in self.spec.fields if field.per == "moment"]
+        seen = {name: self.episodes[name][self.rows, : t + 1] for name in moments}
+        return History(seen, self.episodes.actions[self.rows, :t])
+
+    def played(self, count: int) -> Played:
+        """The first episodes."""
+        facts = {name: one[:count] for name, one in (self.facts or {}).items()}
+        first = slice(count)
+        return Played(self.episodes.at(first), facts, self.seconds[first], self.slowest[first])
 
 
 def _play_group(
-    env: BatchedEnv,
-    choose: Choose,
+    env: Env,
+    choose: Chooser,
     generators: Generators,
-    played: Played,
-    first: int,
+    seen: Arrays,
+    room: _Room,
     go_on: Callable[[], bool],
 ) -> bool:
-    """The episode in every environment, into the rows from `first` on; False if told to end."""
-    rows, seen = slice(first, first + env.count), played.episodes
-    seen["goals"][rows], played.goals[rows] = env.seen_goals, env.goals
-    if env.sight is not None:
-        seen["goals_seen"][rows] = env.sight.goals_sure
+    """The episode in every environment; False if told to end."""
+    rows, episodes = room.rows, room.episodes
     began = time.perf_counter()
-    for t in range(env.horizon):
+    for t in range(room.spec.horizon):
         if not go_on():
             return False
-        _look(env, played, rows, t)
-        found = None if env.sight is None else seen["seen"][rows, : t + 1]
-        past = Past(seen["corners"][rows, :t], seen.actions[rows, :t], found)
+        room.look(seen, env, t)
         asked = time.process_time()
-        actions = choose(env.seen, env.closed, env.seen_goals, generators, past)
+        actions = choose(seen, room.history(t), generators)
         spent = time.process_time() - asked
-        played.slowest[rows] = np.maximum(played.slowest[rows], spent)
-        result = env.step(actions.astype(np.float64))
-        seen.actions[rows, t], seen.rewards[rows, t] = actions, result.rewards
-        played.refused[rows, t], played.blocked[rows, t] = result.refused, result.blocked
-    _look(env, played, rows, env.horizon)
-    played.seconds[rows] = (time.perf_counter() - began) / env.count
-    played.overlap[rows] = result.overlap
-    if played.camera is not None:
-        played.camera[rows] = result.camera_rewards
+        room.slowest[rows] = np.maximum(room.slowest[rows], spent)
+        step = env.step(actions)
+        episodes.actions[rows, t], episodes.rewards[rows, t] = actions, step.rewards
+        episodes.terminated[rows, t], seen = step.terminated, step.seen
+    room.look(seen, env, room.spec.horizon)
+    room.seconds[rows] = (time.perf_counter() - began) / env.count
     return True
-
-
-def _look(env: BatchedEnv, played: Played, rows: slice, t: int) -> None:
-    seen, sight = played.episodes, env.sight
-    played.corners[rows, t], seen["corners"][rows, t] = env.corners, env.seen
-    seen["placed"][rows, t] = env.placed
-    if t:
-        seen.terminated[rows, t - 1] = env.placed.all(axis=1)
-    if sight is not None and played.pictures is not None:
-        # Of several tokens one may have left the picture; alone it would be all that is to be seen.
-        seen["seen"][rows, t] = ~sight.missing | (sight.away & (env.layout.tokens > 1))
-        played.pictures[rows, t] = env.pictures
 
 
 class Rollout:
@@ -199,8 +146,16 @@ class Rollout:
         episode: number of the next episode in this incarnation.
     """
 
-    def __init__(self, env: BatchedEnv, run_seed: int, role: str, index: int, incarnation: int):
-        self._env = env
+    def __init__(
+        self,
+        env: Env,
+        spec: EpisodeSpec,
+        run_seed: int,
+        role: str,
+        index: int,
+        incarnation: int,
+    ) -> None:
+        self._env, self._spec = env, spec
         self._identity = (run_seed, role, index, incarnation)
         self.episode = 0
 
@@ -210,12 +165,13 @@ class Rollout:
         return self._env.count
 
     def play(
-        self, choose: Choose, groups: int = 1, go_on: Callable[[], bool] = lambda: True
+        self, choose: Chooser, groups: int = 1, go_on: Callable[[], bool] = lambda: True
     ) -> Episodes:
         """The next episodes, `groups` times one in every environment; see `play`."""
         first, count = self.episode, groups * self._env.count
         played = play(
             self._env,
+            self._spec,
             choose,
             lambda i: episode_generator(*self._identity, first + i),
             count,

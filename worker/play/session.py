@@ -10,10 +10,11 @@ from types import FrameType
 from typing import TextIO
 
 import torch
-from tangram_agent.policy import Policy
 
 from tangram_agent.arrays import check_batch_size
 from tangram_agent.messages import TAKEN_OVER
+from tangram_agent.types import Weights
+from tangram_core.agent import Actor
 from tangram_core.errors import TangramError
 from tangram_core.process import WATCHDOG_S, Watchdog, formatter, keep_memory, watch_parent
 from tangram_core.setup import Setup
@@ -26,12 +27,33 @@ REPORT_S = 30.0
 _log = logging.getLogger(__name__)
 
 
+class Acting:
+    """An actor with the version of its weights.
+
+    Attributes:
+        actor: the agent's.
+        version: of the weights that are loaded; -1 before the first.
+    """
+
+    def __init__(self, actor: Actor) -> None:
+        self.actor, self.version = actor, -1
+
+    def follow(self, weights: Weights) -> None:
+        """Take over weights that were broadcast.
+
+        Raises:
+            RunError: they belong to another layout or network.
+        """
+        self.actor.load(weights.tensors)
+        self.version = weights.version
+
+
 class IndexTakenError(TangramError):
     """The index that the master gave to this process, which asked for any, is another's now."""
 
 
 @contextmanager
-def joined(config: WorkerConfig, setup: Setup, policy: Policy) -> Iterator[Client]:
+def joined(config: WorkerConfig, setup: Setup, actor: Actor) -> Iterator[Client]:
     """A client to the master that has joined, or that was stopped while it tried.
 
     On leaving, the master is told, after the batches that are on their way, and the signal handlers
@@ -40,7 +62,7 @@ def joined(config: WorkerConfig, setup: Setup, policy: Policy) -> Iterator[Clien
     Args:
         config: of this worker.
         setup: the task, which the master must share.
-        policy: what the master's weights must fit.
+        actor: what the master's weights must fit.
 
     Raises:
         TangramError: the master refuses, or does not answer.
@@ -61,7 +83,7 @@ def joined(config: WorkerConfig, setup: Setup, policy: Policy) -> Iterator[Clien
         config.index,
         setup.fingerprints(),
         spec,
-        policy.shapes,
+        actor.shapes,
     )
     client.on_progress = watchdog.progress
     with client, stopped_by_signals(client), watchdog:

@@ -6,21 +6,18 @@ from contextlib import closing
 
 import numpy as np
 from PIL import Image
-from tangram_agent.policy import Policy
 
 from tangram_agent.messages import PICTURE_HEIGHT, PICTURE_WIDTH, Scores
 from tangram_agent.types import Weights
 from tangram_core.arrays import Pixels
 from tangram_core.service import ServiceConfig
 from tangram_core.setup import Setup
-from tangram_sim.drawing.scenes import episode_sheet
 from worker.config import WorkerConfig
-from worker.play.rollout import Played
-from worker.play.session import joined
-from worker.score.test_set import FixedTests, greedy
+from worker.play.rollout import greedy
+from worker.play.session import Acting, joined
+from worker.score.test_set import FixedTests
 from worker.talk.client import Client
 
-PICTURES, PICTURE_COLUMNS, PICTURE_PIXELS = 12, 4, 216
 POLL_S = 0.2
 # Weights that no newer ones follow for so long are probably the last: their score is waited for.
 STILL_S = 2.0
@@ -69,16 +66,16 @@ def run_evaluator(config: WorkerConfig, setup: Setup) -> int:
     Raises:
         TangramError: a setting that cannot work, or a master that refuses or is gone for long.
     """
-    policy, schedule = Policy(setup), _schedule(config.service)
-    tests = FixedTests(setup, config.service.eval_episodes, config.service.envs)
-    with closing(tests), joined(config, setup, policy) as client:
+    acting, schedule = Acting(setup.agent.actor(setup.task)), _schedule(config.service)
+    tests = FixedTests(setup.task, config.service.eval_episodes, config.service.envs)
+    with closing(tests), joined(config, setup, acting.actor) as client:
         while not client.stopped:
             client.poll(POLL_S)
             schedule.offer(client.newest_weights(), time.monotonic())
             weights = schedule.due(time.monotonic())
             if weights is not None:
-                policy.follow(weights)
-                scores = _evaluate(tests, policy, client)
+                acting.follow(weights)
+                scores = _evaluate(tests, acting, client)
                 if scores is not None:
                     client.send_scores(scores)
                 schedule.scored(time.monotonic())
@@ -89,35 +86,33 @@ def _schedule(service: ServiceConfig) -> Schedule:
     return Schedule(service.eval_seconds, max(STILL_S, 4.0 * service.publish_seconds))
 
 
-def _evaluate(tests: FixedTests, policy: Policy, client: Client) -> Scores | None:
-    """Scores of the policy; None if the client was stopped meanwhile."""
-    began = time.monotonic()
+def _evaluate(tests: FixedTests, acting: Acting, client: Client) -> Scores | None:
+    """Scores of what is loaded; None if the client was stopped meanwhile."""
+    began, task = time.monotonic(), tests.task
 
     def go_on() -> bool:
         client.poll()
         return not client.stopped
 
-    played = tests.play(greedy(policy), go_on)
+    played = tests.play(greedy(acting.actor), go_on)
     client.poll()
     if client.stopped:
         return None
-    scalars = tests.scores(played) | {"seconds": time.monotonic() - began}
-    _log.info(
-        "weights %d: mean reward %.3f, raw overlap %.3f, median angle error %.2f degrees (%.1f s)",
-        policy.version,
-        *(scalars[name] for name in ("mean_reward", "raw_overlap", "angle_error_deg_median")),
-        scalars["seconds"],
-        extra={"event": "scored", "weights_version": policy.version} | scalars,
+    count = {"episodes": float(played.episodes.count), "seconds": time.monotonic() - began}
+    scalars = {**task.score(played), **count}
+    told = ", ".join(
+        score.told(scalars[score.name]) for score in task.scores if score.name in scalars
     )
-    return _message(tests.setup, policy.version, scalars, played)
-
-
-def _message(setup: Setup, version: int, scalars: dict[str, float], played: Played) -> Scores:
-    shown = (played.starts, played.ends, played.goals)
-    starts, ends, goals = (corners[:PICTURES] for corners in shown)
-    layout, arena = setup.layout, setup.sim.arena
-    sheet = episode_sheet(layout, arena, starts, ends, goals, PICTURE_COLUMNS, PICTURE_PIXELS)
-    return Scores(version, scalars, framed(np.asarray(sheet.convert("RGB"))))
+    _log.info(
+        "weights %d: %s (%.1f s)",
+        acting.version,
+        told,
+        scalars["seconds"],
+        extra={"event": "scored", "weights_version": acting.version} | scalars,
+    )
+    picture = task.draw(played)
+    none = np.zeros((0, PICTURE_WIDTH, 3), np.uint8)
+    return Scores(acting.version, scalars, none if picture is None else framed(picture))
 
 
 def framed(picture: Pixels) -> Pixels:

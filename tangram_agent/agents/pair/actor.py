@@ -8,14 +8,15 @@ import numpy as np
 from tangram_agent.agents.pair.config import PairConfig
 from tangram_agent.agents.pair.networks import Networks
 from tangram_agent.agents.pair.planning import Planner
-from tangram_agent.base.acting import NetworkActor, closed
+from tangram_agent.base.acting import NetworkActor
 from tangram_agent.base.config import NetConfig
-from tangram_agent.types import Choice, Past
+from tangram_agent.types import Choice
 from tangram_core.arrays import Floats, Singles
 from tangram_core.spec import Array, Arrays
 from tangram_core.task import Generators, History
 from tangram_sim.motion.actions import make_actions
 from tangram_tasks.place import Place
+from tangram_tasks.played import Past, closed
 
 
 class PairActor(NetworkActor):
@@ -40,7 +41,7 @@ class PairActor(NetworkActor):
         """
         corners, goals = (np.asarray(seen[name], np.float64) for name in ("corners", "goals"))
         flags = np.asarray(closed(seen), np.bool_)
-        actions = self._actions(self._planner.choose(corners, flags, goals, past_of(past)))
+        actions = self._actions(self._planner.choose(corners, flags, goals, Past.of(past)))
         if explore is None:
             return actions
         for i, (action, generator) in enumerate(zip(actions, explore, strict=True)):
@@ -80,9 +81,3 @@ def critic_plays(task: Place) -> bool:
     Of one token that stays on its side there is one proposal, and nothing to choose.
     """
     return task.layout.tokens > 1 or task.sim.allow_flip
-
-
-def past_of(history: History) -> Past:
-    """What the model of motion takes of a history."""
-    corners = history.seen["corners"][:, :-1]
-    return Past(corners, history.actions, history.seen.get("seen"))

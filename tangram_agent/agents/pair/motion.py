@@ -17,12 +17,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tangram_agent.types import Past
 from tangram_core.arrays import Floats
 from tangram_core.errors import RunError
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.motion.actions import chosen_tokens, flips, velocities, velocities_of
+from tangram_tasks.played import Past
 
 _FEATURES = 26
 _SPREAD, _NOISE = 0.1, 0.02  # deviations of entries of K and of a way, at the start

@@ -8,13 +8,14 @@ import torch
 
 from tangram_agent.agents.scene.networks import ActorNet
 from tangram_agent.agents.scene.scenes import Scenes, next_token
-from tangram_agent.base.acting import NetworkActor, closed, tensor
+from tangram_agent.base.acting import NetworkActor, tensor
 from tangram_agent.base.config import ActorCriticConfig, NetConfig
 from tangram_core.arrays import Singles
 from tangram_core.spec import Arrays
 from tangram_core.task import Generators, History
 from tangram_sim.motion.actions import make_actions
 from tangram_tasks.place import Place
+from tangram_tasks.played import closed
 
 
 class SceneActor(NetworkActor):

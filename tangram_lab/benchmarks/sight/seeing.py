@@ -17,8 +17,8 @@ from tangram_sim.geometry.fitting import overlap_depths
 from tangram_sim.geometry.layout import Layout, TokensConfig, make_layout
 from tangram_sim.geometry.overlap import outlines
 from tangram_sim.sight.lens import Lens
-from tangram_sim.tasks.connected import sample_piles
-from tangram_sim.tasks.sampling import sample_batch
+from tangram_sim.targets.connected import sample_piles
+from tangram_sim.targets.sampling import sample_batch
 from tangram_sim.world.world import World, make_world
 from tangram_vision.pictures.seeing import Seen, see
 

@@ -26,8 +26,8 @@ from tangram_sim.geometry.areas import Area, grown, overlap
 from tangram_sim.geometry.dissections import Dissection
 from tangram_sim.geometry.layout import Layout, TokensConfig, make_layout
 from tangram_sim.puzzles.figures import library
-from tangram_sim.tasks.connected import sample_connected
-from tangram_sim.tasks.targets import placement, turned_figure
+from tangram_sim.targets.connected import sample_connected
+from tangram_sim.targets.targets import placement, turned_figure
 from tangram_sim.world.world import World, make_world
 from tangram_vision.pictures.levels import coverage
 from tangram_vision.silhouettes.silhouette_pictures import fill_picture

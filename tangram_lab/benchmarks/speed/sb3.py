@@ -21,12 +21,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from tangram_agent.types import Past
 from tangram_core.arrays import Bools, Floats, Singles
 from tangram_core.errors import TangramError
 from tangram_core.seeding import evaluation_generators
 from tangram_lab.benchmarks.setups import preset
 from tangram_sim.batch import BatchedEnv
+from tangram_tasks.played import Past
 from worker.play.rollout import Generators, play
 
 LIBRARY = "stable_baselines3"

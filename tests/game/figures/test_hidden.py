@@ -14,10 +14,11 @@ from PIL import Image
 
 import tangram_sim  # noqa: F401  # registers the environments
 from tangram_core.errors import ConfigError
+from tangram_core.setup import Setup
+from tangram_game.config import EvalConfig
 from tangram_game.evaluate import evaluate_run
 from tangram_game.figures.hidden import Hidden, hide, lay, means, one_by_one, play_hidden
 from tangram_game.figures.puzzles import Figure, find_figures, play_figures
-from tangram_game.rivals.baselines import exact_policy, random_policy
 from tangram_game.scores import RUN, score_hidden
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.config import RewardConfig
@@ -25,6 +26,7 @@ from tangram_sim.geometry.areas import overlap
 from tangram_sim.geometry.dissections import Dissection
 from tangram_sim.geometry.overlap import overlap_share
 from tangram_sim.sight.lens import Disturbance
+from tangram_tasks.rivals.baselines import exact_policy, random_policy
 from tangram_vision.silhouettes import silhouettes
 from tangram_vision.silhouettes.silhouettes import Filled, covered, fill_outline
 from tests.agent.builders import setup

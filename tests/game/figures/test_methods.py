@@ -14,13 +14,13 @@ from tangram_game.evaluate import evaluate_run
 from tangram_game.figures.methods import Learned, learned_method, together
 from tangram_game.figures.puzzles import find_figures
 from tangram_game.figures.silhouettes import read_silhouette
-from tangram_game.rivals.baselines import exact_policy
 from tangram_game.scores import RUN, score_hidden
 from tangram_sim.geometry.areas import Area
 from tangram_sim.geometry.dissections import Budget, Search, Tokens
 from tangram_sim.geometry.rings import covered_area
 from tangram_sim.puzzles.figures import library
-from tangram_sim.tasks.targets import placement
+from tangram_sim.targets.targets import placement
+from tangram_tasks.rivals.baselines import exact_policy
 from tangram_vision.silhouettes.silhouettes import Method
 from tests.game.figures.test_hidden import OUTLINE, game
 from tests.sim.builders import SEVEN, TRIO, layout_of

@@ -9,9 +9,9 @@ from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError
 from tangram_core.setup import Setup
 from tangram_game.figures.puzzles import find_figures, play_figures
-from tangram_game.rivals.baselines import exact_policy, random_policy
 from tangram_sim.geometry.overlap import overlap_share
 from tangram_sim.puzzles.figures import library, load_puzzle
+from tangram_tasks.rivals.baselines import exact_policy, random_policy
 from tests.agent.builders import setup
 from tests.game.figures.puzzle_files import GAME, SIM, drawn, write_puzzles
 

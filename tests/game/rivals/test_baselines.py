@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tangram_game.rivals.baselines import Told, exact_policy, playing, random_policy
 from tangram_game.rivals.fitted import fitted_policy
-from tangram_game.rivals.oracle import oracle_policy
 from tangram_sim.motion.kinematics import wrap
+from tangram_tasks.rivals.baselines import Told, exact_policy, playing, random_policy
+from tangram_tasks.rivals.oracle import oracle_policy
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.sim.builders import SEVEN
 from worker.score.test_set import FixedTests

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from tangram_core.setup import Setup
-from tangram_game.rivals.baselines import exact_policy
-from tangram_game.rivals.sweeps import _shares, _swept, best_order, first_slide, sweep_policy
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.motion.actions import chosen_tokens
+from tangram_tasks.rivals.baselines import exact_policy
+from tangram_tasks.rivals.sweeps import _shares, _swept, best_order, first_slide, sweep_policy
 from tests.agent.builders import setup
 from tests.sim.builders import SEVEN
 from worker.play.rollout import Choose

@@ -13,7 +13,7 @@ from tangram_sim.config import SimConfig
 from tangram_sim.geometry.areas import Area, straightened
 from tangram_sim.geometry.dissections import Budget, Dissection, Laid, Search, Tokens
 from tangram_sim.geometry.layout import Layout, TokensConfig, make_layout
-from tangram_sim.tasks.connected import sample_connected
+from tangram_sim.targets.connected import sample_connected
 from tangram_vision.silhouettes.silhouettes import (
     UNLEARNED,
     _alike,

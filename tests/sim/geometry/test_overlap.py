@@ -19,7 +19,7 @@ from tangram_sim.geometry.overlap import (
     union_area,
 )
 from tangram_sim.geometry.shapes import SHAPE_NAMES, tan
-from tangram_sim.tasks.sampling import sample_batch
+from tangram_sim.targets.sampling import sample_batch
 from tests.sim.builders import SEVEN, TRIO, layout_of, polygons, random_poses
 
 pytestmark = pytest.mark.fast

@@ -16,7 +16,7 @@ from tangram_sim.geometry.dissections import Budget, Search, Tokens, dissection
 from tangram_sim.geometry.rings import as_area, as_rows, covered_area
 from tangram_sim.motion.actions import goal_rows
 from tangram_sim.puzzles.figures import library
-from tangram_sim.tasks.targets import placement
+from tangram_sim.targets.targets import placement
 from tests.sim.builders import SEVEN, layout_of, pieces
 
 pytestmark = pytest.mark.fast

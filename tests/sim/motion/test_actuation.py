@@ -14,7 +14,7 @@ from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.motion.actions import full_scale
 from tangram_sim.motion.actuation import Actuation, reach
-from tangram_sim.tasks.targets import check_targets
+from tangram_sim.targets.targets import check_targets
 from tests.sim.builders import TRIO, angle_gap, layout_of
 
 pytestmark = pytest.mark.fast

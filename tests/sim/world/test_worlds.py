@@ -15,7 +15,7 @@ from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.overlap import area, clip, overlap_share
 from tangram_sim.rewards import TargetPictures
 from tangram_sim.sight.pictures import BACKGROUND, TOKEN_GRAY, rasterise
-from tangram_sim.tasks.sampling import sample_batch
+from tangram_sim.targets.sampling import sample_batch
 from tangram_sim.world import world as world_module
 from tangram_sim.world.world import World, check_room, check_shown, check_world, make_world
 from tests.sim.builders import LOPSIDED, SQUARE_SCALE, TRIO, angle_gap, layout_of, random_poses

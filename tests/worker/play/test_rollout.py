@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from tangram_agent.policy import Policy
 
-from tangram_agent.types import Past
 from tangram_core.seeding import episode_generator
 from tangram_core.setup import Setup
 from tangram_core.spec import Episodes, joined
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.geometry.overlap import overlap_share
+from tangram_tasks.played import Past
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.sim.builders import sample_poses
 from tests.worker.builders import policy

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tangram_core.seeding import evaluation_generators
-from tangram_game.rivals.baselines import position_policy, random_policy
+from tangram_tasks.rivals.baselines import position_policy, random_policy
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.worker.builders import policy
 from worker.play.rollout import Played

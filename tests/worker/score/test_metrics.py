@@ -10,11 +10,11 @@ from tangram_core.arrays import Bools, Floats
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.puzzles.figures import library
-from tangram_sim.tasks.sampling import sample_batch
+from tangram_sim.targets.sampling import sample_batch
+from tangram_tasks.metrics import Assembled, assembled, covered_shares, pose_errors, summarise
 from tests.sim.builders import SEVEN, layout_of, random_poses
 from tests.worker.builders import ended
 from worker.play.rollout import Played
-from worker.score.metrics import Assembled, assembled, covered_shares, pose_errors, summarise
 
 pytestmark = pytest.mark.fast
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tangram_tasks.pairing import alike, paired
 from tests.sim.builders import SEVEN, layout_of, random_poses
-from worker.score.pairing import alike, paired
 
 pytestmark = pytest.mark.fast
 

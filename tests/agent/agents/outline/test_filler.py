@@ -12,6 +12,7 @@ import torch
 from tangram_agent.config import AgentConfig, NetConfig
 from tangram_agent.policy import Policy
 from torch import nn
+from worker.play.looking import environments
 
 from tangram_agent.agents.outline.filler import Filler
 from tangram_agent.agents.outline.filling import UNUSED, Filling
@@ -20,9 +21,8 @@ from tangram_core.errors import ConfigError
 from tangram_core.setup import Setup
 from tangram_sim.geometry.dissections import Place
 from tangram_sim.puzzles.figures import library
-from tangram_sim.tasks.targets import placement
+from tangram_sim.targets.targets import placement
 from tests.agent.agents.outline.outlines import ALL, TWO, outline_setup
-from worker.play.looking import environments
 
 pytestmark = pytest.mark.fast
 

@@ -11,8 +11,9 @@ from tangram_agent.policy import Policy
 from tangram_agent.agents.pair.motion import Fit, MotionModel, Motions, features, motions_of
 from tangram_agent.base.weights import load_arrays, to_arrays
 from tangram_agent.replay import ReplayBuffer
-from tangram_agent.types import Past, Transitions
+from tangram_agent.types import Transitions
 from tangram_core.errors import ConfigError, RunError
+from tangram_tasks.played import Past
 from tests.agent.agents.pair.pair_scenes import SEVEN
 from tests.agent.builders import PAIR, SQUARE, random_episodes, setup
 

@@ -14,7 +14,7 @@ from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.overlap import overlap_area
 from tangram_sim.puzzles.figures import library
-from tangram_sim.tasks.targets import check_targets, placement, sample_starts, sample_targets
+from tangram_sim.targets.targets import check_targets, placement, sample_starts, sample_targets
 from tests.sim.builders import SEVEN, TRIO, largest_overlap, layout_of, pieces
 
 pytestmark = pytest.mark.fast

@@ -10,8 +10,8 @@ from tangram_core.errors import SamplingError
 from tangram_core.seeding import episode_generator, evaluation_generators
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout
-from tangram_sim.tasks.connected import MAX_PILE, PILES_APART, sample_connected, sample_piles
-from tangram_sim.tasks.sampling import sample_batch
+from tangram_sim.targets.connected import MAX_PILE, PILES_APART, sample_connected, sample_piles
+from tangram_sim.targets.sampling import sample_batch
 from tests.sim.builders import (
     LOPSIDED,
     SEVEN,
@@ -88,7 +88,7 @@ def test_tries_are_bounded_exactly_and_giving_up_names_the_numbers(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The last chunk is cut: 5 tries are 4 and 1, whatever the chunk."""
-    monkeypatch.setattr("tangram_sim.tasks.sampling.MAX_TRIES", 5)
+    monkeypatch.setattr("tangram_sim.targets.sampling.MAX_TRIES", 5)
     layout, sim = layout_of("square", "square"), SimConfig(arena=0.6)
     rng, twin = np.random.default_rng(0), np.random.default_rng(0)
     with pytest.raises(

@@ -12,8 +12,8 @@ from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.overlap import outlines, overlap_share, shared_areas, union_area
 from tangram_sim.rewards import make_reward
-from worker.play.rollout import Played
-from worker.score.pairing import alike, paired
+from tangram_tasks.pairing import alike, paired
+from tangram_tasks.played import Played
 
 SOLVED = 0.95  # of the target covered
 # Share of a piece that a token must cover to count: less is a neighbour that reaches over.

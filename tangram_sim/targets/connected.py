@@ -14,7 +14,7 @@ from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.overlap import outlines, pairs_overlap
 from tangram_sim.motion.kinematics import wrap
-from tangram_sim.tasks.sampling import MAX_TRIES, check_fits
+from tangram_sim.targets.sampling import MAX_TRIES, check_fits
 
 _CHUNK = 16  # candidates that are checked together
 _ALIGNED = 0.7  # share of pieces that meet another corner to corner

@@ -23,8 +23,8 @@ from tangram_sim.motion.actions import horizon
 from tangram_sim.motion.kinematics import wrap
 from tangram_sim.puzzles.assembly import COUNTS, Puzzle, PuzzleRules
 from tangram_sim.puzzles.figures import library
-from tangram_sim.tasks.connected import MAX_PILE, sample_connected, sample_piles
-from tangram_sim.tasks.sampling import sample_batch
+from tangram_sim.targets.connected import MAX_PILE, sample_connected, sample_piles
+from tangram_sim.targets.sampling import sample_batch
 
 Generators = Sequence[np.random.Generator]
 Sides = tuple[Floats, Bools]

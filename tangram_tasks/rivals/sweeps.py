@@ -11,14 +11,14 @@ from itertools import chain, islice, pairwise, permutations, product
 import numpy as np
 import shapely
 
-from tangram_agent.types import Past
 from tangram_core.arrays import AnyArray, Bools, Floats, Ints, Singles
+from tangram_core.task import Generators
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.overlap import outlines, outlines_at, shared_areas
 from tangram_sim.motion.actions import make_actions, velocities_of
-from worker.play.rollout import Choose, Generators
-from worker.score.pairing import alike, all_ways
+from tangram_tasks.pairing import alike, all_ways
+from tangram_tasks.played import Choose, Past
 
 MAX_TOKENS = 8  # the order is found over all sets of them
 _PAIRINGS = 24  # ways to share pieces among equal tokens that are tried

@@ -3,35 +3,16 @@
 Legend: B environments, K tokens, V corners, A entries of an action.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
-
 import numpy as np
 
-from tangram_agent.types import Past
 from tangram_core.arrays import Bools, Floats, Ints, Singles
-from tangram_sim.batch import BatchedEnv
+from tangram_core.task import Generators
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.overlap import outlines, shared_areas
 from tangram_sim.motion.actions import action_size, make_actions, velocities_of
-from worker.play.rollout import Choose, Generators
-from worker.score.pairing import Pairing, paired
-
-
-@dataclass(frozen=True, eq=False)
-class Told:
-    """A policy that is told the world: it is made for the environments in which it plays."""
-
-    of: Callable[[BatchedEnv], Choose]
-
-
-Player = Choose | Told
-
-
-def playing(player: Player, env: BatchedEnv) -> Choose:
-    """The policy, told the world if it asks for that."""
-    return player.of(env) if isinstance(player, Told) else player
+from tangram_tasks.pairing import Pairing, paired
+from tangram_tasks.played import Choose, Past
 
 
 def random_policy(layout: Layout, sim: SimConfig) -> Choose:

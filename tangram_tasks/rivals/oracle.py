@@ -5,17 +5,17 @@ Legend: B environments, K tokens, V corners.
 
 import numpy as np
 
-from tangram_agent.types import Past
 from tangram_core.arrays import Bools, Floats, Singles
-from tangram_game.rivals.baselines import freest
+from tangram_core.task import Generators
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.motion.actions import make_actions
 from tangram_sim.motion.actuation import Command, full_scale, reach
 from tangram_sim.motion.kinematics import wrap
 from tangram_sim.world.world import make_world
-from worker.play.rollout import Choose, Generators
-from worker.score.pairing import paired
+from tangram_tasks.pairing import paired
+from tangram_tasks.played import Choose, Past
+from tangram_tasks.rivals.baselines import freest
 
 _PROBES = 257  # commands that the engine is tried with
 _SURPRISE = 5.0  # deviations beyond which something else has moved a token

@@ -1,0 +1,112 @@
+"""Environments of tokens on the interface of `tangram_core.task.Env`.
+
+Legend: B environments, K tokens, V corners.
+"""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tangram_core.arrays import Bools, Pixels, Singles
+from tangram_core.spec import Array, Arrays
+from tangram_core.task import Env, Generators, Purpose, Step
+from tangram_sim.batch import BatchedEnv, StepResult
+from tangram_sim.sight.lens import View
+from tangram_sim.sight.perception import Eye, Look
+from tangram_sim.targets.targets import Sides
+from tangram_sim.world.world import no_opencv
+
+if TYPE_CHECKING:
+    from tangram_tasks.place import Place
+
+PIXELS = 64  # of a picture's side in tests, where training takes none
+
+
+class PlaceEnv(Env):
+    """B worlds of tokens.
+
+    Attributes:
+        world: what plays.
+    """
+
+    def __init__(self, task: "Place", count: int, purpose: Purpose) -> None:
+        """Open the worlds; to test, their camera is on, but where outlines are shown."""
+        self.count = count
+        shown = task.sim.observe == "silhouette"
+        if purpose == "test" and not shown and not task.sim.pixels:
+            task = task.with_sim(pixels=PIXELS)
+        self.world = BatchedEnv(
+            task.layout, task.sim, task.reward, count, make_eye(task), task.outlines
+        )
+        self._result: StepResult | None = None
+
+    def reset(
+        self,
+        generators: Generators,
+        targets: Sides | None = None,
+        views: list[View] | None = None,
+    ) -> Arrays:
+        """Begin an episode in every environment; see `BatchedEnv.reset`."""
+        self._result = None
+        self.world.reset(generators, targets, views)
+        return self._seen()
+
+    def step(self, actions: Singles) -> Step:
+        """Play one action (B, A) in every environment."""
+        self._result = self.world.step(np.asarray(actions, np.float64))
+        over: Bools = np.asarray(self.world.placed.all(axis=1))
+        return Step(self._seen(), self._result.rewards, over)
+
+    def _seen(self) -> Arrays:
+        world = self.world
+        seen: dict[str, Array] = {"corners": world.seen, "placed": world.placed}
+        if world.sight is not None:
+            # Of several tokens one may have left the picture; alone it would be all there is to
+            # be seen.
+            several = world.layout.tokens > 1
+            seen["seen"] = ~world.sight.missing | (world.sight.away & several)
+            seen["closed"] = world.closed
+            seen["goals_seen"] = world.sight.goals_sure
+        return seen | {"goals": world.seen_goals}
+
+    def facts(self) -> Arrays:
+        """Exact corners and goals, overlap, refused and blocked actions, and what cameras took."""
+        world, result, none = self.world, self._result, np.zeros(self.count, np.bool_)
+        facts: dict[str, Array] = {
+            "corners": world.corners,
+            "goals": world.goals,
+            "overlap": np.zeros(self.count) if result is None else result.overlap,
+            "refused": none if result is None else result.refused,
+            "blocked": none if result is None else result.blocked,
+        }
+        if world.sim.pixels:
+            camera = None if result is None else result.camera_rewards
+            facts["camera"] = np.zeros(self.count) if camera is None else camera
+        if world.sight is not None:
+            facts["pictures"] = world.pictures
+        return facts
+
+    def close(self) -> None:
+        """Close all worlds."""
+        self.world.close()
+
+
+def make_eye(task: "Place") -> Eye | None:
+    """What finds the tokens of a task in pictures; None where corners are observed.
+
+    Raises:
+        ConfigError: OpenCV is not installed.
+    """
+    if not task.sim.looks:
+        return None
+    try:
+        # Only here: most workers look at nothing, and its import takes time and memory.
+        from tangram_vision.pictures.seeing import see  # noqa: PLC0415
+    except ImportError as error:  # also a library that OpenCV needs in its turn
+        raise no_opencv(str(error)) from error
+    layout, arena = task.layout, task.sim.arena
+
+    def look(picture: Pixels, before: Look | None = None) -> Look:
+        return see(picture, layout, arena, before)
+
+    return look

@@ -1,0 +1,132 @@
+"""Episodes of tokens as scores, rivals and pictures see them.
+
+Legend: E episodes, B environments, T steps of an episode, K tokens, V corners, A entries of an
+action.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from tangram_core import task
+from tangram_core.arrays import Bools, Floats, Pixels, Singles
+from tangram_core.spec import Array, Arrays, Episodes
+from tangram_core.task import Chooser, Env, Generators, History
+from tangram_sim.batch import BatchedEnv
+from tangram_tasks.env import PlaceEnv
+
+
+@dataclass(frozen=True, eq=False)
+class Past:
+    """What was seen and done in B episodes so far, t actions in each.
+
+    Attributes:
+        corners: (B, t, V, 2) of the tokens before each action.
+        actions: (B, t, A).
+        seen: (B, t + 1, K) which tokens were seen before each action, and now; None: all were.
+    """
+
+    corners: Singles
+    actions: Singles
+    seen: Array | None = None
+
+    @staticmethod
+    def of(history: History) -> "Past":
+        """What of a history is the tokens'."""
+        corners = history.seen["corners"][:, :-1]
+        return Past(corners, history.actions, history.seen.get("seen"))
+
+
+# (corners (B, V, 2), closed (B, K), goals (B, V, 2), one generator each, what was before)
+# -> actions (B, A)
+Choose = Callable[[Floats, Bools, Floats, Generators, Past], Singles]
+
+
+def closed(seen: Arrays) -> Array:
+    """(B, K) tokens that no action should name: placed, or not seen while others are."""
+    return seen.get("closed", seen["placed"])
+
+
+def chooser(choose: Choose) -> Chooser:
+    """A policy of corners as one of what is observed."""
+
+    def of_seen(seen: Arrays, past: History, generators: Generators) -> Singles:
+        corners, goals = (np.asarray(seen[name], np.float64) for name in ("corners", "goals"))
+        flags = np.asarray(closed(seen), np.bool_)
+        return choose(corners, flags, goals, generators, Past.of(past))
+
+    return of_seen
+
+
+def plain(choose: Choose) -> Callable[[Env], Chooser]:
+    """A rival that is told nothing of the worlds that it plays in."""
+    return lambda _: chooser(choose)
+
+
+def told(make: Callable[[BatchedEnv], Choose]) -> Callable[[Env], Chooser]:
+    """A rival that is made for the worlds that it plays in."""
+
+    def of_env(env: Env) -> Chooser:
+        if not isinstance(env, PlaceEnv):
+            raise TypeError(f"{type(env).__name__} has no tokens")
+        return chooser(make(env.world))
+
+    return of_env
+
+
+@dataclass(frozen=True, eq=False)
+class Played:
+    """E whole episodes: what travels of them, and what only the environments know.
+
+    Attributes:
+        episodes: corners and goals as the policy saw them, its actions and their rewards.
+        corners: (E, T + 1, V, 2) as they are, before each step and after the last.
+        goals: (E, V, 2) corners of the targets as they are.
+        overlap: (E,) raw overlap of exact polygons after the last step.
+        refused: (E, T) where the action named a placed token.
+        blocked: (E, T) where a token could not be set down on others.
+        seconds: (E,) wall time of choosing and moving, an equal share for each of those that were
+            played together.
+        slowest: (E,) processor time of their slowest choice, in seconds.
+        camera: (E,) Eq. 14 of the pictures after the last step; None without a camera.
+        pictures: (E, T + 1, P, P) that were shown to the agent; None where it sees no pictures.
+    """
+
+    episodes: Episodes
+    corners: Floats
+    goals: Floats
+    overlap: Floats
+    refused: Bools
+    blocked: Bools
+    seconds: Floats
+    slowest: Floats
+    camera: Floats | None
+    pictures: Pixels | None
+
+    @property
+    def starts(self) -> Floats:
+        """(E, V, 2) corners of the tokens before the first action."""
+        return self.corners[:, 0]
+
+    @property
+    def ends(self) -> Floats:
+        """(E, V, 2) corners of the tokens after the last action."""
+        return self.corners[:, -1]
+
+    @staticmethod
+    def of(played: task.Played) -> "Played":
+        """What the facts of a `PlaceEnv` say."""
+        facts = played.facts
+        return Played(
+            episodes=played.episodes,
+            corners=facts["corners"],
+            goals=facts["goals"][:, 0],
+            overlap=facts["overlap"][:, -1],
+            refused=facts["refused"][:, 1:],
+            blocked=facts["blocked"][:, 1:],
+            seconds=played.seconds,
+            slowest=played.slowest,
+            camera=facts["camera"][:, -1] if "camera" in facts else None,
+            pictures=facts.get("pictures"),
+        )

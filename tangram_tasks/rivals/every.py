@@ -1,0 +1,30 @@
+"""Which rivals play a task of tokens."""
+
+from collections.abc import Callable, Mapping
+
+from tangram_core.task import Chooser, Env
+from tangram_sim.config import SimConfig
+from tangram_sim.geometry.layout import Layout
+from tangram_tasks.played import plain, told
+from tangram_tasks.rivals.baselines import exact_policy, position_policy, random_policy
+from tangram_tasks.rivals.oracle import oracle_policy
+from tangram_tasks.rivals.sweeps import MAX_TOKENS, sweep_policy
+
+
+def rivals_of(layout: Layout, sim: SimConfig) -> Mapping[str, Callable[[Env], Chooser]]:
+    """Those that a world has, the strongest first.
+
+    `exact` moves every token exactly onto its target, `position only` one token onto its centre and
+    never turns it, `random` is chance. Where tokens slide, `sweep rule` is `exact` in the order
+    that pushes the least out of place. Where a world moves tokens otherwise than actions say, or
+    several noisy looks at them can be put together, `oracle` knows that world and its noise.
+    """
+    several = layout.tokens > 1 or sim.actions_per_token > 1
+    found = {"exact": plain(exact_policy(layout, sim))}
+    if sim.motion == "slide" and layout.tokens <= MAX_TOKENS:
+        found["sweep rule"] = plain(sweep_policy(layout, sim))
+    if sim.inexact or (sim.corner_noise and several):
+        found["oracle"] = told(oracle_policy)
+    if layout.tokens == 1:
+        found["position only"] = plain(position_policy(layout, sim))
+    return found | {"random": plain(random_policy(layout, sim))}
