@@ -12,9 +12,8 @@ from conf.cli import entry, tell
 from conf.commands import Plain
 
 if TYPE_CHECKING:
-    from tangram_agent.task import Place
-
     from tangram_game.config import EvalConfig, PlayConfig
+    from tangram_tasks.place import Place
 
 
 def evaluate() -> int:
@@ -28,8 +27,7 @@ def play() -> int:
 
 
 def _evaluate(settings: Plain) -> int:
-    from tangram_agent.task import from_mapping
-
+    from tangram_core.setup import from_mapping
     from tangram_core.store.files import check_writable
     from tangram_game.config import EvalConfig
 
@@ -46,8 +44,7 @@ def _evaluate(settings: Plain) -> int:
 
 
 def _play(settings: Plain) -> int:
-    from tangram_agent.task import from_mapping
-
+    from tangram_core.setup import from_mapping
     from tangram_core.store.files import check_writable
     from tangram_game.config import PlayConfig, check_compare
 

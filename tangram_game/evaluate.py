@@ -37,7 +37,7 @@ from tangram_game.scores import (
 from tangram_sim.config import SILHOUETTES, SimConfig
 from tangram_sim.drawing.game_drawing import figure_sheet
 from tangram_tasks.place import Place
-from tangram_tasks.played import Played, told
+from tangram_tasks.played import Played
 from worker.score.test_set import FixedTests
 
 MAX_PICTURES = 100  # on a sheet
@@ -123,9 +123,11 @@ def policies(run: Run) -> dict[str, Player]:
             result["beam=1"] = by(run.with_settings({"agent": {"beam": 1}}).actor)
         # Of places that are worth the same the first is taken: that of the largest token.
         return {**result, "largest first": by(run.unlearned().actor), **rivals}
-    first = {name: rivals.pop(name) for name in ("exact", "sweep rule") if name in rivals}
+    first: dict[str, Player] = {
+        name: rivals.pop(name) for name in ("exact", "sweep rule") if name in rivals
+    }
     if task.sim.inexact or (task.sim.corner_noise and task.horizon > 1):
-        first["fitted"] = told(fitted_policy)
+        first["fitted"] = fitted_policy
     return {**result, **first, **rivals}
 
 
@@ -196,7 +198,7 @@ def _report(run: Run, config: EvalConfig, scores: Mapping[str, Scores]) -> dict[
         "updates": run.updates,
         "tokens": [shape.name for shape in task.layout.shapes],
         "sim": asdict(task.sim),
-        "agent": asdict(run.setup.agent.config),
+        "agent": run.setup.config()["agent"],
         "baselines": {name: values for name, values in scores.items() if name != RUN},
     }
 

@@ -137,7 +137,7 @@ def score_hidden(
     except ImportError as error:
         raise _no_library(task, error) from error
     hidden = hide(task, figures, seed, together(task.layout))
-    laid = {name: play_hidden(hidden, player, seed) for name, player in players.items()}
+    laid = {name: play_hidden(hidden, player, seed, at_once) for name, player in players.items()}
     return _of_hidden({name: (hidden, own) for name, own in laid.items()})
 
 

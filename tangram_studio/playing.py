@@ -17,6 +17,7 @@ import torch
 
 from tangram_agent.runs import Run, load_changed
 from tangram_core.arrays import Bools, Floats, Singles
+from tangram_core.task import History
 from tangram_sim.batch import BatchedEnv, Starts
 from tangram_sim.config import RewardConfig
 from tangram_sim.geometry.overlap import overlap_share
@@ -24,9 +25,9 @@ from tangram_sim.motion.actions import chosen_tokens
 from tangram_sim.world.world import World, make_world
 from tangram_tasks.metrics import iou
 from tangram_tasks.pairing import paired
-from tangram_tasks.played import Past
+from tangram_tasks.played import chooser
 from tangram_tasks.rivals.sweeps import sweep_policy
-from worker.score.test_set import greedy
+from worker.play.rollout import greedy
 
 AGENT = "pretrained/tangram7"
 SIM = {"lift": {}, "slide": {"motion": "slide", "actions_per_token": 2}}
@@ -90,7 +91,7 @@ class _Player:
         sim = replace(task.sim.blind, starts="outside")
         self.env = BatchedEnv(self.layout, sim, RewardConfig(), 1)
         slides = motion == "slide"
-        self.choose = sweep_policy(self.layout, sim) if slides else greedy(self.run.policy)
+        self.choose = chooser(sweep_policy(self.layout, sim)) if slides else greedy(self.run.actor)
         self._shown: World | None = make_world(self.layout, sim) if slides else None
 
     def frames(self, before: Floats, after: Floats, flipped: Bools, token: int) -> Floats:
@@ -155,9 +156,11 @@ def next_move(scene: Sides, goal: Sides, motion: str, done: Round | None) -> Mov
     token, blocked, frames = None, False, scene.poses[None]
     if not placed.all():
         before = layout.poses(env.corners)[0]
-        past = Past(done.corners[None], done.actions[None])
         here = env.corners.astype(np.float32)
-        actions = own.choose(env.seen, env.closed, env.seen_goals, [], past)
+        corners = np.concatenate([done.corners, here])[None]
+        past = History({"corners": corners}, done.actions[None])
+        seen = {"corners": env.seen, "placed": env.closed, "goals": env.seen_goals}
+        actions = own.choose(seen, past, [])
         result = env.step(actions.astype(np.float64))
         done = Round(np.concatenate([done.corners, here]), np.concatenate([done.actions, actions]))
         after = layout.poses(env.corners)[0]

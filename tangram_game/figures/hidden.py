@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from tangram_core.agent import AT_ONCE
 from tangram_core.arrays import Bools, Floats, Ints
 from tangram_game.figures.puzzles import Figure, figure_generator, play_figures
 from tangram_game.figures.silhouettes import SECONDS
@@ -200,14 +201,14 @@ def _search(figure: Figure, filled: Filled, corner: Floats) -> Search:
     return Search(laid, filled.iou, filled.seconds, filled.by if laid else "")
 
 
-def play_hidden(hidden: Hidden, player: Player, seed: int) -> Laid:
+def play_hidden(hidden: Hidden, player: Player, seed: int, at_once: int = AT_ONCE) -> Laid:
     """Lay what was found and judge it by the silhouettes."""
     layout, arena, count = hidden.task.layout, hidden.task.sim.arena, len(hidden.figures)
     seconds = np.array([search.seconds for search in hidden.searches])
     ends: Floats = hidden.goals + _BEYOND * arena
     blocked, refused, used = (np.zeros(count, np.int64) for _ in range(3))
     if len(hidden.found):
-        played, rows = lay(hidden, player, seed), hidden.found
+        played, rows = lay(hidden, player, seed, at_once), hidden.found
         ends[rows] = played.ends
         blocked[rows], refused[rows] = played.blocked.sum(axis=1), played.refused.sum(axis=1)
         used[rows] = played.refused.shape[1] - refused[rows]
@@ -216,11 +217,11 @@ def play_hidden(hidden: Hidden, player: Player, seed: int) -> Laid:
     return Laid(ends, coverage, iou(layout, ends, coverage), blocked, refused, used, seconds)
 
 
-def lay(hidden: Hidden, player: Player, seed: int) -> Played:
+def lay(hidden: Hidden, player: Player, seed: int, at_once: int = AT_ONCE) -> Played:
     """Lay what was found, F episodes; the targets are what was found, too."""
     laid = [search.laid for search in hidden.searches if search.laid is not None]
     views = None if hidden.views is None else [hidden.views[e] for e in hidden.found]
-    return play_figures(hidden.task, laid, player, seed, views=views)
+    return play_figures(hidden.task, laid, player, seed, views=views, at_once=at_once)
 
 
 def means(hidden: Hidden, laid: Laid) -> dict[str, Any]:

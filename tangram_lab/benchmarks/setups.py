@@ -1,23 +1,22 @@
 """Setups of the presets, as the measurements use them."""
 
-from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import yaml
 
 import conf
 from tangram_agent.types import Transitions
-from tangram_core.arrays import Bools, Floats, Singles
-from tangram_core.setup import SECTIONS, Setup, make_setup
-from tangram_core.spec import Episodes
-from tangram_sim.batch import BatchedEnv
+from tangram_core.arrays import Singles
+from tangram_core.setup import Setup, make_setup
+from tangram_core.spec import Arrays, Episodes
+from tangram_core.task import Generators, History
 from tangram_sim.geometry.layout import TokensConfig
 from tangram_sim.puzzles.assembly import COUNTS
-from tangram_tasks.played import Past
+from tangram_tasks.place import Place
 from worker.play.rollout import Rollout
 
 
@@ -40,8 +39,20 @@ def preset(agent: str = "tangram", tokens: str = "square") -> Setup:
         if isinstance(line, dict)
         for value in line.values()
     )
-    choices = dict(zip(SECTIONS, (tokens, "physics", "overlap", agent, net), strict=True))
+    choices = {
+        "task": "place",
+        "tokens": tokens,
+        "sim": "physics",
+        "reward": "overlap",
+        "agent": agent,
+        "net": net,
+    }
     return make_setup({name: group(name, choice) for name, choice in choices.items()})
+
+
+def place(setup: Setup) -> Place:
+    """The task of such a setup."""
+    return cast("Place", setup.task)
 
 
 SEVEN = tuple(name for name, count in COUNTS.items() for _ in range(count))
@@ -50,17 +61,18 @@ SEVEN = tuple(name for name, count in COUNTS.items() for _ in range(count))
 def several(count: int) -> Setup:
     """The first tans of the game, each moved once, in the game's arena."""
     setup = preset()
-    return replace(setup, tokens=TokensConfig(SEVEN[:count], 0.6))
+    return replace(setup, task=replace(place(setup), tokens=TokensConfig(SEVEN[:count], 0.6)))
 
 
 def with_sim(setup: Setup, **values: Any) -> Setup:
     """Another simulation."""
-    return replace(setup, sim=replace(setup.sim, **values))
+    return replace(setup, task=place(setup).with_sim(**values))
 
 
 def with_agent(setup: Setup, **values: Any) -> Setup:
     """Another agent."""
-    return replace(setup, agent=replace(setup.agent, **values))
+    agent: Any = setup.agent
+    return replace(setup, agent=replace(agent, config=replace(agent.config, **values)))
 
 
 # Episodes and transitions of them
@@ -72,31 +84,24 @@ ENVS = 32
 def played(setup: Setup, count: int) -> Episodes:
     """Episodes of random actions, without an engine; `count` is a multiple of ENVS."""
 
-    def choose(
-        _corners: Floats,
-        _placed: Bools,
-        _goals: Floats,
-        generators: Sequence[np.random.Generator],
-        _past: Past,
-    ) -> Singles:
-        rows = [generator.uniform(-1.0, 1.0, setup.action_size) for generator in generators]
-        return np.array(rows, np.float32)
+    def choose(_seen: Arrays, _past: History, generators: Generators) -> Singles:
+        size = setup.spec.action_size
+        return np.array([g.uniform(-1.0, 1.0, size) for g in generators], np.float32)
 
-    sim = replace(setup.sim, backend="kinematic")
-    with closing(BatchedEnv(setup.layout, sim, setup.reward, ENVS)) as env:
-        rollout = Rollout(env, 0, "player", 0, 0)
-        return rollout.play(choose, count // ENVS)
+    task = place(setup).with_sim(backend="kinematic")
+    with closing(task.make(ENVS)) as env:
+        return Rollout(env, task.spec, 0, "player", 0, 0).play(choose, count // ENVS)
 
 
 def random_transitions(setup: Setup, count: int) -> Transitions:
     """Transitions of the right shapes; nothing moves as it would."""
-    rng, layout = np.random.default_rng(0), setup.layout
+    rng, layout = np.random.default_rng(0), place(setup).layout
     corners, tokens = layout.corner_count, layout.tokens
     state, after, goal = rng.uniform(-1, 1, (3, count, corners, 2)).astype(np.float32)
     return Transitions(
         state=state,
         placed=np.zeros((count, tokens), np.uint8),
-        action=rng.uniform(-1, 1, (count, setup.action_size)).astype(np.float32),
+        action=rng.uniform(-1, 1, (count, setup.spec.action_size)).astype(np.float32),
         reward=rng.uniform(-1, 1, count).astype(np.float32),
         next_state=after,
         next_placed=np.ones((count, tokens), np.uint8),

@@ -18,7 +18,6 @@ import numpy as np
 import safetensors.numpy
 import torch
 import yaml
-from tangram_agent.policy import Policy
 
 from tangram_agent.checkpoints import ACTING, CHECKPOINTS, load_checkpoint, newest_checkpoint
 from tangram_agent.pretrained import CARD, CARD_TEXT, CONFIG, FORMAT, PREFIX, WEIGHTS
@@ -30,9 +29,9 @@ from tangram_core.store.files import check_writable, write_whole
 from tangram_game.config import EvalConfig
 from tangram_game.evaluate import policies, score_policies
 from tangram_game.figures.puzzles import find_figures
+from tangram_game.playing import by
 from tangram_game.scores import RUN, score_outlines, score_puzzles
 from tangram_sim.targets.targets import has_all_tans
-from worker.score.test_set import greedy
 
 PACKAGE = Path(__file__).resolve().parents[2] / "tangram_agent" / "pretrained"
 RESULT = "result.json"
@@ -81,16 +80,17 @@ def publish(
         chosen = chosen._replace(run=chosen.run.with_settings(shipped))
     weights = _weights(chosen.run)
     config = EvalConfig(str(chosen.run.folder), episodes=tests, seed=TEST_SEED)
-    scores = score_policies(chosen.run.setup, policies(chosen.run), config)
+    scores = score_policies(chosen.run.task, policies(chosen.run), config, chosen.run.actor.at_once)
     card = make_card(name, chosen, seeds)
     card |= {"tests": {"episodes": tests, "seed": TEST_SEED, "scores": scores}}
-    setup = chosen.run.setup
-    if has_all_tans(setup.layout) and setup.sim.observe != "pictures":  # of pieces that touch
+    task = chosen.run.task
+    if has_all_tans(task.layout) and task.sim.observe != "pictures":  # of pieces that touch
         card |= {"puzzles": {split: _on_figures(chosen.run, split) for split in FIGURES}}
     card |= {"sha256": hashlib.sha256(weights).hexdigest()}
     folder = target / name
     # What makes the setup, every value written out; a run's config also names its machine.
-    write_whole(folder / CONFIG, yaml.safe_dump(asdict(chosen.run.setup), sort_keys=False).encode())
+    content = yaml.safe_dump(chosen.run.setup.config(), sort_keys=False)
+    write_whole(folder / CONFIG, content.encode())
     write_whole(folder / WEIGHTS, weights)
     write_whole(folder / CARD_TEXT, card_text(card).encode())
     write_whole(folder / CARD, (json.dumps(card, indent=1) + "\n").encode())
@@ -99,14 +99,14 @@ def publish(
 
 def _shipped(setup: Setup) -> dict[str, dict[str, Any]]:
     """What an agent ships with beside what it was trained with."""
-    return AHEAD if setup.fills else {}
+    return AHEAD if setup.agent_kind == "outline" else {}
 
 
 def _on_figures(run: Run, split: str) -> dict[str, Any]:
     """Scores of a run on the figures of a split."""
-    figures = find_figures(split, run.setup, None, TURNS)
-    score = score_outlines if run.setup.fills else score_puzzles
-    scored = score(run.setup, figures, {RUN: greedy(run.policy)}, TEST_SEED)
+    figures = find_figures(split, run.task, None, TURNS)
+    score = score_outlines if run.task.outlines else score_puzzles
+    scored = score(run.task, figures, {RUN: by(run.actor)}, TEST_SEED, run.actor.at_once)
     return {"turns": TURNS, "scores": scored.means[RUN]}
 
 
@@ -192,17 +192,16 @@ def make_card(name: str, chosen: Candidate, seeds: Sequence[Candidate]) -> dict[
         chosen: the run that ships.
         seeds: all runs, by seed.
     """
-    setup, result = chosen.run.setup, chosen.result
-    acting = sum(parameter.numel() for parameter in Policy(setup).network.parameters())
+    task, setup, result = chosen.run.task, chosen.run.setup, chosen.result
+    acting = sum(tensor.size for tensor in chosen.run.weights.tensors.values())
     return {
         "format": FORMAT,
         "name": name,
         "licence": "MIT",
-        "tokens": [shape.name for shape in setup.layout.shapes],
-        "scale": setup.tokens.scale,
-        "agent": setup.agent.name,
-        "net": setup.net.kind,
-        "sim": {key: told(value) for key, value in asdict(setup.sim).items()},
+        "tokens": [shape.name for shape in task.layout.shapes],
+        "scale": task.tokens.scale,
+        **setup.agent.facts(),
+        "sim": {key: told(value) for key, value in asdict(task.sim).items()},
         "parameters": {"acting": acting, "trained": result["parameters"]},
         "budget": _picked(result, *_BUDGET),
         **_picked(result, "updates", "seed", "episodes", "transitions", "test_episodes"),

@@ -1,12 +1,12 @@
 """Updates: compiled, on a GPU, and against Stable-Baselines3's on the same perceptron."""
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
-from tangram_agent.learner import Learner
 
+from tangram_agent.base.ddpg import Ddpg
 from tangram_agent.types import Transitions
 from tangram_core.errors import ConfigError
 from tangram_core.setup import Setup
@@ -30,7 +30,7 @@ def _compiled(runs: int) -> list[Row]:
     rows = []
     for name, setup, size, least in cases:
         made = with_agent(setup, batch_size=size)
-        whole = updates(made, Learner(made, 0, compiled=True))
+        whole = updates(made, learner(made, compiled=True))
         given = ("learner", f"{name}, batch {size}, compiled", "updates/s"), whole
         rows.append(compare(*given, ("single operations", updates(made)), runs, Bound(least)))
     return rows
@@ -47,9 +47,9 @@ def measure_gpu(runs: int) -> list[Row]:
     rows = []
     for name, made in gpu_cases().items():
         ways = {
-            "ours": updates(made, Learner(made, 0, "cuda", compiled=True)),
-            "single operations on it": updates(made, Learner(made, 0, "cuda")),
-            "one core, compiled": updates(made, Learner(made, 0, compiled=True)),
+            "ours": updates(made, learner(made, "cuda", compiled=True)),
+            "single operations on it": updates(made, learner(made, "cuda")),
+            "one core, compiled": updates(made, learner(made, compiled=True)),
         }
         found, labels = rates(ways, runs), ("gpu", f"{name}, compiled", "updates/s")
         for against, bound in zip([*ways][1:], (Bound(5.0), None), strict=True):
@@ -67,14 +67,19 @@ def gpu_cases() -> dict[str, Setup]:
     }
 
 
-def updates(setup: Setup, learner: Learner | None = None) -> Work:
-    """Updates on one batch; of the project's own learner if none is given."""
-    learner = learner or Learner(setup, 0)
-    transitions = random_transitions(setup, setup.agent.batch_size)
-    batch = learner.prepared(transitions, np.random.default_rng(0))
+def learner(setup: Setup, device: str = "cpu", *, compiled: bool = False) -> Ddpg:
+    """What learns in a setup."""
+    return cast("Ddpg", setup.agent.learner(setup.task, 0, device, compiled=compiled))
+
+
+def updates(setup: Setup, made: Ddpg | None = None) -> Work:
+    """Updates on one batch; by single operations where no learner is given."""
+    own = made or learner(setup)
+    batch = random_transitions(setup, own.config.batch_size)
+    steps = own.steps(batch, np.random.default_rng(0))
 
     def work() -> int:
-        learner.update(batch)
+        own.learn(steps)
         return 1
 
     return work
@@ -112,14 +117,16 @@ def _beside_theirs(runs: int) -> list[Row]:
             how = f"{name}, compiled" if compiled else name
             labels = "learner", f"perceptron [64, 64], batch {BATCH}, {how}", "updates/s"
             bound = Bound(least=2.0 if compiled else 1.5) if name.startswith("every") else None
-            ours = _on_batch(Learner(made, 0, compiled=compiled), batch)
+            ours = _on_batch(learner(made, compiled=compiled), batch)
             rows.append(compare(labels, ours, (label(), _theirs(model, drawn)), runs, bound))
     return rows
 
 
-def _on_batch(learner: Learner, batch: Transitions) -> Work:
+def _on_batch(own: Ddpg, batch: Transitions) -> Work:
+    generator = np.random.default_rng(0)
+
     def update() -> float:
-        learner.update(batch)
+        own.learn(own.steps(batch, generator))
         return 1.0
 
     return update

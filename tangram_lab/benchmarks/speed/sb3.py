@@ -24,10 +24,10 @@ import torch
 from tangram_core.arrays import Bools, Floats, Singles
 from tangram_core.errors import TangramError
 from tangram_core.seeding import evaluation_generators
-from tangram_lab.benchmarks.setups import preset
-from tangram_sim.batch import BatchedEnv
-from tangram_tasks.played import Past
-from worker.play.rollout import Generators, play
+from tangram_core.task import Generators
+from tangram_lab.benchmarks.setups import place, preset
+from tangram_tasks.played import Past, Played, chooser
+from worker.play.rollout import play
 
 LIBRARY = "stable_baselines3"
 NOISE = 0.1
@@ -212,8 +212,8 @@ class Watch:
 
 def _exam(model: Any) -> Callable[[], float]:
     """The mean overlap in our fixed tests, noise off."""
-    setup = preset()
-    env = BatchedEnv(setup.layout, setup.sim, setup.reward, AT_ONCE)
+    task = place(preset())
+    env = task.make(AT_ONCE)
 
     def choose(
         corners: Floats, placed: Bools, goals: Floats, _: Generators, _past: Past
@@ -223,7 +223,9 @@ def _exam(model: Any) -> Callable[[], float]:
 
     def exam() -> float:
         generators = evaluation_generators(TESTS)
-        return float(np.mean(play(env, choose, generators.__getitem__, TESTS).overlap))
+        number = generators.__getitem__
+        played = play(env, task.spec, chooser(choose), number, TESTS, facts=True)
+        return float(np.mean(Played.of(played).overlap))
 
     return exam
 

@@ -12,12 +12,11 @@ from tangram_core.seeding import episode_generator
 from tangram_core.service import ServiceConfig
 from tangram_core.setup import Setup
 from tangram_lab.benchmarks.measure import Bound, Row, compare
-from tangram_lab.benchmarks.setups import preset, several, with_sim
+from tangram_lab.benchmarks.setups import place, preset, several, with_sim
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.sight.pictures import taken_pixels
 from tangram_sim.world.engine import pybullet
-from worker.play.looking import environments
 
 # A bare PyBullet loop
 
@@ -171,18 +170,20 @@ def _row(case: str, setup: Setup, runs: int, bound: Bound | None = None) -> Row:
 
 
 def _bare(setup: Setup) -> BareLoop:
-    return BareLoop(setup.layout, setup.sim, setup.horizon)
+    task = place(setup)
+    return BareLoop(task.layout, task.sim, task.horizon)
 
 
 class Episodes:
     """Whole episodes with actions drawn beforehand, as many at a time as a worker plays."""
 
     def __init__(self, setup: Setup) -> None:
-        self.env = environments(setup, ENVS)
+        task = place(setup)
+        self.env = task.make(ENVS).world
         rng = np.random.default_rng(0)
-        self.actions = rng.uniform(-0.5, 0.5, (setup.horizon, ENVS, setup.action_size))
-        if setup.layout.tokens > 1:
-            moved = (2.0 * np.arange(setup.horizon) + 1.0) / setup.horizon - 1.0
+        self.actions = rng.uniform(-0.5, 0.5, (task.horizon, ENVS, task.action_size))
+        if task.layout.tokens > 1:
+            moved = (2.0 * np.arange(task.horizon) + 1.0) / task.horizon - 1.0
             self.actions[..., 0] = moved[:, None]
         self.number = 0
 

@@ -13,12 +13,11 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event, Thread
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import yaml
 import zmq
-from tangram_agent.policy import Policy
 
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
 from tangram_agent.messages import WORKER_COLUMNS, RunStatus
@@ -33,8 +32,8 @@ from tangram_lab.benchmarks.trainings import (
     wait_for,
 )
 from tangram_lab.benchmarks.trials.proxy import DOWN, UP, Proxy
-from tangram_sim.batch import BatchedEnv
-from worker.play.rollout import Rollout
+from worker.play.rollout import Rollout, exploring
+from worker.play.session import Acting
 from worker.status import ask_status
 from worker.talk.client import Client
 
@@ -75,32 +74,33 @@ class Witness(Thread):
             self.error = error
 
     def _play(self) -> None:
-        setup, policy = self.setup, Policy(self.setup)
+        setup = self.setup
+        acting = Acting(setup.agent.actor(setup.task))
         client = Client(
             self._connect,
             "player",
             INDEX,
             setup.fingerprints(),
             setup.spec,
-            policy.shapes,
+            acting.actor.shapes,
         )
-        with closing(BatchedEnv(setup.layout, setup.sim, setup.reward, ENVS)) as env, client:
+        with closing(setup.task.make(ENVS)) as env, client:
             client.on_progress = lambda: self._look(client)
             if not client.join():
                 return
             first = client.wait_for_weights()
             if first is None:
                 return
-            policy.follow(first)
+            acting.follow(first)
             me = client.welcome
-            rollout = Rollout(env, me.seed, "witness", me.index, me.incarnation)
+            rollout = Rollout(env, setup.spec, me.seed, "witness", me.index, me.incarnation)
             while client.wait_for_window():
                 newest = client.newest_weights()
                 if newest is not None:
-                    policy.follow(newest)
-                episodes = rollout.play(policy.explore)
+                    acting.follow(newest)
+                episodes = rollout.play(exploring(acting.actor))
                 self.sent.append(keys(episodes["corners"][:, 0], episodes.actions[:, 0]))
-                if not client.send(episodes, policy.version):
+                if not client.send(episodes, acting.version):
                     self.sent.pop()
             self._look(client)
 
@@ -127,7 +127,7 @@ def compare(folder: Path, witness: Witness) -> dict[str, int]:
     replay = load_checkpoint(list_checkpoints(folder / "checkpoints")[-1]).arrays["replay"]
     found = keys(replay["state"], replay["action"])
     counts = Counter(found)
-    copies = 1 + sum(one.copies for one in witness.setup.agent.hindsight)
+    copies = 1 + sum(one.copies for one in cast("Any", witness.setup.agent).config.hindsight)
     acknowledged = [key for batch in witness.sent[: witness.acknowledged] for key in batch]
     every = [key for batch in witness.sent for key in batch]
     return {
