@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tangram_agent.policy import Policy
+from worker.play.looking import environments
 
 from conf.commands import COMMANDS, GROUPS, load
 from conf.settings import NESTED
@@ -20,7 +20,7 @@ from tangram_core.errors import TangramError
 from tangram_core.service import ServiceConfig
 from tangram_core.settings import declared_fields
 from tangram_core.setup import Setup, make_setup
-from worker.play.looking import environments
+from tests.agent.builders import Policy
 from worker.play.rollout import Rollout
 
 pytestmark = pytest.mark.fast
@@ -99,7 +99,7 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "net.feed_forward": (ONE, 9),
     "net.scale": (ONE, "sqrt_d"),
     "agent.motion": (ONE, "exact"),
-    "agent.saturation_penalty": (over(ONE, agent={"readout": "token"}), 9.0),
+    "agent.saturation_penalty": (over(ONE, agent={"kind": "scene"}), 9.0),
     "agent.readout": (SEVERAL, "token"),
     "agent.reapply": (SEVERAL, 0),
     "agent.gamma": (PAPER, 0.5),

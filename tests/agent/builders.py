@@ -11,15 +11,17 @@ import numpy as np
 import pytest
 
 from tangram_agent.pretrained import CARD, WEIGHTS
+from tangram_agent.runs import beginning
 from tangram_agent.types import Transitions
 from tangram_core.setup import Setup, make_setup
 from tangram_core.spec import Episodes, EpisodeSpec
+from tangram_core.task import History
 
 SQUARE = {"shapes": ["square"], "scale": 1.131370849898476}  # side 0.4
 PAIR = {"shapes": ["square", "large_triangle"], "scale": 0.8}
 
 PAPER = {
-    "readout": "token",
+    "kind": "scene",
     "saturation_penalty": 0.0,
     "gamma": 0.99,
     "acting_average": 0.0,
@@ -28,7 +30,7 @@ PAPER = {
 # One relabelled goal, and on pairs one proposal of exact motion: what most tests need.
 PLAIN: dict[str, Any] = {"hindsight": [{"strategy": "final"}]}
 PROPOSAL = {"reapply": 0, "motion": "exact"}
-SCENE = {"readout": "token"}
+SCENE = {"kind": "scene"}
 SMALL = {"width": 16, "layers": 2, "feed_forward": 32}
 
 
@@ -39,18 +41,45 @@ def setup(
     **sim: Any,
 ) -> Setup:
     """A setup on the kinematic backend with a small network."""
-    given = PLAIN | (agent or {})
-    if given.get("readout") != "token":
-        given = PROPOSAL | given
+    kind = (agent or {}).get("kind", "pair")
+    usual = {"pair": PLAIN | PROPOSAL, "scene": PLAIN}.get(kind, {})
     return make_setup(
         {
+            "task": {"kind": "fill" if kind == "outline" else "place"},
             "tokens": tokens,
             "sim": {"backend": "kinematic", **sim},
             "reward": {},
-            "agent": given,
+            "agent": {"kind": kind} | usual | (agent or {}),
             "net": net,
         }
     )
+
+
+class Policy:
+    """An actor, asked for corners (B, V, 2), placed (B, K) and goals (B, V, 2)."""
+
+    def __init__(self, made: Setup) -> None:
+        self.made, self.actor = made, made.agent.actor(made.task)
+
+    def load(self, tensors: dict[str, Any]) -> None:
+        """Take over weights."""
+        self.actor.load(tensors)
+
+    def act(self, corners: Any, placed: Any, goals: Any, past: History | None = None) -> Any:
+        """As well as it can."""
+        return self.explore(corners, placed, goals, None, past)
+
+    def explore(
+        self, corners: Any, placed: Any, goals: Any, generators: Any, past: History | None = None
+    ) -> Any:
+        """With exploration."""
+        seen = {"corners": corners, "placed": placed, "goals": goals}
+        return self.actor.act(seen, past or beginning(self.made.spec, seen), generators)
+
+
+def history(corners: Any, actions: Any) -> History:
+    """Of corners (B, t + 1, V, 2), the last of them now, and actions (B, t, A)."""
+    return History({"corners": corners}, actions)
 
 
 def one_tensor(dtype: str, shape: list[int], data: bytes = bytes(4)) -> bytes:
@@ -75,10 +104,10 @@ NAN = one_tensor("F32", [1], b"\xff" * 4)
 def random_episodes(made: Setup, count: int, seed: int = 0) -> Episodes:
     """Episodes of random poses and actions; poses do not follow from actions."""
     rng = np.random.default_rng(seed)
-    layout, steps = made.layout, made.horizon
+    layout, steps = made.task.layout, made.task.horizon
     poses = rng.uniform([-0.7, -0.7, -3], [0.7, 0.7, 3], (count, steps + 2, layout.tokens, 3))
     corners = layout.corners(poses).astype(np.float32)
-    actions = rng.uniform(-1, 1, (count, steps, made.action_size))
+    actions = rng.uniform(-1, 1, (count, steps, made.task.action_size))
     placed = np.zeros((count, steps + 1, layout.tokens), np.uint8)
     placed[:, -1] = 1
     return Episodes(
@@ -103,7 +132,7 @@ def with_bound(spec: EpisodeSpec, bound: float) -> EpisodeSpec:
 def random_transitions(made: Setup, count: int, seed: int = 0, done: int | None = 1) -> Transitions:
     """Transitions of random poses, unplaced before and placed after."""
     rng = np.random.default_rng(seed)
-    layout = made.layout
+    layout = made.task.layout
     poses = rng.uniform([-0.7, -0.7, -3], [0.7, 0.7, 3], (count, 3, layout.tokens, 3))
     corners = layout.corners(poses).astype(np.float32)
     # As a replay gives them: each in rows of its own.
@@ -112,7 +141,7 @@ def random_transitions(made: Setup, count: int, seed: int = 0, done: int | None 
     return Transitions(
         state=before,
         placed=np.zeros((count, layout.tokens), np.uint8),
-        action=rng.uniform(-1, 1, (count, made.action_size)).astype(np.float32),
+        action=rng.uniform(-1, 1, (count, made.task.action_size)).astype(np.float32),
         reward=rng.uniform(-1, 1, count).astype(np.float32),
         next_state=after,
         next_placed=np.repeat(ends[:, None], layout.tokens, axis=1).astype(np.uint8),

@@ -29,7 +29,11 @@ REFUSED = (NotImplementedError, RuntimeError)
 
 def steps_of(learner: Learner, made: Setup, done: int | None) -> Steps:
     """Of a batch on the learner's device."""
-    drawn = transitions(made, 16, 0) if made.pairs else random_transitions(made, 32, 0, done=done)
+    drawn = (
+        transitions(made, 16, 0)
+        if (made.agent_kind == "pair")
+        else random_transitions(made, 32, 0, done=done)
+    )
     return learner.steps(learner.prepared(drawn, np.random.default_rng(0)))
 
 

@@ -50,7 +50,7 @@ def play(learner: Learner, made: Setup, seeds: range, progress: float = 0.25) ->
     for seed in seeds:
         drawn = (
             transitions(made, 16, seed)
-            if made.pairs
+            if (made.agent_kind == "pair")
             else random_transitions(made, 32, seed, done=None)
         )
         batch = learner.prepared(drawn, np.random.default_rng(seed))
@@ -124,7 +124,7 @@ def test_the_first_unplaced_token_moves(placed: list[int], token: int) -> None:
     assert next_token(torch.tensor([placed])).tolist() == [token]
 
 
-@pytest.mark.parametrize("agent", [PAPER, {"readout": "pair"}])
+@pytest.mark.parametrize("agent", [PAPER, {"kind": "pair"}])
 def test_the_critic_loss_is_the_mean_squared_bellman_error(agent: dict[str, Any]) -> None:
     """Against the value by hand: y from the target networks, 0 after the end."""
     made = setup(agent=agent | {"gamma": 0.9}, actions_per_token=2)
@@ -137,7 +137,7 @@ def test_the_critic_loss_is_the_mean_squared_bellman_error(agent: dict[str, Any]
     y = torch.from_numpy(batch.reward) + 0.9 * follow * (1 - torch.from_numpy(batch.done))
     loss, q = learner.critic_loss(steps)
     assert loss.item() == pytest.approx((q - y).square().mean().item(), rel=1e-5)
-    if not made.pairs:  # those move their tokens on before they are valued
+    if not (made.agent_kind == "pair"):  # those move their tokens on before they are valued
         torch.testing.assert_close(q, learner.critic(steps.view, torch.from_numpy(batch.action)))
 
 
@@ -224,7 +224,7 @@ def test_the_penalty_counts_by_its_weight() -> None:
     """Where the value is flat, the actor's gradient is that of the penalty: twice the weight."""
     norms = []
     for weight in (0.5, 1.0):
-        made = setup(agent={"readout": "token", "saturation_penalty": weight})
+        made = setup(agent={"kind": "scene", "saturation_penalty": weight})
         learner = Learner(made, seed=0)
         with torch.no_grad():
             learner.critic.head.readout.weight.zero_()

@@ -20,8 +20,8 @@ NETS: dict[str, Any] = {"mha": SMALL, "mlp": {"kind": "mlp"}}
 
 
 def networks(made: Setup, seed: int = 0) -> tuple[SceneGraph, Actor, Critic]:
-    graph = SceneGraph(made.layout)
-    actor, critic = Actor(graph, made.net), Critic(graph, made.net)
+    graph = SceneGraph(made.task.layout)
+    actor, critic = Actor(graph, made.agent.net), Critic(graph, made.agent.net)
     generator = torch.Generator().manual_seed(seed)
     initialise(actor, generator)
     initialise(critic, generator)
@@ -88,7 +88,7 @@ def test_actions_of_scenes_stay_in_range(kind: str) -> None:
 
 def test_a_turn_of_pairs_is_atan2_over_k() -> None:
     made = Networks(setup())
-    layout = setup().layout
+    layout = setup().task.layout
     pairs = random_pairs(layout, 0)
     velocity, raw = made.actor(pairs)
     outputs = made.actor.head(pairs)
@@ -105,7 +105,7 @@ def test_the_critic_appends_the_action_to_the_base_of_its_token() -> None:
     scenes = replace(inputs(made, 2), token=torch.tensor([0, 1]))
     critic(scenes, torch.tensor([[0.1, 0.2, 0.3]] * 2))
     appended = seen[0][:, :, 4:]
-    corners = made.layout.corner_count
+    corners = made.task.layout.corner_count
     expected = torch.zeros(2, graph.nodes, 3)
     expected[0, corners] = expected[1, corners + 1] = torch.tensor([0.1, 0.2, 0.3])
     assert torch.equal(appended, expected)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from tangram_agent.learner import Learner
 from tangram_agent.networks import travelling
-from tangram_agent.policy import Policy
 
 from tangram_agent.messages import decode_weights
 from tangram_agent.runs import Run
@@ -22,7 +21,7 @@ from tangram_sim.motion.actuation import full_scale
 from tangram_sim.vector import TangramVectorEnv
 from tangram_tasks.played import Past
 from tests.agent.agents.pair.pair_scenes import PERCEPTRON, SEVEN, TWO, seven, transitions
-from tests.agent.builders import PAIR, PAPER, SCENE, SMALL, random_transitions, setup
+from tests.agent.builders import PAIR, PAPER, SCENE, SMALL, Policy, random_transitions, setup
 from tests.agent.messages import broadcast
 
 pytestmark = pytest.mark.fast
@@ -92,7 +91,10 @@ def test_a_critic_travels_where_it_has_a_say_in_what_is_played(made: Setup, has:
     whole, told = Learner(made, 0).acting_weights(7), Policy(made)
     sent = travelling(whole, made).tensors
     left_out = {name.partition(".")[0] for name in whole.tensors.keys() - sent.keys()}
-    assert (made.critic_plays, left_out) == (has, {"critic"} if made.pairs and not has else set())
+    assert (made.critic_plays, left_out) == (
+        has,
+        {"critic"} if (made.agent_kind == "pair") and not has else set(),
+    )
     assert {name: tensor.shape for name, tensor in sent.items()} == told.shapes
     for parameter in told.network.parameters():
         parameter.fill_(np.nan)
@@ -148,10 +150,10 @@ def test_an_action_says_what_was_chosen(flip: bool) -> None:
     assert actions.shape == (count, 4 + flip)
     assert actions.dtype == np.float32
     np.testing.assert_array_equal(chosen_tokens(actions, 7), choice.token)
-    np.testing.assert_array_equal(flips(actions, made.layout, made.sim), choice.flip)
+    np.testing.assert_array_equal(flips(actions, made.task.layout, made.task.sim), choice.flip)
     assert choice.flip.any() == flip
-    command = choice.velocity * full_scale(made.sim)
-    np.testing.assert_allclose(velocities(actions, made.sim), command, atol=1e-5)
+    command = choice.velocity * full_scale(made.task.sim)
+    np.testing.assert_allclose(velocities(actions, made.task.sim), command, atol=1e-5)
     # By the shorter turn: no entry is cut off.
     assert np.abs(actions).max() <= 1.0
 
@@ -199,13 +201,13 @@ def test_a_share_of_actions_takes_any_token_that_is_left_anywhere() -> None:
     token = chosen_tokens(actions, 7)
     assert not scene[1][np.arange(COUNT), token].any()
     assert set(token) == set(range(7))
-    poses = made.layout.poses(scene[0].astype(np.float64))[np.arange(COUNT), token]
-    end = poses + velocities(actions, made.sim)
+    poses = made.task.layout.poses(scene[0].astype(np.float64))[np.arange(COUNT), token]
+    end = poses + velocities(actions, made.task.sim)
     assert np.abs(end[:, :2]).max() <= 1.0 + 1e-5
     np.testing.assert_allclose(end[:, :2].std(axis=0), 1.0 / np.sqrt(3.0), rtol=0.1)
     assert abs(np.exp(1j * end[:, 2]).mean()) < 0.15
     assert set(actions[:, 1]) == {-1.0, 1.0}
-    turned = flips(actions, made.layout, made.sim)
+    turned = flips(actions, made.task.layout, made.task.sim)
     assert 0.2 < turned[token == PARALLELOGRAM].mean() < 0.8
 
 
@@ -245,7 +247,7 @@ def test_whole_episodes_of_a_token_with_two_sides(readout: str, noise: float) ->
     agent = {"readout": readout}
     made = setup(TWO, agent, PERCEPTRON, allow_flip=True, corner_noise=noise)
     policy = policy_of(made)
-    with closing(BatchedEnv(made.layout, made.sim, made.reward, 4)) as env:
+    with closing(BatchedEnv(made.task.layout, made.task.sim, made.task.reward, 4)) as env:
         env.reset(generators(4))
         for _ in range(env.horizon):
             actions = policy.explore(env.seen, env.placed, env.seen_goals, generators(4))

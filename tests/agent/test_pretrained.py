@@ -9,7 +9,6 @@ import pytest
 import safetensors.numpy
 import yaml
 from tangram_agent.learner import Learner
-from tangram_agent.policy import Policy
 
 from tangram_agent import pretrained
 from tangram_agent.pretrained import CARD, CONFIG, FORMAT, WEIGHTS, agent_names, is_name
@@ -24,6 +23,7 @@ from tests.agent.builders import (
     PROPOSAL,
     SMALL,
     SQUARE,
+    Policy,
     random_transitions,
     setup,
     with_weights,

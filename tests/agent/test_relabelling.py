@@ -13,7 +13,7 @@ pytestmark = pytest.mark.fast
 
 STEPS = 3
 MADE = setup(actions_per_token=STEPS)
-LAYOUT = MADE.layout
+LAYOUT = MADE.task.layout
 # One episode of three steps along x; S[t] are the corners at time t, G is the played goal.
 S = LAYOUT.corners(np.array([[[0.1 * t, 0.0, 0.0]] for t in range(4)])).astype(np.float32)
 G = LAYOUT.corners(np.array([[0.0, 0.8, 0.0]])).astype(np.float32)
@@ -122,7 +122,7 @@ def test_copies_and_kinds_stand_one_after_the_other() -> None:
 
 def test_near_goals_lie_on_the_side_that_was_reached() -> None:
     made = setup({"shapes": ["parallelogram"], "scale": 1.0}, actions_per_token=STEPS)
-    layout = made.layout
+    layout = made.task.layout
     path = np.array([[[0.1 * t, 0.0, 0.0]] for t in range(4)])
     corners = layout.corners(path, np.ones((4, 1), dtype=bool)).astype(np.float32)
     there = {"corners": corners[None], "goals": corners[None, 0]}

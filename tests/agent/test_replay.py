@@ -16,7 +16,7 @@ MADE = setup(PAIR)
 
 
 def buffer(capacity: int) -> ReplayBuffer:
-    return ReplayBuffer(capacity, MADE.layout.corner_count, 2, 4)
+    return ReplayBuffer(capacity, MADE.task.layout.corner_count, 2, 4)
 
 
 def numbered(first: int, count: int) -> Transitions:

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 import yaml
 from tangram_agent.learner import Learner
-from tangram_agent.policy import Policy
 
 from tangram_agent.checkpoints import save_checkpoint
 from tangram_agent.runs import load_changed, load_run
 from tangram_core.errors import ConfigError, RunError, TangramError
 from tangram_sim.config import RewardConfig
-from tests.agent.builders import PLAIN, PROPOSAL, SMALL, SQUARE, random_transitions, setup
+from tests.agent.builders import PLAIN, PROPOSAL, SMALL, SQUARE, Policy, random_transitions, setup
 
 pytestmark = pytest.mark.fast
 

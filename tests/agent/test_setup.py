@@ -130,7 +130,7 @@ def test_sizes_follow_from_tokens_and_actions(
 ) -> None:
     config = changed("tokens", shapes=shapes) | {"sim": {"actions_per_token": actions}}
     made = make_setup(config)
-    assert (made.horizon, made.action_size) == (horizon, action_size)
+    assert (made.task.horizon, made.task.action_size) == (horizon, action_size)
 
 
 @pytest.mark.parametrize(
@@ -167,7 +167,7 @@ FUTURE = [{"strategy": "future"}]
         (SEVERAL, {"reward": {"name": "dense"}}, "set agent.readout=token, which values the"),
         (SEVERAL, {"agent": {"gamma": 0.9}}, "agent.gamma=0.9 .*readout=token, which values the"),
         (SEVERAL, {"agent": {"hindsight": FUTURE}}, "strategy=future changes nothing"),
-        (ONE, {"agent": {"readout": "token", "reapply": 0}}, "agent.reapply=0 changes nothing"),
+        (ONE, {"agent": {"kind": "scene", "reapply": 0}}, "agent.reapply=0 changes nothing"),
         (ONE, {"agent": {"polyak": 0.9}}, "agent.polyak=0.9 changes nothing with agent.gamma=0"),
         (
             ONE,
@@ -188,8 +188,8 @@ def test_what_would_change_nothing_is_refused(
 @pytest.mark.parametrize(
     ("tokens", "sections"),
     [
-        (SEVERAL, {"reward": {"name": "dense"}, "agent": {"readout": "token"}}),
-        (SEVERAL, {"agent": {"readout": "token", "gamma": 0.9, "hindsight": FUTURE}}),
+        (SEVERAL, {"reward": {"name": "dense"}, "agent": {"kind": "scene"}}),
+        (SEVERAL, {"agent": {"kind": "scene", "gamma": 0.9, "hindsight": FUTURE}}),
         (ONE, {"reward": {"name": "dense"}, "agent": {"gamma": 0.9, "polyak": 0.9}}),
         (ONE, {"reward": {"name": "dense"}, "agent": {"reapply": 0}}),
     ],

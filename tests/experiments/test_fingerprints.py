@@ -19,12 +19,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import torch
-from tangram_agent.policy import Policy
+from worker.play.looking import environments
 
 from conf.cli import composed
 from master.learn.trainer import Trainer
 from tangram_core.setup import Setup, make_setup
-from worker.play.looking import environments
+from tests.agent.builders import Policy
 from worker.play.rollout import Rollout
 
 FILE = Path(__file__).parents[1] / "golden" / "fingerprints.json"

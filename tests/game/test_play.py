@@ -30,10 +30,10 @@ from tangram_game.play import (
 from tangram_game.show.film import Show, film_pictures
 from tangram_game.show.views import beside, camera_sheets
 from tangram_sim.geometry.overlap import outlines, pairs_overlap
+from tangram_tasks.played import Played
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.game.figures.puzzle_files import GAME, SIM, drawn, write_puzzles
 from tests.worker.builders import write_run
-from worker.play.rollout import Played
 
 pytestmark = pytest.mark.fast
 
@@ -124,7 +124,7 @@ def test_a_picture_shows_all_episodes(tmp_path: Path) -> None:
 
 def test_motion_is_even_and_ends_where_the_episode_did() -> None:
     """A token moved by (0.4, -0.2) and turned by 170 degrees past the cut of the angle."""
-    layout = setup().layout
+    layout = setup().task.layout
     start, end = np.array([[0.0, 0.0, 2.0]]), np.array([[0.4, -0.2, 2.0 + np.radians(170.0)]])
     corners = layout.corners(np.stack([start, end, end])[None])
     frames = motion(layout, corners, count=4)

@@ -54,7 +54,7 @@ def test_a_batch_is_acknowledged_after_its_insert(tmp_path: Path) -> None:
     assert made.run() == "max_updates=6"
     assert hub.values("acknowledge") == [1, 2, 3]
     assert inserted == [4, 8, 12]
-    twins = len(MADE.agent.hindsight) + 1
+    twins = len(MADE.agent.config.hindsight) + 1
     assert made.guard.trainer.replay.added == 12 * twins
 
 
@@ -400,7 +400,7 @@ def test_in_lockstep_rounds_are_inserted_by_index_and_learned_before_the_next(
         ("acknowledge", 2),
     ]
     goals = made.guard.trainer.replay.state()["goal"]
-    own = len(MADE.agent.hindsight) + 1
+    own = len(MADE.agent.config.hindsight) + 1
     np.testing.assert_array_equal(goals[0], played(0, 1).episodes["goals"][0])
     np.testing.assert_array_equal(goals[BATCH * own], played(1, 1).episodes["goals"][0])
 

@@ -6,10 +6,6 @@ from typing import Any
 
 import numpy as np
 import yaml
-from tangram_agent.agents.outline.filling_learner import FillLearner
-from tangram_agent.learner import Learner
-from tangram_agent.networks import travelling
-from tangram_agent.policy import Policy
 
 from tangram_agent.checkpoints import save_checkpoint
 from tangram_agent.types import Weights
@@ -18,38 +14,40 @@ from tangram_core.service import ServiceConfig
 from tangram_core.setup import Setup, make_setup
 from tangram_core.spec import Episodes
 from tangram_sim.geometry.layout import Layout
-from tests.agent.builders import SMALL, SQUARE
-from worker.play.rollout import Played
+from tangram_tasks.played import Played
+from tests.agent.builders import SMALL, SQUARE, Policy
 
 
 def weights(made: Setup, version: int) -> Weights:
     """Random weights; every version has its own, and all of them move the tokens visibly."""
-    learner = FillLearner if made.fills else Learner
-    return learner(made, seed=version).acting_weights(version)
+    return Weights(version, made.agent.learner(made.task, version, "cpu").export())
 
 
 def sent(made: Setup, version: int) -> Weights:
     """What a master sends of them."""
-    return travelling(weights(made, version), made)
+    return Weights(version, made.agent.learner(made.task, version, "cpu").broadcast())
 
 
 def policy(made: Setup, version: int = 1) -> Policy:
     """A policy with random weights."""
     acting = Policy(made)
-    acting.load(weights(made, version))
+    acting.load(weights(made, version).tensors)
     return acting
 
 
 def write_run(folder: Path, tokens: dict[str, Any] = SQUARE, **sections: Any) -> Setup:
     """A run folder with one checkpoint of random weights, on the kinematic backend."""
+    kind = sections.get("agent", {}).get("kind", "pair")
     config = {
+        "task": {"kind": "fill" if kind == "outline" else "place"},
         "tokens": tokens,
         "sim": {"backend": "kinematic"},
         "reward": {},
-        "agent": {},
+        "agent": {"kind": kind},
         "net": SMALL,
         "service": asdict(ServiceConfig()),
     } | sections
+    config["agent"] = {"kind": kind} | config["agent"]
     made = make_setup(config)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.yaml").write_text(yaml.safe_dump(config))

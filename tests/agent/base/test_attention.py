@@ -47,7 +47,7 @@ def slow_attention(layer: GraphAttention, nodes: np.ndarray, edges: np.ndarray, 
 @pytest.mark.parametrize(("scale", "d"), [("d", 4.0), ("sqrt_d", 2.0)])
 def test_attention_equals_the_loop_of_the_equations(scale: str, d: float) -> None:
     layer = attention(scale)
-    edges = setup().layout.adjacency
+    edges = setup().task.layout.adjacency
     nodes = np.random.default_rng(0).standard_normal((5, NODES, WIDTH)).astype(np.float32)
     fast = layer(torch.from_numpy(nodes), torch.from_numpy(edges)).detach().numpy()
     for graph, expected in zip(nodes, fast, strict=True):
@@ -60,7 +60,7 @@ def test_encoder_equals_the_loop_of_the_equations(feed_forward: int) -> None:
     config = NetConfig(width=WIDTH, layers=2, feed_forward=feed_forward)
     encoder = GraphEncoder(4, config)
     initialise(encoder, torch.Generator().manual_seed(1))
-    edges = setup().layout.adjacency
+    edges = setup().task.layout.adjacency
     features = np.random.default_rng(1).standard_normal((1, NODES, 4)).astype(np.float32)
     found, mean = encoder(torch.from_numpy(features), torch.from_numpy(edges))
 
@@ -80,7 +80,7 @@ def test_encoder_equals_the_loop_of_the_equations(feed_forward: int) -> None:
 
 def test_without_an_edge_there_is_no_influence() -> None:
     """Eq. 10: where E(i, j) = 0, j sends nothing to i in one round; i's own query counts."""
-    layer, layout = attention(), setup().layout
+    layer, layout = attention(), setup().task.layout
     edges = torch.from_numpy(layout.adjacency)
     nodes = torch.randn(1, NODES, WIDTH, generator=torch.Generator().manual_seed(0))
     before = layer(nodes, edges)[0]

@@ -51,7 +51,9 @@ def test_a_graph_updates_as_single_operations_do(
     What is compiled ahead changes nothing, and is what updates need.
     """
     made = CASES[case]()
-    monkeypatch.setitem(vars(made.agent), "batch_size", 16 if made.pairs else 32)  # as `play` draws
+    monkeypatch.setitem(
+        vars(made.agent), "batch_size", 16 if (made.agent_kind == "pair") else 32
+    )  # as `play` draws
     plain, whole = Learner(made, 0), Learner(made, 0, compiled=True)
     before = copied(whole)
     whole.compile_ahead()

@@ -12,7 +12,7 @@ pytestmark = pytest.mark.fast
 
 
 def graph_of(made: Setup) -> SceneGraph:
-    return SceneGraph(made.layout)
+    return SceneGraph(made.task.layout)
 
 
 @pytest.mark.parametrize("tokens", [SQUARE, PAIR])
@@ -24,12 +24,12 @@ def test_paper_features_equal_those_of_the_layout(tokens: dict[str, object]) -> 
     found = graph_of(made).node_features(
         Scenes(*(torch.from_numpy(part) for part in parts), torch.zeros(6, dtype=torch.long))
     )
-    expected = made.layout.node_features(batch.state, placed, batch.goal)
+    expected = made.task.layout.node_features(batch.state, placed, batch.goal)
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-6)
 
 
 def test_constants_are_no_weights() -> None:
     graph = graph_of(setup(agent=PAPER))
-    np.testing.assert_array_equal(graph.adjacency, setup().layout.adjacency)
+    np.testing.assert_array_equal(graph.adjacency, setup().task.layout.adjacency)
     assert graph.state_dict() == {}
     assert list(graph.parameters()) == []

@@ -57,7 +57,7 @@ def square(mirrored: bool = False) -> Figure:
     (figure,) = find_figures("train", made, ["square"])
     if not mirrored:
         return figure
-    poses, flipped = made.layout.mirrored(figure.poses, figure.flipped)
+    poses, flipped = made.task.layout.mirrored(figure.poses, figure.flipped)
     return replace(figure, poses=poses, flipped=flipped)
 
 
@@ -91,11 +91,11 @@ def test_what_was_found_reaches_the_player(sim: dict[str, Any]) -> None:
     names = ["hut", "two_squares"] if sim is OUTLINE else ["heart"]  # seeing takes its time
     hidden = hide(made, find_figures("test", made, names), seed=0)
     played = lay(hidden, exact(hidden), seed=0)
-    laid = [made.layout.corners(one.laid.poses, one.laid.flipped) for one in hidden.searches]
+    laid = [made.task.layout.corners(one.laid.poses, one.laid.flipped) for one in hidden.searches]
     np.testing.assert_allclose(played.episodes["goals"], laid, atol=1e-6)
-    goals = [made.layout.corners(one.poses, one.flipped) for one in hidden.figures]
-    assert overlap_share(np.stack(laid), np.stack(goals), made.layout).min() > 0.97
-    assert overlap_share(played.ends, np.stack(goals), made.layout).min() > 0.97
+    goals = [made.task.layout.corners(one.poses, one.flipped) for one in hidden.figures]
+    assert overlap_share(np.stack(laid), np.stack(goals), made.task.layout).min() > 0.97
+    assert overlap_share(played.ends, np.stack(goals), made.task.layout).min() > 0.97
 
 
 def test_an_outline_does_not_depend_on_the_pieces() -> None:
@@ -145,12 +145,15 @@ def test_scores_compare_areas() -> None:
     """The exact union of tokens and figure, whatever lies where."""
     made = game(OUTLINE | {"starts": "anywhere"})
     hidden = hide(made, find_figures("test", made, ["heart", "swan", "hut"]), seed=0)
-    chance = play_hidden(hidden, random_policy(made.layout, hidden.setup.sim), seed=0)
+    chance = play_hidden(hidden, random_policy(made.task.layout, hidden.setup.sim), seed=0)
     assert 0.0 < chance.iou.max() < 0.95
     for e, figure in enumerate(hidden.figures):
-        poses, flipped = made.layout.poses(chance.ends[e]), made.layout.flipped(chance.ends[e])
-        tokens = covered(made.layout, Dissection(poses, flipped))
-        whole = covered(made.layout, Dissection(figure.poses, figure.flipped))
+        poses, flipped = (
+            made.task.layout.poses(chance.ends[e]),
+            made.task.layout.flipped(chance.ends[e]),
+        )
+        tokens = covered(made.task.layout, Dissection(poses, flipped))
+        whole = covered(made.task.layout, Dissection(figure.poses, figure.flipped))
         assert chance.iou[e] == pytest.approx(overlap(tokens, whole), abs=1e-5)
         assert chance.coverage[e] == pytest.approx(
             tokens.intersection(whole).area / whole.area, abs=1e-5
@@ -289,9 +292,9 @@ def test_elsewhere_silhouettes_are_refused() -> None:
     for sim, told in (OUTLINE, reason), (PICTURE, other):
         made = game(sim)
         with pytest.raises(ConfigError, match=told):
-            BatchedEnv(made.layout, made.sim, RewardConfig())
+            BatchedEnv(made.task.layout, made.task.sim, RewardConfig())
         with pytest.raises(ConfigError, match=told):
-            play_figures(made, [square()], random_policy(made.layout, made.sim), 0)
+            play_figures(made, [square()], random_policy(made.task.layout, made.task.sim), 0)
     with pytest.raises(ConfigError, match=reason):
         gymnasium.make("Tangram-v0", observe="silhouette")
 

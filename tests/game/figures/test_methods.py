@@ -64,7 +64,7 @@ def test_it_is_told_who_filled_what(
     monkeypatch.setattr("tangram_game.figures.methods.together", lambda _: method)
     made = game(OUTLINE)
     figures = find_figures("test", made, ["heart", "swan"])
-    formula = exact_policy(made.layout, made.sim)
+    formula = exact_policy(made.task.layout, made.task.sim)
     scored = score_hidden(made, figures, {RUN: formula}, 0)
     assert scored.means[RUN]["filled_by"] == {"search": 0, "beam": 0} | {by: 2}
     assert [one["filled_by"] for one in scored.puzzles] == [by, by]

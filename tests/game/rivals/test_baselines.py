@@ -29,7 +29,7 @@ SHAPES = ("square", "small_triangle", "parallelogram")
 def test_the_exact_policy_scores_one(backend: str, tokens: dict, actions: int) -> None:
     made = setup(tokens, backend=backend, actions_per_token=actions)
     with closing(FixedTests(made, 5, 5)) as tests:
-        scores = tests.scores(tests.play(exact_policy(made.layout, made.sim)))
+        scores = tests.scores(tests.play(exact_policy(made.task.layout, made.task.sim)))
     assert scores["raw_overlap_p10"] > 0.9999
     assert scores["position_error_p90"] < 1e-4
     assert scores["angle_error_deg_p90"] < 1e-2
@@ -52,10 +52,10 @@ def test_the_oracle_ends_on_its_target_in_every_world(
     made = setup({"shapes": [shape], "scale": 0.8}, **sim, actions_per_token=actions)
     with closing(FixedTests(made, 16, 8)) as tests:
         oracle = tests.scores(tests.play(playing(Told(oracle_policy), tests.env)))
-        formula = tests.scores(tests.play(exact_policy(made.layout, made.sim)))
-    assert oracle["position_error_p90"] < 1e-5 * made.sim.arena
+        formula = tests.scores(tests.play(exact_policy(made.task.layout, made.task.sim)))
+    assert oracle["position_error_p90"] < 1e-5 * made.task.sim.arena
     assert oracle["angle_error_deg_p90"] < 1e-2
-    short = formula["position_error_p90"] / 1e-3 / made.sim.arena
+    short = formula["position_error_p90"] / 1e-3 / made.task.sim.arena
     assert max(short, formula["angle_error_deg_p90"] / 0.5) > 1.0
 
 
@@ -81,12 +81,12 @@ def test_the_oracle_puts_noisy_looks_together(tokens: dict, sim: dict[str, Any])
     made = setup(tokens, corner_noise=0.01, actions_per_token=8, starts="outside", **sim)
     found = []
     with closing(FixedTests(made, 30, 15)) as tests:
-        for player in (Told(oracle_policy), exact_policy(made.layout, made.sim)):
+        for player in (Told(oracle_policy), exact_policy(made.task.layout, made.task.sim)):
             played = tests.play(playing(player, tests.env))
             # From where the target is seen: what no policy can know is no matter here.
             ends, goals = (
-                made.layout.poses(played.ends),
-                made.layout.poses(played.episodes["goals"]),
+                made.task.layout.poses(played.ends),
+                made.task.layout.poses(played.episodes["goals"]),
             )
             found.append(np.median(np.abs(ends - goals)[..., :2]))
     assert found[0] < 0.7 * found[1]
@@ -99,7 +99,7 @@ def test_the_oracle_plays_several_tokens(sim: dict[str, Any]) -> None:
     made = setup(tokens, **sim, world="drawn", actions_per_token=3)
     with closing(FixedTests(made, 8, 8)) as tests:
         oracle = tests.scores(tests.play(playing(Told(oracle_policy), tests.env)))
-        formula = tests.scores(tests.play(exact_policy(made.layout, made.sim)))
+        formula = tests.scores(tests.play(exact_policy(made.task.layout, made.task.sim)))
     assert oracle["coverage"] > 0.999
     assert formula["coverage"] < oracle["coverage"] - 0.01
 
@@ -107,10 +107,10 @@ def test_the_oracle_plays_several_tokens(sim: dict[str, Any]) -> None:
 @pytest.mark.parametrize("shape", SHAPES)
 def test_it_turns_no_further_than_the_symmetry_asks_for(shape: str) -> None:
     made = setup({"shapes": [shape], "scale": 1.0})
-    layout, rng = made.layout, np.random.default_rng(0)
+    layout, rng = made.task.layout, np.random.default_rng(0)
     starts, goals = rng.uniform(-3.1, 3.1, (2, 200, 1, 3)) * [0.1, 0.1, 1.0]
     placed = np.zeros((200, 1), bool)
-    policy = exact_policy(layout, made.sim)
+    policy = exact_policy(layout, made.task.sim)
     actions = policy(layout.corners(starts), placed, layout.corners(goals), [])
     assert actions.dtype == np.float32
     symmetry = layout.shapes[0].symmetry
@@ -126,7 +126,7 @@ def test_the_exact_policy_solves_the_game(backend: str, targets: str, allow_flip
     sim = {"targets": targets, "starts": "outside", "mirrored": 0.5, "allow_flip": allow_flip}
     made = setup(GAME, backend=backend, pixels=16, **sim)
     with closing(FixedTests(made, 8, 8)) as tests:
-        played = tests.play(exact_policy(made.layout, made.sim))
+        played = tests.play(exact_policy(made.task.layout, made.task.sim))
         scores = tests.scores(played)
     assert scores["raw_overlap_p10"] > 0.999
     assert (scores["share_solved"], scores["wrong"], scores["refused"]) == (1.0, 0.0, 0.0)
@@ -138,19 +138,21 @@ def test_it_makes_room_before_it_sets_down() -> None:
     made = setup({"shapes": ["square", "large_triangle"], "scale": 0.8})
     starts = np.array([[[-0.6, 0.0, 0.0], [0.6, 0.0, 0.0]]])
     goals = np.array([[[0.6, 0.0, 0.0], [0.0, 0.6, 0.0]]])
-    policy, placed = exact_policy(made.layout, made.sim), np.zeros((1, 2), bool)
-    corners, wanted = made.layout.corners(starts), made.layout.corners(goals)
+    policy, placed = exact_policy(made.task.layout, made.task.sim), np.zeros((1, 2), bool)
+    corners, wanted = made.task.layout.corners(starts), made.task.layout.corners(goals)
     assert policy(corners, placed, wanted, [])[0, 0] > 0.0
     assert policy(corners, np.array([[False, True]]), wanted, [])[0, 0] < 0.0
-    free = made.layout.corners(starts - [0.0, 0.6, 0.0])
+    free = made.task.layout.corners(starts - [0.0, 0.6, 0.0])
     assert policy(free, placed, wanted, [])[0, 0] < 0.0
 
 
 def test_equal_tokens_take_the_nearer_places() -> None:
     made = setup({"shapes": ["square", "square"], "scale": 0.6})
-    starts = made.layout.corners(np.array([[[-0.6, 0.0, 0.0], [0.6, 0.0, 0.0]]]))
-    goals = made.layout.corners(np.array([[[0.5, 0.1, 0.0], [-0.5, 0.1, 0.0]]]))
-    action = exact_policy(made.layout, made.sim)(starts, np.zeros((1, 2), bool), goals, [])
+    starts = made.task.layout.corners(np.array([[[-0.6, 0.0, 0.0], [0.6, 0.0, 0.0]]]))
+    goals = made.task.layout.corners(np.array([[[0.5, 0.1, 0.0], [-0.5, 0.1, 0.0]]]))
+    action = exact_policy(made.task.layout, made.task.sim)(
+        starts, np.zeros((1, 2), bool), goals, []
+    )
     np.testing.assert_allclose(action[0, 1:], [0.05, 0.05, 0.0], atol=1e-6)
 
 
@@ -161,10 +163,10 @@ def test_chance_names_tokens_that_are_left_and_stays_in_the_arena(
     monkeypatch.setattr("tangram_sim.batch.MAX_OVERLAP", 1.0)
     made = setup(GAME, allow_flip=allow_flip, pixels=16)
     with closing(FixedTests(made, 20, 20)) as tests:
-        played = tests.play(random_policy(made.layout, made.sim))
+        played = tests.play(random_policy(made.task.layout, made.task.sim))
     assert not played.refused.any()
     assert played.episodes["placed"][:, -1].all()
-    centres = made.layout.poses(played.ends)[..., :2]
+    centres = made.task.layout.poses(played.ends)[..., :2]
     assert 0.9 < np.abs(centres).max() <= 1.0 + 1e-6
-    turned = made.layout.flipped(played.ends) != made.layout.flipped(played.starts)
+    turned = made.task.layout.flipped(played.ends) != made.task.layout.flipped(played.starts)
     assert turned.any() == allow_flip

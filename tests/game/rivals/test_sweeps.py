@@ -32,9 +32,9 @@ OCCUPIED = ((-0.6, 0.0, 0), (0, 0, 0)), ((0, 0, 0), (0.7, 0.3, 0))
 
 def first(made: Setup, starts: Any, goals: Any, placed: Any = None) -> tuple[int, np.ndarray]:
     """Which token goes first, and its way."""
-    corners, wanted = (made.layout.corners(np.array(p, np.float64)) for p in (starts, goals))
-    flags = np.zeros(made.layout.tokens, np.bool_) if placed is None else np.array(placed)
-    return first_slide(made.layout, corners, flags, wanted)
+    corners, wanted = (made.task.layout.corners(np.array(p, np.float64)) for p in (starts, goals))
+    flags = np.zeros(made.task.layout.tokens, np.bool_) if placed is None else np.array(placed)
+    return first_slide(made.task.layout, corners, flags, wanted)
 
 
 @pytest.mark.parametrize(("starts", "goals"), [THROUGH, OCCUPIED])
@@ -52,7 +52,7 @@ def test_what_would_be_pushed_waits_and_what_is_in_the_way_goes_first(
 def test_a_slide_sweeps_the_part_of_a_token_that_is_in_its_way(
     off: tuple[float, float], share: float
 ) -> None:
-    layout = setup(SQUARES, **SLIDE).layout
+    layout = setup(SQUARES, **SLIDE).task.layout
     corners = layout.corners(np.array([(0, 0, 0), (*off, 0), (9.0, 9.0, 0)]))
     swept = _swept(layout, corners, np.array([0]), np.array([(0.6, 0.0, 0.0)]))
     found = _shares(swept, corners[layout.padded_corners])
@@ -99,8 +99,8 @@ def test_the_best_order_is_that_of_all() -> None:
 
 def covered(made: Setup, choose: Choose, starts: Any, goals: Any) -> tuple[list[int], float]:
     """The tokens that are named in turn, and what is covered in the end, in the engine."""
-    layout, named = made.layout, list[int]()
-    with closing(BatchedEnv(layout, made.sim, made.reward)) as env:
+    layout, named = made.task.layout, list[int]()
+    with closing(BatchedEnv(layout, made.task.sim, made.task.reward)) as env:
         sides = np.zeros((1, layout.tokens), np.bool_)
         env.reset([np.random.default_rng(0)], (np.array([goals], np.float64), sides))
         env._worlds[0].place(np.array(starts, np.float64))
@@ -114,16 +114,16 @@ def covered(made: Setup, choose: Choose, starts: Any, goals: Any) -> tuple[list[
 
 def test_in_the_engine_nothing_is_pushed_out_of_its_place() -> None:
     made = setup(TWO, **SLIDE)
-    order, share = covered(made, sweep_policy(made.layout, made.sim), *THROUGH)
+    order, share = covered(made, sweep_policy(made.task.layout, made.task.sim), *THROUGH)
     assert order == [1, 0]
     assert share == pytest.approx(1.0, abs=1e-3)
-    assert covered(made, exact_policy(made.layout, made.sim), *THROUGH)[1] < 0.9
+    assert covered(made, exact_policy(made.task.layout, made.task.sim), *THROUGH)[1] < 0.9
 
 
 def test_with_actions_left_what_was_pushed_is_put_back_once() -> None:
     made = setup(TWO, **SLIDE, actions_per_token=2)
     starts, goals = ((0.05, 0.03, 0.2), (0.7, 0, 0)), ((0, 0, 0), (0.7, 0, 0))
-    order, share = covered(made, sweep_policy(made.layout, made.sim), starts, goals)
+    order, share = covered(made, sweep_policy(made.task.layout, made.task.sim), starts, goals)
     assert (order[0], share) == (0, pytest.approx(1.0, abs=1e-3))
 
 
@@ -133,7 +133,7 @@ def test_seven_tokens_are_laid_better_than_each_alone_and_with_two_actions_nearl
         made = setup(GAME, **SLIDE, starts="outside", actions_per_token=count)
         with closing(FixedTests(made, 8, 8)) as tests:
             for policy in (exact_policy, sweep_policy)[count - 1 :]:
-                played = tests.play(policy(made.layout, made.sim))
+                played = tests.play(policy(made.task.layout, made.task.sim))
                 scores.append(tests.scores(played)["coverage"])
     assert scores[0] + 0.1 < scores[1] < scores[2]
     assert scores[2] > 0.95

@@ -7,10 +7,10 @@ import pytest
 
 from tangram_core.setup import Setup
 from tangram_game.show.film import film, frames_per_action
+from tangram_tasks.played import Played
 from tests.agent.builders import setup
 from tests.sim.builders import layout_of
 from tests.worker.builders import ended
-from worker.play.rollout import Played
 
 pytestmark = pytest.mark.fast
 

@@ -4,15 +4,15 @@ from contextlib import closing
 
 import numpy as np
 import pytest
-from tangram_agent.policy import Policy
+from worker.play.looking import environments
 
 from tangram_agent.messages import EpisodeBatch, decode_from_worker
 from tangram_core.errors import RunError, WireError
 from tangram_core.setup import Setup
 from tangram_core.spec import Episodes
 from tests.agent.agents.outline.outlines import outline_setup
+from tests.agent.builders import Policy
 from tests.master.builders import trainer
-from worker.play.looking import environments
 from worker.play.rollout import Rollout
 
 pytestmark = pytest.mark.fast
@@ -32,7 +32,7 @@ def test_what_workers_play_is_learned_from() -> None:
     made = trainer(MADE)
     played = rolled_out(MADE)
     made.insert(played)
-    assert (played["goals"].shape, made.transitions) == ((8, MADE.goal_rows, 2), 16)
+    assert (played["goals"].shape, made.transitions) == ((8, MADE.task.goal_rows, 2), 16)
     numbers = made.update(0.0)
     assert set(numbers) == {"critic_loss", "q", "critic_gradient"}
     assert made.updates == 1
@@ -95,7 +95,7 @@ def test_nonsense_that_keeps_its_bounds_harms_nobody() -> None:
     """Whoever has the keys may send any numbers: the master learns nonsense, and goes on."""
     made, generator = trainer(MADE), np.random.default_rng(0)
     played = rolled_out(MADE)
-    for high in (0.0, 1e-3, 0.5, MADE.bound):
+    for high in (0.0, 1e-3, 0.5, MADE.task.bound):
         noise = generator.uniform(-high, high, played["goals"].shape).astype(np.float32)
         corners = generator.uniform(-high, high, played["corners"].shape).astype(np.float32)
         made.insert(Episodes({**played.arrays, "goals": noise}))

@@ -3,13 +3,12 @@
 from typing import Any
 
 import pytest
-from tangram_agent.policy import Policy
 
 from tangram_agent.checkpoints import ACTING
 from tangram_agent.types import Weights
 from tangram_core.setup import Setup
 from tests.agent.agents.pair.pair_scenes import PERCEPTRON, seven
-from tests.agent.builders import random_episodes, setup
+from tests.agent.builders import Policy, random_episodes, setup
 from tests.master.builders import AGENT, play_on, trainer
 
 pytestmark = pytest.mark.fast
@@ -32,7 +31,7 @@ def test_replay_holds_what_was_played_and_nothing_relabelled() -> None:
 
 
 def test_a_critic_without_a_say_stays_with_the_master_and_in_checkpoints() -> None:
-    made = setup(agent=AGENT | {"readout": "pair", "motion": "learned", "gamma": 0.0})
+    made = setup(agent=AGENT | {"kind": "pair", "motion": "learned", "gamma": 0.0})
     master, policy = trainer(made), Policy(made)
     play_on(master, 1)
     arrays, _ = master.state()

@@ -93,7 +93,7 @@ def test_what_is_waited_for(
 def test_it_is_told_where_nothing_can_be_learned_from(tmp_path: Path) -> None:
     made = loop(tmp_path, MADE, FakeHub(MADE, roles=["player"]))
     episodes = arrival(MADE, 1).episodes
-    gone = np.zeros((4, MADE.horizon + 1, 1), np.uint8)
+    gone = np.zeros((4, MADE.task.horizon + 1, 1), np.uint8)
     made.guard.trainer.insert(Episodes({**episodes.arrays, "seen": gone, "goals_seen": gone[:, 0]}))
     said = "waiting for an episode in which pictures show all tokens: larger sim.pixels help"
     assert made.reporter.flush(0).texts["activity"] == said

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tangram_agent.policy import Policy
+from worker.play.looking import environments
 
 from tangram_agent.messages import EpisodeBatch, decode_from_worker
 from tangram_agent.relabelling import learnable
@@ -17,7 +17,7 @@ from tangram_core.spec import Episodes
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.motion.kinematics import KinematicWorld
 from tangram_sim.sight.lens import Disturbance
-from worker.play.looking import environments
+from tests.agent.builders import Policy
 from worker.play.rollout import Rollout
 
 pytestmark = pytest.mark.fast

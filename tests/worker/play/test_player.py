@@ -63,7 +63,7 @@ def assert_episodes(
     goals = np.concatenate([batch.episodes["goals"] for batch in arrived])
     for number, goal in zip(numbers, goals, strict=True):
         rng = episode_generator(*identity, number)
-        expected = made.layout.corners(sample_poses(made.layout, made.sim, rng))
+        expected = made.task.layout.corners(sample_poses(made.task.layout, made.task.sim, rng))
         np.testing.assert_allclose(goal, expected, atol=1e-6)
 
 

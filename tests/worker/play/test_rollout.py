@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tangram_agent.policy import Policy
 
 from tangram_core.seeding import episode_generator
 from tangram_core.setup import Setup
@@ -14,7 +13,7 @@ from tangram_core.spec import Episodes, joined
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.geometry.overlap import overlap_share
 from tangram_tasks.played import Past
-from tests.agent.builders import PAIR, SQUARE, setup
+from tests.agent.builders import PAIR, SQUARE, Policy, setup
 from tests.sim.builders import sample_poses
 from tests.worker.builders import policy
 from worker.play.rollout import Rollout, parts, play
@@ -28,7 +27,7 @@ IDENTITY = (5, "player", 2, 3)
 
 def naive_episode(made: Setup, acting: Policy, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """One episode without any batch: pose arithmetic straight from the definition."""
-    layout, sim = made.layout, made.sim
+    layout, sim = made.task.layout, made.task.sim
     goal = layout.corners(sample_poses(layout, sim, rng))
     pose = sample_poses(layout, sim, rng).copy()
     moves = np.zeros(layout.tokens, int)
@@ -38,11 +37,11 @@ def naive_episode(made: Setup, acting: Policy, rng: np.random.Generator) -> dict
         limited = layout.tokens == 1 and sim.actions_per_token > 1
         return (moves >= sim.actions_per_token) & (not limited)
 
-    for _ in range(made.horizon):
+    for _ in range(made.task.horizon):
         flags = is_placed(moves)
         past = Past(
             np.array(corners[:-1], np.float32).reshape(1, -1, layout.corner_count, 2),
-            np.array(actions, np.float32).reshape(1, -1, made.action_size),
+            np.array(actions, np.float32).reshape(1, -1, made.task.action_size),
         )
         action = acting.explore(corners[-1][None], flags[None], goal[None], [rng], past)[0]
         token = 0
@@ -67,7 +66,7 @@ def naive_episode(made: Setup, acting: Policy, rng: np.random.Generator) -> dict
 
 @contextmanager
 def environment(made: Setup, count: int = 4) -> Iterator[BatchedEnv]:
-    with closing(BatchedEnv(made.layout, made.sim, made.reward, count)) as env:
+    with closing(BatchedEnv(made.task.layout, made.task.sim, made.task.reward, count)) as env:
         yield env
 
 
@@ -163,4 +162,4 @@ def test_the_policy_sees_noise_and_that_is_what_travels() -> None:
     np.testing.assert_array_equal(episodes["corners"][:, 0], seen[0].astype(np.float32))
     np.testing.assert_array_equal(episodes["goals"], seen[1].astype(np.float32))
     for noisy, exact in ((episodes["corners"], played.corners), (episodes["goals"], played.goals)):
-        assert 0.02 < np.abs(noisy - exact).max() <= 4 * 0.02 * made.sim.arena + 1e-6
+        assert 0.02 < np.abs(noisy - exact).max() <= 4 * 0.02 * made.task.sim.arena + 1e-6

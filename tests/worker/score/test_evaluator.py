@@ -13,8 +13,9 @@ from tests.agent.builders import PAIR, SQUARE, setup
 from tests.worker.builders import policy, sent, weights
 from tests.worker.talk.conversation import QUICK, collect, open_hub, with_master
 from worker.config import WorkerConfig
+from worker.play.rollout import greedy
 from worker.score.evaluator import Schedule, run_evaluator
-from worker.score.test_set import FixedTests, greedy
+from worker.score.test_set import FixedTests
 
 
 @pytest.fixture(autouse=True)
@@ -59,7 +60,7 @@ def test_the_newest_weights_are_scored_on_the_fixed_tests(tokens: dict) -> None:
             assert "mean_reward_camera" in scalars
             for name in ("starts", "ends", "goals"):
                 corners = getattr(found, name)
-                assert corners.shape == (12, made.layout.corner_count, 2)
+                assert corners.shape == (12, made.task.layout.corner_count, 2)
                 np.testing.assert_allclose(corners, getattr(expected, name)[:12], atol=1e-4)
 
 

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from tangram_core.seeding import evaluation_generators
+from tangram_tasks.played import Played
 from tangram_tasks.rivals.baselines import position_policy, random_policy
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.worker.builders import policy
-from worker.play.rollout import Played
-from worker.score.test_set import FixedTests, greedy
+from worker.play.rollout import greedy
+from worker.score.test_set import FixedTests
 
 pytestmark = pytest.mark.fast
 
@@ -58,9 +59,9 @@ def test_noise_is_off() -> None:
 
 def test_the_camera_is_on_though_training_has_none() -> None:
     made = setup()
-    assert not made.sim.pixels
+    assert not made.task.sim.pixels
     with closing(FixedTests(made, 20, 10)) as tests:
-        found = tests.play(position_policy(made.layout, made.sim))
+        found = tests.play(position_policy(made.task.layout, made.task.sim))
         scores = tests.scores(found)
     assert found.camera is not None
     np.testing.assert_allclose(found.camera, 2.0 * found.overlap - 1.0, atol=0.1)
@@ -77,7 +78,7 @@ def test_the_camera_is_on_though_training_has_none() -> None:
 )
 def test_the_trained_reward_is_reported_where_it_is_another(reward: dict, own: bool) -> None:
     made = setup(pixels=32)
-    made = replace(made, reward=replace(made.reward, **reward))
+    made = replace(made, reward=replace(made.task.reward, **reward))
     with closing(FixedTests(made, 3, 3)) as tests:
         found = tests.play(greedy(policy(made)))
         scores = tests.scores(found)
@@ -92,11 +93,11 @@ def test_the_position_policy_solves_position_and_nothing_else(
     monkeypatch.setattr("tangram_sim.batch.MAX_OVERLAP", 1.0)
     made = setup(tokens, pixels=32, actions_per_token=actions)
     with closing(FixedTests(made, 10, 10)) as tests:
-        found = tests.play(position_policy(made.layout, made.sim))
-    centres = made.layout.bases(found.ends), made.layout.bases(found.goals)
+        found = tests.play(position_policy(made.task.layout, made.task.sim))
+    centres = made.task.layout.bases(found.ends), made.task.layout.bases(found.goals)
     np.testing.assert_allclose(*centres, atol=1e-6)
     assert found.episodes["placed"][:, -1].all() == (tokens is PAIR or actions == 1)
-    angles = made.layout.poses(found.corners)[..., 2]
+    angles = made.task.layout.poses(found.corners)[..., 2]
     np.testing.assert_allclose(angles[:, -1], angles[:, 0], atol=1e-9)
 
 
@@ -104,18 +105,18 @@ def test_the_position_policy_reaches_the_plateau_of_the_paper() -> None:
     """A square on its target's centre at a uniform angle: 0.8825 raw, 0.765 scaled."""
     made = setup(pixels=16)
     with closing(FixedTests(made, 500, 100)) as tests:
-        found = tests.play(position_policy(made.layout, made.sim))
+        found = tests.play(position_policy(made.task.layout, made.task.sim))
         assert tests.scores(found)["mean_reward"] == pytest.approx(0.765, abs=0.01)
 
 
 @pytest.mark.parametrize("flip", [False, True])
 def test_the_random_policy_fills_the_action_space_from_the_episodes_generators(flip: bool) -> None:
     made = setup({"shapes": ["parallelogram"], "scale": 1.0}, allow_flip=flip)
-    choose = random_policy(made.layout, made.sim)
+    choose = random_policy(made.task.layout, made.task.sim)
     nothing = np.zeros((500, 1))
     one, two = (choose(nothing, nothing, nothing, evaluation_generators(500)) for _ in range(2))
     np.testing.assert_array_equal(one, two)
-    assert one.shape == (500, made.action_size)
+    assert one.shape == (500, made.task.action_size)
     np.testing.assert_allclose(one.min(axis=0), -1.0, atol=0.05)
     np.testing.assert_allclose(one.max(axis=0), 1.0, atol=0.05)
 
@@ -130,7 +131,7 @@ def test_noise_on_the_corners_is_seen_and_not_scored() -> None:
     for noise in (0.0, 0.05):
         made = setup(pixels=16, corner_noise=noise)
         with closing(FixedTests(made, 50, 50)) as tests:
-            found = tests.play(position_policy(made.layout, made.sim))
+            found = tests.play(position_policy(made.task.layout, made.task.sim))
             scores.append(tests.scores(found)["position_error_median"])
     assert scores[0] == pytest.approx(0.0, abs=1e-6)
     # the mean of four corners, of token and target each: 0.1 * sqrt(2 / 4), in the plane

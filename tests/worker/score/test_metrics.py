@@ -12,9 +12,9 @@ from tangram_sim.geometry.layout import Layout
 from tangram_sim.puzzles.figures import library
 from tangram_sim.targets.sampling import sample_batch
 from tangram_tasks.metrics import Assembled, assembled, covered_shares, pose_errors, summarise
+from tangram_tasks.played import Played
 from tests.sim.builders import SEVEN, layout_of, random_poses
 from tests.worker.builders import ended
-from worker.play.rollout import Played
 
 pytestmark = pytest.mark.fast
 

@@ -13,7 +13,7 @@ from tests.sim.builders import SEVEN
 
 TWO = {"shapes": ["small_triangle", "small_triangle"], "scale": 1.0}
 ALL = {"shapes": list(SEVEN), "scale": 0.6}
-AGENT = {"readout": "outline", "gamma": 1.0, "hindsight": [{"strategy": "final", "copies": 3}]}
+AGENT = {"kind": "outline", "copies": 3}
 SIM = {"observe": "silhouette", "starts": "outside", "targets": "connected"}
 
 
@@ -25,7 +25,7 @@ def outline_setup(
 ) -> Setup:
     """A kinematic one with a small network, of corners unless another one is given."""
     flips = {"allow_flip": True} if "parallelogram" in tokens["shapes"] else {}
-    own = {"reapply": 2, "motion": "learned"} | AGENT | (agent or {})
+    own = AGENT | (agent or {})
     return setup(tokens, own, net or SMALL | {"scale": "sqrt_d"}, **(SIM | flips | sim))
 
 
@@ -37,7 +37,7 @@ def played_in(made: Setup, ways: list[Floats], goal: Floats) -> Episodes:
         ways: poses (K, 3) before each step and after the last.
         goal: (K, 3) poses of the target's pieces.
     """
-    layout = made.layout
+    layout = made.task.layout
     corners = np.stack([layout.corners(poses) for poses in ways])[None].astype(np.float32)
     placed = np.tril(np.ones((len(ways), layout.tokens), np.uint8), -1)[None]
     outline = covered_area(layout.corners(goal), layout)
@@ -45,8 +45,8 @@ def played_in(made: Setup, ways: list[Floats], goal: Floats) -> Episodes:
         {
             "corners": corners,
             "placed": placed,
-            "goals": as_rows(outline, layout, made.goal_rows)[None].astype(np.float32),
-            "actions": np.zeros((1, len(ways) - 1, made.action_size), np.float32),
+            "goals": as_rows(outline, layout, made.task.goal_rows)[None].astype(np.float32),
+            "actions": np.zeros((1, len(ways) - 1, made.task.action_size), np.float32),
             "rewards": np.zeros((1, len(ways) - 1), np.float32),
             "terminated": placed[:, 1:].all(axis=2).astype(np.uint8),
         }

@@ -10,7 +10,6 @@ import pytest
 import shapely
 import torch
 from tangram_agent.config import AgentConfig, NetConfig
-from tangram_agent.policy import Policy
 from torch import nn
 from worker.play.looking import environments
 
@@ -23,6 +22,7 @@ from tangram_sim.geometry.dissections import Place
 from tangram_sim.puzzles.figures import library
 from tangram_sim.targets.targets import placement
 from tests.agent.agents.outline.outlines import ALL, TWO, outline_setup
+from tests.agent.builders import Policy
 
 pytestmark = pytest.mark.fast
 
@@ -71,7 +71,7 @@ def test_a_beam_finds_what_values_do_not_tell() -> None:
 
 def test_seven_tans_are_laid_into_a_figure() -> None:
     made = outline_setup(ALL, arena=2.0)
-    poses, flipped = placement(library("test", 0.6)[0], made.layout)
+    poses, flipped = placement(library("test", 0.6)[0], made.task.layout)
     target = poses[None], flipped[None]
     assert overlaps(beam_of(made, 12), Indifferent(), target, 1) == pytest.approx(1.0, abs=1e-4)
 
@@ -79,16 +79,16 @@ def test_seven_tans_are_laid_into_a_figure() -> None:
 def test_where_nothing_fits_a_token_still_covers_what_it_can() -> None:
     """A strip of the area of two triangles has no corner for them."""
     made = outline_setup()
-    filling, layout = Filling(made.layout), made.layout
+    filling, layout = Filling(made.task.layout), made.task.layout
     leg = float(np.sqrt(2.0 * layout.areas[0]))
     strip = np.array([[0, 0], [2 * leg, 0], [2 * leg, leg / 2], [0, leg / 2], [0, 0]])
-    rows = np.concatenate([strip, np.zeros((made.goal_rows - 5, 2))])[None]
+    rows = np.concatenate([strip, np.zeros((made.task.goal_rows - 5, 2))])[None]
     corners = layout.corners(np.array([[0.9, 0.9, 0.0], [-0.9, 0.9, 0.0]]))[None]
     placed = np.zeros((1, 2), np.bool_)
     filler = Filler(Indifferent(), made)
     assert filling.places(filling.rest(rows[0], corners[0], placed[0]), (2,)) == []
     step = filler.choose(corners, placed, rows, np.zeros(1, np.bool_))
-    went = layout.poses(corners)[0, step.token[0], :2] + step.velocity[0, :2] * made.sim.arena
+    went = layout.poses(corners)[0, step.token[0], :2] + step.velocity[0, :2] * made.task.sim.arena
     assert went == pytest.approx([leg, leg / 4], abs=1e-5)  # the strip's middle
     # Exploring nothing is learned from where it lies, and it stays.
     one = [np.random.default_rng(0)]
@@ -97,12 +97,12 @@ def test_where_nothing_fits_a_token_still_covers_what_it_can() -> None:
 
 def test_who_has_a_token_left_where_all_is_covered_lets_it_lie() -> None:
     made = outline_setup()
-    corners = made.layout.corners(np.array([[0.3, 0.2, 0.0], [-0.9, 0.9, 0.0]]))[None]
-    first = corners[0, made.layout.corners_of(0)]
+    corners = made.task.layout.corners(np.array([[0.3, 0.2, 0.0], [-0.9, 0.9, 0.0]]))[None]
+    first = corners[0, made.task.layout.corners_of(0)]
     target = np.concatenate([first, first[:1]])
-    rows = np.concatenate([target, np.zeros((made.goal_rows - len(target), 2))])[None]
+    rows = np.concatenate([target, np.zeros((made.task.goal_rows - len(target), 2))])[None]
     placed = np.array([[True, False]])
-    assert Filling(made.layout).rest(rows[0], corners[0], placed[0]).is_empty
+    assert Filling(made.task.layout).rest(rows[0], corners[0], placed[0]).is_empty
     step = Filler(Indifferent(), made).choose(corners, placed, rows, np.zeros(1, np.bool_))
     assert step.token.tolist() == [1]
     assert (step.velocity == 0).all()
@@ -112,14 +112,14 @@ def test_exploring_takes_any_place_that_is_not_dead() -> None:
     made = outline_setup(ALL, {"uniform_share": 1.0}, arena=2.0)
     policy = Policy(made)
     with closing(environments(made, 12)) as env:
-        figure = placement(library("test", 0.6)[0], made.layout)
+        figure = placement(library("test", 0.6)[0], made.task.layout)
         targets = tuple(np.stack([part] * 12) for part in figure)
         generators = [np.random.default_rng(i) for i in range(12)]
         env.reset(generators, targets)
         actions = policy.explore(env.seen, env.closed, env.seen_goals, generators)
         tokens = {tuple(np.round(env.goals[0, 0] + action[1:3], 2)) for action in actions}
         env.step(actions)
-        ends = Filling(made.layout)
+        ends = Filling(made.task.layout)
         inside = [ends.inside(env.corners[i], env.seen_goals[i]).sum() for i in range(12)]
     assert len(tokens) > 1
     assert min(inside) == 1
@@ -127,7 +127,7 @@ def test_exploring_takes_any_place_that_is_not_dead() -> None:
 
 def test_corners_of_pieces_are_no_outline() -> None:
     made = outline_setup()
-    corners = made.layout.corners(np.zeros((1, 2, 3)))
+    corners = made.task.layout.corners(np.zeros((1, 2, 3)))
     with pytest.raises(ConfigError, match=r"got \(1, 6, 2\): give rows that .*as_rows makes"):
         Policy(made).act(corners, np.zeros((1, 2)), corners)
 
@@ -135,8 +135,8 @@ def test_corners_of_pieces_are_no_outline() -> None:
 def test_filled_is_surer_than_any_value() -> None:
     made = outline_setup()
     filler = Filler(Indifferent(), made)
-    filling = Filling(made.layout)
-    leg = float(np.sqrt(2.0 * made.layout.areas[0]))
+    filling = Filling(made.task.layout)
+    leg = float(np.sqrt(2.0 * made.task.layout.areas[0]))
     first: Sequence[Place] = filling.places(shapely.box(0, 0, leg, leg), (2,))
     last = filling.places(first[0].rest, first[0].left)
     assert filler.values([*first, *last]).tolist() == [0.0, 0.0, np.inf]
@@ -174,13 +174,13 @@ def test_a_lone_token_a_perceptron_and_one_side_are_refused() -> None:
         outline_setup({"shapes": ["small_triangle"], "scale": 1.0})
     made = outline_setup(ALL)
     with pytest.raises(ConfigError, match="sim.allow_flip=true"):
-        replace(made, sim=replace(made.sim, allow_flip=False))
+        replace(made, sim=replace(made.task.sim, allow_flip=False))
     with pytest.raises(ConfigError, match="net.kind=mlp"):
         replace(made, net=NetConfig(kind="mlp"))
 
 
 def test_values_are_for_outlines_alone() -> None:
     made = outline_setup()
-    corners = replace(made.sim, observe="corners")
+    corners = replace(made.task.sim, observe="corners")
     with pytest.raises(ConfigError, match="agent.beam=4"):
         replace(made, sim=corners, agent=AgentConfig(beam=4))

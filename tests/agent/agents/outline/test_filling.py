@@ -14,9 +14,9 @@ from tests.agent.agents.outline.outlines import ALL, outline_setup
 pytestmark = pytest.mark.fast
 
 MADE = outline_setup()
-FILLING = Filling(MADE.layout)
-LEG = float(np.sqrt(2.0 * MADE.layout.areas[0]))  # of a small triangle
-UNIT = float(np.sqrt(MADE.layout.areas.sum()))
+FILLING = Filling(MADE.task.layout)
+LEG = float(np.sqrt(2.0 * MADE.task.layout.areas[0]))  # of a small triangle
+UNIT = float(np.sqrt(MADE.task.layout.areas.sum()))
 SQUARE = Polygon([(0, 0), (LEG, 0), (LEG, LEG), (0, LEG)])
 STRIP = Polygon([(0, 0), (4 * LEG, 0), (4 * LEG, LEG / 4), (0, LEG / 4)])
 
@@ -52,11 +52,11 @@ def test_what_is_left_must_have_the_tokens_area() -> None:
 
 
 def test_what_tokens_cover_is_taken_away() -> None:
-    layout = MADE.layout
+    layout = MADE.task.layout
     poses = np.zeros((2, 3))
     corners = layout.corners(poses + [[0, 0, 0], [5, 5, 0]])
     goal = layout.corners(np.array([[0.0, 0, 0], [2 * LEG, 0, 0]]))
-    outline = as_rows(covered_area(goal, layout), layout, MADE.goal_rows)
+    outline = as_rows(covered_area(goal, layout), layout, MADE.task.goal_rows)
     laid = np.array([True, False])
     rest = FILLING.rest(outline, corners, laid)
     assert rest.area == pytest.approx(layout.areas[0], rel=1e-2)
@@ -94,7 +94,7 @@ def test_too_many_corners_are_not_seen() -> None:
     star = (1.0 + 0.5 * (-1.0) ** np.arange(100)) * np.exp(1j * angles)
     seen = FILLING.seen(Polygon(np.column_stack([star.real, star.imag])), (2,))
     assert (seen.part == UNUSED).all()
-    value = OutlineValue(FILLING.shapes, MADE.net)
+    value = OutlineValue(FILLING.shapes, MADE.agent.net)
     with torch.no_grad():
         logits = value(Corners.of(Rests.joined([seen, FILLING.seen(SQUARE, (2,))])))
     assert logits.abs().max() < 10.0
@@ -124,13 +124,13 @@ def test_features_of_a_square() -> None:
 def test_a_value_does_not_depend_on_what_it_is_valued_with() -> None:
     """Rows without corners are masked: alone or beside a larger state, it is the same."""
     made = outline_setup(ALL)
-    filling = Filling(made.layout)
+    filling = Filling(made.task.layout)
     big = covered_area(
-        made.layout.corners(np.column_stack([np.arange(7.0), np.zeros(7), np.zeros(7)])),
-        made.layout,
+        made.task.layout.corners(np.column_stack([np.arange(7.0), np.zeros(7), np.zeros(7)])),
+        made.task.layout,
     )
     states = [filling.seen(SQUARE, (0, 0, 2, 0, 0)), filling.seen(big, (2, 1, 2, 1, 1))]
-    value = OutlineValue(filling.shapes, made.net)
+    value = OutlineValue(filling.shapes, made.agent.net)
     with torch.no_grad():
         alone = [float(value(Corners.of(one))[0]) for one in states]
         both = value(Corners.of(Rests.joined(states))).tolist()

@@ -20,7 +20,7 @@ from tests.agent.agents.outline.outlines import TWO, outline_setup, played_in
 pytestmark = pytest.mark.fast
 
 MADE = outline_setup(agent={"replay_capacity": 8, "batch_size": 8})
-LEG = float(np.sqrt(2.0 * MADE.layout.areas[0]))
+LEG = float(np.sqrt(2.0 * MADE.task.layout.areas[0]))
 FAR = [9.0, 9.0, 0.0]
 # Two triangles, back to back: they make a square.
 HALF = [0.0, 0.0, 0.0]
@@ -28,11 +28,14 @@ HALF = [0.0, 0.0, 0.0]
 
 def other_half() -> list[float]:
     """Where the second triangle lies: turned by half a turn about the longest side's middle."""
-    own = MADE.layout.corners(np.array([HALF, FAR]))[:3]
+    own = MADE.task.layout.corners(np.array([HALF, FAR]))[:3]
     sides = np.linalg.norm(np.roll(own, -1, axis=0) - own, axis=1)
     i = int(sides.argmax())
     middle = (own[i] + own[(i + 1) % 3]) / 2.0
-    centre = 2.0 * middle - MADE.layout.poses(MADE.layout.corners(np.array([HALF, FAR])))[0, :2]
+    centre = (
+        2.0 * middle
+        - MADE.task.layout.poses(MADE.task.layout.corners(np.array([HALF, FAR])))[0, :2]
+    )
     return [float(centre[0]), float(centre[1]), float(np.pi)]
 
 
@@ -250,7 +253,7 @@ def test_geometry_that_a_library_trips_over_teaches_nothing(
 
 def test_a_state_in_a_mirror_or_turned_is_as_large_and_its_corners_as_sharp() -> None:
     """Corners, sides and areas stay, and rings still run around what is left."""
-    filling = Filling(MADE.layout)
+    filling = Filling(MADE.task.layout)
     house = shapely.Polygon([(0, 0), (1.3, 0), (1, 0.4), (0.5, 0.9), (0, 0.4)])
     one = Rests.joined([filling.seen(house, (2,))] * 200)
     other = one.turned(np.random.default_rng(0))

@@ -66,13 +66,13 @@ def random_pairs(layout: Layout, seed: int) -> Pairs:
 def transitions(made: Setup, count: int, seed: int = 0, placed: float = 0.4) -> Transitions:
     """Transitions between random scenes, tokens on both sides and some of them placed."""
     rng = np.random.default_rng(seed)
-    layout = made.layout
+    layout = made.task.layout
     corners = layout.corners(*random_scene(layout, rng, count, 3)).astype(np.float32)
     flags = (rng.random((count, layout.tokens)) < placed).astype(np.uint8)
     return Transitions(
         state=corners[:, 0],
         placed=flags,
-        action=rng.uniform(-1.0, 1.0, (count, made.action_size)).astype(np.float32),
+        action=rng.uniform(-1.0, 1.0, (count, made.task.action_size)).astype(np.float32),
         reward=np.zeros(count, np.float32),
         next_state=corners[:, 1],
         next_placed=flags,

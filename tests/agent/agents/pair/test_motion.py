@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from tangram_agent.learner import Learner
-from tangram_agent.policy import Policy
 
 from tangram_agent.agents.pair.motion import Fit, MotionModel, Motions, features, motions_of
 from tangram_agent.base.weights import load_arrays, to_arrays
@@ -15,7 +14,7 @@ from tangram_agent.types import Transitions
 from tangram_core.errors import ConfigError, RunError
 from tangram_tasks.played import Past
 from tests.agent.agents.pair.pair_scenes import SEVEN
-from tests.agent.builders import PAIR, SQUARE, random_episodes, setup
+from tests.agent.builders import PAIR, SQUARE, Policy, random_episodes, setup
 
 pytestmark = pytest.mark.fast
 
@@ -198,7 +197,7 @@ def test_sums_of_another_model_are_refused() -> None:
 @pytest.mark.parametrize("tokens", [SQUARE, PAIR])
 def test_motions_are_those_of_the_token_that_each_action_named(tokens: dict, delay: bool) -> None:
     made = setup(tokens, actions_per_token=2, world="delayed" if delay else "plain")
-    layout = made.layout
+    layout = made.task.layout
     poses = np.zeros((1, 3, layout.tokens, 3))
     poses[0, :, -1] = [[0.1, 0.2, 3.0], [0.3, 0.1, -3.0], [0.3, 0.1, -3.0]]
     corners = layout.corners(poses)
@@ -207,7 +206,7 @@ def test_motions_are_those_of_the_token_that_each_action_named(tokens: dict, del
     if delay:  # what is told first is carried out second, and of the last one nothing is seen yet
         corners = corners[:, [0, 0, 1]]
     motions = motions_of(
-        Past(corners[:, :2].astype(np.float32), actions), corners[:, 2], layout, made.sim
+        Past(corners[:, :2].astype(np.float32), actions), corners[:, 2], layout, made.task.sim
     )
     turned = (2.0 * np.pi - 6.0) / np.pi
     np.testing.assert_allclose(motions.way[0, 0], [0.1, -0.05, turned], atol=1e-5)
@@ -226,13 +225,15 @@ def test_a_motion_that_shifted_another_token_tells_nothing(
     made = setup(PAIR, motion=motion, backend="physics")
     poses = np.zeros((1, 2, 2, 3))
     poses[0, 1] = [[0.0, other, 0.0], [0.1, 0.2, 0.3]]
-    corners = made.layout.corners(poses)
+    corners = made.task.layout.corners(poses)
     past = Past(corners[:, :1], np.array([[[1.0, 0.1, 0.2, 0.3]]], np.float32))
-    assert motions_of(past, corners[:, 1], made.layout, made.sim).moved.tolist() == [[tells]]
+    assert motions_of(past, corners[:, 1], made.task.layout, made.task.sim).moved.tolist() == [
+        [tells]
+    ]
 
 
 def test_noise_on_the_corners_of_small_tokens_is_no_contact() -> None:
-    layout = setup(SEVEN, corner_noise=0.01).layout
+    layout = setup(SEVEN, corner_noise=0.01).task.layout
     rng = np.random.default_rng(0)
     before = rng.uniform(-0.5, 0.5, (50, layout.tokens, 3))
     after = before.copy()
@@ -241,7 +242,7 @@ def test_noise_on_the_corners_of_small_tokens_is_no_contact() -> None:
     seen = [layout.corners(p) + 0.02 * rng.standard_normal(shape) for p in (before, after)]
     action = np.array([-1.0, 0.3, 0.3, 0.0], np.float32)
     past = Past(seen[0][:, None], np.tile(action, (50, 1, 1)))
-    assert motions_of(past, seen[1], layout, setup(SEVEN, corner_noise=0.01).sim).moved.all()
+    assert motions_of(past, seen[1], layout, setup(SEVEN, corner_noise=0.01).task.sim).moved.all()
 
 
 @pytest.mark.parametrize(
@@ -265,18 +266,18 @@ def test_what_lies_still_in_pictures_was_refused() -> None:
     made = setup(PAIR, observe="pictures", pixels=64)
     poses = np.zeros((2, 2, 2, 3))
     poses[:, 1, 1] = [[0.004, -0.004, 0.01], [0.03, 0.0, 0.0]]
-    corners = made.layout.corners(poses)
+    corners = made.task.layout.corners(poses)
     past = Past(corners[:, :1].astype(np.float32), np.full((2, 1, 4), 0.5, np.float32))
-    seen = motions_of(past, corners[:, 1], made.layout, made.sim)
+    seen = motions_of(past, corners[:, 1], made.task.layout, made.task.sim)
     assert seen.moved.tolist() == [[0.0], [1.0]]
-    exact = motions_of(past, corners[:, 1], made.layout, setup(PAIR).sim)
+    exact = motions_of(past, corners[:, 1], made.task.layout, setup(PAIR).task.sim)
     assert exact.moved.tolist() == [[1.0], [1.0]]
 
 
 @pytest.mark.parametrize("capacity", [7, 12, 100])
 def test_the_replay_gives_whole_episodes(capacity: int) -> None:
     made = setup(actions_per_token=3)
-    buffer = ReplayBuffer(capacity, made.layout.corner_count, 1, 3)
+    buffer = ReplayBuffer(capacity, made.task.layout.corner_count, 1, 3)
     for first in range(0, 18, 6):
         number = np.arange(first, first + 6, dtype=np.float32)
         points = np.broadcast_to(number[:, None, None], (6, 4, 2))
@@ -308,9 +309,9 @@ def test_an_agent_corrects_itself_by_what_it_has_seen() -> None:
     episodes = random_episodes(made, 5)
     start, goals, placed = episodes["corners"][:, 0], episodes["goals"], episodes["placed"][:, 0]
     first = policy.act(start, placed, goals)
-    poses = made.layout.poses(start.astype(np.float64))
+    poses = made.task.layout.poses(start.astype(np.float64))
     poses[:, 0] += 0.5 * first * SCALE
-    now = made.layout.corners(poses).astype(np.float32)
+    now = made.task.layout.corners(poses).astype(np.float32)
     past = Past(start[:, None], first[:, None])
     blind, told = policy.act(now, placed, goals), policy.act(now, placed, goals, past=past)
     short = np.abs(blind) < 0.5
@@ -327,9 +328,9 @@ def test_with_a_delay_it_plays_for_where_the_action_before_will_have_taken_the_t
     episodes = random_episodes(made, 5)
     start, goals, placed = episodes["corners"][:, 0], episodes["goals"], episodes["placed"][:, 0]
     first = policy.act(start, placed, goals)
-    poses = made.layout.poses(start.astype(np.float64))
+    poses = made.task.layout.poses(start.astype(np.float64))
     poses[:, 0] += first * SCALE
-    there = made.layout.corners(poses)
+    there = made.task.layout.corners(poses)
     late = policy.act(start, placed, goals, past=Past(start[:, None], first[:, None]))
     np.testing.assert_allclose(late, policy.act(there, placed, goals), atol=1e-5)
 
@@ -339,12 +340,14 @@ def test_with_noise_what_was_blocked_has_not_moved() -> None:
     for tokens, counts in ((PAIR, False), (SQUARE, True)):
         made = setup(tokens, corner_noise=0.01)
         rng = np.random.default_rng(0)
-        shape = 8, 1, made.layout.corner_count, 2
-        before = made.layout.corners(rng.uniform(-0.5, 0.5, (8, made.layout.tokens, 3)))[:, None]
-        noise = 0.01 * made.sim.arena * rng.standard_normal((2, *shape))
-        actions = rng.uniform(-1.2, 1.2, (8, 1, made.action_size)).astype(np.float32)
+        shape = 8, 1, made.task.layout.corner_count, 2
+        before = made.task.layout.corners(rng.uniform(-0.5, 0.5, (8, made.task.layout.tokens, 3)))[
+            :, None
+        ]
+        noise = 0.01 * made.task.sim.arena * rng.standard_normal((2, *shape))
+        actions = rng.uniform(-1.2, 1.2, (8, 1, made.task.action_size)).astype(np.float32)
         past = Past((before + noise[0]).astype(np.float32), actions)
-        seen_of = motions_of(past, (before + noise[1])[:, 0], made.layout, made.sim)
+        seen_of = motions_of(past, (before + noise[1])[:, 0], made.task.layout, made.task.sim)
         assert bool(seen_of.moved.any()) == counts
         assert seen_of.command.abs().max() == 1.0  # as far as it is carried out
 

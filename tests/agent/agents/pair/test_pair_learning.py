@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 import torch
 from tangram_agent.learner import Learner
-from tangram_agent.policy import Policy
 
 from tangram_agent.agents.pair.pairs import Pairs
 from tangram_agent.relabelling import PairBatch
 from tangram_core.setup import Setup
 from tangram_sim.batch import BatchedEnv
 from tests.agent.agents.pair.pair_scenes import PERCEPTRON, TWO, seven, transitions
-from tests.agent.builders import setup
+from tests.agent.builders import Policy, setup
 
 pytestmark = pytest.mark.fast
 
@@ -79,7 +78,7 @@ def coverage(learner: Learner, made: Setup, episodes: int) -> float:
     """Mean overlap of episodes that the acting weights play."""
     policy = Policy(made)
     policy.load(learner.acting_weights(0))
-    with closing(BatchedEnv(made.layout, made.sim, made.reward, episodes)) as env:
+    with closing(BatchedEnv(made.task.layout, made.task.sim, made.task.reward, episodes)) as env:
         env.reset([np.random.default_rng([1, i]) for i in range(episodes)])
         for _ in range(env.horizon):
             actions = policy.act(env.corners, env.placed, env.goals)

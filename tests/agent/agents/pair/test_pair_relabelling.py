@@ -23,7 +23,7 @@ PARALLELOGRAM = 6
 
 
 MADE = seven()
-LAYOUT = MADE.layout
+LAYOUT = MADE.task.layout
 BATCH = transitions(MADE, COUNT)
 EXACT = {name: column.astype(np.float64) for name, column in BATCH.arrays.items()}
 ROWS = np.repeat(np.arange(COUNT), PAIRS)
@@ -164,8 +164,8 @@ def test_a_quarter_of_the_pairs_is_asked_from_where_the_action_ended() -> None:
 @pytest.mark.parametrize("shape", ["square", "parallelogram", "large_triangle"])
 def test_one_tokens_pairs_are_the_transitions_with_their_reward(shape: str) -> None:
     """As they come out of the replay."""
-    made = setup({"shapes": [shape], "scale": 0.8}, {"readout": "pair"}, actions_per_token=2)
-    layout, rng = made.layout, np.random.default_rng(0)
+    made = setup({"shapes": [shape], "scale": 0.8}, {"kind": "pair"}, actions_per_token=2)
+    layout, rng = made.task.layout, np.random.default_rng(0)
     reward = rng.uniform(-1.0, 1.0, COUNT).astype(np.float32)
     done = (rng.random(COUNT) < 0.5).astype(np.uint8)
     batch = replace(transitions(made, COUNT), reward=reward, done=done)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from tangram_agent.networks import Networks, initialise
-from tangram_agent.policy import Policy
 
 from tangram_agent.agents.pair import planning
 from tangram_agent.agents.pair.coverage import covered_share, covering, worths
@@ -26,7 +25,7 @@ from tests.agent.agents.pair.pair_scenes import (
     random_scene,
     seven,
 )
-from tests.agent.builders import SMALL, setup
+from tests.agent.builders import SMALL, Policy, setup
 
 pytestmark = pytest.mark.fast
 
@@ -36,7 +35,7 @@ COUNT = 6
 def scenes(made: Setup, count: int = COUNT, seed: int = 0) -> tuple[np.ndarray, ...]:
     """Corners, placed and goals of random scenes; every one has a token left."""
     rng = np.random.default_rng(seed)
-    layout = made.layout
+    layout = made.task.layout
     corners, goals = (layout.corners(*random_scene(layout, rng, count)) for _ in range(2))
     placed = rng.random((count, layout.tokens)) < 0.5
     placed[:, 0] &= ~placed.all(axis=1)
@@ -50,8 +49,8 @@ def random_networks(made: Setup, seed: int = 0) -> Networks:
 
 
 def perfect(made: Setup) -> Planner:
-    graph = PairGraph(made.layout, made.sim.arena)
-    networks = PerfectNetworks(PerfectCritic(made.layout), graph)
+    graph = PairGraph(made.task.layout, made.task.sim.arena)
+    networks = PerfectNetworks(PerfectCritic(made.task.layout), graph)
     return Planner(cast("Networks", networks), made)
 
 
@@ -68,7 +67,7 @@ def total(
     piece: int = 0,
 ) -> tuple[float, np.ndarray]:
     """Value over all pieces of one token's pose, by default the actor's own for one piece."""
-    layout = made.layout
+    layout = made.task.layout
     corners, _, goals = (part[None] for part in scene)
     covered = covering(corners, goals, layout)
     share = covered_share(covered, layout)[0, token]
@@ -80,7 +79,7 @@ def total(
         goal = as_tensor([wanted[index]]), as_tensor([sides[index]]), torch.tensor([index])
         return Pairs(*own, *goal, as_tensor([share[index]]))
 
-    graph = PairGraph(layout, made.sim.arena)
+    graph = PairGraph(layout, made.task.sim.arena)
 
     def proposed(pairs: Pairs) -> np.ndarray:
         place: np.ndarray = graph.moved(pairs, networks.actor(pairs)[0]).pose[0].numpy()
@@ -88,7 +87,7 @@ def total(
 
     if pose is None:
         pose = proposed(pair(here, piece))
-        for _ in range(made.agent.reapply):
+        for _ in range(made.agent.config.reapply):
             pose = proposed(pair(pose, piece))
     still = torch.zeros(1, 3)
     values = [networks.critic(pair(pose, index), still).item() for index in range(layout.tokens)]
@@ -112,11 +111,13 @@ def test_the_best_of_all_is_played(
         every = [
             (*total(made, networks, scene, token, turned, piece=piece), token, turned)
             for token, turned, piece in product(range(2), (False, True), range(2))
-            if not placed[row, token] and (not turned or (flip and made.layout.chiral[token]))
+            if not placed[row, token] and (not turned or (flip and made.task.layout.chiral[token]))
         ]
         _, pose, token, turned = max(every, key=lambda one: one[0])
         assert (choice.token[row], choice.flip[row]) == (token, turned)
-        way = velocities_of((pose - made.layout.poses(corners[row])[token])[None], made.sim)[0]
+        way = velocities_of(
+            (pose - made.task.layout.poses(corners[row])[token])[None], made.task.sim
+        )[0]
         np.testing.assert_allclose(choice.velocity[row], way.clip(-1.0, 1.0), atol=1e-5)
 
 
@@ -152,7 +153,7 @@ def assembled(made: Setup, chooser: Planner, episodes: int) -> tuple[np.ndarray,
     policy = Policy(made)
     policy._planner = chooser  # perfect networks have no weights to load
     flips = []
-    with closing(BatchedEnv(made.layout, made.sim, made.reward, episodes)) as env:
+    with closing(BatchedEnv(made.task.layout, made.task.sim, made.task.reward, episodes)) as env:
         env.reset([np.random.default_rng([7, i]) for i in range(episodes)])
         for _ in range(env.horizon):
             actions = policy.act(env.corners, env.placed, env.goals)
@@ -173,10 +174,10 @@ def test_perfect_networks_assemble_everything(sim: dict[str, Any]) -> None:
 
 def test_a_token_is_turned_over_just_where_its_piece_lies_on_the_other_side() -> None:
     tokens = {"shapes": ["parallelogram"], "scale": 0.8}
-    made = setup(tokens, {"readout": "pair"}, allow_flip=True, mirrored=0.5)
+    made = setup(tokens, {"kind": "pair"}, allow_flip=True, mirrored=0.5)
     rng = np.random.default_rng(0)
-    own, wanted = (random_scene(made.layout, rng, 40) for _ in range(2))
-    corners, goals = made.layout.corners(*own), made.layout.corners(*wanted)
+    own, wanted = (random_scene(made.task.layout, rng, 40) for _ in range(2))
+    corners, goals = made.task.layout.corners(*own), made.task.layout.corners(*wanted)
     choice = perfect(made).choose(corners, np.zeros((40, 1), np.bool_), goals)
     np.testing.assert_array_equal(choice.flip, (own[1] ^ wanted[1])[:, 0])
     assert 5 < choice.flip.sum() < 35
