@@ -22,9 +22,9 @@ NEEDED = "???"  # hydra's word for a value that must be given
 # the command line wins; a set of several tokens comes last, as it brings its starts.
 GROUPS = ("task", "sim", "reward", "net", "agent", "service", "tokens")
 RUN: dict[str, str | list[str]] = {
-    "task": "place",
     "sim": "physics",
     "reward": "overlap",
+    "task": "place",
     "net": "mha_narrow",
     "agent": "tangram",
     "service": "local",

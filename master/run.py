@@ -98,7 +98,13 @@ def run_master(config: MasterConfig, setup: Setup, resolved: Mapping[str, Any]) 
             log.info("workers join with: %s", command_line("tangram-worker", join))
             log.info("an evaluator scores what is learned: %s", evaluator)
         reason = loop.run()
-        result = make_result(loop.finish(launched), loop.guard.trainer.facts(), config.seed, reason)
+        result = make_result(
+            loop.finish(launched),
+            setup.task.scores,
+            loop.guard.trainer.facts(),
+            config.seed,
+            reason,
+        )
         folder.write_result(result)
         loop.reporter.hyperparameters(result)
         loop.dismiss(f"the run has ended ({reason})")
@@ -232,6 +238,7 @@ def _open_hub(config: MasterConfig, setup: Setup, run_id: str, keys: Keys | None
         seed=config.seed,
         fingerprints=setup.fingerprints(),
         spec=setup.spec,
+        scores=frozenset(score.name for score in setup.task.scores),
         window=WINDOW,
         lockstep=service.mode == "lockstep",
     )

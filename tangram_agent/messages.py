@@ -56,29 +56,6 @@ WINDOW = 4  # messages of a worker that may be unacknowledged; a full window pau
 MAX_WINDOW = 1024
 PICTURE_WIDTH, PICTURE_HEIGHT = 1024, 768  # pixels: at most, they fill MAX_FRAMES
 MAX_ROWS = 4096
-# What an evaluator may report; see `worker.score.metrics`.
-SCORE_NAMES = (
-    "mean_reward",
-    "mean_reward_dense",
-    "mean_reward_camera",
-    "mean_train_reward",
-    "raw_overlap",
-    "raw_overlap_p10",
-    "angle_error_deg_median",
-    "angle_error_deg_p90",
-    "position_error_median",
-    "position_error_p90",
-    "coverage",
-    "iou",
-    "share_solved",
-    "wrong",
-    "doubly_used",
-    "refused",
-    "blocked",
-    "actions_used",
-    "episodes",
-    "seconds",
-)
 TAKEN_OVER = "was taken over by a newer process"  # tangram-train reads it in a worker's log
 OPEN = "service.auth=off: open to whoever reaches the port"
 
@@ -228,7 +205,7 @@ class Scores(OfTask):
 
     kind: ClassVar[str] = "scores"
     weights_version: Version
-    scalars: Annotated[Mapping[str, float], Numbers(names=SCORE_NAMES)]
+    scalars: Annotated[Mapping[str, float], Numbers()]
     picture: Pixels
 
     @classmethod

@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from tangram_core.errors import RunError
+from tangram_core.scores import read
 
 FILE_NAME = "result.json"
 BOUNDS = ("max_hours", "max_episodes", "max_updates")
+ROWS = 6  # of scores
 FAULTS = (
     OSError,
     ValueError,
@@ -41,13 +43,9 @@ def read_outcome(path: Path) -> dict[str, Any]:
 
 def outcome_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     """What people want to know of a result, as names and texts."""
-    rows = [
-        ("mean reward", f"{_text(result, 'mean_reward', '{:.3f}')} on exact polygons"),
-        ("", f"{_text(result, 'mean_reward_camera', '{:.3f}')} in the camera's pictures"),
-        ("raw overlap", _text(result, "raw_overlap", "{:.3f}")),
-        ("angle error", _text(result, "angle_error_deg_median", "{:.2f}°") + " (median)"),
-        ("position error", _text(result, "position_error_median", "{:.4f}") + " (median)"),
-    ]
+    scores = read(result["scores"])
+    shown = [score for score in scores[:ROWS] if result[score.name] is not None] or scores[:1]
+    rows = [(score.label, score.shown(result[score.name])) for score in shown]
     if result["scored_updates"] is None:
         rows = [("scores", "none: no evaluator took part; tangram-eval scores a finished run")]
     elif result["scored_updates"] != result["updates"]:
@@ -79,8 +77,3 @@ def duration(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
-
-
-def _text(result: Mapping[str, Any], name: str, pattern: str) -> str:
-    value = result[name]
-    return "-" if value is None else pattern.format(value)

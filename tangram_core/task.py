@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 
 from tangram_core.arrays import Bools, Floats, Pixels, Singles
+from tangram_core.scores import Score
 from tangram_core.seeding import episode_generator
 from tangram_core.settings import Settings
 from tangram_core.spec import Array, Arrays, Episodes, EpisodeSpec
@@ -18,31 +19,6 @@ from tangram_core.spec import Array, Arrays, Episodes, EpisodeSpec
 Generators = Sequence[np.random.Generator]
 Purpose = Literal["play", "test"]
 Json = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Score:
-    """A number by which play is judged, as people are shown it.
-
-    Attributes:
-        name: in result.json, in TensorBoard and in files of scores.
-        label: of a few words, with the unit.
-        digits: after the point.
-        unit: written behind the number.
-    """
-
-    name: str
-    label: str
-    digits: int = 3
-    unit: str = ""
-
-    def shown(self, value: float | None) -> str:
-        """The number as people read it."""
-        return "-" if value is None else f"{value:.{self.digits}f}{self.unit}"
-
-    def told(self, value: float) -> str:
-        """With its label."""
-        return f"{self.label} {self.shown(value)}"
 
 
 @dataclass(frozen=True, eq=False)

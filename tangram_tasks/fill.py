@@ -5,8 +5,9 @@ from dataclasses import dataclass, fields
 from typing import ClassVar
 
 from tangram_core.errors import ConfigError
+from tangram_core.scores import Score
 from tangram_core.settings import refuse_ignored, told
-from tangram_core.task import Chooser, Env, Played, Score
+from tangram_core.task import Chooser, Env, Played
 from tangram_sim.config import SILHOUETTES, RewardConfig
 from tangram_tasks.place import SEVERAL, Place
 

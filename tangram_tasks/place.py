@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 
 from tangram_core.arrays import Floats, Pixels
+from tangram_core.scores import Score
 from tangram_core.spec import Array, EpisodeSpec
-from tangram_core.task import Chooser, Env, Json, Played, Purpose, Score, Task
+from tangram_core.task import Chooser, Env, Json, Played, Purpose, Task
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.episodes import spec_of
 from tangram_sim.geometry.layout import Layout, TokensConfig, make_layout

@@ -16,8 +16,9 @@ from rich.text import Text
 from tangram_agent.messages import OPEN, WORKER_COLUMNS, AskStatus, RunStatus, decode_from_master
 from tangram_agent.outcome import FILE_NAME, duration, outcome_rows, read_outcome
 from tangram_agent.runs import CONFIG
-from tangram_core.code import own_code
+from tangram_core.code import code_of
 from tangram_core.errors import TangramError, WireError
+from tangram_core.scores import read, told
 from worker.config import StatusConfig
 from worker.talk.connection import Sockets
 from worker.talk.discovery import find_master, host_error, keys_error
@@ -108,7 +109,7 @@ def ask_status(
 def status_rows(status: RunStatus) -> list[tuple[str, str]]:
     """What people want to know of a run that goes on, as names and texts."""
     numbers = defaultdict(lambda: UNKNOWN, status.numbers)
-    return [*_lines(numbers, status.texts), *_scores(numbers)]
+    return [*_lines(numbers, status.texts), *_scores(status)]
 
 
 def worker_rows(status: RunStatus) -> list[tuple[str, ...]]:
@@ -134,7 +135,8 @@ def _read(frames: list[bytes]) -> RunStatus | None:
 
 def _plain(status: RunStatus) -> dict[str, Any]:
     rows = [dict(zip(WORKER_COLUMNS, row, strict=True)) for row in status.workers.tolist()]
-    return {**status.texts, **status.numbers, "workers": rows}
+    texts = {name: text for name, text in status.texts.items() if name != "scores"}
+    return {**texts, **status.numbers, "workers": rows}
 
 
 def _print(console: Console, status: RunStatus, connect: str) -> None:
@@ -153,9 +155,8 @@ def _evaluator(connect: str) -> str:
     address = find_master(connect)
     if address is not None and address.keys and "evaluator" not in address.keys:
         return f"{connect} has no key for one, tangram-keys makes it (add=NAME role=evaluator)"
-    reward = {} if address is None else dict((address.settings or {}).get("reward", {}))
-    own = own_code(str(reward.get("name", "")))
-    named = f" {quote('reward.name=' + reward['name'])}" if own else ""
+    own = {} if address is None else code_of(address.settings or {})
+    named = "".join(f" {quote(f'{name}={value}')}" for name, value in own.items())
     return f"tangram-worker connect={connect} role=evaluator{named}"
 
 
@@ -166,12 +167,13 @@ def _print_rows(console: Console, rows: Iterable[tuple[str, str]]) -> None:
     console.print(grid, highlight=False)
 
 
-def _scores(n: Mapping[str, float]) -> Iterator[tuple[str, str]]:
+def _scores(status: RunStatus) -> Iterator[tuple[str, str]]:
+    n = status.numbers
     if "play/reward" in n:
         yield "players' reward", f"{n['play/reward']:.3f}, with exploration"
-    if "test/mean_reward" in n:
-        angle = f"angle error {n['test/angle_error_deg_median']:.2f} deg"
-        yield "last test", f"mean reward {n['test/mean_reward']:.3f}, {angle}"
+    found = told(read(status.texts.get("scores", "")), n, "test/")
+    if found:
+        yield "last test", found
 
 
 def _lines(n: Mapping[str, float], texts: Mapping[str, str]) -> Iterator[tuple[str, str]]:

@@ -26,6 +26,7 @@ class WelcomeInfo:
         seed: of the run.
         fingerprints: section of the settings -> digest; a worker's must be equal.
         spec: the task that arrays are checked against.
+        scores: names that an evaluator may report.
         window: most unacknowledged batches of one peer.
         lockstep: players wait for orders.
     """
@@ -34,6 +35,7 @@ class WelcomeInfo:
     seed: int
     fingerprints: Mapping[str, str]
     spec: EpisodeSpec
+    scores: frozenset[str] = frozenset()
     window: int = 4
     lockstep: bool = False
 

@@ -46,6 +46,7 @@ from tangram_agent.messages import (
 from tangram_agent.schema import DamagedError, ProtocolError
 from tangram_agent.types import Weights
 from tangram_core.errors import WireError
+from tangram_core.scores import COUNTS
 from tangram_core.wire.addresses import IPC
 
 # Most messages taken in one poll, so that the loop gets its turn under any load.
@@ -309,6 +310,10 @@ class Hub:
 
     def _scores(self, peer: Peer, scores: Scores) -> ScoresArrived | None:
         """Scores, once for each of the published weights."""
+        odd = scores.scalars.keys() - self._info.scores - set(COUNTS)
+        if odd:
+            self._reject(peer, 0, f"scores: the task has none that is called {min(odd)}")
+            return None
         peer.damaged = 0
         if reason := self._exams.take(scores.weights_version, peer.index):
             self._reject(peer, 0, reason, "excess_scores")

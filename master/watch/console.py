@@ -20,9 +20,11 @@ from rich.text import Text
 from tangram_agent.messages import OPEN, RunStatus
 from tangram_agent.outcome import duration, plural
 from tangram_core.process import Every, formatter
+from tangram_core.scores import read, told
 
 PANEL_S = 0.5
 LINE_S = 10.0
+LINE = 3  # scores in a line
 PANEL_WIDTH = 76
 TEST = "test/"  # before the names of scores
 PLAYED = "play/reward"  # what the players got lately, exploration included
@@ -195,7 +197,7 @@ def status_line(status: RunStatus) -> str:
         plural(n["updates"], "update"),
         f"{n['transitions_per_s']:,.0f} transitions/s",
         f"{n['updates_per_s']:,.1f} updates/s",
-        _scores(n),
+        _scores(status),
         plural(n["players"], "worker"),
         status.texts["activity"],
         OPEN if n.get("open_to_all") else "",
@@ -215,18 +217,9 @@ def status_panel(status: RunStatus, title: str, evaluator: str = "") -> Panel:
     grid.add_row("transitions/s", rates[0], "updates/s", rates[1])
     if PLAYED in n:
         grid.add_row("players' reward", f"{n[PLAYED]:.3f}", "", "with exploration")
-    grid.add_row(
-        "mean reward",
-        Text(_score(n, "mean_reward", "{:.3f}"), style="bold green"),
-        "raw overlap",
-        _score(n, "raw_overlap", "{:.3f}"),
-    )
-    grid.add_row(
-        "angle error",
-        _score(n, "angle_error_deg_median", "{:.2f}°"),
-        "position error",
-        _score(n, "position_error_median", "{:.4f}"),
-    )
+    cells = _cells(status)
+    for pair in zip(cells[::2], cells[1::2], strict=True):
+        grid.add_row(*(cell for one in pair for cell in one))
     helpers = f"{plural(n['players'], 'worker')}, {plural(n['evaluators'], 'evaluator')}"
     text = f"{helpers} · {status.texts['activity']}"
     foot = Text(text, style="dim", no_wrap=True, overflow="ellipsis")
@@ -255,18 +248,17 @@ def _left(n: Mapping[str, float]) -> str:
     return f", {duration(n['left_s'])} left" if n["left_s"] > 0 else ""
 
 
-def _scores(n: Mapping[str, float]) -> str:
+def _scores(status: RunStatus) -> str:
     """The scores that matter most, or nothing before the first evaluation."""
-    known = (
-        ("mean_reward", "reward {:.3f}"),
-        ("angle_error_deg_median", "angle {:.2f}°"),
-        ("position_error_median", "position {:.4f}"),
-    )
-    scores = [text.format(n[TEST + name]) for name, text in known if TEST + name in n]
-    if not scores and PLAYED in n:
-        scores = [f"players' reward {n[PLAYED]:.3f}"]
-    return ", ".join(scores)
+    n = status.numbers
+    found = told(read(status.texts.get("scores", ""))[:LINE], n, TEST)
+    return found or (f"players' reward {n[PLAYED]:.3f}" if PLAYED in n else "")
 
 
-def _score(n: Mapping[str, float], name: str, pattern: str) -> str:
-    return pattern.format(n[TEST + name]) if TEST + name in n else "-"
+def _cells(status: RunStatus) -> list[tuple[str, str | Text]]:
+    """Labels and numbers of an even number of scores, the first one to be seen first."""
+    cells = list[tuple[str, str | Text]]()
+    for score in read(status.texts.get("scores", "")):
+        shown = score.shown(status.numbers.get(TEST + score.name))
+        cells.append((score.label, shown if cells else Text(shown, style="bold green")))
+    return cells + [("", "")] * (len(cells) % 2)

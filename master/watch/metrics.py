@@ -10,7 +10,7 @@ import json
 import logging
 import threading
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -23,16 +23,13 @@ from torch.utils.tensorboard.summary import hparams
 
 from tangram_core.arrays import Pixels
 from tangram_core.process import Every
+from tangram_core.scores import SHOWN, read
 from tangram_core.store.files import make_folders, write_whole
 
 FLUSH_S = 30
 RETRY_S = 60.0
 POINT = ("updates", "episodes", "train_s")  # where an evaluation stands
-HPARAMS = (
-    *("seed", "tokens", "agent", "net", "reward", "actions_per_token", "backend"),
-    *("updates", "episodes", "workers", "parameters", "train_s"),
-)
-FINAL = ("mean_reward", "raw_overlap", "angle_error_deg_median", "position_error_median")
+HPARAMS = ("seed", "updates", "episodes", "workers", "train_s")  # beside what tells task and agent
 
 log = logging.getLogger(__name__)
 
@@ -125,14 +122,15 @@ class Metrics:
         indented = "".join(f"    {line}\n" for line in text.splitlines())
         self._try(lambda: self._writer.add_text("config", indented))
 
-    def hyperparameters(self, result: Mapping[str, Any]) -> None:
+    def hyperparameters(self, result: Mapping[str, Any], facts: Collection[str]) -> None:
         """What runs are compared by in the HPARAMS tab, and which curves end in their scores.
 
         Args:
             result: of the run, as in result.json.
+            facts: names in it of what tells task and agent.
         """
-        values = {name: _plain(result[name]) for name in HPARAMS}
-        tags = {f"test/{name}": 0.0 for name in FINAL}
+        values = {name: _plain(result[name]) for name in (*HPARAMS, *facts)}
+        tags = {f"test/{score.name}": 0.0 for score in read(result["scores"])[:SHOWN]}
 
         def write() -> None:
             # The writer's own add_hparams makes another run in TensorBoard's list.

@@ -1,5 +1,6 @@
 """How the run stands, collected once, and told at bounded rates to everybody who shows it."""
 
+import json
 import logging
 import time
 from collections import OrderedDict
@@ -27,6 +28,7 @@ from tangram_agent.messages import WORKER_COLUMNS, RunStatus, Scores
 from tangram_core.arrays import Floats
 from tangram_core.errors import RunError
 from tangram_core.process import Every
+from tangram_core.scores import SHOWN, written
 from tangram_core.store.files import write_whole
 
 UNKNOWN = -1.0
@@ -116,6 +118,7 @@ class StatusCollector:
         texts = {
             "run": self._name,
             "run_id": record.run_id,
+            "scores": json.dumps(written(trainer.setup.task.scores[:SHOWN])),
             "activity": HOMELESS if self._checkpointer.homeless else activity(trainer, players),
         }
         return RunStatus(numbers, texts, _workers(self._hub.peers if each else (), trainer.updates))
@@ -281,7 +284,7 @@ class Reporter:
 
     def hyperparameters(self, result: Mapping[str, Any]) -> None:
         """Write what runs are compared by."""
-        self._metrics.hyperparameters(result)
+        self._metrics.hyperparameters(result, self._trainer.facts())
 
     def draw(self) -> None:
         """Write the picture of the last evaluation, where there is one.

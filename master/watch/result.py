@@ -7,7 +7,7 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from shutil import which
@@ -23,27 +23,21 @@ from master.watch.console import TEST, sturdy_console
 from tangram_agent.messages import RunStatus
 from tangram_agent.outcome import outcome_rows, read_outcome
 from tangram_core.code import code_of
+from tangram_core.scores import Score, written
 
 PLAIN = re.compile(r"[\w.]+=[\w./:-]+")
 ROOT = Path(__file__).resolve().parents[2]
-SCORES = (
-    "mean_reward",
-    "mean_reward_dense",
-    "mean_reward_camera",
-    "raw_overlap",
-    "raw_overlap_p10",
-    "angle_error_deg_median",
-    "angle_error_deg_p90",
-    "position_error_median",
-    "position_error_p90",
-)
 log = logging.getLogger(__name__)
 
 PACKAGES = ("tangram-rl", "torch", "numpy", "pyzmq", "pybullet")
 
 
 def make_result(
-    status: RunStatus, facts: Mapping[str, Any], seed: int, reason: str
+    status: RunStatus,
+    scores: Sequence[Score],
+    facts: Mapping[str, Any],
+    seed: int,
+    reason: str,
 ) -> dict[str, Any]:
     """The content of result.json; scores are null where no evaluator sent any.
 
@@ -51,6 +45,7 @@ def make_result(
 
     Args:
         status: at the end of the run.
+        scores: that the task declares.
         facts: of what has learned.
         seed: of the run.
         reason: of its end.
@@ -58,7 +53,8 @@ def make_result(
     n = status.numbers
     scored = int(n["scored_updates"])
     return {
-        **{name: n.get(TEST + name) for name in SCORES},
+        **{score.name: n.get(TEST + score.name) for score in scores},
+        "scores": written(scores),
         "test_episodes": n.get(f"{TEST}episodes"),
         "scored_updates": scored if scored >= 0 else None,
         **{name: int(n[name]) for name in ("episodes", "transitions", "updates")},

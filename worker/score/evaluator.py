@@ -10,6 +10,7 @@ from PIL import Image
 from tangram_agent.messages import PICTURE_HEIGHT, PICTURE_WIDTH, Scores
 from tangram_agent.types import Weights
 from tangram_core.arrays import Pixels
+from tangram_core.scores import SHOWN, told
 from tangram_core.service import ServiceConfig
 from tangram_core.setup import Setup
 from worker.config import WorkerConfig
@@ -100,13 +101,10 @@ def _evaluate(tests: FixedTests, acting: Acting, client: Client) -> Scores | Non
         return None
     count = {"episodes": float(played.episodes.count), "seconds": time.monotonic() - began}
     scalars = {**task.score(played), **count}
-    told = ", ".join(
-        score.told(scalars[score.name]) for score in task.scores if score.name in scalars
-    )
     _log.info(
         "weights %d: %s (%.1f s)",
         acting.version,
-        told,
+        told(task.scores[:SHOWN], scalars),
         scalars["seconds"],
         extra={"event": "scored", "weights_version": acting.version} | scalars,
     )

@@ -127,7 +127,7 @@ def connected(case: Case, setup: Setup, episodes: Episodes, workers: int = 1) ->
 @contextmanager
 def opened(way: str, setup: Setup, keys: Keys | None) -> Iterator[tuple[Hub, Path]]:
     """A Hub, and a folder that is there as long."""
-    info = WelcomeInfo("bench", 0, setup.fingerprints(), setup.spec, WINDOW)
+    info = WelcomeInfo("bench", 0, setup.fingerprints(), setup.spec, window=WINDOW)
     with tempfile.TemporaryDirectory() as folder:
         bind = f"{IPC}{folder}/hub" if way == UNIX else "127.0.0.1"
         with Hub(bind, 0, info, keys=keys) as hub:

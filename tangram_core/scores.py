@@ -1,0 +1,72 @@
+"""Scores: what they are called, how people read them, and how a file or a message names them."""
+
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import astuple, dataclass
+from typing import Any
+
+from tangram_core.errors import ConfigError
+
+NAME = re.compile(r"[a-z][a-z0-9_]{0,40}")
+MAX_LABEL, MAX_UNIT, MAX_DIGITS = 40, 8, 9
+SHOWN = 4  # where there is little room
+COUNTS = ("episodes", "seconds")  # what every evaluation tells beside its scores
+
+
+@dataclass(frozen=True)
+class Score:
+    """A number by which play is judged, as people are shown it.
+
+    Attributes:
+        name: in result.json, in TensorBoard and in files of scores.
+        label: a few words.
+        digits: after the point.
+        unit: written behind the number.
+    """
+
+    name: str
+    label: str
+    digits: int = 3
+    unit: str = ""
+
+    def __post_init__(self) -> None:
+        if not NAME.fullmatch(self.name) or self.name in COUNTS:
+            raise ConfigError(
+                f"a score's name has small letters, digits and _, at most 41, got {self.name!r}: "
+                "give it another"
+            )
+        fits = len(self.label) <= MAX_LABEL and len(self.unit) <= MAX_UNIT
+        if not (fits and 0 <= self.digits <= MAX_DIGITS):
+            raise ConfigError(
+                f"score {self.name}: a label has at most {MAX_LABEL} characters, a unit "
+                f"{MAX_UNIT}, and {MAX_DIGITS} digits are shown: make them shorter"
+            )
+
+    def shown(self, value: float | None) -> str:
+        """The number as people read it."""
+        return "-" if value is None else f"{value:.{self.digits}f}{self.unit}"
+
+    def told(self, value: float) -> str:
+        """With its label."""
+        return f"{self.label} {self.shown(value)}"
+
+
+def written(scores: Iterable[Score]) -> list[list[Any]]:
+    """Scores as JSON has them."""
+    return [list(astuple(score)) for score in scores]
+
+
+def read(content: Any) -> tuple[Score, ...]:
+    """Scores from JSON, or from a text of it; none where it is nothing of the kind."""
+    try:
+        rows = json.loads(content) if isinstance(content, str) else content
+        return tuple(Score(*row) for row in rows)
+    except (ValueError, TypeError, RecursionError, ConfigError):
+        return ()
+
+
+def told(scores: Sequence[Score], values: Mapping[str, float], before: str = "") -> str:
+    """Those that there are values of, by names with something before them, in one line."""
+    known = [score for score in scores if before + score.name in values]
+    return ", ".join(score.told(values[before + score.name]) for score in known)
