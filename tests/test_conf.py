@@ -12,14 +12,17 @@ from unittest.mock import patch
 import pytest
 import yaml
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from tangram_agent.config import AgentConfig, NetConfig, ServiceConfig
 
 from conf.cli import composed, entry, with_run_config
-from conf.commands import COMMANDS, GROUPS, OVER, Plain, load
+from conf.commands import COMMANDS, GROUPS, OVER, Plain, laid_over
 from conf.help import choices, group_help, help_text, setting_names
+from conf.kinds import Kinds, kinds_of
 from conf.settings import PAGE, page
 from conf.sweep import check_launcher, refuse_lost_job
+from tangram_agent.agents.pair.config import PairConfig
+from tangram_agent.base.config import NetConfig
 from tangram_core.errors import ConfigError, TangramError
+from tangram_core.service import ServiceConfig
 from tangram_core.settings import KEY, PLAY, declared_fields
 from tangram_core.setup import Setup, from_mapping, make_setup
 from tangram_sim.config import RewardConfig, SimConfig
@@ -42,8 +45,8 @@ def test_a_preset_sets_what_is_declared_and_differs(group: str, name: str) -> No
     text = (files("conf") / group / f"{name}.yaml").read_text("utf-8")
     assert text.startswith("# ")
     made = compose("train", f"{group}={name}")[group]
-    from_mapping(load(GROUPS[group]), made)
-    usual = COMMANDS["train"].sections()[group]
+    kinds = kinds_of([f"{group}={name}"])
+    usual = COMMANDS["train"].sections(kinds)[group]
     written = yaml.safe_load(text) or {}
     own = written.get(group, written)  # of one for the whole config its own section
     for key in set(own) - {"defaults", "name", "kind", "backend"}:
@@ -53,17 +56,17 @@ def test_a_preset_sets_what_is_declared_and_differs(group: str, name: str) -> No
 
 def test_what_is_not_given_is_as_the_tangram_agent_has_it() -> None:
     setup = make_setup(compose("train", "agent=tangram"))
-    assert setup.agent == AgentConfig()
-    assert (setup.sim, setup.reward) == (SimConfig(), RewardConfig())
+    assert setup.agent.config == PairConfig()
+    assert (setup.task.sim, setup.task.reward) == (SimConfig(), RewardConfig())
     assert from_mapping(ServiceConfig, compose("train")["service"]) == ServiceConfig()
-    assert make_setup(compose("train", "agent=paper")).net == NetConfig()
+    assert make_setup(compose("train", "agent=paper")).agent.net == NetConfig()
 
 
 @pytest.mark.parametrize("primary", WITH_GROUPS)
 def test_primaries_with_groups_make_a_setup(primary: str) -> None:
     setup = make_setup(compose(primary))
     assert setup == make_setup(compose("train"))
-    assert setup.layout.tokens == 1
+    assert setup.task.layout.tokens == 1
 
 
 @pytest.mark.parametrize(
@@ -75,15 +78,15 @@ def test_primaries_with_groups_make_a_setup(primary: str) -> None:
     ],
 )
 def test_preset_of_each_shape_has_the_same_area(name: str) -> None:
-    layout = make_setup(compose("train", f"tokens={name}")).layout
+    layout = make_setup(compose("train", f"tokens={name}")).task.layout
     assert [shape.name for shape in layout.shapes] == [name]
     assert layout.shapes[0].area == pytest.approx(0.16, abs=1e-12)
 
 
 def test_presets_of_more_and_of_own_shapes() -> None:
-    pair = make_setup(compose("train", "tokens=pair")).layout
+    pair = make_setup(compose("train", "tokens=pair")).task.layout
     assert [shape.area for shape in pair.shapes] == pytest.approx([0.16, 0.16], abs=1e-12)
-    (hexagon,) = make_setup(compose("train", "tokens=hexagon")).layout.shapes
+    (hexagon,) = make_setup(compose("train", "tokens=hexagon")).task.layout.shapes
     assert hexagon.area == pytest.approx(0.16, abs=1e-6)
     assert hexagon.symmetry == 6
 
@@ -113,7 +116,7 @@ def test_net_is_the_agents_unless_it_is_chosen(
 @pytest.mark.parametrize("name", ["paper", "mlp"])
 def test_where_the_paper_is_silent_its_presets_follow_the_hindsight_paper(name: str) -> None:
     """Values of the appendix of [16]."""
-    agent = make_setup(compose("train", f"agent={name}")).agent
+    agent = make_setup(compose("train", f"agent={name}")).agent.config
     assert agent.saturation_penalty == 1.0
     assert (agent.noise, agent.uniform_share) == (0.1, 0.2)
     assert (agent.gamma, agent.polyak, agent.batch_size) == (0.98, 0.95, 128)
@@ -122,7 +125,7 @@ def test_where_the_paper_is_silent_its_presets_follow_the_hindsight_paper(name: 
 
 @pytest.mark.parametrize("name", ["paper", "mlp"])
 def test_paper_presets_add_nothing_to_the_text(name: str) -> None:
-    agent = make_setup(compose("train", f"agent={name}")).agent
+    agent = make_setup(compose("train", f"agent={name}")).agent.config
     assert (agent.lr_final, agent.acting_average) == (1.0, 0.0)
     assert [relabel.strategy for relabel in agent.hindsight] == ["final"]
 
@@ -145,7 +148,11 @@ def apply(path: Path, *overrides: str) -> dict[str, Any]:
 def test_run_config_replaces_the_groups(stored: Path) -> None:
     settings = apply(stored)
     setup: Setup = make_setup(settings)
-    assert (setup.agent.name, setup.layout.tokens, setup.net.kind) == ("mlp", 2, "mlp")
+    assert (setup.agent.config.name, setup.task.layout.tokens, setup.agent.net.kind) == (
+        "mlp",
+        2,
+        "mlp",
+    )
     assert "from_config" not in settings
     assert "seed" not in settings
 
@@ -198,8 +205,11 @@ LAUGHS = b"a0: &a0 {b: 1}\n" + b"".join(
         (b"[" * 10_000, "is no file of settings: it must have .* and 20 levels"),
         (LAUGHS, "is no file of settings: .* 10000 values with what aliases repeat"),
         (b"\xff\xfe\xfa", "is not valid YAML \\(it is no UTF-8"),
-        (b"3", "lacks sim"),
-        (b"{agent: {}, net: {}}", "lacks sim, reward, service, tokens"),
+        (b"3", "names no task: it must have task.kind"),
+        (
+            b"{task: {kind: place}, agent: {kind: pair}, net: {}}",
+            "lacks tokens, sim, reward, service",
+        ),
     ],
 )
 def test_wrong_run_config_is_refused(tmp_path: Path, content: bytes | None, message: str) -> None:
@@ -236,13 +246,15 @@ def test_help_of_a_group_has_a_line_for_each_setting(group: str) -> None:
     lines = group_help("train", group).splitlines()
     assert lines[0] == f"{group}={'|'.join(choices(group))}"
     names = [line.partition(":")[0] for line in lines[2:]]
-    assert names == [f"{group}.{own.name}" for own in declared_fields(load(GROUPS[group]))]
+    section = Kinds().sections()[group]
+    every = [] if section is None else declared_fields(section)
+    assert names == [f"{group}.{own.name}" for own in every]
 
 
 @pytest.mark.parametrize("group", OVER)
 def test_help_of_what_is_laid_over_a_run_has_what_it_may_be_played_with(group: str) -> None:
     names = [line.partition(":")[0] for line in group_help("eval", group).splitlines()[2:]]
-    kinds = {own.name: own.metadata[KEY].part for own in declared_fields(load(GROUPS[group]))}
+    kinds = {name: own.metadata[KEY].part for name, own in laid_over(group).items()}
     assert names == [f"{group}.{name}" for name, part in kinds.items() if part == PLAY]
     refused = {"sim": "sim.arena", "agent": "agent.batch_size"}.get(group)
     assert refused not in names
@@ -308,7 +320,7 @@ def test_a_config_is_composed_once(entered: Entered) -> None:
 def test_presets_of_ones_own_are_taken(entered: Entered, presets: Path, form: str) -> None:
     status, [settings] = entered(f"train tokens=mine {form.format(presets)} seed=3")
     assert (status, settings["seed"]) == (0, 3)
-    assert [shape.name for shape in make_setup(settings).layout.shapes] == ["square", "bar"]
+    assert [shape.name for shape in make_setup(settings).task.layout.shapes] == ["square", "bar"]
 
 
 @pytest.mark.parametrize(
@@ -366,7 +378,7 @@ def test_entry_hands_over_plain_settings(entered: Entered) -> None:
     assert settings == (
         {"run_dir": "x", "episodes": 100, "seed": 3, "turns": 1}
         | dict.fromkeys(("out", "puzzle", "sheet"))
-        | {s: dict.fromkeys(own) for s, own in COMMANDS["train"].sections().items() if s in OVER}
+        | {group: dict.fromkeys(laid_over(group)) for group in OVER}
     )
 
 

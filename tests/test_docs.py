@@ -10,9 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from conf.commands import COMMANDS
+from conf.commands import COMMANDS, GROUPS
 from conf.help import choices, setting_names
-from tangram_core.setup import SECTIONS
 from tangram_lab.benchmarks.cli import _parser as bench_parser
 from tests.blocks import PAGES
 
@@ -49,7 +48,7 @@ def found_below(name: str) -> bool:
 def dead_settings(text: str) -> list[str]:
     """Settings of a group in inline code that no command has."""
     known = set(setting_names("train"))
-    dotted = rf"(?:{'|'.join(SECTIONS)}|service)\.\w+"
+    dotted = rf"(?:{'|'.join(GROUPS)})\.\w+"
     named = [
         match[0] for span in spans(text) if (match := re.match(rf"{dotted}(?![\w.(/:-])", span))
     ]

@@ -11,17 +11,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from worker.play.looking import environments
 
-from conf.commands import COMMANDS, GROUPS, load
+from conf.commands import COMMANDS, GROUPS, declared, load
+from conf.kinds import every_kind
 from conf.settings import NESTED
 from master.learn.trainer import Trainer
+from tangram_agent.runs import beginning
 from tangram_core.errors import TangramError
 from tangram_core.service import ServiceConfig
 from tangram_core.settings import declared_fields
 from tangram_core.setup import Setup, make_setup
-from tests.agent.builders import Policy
-from worker.play.rollout import Rollout
+from worker.play.rollout import Rollout, exploring
+from worker.play.session import Acting
 
 pytestmark = pytest.mark.fast
 
@@ -38,10 +39,11 @@ AGENT = {
     "uniform_share": 0.25,
 }
 ONE: Config = {
+    "task": {"kind": "place"},
     "tokens": {"shapes": ["large_triangle"], "scale": 0.8},
     "sim": {"backend": "kinematic"},
     "reward": {},
-    "agent": AGENT,
+    "agent": {"kind": "pair", **AGENT},
     "net": {"width": 8, "layers": 1, "feed_forward": 8},
 }
 SEVERAL: Config = ONE | {
@@ -56,6 +58,11 @@ def over(base: Config, **sections: dict[str, Any]) -> Config:
 
 PAPER = over(ONE, agent={"gamma": 0.9}, sim={"actions_per_token": 2})
 MLP = ONE | {"net": {"kind": "mlp", "hidden": [8]}}
+OUTLINES = over(
+    SEVERAL,
+    task={"kind": "fill"},
+    sim={"observe": "silhouette", "starts": "outside", "allow_flip": True},
+) | {"agent": {"kind": "outline", **AGENT, "learning_starts": 2}}
 PHYSICS = over(ONE, sim={"backend": "physics"})
 # So crowded that nearly every order pushes something away.
 SLIDE = over(
@@ -100,10 +107,10 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "net.scale": (ONE, "sqrt_d"),
     "agent.motion": (ONE, "exact"),
     "agent.saturation_penalty": (over(ONE, agent={"kind": "scene"}), 9.0),
-    "agent.readout": (SEVERAL, "token"),
     "agent.reapply": (SEVERAL, 0),
     "agent.gamma": (PAPER, 0.5),
     "agent.polyak": (PAPER, 0.5),
+    "agent.copies": (OUTLINES, 1),
     "agent.acting_average": (ONE, 0.0),
     "agent.actor_lr": (ONE, 1e-2),
     "agent.critic_lr": (ONE, 1e-2),
@@ -139,18 +146,19 @@ def changed(base: Config, name: str, value: object) -> Config:
 
 def steps_of(setup: Setup) -> Iterator[str]:
     """Digests of a short seeded run: of what is played, of what is learned, and so on."""
-    trainer, policy = Trainer(setup, 0, "cpu"), Policy(setup)
-    with closing(environments(setup, ENVS)) as env:
-        policy.follow(trainer.weights())
-        env.reset([np.random.default_rng(i) for i in range(ENVS)])
-        yield digest(policy.act(env.seen, env.placed, env.seen_goals))
-        result = env.step(np.zeros((ENVS, setup.action_size)))
-        yield digest(result.rewards, np.array(result.camera_rewards, np.float64))
-        rollout = Rollout(env, 0, "player", 0, 0)
+    trainer, acting = Trainer(setup, 0, "cpu"), Acting(setup.agent.actor(setup.task))
+    with closing(setup.task.make(ENVS)) as env:
+        acting.follow(trainer.weights())
+        seen = env.reset([np.random.default_rng(i) for i in range(ENVS)])
+        yield digest(acting.actor.act(seen, beginning(setup.spec, seen)))
+        result = env.step(np.zeros((ENVS, setup.spec.action_size), np.float32))
+        facts = env.facts()
+        yield digest(result.rewards, np.array(facts.get("camera"), np.float64))
+        rollout = Rollout(env, setup.spec, 0, "player", 0, 0)
         for turn in range(TURNS):
-            policy.follow(trainer.weights())
-            played = rollout.play(policy.explore)
-            yield digest(played.corners, played.actions, played.rewards, played.goals)
+            acting.follow(trainer.weights())
+            played = rollout.play(exploring(acting.actor))
+            yield digest(*(played.arrays[name] for name in sorted(played.arrays)))
             trainer.insert(played)
             while trainer.rate_limiter.may_update():
                 trainer.update(turn / TURNS)
@@ -201,11 +209,10 @@ def test_an_equal_run_has_an_equal_trace(base: Config) -> None:
 
 
 def test_every_setting_of_a_run_is_walked() -> None:
-    groups = {name: kind for name, kind in (GROUPS | NESTED).items() if name != "service"}
-    declared = {
-        f"{g}.{own.name}" for g, kind in groups.items() for own in declared_fields(load(kind))
-    }
-    assert SHOWS.keys() | ELSEWHERE.keys() == declared
+    groups = [(g, kinds.sections().get(g)) for g in GROUPS for kinds in every_kind(g)]
+    groups += [(group, load(name)) for group, name in NESTED.items()]
+    known = {f"{g}.{own.name}" for g, kind in groups if g != "service" for own in declared(kind)}
+    assert SHOWS.keys() | ELSEWHERE.keys() == known
     assert not SHOWS.keys() & ELSEWHERE.keys()
 
 
@@ -222,6 +229,7 @@ def read_names() -> set[str]:
         "tangram_core",
         "tangram_game",
         "tangram_lab",
+        "tangram_tasks",
     ):
         for path in (ROOT / package).rglob("*.py"):
             if path.name in ("config.py", "commands.py"):
@@ -235,11 +243,8 @@ def read_names() -> set[str]:
 
 
 def test_every_setting_of_a_command_is_read() -> None:
-    owners = [*(load(name) for c in COMMANDS.values() for name in c.settings)]
-    declared = {
-        own.name for kind in (*owners, load(GROUPS["service"])) for own in declared_fields(kind)
-    }
-    assert declared <= read_names()
+    owners = [*(load(name) for c in COMMANDS.values() for name in c.settings), ServiceConfig]
+    assert {own.name for kind in owners for own in declared_fields(kind)} <= read_names()
 
 
 # What could have no effect
@@ -255,7 +260,6 @@ def test_every_setting_of_a_command_is_read() -> None:
         (MLP, "net.scale", "sqrt_d", "net.kind=mlp"),
         (PHYSICS, "sim.motion", "slide", "one token"),
         (ONE, "sim.mirrored", 0.5, "tokens that are their own mirror images"),
-        (SEVERAL, "agent.beam", 12, "agent.readout=pair"),
         (ONE, "agent.polyak", 0.5, "agent.gamma=0"),
         (FINAL_TWICE, "agent.hindsight.position", 0.1, "agent.hindsight.strategy=final"),
         (FINAL_TWICE, "agent.hindsight.angle", 0.1, "agent.hindsight.strategy=final"),

@@ -12,7 +12,7 @@ import pytest
 
 from tangram_agent.pretrained import CARD, WEIGHTS
 from tangram_agent.runs import beginning
-from tangram_agent.types import Transitions
+from tangram_agent.types import Transitions, Weights
 from tangram_core.setup import Setup, make_setup
 from tangram_core.spec import Episodes, EpisodeSpec
 from tangram_core.task import History
@@ -59,11 +59,16 @@ class Policy:
     """An actor, asked for corners (B, V, 2), placed (B, K) and goals (B, V, 2)."""
 
     def __init__(self, made: Setup) -> None:
-        self.made, self.actor = made, made.agent.actor(made.task)
+        self.made, self.actor, self.version = made, made.agent.actor(made.task), -1
 
     def load(self, tensors: dict[str, Any]) -> None:
         """Take over weights."""
         self.actor.load(tensors)
+
+    def follow(self, weights: Weights) -> None:
+        """Take over what a master sends."""
+        self.actor.load(weights.tensors)
+        self.version = weights.version
 
     def act(self, corners: Any, placed: Any, goals: Any, past: History | None = None) -> Any:
         """As well as it can."""

@@ -45,9 +45,8 @@ from worker.talk import client as client_module
 from worker.talk.client import Client
 from worker.talk.connection import Timing
 
-MADE = replace(
-    small_setup(replay_capacity=4096, updates_per_transition=0.01), reward=RewardConfig(NOTHING)
-)
+SMALL = small_setup(replay_capacity=4096, updates_per_transition=0.01)
+MADE = replace(SMALL, task=replace(SMALL.task, reward=RewardConfig(NOTHING)))
 SPEC = MADE.spec
 AT_ONCE = Timing(retry_s=0.0, resend_s=0.0, heartbeat_s=1000.0)
 FIRST_TAG = 2.0  # rewards of hindsight twins are 0
@@ -329,7 +328,7 @@ class Histories(RuleBasedStateMachine):
 
     @invariant()
     def acknowledged_is_inserted_once_and_in_order(self) -> None:
-        rewards = self.loop.guard.trainer.replay.state()["reward"]
+        rewards = self.loop.guard.trainer.learner.replay.state()["reward"]
         found = [float(tag) for tag in rewards if tag >= FIRST_TAG]
         times = Counter(found)
         assert set(times.values()) <= {1}

@@ -55,7 +55,7 @@ def test_a_batch_is_acknowledged_after_its_insert(tmp_path: Path) -> None:
     assert hub.values("acknowledge") == [1, 2, 3]
     assert inserted == [4, 8, 12]
     twins = len(MADE.agent.config.hindsight) + 1
-    assert made.guard.trainer.replay.added == 12 * twins
+    assert made.guard.trainer.learner.replay.added == 12 * twins
 
 
 def test_what_the_disk_does_not_take_is_not_acknowledged(
@@ -399,7 +399,7 @@ def test_in_lockstep_rounds_are_inserted_by_index_and_learned_before_the_next(
         ("acknowledge", 2),
         ("acknowledge", 2),
     ]
-    goals = made.guard.trainer.replay.state()["goal"]
+    goals = made.guard.trainer.learner.replay.state()["goal"]
     own = len(MADE.agent.config.hindsight) + 1
     np.testing.assert_array_equal(goals[0], played(0, 1).episodes["goals"][0])
     np.testing.assert_array_equal(goals[BATCH * own], played(1, 1).episodes["goals"][0])

@@ -4,7 +4,6 @@ from contextlib import closing
 
 import numpy as np
 import pytest
-from worker.play.looking import environments
 
 from tangram_agent.messages import EpisodeBatch, decode_from_worker
 from tangram_core.errors import RunError, WireError
@@ -13,7 +12,7 @@ from tangram_core.spec import Episodes
 from tests.agent.agents.outline.outlines import outline_setup
 from tests.agent.builders import Policy
 from tests.master.builders import trainer
-from worker.play.rollout import Rollout
+from worker.play.rollout import Rollout, exploring
 
 pytestmark = pytest.mark.fast
 
@@ -24,8 +23,10 @@ MADE = outline_setup(
 
 def rolled_out(made: Setup, count: int = 2, seed: int = 0) -> Episodes:
     """What a worker of four environments plays."""
-    with closing(environments(made, 4)) as env:
-        return Rollout(env, seed, "player", 0, 1).play(Policy(made).explore, count)
+    with closing(made.task.make(4)) as env:
+        return Rollout(env, made.spec, seed, "player", 0, 1).play(
+            exploring(Policy(made).actor), count
+        )
 
 
 def test_what_workers_play_is_learned_from() -> None:
@@ -47,7 +48,7 @@ def test_a_worker_that_plays_nonsense_asks_for_no_update() -> None:
     played["placed"][:] = 0
     for _ in range(20):
         made.insert(played)
-    assert (len(made.replay), made.rate_limiter.may_update()) == (0, False)
+    assert (len(made.learner.replay), made.rate_limiter.may_update()) == (0, False)
     made.insert(rolled_out(MADE))
     assert made.rate_limiter.may_update()
     made.update(0.0)
@@ -104,4 +105,4 @@ def test_nonsense_that_keeps_its_bounds_harms_nobody() -> None:
         flags = generator.integers(0, 2, played["placed"].shape).astype(np.uint8)
         made.insert(Episodes({**played.arrays, "placed": flags}))
     assert np.isfinite(list(made.update(0.0).values())).all()
-    made.replay.check_valid()
+    made.learner.replay.check_valid()

@@ -22,7 +22,7 @@ def test_replay_holds_what_was_played_and_nothing_relabelled() -> None:
     """Other goals are made anew for every update, of the token that moved."""
     made = trainer(made_setup(mirrored=0.5))
     made.insert(random_episodes(made.setup, 2))
-    assert made.transitions == len(made.replay) == 14
+    assert made.transitions == len(made.learner.replay) == 14
     numbers = made.update(0.0)
     assert made.updates == 1
     assert set(numbers) >= {"critic_loss", "actor_loss", "q", "saturation"}

@@ -1,7 +1,6 @@
 """Going on from a checkpoint: bit-equal, past corrupt ones, and never with another task."""
 
 import logging
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from master.record.resumable import check_resumable, check_same_task
 from master.record.rundir import Record, RunFolder
 from tangram_agent.checkpoints import list_checkpoints, load_checkpoint, save_checkpoint
 from tangram_core.errors import ConfigError, RunError
-from tangram_core.setup import SECTIONS, Setup
+from tangram_core.setup import Setup
 from tests.agent.agents.pair.pair_scenes import PERCEPTRON, seven
 from tests.agent.builders import PAIR, setup
 from tests.master.builders import (
@@ -34,7 +33,7 @@ MADE = small_setup()
 PAIRS = AGENT
 HUB = {"player/0": {"incarnation": 2, "sequence": 17}}
 REST = Restored(Record(), HUB)
-MINE: dict[str, Any] = {name: asdict(getattr(MADE, name)) for name in SECTIONS}
+MINE: dict[str, Any] = MADE.config()
 OTHER = MINE | {"tokens": {"shapes": ["parallelogram"], "scale": 1.0}}
 
 
@@ -69,7 +68,7 @@ def test_another_seed_gives_another_run() -> None:
     one, other = trainer(MADE, seed=0), trainer(MADE, seed=1)
     for made in (one, other):
         play_on(made, 2)
-    assert not np.array_equal(*(made.replay.state()["goal"] for made in (one, other)))
+    assert not np.array_equal(*(made.learner.replay.state()["goal"] for made in (one, other)))
 
 
 def test_nothing_to_go_on_from(tmp_path: Path) -> None:
@@ -126,7 +125,7 @@ def test_settings_of_the_agent_may_change_on_the_way(tmp_path: Path) -> None:
     save_run(tmp_path, made, REST, keep=1)
     resumed = trainer(small_setup(updates_per_transition=1.0, replay_capacity=32))
     assert restore_run(tmp_path, resumed) is not None
-    assert (len(resumed.replay), resumed.rate_limiter.may_update()) == (32, False)
+    assert (len(resumed.learner.replay), resumed.rate_limiter.may_update()) == (32, False)
     play_on(resumed, 1)
     assert resumed.updates == 6 + 4
 
@@ -225,7 +224,7 @@ def test_a_warm_start_takes_the_networks_and_nothing_else(
         np.testing.assert_array_equal(ours[name], expected[name], err_msg=name)
     assert any(not np.array_equal(begun[n], theirs[n]) for n in networks if "motion." in n)
     assert not any(own.any() for name, own in ours.items() if "optimiser" in name)
-    assert (fresh.updates, fresh.episodes, len(fresh.replay)) == (0, 0, 0)
+    assert (fresh.updates, fresh.episodes, len(fresh.learner.replay)) == (0, 0, 0)
 
 
 def test_networks_of_another_shape_can_be_taken_over(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from master.watch.result import SCORES, make_result
+from master.watch.result import make_result
 from tangram_core.process import Every
 from tangram_core.spec import Episodes
 from tests.master.builders import FakeHub, arrival, loop, scores, shown, small_setup
@@ -95,7 +95,7 @@ def test_it_is_told_where_nothing_can_be_learned_from(tmp_path: Path) -> None:
     episodes = arrival(MADE, 1).episodes
     gone = np.zeros((4, MADE.task.horizon + 1, 1), np.uint8)
     made.guard.trainer.insert(Episodes({**episodes.arrays, "seen": gone, "goals_seen": gone[:, 0]}))
-    said = "waiting for an episode in which pictures show all tokens: larger sim.pixels help"
+    said = f"waiting for an episode to learn from: {MADE.task.waits}"
     assert made.reporter.flush(0).texts["activity"] == said
     made.guard.trainer.insert(episodes)
     assert made.reporter.flush(0).texts["activity"] == "learning, workers wait"
@@ -108,11 +108,16 @@ def test_a_status_that_cannot_be_told_as_it_is_ends_nothing_and_keeps_the_scores
     hub = FakeHub(MADE)
     hub.counters.update({f"event{i}": 2**70 for i in range(100)})
     made = loop(tmp_path, MADE, hub)
-    found = dict.fromkeys(SCORES, 0.5) | {"raw_overlap": float("nan"), "mean_reward": 1e300}
+    found = {score.name: 0.5 for score in MADE.task.scores} | {
+        "raw_overlap": float("nan"),
+        "mean_reward": 1e300,
+    }
     made.clock.record.score(found, version=0)
     status = made.reporter.flush(queue=0)
     assert hub.values("tell") == [status]
     status.encode()
-    result = make_result(status, made.guard.trainer.facts(), seed=0, reason="SIGTERM")
+    result = make_result(
+        status, MADE.task.scores, made.guard.trainer.facts(), seed=0, reason="SIGTERM"
+    )
     assert (result["raw_overlap"], result["mean_reward"]) == (None, 1e18)
     assert result["position_error_p90"] == 0.5

@@ -9,7 +9,9 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from master.record.rundir import RunFolder
-from master.watch.result import SCORES, go_on_command, show_result
+from master.watch.result import go_on_command, show_result
+from tangram_core.scores import written
+from tangram_tasks.place import ONE_TOKEN
 from tests.master.builders import screen, text
 
 pytestmark = pytest.mark.fast
@@ -22,7 +24,8 @@ SCORED = {
 }
 
 
-RESULT = dict.fromkeys(SCORES) | {
+RESULT = dict.fromkeys(score.name for score in ONE_TOKEN) | {
+    "scores": written(ONE_TOKEN),
     "scored_updates": None,
     "updates": 1234,
     "episodes": 5678,
@@ -38,7 +41,7 @@ RESULT = dict.fromkeys(SCORES) | {
         ({}, ["none: no evaluator took part", "1:01 of training, 1:15 in all"], ["mean reward"]),
         (
             SCORED | {"scored_updates": 1234},
-            ["0.931 on exact polygons", "- in the camera's", "1.21° (median)", "1,234"],
+            ["mean reward              0.931", "1.21°", "0.0103", "1,234"],
             ["weights after"],
         ),
         (SCORED | {"scored_updates": 1000}, ["weights after 1,000 updates"], ["go on"]),

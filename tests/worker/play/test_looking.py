@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from worker.play.looking import environments
 
 from tangram_agent.messages import EpisodeBatch, decode_from_worker
 from tangram_agent.relabelling import learnable
@@ -18,7 +17,7 @@ from tangram_sim.batch import BatchedEnv
 from tangram_sim.motion.kinematics import KinematicWorld
 from tangram_sim.sight.lens import Disturbance
 from tests.agent.builders import Policy
-from worker.play.rollout import Rollout
+from worker.play.rollout import Rollout, exploring
 
 pytestmark = pytest.mark.fast
 
@@ -26,23 +25,25 @@ pytestmark = pytest.mark.fast
 def setup(*shapes: str, **sim: Any) -> Setup:
     return make_setup(
         {
+            "task": {"kind": "place"},
             "tokens": {"shapes": list(shapes), "scale": 0.8},
             "sim": {"backend": "kinematic", "pixels": 64, "observe": "pictures", **sim},
             "reward": {},
-            "agent": {"uniform_share": 0.25},
+            "agent": {"kind": "pair", "uniform_share": 0.25},
             "net": {"width": 8, "layers": 1, "feed_forward": 8},
         }
     )
 
 
 def played(task: Setup, policy: Policy, groups: int = 2) -> Episodes:
-    with closing(environments(task, 4)) as env:
-        return Rollout(env, 0, "player", 0, 0).play(policy.explore, groups)
+    with closing(task.task.make(4)) as env:
+        return Rollout(env, task.spec, 0, "player", 0, 0).play(exploring(policy.actor), groups)
 
 
 def at_random(task: Setup) -> Setup:
     """All actions are uniform, whatever the untrained weights are: they decide what is seen."""
-    return replace(task, agent=replace(task.agent, uniform_share=1.0))
+    config = replace(task.agent.config, uniform_share=1.0)
+    return replace(task, agent=replace(task.agent, config=config))
 
 
 def noisy(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -95,7 +96,7 @@ def test_the_same_pictures_give_the_same_episodes(
 
 def test_what_is_seen_is_near_and_the_reward_is_that_of_pictures() -> None:
     task = setup("square", pixels=128, picture="grey")
-    with closing(environments(task, 4)) as env:
+    with closing(task.task.make(4)) as env:
         env.reset([np.random.default_rng(i) for i in range(4)])
         off = task.layout.bases(env.seen) - task.layout.bases(env.corners)
         assert 0.0 < np.abs(off).max() < 0.005
@@ -109,7 +110,7 @@ def test_what_is_seen_is_near_and_the_reward_is_that_of_pictures() -> None:
 
 def test_alike_tokens_are_moved_where_they_are_seen() -> None:
     task = setup("small_triangle", "small_triangle")
-    with closing(environments(task, 6)) as env:
+    with closing(task.task.make(6)) as env:
         env.reset([np.random.default_rng(i) for i in range(6)])
         assert not env.sight.missing.any()
         before = task.layout.bases(env.seen)
@@ -140,8 +141,8 @@ def test_what_no_picture_shows_ends_no_worker(
         """As far as an action can be told."""
         return np.stack([np.sign(one.uniform(-1.0, 1.0, 3)) for one in scene[3]]).astype(np.float32)
 
-    with closing(environments(task, 4)) as env:
-        episodes = Rollout(env, 0, "player", 0, 0).play(far, 24)
+    with closing(task.task.make(4)) as env:
+        episodes = Rollout(env, task.spec, 0, "player", 0, 0).play(far, 24)
     seen = episodes["goals_seen"]
     assert not np.asarray(seen).all()
     spec = task.spec

@@ -16,7 +16,7 @@ from tangram_tasks.played import Past
 from tests.agent.builders import PAIR, SQUARE, Policy, setup
 from tests.sim.builders import sample_poses
 from tests.worker.builders import policy
-from worker.play.rollout import Rollout, parts, play
+from worker.play.rollout import Rollout, exploring, parts, play
 
 pytestmark = pytest.mark.fast
 
@@ -73,7 +73,9 @@ def environment(made: Setup, count: int = 4) -> Iterator[BatchedEnv]:
 def rolled_out(made: Setup, envs: int, count: int) -> Episodes:
     with environment(made, envs) as env:
         rollout, acting = Rollout(env, *IDENTITY), policy(made)
-        played = [rollout.play(acting.explore, groups) for groups in (1, count // envs - 1)]
+        played = [
+            rollout.play(exploring(acting.actor), groups) for groups in (1, count // envs - 1)
+        ]
         assert rollout.episode == count
     return joined(played)
 
@@ -108,7 +110,9 @@ def test_each_part_of_the_identity_gives_other_episodes(position: int) -> None:
     other = list(IDENTITY)
     other[position] = "evaluator" if position == 1 else IDENTITY[position] + 1
     with environment(made) as env:
-        one, two = (Rollout(env, *who).play(policy(made).explore) for who in (IDENTITY, other))
+        one, two = (
+            Rollout(env, *who).play(exploring(policy(made).actor)) for who in (IDENTITY, other)
+        )
     assert not np.isclose(one["goals"], two["goals"]).any(axis=(1, 2)).all()
     assert not np.isclose(one["corners"][:, 0], two["corners"][:, 0]).any(axis=(1, 2)).all()
 
@@ -129,8 +133,8 @@ def test_as_many_episodes_as_asked_for_in_any_number_of_environments(camera: boo
     made = setup(pixels=32 * camera)
     acting = policy(made)
     with environment(made, 3) as env:
-        four = play(env, acting.explore, np.random.default_rng, 4)
-        six = play(env, acting.explore, np.random.default_rng, 6)
+        four = play(env, exploring(acting.actor), np.random.default_rng, 4)
+        six = play(env, exploring(acting.actor), np.random.default_rng, 6)
     assert len(four.overlap) == len(four.starts) == four.episodes.count == 4
     np.testing.assert_array_equal(four.corners, six.corners[:4])
     np.testing.assert_array_equal(four.episodes.actions, six.episodes.actions[:4])
@@ -144,7 +148,7 @@ def test_play_ends_before_an_action_when_it_is_told_to(asked: int, groups: int) 
     answers = iter([True] * asked + [False])
     with environment(made, 3) as env:
         rollout = Rollout(env, *IDENTITY)
-        episodes = rollout.play(policy(made).explore, 5, lambda: next(answers))
+        episodes = rollout.play(exploring(policy(made).actor), 5, lambda: next(answers))
     assert episodes.count == rollout.episode == 3 * groups
 
 

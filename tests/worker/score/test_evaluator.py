@@ -53,7 +53,7 @@ def test_the_newest_weights_are_scored_on_the_fixed_tests(tokens: dict) -> None:
     with closing(FixedTests(made, 20, 6)) as tests:
         for one in arrived:
             found = one.scores
-            expected = tests.play(greedy(policy(made, found.weights_version)))
+            expected = tests.play(greedy(policy(made, found.weights_version).actor))
             scalars = dict(found.scalars)
             assert scalars.pop("seconds") >= 0.0
             assert scalars == pytest.approx(tests.scores(expected), abs=1e-4)

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.fast
 def played(episodes: int, at_once: int, **more: object) -> Played:
     made = setup(pixels=32)
     with closing(FixedTests(made, episodes, at_once, **more)) as tests:
-        return tests.play(greedy(policy(made)))
+        return tests.play(greedy(policy(made).actor))
 
 
 def test_the_set_does_not_depend_on_how_many_play_at_a_time() -> None:
@@ -38,7 +38,7 @@ def test_the_set_does_not_depend_on_how_many_play_at_a_time() -> None:
 def test_the_default_set_is_that_of_the_simulation() -> None:
     made = setup(pixels=32)
     with closing(FixedTests(made, 3, 3)) as tests:
-        goals = tests.play(greedy(policy(made))).goals
+        goals = tests.play(greedy(policy(made).actor)).goals
         tests.env.reset(evaluation_generators(3))
         np.testing.assert_array_equal(goals, tests.env.goals)
 
@@ -52,7 +52,7 @@ def test_noise_is_off() -> None:
     made = setup(agent={"noise": 1.0, "uniform_share": 1.0}, pixels=32)
     acting = policy(made)
     with closing(FixedTests(made, 3, 3)) as tests:
-        found = tests.play(greedy(acting))
+        found = tests.play(greedy(acting.actor))
     expected = acting.act(found.starts, found.episodes["placed"][:, 0], found.goals)
     np.testing.assert_array_equal(found.episodes.actions[:, 0], expected)
 
@@ -80,7 +80,7 @@ def test_the_trained_reward_is_reported_where_it_is_another(reward: dict, own: b
     made = setup(pixels=32)
     made = replace(made, reward=replace(made.task.reward, **reward))
     with closing(FixedTests(made, 3, 3)) as tests:
-        found = tests.play(greedy(policy(made)))
+        found = tests.play(greedy(policy(made).actor))
         scores = tests.scores(found)
     assert scores["mean_reward"] == pytest.approx(float(np.mean(2.0 * found.overlap - 1.0)))
     assert ("mean_train_reward" in scores) == own
@@ -123,7 +123,7 @@ def test_the_random_policy_fills_the_action_space_from_the_episodes_generators(f
 
 def test_the_number_of_actions_can_be_another_than_in_training() -> None:
     with closing(FixedTests(setup(pixels=16, actions_per_token=5), 2, 2)) as tests:
-        assert tests.play(greedy(policy(setup()))).episodes.actions.shape == (2, 5, 3)
+        assert tests.play(greedy(policy(setup()).actor)).episodes.actions.shape == (2, 5, 3)
 
 
 def test_noise_on_the_corners_is_seen_and_not_scored() -> None:
