@@ -129,7 +129,6 @@ def _column(field: Field, shape: tuple[int, ...]) -> Column:
     return Column(field.name, _LITTLE[field.dtype], shape, low, high)
 
 
-@lru_cache
 def most_episodes(spec: EpisodeSpec) -> int:
     """Most episodes in one message, bounded in number and in bytes."""
     return min(MAX_EPISODES, MAX_BATCH_BYTES // _bytes(spec))

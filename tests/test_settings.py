@@ -150,7 +150,7 @@ def steps_of(setup: Setup) -> Iterator[str]:
         for turn in range(TURNS):
             policy.follow(trainer.weights())
             played = rollout.play(policy.explore)
-            yield digest(played.corners, played.actions, played.rewards, played.goals)
+            yield digest(*(played.arrays[name] for name in sorted(played.arrays)))
             trainer.insert(played)
             while trainer.rate_limiter.may_update():
                 trainer.update(turn / TURNS)

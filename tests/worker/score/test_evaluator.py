@@ -9,6 +9,7 @@ import pytest
 from master.hub.hub import Hub
 from master.record.delivery import Arrival, ScoresArrived
 from tangram_agent.config import ServiceConfig
+from tangram_agent.messages import PICTURE_WIDTH
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.worker.builders import policy, sent, weights
 from tests.worker.talk.conversation import QUICK, collect, open_hub, with_master
@@ -57,10 +58,8 @@ def test_the_newest_weights_are_scored_on_the_fixed_tests(tokens: dict) -> None:
             assert scalars.pop("seconds") >= 0.0
             assert scalars == pytest.approx(tests.scores(expected), abs=1e-4)
             assert "mean_reward_camera" in scalars
-            for name in ("starts", "ends", "goals"):
-                corners = getattr(found, name)
-                assert corners.shape == (12, made.layout.corner_count, 2)
-                np.testing.assert_allclose(corners, getattr(expected, name)[:12], atol=1e-4)
+            assert found.picture.shape[1:] == (PICTURE_WIDTH, 3)
+            assert len(np.unique(found.picture)) > 9  # something is drawn
 
 
 @pytest.mark.cluster

@@ -358,5 +358,5 @@ def test_scores_and_stats_arrive_and_without_a_master_scores_are_lost_and_counte
         assert isinstance(arrival, ScoresArrived)
         assert (arrival.index, arrival.incarnation) == (2, 1)
         assert arrival.scores.scalars == scores().scalars
-        np.testing.assert_array_equal(arrival.scores.ends, scores().ends)
+        np.testing.assert_array_equal(arrival.scores.picture, scores().picture)
         both(stage, client, lambda: stage.hub.peers[0].stats == {"episodes": 12.0})
