@@ -68,6 +68,7 @@ def score_puzzles(
     for name, player in players.items():
         played[name] = play_figures(task, figures, player, seed, at_once=at_once)
         own = summarise(task.layout, task.sim, played[name], own_reward=False)
+        own["episodes"] = float(len(figures))
         scores[name] = own | of_several(played[name], at_once)
     run, titles = played[RUN], [figure.title for figure in figures]
     each = _one_by_one(task, figures, run)

@@ -63,7 +63,6 @@ def summarise(layout: Layout, sim: SimConfig, played: Played, own_reward: bool) 
         "angle_error_deg_p90": float(np.percentile(angle, 90)),
         "position_error_median": float(np.median(position)),
         "position_error_p90": float(np.percentile(position, 90)),
-        "episodes": float(len(played.overlap)),
     }
     if played.camera is not None:
         scores["mean_reward_camera"] = float(np.mean(played.camera))

@@ -35,9 +35,9 @@ class WelcomeInfo:
     seed: int
     fingerprints: Mapping[str, str]
     spec: EpisodeSpec
-    scores: frozenset[str] = frozenset()
     window: int = 4
     lockstep: bool = False
+    scores: frozenset[str] = frozenset()
 
 
 class Admission:

@@ -13,11 +13,12 @@ from master.record.delivery import Arrival, EpisodesArrived
 from tangram_agent.arrays import WeightShapes
 from tangram_agent.messages import Heartbeat, Reject, ToWorker, Welcome, decode_from_master
 from tangram_agent.schema import Plain
-from tests.agent.messages import FINGERPRINTS, SPEC, batch, hello
+from tests.agent.messages import FINGERPRINTS, SPEC, TASK, batch, hello
 
 LIMIT_S = 100.0
 WINDOW = 3
-INFO = WelcomeInfo("run", 7, FINGERPRINTS, SPEC, WINDOW)
+NAMES = frozenset(score.name for score in TASK.task.scores)
+INFO = WelcomeInfo("run", 7, FINGERPRINTS, SPEC, WINDOW, scores=NAMES)
 
 
 class Stage:

@@ -13,6 +13,7 @@ from tangram_core.arrays import Singles
 from tangram_core.errors import ConfigError
 from tangram_core.setup import Setup, make_setup
 from tangram_core.spec import Episodes
+from tangram_core.task import Generators
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.motion.kinematics import KinematicWorld
 from tangram_sim.sight.lens import Disturbance
@@ -96,13 +97,16 @@ def test_the_same_pictures_give_the_same_episodes(
 
 def test_what_is_seen_is_near_and_the_reward_is_that_of_pictures() -> None:
     task = setup("square", pixels=128, picture="grey")
-    with closing(task.task.make(4)) as env:
+    with closing(task.task.make(4)) as own:
+        env = own.world
         env.reset([np.random.default_rng(i) for i in range(4)])
-        off = task.layout.bases(env.seen) - task.layout.bases(env.corners)
+        off = task.task.layout.bases(env.seen) - task.task.layout.bases(env.corners)
         assert 0.0 < np.abs(off).max() < 0.005
-        gap = task.layout.bases(env.seen_goals) - task.layout.bases(env.goals)
+        gap = task.task.layout.bases(env.seen_goals) - task.task.layout.bases(env.goals)
         assert 0.0 < np.abs(gap).max() < 0.005
-        way = (task.layout.bases(env.seen_goals) - task.layout.bases(env.seen))[:, 0] / 2.0
+        way = (task.task.layout.bases(env.seen_goals) - task.task.layout.bases(env.seen))[
+            :, 0
+        ] / 2.0
         result = env.step(np.column_stack([way, np.zeros(4)]))
         np.testing.assert_array_equal(result.rewards, result.camera_rewards)
         assert np.abs(result.rewards - (2.0 * result.overlap - 1.0)).max() > 1e-4
@@ -110,13 +114,14 @@ def test_what_is_seen_is_near_and_the_reward_is_that_of_pictures() -> None:
 
 def test_alike_tokens_are_moved_where_they_are_seen() -> None:
     task = setup("small_triangle", "small_triangle")
-    with closing(task.task.make(6)) as env:
+    with closing(task.task.make(6)) as own:
+        env = own.world
         env.reset([np.random.default_rng(i) for i in range(6)])
         assert not env.sight.missing.any()
-        before = task.layout.bases(env.seen)
+        before = task.task.layout.bases(env.seen)
         action = np.tile([1.0, 0.05, 0.0, 0.0], (6, 1))  # the second token, a little to the right
         env.step(action)
-        moved = task.layout.bases(env.seen) - before
+        moved = task.task.layout.bases(env.seen) - before
         sure = ~env.sight.missing.any(axis=1)
         assert sure.sum() >= 4
         np.testing.assert_allclose(moved[sure, 1], [[0.1, 0.0]] * sure.sum(), atol=0.02)
@@ -137,9 +142,10 @@ def test_what_no_picture_shows_ends_no_worker(
     monkeypatch.setattr("tangram_sim.sight.lens.FULL", Disturbance(**full))
     task = setup("square", **sim)
 
-    def far(*scene: Any) -> Singles:
+    def far(_seen: object, _past: object, generators: Generators) -> Singles:
         """As far as an action can be told."""
-        return np.stack([np.sign(one.uniform(-1.0, 1.0, 3)) for one in scene[3]]).astype(np.float32)
+        drawn = [np.sign(one.uniform(-1.0, 1.0, 3)) for one in generators]
+        return np.stack(drawn).astype(np.float32)
 
     with closing(task.task.make(4)) as env:
         episodes = Rollout(env, task.spec, 0, "player", 0, 0).play(far, 24)
@@ -167,4 +173,4 @@ def test_what_is_missing_travels_and_is_not_learned_from() -> None:
 def test_without_an_eye_pictures_are_refused() -> None:
     task = setup("square")
     with pytest.raises(ConfigError, match="^sim.observe=pictures is for tangram-train, .*corners$"):
-        BatchedEnv(task.layout, task.sim, task.reward)
+        BatchedEnv(task.task.layout, task.task.sim, task.task.reward)

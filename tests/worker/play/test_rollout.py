@@ -9,11 +9,11 @@ import pytest
 
 from tangram_core.seeding import episode_generator
 from tangram_core.setup import Setup
-from tangram_core.spec import Episodes, joined
-from tangram_sim.batch import BatchedEnv
+from tangram_core.spec import Arrays, Episodes, joined
 from tangram_sim.geometry.overlap import overlap_share
-from tangram_tasks.played import Past
-from tests.agent.builders import PAIR, SQUARE, Policy, setup
+from tangram_tasks.env import PlaceEnv
+from tangram_tasks.played import Played
+from tests.agent.builders import PAIR, SQUARE, Policy, history, setup
 from tests.sim.builders import sample_poses
 from tests.worker.builders import policy
 from worker.play.rollout import Rollout, exploring, parts, play
@@ -39,8 +39,8 @@ def naive_episode(made: Setup, acting: Policy, rng: np.random.Generator) -> dict
 
     for _ in range(made.task.horizon):
         flags = is_placed(moves)
-        past = Past(
-            np.array(corners[:-1], np.float32).reshape(1, -1, layout.corner_count, 2),
+        past = history(
+            np.array(corners, np.float32).reshape(1, -1, layout.corner_count, 2),
             np.array(actions, np.float32).reshape(1, -1, made.task.action_size),
         )
         action = acting.explore(corners[-1][None], flags[None], goal[None], [rng], past)[0]
@@ -65,14 +65,14 @@ def naive_episode(made: Setup, acting: Policy, rng: np.random.Generator) -> dict
 
 
 @contextmanager
-def environment(made: Setup, count: int = 4) -> Iterator[BatchedEnv]:
-    with closing(BatchedEnv(made.task.layout, made.task.sim, made.task.reward, count)) as env:
+def environment(made: Setup, count: int = 4) -> Iterator[PlaceEnv]:
+    with closing(made.task.make(count)) as env:
         yield env
 
 
 def rolled_out(made: Setup, envs: int, count: int) -> Episodes:
     with environment(made, envs) as env:
-        rollout, acting = Rollout(env, *IDENTITY), policy(made)
+        rollout, acting = Rollout(env, made.spec, *IDENTITY), policy(made)
         played = [
             rollout.play(exploring(acting.actor), groups) for groups in (1, count // envs - 1)
         ]
@@ -111,7 +111,8 @@ def test_each_part_of_the_identity_gives_other_episodes(position: int) -> None:
     other[position] = "evaluator" if position == 1 else IDENTITY[position] + 1
     with environment(made) as env:
         one, two = (
-            Rollout(env, *who).play(exploring(policy(made).actor)) for who in (IDENTITY, other)
+            Rollout(env, made.spec, *who).play(exploring(policy(made).actor))
+            for who in (IDENTITY, other)
         )
     assert not np.isclose(one["goals"], two["goals"]).any(axis=(1, 2)).all()
     assert not np.isclose(one["corners"][:, 0], two["corners"][:, 0]).any(axis=(1, 2)).all()
@@ -133,8 +134,8 @@ def test_as_many_episodes_as_asked_for_in_any_number_of_environments(camera: boo
     made = setup(pixels=32 * camera)
     acting = policy(made)
     with environment(made, 3) as env:
-        four = play(env, exploring(acting.actor), np.random.default_rng, 4)
-        six = play(env, exploring(acting.actor), np.random.default_rng, 6)
+        given = env, made.spec, exploring(acting.actor), np.random.default_rng
+        four, six = (Played.of(play(*given, count, facts=True)) for count in (4, 6))
     assert len(four.overlap) == len(four.starts) == four.episodes.count == 4
     np.testing.assert_array_equal(four.corners, six.corners[:4])
     np.testing.assert_array_equal(four.episodes.actions, six.episodes.actions[:4])
@@ -147,7 +148,7 @@ def test_play_ends_before_an_action_when_it_is_told_to(asked: int, groups: int) 
     made = setup(actions_per_token=2)
     answers = iter([True] * asked + [False])
     with environment(made, 3) as env:
-        rollout = Rollout(env, *IDENTITY)
+        rollout = Rollout(env, made.spec, *IDENTITY)
         episodes = rollout.play(exploring(policy(made).actor), 5, lambda: next(answers))
     assert episodes.count == rollout.episode == 3 * groups
 
@@ -156,12 +157,13 @@ def test_the_policy_sees_noise_and_that_is_what_travels() -> None:
     made = setup(corner_noise=0.02)
     seen: list[np.ndarray] = []
 
-    def choose(corners: np.ndarray, _placed: object, goals: np.ndarray, *_: object) -> Any:
-        seen.extend([corners.copy(), goals.copy()])
+    def choose(now: Arrays, *_: object) -> Any:
+        seen.extend([now["corners"].copy(), now["goals"].copy()])
         return np.zeros((4, 3), np.float32)
 
     with environment(made) as env:
-        played = play(env, choose, np.random.default_rng, 4)
+        whole = play(env, made.spec, choose, np.random.default_rng, 4, facts=True)
+    played = Played.of(whole)
     episodes = played.episodes
     np.testing.assert_array_equal(episodes["corners"][:, 0], seen[0].astype(np.float32))
     np.testing.assert_array_equal(episodes["goals"], seen[1].astype(np.float32))

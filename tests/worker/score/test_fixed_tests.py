@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tangram_core.seeding import evaluation_generators
-from tangram_tasks.played import Played
+from tangram_tasks.played import Played, chooser
 from tangram_tasks.rivals.baselines import position_policy, random_policy
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.worker.builders import policy
@@ -19,8 +19,8 @@ pytestmark = pytest.mark.fast
 
 def played(episodes: int, at_once: int, **more: object) -> Played:
     made = setup(pixels=32)
-    with closing(FixedTests(made, episodes, at_once, **more)) as tests:
-        return tests.play(greedy(policy(made).actor))
+    with closing(FixedTests(made.task, episodes, at_once, **more)) as tests:
+        return Played.of(tests.play(greedy(policy(made).actor)))
 
 
 def test_the_set_does_not_depend_on_how_many_play_at_a_time() -> None:
@@ -37,10 +37,10 @@ def test_the_set_does_not_depend_on_how_many_play_at_a_time() -> None:
 
 def test_the_default_set_is_that_of_the_simulation() -> None:
     made = setup(pixels=32)
-    with closing(FixedTests(made, 3, 3)) as tests:
-        goals = tests.play(greedy(policy(made).actor)).goals
+    with closing(FixedTests(made.task, 3, 3)) as tests:
+        goals = Played.of(tests.play(greedy(policy(made).actor))).goals
         tests.env.reset(evaluation_generators(3))
-        np.testing.assert_array_equal(goals, tests.env.goals)
+        np.testing.assert_array_equal(goals, tests.env.facts()["goals"])
 
 
 @pytest.mark.parametrize("other", [{"seed": 1}, {"role": "play"}])
@@ -51,8 +51,8 @@ def test_another_name_is_another_set(other: dict) -> None:
 def test_noise_is_off() -> None:
     made = setup(agent={"noise": 1.0, "uniform_share": 1.0}, pixels=32)
     acting = policy(made)
-    with closing(FixedTests(made, 3, 3)) as tests:
-        found = tests.play(greedy(acting.actor))
+    with closing(FixedTests(made.task, 3, 3)) as tests:
+        found = Played.of(tests.play(greedy(acting.actor)))
     expected = acting.act(found.starts, found.episodes["placed"][:, 0], found.goals)
     np.testing.assert_array_equal(found.episodes.actions[:, 0], expected)
 
@@ -60,9 +60,9 @@ def test_noise_is_off() -> None:
 def test_the_camera_is_on_though_training_has_none() -> None:
     made = setup()
     assert not made.task.sim.pixels
-    with closing(FixedTests(made, 20, 10)) as tests:
-        found = tests.play(position_policy(made.task.layout, made.task.sim))
-        scores = tests.scores(found)
+    with closing(FixedTests(made.task, 20, 10)) as tests:
+        whole = tests.play(chooser(position_policy(made.task.layout, made.task.sim)))
+    found, scores = Played.of(whole), made.task.score(whole)
     assert found.camera is not None
     np.testing.assert_allclose(found.camera, 2.0 * found.overlap - 1.0, atol=0.1)
     assert scores["mean_reward_camera"] == pytest.approx(scores["mean_reward"], abs=0.03)
@@ -78,10 +78,11 @@ def test_the_camera_is_on_though_training_has_none() -> None:
 )
 def test_the_trained_reward_is_reported_where_it_is_another(reward: dict, own: bool) -> None:
     made = setup(pixels=32)
-    made = replace(made, reward=replace(made.task.reward, **reward))
-    with closing(FixedTests(made, 3, 3)) as tests:
-        found = tests.play(greedy(policy(made).actor))
-        scores = tests.scores(found)
+    task = replace(made.task, reward=replace(made.task.reward, **reward))
+    made = replace(made, task=task)
+    with closing(FixedTests(made.task, 3, 3)) as tests:
+        whole = tests.play(greedy(policy(made).actor))
+    found, scores = Played.of(whole), made.task.score(whole)
     assert scores["mean_reward"] == pytest.approx(float(np.mean(2.0 * found.overlap - 1.0)))
     assert ("mean_train_reward" in scores) == own
 
@@ -92,8 +93,8 @@ def test_the_position_policy_solves_position_and_nothing_else(
 ) -> None:
     monkeypatch.setattr("tangram_sim.batch.MAX_OVERLAP", 1.0)
     made = setup(tokens, pixels=32, actions_per_token=actions)
-    with closing(FixedTests(made, 10, 10)) as tests:
-        found = tests.play(position_policy(made.task.layout, made.task.sim))
+    with closing(FixedTests(made.task, 10, 10)) as tests:
+        found = Played.of(tests.play(chooser(position_policy(made.task.layout, made.task.sim))))
     centres = made.task.layout.bases(found.ends), made.task.layout.bases(found.goals)
     np.testing.assert_allclose(*centres, atol=1e-6)
     assert found.episodes["placed"][:, -1].all() == (tokens is PAIR or actions == 1)
@@ -104,9 +105,9 @@ def test_the_position_policy_solves_position_and_nothing_else(
 def test_the_position_policy_reaches_the_plateau_of_the_paper() -> None:
     """A square on its target's centre at a uniform angle: 0.8825 raw, 0.765 scaled."""
     made = setup(pixels=16)
-    with closing(FixedTests(made, 500, 100)) as tests:
-        found = tests.play(position_policy(made.task.layout, made.task.sim))
-        assert tests.scores(found)["mean_reward"] == pytest.approx(0.765, abs=0.01)
+    with closing(FixedTests(made.task, 500, 100)) as tests:
+        found = tests.play(chooser(position_policy(made.task.layout, made.task.sim)))
+        assert made.task.score(found)["mean_reward"] == pytest.approx(0.765, abs=0.01)
 
 
 @pytest.mark.parametrize("flip", [False, True])
@@ -122,7 +123,7 @@ def test_the_random_policy_fills_the_action_space_from_the_episodes_generators(f
 
 
 def test_the_number_of_actions_can_be_another_than_in_training() -> None:
-    with closing(FixedTests(setup(pixels=16, actions_per_token=5), 2, 2)) as tests:
+    with closing(FixedTests(setup(pixels=16, actions_per_token=5).task, 2, 2)) as tests:
         assert tests.play(greedy(policy(setup()).actor)).episodes.actions.shape == (2, 5, 3)
 
 
@@ -130,9 +131,9 @@ def test_noise_on_the_corners_is_seen_and_not_scored() -> None:
     scores = []
     for noise in (0.0, 0.05):
         made = setup(pixels=16, corner_noise=noise)
-        with closing(FixedTests(made, 50, 50)) as tests:
-            found = tests.play(position_policy(made.task.layout, made.task.sim))
-            scores.append(tests.scores(found)["position_error_median"])
+        with closing(FixedTests(made.task, 50, 50)) as tests:
+            found = tests.play(chooser(position_policy(made.task.layout, made.task.sim)))
+            scores.append(made.task.score(found)["position_error_median"])
     assert scores[0] == pytest.approx(0.0, abs=1e-6)
     # the mean of four corners, of token and target each: 0.1 * sqrt(2 / 4), in the plane
     assert scores[1] == pytest.approx(0.1 * np.sqrt(0.5) * np.sqrt(2 * np.log(2)), rel=0.3)

@@ -198,7 +198,8 @@ def standing_in(port: int | str = "*") -> Iterator[StandIn]:
 def open_hub(made: Setup, window: int = 4, seed: int = 11, lockstep: bool = False) -> Hub:
     """A master's hub on a free port."""
     spec = with_bound(made.spec, 100.0)
-    info = WelcomeInfo("run", seed, made.fingerprints(), spec, window, lockstep)
+    names = frozenset(score.name for score in made.task.scores)
+    info = WelcomeInfo("run", seed, made.fingerprints(), spec, window, lockstep, names)
     return Hub("127.0.0.1", 0, info)
 
 
