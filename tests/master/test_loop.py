@@ -246,7 +246,9 @@ def test_the_final_weights_are_waited_for_and_reported(tmp_path: Path) -> None:
     reason = made.run()
     # First the score of older weights comes, which is not the one that counts.
     hub.script.extend([[scores(MADE, 1, reward=0.1)], [], [scores(MADE, 4, reward=0.9)]])
-    result = make_result(made.finish(launched=False), made.guard.trainer.facts(), 7, reason)
+    result = make_result(
+        made.finish(launched=False), MADE.task.scores, made.guard.trainer.facts(), 7, reason
+    )
     assert (result["scored_updates"], result["updates"]) == (4, 4)
     assert (result["mean_reward"], result["mean_reward_camera"]) == (0.9, None)
     assert (result["test_episodes"], result["workers"]) == (100.0, 1)
@@ -304,7 +306,9 @@ def test_who_is_waited_for(
     hub = FakeHub(MADE, [[], [scores(MADE, 0)]], roles)
     made = loop(tmp_path, MADE, hub)
     made.signals.reason = reason
-    result = make_result(made.finish(launched), made.guard.trainer.facts(), 7, "over")
+    result = make_result(
+        made.finish(launched), MADE.task.scores, made.guard.trainer.facts(), 7, "over"
+    )
     assert hub.polls == 2 * waits
     assert (made.clock.record.scored_version == 0) is waits
     assert (result["scored_updates"], result["mean_reward"]) == ((0, 0.5) if waits else (None,) * 2)

@@ -46,6 +46,13 @@ class FillBatch:
     places: Rests
     ends: Flags
 
+    @property
+    def arrays(self) -> dict[str, Array]:
+        """All that it consists of, by name."""
+        states = {"filled": self.filled, "played": self.played, "places": self.places}
+        named = {f"{n}_{part}": one for n, own in states.items() for part, one in vars(own).items()}
+        return named | {"ends": self.ends}
+
 
 class FillReplay:
     """Two rings over preallocated arrays: of states that were played and of those of hindsight.

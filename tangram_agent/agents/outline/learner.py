@@ -21,7 +21,7 @@ from tangram_agent.base.config import NetConfig
 from tangram_agent.base.learning import NetworkLearner, Rates, frozen, polyak_update
 from tangram_agent.relabelling import learnable
 from tangram_core.agent import Streams
-from tangram_core.spec import Array, Episodes
+from tangram_core.spec import Array, Arrays, Episodes
 from tangram_tasks.fill import Fill
 
 
@@ -36,6 +36,7 @@ class FillLearner(NetworkLearner):
         super().__init__(config, {"value": self.value}, self.value, seed, device)
         self.replay = FillReplay(layout, config.replay_capacity, config.copies)
         self.capacity = config.replay_capacity
+        self.batch: FillBatch | None = None
 
     def _more_parts(self) -> dict[str, nn.Module]:
         self.target = frozen(self.value)
@@ -60,8 +61,12 @@ class FillLearner(NetworkLearner):
 
     def update(self, share: float, rng: Streams) -> dict[str, float]:
         """See `Learner.update`; its numbers are those of `learn`."""
-        batch = self.replay.sample(self.config.batch_size, rng["replay"])
-        return self.learn(batch, share)
+        self.batch = self.replay.sample(self.config.batch_size, rng["replay"])
+        return self.learn(self.batch, share)
+
+    def evidence(self) -> Arrays:
+        """The batch of the last update."""
+        return {} if self.batch is None else self.batch.arrays
 
     def learn(self, batch: FillBatch, share: float = 0.0) -> dict[str, float]:
         """One step on a batch; see `Ddpg.learn`.

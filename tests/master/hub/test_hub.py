@@ -76,7 +76,7 @@ DIFFERS = (
     [
         (
             {"fingerprints": FINGERPRINTS | {"tokens": "other"}},
-            "refused_tokens",
+            "refused_settings",
             DIFFERS.format(
                 "tokens", f"tokens: the worker has other, the master {FINGERPRINTS['tokens']}"
             ),

@@ -107,8 +107,7 @@ def test_too_many_in_a_row_end_the_run_and_the_batch_is_kept(
         guard.update(0.0)
     assert guard.undone == 5
     batch = safetensors.numpy.load_file(tmp_path / "bad")
-    assert learning.batch is not None
-    assert same(batch, learning.batch.arrays)
+    assert same(batch, learning.learner.evidence())
 
 
 def test_weights_that_went_bad_without_a_loss_are_never_given_out(

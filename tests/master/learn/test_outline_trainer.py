@@ -37,6 +37,7 @@ def test_what_workers_play_is_learned_from() -> None:
     numbers = made.update(0.0)
     assert set(numbers) == {"critic_loss", "q", "critic_gradient"}
     assert made.updates == 1
+    assert len(made.learner.evidence()["ends"]) == 4  # what a failure would be looked for in
     policy = Policy(MADE)
     policy.follow(made.weights())
     assert policy.version == 1

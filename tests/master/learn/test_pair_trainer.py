@@ -5,7 +5,6 @@ from typing import Any
 import pytest
 
 from tangram_agent.checkpoints import ACTING
-from tangram_agent.types import Weights
 from tangram_core.setup import Setup
 from tests.agent.agents.pair.pair_scenes import PERCEPTRON, seven
 from tests.agent.builders import Policy, random_episodes, setup
@@ -26,8 +25,7 @@ def test_replay_holds_what_was_played_and_nothing_relabelled() -> None:
     numbers = made.update(0.0)
     assert made.updates == 1
     assert set(numbers) >= {"critic_loss", "actor_loss", "q", "saturation"}
-    assert made.batch is not None
-    assert made.batch.count == made.setup.agent.batch_size
+    assert len(made.learner.evidence()["reward"]) == made.setup.agent.config.batch_size
 
 
 def test_a_critic_without_a_say_stays_with_the_master_and_in_checkpoints() -> None:
@@ -35,7 +33,7 @@ def test_a_critic_without_a_say_stays_with_the_master_and_in_checkpoints() -> No
     master, policy = trainer(made), Policy(made)
     play_on(master, 1)
     arrays, _ = master.state()
-    policy.load(Weights(1, arrays[ACTING]))
+    policy.load(arrays[ACTING])
     policy.follow(master.weights())
     parts = [
         {name.partition(".")[0] for name in one}

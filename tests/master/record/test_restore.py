@@ -143,7 +143,7 @@ def test_a_checkpoint_that_lacks_a_part_is_refused(tmp_path: Path, lost: str) ->
 @pytest.mark.parametrize(
     ("forged", "reason"),
     [
-        ({"setup": 3}, "other settings of net, reward, sim, tokens"),
+        ({"setup": 3}, "other settings of net, reward, sim, task, tokens"),
         ({"rate_limiter": 3}, "not that of a run .AttributeError"),
         ({"episodes": 1e400}, "not that of a run .OverflowError"),
         ({"record": Record().state() | {"loop_s": "x"}}, "Expected `float`, got `str` - at"),

@@ -80,7 +80,8 @@ def test_what_is_written_is_read_back_and_only_the_user_may_read_the_connection(
     tmp_path: Path,
 ) -> None:
     folder = RunFolder(tmp_path)
-    config = {"tokens": {"shapes": ["square"]}, "service": {"envs": 4}, "seed": 0}
+    kinds = {"task": {"kind": "place"}, "agent": {"kind": "pair"}}
+    config = {"tokens": {"shapes": ["square"]}, "service": {"envs": 4}, "seed": 0, **kinds}
     folder.write_config(config)
     assert list(yaml.safe_load(folder.config.read_text()).items()) == list(config.items())
     folder.write_result({"mean_reward": None})
@@ -92,6 +93,6 @@ def test_what_is_written_is_read_back_and_only_the_user_may_read_the_connection(
     finally:
         os.umask(before)
     assert stat.S_IMODE(folder.connection.stat().st_mode) == 0o600
-    settings = {name: config[name] for name in ("tokens", "service")}
+    settings = {name: config[name] for name in ("task", "tokens", "agent", "service")}
     content = {"endpoint": "tcp://127.0.0.1:5555", "settings": settings}
     assert json.loads(folder.connection.read_text()) == content

@@ -23,6 +23,8 @@ from master.watch.console import (
 )
 from tangram_agent.messages import OPEN, WORKER_COLUMNS, RunStatus
 from tangram_agent.outcome import duration
+from tangram_core.scores import SHOWN, written
+from tangram_tasks.place import ONE_TOKEN
 from tests.master.builders import screen, text
 
 log = logging.getLogger("master.test")
@@ -44,7 +46,7 @@ STATUS = RunStatus(
         "test/angle_error_deg_median": 1.214,
         "test/position_error_median": 0.01034,
     },
-    {"activity": "learning"},
+    {"activity": "learning", "scores": json.dumps(written(ONE_TOKEN[:SHOWN]))},
     np.zeros((0, len(WORKER_COLUMNS))),
 )
 UNSCORED = {name: value for name, value in STATUS.numbers.items() if "/" not in name}
@@ -67,7 +69,8 @@ def test_durations(seconds: float, shown: str) -> None:
         (
             STATUS,
             "1:23 | 27%, 1:01:40 left | 12,345 episodes | 1,234 updates | 950 transitions/s | "
-            "95.1 updates/s | reward 0.931, angle 1.21°, position 0.0103 | 2 workers | learning",
+            "95.1 updates/s | mean reward 0.931, raw overlap 0.966, "
+            "angle error (median) 1.21° | 2 workers | learning",
             ["27%  1:23, 1:01:40 left", "0.931", "1.21°", "2 workers, 1 evaluator · learning"],
         ),
         (

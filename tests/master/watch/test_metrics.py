@@ -37,7 +37,9 @@ def test_points_stand_under_their_names_and_steps(tmp_path: Path) -> None:
     metrics.scores({"mean_reward": 0.9}, updates=20, episodes=300, seconds=12.7)
     metrics.picture(np.full((4, 6, 3), 255, np.uint8), 20)
     metrics.settings({"agent": {"noise": 0.1}})
-    metrics.hyperparameters(dict.fromkeys(HPARAMS, 1) | {"tokens": ["square", "square"]})
+    told = {"tokens": ["square", "square"]}
+    scores = {"scores": [["mean_reward", "mean reward", 3, ""]]}
+    metrics.hyperparameters(dict.fromkeys(HPARAMS, 1) | told | scores, told)
     metrics.close()
     events = read(tmp_path)
     assert points(events, "train/q") == [(10, 0.5), (20, 0.75)]
@@ -50,7 +52,7 @@ def test_points_stand_under_their_names_and_steps(tmp_path: Path) -> None:
     assert "noise: 0.1" in str(events.Tensors("config/text_summary")[0].tensor_proto)
     content = events.summary_metadata["_hparams_/session_start_info"].plugin_data.content
     told = HParamsPluginData.FromString(content).session_start_info.hparams
-    assert set(told) == set(HPARAMS)
+    assert set(told) == {*HPARAMS, "tokens"}
     assert told["tokens"].string_value == "square+square"
     assert [path.is_file() for path in tmp_path.iterdir()] == [True, True]  # one run in the list
 

@@ -41,7 +41,7 @@ RESULT = dict.fromkeys(score.name for score in ONE_TOKEN) | {
         ({}, ["none: no evaluator took part", "1:01 of training, 1:15 in all"], ["mean reward"]),
         (
             SCORED | {"scored_updates": 1234},
-            ["mean reward              0.931", "1.21°", "0.0103", "1,234"],
+            ["mean reward", "0.931", "1.21°", "0.0103", "1,234"],
             ["weights after"],
         ),
         (SCORED | {"scored_updates": 1000}, ["weights after 1,000 updates"], ["go on"]),
