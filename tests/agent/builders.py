@@ -55,6 +55,16 @@ def setup(
     )
 
 
+def learner_of(made: Setup, seed: int = 0, device: str = "cpu", compiled: bool = False) -> Any:
+    """Who learns it."""
+    return made.agent.learner(made.task, seed, device, compiled=compiled)
+
+
+def learn(learner: Any, batch: Transitions, share: float = 0.0, seed: int = 0) -> dict[str, float]:
+    """One update on transitions; its numbers."""
+    return learner.learn(learner.steps(batch, np.random.default_rng(seed)), share)
+
+
 class Policy:
     """An actor, asked for corners (B, V, 2), placed (B, K) and goals (B, V, 2)."""
 
