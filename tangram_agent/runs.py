@@ -66,7 +66,9 @@ class Stored(NamedTuple):
 
     def made(self) -> "Run":
         """The run with its actor."""
-        return Run(self.folder, self.config, self.setup, self.weights)
+        run = Run(self.folder, self.config, self.setup, self.weights)
+        _ = run.actor  # refuses weights of another network here, not where it first plays
+        return run
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ import pytest
 
 from conf.commands import COMMANDS
 from conf.help import choices, setting_names
-from tangram_core.setup import SECTIONS
+from conf.kinds import every_kind
 from tangram_lab.benchmarks.cli import _parser as bench_parser
 from tests.blocks import PAGES
 
@@ -48,8 +48,9 @@ def found_below(name: str) -> bool:
 
 def dead_settings(text: str) -> list[str]:
     """Settings of a group in inline code that no command has."""
-    known = set(setting_names("train"))
-    dotted = rf"(?:{'|'.join(SECTIONS)}|service)\.\w+"
+    known = {name for kinds in every_kind("agent") for name in setting_names("train", kinds)}
+    groups = {name.partition(".")[0] for name in known if "." in name}
+    dotted = rf"(?:{'|'.join(groups)})\.\w+"
     named = [
         match[0] for span in spans(text) if (match := re.match(rf"{dotted}(?![\w.(/:-])", span))
     ]
