@@ -26,6 +26,7 @@ from tangram_agent.types import Weights
 from tangram_core.agent import Actor
 from tangram_core.arrays import Floats, Singles
 from tangram_core.errors import ConfigError, RunError
+from tangram_core.registry import KIND
 from tangram_core.settings import (
     KEY,
     LEARNING,
@@ -66,7 +67,9 @@ class Stored(NamedTuple):
 
     def made(self) -> "Run":
         """The run with its actor."""
-        return Run(self.folder, self.config, self.setup, self.weights)
+        run = Run(self.folder, self.config, self.setup, self.weights)
+        _ = run.actor  # refuses weights of another network here, not where it first plays
+        return run
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,6 +217,8 @@ def _changed(folder: Path, trained: Setup, changes: Changes) -> Setup:
         holds = trained.sections.get(section)
         if holds is None:
             raise ConfigError(f"{folder} has no settings of {section}: leave {given[0]} out")
+        if KIND in values:
+            _refuse_other(f"{section}.{KIND}", values[KIND], config[section][KIND])
         _check_playable(holds, values)
         config[section] |= values
     try:
@@ -232,11 +237,15 @@ def _check_playable(trained: Settings, values: Mapping[str, Any]) -> None:
         if part == LEARNING:
             refuse_ignored(given, "a trained run, which only plays", ANOTHER)
         if part == NETWORK:
-            was = told(getattr(trained, own.name))
-            raise ConfigError(
-                f"{given} does not fit this run, whose weights were trained with {name}={was}: "
-                f"leave it out, or {ANOTHER}"
-            )
+            _refuse_other(name, values[own.name], getattr(trained, own.name))
+
+
+def _refuse_other(name: str, given: object, was: object) -> None:
+    """What the weights are of cannot be changed."""
+    raise ConfigError(
+        f"{name}={told(given)} does not fit this run, whose weights were trained with "
+        f"{name}={told(was)}: leave it out, or {ANOTHER}"
+    )
 
 
 def read_config(path: Path) -> dict[str, Any]:

@@ -183,8 +183,9 @@ def from_mapping(kind: type[Made], mapping: Mapping[str, Any], section: str = ""
         made: Made = dacite.from_dict(cast("Any", kind), mapping, rules)
         return made
     except dacite.DaciteError as error:
-        where = f" of {section}" if section else ""
-        raise ConfigError(f"wrong config{where}: {error}") from None
+        if section and isinstance(error, dacite.DaciteFieldError):
+            error.update_path(section)
+        raise ConfigError(f"wrong config: {error}") from None
 
 
 def _check_names(kind: type[Any], mapping: Mapping[str, Any], group: str) -> None:

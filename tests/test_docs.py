@@ -12,6 +12,7 @@ import pytest
 
 from conf.commands import COMMANDS, GROUPS
 from conf.help import choices, setting_names
+from conf.kinds import every_kind
 from tangram_lab.benchmarks.cli import _parser as bench_parser
 from tests.blocks import PAGES
 
@@ -47,8 +48,14 @@ def found_below(name: str) -> bool:
 
 def dead_settings(text: str) -> list[str]:
     """Settings of a group in inline code that no command has."""
+<<<<<<< HEAD
     known = set(setting_names("train"))
     dotted = rf"(?:{'|'.join(GROUPS)})\.\w+"
+=======
+    known = {name for kinds in every_kind("agent") for name in setting_names("train", kinds)}
+    groups = {name.partition(".")[0] for name in known if "." in name}
+    dotted = rf"(?:{'|'.join(groups)})\.\w+"
+>>>>>>> ta
     named = [
         match[0] for span in spans(text) if (match := re.match(rf"{dotted}(?![\w.(/:-])", span))
     ]

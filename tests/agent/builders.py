@@ -34,25 +34,43 @@ SCENE = {"kind": "scene"}
 SMALL = {"width": 16, "layers": 2, "feed_forward": 32}
 
 
-def setup(
+def sections(
     tokens: dict[str, Any] = SQUARE,
     agent: dict[str, Any] | None = None,
     net: dict[str, Any] = SMALL,
     **sim: Any,
-) -> Setup:
-    """A setup on the kinematic backend with a small network."""
+) -> dict[str, Any]:
+    """A config on the kinematic backend with a small network."""
     kind = (agent or {}).get("kind", "pair")
     usual = {"pair": PLAIN | PROPOSAL, "scene": PLAIN}.get(kind, {})
-    return make_setup(
-        {
-            "task": {"kind": "fill" if kind == "outline" else "place"},
-            "tokens": tokens,
-            "sim": {"backend": "kinematic", **sim},
-            "reward": {},
-            "agent": {"kind": kind} | usual | (agent or {}),
-            "net": net,
-        }
-    )
+    return {
+        "task": {"kind": "fill" if kind == "outline" else "place"},
+        "tokens": tokens,
+        "sim": {"backend": "kinematic", **sim},
+        "reward": {},
+        "agent": {"kind": kind} | usual | (agent or {}),
+        "net": net,
+    }
+
+
+def setup(*given: Any, **named: Any) -> Setup:
+    """What such a config makes."""
+    return make_setup(sections(*given, **named))
+
+
+def learner_of(made: Setup, seed: int = 0, device: str = "cpu", compiled: bool = False) -> Any:
+    """Who learns it."""
+    return made.agent.learner(made.task, seed, device, compiled=compiled)
+
+
+def learn(learner: Any, batch: Transitions, share: float = 0.0, seed: int = 0) -> dict[str, float]:
+    """One update on transitions; its numbers."""
+    return learner.learn(learner.steps(batch, np.random.default_rng(seed)), share)
+
+
+def seen_in(batch: Transitions) -> dict[str, Any]:
+    """What is observed before the actions."""
+    return {"corners": batch.state, "placed": batch.placed, "goals": batch.goal}
 
 
 class Policy:

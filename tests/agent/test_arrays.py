@@ -156,7 +156,7 @@ def test_values_at_their_bounds_pass(name: str, value: float) -> None:
 @pytest.mark.parametrize("reward", ["overlap", "dense"])
 def test_a_run_takes_no_reward_that_its_own_cannot_be(reward: str) -> None:
     """Episodes of 1e6 among thousands spoilt for good what a critic had learned."""
-    spec = replace(setup(), reward=RewardConfig(reward)).spec
+    spec = replace(setup().task, reward=RewardConfig(reward)).spec
     (column,) = [one for one in columns(spec, 1) if one.name == "rewards"]
     worst = np.full(column.shape, spec.rewards[0], np.float32)
     assert -1.5 < spec.rewards[0] <= -1.0

@@ -9,32 +9,29 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tangram_agent.agents.outline.filling_learner import FillLearner
-from tangram_agent.learner import NUMBERS, Learner
-from tangram_agent.steps import Steps
 
-from tangram_agent.agents.outline.filling_replay import FillReplay
 from tangram_agent.agents.pair.motion import Fit, MotionModel
+from tangram_agent.base.ddpg import NUMBERS, Ddpg, Steps
 from tangram_core.setup import Setup
 from tests.agent.agents.outline.outlines import outline_setup
 from tests.agent.agents.outline.test_filling_learning import episode
 from tests.agent.agents.pair.pair_scenes import transitions
 from tests.agent.agents.pair.test_motion import commands, seen
-from tests.agent.builders import random_transitions
+from tests.agent.builders import learner_of, random_transitions
 from tests.agent.test_learner import CASES
 
 META = "meta"
 REFUSED = (NotImplementedError, RuntimeError)
 
 
-def steps_of(learner: Learner, made: Setup, done: int | None) -> Steps:
+def steps_of(learner: Ddpg, made: Setup, done: int | None) -> Steps:
     """Of a batch on the learner's device."""
     drawn = (
         transitions(made, 16, 0)
         if (made.agent_kind == "pair")
         else random_transitions(made, 32, 0, done=done)
     )
-    return learner.steps(learner.prepared(drawn, np.random.default_rng(0)))
+    return learner.steps(drawn, np.random.default_rng(0))
 
 
 # Whether no transition ends its episode, all do, or some; those of pairs are drawn in one way.
@@ -45,7 +42,7 @@ ENDS = [(case, done) for case in CASES for done in ([None] if case[0] == "pairs"
 @pytest.mark.parametrize(("case", "done"), ENDS)
 def test_an_update_stays_on_its_device(case: tuple[str, str], done: int | None) -> None:
     made = CASES[case]()
-    learner = Learner(made, 0, META)
+    learner = learner_of(made, 0, META)
     numbers = learner._step_all(steps_of(learner, made, done), learner.rates(0.5))
     assert (numbers.device.type, len(numbers)) == (META, len(NUMBERS))
 
@@ -57,7 +54,7 @@ def test_a_traced_update_stays_on_its_device(
 ) -> None:
     monkeypatch.setattr("torch._inductor.standalone_compile", lambda graph, *_, **__: graph)
     made = CASES[case]()
-    learner = Learner(made, 0, META, compiled=True)
+    learner = learner_of(made, 0, META, compiled=True)
     numbers = learner._step_all(steps_of(learner, made, None), learner.rates(0.5))
     assert (numbers.device.type, len(numbers)) == (META, len(NUMBERS))
 
@@ -74,10 +71,9 @@ def test_the_fit_of_a_motion_stays_on_its_device() -> None:
 @pytest.mark.fast
 def test_learning_what_can_be_filled_stays_on_its_device() -> None:
     made = outline_setup(agent={"replay_capacity": 8, "batch_size": 8})
-    replay, generator = FillReplay(made), np.random.default_rng(0)
-    replay.insert(episode([9.0, 9.0, 0.0]), generator)
-    learner = FillLearner(made, 0, META)
-    found = learner._step_value(replay.sample(8, generator), learner.rates(0.5))
+    learner, generator = learner_of(made, 0, META), np.random.default_rng(0)
+    learner.insert(episode([9.0, 9.0, 0.0]), {"hindsight": generator})
+    found = learner._step_value(learner.replay.sample(8, generator), learner.rates(0.5))
     assert {one.device.type for one in found.values()} == {META}
 
 
@@ -85,7 +81,7 @@ def test_learning_what_can_be_filled_stays_on_its_device() -> None:
 def test_the_device_refuses_what_these_tests_are_for() -> None:
     """To mix with the CPU, and to give a value to the host."""
     made = CASES["ddpg", "paper"]()
-    away, here = Learner(made, 0, META), Learner(made, 0)
+    away, here = learner_of(made, 0, META), learner_of(made, 0)
     steps = steps_of(away, made, None)
     with pytest.raises(REFUSED, match="device|meta"):
         here.critic_loss(steps)

@@ -1,4 +1,4 @@
-"""Eqs. 3-6 with either readout: hand-made targets, goldens, and what must have no effect."""
+"""Eqs. 3-6 on scenes and pairs: hand-made targets, goldens, and what must have no effect."""
 
 import json
 from collections.abc import Callable, Iterable
@@ -9,22 +9,25 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tangram_agent.learner import (
-    Learner,
-    NotFiniteError,
-    Rates,
-    average_so_far,
-    critic_target,
-    polyak_update,
-    saturation,
-)
 
 from tangram_agent.agents.scene.scenes import Scenes, next_token
 from tangram_agent.base.adam import Adam
+from tangram_agent.base.ddpg import Ddpg, critic_target, saturation
+from tangram_agent.base.learning import Rates, average_so_far, polyak_update
+from tangram_core.agent import NotFiniteError
 from tangram_core.errors import RunError
 from tangram_core.setup import Setup
 from tests.agent.agents.pair.pair_scenes import PERCEPTRON, TWO, seven, transitions
-from tests.agent.builders import PAIR, PAPER, SCENE, SMALL, random_transitions, setup
+from tests.agent.builders import (
+    PAIR,
+    PAPER,
+    SCENE,
+    SMALL,
+    learn,
+    learner_of,
+    random_transitions,
+    setup,
+)
 
 pytestmark = pytest.mark.fast
 
@@ -44,7 +47,7 @@ CASES: dict[tuple[str, str], Callable[[], Setup]] = {
 }
 
 
-def play(learner: Learner, made: Setup, seeds: range, progress: float = 0.25) -> list[Any]:
+def play(learner: Ddpg, made: Setup, seeds: range, progress: float = 0.25) -> list[Any]:
     """Updates on what the seeds draw."""
     numbers = []
     for seed in seeds:
@@ -53,8 +56,7 @@ def play(learner: Learner, made: Setup, seeds: range, progress: float = 0.25) ->
             if (made.agent_kind == "pair")
             else random_transitions(made, 32, seed, done=None)
         )
-        batch = learner.prepared(drawn, np.random.default_rng(seed))
-        numbers.append(learner.update(batch, progress))
+        numbers.append(learn(learner, drawn, progress, seed))
     return numbers
 
 
@@ -63,7 +65,7 @@ def changed(one: dict[str, Any], other: dict[str, Any]) -> set[str]:
     return {name.split(".")[0] for name in one if not np.array_equal(one[name], other[name])}
 
 
-def scaled(learner: Learner, parts: Iterable[str], factor: float) -> Learner:
+def scaled(learner: Ddpg, parts: Iterable[str], factor: float) -> Ddpg:
     """The learner with every weight of some parts multiplied."""
     with torch.no_grad():
         for part in parts:
@@ -72,7 +74,7 @@ def scaled(learner: Learner, parts: Iterable[str], factor: float) -> Learner:
     return learner
 
 
-def copied(learner: Learner) -> dict[str, Any]:
+def copied(learner: Ddpg) -> dict[str, Any]:
     return {name: value.copy() for name, value in learner.state().items()}
 
 
@@ -106,8 +108,8 @@ def test_a_young_average_forgets_its_start(rho: float, updates: int, expected: f
 
 
 def test_after_the_first_update_the_actor_itself_plays() -> None:
-    learner = Learner(setup(agent=SCENE | {"acting_average": 0.99}), seed=0)
-    learner.update(random_transitions(setup(), 16, done=None))
+    learner = learner_of(setup(agent=SCENE | {"acting_average": 0.99}))
+    learn(learner, random_transitions(setup(), 16, done=None))
     pairs = zip(learner.acting.parameters(), learner.actor.parameters(), strict=True)
     assert all(torch.equal(average, own) for average, own in pairs)
 
@@ -128,23 +130,23 @@ def test_the_first_unplaced_token_moves(placed: list[int], token: int) -> None:
 def test_the_critic_loss_is_the_mean_squared_bellman_error(agent: dict[str, Any]) -> None:
     """Against the value by hand: y from the target networks, 0 after the end."""
     made = setup(agent=agent | {"gamma": 0.9}, actions_per_token=2)
-    learner = scaled(Learner(made, seed=0), TARGETS, 1.5)
+    learner = scaled(learner_of(made), TARGETS, 1.5)
     batch = random_transitions(made, 6, done=None)
     assert 0 < batch.done.sum() < 6
-    steps = learner.steps(learner.prepared(batch, np.random.default_rng(0)))
+    steps = learner.steps(batch, np.random.default_rng(0))
     assert steps.follow is not None
     follow = learner.target_critic(steps.follow, learner.target_actor(steps.follow)[0])
     y = torch.from_numpy(batch.reward) + 0.9 * follow * (1 - torch.from_numpy(batch.done))
     loss, q = learner.critic_loss(steps)
     assert loss.item() == pytest.approx((q - y).square().mean().item(), rel=1e-5)
-    if not (made.agent_kind == "pair"):  # those move their tokens on before they are valued
+    if made.agent_kind != "pair":  # those move their tokens on before they are valued
         torch.testing.assert_close(q, learner.critic(steps.view, torch.from_numpy(batch.action)))
 
 
 def test_the_actor_loss_is_minus_the_value_of_its_actions() -> None:
     made = setup(agent=SCENE)
-    learner = Learner(made, seed=0)
-    steps = learner.steps(random_transitions(made, 6))
+    learner = learner_of(made)
+    steps = learner.steps(random_transitions(made, 6), np.random.default_rng(0))
     velocity, raw = learner.actor(steps.start)
     loss, penalty = learner.actor_loss(steps)
     assert loss.item() == pytest.approx(-learner.critic(steps.start, velocity).mean().item(), 1e-6)
@@ -155,7 +157,7 @@ def test_the_token_that_moved_is_valued_and_the_next_one_is_asked() -> None:
     made = setup(PAIR, agent=SCENE)
     batch = replace(random_transitions(made, 3), placed=np.array([[0, 0], [1, 0], [1, 1]], "u1"))
     batch.action[:, 0] = [0.5, 0.5, -0.5]
-    steps = Learner(made, seed=0).steps(batch)
+    steps = learner_of(made).steps(batch, np.random.default_rng(0))
     assert isinstance(steps.view, Scenes)
     assert isinstance(steps.start, Scenes)
     assert steps.view.token.tolist() == [1, 1, 0]
@@ -167,12 +169,12 @@ def test_the_token_that_moved_is_valued_and_the_next_one_is_asked() -> None:
     ("agent", "actions", "there"),
     [({"gamma": 0.9}, 1, False), ({}, 2, False), ({"gamma": 0.9}, 2, True)],
 )
-@pytest.mark.parametrize("readout", ["token", "pair"])
+@pytest.mark.parametrize("kind", ["scene", "pair"])
 def test_target_networks_are_there_where_something_bootstraps(
-    agent: dict[str, Any], actions: int, there: bool, readout: str
+    agent: dict[str, Any], actions: int, there: bool, kind: str
 ) -> None:
-    made = setup(agent=agent | {"readout": readout}, actions_per_token=actions)
-    learner = Learner(made, seed=0)
+    made = setup(agent=agent | {"kind": kind}, actions_per_token=actions)
+    learner = learner_of(made)
     assert learner.bootstraps == there
     assert hasattr(learner, "target_actor") == there
     assert any(name.startswith("target_critic.") for name in learner.state()) == there
@@ -180,21 +182,21 @@ def test_target_networks_are_there_where_something_bootstraps(
 
 def test_target_networks_matter_just_where_an_episode_goes_on() -> None:
     made = setup(agent=SCENE | {"gamma": 0.99}, actions_per_token=2)
-    plain = Learner(made, seed=0)
-    spoilt = scaled(Learner(made, seed=0), TARGETS, float("nan"))
+    plain = learner_of(made)
+    spoilt = scaled(learner_of(made), TARGETS, float("nan"))
     for seed in range(3):
         for learner in (plain, spoilt):
-            learner.update(random_transitions(made, 16, seed))
+            learn(learner, random_transitions(made, 16, seed))
     assert changed(plain.state(), spoilt.state()) == set(TARGETS)
     with pytest.raises(NotFiniteError, match="update 4 is not finite .critic_loss=nan"):
-        spoilt.update(random_transitions(made, 16, done=None))
+        learn(spoilt, random_transitions(made, 16, done=None))
     assert spoilt.updates == 3
 
 
 def test_an_update_moves_each_network_and_drags_the_averages() -> None:
     agent = SCENE | {"gamma": 0.9, "polyak": 0.9, "acting_average": 0.5}
     made = setup(agent=agent, actions_per_token=2)
-    learner = Learner(made, seed=0)
+    learner = learner_of(made)
     learner.updates = 1000  # the acting average is no longer young
     before = copied(learner)
     play(learner, made, range(1))
@@ -212,7 +214,7 @@ def test_an_update_moves_each_network_and_drags_the_averages() -> None:
 def test_the_actor_step_leaves_the_critic_alone(case: tuple[str, str]) -> None:
     """The critic's own step uses the critic's loss only: spoil the actor, the critic agrees."""
     made = CASES[case]()
-    plain, spoilt = Learner(made, seed=0), scaled(Learner(made, seed=0), ["actor"], -3.0)
+    plain, spoilt = learner_of(made), scaled(learner_of(made), ["actor"], -3.0)
     for learner in (plain, spoilt):
         play(learner, made, range(2))
     parts = changed(plain.state(), spoilt.state())
@@ -225,11 +227,10 @@ def test_the_penalty_counts_by_its_weight() -> None:
     norms = []
     for weight in (0.5, 1.0):
         made = setup(agent={"kind": "scene", "saturation_penalty": weight})
-        learner = Learner(made, seed=0)
+        learner = learner_of(made)
         with torch.no_grad():
             learner.critic.head.readout.weight.zero_()
-        batch = learner.prepared(random_transitions(made, 16), np.random.default_rng(0))
-        steps = learner.steps(batch)
+        steps = learner.steps(random_transitions(made, 16), np.random.default_rng(0))
         norms.append(learner._all_steps(steps, Rates(0.0, 0.0, 0.0))[-1].item())
     assert norms[1] == pytest.approx(2.0 * norms[0], rel=1e-5)
     assert norms[0] > 0.0
@@ -246,16 +247,16 @@ UNDECAYED = {"lr_final": 1.0}
 def test_cosine_decay_of_the_learning_rate(
     options: dict[str, Any], progress: float, share: float
 ) -> None:
-    learner = Learner(setup(agent=SCENE | {"actor_lr": 2e-3} | options), seed=0)
+    learner = learner_of(setup(agent=SCENE | {"actor_lr": 2e-3} | options))
     rates = learner.rates(progress)
     assert (rates.actor, rates.critic) == pytest.approx((2e-3 * share, 1e-3 * share))
 
 
 def test_networks_step_by_their_own_rates() -> None:
     """The first step of Adam is as long as its rate."""
-    learner = Learner(setup(agent=SCENE | {"actor_lr": 2e-3, "critic_lr": 5e-4}), seed=0)
+    learner = learner_of(setup(agent=SCENE | {"actor_lr": 2e-3, "critic_lr": 5e-4}))
     before = copied(learner)
-    learner.update(random_transitions(setup(), 16), 0.5)
+    learn(learner, random_transitions(setup(), 16), 0.5)
     for part, rate in (("actor", 2e-3 * 0.505), ("critic", 5e-4 * 0.505)):
         assert largest_change(before, learner.state(), part) == pytest.approx(rate, rel=1e-3)
 
@@ -282,7 +283,7 @@ def test_steps_are_those_of_torch() -> None:
 @pytest.mark.parametrize("case", CASES)
 def test_a_restored_learner_goes_on_bit_for_bit(case: tuple[str, str]) -> None:
     made = CASES[case]()
-    first, again, second = (Learner(made, seed) for seed in (0, 0, 9))
+    first, again, second = (learner_of(made, seed) for seed in (0, 0, 9))
     assert changed(first.state(), again.state()) == set()
     assert {"actor", "critic"} <= changed(first.state(), second.state())
     play(first, made, range(2), 0.1)
@@ -305,22 +306,22 @@ def test_a_restored_learner_goes_on_bit_for_bit(case: tuple[str, str]) -> None:
 )
 def test_weights_of_another_network_are_refused(made: Setup, other: Setup, reason: str) -> None:
     with pytest.raises(RunError, match=reason):
-        Learner(other, seed=0).load_state(Learner(made, seed=0).state())
+        learner_of(other).load_state(learner_of(made).state())
     with pytest.raises(RunError, match="not a learner's checkpoint"):
-        Learner(made, seed=0).load_state({})
+        learner_of(made).load_state({})
 
 
 @pytest.mark.parametrize("name", ["exp_avg", "exp_avg_sq", "step"])
 def test_averages_of_another_optimiser_are_refused(name: str) -> None:
     made = CASES[next(iter(CASES))]()
-    learner = Learner(made, seed=0)
+    learner = learner_of(made)
     play(learner, made, range(1), 0.1)
     key = f"actor_optimiser.0.{name}"
     whole = copied(learner)
     wrong = {key: np.zeros(5, np.float32)}
     for state in (whole | wrong, {k: v for k, v in whole.items() if k != key}):
         with pytest.raises(RunError, match="averages are not those of this network: start a new"):
-            Learner(made, seed=0).load_state(state)
+            learner_of(made).load_state(state)
 
 
 @pytest.mark.parametrize(
@@ -332,14 +333,14 @@ def test_averages_of_another_optimiser_are_refused(name: str) -> None:
     ],
 )
 def test_one_network_serves_other_sets_of_tokens(made: Setup, other: Setup) -> None:
-    learner = Learner(other, 0)
-    learner.load_state(Learner(made, 1).state())
-    assert "actor" not in changed(learner.state(), Learner(made, 1).state())
+    learner = learner_of(other, 0)
+    learner.load_state(learner_of(made, 1).state())
+    assert "actor" not in changed(learner.state(), learner_of(made, 1).state())
 
 
 def golden(made: Setup) -> dict[str, float]:
     """Losses of the first two updates, and sums over the weights after them."""
-    learner = Learner(made, seed=1)
+    learner = learner_of(made, seed=1)
     numbers = play(learner, made, range(2))
     result = {f"{name}_{i}": v for i, one in enumerate(numbers) for name, v in one.items()}
     state = learner.state()

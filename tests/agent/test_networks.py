@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tangram_agent.networks import Actor, Critic, Networks, initialise, parameter_count
 
+from tangram_agent.agents.pair.networks import Networks
+from tangram_agent.agents.scene.networks import ActorNet, CriticNet
 from tangram_agent.agents.scene.scenes import SceneGraph, Scenes
+from tangram_agent.base.networks import initialise, parameter_count
 from tangram_core.setup import Setup
 from tests.agent.agents.pair.pair_scenes import random_pairs
 from tests.agent.builders import PAIR, PAPER, SMALL, random_transitions, setup
@@ -19,13 +21,12 @@ pytestmark = pytest.mark.fast
 NETS: dict[str, Any] = {"mha": SMALL, "mlp": {"kind": "mlp"}}
 
 
-def networks(made: Setup, seed: int = 0) -> tuple[SceneGraph, Actor, Critic]:
-    graph = SceneGraph(made.task.layout)
-    actor, critic = Actor(graph, made.agent.net), Critic(graph, made.agent.net)
+def networks(made: Setup, seed: int = 0) -> tuple[SceneGraph, ActorNet, CriticNet]:
+    actor, critic = (kind(made.task.layout, made.agent.net) for kind in (ActorNet, CriticNet))
     generator = torch.Generator().manual_seed(seed)
     initialise(actor, generator)
     initialise(critic, generator)
-    return graph, actor, critic
+    return actor.graph, actor, critic
 
 
 def inputs(made: Setup, count: int = 5) -> Scenes:
@@ -87,8 +88,8 @@ def test_actions_of_scenes_stay_in_range(kind: str) -> None:
 
 
 def test_a_turn_of_pairs_is_atan2_over_k() -> None:
-    made = Networks(setup())
     layout = setup().task.layout
+    made = Networks(layout, 2.0, setup().agent.net, motion=False)
     pairs = random_pairs(layout, 0)
     velocity, raw = made.actor(pairs)
     outputs = made.actor.head(pairs)

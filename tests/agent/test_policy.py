@@ -1,4 +1,4 @@
-"""Acting and exploring with either readout of a scene, and weights over the wire."""
+"""Acting and exploring on scenes and on pairs, and weights over the wire."""
 
 from contextlib import closing
 from pathlib import Path
@@ -6,23 +6,36 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tangram_agent.learner import Learner
-from tangram_agent.networks import travelling
 
+from tangram_agent.agents.pair.actor import critic_plays
+from tangram_agent.base.weights import to_arrays
 from tangram_agent.messages import decode_weights
 from tangram_agent.runs import Run
 from tangram_agent.types import Transitions, Weights
-from tangram_core.errors import ConfigError, RunError
+from tangram_core.errors import ConfigError, RunError, WireError
 from tangram_core.setup import Setup
+from tangram_core.task import History
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.env import TangramEnv
 from tangram_sim.motion.actions import chosen_tokens, flips, velocities
 from tangram_sim.motion.actuation import full_scale
 from tangram_sim.vector import TangramVectorEnv
-from tangram_tasks.played import Past
 from tests.agent.agents.pair.pair_scenes import PERCEPTRON, SEVEN, TWO, seven, transitions
-from tests.agent.builders import PAIR, PAPER, SCENE, SMALL, Policy, random_transitions, setup
+from tests.agent.builders import (
+    PAIR,
+    PAPER,
+    SCENE,
+    SMALL,
+    Policy,
+    history,
+    learn,
+    learner_of,
+    random_transitions,
+    seen_in,
+    setup,
+)
 from tests.agent.messages import broadcast
+from worker.play.session import Acting
 
 pytestmark = pytest.mark.fast
 
@@ -34,7 +47,7 @@ Scene = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 def policy_of(made: Setup) -> Policy:
     policy = Policy(made)
-    policy.load(Learner(made, 0).acting_weights(7))
+    policy.load(learner_of(made).export())
     return policy
 
 
@@ -42,10 +55,9 @@ def scene_of(batch: Transitions) -> Scene:
     return batch.state, batch.placed, batch.goal
 
 
-def past_of(made: Setup, count: int) -> Past:
+def past_of(batch: Transitions) -> History:
     """One action that did not do what it should have."""
-    batch = random_transitions(made, count)
-    return Past(batch.state[:, None], batch.action[:, None])
+    return history(np.stack([batch.state, batch.state], axis=1), batch.action[:, None])
 
 
 def generators(count: int) -> list[np.random.Generator]:
@@ -62,16 +74,17 @@ def explored(made: Setup, count: int = COUNT) -> tuple[np.ndarray, np.ndarray]:
     "made", [setup(agent=SCENE), seven({}, SMALL), seven({}, PERCEPTRON, **SLIDE)]
 )
 def test_weights_travel_to_workers(made: Setup) -> None:
-    weights, policy = Learner(made, 0).acting_weights(7), Policy(made)
+    weights, actor = Weights(7, learner_of(made).broadcast()), made.agent.actor(made.task)
+    policy = Acting(actor)
     assert policy.version == -1
-    assert {name: tensor.shape for name, tensor in weights.tensors.items()} == policy.shapes
-    epoch, arrived = decode_weights(broadcast(weights, "run"), policy.shapes)
-    policy.load(arrived)
+    assert {name: tensor.shape for name, tensor in weights.tensors.items()} == actor.shapes
+    epoch, arrived = decode_weights(broadcast(weights, "run"), actor.shapes)
+    policy.follow(arrived)
     assert (epoch, policy.version) == ("run", 7)
-    for name, tensor in policy.weights().tensors.items():
+    for name, tensor in to_arrays(actor.network).items():
         np.testing.assert_array_equal(tensor, weights.tensors[name])
     with pytest.raises(RunError, match="on one side only"):
-        policy.load(Weights(0, {}))
+        policy.follow(Weights(0, {}))
 
 
 ONE = {"shapes": ["parallelogram"], "scale": 0.8}
@@ -88,19 +101,20 @@ HAS_A_SAY = [
 @pytest.mark.parametrize(("made", "has"), HAS_A_SAY)
 def test_a_critic_travels_where_it_has_a_say_in_what_is_played(made: Setup, has: bool) -> None:
     """What did not come is no number here: whoever asked it would not act as others do."""
-    whole, told = Learner(made, 0).acting_weights(7), Policy(made)
-    sent = travelling(whole, made).tensors
-    left_out = {name.partition(".")[0] for name in whole.tensors.keys() - sent.keys()}
-    assert (made.critic_plays, left_out) == (
+    learner, told = learner_of(made), Policy(made)
+    sent = learner.broadcast()
+    left_out = {name.partition(".")[0] for name in learner.export().keys() - sent.keys()}
+    assert (critic_plays(made.task), left_out) == (
         has,
         {"critic"} if (made.agent_kind == "pair") and not has else set(),
     )
-    assert {name: tensor.shape for name, tensor in sent.items()} == told.shapes
-    for parameter in told.network.parameters():
+    assert {name: tensor.shape for name, tensor in sent.items()} == told.actor.shapes
+    for parameter in told.actor.network.parameters():
         parameter.fill_(np.nan)
-    told.follow(Weights(7, sent))
-    scene, knows = scene_of(random_transitions(made, 20)), policy_of(made)
-    for past in (None, past_of(made, 20)):
+    told.load(sent)
+    batch, knows = random_transitions(made, 20), policy_of(made)
+    scene = scene_of(batch)
+    for past in (None, past_of(batch)):
         np.testing.assert_array_equal(told.act(*scene, past=past), knows.act(*scene, past=past))
         one, other = (p.explore(*scene, generators(20), past) for p in (told, knows))
         np.testing.assert_array_equal(one, other)
@@ -109,32 +123,34 @@ def test_a_critic_travels_where_it_has_a_say_in_what_is_played(made: Setup, has:
 
 def test_what_travels_is_no_checkpoint() -> None:
     """Who plays a finished run may set what makes its critic play."""
-    policy, whole = Policy(setup()), Learner(setup(), 0).acting_weights(7)
-    sent = travelling(whole, setup())
-    for take, weights in ((policy.load, sent), (policy.follow, whole)):
-        with pytest.raises(RunError, match="'critic.head.* is on one side only"):
-            take(weights)
-    policy.load(whole)
-    policy.follow(sent)
+    learner, policy = learner_of(setup(ONE)), Policy(setup(ONE, allow_flip=True))
+    with pytest.raises(RunError, match="'critic.head.* is on one side only"):
+        policy.load(learner.broadcast())
+    policy.load(learner.export())
+    whole = Weights(7, learner.export())
+    with pytest.raises(WireError, match="critic.head"):
+        decode_weights(broadcast(whole), Policy(setup(ONE)).actor.shapes)
 
 
 def test_weights_are_a_copy() -> None:
     made = setup(agent=SCENE)
-    learner = Learner(made, seed=0)
-    weights = learner.acting_weights(0)
-    before = {name: value.copy() for name, value in weights.tensors.items()}
-    learner.update(random_transitions(made, 8))
+    learner = learner_of(made)
+    weights = learner.broadcast()
+    before = {name: value.copy() for name, value in weights.items()}
+    learn(learner, random_transitions(made, 8))
     for name, value in before.items():
-        np.testing.assert_array_equal(weights.tensors[name], value)
+        np.testing.assert_array_equal(weights[name], value)
 
 
 def test_acting_is_the_acting_network_of_the_learner() -> None:
     made = setup(agent=SCENE | {"acting_average": 0.5})
-    learner, policy = Learner(made, seed=0), Policy(made)
+    learner, policy = learner_of(made), Policy(made)
     batch = random_transitions(made, 8)
-    learner.update(batch)
-    policy.load(learner.acting_weights(1))
-    expected = learner.acting(learner.steps(batch).view)[0].detach().numpy()
+    learn(learner, batch)
+    policy.load(learner.broadcast())
+    expected = (
+        learner.acting(learner.steps(batch, np.random.default_rng(0)).view)[0].detach().numpy()
+    )
     np.testing.assert_allclose(policy.act(*scene_of(batch)), expected, atol=1e-6)
 
 
@@ -146,7 +162,7 @@ def test_an_action_says_what_was_chosen(flip: bool) -> None:
     policy, scene = policy_of(made), scene_of(transitions(made, count))
     actions = policy.act(*scene)
     exact = [part.astype(np.float64) for part in scene]
-    choice = policy._planner.choose(exact[0], exact[1] > 0, exact[2])  # type: ignore[union-attr]
+    choice = policy.actor._planner.choose(exact[0], exact[1] > 0, exact[2])
     assert actions.shape == (count, 4 + flip)
     assert actions.dtype == np.float32
     np.testing.assert_array_equal(chosen_tokens(actions, 7), choice.token)
@@ -235,17 +251,16 @@ def test_exploring_does_not_depend_on_the_batching(made: Setup) -> None:
 
 
 def learns(made: Setup) -> None:
-    learner = Learner(made, 0)
-    learner.update(learner.prepared(transitions(made, 8), np.random.default_rng(0)))
+    learner = learner_of(made)
+    learn(learner, transitions(made, 8))
     assert learner.updates == 1
 
 
-@pytest.mark.parametrize("readout", ["pair", "token"])
+@pytest.mark.parametrize("kind", ["pair", "scene"])
 @pytest.mark.parametrize("noise", [0.0, 0.05])
-def test_whole_episodes_of_a_token_with_two_sides(readout: str, noise: float) -> None:
-    """Every readout plays every task, also one whose tokens may be turned over."""
-    agent = {"readout": readout}
-    made = setup(TWO, agent, PERCEPTRON, allow_flip=True, corner_noise=noise)
+def test_whole_episodes_of_a_token_with_two_sides(kind: str, noise: float) -> None:
+    """Either plays every task, also one whose tokens may be turned over."""
+    made = setup(TWO, {"kind": kind}, PERCEPTRON, allow_flip=True, corner_noise=noise)
     policy = policy_of(made)
     with closing(BatchedEnv(made.task.layout, made.task.sim, made.task.reward, 4)) as env:
         env.reset(generators(4))
@@ -262,7 +277,7 @@ def test_the_agent_of_the_paper_plays_and_learns_the_game() -> None:
 
 
 def run_of(made: Setup) -> Run:
-    return Run(Path("run"), {}, made, 7, policy_of(made))
+    return Run(Path("run"), {}, made, Weights(7, learner_of(made).export()))
 
 
 SHOWN = {"observation": 53, "achieved_goal": 46, "desired_goal": 46}
@@ -277,7 +292,8 @@ def test_predict_takes_what_the_environments_show() -> None:
     for _ in range(3):  # with tokens that are placed, too
         batch = several.batch
         actions = run.predict(observations)
-        expected = run.policy.act(batch.seen, batch.placed, batch.seen_goals)
+        shown = {"corners": batch.seen, "placed": batch.placed, "goals": batch.seen_goals}
+        expected = run.act(shown)
         np.testing.assert_array_equal(actions, expected)
         alone = run.predict(observation)
         np.testing.assert_allclose(alone, actions[1], atol=1e-5)
@@ -329,11 +345,11 @@ def test_an_observation_of_another_form_is_refused(observation: Any, reason: str
 
 def test_a_run_plays_on_with_other_settings_of_the_agent() -> None:
     run = run_of(seven({}, PERCEPTRON))
-    scene = scene_of(transitions(run.setup, 8))
+    scene = seen_in(transitions(run.setup, 8))
     other = run.with_settings({"agent": {"reapply": 3}})
-    assert (other.setup.agent.reapply, run.setup.agent.reapply) == (3, 0)
-    assert other.policy.version == 7
-    assert not np.allclose(other.policy.act(*scene), run.policy.act(*scene), atol=1e-3)
+    assert (other.setup.agent.config.reapply, run.setup.agent.config.reapply) == (3, 0)
+    assert other.updates == 7
+    assert not np.allclose(other.act(scene), run.act(scene), atol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -343,7 +359,8 @@ def test_a_run_plays_on_with_other_settings_of_the_agent() -> None:
         ("agent", "reapply", "x", "wrong config: .*agent.reapply"),
         ("agent", "odd", 1, "there is no setting agent.odd"),
         ("agent", "batch_size", 9, "agent.batch_size=9 changes nothing with a trained run, which"),
-        ("agent", "readout", "token", "agent.readout=token does not fit this run, whose weights"),
+        ("agent", "kind", "scene", "agent.kind=scene does not fit .*kind=pair: leave"),
+        ("agent", "motion", "learned", "agent.motion=learned does not fit this run, whose weights"),
         ("sim", "arena", 3.0, "trained with sim.arena=2: leave it out, or train a run with it"),
         ("sim", "motion", "slide", "run with sim.motion=slide: .* needs the engine's contacts"),
     ],
@@ -358,6 +375,6 @@ def test_settings_that_a_trained_run_cannot_play_with_are_refused(
 def test_settings_of_the_world_are_those_that_are_played_in() -> None:
     run = run_of(seven({}, PERCEPTRON))
     other = run.with_settings({"sim": {"allow_flip": True, "corner_noise": 0.01}})
-    assert (other.setup.sim.allow_flip, other.setup.sim.corner_noise) == (True, 0.01)
-    assert other.policy.act(*scene_of(transitions(other.setup, 8))).shape == (8, 5)
+    assert (other.task.sim.allow_flip, other.task.sim.corner_noise) == (True, 0.01)
+    assert other.act(seen_in(transitions(other.setup, 8))).shape == (8, 5)
     assert run.with_settings({"sim": {}}) is run

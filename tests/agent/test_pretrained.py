@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import safetensors.numpy
 import yaml
-from tangram_agent.learner import Learner
 
 from tangram_agent import pretrained
 from tangram_agent.pretrained import CARD, CONFIG, FORMAT, WEIGHTS, agent_names, is_name
@@ -19,12 +18,11 @@ from tangram_sim.register import KWARGS
 from tests.agent.builders import (
     BFLOAT,
     NAN,
-    PLAIN,
-    PROPOSAL,
-    SMALL,
-    SQUARE,
     Policy,
+    learner_of,
     random_transitions,
+    sections,
+    seen_in,
     setup,
     with_weights,
 )
@@ -32,9 +30,8 @@ from tests.agent.builders import (
 pytestmark = pytest.mark.fast
 
 MADE = setup()
-TENSORS = Learner(MADE, seed=3).acting_weights(1).tensors
-WORLD = {"tokens": SQUARE, "sim": {"backend": "kinematic"}, "reward": {}}
-SECTIONS = WORLD | {"agent": PLAIN | PROPOSAL, "net": SMALL}
+TENSORS = learner_of(MADE, 3).export()
+SECTIONS = sections()
 
 
 def write_agent(folder: Path, **card: object) -> Path:
@@ -63,10 +60,9 @@ def test_an_agent_is_found_by_its_name(package: Path, run_dir: str | Path) -> No
     run = load_run(run_dir)
     assert (run.folder, run.updates, run.config) == (Path("pretrained/square"), 12, SECTIONS)
     expected = Policy(MADE)
-    expected.load(Learner(MADE, seed=3).acting_weights(1))
-    batch = random_transitions(MADE, 4)
-    scene = (batch.state, batch.placed, batch.goal)
-    np.testing.assert_array_equal(run.policy.act(*scene), expected.act(*scene))
+    expected.load(TENSORS)
+    scene = seen_in(random_transitions(MADE, 4))
+    np.testing.assert_array_equal(run.act(scene), expected.act(*scene.values()))
 
 
 def test_a_folder_is_read_from_anywhere_and_wins_over_the_package(
@@ -121,7 +117,7 @@ def test_the_packages_own_agents_are_whole_small_and_good(name: str) -> None:
     folder = pretrained.PACKAGED / name
     run = load_run(f"pretrained/{name}")
     card = json.loads((folder / CARD).read_bytes())
-    assert [shape.name for shape in run.setup.layout.shapes] == card["task"]["tokens"]
+    assert [shape.name for shape in run.task.layout.shapes] == card["task"]["tokens"]
     assert card["tests"]["scores"]["this run"]["mean_reward"] > 0.9  # as it ships
     assert len((folder / WEIGHTS).read_bytes()) < 1_000_000
     assert f"# pretrained/{name}\n" in (folder / "card.md").read_text()
@@ -131,14 +127,14 @@ def test_the_packages_own_agents_are_whole_small_and_good(name: str) -> None:
     ("name", "agent"), [("Tangram-v0", "pretrained/square"), ("Tangram7-v0", "pretrained/tangram7")]
 )
 def test_an_id_is_what_its_agent_was_trained_on(name: str, agent: str) -> None:
-    setup = load_run(agent).setup
+    task = load_run(agent).task
     env = TangramEnv(**KWARGS[name])
-    assert env.layout.fingerprint() == setup.layout.fingerprint()
-    assert env.sim == setup.sim
-    assert setup.reward.name == "overlap"
+    assert env.layout.fingerprint() == task.layout.fingerprint()
+    assert env.sim == task.sim
+    assert task.reward.name == "overlap"
     env.close()
 
 
 def test_an_agent_of_outlines_says_that_no_observation_has_them() -> None:
-    with pytest.raises(ConfigError, match=r"silhouette fills outlines, .* call policy\.act"):
+    with pytest.raises(ConfigError, match=r"silhouette fills outlines, .* call act"):
         load_run("pretrained/tangram7_silhouette").predict({})

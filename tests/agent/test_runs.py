@@ -6,27 +6,34 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from tangram_agent.learner import Learner
 
 from tangram_agent.checkpoints import save_checkpoint
 from tangram_agent.runs import load_changed, load_run
 from tangram_core.errors import ConfigError, RunError, TangramError
 from tangram_sim.config import RewardConfig
-from tests.agent.builders import PLAIN, PROPOSAL, SMALL, SQUARE, Policy, random_transitions, setup
+from tests.agent.builders import (
+    SMALL,
+    Policy,
+    learner_of,
+    random_transitions,
+    sections,
+    seen_in,
+    setup,
+)
 
 pytestmark = pytest.mark.fast
 
 MADE = setup()
 WEIGHTS = "checkpoints/00000020/weights.safetensors"
-WORLD = {"tokens": SQUARE, "sim": {"backend": "kinematic"}, "reward": {}}
-CONFIG: dict[str, Any] = WORLD | {"agent": PLAIN | PROPOSAL, "net": SMALL}
+CONFIG = sections()
+KINDS = "{task: {kind: place}, agent: {kind: pair}}"
 
 
 @pytest.fixture
 def run_dir(tmp_path: Path) -> Path:
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(CONFIG))
     for updates in (10, 20):
-        arrays = {"weights": Learner(MADE, seed=updates).acting_weights(1).tensors}
+        arrays = {"weights": learner_of(MADE, updates).export()}
         counters = {"setup": MADE.contents()}
         save_checkpoint(tmp_path / "checkpoints", updates, arrays, counters, keep=2)
     return tmp_path
@@ -38,10 +45,9 @@ def test_a_run_acts_as_it_was_saved(run_dir: Path, checkpoint: str | None, updat
     assert run.updates == updates
     assert run.config == CONFIG
     expected = Policy(MADE)
-    expected.load(Learner(MADE, seed=updates).acting_weights(1))
-    batch = random_transitions(MADE, 4)
-    scene = (batch.state, batch.placed, batch.goal)
-    np.testing.assert_array_equal(run.policy.act(*scene), expected.act(*scene))
+    expected.load(learner_of(MADE, updates).export())
+    scene = seen_in(random_transitions(MADE, 4))
+    np.testing.assert_array_equal(run.act(scene), expected.act(*scene.values()))
 
 
 def spoil(path: Path) -> None:
@@ -58,7 +64,8 @@ def spoil(path: Path) -> None:
         (lambda run: (run / "config.yaml").write_text("a: [1"), "not valid YAML"),
         (lambda run: (run / "config.yaml").write_text("[" * 9999), "is no file of sett"),
         (lambda run: (run / "config.yaml").write_text("- 1"), "holds no settings"),
-        (lambda run: (run / "config.yaml").write_text("tokens: {}"), "no section sim"),
+        (lambda run: (run / "config.yaml").write_text("tokens: {}"), "names no task: .*CHANGELOG"),
+        (lambda run: (run / "config.yaml").write_text(KINDS), "no section tokens, sim"),
         (lambda run: (run / "checkpoints").rename(run / "gone"), "no checkpoint in"),
         (lambda run: spoil(run / WEIGHTS), "checksum of weights.safetensors differs"),
     ],
@@ -74,7 +81,7 @@ def test_a_broken_run_is_refused_in_clear_words(run_dir: Path, harm: Any, reason
     ("section", "content"),
     [
         ("tokens", {"shapes": ["parallelogram"], "scale": 1.0}),
-        ("agent", {"motion": "exact", "reapply": 0}),
+        ("agent", {"kind": "pair", "motion": "exact", "reapply": 0}),
         ("net", {**SMALL, "scale": "sqrt_d"}),
         ("sim", {"arena": 3.0}),
     ],
@@ -91,7 +98,7 @@ def test_a_config_that_was_changed_after_the_training_is_refused(
 def test_a_run_may_be_played_in_another_world(run_dir: Path) -> None:
     config = CONFIG | {"sim": {"backend": "physics"}, "reward": {"name": "dense"}}
     (run_dir / "config.yaml").write_text(yaml.safe_dump(config))
-    assert load_run(run_dir).setup.sim.backend == "physics"
+    assert load_run(run_dir).task.sim.backend == "physics"
 
 
 def test_a_run_folder_has_no_code_loaded_that_was_not_named(run_dir: Path) -> None:
@@ -103,15 +110,15 @@ def test_a_run_folder_has_no_code_loaded_that_was_not_named(run_dir: Path) -> No
         load_run(run_dir)
     with pytest.raises(ConfigError, match=f"has sha256 .* want {'0' * 64}"):
         load_run(run_dir, reward=f"{own}:near")
-    assert load_changed(run_dir, {"reward": {"name": "overlap"}}).setup.reward == RewardConfig()
+    assert load_changed(run_dir, {"reward": {"name": "overlap"}}).task.reward == RewardConfig()
     config["reward"] = {"name": f"{own}:near"}
     (run_dir / "config.yaml").write_text(yaml.safe_dump(config))
-    assert load_run(run_dir, reward=f"{own}:near").setup.reward.own == (own, "near")
+    assert load_run(run_dir, reward=f"{own}:near").task.reward.own == (own, "near")
 
 
 def test_weights_of_another_net_are_refused(tmp_path: Path) -> None:
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(CONFIG | {"net": {**SMALL, "width": 32}}))
-    arrays = {"weights": Learner(MADE, seed=0).acting_weights(1).tensors}
+    arrays = {"weights": learner_of(MADE, 0).export()}
     save_checkpoint(tmp_path / "checkpoints", 10, arrays, {}, keep=2)
     with pytest.raises(RunError, match="weights of another layout"):
         load_run(tmp_path)

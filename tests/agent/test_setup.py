@@ -12,16 +12,21 @@ from tangram_core.setup import from_mapping, make_setup
 pytestmark = pytest.mark.fast
 
 BASE: dict[str, dict[str, Any]] = {
+    "task": {"kind": "place"},
     "tokens": {"shapes": ["square"], "scale": 1.0},
     "sim": {},
     "reward": {},
-    "agent": {},
+    "agent": {"kind": "pair"},
     "net": {},
 }
 
 
 def changed(section: str, **values: Any) -> dict[str, dict[str, Any]]:
-    return {**BASE, section: {**BASE[section], **values}}
+    return with_sections(BASE, {section: values})
+
+
+def with_sections(config: dict[str, Any], more: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    return config | {name: config[name] | own for name, own in more.items()}
 
 
 @pytest.mark.parametrize(
@@ -46,12 +51,12 @@ def changed(section: str, **values: Any) -> dict[str, dict[str, Any]]:
             r"batch_size \(10\) must not exceed agent.replay_capacity \(5\)",
         ),
         (changed("agent", lr_final=1.5), "agent.lr_final must be between 0 and 1, got 1.5"),
-        (
-            changed("agent", readout="x"),
-            "agent.readout must be one of pair, token, outline, got 'x'",
-        ),
+        (changed("agent", kind="x"), "agent.kind=x: .* choose from scene, pair, outline"),
+        (changed("task", kind="x"), "task.kind=x: there is no such task: choose from place, fill"),
+        (changed("task", odd=1), "there is no setting task.odd: delete it"),
         (changed("agent", reapply=-1), "agent.reapply must be between 0 and 100, got -1"),
-        (changed("agent", beam=0), "agent.beam must be between 1 and 32, got 0"),
+        (changed("agent", kind="outline", beam=0), "agent.beam must be between 1 and 32, got 0"),
+        (changed("agent", beam=2), "there is no setting agent.beam: delete it; .* older version"),
         (changed("agent", hindsight=[{"strategy": "x"}]), "must be one of final, future, near"),
         (
             changed("agent", hindsight=[{"strategy": "near", "copies": 0}]),
@@ -62,12 +67,17 @@ def changed(section: str, **values: Any) -> dict[str, dict[str, Any]]:
         (changed("net", hidden=[]), "net.hidden must name at least one layer"),
         (changed("net", hidden=[0]), "net.hidden must be between 1 and 65536, got 0"),
         (changed("net", scale="none"), "net.scale must be one of d, sqrt_d"),
-        ({"tokens": BASE["tokens"]}, "no section sim, reward, agent, net"),
+        ({n: BASE[n] for n in ("task", "tokens", "agent")}, "no section sim, reward, net"),
+        (
+            {"tokens": {}, "agent": {"kind": "pair"}},
+            "names no task: .* task.kind; .*CHANGELOG",
+        ),
+        ({"task": {"kind": "place"}, "agent": {}}, "names no agent: it must have agent.kind"),
     ],
 )
 def test_wrong_settings_are_refused_in_clear_words(config: dict[str, Any], reason: str) -> None:
     with pytest.raises(ConfigError, match=reason):
-        _ = make_setup(config).layout
+        _ = make_setup(config).task.layout
 
 
 @pytest.mark.parametrize(
@@ -110,7 +120,7 @@ def test_settings_that_only_one_version_knows_do_not_differ() -> None:
     older = made.contents()
     del older["agent"]["motion"], older["agent"]["hindsight"][0]["angle"], older["reward"]
     assert made.differences(older | {"newer": {}}) == []
-    assert made.differences(3) == ["agent", "net", "reward", "sim", "tokens"]
+    assert made.differences(3) == ["agent", "net", "reward", "sim", "task", "tokens"]
     older["agent"]["hindsight"][0]["copies"] = 7
     assert made.differences(older) == ["agent"]
     older["agent"]["hindsight"] = []
@@ -118,7 +128,7 @@ def test_settings_that_only_one_version_knows_do_not_differ() -> None:
 
 
 def test_whole_numbers_are_welcome_as_floats() -> None:
-    assert make_setup(changed("sim", arena=3)).sim.arena == 3.0
+    assert make_setup(changed("sim", arena=3)).task.sim.arena == 3.0
 
 
 @pytest.mark.parametrize(
@@ -164,10 +174,10 @@ FUTURE = [{"strategy": "future"}]
     [
         (SEVERAL, {"reward": {"name": "dense"}}, "reward.name=dense changes nothing with 2 tokens"),
         (SEVERAL, {"reward": {"source": "camera"}}, "reward.source=camera changes nothing"),
-        (SEVERAL, {"reward": {"name": "dense"}}, "set agent.readout=token, which values the"),
-        (SEVERAL, {"agent": {"gamma": 0.9}}, "agent.gamma=0.9 .*readout=token, which values the"),
+        (SEVERAL, {"reward": {"name": "dense"}}, "set agent=paper, which values the"),
+        (SEVERAL, {"agent": {"gamma": 0.9}}, "agent.gamma=0.9 .*agent=paper, which values the"),
         (SEVERAL, {"agent": {"hindsight": FUTURE}}, "strategy=future changes nothing"),
-        (ONE, {"agent": {"kind": "scene", "reapply": 0}}, "agent.reapply=0 changes nothing"),
+        (ONE, {"agent": {"kind": "scene", "reapply": 0}}, "no setting agent.reapply: delete it"),
         (ONE, {"agent": {"polyak": 0.9}}, "agent.polyak=0.9 changes nothing with agent.gamma=0"),
         (
             ONE,
@@ -180,7 +190,7 @@ FUTURE = [{"strategy": "future"}]
 def test_what_would_change_nothing_is_refused(
     tokens: dict[str, Any], sections: dict[str, Any], reason: str
 ) -> None:
-    config = changed("tokens", **tokens) | sections
+    config = with_sections(changed("tokens", **tokens), sections)
     with pytest.raises(ConfigError, match=reason):
         make_setup(config)
 
@@ -195,4 +205,4 @@ def test_what_would_change_nothing_is_refused(
     ],
 )
 def test_what_has_an_effect_is_taken(tokens: dict[str, Any], sections: dict[str, Any]) -> None:
-    make_setup(changed("tokens", **tokens) | sections)
+    make_setup(with_sections(changed("tokens", **tokens), sections))

@@ -19,13 +19,11 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import torch
-from worker.play.looking import environments
 
 from conf.cli import composed
 from master.learn.trainer import Trainer
 from tangram_core.setup import Setup, make_setup
-from tests.agent.builders import Policy
-from worker.play.rollout import Rollout
+from worker.play.rollout import Rollout, exploring
 
 FILE = Path(__file__).parents[1] / "golden" / "fingerprints.json"
 UPDATES = 20
@@ -42,7 +40,7 @@ AGENTS = {
     "perceptron": ("agent=mlp",),
     "pairs": ("agent=tangram",),
     "seven": ("agent=tangram", "tokens=tangram7", "net=mlp_pairs"),
-    "outline": ("agent=outline", "tokens=tangram7", "sim=silhouette"),
+    "outline": ("task=fill", "agent=outline", "tokens=tangram7", "sim=silhouette"),
     "pictures": (
         "agent=tangram",
         "tokens=large_triangle",  # a square is seen alike at four angles: rounding chooses one
@@ -59,7 +57,13 @@ Tensors = Mapping[str, npt.NDArray[Any]]
 def setup_of(name: str) -> Setup:
     """An agent with small batches, that begins to learn soon."""
     setup = make_setup(composed("train", ["run_dir=x", *AGENTS[name]]))
-    return replace(setup, agent=replace(setup.agent, **SHORT))
+    return with_agent(setup, **SHORT)
+
+
+def with_agent(setup: Setup, **settings: Any) -> Setup:
+    """Learned otherwise."""
+    config = replace(setup.agent.config, **settings)
+    return replace(setup, agent=replace(setup.agent, config=config))
 
 
 def total(arrays: Iterable[npt.NDArray[Any]]) -> float:
@@ -75,25 +79,24 @@ def fingerprint(setup: Setup, moved_by: int | None = None) -> dict[str, float]:
         moved_by: a seed, to begin with weights that are moved by a rounding error or four.
     """
     torch.set_num_threads(1)
-    trainer, policy = Trainer(setup, SEED, "cpu"), Policy(setup)
+    trainer, actor = Trainer(setup, SEED, "cpu"), setup.agent.actor(setup.task)
     if moved_by is not None:
         generator = torch.Generator().manual_seed(moved_by)
         with torch.no_grad():
             for weights in every_weight(trainer):
                 noise = torch.rand(weights.shape, generator=generator) * 2.0 - 1.0
                 weights.mul_(1.0 + STEP * noise)
-    first = trainer.learner.acting_weights(0).tensors
+    first = trainer.learner.export()
     losses: dict[str, list[float]] = {}
-    with closing(environments(setup, ENVS)) as env:
-        rollout = Rollout(env, SEED, "player", 0, 0)
+    with closing(setup.task.make(ENVS)) as env:
+        rollout = Rollout(env, setup.spec, SEED, "player", 0, 0)
         while trainer.updates < UPDATES:
-            newest = trainer.weights()
-            policy.follow(newest)
-            trainer.insert(rollout.play(policy.explore, BATCH_EPISODES // ENVS))
+            actor.load(trainer.weights().tensors)
+            trainer.insert(rollout.play(exploring(actor), BATCH_EPISODES // ENVS))
             while trainer.rate_limiter.may_update() and trainer.updates < UPDATES:
                 for name, loss in trainer.update(trainer.updates / UPDATES).items():
                     losses.setdefault(name, []).append(loss)
-    last = trainer.learner.acting_weights(trainer.updates).tensors
+    last = trainer.learner.export()
     went = (last[name].astype(np.float64) - first[name] for name in last)
     found = {"weights": total(last.values()), "moved": total(went)}
     return found | {name: math.fsum(losses[name]) / UPDATES for name in ("critic_loss", "q")}
@@ -135,8 +138,8 @@ def test_an_agent_trains_as_it_always_did(name: str) -> None:
 def test_a_thousandth_more_of_a_learning_rate_is_seen() -> None:
     expected = json.loads(FILE.read_text())["paper"]["moved"]
     setup = setup_of("paper")
-    rate = replace(setup.agent, actor_lr=setup.agent.actor_lr * 1.001)
-    found = fingerprint(replace(setup, agent=rate))["moved"]
+    faster = with_agent(setup, actor_lr=setup.agent.config.actor_lr * 1.001)
+    found = fingerprint(faster)["moved"]
     assert abs(found - expected["value"]) > expected["tolerance"]
 
 

@@ -18,7 +18,7 @@ from tangram_lab.experiments import pretrained
 from tangram_lab.experiments.pretrained import main, publish
 from tests.agent.agents.outline.outlines import AGENT as FILLER
 from tests.agent.agents.outline.outlines import SIM as OUTLINES
-from tests.agent.builders import random_transitions, setup
+from tests.agent.builders import random_transitions, seen_in, setup
 from tests.sim.builders import SEVEN
 from tests.worker.builders import write_run
 
@@ -86,12 +86,11 @@ def test_an_agent_is_its_run_and_its_card_tells_everything(tmp_path: Path) -> No
         "config.yaml",
         "weights.safetensors",
     }
-    batch = random_transitions(setup(), 4)
-    scene = (batch.state, batch.placed, batch.goal)
+    scene = seen_in(random_transitions(setup(), 4))
     agent, run = load_run(folder), load_run(runs[1])
     assert agent.updates == 7
     assert agent.setup == run.setup
-    np.testing.assert_array_equal(agent.policy.act(*scene), run.policy.act(*scene))
+    np.testing.assert_array_equal(agent.act(scene), run.act(scene))
     text = (folder / "card.md").read_text()
     for words in (
         "tangram-eval run_dir=pretrained/square episodes=3 seed=1",
@@ -122,7 +121,7 @@ def test_an_agent_of_outlines_ships_with_its_beam_and_is_told_as_such(
     write_run(run, tokens=seven, sim=OUTLINES | sim | {"targets": "touching"}, agent=FILLER)
     folder = publish([run], "outlines", tmp_path / "out", 1)
     agent, card = load_run(folder).setup.agent, json.loads((folder / "card.json").read_text())
-    assert agent.beam == 12
+    assert agent.config.beam == 12
     assert set(card["tests"]["scores"]) == {"this run", "beam=1", "largest first", "random"}
     told = {*card["tests"]["scores"]["this run"], *card["puzzles"]["test"]["scores"]}
     assert {"iou", "share_solved_iou", "raw_overlap_p10"} <= told

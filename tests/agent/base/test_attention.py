@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from tangram_agent.networks import initialise
 
 from tangram_agent.base.attention import (
     NO_EDGE,
@@ -13,6 +12,7 @@ from tangram_agent.base.attention import (
     softmax_mean,
 )
 from tangram_agent.base.config import NetConfig
+from tangram_agent.base.networks import initialise
 from tests.agent.builders import setup
 
 pytestmark = pytest.mark.fast

@@ -8,17 +8,18 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
-from tangram_agent.learner import Learner, Rates
 
 from master.config import COMPILERS, MasterConfig, check_compiling
 from master.learn.trainer import Trainer
 from master.record.rundir import RunFolder
 from master.run import _make_trainer
 from tangram_agent.base.compiling import Compiled, cache_folder
+from tangram_agent.base.learning import Rates
 from tangram_core.errors import ConfigError, RunError
 from tangram_core.process import Watchdog
 from tangram_core.service import ServiceConfig
-from tests.agent.builders import PAPER, setup
+from tests.agent.agents.outline.outlines import outline_setup
+from tests.agent.builders import PAPER, learner_of, setup
 from tests.agent.test_learner import CASES, changed, copied, play
 
 # Agents whose updates differ in their parts: bootstrapping, several tokens, pairs.
@@ -52,11 +53,11 @@ def test_a_graph_updates_as_single_operations_do(
     """
     made = CASES[case]()
     monkeypatch.setitem(
-        vars(made.agent), "batch_size", 16 if (made.agent_kind == "pair") else 32
+        vars(made.agent.config), "batch_size", 16 if (made.agent_kind == "pair") else 32
     )  # as `play` draws
-    plain, whole = Learner(made, 0), Learner(made, 0, compiled=True)
+    plain, whole = learner_of(made, 0), learner_of(made, 0, compiled=True)
     before = copied(whole)
-    whole.compile_ahead()
+    whole.prepare()
     assert changed(before, whole.state()) == set()
     numbers = [play(learner, made, range(4)) for learner in (plain, whole)]
     np.testing.assert_allclose(*map(_values, numbers), rtol=2e-4, atol=2e-6)
@@ -75,9 +76,9 @@ def test_a_graph_updates_as_single_operations_do(
 def test_a_gpu_updates_as_a_processor_does(case: tuple[str, str], compiled: bool) -> None:
     """By torch's own compiler, recorded; what was learned there is gone on with here."""
     made = CASES[case]()
-    here, there = Learner(made, 0), Learner(made, 0, "cuda", compiled)
+    here, there = learner_of(made, 0), learner_of(made, 0, "cuda", compiled)
     before = copied(there)
-    there.compile_ahead()
+    there.prepare()
     assert changed(before, there.state()) == set()
     numbers = [play(learner, made, range(4)) for learner in (here, there)]
     np.testing.assert_allclose(*map(_values, numbers), rtol=2e-3, atol=2e-5)
@@ -112,7 +113,7 @@ def _values(numbers: list[Any]) -> list[list[float]]:
 def test_a_graph_goes_on_with_what_was_restored(traced: list[Any]) -> None:
     """It holds on to tensors, which a restored state must fill and not replace."""
     made = setup(agent=PAPER, net=FEW)
-    first, second = (Learner(made, seed, compiled=True) for seed in (0, 9))
+    first, second = (learner_of(made, seed, compiled=True) for seed in (0, 9))
     play(second, made, range(1))
     play(first, made, range(2))
     second.load_state(copied(first))
@@ -146,10 +147,10 @@ def test_a_compiler_that_fails_is_told_with_its_remedy(monkeypatch: pytest.Monke
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("torch._inductor.standalone_compile", fails)
-    learner = Learner(setup(agent=PAPER, net=FEW), 0, compiled=True)
+    learner = learner_of(setup(agent=PAPER, net=FEW), 0, compiled=True)
     before = copied(learner)
     with pytest.raises(RunError, match=r"No space left.*: empty .*service.compile=false"):
-        learner.compile_ahead()
+        learner.prepare()
     assert changed(before, learner.state()) == set()
 
 
@@ -173,7 +174,7 @@ def test_a_compiled_update_is_the_same_twice(
     """By torch's own compiler."""
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
     made = setup(agent=PAPER, net=FEW)
-    plain, whole = Learner(made, 0), Learner(made, 0, compiled=True)
+    plain, whole = learner_of(made, 0), learner_of(made, 0, compiled=True)
     before = copied(whole)
     once = play(whole, made, range(3))
     after = copied(whole)
@@ -199,13 +200,13 @@ def test_a_run_stays_with_what_it_began_with(began: bool) -> None:
 @pytest.mark.fast
 def test_what_cannot_be_compiled_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     wanted = ServiceConfig(compile=True)
-    check_compiling(ServiceConfig(), fills=True)
-    with pytest.raises(ConfigError, match="compile=true changes nothing with an agent of"):
-        check_compiling(wanted, fills=True)
+    check_compiling(ServiceConfig())
+    with pytest.raises(ConfigError, match="compile=true changes nothing with agent.kind=outline"):
+        learner_of(outline_setup(), compiled=True)
     monkeypatch.setenv("CXX", "no-such-compiler")
     with pytest.raises(ConfigError, match="no-such-compiler is not found: install g"):
-        check_compiling(wanted, fills=False)
+        check_compiling(wanted)
     monkeypatch.delenv("CXX")
     monkeypatch.setenv("PATH", "")
     with pytest.raises(ConfigError, match=r"g\+\+ or clang\+\+ is not found"):
-        check_compiling(wanted, fills=False)
+        check_compiling(wanted)

@@ -9,20 +9,19 @@ import numpy as np
 import pytest
 import shapely
 import torch
-from tangram_agent.config import AgentConfig, NetConfig
 from torch import nn
-from worker.play.looking import environments
 
 from tangram_agent.agents.outline.filler import Filler
 from tangram_agent.agents.outline.filling import UNUSED, Filling
 from tangram_agent.agents.outline.values import Corners
+from tangram_agent.base.config import NetConfig
 from tangram_core.errors import ConfigError
 from tangram_core.setup import Setup
 from tangram_sim.geometry.dissections import Place
 from tangram_sim.puzzles.figures import library
 from tangram_sim.targets.targets import placement
 from tests.agent.agents.outline.outlines import ALL, TWO, outline_setup
-from tests.agent.builders import Policy
+from tests.agent.builders import SCENE, Policy, setup
 
 pytestmark = pytest.mark.fast
 
@@ -41,16 +40,13 @@ class Wrong(nn.Module):
         return (corners.part != UNUSED).sum(dim=1).float()
 
 
-def beam_of(made: Setup, width: int) -> Setup:
-    return replace(made, agent=replace(made.agent, beam=width))
-
-
-def overlaps(made: Setup, value: nn.Module, targets: Any = None, count: int = 6) -> np.ndarray:
+def overlaps(
+    made: Setup, value: nn.Module, beam: int, targets: Any = None, count: int = 6
+) -> np.ndarray:
     """Raw overlap of some episodes, played by these values."""
-    filler = Filler(value, made)
     policy = Policy(made)
-    policy._filler = filler
-    with closing(environments(made, count)) as env:
+    policy.actor._filler = Filler(value, made.task, beam)
+    with closing(made.task.make(count).world) as env:
         env.reset([np.random.default_rng(i) for i in range(count)], targets)
         for _ in range(env.horizon):
             result = env.step(policy.act(env.seen, env.closed, env.seen_goals))
@@ -62,18 +58,18 @@ def overlaps(made: Setup, value: nn.Module, targets: Any = None, count: int = 6)
 def test_a_beam_finds_what_values_do_not_tell() -> None:
     """Two triangles, glued by chance: in some outlines one fits where the other then does not."""
     made = outline_setup()
-    alone = [overlaps(made, value) for value in (Indifferent(), Wrong())]
+    alone = [overlaps(made, value, 1) for value in (Indifferent(), Wrong())]
     assert (np.stack(alone) > 0.99).any(axis=1).all()
     assert (np.stack(alone) < 0.9).any(axis=1).all()
     for value in (Indifferent(), Wrong()):
-        assert overlaps(beam_of(made, 2), value) == pytest.approx(1.0, abs=1e-4)
+        assert overlaps(made, value, 2) == pytest.approx(1.0, abs=1e-4)
 
 
 def test_seven_tans_are_laid_into_a_figure() -> None:
     made = outline_setup(ALL, arena=2.0)
     poses, flipped = placement(library("test", 0.6)[0], made.task.layout)
     target = poses[None], flipped[None]
-    assert overlaps(beam_of(made, 12), Indifferent(), target, 1) == pytest.approx(1.0, abs=1e-4)
+    assert overlaps(made, Indifferent(), 12, target, 1) == pytest.approx(1.0, abs=1e-4)
 
 
 def test_where_nothing_fits_a_token_still_covers_what_it_can() -> None:
@@ -85,7 +81,7 @@ def test_where_nothing_fits_a_token_still_covers_what_it_can() -> None:
     rows = np.concatenate([strip, np.zeros((made.task.goal_rows - 5, 2))])[None]
     corners = layout.corners(np.array([[0.9, 0.9, 0.0], [-0.9, 0.9, 0.0]]))[None]
     placed = np.zeros((1, 2), np.bool_)
-    filler = Filler(Indifferent(), made)
+    filler = Filler(Indifferent(), made.task, 1)
     assert filling.places(filling.rest(rows[0], corners[0], placed[0]), (2,)) == []
     step = filler.choose(corners, placed, rows, np.zeros(1, np.bool_))
     went = layout.poses(corners)[0, step.token[0], :2] + step.velocity[0, :2] * made.task.sim.arena
@@ -103,7 +99,7 @@ def test_who_has_a_token_left_where_all_is_covered_lets_it_lie() -> None:
     rows = np.concatenate([target, np.zeros((made.task.goal_rows - len(target), 2))])[None]
     placed = np.array([[True, False]])
     assert Filling(made.task.layout).rest(rows[0], corners[0], placed[0]).is_empty
-    step = Filler(Indifferent(), made).choose(corners, placed, rows, np.zeros(1, np.bool_))
+    step = Filler(Indifferent(), made.task, 1).choose(corners, placed, rows, np.zeros(1, np.bool_))
     assert step.token.tolist() == [1]
     assert (step.velocity == 0).all()
 
@@ -111,7 +107,7 @@ def test_who_has_a_token_left_where_all_is_covered_lets_it_lie() -> None:
 def test_exploring_takes_any_place_that_is_not_dead() -> None:
     made = outline_setup(ALL, {"uniform_share": 1.0}, arena=2.0)
     policy = Policy(made)
-    with closing(environments(made, 12)) as env:
+    with closing(made.task.make(12).world) as env:
         figure = placement(library("test", 0.6)[0], made.task.layout)
         targets = tuple(np.stack([part] * 12) for part in figure)
         generators = [np.random.default_rng(i) for i in range(12)]
@@ -134,7 +130,7 @@ def test_corners_of_pieces_are_no_outline() -> None:
 
 def test_filled_is_surer_than_any_value() -> None:
     made = outline_setup()
-    filler = Filler(Indifferent(), made)
+    filler = Filler(Indifferent(), made.task, 1)
     filling = Filling(made.task.layout)
     leg = float(np.sqrt(2.0 * made.task.layout.areas[0]))
     first: Sequence[Place] = filling.places(shapely.box(0, 0, leg, leg), (2,))
@@ -149,13 +145,9 @@ def test_filled_is_surer_than_any_value() -> None:
 @pytest.mark.parametrize(
     ("agent", "sim", "reason"),
     [
-        ({}, {"observe": "corners"}, "needs sim.observe=silhouette, got corners"),
-        ({"noise": 0.2}, {}, "agent.noise=0.2"),
-        ({"actor_lr": 0.1}, {}, "agent.actor_lr"),
-        ({"noise": 0.2}, {}, "agent.noise"),
-        ({"hindsight": []}, {}, "without a filled one"),
-        ({"hindsight": [{"strategy": "near", "position": 0.1}]}, {}, "hindsight.strategy"),
-        ({"gamma": 0.9}, {}, r"agent.gamma=0.9: .* set agent.gamma=1"),
+        ({}, {"observe": "corners"}, "shows outlines, got sim.observe=corners: set sim=silhouette"),
+        ({"noise": 0.2}, {}, "no setting agent.noise"),
+        ({"copies": 0}, {}, "agent.copies must be between 1 and 64, got 0"),
         ({}, {"starts": "anywhere"}, r"sim.starts=anywhere: .* set sim.starts=outside"),
         ({}, {"actions_per_token": 2}, r"actions_per_token=2: .* set sim.actions_per_token=1"),
         ({}, {"world": "drawn"}, "sim.world=drawn: .* set sim.world=plain"),
@@ -174,13 +166,15 @@ def test_a_lone_token_a_perceptron_and_one_side_are_refused() -> None:
         outline_setup({"shapes": ["small_triangle"], "scale": 1.0})
     made = outline_setup(ALL)
     with pytest.raises(ConfigError, match="sim.allow_flip=true"):
-        replace(made, sim=replace(made.task.sim, allow_flip=False))
+        made.task.with_sim(allow_flip=False)
     with pytest.raises(ConfigError, match="net.kind=mlp"):
-        replace(made, net=NetConfig(kind="mlp"))
+        replace(made, agent=replace(made.agent, net=NetConfig(kind="mlp")))
 
 
 def test_values_are_for_outlines_alone() -> None:
-    made = outline_setup()
-    corners = replace(made.task.sim, observe="corners")
-    with pytest.raises(ConfigError, match="agent.beam=4"):
-        replace(made, sim=corners, agent=AgentConfig(beam=4))
+    made, other = outline_setup(), setup()
+    with pytest.raises(ConfigError, match="agent.kind=outline fills outlines: set task=fill, or"):
+        replace(made, task=other.task)
+    for shown in (other, setup(agent=SCENE)):
+        with pytest.raises(ConfigError, match=f"agent.kind={shown.agent_kind} plays tokens whose"):
+            replace(shown, task=made.task)

@@ -77,7 +77,7 @@ def test_corners_follow_each_other_around_every_ring() -> None:
     ring = SQUARE.buffer(LEG, join_style="mitre").difference(SQUARE)
     seen = FILLING.seen(ring, (2,))
     if (seen.part[0] == UNUSED).all():  # eight corners are more than two triangles have
-        seen = Filling(outline_setup(ALL, allow_flip=True).layout).seen(ring, (0,) * 5)
+        seen = Filling(outline_setup(ALL, allow_flip=True).task.layout).seen(ring, (0,) * 5)
     used = np.flatnonzero(seen.part[0] != UNUSED)
     assert len(used) == 8
     for start in (used[0], used[4]):

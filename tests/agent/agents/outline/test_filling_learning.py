@@ -7,15 +7,16 @@ import pytest
 import shapely
 import torch
 from shapely.errors import GEOSException
-from tangram_agent.agents.outline.filling_learner import FillLearner
 
 from tangram_agent.agents.outline.filling import MOST_PLACES, UNUSED, Filling, Rests
 from tangram_agent.agents.outline.filling_replay import FILLED, OPEN, FillReplay
+from tangram_agent.agents.outline.learner import FillLearner
 from tangram_agent.agents.outline.values import Corners, features
 from tangram_core.agent import NotFiniteError
 from tangram_core.errors import RunError
 from tangram_core.spec import Episodes
 from tests.agent.agents.outline.outlines import TWO, outline_setup, played_in
+from tests.agent.builders import learner_of
 
 pytestmark = pytest.mark.fast
 
@@ -48,12 +49,16 @@ def episode(*last: list[float]) -> Episodes:
     return played_in(MADE, ways, GOAL)
 
 
+def empty() -> FillReplay:
+    return FillReplay(MADE.task.layout, capacity=8, copies=3)
+
+
 def rows(replay: FillReplay) -> dict[str, Any]:
     return replay.state()
 
 
 def test_a_solved_episode_gives_its_states_and_what_they_could_go_on_to() -> None:
-    replay = FillReplay(MADE)
+    replay = empty()
     replay.insert(episode(other_half()), np.random.default_rng(0))
     state = rows(replay)
     assert state["counters"].tolist() == [2, 3]
@@ -72,7 +77,7 @@ def test_a_solved_episode_gives_its_states_and_what_they_could_go_on_to() -> Non
 
 def test_what_went_wrong_teaches_up_to_where_it_did() -> None:
     """The second triangle lies beside: its state is learned from, hindsight has the first alone."""
-    replay = FillReplay(MADE)
+    replay = empty()
     replay.insert(episode([5.0, 5.0, 0.0]), np.random.default_rng(0))
     state = rows(replay)
     assert state["counters"].tolist() == [2, 3]
@@ -86,7 +91,7 @@ def test_nothing_is_learned_after_a_token_lay_beside() -> None:
         np.array([[5.0, 5.0, 0.0], FAR]),
         np.array([[5.0, 5.0, 0.0], HALF]),
     ]
-    replay = FillReplay(MADE)
+    replay = empty()
     replay.insert(played_in(MADE, ways, GOAL), np.random.default_rng(0))
     assert rows(replay)["counters"].tolist() == [1, 3]
 
@@ -95,7 +100,7 @@ PILED = [np.array([FAR, FAR]), np.array([HALF, FAR]), np.array([HALF, HALF])]
 
 
 def test_tokens_that_lie_on_each_other_are_no_outline_that_they_fill() -> None:
-    replay, generator = FillReplay(MADE), np.random.default_rng(1)
+    replay, generator = empty(), np.random.default_rng(1)
     for _ in range(4):
         replay.insert(played_in(MADE, PILED, GOAL), generator)
     assert set(rows(replay)["filled_left"].ravel().tolist()) == {1}
@@ -103,7 +108,7 @@ def test_tokens_that_lie_on_each_other_are_no_outline_that_they_fill() -> None:
 
 def test_what_no_tokens_fill_is_never_marked_as_filled() -> None:
     """Both lie where there is room for one: nothing is left to fill, but it was none of theirs."""
-    replay = FillReplay(MADE)
+    replay = empty()
     replay.insert(played_in(MADE, PILED, np.array([HALF, HALF])), np.random.default_rng(0))
     state = rows(replay)
     assert state["counters"][0] >= 1
@@ -111,18 +116,18 @@ def test_what_no_tokens_fill_is_never_marked_as_filled() -> None:
 
 
 def test_episodes_that_nothing_is_learned_from_do_not_count() -> None:
-    replay, nowhere = FillReplay(MADE), [np.array([FAR, FAR])] * 3
+    replay, nowhere = empty(), [np.array([FAR, FAR])] * 3
     assert replay.insert(played_in(MADE, nowhere, GOAL), np.random.default_rng(0)) == 0
     assert rows(replay)["counters"].tolist() == [0, 0]
     assert replay.insert(episode([5.0, 5.0, 0.0]), np.random.default_rng(0)) == 2
 
 
 def test_a_full_ring_forgets_the_oldest_and_comes_back_whole() -> None:
-    replay, generator = FillReplay(MADE), np.random.default_rng(0)
+    replay, generator = empty(), np.random.default_rng(0)
     for _ in range(6):
         replay.insert(episode(other_half()), generator)
     assert len(replay) == 8
-    again = FillReplay(MADE)
+    again = empty()
     again.load_state({name: column.copy() for name, column in replay.state().items()})
     for name, column in replay.state().items():
         assert (again.state()[name] == column).all(), name
@@ -143,32 +148,31 @@ def test_a_full_ring_forgets_the_oldest_and_comes_back_whole() -> None:
     ],
 )
 def test_a_damaged_replay_is_refused(column: str, value: float, reason: str) -> None:
-    replay = FillReplay(MADE)
+    replay = empty()
     replay.insert(episode(other_half()), np.random.default_rng(0))
     state = {name: part.copy() for name, part in replay.state().items()}
     state[column].flat[0] = value
     with pytest.raises(RunError, match=reason):
-        FillReplay(MADE).load_state(state)
+        empty().load_state(state)
 
 
 @pytest.mark.parametrize("lost", ["ends", "counters", "filled_left"])
 def test_a_replay_without_a_column_is_refused(lost: str) -> None:
-    state = FillReplay(MADE).state()
+    state = empty().state()
     with pytest.raises(RunError, match="replay state"):
-        FillReplay(MADE).load_state({n: c for n, c in state.items() if n != lost})
+        empty().load_state({n: c for n, c in state.items() if n != lost})
 
 
 def test_an_empty_replay_cannot_be_sampled() -> None:
     with pytest.raises(ValueError, match="empty"):
-        FillReplay(MADE).sample(4, np.random.default_rng(0))
+        empty().sample(4, np.random.default_rng(0))
 
 
 def learned() -> tuple[FillLearner, FillReplay]:
-    made = outline_setup(agent={"replay_capacity": 8, "batch_size": 8})
-    replay = FillReplay(made)
+    replay = empty()
     replay.insert(episode(other_half()), np.random.default_rng(0))
     replay.insert(episode([5.0, 5.0, 0.0]), np.random.default_rng(0))
-    return FillLearner(made, seed=0), replay
+    return learner_of(MADE), replay
 
 
 def test_a_state_is_worth_the_best_that_it_can_go_on_to() -> None:
@@ -210,7 +214,7 @@ def test_it_learns_what_can_be_filled() -> None:
     learner, replay = learned()
     generator = np.random.default_rng(4)
     strip = np.zeros((1, 8), np.uint8)
-    filling = Filling(outline_setup(TWO).layout)
+    filling = Filling(outline_setup(TWO).task.layout)
     bar = shapely.box(0, 0, 4 * LEG, LEG / 4)
     for _ in range(150):
         batch = replay.sample(8, generator)
@@ -243,7 +247,7 @@ def test_geometry_that_a_library_trips_over_teaches_nothing(
     def trip(*_: object) -> None:
         raise GEOSException("TopologyException: side location conflict")
 
-    replay = FillReplay(MADE)
+    replay = empty()
     monkeypatch.setattr(Filling, "places", trip)
     replay.insert(episode(other_half()), np.random.default_rng(0))
     monkeypatch.undo()

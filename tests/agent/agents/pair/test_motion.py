@@ -5,8 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from tangram_agent.learner import Learner
 
+from tangram_agent.agents.pair.learner import screens_motions
 from tangram_agent.agents.pair.motion import Fit, MotionModel, Motions, features, motions_of
 from tangram_agent.base.weights import load_arrays, to_arrays
 from tangram_agent.replay import ReplayBuffer
@@ -14,7 +14,7 @@ from tangram_agent.types import Transitions
 from tangram_core.errors import ConfigError, RunError
 from tangram_tasks.played import Past
 from tests.agent.agents.pair.pair_scenes import SEVEN
-from tests.agent.builders import PAIR, SQUARE, Policy, random_episodes, setup
+from tests.agent.builders import PAIR, SQUARE, Policy, history, learner_of, random_episodes, setup
 
 pytestmark = pytest.mark.fast
 
@@ -258,7 +258,7 @@ def test_motions_are_screened_only_where_the_world_is_exact_and_seen(
     tokens: dict, sim: dict, screened: bool
 ) -> None:
     made = setup(tokens, {"motion": "learned"}, **{"observe": "pictures", "pixels": 64} | sim)
-    assert made.screens_motions == screened
+    assert screens_motions(made.task) == screened
 
 
 def test_what_lies_still_in_pictures_was_refused() -> None:
@@ -301,18 +301,18 @@ def test_a_replay_that_cannot_hold_an_episode_is_refused() -> None:
 def test_an_agent_corrects_itself_by_what_it_has_seen() -> None:
     """In a world that goes half as far as it is told: the second command is longer."""
     made = setup(agent=LEARNED, actions_per_token=2)
-    learner = Learner(made, 0)
+    learner = learner_of(made, 0)
     for part in (learner.motion, learner.acting.motion):  # type: ignore[union-attr]
         part.load_state_dict(at_first().state_dict())  # type: ignore[union-attr,operator]
     policy = Policy(made)
-    policy.load(learner.acting_weights(1))
+    policy.load(learner.broadcast())
     episodes = random_episodes(made, 5)
     start, goals, placed = episodes["corners"][:, 0], episodes["goals"], episodes["placed"][:, 0]
     first = policy.act(start, placed, goals)
     poses = made.task.layout.poses(start.astype(np.float64))
     poses[:, 0] += 0.5 * first * SCALE
     now = made.task.layout.corners(poses).astype(np.float32)
-    past = Past(start[:, None], first[:, None])
+    past = history(np.stack([start, now], axis=1), first[:, None])
     blind, told = policy.act(now, placed, goals), policy.act(now, placed, goals, past=past)
     short = np.abs(blind) < 0.5
     assert short.sum() > 5
@@ -323,15 +323,16 @@ def test_with_a_delay_it_plays_for_where_the_action_before_will_have_taken_the_t
     """Told the same again where the token seems not to have moved, it would go twice as far."""
     made = setup(agent=LEARNED, actions_per_token=3, world="delayed")
     policy = Policy(made)
-    learner = Learner(made, 0)
-    policy.load(learner.acting_weights(1))
+    learner = learner_of(made, 0)
+    policy.load(learner.broadcast())
     episodes = random_episodes(made, 5)
     start, goals, placed = episodes["corners"][:, 0], episodes["goals"], episodes["placed"][:, 0]
     first = policy.act(start, placed, goals)
     poses = made.task.layout.poses(start.astype(np.float64))
     poses[:, 0] += first * SCALE
     there = made.task.layout.corners(poses)
-    late = policy.act(start, placed, goals, past=Past(start[:, None], first[:, None]))
+    past = history(np.stack([start, start], axis=1), first[:, None])
+    late = policy.act(start, placed, goals, past=past)
     np.testing.assert_allclose(late, policy.act(there, placed, goals), atol=1e-5)
 
 

@@ -7,14 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tangram_agent.learner import Learner
 
+from tangram_agent.agents.pair.batch import PairBatch, make_pairs
+from tangram_agent.agents.pair.learner import PairLearner
 from tangram_agent.agents.pair.pairs import Pairs
-from tangram_agent.relabelling import PairBatch
+from tangram_agent.types import Transitions
 from tangram_core.setup import Setup
 from tangram_sim.batch import BatchedEnv
 from tests.agent.agents.pair.pair_scenes import PERCEPTRON, TWO, seven, transitions
-from tests.agent.builders import Policy, setup
+from tests.agent.builders import Policy, learn, learner_of, setup
 
 pytestmark = pytest.mark.fast
 
@@ -27,17 +28,21 @@ CASES: dict[str, dict[str, Any]] = {
 }
 
 
+def pairs_in(made: Setup, batch: Transitions) -> PairBatch:
+    hindsight = made.agent.config.hindsight
+    return make_pairs(batch, made.task.layout, hindsight, np.random.default_rng(0))
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_the_losses_by_hand(case: str) -> None:
     """Before the first update the acting networks are the learner's own."""
     made = seven(**CASES[case])
-    learner = Learner(made, 0)
-    batch = learner.prepared(transitions(made, 8, 0), np.random.default_rng(0))
-    assert isinstance(batch, PairBatch)
+    learner = learner_of(made, 0)
+    batch = pairs_in(made, transitions(made, 8, 0))
     t = {name: torch.from_numpy(np.asarray(c, np.float32)) for name, c in vars(batch).items()}
     for name in ("token", "piece"):
         t[name] = t[name].long()
-    steps, own, still = learner.steps(batch), learner.acting, torch.zeros(64, 3)
+    steps, own, still = learner.steps_of(batch), learner.acting, torch.zeros(64, 3)
 
     def pairs_of(when: str) -> Pairs:
         columns = ("token", "goal", "goal_flipped", "piece", "covered")
@@ -56,28 +61,28 @@ def test_the_losses_by_hand(case: str) -> None:
 
 
 def test_with_several_tokens_nothing_is_bootstrapped() -> None:
-    learner = Learner(seven(**CASES["mlp"]), 0)
+    learner = learner_of(seven(**CASES["mlp"]), 0)
     assert not learner.bootstraps
     assert set(learner.parts) == {"actor", "critic", "acting"}
 
 
 def test_noise_on_the_corners_does_no_harm() -> None:
     made = seven(**CASES["mlp"])
-    learner, batch = Learner(made, 0), transitions(made, 64)
+    learner, batch = learner_of(made, 0), transitions(made, 64)
     rng = np.random.default_rng(0)
     names = ("state", "next_state", "goal")
     noise = {name: 0.2 * rng.standard_normal(batch.state.shape) for name in names}
     noisy = {name: (vars(batch)[name] + noise[name]).astype(np.float32) for name in names}
-    pairs = learner.prepared(replace(batch, **noisy), rng)
+    pairs = pairs_in(made, replace(batch, **noisy))
     for share in (pairs.covered, pairs.reward):
         assert 0.0 <= share.min() < share.max() <= 1.0
-    learner.update(pairs)
+    learner.learn(learner.steps_of(pairs))
 
 
-def coverage(learner: Learner, made: Setup, episodes: int) -> float:
+def coverage(learner: PairLearner, made: Setup, episodes: int) -> float:
     """Mean overlap of episodes that the acting weights play."""
     policy = Policy(made)
-    policy.load(learner.acting_weights(0))
+    policy.load(learner.broadcast())
     with closing(BatchedEnv(made.task.layout, made.task.sim, made.task.reward, episodes)) as env:
         env.reset([np.random.default_rng([1, i]) for i in range(episodes)])
         for _ in range(env.horizon):
@@ -96,10 +101,9 @@ def test_it_learns_to_assemble_two_tokens() -> None:
     }
     net = {"kind": "mlp", "hidden": [64, 64]}
     made = setup(TWO, agent, net, starts="outside", mirrored=0.5)
-    learner = Learner(made, seed=1)
+    learner = learner_of(made, seed=1)
     before = coverage(learner, made, 30)
     for i in range(UPDATES):
-        scenes = transitions(made, 48, i)
-        learner.update(learner.prepared(scenes, np.random.default_rng(i)), i / UPDATES)
+        learn(learner, transitions(made, 48, i), i / UPDATES, i)
     assert before < 0.2
     assert coverage(learner, made, 30) > 0.6

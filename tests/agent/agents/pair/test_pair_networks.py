@@ -1,14 +1,14 @@
 """Actor and critic of pairs: what turning and mirroring a scene does to them."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from tangram_agent.networks import Networks, initialise
 
+from tangram_agent.agents.pair.networks import Networks
 from tangram_agent.agents.pair.pairs import Pairs
+from tangram_agent.base.networks import initialise
 from tests.agent.agents.pair.pair_scenes import (
     PERCEPTRON,
     as_tensor,
@@ -21,13 +21,13 @@ from tests.agent.builders import SMALL
 
 pytestmark = pytest.mark.fast
 
-LAYOUT = seven().layout
+LAYOUT = seven().task.layout
 NETS = {"mha": SMALL, "mlp": PERCEPTRON}
 PARALLELOGRAM = 6
 
 
-def networks(kind: str, seed: int = 0, **agent: Any) -> Networks:
-    made = Networks(seven(agent, NETS[kind]))
+def networks(kind: str, seed: int = 0) -> Networks:
+    made = Networks(LAYOUT, 2.0, seven(net=NETS[kind]).agent.net, motion=False)
     initialise(made, torch.Generator().manual_seed(seed))
     return made.requires_grad_(False)
 
@@ -109,6 +109,3 @@ def test_the_critic_knows_how_much_is_covered_and_which_side_it_is(kind: str) ->
     changed = (value - flipped).abs() > 0.0
     # Only a parallelogram has two sides.
     assert changed.tolist() == (pairs.piece == PARALLELOGRAM).tolist()
-
-
-# Option -> whether actor and critic stay the same.

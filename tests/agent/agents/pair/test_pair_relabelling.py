@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tangram_agent.agents.pair.batch import PairBatch, make_pairs
 from tangram_agent.agents.pair.coverage import Lying, covered_share, covering, newly_covered
-from tangram_agent.relabelling import PairBatch, make_pairs
 from tangram_agent.types import Transitions
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.motion.actions import chosen_tokens
@@ -32,8 +32,8 @@ SYMMETRY = np.array([shape.symmetry for shape in LAYOUT.shapes])
 
 
 def made_pairs(hindsight: list[dict[str, Any]], seed: int = 0) -> PairBatch:
-    made = seven({"hindsight": hindsight})
-    return make_pairs(BATCH, made, np.random.default_rng(seed))
+    goals = seven({"hindsight": hindsight}).agent.config.hindsight
+    return make_pairs(BATCH, LAYOUT, goals, np.random.default_rng(seed))
 
 
 def is_played(pairs: PairBatch) -> np.ndarray:
@@ -169,7 +169,7 @@ def test_one_tokens_pairs_are_the_transitions_with_their_reward(shape: str) -> N
     reward = rng.uniform(-1.0, 1.0, COUNT).astype(np.float32)
     done = (rng.random(COUNT) < 0.5).astype(np.uint8)
     batch = replace(transitions(made, COUNT), reward=reward, done=done)
-    pairs = make_pairs(batch, made, np.random.default_rng(1))
+    pairs = make_pairs(batch, layout, made.agent.config.hindsight, np.random.default_rng(1))
     np.testing.assert_array_equal(pairs.reward, batch.reward)
     np.testing.assert_array_equal(pairs.done, batch.done)
     np.testing.assert_array_equal(pairs.velocity, batch.action)

@@ -7,12 +7,13 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
-from tangram_agent.networks import Networks, initialise
 
 from tangram_agent.agents.pair import planning
 from tangram_agent.agents.pair.coverage import covered_share, covering, worths
+from tangram_agent.agents.pair.networks import Networks
 from tangram_agent.agents.pair.pairs import PairGraph, Pairs
 from tangram_agent.agents.pair.planning import Planner
+from tangram_agent.base.networks import initialise
 from tangram_core.setup import Setup
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.motion.actions import velocities_of
@@ -43,7 +44,7 @@ def scenes(made: Setup, count: int = COUNT, seed: int = 0) -> tuple[np.ndarray, 
 
 
 def random_networks(made: Setup, seed: int = 0) -> Networks:
-    networks = Networks(made)
+    networks = Networks(made.task.layout, made.task.sim.arena, made.agent.net, motion=False)
     initialise(networks, torch.Generator().manual_seed(seed))
     return networks.requires_grad_(False)
 
@@ -51,7 +52,11 @@ def random_networks(made: Setup, seed: int = 0) -> Networks:
 def perfect(made: Setup) -> Planner:
     graph = PairGraph(made.task.layout, made.task.sim.arena)
     networks = PerfectNetworks(PerfectCritic(made.task.layout), graph)
-    return Planner(cast("Networks", networks), made)
+    return planner(cast("Networks", networks), made)
+
+
+def planner(networks: Networks, made: Setup) -> Planner:
+    return Planner(networks, made.task, made.agent.config.reapply)
 
 
 # Against brute force
@@ -105,7 +110,7 @@ def test_the_best_of_all_is_played(
     made = setup(TWO, {"reapply": options.get("reapply", 0)}, net, allow_flip=flip)
     networks = random_networks(made)
     corners, placed, goals = scenes(made)
-    choice = Planner(networks, made).choose(corners, placed, goals)
+    choice = planner(networks, made).choose(corners, placed, goals)
     for row in range(COUNT):
         scene = corners[row], placed[row], goals[row]
         every = [
@@ -124,7 +129,7 @@ def test_the_best_of_all_is_played(
 @pytest.mark.parametrize("sim", [{}, {"allow_flip": True}])
 def test_a_choice_does_not_depend_on_the_others_of_the_batch(sim: dict[str, Any]) -> None:
     made = seven({"reapply": 1}, **sim)
-    chooser = Planner(random_networks(made), made)
+    chooser = planner(random_networks(made), made)
     corners, placed, goals = scenes(made, COUNT)
     placed[3] = True
     together = chooser.choose(corners, placed, goals)
@@ -138,10 +143,10 @@ def test_a_choice_does_not_depend_on_the_others_of_the_batch(sim: dict[str, Any]
 def test_no_placed_token_is_named_while_others_are_left() -> None:
     made = seven()
     corners, placed, goals = scenes(made, 40)
-    token = Planner(random_networks(made), made).choose(corners, placed, goals).token
+    token = planner(random_networks(made), made).choose(corners, placed, goals).token
     assert not placed[np.arange(40), token].any()
     assert len(set(token)) > 1
-    nothing = Planner(random_networks(made), made).choose(corners, placed | True, goals)
+    nothing = planner(random_networks(made), made).choose(corners, placed | True, goals)
     assert not nothing.token.any()
 
 
@@ -151,7 +156,7 @@ def test_no_placed_token_is_named_while_others_are_left() -> None:
 def assembled(made: Setup, chooser: Planner, episodes: int) -> tuple[np.ndarray, np.ndarray]:
     """Overlap at the end (B,), and flips (B, T) of whole episodes."""
     policy = Policy(made)
-    policy._planner = chooser  # perfect networks have no weights to load
+    policy.actor._planner = chooser  # perfect networks have no weights to load
     flips = []
     with closing(BatchedEnv(made.task.layout, made.task.sim, made.task.reward, episodes)) as env:
         env.reset([np.random.default_rng([7, i]) for i in range(episodes)])
