@@ -15,7 +15,6 @@ from tangram_agent.runs import load_changed, load_run
 from tangram_agent.types import Choice
 from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError, RunError
-from tangram_core.setup import Setup
 from tangram_game.config import PlayConfig
 from tangram_game.play import (
     compare_runs,
@@ -30,6 +29,7 @@ from tangram_game.play import (
 from tangram_game.show.film import Show, film_pictures
 from tangram_game.show.views import beside, camera_sheets
 from tangram_sim.geometry.overlap import outlines, pairs_overlap
+from tangram_tasks.place import Place
 from tangram_tasks.played import Played
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.game.figures.puzzle_files import GAME, SIM, drawn, write_puzzles
@@ -87,7 +87,7 @@ def test_only_what_was_found_is_drawn_over_the_cameras_view(tmp_path: Path) -> N
     played = play_episodes(run, PlayConfig(str(tmp_path / "run"), episodes=2))
 
     def coloured() -> int:
-        (first, _) = camera_sheets(run.setup, played, 1, 60)
+        (first, _) = camera_sheets(run.task, played, 1, 60)
         red, _, blue = np.asarray(first, np.int64).transpose(2, 0, 1)
         return np.count_nonzero(blue > red + 30)
 
@@ -96,7 +96,7 @@ def test_only_what_was_found_is_drawn_over_the_cameras_view(tmp_path: Path) -> N
     one = coloured()
     confidence[0] = 0
     assert both > one > coloured() == 0
-    assert camera_sheets(run.setup, replace(played, pictures=None), 1, 60) == []
+    assert camera_sheets(run.task, replace(played, pictures=None), 1, 60) == []
 
 
 def test_every_frame_has_the_view_of_its_moment() -> None:
@@ -196,10 +196,10 @@ def test_what_looks_ahead_plays_one_by_one(tmp_path: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(Filler, "choose", stays)
     run = load_run("pretrained/tangram7_silhouette")
-    assert run.setup.agent.beam == 12
+    assert run.setup.agent.config.beam == 12
     for what in ({"episodes": 2}, {"puzzle": ("cat", "heart")}):
         make_show(run, PlayConfig(str(run.folder), **what))
-    assert asked == [1] * 4 * run.setup.horizon
+    assert asked == [1] * 4 * run.task.horizon
 
 
 def test_puzzles_by_name_start_beside_their_figures_and_elsewhere_with_another_seed(
@@ -208,7 +208,7 @@ def test_puzzles_by_name_start_beside_their_figures_and_elsewhere_with_another_s
     names = ("cat", "sun_over_mountains")
     shows = [shown(of_game(tmp_path, puzzle=names, seed=seed)) for seed in (0, 0, 1)]
     assert shows[0].titles == ["cat", "sun over mountains"]
-    starts, layout = [show.played.starts for show in shows], shows[0].setup.layout
+    starts, layout = [show.played.starts for show in shows], shows[0].task.layout
     assert (starts[0] == starts[1]).all()
     assert (starts[0] != starts[2]).all()
     for start, goal in zip(starts[0], shows[0].played.goals, strict=True):
@@ -265,13 +265,13 @@ def compared(folder: Path, *names: str, **more: Any) -> PlayConfig:
     return PlayConfig(compare=runs, **({"out": str(folder / "both.gif"), "episodes": 2} | more))
 
 
-def played_by_two(folder: Path, episodes: int, **second: Any) -> list[tuple[Setup, Played]]:
-    """Setups and episodes of two runs of the square, the second with other sections."""
+def played_by_two(folder: Path, episodes: int, **second: Any) -> list[tuple[Place, Played]]:
+    """Tasks and episodes of two runs of the square, the second with other sections."""
     write_run(folder / "first")
     write_run(folder / "second", **second)
     config = compared(folder, "first", "second", episodes=episodes)
     runs = [load_run(run) for run in config.run_dirs]
-    return [(run.setup, play_episodes(run, config)) for run in runs]
+    return [(run.task, play_episodes(run, config)) for run in runs]
 
 
 def test_all_have_the_same_starts_and_targets(tmp_path: Path) -> None:

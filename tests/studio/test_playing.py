@@ -79,5 +79,5 @@ def test_a_pushed_token_has_as_many_actions_as_the_agent_has() -> None:
     goal = figure("swan")
     moves = laid(Sides(begin(goal, "slide", 1), goal.flipped), goal, "slide")
     tokens = [move.token for move in moves if move.token is not None]
-    allowed = player("slide").run.setup.sim.actions_per_token
+    allowed = player("slide").run.task.sim.actions_per_token
     assert max(np.bincount(tokens)) <= allowed

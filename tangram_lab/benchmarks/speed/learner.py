@@ -1,11 +1,14 @@
 """Updates: compiled, on a GPU, and against Stable-Baselines3's on the same perceptron."""
 
 from dataclasses import replace
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
 import torch
 
+from tangram_agent.agents.pair.batch import make_pairs
+from tangram_agent.agents.pair.learner import PairLearner
 from tangram_agent.base.ddpg import Ddpg
 from tangram_agent.types import Transitions
 from tangram_core.errors import ConfigError
@@ -74,12 +77,15 @@ def learner(setup: Setup, device: str = "cpu", *, compiled: bool = False) -> Ddp
 
 def updates(setup: Setup, made: Ddpg | None = None) -> Work:
     """Updates on one batch; by single operations where no learner is given."""
-    own = made or learner(setup)
+    own, generator = made or learner(setup), np.random.default_rng(0)
     batch = random_transitions(setup, own.config.batch_size)
-    steps = own.steps(batch, np.random.default_rng(0))
+    steps = partial(own.steps, batch, generator)
+    if isinstance(own, PairLearner):  # pairs are made before; that they become tensors counts
+        pairs = make_pairs(batch, own.task.layout, own.config.hindsight, generator)
+        steps = partial(own.steps_of, pairs)
 
     def work() -> int:
-        own.learn(steps)
+        own.learn(steps())
         return 1
 
     return work

@@ -47,8 +47,11 @@ ON_A_PORT = ("service.bind=127.0.0.1", "service.log_format=json")
 NOISE = 0.02  # of the mean reward, between two trainings of so many updates
 UPDATES = 200  # before the attacks begin
 BATCHES = 40
-TASK: dict[str, Any] = {"tokens": {"shapes": ["square"], "scale": 1.0}} | {
-    name: {} for name in ("sim", "reward", "agent", "net")
+TASK: dict[str, Any] = {
+    "task": {"kind": "place"},
+    "tokens": {"shapes": ["square"], "scale": 1.0},
+    "agent": {"kind": "pair"},
+    **{name: {} for name in ("sim", "reward", "net")},
 }
 
 

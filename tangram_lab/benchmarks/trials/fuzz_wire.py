@@ -162,10 +162,11 @@ def run_fuzz(messages: int, live: int, seed: int, out: Path | None, folder: Path
     """Both; returns 1 if something was raised or the master did not live through it."""
     setup = make_setup(
         {
+            "task": {"kind": "place"},
             "tokens": {"shapes": ["square"], "scale": 1.0},
             "sim": {},
             "reward": {},
-            "agent": {},
+            "agent": {"kind": "pair"},
             "net": {},
         }
     )

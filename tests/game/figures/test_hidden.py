@@ -14,7 +14,6 @@ from PIL import Image
 
 import tangram_sim  # noqa: F401  # registers the environments
 from tangram_core.errors import ConfigError
-from tangram_core.setup import Setup
 from tangram_game.config import EvalConfig
 from tangram_game.evaluate import evaluate_run
 from tangram_game.figures.hidden import Hidden, hide, lay, means, one_by_one, play_hidden
@@ -26,6 +25,8 @@ from tangram_sim.geometry.areas import overlap
 from tangram_sim.geometry.dissections import Dissection
 from tangram_sim.geometry.overlap import overlap_share
 from tangram_sim.sight.lens import Disturbance
+from tangram_tasks.place import Place
+from tangram_tasks.played import plain
 from tangram_tasks.rivals.baselines import exact_policy, random_policy
 from tangram_vision.silhouettes import silhouettes
 from tangram_vision.silhouettes.silhouettes import Filled, covered, fill_outline
@@ -47,8 +48,8 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tangram_vision.silhouettes.silhouette_pictures._EACH_S", 60.0)
 
 
-def game(sim: dict[str, Any]) -> Setup:
-    return setup(GAME, **sim)
+def game(sim: dict[str, Any]) -> Place:
+    return setup(GAME, **sim).task
 
 
 def square(mirrored: bool = False) -> Figure:
@@ -57,12 +58,12 @@ def square(mirrored: bool = False) -> Figure:
     (figure,) = find_figures("train", made, ["square"])
     if not mirrored:
         return figure
-    poses, flipped = made.task.layout.mirrored(figure.poses, figure.flipped)
+    poses, flipped = made.layout.mirrored(figure.poses, figure.flipped)
     return replace(figure, poses=poses, flipped=flipped)
 
 
 def exact(hidden: Hidden) -> Any:
-    return exact_policy(hidden.setup.layout, hidden.setup.sim)
+    return plain(exact_policy(hidden.task.layout, hidden.task.sim))
 
 
 # What reaches the player
@@ -91,11 +92,11 @@ def test_what_was_found_reaches_the_player(sim: dict[str, Any]) -> None:
     names = ["hut", "two_squares"] if sim is OUTLINE else ["heart"]  # seeing takes its time
     hidden = hide(made, find_figures("test", made, names), seed=0)
     played = lay(hidden, exact(hidden), seed=0)
-    laid = [made.task.layout.corners(one.laid.poses, one.laid.flipped) for one in hidden.searches]
+    laid = [made.layout.corners(one.laid.poses, one.laid.flipped) for one in hidden.searches]
     np.testing.assert_allclose(played.episodes["goals"], laid, atol=1e-6)
-    goals = [made.task.layout.corners(one.poses, one.flipped) for one in hidden.figures]
-    assert overlap_share(np.stack(laid), np.stack(goals), made.task.layout).min() > 0.97
-    assert overlap_share(played.ends, np.stack(goals), made.task.layout).min() > 0.97
+    goals = [made.layout.corners(one.poses, one.flipped) for one in hidden.figures]
+    assert overlap_share(np.stack(laid), np.stack(goals), made.layout).min() > 0.97
+    assert overlap_share(played.ends, np.stack(goals), made.layout).min() > 0.97
 
 
 def test_an_outline_does_not_depend_on_the_pieces() -> None:
@@ -145,15 +146,12 @@ def test_scores_compare_areas() -> None:
     """The exact union of tokens and figure, whatever lies where."""
     made = game(OUTLINE | {"starts": "anywhere"})
     hidden = hide(made, find_figures("test", made, ["heart", "swan", "hut"]), seed=0)
-    chance = play_hidden(hidden, random_policy(made.task.layout, hidden.setup.sim), seed=0)
+    chance = play_hidden(hidden, plain(random_policy(made.layout, hidden.task.sim)), seed=0)
     assert 0.0 < chance.iou.max() < 0.95
     for e, figure in enumerate(hidden.figures):
-        poses, flipped = (
-            made.task.layout.poses(chance.ends[e]),
-            made.task.layout.flipped(chance.ends[e]),
-        )
-        tokens = covered(made.task.layout, Dissection(poses, flipped))
-        whole = covered(made.task.layout, Dissection(figure.poses, figure.flipped))
+        poses, flipped = made.layout.poses(chance.ends[e]), made.layout.flipped(chance.ends[e])
+        tokens = covered(made.layout, Dissection(poses, flipped))
+        whole = covered(made.layout, Dissection(figure.poses, figure.flipped))
         assert chance.iou[e] == pytest.approx(overlap(tokens, whole), abs=1e-5)
         assert chance.coverage[e] == pytest.approx(
             tokens.intersection(whole).area / whole.area, abs=1e-5
@@ -276,7 +274,7 @@ def test_the_report_has_a_row_for_each_puzzle(
 def test_pictures_are_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    formula = exact_policy(game(PICTURE).layout, game(PICTURE).sim)
+    formula = plain(exact_policy(game(PICTURE).layout, game(PICTURE).sim))
     monkeypatch.setattr("tangram_game.evaluate.policies", lambda _: {RUN: formula})
     report = evaluated(tmp_path, PICTURE, "square")
     assert report["iou"] > 0.95
@@ -292,9 +290,9 @@ def test_elsewhere_silhouettes_are_refused() -> None:
     for sim, told in (OUTLINE, reason), (PICTURE, other):
         made = game(sim)
         with pytest.raises(ConfigError, match=told):
-            BatchedEnv(made.task.layout, made.task.sim, RewardConfig())
+            BatchedEnv(made.layout, made.sim, RewardConfig())
         with pytest.raises(ConfigError, match=told):
-            play_figures(made, [square()], random_policy(made.task.layout, made.task.sim), 0)
+            play_figures(made, [square()], plain(random_policy(made.layout, made.sim)), 0)
     with pytest.raises(ConfigError, match=reason):
         gymnasium.make("Tangram-v0", observe="silhouette")
 

@@ -20,6 +20,7 @@ from tangram_sim.geometry.dissections import Budget, Search, Tokens
 from tangram_sim.geometry.rings import covered_area
 from tangram_sim.puzzles.figures import library
 from tangram_sim.targets.targets import placement
+from tangram_tasks.played import plain
 from tangram_tasks.rivals.baselines import exact_policy
 from tangram_vision.silhouettes.silhouettes import Method
 from tests.game.figures.test_hidden import OUTLINE, game
@@ -64,12 +65,12 @@ def test_it_is_told_who_filled_what(
     monkeypatch.setattr("tangram_game.figures.methods.together", lambda _: method)
     made = game(OUTLINE)
     figures = find_figures("test", made, ["heart", "swan"])
-    formula = exact_policy(made.task.layout, made.task.sim)
+    formula = plain(exact_policy(made.layout, made.sim))
     scored = score_hidden(made, figures, {RUN: formula}, 0)
     assert scored.means[RUN]["filled_by"] == {"search": 0, "beam": 0} | {by: 2}
     assert [one["filled_by"] for one in scored.puzzles] == [by, by]
     assert scored.means[RUN]["share_solved_iou"] == 1.0
-    shown = read_silhouette("swan", load_run("pretrained/tangram7").setup)
+    shown = read_silhouette("swan", load_run("pretrained/tangram7").task)
     assert shown.told.startswith(f"filled by the {by} in ")
 
 

@@ -2,7 +2,6 @@
 
 import struct
 import zlib
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -171,7 +170,7 @@ def test_files_that_are_no_pictures_are_refused(tmp_path: Path) -> None:
 
 
 def test_what_was_seen_is_drawn_before_the_film(tmp_path: Path) -> None:
-    layout = load_run("pretrained/square").setup.layout
+    layout = load_run("pretrained/square").task.layout
     target = photo(tmp_path / "it.jpg", levels(layout, POSES[:1]), quality=80)
     sizes = []
     for out in ("it.gif", "it.png"):
@@ -189,9 +188,9 @@ def test_what_was_seen_is_drawn_before_the_film(tmp_path: Path) -> None:
 
 
 def test_tokens_must_lie_within_the_arena(tmp_path: Path) -> None:
-    setup = load_run("pretrained/square").setup
-    target = photo(tmp_path / "it.png", levels(setup.layout, POSES[:1]))
-    near = replace(setup, sim=replace(setup.sim, arena=0.4))
+    task = load_run("pretrained/square").task
+    target = photo(tmp_path / "it.png", levels(task.layout, POSES[:1]))
+    near = task.with_sim(arena=0.4)
     with pytest.raises(ConfigError, match="it.png shows tokens that reach 0.262 .*only 0.2: "):
         read_photograph(target, near)
 

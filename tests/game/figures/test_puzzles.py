@@ -7,10 +7,11 @@ import pytest
 
 from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError
-from tangram_core.setup import Setup
 from tangram_game.figures.puzzles import find_figures, play_figures
 from tangram_sim.geometry.overlap import overlap_share
 from tangram_sim.puzzles.figures import library, load_puzzle
+from tangram_tasks.place import Place
+from tangram_tasks.played import plain
 from tangram_tasks.rivals.baselines import exact_policy, random_policy
 from tests.agent.builders import setup
 from tests.game.figures.puzzle_files import GAME, SIM, drawn, write_puzzles
@@ -18,8 +19,8 @@ from tests.game.figures.puzzle_files import GAME, SIM, drawn, write_puzzles
 pytestmark = pytest.mark.fast
 
 
-def game(**sim: object) -> Setup:
-    return setup(GAME, **(SIM | sim))
+def game(**sim: object) -> Place:
+    return setup(GAME, **(SIM | sim)).task
 
 
 @pytest.mark.parametrize("split", ["train", "test"])
@@ -40,7 +41,7 @@ def test_puzzles_are_turned_evenly_from_how_they_are_drawn() -> None:
     assert [one.title for one in found[:2]] == ["heart", "heart 45°"]
     drawn_as = load_puzzle("heart").corners @ (1.0, 1j)
     for one in found:
-        corners = made.task.layout.corners(one.poses, one.flipped) @ (1.0, 1j)
+        corners = made.layout.corners(one.poses, one.flipped) @ (1.0, 1j)
         turned = drawn_as * np.exp(1j * np.radians(one.degrees))
         # In the middle of the arena, whichever way it is turned.
         middle = [(part.min() + part.max()) / 2.0 for part in (turned.real, turned.imag)]
@@ -50,12 +51,12 @@ def test_puzzles_are_turned_evenly_from_how_they_are_drawn() -> None:
 
 @pytest.mark.parametrize("scale", [0.6, 0.3])
 def test_pieces_are_as_large_as_the_tokens(tmp_path: Path, scale: float) -> None:
-    made = setup(GAME | {"scale": scale}, **SIM)
+    made = setup(GAME | {"scale": scale}, **SIM).task
     path = write_puzzles(tmp_path / "mine.json", drawn("cat"))
     (figure,) = find_figures(str(path), made)
-    corners = made.task.layout.corners(figure.poses, figure.flipped)[None]
+    corners = made.layout.corners(figure.poses, figure.flipped)[None]
     own = load_puzzle("cat", scale).corners[None]
-    assert overlap_share(corners, own, made.task.layout)[0] > 0.99
+    assert overlap_share(corners, own, made.layout)[0] > 0.99
 
 
 @pytest.mark.parametrize(
@@ -86,7 +87,7 @@ def test_a_figure_that_does_not_fit_into_the_arena_is_refused() -> None:
 def starts(names: list[str], seed: int = 0, turns: int = 1) -> dict[tuple[str, float], Floats]:
     made = game()
     figures = find_figures("test", made, names, turns)
-    played = play_figures(made, figures, random_policy(made.task.layout, made.task.sim), seed)
+    played = play_figures(made, figures, plain(random_policy(made.layout, made.sim)), seed)
     assert len(played.starts) == len(figures)
     keys = [(one.name, one.degrees) for one in figures]
     return dict(zip(keys, played.starts, strict=True))
@@ -105,8 +106,8 @@ def test_starts_depend_on_seed_and_figure_and_nothing_else() -> None:
 def test_more_puzzles_than_are_played_at_a_time() -> None:
     made = game()
     figures = find_figures("train", made)
-    played = play_figures(made, figures, exact_policy(made.task.layout, made.task.sim), 0)
+    played = play_figures(made, figures, plain(exact_policy(made.layout, made.sim)), 0)
     assert len(played.overlap) == len(figures) == 35
-    goals = [made.task.layout.corners(one.poses, one.flipped) for one in figures]
+    goals = [made.layout.corners(one.poses, one.flipped) for one in figures]
     np.testing.assert_allclose(played.goals, np.stack(goals))
     np.testing.assert_allclose(played.overlap, 1.0, atol=1e-5)

@@ -54,7 +54,7 @@ def picture(path: Path, ground: int = 235, ink: int = 40) -> str:
 
 
 def read(name: str) -> object:
-    return read_silhouette(name, load_run("pretrained/tangram7").setup)
+    return read_silhouette(name, load_run("pretrained/tangram7").task)
 
 
 @pytest.mark.parametrize("name", ["cat", "cat.png", "dark.jpg", "square.svg", "pieces.svg"])
@@ -64,7 +64,7 @@ def test_silhouettes_are_filled_whatever_they_come_from(tmp_path: Path, name: st
     svg(tmp_path / "square.svg", SQUARE)
     svg(tmp_path / "pieces.svg", '<polygon points="0,0 8,0 8,8"/><polygon points="0,0 8,8 0,8"/>')
     source = name if name == "cat" else str(tmp_path / name)
-    shown = read_silhouette(source, load_run("pretrained/tangram7").setup)
+    shown = read_silhouette(source, load_run("pretrained/tangram7").task)
     assert shown.told.startswith("filled by the search in ")
     assert float(shown.told.split()[-1]) > 0.97
     assert shown.figure.name == Path(name).stem
@@ -77,9 +77,9 @@ def test_tokens_are_drawn_where_a_tilted_camera_saw_them(tmp_path: Path) -> None
     puzzle = load_puzzle("cat", 1.0)
     area = covered_area(puzzle.corners, puzzle.layout)
     photographed(area, 15.0, 120.0).save(tmp_path / "aslant.png")
-    setup = load_run("pretrained/tangram7").setup
-    shown = read_silhouette(str(tmp_path / "aslant.png"), setup)
-    tokens = covered_area(shown.outlines[0], setup.layout)
+    task = load_run("pretrained/tangram7").task
+    shown = read_silhouette(str(tmp_path / "aslant.png"), task)
+    tokens = covered_area(shown.outlines[0], task.layout)
     ink = np.asarray(shown.picture.convert("L")) < 128
     side = np.arange(len(ink)) + 0.5
     drawn = shapely.contains_xy(tokens, *np.meshgrid(side, side))
@@ -126,7 +126,7 @@ def test_an_agent_of_outlines_fills_what_a_picture_shows(filler: Path, tmp_path:
 
 def test_an_agent_of_outlines_has_one_solution(filler: Path) -> None:
     with pytest.raises(ConfigError, match=r"solutions=3 changes nothing with an agent of outlines"):
-        read_silhouette("cat", load_run(filler).setup, 3)
+        read_silhouette("cat", load_run(filler).task, 3)
 
 
 @pytest.mark.parametrize(
@@ -156,7 +156,7 @@ def test_a_puzzle_file_of_one_is_filled_and_one_of_more_is_refused(tmp_path: Pat
     for count in (1, 2):
         some = content | {"puzzles": content["puzzles"][:count]}
         (tmp_path / f"{count}.json").write_text(json.dumps(some))
-    shown = read_silhouette(str(tmp_path / "1.json"), load_run("pretrained/tangram7").setup)
+    shown = read_silhouette(str(tmp_path / "1.json"), load_run("pretrained/tangram7").task)
     assert float(shown.told.split()[-1]) > 0.97
     with pytest.raises(ConfigError, match="has 2 puzzles, and one silhouette is filled"):
         read(str(tmp_path / "2.json"))

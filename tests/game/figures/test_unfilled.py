@@ -41,7 +41,7 @@ def outline(path: Path, *rings: Any, **more: Any) -> str:
 
 def refused(name: str, out: Path | None) -> str:
     with pytest.raises(ConfigError) as raised:
-        read_silhouette(name, load_run("pretrained/tangram7").setup, out=out)
+        read_silhouette(name, load_run("pretrained/tangram7").task, out=out)
     assert "\n" not in str(raised.value)
     return str(raised.value)
 
@@ -162,7 +162,7 @@ def test_the_command_searches_once(
 def test_so_many_dissections_are_found(tmp_path: Path, name: str, told: str) -> None:
     outline(tmp_path / "square.json", SQUARE)
     source = name if name == "cat" else str(tmp_path / name)
-    shown = read_silhouette(source, load_run("pretrained/tangram7").setup, 5)
+    shown = read_silhouette(source, load_run("pretrained/tangram7").task, 5)
     assert shown.told == told
     assert len(shown.outlines) == int(told[0])
     assert shown.figure.name == Path(name).stem
@@ -198,6 +198,6 @@ def test_solutions_are_those_of_a_silhouette(settings: dict[str, Any], message: 
 
 
 def test_of_a_picture_one_dissection_is_known(tmp_path: Path) -> None:
-    setup = load_run("pretrained/tangram7").setup
+    task = load_run("pretrained/tangram7").task
     with pytest.raises(ConfigError, match=r"solutions=2 needs an exact outline, and .*it\.png is"):
-        read_silhouette(str(tmp_path / "it.png"), setup, 2)
+        read_silhouette(str(tmp_path / "it.png"), task, 2)

@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tangram_game.playing import play_tests
 from tangram_game.rivals.fitted import fitted_policy
 from tangram_sim.motion.kinematics import wrap
-from tangram_tasks.rivals.baselines import Told, exact_policy, playing, random_policy
+from tangram_tasks.played import Played, chooser, plain, told
+from tangram_tasks.rivals.baselines import exact_policy, random_policy
 from tangram_tasks.rivals.oracle import oracle_policy
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.sim.builders import SEVEN
@@ -27,9 +29,9 @@ SHAPES = ("square", "small_triangle", "parallelogram")
 @pytest.mark.parametrize("tokens", [SQUARE, PAIR], ids=["one", "two"])
 @pytest.mark.parametrize("actions", [1, 3])
 def test_the_exact_policy_scores_one(backend: str, tokens: dict, actions: int) -> None:
-    made = setup(tokens, backend=backend, actions_per_token=actions)
+    made = setup(tokens, backend=backend, actions_per_token=actions).task
     with closing(FixedTests(made, 5, 5)) as tests:
-        scores = tests.scores(tests.play(exact_policy(made.task.layout, made.task.sim)))
+        scores = made.score(tests.play(chooser(exact_policy(made.layout, made.sim))))
     assert scores["raw_overlap_p10"] > 0.9999
     assert scores["position_error_p90"] < 1e-4
     assert scores["angle_error_deg_p90"] < 1e-2
@@ -49,28 +51,28 @@ WORLDS: list[tuple[dict[str, Any], int]] = [
 def test_the_oracle_ends_on_its_target_in_every_world(
     sim: dict[str, Any], actions: int, shape: str
 ) -> None:
-    made = setup({"shapes": [shape], "scale": 0.8}, **sim, actions_per_token=actions)
+    made = setup({"shapes": [shape], "scale": 0.8}, **sim, actions_per_token=actions).task
     with closing(FixedTests(made, 16, 8)) as tests:
-        oracle = tests.scores(tests.play(playing(Told(oracle_policy), tests.env)))
-        formula = tests.scores(tests.play(exact_policy(made.task.layout, made.task.sim)))
-    assert oracle["position_error_p90"] < 1e-5 * made.task.sim.arena
+        oracle = made.score(tests.play(told(oracle_policy)(tests.env)))
+        formula = made.score(tests.play(chooser(exact_policy(made.layout, made.sim))))
+    assert oracle["position_error_p90"] < 1e-5 * made.sim.arena
     assert oracle["angle_error_deg_p90"] < 1e-2
-    short = formula["position_error_p90"] / 1e-3 / made.task.sim.arena
+    short = formula["position_error_p90"] / 1e-3 / made.sim.arena
     assert max(short, formula["angle_error_deg_p90"] / 0.5) > 1.0
 
 
 def test_worlds_that_are_tried_in_have_no_camera() -> None:
     seen = {"observe": "pictures", "pixels": 64, "disturbance": 1.0}
-    made = setup(SQUARE, backend="physics", world="bullet", **seen)
+    made = setup(SQUARE, backend="physics", world="bullet", **seen).task
     with closing(FixedTests(made, 2, 2)) as tests:
-        assert tests.play(playing(Told(oracle_policy), tests.env)).camera is not None
+        assert Played.of(tests.play(told(oracle_policy)(tests.env))).camera is not None
 
 
 @pytest.mark.parametrize(("sim", "actions"), [({"world": "delayed"}, 2), WORLDS[0]])
 def test_a_fitted_model_of_motion_serves_the_formula(sim: dict[str, Any], actions: int) -> None:
-    made = setup(SQUARE, **sim, actions_per_token=actions)
+    made = setup(SQUARE, **sim, actions_per_token=actions).task
     with closing(FixedTests(made, 16, 8)) as tests:
-        fitted = tests.scores(tests.play(playing(Told(fitted_policy), tests.env)))
+        fitted = made.score(tests.play(fitted_policy(tests.env)))
     assert fitted["mean_reward"] > 0.995
 
 
@@ -78,16 +80,13 @@ def test_a_fitted_model_of_motion_serves_the_formula(sim: dict[str, Any], action
 @pytest.mark.parametrize("tokens", [SQUARE, PAIR], ids=["one", "two"])
 def test_the_oracle_puts_noisy_looks_together(tokens: dict, sim: dict[str, Any]) -> None:
     """The look at the target is one: its noise is left, and of eight looks at a token a third."""
-    made = setup(tokens, corner_noise=0.01, actions_per_token=8, starts="outside", **sim)
+    made = setup(tokens, corner_noise=0.01, actions_per_token=8, starts="outside", **sim).task
     found = []
     with closing(FixedTests(made, 30, 15)) as tests:
-        for player in (Told(oracle_policy), exact_policy(made.task.layout, made.task.sim)):
-            played = tests.play(playing(player, tests.env))
+        for player in (told(oracle_policy), plain(exact_policy(made.layout, made.sim))):
+            played = play_tests(tests, player)
             # From where the target is seen: what no policy can know is no matter here.
-            ends, goals = (
-                made.task.layout.poses(played.ends),
-                made.task.layout.poses(played.episodes["goals"]),
-            )
+            ends, goals = (made.layout.poses(c) for c in (played.ends, played.episodes["goals"]))
             found.append(np.median(np.abs(ends - goals)[..., :2]))
     assert found[0] < 0.7 * found[1]
 
@@ -96,21 +95,21 @@ def test_the_oracle_puts_noisy_looks_together(tokens: dict, sim: dict[str, Any])
 def test_the_oracle_plays_several_tokens(sim: dict[str, Any]) -> None:
     sim = sim | {"backend": "physics", "starts": "outside", "arena": 3.0}
     tokens = {"shapes": ["square", "parallelogram"], "scale": 0.6}
-    made = setup(tokens, **sim, world="drawn", actions_per_token=3)
+    made = setup(tokens, **sim, world="drawn", actions_per_token=3).task
     with closing(FixedTests(made, 8, 8)) as tests:
-        oracle = tests.scores(tests.play(playing(Told(oracle_policy), tests.env)))
-        formula = tests.scores(tests.play(exact_policy(made.task.layout, made.task.sim)))
+        oracle = made.score(tests.play(told(oracle_policy)(tests.env)))
+        formula = made.score(tests.play(chooser(exact_policy(made.layout, made.sim))))
     assert oracle["coverage"] > 0.999
     assert formula["coverage"] < oracle["coverage"] - 0.01
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_it_turns_no_further_than_the_symmetry_asks_for(shape: str) -> None:
-    made = setup({"shapes": [shape], "scale": 1.0})
-    layout, rng = made.task.layout, np.random.default_rng(0)
+    made = setup({"shapes": [shape], "scale": 1.0}).task
+    layout, rng = made.layout, np.random.default_rng(0)
     starts, goals = rng.uniform(-3.1, 3.1, (2, 200, 1, 3)) * [0.1, 0.1, 1.0]
     placed = np.zeros((200, 1), bool)
-    policy = exact_policy(layout, made.task.sim)
+    policy = exact_policy(layout, made.sim)
     actions = policy(layout.corners(starts), placed, layout.corners(goals), [])
     assert actions.dtype == np.float32
     symmetry = layout.shapes[0].symmetry
@@ -124,10 +123,9 @@ def test_it_turns_no_further_than_the_symmetry_asks_for(shape: str) -> None:
 @pytest.mark.parametrize("allow_flip", [False, True])
 def test_the_exact_policy_solves_the_game(backend: str, targets: str, allow_flip: bool) -> None:
     sim = {"targets": targets, "starts": "outside", "mirrored": 0.5, "allow_flip": allow_flip}
-    made = setup(GAME, backend=backend, pixels=16, **sim)
+    made = setup(GAME, backend=backend, pixels=16, **sim).task
     with closing(FixedTests(made, 8, 8)) as tests:
-        played = tests.play(exact_policy(made.task.layout, made.task.sim))
-        scores = tests.scores(played)
+        scores = made.score(tests.play(chooser(exact_policy(made.layout, made.sim))))
     assert scores["raw_overlap_p10"] > 0.999
     assert (scores["share_solved"], scores["wrong"], scores["refused"]) == (1.0, 0.0, 0.0)
     assert scores["angle_error_deg_p90"] < 0.1
@@ -135,24 +133,22 @@ def test_the_exact_policy_solves_the_game(backend: str, targets: str, allow_flip
 
 def test_it_makes_room_before_it_sets_down() -> None:
     """The first token's place is under the second: the second goes first."""
-    made = setup({"shapes": ["square", "large_triangle"], "scale": 0.8})
+    made = setup({"shapes": ["square", "large_triangle"], "scale": 0.8}).task
     starts = np.array([[[-0.6, 0.0, 0.0], [0.6, 0.0, 0.0]]])
     goals = np.array([[[0.6, 0.0, 0.0], [0.0, 0.6, 0.0]]])
-    policy, placed = exact_policy(made.task.layout, made.task.sim), np.zeros((1, 2), bool)
-    corners, wanted = made.task.layout.corners(starts), made.task.layout.corners(goals)
+    policy, placed = exact_policy(made.layout, made.sim), np.zeros((1, 2), bool)
+    corners, wanted = made.layout.corners(starts), made.layout.corners(goals)
     assert policy(corners, placed, wanted, [])[0, 0] > 0.0
     assert policy(corners, np.array([[False, True]]), wanted, [])[0, 0] < 0.0
-    free = made.task.layout.corners(starts - [0.0, 0.6, 0.0])
+    free = made.layout.corners(starts - [0.0, 0.6, 0.0])
     assert policy(free, placed, wanted, [])[0, 0] < 0.0
 
 
 def test_equal_tokens_take_the_nearer_places() -> None:
-    made = setup({"shapes": ["square", "square"], "scale": 0.6})
-    starts = made.task.layout.corners(np.array([[[-0.6, 0.0, 0.0], [0.6, 0.0, 0.0]]]))
-    goals = made.task.layout.corners(np.array([[[0.5, 0.1, 0.0], [-0.5, 0.1, 0.0]]]))
-    action = exact_policy(made.task.layout, made.task.sim)(
-        starts, np.zeros((1, 2), bool), goals, []
-    )
+    made = setup({"shapes": ["square", "square"], "scale": 0.6}).task
+    starts = made.layout.corners(np.array([[[-0.6, 0.0, 0.0], [0.6, 0.0, 0.0]]]))
+    goals = made.layout.corners(np.array([[[0.5, 0.1, 0.0], [-0.5, 0.1, 0.0]]]))
+    action = exact_policy(made.layout, made.sim)(starts, np.zeros((1, 2), bool), goals, [])
     np.testing.assert_allclose(action[0, 1:], [0.05, 0.05, 0.0], atol=1e-6)
 
 
@@ -161,12 +157,12 @@ def test_chance_names_tokens_that_are_left_and_stays_in_the_arena(
     allow_flip: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tangram_sim.batch.MAX_OVERLAP", 1.0)
-    made = setup(GAME, allow_flip=allow_flip, pixels=16)
+    made = setup(GAME, allow_flip=allow_flip, pixels=16).task
     with closing(FixedTests(made, 20, 20)) as tests:
-        played = tests.play(random_policy(made.task.layout, made.task.sim))
+        played = play_tests(tests, plain(random_policy(made.layout, made.sim)))
     assert not played.refused.any()
     assert played.episodes["placed"][:, -1].all()
-    centres = made.task.layout.poses(played.ends)[..., :2]
+    centres = made.layout.poses(played.ends)[..., :2]
     assert 0.9 < np.abs(centres).max() <= 1.0 + 1e-6
-    turned = made.task.layout.flipped(played.ends) != made.task.layout.flipped(played.starts)
+    turned = made.layout.flipped(played.ends) != made.layout.flipped(played.starts)
     assert turned.any() == allow_flip

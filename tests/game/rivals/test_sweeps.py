@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tangram_core.setup import Setup
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.motion.actions import chosen_tokens
+from tangram_tasks.place import Place
+from tangram_tasks.played import Choose, chooser
 from tangram_tasks.rivals.baselines import exact_policy
 from tangram_tasks.rivals.sweeps import _shares, _swept, best_order, first_slide, sweep_policy
 from tests.agent.builders import setup
 from tests.sim.builders import SEVEN
-from worker.play.rollout import Choose
 from worker.score.test_set import FixedTests
 
 pytestmark = pytest.mark.fast
@@ -30,18 +30,18 @@ THROUGH = ((-0.6, 0.7, 0), (-0.7, 0, 0)), ((0, 0, 0), (0.7, 0, 0))
 OCCUPIED = ((-0.6, 0.0, 0), (0, 0, 0)), ((0, 0, 0), (0.7, 0.3, 0))
 
 
-def first(made: Setup, starts: Any, goals: Any, placed: Any = None) -> tuple[int, np.ndarray]:
+def first(made: Place, starts: Any, goals: Any, placed: Any = None) -> tuple[int, np.ndarray]:
     """Which token goes first, and its way."""
-    corners, wanted = (made.task.layout.corners(np.array(p, np.float64)) for p in (starts, goals))
-    flags = np.zeros(made.task.layout.tokens, np.bool_) if placed is None else np.array(placed)
-    return first_slide(made.task.layout, corners, flags, wanted)
+    corners, wanted = (made.layout.corners(np.array(p, np.float64)) for p in (starts, goals))
+    flags = np.zeros(made.layout.tokens, np.bool_) if placed is None else np.array(placed)
+    return first_slide(made.layout, corners, flags, wanted)
 
 
 @pytest.mark.parametrize(("starts", "goals"), [THROUGH, OCCUPIED])
 def test_what_would_be_pushed_waits_and_what_is_in_the_way_goes_first(
     starts: Any, goals: Any
 ) -> None:
-    token, way = first(setup(TWO, **SLIDE), starts, goals)
+    token, way = first(setup(TWO, **SLIDE).task, starts, goals)
     assert token == 1
     np.testing.assert_allclose(way, np.subtract(goals[1], starts[1]), atol=1e-9)
 
@@ -63,12 +63,12 @@ def test_equal_tokens_share_their_pieces_so_that_none_is_in_the_way() -> None:
     """The least way in all would lead through the square that can move no more."""
     starts = ((0, 0, 0), (-0.6, 0, 0), (-0.6, 0.6, 0))
     goals = ((0, 0, 0), (0.6, 0, 0), (0.6, 0.6, 0))
-    token, way = first(setup(SQUARES, **SLIDE), starts, goals, [True, False, False])
+    token, way = first(setup(SQUARES, **SLIDE).task, starts, goals, [True, False, False])
     np.testing.assert_allclose(way, (1.2, {1: 0.6, 2: -0.6}[token], 0.0), atol=1e-9)
 
 
 def test_who_lies_in_its_place_stays_and_who_can_move_no_more_is_not_named() -> None:
-    made = setup(TWO, **SLIDE)
+    made = setup(TWO, **SLIDE).task
     _, goals = THROUGH
     for placed, expected in (([True, False], 1), ([False, False], 0)):
         token, way = first(made, goals, goals, placed)
@@ -97,10 +97,10 @@ def test_the_best_order_is_that_of_all() -> None:
         assert (total, token) == (pytest.approx(cost(best)), best[0])
 
 
-def covered(made: Setup, choose: Choose, starts: Any, goals: Any) -> tuple[list[int], float]:
+def covered(made: Place, choose: Choose, starts: Any, goals: Any) -> tuple[list[int], float]:
     """The tokens that are named in turn, and what is covered in the end, in the engine."""
-    layout, named = made.task.layout, list[int]()
-    with closing(BatchedEnv(layout, made.task.sim, made.task.reward)) as env:
+    layout, named = made.layout, list[int]()
+    with closing(BatchedEnv(layout, made.sim, made.reward)) as env:
         sides = np.zeros((1, layout.tokens), np.bool_)
         env.reset([np.random.default_rng(0)], (np.array([goals], np.float64), sides))
         env._worlds[0].place(np.array(starts, np.float64))
@@ -113,27 +113,27 @@ def covered(made: Setup, choose: Choose, starts: Any, goals: Any) -> tuple[list[
 
 
 def test_in_the_engine_nothing_is_pushed_out_of_its_place() -> None:
-    made = setup(TWO, **SLIDE)
-    order, share = covered(made, sweep_policy(made.task.layout, made.task.sim), *THROUGH)
+    made = setup(TWO, **SLIDE).task
+    order, share = covered(made, sweep_policy(made.layout, made.sim), *THROUGH)
     assert order == [1, 0]
     assert share == pytest.approx(1.0, abs=1e-3)
-    assert covered(made, exact_policy(made.task.layout, made.task.sim), *THROUGH)[1] < 0.9
+    assert covered(made, exact_policy(made.layout, made.sim), *THROUGH)[1] < 0.9
 
 
 def test_with_actions_left_what_was_pushed_is_put_back_once() -> None:
-    made = setup(TWO, **SLIDE, actions_per_token=2)
+    made = setup(TWO, **SLIDE, actions_per_token=2).task
     starts, goals = ((0.05, 0.03, 0.2), (0.7, 0, 0)), ((0, 0, 0), (0.7, 0, 0))
-    order, share = covered(made, sweep_policy(made.task.layout, made.task.sim), starts, goals)
+    order, share = covered(made, sweep_policy(made.layout, made.sim), starts, goals)
     assert (order[0], share) == (0, pytest.approx(1.0, abs=1e-3))
 
 
 def test_seven_tokens_are_laid_better_than_each_alone_and_with_two_actions_nearly_whole() -> None:
     scores = list[float]()
     for count in (1, 2):
-        made = setup(GAME, **SLIDE, starts="outside", actions_per_token=count)
+        made = setup(GAME, **SLIDE, starts="outside", actions_per_token=count).task
         with closing(FixedTests(made, 8, 8)) as tests:
             for policy in (exact_policy, sweep_policy)[count - 1 :]:
-                played = tests.play(policy(made.task.layout, made.task.sim))
-                scores.append(tests.scores(played)["coverage"])
+                played = tests.play(chooser(policy(made.layout, made.sim)))
+                scores.append(made.score(played)["coverage"])
     assert scores[0] + 0.1 < scores[1] < scores[2]
     assert scores[2] > 0.95

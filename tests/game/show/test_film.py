@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tangram_core.setup import Setup
 from tangram_game.show.film import film, frames_per_action
+from tangram_tasks.place import Place
 from tangram_tasks.played import Played
 from tests.agent.builders import setup
 from tests.sim.builders import layout_of
@@ -25,9 +25,9 @@ def played(
     flip: bool = False,
     refused: bool = False,
     blocked: bool = False,
-) -> tuple[Setup, Played]:
+) -> tuple[Place, Played]:
     """The square is moved up by 0.4; then the parallelogram, by the second action."""
-    made = setup(TWO, allow_flip=True)
+    made = setup(TWO, allow_flip=True).task
     actions = np.array([[-0.5, -1.0, 0.0, 0.2, 0.0], [0.5, 1.0 if flip else -1.0, *second]])
     middle = STARTS + [[0.0, 0.4, 0.0], [0.0, 0.0, 0.0]]
     way = np.array(second) * [2.0, 2.0, np.pi] * (not (refused or blocked))
@@ -63,7 +63,7 @@ def test_frames_begin_and_end_where_the_episode_did() -> None:
 @pytest.mark.parametrize("motion", ["lift", "slide"])
 def test_only_lifted_tokens_rise(motion: str) -> None:
     made, episode = played((0.1, -0.2, 0.5))
-    made = setup(TWO, backend="physics", motion=motion, allow_flip=motion == "lift")
+    made = setup(TWO, backend="physics", motion=motion, allow_flip=motion == "lift").task
     if motion == "slide":
         actions = np.delete(episode.episodes.actions, 1, axis=2)
         episode = ended(LAYOUT, episode.corners, episode.goals, actions=actions)
@@ -81,7 +81,7 @@ def test_others_wait_for_what_is_carried_and_give_way_to_what_slides() -> None:
     before, landed = (film(made, pushed)[i].corners(LAYOUT)[0, other] for i in (COUNT - 1, COUNT))
     np.testing.assert_allclose(before, corners[0, 0, other], atol=1e-9)
     np.testing.assert_allclose(landed, corners[0, 1, other], atol=1e-9)
-    sliding = setup(TWO, backend="physics", motion="slide")
+    sliding = setup(TWO, backend="physics", motion="slide").task
     moved = film(sliding, pushed)[COUNT // 2].corners(LAYOUT)[0, other]
     assert 0.02 < np.abs(moved - corners[0, 0, other]).max() < 0.08
 
