@@ -48,14 +48,9 @@ def found_below(name: str) -> bool:
 
 def dead_settings(text: str) -> list[str]:
     """Settings of a group in inline code that no command has."""
-<<<<<<< HEAD
-    known = set(setting_names("train"))
-    dotted = rf"(?:{'|'.join(GROUPS)})\.\w+"
-=======
     known = {name for kinds in every_kind("agent") for name in setting_names("train", kinds)}
     groups = {name.partition(".")[0] for name in known if "." in name}
     dotted = rf"(?:{'|'.join(groups)})\.\w+"
->>>>>>> ta
     named = [
         match[0] for span in spans(text) if (match := re.match(rf"{dotted}(?![\w.(/:-])", span))
     ]
