@@ -95,7 +95,7 @@ def tell(line: str) -> None:
 
     Not from a child, which shares the terminal with the process that started it.
     """
-    from tangram_core.process import VARIABLE
+    from tangram_core.run.process import VARIABLE
 
     if sys.stderr.isatty() and VARIABLE not in os.environ:
         print(line, file=sys.stderr, flush=True)

@@ -13,7 +13,7 @@ import yaml
 
 from tangram_core.errors import ConfigError
 from tangram_core.registry import KIND, OURS, find_agent, find_task
-from tangram_core.service import ServiceConfig
+from tangram_core.run.service import ServiceConfig
 from tangram_core.settings import Settings
 from tangram_core.setup import AGENT, TASK
 

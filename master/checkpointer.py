@@ -21,7 +21,10 @@ from master.learn.trainer import LEARNER, Trainer
 from master.record.delivery import EpisodesArrived
 from master.record.journal import Journal, JournalError, Place
 from master.record.rundir import Claim, Clock, FolderError, Record
-from tangram_agent.checkpoints import (
+from tangram_core.errors import RunError
+from tangram_core.run.process import Every
+from tangram_core.run.service import ServiceConfig
+from tangram_core.store.checkpoints import (
     CHECKPOINTS,
     Checkpoint,
     CorruptError,
@@ -33,9 +36,6 @@ from tangram_agent.checkpoints import (
     set_aside,
     was_set_aside,
 )
-from tangram_core.errors import RunError
-from tangram_core.process import Every
-from tangram_core.service import ServiceConfig
 
 MINUTE_S = 60.0
 RETRY_S = 1.0

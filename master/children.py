@@ -13,7 +13,7 @@ from typing import IO
 
 import psutil
 
-from tangram_core.process import Lifeline
+from tangram_core.run.process import Lifeline
 
 # A process that lived for so long starts with a clean record.
 STEADY_S = 60.0

@@ -75,8 +75,8 @@ def _checked(settings: Plain, *, plays: bool) -> "tuple[MasterConfig, Setup]":
         ConfigError: it cannot be trained.
     """
     from master.config import MasterConfig, check_compiling
-    from tangram_agent.arrays import check_batch_size
     from tangram_core.setup import from_mapping, make_setup
+    from tangram_core.wire.arrays import check_batch_size
 
     setup = make_setup(settings)
     rest = {name: value for name, value in settings.items() if name not in setup.sections}

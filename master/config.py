@@ -4,10 +4,10 @@ import os
 import shutil
 from dataclasses import dataclass, field
 
-from tangram_agent.messages import ROLES
 from tangram_core.errors import ConfigError
-from tangram_core.service import ServiceConfig
+from tangram_core.run.service import ServiceConfig
 from tangram_core.settings import Settings, check_folder, declared, setting
+from tangram_core.wire.messages import ROLES
 
 MAX_WORKERS = 1024
 COMPILERS = ("g++", "clang++")

@@ -17,9 +17,9 @@ from master.record.rundir import RunFolder
 from master.signals import SAME_WISH_S, handling, show_cursor, stop_notice
 from master.watch.console import logging_to, sturdy_console
 from master.watch.result import show_finished
-from tangram_agent.messages import TAKEN_OVER
-from tangram_core.code import code_of
-from tangram_core.process import WATCHDOG_S, Every, watch_parent
+from tangram_core.run.code import code_of
+from tangram_core.run.process import WATCHDOG_S, Every, watch_parent
+from tangram_core.wire.messages import TAKEN_OVER
 
 # While the master starts, its connection file is looked for this often.
 LOOK_S = 0.1

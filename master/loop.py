@@ -15,10 +15,10 @@ from master.record.delivery import EpisodesArrived, ScoresArrived
 from master.record.rundir import Clock, FolderError, RunFolder
 from master.signals import StopSignals, stop_notice
 from master.watch.report import Reporter
-from tangram_agent.messages import RunStatus
 from tangram_core.errors import RunError
-from tangram_core.process import Every, Watchdog
-from tangram_core.service import ServiceConfig
+from tangram_core.run.process import Every, Watchdog
+from tangram_core.run.service import ServiceConfig
+from tangram_core.wire.messages import RunStatus
 
 # Between two looks at the sockets: learning goes on for so long, or idleness lasts.
 LEARN_S = 0.05

@@ -34,13 +34,12 @@ from master.watch.health import OFF, Health
 from master.watch.metrics import Metrics
 from master.watch.report import Reporter, StatusCollector
 from master.watch.result import command_line, go_on_command, make_result, show_finished, show_result
-from tangram_agent.base.compiling import cache_folder
-from tangram_agent.messages import OPEN, WINDOW
-from tangram_core.code import code_of
-from tangram_core.process import WATCHDOG_S, Watchdog, keep_memory, watch_parent
-from tangram_core.service import ServiceConfig
+from tangram_core.run.code import code_of
+from tangram_core.run.process import WATCHDOG_S, Watchdog, keep_memory, watch_parent
+from tangram_core.run.service import ServiceConfig
 from tangram_core.setup import Setup
 from tangram_core.wire.addresses import LOCAL, dns_error, reachable, with_host
+from tangram_core.wire.messages import OPEN, WINDOW
 
 # A clean end after the parent's death; a large replay takes seconds to write.
 GRACE_S = 30.0
@@ -275,8 +274,7 @@ def _make_trainer(
         if config.warm_start is not None:
             warm_start(Path(config.warm_start), trainer)
     if service.compile:
-        kept = cache_folder()
-        log.info("compiles its update: up to a minute at first, seconds once %s has it", kept)
+        log.info("compiles its update: up to a minute at first, seconds once it was compiled here")
         trainer.learner.prepare()
         watchdog.progress()
     elif device == "cuda" and trainer.learner.compiles:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, Self
 
-from tangram_agent.outcome import CTRL_C
+from tangram_core.run.outcome import CTRL_C
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 # submitit's, near a time limit: all processes of a job get it, and tangram-train leaves it to

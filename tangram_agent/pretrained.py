@@ -13,9 +13,9 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
-from tangram_agent.arrays import decode_tensors
-from tangram_agent.types import Weights
+from tangram_core.agent import Weights
 from tangram_core.errors import RunError, WireError
+from tangram_core.wire.arrays import decode_tensors
 
 PREFIX = "pretrained"
 CONFIG = "config.yaml"

@@ -14,16 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tangram_agent.checkpoints import (
-    ACTING,
-    CHECKPOINTS,
-    SETUP,
-    load_checkpoint,
-    newest_checkpoint,
-)
 from tangram_agent.pretrained import is_agent, is_name, packaged, read_agent
-from tangram_agent.types import Weights
-from tangram_core.agent import Actor
+from tangram_core.agent import Actor, Weights
 from tangram_core.arrays import Floats, Singles
 from tangram_core.errors import ConfigError, RunError
 from tangram_core.registry import KIND
@@ -39,13 +31,19 @@ from tangram_core.settings import (
 )
 from tangram_core.setup import Setup, make_setup
 from tangram_core.spec import Arrays, EpisodeSpec
-from tangram_core.store.stored import load_settings
+from tangram_core.store.checkpoints import (
+    ACTING,
+    CHECKPOINTS,
+    SETUP,
+    load_checkpoint,
+    newest_checkpoint,
+)
+from tangram_core.store.stored import CONFIG, load_settings
 from tangram_core.task import History
 from tangram_sim.config import with_given_reward
 from tangram_sim.geometry.shapes import MAX_COORDINATE
 from tangram_tasks.place import Place
 
-CONFIG = "config.yaml"
 POLICY_SECTIONS = ("tokens", "agent", "net")
 ANOTHER = "train a run with it"
 

@@ -21,6 +21,19 @@ Tensors = dict[str, Singles]
 AT_ONCE = 32
 
 
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """The weights that workers play with.
+
+    Attributes:
+        version: number of the broadcast, rising within an epoch.
+        tensors: name -> float32 array of the acting network, or of what of it travels.
+    """
+
+    version: int
+    tensors: Tensors
+
+
 class NotFiniteError(RunError):
     """Numbers of an update, or weights, that are not finite."""
 

@@ -14,9 +14,9 @@ from rich.console import Console
 from rich.table import Table
 
 from tangram_agent.agents.outline.agent import Outline
-from tangram_agent.outcome import plural
 from tangram_agent.runs import Run, load_changed
 from tangram_core.agent import AT_ONCE
+from tangram_core.run.outcome import plural
 from tangram_core.store.files import write_whole
 from tangram_game.config import EvalConfig, source_and_names
 from tangram_game.figures.puzzles import find_figures

@@ -12,10 +12,10 @@ import torch
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 from rich.console import Console
 
-from tangram_agent.outcome import plural
 from tangram_agent.runs import Run, load_changed
 from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError, RunError
+from tangram_core.run.outcome import plural
 from tangram_core.settings import told
 from tangram_core.store.files import write_whole
 from tangram_game.config import MAX_SHOWN, PlayConfig, source_and_names

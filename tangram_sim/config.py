@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from tangram_core.code import own_code
 from tangram_core.errors import ConfigError
+from tangram_core.run.code import own_code
 from tangram_core.settings import NETWORK, Settings, refuse_ignored, setting, told
 from tangram_sim.dynamics import WORLDS, Dynamics
 

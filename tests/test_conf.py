@@ -22,7 +22,7 @@ from conf.sweep import check_launcher, refuse_lost_job
 from tangram_agent.agents.pair.config import PairConfig
 from tangram_agent.base.config import NetConfig
 from tangram_core.errors import ConfigError, TangramError
-from tangram_core.service import ServiceConfig
+from tangram_core.run.service import ServiceConfig
 from tangram_core.settings import KEY, PLAY, declared_fields
 from tangram_core.setup import Setup, from_mapping, make_setup
 from tangram_sim.config import RewardConfig, SimConfig

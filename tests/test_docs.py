@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from conf.commands import COMMANDS, GROUPS
+from conf.commands import COMMANDS
 from conf.help import choices, setting_names
 from conf.kinds import every_kind
 from tangram_lab.benchmarks.cli import _parser as bench_parser

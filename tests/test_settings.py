@@ -18,7 +18,7 @@ from conf.settings import NESTED
 from master.learn.trainer import Trainer
 from tangram_agent.runs import beginning
 from tangram_core.errors import TangramError
-from tangram_core.service import ServiceConfig
+from tangram_core.run.service import ServiceConfig
 from tangram_core.settings import declared_fields
 from tangram_core.setup import Setup, make_setup
 from worker.play.rollout import Rollout, exploring

@@ -22,7 +22,7 @@ def status() -> int:
 
 def _of_the_run(settings: Plain) -> tuple[str, Plain] | None:
     """What the connection file says of the run; nothing where only an address is given."""
-    from tangram_core.process import watch_parent
+    from tangram_core.run.process import watch_parent
     from worker.talk.discovery import as_address, await_master
 
     watch_parent()  # already here: a parent may end while the file is waited for

@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass, field
 
-from tangram_agent.messages import MAX_INDEX, ROLES
 from tangram_core.errors import ConfigError
-from tangram_core.service import ServiceConfig
+from tangram_core.run.service import ServiceConfig
 from tangram_core.settings import Settings, declared, setting
+from tangram_core.wire.messages import MAX_INDEX, ROLES
 from worker.talk.discovery import as_address, find_master
 
 

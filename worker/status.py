@@ -13,12 +13,18 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from tangram_agent.messages import OPEN, WORKER_COLUMNS, AskStatus, RunStatus, decode_from_master
-from tangram_agent.outcome import FILE_NAME, duration, outcome_rows, read_outcome
-from tangram_agent.runs import CONFIG
-from tangram_core.code import code_of
 from tangram_core.errors import TangramError, WireError
+from tangram_core.run.code import code_of
+from tangram_core.run.outcome import FILE_NAME, duration, outcome_rows, read_outcome
 from tangram_core.scores import read, told
+from tangram_core.store.stored import CONFIG
+from tangram_core.wire.messages import (
+    OPEN,
+    WORKER_COLUMNS,
+    AskStatus,
+    RunStatus,
+    decode_from_master,
+)
 from worker.config import StatusConfig
 from worker.talk.connection import Sockets
 from worker.talk.discovery import find_master, host_error, keys_error

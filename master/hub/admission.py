@@ -13,8 +13,8 @@ from master.hub.security import Holder
 from master.hub.sockets import Sockets
 from master.record.audit import Audit
 from master.record.counters import Counters
-from tangram_agent.messages import ROLES, TAKEN_OVER, Hello, Refused, Stop, Welcome
 from tangram_core.spec import EpisodeSpec
+from tangram_core.wire.messages import ROLES, TAKEN_OVER, Hello, Refused, Stop, Welcome
 
 
 @dataclass(frozen=True)

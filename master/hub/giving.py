@@ -21,9 +21,9 @@ from master.hub.security import (
 )
 from master.record.audit import write_line
 from master.record.rundir import RunFolder
-from tangram_agent.messages import ROLES
 from tangram_core.errors import ConfigError, RunError
 from tangram_core.store.files import private, write_whole
+from tangram_core.wire.messages import ROLES
 
 TCP = "tcp://"
 NEEDLESS = "nobody needs them: the master asks for none (unix sockets, or service.auth=off)"

@@ -21,8 +21,12 @@ from master.hub.sockets import Received, Sockets
 from master.record.audit import Audit
 from master.record.counters import Counters
 from master.record.delivery import Arrival, EpisodesArrived, Exams, ScoresArrived, Verdict, Waiting
-from tangram_agent.arrays import MAX_FRAMES, join_frames
-from tangram_agent.messages import (
+from tangram_core.agent import Weights
+from tangram_core.errors import WireError
+from tangram_core.scores import COUNTS
+from tangram_core.wire.addresses import IPC
+from tangram_core.wire.arrays import MAX_FRAMES, join_frames
+from tangram_core.wire.messages import (
     Ack,
     Alive,
     AskStatus,
@@ -43,11 +47,7 @@ from tangram_agent.messages import (
     WeightsMessage,
     decode_from_worker,
 )
-from tangram_agent.schema import DamagedError, ProtocolError
-from tangram_agent.types import Weights
-from tangram_core.errors import WireError
-from tangram_core.scores import COUNTS
-from tangram_core.wire.addresses import IPC
+from tangram_core.wire.schema import DamagedError, ProtocolError
 
 # Most messages taken in one poll, so that the loop gets its turn under any load.
 MAX_DRAIN = 256

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 
 from master.hub.gate import AMPLE, Room
 from master.record.delivery import EpisodesArrived, Ledger
-from tangram_agent.messages import MAX_ID, MAX_INDEX, ROLES, TAKEN_OVER, Hello, Refused, Stop
-from tangram_agent.schema import MAX_COUNT
 from tangram_core.errors import RunError, TangramError
+from tangram_core.wire.messages import MAX_ID, MAX_INDEX, ROLES, TAKEN_OVER, Hello, Refused, Stop
+from tangram_core.wire.schema import MAX_COUNT
 
 CROWDED = 0.9  # share of the room from which on there is a warning
 # One that asks for weights again before it has shown that it got them waits so long, then twice.

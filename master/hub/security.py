@@ -27,12 +27,12 @@ from zmq.utils import z85
 
 from master.record.audit import Audit
 from master.record.counters import Counters
-from tangram_agent.messages import ROLES
 from tangram_core.errors import ConfigError, RunError
-from tangram_core.process import Every
-from tangram_core.service import ServiceConfig
+from tangram_core.run.process import Every
+from tangram_core.run.service import ServiceConfig
 from tangram_core.store.files import own_folder, write_whole
 from tangram_core.wire.addresses import IPC, LOCAL
+from tangram_core.wire.messages import ROLES
 
 PRIVATE = 0o600
 DOMAIN = "tangram"

@@ -11,13 +11,13 @@ from master.hub.gate import AMPLE, Gate, Room
 from master.hub.security import Authenticator, Holder, Keys
 from master.record.audit import Audit
 from master.record.counters import Counters
-from tangram_agent.arrays import MAX_FRAME_BYTES
-from tangram_agent.messages import Greet, Refused, Reject, Stop
-from tangram_agent.schema import Plain
 from tangram_core.errors import ConfigError, RunError
-from tangram_core.process import Every
+from tangram_core.run.process import Every
 from tangram_core.store.files import own_folder
 from tangram_core.wire.addresses import IPC, KEEPALIVE
+from tangram_core.wire.arrays import MAX_FRAME_BYTES
+from tangram_core.wire.messages import Greet, Refused, Reject, Stop
+from tangram_core.wire.schema import Plain
 
 LINGER_MS = 1000
 # Messages queued for each peer and direction; what a peer has no room for it must ask for again.

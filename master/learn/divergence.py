@@ -10,10 +10,9 @@ import safetensors.numpy
 
 from master.learn.trainer import Trainer
 from master.record.counters import Counters
-from tangram_agent.types import Weights
-from tangram_core.agent import NotFiniteError
+from tangram_core.agent import NotFiniteError, Weights
 from tangram_core.errors import RunError
-from tangram_core.process import Every
+from tangram_core.run.process import Every
 from tangram_core.store.files import write_whole
 
 # Going back further costs updates, keeping more often costs time.

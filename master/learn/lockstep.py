@@ -8,10 +8,10 @@ inserted says which round it is, so a run that was stopped goes on where it was.
 """
 
 from master.record.delivery import EpisodesArrived
-from tangram_agent.arrays import check_batch_size
-from tangram_agent.messages import Go
-from tangram_core.service import ServiceConfig
+from tangram_core.run.service import ServiceConfig
 from tangram_core.spec import EpisodeSpec
+from tangram_core.wire.arrays import check_batch_size
+from tangram_core.wire.messages import Go
 
 
 class Lockstep:

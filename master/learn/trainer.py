@@ -9,11 +9,11 @@ import torch
 
 from master.learn.rate_limiter import LAG_UPDATES, RateLimiter
 from master.record.resumable import check_same_task
-from tangram_agent.checkpoints import ACTING, SETUP
-from tangram_agent.types import Weights
+from tangram_core.agent import Weights
 from tangram_core.errors import ConfigError, RunError
 from tangram_core.setup import Setup
 from tangram_core.spec import Episodes
+from tangram_core.store.checkpoints import ACTING, SETUP
 
 COMPILED = "compiled"  # of a checkpoint's values: how its updates were made
 LEARNER, REPLAY = "learner", "replay"  # the checkpoint's files: networks and optimisers; experience

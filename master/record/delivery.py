@@ -15,8 +15,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 
-from tangram_agent.messages import Ack, EpisodeBatch, Reject, Scores
 from tangram_core.spec import Episodes
+from tangram_core.wire.messages import Ack, EpisodeBatch, Reject, Scores
 
 REMEMBERED_VERSIONS = 4096
 # Peers that have left and whose batches still wait.

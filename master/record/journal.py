@@ -31,12 +31,12 @@ from typing import Annotated, ClassVar
 import msgspec
 
 from master.record.delivery import EpisodesArrived
-from tangram_agent.arrays import join_frames
-from tangram_agent.messages import Count, Id, Index, Number, Role
-from tangram_agent.schema import MAX_COUNT, Plain
 from tangram_core.errors import RunError
-from tangram_core.process import Every
+from tangram_core.run.process import Every
 from tangram_core.store.files import is_same, make_folders, sync_folder
+from tangram_core.wire.arrays import join_frames
+from tangram_core.wire.messages import Count, Id, Index, Number, Role
+from tangram_core.wire.schema import MAX_COUNT, Plain
 
 FORMAT = 4
 SUFFIX = ".log"

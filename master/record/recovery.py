@@ -26,11 +26,11 @@ from master.record.journal import (
     segment_path,
     segments,
 )
-from tangram_agent.arrays import split_frames
-from tangram_agent.messages import EpisodeBatch, decode_from_worker
-from tangram_agent.schema import ProtocolError, opened, read
 from tangram_core.errors import RunError, WireError
 from tangram_core.spec import EpisodeSpec
+from tangram_core.wire.arrays import split_frames
+from tangram_core.wire.messages import EpisodeBatch, decode_from_worker
+from tangram_core.wire.schema import ProtocolError, opened, read
 
 OLD_HEAD = struct.Struct("<II")  # of formats 1 and 2: length and CRC of the body
 CHUNK = 2**20

@@ -7,15 +7,15 @@ from typing import Any
 from master.record.journal import segments
 from master.record.recovery import check_journal
 from master.record.rundir import RunFolder
-from tangram_agent.checkpoints import (
+from tangram_core.errors import RunError
+from tangram_core.setup import Setup, make_setup
+from tangram_core.store.checkpoints import (
     CHECKPOINTS,
     SETUP,
     CorruptError,
     list_checkpoints,
     load_checkpoint,
 )
-from tangram_core.errors import RunError
-from tangram_core.setup import Setup, make_setup
 
 
 def check_resumable(folder: RunFolder, resolved: Mapping[str, Any]) -> None:

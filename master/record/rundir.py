@@ -16,11 +16,11 @@ import yaml
 
 from master.config import MasterConfig
 from master.record.journal import segments
-from tangram_agent.checkpoints import list_checkpoints
-from tangram_agent.outcome import FILE_NAME as RESULT
-from tangram_agent.outcome import bound_of, read_outcome
 from tangram_core.errors import ConfigError, RunError
+from tangram_core.run.outcome import FILE_NAME as RESULT
+from tangram_core.run.outcome import bound_of, read_outcome
 from tangram_core.setup import section_names
+from tangram_core.store.checkpoints import list_checkpoints
 from tangram_core.store.files import PUBLIC, is_same, make_folders, private, write_whole
 
 PRIVATE = 0o600

@@ -17,10 +17,10 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from tangram_agent.messages import OPEN, RunStatus
-from tangram_agent.outcome import duration, plural
-from tangram_core.process import Every, formatter
+from tangram_core.run.outcome import duration, plural
+from tangram_core.run.process import Every, formatter
 from tangram_core.scores import read, told
+from tangram_core.wire.messages import OPEN, RunStatus
 
 PANEL_S = 0.5
 LINE_S = 10.0

@@ -15,9 +15,9 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 
-from tangram_agent.messages import WORKER_COLUMNS, RunStatus
 from tangram_core.errors import ConfigError
-from tangram_core.process import Every
+from tangram_core.run.process import Every
+from tangram_core.wire.messages import WORKER_COLUMNS, RunStatus
 
 OFF = -1
 # A loop that has not come round for so long hangs; a checkpoint of a large replay takes seconds.

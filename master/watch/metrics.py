@@ -22,7 +22,7 @@ from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
 from tangram_core.arrays import Pixels
-from tangram_core.process import Every
+from tangram_core.run.process import Every
 from tangram_core.scores import SHOWN, read
 from tangram_core.store.files import make_folders, write_whole
 

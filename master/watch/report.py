@@ -24,12 +24,12 @@ from master.record.delivery import REMEMBERED_VERSIONS, EpisodesArrived
 from master.record.rundir import Clock, Record
 from master.watch.console import PLAYED, TEST, Progress
 from master.watch.metrics import Means, Metrics
-from tangram_agent.messages import WORKER_COLUMNS, RunStatus, Scores
 from tangram_core.arrays import Floats
 from tangram_core.errors import RunError
-from tangram_core.process import Every
+from tangram_core.run.process import Every
 from tangram_core.scores import SHOWN, written
 from tangram_core.store.files import write_whole
+from tangram_core.wire.messages import WORKER_COLUMNS, RunStatus, Scores
 
 UNKNOWN = -1.0
 PICTURE_S = 30.0

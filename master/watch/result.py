@@ -20,10 +20,10 @@ from master.children import override
 from master.config import MasterConfig
 from master.record.rundir import RunFolder
 from master.watch.console import TEST, sturdy_console
-from tangram_agent.messages import RunStatus
-from tangram_agent.outcome import outcome_rows, read_outcome
-from tangram_core.code import code_of
+from tangram_core.run.code import code_of
+from tangram_core.run.outcome import outcome_rows, read_outcome
 from tangram_core.scores import Score, written
+from tangram_core.wire.messages import RunStatus
 
 PLAIN = re.compile(r"[\w.]+=[\w./:-]+")
 ROOT = Path(__file__).resolve().parents[2]

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from tangram_agent.base.weights import load_arrays
+from tangram_agent.nets.weights import load_arrays
 from tangram_core.agent import Actor
 from tangram_core.arrays import Singles
 

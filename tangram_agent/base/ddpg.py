@@ -16,9 +16,9 @@ from torch import Tensor, nn
 from tangram_agent.base.compiling import Compiled
 from tangram_agent.base.config import ActorCriticConfig
 from tangram_agent.base.learning import NetworkLearner, Rates, frozen, polyak_update
-from tangram_agent.relabelling import learnable, with_relabelled
-from tangram_agent.replay import ReplayBuffer
-from tangram_agent.types import Transitions
+from tangram_agent.base.relabelling import learnable, with_relabelled
+from tangram_agent.base.replay import ReplayBuffer
+from tangram_agent.base.types import Transitions
 from tangram_core.agent import Streams
 from tangram_core.arrays import Ints
 from tangram_core.spec import Array, Arrays, Episodes

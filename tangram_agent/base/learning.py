@@ -12,8 +12,8 @@ from torch import Tensor, nn
 
 from tangram_agent.base.adam import Adam
 from tangram_agent.base.config import LearningConfig
-from tangram_agent.base.networks import initialise, parameter_count
-from tangram_agent.base.weights import load_arrays, to_arrays, under
+from tangram_agent.nets.networks import initialise, parameter_count
+from tangram_agent.nets.weights import load_arrays, to_arrays, under
 from tangram_core.agent import Learner, NotFiniteError, Tensors
 from tangram_core.errors import RunError
 from tangram_core.spec import Array

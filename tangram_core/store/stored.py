@@ -6,6 +6,7 @@ import yaml
 
 from tangram_core.errors import ConfigError
 
+CONFIG = "config.yaml"  # of a run
 MAX_TEXT = 100_000  # characters: a run's config.yaml has some 3,000
 MAX_VALUES = 10_000
 MAX_DEPTH = 20

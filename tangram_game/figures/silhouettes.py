@@ -14,9 +14,9 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFilter
 from PIL.PngImagePlugin import PngInfo
 
-from tangram_agent.outcome import plural
 from tangram_core.arrays import Bools, Floats
 from tangram_core.errors import ConfigError, RunError
+from tangram_core.run.outcome import plural
 from tangram_core.settings import refuse_ignored
 from tangram_core.store.files import write_whole
 from tangram_game.figures.puzzles import Figure, reach_beyond

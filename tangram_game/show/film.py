@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from PIL import Image
 
-from tangram_agent.outcome import plural
 from tangram_core.arrays import Bools, Floats, Ints
+from tangram_core.run.outcome import plural
 from tangram_sim.drawing.game_drawing import Held, captions, draw_game, tiles
 from tangram_sim.drawing.scenes import contact_sheet
 from tangram_sim.geometry.layout import Layout

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw
 
-from tangram_agent.outcome import plural
 from tangram_core.arrays import Bools, Floats
+from tangram_core.run.outcome import plural
 from tangram_sim.drawing.scenes import contact_sheet
 from tangram_sim.drawing.strokes import FRAME, PAPER, SAMPLES, Point, colour_of, draw_outline, shown
 from tangram_sim.geometry.layout import Layout

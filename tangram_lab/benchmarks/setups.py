@@ -9,7 +9,7 @@ import numpy as np
 import yaml
 
 import conf
-from tangram_agent.types import Transitions
+from tangram_agent.base.types import Transitions
 from tangram_core.arrays import Singles
 from tangram_core.setup import Setup, make_setup
 from tangram_core.spec import Arrays, Episodes

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 
 import torch
 
-from tangram_core.process import keep_memory
+from tangram_core.run.process import keep_memory
 from tangram_lab.benchmarks.measure import Row, page, show, write
 from tangram_lab.benchmarks.speed.learner import measure_gpu, measure_learner
 from tangram_lab.benchmarks.speed.scaling import measure_scaling

@@ -20,7 +20,7 @@ import zmq
 
 from master.children import command, override
 from tangram_core.errors import TangramError
-from tangram_core.process import Lifeline
+from tangram_core.run.process import Lifeline
 from tangram_core.setup import Setup, make_setup
 from worker.status import ask_status
 

@@ -19,12 +19,12 @@ import safetensors.numpy
 import torch
 import yaml
 
-from tangram_agent.checkpoints import ACTING, CHECKPOINTS, load_checkpoint, newest_checkpoint
 from tangram_agent.pretrained import CARD, CARD_TEXT, CONFIG, FORMAT, PREFIX, WEIGHTS
 from tangram_agent.runs import Run, load_run
 from tangram_core.errors import ConfigError, RunError, TangramError
 from tangram_core.settings import told
 from tangram_core.setup import Setup
+from tangram_core.store.checkpoints import ACTING, CHECKPOINTS, load_checkpoint, newest_checkpoint
 from tangram_core.store.files import check_writable, write_whole
 from tangram_game.config import EvalConfig
 from tangram_game.evaluate import policies, score_policies

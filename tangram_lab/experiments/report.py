@@ -8,9 +8,10 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure as Canvas
 
-from tangram_agent.runs import CONFIG, read_config
+from tangram_agent.runs import read_config
 from tangram_core.errors import RunError
 from tangram_core.store.files import write_whole
+from tangram_core.store.stored import CONFIG
 from tangram_lab.experiments.rows import AGENT, RUN, SCORES, Spread, of_a_study, read_rows, spreads
 from tangram_lab.experiments.runner import read_json
 from tangram_lab.experiments.studies import Figure, Study, read_studies

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tangram_agent.base.types import Transitions
 from tangram_agent.pretrained import CARD, WEIGHTS
 from tangram_agent.runs import beginning
-from tangram_agent.types import Transitions, Weights
+from tangram_core.agent import Weights
 from tangram_core.setup import Setup, make_setup
 from tangram_core.spec import Episodes, EpisodeSpec
 from tangram_core.task import History

@@ -7,10 +7,10 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from tangram_agent.arrays import join_frames
-from tangram_agent.messages import PICTURE_WIDTH, EpisodeBatch, Hello, Scores, WeightsMessage
-from tangram_agent.types import Weights
+from tangram_core.agent import Weights
 from tangram_core.spec import Episodes
+from tangram_core.wire.arrays import join_frames
+from tangram_core.wire.messages import PICTURE_WIDTH, EpisodeBatch, Hello, Scores, WeightsMessage
 from tests.agent.builders import PAIR, random_episodes, setup, with_bound
 
 BOUND = 4.0

@@ -11,8 +11,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from safetensors.numpy import save
 
-from tangram_agent import arrays
-from tangram_agent.arrays import (
+from tangram_core.errors import ConfigError, WireError
+from tangram_core.spec import Episodes, EpisodeSpec, Field
+from tangram_core.wire import arrays
+from tangram_core.wire.arrays import (
     MAX_BATCH_BYTES,
     MAX_EPISODES,
     MAX_FRAME_BYTES,
@@ -27,8 +29,6 @@ from tangram_agent.arrays import (
     most_episodes,
     split_frames,
 )
-from tangram_core.errors import ConfigError, WireError
-from tangram_core.spec import Episodes, EpisodeSpec, Field
 from tangram_sim.config import RewardConfig
 from tests.agent.builders import BFLOAT, one_tensor, setup
 from tests.agent.messages import BOUND, SHAPES, SPEC, episodes, weights

@@ -11,8 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tangram_agent.arrays import most_episodes
-from tangram_agent.messages import (
+from tangram_core.agent import Weights
+from tangram_core.errors import WireError
+from tangram_core.wire.arrays import most_episodes
+from tangram_core.wire.messages import (
     MAX_ROWS,
     PICTURE_WIDTH,
     ROLES,
@@ -41,7 +43,7 @@ from tangram_agent.messages import (
     decode_from_worker,
     decode_weights,
 )
-from tangram_agent.schema import (
+from tangram_core.wire.schema import (
     PROTOCOL,
     Between,
     Bound,
@@ -54,8 +56,6 @@ from tangram_agent.schema import (
     Texts,
     by_kind,
 )
-from tangram_agent.types import Weights
-from tangram_core.errors import WireError
 from tests.agent.messages import (
     SHAPES,
     SPEC,

@@ -11,7 +11,7 @@ import torch
 from tangram_agent.agents.pair.networks import Networks
 from tangram_agent.agents.scene.networks import ActorNet, CriticNet
 from tangram_agent.agents.scene.scenes import SceneGraph, Scenes
-from tangram_agent.base.networks import initialise, parameter_count
+from tangram_agent.nets.networks import initialise, parameter_count
 from tangram_core.setup import Setup
 from tests.agent.agents.pair.pair_scenes import random_pairs
 from tests.agent.builders import PAIR, PAPER, SMALL, random_transitions, setup

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from tangram_agent.agents.pair.actor import critic_plays
-from tangram_agent.base.weights import to_arrays
-from tangram_agent.messages import decode_weights
+from tangram_agent.base.types import Transitions
+from tangram_agent.nets.weights import to_arrays
 from tangram_agent.runs import Run
-from tangram_agent.types import Transitions, Weights
+from tangram_core.agent import Weights
 from tangram_core.errors import ConfigError, RunError, WireError
 from tangram_core.setup import Setup
 from tangram_core.task import History
+from tangram_core.wire.messages import decode_weights
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.env import TangramEnv
 from tangram_sim.motion.actions import chosen_tokens, flips, velocities

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from tangram_agent.base.config import RelabelConfig
-from tangram_agent.relabelling import flatten, with_relabelled
-from tangram_agent.types import Transitions
+from tangram_agent.base.relabelling import flatten, with_relabelled
+from tangram_agent.base.types import Transitions
 from tangram_core.spec import Episodes
 from tests.agent.builders import random_episodes, setup
 

@@ -5,8 +5,8 @@ from collections import deque
 import numpy as np
 import pytest
 
-from tangram_agent.replay import ReplayBuffer
-from tangram_agent.types import Transitions
+from tangram_agent.base.replay import ReplayBuffer
+from tangram_agent.base.types import Transitions
 from tangram_core.errors import RunError
 from tests.agent.builders import PAIR, random_transitions, setup
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import yaml
 
-from tangram_agent.checkpoints import save_checkpoint
 from tangram_agent.runs import load_changed, load_run
 from tangram_core.errors import ConfigError, RunError, TangramError
+from tangram_core.store.checkpoints import save_checkpoint
 from tangram_sim.config import RewardConfig
 from tests.agent.builders import (
     SMALL,

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tangram_agent.schema import (
+from tangram_core.errors import WireError
+from tangram_core.wire.schema import (
     MAX_ENTRIES,
     MAX_HEADER,
     MAX_NUMBER,
@@ -29,7 +30,6 @@ from tangram_agent.schema import (
     read,
     seal,
 )
-from tangram_core.errors import WireError
 from tests.agent.messages import with_checksum
 
 pytestmark = pytest.mark.fast

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from tangram_core.errors import ConfigError
-from tangram_core.service import ServiceConfig
+from tangram_core.run.service import ServiceConfig
 from tangram_core.setup import from_mapping, make_setup
 
 pytestmark = pytest.mark.fast

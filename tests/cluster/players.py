@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
 from tangram_core.setup import Setup, make_setup
 from tangram_core.spec import Episodes
+from tangram_core.store.checkpoints import list_checkpoints, load_checkpoint
 from tests.agent.builders import random_episodes
 from tests.agent.no_reward import NOTHING
 from tests.cluster.processes import LIMIT_S, started, wait_for_file

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import zmq
 
-from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
 from tangram_core.errors import TangramError
+from tangram_core.store.checkpoints import list_checkpoints, load_checkpoint
 from tests.cluster.processes import LIMIT_S, pids_of, refused, run, started
 from worker.status import ask_status
 

@@ -12,9 +12,9 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
-from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
 from tangram_cli.commands import COMMON_NAMES
 from tangram_core.setup import make_setup
+from tangram_core.store.checkpoints import list_checkpoints, load_checkpoint
 from tests.cluster.conftest import UPDATES
 from tests.cluster.processes import ended, pids_of, refused, run, run_here
 

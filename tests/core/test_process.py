@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tangram_core.errors import ConfigError
-from tangram_core.process import VARIABLE, Lifeline, watch_parent
+from tangram_core.run.process import VARIABLE, Lifeline, watch_parent
 
 pytestmark = pytest.mark.cluster
 
@@ -21,7 +21,7 @@ LIMIT_S = 30.0
 # Tells when it watches, then waits for ever; `kind` decides how it takes SIGTERM.
 CHILD = """
     import signal, sys, threading
-    from tangram_core.process import watch_parent
+    from tangram_core.run.process import watch_parent
     kind = sys.argv[1]
     if kind == "orderly":
         signal.signal(signal.SIGTERM, lambda *_: (print("orderly", flush=True), sys.exit(3)))
@@ -130,7 +130,7 @@ def test_telling_a_child_that_does_not_listen_does_not_block() -> None:
 
 HANGS = """
 import time, threading
-from tangram_core.process import Watchdog
+from tangram_core.run.process import Watchdog
 def hang_here():
     {hang}
 with Watchdog(0.0) as off:
@@ -180,7 +180,7 @@ def test_a_watchdog_that_is_off_or_was_left_ends_nothing() -> None:
 FREEING = """
     import resource, sys
     import numpy as np
-    from tangram_core.process import keep_memory
+    from tangram_core.run.process import keep_memory
     if sys.argv[1] == "kept":
         keep_memory()
     def work():

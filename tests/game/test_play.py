@@ -11,8 +11,8 @@ from PIL import Image
 
 import tangram_game.show.film as film_module
 from tangram_agent.agents.outline.filler import Filler
+from tangram_agent.base.types import Choice
 from tangram_agent.runs import load_changed, load_run
-from tangram_agent.types import Choice
 from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError, RunError
 from tangram_game.config import PlayConfig

@@ -29,11 +29,11 @@ from master.record.rundir import Claim, Clock, Record, RunFolder
 from master.signals import StopSignals
 from master.watch.metrics import Metrics
 from master.watch.report import Reporter, StatusCollector
-from tangram_agent.messages import PICTURE_WIDTH, EpisodeBatch, Go, RunStatus, Scores
-from tangram_agent.types import Weights
-from tangram_core.process import Watchdog
-from tangram_core.service import ServiceConfig
+from tangram_core.agent import Weights
+from tangram_core.run.process import Watchdog
+from tangram_core.run.service import ServiceConfig
 from tangram_core.setup import Setup
+from tangram_core.wire.messages import PICTURE_WIDTH, EpisodeBatch, Go, RunStatus, Scores
 from tests.agent.builders import random_episodes, setup
 
 # Small tensors on several threads wait for cores that others use, a hundred times longer.

@@ -16,10 +16,10 @@ from master.learn.trainer import Trainer
 from master.record.journal import JournalError, segments
 from master.record.recovery import Reader
 from master.record.rundir import RunFolder
-from tangram_agent import checkpoints as checkpoints_module
-from tangram_agent.checkpoints import DiskError, list_checkpoints
 from tangram_core.errors import ConfigError, RunError
-from tangram_core.process import Every
+from tangram_core.run.process import Every
+from tangram_core.store import checkpoints as checkpoints_module
+from tangram_core.store.checkpoints import DiskError, list_checkpoints
 from tests.master.builders import Disk, FakeHub, arrival, loop, small_setup
 
 pytestmark = pytest.mark.fast

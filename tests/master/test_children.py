@@ -105,7 +105,7 @@ def test_the_users_own_number_of_threads_wins(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.cluster
 def test_a_child_ends_with_its_parent() -> None:
-    code = "import signal, tangram_core.process as own; own.watch_parent(); signal.pause()"
+    code = "import signal, tangram_core.run.process as own; own.watch_parent(); signal.pause()"
     made = Child("worker", ["-c", code])
     ended: SimpleQueue[Child] = SimpleQueue()
     made.start(ended.put)

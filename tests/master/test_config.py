@@ -6,7 +6,7 @@ import pytest
 
 from master.config import MasterConfig
 from tangram_core.errors import ConfigError
-from tangram_core.service import ServiceConfig
+from tangram_core.run.service import ServiceConfig
 from tangram_core.setup import from_mapping
 
 pytestmark = pytest.mark.fast

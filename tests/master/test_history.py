@@ -33,8 +33,8 @@ from master.record.rundir import RunFolder
 from master.run import open_run
 from master.signals import StopSignals
 from tangram_core.errors import TangramError, WireError
-from tangram_core.process import Watchdog
-from tangram_core.service import ServiceConfig
+from tangram_core.run.process import Watchdog
+from tangram_core.run.service import ServiceConfig
 from tangram_core.spec import Episodes
 from tangram_sim.config import RewardConfig
 from tests.agent.builders import random_episodes

@@ -17,7 +17,7 @@ from master.launch import Launcher, master_arguments, run_training
 from master.record.rundir import RunFolder
 from master.watch.console import logging_to, sturdy_console
 from tangram_core.errors import ConfigError
-from tangram_core.service import ServiceConfig
+from tangram_core.run.service import ServiceConfig
 from tangram_core.setup import from_mapping
 
 LIMIT_S = 100.0
@@ -72,7 +72,7 @@ def test_a_folder_in_use_is_left_alone(tmp_path: Path) -> None:
 MASTER = """
 import os, signal, sys, threading
 from pathlib import Path
-from tangram_core.process import watch_parent
+from tangram_core.run.process import watch_parent
 folder = Path({folder!r})
 news = open(folder / "news", "w")
 heard = threading.Event()
@@ -97,7 +97,7 @@ while {condition}:
 """
 WORKER = """
 import signal
-from tangram_core.process import watch_parent
+from tangram_core.run.process import watch_parent
 watch_parent()
 signal.pause()
 """
@@ -422,7 +422,7 @@ def test_a_signal_that_comes_again_at_once_cuts_nobody_short(
     monkeypatch.setattr(launch_module, "LEAVE_S", LIMIT_S)
     leaving = """
 import signal, sys, time
-from tangram_core.process import watch_parent
+from tangram_core.run.process import watch_parent
 watch_parent()
 def leave(*_):
     time.sleep(0.3)

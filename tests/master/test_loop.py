@@ -16,11 +16,11 @@ from master import loop as loop_module
 from master.record.delivery import EpisodesArrived
 from master.watch import metrics as metrics_module
 from master.watch.result import make_result
-from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
-from tangram_agent.messages import Go
-from tangram_core import process as process_module
 from tangram_core.errors import RunError
-from tangram_core.process import Every
+from tangram_core.run import process as process_module
+from tangram_core.run.process import Every
+from tangram_core.store.checkpoints import list_checkpoints, load_checkpoint
+from tangram_core.wire.messages import Go
 from tests.master.builders import FakeHub, arrival, loop, scores, small_setup
 
 pytestmark = pytest.mark.fast

@@ -20,10 +20,10 @@ from master.record.journal import segments
 from master.record.rundir import Record, RunFolder
 from master.run import UNBOUNDED, open_run
 from master.signals import StopSignals
-from tangram_agent.messages import OPEN
 from tangram_core.errors import ConfigError, RunError
-from tangram_core.process import Every, Watchdog
-from tangram_core.service import ServiceConfig
+from tangram_core.run.process import Every, Watchdog
+from tangram_core.run.service import ServiceConfig
+from tangram_core.wire.messages import OPEN
 from tests.master.builders import ShownProgress, arrival, journal, small_setup, trainer
 from tests.ports import free_ports
 

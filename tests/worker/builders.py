@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import yaml
 
-from tangram_agent.checkpoints import save_checkpoint
-from tangram_agent.types import Weights
+from tangram_core.agent import Weights
 from tangram_core.arrays import Floats
-from tangram_core.service import ServiceConfig
+from tangram_core.run.service import ServiceConfig
 from tangram_core.setup import Setup, make_setup
 from tangram_core.spec import Episodes
+from tangram_core.store.checkpoints import save_checkpoint
 from tangram_sim.geometry.layout import Layout
 from tangram_tasks.played import Played
 from tests.agent.builders import SMALL, SQUARE, Policy

@@ -10,8 +10,8 @@ import pytest
 import zmq
 
 from master.hub.security import make_keys, make_pair
-from tangram_agent.messages import RunStatus
 from tangram_core.errors import RunError, TangramError
+from tangram_core.wire.messages import RunStatus
 from tests.master.hub.dealers import Stage, staged
 from tests.master.watch.test_health import STATUS
 from tests.master.watch.test_result import RESULT

@@ -3,11 +3,11 @@
 import math
 from contextlib import closing
 
-from tangram_agent.arrays import most_episodes
-from tangram_agent.messages import Go
 from tangram_core.errors import TangramError
 from tangram_core.setup import Setup
 from tangram_core.spec import Episodes
+from tangram_core.wire.arrays import most_episodes
+from tangram_core.wire.messages import Go
 from worker.config import WorkerConfig
 from worker.play.rollout import Rollout, exploring, parts
 from worker.play.session import Acting, Report, joined

@@ -11,13 +11,12 @@ from typing import TextIO
 
 import torch
 
-from tangram_agent.arrays import check_batch_size
-from tangram_agent.messages import TAKEN_OVER
-from tangram_agent.types import Weights
-from tangram_core.agent import Actor
+from tangram_core.agent import Actor, Weights
 from tangram_core.errors import TangramError
-from tangram_core.process import WATCHDOG_S, Watchdog, formatter, keep_memory, watch_parent
+from tangram_core.run.process import WATCHDOG_S, Watchdog, formatter, keep_memory, watch_parent
 from tangram_core.setup import Setup
+from tangram_core.wire.arrays import check_batch_size
+from tangram_core.wire.messages import TAKEN_OVER
 from worker.config import WorkerConfig
 from worker.talk.client import Client
 

@@ -7,12 +7,12 @@ from contextlib import closing
 import numpy as np
 from PIL import Image
 
-from tangram_agent.messages import PICTURE_HEIGHT, PICTURE_WIDTH, Scores
-from tangram_agent.types import Weights
+from tangram_core.agent import Weights
 from tangram_core.arrays import Pixels
+from tangram_core.run.service import ServiceConfig
 from tangram_core.scores import SHOWN, told
-from tangram_core.service import ServiceConfig
 from tangram_core.setup import Setup
+from tangram_core.wire.messages import PICTURE_HEIGHT, PICTURE_WIDTH, Scores
 from worker.config import WorkerConfig
 from worker.play.rollout import greedy
 from worker.play.session import Acting, joined

@@ -16,8 +16,12 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Self
 
-from tangram_agent.arrays import WeightShapes
-from tangram_agent.messages import (
+from tangram_core.agent import Weights
+from tangram_core.errors import TangramError, WireError
+from tangram_core.spec import Episodes, EpisodeSpec
+from tangram_core.wire.addresses import host_of, reachable
+from tangram_core.wire.arrays import WeightShapes
+from tangram_core.wire.messages import (
     WINDOW,
     Ack,
     Alive,
@@ -38,11 +42,7 @@ from tangram_agent.messages import (
     Welcome,
     decode_from_master,
 )
-from tangram_agent.schema import Plain, ProtocolError
-from tangram_agent.types import Weights
-from tangram_core.errors import TangramError, WireError
-from tangram_core.spec import Episodes, EpisodeSpec
-from tangram_core.wire.addresses import host_of, reachable
+from tangram_core.wire.schema import Plain, ProtocolError
 from worker.talk.connection import Connection, Sockets, Timing
 from worker.talk.outbox import NewestWeights, Outbox
 

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from tangram_agent.arrays import MAX_WEIGHTS_BYTES
-from tangram_agent.schema import MAX_HEADER
 from tangram_core.errors import RunError, TangramError
 from tangram_core.wire.addresses import KEEPALIVE
+from tangram_core.wire.arrays import MAX_WEIGHTS_BYTES
+from tangram_core.wire.schema import MAX_HEADER
 from worker.talk.discovery import (
     PATIENCE_S,
     MasterAddress,

@@ -12,8 +12,8 @@ from typing import Any
 
 from zmq.utils import z85
 
-from tangram_agent.outcome import FILE_NAME as RESULT
 from tangram_core.errors import RunError
+from tangram_core.run.outcome import FILE_NAME as RESULT
 from tangram_core.store.files import check_own
 from tangram_core.wire.addresses import IPC, dns_error
 

@@ -1,8 +1,8 @@
 """What a worker keeps: batches until the master has them, and the newest weights."""
 
-from tangram_agent.arrays import WeightShapes
-from tangram_agent.messages import decode_weights
-from tangram_agent.types import Weights
+from tangram_core.agent import Weights
+from tangram_core.wire.arrays import WeightShapes
+from tangram_core.wire.messages import decode_weights
 
 
 class Outbox:

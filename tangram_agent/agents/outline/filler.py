@@ -16,7 +16,7 @@ from torch import nn
 
 from tangram_agent.agents.outline.filling import Filling, Rests
 from tangram_agent.agents.outline.values import Corners
-from tangram_agent.types import Choice
+from tangram_agent.base.types import Choice
 from tangram_core.arrays import Bools, Floats
 from tangram_core.errors import ConfigError
 from tangram_sim.config import MAX_OVERLAP

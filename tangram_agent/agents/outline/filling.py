@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from tangram_agent.types import Flags
+from tangram_agent.base.types import Flags
 from tangram_core.arrays import AnyArray, Bools, Ints, Singles
 from tangram_sim.geometry.areas import Area, opened, rings
 from tangram_sim.geometry.dissections import Budget, Place, Search, Tokens, without

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from shapely.errors import GEOSException
 
 from tangram_agent.agents.outline.filling import MOST_PLACES, UNUSED, Filling, Rests
-from tangram_agent.types import Flags
+from tangram_agent.base.types import Flags
 from tangram_core.arrays import Bools, Ints
 from tangram_core.errors import RunError
 from tangram_core.spec import Episodes

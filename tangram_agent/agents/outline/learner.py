@@ -19,7 +19,7 @@ from tangram_agent.agents.outline.filling_replay import FILLED, OPEN, FillBatch,
 from tangram_agent.agents.outline.values import Corners, OutlineValue
 from tangram_agent.base.config import NetConfig
 from tangram_agent.base.learning import NetworkLearner, Rates, frozen, polyak_update
-from tangram_agent.relabelling import learnable
+from tangram_agent.base.relabelling import learnable
 from tangram_core.agent import Streams
 from tangram_core.spec import Array, Arrays, Episodes
 from tangram_tasks.fill import Fill

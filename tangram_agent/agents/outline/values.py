@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from tangram_agent.agents.outline.filling import UNUSED, Rests
-from tangram_agent.base.attention import GraphEncoder
 from tangram_agent.base.config import NetConfig
+from tangram_agent.nets.attention import GraphEncoder
 
 _OWN = 13  # features of a corner, without the tokens that are left
 _FAR = 1e4

@@ -10,7 +10,7 @@ from tangram_agent.agents.pair.networks import Networks
 from tangram_agent.agents.pair.planning import Planner
 from tangram_agent.base.acting import NetworkActor
 from tangram_agent.base.config import NetConfig
-from tangram_agent.types import Choice
+from tangram_agent.base.types import Choice
 from tangram_core.arrays import Floats, Singles
 from tangram_core.spec import Array, Arrays
 from tangram_core.task import Generators, History

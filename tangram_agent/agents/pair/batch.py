@@ -9,8 +9,8 @@ import numpy as np
 
 from tangram_agent.agents.pair.coverage import Lying, covered_share, covering, lying, newly_covered
 from tangram_agent.base.config import RelabelConfig
-from tangram_agent.relabelling import spread
-from tangram_agent.types import Flags, Transitions
+from tangram_agent.base.relabelling import spread
+from tangram_agent.base.types import Flags, Transitions
 from tangram_core.arrays import Bools, Floats, Ints, Singles
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.motion.actions import chosen_tokens

@@ -20,8 +20,8 @@ from tangram_agent.agents.pair.pairs import Pairs
 from tangram_agent.base.config import NetConfig
 from tangram_agent.base.ddpg import NUMBERS, Ddpg, Steps
 from tangram_agent.base.learning import read_slots, saved_slots
-from tangram_agent.base.weights import under
-from tangram_agent.types import Transitions
+from tangram_agent.base.types import Transitions
+from tangram_agent.nets.weights import under
 from tangram_core.agent import Streams, Tensors
 from tangram_core.arrays import Bools, Floats
 from tangram_core.errors import RunError

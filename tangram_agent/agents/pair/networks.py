@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from tangram_agent.agents.pair.motion import MotionModel
 from tangram_agent.agents.pair.pairs import PairGraph, Pairs
 from tangram_agent.base.config import NetConfig
-from tangram_agent.base.networks import VELOCITY, Head
+from tangram_agent.nets.networks import VELOCITY, Head
 from tangram_sim.geometry.layout import Layout
 
 

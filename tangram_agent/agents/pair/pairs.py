@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
-from tangram_agent.base.graph import turn, turn_back, unit
+from tangram_agent.nets.graph import turn, turn_back, unit
 from tangram_sim.geometry.fitting import KINDS, kind_of
 from tangram_sim.geometry.layout import Layout
 

@@ -17,7 +17,7 @@ from tangram_agent.agents.pair.coverage import covered_share, covering, worths
 from tangram_agent.agents.pair.motion import Belief, motions_of
 from tangram_agent.agents.pair.networks import Networks
 from tangram_agent.agents.pair.pairs import PairGraph, Pairs
-from tangram_agent.types import Choice
+from tangram_agent.base.types import Choice
 from tangram_core.arrays import Bools, Floats, Singles
 from tangram_sim.motion.actions import velocities_of
 from tangram_tasks.place import Place

@@ -7,8 +7,8 @@ from tangram_agent.agents.scene.networks import ActorNet, CriticNet
 from tangram_agent.agents.scene.scenes import Scenes, next_token
 from tangram_agent.base.config import ActorCriticConfig, NetConfig
 from tangram_agent.base.ddpg import Ddpg, Steps
-from tangram_agent.base.networks import VELOCITY
-from tangram_agent.types import Transitions
+from tangram_agent.base.types import Transitions
+from tangram_agent.nets.networks import VELOCITY
 from tangram_sim.motion.actions import chosen_tokens
 from tangram_tasks.place import Place
 

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from tangram_agent.agents.scene.scenes import SceneGraph, Scenes
 from tangram_agent.base.config import NetConfig
-from tangram_agent.base.networks import VELOCITY, Head
+from tangram_agent.nets.networks import VELOCITY, Head
 from tangram_sim.geometry.layout import Layout
 
 

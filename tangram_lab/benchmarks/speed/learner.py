@@ -10,7 +10,7 @@ import torch
 from tangram_agent.agents.pair.batch import make_pairs
 from tangram_agent.agents.pair.learner import PairLearner
 from tangram_agent.base.ddpg import Ddpg
-from tangram_agent.types import Transitions
+from tangram_agent.base.types import Transitions
 from tangram_core.errors import ConfigError
 from tangram_core.setup import Setup
 from tangram_lab.benchmarks.measure import Bound, Row, Work, compare, compared, rates

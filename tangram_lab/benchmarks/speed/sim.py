@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from tangram_core.arrays import Floats
+from tangram_core.run.service import ServiceConfig
 from tangram_core.seeding import episode_generator
-from tangram_core.service import ServiceConfig
 from tangram_core.setup import Setup
 from tangram_lab.benchmarks.measure import Bound, Row, compare
 from tangram_lab.benchmarks.setups import place, preset, several, with_sim

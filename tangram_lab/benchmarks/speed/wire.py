@@ -22,11 +22,11 @@ from master.hub.admission import WelcomeInfo
 from master.hub.hub import Hub
 from master.hub.security import Keys, make_keys
 from master.record.delivery import EpisodesArrived
-from tangram_agent.messages import WINDOW, Ack, EpisodeBatch
 from tangram_core.errors import TangramError
 from tangram_core.setup import Setup
 from tangram_core.spec import Episodes
 from tangram_core.wire.addresses import IPC
+from tangram_core.wire.messages import WINDOW, Ack, EpisodeBatch
 from tangram_lab.benchmarks.measure import Bound, Row, Work, compared, rates, single
 from tangram_lab.benchmarks.setups import played, several
 from worker.talk.client import Client

@@ -22,10 +22,10 @@ import zmq
 from master.record.delivery import EpisodesArrived
 from master.record.journal import MAGIC, Journal, segments
 from master.record.recovery import Reader
-from tangram_agent.checkpoints import list_checkpoints, load_checkpoint, save_checkpoint
-from tangram_agent.messages import EpisodeBatch
 from tangram_core.errors import RunError, TangramError
 from tangram_core.setup import Setup, make_setup
+from tangram_core.store.checkpoints import list_checkpoints, load_checkpoint, save_checkpoint
+from tangram_core.wire.messages import EpisodeBatch
 from tangram_lab.benchmarks.measure import show, write
 from tangram_lab.benchmarks.trainings import LOOK_S, MIB, Watched, result_of
 from tangram_lab.benchmarks.trials.attacks import BESIEGED, LIVE, OPEN_FILES

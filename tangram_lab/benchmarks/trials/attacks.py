@@ -19,10 +19,10 @@ import zmq
 
 from master.hub.admission import WelcomeInfo
 from master.hub.hub import Hub
-from tangram_agent.arrays import MAX_FRAME_BYTES
-from tangram_agent.messages import PICTURE_WIDTH, EpisodeBatch, Heartbeat, Scores, WantWeights
-from tangram_agent.schema import MAX_COUNT, opened, seal
 from tangram_core.errors import TangramError
+from tangram_core.wire.arrays import MAX_FRAME_BYTES
+from tangram_core.wire.messages import PICTURE_WIDTH, EpisodeBatch, Heartbeat, Scores, WantWeights
+from tangram_core.wire.schema import MAX_COUNT, opened, seal
 from tangram_lab.benchmarks.trainings import MIB
 from tangram_lab.benchmarks.trials.chaos import Witness
 from tangram_lab.benchmarks.trials.fuzz_wire import fuzzed, resealed, valid_messages

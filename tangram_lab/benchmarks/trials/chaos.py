@@ -19,10 +19,10 @@ import numpy as np
 import yaml
 import zmq
 
-from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
-from tangram_agent.messages import WORKER_COLUMNS, RunStatus
 from tangram_core.errors import TangramError
 from tangram_core.setup import Setup, make_setup
+from tangram_core.store.checkpoints import list_checkpoints, load_checkpoint
+from tangram_core.wire.messages import WORKER_COLUMNS, RunStatus
 from tangram_lab.benchmarks.measure import show, write
 from tangram_lab.benchmarks.trainings import (
     LOOK_S,

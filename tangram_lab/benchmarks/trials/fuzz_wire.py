@@ -11,7 +11,9 @@ import numpy as np
 import yaml
 import zmq
 
-from tangram_agent.messages import (
+from tangram_core.errors import WireError
+from tangram_core.setup import Setup, make_setup
+from tangram_core.wire.messages import (
     PICTURE_WIDTH,
     AskStatus,
     Bye,
@@ -22,9 +24,7 @@ from tangram_agent.messages import (
     WantWeights,
     decode_from_worker,
 )
-from tangram_agent.schema import CHECKSUM, DamagedError, checksum
-from tangram_core.errors import WireError
-from tangram_core.setup import Setup, make_setup
+from tangram_core.wire.schema import CHECKSUM, DamagedError, checksum
 from tangram_lab.benchmarks.measure import show, write
 from tangram_lab.benchmarks.trainings import start_training, wait_for
 from worker.status import ask_status

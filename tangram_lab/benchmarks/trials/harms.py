@@ -10,9 +10,9 @@ import psutil
 
 from master.children import override
 from master.record.journal import segments
-from tangram_agent.messages import EpisodeBatch
-from tangram_agent.schema import MAX_COUNT
 from tangram_core.errors import TangramError
+from tangram_core.wire.messages import EpisodeBatch
+from tangram_core.wire.schema import MAX_COUNT
 from tangram_lab.benchmarks.trials.chaos import Witness, compare
 from tangram_lab.benchmarks.trials.intruder import NOBODY, knock
 from tangram_lab.benchmarks.trials.target import (

@@ -15,12 +15,12 @@ import numpy as np
 import zmq
 
 from master.children import command
-from tangram_agent.arrays import columns
-from tangram_agent.checkpoints import list_checkpoints, load_checkpoint
-from tangram_agent.messages import Hello
-from tangram_agent.schema import opened, seal
 from tangram_core.setup import Setup
 from tangram_core.spec import Episodes
+from tangram_core.store.checkpoints import list_checkpoints, load_checkpoint
+from tangram_core.wire.arrays import columns
+from tangram_core.wire.messages import Hello
+from tangram_core.wire.schema import opened, seal
 from tangram_lab.benchmarks.trainings import Watched, start_training, wait_for
 from tangram_lab.benchmarks.trials.chaos import SETTINGS
 from worker.talk.discovery import find_master

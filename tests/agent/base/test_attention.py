@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 import torch
 
-from tangram_agent.base.attention import (
+from tangram_agent.base.config import NetConfig
+from tangram_agent.nets.attention import (
     NO_EDGE,
     SHORT_ROW,
     GraphAttention,
     GraphEncoder,
     softmax_mean,
 )
-from tangram_agent.base.config import NetConfig
-from tangram_agent.base.networks import initialise
+from tangram_agent.nets.networks import initialise
 from tests.agent.builders import setup
 
 pytestmark = pytest.mark.fast

@@ -16,8 +16,8 @@ from master.run import _make_trainer
 from tangram_agent.base.compiling import Compiled, cache_folder
 from tangram_agent.base.learning import Rates
 from tangram_core.errors import ConfigError, RunError
-from tangram_core.process import Watchdog
-from tangram_core.service import ServiceConfig
+from tangram_core.run.process import Watchdog
+from tangram_core.run.service import ServiceConfig
 from tests.agent.agents.outline.outlines import outline_setup
 from tests.agent.builders import PAPER, learner_of, setup
 from tests.agent.test_learner import CASES, changed, copied, play

@@ -10,9 +10,9 @@ import zmq
 from master.hub.admission import WelcomeInfo
 from master.hub.hub import Hub
 from master.record.delivery import Arrival, EpisodesArrived
-from tangram_agent.arrays import WeightShapes
-from tangram_agent.messages import Heartbeat, Reject, ToWorker, Welcome, decode_from_master
-from tangram_agent.schema import Plain
+from tangram_core.wire.arrays import WeightShapes
+from tangram_core.wire.messages import Heartbeat, Reject, ToWorker, Welcome, decode_from_master
+from tangram_core.wire.schema import Plain
 from tests.agent.messages import FINGERPRINTS, SPEC, TASK, batch, hello
 
 LIMIT_S = 100.0

@@ -26,8 +26,8 @@ from master.hub.gate import (
 from master.hub.security import Keys, make_keys
 from master.hub.sockets import MAX_COMMAND, Sockets
 from master.record.counters import Counters
-from tangram_agent.arrays import MAX_FRAME_BYTES
 from tangram_core.errors import ConfigError
+from tangram_core.wire.arrays import MAX_FRAME_BYTES
 from tangram_lab.benchmarks.trials.strangers import connection
 
 LIMIT_S = 100.0

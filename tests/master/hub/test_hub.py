@@ -9,7 +9,9 @@ import pytest
 
 from master.hub.gate import HANDSHAKES, RESERVE, Room
 from master.hub.registry import STATUS_AGAIN_S
-from tangram_agent.messages import (
+from tangram_core.agent import Weights
+from tangram_core.errors import WireError
+from tangram_core.wire.messages import (
     WORKER_COLUMNS,
     Ack,
     Alive,
@@ -25,9 +27,7 @@ from tangram_agent.messages import (
     WeightsMessage,
     Welcome,
 )
-from tangram_agent.schema import PROTOCOL
-from tangram_agent.types import Weights
-from tangram_core.errors import WireError
+from tangram_core.wire.schema import PROTOCOL
 from tests.agent.messages import (
     FINGERPRINTS,
     SHAPES,

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tangram_agent.messages import Ack, Alive, Bye, Go, Reject, Stop, Welcome
+from tangram_core.wire.messages import Ack, Alive, Bye, Go, Reject, Stop, Welcome
 from tests.agent.messages import SPEC, batch, hello, with_checksum, with_header
 from tests.master.hub.dealers import INFO, WINDOW, Dealer, Stage, staged
 

@@ -15,8 +15,9 @@ from master.hub.hub import Hub
 from master.hub.sockets import MAX_COMMAND
 from master.record.delivery import EpisodesArrived
 from master.watch.report import _workers
-from tangram_agent.arrays import MAX_FRAMES
-from tangram_agent.messages import (
+from tangram_core.errors import ConfigError
+from tangram_core.wire.arrays import MAX_FRAMES
+from tangram_core.wire.messages import (
     Alive,
     AskStatus,
     Bye,
@@ -27,8 +28,7 @@ from tangram_agent.messages import (
     RunStatus,
     WantWeights,
 )
-from tangram_agent.schema import Between, Bound, Flag, Numbers, Text
-from tangram_core.errors import ConfigError
+from tangram_core.wire.schema import Between, Bound, Flag, Numbers, Text
 from tests.agent.messages import FINGERPRINTS, SPEC, batch, hello, scores, weights, with_header
 from tests.master.hub.dealers import INFO, WINDOW, Dealer, Stage, staged
 

@@ -7,8 +7,8 @@ import pytest
 
 from master.hub.gate import DESCRIPTORS, HANDSHAKES, RESERVE, Room
 from master.hub.registry import Peer, RefusedError, Registry
-from tangram_agent.schema import MAX_COUNT
 from tangram_core.errors import RunError
+from tangram_core.wire.schema import MAX_COUNT
 from tests.agent.messages import FINGERPRINTS, hello
 
 pytestmark = pytest.mark.fast

@@ -27,7 +27,7 @@ from master.hub.security import (
 from master.record.audit import Audit
 from master.record.rundir import RunFolder
 from tangram_core.errors import ConfigError, RunError
-from tangram_core.service import ServiceConfig
+from tangram_core.run.service import ServiceConfig
 
 pytestmark = pytest.mark.fast
 

@@ -6,10 +6,10 @@ import pytest
 
 from master.learn.lockstep import Lockstep
 from master.record.delivery import EpisodesArrived
-from tangram_agent.messages import EpisodeBatch, Go
 from tangram_core.errors import ConfigError
-from tangram_core.service import ServiceConfig
+from tangram_core.run.service import ServiceConfig
 from tangram_core.spec import Field
+from tangram_core.wire.messages import EpisodeBatch, Go
 from tests.agent.builders import random_episodes
 from tests.master.builders import small_setup
 

@@ -5,10 +5,10 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from tangram_agent.messages import EpisodeBatch, decode_from_worker
 from tangram_core.errors import RunError, WireError
 from tangram_core.setup import Setup
 from tangram_core.spec import Episodes
+from tangram_core.wire.messages import EpisodeBatch, decode_from_worker
 from tests.agent.agents.outline.outlines import outline_setup
 from tests.agent.builders import Policy
 from tests.master.builders import trainer

@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from tangram_agent.checkpoints import ACTING
 from tangram_core.setup import Setup
+from tangram_core.store.checkpoints import ACTING
 from tests.agent.agents.pair.pair_scenes import PERCEPTRON, seven
 from tests.agent.builders import Policy, random_episodes, setup
 from tests.master.builders import AGENT, play_on, trainer

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tangram_agent.checkpoints import (
+from tangram_core.errors import RunError
+from tangram_core.store.checkpoints import (
     CorruptError,
     list_checkpoints,
     load_checkpoint,
@@ -16,7 +17,6 @@ from tangram_agent.checkpoints import (
     save_checkpoint,
     set_aside,
 )
-from tangram_core.errors import RunError
 from tests.agent.builders import BFLOAT, watched_disk
 
 pytestmark = pytest.mark.fast

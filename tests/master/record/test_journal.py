@@ -17,10 +17,10 @@ from master.record import journal as journal_module
 from master.record.delivery import EpisodesArrived
 from master.record.journal import FORMAT, HEAD, MAGIC, JournalError, Place, Title, _head, segments
 from master.record.recovery import Reader, journal_run_id
-from tangram_agent.arrays import join_frames, most_episodes
-from tangram_agent.schema import opened, seal
 from tangram_core.errors import RunError
 from tangram_core.setup import Setup
+from tangram_core.wire.arrays import join_frames, most_episodes
+from tangram_core.wire.schema import opened, seal
 from tests.agent.builders import PAIR, setup, watched_disk
 from tests.master.builders import Disk, arrival, close_journals, journal, small_setup
 

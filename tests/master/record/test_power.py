@@ -12,7 +12,7 @@ import pytest
 from master.record.journal import Journal, Place
 from master.record.recovery import Reader
 from master.record.rundir import RunFolder
-from tangram_agent.checkpoints import list_checkpoints, load_checkpoint, save_checkpoint
+from tangram_core.store.checkpoints import list_checkpoints, load_checkpoint, save_checkpoint
 from tangram_core.store.files import write_whole
 from tests.master.builders import arrival, small_setup
 from tests.master.record.power import Machine, PowerCutError

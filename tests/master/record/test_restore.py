@@ -12,9 +12,9 @@ from master.learn.trainer import Trainer, choose_device
 from master.record.journal import Place, segments
 from master.record.resumable import check_resumable, check_same_task
 from master.record.rundir import Record, RunFolder
-from tangram_agent.checkpoints import list_checkpoints, load_checkpoint, save_checkpoint
 from tangram_core.errors import ConfigError, RunError
 from tangram_core.setup import Setup
+from tangram_core.store.checkpoints import list_checkpoints, load_checkpoint, save_checkpoint
 from tests.agent.agents.pair.pair_scenes import PERCEPTRON, seven
 from tests.agent.builders import PAIR, setup
 from tests.master.builders import (

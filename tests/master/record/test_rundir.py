@@ -12,8 +12,8 @@ import yaml
 
 from master.record.journal import segment_path
 from master.record.rundir import RunFolder
-from tangram_agent.checkpoints import save_checkpoint
 from tangram_core.errors import ConfigError, RunError
+from tangram_core.store.checkpoints import save_checkpoint
 from tangram_core.store.files import write_whole
 
 pytestmark = pytest.mark.fast

@@ -21,9 +21,9 @@ from master.watch.console import (
     status_line,
     status_panel,
 )
-from tangram_agent.messages import OPEN, WORKER_COLUMNS, RunStatus
-from tangram_agent.outcome import duration
+from tangram_core.run.outcome import duration
 from tangram_core.scores import SHOWN, written
+from tangram_core.wire.messages import OPEN, WORKER_COLUMNS, RunStatus
 from tangram_tasks.place import ONE_TOKEN
 from tests.master.builders import screen, text
 

@@ -17,8 +17,8 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from master.watch import health as health_module
 from master.watch.health import Health
-from tangram_agent.messages import WORKER_COLUMNS, RunStatus
 from tangram_core.errors import ConfigError
+from tangram_core.wire.messages import WORKER_COLUMNS, RunStatus
 
 pytestmark = pytest.mark.cluster
 

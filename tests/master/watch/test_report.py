@@ -7,7 +7,7 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from master.watch.result import make_result
-from tangram_core.process import Every
+from tangram_core.run.process import Every
 from tangram_core.spec import Episodes
 from tests.master.builders import FakeHub, arrival, loop, scores, shown, small_setup
 

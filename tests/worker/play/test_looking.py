@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tangram_agent.messages import EpisodeBatch, decode_from_worker
-from tangram_agent.relabelling import learnable
+from tangram_agent.base.relabelling import learnable
 from tangram_core.arrays import Singles
 from tangram_core.errors import ConfigError
 from tangram_core.setup import Setup, make_setup
 from tangram_core.spec import Episodes
 from tangram_core.task import Generators
+from tangram_core.wire.messages import EpisodeBatch, decode_from_worker
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.motion.kinematics import KinematicWorld
 from tangram_sim.sight.lens import Disturbance

@@ -17,12 +17,12 @@ import zmq
 
 from master.hub.hub import Hub
 from master.record.delivery import EpisodesArrived
-from tangram_agent.messages import Go
 from tangram_core.errors import TangramError
-from tangram_core.process import Lifeline
+from tangram_core.run.process import Lifeline
+from tangram_core.run.service import ServiceConfig
 from tangram_core.seeding import episode_generator
-from tangram_core.service import ServiceConfig
 from tangram_core.setup import Setup
+from tangram_core.wire.messages import Go
 from tests.agent.builders import setup
 from tests.sim.builders import sample_poses
 from tests.worker.builders import policy, sent, write_run
@@ -105,7 +105,7 @@ def test_messages_hold_the_episodes_of_this_worker_in_order(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Two groups of 4 fill a message of 6; the rest follows at once, with the same weights."""
-    monkeypatch.setattr("tangram_agent.arrays.MAX_EPISODES", 6)
+    monkeypatch.setattr("tangram_core.wire.arrays.MAX_EPISODES", 6)
     made = greedy_setup()
 
     def script(hub: Hub) -> list[EpisodesArrived]:
@@ -290,7 +290,7 @@ def test_a_process_whose_parent_is_gone_takes_its_leave(tmp_path: Path) -> None:
 
 def test_what_is_too_large_for_a_message_is_split(monkeypatch: pytest.MonkeyPatch) -> None:
     made = greedy_setup()
-    monkeypatch.setattr("tangram_agent.arrays.MAX_EPISODES", 3)
+    monkeypatch.setattr("tangram_core.wire.arrays.MAX_EPISODES", 3)
 
     def script(hub: Hub) -> list[EpisodesArrived]:
         hub.publish(sent(made, 1))

@@ -8,8 +8,8 @@ import pytest
 
 from master.hub.hub import Hub
 from master.record.delivery import Arrival, ScoresArrived
-from tangram_agent.messages import PICTURE_WIDTH
-from tangram_core.service import ServiceConfig
+from tangram_core.run.service import ServiceConfig
+from tangram_core.wire.messages import PICTURE_WIDTH
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.worker.builders import policy, sent, weights
 from tests.worker.talk.conversation import QUICK, collect, open_hub, with_master

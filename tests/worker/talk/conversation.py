@@ -18,7 +18,8 @@ import zmq
 from master.hub.admission import WelcomeInfo
 from master.hub.hub import Hub
 from master.record.delivery import Arrival
-from tangram_agent.messages import (
+from tangram_core.setup import Setup
+from tangram_core.wire.messages import (
     EpisodeBatch,
     Heartbeat,
     Hello,
@@ -27,8 +28,7 @@ from tangram_agent.messages import (
     Welcome,
     decode_from_worker,
 )
-from tangram_agent.schema import Plain
-from tangram_core.setup import Setup
+from tangram_core.wire.schema import Plain
 from tests.agent.builders import with_bound
 from tests.agent.messages import FINGERPRINTS, SPEC
 from tests.master.hub.dealers import Stage

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from master.record.delivery import ScoresArrived
-from tangram_agent.messages import (
+from tangram_core.errors import RunError, TangramError, WireError
+from tangram_core.wire.messages import (
     Ack,
     Alive,
     Go,
@@ -21,7 +22,6 @@ from tangram_agent.messages import (
     WantWeights,
     WeightsMessage,
 )
-from tangram_core.errors import RunError, TangramError, WireError
 from tests.agent.messages import SHAPES, broadcast, episodes, scores, weights, with_header
 from tests.master.hub.dealers import Stage
 from tests.ports import free_ports

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 import zmq
 
-from tangram_agent.messages import Alive, Greet, Hello
 from tangram_core.errors import TangramError
 from tangram_core.wire.addresses import KEEPALIVE
+from tangram_core.wire.messages import Alive, Greet, Hello
 from tests.agent.messages import SHAPES, episodes, weights
 from tests.master.hub.dealers import staged
 from tests.ports import free_ports

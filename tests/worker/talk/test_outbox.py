@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tangram_agent.types import Weights
+from tangram_core.agent import Weights
 from tests.agent.messages import SHAPES
 from worker.talk.outbox import NewestWeights, Outbox
 

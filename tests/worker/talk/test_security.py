@@ -21,7 +21,9 @@ from master.hub.security import Given, Keys, Pair, make_keys, make_pair, read_ke
 from master.loop import Loop
 from master.record.audit import Audit
 from master.record.rundir import RunFolder
-from tangram_agent.messages import (
+from tangram_core.agent import Weights
+from tangram_core.errors import RunError, TangramError
+from tangram_core.wire.messages import (
     PICTURE_WIDTH,
     Greet,
     Heartbeat,
@@ -31,8 +33,6 @@ from tangram_agent.messages import (
     Welcome,
     decode_from_master,
 )
-from tangram_agent.types import Weights
-from tangram_core.errors import RunError, TangramError
 from tangram_lab.benchmarks.trials.intruder import NOBODY, knock
 from tests.agent.builders import random_episodes
 from tests.agent.messages import episodes, hello, weights

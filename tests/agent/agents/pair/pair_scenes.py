@@ -9,7 +9,7 @@ from torch import Tensor
 
 from tangram_agent.agents.pair.coverage import Lying, newly_covered
 from tangram_agent.agents.pair.pairs import PairGraph, Pairs
-from tangram_agent.types import Transitions
+from tangram_agent.base.types import Transitions
 from tangram_core.arrays import Bools, Floats
 from tangram_core.setup import Setup
 from tangram_sim.geometry.layout import Layout

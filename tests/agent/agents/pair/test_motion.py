@@ -8,9 +8,9 @@ import torch
 
 from tangram_agent.agents.pair.learner import screens_motions
 from tangram_agent.agents.pair.motion import Fit, MotionModel, Motions, features, motions_of
-from tangram_agent.base.weights import load_arrays, to_arrays
-from tangram_agent.replay import ReplayBuffer
-from tangram_agent.types import Transitions
+from tangram_agent.base.replay import ReplayBuffer
+from tangram_agent.base.types import Transitions
+from tangram_agent.nets.weights import load_arrays, to_arrays
 from tangram_core.errors import ConfigError, RunError
 from tangram_tasks.played import Past
 from tests.agent.agents.pair.pair_scenes import SEVEN

@@ -11,7 +11,7 @@ import torch
 from tangram_agent.agents.pair.batch import PairBatch, make_pairs
 from tangram_agent.agents.pair.learner import PairLearner
 from tangram_agent.agents.pair.pairs import Pairs
-from tangram_agent.types import Transitions
+from tangram_agent.base.types import Transitions
 from tangram_core.setup import Setup
 from tangram_sim.batch import BatchedEnv
 from tests.agent.agents.pair.pair_scenes import PERCEPTRON, TWO, seven, transitions

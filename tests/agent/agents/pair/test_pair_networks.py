@@ -8,7 +8,7 @@ import torch
 
 from tangram_agent.agents.pair.networks import Networks
 from tangram_agent.agents.pair.pairs import Pairs
-from tangram_agent.base.networks import initialise
+from tangram_agent.nets.networks import initialise
 from tests.agent.agents.pair.pair_scenes import (
     PERCEPTRON,
     as_tensor,

@@ -8,7 +8,7 @@ import pytest
 
 from tangram_agent.agents.pair.batch import PairBatch, make_pairs
 from tangram_agent.agents.pair.coverage import Lying, covered_share, covering, newly_covered
-from tangram_agent.types import Transitions
+from tangram_agent.base.types import Transitions
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.motion.actions import chosen_tokens
 from tests.agent.agents.pair.pair_scenes import seven, transitions

@@ -13,7 +13,7 @@ from tangram_agent.agents.pair.coverage import covered_share, covering, worths
 from tangram_agent.agents.pair.networks import Networks
 from tangram_agent.agents.pair.pairs import PairGraph, Pairs
 from tangram_agent.agents.pair.planning import Planner
-from tangram_agent.base.networks import initialise
+from tangram_agent.nets.networks import initialise
 from tangram_core.setup import Setup
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.motion.actions import velocities_of

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from tangram_core.process import FORMATS
+from tangram_core.run.process import FORMATS
 from tangram_core.settings import Settings, setting
 from tangram_core.wire.addresses import LOCAL, check_host
 

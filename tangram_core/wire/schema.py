@@ -20,8 +20,8 @@ from typing import Any, ClassVar, Self, TypeVar, get_args, get_type_hints
 
 import msgpack
 
-from tangram_agent.arrays import Column, decode_columns, encode_columns
 from tangram_core.errors import WireError
+from tangram_core.wire.arrays import Column, decode_columns, encode_columns
 
 PROTOCOL = 8
 MAX_HEADER = 16 * 1024

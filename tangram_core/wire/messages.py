@@ -13,7 +13,11 @@ from typing import Annotated, Any, ClassVar, Self, cast
 
 import numpy as np
 
-from tangram_agent.arrays import (
+from tangram_core.agent import Weights
+from tangram_core.arrays import Floats, Pixels
+from tangram_core.errors import WireError
+from tangram_core.spec import Episodes, EpisodeSpec
+from tangram_core.wire.arrays import (
     MAX_EPISODES,
     Column,
     WeightShapes,
@@ -23,7 +27,7 @@ from tangram_agent.arrays import (
     most_episodes,
     split_frames,
 )
-from tangram_agent.schema import (
+from tangram_core.wire.schema import (
     MAX_COUNT,
     MAX_NUMBER,
     MAX_TEXT,
@@ -41,10 +45,6 @@ from tangram_agent.schema import (
     read,
     received,
 )
-from tangram_agent.types import Weights
-from tangram_core.arrays import Floats, Pixels
-from tangram_core.errors import WireError
-from tangram_core.spec import Episodes, EpisodeSpec
 
 ROLES = ("player", "evaluator")
 MAX_ID = 64

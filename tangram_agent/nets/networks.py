@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from tangram_agent.base.attention import GraphEncoder
 from tangram_agent.base.config import NetConfig
-from tangram_agent.base.graph import Graph
+from tangram_agent.nets.attention import GraphEncoder
+from tangram_agent.nets.graph import Graph
 
 VELOCITY = 3
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from tangram_agent.base.config import RelabelConfig
-from tangram_agent.types import Transitions
+from tangram_agent.base.types import Transitions
 from tangram_core.arrays import Floats, Singles
 from tangram_core.spec import Episodes
 from tangram_sim.geometry.layout import Layout

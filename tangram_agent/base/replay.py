@@ -3,7 +3,7 @@
 import numpy as np
 import numpy.typing as npt
 
-from tangram_agent.types import Transitions
+from tangram_agent.base.types import Transitions
 from tangram_core.arrays import Ints, Singles
 from tangram_core.errors import RunError
 from tangram_tasks.played import Past

@@ -62,16 +62,3 @@ class Transitions:
     def count(self) -> int:
         """B."""
         return len(self.state)
-
-
-@dataclass(frozen=True, eq=False)
-class Weights:
-    """The weights that workers play with.
-
-    Attributes:
-        version: number of the broadcast, rising within an epoch.
-        tensors: name -> float32 array of the acting network, or of what of it travels.
-    """
-
-    version: int
-    tensors: dict[str, Singles]

@@ -22,9 +22,9 @@ import numpy as np
 import numpy.typing as npt
 import safetensors.numpy
 
-from tangram_agent.arrays import load_tensors
 from tangram_core.errors import RunError, WireError
 from tangram_core.store.files import make_folders, sync_folder
+from tangram_core.wire.arrays import load_tensors
 
 FORMAT_VERSION = 3
 MANIFEST = "manifest.json"
