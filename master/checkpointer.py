@@ -259,8 +259,8 @@ def restore_run(folder: Path, trainer: Trainer) -> Restored | None:
 def warm_start(run_dir: Path, trainer: Trainer) -> None:
     """Give the trainer the networks of another run, with fresh optimisers and an empty replay.
 
-    The other run may have had other tokens, where the networks do not depend on them (net=mha), and
-    another world: what a command comes to is learned anew.
+    The other run may have had another task, where its networks are of the same shapes; what an
+    agent learned of its world it may learn anew.
 
     Raises:
         RunError: there is no whole checkpoint, or its networks have other shapes.

@@ -84,8 +84,8 @@ def _add(config: KeysConfig, folder: RunFolder, keys: Keys, name: str) -> list[s
         )
     if out.exists():
         old = _content(out, {}).get("keys")
-        pairs = old.values() if isinstance(old, dict) else []
-        publics = {str(pair.get("public")) for pair in pairs if isinstance(pair, dict)}
+        given = old.values() if isinstance(old, dict) else []
+        publics = {str(one.get("public")) for one in given if isinstance(one, dict)}
         former = publics and not holders(keys).keys() & publics
         remedy = "delete it (its key is none of this run any more), or " if former else ""
         raise ConfigError(f"out={out} is there already: {remedy}name another file with out=")

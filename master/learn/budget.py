@@ -34,12 +34,12 @@ class Budget:
     @property
     def share(self) -> float:
         """The largest used share, in [0, 1]; 0 where nothing is bounded."""
-        pairs = (
+        spent = (
             (self._record.loop_s, self.max_seconds),
             (self._trainer.episodes, self.max_episodes),
             (self._trainer.updates, self.max_updates),
         )
-        return min(max((used / bound for used, bound in pairs if bound), default=0.0), 1.0)
+        return min(max((used / bound for used, bound in spent if bound), default=0.0), 1.0)
 
     def takes_episodes(self) -> bool:
         """Whether more episodes may enter the replay."""

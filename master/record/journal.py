@@ -224,7 +224,7 @@ class Journal:
         """Append a record; JournalError if it does not fit, and what was written is taken back."""
         left = memoryview(record)
         try:
-            while left:  # a disk that fills up takes a part of it
+            while left:  # a disk that is nearly full takes a part of it
                 left = left[file.write(left) or 0 :]
         except OSError as error:
             self._take_back(file)

@@ -22,8 +22,8 @@ def check_resumable(folder: RunFolder, resolved: Mapping[str, Any]) -> None:
     """Refuse another task, or a warm start from nowhere, before anything is overwritten.
 
     Raises:
-        RunError: the newest checkpoint was made with other tokens, sim, reward or net, or by an
-            agent whose networks mean something else, or there is none, and the journal was, or the
+        RunError: the newest checkpoint was made of another task or networks, or by an agent whose
+            networks mean something else, or there is none, and the journal was, or the
             run that this one is to begin with has none.
     """
     found = list_checkpoints(folder.checkpoints)

@@ -26,7 +26,7 @@ from tangram_core.errors import RunError, WireError
 from tangram_core.store.files import make_folders, sync_folder
 from tangram_core.wire.arrays import load_tensors
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 MANIFEST = "manifest.json"
 CHECKPOINTS = "checkpoints"  # the folder of all of them in that of a run
 ACTING = "weights"  # the file of acting weights
