@@ -12,10 +12,9 @@ from typing import Any
 import yaml
 
 from tangram_core.errors import ConfigError
-from tangram_core.registry import KIND, OURS, find_agent, find_task
+from tangram_core.registry import AGENT, KIND, OURS, TASK, find_agent, find_task
 from tangram_core.run.service import ServiceConfig
 from tangram_core.settings import Settings
-from tangram_core.setup import AGENT, TASK
 
 Sections = dict[str, type[Settings] | None]
 MAX_STEPS = 16  # from a preset to the one that it goes out from

@@ -6,13 +6,16 @@ Another package announces its own as entry points of the groups `tangram_rl.task
 
 from importlib import import_module
 from importlib.metadata import entry_points
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from tangram_core.agent import Agent
 from tangram_core.errors import ConfigError
-from tangram_core.task import Task
+
+if TYPE_CHECKING:  # a command line that is wrong need not wait for numpy
+    from tangram_core.agent import Agent
+    from tangram_core.task import Task
 
 Role = Literal["task", "agent"]
+TASK, AGENT = "task", "agent"  # the sections that every run has
 KIND = "kind"  # the setting that names it, in the section of its role
 OURS: dict[Role, dict[str, str]] = {
     "task": {
@@ -27,17 +30,21 @@ OURS: dict[Role, dict[str, str]] = {
 }
 
 
-def find_task(kind: str) -> type[Task]:
+def find_task(kind: str) -> "type[Task]":
     """The class of a task.
 
     Raises:
         ConfigError: there is none of this name, or it is no task.
     """
+    from tangram_core.task import Task  # noqa: PLC0415
+
     return _found("task", kind, Task)
 
 
-def find_agent(kind: str) -> type[Agent]:
+def find_agent(kind: str) -> "type[Agent]":
     """The class of an agent; errors as for `find_task`."""
+    from tangram_core.agent import Agent  # noqa: PLC0415
+
     return _found("agent", kind, Agent)
 
 

@@ -10,13 +10,12 @@ import dacite
 
 from tangram_core.agent import Agent
 from tangram_core.errors import ConfigError
-from tangram_core.registry import KIND, find_agent, find_task
+from tangram_core.registry import AGENT, KIND, TASK, find_agent, find_task
 from tangram_core.settings import KEY, NETWORK, Settings, declared_fields
 from tangram_core.spec import EpisodeSpec
 from tangram_core.task import Task
 
 Made = TypeVar("Made")
-TASK, AGENT = "task", "agent"  # the sections that every run has
 
 
 @dataclass(frozen=True)

@@ -18,13 +18,13 @@ pytestmark = pytest.mark.fast
 
 ROOT = Path(__file__).parents[1]
 OURS = {"conf", "master", "worker"}
-OURS |= {f"tangram_{name}" for name in ("agent", "core", "game", "sim", "vision")}
+OURS |= {f"tangram_{name}" for name in ("agent", "core", "game", "sim", "tasks", "vision")}
 DOCKER = ROOT / "docker"
 COMPOSE: dict[str, Any] = yaml.safe_load((DOCKER / "docker-compose.yml").read_text())
 # Neither plays nor learns: the gymnasium environment, and the figures of reports.
 LEFT_OUT = {"gymnasium", "matplotlib", "pandas"}
 DISTRIBUTIONS = cache(packages_distributions)  # of all that is installed: a second
-EXTRAS = {"av", "PIL"}  # of films and pictures, which no container makes
+EXTRAS = {"av"}  # of films, which no container makes
 
 
 def requirements(name: str) -> set[str]:
@@ -68,7 +68,7 @@ def test_images_have_all_that_the_project_needs_and_nothing_else() -> None:
 def test_what_an_image_imports_is_in_it(image: str, more: list[str]) -> None:
     """Of tangram_sim each image has what it uses: the tests of the house look at that."""
     distributions, lacking = DISTRIBUTIONS(), set()
-    packages = (image, "tangram_agent", "tangram_core", *more)
+    packages = (image, "tangram_agent", "tangram_core", "tangram_tasks", *more)
     for path in (path for name in packages for path in (ROOT / name).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
             names = [one.name for one in node.names] if isinstance(node, ast.Import) else []

@@ -29,6 +29,7 @@ OURS = (
     "tangram_lab",
     "tangram_sim",
     "tangram_studio",
+    "tangram_tasks",
     "tangram_vision",
 )
 PACKAGES = ("conf", "master", "worker", *OURS)
@@ -110,8 +111,6 @@ def test_every_package_is_installed() -> None:
 
 
 # Folders
-
-GROWN = {"tangram_agent"}  # it is being taken apart
 
 
 def test_a_folder_has_at_most_twelve_files_and_says_what_is_in_it() -> None:

@@ -42,7 +42,7 @@ def test_master_and_registration_never_load_the_engine() -> None:
 
 def test_the_launcher_needs_no_torch() -> None:
     """It would start the master two seconds later, and hold 200 MB for as long as that trains."""
-    needs = "master.launch, tangram_agent.setup, tangram_sim.rewards, tangram_sim.world.world"
+    needs = "master.launch, tangram_agent.agents.pair.agent, tangram_agent.agents.outline.agent"
     assert run_python(f"import sys, {needs}\nprint('torch' in sys.modules)") == "False"
 
 
@@ -70,9 +70,11 @@ def test_learning_needs_no_compiler() -> None:
     """Its import would take the master more than a second and 70 MB."""
     told = run_python(
         "import sys\n"
-        "from tangram_agent.learner import Learner\n"
+        "import numpy as np\n"
         "from tests.agent.builders import SCENE, random_transitions, setup\n"
-        "Learner(setup(agent=SCENE), 0).update(random_transitions(setup(), 4), 0.0)\n"
+        "made = setup(agent=SCENE)\n"
+        "own = made.agent.learner(made.task, 0)\n"
+        "own.learn(own.steps(random_transitions(made, 4), np.random.default_rng(0)))\n"
         "print('torch._dynamo' in sys.modules)"
     )
     assert told == "False"

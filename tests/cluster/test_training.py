@@ -39,7 +39,7 @@ def test_a_short_training_learns_position_and_angle_and_leaves_a_whole_run(train
     assert result.items() >= (facts | {"tokens": ["square"]}).items()
 
     config = yaml.safe_load((trained / "config.yaml").read_text())
-    assert make_setup(config).layout.tokens == 1
+    assert make_setup(config).task.layout.tokens == 1
     checkpoint = load_checkpoint(list_checkpoints(trained / "checkpoints")[-1])
     assert checkpoint.updates == UPDATES
     assert set(checkpoint.arrays) == {"weights", "learner", "replay"}

@@ -146,7 +146,7 @@ def test_every_harm_to_a_file_is_found(tmp_path: Path, file: str, harm: str) -> 
 @pytest.mark.parametrize(
     ("change", "kind", "reason"),
     [
-        ({"format_version": 2}, RunError, "has format 2, this version reads 3: use the version"),
+        ({"format_version": 2}, RunError, "has format 2, this version reads 4: use the version"),
         ({"format_version": None}, CorruptError, "manifest.json has no format_version"),
         ({"updates": 6}, CorruptError, "checksum of manifest.json differs"),
         ({"counters": {}}, CorruptError, "checksum of manifest.json differs"),
@@ -167,7 +167,7 @@ def test_a_changed_manifest_is_refused_and_another_format_is_not_taken_for_corru
 def seal(path: Path, body: dict[str, object]) -> None:
     """Write a manifest whose checksum holds."""
     told = hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()
-    (path / "manifest.json").write_text(json.dumps({"format_version": 3, "sha256": told, **body}))
+    (path / "manifest.json").write_text(json.dumps({"format_version": 4, "sha256": told, **body}))
 
 
 @pytest.mark.parametrize(
