@@ -81,7 +81,7 @@ def _checked(settings: Plain, *, plays: bool) -> "tuple[MasterConfig, Setup]":
     setup = make_setup(settings)
     rest = {name: value for name, value in settings.items() if name not in setup.sections}
     config = from_mapping(MasterConfig, rest)
-    setup.agent.check_training()
+    setup.agent.check_training(compiled=config.service.compile)
     given, setup = setup.sections, replace(setup, task=setup.task.pinned())
     setup.task.check(plays=plays)
     check_batch_size(setup.spec)

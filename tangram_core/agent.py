@@ -228,8 +228,8 @@ class Agent(ABC):
             ConfigError: it cannot do it so.
         """
 
-    def check_training(self) -> None:  # noqa: B027
-        """Refuse settings that are for playing a finished run alone.
+    def check_training(self, *, compiled: bool = False) -> None:  # noqa: B027
+        """Refuse settings that are for playing a finished run alone, or to compile what cannot be.
 
         Raises:
             ConfigError: names the setting.

@@ -39,8 +39,10 @@ class Outline(Agent):
             refuse_ignored("net.kind=mlp", "outlines", "set net.kind=mha")
         check_capacity(task, self.config.replay_capacity)
 
-    def check_training(self) -> None:
-        """Refuse what is for play alone."""
+    def check_training(self, *, compiled: bool = False) -> None:
+        """Refuse what is for play alone, and to compile."""
+        if compiled:
+            refuse_ignored("service.compile=true", "agent.kind=outline", "leave it out", False)
         if self.config.beam > 1:
             raise ConfigError(
                 f"agent.beam={self.config.beam} is for play, an evaluator would be silent "
@@ -60,7 +62,7 @@ class Outline(Agent):
         from tangram_agent.agents.outline.learner import FillLearner  # noqa: PLC0415
 
         if compiled:
-            refuse_ignored("service.compile=true", "agent.kind=outline", "leave it out", False)
+            self.check_training(compiled=True)
         return FillLearner(cast("Fill", task), self.config, self.net, seed, device)
 
     def facts(self) -> Json:

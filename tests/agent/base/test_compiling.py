@@ -19,8 +19,8 @@ from tangram_core.errors import ConfigError, RunError
 from tangram_core.run.process import Watchdog
 from tangram_core.run.service import ServiceConfig
 from tests.agent.agents.outline.outlines import outline_setup
+from tests.agent.base.test_ddpg import CASES, changed, copied, play
 from tests.agent.builders import PAPER, learner_of, setup
-from tests.agent.test_learner import CASES, changed, copied, play
 
 # Agents whose updates differ in their parts: bootstrapping, several tokens, pairs.
 FEW = {"kind": "mlp", "hidden": [4]}  # what is traced soon
@@ -201,6 +201,8 @@ def test_a_run_stays_with_what_it_began_with(began: bool) -> None:
 def test_what_cannot_be_compiled_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     wanted = ServiceConfig(compile=True)
     check_compiling(ServiceConfig())
+    with pytest.raises(ConfigError, match="compile=true changes nothing with agent.kind=outline"):
+        outline_setup().agent.check_training(compiled=True)  # before there is a folder of the run
     with pytest.raises(ConfigError, match="compile=true changes nothing with agent.kind=outline"):
         learner_of(outline_setup(), compiled=True)
     monkeypatch.setenv("CXX", "no-such-compiler")

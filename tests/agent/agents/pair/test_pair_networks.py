@@ -1,5 +1,6 @@
 """Actor and critic of pairs: what turning and mirroring a scene does to them."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +18,7 @@ from tests.agent.agents.pair.pair_scenes import (
     random_scene,
     seven,
 )
-from tests.agent.builders import SMALL
+from tests.agent.builders import SMALL, setup
 
 pytestmark = pytest.mark.fast
 
@@ -109,3 +110,14 @@ def test_the_critic_knows_how_much_is_covered_and_which_side_it_is(kind: str) ->
     changed = (value - flipped).abs() > 0.0
     # Only a parallelogram has two sides.
     assert changed.tolist() == (pairs.piece == PARALLELOGRAM).tolist()
+
+
+def test_a_turn_of_pairs_is_atan2_over_k() -> None:
+    layout = setup().task.layout
+    made = Networks(layout, 2.0, setup().agent.net, motion=False)
+    pairs = random_pairs(layout, 0)
+    velocity, raw = made.actor(pairs)
+    outputs = made.actor.head(pairs)
+    assert torch.equal(raw, outputs[:, :2])  # the turn has no bound to run into
+    expected = torch.atan2(outputs[:, 3], outputs[:, 2]) / 4 / math.pi
+    torch.testing.assert_close(velocity[:, 2], expected)

@@ -31,7 +31,7 @@ from tests.agent.builders import (
 
 pytestmark = pytest.mark.fast
 
-GOLDEN = Path(__file__).parents[1] / "golden"
+GOLDEN = Path(__file__).parents[2] / "golden"
 TARGETS = ("target_actor", "target_critic")
 MLP = {"kind": "mlp"}
 NEAR = {"strategy": "near", "position": 0.1, "angle": 0.5}
@@ -357,7 +357,7 @@ ROUNDING = float(np.finfo(np.float32).eps)
 
 @pytest.mark.parametrize("case", CASES)
 def test_golden_values_of_two_updates(case: tuple[str, str]) -> None:
-    """Rewrite them with `python -m tests.agent.test_learner` when a change is meant."""
+    """Rewrite them with `python -m tests.agent.base.test_ddpg` when a change is meant."""
     expected = json.loads((GOLDEN / f"{case[0]}.json").read_text())[case[1]]
     near = pytest.approx(expected, rel=2 * 64 * 64 * ROUNDING, abs=64 * ROUNDING)
     assert golden(CASES[case]()) == near

@@ -1,6 +1,5 @@
 """Sizes of Table I, symmetries, and the ranges of what actors give."""
 
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -8,12 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from tangram_agent.agents.pair.networks import Networks
 from tangram_agent.agents.scene.networks import ActorNet, CriticNet
 from tangram_agent.agents.scene.scenes import SceneGraph, Scenes
 from tangram_agent.nets.networks import initialise, parameter_count
 from tangram_core.setup import Setup
-from tests.agent.agents.pair.pair_scenes import random_pairs
 from tests.agent.builders import PAIR, PAPER, SMALL, random_transitions, setup
 
 pytestmark = pytest.mark.fast
@@ -85,17 +82,6 @@ def test_actions_of_scenes_stay_in_range(kind: str) -> None:
     assert raw.abs().max() > 1.0
     assert 0.9 < velocity.abs().max() <= 1.0
     torch.testing.assert_close(velocity, torch.tanh(raw))
-
-
-def test_a_turn_of_pairs_is_atan2_over_k() -> None:
-    layout = setup().task.layout
-    made = Networks(layout, 2.0, setup().agent.net, motion=False)
-    pairs = random_pairs(layout, 0)
-    velocity, raw = made.actor(pairs)
-    outputs = made.actor.head(pairs)
-    assert torch.equal(raw, outputs[:, :2])  # the turn has no bound to run into
-    expected = torch.atan2(outputs[:, 3], outputs[:, 2]) / 4 / math.pi
-    torch.testing.assert_close(velocity[:, 2], expected)
 
 
 def test_the_critic_appends_the_action_to_the_base_of_its_token() -> None:

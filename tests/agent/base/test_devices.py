@@ -17,8 +17,8 @@ from tests.agent.agents.outline.outlines import outline_setup
 from tests.agent.agents.outline.test_filling_learning import episode
 from tests.agent.agents.pair.pair_scenes import transitions
 from tests.agent.agents.pair.test_motion import commands, seen
+from tests.agent.base.test_ddpg import CASES
 from tests.agent.builders import learner_of, random_transitions
-from tests.agent.test_learner import CASES
 
 META = "meta"
 REFUSED = (NotImplementedError, RuntimeError)
