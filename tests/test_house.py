@@ -60,7 +60,7 @@ def lint_imports(folder: Path) -> subprocess.CompletedProcess[str]:
 
 def test_import_contracts_catch_every_wrong_arrow(tmp_path: Path) -> None:
     for name in PACKAGES:
-        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("*.pyc"))
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
     wrong = {
         "tangram_sim/wrong.py": "import torch, pybullet, cv2, zmq, omegaconf",
@@ -116,7 +116,7 @@ def test_every_package_is_installed() -> None:
 def test_a_folder_has_at_most_twelve_files_and_says_what_is_in_it() -> None:
     for folder in {path.parent for name in PACKAGES for path in (ROOT / name).rglob("*.py")}:
         place = str(folder.relative_to(ROOT))
-        assert place in GROWN or len(list(folder.glob("*.py"))) <= 12, place
+        assert len(list(folder.glob("*.py"))) <= 12, place
         told = ast.get_docstring(ast.parse((folder / "__init__.py").read_text()))
         assert told is not None, place
         assert len(told.splitlines()) <= 10, place
