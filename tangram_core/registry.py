@@ -21,11 +21,13 @@ OURS: dict[Role, dict[str, str]] = {
     "task": {
         "place": "tangram_tasks.place:Place",
         "fill": "tangram_tasks.fill:Fill",
+        "gym": "tangram_tasks.gym.task:Gym",
     },
     "agent": {
         "scene": "tangram_agent.agents.scene.agent:Scene",
         "pair": "tangram_agent.agents.pair.agent:Pair",
         "outline": "tangram_agent.agents.outline.agent:Outline",
+        "goal": "tangram_agent.agents.goal.agent:Goal",
     },
 }
 

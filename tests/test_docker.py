@@ -63,10 +63,11 @@ def test_images_have_all_that_the_project_needs_and_nothing_else() -> None:
 
 
 @pytest.mark.parametrize(
-    ("image", "more"), [("master", []), ("worker", ["tangram_game", "tangram_tasks", "tangram_vision"])]
+    ("image", "more"),
+    [("master", []), ("worker", ["tangram_game", "tangram_tasks", "tangram_vision"])],
 )
 def test_what_an_image_imports_is_in_it(image: str, more: list[str]) -> None:
-    """Of tangram_sim, and the master of tasks, each image has what it uses: the tests of the house look at that."""
+    """Of tangram_sim each image has what it uses: the tests of the house look at that."""
     distributions, lacking = DISTRIBUTIONS(), set()
     packages = (image, "tangram_agent", "tangram_core", *more)
     for path in (path for name in packages for path in (ROOT / name).rglob("*.py")):
