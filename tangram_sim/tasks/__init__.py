@@ -1,0 +1,1 @@
+"""Tasks that agents learn, one folder each."""

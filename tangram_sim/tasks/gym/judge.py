@@ -1,0 +1,213 @@
+"""One environment: what its episodes are made of, what steps are worth, what cannot be learned.
+
+Legend: n rows, G entries of a goal, A entries of an action.
+"""
+
+import importlib
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, NoReturn
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from tangram_core.spec import MAX_REWARD, Array, EpisodeSpec, Field
+from tangram_sim.arrays import Bools, Floats, Singles
+from tangram_sim.errors import ConfigError
+from tangram_sim.tasks.gym.task import SUCCESS, GymConfig
+
+OBSERVATION, ACHIEVED, DESIRED = "observation", "achieved_goal", "desired_goal"
+MOST = 1e6  # of a number that is observed: only what is wrong lies beyond
+TRIED = 10  # random steps by which an environment is looked at
+Environment = gymnasium.Env[Any, Any]
+
+
+class Judge:
+    """Makes environments of one kind, and judges steps by one of them.
+
+    Attributes:
+        spec: what the episodes are made of.
+        low, high: (A,) bounds of the environment's own actions.
+    """
+
+    def __init__(self, config: GymConfig) -> None:
+        """Make one and look at it.
+
+        Raises:
+            ConfigError: it cannot be made, or cannot be learned; names the remedy.
+        """
+        self._config = config
+        self._horizon = self._registered()
+        self.env = self.make()
+        sizes = {name: self._box(name).shape[0] for name in (OBSERVATION, ACHIEVED, DESIRED)}
+        if sizes[ACHIEVED] != sizes[DESIRED]:
+            self._refuse("its achieved and desired goals differ in size")
+        self.low, self.high = self._action_bounds()
+        self._compute: Callable[..., Any] = self._method("compute_reward")
+        rewards = self._look()
+        self.spec = EpisodeSpec(
+            horizon=self._horizon,
+            action_size=len(self.low),
+            fields=tuple(
+                Field(name, (size,), -MOST, MOST, "episode" if name == DESIRED else "moment")
+                for name, size in sizes.items()
+            ),
+            achieved=ACHIEVED,
+            desired=DESIRED,
+            rewards=(-1.0, 0.0) if set(rewards) <= {-1.0, 0.0} else (-MAX_REWARD, MAX_REWARD),
+        )
+
+    def make(self) -> Environment:
+        """A new environment, without its time limit."""
+        try:
+            with _quiet():
+                return gymnasium.make(
+                    self._config.id, max_episode_steps=-1, disable_env_checker=True
+                )
+        except Exception as error:  # whatever the environment's own code raises
+            why = f"{type(error).__name__}: {error}".strip().splitlines()[0]
+            raise ConfigError(
+                f"task.id={self._config.id} cannot be made ({why}): install what it needs, for "
+                "Fetch and Panda: pip install 'tangram-rl[robotics]'"
+            ) from error
+
+    def scaled(self, actions: Singles) -> Singles:
+        """Actions of the environment (B, A), from those of [-1, 1]."""
+        scaled: Singles = self.low + (actions + 1.0) * 0.5 * (self.high - self.low)
+        return scaled
+
+    def rewards(self, achieved: Array, desired: Array) -> Floats:
+        """(n,) of goals (n, G)."""
+        return np.asarray(self._compute(achieved, desired, {}), np.float64)
+
+    def ended(self, achieved: Array, desired: Array) -> Bools:
+        """(n,) whether steps that came to goals (n, G) terminate for others.
+
+        By `compute_terminated`, as gymnasium-robotics has it. What has none is taken to end where
+        its reward is that of a goal that is reached, as Panda's do: `GymEnv` checks it.
+        """
+        if not self._config.ends:
+            return np.zeros(len(achieved), bool)
+        if self._ends is None:
+            reached: Bools = self.rewards(achieved, desired) == self._best
+            return reached
+        rows = zip(achieved, desired, strict=True)
+        return np.fromiter((self._ends(*row, {}) for row in rows), bool, len(achieved))
+
+    def _registered(self) -> int:
+        """Steps of an episode."""
+        config = self._config
+        if not config.id:
+            raise ConfigError("task.id must name an environment, got '': set task.id=FetchReach-v4")
+        for module in config.imports:
+            try:
+                with _quiet():
+                    importlib.import_module(module)
+            except ImportError as error:
+                raise ConfigError(
+                    f"task.imports: cannot import {module} ({error}): install its package, for "
+                    "gymnasium_robotics and panda_gym: pip install 'tangram-rl[robotics]'"
+                ) from error
+        try:
+            horizon = gymnasium.spec(config.id).max_episode_steps
+        except gymnasium.error.Error as error:
+            raise ConfigError(
+                f"task.id={config.id} is not registered: mend it, or add the module that registers "
+                "it to task.imports, such as panda_gym"
+            ) from error
+        if not horizon:
+            self._refuse("it has no time limit: register it with max_episode_steps")
+        return horizon
+
+    def _box(self, name: str) -> spaces.Box:
+        """The space of a part of what is observed."""
+        space = self.env.observation_space
+        part = space.get(name) if isinstance(space, spaces.Dict) else None
+        if part is None:
+            self._refuse(f"what it observes is no dict with {name}: it is no goal environment")
+        if not isinstance(part, spaces.Box) or len(part.shape) != 1 or part.dtype == np.uint8:
+            self._refuse(f"its {name} is {part}, and must be a list of numbers; pictures are none")
+        return part
+
+    def _action_bounds(self) -> tuple[Singles, Singles]:
+        space = self.env.action_space
+        if not isinstance(space, spaces.Box) or len(space.shape) != 1 or not space.is_bounded():
+            self._refuse(f"its actions are {space}, and must be a bounded list of numbers")
+        return space.low.astype(np.float32), space.high.astype(np.float32)
+
+    def _method(self, name: str) -> Any:
+        """A method of the environment, or of a wrapper that it was registered with."""
+        if not self.env.has_wrapper_attr(name):
+            self._refuse(f"it has no {name}: it is no goal environment")
+        return self.env.get_wrapper_attr(name)
+
+    def _look(self) -> Floats:
+        """Play a few random steps, and compare what they pay with what is computed of the goals."""
+        rng = np.random.default_rng(0)
+        seen, _ = self.env.reset(seed=0)
+        achieved, desired, paid = [seen[ACHIEVED]], seen[DESIRED], []
+        for _ in range(TRIED):
+            action = self.scaled(rng.uniform(-1, 1, len(self.low)).astype(np.float32))
+            seen, reward, _, _, info = self.env.step(action)
+            if succeeded(info) is None:
+                self._refuse(f"its info lacks {SUCCESS}, which its score is made of")
+            achieved.append(seen[ACHIEVED])
+            paid.append(float(reward))
+        A = np.concatenate([achieved, achieved, [desired]])
+        D = np.concatenate([[desired] * len(achieved), achieved[::-1], [desired]])
+        found = self._whole(A, D)
+        if not np.allclose(found[1 : len(achieved)], paid, rtol=1e-4, atol=1e-6):
+            self._refuse("its steps do not pay what compute_reward says of the goals alone")
+        self._ends = None
+        self._best = float(found[-1])
+        if self.env.has_wrapper_attr("compute_terminated"):
+            self._ends = self.env.get_wrapper_attr("compute_terminated")
+        return found
+
+    def _whole(self, achieved: Array, desired: Array) -> Floats:
+        """(n,) rewards of arrays, which must be those of each row."""
+        try:
+            found = self.rewards(achieved, desired)
+        except Exception as error:  # noqa: BLE001
+            found, why = np.zeros(0), f" ({type(error).__name__}: {error})".splitlines()[0]
+        else:
+            why = ""
+        rows = zip(achieved, desired, strict=True)
+        single = np.array([float(self._compute(*row, {})) for row in rows])
+        if found.shape != single.shape or not np.allclose(found, single):
+            self._refuse(
+                f"its compute_reward does not take arrays of goals (n, {achieved.shape[1]}) and "
+                f"info={{}}{why}: let it compute along the last axis"
+            )
+        return found
+
+    def _refuse(self, why: str) -> NoReturn:
+        raise ConfigError(f"task.id={self._config.id} cannot be learned: {why}")
+
+
+def succeeded(info: Mapping[str, Any]) -> bool | None:
+    """Whether a step is a success; None: not told. Mazes of gymnasium-robotics say `success`."""
+    found = info.get(SUCCESS, info.get("success"))
+    return None if found is None else bool(found)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Send nowhere what engines written in C tell of themselves: sys.stdout is not asked by it."""
+    try:
+        kept = {number: os.dup(number) for number in (1, 2)}
+    except OSError:  # this process has none
+        yield
+        return
+    null = os.open(os.devnull, os.O_WRONLY)
+    try:
+        for number in kept:
+            os.dup2(null, number)
+        yield
+    finally:
+        for number, old in kept.items():
+            os.dup2(old, number)
+            os.close(old)
+        os.close(null)

@@ -1,0 +1,135 @@
+"""Environments with the goal interface of gymnasium, as a task.
+
+Legend: E episodes, T steps of an episode, n rows, A entries of an action.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from tangram_core.spec import Array, Arrays, EpisodeSpec
+from tangram_core.task import Chooser, Env, Generators, History, Played, Purpose, Score, Task
+from tangram_sim.arrays import Bools, Floats, Singles
+from tangram_sim.errors import ConfigError
+from tangram_sim.settings import Settings, setting
+
+if TYPE_CHECKING:  # the judge loads gymnasium
+    from tangram_sim.tasks.gym.judge import Judge
+
+SUCCESS = "is_success"  # in gymnasium's info, and in the facts of a moment
+
+
+@dataclass(frozen=True)
+class GymConfig(Settings, section="task"):
+    """Which environment of gymnasium is played."""
+
+    id: str = setting("", "the environment's id at gymnasium, such as FetchReach-v4")
+    imports: tuple[str, ...] = setting(
+        (), "modules to import first, which register environments: gymnasium_robotics, panda_gym"
+    )
+    ends: bool = setting(
+        True,
+        "whether a step that terminates ends what counts; false: as if nothing ever terminated",
+    )
+    fresh: bool = setting(
+        False,
+        "make each environment anew for each episode: slow, and exact where an episode depends on "
+        "the one before it, as PandaPush-v3 does",
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if ":" in self.id:  # gymnasium would import what stands before it
+            module, _, name = self.id.partition(":")
+            raise ConfigError(
+                f"task.id must not have a colon, got '{self.id}': "
+                f"set task.imports=[{module}] task.id={name}"
+            )
+
+
+@dataclass(frozen=True)
+class Gym(Task):
+    """An environment whose observation is a dict of observation, achieved_goal and desired_goal.
+
+    Every field is float32 within +-1e6, whatever its space says: PandaPush-v3 says 10 and reaches
+    50. What an action of [-1, 1] does is scaled to the action space. Its `compute_reward` is what a
+    step pays, of goals rounded to float32, so that the master comes to the same reward. The master
+    makes one environment for it, the first time that the spec or a reward is asked for.
+    """
+
+    sections: ClassVar = {"task": GymConfig}
+    scores: ClassVar = (
+        Score("success", "success at the end, share", best=1.0),
+        Score("success_any", "success at any time, share", best=1.0),
+        Score("mean_return", "return", digits=1),
+        Score("steps", "steps to the first success", digits=1),
+    )
+    task: GymConfig = GymConfig()
+
+    @cached_property
+    def judge(self) -> "Judge":
+        """One environment, of which spec and rewards come; made when it is asked for first.
+
+        Raises:
+            ConfigError: it cannot be made, or cannot be learned.
+        """
+        from tangram_sim.tasks.gym.judge import Judge  # noqa: PLC0415
+
+        return Judge(self.task)
+
+    @property
+    def spec(self) -> EpisodeSpec:
+        """What the environment's spaces and its registered time limit say."""
+        return self.judge.spec
+
+    def check(self, *, plays: bool) -> None:  # noqa: ARG002
+        """Refuse what is no environment with goals, or is not installed: the master needs it too.
+
+        Raises:
+            ConfigError: names the setting and the remedy.
+        """
+        self.judge  # noqa: B018
+
+    def rewards(self, achieved: Array, desired: Array) -> Floats:
+        """(n,) what the environment's own `compute_reward` says."""
+        return self.judge.rewards(achieved, desired)
+
+    def ended(self, achieved: Array, desired: Array, recorded: Bools) -> Bools:  # noqa: ARG002
+        """(n,) whether it would terminate, by these goals alone."""
+        return self.judge.ended(achieved, desired)
+
+    def make(self, count: int, purpose: Purpose = "play") -> Env:  # noqa: ARG002
+        """So many environments in this process.
+
+        Raises:
+            ConfigError: they cannot be made.
+        """
+        from tangram_sim.tasks.gym.envs import GymEnv  # noqa: PLC0415
+
+        return GymEnv(self.judge, self.task, count)
+
+    def score(self, played: Played) -> dict[str, float]:
+        """Success where an episode ends: where it terminates first, else at its last step."""
+        terminated = played.episodes.terminated.astype(bool)
+        horizon = terminated.shape[1]
+        success = played.facts[SUCCESS][:, 1:].astype(bool)  # (E, T) after each step
+        last = np.where(terminated.any(1), terminated.argmax(1), horizon - 1)
+        first = np.where(success.any(1), success.argmax(1) + 1, horizon)
+        counts = np.arange(horizon) <= last[:, None]
+        return {
+            "success": float(success[np.arange(len(last)), last].mean()),
+            "success_any": float((success & counts).any(1).mean()),
+            "mean_return": float((played.episodes.rewards * counts).sum(1).mean()),
+            "steps": float(first.mean()),
+        }
+
+    def rivals(self) -> Mapping[str, Callable[[Env], Chooser]]:
+        """Random actions: no rule is known that plays every environment."""
+        return {"random actions": lambda _: self._random}
+
+    def _random(self, seen: Arrays, past: History, generators: Generators) -> Singles:  # noqa: ARG002
+        size = self.spec.action_size
+        return np.stack([one.uniform(-1.0, 1.0, size) for one in generators]).astype(np.float32)
