@@ -1,0 +1,87 @@
+"""The losses of DDPG, TD3 and SAC.
+
+Legend: B transitions, C critics.
+"""
+
+from collections.abc import Iterator
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+
+from tangram_agent.agents.goal.agent import GoalConfig
+from tangram_agent.agents.goal.gaussian import GaussianPolicy, Temperature
+from tangram_agent.base.actor_critic import ActorCritic, Batch, Loss
+from tangram_agent.base.networks import Critics
+
+MOST_SMOOTHED = 0.5  # Fujimoto et al. 2018
+
+
+class GoalLearner(ActorCritic[GoalConfig]):
+    """One of the three, as the settings say.
+
+    Slow copies follow in every update; TD3's paper moves them with the actor alone.
+    """
+
+    draws = 2
+
+    def modules(self) -> dict[str, nn.Module]:
+        """Critics, and what SAC's entropy is worth."""
+        config = self.config
+        count = 1 if config.algorithm == "ddpg" else 2
+        self.critic = Critics(self.size, self.actions, config, count)
+        if config.algorithm == "td3":
+            self.delay = config.actor_delay
+        if config.algorithm != "sac":
+            return {"critic": self.critic}
+        self.temperature = Temperature()
+        return {"critic": self.critic, "temperature": self.temperature}
+
+    def follows(self) -> tuple[str, ...]:
+        """SAC asks the actor itself what comes next."""
+        return ("critic",) if self.config.algorithm == "sac" else ("actor", "critic")
+
+    def losses(self, batch: Batch) -> Iterator[Loss]:
+        """The critics first, then the actor by what they say."""
+        with torch.no_grad():
+            target = self._target(batch)
+        values = self.critic(batch.rows, batch.actions)
+        yield Loss("critic", (values - target).square().mean(1).sum(), {"q": values.mean()})
+        if not batch.acts:
+            return
+        if self.config.algorithm == "sac":
+            yield from self._entropic(batch)
+            return
+        actions = self.actor(batch.rows)
+        value = self.critic(batch.rows, actions)[0].mean()
+        penalty = actions.square().mean()
+        yield Loss("actor", self.config.action_penalty * penalty - value, {"effort": penalty})
+
+    def _target(self, batch: Batch) -> Tensor:
+        """(B,) y = r + gamma (1 - d) min Q'(s', a')."""
+        config, following = self.config, batch.following
+        bonus = batch.rewards.new_zeros(())
+        if config.algorithm == "sac":
+            actions, density = cast("GaussianPolicy", self.actor).drawn(following, batch.normals[0])
+            bonus = self.temperature() * density
+        else:
+            actions = self.slow["actor"](following)
+            if config.algorithm == "td3":
+                noise = config.smoothing * batch.normals[0]
+                actions = actions + noise.clamp(-MOST_SMOOTHED, MOST_SMOOTHED)
+                actions = actions.clamp(-1.0, 1.0)
+        value = self.slow["critic"](following, actions).amin(0) - bonus
+        target = batch.rewards + config.gamma * batch.goes_on * value
+        # Entropy adds to what rewards come to, without a bound that is known.
+        return target if config.algorithm == "sac" else self.bounded(target)
+
+    def _entropic(self, batch: Batch) -> Iterator[Loss]:
+        """SAC's actor, then its temperature (Haarnoja et al. 2018, equations 9 and 18)."""
+        actions, density = cast("GaussianPolicy", self.actor).drawn(batch.rows, batch.normals[1])
+        value = self.critic(batch.rows, actions).amin(0)
+        penalty = actions.square().mean()
+        worth = self.temperature().detach()
+        loss = (worth * density - value).mean() + self.config.action_penalty * penalty
+        yield Loss("actor", loss, {"effort": penalty, "entropy": -density.mean()})
+        lacking = (density.detach().mean() - self.config.entropy * self.actions).detach()
+        yield Loss("temperature", -self.temperature.logarithm * lacking, {"temperature": worth})

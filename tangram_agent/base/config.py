@@ -1,0 +1,65 @@
+"""Settings that every actor-critic has."""
+
+from dataclasses import dataclass
+
+from tangram_sim.errors import ConfigError
+from tangram_sim.settings import LEARNING, NETWORK, Settings, setting
+
+GOALS = ("future", "next", "final")
+
+
+@dataclass(frozen=True)
+class BaseConfig(Settings, section="agent"):
+    """Networks, pace, replay, hindsight and exploration."""
+
+    hidden: tuple[int, ...] = setting(
+        (256, 256, 256), "widths of the hidden layers", low=1, high=65536, part=NETWORK
+    )
+    layer_norm: bool = setting(True, "normalise each hidden layer (Ba et al. 2016)", part=NETWORK)
+    learning_rate: float = setting(
+        5e-4, "Adam's, of all networks", low=1e-9, high=1e3, part=LEARNING
+    )
+    batch_size: int = setting(512, "transitions in one update", low=1, part=LEARNING)
+    updates_per_transition: float = setting(
+        0.1, "updates for each transition played", low=1e-9, high=1e3, part=LEARNING
+    )
+    learning_starts: int = setting(
+        1000, "transitions played before the first update", low=1, part=LEARNING
+    )
+    replay_capacity: int = setting(
+        1_000_000, "transitions kept, in whole episodes", low=1, high=1_000_000_000, part=LEARNING
+    )
+    gamma: float = setting(0.98, "discount", low=0, high=0.99999, part=LEARNING)
+    polyak: float = setting(
+        0.995, "share of a target network that an update keeps", low=0, high=1, part=LEARNING
+    )
+    clip_targets: bool = setting(
+        True, "keep targets within what the task's rewards can add up to", part=LEARNING
+    )
+    goals: tuple[str, ...] = setting(
+        ("future",),
+        "achieved goals that take the desired one's place, each as often: of a later moment of the "
+        "episode, of the next one, of the last one",
+        choices=GOALS,
+        part=LEARNING,
+    )
+    relabel_share: float = setting(
+        0.8, "share of a batch whose goal is another; 0: no hindsight", low=0, high=1, part=LEARNING
+    )
+    noise: float = setting(
+        0.2, "deviation of the Gaussian exploration noise on actions", low=0, part=LEARNING
+    )
+    uniform_share: float = setting(
+        0.3, "share of actions drawn uniformly", low=0, high=1, part=LEARNING
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("hidden", "goals"):
+            if not getattr(self, name):
+                raise ConfigError(f"{self.section}.{name} must name at least one, got []")
+        if self.batch_size > self.replay_capacity:
+            raise ConfigError(
+                f"{self.section}.batch_size ({self.batch_size}) must not exceed "
+                f"{self.section}.replay_capacity ({self.replay_capacity})"
+            )

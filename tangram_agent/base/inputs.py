@@ -1,0 +1,131 @@
+"""A task's fields as normalised rows of numbers, which networks see.
+
+Legend: B rows, E episodes, T steps of an episode, F entries of a row.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from tangram_core.spec import Array, Arrays, Episodes, EpisodeSpec
+from tangram_sim.arrays import Floats, Singles
+from tangram_sim.errors import ConfigError, RunError
+
+FURTHEST = 5.0  # of a normalised entry, in deviations
+LEAST = 1e-2  # of a deviation: below it an entry counts as constant
+
+
+class Inputs:
+    """Which fields make up a row: those of each moment, then those of the episode.
+
+    Attributes:
+        size: F.
+    """
+
+    def __init__(self, spec: EpisodeSpec) -> None:
+        """Take all fields that are observed; `check` those of a task first."""
+        fields = sorted(spec.fields, key=lambda field: field.per == "episode")
+        self._spec, self._fields = spec, [field for field in fields if field.per != "step"]
+        self.size = sum(int(np.prod(field.shape)) for field in self._fields)
+
+    @staticmethod
+    def check(spec: EpisodeSpec) -> None:
+        """Raise ConfigError for a field that is no row of numbers."""
+        for field in spec.fields:
+            if field.dtype != "f4":
+                raise ConfigError(
+                    f"this agent sees numbers, and the task's field {field.name} is {field.dtype}: "
+                    "choose an agent for such fields, or let the task give it as f4"
+                )
+
+    def rows(self, seen: Arrays) -> Singles:
+        """(B, F) of fields with B rows each."""
+        count = len(seen[self._spec.achieved])
+        parts = [seen[field.name].reshape(count, -1) for field in self._fields]
+        return np.concatenate(parts, axis=1, dtype=np.float32)
+
+    def of_episodes(self, episodes: Episodes) -> Singles:
+        """(2 * E * (T + 1), F) of all moments: with the goal that was played for, and their own.
+
+        Hindsight takes one for the other, so statistics count both alike.
+        """
+        moments, spec = episodes.steps + 1, self._spec
+        seen = {
+            field.name: episodes[field.name].reshape(-1, *field.shape)
+            if field.per == "moment"
+            else np.repeat(episodes[field.name], moments, axis=0)
+            for field in self._fields
+        }
+        own = seen | {spec.desired: seen[spec.achieved]}
+        return np.concatenate([self.rows(seen), self.rows(own)])
+
+
+class Normaliser:
+    """Running mean and deviation of each entry (Chan et al. 1979), in double precision.
+
+    Attributes:
+        size: F.
+        mean, scale: (F,) float32, by which rows are normalised: `Actor` gets the same.
+    """
+
+    def __init__(self, size: int) -> None:
+        self.size, self._count = size, 0.0
+        self._mean, self._squares = np.zeros(size), np.zeros(size)
+        self._settle()
+
+    def add(self, rows: Array) -> None:
+        """Take rows (B, F) into account."""
+        count, mean = len(rows), rows.mean(axis=0, dtype=np.float64)
+        squares = np.square(rows - mean).sum(axis=0)
+        whole, apart = self._count + count, mean - self._mean
+        self._squares += squares + apart**2 * (self._count * count / whole)
+        self._mean += apart * (count / whole)
+        self._count = whole
+        self._settle()
+
+    def __call__(self, rows: Singles) -> Singles:
+        """Rows (B, F) of mean 0 and deviation 1, within +-5."""
+        return normalised(rows, self.mean, self.scale)
+
+    def state(self) -> dict[str, Array]:
+        """All of it, for a checkpoint."""
+        return {
+            "count": np.array([self._count]),
+            "mean": self._mean.copy(),
+            "squares": self._squares.copy(),
+        }
+
+    def load_state(self, state: Mapping[str, Array]) -> None:
+        """Take over a state.
+
+        Raises:
+            RunError: it is of another task, or no numbers.
+        """
+        wanted = {"count": (1,), "mean": (self.size,), "squares": (self.size,)}
+        for name, shape in wanted.items():
+            if (
+                name not in state
+                or state[name].shape != shape
+                or not np.isfinite(state[name]).all()
+            ):
+                raise RunError(
+                    f"normaliser state: '{name}' must be {shape} finite numbers: it is of another "
+                    "task, or damaged: take another checkpoint"
+                )
+        self._count = float(state["count"][0])
+        self._mean = np.array(state["mean"], np.float64)
+        self._squares = np.array(state["squares"], np.float64)
+        self._settle()
+
+    def _settle(self) -> None:
+        deviation: Floats = np.sqrt(self._squares / max(self._count, 1.0))
+        if not self._count:
+            deviation = np.ones(self.size)
+        self.mean: Singles = self._mean.astype(np.float32)
+        self.scale: Singles = np.maximum(deviation, LEAST).astype(np.float32)
+
+
+def normalised(rows: Singles, mean: Singles, scale: Singles) -> Singles:
+    """Rows (B, F) as networks see them."""
+    clipped: Singles = np.clip((rows - mean) / scale, -FURTHEST, FURTHEST)
+    return clipped

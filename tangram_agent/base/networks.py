@@ -1,0 +1,55 @@
+"""Perceptrons: policies and critics of rows of numbers.
+
+Legend: B rows, F entries of a row, A entries of an action, C critics.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from tangram_agent.base.config import BaseConfig
+
+
+def perceptron(inputs: int, hidden: tuple[int, ...], outputs: int, norm: bool) -> nn.Sequential:
+    """Linear layers with ReLU between, each normalised before it where `norm` says so."""
+    layers: list[nn.Module] = []
+    for size in hidden:
+        layers += [nn.Linear(inputs, size), *([nn.LayerNorm(size)] if norm else []), nn.ReLU()]
+        inputs = size
+    return nn.Sequential(*layers, nn.Linear(inputs, outputs))
+
+
+class Policy(nn.Module):
+    """Actions of rows, bounded by tanh; Gaussian noise explores.
+
+    Attributes:
+        actions: A.
+    """
+
+    def __init__(self, inputs: int, actions: int, config: BaseConfig) -> None:
+        super().__init__()
+        self.layers = perceptron(inputs, config.hidden, actions, config.layer_norm)
+        self.actions, self._noise = actions, config.noise
+
+    def forward(self, rows: Tensor) -> Tensor:
+        """(B, A) in [-1, 1] of rows (B, F)."""
+        return torch.tanh(self.layers(rows))
+
+    def explore(self, rows: Tensor, normals: Tensor) -> Tensor:
+        """(B, A) in [-1, 1], with what was drawn from a standard normal (B, A)."""
+        actions: Tensor = self(rows) + self._noise * normals
+        return actions.clamp(-1.0, 1.0)
+
+
+class Critics(nn.Module):
+    """Values of rows and actions, by several networks that differ in their first weights."""
+
+    def __init__(self, inputs: int, actions: int, config: BaseConfig, count: int = 2) -> None:
+        super().__init__()
+        self.each = nn.ModuleList(
+            perceptron(inputs + actions, config.hidden, 1, config.layer_norm) for _ in range(count)
+        )
+
+    def forward(self, rows: Tensor, actions: Tensor) -> Tensor:
+        """(C, B)."""
+        both = torch.cat([rows, actions], dim=-1)
+        return torch.stack([one(both).squeeze(-1) for one in self.each])

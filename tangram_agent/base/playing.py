@@ -1,0 +1,71 @@
+"""Who acts in a worker by a policy.
+
+Legend: B environments, F entries of a row, A entries of an action.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+
+from tangram_agent.base.inputs import Inputs, normalised
+from tangram_agent.base.networks import Policy
+from tangram_agent.weights import load_arrays, under
+from tangram_core.agent import Actor
+from tangram_core.spec import Arrays
+from tangram_core.task import Generators, History
+from tangram_sim.arrays import Singles
+from tangram_sim.errors import RunError
+
+MEAN, SCALE, POLICY = "mean", "scale", "policy."
+
+
+class PolicyActor(Actor):
+    """A policy, and the statistics that what it sees is normalised with."""
+
+    def __init__(self, policy: Policy, inputs: Inputs, uniform_share: float) -> None:
+        self._policy, self._inputs, self._uniform = (
+            policy.requires_grad_(False),
+            inputs,
+            uniform_share,
+        )
+        self._mean = np.zeros(inputs.size, np.float32)
+        self._scale = np.ones(inputs.size, np.float32)
+
+    @property
+    def shapes(self) -> Mapping[str, tuple[int, ...]]:
+        """Of the statistics and of the policy's parameters."""
+        size = (self._inputs.size,)
+        own = self._policy.named_parameters()
+        return {MEAN: size, SCALE: size} | {POLICY + name: tuple(p.shape) for name, p in own}
+
+    def load(self, weights: Mapping[str, Singles]) -> None:
+        """Take over what `ActorCritic.broadcast` gives."""
+        for name in (MEAN, SCALE):
+            if name not in weights or weights[name].shape != self.shapes[name]:
+                raise RunError(
+                    f"weights of another task: '{name}' must be {self.shapes[name]}: play the task "
+                    "that they were trained with"
+                )
+        if not (np.isfinite(weights[MEAN]).all() and (weights[SCALE] > 0).all()):
+            raise RunError("damaged weights: the statistics must be finite, with positive scales")
+        load_arrays(self._policy, under(POLICY, dict(weights)))
+        self._mean, self._scale = np.array(weights[MEAN]), np.array(weights[SCALE])
+
+    def act(self, seen: Arrays, past: History, explore: Generators | None = None) -> Singles:  # noqa: ARG002
+        """What the policy does; where it explores, with noise, or now and then something else."""
+        rows = torch.from_numpy(normalised(self._inputs.rows(seen), self._mean, self._scale))
+        with torch.no_grad():
+            if explore is None:
+                return np.asarray(self._policy(rows).numpy(), np.float32)
+            size = self._policy.actions
+            # Always the same draws, so that an episode's later ones hang on nothing else.
+            drawn = [
+                (one.random(), one.uniform(-1, 1, size), one.standard_normal(size))
+                for one in explore
+            ]
+            chance, uniform, normals = (
+                np.array(part, np.float32) for part in zip(*drawn, strict=True)
+            )
+            actions = self._policy.explore(rows, torch.from_numpy(normals)).numpy()
+        return np.where(chance[:, None] < self._uniform, uniform, actions).astype(np.float32)
