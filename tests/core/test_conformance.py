@@ -1,0 +1,185 @@
+"""Tasks and agents keep the promises of their interfaces, and who breaks one is told."""
+
+import importlib.util
+import sys
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tangram_agent.agents.goal.agent import Goal, GoalConfig
+from tangram_core.agent import Agent
+from tangram_core.conformance import ConformanceError, check_agent, check_task
+from tangram_core.task import Task
+from tangram_sim.tasks.gym.task import Gym, GymConfig
+
+pytestmark = pytest.mark.fast
+
+EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
+SMALL: dict[str, Any] = {
+    "hidden": (8,),
+    "batch_size": 16,
+    "learning_starts": 20,
+    "replay_capacity": 200,
+}
+
+
+def example(name: str) -> Any:
+    """The module of a file of docs/examples."""
+    spec = importlib.util.spec_from_file_location(f"example_{name}", EXAMPLES / f"{name}.py")
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+POINT, TD3 = example("point"), example("td3")
+TOY = Gym(GymConfig(id="Toy-v0", imports=("tests.core.toy",)))
+TASKS: dict[str, Task] = {
+    "point": POINT.Point(),
+    "toy": TOY,
+    "toy without ends": Gym(replace(TOY.task, ends=False)),
+    "toy made anew": Gym(replace(TOY.task, fresh=True)),
+}
+AGENTS: dict[str, Agent] = {
+    name: Goal(GoalConfig(algorithm=name, **SMALL)) for name in ("ddpg", "td3", "sac")
+} | {
+    "every goal": Goal(GoalConfig(goals=("future", "next", "final"), **SMALL)),
+    "example": TD3.TD3(TD3.TD3Config(**SMALL)),
+}
+
+
+@pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+def test_a_task_keeps_its_promises(task: Task) -> None:
+    check_task(task)
+
+
+@pytest.mark.parametrize("task", ["point", "toy"])
+@pytest.mark.parametrize("agent", AGENTS.values(), ids=AGENTS)
+def test_an_agent_keeps_its_promises(agent: Agent, task: str) -> None:
+    check_agent(agent, TASKS[task])
+
+
+# Broken promises: each is found, and named
+
+
+class Points(POINT.Points):  # type: ignore[misc,name-defined]
+    """Environments of the example, with one fault."""
+
+    def __init__(self, task: Task, count: int, fault: str) -> None:
+        super().__init__(task, count)
+        self.fault = fault
+
+    def reset(self, generators: Any) -> Any:
+        if self.fault == "global randomness":
+            generators = [np.random.default_rng() for _ in generators]
+        if self.fault == "neighbours":
+            generators = [generators[-1]] * len(generators)
+        return super().reset(generators)
+
+    def step(self, actions: Any) -> Any:
+        step = super().step(actions)
+        if self.fault == "pays otherwise":
+            return replace(step, rewards=step.rewards * 0.5)
+        if self.fault == "flags of numbers":
+            return replace(step, terminated=step.rewards)
+        if self.fault == "goal moves":
+            self.goal = self.goal * 0.9
+        return step
+
+    def seen(self) -> Any:
+        seen = super().seen()
+        changed = {
+            "double precision": {"place": seen["place"].astype("f8")},
+            "out of bounds": {"place": seen["place"] + 2},
+            "not a number": {"place": seen["place"] * np.nan},
+            "a field more": {"speed": seen["place"]},
+            "a row less": {"place": seen["place"][1:]},
+        }
+        return seen | changed.get(self.fault, {})
+
+
+class Broken(POINT.Point):  # type: ignore[misc,name-defined]
+    """The example, with one fault of its environments."""
+
+    fault = ""
+
+    def make(self, count: int, purpose: str = "play") -> Any:
+        return Points(self, count, self.fault)
+
+
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [
+        ("global randomness", "Points.reset: wanted the same of the same generators"),
+        ("neighbours", "Points.step: wanted an episode as it is beside others"),
+        ("pays otherwise", "Broken.rewards: wanted what the step was paid"),
+        ("flags of numbers", "Points.step: wanted terminated"),
+        ("goal moves", "Points.step: wanted field goal to stay"),
+        ("double precision", "Points.reset: wanted place to be f4 (3, 2), got <f8"),
+        ("out of bounds", "Points.reset: wanted place within -1 and 1"),
+        ("not a number", "Points.reset: wanted place within -1 and 1, got nan"),
+        ("a field more", "Points.reset: wanted fields ['goal', 'place'], got ['goal', 'place'"),
+        ("a row less", "Points.reset: wanted place to be f4 (3, 2)"),
+    ],
+)
+def test_a_task_that_breaks_a_promise_is_told(fault: str, told: str) -> None:
+    task = type("Broken", (Broken,), {"fault": fault})()
+    with pytest.raises(ConformanceError) as caught:
+        check_task(task)
+    assert str(caught.value).startswith(told)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"score": lambda self, played: {"speed": 1.0}}, ".score: wanted success"),
+        ({"score": lambda self, played: {"success": np.nan}}, ".score: wanted finite"),
+        ({"ended": lambda self, a, d, recorded: ~recorded}, ".ended: wanted bool"),
+        ({"tests": lambda self, n: [np.random.default_rng(n)] * n}, ".tests: wanted the first"),
+        (
+            {"rivals": lambda self: {"two": lambda env: lambda *_: np.full((3, 2), 2, "f4")}},
+            ".rivals",
+        ),
+        ({"draw": lambda self, played: np.zeros((4, 4))}, ".draw: wanted uint8"),
+        ({"identity": lambda self: {"task": self}}, ".identity: wanted what JSON"),
+    ],
+)
+def test_what_a_task_says_is_checked(changes: Mapping[str, Any], told: str) -> None:
+    with pytest.raises(ConformanceError, match=f"^Wrong{told}"):
+        check_task(type("Wrong", (POINT.Point,), dict(changes))())
+
+
+def broadcasts_half(self: Any) -> Any:
+    return {name: tensor.astype(np.float64) for name, tensor in full(self).items()}
+
+
+full = TD3.TD3Learner.broadcast
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"broadcast": broadcasts_half}, ".broadcast: wanted"),
+        (
+            {"broadcast": lambda self: full(self) | {"more": np.zeros(1, "f4")}},
+            ".broadcast: wanted",
+        ),
+        ({"update": lambda self, share, rng: {"q": np.nan}}, ".update: wanted finite"),
+        ({"update": lambda self, share, rng: {"q": 1.0}}, ".update: wanted updates to be 1"),
+        ({"load_state": lambda self, state: None}, ".load_state: wanted the numbers of one"),
+        ({"begin_with": lambda self, state: None}, ".load_state: wanted the numbers of one"),
+        ({"insert": lambda self, episodes, rng: 0}, ".insert: wanted 1 to"),
+    ],
+)
+def test_an_agent_that_breaks_a_promise_is_told(changes: Mapping[str, Any], told: str) -> None:
+    learner = type("Wrong", (TD3.TD3Learner,), dict(changes))
+    agent = type("Agent", (TD3.TD3,), {"learns": lambda self: learner})(TD3.TD3Config(**SMALL))
+    with pytest.raises(ConformanceError, match=f"^Wrong{told}"):
+        check_agent(agent, POINT.Point())
