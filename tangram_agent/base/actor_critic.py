@@ -105,7 +105,7 @@ class ActorCritic(Learner, Generic[Config]):
         self._task, self._inputs = task, Inputs(task.spec)
         self.size, self.actions = self._inputs.size, task.spec.action_size
         self._normaliser = Normaliser(self.size)
-        self._replay = EpisodeReplay(task.spec, self.config.replay_capacity)
+        self._replay = EpisodeReplay(task, self.config.replay_capacity)
         self.capacity = self._replay.capacity * task.spec.horizon
         self._device, self.device = torch.device(device), device
         with torch.random.fork_rng(devices=[]):  # what others draw from torch stays as it is
@@ -176,7 +176,7 @@ class ActorCritic(Learner, Generic[Config]):
 
     def batch(self, rng: Streams) -> Batch:
         """What the next update learns from: all that is random in it is drawn here."""
-        found = self._replay.sample(self._task, self.config, rng)
+        found = self._replay.sample(self.config, rng)
         shape = (self.draws, *found.actions.shape)
         return self._on_device(
             self._normaliser(self._inputs.rows(found.before)),

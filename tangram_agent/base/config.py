@@ -46,6 +46,13 @@ class BaseConfig(Settings, section="agent"):
     relabel_share: float = setting(
         0.8, "share of a batch whose goal is another; 0: no hindsight", low=0, high=1, part=LEARNING
     )
+    moved_share: float = setting(
+        0.5,
+        "share of a batch from episodes whose goal was not achieved at their start already",
+        low=0,
+        high=1,
+        part=LEARNING,
+    )
     noise: float = setting(
         0.2, "deviation of the Gaussian exploration noise on actions", low=0, part=LEARNING
     )

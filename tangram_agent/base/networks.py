@@ -51,5 +51,9 @@ class Critics(nn.Module):
 
     def forward(self, rows: Tensor, actions: Tensor) -> Tensor:
         """(C, B)."""
-        both = torch.cat([rows, actions], dim=-1)
-        return torch.stack([one(both).squeeze(-1) for one in self.each])
+        return torch.stack([self.one(i, rows, actions) for i in range(len(self.each))])
+
+    def one(self, index: int, rows: Tensor, actions: Tensor) -> Tensor:
+        """(B,) what one of them says."""
+        value: Tensor = self.each[index](torch.cat([rows, actions], dim=-1))
+        return value.squeeze(-1)

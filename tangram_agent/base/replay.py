@@ -10,7 +10,7 @@ import numpy as np
 
 from tangram_agent.base.config import BaseConfig
 from tangram_core.agent import Streams
-from tangram_core.spec import Array, Arrays, Episodes, EpisodeSpec
+from tangram_core.spec import Array, Arrays, Episodes
 from tangram_core.task import Task
 from tangram_sim.arrays import Bools, Ints, Singles
 from tangram_sim.errors import RunError
@@ -44,10 +44,16 @@ class EpisodeReplay:
         added: episodes ever added; the next one goes to slot `added % capacity`.
     """
 
-    def __init__(self, spec: EpisodeSpec, transitions: int) -> None:
+    def __init__(self, task: Task, transitions: int) -> None:
         """Room for as many whole episodes as so many transitions make, and for one at least."""
+        spec = task.spec
         self.capacity, self.added = max(1, transitions // spec.horizon), 0
-        self._spec, self._lost = spec, 0  # episodes that were added before a smaller one took over
+        self._moved = np.zeros(self.capacity, bool)
+        self._task, self._spec, self._lost = (
+            task,
+            spec,
+            0,
+        )  # episodes that were added before a smaller one took over
         self._arrays = dict(spec.empty(self.capacity).arrays)
 
     def __len__(self) -> int:
@@ -60,21 +66,35 @@ class EpisodeReplay:
         for name, array in self._arrays.items():
             array[slots] = episodes[name][episodes.count - kept :]
         self.added += episodes.count
+        self._look(slots)
 
-    def sample(self, task: Task, config: BaseConfig, rng: Streams) -> Transitions:
-        """A batch, drawn uniformly with replacement; a share of it has another goal.
+    def _look(self, slots: Ints) -> None:
+        """Note which episodes came to what would not have been reached at their start."""
+        achieved = self._arrays[self._spec.achieved][slots]
+        first, last = achieved[:, 0], achieved[:, -1]
+        self._moved[slots] = self._task.rewards(first, last) < self._task.rewards(last, last)
 
-        A goal that another moment achieved is one that the step might have been made for, and
-        `task` says what it would have been worth (Andrychowicz et al. 2017).
+    def sample(self, config: BaseConfig, rng: Streams) -> Transitions:
+        """A batch, drawn with replacement; a share of it has another goal.
+
+        A goal that another moment achieved is one that the step might have been made for, and the
+        task says what it would have been worth (Andrychowicz et al. 2017). Where little moves at
+        first, most such goals are reached whatever is done: a share of the batch comes of episodes
+        that moved (after Zhao and Tresp 2018, who weigh by energy).
 
         Raises:
             ValueError: the replay is empty.
         """
         if not len(self):
             raise ValueError("cannot sample from an empty replay")
-        spec, arrays = self._spec, self._arrays
+        spec, arrays, task = self._spec, self._arrays, self._task
         oldest = self.added - len(self)
         rows = (oldest + rng["replay"].integers(len(self), size=config.batch_size)) % self.capacity
+        moved = np.flatnonzero(self._moved)
+        chosen = rng["replay"].random(config.batch_size) < config.moved_share * bool(len(moved))
+        rows[chosen] = (
+            moved[rng["replay"].integers(len(moved), size=chosen.sum())] if len(moved) else 0
+        )
         steps = rng["replay"].integers(spec.horizon, size=config.batch_size)
         other = rng["hindsight"].random(config.batch_size) < config.relabel_share
         moments = later(steps, spec.horizon, config.goals, rng["hindsight"])
@@ -145,6 +165,8 @@ class EpisodeReplay:
         slots = (self._lost + np.arange(len(order))) % self.capacity
         for name, array in self._arrays.items():
             array[slots] = state[name][order]
+        self._moved[:] = False
+        self._look(slots)
 
 
 def later(steps: Ints, horizon: int, goals: tuple[str, ...], rng: np.random.Generator) -> Ints:

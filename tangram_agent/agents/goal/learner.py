@@ -53,7 +53,7 @@ class GoalLearner(ActorCritic[GoalConfig]):
             yield from self._entropic(batch)
             return
         actions = self.actor(batch.rows)
-        value = self.critic(batch.rows, actions)[0].mean()
+        value = self.critic.one(0, batch.rows, actions).mean()
         penalty = actions.square().mean()
         yield Loss("actor", self.config.action_penalty * penalty - value, {"effort": penalty})
 

@@ -5,6 +5,7 @@ Legend: n rows, G entries of a goal, A entries of an action.
 
 import importlib
 import os
+import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, NoReturn
@@ -41,6 +42,7 @@ class Judge:
         self._config = config
         self._horizon = self._registered()
         self.env = self.make()
+        weakref.finalize(self, self.env.close)  # engines complain at exit of what is left open
         sizes = {name: self._box(name).shape[0] for name in (OBSERVATION, ACHIEVED, DESIRED)}
         if sizes[ACHIEVED] != sizes[DESIRED]:
             self._refuse("its achieved and desired goals differ in size")
