@@ -49,7 +49,7 @@ class OneByOne(Toy):
     """Its reward takes one goal at a time."""
 
     def compute_reward(self, achieved: Array, desired: Array, info: Any) -> Array:
-        return np.float32(-(np.linalg.norm(achieved - desired) > 0.3))
+        return -np.float32(np.linalg.norm(achieved - desired) > 0.3)
 
 
 class Pays(Toy):

@@ -76,9 +76,9 @@ class Judge:
             ) from error
 
     def scaled(self, actions: Singles) -> Singles:
-        """Actions of the environment (B, A), from those of [-1, 1]."""
-        scaled: Singles = self.low + (actions + 1.0) * 0.5 * (self.high - self.low)
-        return scaled
+        """Actions of the environment (B, A), from those of [-1, 1]; never beyond by a rounding."""
+        scaled = self.low + (actions + 1.0) * 0.5 * (self.high - self.low)
+        return np.clip(scaled, self.low, self.high)
 
     def rewards(self, achieved: Array, desired: Array) -> Floats:
         """(n,) of goals (n, G)."""
@@ -170,15 +170,14 @@ class Judge:
 
     def _whole(self, achieved: Array, desired: Array) -> Floats:
         """(n,) rewards of arrays, which must be those of each row."""
+        rows, why = zip(achieved, desired, strict=True), ""
         try:
             found = self.rewards(achieved, desired)
-        except Exception as error:  # noqa: BLE001
-            found, why = np.zeros(0), f" ({type(error).__name__}: {error})".splitlines()[0]
-        else:
-            why = ""
-        rows = zip(achieved, desired, strict=True)
-        single = np.array([float(self._compute(*row, {})) for row in rows])
-        if found.shape != single.shape or not np.allclose(found, single):
+            single = np.array([float(self._compute(*row, {})) for row in rows])
+            agree = found.shape == single.shape and np.allclose(found, single)
+        except Exception as error:  # noqa: BLE001  # whatever the environment's own code raises
+            agree, why = False, f" ({type(error).__name__}: {error})".splitlines()[0]
+        if not agree:
             self._refuse(
                 f"its compute_reward does not take arrays of goals (n, {achieved.shape[1]}) and "
                 f"info={{}}{why}: let it compute along the last axis"

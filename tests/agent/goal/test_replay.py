@@ -1,0 +1,147 @@
+"""The replay of whole episodes: which are kept, and which goals take the desired one's place."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tangram_agent.base.config import BaseConfig
+from tangram_agent.base.replay import EpisodeReplay, later
+from tangram_core.agent import Streams
+from tangram_core.spec import Episodes
+from tangram_sim.errors import RunError
+from tests.agent.goal.worlds import Line
+
+pytestmark = pytest.mark.fast
+
+TASK = Line()
+CONFIG = BaseConfig(batch_size=400, moved_share=0.0, relabel_share=0.5)
+
+
+def streams(seed: int = 0) -> Streams:
+    return {
+        name: np.random.default_rng([seed, i]) for i, name in enumerate(("replay", "hindsight"))
+    }
+
+
+def episodes(*numbers: int, moves: bool = True) -> Episodes:
+    """Episode n stands at 100 n + t at moment t, or at 100 n if it never moves."""
+    made = TASK.spec.empty(len(numbers))
+    for row, number in enumerate(numbers):
+        made["place"][row, :, 0] = 100 * number + np.arange(5) * moves
+        made["goal"][row] = -1
+        made["actions"][row, :, 0] = np.arange(4) / 10
+        made["rewards"][row] = -1
+    return made
+
+
+def replay(capacity: int, *batches: Episodes) -> EpisodeReplay:
+    made = EpisodeReplay(TASK, capacity)
+    for batch in batches:
+        made.add(batch)
+    return made
+
+
+def numbers(kept: EpisodeReplay) -> set[int]:
+    found = kept.sample(CONFIG, streams())
+    return set((found.before["place"][:, 0] // 100).astype(int).tolist())
+
+
+def test_the_newest_episodes_are_kept() -> None:
+    kept = replay(4 * 3, episodes(1, 2), episodes(3), episodes(4, 5))
+    assert len(kept) == 3
+    assert numbers(kept) == {3, 4, 5}
+    assert numbers(replay(4 * 3, episodes(1, 2, 3, 4, 5))) == {3, 4, 5}
+
+
+def test_a_batch_has_what_followed_and_what_it_was_worth() -> None:
+    found = replay(100, episodes(1, 2, 3)).sample(CONFIG, streams())
+    before, after = found.before["place"][:, 0], found.after["place"][:, 0]
+    assert (after == before + 1).all()
+    assert found.actions[:, 0] == pytest.approx((before % 100) / 10)
+    goal = found.before["goal"][:, 0]
+    assert (found.after["goal"][:, 0] == goal).all()
+    relabelled = goal != -1
+    assert 0.4 < relabelled.mean() < 0.6
+    assert (goal[relabelled] >= after[relabelled]).all()  # of this episode, and of a later moment
+    assert (goal[relabelled] < before[relabelled] + 5).all()
+    assert (found.rewards == np.where(goal == after, 0, -1)).all()
+    assert (found.terminated == (goal == after)).all()
+
+
+def test_without_hindsight_all_is_as_it_was_played() -> None:
+    found = replay(100, episodes(1, 2)).sample(replace(CONFIG, relabel_share=0.0), streams())
+    assert (found.before["goal"] == -1).all()
+    assert (found.rewards == -1).all()
+    assert not found.terminated.any()
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"),
+    [
+        ("next", {0: {1}, 2: {3}, 3: {4}}),
+        ("final", {0: {4}, 2: {4}, 3: {4}}),
+        ("future", {0: {1, 2, 3, 4}, 2: {3, 4}, 3: {4}}),
+    ],
+)
+def test_goals_are_of_later_moments(kind: str, expected: dict[int, set[int]]) -> None:
+    for step, moments in expected.items():
+        found = later(np.full(200, step), 4, (kind,), np.random.default_rng(0))
+        assert set(found.tolist()) == moments
+
+
+def test_several_kinds_are_as_often() -> None:
+    found = later(np.zeros(3000, np.int64), 100, ("next", "final"), np.random.default_rng(0))
+    assert set(found.tolist()) == {1, 100}
+    assert 0.45 < (found == 1).mean() < 0.55
+
+
+def test_a_share_comes_of_episodes_that_moved() -> None:
+    kept = replay(1000, episodes(*range(1, 10), moves=False), episodes(10))
+    found = kept.sample(replace(CONFIG, moved_share=0.5), streams())
+    assert 0.45 < (found.before["place"][:, 0] >= 1000).mean() < 0.65
+    still = replay(1000, episodes(1, 2, moves=False))  # none moved: any will do
+    assert len(still.sample(replace(CONFIG, moved_share=0.5), streams()).rewards) == 400
+
+
+@pytest.mark.parametrize("added", [2, 3, 7])
+def test_a_replay_goes_on_from_its_state(added: int) -> None:
+    kept = replay(4 * 3, *(episodes(n) for n in range(added)))
+    other = EpisodeReplay(TASK, 4 * 3)
+    other.load_state(kept.state())
+    for one in (kept, other):
+        one.add(episodes(99))
+    first, second = (one.sample(CONFIG, streams(5)) for one in (kept, other))
+    assert (first.before["place"] == second.before["place"]).all()
+    assert (first.before["goal"] == second.before["goal"]).all()
+
+
+@pytest.mark.parametrize("capacity", [2, 3, 5])
+def test_a_replay_of_another_size_keeps_the_newest(capacity: int) -> None:
+    kept = replay(4 * 3, *(episodes(n) for n in range(1, 8)))
+    other = EpisodeReplay(TASK, 4 * capacity)
+    other.load_state(kept.state())
+    newest = set(range(8 - min(3, capacity), 8))
+    assert numbers(other) == newest
+    third = EpisodeReplay(TASK, 4 * 3)
+    third.load_state(other.state())
+    assert numbers(third) == newest
+    other.add(episodes(8))
+    assert numbers(other) == ({*newest, 8} if capacity > 3 else set(range(9 - capacity, 9)))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"place": np.zeros((2, 4, 1), "f4")},
+        {"place": np.zeros((2, 5, 1), "f8")},
+        {"place": np.full((2, 5, 1), np.nan, "f4")},
+        {"actions": np.full((2, 4, 1), 2, "f4")},
+        {"added": np.array([1])},
+    ],
+)
+def test_a_state_that_does_not_fit_is_refused(wrong: dict[str, Any]) -> None:
+    state = replay(100, episodes(1, 2)).state()
+    with pytest.raises(RunError, match="replay state: '"):
+        EpisodeReplay(TASK, 100).load_state(state | wrong)

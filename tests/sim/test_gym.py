@@ -1,0 +1,124 @@
+"""Environments of gymnasium as a task: what is played, what it is worth, and what is refused."""
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tangram_core.conformance import play
+from tangram_core.spec import Episodes
+from tangram_core.task import Played
+from tangram_sim.errors import ConfigError, RunError
+from tangram_sim.seeding import episode_generator
+from tangram_sim.tasks.gym.task import Gym, GymConfig
+
+pytestmark = pytest.mark.fast
+
+TOY = GymConfig(id="Toy-v0", imports=("tests.core.toy",))
+
+
+def generators(count: int) -> list[np.random.Generator]:
+    return [episode_generator(1, "test", 0, 0, i) for i in range(count)]
+
+
+def towards(seen: dict[str, np.ndarray], *_: object) -> np.ndarray:  # type: ignore[type-arg]
+    """A rule that solves the toy: go at the goal."""
+    way = seen["desired_goal"] - seen["achieved_goal"]
+    return np.clip(way * 10, -1, 1).astype(np.float32)
+
+
+def test_to_make_a_task_makes_no_environment() -> None:
+    task = Gym(TOY)
+    assert task.identity()["task"]["id"] == "Toy-v0"
+    assert "judge" not in vars(task)
+    assert task.spec.horizon == 10
+    assert "judge" in vars(task)
+
+
+def test_the_spec_is_what_the_environment_says() -> None:
+    spec = Gym(TOY).spec
+    assert [(f.name, f.shape, f.per, f.dtype) for f in spec.fields] == [
+        ("observation", (2,), "moment", "f4"),
+        ("achieved_goal", (2,), "moment", "f4"),
+        ("desired_goal", (2,), "episode", "f4"),
+    ]
+    assert (spec.action_size, spec.achieved, spec.desired) == (2, "achieved_goal", "desired_goal")
+    assert spec.rewards == (-1.0, 0.0)  # all that its reward was seen to be
+
+
+def test_an_action_covers_the_bounds_of_the_environment() -> None:
+    judge = Gym(TOY).judge
+    ends = np.array([[-1, -1], [1, 1], [0, 0]], np.float32)
+    assert judge.scaled(ends) == pytest.approx(np.array([[-0.2, -0.2], [0.1, 0.1], [-0.05, -0.05]]))
+
+
+def test_what_terminates_plays_on_and_is_marked() -> None:
+    task = Gym(TOY)
+    env = task.make(4)
+    played = play(task, env, generators(4), towards)
+    terminated = played.episodes.terminated.astype(bool)
+    assert terminated.any(1).all()
+    assert (terminated == (played.episodes.rewards == 0)).all()
+    unmarked = Gym(replace(TOY, ends=False))
+    again = play(unmarked, unmarked.make(4), generators(4), towards)
+    assert not again.episodes.terminated.any()
+    assert (again.episodes.rewards == played.episodes.rewards).all()
+
+
+def test_scores_count_up_to_the_first_end() -> None:
+    """Two episodes of four steps: one ends in its second, one is there for a while and leaves."""
+    episodes = Episodes(
+        {
+            "actions": np.zeros((2, 4, 1), np.float32),
+            "rewards": np.array([[-1, 0, -1, -1], [-1, -1, 0, -1]], np.float32),
+            "terminated": np.array([[0, 1, 0, 0], [0, 0, 0, 0]], np.uint8),
+        }
+    )
+    facts = {"is_success": np.array([[0, 0, 1, 0, 0], [0, 0, 0, 1, 0]], bool)}
+    found = Gym(TOY).score(Played(episodes, facts))
+    assert found == {"success": 0.5, "success_any": 1.0, "mean_return": -2.0, "steps": 2.5}
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"id": ""}, "task.id must name an environment, got '': set task.id=FetchReach-v4"),
+        ({"id": "os:Toy-v0"}, "got 'os:Toy-v0': set task.imports=[os] task.id=Toy-v0"),
+        ({"id": "Nowhere-v0"}, "task.id=Nowhere-v0 is not registered"),
+        ({"imports": ("no_such",)}, "task.imports: cannot import no_such (No module named"),
+        ({"id": "Endless-v0"}, "no time limit: register it with max_episode_steps"),
+        ({"id": "CartPole-v1"}, "it is no goal environment"),
+        ({"id": "Pictures-v0"}, "its observation is Box(0, 255, (8, 8, 3), uint8)"),
+        ({"id": "Discrete-v0"}, "its actions are Discrete(3)"),
+        ({"id": "Unbounded-v0"}, "must be a bounded list of numbers"),
+        ({"id": "OneByOne-v0"}, "its compute_reward does not take arrays of goals (n, 2)"),
+        ({"id": "Pays-v0"}, "its steps do not pay what compute_reward says"),
+        ({"id": "Untold-v0"}, "its info lacks is_success"),
+    ],
+)
+def test_what_cannot_be_learned_is_refused_by_name(changes: dict[str, object], told: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        Gym(replace(TOY, **changes)).check(plays=True)  # type: ignore[arg-type]
+    assert told in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_colon_imports_nothing() -> None:
+    with pytest.raises(ConfigError, match="colon"):
+        GymConfig(id="this:Toy-v0")
+    assert "this" not in sys.modules
+
+
+def test_an_end_that_no_goal_tells_is_refused_in_play() -> None:
+    task = Gym(replace(TOY, id="Ends-v0"))
+    with pytest.raises(ConfigError, match="hindsight cannot tell .* set task.ends=false"):
+        play(task, task.make(3), generators(3), towards)
+    task = Gym(replace(TOY, id="Ends-v0", ends=False))
+    play(task, task.make(3), generators(3), towards)
+
+
+def test_a_goal_that_moves_is_refused_in_play() -> None:
+    task = Gym(replace(TOY, id="Wanders-v0", ends=False))
+    with pytest.raises(RunError, match="goal moved"):
+        play(task, task.make(3), generators(3), towards)
