@@ -50,8 +50,8 @@ class TD3Learner(ActorCritic):
         config = self.config
         with torch.no_grad():  # the target: smoothed action, lesser value
             noise = (config.smoothing * batch.normals[0]).clamp(-0.5, 0.5)
-            actions = (self.slow["actor"](batch.following) + noise).clamp(-1, 1)
-            value = torch.minimum(*self.slow["critic"](batch.following, actions))
+            actions = (self.targets["actor"](batch.following) + noise).clamp(-1, 1)
+            value = torch.minimum(*self.targets["critic"](batch.following, actions))
             y = self.bounded(batch.rewards + config.gamma * batch.goes_on * value)
         first, second = self.critic(batch.rows, batch.actions)
         yield Loss("critic", (first - y).square().mean() + (second - y).square().mean())

@@ -86,7 +86,7 @@ class ActorCritic(Learner, Generic[Config]):
         size, actions: F and A.
         actor: the policy.
         parts: all networks that learn, by name: the actor and `modules`.
-        slow: frozen copies of those that `follows` names, which follow them slowly.
+        targets: frozen copies of those that `target_names` says, which follow them slowly.
     """
 
     draws = 1
@@ -119,11 +119,12 @@ class ActorCritic(Learner, Generic[Config]):
                     "LayerNorm in the place of BatchNorm"
                 )
             module.to(self._device)
-        self.slow = {
-            name: copy.deepcopy(self.parts[name]).requires_grad_(False) for name in self.follows()
+        self.targets = {
+            name: copy.deepcopy(self.parts[name]).requires_grad_(False)
+            for name in self.target_names()
         }
         # Kept as lists: walking the modules takes a fifth of a small network's update.
-        self._lists, self._slow = _parameters(self.parts), _parameters(self.slow)
+        self._lists, self._targets = _parameters(self.parts), _parameters(self.targets)
         self.parameters = sum(one.numel() for own in self._lists.values() for one in own)
         self._optimisers = {name: Adam(own) for name, own in self._lists.items()}
         self._names: dict[bool, tuple[str, ...]] = {}
@@ -140,8 +141,8 @@ class ActorCritic(Learner, Generic[Config]):
     def losses(self, batch: Batch) -> Iterator[Loss]:
         """Yield a network's loss; it makes its step before the next one is asked for."""
 
-    def follows(self) -> tuple[str, ...]:
-        """Names of the networks that have a slow copy."""
+    def target_names(self) -> tuple[str, ...]:
+        """Names of the networks that have a target network."""
         return ("actor", "critic")
 
     def bounded(self, values: Tensor) -> Tensor:
@@ -197,8 +198,8 @@ class ActorCritic(Learner, Generic[Config]):
             own = {f"{loss.part}_loss": loss.value, f"{loss.part}_gradient": norm}
             numbers |= own | dict(loss.told)
         with torch.no_grad():
-            for name, slow in self._slow.items():
-                torch._foreach_lerp_(slow, self._lists[name], 1.0 - self.config.polyak)
+            for name, target in self._targets.items():
+                torch._foreach_lerp_(target, self._lists[name], 1.0 - self.config.polyak)
         self._names[batch.acts] = tuple(numbers)
         return torch.stack([one.detach() for one in numbers.values()])
 
@@ -220,7 +221,7 @@ class ActorCritic(Learner, Generic[Config]):
         return {MEAN: self._normaliser.mean, SCALE: self._normaliser.scale, **policy}
 
     def state(self) -> dict[str, Array]:
-        """Networks, slow copies, optimisers, statistics and the counter."""
+        """Networks, target networks, optimisers, statistics and the counter."""
         state: dict[str, Array] = {_COUNTER: np.array([self.updates], np.int64)}
         for part, module in self._modules().items():
             state |= {f"{part}.{name}": value for name, value in to_arrays(module).items()}
@@ -267,11 +268,11 @@ class ActorCritic(Learner, Generic[Config]):
 
     def _modules(self) -> dict[str, nn.Module]:
         """All networks, by the names under which a checkpoint has them."""
-        return self.parts | {f"slow_{name}": module for name, module in self.slow.items()}
+        return self.parts | {f"target_{name}": module for name, module in self.targets.items()}
 
     def _changed(self) -> list[Tensor]:
         """All that an update changes."""
-        every: list[Sequence[Tensor]] = [*self._lists.values(), *self._slow.values()]
+        every: list[Sequence[Tensor]] = [*self._lists.values(), *self._targets.values()]
         every += [own for each in self._optimisers.values() for own in each.slots.values()]
         return [one for own in every for one in own]
 

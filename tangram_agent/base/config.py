@@ -13,15 +13,15 @@ class BaseConfig(Settings, section="agent"):
     """Networks, pace, replay, hindsight and exploration."""
 
     hidden: tuple[int, ...] = setting(
-        (256, 256, 256), "widths of the hidden layers", low=1, high=65536, part=NETWORK
+        (256, 256), "widths of the hidden layers", low=1, high=65536, part=NETWORK
     )
     layer_norm: bool = setting(True, "normalise each hidden layer (Ba et al. 2016)", part=NETWORK)
     learning_rate: float = setting(
-        5e-4, "Adam's, of all networks", low=1e-9, high=1e3, part=LEARNING
+        1e-3, "Adam's, of all networks", low=1e-9, high=1e3, part=LEARNING
     )
     batch_size: int = setting(512, "transitions in one update", low=1, part=LEARNING)
     updates_per_transition: float = setting(
-        0.1, "updates for each transition played", low=1e-9, high=1e3, part=LEARNING
+        0.2, "updates for each transition played", low=1e-9, high=1e3, part=LEARNING
     )
     learning_starts: int = setting(
         1000, "transitions played before the first update", low=1, part=LEARNING
@@ -29,9 +29,9 @@ class BaseConfig(Settings, section="agent"):
     replay_capacity: int = setting(
         1_000_000, "transitions kept, in whole episodes", low=1, high=1_000_000_000, part=LEARNING
     )
-    gamma: float = setting(0.98, "discount", low=0, high=0.99999, part=LEARNING)
+    gamma: float = setting(0.95, "discount", low=0, high=0.99999, part=LEARNING)
     polyak: float = setting(
-        0.995, "share of a target network that an update keeps", low=0, high=1, part=LEARNING
+        0.99, "share of a target network that an update keeps", low=0, high=1, part=LEARNING
     )
     clip_targets: bool = setting(
         True, "keep targets within what the task's rewards can add up to", part=LEARNING
@@ -57,7 +57,7 @@ class BaseConfig(Settings, section="agent"):
         0.2, "deviation of the Gaussian exploration noise on actions", low=0, part=LEARNING
     )
     uniform_share: float = setting(
-        0.3, "share of actions drawn uniformly", low=0, high=1, part=LEARNING
+        0.2, "share of actions drawn uniformly", low=0, high=1, part=LEARNING
     )
 
     def __post_init__(self) -> None:

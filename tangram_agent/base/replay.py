@@ -46,15 +46,11 @@ class EpisodeReplay:
 
     def __init__(self, task: Task, transitions: int) -> None:
         """Room for as many whole episodes as so many transitions make, and for one at least."""
-        spec = task.spec
-        self.capacity, self.added = max(1, transitions // spec.horizon), 0
+        self._task, self._spec = task, task.spec
+        self.capacity, self.added = max(1, transitions // self._spec.horizon), 0
+        self._lost = 0  # episodes that were added and not taken over with a state
         self._moved = np.zeros(self.capacity, bool)
-        self._task, self._spec, self._lost = (
-            task,
-            spec,
-            0,
-        )  # episodes that were added before a smaller one took over
-        self._arrays = dict(spec.empty(self.capacity).arrays)
+        self._arrays = dict(self._spec.empty(self.capacity).arrays)
 
     def __len__(self) -> int:
         return min(self.added - self._lost, self.capacity)
@@ -78,9 +74,7 @@ class EpisodeReplay:
         """A batch, drawn with replacement; a share of it has another goal.
 
         A goal that another moment achieved is one that the step might have been made for, and the
-        task says what it would have been worth (Andrychowicz et al. 2017). Where little moves at
-        first, most such goals are reached whatever is done: a share of the batch comes of episodes
-        that moved (after Zhao and Tresp 2018, who weigh by energy).
+        task says what it would have been worth (Andrychowicz et al. 2017).
 
         Raises:
             ValueError: the replay is empty.
@@ -88,13 +82,7 @@ class EpisodeReplay:
         if not len(self):
             raise ValueError("cannot sample from an empty replay")
         spec, arrays, task = self._spec, self._arrays, self._task
-        oldest = self.added - len(self)
-        rows = (oldest + rng["replay"].integers(len(self), size=config.batch_size)) % self.capacity
-        moved = np.flatnonzero(self._moved)
-        chosen = rng["replay"].random(config.batch_size) < config.moved_share * bool(len(moved))
-        rows[chosen] = (
-            moved[rng["replay"].integers(len(moved), size=chosen.sum())] if len(moved) else 0
-        )
+        rows = self._chosen(config, rng["replay"])
         steps = rng["replay"].integers(spec.horizon, size=config.batch_size)
         other = rng["hindsight"].random(config.batch_size) < config.relabel_share
         moments = later(steps, spec.horizon, config.goals, rng["hindsight"])
@@ -111,6 +99,20 @@ class EpisodeReplay:
             np.where(other, rewards, arrays["rewards"][rows, steps]).astype(np.float32),
             np.where(other, task.ended(achieved, desired, recorded), recorded),
         )
+
+    def _chosen(self, config: BaseConfig, rng: np.random.Generator) -> Ints:
+        """(B,) episodes, by their slots; some of those that moved, where there are such.
+
+        Where little moves at first, most achieved goals are reached whatever is done, and teach
+        nothing (after Zhao and Tresp 2018, who weigh episodes by energy).
+        """
+        oldest, count = self.added - len(self), config.batch_size
+        rows = (oldest + rng.integers(len(self), size=count)) % self.capacity
+        moved = np.flatnonzero(self._moved)
+        if len(moved):
+            own = rng.random(count) < config.moved_share
+            rows[own] = moved[rng.integers(len(moved), size=own.sum())]
+        return rows
 
     def _seen(self, rows: Ints, moments: Ints, desired: Array) -> Arrays:
         """What was seen at these moments, with these goals."""

@@ -20,7 +20,7 @@ MOST_SMOOTHED = 0.5  # Fujimoto et al. 2018
 class GoalLearner(ActorCritic[GoalConfig]):
     """One of the three, as the settings say.
 
-    Slow copies follow in every update; TD3's paper moves them with the actor alone.
+    Target networks follow in every update; TD3's paper moves them with the actor alone.
     """
 
     draws = 2
@@ -37,7 +37,7 @@ class GoalLearner(ActorCritic[GoalConfig]):
         self.temperature = Temperature()
         return {"critic": self.critic, "temperature": self.temperature}
 
-    def follows(self) -> tuple[str, ...]:
+    def target_names(self) -> tuple[str, ...]:
         """SAC asks the actor itself what comes next."""
         return ("critic",) if self.config.algorithm == "sac" else ("actor", "critic")
 
@@ -65,12 +65,12 @@ class GoalLearner(ActorCritic[GoalConfig]):
             actions, density = cast("GaussianPolicy", self.actor).drawn(following, batch.normals[0])
             bonus = self.temperature() * density
         else:
-            actions = self.slow["actor"](following)
+            actions = self.targets["actor"](following)
             if config.algorithm == "td3":
                 noise = config.smoothing * batch.normals[0]
                 actions = actions + noise.clamp(-MOST_SMOOTHED, MOST_SMOOTHED)
                 actions = actions.clamp(-1.0, 1.0)
-        value = self.slow["critic"](following, actions).amin(0) - bonus
+        value = self.targets["critic"](following, actions).amin(0) - bonus
         target = batch.rewards + config.gamma * batch.goes_on * value
         # Entropy adds to what rewards come to, without a bound that is known.
         return target if config.algorithm == "sac" else self.bounded(target)

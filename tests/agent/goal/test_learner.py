@@ -41,7 +41,7 @@ def streams(made: ActorCritic[Any]) -> dict[str, np.random.Generator]:
 
 def parts(made: Any) -> dict[str, Tensor]:
     """All parameters of each network in one."""
-    modules = made.parts | {f"slow_{name}": one for name, one in made.slow.items()}
+    modules = made.parts | {f"target_{name}": one for name, one in made.targets.items()}
     return {
         name: torch.cat([p.detach().flatten().clone() for p in module.parameters()])
         for name, module in modules.items()
@@ -51,9 +51,9 @@ def parts(made: Any) -> dict[str, Tensor]:
 @pytest.mark.parametrize(
     ("algorithm", "networks"),
     [
-        ("ddpg", {"actor", "critic", "slow_actor", "slow_critic"}),
-        ("td3", {"actor", "critic", "slow_actor", "slow_critic"}),
-        ("sac", {"actor", "critic", "temperature", "slow_critic"}),
+        ("ddpg", {"actor", "critic", "target_actor", "target_critic"}),
+        ("td3", {"actor", "critic", "target_actor", "target_critic"}),
+        ("sac", {"actor", "critic", "temperature", "target_critic"}),
     ],
 )
 def test_an_update_moves_all_networks(algorithm: str, networks: set[str]) -> None:
@@ -63,9 +63,9 @@ def test_an_update_moves_all_networks(algorithm: str, networks: set[str]) -> Non
     made.update(0.0, streams(made))
     after = parts(made)
     assert all(not torch.equal(before[name], after[name]) for name in networks)
-    for name in made.slow:
-        expected = torch.lerp(before[f"slow_{name}"], after[name], 1 - SMALL.polyak)
-        assert torch.allclose(after[f"slow_{name}"], expected, atol=1e-7)
+    for name in made.targets:
+        expected = torch.lerp(before[f"target_{name}"], after[name], 1 - SMALL.polyak)
+        assert torch.allclose(after[f"target_{name}"], expected, atol=1e-7)
 
 
 def test_a_delayed_actor_moves_in_every_other_update() -> None:
