@@ -96,8 +96,9 @@ def check_agent(agent: Agent, task: Task, device: str = "cpu") -> None:
     finally:
         env.close()
     rng = _streams(learner)
-    while learner.kept < agent.pace.learning_starts:  # some take a while until they learn
-        found = learner.insert(episodes, rng)
+    known = 0
+    while known < agent.pace.learning_starts:
+        known += (found := learner.insert(episodes, rng))
         if not 0 < found <= episodes.transitions:
             _fail(learner, "insert", f"1 to {episodes.transitions} transitions", found)
     for number in range(3):
