@@ -1,10 +1,7 @@
 """Tasks and agents keep the promises of their interfaces, and who breaks one is told."""
 
-import importlib.util
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,27 +12,16 @@ from tangram_core.agent import Agent
 from tangram_core.conformance import ConformanceError, check_agent, check_task
 from tangram_core.task import Task
 from tangram_sim.tasks.gym.task import Gym, GymConfig
+from tests.core.examples import example
 
 pytestmark = pytest.mark.fast
 
-EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 SMALL: dict[str, Any] = {
     "hidden": (8,),
     "batch_size": 16,
     "learning_starts": 20,
     "replay_capacity": 200,
 }
-
-
-def example(name: str) -> Any:
-    """The module of a file of docs/examples."""
-    spec = importlib.util.spec_from_file_location(f"example_{name}", EXAMPLES / f"{name}.py")
-    assert spec
-    assert spec.loader
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 POINT, TD3 = example("point"), example("td3")
