@@ -237,11 +237,15 @@ class ActorCritic(Learner, Generic[Config]):
             raise RunError("learner state: no counter of updates: not a learner's checkpoint")
         self.begin_with(state)
         for part, optimiser in self._optimisers.items():
-            slots: dict[str, list[Tensor]] = {name: [] for name in optimiser.slots}
             own = under(f"{part}_optimiser.", dict(state))
-            for key in sorted(own, key=lambda key: int(key.partition(".")[0])):
-                value = torch.from_numpy(np.array(own[key])).to(self._device)
-                slots.setdefault(key.partition(".")[2], []).append(value)
+            slots = {
+                name: [
+                    self._tensor(own[key])
+                    for i in range(len(kept))
+                    if (key := f"{i}.{name}") in own
+                ]
+                for name, kept in optimiser.slots.items()
+            }
             optimiser.load(slots)
         self.updates = int(state[_COUNTER][0])
 
@@ -277,9 +281,11 @@ class ActorCritic(Learner, Generic[Config]):
         return [one for own in every for one in own]
 
     def _on_device(self, *arrays: Array) -> Batch:
-        parts = (torch.from_numpy(np.asarray(one, np.float32)) for one in arrays)
-        acts = self.updates % self.delay == 0
-        return Batch(*(one.to(self._device) for one in parts), acts=acts)
+        parts = (self._tensor(np.asarray(one, np.float32)) for one in arrays)
+        return Batch(*parts, acts=self.updates % self.delay == 0)
+
+    def _tensor(self, array: Array) -> Tensor:
+        return torch.from_numpy(np.array(array)).to(self._device)
 
 
 def _parameters(modules: Mapping[str, nn.Module]) -> dict[str, list[Tensor]]:
