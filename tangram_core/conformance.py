@@ -31,6 +31,9 @@ class ConformanceError(TangramError):
     """A promise of an interface that is not kept."""
 
 
+_AS_GOOD: dict[str, tuple[Any, ...]] = {"f4": (np.float64,), "u1": (np.bool_,)}
+
+
 def check_task(task: Task, count: int = 3) -> None:
     """Play a task with random actions, and hold it to `Task` and `Env`.
 
@@ -90,9 +93,10 @@ def check_agent(agent: Agent, task: Task, device: str = "cpu") -> None:
         _fail(agent, "pace", "a positive pace and start", agent.pace)
     learner = agent.learner(task, 0, device)
     _check_acting(agent, task, learner)
-    env = task.make(4)
+    actor, env = agent.actor(task), task.make(4)
+    actor.load(learner.broadcast())
     try:
-        episodes = play(task, env, _generators(4), _random(task)).episodes
+        episodes = play(task, env, _generators(4), actor.act).episodes
     finally:
         env.close()
     rng = _streams(learner)
@@ -121,7 +125,8 @@ def play(task: Task, env: Env, generators: Generators, act: Act) -> Played:
             elif field.per == "step" and t:
                 arrays[field.name][:, t - 1] = seen[field.name]
             elif field.per == "episode":
-                if t and not np.array_equal(arrays[field.name], seen[field.name]):
+                now = seen[field.name].astype(field.dtype)
+                if t and not np.array_equal(arrays[field.name], now):
                     _fail(env, "step", f"field {field.name} to stay in an episode", "another one")
                 arrays[field.name][:] = seen[field.name]
         if t == spec.horizon:
@@ -158,7 +163,8 @@ def _check_step(env: Env, step: Step, task: Task) -> None:
 
 def _check_array(owner: object, method: str, field: Field, array: Array, count: int) -> None:
     wanted = (count, *field.shape)
-    if array.shape != wanted or array.dtype != field.dtype:
+    # What is more exact is rounded when it is kept, and a flag is a number.
+    if array.shape != wanted or array.dtype not in (field.dtype, *_AS_GOOD[field.dtype]):
         came = f"{array.dtype.str} {array.shape}"
         _fail(owner, method, f"{field.name} to be {field.dtype} {wanted}", came)
     if not ((field.low <= array) & (array <= field.high)).all():  # nor is a NaN

@@ -92,7 +92,7 @@ class Env(ABC):
 
         Returns:
             What is observed: every field of the spec that is one of each moment or episode, (B,
-            *shape) and of its dtype.
+            *shape), of its dtype or a more exact one.
         """
 
     @abstractmethod

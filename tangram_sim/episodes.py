@@ -15,7 +15,8 @@ def spec_of(
     corners (V, 2) of the tokens and goals (V, 2) of their targets are as they are seen; placed (K,)
     is 1 where a token is placed. Where pictures are what is observed, seen (K,) is 1 where a token
     was found in the picture, or should have left that of several tokens, and goals_seen (K,) the
-    same of the target's pieces.
+    same of the target's pieces; closed (K,) is 1 where no action should name a token: it is placed,
+    or not seen while others are.
 
     Args:
         layout: the tokens.
@@ -26,6 +27,7 @@ def spec_of(
     tokens, bound = layout.tokens, corner_bound(layout.tokens, sim)
     looks = (
         Field("seen", (tokens,), 0, 1, "moment", "u1"),
+        Field("closed", (tokens,), 0, 1, "moment", "u1"),
         Field("goals_seen", (tokens,), 0, 1, "episode", "u1"),
     )
     rows = goal_rows(layout, sim) if outlines else layout.corner_count

@@ -4,11 +4,16 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
+import numpy as np
+
+from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError
 from tangram_core.scores import Score
 from tangram_core.settings import refuse_ignored, told
+from tangram_core.spec import Array
 from tangram_core.task import Chooser, Env, Played
 from tangram_sim.config import SILHOUETTES, RewardConfig
+from tangram_sim.rewards import scaled_overlap
 from tangram_tasks.place import SEVERAL, Place
 
 _AREAS = (
@@ -27,6 +32,19 @@ class Fill(Place):
     def scores(self) -> tuple[Score, ...]:  # type: ignore[override]
         """Nothing of where a piece should lie: any dissection counts."""
         return tuple(score for score in SEVERAL if score.name in _AREAS)
+
+    def rewards(self, achieved: Array, desired: Array) -> Floats:
+        """(n,) Eq. 14 of corners (n, V, 2) and of outlines as rows (n, G, 2)."""
+        # Only here: no worker asks, and shapely takes its time.
+        import shapely  # noqa: PLC0415
+
+        from tangram_sim.geometry.overlap import outlines  # noqa: PLC0415
+        from tangram_sim.geometry.rings import as_area  # noqa: PLC0415
+
+        tokens = shapely.polygons(outlines(achieved.astype(np.float64), self.layout))
+        areas = np.array([as_area(rows) for rows in desired])
+        shared = shapely.area(shapely.intersection(tokens, areas[:, None])).sum(axis=1)
+        return scaled_overlap(np.clip(shared / self.layout.areas.sum(), 0.0, 1.0))
 
     def score(self, played: Played) -> dict[str, float]:
         """Those of areas."""

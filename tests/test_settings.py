@@ -79,6 +79,19 @@ NEAR = {"strategy": "near", "copies": 1, "position": 0.1, "angle": 0.1}
 FINAL_TWICE = over(ONE, sim={"actions_per_token": 2}, agent={"hindsight": [{"strategy": "final"}]})
 NEAR_ONE = over(ONE, agent={"hindsight": [NEAR]})
 
+GOAL: Config = {
+    "task": {"kind": "gym", "id": "Toy-v0", "imports": ["tests.core.toy"]},
+    "agent": {
+        "kind": "goal",
+        "hidden": [8],
+        "batch_size": 8,
+        "learning_starts": 8,
+        "replay_capacity": 256,
+        "updates_per_transition": 0.1,
+    },
+}
+SAC = over(GOAL, agent={"algorithm": "sac"})
+
 # Setting -> a run in which it has an effect, and another value.
 SHOWS: dict[str, tuple[Config, object]] = {
     "tokens.shapes": (ONE, ["square"]),
@@ -121,6 +134,17 @@ SHOWS: dict[str, tuple[Config, object]] = {
     "agent.learning_starts": (ONE, 16),
     "agent.noise": (ONE, 0.2),
     "agent.uniform_share": (ONE, 1.0),
+    "agent.algorithm": (GOAL, "ddpg"),
+    "agent.hidden": (GOAL, [9]),
+    "agent.layer_norm": (GOAL, False),
+    "agent.learning_rate": (GOAL, 1e-2),
+    "agent.goals": (GOAL, ["next"]),
+    "agent.relabel_share": (GOAL, 0.0),
+    "agent.moved_share": (GOAL, 1.0),
+    "agent.action_penalty": (GOAL, 1.0),
+    "agent.actor_delay": (GOAL, 1),
+    "agent.smoothing": (GOAL, 0.4),
+    "agent.entropy": (SAC, 0.5),
     "agent.hindsight": (ONE, [{"strategy": "final"}]),
     "agent.hindsight.strategy": (FINAL_TWICE, "future"),
     "agent.hindsight.copies": (NEAR_ONE, 2),
@@ -131,6 +155,11 @@ SHOWS: dict[str, tuple[Config, object]] = {
 ELSEWHERE = {
     "agent.name": "the label of a run in reports",
     "agent.beam": "tests/agent/agents/outline/test_filler.py: a beam finds what values do not tell",
+    "agent.clip_targets": "tests/agent/agents/goal/test_learner.py: targets are bounded",
+    "task.id": "tests/tasks/test_gym.py: it is made, or refused by name",
+    "task.imports": "tests/tasks/test_gym.py: a module that is not there is named",
+    "task.ends": "tests/core/test_conformance.py: a toy without ends",
+    "task.fresh": "tests/core/test_conformance.py: a toy made anew",
     "reward.sha256": "tests/sim/test_rewards.py: another file is refused",
 }
 

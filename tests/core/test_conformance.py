@@ -10,8 +10,11 @@ import pytest
 from tangram_agent.agents.goal.agent import Goal, GoalConfig
 from tangram_core.agent import Agent
 from tangram_core.conformance import ConformanceError, check_agent, check_task
+from tangram_core.setup import Setup
 from tangram_core.task import Task
 from tangram_tasks.gym.task import Gym, GymConfig
+from tests.agent.agents.outline.outlines import outline_setup
+from tests.agent.builders import PAIR, SCENE, SQUARE, setup
 from tests.core.examples import example
 
 pytestmark = pytest.mark.fast
@@ -32,6 +35,14 @@ TASKS: dict[str, Task] = {
     "toy without ends": Gym(replace(TOY.config, ends=False)),
     "toy made anew": Gym(replace(TOY.config, fresh=True)),
 }
+TINY = {"width": 8, "layers": 1, "feed_forward": 8}
+FEW = {"batch_size": 8, "learning_starts": 8, "replay_capacity": 64}
+OF_TOKENS = {
+    "scene": setup(agent=SCENE | FEW, net=TINY, actions_per_token=2),
+    "pair": setup(PAIR, FEW | {"motion": "learned"}, TINY),
+    "pair of pictures": setup(SQUARE, FEW, TINY, observe="pictures", pixels=64),
+    "outline": outline_setup(agent=FEW, net=TINY),
+}
 AGENTS: dict[str, Agent] = {
     name: Goal(GoalConfig(algorithm=name, **SMALL)) for name in ("ddpg", "td3", "sac")
 } | {
@@ -49,6 +60,12 @@ def test_a_task_keeps_its_promises(task: Task) -> None:
 @pytest.mark.parametrize("agent", AGENTS.values(), ids=AGENTS)
 def test_an_agent_keeps_its_promises(agent: Agent, task: str) -> None:
     check_agent(agent, TASKS[task])
+
+
+@pytest.mark.parametrize("made", OF_TOKENS.values(), ids=OF_TOKENS)
+def test_tasks_and_agents_of_tokens_keep_their_promises(made: Setup) -> None:
+    check_task(made.task)
+    check_agent(made.agent, made.task)
 
 
 # Broken promises: each is found, and named
@@ -81,7 +98,7 @@ class Points(POINT.Points):  # type: ignore[misc,name-defined]
     def seen(self) -> Any:
         seen = super().seen()
         changed = {
-            "double precision": {"place": seen["place"].astype("f8")},
+            "whole numbers": {"place": seen["place"].astype("i4")},
             "out of bounds": {"place": seen["place"] + 2},
             "not a number": {"place": seen["place"] * np.nan},
             "a field more": {"speed": seen["place"]},
@@ -107,7 +124,7 @@ class Broken(POINT.Point):  # type: ignore[misc,name-defined]
         ("pays otherwise", "Broken.rewards: wanted what the step was paid"),
         ("flags of numbers", "Points.step: wanted terminated"),
         ("goal moves", "Points.step: wanted field goal to stay"),
-        ("double precision", "Points.reset: wanted place to be f4 (3, 2), got <f8"),
+        ("whole numbers", "Points.reset: wanted place to be f4 (3, 2), got <i4"),
         ("out of bounds", "Points.reset: wanted place within -1 and 1"),
         ("not a number", "Points.reset: wanted place within -1 and 1, got nan"),
         ("a field more", "Points.reset: wanted fields ['goal', 'place'], got ['goal', 'place'"),

@@ -89,7 +89,9 @@ class _Room:
         for field in self.spec.fields:
             if field.per == "moment":
                 self.episodes[field.name][self.rows, t] = seen[field.name]
-            elif t == 0:
+            elif field.per == "step" and t:
+                self.episodes[field.name][self.rows, t - 1] = seen[field.name]
+            elif field.per == "episode" and not t:
                 self.episodes[field.name][self.rows] = seen[field.name]
         if self.facts is None:
             return
