@@ -1,5 +1,7 @@
-"""What learns and acts: networks, hindsight, replay, learners; and the service's messages.
+"""The agents, and what they are made of, on the interface of `tangram_core.agent`.
 
-Start with `setup.py`, what master and workers must agree on, then `learner.py` and `policy.py`. May
-import tangram_sim and tangram_core.
+`agents/` has a folder for each: `scene` (the paper's), `pair`, `outline`, `goal`. `base/` is what
+agents of tokens share, `flat/` what agents of rows of numbers share, `nets/` are layers. `runs.py`
+loads a finished run. May import tangram_tasks, tangram_sim and tangram_core; start with
+`agents/scene/agent.py`.
 """

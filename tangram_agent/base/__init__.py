@@ -1,4 +1,4 @@
-"""What every agent is made of: graphs, attention, weights, Adam, compiled updates.
+"""What agents of tokens share: learning by gradients, DDPG with hindsight, acting, settings.
 
-Knows no agent: imports none of tangram_agent.agents.
+Start with `learning.py`, then `ddpg.py`. Knows no agent: imports none of tangram_agent.agents.
 """
