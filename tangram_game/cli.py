@@ -12,8 +12,8 @@ from conf.cli import entry, tell
 from conf.commands import Plain
 
 if TYPE_CHECKING:
+    from tangram_agent.runs import Stored
     from tangram_game.config import EvalConfig, PlayConfig
-    from tangram_tasks.place import Place
 
 
 def evaluate() -> int:
@@ -53,17 +53,17 @@ def _play(settings: Plain) -> int:
     config = from_mapping(PlayConfig, with_changes(paths))
     check_writable("out", Path(config.out).absolute())
     _check_drawings(config)
-    tasks = _check_played(config.run_dirs, config)
+    stored = _check_played(config.run_dirs, config)
     if config.target is not None:
         from tangram_game.figures.photographs import read_photograph
 
-        read_photograph(config.target, tasks[0])
+        read_photograph(config.target, stored[0].task)
     filled = None
     if config.silhouette is not None:
         from tangram_game.figures.silhouettes import read_silhouette
 
         out = Path(config.out)
-        filled = read_silhouette(config.silhouette, tasks[0], config.solutions, out)
+        filled = read_silhouette(config.silhouette, stored[0].task, config.solutions, out)
     tell(f"loads and plays {', '.join(config.run_dirs)}")
 
     if config.compare is not None:
@@ -75,18 +75,18 @@ def _play(settings: Plain) -> int:
     return play_run(config, filled)
 
 
-def _check_played(run_dirs: Sequence[str], config: "EvalConfig | PlayConfig") -> list["Place"]:
+def _check_played(run_dirs: Sequence[str], config: "EvalConfig | PlayConfig") -> list["Stored"]:
     """Refuse what cannot be played before torch is loaded; returns what the runs play."""
     from tangram_agent.runs import read_changed
 
-    tasks = [read_changed(run_dir, config.changes).task for run_dir in run_dirs]
+    stored = [read_changed(run_dir, config.changes) for run_dir in run_dirs]
     if config.puzzle is not None:
         from tangram_game.config import source_and_names
         from tangram_game.figures.puzzles import find_figures
 
         source, names = source_and_names(config.puzzle)
-        find_figures(source, tasks[0], names)
-    return tasks
+        find_figures(source, stored[0].task, names)
+    return stored
 
 
 def _check_drawings(config: "PlayConfig") -> None:

@@ -106,7 +106,10 @@ def evaluate_run(config: EvalConfig) -> int:
     torch.set_num_threads(1)
     began = time.monotonic()
     run = load_changed(config.run, config.changes)
-    report = (_episodes if config.puzzle is None else _puzzles)(run, config)
+    if not isinstance(run.setup.task, Place) and config.puzzle is None:
+        report = _any_task(run, config)
+    else:
+        report = (_episodes if config.puzzle is None else _puzzles)(run, config)
     if config.out is not None:
         report |= {"seconds": time.monotonic() - began}
         write_whole(Path(config.out), (json.dumps(report, indent=1) + "\n").encode())
@@ -158,6 +161,24 @@ def _episodes(run: Run, config: EvalConfig) -> dict[str, Any]:
     caption = f"{config.episodes:,} {tests}, {_told(run.task)}; positions in arena units"
     Console(highlight=False).print(scores_table(_title(run), caption, scores))
     return {**_report(run, config, scores), "episodes": config.episodes}
+
+
+def _any_task(run: Run, config: EvalConfig) -> dict[str, Any]:
+    """Play test episodes of a task that is not of tokens, and print what it declares."""
+    task, scores = run.setup.task, dict[str, Scores]()
+    players: dict[str, Player] = {RUN: by(run.actor), **task.rivals()}
+    with closing(FixedTests(task, config.episodes, run.actor.at_once, seed=config.seed)) as tests:
+        for name, player in players.items():
+            scores[name] = dict(task.score(tests.play(player(tests.env))))
+    table = Table(title=_title(run), caption=f"{config.episodes:,} tests of seed {config.seed}")
+    for name in ("", *scores):
+        table.add_column(name, justify="right" if name else "left")
+    for score in task.scores:
+        table.add_row(score.label, *(score.shown(own.get(score.name)) for own in scores.values()))
+    Console(highlight=False).print(table)
+    rivals = {name: own for name, own in scores.items() if name != RUN}
+    told = {"test_seed": config.seed, "run_dir": str(run.folder), "updates": run.updates}
+    return {**scores[RUN], **told, "episodes": config.episodes, "baselines": rivals}
 
 
 def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
