@@ -197,7 +197,7 @@ sweep() { # RUN_DIR
     .venv/bin/tangram-train --multirun hydra/launcher=submitit_slurm \
         hydra.sweep.dir="$work/submitit" hydra.launcher.cpus_per_task=2 \
         hydra.launcher.timeout_min=30 hydra.launcher.array_parallelism=2 \
-        run_dir="$1" seed=0,1,2 agent=paper,tangram sim=kinematic max_updates=40 \
+        run_dir="$1" seed=0,1,2 agent=quick,tangram sim=kinematic max_updates=40 \
         agent.learning_starts=64 agent.updates_per_transition=0.1 "${TINY[@]}" \
         >"$work/sweep.log" 2>&1 || { tail "$work/sweep.log"; return 1; }
 }

@@ -12,7 +12,7 @@ import pytest
 
 from conf.commands import COMMANDS
 from conf.help import choices, setting_names
-from conf.kinds import every_kind
+from conf.kinds import every_kind, kinds_of
 from tangram_lab.benchmarks.cli import _parser as bench_parser
 from tests.blocks import PAGES
 
@@ -48,7 +48,8 @@ def found_below(name: str) -> bool:
 
 def dead_settings(text: str) -> list[str]:
     """Settings of a group in inline code that no command has."""
-    known = {name for kinds in every_kind("agent") for name in setting_names("train", kinds)}
+    every = [*every_kind("task"), *every_kind("agent")]
+    known = {name for kinds in every for name in setting_names("train", kinds)}
     groups = {name.partition(".")[0] for name in known if "." in name}
     dotted = rf"(?:{'|'.join(groups)})\.\w+"
     named = [
@@ -76,7 +77,7 @@ def unknown(words: list[str]) -> list[str]:
         bench_parser().parse_args([f"--{word}" if "=" in word else word for word in words[1:]])
         return []
     name = PRIMARIES[words[0]]
-    settings, groups = set(setting_names(name)), COMMANDS[name].groups
+    settings, groups = set(setting_names(name, kinds_of(words))), COMMANDS[name].groups
     refused = []
     for word in words[1:]:
         key, _, value = word.partition("=")

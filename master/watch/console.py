@@ -216,7 +216,7 @@ def status_panel(status: RunStatus, title: str, evaluator: str = "") -> Panel:
     rates = f"{n['transitions_per_s']:,.0f}", f"{n['updates_per_s']:,.1f}"
     grid.add_row("transitions/s", rates[0], "updates/s", rates[1])
     if PLAYED in n:
-        grid.add_row("players' reward", f"{n[PLAYED]:.3f}", "", "with exploration")
+        grid.add_row("players' reward", f"{n[PLAYED]:.3f}", "with exploration", "")
     cells = _cells(status)
     for pair in zip(cells[::2], cells[1::2], strict=True):
         grid.add_row(*(cell for one in pair for cell in one))

@@ -121,18 +121,13 @@ class Numbers(Bound):
     Attributes:
         lenient: what does not fit is left out or brought to the nearest bound: these numbers are
             for people to look at, and must not end the loop that tells them.
-        names: of which there may be numbers, any if there are none.
     """
 
     lenient: bool = False
-    names: Collection[str] = ()
 
     def check(self, where: str, value: Any) -> dict[str, float]:
         """All as floats."""
         for key, number in _entries(where, value):
-            if self.names and key not in self.names:
-                known = ", ".join(self.names)
-                raise WireError(f"{where} has a name not among {known}: {_shown(key)}")
             # Comparisons with NaN are false.
             if not (_is_number(number) and -MAX_NUMBER <= number <= MAX_NUMBER):
                 raise _wrong(f"{where}.{key}", "a finite number", number)

@@ -18,7 +18,6 @@ from tangram_core.wire.messages import (
     MAX_ROWS,
     PICTURE_WIDTH,
     ROLES,
-    SCORE_NAMES,
     WORKER_COLUMNS,
     Ack,
     Alive,
@@ -94,7 +93,7 @@ BOUNDS: dict[str, dict[str, Bound]] = {
     "bye": REASON,
     "ask_status": {},
     "episodes": {"sequence": Between(1, BIG), "weights_version": Between(-1, BIG)},
-    "scores": {"weights_version": Between(-1, BIG), "scalars": Numbers(names=SCORE_NAMES)},
+    "scores": {"weights_version": Between(-1, BIG), "scalars": Numbers()},
     "welcome": {
         "epoch": Text(64),
         "run_id": Text(256),
@@ -216,8 +215,8 @@ def values_of(bound: Bound) -> st.SearchStrategy[Any]:
             letters = st.characters(exclude_categories=() if cut else ["Cs"])
             text = st.text(letters, min_size=int(needed), max_size=min(longest, 200))
             return st.sampled_from(sorted(choices)) if choices else text
-        case Numbers(names=names):
-            keys = st.sampled_from(names) if names else words
+        case Numbers():
+            keys = words
             return st.dictionaries(keys, st.floats(-1e18, 1e18), max_size=5)
         case Texts():
             return st.dictionaries(words, st.text("é9", min_size=1, max_size=16), max_size=5)
@@ -246,7 +245,7 @@ def test_batches_come_back_as_they_were_sent(
         np.testing.assert_array_equal(received.episodes[name], array)
 
 
-@given(st.integers(0, 9), values_of(Numbers(names=SCORE_NAMES)), st.integers(-1, BIG))
+@given(st.integers(0, 9), values_of(Numbers()), st.integers(-1, BIG))
 def test_scores_come_back_as_they_were_sent(
     count: int, scalars: dict[str, float], version: int
 ) -> None:

@@ -223,6 +223,17 @@ def test_each_role_sends_its_own_kind_only(
     assert (stage.arrivals, stage.hub.counters["rejected"]) == ([], 1)
 
 
+def test_scores_that_the_task_does_not_declare_are_refused(stage: Stage) -> None:
+    """Each name is a curve of its own: whoever made up names would fill the disk."""
+    dealer = stage.dealer()
+    dealer.join(role="evaluator")
+    stage.hub.publish(weights(7))
+    sent = replace(scores(), weights_version=7, scalars={"mean_reward": 0.5, "made_up": 1.0})
+    told = "evaluator 0: scores: the task has none that is called made_up"
+    assert dealer.ask(sent.encode(SPEC)) == Reject(told, sequence=0, final=True)
+    assert stage.arrivals == []
+
+
 def test_scores_are_taken_once_for_each_of_the_published_weights(
     stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -70,7 +70,7 @@ def test_durations(seconds: float, shown: str) -> None:
             STATUS,
             "1:23 | 27%, 1:01:40 left | 12,345 episodes | 1,234 updates | 950 transitions/s | "
             "95.1 updates/s | mean reward 0.931, raw overlap 0.966, "
-            "angle error (median) 1.21° | 2 workers | learning",
+            "angle error 1.21° | 2 workers | learning",
             ["27%  1:23, 1:01:40 left", "0.931", "1.21°", "2 workers, 1 evaluator · learning"],
         ),
         (

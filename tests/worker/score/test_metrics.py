@@ -251,7 +251,6 @@ def test_the_scores_of_a_known_set() -> None:
             "angle_error_deg_p90": 9.0,
             "position_error_median": 0.05,
             "position_error_p90": 0.09,
-            "episodes": 11.0,
             "mean_reward_camera": 0.25,
             "mean_train_reward": 0.05,
         }
