@@ -21,8 +21,8 @@ OURS = {"conf", "master", "worker"}
 OURS |= {f"tangram_{name}" for name in ("agent", "core", "game", "sim", "tasks", "vision")}
 DOCKER = ROOT / "docker"
 COMPOSE: dict[str, Any] = yaml.safe_load((DOCKER / "docker-compose.yml").read_text())
-# Neither plays nor learns: the gymnasium environment, and the figures of reports.
-LEFT_OUT = {"gymnasium", "matplotlib", "pandas"}
+# Neither plays nor learns: the figures of reports.
+LEFT_OUT = {"matplotlib", "pandas"}
 DISTRIBUTIONS = cache(packages_distributions)  # of all that is installed: a second
 EXTRAS = {"av"}  # of films, which no container makes
 

@@ -66,7 +66,7 @@ def test_settings_are_found() -> None:
     assert {"seed=1", "tokens=parallelogram", "role=evaluator", "service.bind=0.0.0.0"} <= set(
         found["train.sbatch"]
     )
-    assert {"max_updates=0", "agent=paper", "sim=kinematic"} <= set(found["tryparts.sh"])
+    assert {"max_updates=0", "agent=quick", "sim=kinematic"} <= set(found["tryparts.sh"])
 
 
 @pytest.mark.parametrize("path", JOBS, ids=identity)
