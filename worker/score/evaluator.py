@@ -114,9 +114,9 @@ def _evaluate(tests: FixedTests, acting: Acting, client: Client) -> Scores | Non
 
 
 def framed(picture: Pixels) -> Pixels:
-    """A picture (H, W, 3) as a message takes it: smaller if need be, on white of its width."""
+    """A picture (H, W, 3) as a message takes it: smaller if need be, its paper as wide."""
     image = Image.fromarray(picture)
     image.thumbnail((PICTURE_WIDTH, PICTURE_HEIGHT))
-    canvas = Image.new("RGB", (PICTURE_WIDTH, image.height), "white")
+    canvas = Image.new("RGB", (PICTURE_WIDTH, image.height), image.getpixel((0, 0)))
     canvas.paste(image)
     return np.asarray(canvas)
