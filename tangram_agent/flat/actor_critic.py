@@ -3,8 +3,6 @@
 Legend: B transitions, F entries of a row, A entries of an action, N draws.
 """
 
-import copy
-import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -16,13 +14,20 @@ from torch import Tensor, nn
 
 from tangram_agent.base.adam import Adam
 from tangram_agent.base.compiling import Compiled
+from tangram_agent.base.learning import (
+    check_finite,
+    frozen,
+    gradient_norm,
+    read_slots,
+    saved_slots,
+)
 from tangram_agent.flat.agent import ActorCriticAgent
 from tangram_agent.flat.config import BaseConfig
 from tangram_agent.flat.inputs import Inputs, Normaliser
 from tangram_agent.flat.playing import MEAN, POLICY, SCALE
 from tangram_agent.flat.replay import EpisodeReplay
 from tangram_agent.nets.weights import load_arrays, to_arrays, under
-from tangram_core.agent import Learner, NotFiniteError, Streams, Tensors
+from tangram_core.agent import Learner, Streams, Tensors
 from tangram_core.errors import ConfigError, RunError
 from tangram_core.spec import Array, Arrays, Episodes
 from tangram_core.task import Task
@@ -119,10 +124,7 @@ class ActorCritic(Learner, Generic[Config]):
                     "LayerNorm in the place of BatchNorm"
                 )
             module.to(self._device)
-        self.targets = {
-            name: copy.deepcopy(self.parts[name]).requires_grad_(False)
-            for name in self.target_names()
-        }
+        self.targets = {name: frozen(self.parts[name]) for name in self.target_names()}
         # Kept as lists: walking the modules takes a fifth of a small network's update.
         self._lists, self._targets = _parameters(self.parts), _parameters(self.targets)
         self.parameters = sum(one.numel() for own in self._lists.values() for one in own)
@@ -169,9 +171,7 @@ class ActorCritic(Learner, Generic[Config]):
         self._last = batch = self.batch(rng)
         found = self._step(batch, Rates(self.config.learning_rate))
         numbers = dict(zip(self._names[batch.acts], found.tolist(), strict=True))
-        if not all(map(math.isfinite, numbers.values())):
-            listed = ", ".join(f"{name}={value:g}" for name, value in numbers.items())
-            raise NotFiniteError(f"update {self.updates + 1} is not finite ({listed})")
+        check_finite(self.updates + 1, numbers)
         self.updates += 1
         return numbers
 
@@ -226,9 +226,7 @@ class ActorCritic(Learner, Generic[Config]):
         for part, module in self._modules().items():
             state |= {f"{part}.{name}": value for name, value in to_arrays(module).items()}
         for part, optimiser in self._optimisers.items():
-            for name, tensors in optimiser.slots.items():
-                for i, tensor in enumerate(tensors):
-                    state[f"{part}_optimiser.{i}.{name}"] = tensor.cpu().numpy().copy()
+            state |= saved_slots(part, optimiser.slots)
         return state | {f"seen.{name}": value for name, value in self._normaliser.state().items()}
 
     def load_state(self, state: Mapping[str, Array]) -> None:
@@ -237,16 +235,7 @@ class ActorCritic(Learner, Generic[Config]):
             raise RunError("learner state: no counter of updates: not a learner's checkpoint")
         self.begin_with(state)
         for part, optimiser in self._optimisers.items():
-            own = under(f"{part}_optimiser.", dict(state))
-            slots = {
-                name: [
-                    self._tensor(own[key])
-                    for i in range(len(kept))
-                    if (key := f"{i}.{name}") in own
-                ]
-                for name, kept in optimiser.slots.items()
-            }
-            optimiser.load(slots)
+            optimiser.load(read_slots(part, state, self._device))
         self.updates = int(state[_COUNTER][0])
 
     def begin_with(self, state: Mapping[str, Array]) -> None:
@@ -290,14 +279,3 @@ class ActorCritic(Learner, Generic[Config]):
 
 def _parameters(modules: Mapping[str, nn.Module]) -> dict[str, list[Tensor]]:
     return {name: list(module.parameters()) for name, module in modules.items()}
-
-
-def gradient_norm(gradients: Sequence[Tensor], traced: bool) -> Tensor:
-    """The norm of all gradients together, ().
-
-    torch's own is one kernel for all of them, which compiled code cannot call directly: what is
-    traced is told in single operations.
-    """
-    if not traced:
-        return nn.utils.get_total_norm(gradients)
-    return torch.stack([one.square().sum() for one in gradients]).sum().sqrt()
