@@ -26,8 +26,10 @@ from conf.commands import COMMANDS, GROUPS, Plain
 from conf.help import choices, group_help, help_text, setting_names
 from conf.kinds import Kinds, kinds_of
 from conf.names import hidden, revealed
+from conf.own import with_named_code
 from conf.sweep import LAUNCHER, check_launcher, refuse_lost_job
 from tangram_core.errors import ConfigError, TangramError
+from tangram_core.registry import TASK
 from tangram_core.settings import CONTROL
 
 if TYPE_CHECKING:
@@ -65,6 +67,8 @@ def entry(config_name: str, task: Callable[[Plain], int], stored: Stored | None 
     gc.disable()  # composing makes much and drops nothing: collecting was a fifth of its time
     try:
         folder, arguments = without_own_presets(arguments)
+        composes = TASK in COMMANDS[config_name].groups
+        arguments = with_named_code(arguments, composes=composes)
         if {"-h", "--help"} & set(arguments):
             kinds = kinds_of(arguments, folder)
             sections = COMMANDS[config_name].sections(kinds)
@@ -245,7 +249,7 @@ def _plain(config: Any, stored: Stored | None, config_name: str) -> Plain:
         # The jobs of one sweep start at one time and share their arguments: a folder for each.
         plain["run_dir"] = f"{plain['run_dir']}/{HydraConfig.get().job.num}"
     overrides = list(HydraConfig.get().overrides.task)
-    return with_named_code(with_run_config(plain, overrides, stored), overrides)
+    return with_named_reward(with_run_config(plain, overrides, stored), overrides)
 
 
 def composed(config_name: str, overrides: Sequence[str]) -> Plain:
@@ -359,8 +363,8 @@ def _stored_kinds(arguments: Sequence[str]) -> Plain | None:
     return None if found is None else found[1]
 
 
-def with_named_code(settings: Plain, overrides: Sequence[str]) -> Plain:
-    """Refuse code that a run's settings, or a preset, name and the command line does not.
+def with_named_reward(settings: Plain, overrides: Sequence[str]) -> Plain:
+    """Refuse a reward that a run's settings, or a preset, name and the command line does not.
 
     Raises:
         ConfigError: says which file, and what to add.

@@ -87,7 +87,7 @@ def choices(group: str, folder: str | None = None) -> list[str]:
 def group_defaults(command: Command, kinds: Kinds) -> dict[str, list[str]]:
     """Config group -> presets that a command takes by default."""
     groups = command.chosen(kinds).items()
-    return {group: [name] if isinstance(name, str) else name for group, name in groups}
+    return {group: [name] if isinstance(name, str) else name or [] for group, name in groups}
 
 
 def setting_names(config_name: str, kinds: Kinds = USUAL) -> list[str]:

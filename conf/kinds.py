@@ -13,6 +13,7 @@ import yaml
 
 from tangram_core.errors import ConfigError
 from tangram_core.registry import AGENT, KIND, OURS, TASK, find_agent, find_task
+from tangram_core.run.code import unquoted
 from tangram_core.run.service import ServiceConfig
 from tangram_core.settings import Settings
 
@@ -34,7 +35,7 @@ class Kinds:
 
     def named(self) -> dict[str, str]:
         """Section -> the kind that stands in it."""
-        return {TASK: self.task, AGENT: self.agent}
+        return {"task": self.task, "agent": self.agent}
 
 
 def every_kind(group: str) -> list[Kinds]:
@@ -68,7 +69,7 @@ def _chosen(
     given = [a.partition("=") for a in arguments]
     exact = [value for name, _, value in given if name.lstrip("+") == f"{role}.{KIND}"]
     if exact:
-        return exact[-1]
+        return unquoted(exact[-1])
     presets = [value for name, _, value in given if name.lstrip("+") == role]
     if presets:
         kinds = {_kind(role, preset, folder) for preset in presets[-1].split(",")}

@@ -188,7 +188,9 @@ def command(name: str) -> list[str]:
 
 
 def override(name: str, value: str) -> str:
-    """A setting whose value may hold anything, such as a path with blanks or `=`."""
+    """A setting whose value may hold anything, such as a path with blanks or `=`, or is a list."""
+    if value.startswith("["):
+        return f"{name}={value}"
     escaped = value.replace("'", "\\'")
     return f"{name}='{escaped}'"
 

@@ -3,12 +3,15 @@
 Everything heavy is imported after the config was composed, so --help and wrong input are instant.
 """
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from conf.cli import entry, tell
 from conf.commands import Plain
+from tangram_core.registry import AGENT, SHA256, TASK
+from tangram_core.run.process import VARIABLE
 
 if TYPE_CHECKING:
     from master.config import MasterConfig
@@ -89,7 +92,28 @@ def _checked(settings: Plain, *, plays: bool) -> "tuple[MasterConfig, Setup]":
     for name, section in setup.sections.items():
         if section is not None and section != given[name]:  # it names code by its content now
             settings[name] = settings[name] | vars(section)
+    for role, kind in setup.kinds.items():
+        settings[role] = settings[role] | kind
+    _hold_own_code(setup)
     return config, setup
+
+
+def _hold_own_code(setup: "Setup") -> None:
+    """Play and learn a little with a task or an agent of the user's own, before anything starts.
+
+    Raises:
+        ConformanceError: a promise of its interface is not kept.
+    """
+    own = [role for role, kind in setup.kinds.items() if SHA256 in kind]
+    if not own or VARIABLE in os.environ:  # the launcher did it
+        return
+    from tangram_core.conformance import check_agent, check_task
+
+    tell(f"plays a little with {' and '.join(own)} of your own")
+    if TASK in own:
+        check_task(setup.task)
+    if AGENT in own:
+        check_agent(setup.agent, setup.task)
 
 
 def _make_absolute(settings: Plain) -> None:

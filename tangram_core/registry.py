@@ -1,7 +1,8 @@
 """Tasks and agents by their names: those that come with the package, and those of others.
 
 Another package announces its own as entry points of the groups `tangram_rl.tasks` and
-`tangram_rl.agents`.
+`tangram_rl.agents`. One in a file is named path/to/file.py:Name, and is known once `load_own` has
+loaded it.
 """
 
 from importlib import import_module
@@ -9,6 +10,8 @@ from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, Literal
 
 from tangram_core.errors import ConfigError
+from tangram_core.run.code import load_code, own_code, read_code
+from tangram_core.settings import Settings
 
 if TYPE_CHECKING:  # a command line that is wrong need not wait for numpy
     from tangram_core.agent import Agent
@@ -17,6 +20,7 @@ if TYPE_CHECKING:  # a command line that is wrong need not wait for numpy
 Role = Literal["task", "agent"]
 TASK, AGENT = "task", "agent"  # the sections that every run has
 KIND = "kind"  # the setting that names it, in the section of its role
+SHA256 = "sha256"  # of the file that it stands in, beside its name
 OURS: dict[Role, dict[str, str]] = {
     "task": {
         "place": "tangram_tasks.place:Place",
@@ -32,34 +36,111 @@ OURS: dict[Role, dict[str, str]] = {
 }
 
 
+_own: dict[tuple[Role, str], tuple[type[Any], str]] = {}  # role, name -> class, sha256
+
+
 def find_task(kind: str) -> "type[Task]":
     """The class of a task.
 
     Raises:
-        ConfigError: there is none of this name, or it is no task.
+        ConfigError: there is none of this name, it is no task, or it stands in a file that nobody
+            named.
     """
-    from tangram_core.task import Task  # noqa: PLC0415
-
-    return _found("task", kind, Task)
+    return _own_of("task", kind)[0] if own_code(kind) else _found("task", kind)
 
 
 def find_agent(kind: str) -> "type[Agent]":
     """The class of an agent; errors as for `find_task`."""
-    from tangram_core.agent import Agent  # noqa: PLC0415
-
-    return _found("agent", kind, Agent)
+    return _own_of("agent", kind)[0] if own_code(kind) else _found("agent", kind)
 
 
-def _found(role: Role, kind: str, base: type[Any]) -> type[Any]:
+def announced(role: Role) -> dict[str, str]:
+    """The tasks or agents of other packages: name -> module:Class."""
+    return {one.name: one.value for one in entry_points(group=f"tangram_rl.{role}s")}
+
+
+def load_own(role: Role, given: str) -> None:
+    """Load a task or an agent that a command line, or a program, names in a file.
+
+    Args:
+        role: which.
+        given: path/to/file.py:Name.
+
+    Raises:
+        ConfigError: it cannot be loaded, or is none.
+    """
+    own = own_code(given)
+    if own is None:
+        raise ConfigError(f"{role}={given}: name it as in {role}=path/to/file.py:Name")
+    path, name = own
+    source, digest = read_code(role, given, path)
+    found = load_code(role, given, path, name, source)
+    _own[role, name] = _checked(f"{role}={given}", role, found), digest
+
+
+def named(role: Role, kind: str) -> dict[str, str]:
+    """A kind as a config has it; of one in a file the whole path and the file's content.
+
+    Raises:
+        ConfigError: it stands in a file that nobody named.
+    """
+    own = own_code(kind)
+    if own is None:
+        return {KIND: kind}
+    return {KIND: f"{own[0].absolute()}:{own[1]}", SHA256: _own_of(role, kind)[1]}
+
+
+def identity(role: Role, kind: str) -> dict[str, str]:
+    """What processes on different machines compare of a kind: not where its file lies."""
+    said = named(role, kind)
+    return said | {KIND: said[KIND].rpartition(":")[2]} if SHA256 in said else said
+
+
+def _own_of(role: Role, kind: str) -> tuple[type[Any], str]:
+    found = _own.get((role, kind.rpartition(":")[2]))
+    if found is None:
+        raise ConfigError(
+            f"the settings of the run name code, {kind}, which is not loaded unless you name it: "
+            f"add {role}={kind} if you trust it"
+        )
+    return found
+
+
+def _found(role: Role, kind: str) -> type[Any]:
     place, others = OURS[role].get(kind), dict[str, str]()
     if place is None:
-        others = {one.name: one.value for one in entry_points(group=f"tangram_rl.{role}s")}
+        others = announced(role)
         place = others.get(kind)
         if place is None:
             known = ", ".join([*OURS[role], *others])
             raise ConfigError(f"{role}.{KIND}={kind}: there is no such {role}: choose from {known}")
     module, _, name = place.partition(":")
-    found = getattr(import_module(module), name, None)
+    found: Any = getattr(import_module(module), name, None)
+    return found if kind in OURS[role] else _checked(f"{role}={kind} ({place})", role, found)
+
+
+def _checked(what: str, role: Role, found: object) -> type[Any]:
+    """Refuse what cannot be made of settings; see the docstrings of `Task` and `Agent`."""
+    from tangram_core.agent import Agent  # noqa: PLC0415 - a wrong command line needs no numpy
+    from tangram_core.task import Task  # noqa: PLC0415
+
+    base: type[Any] = Task if role == "task" else Agent
     if not (isinstance(found, type) and issubclass(found, base)):
-        raise ConfigError(f"{role}.{KIND}={kind}: {place} is no {base.__name__}: mend its package")
+        raise ConfigError(f"{what} is no {base.__name__}: derive its class from {base.__module__}")
+    lacking = sorted(getattr(found, "__abstractmethods__", ()))
+    if lacking:
+        raise ConfigError(f"{what} has no {', '.join(lacking)}: see {base.__module__}")
+    kind: Any = found
+    held = kind.__dataclass_fields__
+    for name, section in kind.sections.items():
+        if not (isinstance(section, type) and issubclass(section, Settings)):
+            raise ConfigError(f"{what}: sections[{name!r}] is no dataclass of Settings")
+        if section.section != name or {KIND, SHA256} & {*vars(section)}:
+            raise ConfigError(
+                f"{what}: {section.__name__} must say section={name!r}, and have no setting {KIND} "
+                f"or {SHA256}"
+            )
+        attribute = "config" if name == role else name
+        if attribute not in held:
+            raise ConfigError(f"{what} has no field {attribute}: declare it, in a @dataclass")
     return found

@@ -10,7 +10,17 @@ import dacite
 
 from tangram_core.agent import Agent
 from tangram_core.errors import ConfigError
-from tangram_core.registry import AGENT, KIND, TASK, find_agent, find_task
+from tangram_core.registry import (
+    AGENT,
+    KIND,
+    SHA256,
+    TASK,
+    Role,
+    find_agent,
+    find_task,
+    identity,
+    named,
+)
 from tangram_core.settings import KEY, NETWORK, Settings, declared_fields
 from tangram_core.spec import EpisodeSpec
 from tangram_core.task import Task
@@ -42,6 +52,11 @@ class Setup:
         return self.task.spec
 
     @property
+    def kinds(self) -> dict[str, dict[str, str]]:
+        """How the two are named in a config; by its content too, what stands in a file."""
+        return {TASK: named("task", self.task_kind), AGENT: named("agent", self.agent_kind)}
+
+    @property
     def sections(self) -> dict[str, Settings | None]:
         """Section of the settings -> what it holds; nothing where it only names the kind."""
         own = {TASK: None, AGENT: None}
@@ -49,11 +64,10 @@ class Setup:
 
     def config(self) -> dict[str, Any]:
         """The sections of a config that makes this setup."""
-        kinds = {TASK: {KIND: self.task_kind}, AGENT: {KIND: self.agent_kind}}
         held = {
             n: {} if one is None else asdict(cast("Any", one)) for n, one in self.sections.items()
         }
-        return {name: kinds.get(name, {}) | held[name] for name in held}
+        return {name: self.kinds.get(name, {}) | held[name] for name in held}
 
     def fingerprints(self) -> dict[str, str]:
         """A digest of each section: two processes with the same ones play the same task."""
@@ -66,7 +80,7 @@ class Setup:
 
     def contents(self) -> dict[str, Any]:
         """Each section as JSON values, for a checkpoint; see `Task.identity`."""
-        kinds = {TASK: {KIND: self.task_kind}, AGENT: {KIND: self.agent_kind}}
+        kinds = {TASK: identity("task", self.task_kind), AGENT: identity("agent", self.agent_kind)}
         every = self.task.identity() | self.agent.identity()
         joined = {n: kinds.get(n, {}) | every.get(n, {}) for n in kinds.keys() | every.keys()}
         plain: dict[str, Any] = json.loads(json.dumps(joined, sort_keys=True))
@@ -139,7 +153,7 @@ def make_setup(config: Mapping[str, Any]) -> Setup:
     missing = [name for name in section_names(config) if name not in config]
     if missing:
         raise ConfigError(f"the config has no section {', '.join(missing)}")
-    return Setup(_made(task, config, TASK), _made(agent, config, AGENT), *kinds)
+    return Setup(_made(task, config, "task"), _made(agent, config, "agent"), *kinds)
 
 
 def _kind(config: Mapping[str, Any], role: str) -> str:
@@ -153,10 +167,17 @@ def _kind(config: Mapping[str, Any], role: str) -> str:
     return kind
 
 
-def _made(kind: type[Made], config: Mapping[str, Any], role: str) -> Made:
+def _made(kind: type[Made], config: Mapping[str, Any], role: Role) -> Made:
     """A task or an agent of its sections."""
     sections: Mapping[str, type[Settings]] = kind.sections  # type: ignore[attr-defined]
-    own = {name: value for name, value in config[role].items() if name != KIND}
+    said = named(role, config[role][KIND])
+    wanted = config[role].get(SHA256)
+    if SHA256 in said and wanted not in (None, said[SHA256]):
+        raise ConfigError(
+            f"{role}={config[role][KIND]}: the file has sha256 {said[SHA256]}, and the settings of "
+            f"the run want {wanted}: name the file that it began with, or begin a new run"
+        )
+    own = {name: value for name, value in config[role].items() if name not in said}
     if role not in sections and own:
         raise ConfigError(f"there is no setting {role}.{min(own)}: delete it")
     given = {name: own if name == role else config[name] for name in sections}

@@ -141,7 +141,8 @@ class Task(ABC):
 
     **Scores.** `scores` declares what people are shown; the first one is the headline, by which
     runs are compared. `score` computes them, of played test episodes. Beside a run `rivals` play
-    the same tests: what learned nothing, a formula, a rule or a planner.
+    the same tests: what learned nothing, a formula, a rule or a planner; random actions, where a
+    task names no other.
     """
 
     sections: ClassVar[Mapping[str, type[Settings]]] = {}
@@ -182,7 +183,13 @@ class Task(ABC):
 
     def rivals(self) -> Mapping[str, Callable[[Env], Chooser]]:
         """What learned nothing, by its name in tables, made for environments that it plays in."""
-        return {}
+        size = self.spec.action_size
+
+        def uniform(_seen: Arrays, _past: History, generators: Generators) -> Singles:
+            drawn = [one.uniform(-1.0, 1.0, size) for one in generators]
+            return np.stack(drawn).astype(np.float32)
+
+        return {"random": lambda _: uniform}
 
     def draw(self, played: Played) -> Pixels | None:  # noqa: ARG002
         """A picture (H, W, 3) of a few test episodes; None: there is none to be drawn."""

@@ -4,18 +4,16 @@ Every reward lies in about [-1, 1] and is +1 exactly where the goal is reached. 
 arrays.py: achieved and desired are (B, V, 2) corners, rewards are (B,).
 """
 
-import hashlib
-import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 
 from tangram_core.arrays import Floats, Pixels
 from tangram_core.errors import ConfigError
+from tangram_core.run.code import load_code, read_code
 from tangram_sim.config import RewardConfig, SimConfig
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.overlap import overlap_share
@@ -161,8 +159,7 @@ def reward_identity(config: RewardConfig) -> dict[str, Any]:
     del content["sha256"]
     if config.own is not None:
         path, function = config.own
-        digest = hashlib.sha256(_source(config, path)).hexdigest()[:16]
-        content["name"] = f"{digest}:{function}"
+        content["name"] = f"{_source(config, path)[1][:16]}:{function}"
     return content
 
 
@@ -175,51 +172,22 @@ def pinned(config: RewardConfig) -> RewardConfig:
     if config.own is None:
         return config
     path, function = config.own
-    digest = hashlib.sha256(_source(config, path)).hexdigest()
-    return replace(config, name=f"{path.absolute()}:{function}", sha256=digest)
+    return replace(config, name=f"{path.absolute()}:{function}", sha256=_source(config, path)[1])
 
 
-def _source(config: RewardConfig, path: Path) -> bytes:
-    try:
-        source = path.read_bytes()
-    except OSError as error:
-        raise ConfigError(
-            f"reward.name={config.name}: cannot read '{path}' on this machine "
-            f"({error.strerror or error}): put a copy there, or say where it lies with "
-            "reward.name=path/to/file.py:function"
-        ) from None
-    found = hashlib.sha256(source).hexdigest()
-    if config.sha256 not in (None, found):
-        raise ConfigError(
-            f"reward.name={config.name}: '{path}' has sha256 {found}, and the settings of the run "
-            f"want {config.sha256}: name the file that it began with; only a new run may set "
-            f"reward.sha256={found}"
-        )
-    return source
+def _source(config: RewardConfig, path: Path) -> tuple[bytes, str]:
+    return read_code("reward.name", config.name, path, config.sha256)
 
 
 def _load(config: RewardConfig, path: Path, attribute: str) -> UserReward:
-    name, source = config.name, _source(config, path)
-    # Registered as an import would, since dataclasses look their module up. A user's file is not
-    # found by this name, and two files with one name do not meet.
-    module = ModuleType(f"_tangram_reward_{hashlib.sha256(source).hexdigest()[:16]}")
-    module.__file__ = str(path)
-    sys.modules[module.__name__] = module
-    try:
-        exec(compile(source, path, "exec"), module.__dict__)  # noqa: S102
-    except (Exception, SystemExit) as error:  # it is the user's code: anything may go wrong
+    loaded: UserReward = load_code(
+        "reward.name", config.name, path, attribute, _source(config, path)[0]
+    )
+    if not callable(loaded):
         raise ConfigError(
-            f"reward.name={name}: cannot load '{path}' ({type(error).__name__}: {error}): it must "
-            "be one file that needs nothing but installed packages"
-        ) from error
-    function = getattr(module, attribute, None)
-    if function is None:
-        raise ConfigError(f"reward.name={name}: '{path}' has no '{attribute}'")
-    if not callable(function):
-        raise ConfigError(
-            f"reward.name={name}: '{attribute}' is not a function (achieved, desired, layout)"
+            f"reward.name={config.name}: '{attribute}' is not a function (achieved, desired, "
+            "layout)"
         )
-    loaded: UserReward = function
     return loaded
 
 

@@ -17,6 +17,7 @@ import yaml
 from master.config import MasterConfig
 from master.record.journal import segments
 from tangram_core.errors import ConfigError, RunError
+from tangram_core.run.code import code_of, own_code, read_code
 from tangram_core.run.outcome import FILE_NAME as RESULT
 from tangram_core.run.outcome import bound_of, read_outcome
 from tangram_core.setup import section_names
@@ -131,8 +132,16 @@ class RunFolder:
                 write()
 
     def write_config(self, resolved: Mapping[str, Any]) -> None:
-        """Write the resolved config as plain YAML."""
+        """Write the resolved config as plain YAML, and a copy of the code that it names.
+
+        The copy is for the record: nothing loads it.
+        """
         self._write(self.config, yaml.safe_dump(dict(resolved), sort_keys=False).encode())
+        for setting, value in code_of(resolved).items():
+            own = own_code(value)
+            if own is not None:
+                source, _ = read_code(setting, value, own[0])
+                self._write(self.path / f"{setting.partition('.')[0]}_{own[0].name}", source)
 
     def read_config(self) -> dict[str, Any]:
         """What `write_config` wrote."""

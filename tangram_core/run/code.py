@@ -1,10 +1,24 @@
-"""Code of the user's own: which settings name it, and that only a command line has it loaded."""
+"""Code of the user's own: which settings name it, and how it is read from a file.
 
-from collections.abc import Mapping
+Settings may come from anybody: from a run's folder or a master. So what they name is loaded only
+where a command line, or a program, names it itself.
+"""
+
+import hashlib
+import sys
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
-NAMES = ("task.kind", "agent.kind", "reward.name")  # settings that may name path/to/file.py:Name
+from tangram_core.errors import ConfigError
+
+MODULES = "task.imports"
+# Argument -> section and setting that may hold path/to/file.py:Name.
+NAMES = {"task": ("task", "kind"), "agent": ("agent", "kind"), "reward.name": ("reward", "name")}
+KNOWN = ("gymnasium_robotics", "panda_gym")  # modules of the extra `robotics`
+
+_named = set[str]()  # modules
 
 
 def own_code(name: str) -> tuple[Path, str] | None:
@@ -14,12 +28,98 @@ def own_code(name: str) -> tuple[Path, str] | None:
     return (Path(path).expanduser(), what) if code else None
 
 
+def unquoted(value: str) -> str:
+    """A value as it was before it was quoted for a command line."""
+    quoted = len(value) > 1 and value[0] == value[-1] == "'"
+    return value[1:-1].replace("\\'", "'") if quoted else value
+
+
 def code_of(resolved: Mapping[str, Any]) -> dict[str, str]:
     """The settings of a run that are code, which each of its commands must name itself."""
-    found = {}
-    for setting in NAMES:
-        section, _, key = setting.partition(".")
-        value = resolved.get(section, {}).get(key, "")
-        if isinstance(value, str) and own_code(value) is not None:
-            found[setting] = value
+    found = {name: value for name, value in _values(resolved) if own_code(value) is not None}
+    modules = _read(resolved, *MODULES.split("."))
+    if isinstance(modules, list | tuple) and not set(modules) <= {*KNOWN}:
+        found[MODULES] = f"[{','.join(map(str, modules))}]"
     return found
+
+
+def _values(resolved: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    for name, place in NAMES.items():
+        value = _read(resolved, *place)
+        if isinstance(value, str):
+            yield name, value
+
+
+def _read(resolved: Mapping[str, Any], section: str, key: str) -> object:
+    content = resolved.get(section)
+    return content.get(key) if isinstance(content, Mapping) else None
+
+
+def name_modules(modules: str) -> None:
+    """Let modules be imported that a command line names, as [one,other]."""
+    _named.update(one.strip() for one in modules.strip("[]").split(","))
+
+
+def check_module(module: str) -> None:
+    """Refuse a module that nobody named.
+
+    Raises:
+        ConfigError: says what to add.
+    """
+    if module not in {*KNOWN, *_named}:
+        raise ConfigError(
+            f"the settings of the run name code, the module {module}, which is not imported unless "
+            f"you name it: add {MODULES}=[{module}] if you trust it"
+        )
+
+
+def read_code(setting: str, given: str, path: Path, sha256: str | None = None) -> tuple[bytes, str]:
+    """Content of a user's file, and its digest.
+
+    Args:
+        setting: that names it, for errors.
+        given: its value.
+        path: of the file.
+        sha256: that it must have; None: any.
+
+    Raises:
+        ConfigError: it cannot be read, or has another content.
+    """
+    try:
+        source = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(
+            f"{setting}={given}: cannot read '{path}' on this machine "
+            f"({error.strerror or error}): put a copy there, or say where it lies with "
+            f"{setting}=path/to/file.py:{given.rpartition(':')[2]}"
+        ) from None
+    found = hashlib.sha256(source).hexdigest()
+    if sha256 not in (None, found):
+        raise ConfigError(
+            f"{setting}={given}: '{path}' has sha256 {found}, and the settings of the run want "
+            f"{sha256}: name the file that it began with, or begin a new run"
+        )
+    return source, found
+
+
+def load_code(setting: str, given: str, path: Path, name: str, source: bytes) -> Any:
+    """What a user's file has under a name.
+
+    Raises:
+        ConfigError: it cannot be loaded, or has none.
+    """
+    # Registered as an import would, since dataclasses look their module up. A user's file is not
+    # found by this name, and two files with one name do not meet.
+    module = ModuleType(f"_tangram_own_{hashlib.sha256(source).hexdigest()[:16]}")
+    module.__file__ = str(path)
+    sys.modules[module.__name__] = module
+    try:
+        exec(compile(source, path, "exec"), module.__dict__)  # noqa: S102
+    except (Exception, SystemExit) as error:  # it is the user's code: anything may go wrong
+        raise ConfigError(
+            f"{setting}={given}: cannot load '{path}' ({type(error).__name__}: {error}): it must "
+            "be one file that needs nothing but installed packages"
+        ) from error
+    if not hasattr(module, name):
+        raise ConfigError(f"{setting}={given}: '{path}' has no '{name}'")
+    return getattr(module, name)

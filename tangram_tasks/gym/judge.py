@@ -16,6 +16,7 @@ from gymnasium import spaces
 
 from tangram_core.arrays import Bools, Floats, Singles
 from tangram_core.errors import ConfigError
+from tangram_core.run.code import check_module
 from tangram_core.spec import MAX_REWARD, Array, EpisodeSpec, Field
 from tangram_tasks.gym.task import SUCCESS, GymConfig
 
@@ -104,6 +105,7 @@ class Judge:
         if not config.id:
             raise ConfigError("task.id must name an environment, got '': set task.id=FetchReach-v4")
         for module in config.imports:
+            check_module(module)
             try:
                 with _quiet():
                     importlib.import_module(module)

@@ -3,19 +3,18 @@
 Legend: E episodes, T steps of an episode, n rows, A entries of an action.
 """
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from tangram_core.arrays import Bools, Floats, Singles
+from tangram_core.arrays import Bools, Floats
 from tangram_core.errors import ConfigError
 from tangram_core.scores import Score
 from tangram_core.settings import Settings, setting
-from tangram_core.spec import Array, Arrays, EpisodeSpec
-from tangram_core.task import Chooser, Env, Generators, History, Json, Played, Purpose, Task
+from tangram_core.spec import Array, EpisodeSpec
+from tangram_core.task import Env, Json, Played, Purpose, Task
 
 if TYPE_CHECKING:  # the judge loads gymnasium
     from tangram_tasks.gym.judge import Judge
@@ -130,11 +129,3 @@ class Gym(Task):
     def facts(self) -> Json:
         """Its id."""
         return {"task": self.config.id}
-
-    def rivals(self) -> Mapping[str, Callable[[Env], Chooser]]:
-        """Random actions: no rule is known that plays every environment."""
-        return {"random": lambda _: self._random}
-
-    def _random(self, seen: Arrays, past: History, generators: Generators) -> Singles:  # noqa: ARG002
-        size = self.spec.action_size
-        return np.stack([one.uniform(-1.0, 1.0, size) for one in generators]).astype(np.float32)
