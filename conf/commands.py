@@ -11,7 +11,7 @@ from importlib import import_module
 from typing import Any
 
 from conf.kinds import Kinds, every_kind
-from tangram_core.registry import KIND, OURS
+from tangram_core.registry import KIND
 from tangram_core.settings import Settings, declared_fields, setting
 
 Plain = dict[str, Any]
@@ -76,12 +76,12 @@ class Command:
     def chosen(self, kinds: Kinds) -> dict[str, str | list[str] | None]:
         """Config group -> presets, of the groups that a task and an agent have.
 
-        None: the presets are of other tasks or agents than what is played.
+        None: those by default are of another task or agent than is played.
         """
-        known, named = kinds.sections(), kinds.named()
-        own = {role for role, ours in OURS.items() if named[role] not in ours}
+        known, usual = kinds.sections(), USUAL.named()
+        other = {role for role, kind in kinds.named().items() if kind != usual[role]}
         groups = {group: preset for group, preset in self.groups.items() if group in known}
-        return groups | dict.fromkeys(own & groups.keys())
+        return groups | dict.fromkeys(other & groups.keys())
 
     def sections(self, kinds: Kinds = USUAL) -> dict[str, Plain]:
         """Group -> setting -> default, of the groups whose settings are declared.

@@ -135,11 +135,10 @@ def _checked(what: str, role: Role, found: object) -> type[Any]:
     for name, section in kind.sections.items():
         if not (isinstance(section, type) and issubclass(section, Settings)):
             raise ConfigError(f"{what}: sections[{name!r}] is no dataclass of Settings")
-        if section.section != name or {KIND, SHA256} & {*vars(section)}:
-            raise ConfigError(
-                f"{what}: {section.__name__} must say section={name!r}, and have no setting {KIND} "
-                f"or {SHA256}"
-            )
+        if section.section != name:
+            raise ConfigError(f"{what}: {section.__name__} must say section={name!r}")
+        if name == role and {KIND, SHA256} & {*vars(section)}:
+            raise ConfigError(f"{what}: {section.__name__} must not declare {KIND} or {SHA256}")
         attribute = "config" if name == role else name
         if attribute not in held:
             raise ConfigError(f"{what} has no field {attribute}: declare it, in a @dataclass")

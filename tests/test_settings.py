@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import tests.core.toy  # noqa: F401 - registers environments
 from conf.commands import COMMANDS, GROUPS, declared, load
 from conf.kinds import every_kind
 from conf.settings import NESTED
@@ -157,7 +158,7 @@ ELSEWHERE = {
     "agent.beam": "tests/agent/agents/outline/test_filler.py: a beam finds what values do not tell",
     "agent.clip_targets": "tests/agent/agents/goal/test_learner.py: targets are bounded",
     "task.id": "tests/tasks/test_gym.py: it is made, or refused by name",
-    "task.imports": "tests/tasks/test_gym.py: a module that is not there is named",
+    "task.imports": "tests/cluster/test_own_code.py: a module that is not there is named",
     "task.ends": "tests/core/test_conformance.py: a toy without ends",
     "task.fresh": "tests/core/test_conformance.py: a toy made anew",
     "reward.sha256": "tests/sim/test_rewards.py: another file is refused",

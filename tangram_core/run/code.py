@@ -61,12 +61,12 @@ def name_modules(modules: str) -> None:
 
 
 def check_module(module: str) -> None:
-    """Refuse a module that nobody named.
+    """Refuse a module that nobody named, or has imported.
 
     Raises:
         ConfigError: says what to add.
     """
-    if module not in {*KNOWN, *_named}:
+    if module not in {*KNOWN, *_named, *sys.modules}:
         raise ConfigError(
             f"the settings of the run name code, the module {module}, which is not imported unless "
             f"you name it: add {MODULES}=[{module}] if you trust it"

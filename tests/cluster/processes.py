@@ -14,6 +14,8 @@ from unittest import mock
 from hydra.core.global_hydra import GlobalHydra
 
 from tangram_cli.commands import COMMANDS
+from tangram_core import registry
+from tangram_core.run import code
 
 BIN = Path(sys.executable).parent
 LIMIT_S = 600.0  # waits end by what they wait for; a busy machine takes minutes to start a master
@@ -48,6 +50,8 @@ def here(command: str, *arguments: str, cwd: Path) -> tuple[int, str, str]:
         mock.patch.object(sys, "argv", [command, *arguments]),
         mock.patch.object(sys, "meta_path", [*sys.meta_path]),
         mock.patch.dict(os.environ),
+        mock.patch.object(registry, "_own", {}),  # what this command names is not the next one's
+        mock.patch.object(code, "_named", set()),
     ):
         try:
             status = COMMANDS[command.removeprefix("tangram-")]()

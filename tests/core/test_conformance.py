@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import tests.core.toy  # noqa: F401 - registers environments
 from tangram_agent.agents.goal.agent import Goal, GoalConfig
 from tangram_core.agent import Agent
 from tangram_core.conformance import ConformanceError, check_agent, check_task

@@ -9,7 +9,7 @@ import torch
 from tangram_agent.agents.scene.networks import ActorNet
 from tangram_agent.agents.scene.scenes import Scenes, next_token
 from tangram_agent.base.acting import NetworkActor, tensor
-from tangram_agent.base.config import ActorCriticConfig, NetConfig
+from tangram_agent.base.config import ActorCriticConfig
 from tangram_core.arrays import Singles
 from tangram_core.spec import Arrays
 from tangram_core.task import Generators, History
@@ -21,8 +21,8 @@ from tangram_tasks.played import closed
 class SceneActor(NetworkActor):
     """The next token in the set's order, by the actor's velocity."""
 
-    def __init__(self, task: Place, config: ActorCriticConfig, net: NetConfig) -> None:
-        super().__init__(ActorNet(task.layout, net))
+    def __init__(self, task: Place, config: ActorCriticConfig, network: ActorNet) -> None:
+        super().__init__(network)
         self._task, self._config = task, config
 
     def act(self, seen: Arrays, past: History, explore: Generators | None = None) -> Singles:  # noqa: ARG002

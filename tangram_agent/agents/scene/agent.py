@@ -12,6 +12,8 @@ from tangram_tasks.place import Place
 if TYPE_CHECKING:  # need torch
     from tangram_agent.agents.scene.actor import SceneActor
     from tangram_agent.agents.scene.learner import SceneLearner
+    from tangram_agent.agents.scene.networks import ActorNet, CriticNet
+    from tangram_sim.geometry.layout import Layout
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,8 @@ class Scene(Agent):
         """See `Agent.actor`."""
         from tangram_agent.agents.scene.actor import SceneActor  # noqa: PLC0415
 
-        return SceneActor(cast("Place", task), self.config, self.net)
+        place = cast("Place", task)
+        return SceneActor(place, self.config, self.networks(place.layout)[0])
 
     def learner(
         self, task: Task, seed: int, device: str = "cpu", *, compiled: bool = False
@@ -49,7 +52,15 @@ class Scene(Agent):
         """See `Agent.learner`."""
         from tangram_agent.agents.scene.learner import SceneLearner  # noqa: PLC0415
 
-        return SceneLearner(cast("Place", task), self.config, self.net, seed, device, compiled)
+        place = cast("Place", task)
+        networks = self.networks(place.layout)
+        return SceneLearner(place, self.config, networks, seed, device, compiled)
+
+    def networks(self, layout: "Layout") -> "tuple[ActorNet, CriticNet]":
+        """Actor and critic, with whatever weights; another kind of them overrides this."""
+        from tangram_agent.agents.scene.networks import ActorNet, CriticNet  # noqa: PLC0415
+
+        return ActorNet(layout, self.net), CriticNet(layout, self.net)
 
     def facts(self) -> Json:
         """Its preset and its network."""

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from tangram_agent.agents.scene.networks import ActorNet, CriticNet
 from tangram_agent.agents.scene.scenes import Scenes, next_token
-from tangram_agent.base.config import ActorCriticConfig, NetConfig
+from tangram_agent.base.config import ActorCriticConfig
 from tangram_agent.base.ddpg import Ddpg, Steps
 from tangram_agent.base.types import Transitions
 from tangram_agent.nets.networks import VELOCITY
@@ -22,12 +22,12 @@ class SceneLearner(Ddpg):
         self,
         task: Place,
         config: ActorCriticConfig,
-        net: NetConfig,
+        networks: tuple[ActorNet, CriticNet],
         seed: int,
         device: str = "cpu",
         compiled: bool = False,
     ) -> None:
-        actor, critic = ActorNet(task.layout, net), CriticNet(task.layout, net)
+        actor, critic = networks
         super().__init__(task, config, (actor, critic, actor), seed, device, compiled)
 
     def steps(self, batch: Transitions, generator: np.random.Generator) -> Steps:  # noqa: ARG002

@@ -3,6 +3,9 @@
 Legend: M scenes.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
@@ -15,10 +18,11 @@ from tangram_sim.geometry.layout import Layout
 class ActorNet(nn.Module):
     """pi(s, g): which velocity to give to the token that is to move; tanh bounds it."""
 
-    def __init__(self, layout: Layout, net: NetConfig) -> None:
+    def __init__(self, layout: Layout, net: NetConfig, head: Callable[..., Any] = Head) -> None:
+        """Make it of layers that are made and called as `Head` is."""
         super().__init__()
         self.graph = SceneGraph(layout)
-        self.head = Head(self.graph, net, VELOCITY, at_base=True)
+        self.head = head(self.graph, net, VELOCITY, at_base=True)
 
     def forward(self, scenes: Scenes, features: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Velocity (M, 3) in [-1, 1] in the arena's axes, and its pre-activations (M, 3).
@@ -33,10 +37,11 @@ class ActorNet(nn.Module):
 class CriticNet(nn.Module):
     """Q(s, g, a): what a velocity of the token that is to move is worth (Eq. 3)."""
 
-    def __init__(self, layout: Layout, net: NetConfig) -> None:
+    def __init__(self, layout: Layout, net: NetConfig, head: Callable[..., Any] = Head) -> None:
+        """Make it of layers that are made and called as `Head` is."""
         super().__init__()
         self.graph = SceneGraph(layout)
-        self.head = Head(self.graph, net, 1, at_base=False, action=VELOCITY)
+        self.head = head(self.graph, net, 1, at_base=False, action=VELOCITY)
 
     def forward(
         self,

@@ -1,0 +1,43 @@
+"""A network of one's own for the paper's agent: each node by itself, then their mean (deep sets).
+
+Train it with: tangram-train agent=docs/examples/network.py:Sets
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+
+from tangram_agent.agents.scene.agent import Scene
+from tangram_agent.agents.scene.networks import ActorNet, CriticNet
+
+
+class SetsHead(nn.Module):
+    """Made and called as `tangram_agent.nets.networks.Head` is; M scenes of N nodes."""
+
+    def __init__(self, graph, net, outputs, *, at_base, action=0):
+        super().__init__()
+        self.graph, width = graph, net.width
+        self.nodes = nn.Sequential(
+            nn.Linear(graph.features, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU()
+        )
+        self.read = nn.Sequential(
+            nn.Linear(2 * width + action, width), nn.ReLU(), nn.Linear(width, outputs)
+        )
+
+    def see(self, view):
+        return self.graph.node_features(view)  # (M, N, F)
+
+    def forward(self, view, action=None, features=None):
+        nodes = self.nodes(self.see(view) if features is None else features)
+        rows = torch.arange(len(nodes), device=nodes.device)
+        parts = [nodes[rows, self.graph.base_node(view)], nodes.mean(1)]  # who moves, and all
+        return self.read(torch.cat([*parts, *([] if action is None else [action])], -1))
+
+
+@dataclass(frozen=True)
+class Sets(Scene):
+    """The paper's agent but for its layers."""
+
+    def networks(self, layout):
+        return ActorNet(layout, self.net, SetsHead), CriticNet(layout, self.net, SetsHead)
