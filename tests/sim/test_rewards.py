@@ -249,7 +249,7 @@ def test_another_file_than_the_one_that_was_written_down_is_refused(
     use(ours)
     Path("own.py").write_text("raise SystemExit")
     found = hashlib.sha256(b"raise SystemExit").hexdigest()
-    told = rf"sha256 {found}, and .* want {ours.sha256}: name the .*; only a new run may set reward"
+    told = rf"sha256 {found}, and .* want {ours.sha256}: name the .*, or begin a new run"
     with pytest.raises(ConfigError, match=told):
         use(ours)
 

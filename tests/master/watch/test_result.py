@@ -66,10 +66,11 @@ def test_the_command_that_goes_on_has_the_workers_and_the_code_of_before(
 ) -> None:
     folder = RunFolder(tmp_path)
     bounds = {"max_hours": 0.0, "max_episodes": 0, "max_updates": 2000}
-    reward = {"reward": {"name": "/a/own.py:near"}}
+    (tmp_path / "own.py").touch()
+    reward = {"reward": {"name": f"{tmp_path}/own.py:near"}}
     folder.write_config({"seed": 3, **bounds, "workers": 2, **reward})
     settings = f"run_dir={tmp_path} from_config={tmp_path}/config.yaml resume=auto seed=3 workers=2"
-    own = "reward.name=/a/own.py:near"
+    own = f"reward.name={tmp_path}/own.py:near"
     assert go_on_command(folder, launched).endswith(f"{name} {settings} {own}")
 
 
