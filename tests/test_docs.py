@@ -6,6 +6,7 @@ Links and anchors: tests/test_house_slow.py.
 import re
 import shlex
 from collections.abc import Iterator
+from contextlib import chdir
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ import pytest
 from conf.commands import COMMANDS
 from conf.help import choices, setting_names
 from conf.kinds import every_kind, kinds_of
+from conf.own import with_named_code
 from tangram_lab.benchmarks.cli import _parser as bench_parser
 from tests.blocks import PAGES
 
@@ -77,7 +79,10 @@ def unknown(words: list[str]) -> list[str]:
         bench_parser().parse_args([f"--{word}" if "=" in word else word for word in words[1:]])
         return []
     name = PRIMARIES[words[0]]
-    settings, groups = set(setting_names(name, kinds_of(words))), COMMANDS[name].groups
+    groups = COMMANDS[name].groups
+    with chdir(ROOT):  # where a page's commands find the examples
+        words = with_named_code(words, composes="task" in groups)
+    settings = set(setting_names(name, kinds_of(words)))
     refused = []
     for word in words[1:]:
         key, _, value = word.partition("=")

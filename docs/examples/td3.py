@@ -2,7 +2,8 @@
 
 Replay, hindsight, normalised inputs, optimisers and checkpoints come with the base. Train it with:
 
-    tangram-train agent=docs/examples/td3.py:TD3 task=gym task.id=PandaPush-v3
+    tangram-train agent=docs/examples/td3.py:TD3 task=gym task.id=PandaPush-v3 \
+        task.imports=[panda_gym] task.fresh=true service.envs=2
 """
 
 from dataclasses import dataclass
