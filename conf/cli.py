@@ -136,6 +136,7 @@ def _run(
 ) -> int:
     """Hand over to hydra, so that its --multirun and --cfg work as everywhere."""
     import hydra
+    from hydra.core.hydra_config import HydraConfig
     from hydra.errors import HydraException
     from omegaconf import DictConfig
     from omegaconf.errors import OmegaConfBaseException
@@ -146,6 +147,8 @@ def _run(
     def job(config: DictConfig) -> None:
         gc.enable()
         try:
+            if _is_elsewhere():  # a process of its own, which has loaded nothing
+                with_named_code(HydraConfig.get().overrides.task, composes=True)
             statuses.append(_in_sweep(task(_plain(config, stored, config_name))))
         except (TangramError, OSError, MemoryError) as error:
             if _is_elsewhere():

@@ -5,6 +5,7 @@ where a command line, or a program, names it itself.
 """
 
 import hashlib
+import re
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -29,9 +30,9 @@ def own_code(name: str) -> tuple[Path, str] | None:
 
 
 def unquoted(value: str) -> str:
-    """A value as it was before it was quoted for a command line."""
+    """A value as it was before it was quoted, or its signs escaped, for a command line."""
     quoted = len(value) > 1 and value[0] == value[-1] == "'"
-    return value[1:-1].replace("\\'", "'") if quoted else value
+    return re.sub(r"\\(.)", r"\1", value[1:-1] if quoted else value)
 
 
 def code_of(resolved: Mapping[str, Any]) -> dict[str, str]:

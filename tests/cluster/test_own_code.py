@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shutil
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 import yaml
 
 from conf.cli import composed
+from master.children import override
 from tangram_core.registry import find_agent, find_task, load_own
 from tests.cluster.processes import LIMIT_S, refused, run_here, started, wait_for_file
 from tests.cluster.test_cli import READ
@@ -17,20 +19,27 @@ from tests.core.examples import EXAMPLES
 pytestmark = pytest.mark.cluster
 
 POINT, TD3 = f"task={EXAMPLES}/point.py:Point", f"agent={EXAMPLES}/td3.py:TD3"
+SETS = f"agent={EXAMPLES}/network.py:Sets"
 FEW = ("max_updates=3", "service.eval_episodes=2", "agent.batch_size=16")
 TRAININGS = [
-    (f"agent={EXAMPLES}/network.py:Sets", "sim=kinematic", "agent.learning_starts=32"),
-    (POINT, TD3, "agent.learning_starts=40", "agent.hidden=[16]"),
+    ((SETS,), ("sim=kinematic", "agent.learning_starts=32")),
+    ((POINT, TD3), ("agent.learning_starts=40", "agent.hidden=[16]")),
 ]
 
 
-@pytest.mark.parametrize("own", TRAININGS)
+@pytest.mark.parametrize(("own", "more"), TRAININGS)
 def test_the_examples_train_through_a_master_and_two_workers(
-    folder: Path, own: tuple[str, ...]
+    folder: Path, own: tuple[str, ...], more: tuple[str, ...]
 ) -> None:
-    code = [one for one in own if ".py:" in one]
+    """From a folder whose name must be quoted."""
+    mine, code = folder / "it's mine", list[str]()
+    mine.mkdir()
+    for one in own:
+        role, _, path = one.partition("=")
+        source, _, name = path.rpartition(":")
+        code.append(override(role, f"{shutil.copy(source, mine)}:{name}"))
     with ExitStack() as stack:
-        settings = (f"run_dir={folder}", *FEW, *own)
+        settings = (f"run_dir={folder}", *FEW, *more, *code)
         master = stack.enter_context(started("tangram-master", *settings, cwd=folder))
         wait_for_file(folder / "connection.json", master)
         join = (f"connect={folder}", *code)
@@ -39,10 +48,10 @@ def test_the_examples_train_through_a_master_and_two_workers(
         stack.enter_context(started("tangram-worker", *join, "role=evaluator", cwd=folder))
         assert master.wait(LIMIT_S) == 0
     assert json.loads((folder / "result.json").read_text())["updates"] == 3
-    for one in code:
-        role, _, path = one.rpartition(":")[0].partition("=")
-        copy = folder / f"{role}_{Path(path).name}"
-        assert copy.read_bytes() == Path(path).read_bytes()
+    for one in own:
+        role, _, path = one.partition("=")
+        source = Path(path.rpartition(":")[0])
+        assert (folder / f"{role}_{source.name}").read_bytes() == source.read_bytes()
     told = refused("tangram-eval", f"run_dir={folder}", cwd=folder)
     assert "which is not loaded unless you name it" in told
     scored = run_here("tangram-eval", f"run_dir={folder}", "episodes=2", *code, cwd=folder)
