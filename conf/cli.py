@@ -136,7 +136,6 @@ def _run(
 ) -> int:
     """Hand over to hydra, so that its --multirun and --cfg work as everywhere."""
     import hydra
-    from hydra.core.hydra_config import HydraConfig
     from hydra.errors import HydraException
     from omegaconf import DictConfig
     from omegaconf.errors import OmegaConfBaseException
@@ -147,8 +146,6 @@ def _run(
     def job(config: DictConfig) -> None:
         gc.enable()
         try:
-            if _is_elsewhere():  # a process of its own, which has loaded nothing
-                with_named_code(HydraConfig.get().overrides.task, composes=True)
             statuses.append(_in_sweep(task(_plain(config, stored, config_name))))
         except (TangramError, OSError, MemoryError) as error:
             if _is_elsewhere():
@@ -252,6 +249,8 @@ def _plain(config: Any, stored: Stored | None, config_name: str) -> Plain:
         # The jobs of one sweep start at one time and share their arguments: a folder for each.
         plain["run_dir"] = f"{plain['run_dir']}/{HydraConfig.get().job.num}"
     overrides = list(HydraConfig.get().overrides.task)
+    if _is_elsewhere():  # a process of its own, which has loaded nothing
+        with_named_code(overrides, composes=True)
     return with_named_reward(with_run_config(plain, overrides, stored), overrides)
 
 
