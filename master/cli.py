@@ -87,6 +87,8 @@ def _checked(settings: Plain, *, plays: bool) -> "tuple[MasterConfig, Setup]":
     setup.agent.check_training(compiled=config.service.compile)
     given, setup = setup.sections, replace(setup, task=setup.task.pinned())
     setup.task.check(plays=plays)
+    if config.service.mode == "lockstep":
+        setup.task.check_exact()
     check_batch_size(setup.spec)
     check_compiling(config.service)
     for name, section in setup.sections.items():

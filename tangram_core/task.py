@@ -127,8 +127,8 @@ class Task(ABC):
     The master makes one too, and so does whoever shows a run: to make a task loads no engine.
     `make` does, and only a worker calls it. So nothing heavy is imported at the top of its file.
 
-    What must be there: `spec`, `scores`, `rewards`, `make` and `score`. What may: `check`, `ended`,
-    `rivals` and `draw`.
+    What must be there: `spec`, `scores`, `rewards`, `make` and `score`. What may: `check`,
+    `check_exact`, `ended`, `rivals` and `draw`.
 
     **Goals.** Two fields of the spec hold goals of the same shape: what is achieved at each moment,
     and what is desired in an episode. Hindsight asks `rewards` what the same step would have been
@@ -179,6 +179,13 @@ class Task(ABC):
 
         Raises:
             ConfigError: names the setting and the remedy.
+        """
+
+    def check_exact(self) -> None:  # noqa: B027
+        """Refuse what plays an episode otherwise after another one: lockstep promises the same run.
+
+        Raises:
+            ConfigError: names the remedy.
         """
 
     def rivals(self) -> Mapping[str, Callable[[Env], Chooser]]:

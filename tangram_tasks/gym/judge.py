@@ -99,6 +99,20 @@ class Judge:
         rows = zip(achieved, desired, strict=True)
         return np.fromiter((self._ends(*row, {}) for row in rows), bool, len(achieved))
 
+    def repeats(self) -> bool:
+        """Whether an episode is the same again after another one."""
+        first, _, again = (self._played(seed) for seed in (0, 1, 0))
+        return np.array_equal(first, again)
+
+    def _played(self, seed: int) -> Floats:
+        """What is observed in an episode of random actions."""
+        rng = np.random.default_rng(seed)
+        observed = [self.env.reset(seed=seed)[0][OBSERVATION]]
+        for _ in range(self._horizon):
+            action = self.scaled(rng.uniform(-1, 1, len(self.low)).astype(np.float32))
+            observed.append(self.env.step(action)[0][OBSERVATION])
+        return np.array(observed)
+
     def _registered(self) -> int:
         """Steps of an episode."""
         config = self._config

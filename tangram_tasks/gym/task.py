@@ -93,6 +93,14 @@ class Gym(Task):
         """
         self.judge  # noqa: B018
 
+    def check_exact(self) -> None:
+        """Refuse an environment that plays otherwise after another episode, unless made anew."""
+        if not (self.config.fresh or self.judge.repeats()):
+            raise ConfigError(
+                f"service.mode=lockstep, and task.id={self.config.id} plays an episode otherwise "
+                "after another one: set task.fresh=true"
+            )
+
     def rewards(self, achieved: Array, desired: Array) -> Floats:
         """(n,) what the environment's own `compute_reward` says."""
         return self.judge.rewards(achieved, desired)

@@ -119,6 +119,11 @@ WRONG = [
     ("tangram-worker connect=tcp://127.0.0.1:1 reward.name=own.py:none", "cannot read 'own.py' on"),
     ("tangram-train tokens.shapes=[square,square,square] tokens.scale=2.2", "no room for token"),
     ("tangram-master tokens.scale=1000", "does not fit into an arena of width 2"),
+    (
+        "tangram-train task=gym task.id=Wears-v0 task.imports=[tests.core.toy] agent=goal "
+        "service.mode=lockstep",
+        "plays an episode otherwise after another one: set task.fresh=true",
+    ),
     ("tangram-worker", "say which run: connect=runs/..., or a"),
     ("tangram-worker connect=tcp://127.0.0.1:99999", "port from 1 to 65535"),
     ("tangram-status connect=tcp://127.0.0.1:65536", "port from 1 to 65535"),

@@ -83,6 +83,18 @@ class Wanders(Toy):
         return super().step(action)
 
 
+class Wears(Toy):
+    """Every episode begins a little further away."""
+
+    worn = 0.0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.worn += 0.001
+        self.place = self.place + self.worn
+        return self._seen(), {}
+
+
 PICTURE = spaces.Dict(
     {
         "observation": spaces.Box(0, 255, (8, 8, 3), np.uint8),
@@ -97,6 +109,7 @@ for name, kind, more in (
     ("Ends-v0", Ends, {}),
     ("Untold-v0", Untold, {}),
     ("Wanders-v0", Wanders, {}),
+    ("Wears-v0", Wears, {}),
     ("Pictures-v0", Toy, {"observation_space": PICTURE}),
     ("Discrete-v0", Toy, {"action_space": spaces.Discrete(3)}),
     ("Unbounded-v0", Toy, {"action_space": spaces.Box(-np.inf, np.inf, (2,))}),

@@ -123,3 +123,10 @@ def test_a_goal_that_moves_is_refused_in_play() -> None:
     task = Gym(replace(TOY, id="Wanders-v0", ends=False))
     with pytest.raises(RunError, match="goal moved"):
         play(task, task.make(3), generators(3), towards)
+
+
+def test_lockstep_is_refused_where_an_episode_hangs_on_the_one_before() -> None:
+    Gym(TOY).check_exact()
+    Gym(replace(TOY, id="Wears-v0", fresh=True)).check_exact()
+    with pytest.raises(ConfigError, match="set task.fresh=true"):
+        Gym(replace(TOY, id="Wears-v0")).check_exact()

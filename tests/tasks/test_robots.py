@@ -21,4 +21,6 @@ pytestmark = pytest.mark.slow
 def test_robots_keep_the_promises_of_a_task(package: str, id: str, fresh: bool) -> None:  # noqa: A002
     if not find_spec(package):
         pytest.skip(f"{package} is not installed: pip install '.[robotics]'")
-    check_task(Gym(GymConfig(id=id, imports=(package,), fresh=fresh)))
+    task = Gym(GymConfig(id=id, imports=(package,), fresh=fresh))
+    check_task(task)
+    assert task.judge.repeats() != fresh  # what must be made anew is what does not repeat itself
