@@ -13,12 +13,11 @@ from tangram_agent.runs import Run
 from tangram_core.agent import AT_ONCE
 from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError
-from tangram_game.figures.puzzles import Figure, play_figures
-from tangram_game.playing import Player
+from tangram_game.figures.puzzles import Figure, Player, play_figures
 from tangram_sim.rewards import scaled_overlap
 from tangram_tasks.metrics import SOLVED, assembled, pose_errors, summarise
 from tangram_tasks.place import Place
-from tangram_tasks.played import Played, plain
+from tangram_tasks.played import Played
 from tangram_tasks.rivals.baselines import exact_policy
 
 if TYPE_CHECKING:  # needs OpenCV and shapely
@@ -33,6 +32,7 @@ OF_AREAS = (
     *("coverage", "iou", "blocked", "refused", "actions_used"),
 )
 _COUNTS = ("wrong", "doubly_used", "refused", "blocked", "actions_used")
+_OF_PIECES = ("wrong", "doubly_used", "position_errors", "angle_errors_deg")  # not of outlines
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,48 +63,24 @@ def score_puzzles(
     seed: int,
     at_once: int = AT_ONCE,
 ) -> Scored:
-    """Scores of each policy on the same starts."""
-    scores, played = dict[str, Scores](), dict[str, Played]()
-    for name, player in players.items():
-        played[name] = play_figures(task, figures, player, seed, at_once=at_once)
-        own = summarise(task.layout, task.sim, played[name], own_reward=False)
-        own["episodes"] = float(len(figures))
-        scores[name] = own | of_several(played[name], at_once)
-    run, titles = played[RUN], [figure.title for figure in figures]
-    each = _one_by_one(task, figures, run)
-    return Scored(scores, each, titles, run.ends, run.goals, "positions in arena units")
-
-
-def score_outlines(
-    task: Place,
-    figures: Sequence[Figure],
-    players: Mapping[str, Player],
-    seed: int,
-    at_once: int = AT_ONCE,
-) -> Scored:
-    """Scores of each policy that sees the outlines of puzzles, and fills them itself."""
+    """Scores of each policy on the same starts; who sees outlines fills them itself."""
     played = {
         name: play_figures(task, figures, player, seed, at_once=at_once)
         for name, player in players.items()
     }
-    scores = {name: of_outlines(task, own, at_once) for name, own in played.items()}
-    run, found = played[RUN], assembled(task.layout, played[RUN])
-    each = [
-        {
-            "name": figure.name,
-            "degrees": figure.degrees,
-            "coverage": float(found.coverage[e]),
-            "iou": float(found.iou[e]),
-            "solved": bool(found.iou[e] >= SOLVED),
-            **{name: int(getattr(found, name)[e]) for name in ("blocked", "refused")},
-            "actions_used": int(found.actions_used[e]),
-            "seconds": float(run.seconds[e]),
-        }
-        for e, figure in enumerate(figures)
-    ]
-    titles = [figure.title for figure in figures]
-    told = "played by the run itself; any dissection counts, so no errors of position and angle"
-    return Scored(scores, each, titles, run.ends, run.goals, told)
+    scores = {name: _of_puzzles(task, own, at_once) for name, own in played.items()}
+    run, titles = played[RUN], [figure.title for figure in figures]
+    told = "positions in arena units"
+    if task.outlines:
+        told = "played by the run itself; any dissection counts, so no errors of position and angle"
+    return Scored(scores, _one_by_one(task, figures, run), titles, run.ends, run.goals, told)
+
+
+def _of_puzzles(task: Place, played: Played, at_once: int) -> Scores:
+    if task.outlines:
+        return of_outlines(task, played, at_once)
+    own: Scores = {**summarise(task.layout, task.sim, played, own_reward=False)}
+    return own | {"episodes": float(len(played.overlap))} | of_several(played, at_once)
 
 
 def of_outlines(task: Place, played: Played, at_once: int) -> Scores:
@@ -157,12 +133,11 @@ def score_pictured(run: Run, figures: Sequence[Figure], seed: int) -> Scored:
         from tangram_vision.silhouettes.silhouettes import UNLEARNED  # noqa: PLC0415
     except ImportError as error:
         raise _no_library(task, error) from error
-    own, player = learned_method(run), plain(exact_policy(task.layout, task.sim))
+    own, policy = learned_method(run), exact_policy(task.layout, task.sim)
     methods = {RUN: own, "largest first": replace(own, values=None), "search": UNLEARNED}
     every = {name: hide(task, figures, seed, method) for name, method in methods.items()}
-    return _of_hidden(
-        {name: (hidden, play_hidden(hidden, player, seed)) for name, hidden in every.items()}
-    )
+    laid = {name: play_hidden(hidden, lambda _: policy, seed) for name, hidden in every.items()}
+    return _of_hidden({name: (hidden, laid[name]) for name, hidden in every.items()})
 
 
 def _of_hidden(every: "Mapping[str, tuple[Hidden, Laid]]") -> Scored:
@@ -212,13 +187,14 @@ def of_several(played: Played, at_once: int) -> Scores:
 def _one_by_one(task: Place, figures: Sequence[Figure], played: Played) -> list[dict[str, Any]]:
     found = assembled(task.layout, played)
     position, angle = pose_errors(task.layout, played.ends, played.goals)
-    return [
+    solved = found.iou >= SOLVED if task.outlines else found.solved
+    lines = [
         {
             "name": figure.name,
             "degrees": figure.degrees,
             "coverage": float(found.coverage[e]),
             "iou": float(found.iou[e]),
-            "solved": bool(found.solved[e]),
+            "solved": bool(solved[e]),
             **{name: int(getattr(found, name)[e]) for name in _COUNTS},
             "position_errors": position[e].tolist(),
             "angle_errors_deg": angle[e].tolist(),
@@ -226,3 +202,5 @@ def _one_by_one(task: Place, figures: Sequence[Figure], played: Played) -> list[
         }
         for e, figure in enumerate(figures)
     ]
+    left_out = _OF_PIECES if task.outlines else ()
+    return [{key: one[key] for key in one if key not in left_out} for one in lines]

@@ -15,9 +15,8 @@ import numpy as np
 
 from tangram_core.agent import AT_ONCE
 from tangram_core.arrays import Bools, Floats, Ints
-from tangram_game.figures.puzzles import Figure, figure_generator, play_figures
+from tangram_game.figures.puzzles import Figure, Player, figure_generator, play_figures
 from tangram_game.figures.silhouettes import SECONDS
-from tangram_game.playing import Player
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.areas import Area
 from tangram_sim.geometry.dissections import Dissection

@@ -28,9 +28,8 @@ from tangram_core.store.checkpoints import ACTING, CHECKPOINTS, load_checkpoint,
 from tangram_core.store.files import check_writable, write_whole
 from tangram_game.config import EvalConfig
 from tangram_game.evaluate import policies, score_policies
-from tangram_game.figures.puzzles import find_figures
-from tangram_game.playing import by
-from tangram_game.scores import RUN, score_outlines, score_puzzles
+from tangram_game.figures.puzzles import by, find_figures
+from tangram_game.scores import RUN, score_puzzles
 from tangram_sim.targets.targets import has_all_tans
 
 PACKAGE = Path(__file__).resolve().parents[2] / "tangram_agent" / "pretrained"
@@ -105,8 +104,7 @@ def _shipped(setup: Setup) -> dict[str, dict[str, Any]]:
 def _on_figures(run: Run, split: str) -> dict[str, Any]:
     """Scores of a run on the figures of a split."""
     figures = find_figures(split, run.task, None, TURNS)
-    score = score_outlines if run.task.outlines else score_puzzles
-    scored = score(run.task, figures, {RUN: by(run.actor)}, TEST_SEED, run.actor.at_once)
+    scored = score_puzzles(run.task, figures, {RUN: by(run.actor)}, TEST_SEED, run.actor.at_once)
     return {"turns": TURNS, "scores": scored.means[RUN]}
 
 

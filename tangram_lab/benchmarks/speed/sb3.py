@@ -24,9 +24,10 @@ import torch
 from tangram_core.arrays import Bools, Floats, Singles
 from tangram_core.errors import TangramError
 from tangram_core.seeding import evaluation_generators
-from tangram_core.task import Generators
+from tangram_core.spec import Arrays
+from tangram_core.task import Generators, History
 from tangram_lab.benchmarks.setups import place, preset
-from tangram_tasks.played import Past, Played, chooser
+from tangram_tasks.played import Played, as_seen
 from worker.play.rollout import play
 
 LIBRARY = "stable_baselines3"
@@ -215,16 +216,14 @@ def _exam(model: Any) -> Callable[[], float]:
     task = place(preset())
     env = task.make(AT_ONCE)
 
-    def choose(
-        corners: Floats, placed: Bools, goals: Floats, _: Generators, _past: Past
-    ) -> Singles:
-        actions: Singles = model.predict(observation(corners, placed, goals), deterministic=True)[0]
+    def choose(seen: Arrays, _past: History, _: Generators) -> Singles:
+        actions: Singles = model.predict(observation(*as_seen(seen)), deterministic=True)[0]
         return actions
 
     def exam() -> float:
         generators = evaluation_generators(TESTS)
         number = generators.__getitem__
-        played = play(env, task.spec, chooser(choose), number, TESTS, facts=True)
+        played = play(env, task.spec, choose, number, TESTS, facts=True)
         return float(np.mean(Played.of(played).overlap))
 
     return exam
