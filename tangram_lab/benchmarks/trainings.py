@@ -83,6 +83,12 @@ def processes_of(folder: Path) -> dict[psutil.Process, str]:
     return found
 
 
+def numbers_of(folder: Path, patience_s: float = PATIENCE_S) -> dict[str, float]:
+    """Those of a run's status; TangramError where its master does not answer in time."""
+    with zmq.Context() as context:
+        return dict(ask_status(str(folder), context, patience_s).numbers)
+
+
 def result_of(folder: Path) -> dict[str, Any]:
     """The content of a finished run's result.json."""
     content = json.loads((folder / "result.json").read_text())
