@@ -161,7 +161,12 @@ def _turns(puzzle: Puzzle, task: Place, turns: int) -> list[Figure]:
     figures = []
     for degrees in (360.0 * i / turns for i in range(turns)):
         there = turned_figure(task.layout, (poses, flipped), np.radians(degrees))
-        _check_inside(puzzle, task, task.layout.corners(there, flipped))
+        check_inside(
+            f"puzzle '{puzzle.name}'",
+            task,
+            task.layout.corners(there, flipped),
+            "name a run of a larger arena or of smaller tokens",
+        )
         figures.append(Figure(puzzle.name, degrees, there, flipped))
     return figures
 
@@ -177,16 +182,10 @@ def _placed(puzzle: Puzzle, task: Place) -> tuple[Floats, Bools]:
         ) from None
 
 
-def reach_beyond(task: Place, corners: Floats) -> float | None:
-    """How far corners (V, 2) reach from the middle where a run's arena does not; else None."""
-    reach = float(np.abs(corners).max())
-    return reach if reach > task.sim.arena / 2.0 + _ROUNDING else None
-
-
-def _check_inside(puzzle: Puzzle, task: Place, corners: Floats) -> None:
-    reach = reach_beyond(task, corners)
-    if reach is not None:
+def check_inside(what: str, task: Place, corners: Floats, remedy: str) -> None:
+    """Raise ConfigError where corners (V, 2) around the middle reach out of a run's arena."""
+    reach, half = float(np.abs(corners).max()), task.sim.arena / 2.0
+    if reach > half + _ROUNDING:
         raise ConfigError(
-            f"puzzle '{puzzle.name}' reaches {reach:.3g} from its middle, and the run's arena only "
-            f"{task.sim.arena / 2.0:.3g}: name a run of a larger arena or of smaller tokens"
+            f"{what} reaches {reach:.3g} from its middle, and the arena only {half:.3g}: {remedy}"
         )

@@ -77,9 +77,7 @@ def test_what_cannot_be_played_is_refused_by_name(
 
 def test_a_figure_that_does_not_fit_into_the_arena_is_refused() -> None:
     find_figures("train", game())
-    with pytest.raises(
-        ConfigError, match="reaches 0.* from its middle, and the run's arena only 0"
-    ):
+    with pytest.raises(ConfigError, match="reaches 0.* from its middle, and the arena only 0"):
         find_figures("train", game(arena=1.4))
 
 
