@@ -11,11 +11,11 @@ import numpy as np
 
 from tangram_agent.runs import Run
 from tangram_core.agent import AT_ONCE
-from tangram_core.arrays import Floats
+from tangram_core.arrays import Bools, Floats
 from tangram_core.errors import ConfigError
 from tangram_game.figures.puzzles import Figure, Player, play_figures
 from tangram_sim.rewards import scaled_overlap
-from tangram_tasks.metrics import SOLVED, assembled, pose_errors, summarise
+from tangram_tasks.metrics import SOLVED, Assembled, assembled, pose_errors, summarise
 from tangram_tasks.place import Place
 from tangram_tasks.played import Played
 from tangram_tasks.rivals.baselines import exact_policy
@@ -26,13 +26,9 @@ if TYPE_CHECKING:  # needs OpenCV and shapely
 RUN = "this run"
 Scores = dict[str, Any]  # numbers, and `coverage_each` of the episodes
 
-# What is told of filled outlines: nothing of where a piece should lie.
-OF_AREAS = (
-    *("mean_reward", "raw_overlap", "raw_overlap_p10"),
-    *("coverage", "iou", "blocked", "refused", "actions_used"),
-)
-_COUNTS = ("wrong", "doubly_used", "refused", "blocked", "actions_used")
-_OF_PIECES = ("wrong", "doubly_used", "position_errors", "angle_errors_deg")  # not of outlines
+_SHARES = ("coverage", "iou")
+_ACTIONS = ("refused", "blocked", "actions_used")
+_PIECES = ("wrong", "doubly_used")  # are not told of silhouettes: any dissection counts
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,13 +82,15 @@ def _of_puzzles(task: Place, played: Played, at_once: int) -> Scores:
 def of_outlines(task: Place, played: Played, at_once: int) -> Scores:
     """Scores of filled outlines; any dissection counts, so none tells of single pieces."""
     found = assembled(task.layout, played)
-    means = {key: value for key, value in found.means().items() if key in OF_AREAS}
-    areas = {
-        "mean_reward": float(np.mean(scaled_overlap(found.coverage))),
-        "share_solved_iou": float(np.mean(found.iou >= SOLVED)),
-        "episodes": float(len(found.coverage)),
-    }
-    return means | areas | of_several(played, at_once)
+    return _of_areas(found) | {"episodes": float(len(found.iou))} | of_several(played, at_once)
+
+
+def _of_areas(found: "Assembled | Laid") -> Scores:
+    """Means of what tells nothing of single pieces."""
+    means = {name: float(np.mean(getattr(found, name))) for name in (*_SHARES, *_ACTIONS)}
+    reward = float(np.mean(scaled_overlap(found.coverage)))
+    solved = float(np.mean(found.iou >= SOLVED))
+    return means | {"mean_reward": reward, "share_solved_iou": solved}
 
 
 def score_hidden(
@@ -142,16 +140,40 @@ def score_pictured(run: Run, figures: Sequence[Figure], seed: int) -> Scored:
 
 def _of_hidden(every: "Mapping[str, tuple[Hidden, Laid]]") -> Scored:
     """Scores of what each policy laid."""
-    from tangram_game.figures.hidden import means, one_by_one  # noqa: PLC0415
-
     hidden, laid = every[RUN]
     told = (
         f"{hidden.filled} of {len(hidden.figures)} filled ({_by(hidden.filled_by)}); any "
         "dissection counts, so no errors of position and angle, and no pieces under others"
     )
-    scores = {name: means(*own) for name, own in every.items()}
-    each = one_by_one(hidden, laid)
+    scores = {name: hidden_means(*own) for name, own in every.items()}
+    each = hidden_lines(hidden, laid)
     return Scored(scores, each, hidden.titles, laid.ends, hidden.goals, told)
+
+
+def hidden_means(hidden: "Hidden", laid: "Laid") -> Scores:
+    """Scores of all puzzles, those that were not filled among them."""
+    return _of_areas(laid) | {
+        "filled": hidden.filled,
+        "filled_by": hidden.filled_by,
+        "not_filled": len(hidden.figures) - hidden.filled,
+        "search_seconds": float(np.mean([search.seconds for search in hidden.searches])),
+        "seconds_per_puzzle": float(np.mean(laid.seconds)),
+    }
+
+
+def hidden_lines(hidden: "Hidden", laid: "Laid") -> list[dict[str, Any]]:
+    """Scores of each puzzle."""
+    return [
+        _line(figure, laid, e, laid.iou >= SOLVED, _ACTIONS)
+        | {
+            "filled": search.filled,
+            "filled_by": search.by if search.filled else "",
+            "search_iou": search.iou,
+            "search_seconds": search.seconds,
+            "seconds": float(laid.seconds[e]),
+        }
+        for e, (figure, search) in enumerate(zip(hidden.figures, hidden.searches, strict=True))
+    ]
 
 
 def _no_library(task: Place, error: ImportError) -> ConfigError:
@@ -186,21 +208,29 @@ def of_several(played: Played, at_once: int) -> Scores:
 
 def _one_by_one(task: Place, figures: Sequence[Figure], played: Played) -> list[dict[str, Any]]:
     found = assembled(task.layout, played)
-    position, angle = pose_errors(task.layout, played.ends, played.goals)
     solved = found.iou >= SOLVED if task.outlines else found.solved
+    counts = (*(() if task.outlines else _PIECES), *_ACTIONS)
     lines = [
-        {
-            "name": figure.name,
-            "degrees": figure.degrees,
-            "coverage": float(found.coverage[e]),
-            "iou": float(found.iou[e]),
-            "solved": bool(solved[e]),
-            **{name: int(getattr(found, name)[e]) for name in _COUNTS},
-            "position_errors": position[e].tolist(),
-            "angle_errors_deg": angle[e].tolist(),
-            "seconds": float(played.seconds[e]),
-        }
+        _line(figure, found, e, solved, counts) | {"seconds": float(played.seconds[e])}
         for e, figure in enumerate(figures)
     ]
-    left_out = _OF_PIECES if task.outlines else ()
-    return [{key: one[key] for key in one if key not in left_out} for one in lines]
+    if task.outlines:
+        return lines
+    position, angle = pose_errors(task.layout, played.ends, played.goals)
+    return [
+        one | {"position_errors": position[e].tolist(), "angle_errors_deg": angle[e].tolist()}
+        for e, one in enumerate(lines)
+    ]
+
+
+def _line(
+    figure: Figure, found: "Assembled | Laid", e: int, solved: Bools, counts: Sequence[str]
+) -> dict[str, Any]:
+    """What every list tells of a puzzle; `solved` (E,)."""
+    return {
+        "name": figure.name,
+        "degrees": figure.degrees,
+        **{name: float(getattr(found, name)[e]) for name in _SHARES},
+        "solved": bool(solved[e]),
+        **{name: int(getattr(found, name)[e]) for name in counts},
+    }

@@ -17,9 +17,9 @@ from tangram_core.errors import ConfigError
 from tangram_core.task import Chooser, Env
 from tangram_game.config import EvalConfig
 from tangram_game.evaluate import evaluate_run
-from tangram_game.figures.hidden import Hidden, hide, lay, means, one_by_one, play_hidden
+from tangram_game.figures.hidden import Hidden, hide, lay, play_hidden
 from tangram_game.figures.puzzles import Figure, find_figures, play_figures
-from tangram_game.scores import RUN, score_hidden
+from tangram_game.scores import RUN, hidden_lines, hidden_means, score_hidden
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.config import RewardConfig
 from tangram_sim.geometry.areas import overlap
@@ -187,11 +187,11 @@ def test_what_was_not_filled_counts_as_nothing(monkeypatch: pytest.MonkeyPatch) 
     assert laid.seconds[1] == 0.25
     assert laid.iou[[0, 2]].min() > 0.999
     assert laid.actions_used[[0, 2]].tolist() == [7, 7]
-    scores = means(hidden, laid)
+    scores = hidden_means(hidden, laid)
     assert (scores["filled"], scores["not_filled"]) == (2, 1)
     assert scores["iou"] == pytest.approx(2 / 3, abs=1e-3)
     assert scores["share_solved_iou"] == pytest.approx(2 / 3)
-    assert [one["filled"] for one in one_by_one(hidden, laid)] == [True, False, True]
+    assert [one["filled"] for one in hidden_lines(hidden, laid)] == [True, False, True]
     assert hidden.titles == ["heart", "swan, not filled", "hut"]
 
 
