@@ -17,10 +17,11 @@ from tangram_agent.agents.outline.agent import Outline
 from tangram_agent.runs import Run, load_changed
 from tangram_core.agent import AT_ONCE
 from tangram_core.run.outcome import plural
+from tangram_core.scores import Score
 from tangram_core.store.files import write_whole
+from tangram_core.task import Task
 from tangram_game.config import EvalConfig, source_and_names
-from tangram_game.figures.puzzles import find_figures
-from tangram_game.playing import Player, by
+from tangram_game.figures.puzzles import Player, by, find_figures
 from tangram_game.rivals.fitted import fitted_policy
 from tangram_game.scores import (
     RUN,
@@ -30,7 +31,6 @@ from tangram_game.scores import (
     of_outlines,
     of_several,
     score_hidden,
-    score_outlines,
     score_pictured,
     score_puzzles,
 )
@@ -44,46 +44,14 @@ MAX_PICTURES = 100  # on a sheet
 MAX_PADDED = 5  # policies in a table
 MAX_LINES = 40  # of puzzles and of faults on the screen
 
-# Scores in the order of the table, with their labels and digits; the rest is only in the file.
-_REWARDS = {
-    "mean_reward": ("mean reward, polygons [-1, 1]", 3),
-    "mean_reward_camera": ("mean reward, camera [-1, 1]", 3),
-    "mean_train_reward": ("mean reward, as trained on", 3),
-}
-_ERRORS = {
-    "position_error_median": ("position error, median", 4),
-    "position_error_p90": ("position error, 90th percentile", 4),
-    "angle_error_deg_median": ("angle error, median (degrees)", 2),
-    "angle_error_deg_p90": ("angle error, 90th percentile", 2),
-}
-_ONE_TOKEN = {
-    **_REWARDS,
-    "raw_overlap": ("raw overlap [0, 1]", 3),
-    "raw_overlap_p10": ("raw overlap, 10th percentile", 3),
-    **_ERRORS,
-}
-# Short: a table of six policies should fit into 80 columns.
-_SEVERAL = {
-    "coverage": ("covered [0, 1]", 3),
-    "raw_overlap_p10": ("covered, 10th perc.", 3),
-    "iou": ("IoU", 3),
-    "share_solved": ("solved, 95 % covered", 3),
-    "share_solved_iou": ("solved, IoU 0.95", 3),
-    "mean_train_reward": ("reward as trained on", 3),
-    "position_error_median": ("position, median", 4),
-    "position_error_p90": ("position, 90th perc.", 4),
-    "angle_error_deg_median": ("angle (°), median", 2),
-    "angle_error_deg_p90": ("angle (°), 90th perc.", 2),
-    "wrong": ("under another shape", 2),
-    "doubly_used": ("under two tokens", 2),
-    "refused": ("refused: was placed", 2),
-    "blocked": ("blocked by others", 2),
-    "actions_used": ("actions", 2),
-    "seconds_per_puzzle": ("seconds", 3),
-    "search_seconds": ("of them the search", 3),
-    "ms_per_decision": ("ms for each action", 1),
-    "ms_slowest": ("CPU ms of the slowest", 0),
-}
+# What is shown beside the scores that a task declares; the rest is only in the file.
+_BESIDE = (
+    Score("share_solved_iou", "solved (IoU 0.95)"),
+    Score("seconds_per_puzzle", "seconds"),
+    Score("search_seconds", "of them the search"),
+    Score("ms_per_decision", "ms for each action", 1),
+    Score("ms_slowest", "CPU ms of the slowest", 0),
+)
 
 
 def evaluate_run(config: EvalConfig) -> int:
@@ -106,10 +74,7 @@ def evaluate_run(config: EvalConfig) -> int:
     torch.set_num_threads(1)
     began = time.monotonic()
     run = load_changed(config.run, config.changes)
-    if not isinstance(run.setup.task, Place) and config.puzzle is None:
-        report = _any_task(run, config)
-    else:
-        report = (_episodes if config.puzzle is None else _puzzles)(run, config)
+    report = (_episodes if config.puzzle is None else _puzzles)(run, config)
     if config.out is not None:
         report |= {"seconds": time.monotonic() - began}
         write_whole(Path(config.out), (json.dumps(report, indent=1) + "\n").encode())
@@ -119,8 +84,8 @@ def evaluate_run(config: EvalConfig) -> int:
 
 def policies(run: Run) -> dict[str, Player]:
     """The run, and those to compare it with, by their names in tables and files."""
-    result, rivals = {RUN: by(run.actor)}, dict(run.task.rivals())
-    agent, task = run.setup.agent, run.task
+    result, task = {RUN: by(run.actor)}, run.setup.task
+    rivals, agent = dict(task.rivals()), run.setup.agent
     if isinstance(agent, Outline):
         if agent.config.beam > 1:
             result["beam=1"] = by(run.with_settings({"agent": {"beam": 1}}).actor)
@@ -129,13 +94,15 @@ def policies(run: Run) -> dict[str, Player]:
     first: dict[str, Player] = {
         name: rivals.pop(name) for name in ("exact", "sweep rule") if name in rivals
     }
-    if task.sim.inexact or (task.sim.corner_noise and task.horizon > 1):
+    if isinstance(task, Place) and (
+        task.sim.inexact or (task.sim.corner_noise and task.horizon > 1)
+    ):
         first["fitted"] = fitted_policy
     return {**result, **first, **rivals}
 
 
 def score_policies(
-    task: Place, players: Mapping[str, Player], config: EvalConfig, at_once: int = AT_ONCE
+    task: Task, players: Mapping[str, Player], config: EvalConfig, at_once: int = AT_ONCE
 ) -> dict[str, Scores]:
     """Scores of each policy, on the same episodes."""
     with closing(FixedTests(task, config.episodes, at_once, seed=config.seed)) as tests:
@@ -144,10 +111,10 @@ def score_policies(
 
 def _scored(tests: FixedTests, player: Player, at_once: int) -> Scores:
     whole, task = tests.play(player(tests.env)), tests.task
-    played = Played.of(whole)
     scores: Scores = {**task.score(whole), "episodes": float(whole.episodes.count)}
     if not isinstance(task, Place):
         return scores
+    played = Played.of(whole)
     if task.outlines:
         return scores | of_outlines(task, played, at_once)
     several = task.layout.tokens > 1
@@ -156,29 +123,14 @@ def _scored(tests: FixedTests, player: Player, at_once: int) -> Scores:
 
 def _episodes(run: Run, config: EvalConfig) -> dict[str, Any]:
     """Play the test episodes and print the scores; the file's content."""
-    scores = score_policies(run.task, policies(run), config, run.actor.at_once)
+    task = run.setup.task
+    scores = score_policies(task, policies(run), config, run.actor.at_once)
     tests = "fixed tests" if config.seed == 0 else f"tests of seed {config.seed}"
-    caption = f"{config.episodes:,} {tests}, {_told(run.task)}; positions in arena units"
-    Console(highlight=False).print(scores_table(_title(run), caption, scores))
+    caption = f"{config.episodes:,} {tests}"
+    if isinstance(task, Place):
+        caption = f"{caption}, {_told(task)}; positions in arena units"
+    Console(highlight=False).print(scores_table(_title(run), caption, task.scores, scores))
     return {**_report(run, config, scores), "episodes": config.episodes}
-
-
-def _any_task(run: Run, config: EvalConfig) -> dict[str, Any]:
-    """Play test episodes of a task that is not of tokens, and print what it declares."""
-    task, scores = run.setup.task, dict[str, Scores]()
-    players: dict[str, Player] = {RUN: by(run.actor), **task.rivals()}
-    with closing(FixedTests(task, config.episodes, run.actor.at_once, seed=config.seed)) as tests:
-        for name, player in players.items():
-            scores[name] = dict(task.score(tests.play(player(tests.env))))
-    table = Table(title=_title(run), caption=f"{config.episodes:,} tests of seed {config.seed}")
-    for name in ("", *scores):
-        table.add_column(name, justify="right" if name else "left")
-    for score in task.scores:
-        table.add_row(score.label, *(score.shown(own.get(score.name)) for own in scores.values()))
-    Console(highlight=False).print(table)
-    rivals = {name: own for name, own in scores.items() if name != RUN}
-    told = {"test_seed": config.seed, "run_dir": str(run.folder), "updates": run.updates}
-    return {**scores[RUN], **told, "episodes": config.episodes, "baselines": rivals}
 
 
 def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
@@ -189,15 +141,15 @@ def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
     if task.outlines and task.sim.observe == "silhouette_pictures":
         scored = score_pictured(run, figures, config.seed)
     else:
-        shown = score_hidden if task.sim.observe in SILHOUETTES else score_puzzles
-        score = score_outlines if task.outlines else shown
+        hides = task.sim.observe in SILHOUETTES and not task.outlines
+        score = score_hidden if hides else score_puzzles
         scored = score(task, figures, policies(run), config.seed, run.actor.at_once)
     scores, lines = scored.means, scored.puzzles
     console = Console(highlight=False)
     count = len(figures)
     which = f"{plural(count, 'puzzle')} of {Path(source or 'the library').name}"
     caption = f"{which}, {_told(task)}; {scored.told}"
-    console.print(scores_table(_title(run), caption, scores))
+    console.print(scores_table(_title(run), caption, task.scores, scores))
     console.print(puzzles_table(lines, full=config.out))
     if config.sheet is not None:
         write_sheet(config.sheet, task, scored)
@@ -211,14 +163,15 @@ def _puzzles(run: Run, config: EvalConfig) -> dict[str, Any]:
 
 def _report(run: Run, config: EvalConfig, scores: Mapping[str, Scores]) -> dict[str, Any]:
     """The file's content: the run's scores on top, by the same names as in result.json."""
-    task = run.task
+    task, world = run.setup.task, dict[str, Any]()
+    if isinstance(task, Place):
+        world = {"tokens": [shape.name for shape in task.layout.shapes], "sim": asdict(task.sim)}
     return {
         **scores[RUN],
         "test_seed": config.seed,
         "run_dir": str(run.folder),
         "updates": run.updates,
-        "tokens": [shape.name for shape in task.layout.shapes],
-        "sim": asdict(task.sim),
+        **world,
         "agent": run.setup.config()["agent"],
         "baselines": {name: values for name, values in scores.items() if name != RUN},
     }
@@ -265,7 +218,9 @@ def write_sheet(path: str, task: Place, scored: Scored) -> None:
     write_whole(Path(path), picture.getvalue())
 
 
-def scores_table(title: str, caption: str, scores: Mapping[str, Scores]) -> Table:
+def scores_table(
+    title: str, caption: str, declared: Sequence[Score], scores: Mapping[str, Scores]
+) -> Table:
     """One column for each policy, one row for each score."""
     # More than five fit into 80 columns without the blanks.
     table = Table(title=title, caption=caption, padding=(0, int(len(scores) <= MAX_PADDED)))
@@ -274,10 +229,9 @@ def scores_table(title: str, caption: str, scores: Mapping[str, Scores]) -> Tabl
         table.add_column(
             name.replace("=", " "), justify="right", style="bold" if name == RUN else "dim"
         )
-    rows = _SEVERAL if "coverage" in scores[RUN] else _ONE_TOKEN
-    for key, (label, digits) in rows.items():
-        if key in scores[RUN]:
-            table.add_row(label, *(f"{values[key]:.{digits}f}" for values in scores.values()))
+    for score in (*declared, *_BESIDE):
+        if score.name in scores[RUN]:
+            table.add_row(score.label, *(score.shown(own[score.name]) for own in scores.values()))
     return table
 
 

@@ -20,9 +20,8 @@ from tangram_core.settings import told
 from tangram_core.store.files import write_whole
 from tangram_game.config import MAX_SHOWN, PlayConfig, source_and_names
 from tangram_game.figures.photographs import draw_photograph, read_photograph
-from tangram_game.figures.puzzles import find_figures, play_figures
+from tangram_game.figures.puzzles import by, find_figures, play_figures
 from tangram_game.figures.silhouettes import Shown, draw_silhouette, read_silhouette
-from tangram_game.playing import by, play_tests
 from tangram_game.show.film import WIDTH, Show, film_pictures, frames_per_action
 from tangram_game.show.views import beside, camera_sheets
 from tangram_sim.drawing.game_drawing import figure_sheet, tiles
@@ -32,6 +31,7 @@ from tangram_sim.motion.kinematics import wrap
 from tangram_tasks.metrics import SOLVED, assembled
 from tangram_tasks.place import Place
 from tangram_tasks.played import Played
+from worker.play.rollout import greedy
 from worker.score.test_set import FixedTests
 
 FRAME_MS = 50
@@ -93,7 +93,7 @@ def play_episodes(run: Run, config: PlayConfig) -> Played:
     with closing(
         FixedTests(run.task, config.episodes, run.actor.at_once, role="play", seed=config.seed)
     ) as tests:
-        return play_tests(tests, by(run.actor))
+        return Played.of(tests.play(greedy(run.actor)))
 
 
 def puzzle_show(run: Run, config: PlayConfig) -> Show:

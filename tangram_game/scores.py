@@ -11,14 +11,13 @@ import numpy as np
 
 from tangram_agent.runs import Run
 from tangram_core.agent import AT_ONCE
-from tangram_core.arrays import Floats
+from tangram_core.arrays import Bools, Floats
 from tangram_core.errors import ConfigError
-from tangram_game.figures.puzzles import Figure, play_figures
-from tangram_game.playing import Player
+from tangram_game.figures.puzzles import Figure, Player, play_figures
 from tangram_sim.rewards import scaled_overlap
-from tangram_tasks.metrics import SOLVED, assembled, pose_errors, summarise
+from tangram_tasks.metrics import SOLVED, Assembled, assembled, pose_errors, summarise
 from tangram_tasks.place import Place
-from tangram_tasks.played import Played, plain
+from tangram_tasks.played import Played
 from tangram_tasks.rivals.baselines import exact_policy
 
 if TYPE_CHECKING:  # needs OpenCV and shapely
@@ -27,12 +26,9 @@ if TYPE_CHECKING:  # needs OpenCV and shapely
 RUN = "this run"
 Scores = dict[str, Any]  # numbers, and `coverage_each` of the episodes
 
-# What is told of filled outlines: nothing of where a piece should lie.
-OF_AREAS = (
-    *("mean_reward", "raw_overlap", "raw_overlap_p10"),
-    *("coverage", "iou", "blocked", "refused", "actions_used"),
-)
-_COUNTS = ("wrong", "doubly_used", "refused", "blocked", "actions_used")
+_SHARES = ("coverage", "iou")
+_ACTIONS = ("refused", "blocked", "actions_used")
+_PIECES = ("wrong", "doubly_used")  # are not told of silhouettes: any dissection counts
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,60 +59,38 @@ def score_puzzles(
     seed: int,
     at_once: int = AT_ONCE,
 ) -> Scored:
-    """Scores of each policy on the same starts."""
-    scores, played = dict[str, Scores](), dict[str, Played]()
-    for name, player in players.items():
-        played[name] = play_figures(task, figures, player, seed, at_once=at_once)
-        own = summarise(task.layout, task.sim, played[name], own_reward=False)
-        own["episodes"] = float(len(figures))
-        scores[name] = own | of_several(played[name], at_once)
-    run, titles = played[RUN], [figure.title for figure in figures]
-    each = _one_by_one(task, figures, run)
-    return Scored(scores, each, titles, run.ends, run.goals, "positions in arena units")
-
-
-def score_outlines(
-    task: Place,
-    figures: Sequence[Figure],
-    players: Mapping[str, Player],
-    seed: int,
-    at_once: int = AT_ONCE,
-) -> Scored:
-    """Scores of each policy that sees the outlines of puzzles, and fills them itself."""
+    """Scores of each policy on the same starts; who sees outlines fills them itself."""
     played = {
         name: play_figures(task, figures, player, seed, at_once=at_once)
         for name, player in players.items()
     }
-    scores = {name: of_outlines(task, own, at_once) for name, own in played.items()}
-    run, found = played[RUN], assembled(task.layout, played[RUN])
-    each = [
-        {
-            "name": figure.name,
-            "degrees": figure.degrees,
-            "coverage": float(found.coverage[e]),
-            "iou": float(found.iou[e]),
-            "solved": bool(found.iou[e] >= SOLVED),
-            **{name: int(getattr(found, name)[e]) for name in ("blocked", "refused")},
-            "actions_used": int(found.actions_used[e]),
-            "seconds": float(run.seconds[e]),
-        }
-        for e, figure in enumerate(figures)
-    ]
-    titles = [figure.title for figure in figures]
-    told = "played by the run itself; any dissection counts, so no errors of position and angle"
-    return Scored(scores, each, titles, run.ends, run.goals, told)
+    scores = {name: _of_puzzles(task, own, at_once) for name, own in played.items()}
+    run, titles = played[RUN], [figure.title for figure in figures]
+    told = "positions in arena units"
+    if task.outlines:
+        told = "played by the run itself; any dissection counts, so no errors of position and angle"
+    return Scored(scores, _one_by_one(task, figures, run), titles, run.ends, run.goals, told)
+
+
+def _of_puzzles(task: Place, played: Played, at_once: int) -> Scores:
+    if task.outlines:
+        return of_outlines(task, played, at_once)
+    own: Scores = {**summarise(task.layout, task.sim, played, own_reward=False)}
+    return own | {"episodes": float(len(played.overlap))} | of_several(played, at_once)
 
 
 def of_outlines(task: Place, played: Played, at_once: int) -> Scores:
     """Scores of filled outlines; any dissection counts, so none tells of single pieces."""
     found = assembled(task.layout, played)
-    means = {key: value for key, value in found.means().items() if key in OF_AREAS}
-    areas = {
-        "mean_reward": float(np.mean(scaled_overlap(found.coverage))),
-        "share_solved_iou": float(np.mean(found.iou >= SOLVED)),
-        "episodes": float(len(found.coverage)),
-    }
-    return means | areas | of_several(played, at_once)
+    return _of_areas(found) | {"episodes": float(len(found.iou))} | of_several(played, at_once)
+
+
+def _of_areas(found: "Assembled | Laid") -> Scores:
+    """Means of what tells nothing of single pieces."""
+    means = {name: float(np.mean(getattr(found, name))) for name in (*_SHARES, *_ACTIONS)}
+    reward = float(np.mean(scaled_overlap(found.coverage)))
+    solved = float(np.mean(found.iou >= SOLVED))
+    return means | {"mean_reward": reward, "share_solved_iou": solved}
 
 
 def score_hidden(
@@ -157,26 +131,49 @@ def score_pictured(run: Run, figures: Sequence[Figure], seed: int) -> Scored:
         from tangram_vision.silhouettes.silhouettes import UNLEARNED  # noqa: PLC0415
     except ImportError as error:
         raise _no_library(task, error) from error
-    own, player = learned_method(run), plain(exact_policy(task.layout, task.sim))
+    own, policy = learned_method(run), exact_policy(task.layout, task.sim)
     methods = {RUN: own, "largest first": replace(own, values=None), "search": UNLEARNED}
     every = {name: hide(task, figures, seed, method) for name, method in methods.items()}
-    return _of_hidden(
-        {name: (hidden, play_hidden(hidden, player, seed)) for name, hidden in every.items()}
-    )
+    laid = {name: play_hidden(hidden, lambda _: policy, seed) for name, hidden in every.items()}
+    return _of_hidden({name: (hidden, laid[name]) for name, hidden in every.items()})
 
 
 def _of_hidden(every: "Mapping[str, tuple[Hidden, Laid]]") -> Scored:
     """Scores of what each policy laid."""
-    from tangram_game.figures.hidden import means, one_by_one  # noqa: PLC0415
-
     hidden, laid = every[RUN]
     told = (
         f"{hidden.filled} of {len(hidden.figures)} filled ({_by(hidden.filled_by)}); any "
         "dissection counts, so no errors of position and angle, and no pieces under others"
     )
-    scores = {name: means(*own) for name, own in every.items()}
-    each = one_by_one(hidden, laid)
+    scores = {name: hidden_means(*own) for name, own in every.items()}
+    each = hidden_lines(hidden, laid)
     return Scored(scores, each, hidden.titles, laid.ends, hidden.goals, told)
+
+
+def hidden_means(hidden: "Hidden", laid: "Laid") -> Scores:
+    """Scores of all puzzles, those that were not filled among them."""
+    return _of_areas(laid) | {
+        "filled": hidden.filled,
+        "filled_by": hidden.filled_by,
+        "not_filled": len(hidden.figures) - hidden.filled,
+        "search_seconds": float(np.mean([search.seconds for search in hidden.searches])),
+        "seconds_per_puzzle": float(np.mean(laid.seconds)),
+    }
+
+
+def hidden_lines(hidden: "Hidden", laid: "Laid") -> list[dict[str, Any]]:
+    """Scores of each puzzle."""
+    return [
+        _line(figure, laid, e, laid.iou >= SOLVED, _ACTIONS)
+        | {
+            "filled": search.filled,
+            "filled_by": search.by if search.filled else "",
+            "search_iou": search.iou,
+            "search_seconds": search.seconds,
+            "seconds": float(laid.seconds[e]),
+        }
+        for e, (figure, search) in enumerate(zip(hidden.figures, hidden.searches, strict=True))
+    ]
 
 
 def _no_library(task: Place, error: ImportError) -> ConfigError:
@@ -211,18 +208,29 @@ def of_several(played: Played, at_once: int) -> Scores:
 
 def _one_by_one(task: Place, figures: Sequence[Figure], played: Played) -> list[dict[str, Any]]:
     found = assembled(task.layout, played)
-    position, angle = pose_errors(task.layout, played.ends, played.goals)
-    return [
-        {
-            "name": figure.name,
-            "degrees": figure.degrees,
-            "coverage": float(found.coverage[e]),
-            "iou": float(found.iou[e]),
-            "solved": bool(found.solved[e]),
-            **{name: int(getattr(found, name)[e]) for name in _COUNTS},
-            "position_errors": position[e].tolist(),
-            "angle_errors_deg": angle[e].tolist(),
-            "seconds": float(played.seconds[e]),
-        }
+    solved = found.iou >= SOLVED if task.outlines else found.solved
+    counts = (*(() if task.outlines else _PIECES), *_ACTIONS)
+    lines = [
+        _line(figure, found, e, solved, counts) | {"seconds": float(played.seconds[e])}
         for e, figure in enumerate(figures)
     ]
+    if task.outlines:
+        return lines
+    position, angle = pose_errors(task.layout, played.ends, played.goals)
+    return [
+        one | {"position_errors": position[e].tolist(), "angle_errors_deg": angle[e].tolist()}
+        for e, one in enumerate(lines)
+    ]
+
+
+def _line(
+    figure: Figure, found: "Assembled | Laid", e: int, solved: Bools, counts: Sequence[str]
+) -> dict[str, Any]:
+    """What every list tells of a puzzle; `solved` (E,)."""
+    return {
+        "name": figure.name,
+        "degrees": figure.degrees,
+        **{name: float(getattr(found, name)[e]) for name in _SHARES},
+        "solved": bool(solved[e]),
+        **{name: int(getattr(found, name)[e]) for name in counts},
+    }

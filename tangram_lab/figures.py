@@ -36,10 +36,10 @@ def new_figure(
     return figure, list(made.flat)
 
 
-def legend_below(figure: Figure, panel: Axes, columns: int = 3) -> None:
+def legend_below(figure: Figure, panel: Axes) -> None:
     """One legend for all panels, from the labels of one."""
     handles, names = panel.get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=columns, frameon=False)
+    figure.legend(handles, names, loc="outside lower center", ncols=3, frameon=False)
 
 
 def save(figure: Figure, path: Path) -> None:

@@ -21,7 +21,7 @@ from PIL import Image
 from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError
 from tangram_game.figures.methods import together
-from tangram_game.figures.puzzles import reach_beyond
+from tangram_game.figures.puzzles import check_inside
 from tangram_game.figures.silhouettes import why_unfilled
 from tangram_sim.drawing.strokes import colour_of
 from tangram_sim.geometry.areas import Area, polygons
@@ -180,12 +180,7 @@ def _answer(drawn: Silhouette, found: Dissection, exact: bool, iou: float, how: 
     task = player("lift").run.task
     layout = task.layout
     poses = turned_figure(layout, (found.poses, found.flipped), 0.0)
-    reach = reach_beyond(task, layout.corners(poses, found.flipped))
-    if reach is not None:
-        raise ConfigError(
-            f"the figure reaches {reach:.2f} from its middle and the table only "
-            f"{task.sim.arena / 2.0:g}: draw it less long"
-        )
+    check_inside("the figure", task, layout.corners(poses, found.flipped), "draw it less long")
     seen, share = _seen(drawn)
     corners = drawn.corners(layout, found) * share
     pieces = [corners[layout.corners_of(k)].round(1).tolist() for k in range(layout.tokens)]

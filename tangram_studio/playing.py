@@ -25,7 +25,6 @@ from tangram_sim.motion.actions import chosen_tokens
 from tangram_sim.world.world import World, make_world
 from tangram_tasks.metrics import iou
 from tangram_tasks.pairing import paired
-from tangram_tasks.played import chooser
 from tangram_tasks.rivals.sweeps import sweep_policy
 from worker.play.rollout import greedy
 
@@ -91,7 +90,7 @@ class _Player:
         sim = replace(task.sim.blind, starts="outside")
         self.env = BatchedEnv(self.layout, sim, RewardConfig(), 1)
         slides = motion == "slide"
-        self.choose = chooser(sweep_policy(self.layout, sim)) if slides else greedy(self.run.actor)
+        self.choose = sweep_policy(self.layout, sim) if slides else greedy(self.run.actor)
         self._shown: World | None = make_world(self.layout, sim) if slides else None
 
     def frames(self, before: Floats, after: Floats, flipped: Bools, token: int) -> Floats:

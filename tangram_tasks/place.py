@@ -30,14 +30,14 @@ _REWARD = Score("mean_reward", "mean reward")
 _ERRORS = (
     Score("angle_error_deg_median", "angle error", 2, "°"),
     Score("position_error_median", "position error", 4),
-    Score("angle_error_deg_p90", "angle error, 90th percentile", 2, "°"),
-    Score("position_error_p90", "position error, 90th percentile", 4),
+    Score("angle_error_deg_p90", "angle error, 90th perc.", 2, "°"),
+    Score("position_error_p90", "position error, 90th perc.", 4),
 )
 _MORE = (
-    Score("mean_reward_camera", "mean reward in the camera's pictures"),
+    Score("mean_reward_camera", "mean reward, camera"),
     Score("mean_reward_dense", "mean reward of Eq. 15"),
     Score("mean_train_reward", "mean reward as trained on"),
-    Score("raw_overlap_p10", "raw overlap, 10th percentile"),
+    Score("raw_overlap_p10", "raw overlap, 10th perc."),
 )
 ONE_TOKEN = (_REWARD, Score("raw_overlap", "raw overlap"), *_ERRORS, *_MORE)
 SEVERAL = (

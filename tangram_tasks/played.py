@@ -4,7 +4,6 @@ Legend: E episodes, B environments, T steps of an episode, K tokens, V corners, 
 action.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,9 +11,7 @@ import numpy as np
 from tangram_core import task
 from tangram_core.arrays import Bools, Floats, Pixels, Singles
 from tangram_core.spec import Array, Arrays, Episodes
-from tangram_core.task import Chooser, Env, Generators, History
-from tangram_sim.batch import BatchedEnv
-from tangram_tasks.env import PlaceEnv
+from tangram_core.task import History
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,41 +35,15 @@ class Past:
         return Past(corners, history.actions, history.seen.get("seen"))
 
 
-# (corners (B, V, 2), closed (B, K), goals (B, V, 2), one generator each, what was before)
-# -> actions (B, A)
-Choose = Callable[[Floats, Bools, Floats, Generators, Past], Singles]
-
-
 def closed(seen: Arrays) -> Array:
     """(B, K) tokens that no action should name: placed, or not seen while others are."""
     return seen.get("closed", seen["placed"])
 
 
-def chooser(choose: Choose) -> Chooser:
-    """A policy of corners as one of what is observed."""
-
-    def of_seen(seen: Arrays, past: History, generators: Generators) -> Singles:
-        corners, goals = (np.asarray(seen[name], np.float64) for name in ("corners", "goals"))
-        flags = np.asarray(closed(seen), np.bool_)
-        return choose(corners, flags, goals, generators, Past.of(past))
-
-    return of_seen
-
-
-def plain(choose: Choose) -> Callable[[Env], Chooser]:
-    """A rival that is told nothing of the worlds that it plays in."""
-    return lambda _: chooser(choose)
-
-
-def told(make: Callable[[BatchedEnv], Choose]) -> Callable[[Env], Chooser]:
-    """A rival that is made for the worlds that it plays in."""
-
-    def of_env(env: Env) -> Chooser:
-        if not isinstance(env, PlaceEnv):
-            raise TypeError(f"{type(env).__name__} has no tokens")
-        return chooser(make(env.world))
-
-    return of_env
+def as_seen(seen: Arrays) -> tuple[Floats, Bools, Floats]:
+    """What rivals go by: corners (B, V, 2), `closed` tokens (B, K) and goals (B, V, 2)."""
+    corners, goals = (np.asarray(seen[name], np.float64) for name in ("corners", "goals"))
+    return corners, np.asarray(closed(seen), np.bool_), goals
 
 
 @dataclass(frozen=True, eq=False)

@@ -71,7 +71,7 @@ def test_import_contracts_catch_every_wrong_arrow(tmp_path: Path) -> None:
         "worker/talk/wrong.py": "import worker.play.rollout",
         "tangram_game/show/wrong.py": "import master.config, tangram_game.figures.puzzles",
         "tangram_vision/pictures/wrong.py": "import tangram_vision.given.photos",
-        "tangram_lab/benchmarks/sight/wrong.py": "import tangram_lab.benchmarks.speed.sim",
+        "tangram_lab/benchmarks/trials/wrong.py": "import tangram_lab.benchmarks.speed.wire",
     }
     for path, code in wrong.items():
         (tmp_path / path).write_text(code)

@@ -9,22 +9,19 @@ Legend: E puzzles, F of them for which something was found, K tokens, V corners.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
 from tangram_core.agent import AT_ONCE
-from tangram_core.arrays import Bools, Floats, Ints
-from tangram_game.figures.puzzles import Figure, figure_generator, play_figures
+from tangram_core.arrays import Floats, Ints
+from tangram_game.figures.puzzles import Figure, Player, figure_generator, play_figures
 from tangram_game.figures.silhouettes import SECONDS
-from tangram_game.playing import Player
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.areas import Area
 from tangram_sim.geometry.dissections import Dissection
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.overlap import overlap_share
 from tangram_sim.motion.kinematics import wrap
-from tangram_sim.rewards import scaled_overlap
 from tangram_sim.sight.lens import Lens, View
 from tangram_tasks.metrics import SOLVED, iou
 from tangram_tasks.place import Place
@@ -136,11 +133,6 @@ class Laid:
     actions_used: Ints
     seconds: Floats
 
-    @property
-    def solved(self) -> Bools:
-        """(E,) where the IoU is at least `SOLVED`."""
-        return np.asarray(self.iou >= SOLVED)
-
 
 def hide(task: Place, figures: Sequence[Figure], seed: int, method: Method = UNLEARNED) -> Hidden:
     """Search how a run's tokens fill puzzles of which only the silhouettes are shown.
@@ -222,39 +214,3 @@ def lay(hidden: Hidden, player: Player, seed: int, at_once: int = AT_ONCE) -> Pl
     laid = [search.laid for search in hidden.searches if search.laid is not None]
     views = None if hidden.views is None else [hidden.views[e] for e in hidden.found]
     return play_figures(hidden.task, laid, player, seed, views=views, at_once=at_once)
-
-
-def means(hidden: Hidden, laid: Laid) -> dict[str, Any]:
-    """Scores of all puzzles, those that were not filled among them."""
-    names = ("coverage", "iou", "blocked", "refused", "actions_used")
-    return {
-        "mean_reward": float(np.mean(scaled_overlap(laid.coverage))),
-        **{name: float(np.mean(getattr(laid, name))) for name in names},
-        "share_solved_iou": float(np.mean(laid.solved)),
-        "filled": hidden.filled,
-        "filled_by": hidden.filled_by,
-        "not_filled": len(hidden.figures) - hidden.filled,
-        "search_seconds": float(np.mean([search.seconds for search in hidden.searches])),
-        "seconds_per_puzzle": float(np.mean(laid.seconds)),
-    }
-
-
-def one_by_one(hidden: Hidden, laid: Laid) -> list[dict[str, Any]]:
-    """Scores of each puzzle."""
-    return [
-        {
-            "name": figure.name,
-            "degrees": figure.degrees,
-            "coverage": float(laid.coverage[e]),
-            "iou": float(laid.iou[e]),
-            "solved": bool(laid.solved[e]),
-            "filled": search.filled,
-            "filled_by": search.by if search.filled else "",
-            "search_iou": search.iou,
-            **{name: int(getattr(laid, name)[e]) for name in ("blocked", "refused")},
-            "actions_used": int(laid.actions_used[e]),
-            "search_seconds": search.seconds,
-            "seconds": float(laid.seconds[e]),
-        }
-        for e, (figure, search) in enumerate(zip(hidden.figures, hidden.searches, strict=True))
-    ]

@@ -7,7 +7,7 @@ from PIL import Image
 
 from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError
-from tangram_game.figures.puzzles import Figure, reach_beyond
+from tangram_game.figures.puzzles import Figure, check_inside
 from tangram_game.show.views import outlined
 from tangram_sim.drawing.scenes import contact_sheet
 from tangram_sim.geometry.layout import Layout
@@ -48,7 +48,7 @@ def read_photograph(target: str, task: Place) -> Photograph:
     picture = read_picture(Path(target), source)
     found = find_tokens(picture, layout, source)
     poses = turned_figure(layout, (found.poses, found.flipped), 0.0)
-    _check_inside(source, task, layout.corners(poses, found.flipped))
+    check_inside(source, task, layout.corners(poses, found.flipped), "lay tokens nearer together")
     outlines = layout.corners(found.poses, found.flipped) * (found.unit, -found.unit)
     return Photograph(picture, outlines, Figure(Path(target).stem, 0.0, poses, found.flipped))
 
@@ -58,12 +58,3 @@ def draw_photograph(photograph: Photograph, layout: Layout, size: int) -> Image.
     picture = outlined(photograph.picture, layout, photograph.outlines, size)
     seen = f"{layout.tokens} tokens" if layout.tokens > 1 else layout.shapes[0].name
     return contact_sheet([picture], 1, [f"seen: {seen.replace('_', ' ')}"])
-
-
-def _check_inside(source: str, task: Place, corners: Floats) -> None:
-    reach = reach_beyond(task, corners)
-    if reach is not None:
-        raise ConfigError(
-            f"{source} shows tokens that reach {reach:.3g} from their middle at the run's scale, "
-            f"and its arena only {task.sim.arena / 2.0:.3g}: lay them nearer together"
-        )

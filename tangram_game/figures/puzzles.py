@@ -3,18 +3,19 @@
 Legend: E episodes, K tokens.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from tangram_core.agent import AT_ONCE
-from tangram_core.arrays import Bools, Floats
+from tangram_core.agent import AT_ONCE, Actor
+from tangram_core.arrays import Bools, Floats, Ints
 from tangram_core.errors import ConfigError
 from tangram_core.seeding import episode_generator
-from tangram_game.playing import Player, play_targets
+from tangram_core.spec import Arrays
+from tangram_core.task import Chooser, Env, Generators
 from tangram_sim.config import SILHOUETTES, RewardConfig
 from tangram_sim.puzzles.assembly import Puzzle, PuzzleRules
 from tangram_sim.puzzles.figures import SPLITS, library, read_puzzles
@@ -22,7 +23,9 @@ from tangram_sim.sight.lens import View
 from tangram_sim.targets.targets import placement, turned_figure
 from tangram_tasks.place import Place
 from tangram_tasks.played import Played
+from worker.play import rollout
 
+Player = Callable[[Env], Chooser]  # made for the environments in which it plays
 _ROUNDING = 1e-9
 
 
@@ -73,6 +76,11 @@ def find_figures(
     return figures
 
 
+def by(actor: Actor) -> Player:
+    """What an actor plays, exploration off."""
+    return lambda _: rollout.greedy(actor)
+
+
 def play_figures(
     task: Place,
     figures: Sequence[Figure],
@@ -107,13 +115,19 @@ def play_figures(
     sim = task.sim if shows else task.sim.blind
     targets = (np.stack([f.poses for f in figures]), np.stack([f.flipped for f in figures]))
     shown = replace(task, sim=sim, reward=RewardConfig())
-    known = None if views is None else list(views)
     with closing(shown.make(min(at_once, len(figures)))) as env:
 
         def generator(number: int) -> np.random.Generator:
             return figure_generator(figures[number], seed)
 
-        return play_targets(shown, env, player, generator, targets, known)
+        def begin(numbers: Ints, generators: Generators) -> Arrays:
+            seen = None if views is None else [views[i] for i in numbers.tolist()]
+            return env.reset(generators, (targets[0][numbers], targets[1][numbers]), seen)
+
+        choose, count = player(env), len(figures)
+        return Played.of(
+            rollout.play(env, shown.spec, choose, generator, count, begin=begin, facts=True)
+        )
 
 
 def figure_generator(figure: Figure, seed: int, what: str = "puzzle") -> np.random.Generator:
@@ -147,7 +161,12 @@ def _turns(puzzle: Puzzle, task: Place, turns: int) -> list[Figure]:
     figures = []
     for degrees in (360.0 * i / turns for i in range(turns)):
         there = turned_figure(task.layout, (poses, flipped), np.radians(degrees))
-        _check_inside(puzzle, task, task.layout.corners(there, flipped))
+        check_inside(
+            f"puzzle '{puzzle.name}'",
+            task,
+            task.layout.corners(there, flipped),
+            "name a run of a larger arena or of smaller tokens",
+        )
         figures.append(Figure(puzzle.name, degrees, there, flipped))
     return figures
 
@@ -163,16 +182,10 @@ def _placed(puzzle: Puzzle, task: Place) -> tuple[Floats, Bools]:
         ) from None
 
 
-def reach_beyond(task: Place, corners: Floats) -> float | None:
-    """How far corners (V, 2) reach from the middle where a run's arena does not; else None."""
-    reach = float(np.abs(corners).max())
-    return reach if reach > task.sim.arena / 2.0 + _ROUNDING else None
-
-
-def _check_inside(puzzle: Puzzle, task: Place, corners: Floats) -> None:
-    reach = reach_beyond(task, corners)
-    if reach is not None:
+def check_inside(what: str, task: Place, corners: Floats, remedy: str) -> None:
+    """Raise ConfigError where corners (V, 2) around the middle reach out of a run's arena."""
+    reach, half = float(np.abs(corners).max()), task.sim.arena / 2.0
+    if reach > half + _ROUNDING:
         raise ConfigError(
-            f"puzzle '{puzzle.name}' reaches {reach:.3g} from its middle, and the run's arena only "
-            f"{task.sim.arena / 2.0:.3g}: name a run of a larger arena or of smaller tokens"
+            f"{what} reaches {reach:.3g} from its middle, and the arena only {half:.3g}: {remedy}"
         )

@@ -19,7 +19,7 @@ from tangram_core.errors import ConfigError, RunError
 from tangram_core.run.outcome import plural
 from tangram_core.settings import refuse_ignored
 from tangram_core.store.files import write_whole
-from tangram_game.figures.puzzles import Figure, reach_beyond
+from tangram_game.figures.puzzles import Figure, check_inside
 from tangram_game.show.views import outlined
 from tangram_sim.drawing.game_drawing import tiles
 from tangram_sim.drawing.scenes import contact_sheet
@@ -86,12 +86,8 @@ def read_silhouette(name: str, task: Place, count: int = 1, out: Path | None = N
         beside = "" if out is None else f"; {_kept(_draw_attempt(drawn, layout), out)}"
         raise ConfigError(f"{source} {why_unfilled(drawn, layout)}{beside}")
     poses = turned_figure(layout, (laid[0].poses, laid[0].flipped), 0.0)
-    reach = reach_beyond(task, layout.corners(poses, laid[0].flipped))
-    if reach is not None:
-        raise ConfigError(
-            f"{source} reaches {reach:.3g} from its middle at the run's scale, and its arena only "
-            f"{task.sim.arena / 2.0:.3g}: name a run of a larger arena"
-        )
+    corners = layout.corners(poses, laid[0].flipped)
+    check_inside(source, task, corners, "name a run of a larger arena")
     outlines = np.stack([drawn.corners(layout, one) for one in laid])
     figure = Figure(Path(name).stem, 0.0, poses, laid[0].flipped)
     return Shown(drawn.picture, outlines, figure, _told(drawn, count))

@@ -9,13 +9,14 @@ import numpy as np
 import torch
 
 from tangram_agent.agents.pair.motion import Fit, MotionModel, motions_of
-from tangram_core.arrays import Bools, Floats, Singles
+from tangram_core.arrays import Singles
 from tangram_core.seeding import episode_generator
-from tangram_core.task import Chooser, Env, Generators
+from tangram_core.spec import Arrays
+from tangram_core.task import Chooser, Env, Generators, History
 from tangram_sim.motion.actions import make_actions, velocities_of
 from tangram_tasks.env import PlaceEnv
 from tangram_tasks.pairing import paired
-from tangram_tasks.played import Past, chooser
+from tangram_tasks.played import Past, as_seen
 from tangram_tasks.rivals.baselines import freest, random_policy
 from worker.play.rollout import play
 
@@ -31,9 +32,8 @@ def fitted_policy(of: Env) -> Chooser:
     layout, sim = cast("PlaceEnv", of).world.layout, cast("PlaceEnv", of).world.sim
     model = _fitted(cast("PlaceEnv", of))
 
-    def choose(
-        corners: Floats, placed: Bools, goals: Floats, _generators: Generators, past: Past
-    ) -> Singles:
+    def choose(seen: Arrays, history: History, _generators: Generators) -> Singles:
+        (corners, placed, goals), past = as_seen(seen), Past.of(history)
         belief = model.belief(motions_of(past, corners, layout, sim))
         ahead = model.ahead(belief, corners, past, layout, sim)
         pairing = paired(layout, ahead, goals)
@@ -42,7 +42,7 @@ def fitted_policy(of: Env) -> Chooser:
         command = model.command(belief, torch.from_numpy(wanted)).numpy()
         return make_actions(token, command, pairing.other_side[rows, token], layout.tokens, sim)
 
-    return chooser(choose)
+    return choose
 
 
 def _fitted(env: PlaceEnv) -> MotionModel:
@@ -52,7 +52,7 @@ def _fitted(env: PlaceEnv) -> MotionModel:
         return episode_generator(0, "fitted", 0, 0, number)
 
     world = env.world
-    chance, count = chooser(random_policy(world.layout, world.sim)), -(-COMMANDS // world.horizon)
+    chance, count = random_policy(world.layout, world.sim), -(-COMMANDS // world.horizon)
     seen = play(env, world.spec, chance, generator, count).episodes
     past = Past(seen["corners"][:, :-1], seen.actions, seen.arrays.get("seen"))
     motions = motions_of(past, seen["corners"][:, -1].astype(np.float64), world.layout, world.sim)

@@ -1,4 +1,4 @@
-"""`tangram-bench`: how fast it is against what else one could do, and long trials of endurance."""
+"""`tangram-bench`: how fast it is against what else one could do, and trials with faults."""
 
 import argparse
 import re
@@ -22,7 +22,6 @@ examples:
   tangram-bench attack out=attack.json      every attack that is known, on real trainings
 """
 RATES = {
-    "sim": "the simulation, also where tokens are seen in pictures, against a bare PyBullet loop",
     "wire": "worker to master, against bare ROUTER-DEALER sockets",
     "learner": "updates, compiled or not, against Stable-Baselines3",
     "train": "a whole training, against Stable-Baselines3 (minutes=)",
@@ -30,21 +29,14 @@ RATES = {
     "gpu": "updates on a GPU, against single operations there and one core",
 }
 TRIALS = {
-    "chaos": ("random faults over a real training", 20.0),
-    "attack": ("every attack that is known, on trainings that run; what held", None),
-    "fuzz": ("mutated messages against decoder and master", None),
-    "silhouettes": ("silhouettes filled with seven tans: how many, how fast", None),
-    "seeing": ("tokens found in pictures: how exactly, how surely, how fast", None),
-    "soak": ("memory and open files of a long training, drawn", 60.0),
+    "chaos": "random faults over a real training",
+    "attack": "every attack that is known, on trainings that run; what held",
 }
 # Option -> its bounds.
 BOUNDS = {
     "runs": (1, 10_000),
     "seeds": (1, 1000),
     "minutes": (0.01, 1e5),
-    "messages": (1, 10**12),
-    "live": (1, 10**12),
-    "scenes": (1, 10**6),
     "seed": (0, 2**63 - 1),
 }
 
@@ -64,18 +56,11 @@ def _parser() -> argparse.ArgumentParser:
         if name in ("all", "train"):
             limit = "that a rival's training may last (5)"
             one.add_argument("--minutes", type=float, default=5.0, help=limit)
-        if name in ("all", "train"):
             one.add_argument("--seeds", type=int, default=3, help="trainings of each (3)")
-    for name, (text, minutes) in TRIALS.items():
+    for name, text in TRIALS.items():
         one = kinds.add_parser(name, help=text, description=text)
-        if minutes is not None:
-            one.add_argument("--minutes", type=float, default=minutes, help=f"({minutes:g})")
-        elif name == "fuzz":
-            one.add_argument("--messages", type=int, default=1_000_000, help="for the decoder")
-            one.add_argument("--live", type=int, default=100_000, help="for a live master")
-        elif name in ("seeing", "silhouettes"):
-            one.add_argument("--scenes", type=int, default=200, help="of each kind (200)")
-        if name != "attack":
+        if name == "chaos":
+            one.add_argument("--minutes", type=float, default=20.0, help="of faults (20)")
             one.add_argument("--seed", type=int, default=0, help="of everything random (0)")
         one.add_argument("--out", type=Path, help="JSON file of the results")
     return parser
@@ -113,22 +98,10 @@ def _run(arguments: argparse.Namespace) -> int:
         from tangram_lab.benchmarks.stages import run_stages
 
         return run_stages(arguments)
-    from tangram_lab.benchmarks.sight.seeing import run_seeing
-    from tangram_lab.benchmarks.sight.silhouettes import run_silhouettes
     from tangram_lab.benchmarks.trials.attack import run_attack
     from tangram_lab.benchmarks.trials.chaos import run_chaos
-    from tangram_lab.benchmarks.trials.fuzz_wire import run_fuzz
-    from tangram_lab.benchmarks.trials.soak import run_soak
 
-    of_scenes = {"seeing": run_seeing, "silhouettes": run_silhouettes}
-    if arguments.kind in of_scenes:
-        return of_scenes[arguments.kind](arguments.scenes, arguments.seed, arguments.out)
     with tempfile.TemporaryDirectory(prefix="tangram-") as folder:
         if arguments.kind == "attack":
             return run_attack(arguments.out, Path(folder))
-        if arguments.kind == "chaos":
-            return run_chaos(arguments.minutes, arguments.seed, arguments.out, Path(folder))
-        if arguments.kind == "soak":
-            return run_soak(arguments.minutes, arguments.seed, arguments.out, Path(folder) / "run")
-        numbers = (arguments.messages, arguments.live, arguments.seed)
-        return run_fuzz(*numbers, arguments.out, Path(folder) / "run")
+        return run_chaos(arguments.minutes, arguments.seed, arguments.out, Path(folder))

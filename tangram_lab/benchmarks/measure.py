@@ -72,12 +72,10 @@ class Bound:
         return ", ".join(parts + ([f"<= {self.most:g}"] if self.most is not None else []))
 
 
-def rate(
-    work: Work, span_s: float = SPAN_S, clock: Callable[[], float] = time.perf_counter
-) -> float:
-    """Units in a second of the clock, over at least `span_s`."""
-    begin, count = clock(), 0.0
-    while (passed := clock() - begin) < span_s:
+def rate(work: Work, span_s: float) -> float:
+    """Units in a second, over at least `span_s`."""
+    begin, count = time.perf_counter(), 0.0
+    while (passed := time.perf_counter() - begin) < span_s:
         count += work()
     return count / passed
 

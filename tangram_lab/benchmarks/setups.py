@@ -2,13 +2,11 @@
 
 from contextlib import closing
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import yaml
 
-import conf
+from conf.cli import composed
 from tangram_agent.base.types import Transitions
 from tangram_core.arrays import Singles
 from tangram_core.setup import Setup, make_setup
@@ -20,34 +18,9 @@ from tangram_tasks.place import Place
 from worker.play.rollout import Rollout
 
 
-def preset(agent: str = "tangram", tokens: str = "square") -> Setup:
-    """The setup of an agent's preset on a token set, read from the config's files."""
-    folder = Path(conf.__file__).parent
-
-    def group(name: str, choice: str) -> dict[str, Any]:
-        content = yaml.safe_load((folder / name / f"{choice}.yaml").read_text())
-        own = {key: value for key, value in content.items() if key != "defaults"}
-        bases = (base for base in content.get("defaults", []) if isinstance(base, str))
-        for base in bases:
-            own = own if base == "_self_" else group(name, base) | own
-        return own
-
-    agent_file = yaml.safe_load((folder / "agent" / f"{agent}.yaml").read_text())
-    (net,) = (
-        value
-        for line in agent_file["defaults"]
-        if isinstance(line, dict)
-        for value in line.values()
-    )
-    choices = {
-        "task": "place",
-        "tokens": tokens,
-        "sim": "physics",
-        "reward": "overlap",
-        "agent": agent,
-        "net": net,
-    }
-    return make_setup({name: group(name, choice) for name, choice in choices.items()})
+def preset(agent: str = "tangram") -> Setup:
+    """What tangram-train makes of an agent's preset: one square, moved by PyBullet."""
+    return make_setup(composed("train", ["run_dir=x", f"agent={agent}"]))
 
 
 def place(setup: Setup) -> Place:

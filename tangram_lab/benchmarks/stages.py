@@ -9,12 +9,10 @@ from tangram_core.run.process import keep_memory
 from tangram_lab.benchmarks.measure import Row, page, show, write
 from tangram_lab.benchmarks.speed.learner import measure_gpu, measure_learner
 from tangram_lab.benchmarks.speed.scaling import measure_scaling
-from tangram_lab.benchmarks.speed.sim import measure_sim
 from tangram_lab.benchmarks.speed.train import measure_train
 from tangram_lab.benchmarks.speed.wire import measure_wire
 
 STAGES: dict[str, Callable[[argparse.Namespace], Sequence[Row]]] = {
-    "sim": lambda given: measure_sim(given.runs),
     "wire": lambda given: measure_wire(given.runs),
     "learner": lambda given: measure_learner(given.runs),
     "scaling": lambda given: measure_scaling(given.runs),

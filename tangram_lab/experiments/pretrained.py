@@ -23,14 +23,12 @@ from tangram_agent.pretrained import CARD, CARD_TEXT, CONFIG, FORMAT, PREFIX, WE
 from tangram_agent.runs import Run, load_run
 from tangram_core.errors import ConfigError, RunError, TangramError
 from tangram_core.settings import told
-from tangram_core.setup import Setup
 from tangram_core.store.checkpoints import ACTING, CHECKPOINTS, load_checkpoint, newest_checkpoint
 from tangram_core.store.files import check_writable, write_whole
 from tangram_game.config import EvalConfig
 from tangram_game.evaluate import policies, score_policies
-from tangram_game.figures.puzzles import find_figures
-from tangram_game.playing import by
-from tangram_game.scores import RUN, score_outlines, score_puzzles
+from tangram_game.figures.puzzles import by, find_figures
+from tangram_game.scores import RUN, score_puzzles
 from tangram_sim.targets.targets import has_all_tans
 
 PACKAGE = Path(__file__).resolve().parents[2] / "tangram_agent" / "pretrained"
@@ -38,7 +36,7 @@ RESULT = "result.json"
 MAX_BYTES = 1_000_000  # of the weights: they travel with every installation
 FIGURES, TURNS = ("test", "train"), 4  # splits of the library, and angles of each figure
 TESTS, TEST_SEED = 400, 1  # tests that no choice was made on: training is scored on seed 0
-AHEAD: dict[str, dict[str, Any]] = {"agent": {"beam": 12}}  # as an agent of outlines ships
+BEAM = 12  # of an agent of outlines, as it ships
 
 
 class Candidate(NamedTuple):
@@ -75,9 +73,8 @@ def publish(
     seeds = sorted((_read(path) for path in run_dirs), key=lambda one: int(one.result["seed"]))
     _check_one_setup(seeds)
     chosen = median(seeds)
-    shipped = _shipped(chosen.run.setup)
-    if shipped:
-        chosen = chosen._replace(run=chosen.run.with_settings(shipped))
+    if chosen.run.setup.agent_kind == "outline":  # looks ahead, which it does not in training
+        chosen = chosen._replace(run=chosen.run.with_settings({"agent": {"beam": BEAM}}))
     weights = _weights(chosen.run)
     config = EvalConfig(str(chosen.run.folder), episodes=tests, seed=TEST_SEED)
     scores = score_policies(chosen.run.task, policies(chosen.run), config, chosen.run.actor.at_once)
@@ -97,16 +94,10 @@ def publish(
     return folder
 
 
-def _shipped(setup: Setup) -> dict[str, dict[str, Any]]:
-    """What an agent ships with beside what it was trained with."""
-    return AHEAD if setup.agent_kind == "outline" else {}
-
-
 def _on_figures(run: Run, split: str) -> dict[str, Any]:
     """Scores of a run on the figures of a split."""
     figures = find_figures(split, run.task, None, TURNS)
-    score = score_outlines if run.task.outlines else score_puzzles
-    scored = score(run.task, figures, {RUN: by(run.actor)}, TEST_SEED, run.actor.at_once)
+    scored = score_puzzles(run.task, figures, {RUN: by(run.actor)}, TEST_SEED, run.actor.at_once)
     return {"turns": TURNS, "scores": scored.means[RUN]}
 
 

@@ -18,6 +18,7 @@ from tangram_lab.experiments.studies import Figure, Study, read_studies
 from tangram_lab.figures import COLOURS, legend_below, new_figure, save
 
 GRID = 200  # points of a curve of several seeds
+NAMED = 6  # settings in the name of a row
 LABELS = {
     "mean_reward": "mean reward",
     "mean_reward_dense": "mean reward, dense",
@@ -240,7 +241,7 @@ def write_runs(folder: Path, out: Path) -> Path:
     first = ["agent.name"] * ("agent.name" not in differ)
     rows = pd.DataFrame(
         {
-            "label": ", ".join(f"{n}={told.get(n)}" for n in (*first, *_few(differ))),
+            "label": ", ".join(f"{n}={told.get(n)}" for n in (*first, *differ[:NAMED])),
             "all": repr([told.get(n) for n in differ]),
             "seed": seed,
             "finished": "ended_by" in result,
@@ -273,8 +274,3 @@ def _flat(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]
             yield from _flat(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value
-
-
-def _few(names: Sequence[str], most: int = 6) -> Sequence[str]:
-    """Enough settings for a row's name."""
-    return names[:most]

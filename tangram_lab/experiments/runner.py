@@ -30,7 +30,6 @@ class Work:
 
     def __init__(self, job: Job, run_dir: Path, missing: Sequence[str]) -> None:
         self.job, self.run_dir, self.missing = job, run_dir, list(missing)
-        self.failed = ""
 
     @property
     def trained(self) -> bool:

@@ -6,16 +6,17 @@ Legend: B environments, K tokens, V corners, A entries of an action.
 import numpy as np
 
 from tangram_core.arrays import Bools, Floats, Ints, Singles
-from tangram_core.task import Generators
+from tangram_core.spec import Arrays
+from tangram_core.task import Chooser, Generators, History
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.overlap import outlines, shared_areas
 from tangram_sim.motion.actions import action_size, make_actions, velocities_of
 from tangram_tasks.pairing import Pairing, paired
-from tangram_tasks.played import Choose, Past
+from tangram_tasks.played import as_seen
 
 
-def random_policy(layout: Layout, sim: SimConfig) -> Choose:
+def random_policy(layout: Layout, sim: SimConfig) -> Chooser:
     """Chance: of one token every entry uniform in [-1, 1].
 
     Of several, any that is left goes to any pose with its centre in the arena: uniform entries
@@ -23,13 +24,8 @@ def random_policy(layout: Layout, sim: SimConfig) -> Choose:
     """
     size = action_size(layout.tokens, sim)
 
-    def choose(
-        corners: Floats,
-        placed: Bools,
-        _goals: Floats,
-        generators: Generators,
-        _past: Past | None = None,
-    ) -> Singles:
+    def choose(seen: Arrays, _past: History, generators: Generators) -> Singles:
+        corners, placed, _goals = as_seen(seen)
         drawn = np.array([generator.uniform(-1.0, 1.0, size) for generator in generators])
         if layout.tokens == 1:
             return drawn.astype(np.float32)
@@ -42,19 +38,14 @@ def random_policy(layout: Layout, sim: SimConfig) -> Choose:
     return choose
 
 
-def position_policy(layout: Layout, sim: SimConfig) -> Choose:
+def position_policy(layout: Layout, sim: SimConfig) -> Chooser:
     """Token after token exactly onto the centre of its own target, and never turned.
 
     A square moved so overlaps by 0.8825 on average: that is the plateau of the paper's Table II.
     """
 
-    def choose(
-        corners: Floats,
-        placed: Bools,
-        goals: Floats,
-        _generators: Generators,
-        _past: Past | None = None,
-    ) -> Singles:
+    def choose(seen: Arrays, _past: History, _generators: Generators) -> Singles:
+        corners, placed, goals = as_seen(seen)
         token = np.argmin(placed, axis=1)
         way = (layout.poses(goals) - layout.poses(corners))[np.arange(len(token)), token]
         way[:, 2] = 0.0
@@ -63,7 +54,7 @@ def position_policy(layout: Layout, sim: SimConfig) -> Choose:
     return choose
 
 
-def exact_policy(layout: Layout, sim: SimConfig) -> Choose:
+def exact_policy(layout: Layout, sim: SimConfig) -> Chooser:
     """Each token exactly onto a piece of its shape as it is seen, by the smallest turn that fits.
 
     Equal tokens share the pieces by the least way in all. Next is the one whose place is covered
@@ -71,13 +62,8 @@ def exact_policy(layout: Layout, sim: SimConfig) -> Choose:
     a circle, float32 actions, and the engine's arithmetic.
     """
 
-    def choose(
-        corners: Floats,
-        placed: Bools,
-        goals: Floats,
-        _generators: Generators,
-        _past: Past | None = None,
-    ) -> Singles:
+    def choose(seen: Arrays, _past: History, _generators: Generators) -> Singles:
+        corners, placed, goals = as_seen(seen)
         pairing = paired(layout, corners, goals)
         token = freest(layout, corners, placed, goals, pairing)
         rows = np.arange(len(token))

@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping
 from tangram_core.task import Chooser, Env
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout
-from tangram_tasks.played import plain, told
 from tangram_tasks.rivals.baselines import exact_policy, position_policy, random_policy
 from tangram_tasks.rivals.oracle import oracle_policy
 from tangram_tasks.rivals.sweeps import MAX_TOKENS, sweep_policy
@@ -20,11 +19,11 @@ def rivals_of(layout: Layout, sim: SimConfig) -> Mapping[str, Callable[[Env], Ch
     several noisy looks at them can be put together, `oracle` knows that world and its noise.
     """
     several = layout.tokens > 1 or sim.actions_per_token > 1
-    found = {"exact": plain(exact_policy(layout, sim))}
+    found: dict[str, Callable[[Env], Chooser]] = {"exact": lambda _: exact_policy(layout, sim)}
     if sim.motion == "slide" and layout.tokens <= MAX_TOKENS:
-        found["sweep rule"] = plain(sweep_policy(layout, sim))
+        found["sweep rule"] = lambda _: sweep_policy(layout, sim)
     if sim.inexact or (sim.corner_noise and several):
-        found["oracle"] = told(oracle_policy)
+        found["oracle"] = oracle_policy
     if layout.tokens == 1:
-        found["position only"] = plain(position_policy(layout, sim))
-    return found | {"random": plain(random_policy(layout, sim))}
+        found["position only"] = lambda _: position_policy(layout, sim)
+    return found | {"random": lambda _: random_policy(layout, sim)}

@@ -3,25 +3,29 @@
 Legend: B environments, K tokens, V corners.
 """
 
+from typing import cast
+
 import numpy as np
 
-from tangram_core.arrays import Bools, Floats, Singles
-from tangram_core.task import Generators
+from tangram_core.arrays import Floats, Singles
+from tangram_core.spec import Arrays
+from tangram_core.task import Chooser, Env, Generators, History
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.motion.actions import make_actions
 from tangram_sim.motion.actuation import Command, full_scale, reach
 from tangram_sim.motion.kinematics import wrap
 from tangram_sim.world.world import make_world
+from tangram_tasks.env import PlaceEnv
 from tangram_tasks.pairing import paired
-from tangram_tasks.played import Choose, Past
+from tangram_tasks.played import as_seen
 from tangram_tasks.rivals.baselines import freest
 
 _PROBES = 257  # commands that the engine is tried with
 _SURPRISE = 5.0  # deviations beyond which something else has moved a token
 
 
-def oracle_policy(env: BatchedEnv) -> Choose:
+def oracle_policy(of: Env) -> Chooser:
     """As `exact_policy`, told the world that each episode has: gain, bias, damping.
 
     Each action gives the command that ends nearest to the piece, also the long way round where the
@@ -30,16 +34,12 @@ def oracle_policy(env: BatchedEnv) -> Choose:
 
     With noise on corners it goes by where the tokens are most likely to be, see `_Filter`.
     """
+    env = cast("PlaceEnv", of).world
     layout, sim, world, engine = env.layout, env.sim, env.actuation, _Engine(env)
     tracker = _Filter(env, engine)
 
-    def choose(
-        corners: Floats,
-        placed: Bools,
-        goals: Floats,
-        _generators: Generators,
-        _past: Past | None = None,
-    ) -> Singles:
+    def choose(seen: Arrays, _past: History, _generators: Generators) -> Singles:
+        corners, placed, goals = as_seen(seen)
         poses, sides = tracker.follow(corners), layout.flipped(corners)
         if world.pending is not None:  # that comes first
             _carry(env, engine, world.pending, poses)

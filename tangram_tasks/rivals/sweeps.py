@@ -12,13 +12,14 @@ import numpy as np
 import shapely
 
 from tangram_core.arrays import AnyArray, Bools, Floats, Ints, Singles
-from tangram_core.task import Generators
+from tangram_core.spec import Arrays
+from tangram_core.task import Chooser, Generators, History
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.geometry.overlap import outlines, outlines_at, shared_areas
 from tangram_sim.motion.actions import make_actions, velocities_of
 from tangram_tasks.pairing import alike, all_ways
-from tangram_tasks.played import Choose, Past
+from tangram_tasks.played import as_seen
 
 MAX_TOKENS = 8  # the order is found over all sets of them
 _PAIRINGS = 24  # ways to share pieces among equal tokens that are tried
@@ -30,17 +31,15 @@ _WAITING = 0.05  # one that still has to go to its place, and then starts from e
 _AGAIN = 0.3  # and one in its place that may move again.
 
 
-def sweep_policy(layout: Layout, sim: SimConfig) -> Choose:
+def sweep_policy(layout: Layout, sim: SimConfig) -> Chooser:
     """Each token exactly onto a piece, in the order that pushes the least out of place.
 
     The share of a token that a slide sweeps counts as lost; where it is pushed to is not foreseen.
     Order and pieces are found anew for each action.
     """
 
-    def choose(
-        corners: Floats, placed: Bools, goals: Floats, _: Generators, _past: Past | None = None
-    ) -> Singles:
-        rows = zip(corners, np.asarray(placed, np.bool_), goals, strict=True)
+    def choose(seen: Arrays, _past: History, _: Generators) -> Singles:
+        rows = zip(*as_seen(seen), strict=True)
         tokens, ways = zip(*(first_slide(layout, *row) for row in rows), strict=True)
         velocity, none = velocities_of(np.stack(ways), sim), np.zeros(len(ways), np.bool_)
         return make_actions(np.array(tokens), velocity, none, layout.tokens, sim)

@@ -15,7 +15,7 @@ import numpy as np
 import shapely
 from shapely import Polygon
 
-from tangram_core.arrays import Bools, Floats
+from tangram_core.arrays import Floats
 from tangram_core.errors import ConfigError
 from tangram_sim.geometry.areas import Area, grown
 from tangram_sim.geometry.overlap import outlines
@@ -152,30 +152,15 @@ def _joined(rings: list[Floats], source: str) -> Area:
 
 
 def _meetings(rings: list[Floats]) -> int:
-    """How many pairs of sides cross or touch, but for neighbours."""
-    z = np.concatenate([ring @ (1.0, 1j) for ring in rings])
-    ahead = np.concatenate([np.roll(ring @ (1.0, 1j), -1) for ring in rings])
+    """How many pairs of sides cross or touch, but for neighbours; counting ends beyond the most."""
+    ends = [np.stack([ring, np.roll(ring, -1, axis=0)], axis=1) for ring in rings]
+    sides = shapely.linestrings(np.concatenate(ends))
     starts = np.cumsum([0, *map(len, rings)])
     after = np.concatenate([np.roll(np.arange(a, b), -1) for a, b in pairwise(starts)])
-    count = 0
-    for i in range(len(z) - 1):
-        later = slice(i + 1, len(z))
-        meet = _meet(z[i], ahead[i], z[later], ahead[later])
-        neighbours = (after[later] == i) | (np.arange(i + 1, len(z)) == after[i])
-        count += int(np.count_nonzero(meet & ~neighbours))
+    tree, count = shapely.STRtree(sides), 0
+    for i, side in enumerate(sides):
+        meet = tree.query(side, predicate="intersects")
+        count += int(np.count_nonzero((meet > i) & (meet != after[i]) & (after[meet] != i)))
         if count > MAX_MEETINGS:
             break
     return count
-
-
-def _meet(start: complex, end: complex, starts: Any, ends: Any) -> Bools:
-    """Which of n sides (n,) a side crosses or touches."""
-    way, ways = end - start, ends - starts
-    across = ((starts - start) * np.conj(way)).imag * ((ends - start) * np.conj(way)).imag
-    along = ((start - starts) * ways.conj()).imag * ((end - starts) * ways.conj()).imag
-    near = np.ones(len(starts), np.bool_)
-    for part in (np.real, np.imag):  # sides in one line meet only where they reach each other
-        low, high = np.minimum(part(starts), part(ends)), np.maximum(part(starts), part(ends))
-        near &= (low <= max(part(start), part(end))) & (high >= min(part(start), part(end)))
-    found: Bools = (across <= 0.0) & (along <= 0.0) & near
-    return found

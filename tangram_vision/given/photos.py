@@ -17,11 +17,12 @@ from PIL import Image
 from tangram_core.arrays import Bools, Floats, Ints, Pixels, Singles
 from tangram_core.errors import ConfigError
 from tangram_sim.geometry.layout import Layout
+from tangram_sim.sight.perception import Look
 from tangram_sim.targets.connected import MAX_PILE
 from tangram_vision.pictures.blobs import find_blobs, likeness
 from tangram_vision.pictures.kinds import kinds_of
 from tangram_vision.pictures.levels import MIN_CONTRAST
-from tangram_vision.pictures.seeing import Seen, see
+from tangram_vision.pictures.seeing import see
 from tangram_vision.silhouettes.tilts import from_above, shift
 
 # Along a side, at most, in which tokens are searched: the fewer, the less a skew matters.
@@ -133,7 +134,7 @@ def _spots(cover: Singles, layout: Layout, source: str) -> "_Spots":
     return spots
 
 
-def _seen(cover: Singles, layout: Layout, view: float) -> Seen | None:
+def _seen(cover: Singles, layout: Layout, view: float) -> Look | None:
     """All tokens of a layout in a square of coverage that is so wide; None if some are missing."""
     for pixels in _PIXELS:
         small = _smaller(cover, pixels)

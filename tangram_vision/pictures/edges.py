@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from tangram_core.arrays import Bools, Floats, Ints, Singles
-from tangram_vision.pictures.kinds import Kind
+from tangram_vision.pictures.kinds import Kind, lines_of
 
 WIDE, NARROW = 3.0, 2.0  # pixels that lines reach, at first and in the end
 _ROUNDS = (WIDE, WIDE, WIDE, NARROW, NARROW)
@@ -25,14 +25,13 @@ class Outlines:
     """
 
     def __init__(self, kinds: Sequence[Kind], reach: float) -> None:
-        every = [kind.lines(reach) for kind in kinds]
+        every = [lines_of(kind, reach) for kind in kinds]
         counts = [len(lines.x) for lines in every]
         self.z = np.concatenate([lines.x + 1j * lines.y for lines in every])
         self.owner: Ints = np.repeat(np.arange(len(kinds)), counts)
         self.expected = np.concatenate([lines.expected for lines in every])
         self.change = np.concatenate([lines.change for lines in every])
         self._solve = np.concatenate([lines.solve for lines in every], axis=1)
-        self.edge = np.concatenate([lines.edge for lines in every])
         self._starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
         self._counts = np.array(counts)
 

@@ -32,7 +32,6 @@ class Lines:
         change: (M, 3) how that changes where the shape moves by x, y (pixels) and turns (rad), seen
             in its body frame; the lines stay.
         solve: (3, M) the least-squares move for a change.
-        edge: (M,) number of the edge that is crossed.
     """
 
     x: Floats
@@ -40,7 +39,6 @@ class Lines:
     expected: Floats
     change: Floats
     solve: Floats
-    edge: Ints
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +56,6 @@ class Kind(Side):
         """Pixels."""
         z = self.corners @ (1.0, 1j)
         return float(np.abs(np.roll(z, -1) - z).sum())
-
-    def lines(self, reach: float) -> Lines:
-        """The lines that reach so many pixels in and out."""
-        return _lines(self, reach)
 
 
 @lru_cache(maxsize=8)
@@ -99,12 +93,11 @@ def _filled(corners: Floats) -> tuple[Complex, Floats]:
 
 
 @lru_cache(maxsize=64)
-def _lines(kind: Kind, reach: float) -> Lines:
+def lines_of(kind: Kind, reach: float) -> Lines:
+    """The lines that reach so many pixels in and out."""
     offset = np.arange(-reach, reach + _STEP / 2, _STEP)
-    xs, ys, edges = [], [], []
-    for edge, (start, end) in enumerate(
-        zip(kind.corners, np.roll(kind.corners, -1, axis=0), strict=True)
-    ):
+    xs, ys = [], []
+    for start, end in zip(kind.corners, np.roll(kind.corners, -1, axis=0), strict=True):
         length = float(np.hypot(*(end - start)))
         along, out = (end - start) / length, np.array([end[1] - start[1], start[0] - end[0]])
         margin = min(_CORNER, length / 4.0)
@@ -113,7 +106,6 @@ def _lines(kind: Kind, reach: float) -> Lines:
         samples = place[:, None] + offset[:, None] * (out / length)
         xs.append(samples[..., 0])
         ys.append(samples[..., 1])
-        edges.append(np.full(count, edge))
     x, y = np.concatenate(xs), np.concatenate(ys)
     moves = np.array([(_SHIFT, 0, 0), (0, _SHIFT, 0), (0, 0, _SHIFT / 10.0)])
     change = np.stack(
@@ -125,7 +117,7 @@ def _lines(kind: Kind, reach: float) -> Lines:
         axis=1,
     )
     expected = _covered(kind.corners, x, y, np.zeros(3))
-    return Lines(x, y, expected, change, np.linalg.pinv(change), np.concatenate(edges))
+    return Lines(x, y, expected, change, np.linalg.pinv(change))
 
 
 def _covered(corners: Floats, x: Floats, y: Floats, move: Floats) -> Floats:

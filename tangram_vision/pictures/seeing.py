@@ -37,17 +37,6 @@ _TRIES = 8  # piles that are searched for one picture
 
 
 @dataclass(frozen=True, eq=False)
-class Seen(Look):
-    """What was seen of K tokens.
-
-    Attributes:
-        blobs: connected areas that were found.
-    """
-
-    blobs: int
-
-
-@dataclass(frozen=True, eq=False)
 class _Explained:
     """What one blob is.
 
@@ -60,7 +49,7 @@ class _Explained:
     doubtful: bool = False
 
 
-def see(picture: Pixels, layout: Layout, arena: float, before: Look | None = None) -> Seen:
+def see(picture: Pixels, layout: Layout, arena: float, before: Look | None = None) -> Look:
     """What a picture (P, P) of an arena shows of a layout's tokens.
 
     Args:
@@ -73,10 +62,9 @@ def see(picture: Pixels, layout: Layout, arena: float, before: Look | None = Non
     kinds = kinds_of(layout, arena, pixels)
     cover = coverage(picture)
     poses, flipped = np.zeros((layout.tokens, 3)), np.zeros(layout.tokens, np.bool_)
-    known, sure, count = np.zeros_like(flipped), np.zeros_like(flipped), 0
+    known, sure = np.zeros_like(flipped), np.zeros_like(flipped)
     if cover is not None:
         puzzle = _puzzle(cover, kinds, Counter({kind.shape: len(kind.tokens) for kind in kinds}))
-        count = len(puzzle.blobs)
         left = {kind.shape: list(kind.tokens) for kind in kinds}
         stayed = None if before is None else _stayed(puzzle, cover, before, arena)
         for one in stayed or puzzle.explained():
@@ -87,7 +75,7 @@ def see(picture: Pixels, layout: Layout, arena: float, before: Look | None = Non
     unit = arena / pixels
     poses[known, :2] = (poses[known, :2] + (-pixels / 2.0, pixels / 2.0)) * unit
     poses[:, 2] = np.angle(np.exp(1j * poses[:, 2]))
-    return Seen(poses, flipped, known, sure, count)
+    return Look(poses, flipped, known, sure)
 
 
 def _puzzle(cover: Singles, kinds: Sequence[Kind], left: Counter[int]) -> "_Puzzle":

@@ -16,7 +16,6 @@ import pytest
 import zmq
 
 from tangram_core.setup import make_setup
-from tangram_lab.benchmarks.trainings import Growth
 from tangram_lab.benchmarks.trials import attack, attacks, harms
 from tangram_lab.benchmarks.trials.attack import FILES, TASK, beside
 from tangram_lab.benchmarks.trials.attacks import (
@@ -29,7 +28,7 @@ from tangram_lab.benchmarks.trials.attacks import (
 )
 from tangram_lab.benchmarks.trials.chaos import Witness
 from tangram_lab.benchmarks.trials.harms import LOCKSTEP, OWN, acknowledged_again
-from tangram_lab.benchmarks.trials.target import Attack, Seen, Target, tried
+from tangram_lab.benchmarks.trials.target import Attack, Growth, Seen, Target, tried
 
 pytestmark = pytest.mark.slow
 

@@ -4,23 +4,15 @@ import argparse
 import json
 import subprocess
 import sys
-from contextlib import closing
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from tangram_core.errors import ConfigError
 from tangram_lab.benchmarks.cli import main
 from tangram_lab.benchmarks.measure import Bound, compared, rates, single
-from tangram_lab.benchmarks.sight.seeing import NEAR, SCALE, _same
-from tangram_lab.benchmarks.sight.silhouettes import convex_outlines
 from tangram_lab.benchmarks.speed.learner import measure_gpu
 from tangram_lab.benchmarks.stages import STAGES, run_stages
-from tangram_sim.config import SimConfig
-from tangram_sim.world.world import make_world
-from tangram_vision.pictures.seeing import Seen
-from tests.sim.builders import SEVEN, layout_of
 
 LABELS = ("stage", "case", "unit")
 
@@ -66,12 +58,12 @@ def bench(*arguments: str) -> "subprocess.CompletedProcess[str]":
 @pytest.mark.check
 @pytest.mark.cluster
 def test_a_stage_prints_a_table_and_writes_where_its_numbers_come_from(tmp_path: Path) -> None:
-    done = bench("sim", "runs=1", f"out={tmp_path / 'sim.json'}")
+    done = bench("wire", "runs=1", f"out={tmp_path / 'wire.json'}")
     assert done.returncode == 0, done.stderr
     assert "bare" in done.stdout
-    content = json.loads((tmp_path / "sim.json").read_text())
+    content = json.loads((tmp_path / "wire.json").read_text())
     assert {"command", "commit", "processor", "cores", "versions", "rows"} <= content.keys()
-    assert {row["stage"] for row in content["rows"]} == {"sim"}
+    assert {row["stage"] for row in content["rows"]} == {"wire"}
 
 
 @pytest.mark.fast
@@ -80,12 +72,10 @@ def test_a_stage_prints_a_table_and_writes_where_its_numbers_come_from(tmp_path:
     [
         ("wire runs=0", "runs must be between 1 and 10000, got 0"),
         ("train seeds=0", "seeds must be between 1 and 1000, got 0"),
-        ("soak minutes=inf", "minutes must be a finite number, between 0.01 and 100000, got inf"),
+        ("chaos minutes=inf", "minutes must be a finite number, between 0.01 and 100000, got inf"),
         ("chaos minutes=0", "minutes must be between 0.01 and 100000, got 0"),
         ("chaos seed=-1", "seed must be between 0 and"),
-        ("fuzz messages=0", "messages must be between 1 and"),
-        ("fuzz live=0", "live must be between 1 and"),
-        ("sim out=/", "out=/ cannot be written (it is a folder)"),
+        ("wire out=/", "out=/ cannot be written (it is a folder)"),
     ],
 )
 def test_a_number_out_of_its_bounds_is_refused(
@@ -122,59 +112,3 @@ def test_wrong_arguments_are_answered_in_one_line() -> None:
     assert done.returncode == 2
     assert "invalid choice: 'nothing'" in done.stderr
     assert "Traceback" not in done.stderr
-
-
-@pytest.mark.check
-@pytest.mark.slow
-def test_what_is_seen_of_single_tokens_is_exact(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """One scene of each kind; those of several tokens are held by the tests of tangram_vision."""
-    out = tmp_path / "seeing.json"
-    monkeypatch.setattr(sys, "argv", ["tangram-bench", "seeing", "scenes=1", f"out={out}"])
-    assert main() == 0
-    content = json.loads(out.read_text())
-    rows = {(row["what"], row["pictures"]): row for row in content["rows"]}
-    assert len(rows) == len(content["rows"]) == 12
-    for pictures, position, degrees in (("128 grey", 2e-3, 0.5), ("128 binary", 5e-3, 2.0)):
-        row = rows["one token, five shapes", pictures]
-        assert (row["scenes"], row["all found"], row["sure but wrong"]) == (5, 1.0, 0.0)
-        assert row["95th perc."] < position
-        assert row["95th perc. (°)"] < degrees
-    assert [row["all found"] for row in content["disturbed"]] == [1.0] * 3
-
-
-@pytest.mark.fast
-def test_a_small_token_that_lies_elsewhere_gives_another_picture() -> None:
-    layout = layout_of(*SEVEN, scale=0.6)
-    sim = SimConfig(backend="kinematic", pixels=128, picture="grey")
-    poses = np.array(
-        [[(token % 3) * 0.6 - 0.6, (token // 3) * 0.6 - 0.6, 0.0] for token in range(7)]
-    )
-    sides, sure = np.zeros(7, np.bool_), np.ones(7, np.bool_)
-    with closing(make_world(layout, sim)) as world:
-        world.place(poses, sides)
-        picture = world.picture()
-        off = poses + np.array([(1.5 * NEAR * (token == 4), 0.0, 0.0) for token in range(7)])
-        same = [_same(world, Seen(lying, sides, sure, sure, 7), picture) for lying in (poses, off)]
-    assert same == [True, False]
-
-
-@pytest.mark.check
-@pytest.mark.slow
-def test_silhouettes_are_counted_by_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    out = tmp_path / "silhouettes.json"
-    monkeypatch.setattr("tangram_lab.benchmarks.sight.silhouettes.TURNS", 1)
-    monkeypatch.setattr("tangram_lab.benchmarks.sight.silhouettes.CAMERAS", ((128, "grey"),))
-    # All of them are searched through in tests/sim/geometry/test_dissections.py.
-    few = convex_outlines(float(np.sqrt(layout_of(*SEVEN, scale=SCALE).areas.sum())))[2:6]
-    monkeypatch.setattr("tangram_lab.benchmarks.sight.silhouettes.convex_outlines", lambda _: few)
-    monkeypatch.setattr(sys, "argv", ["tangram-bench", "silhouettes", "scenes=2", f"out={out}"])
-    assert main() == 0
-    content = json.loads(out.read_text())
-    exact, grey = content["rows"]
-    assert (exact["figures"], exact["filled"], exact["test (14)"]) == (19, 1.0, 1.0)
-    assert grey["silhouette"] == "128 px grey"
-    assert (grey["filled"], grey["convex (3)"]) == (1.0, 1.0)
-    (convex,) = content["convex"]
-    assert (convex["filled"], convex["searched through, none found"]) == (3, 1)

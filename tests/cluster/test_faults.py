@@ -94,15 +94,16 @@ def test_who_is_frozen_harms_nobody_and_comes_back(folder: Path) -> None:
 def test_no_process_is_left_of_a_training_whose_parent_was_killed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
 ) -> None:
-    """The launcher of its processes, or the trial that started the launcher."""
-    monkeypatch.setenv("TMPDIR", str(tmp_path))  # where a trial trains
+    """The launcher of its processes, or the measurement that started the launcher."""
+    monkeypatch.setenv("TMPDIR", str(tmp_path))  # where a measurement trains
     itself = command == "tangram-train"
     quick = (f"run_dir={tmp_path / 'run'}", "sim=kinematic", "net=mlp", "workers=2")
-    with started(command, *(quick if itself else ["soak"]), cwd=tmp_path) as process:
+    # A measurement begins with one worker, and a launcher below it.
+    with started(command, *(quick if itself else ["train"]), cwd=tmp_path) as process:
         end = time.monotonic() + LIMIT_S
-        while len(pids_of(tmp_path)) < 5 and time.monotonic() < end:
+        while len(pids_of(tmp_path)) < 4 + itself and time.monotonic() < end:
             time.sleep(0.05)
         children = [pid for pid in pids_of(tmp_path) if pid != process.pid]
         os.kill(process.pid, signal.SIGKILL)
-        assert len(children) == 5 - itself
+        assert len(children) == 4
         assert all_ended(children)

@@ -15,6 +15,7 @@ from tangram_game.config import EvalConfig, PlayConfig
 from tangram_game.evaluate import evaluate_run, scores_table
 from tangram_game.play import play_run
 from tangram_game.scores import RUN
+from tangram_tasks.place import ONE_TOKEN
 from tests.agent.builders import PAIR, SQUARE
 from tests.game.figures.puzzle_files import GAME, SIM, drawn, write_puzzles
 from tests.worker.builders import write_run
@@ -94,7 +95,7 @@ def test_in_another_world_there_is_an_oracle(
 def test_all_policies_of_one_token_fit_into_80_columns(capsys: pytest.CaptureFixture[str]) -> None:
     scores = {"mean_reward": -0.987, "position_error_p90": 1.2345, "angle_error_deg_p90": 180.0}
     names = RUN, "exact", "fitted", "oracle", "position only", "random"
-    Console(width=80).print(scores_table("run", "", dict.fromkeys(names, scores)))
+    Console(width=80).print(scores_table("run", "", ONE_TOKEN, dict.fromkeys(names, scores)))
     printed = capsys.readouterr().out
     assert "…" not in printed
     assert printed.count("1.2345") == len(names)

@@ -11,8 +11,7 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -24,9 +23,10 @@ import torch
 from tangram_core.arrays import Bools, Floats, Singles
 from tangram_core.errors import TangramError
 from tangram_core.seeding import evaluation_generators
-from tangram_core.task import Generators
+from tangram_core.spec import Arrays
+from tangram_core.task import Generators, History
 from tangram_lab.benchmarks.setups import place, preset
-from tangram_tasks.played import Past, Played, chooser
+from tangram_tasks.played import Played, as_seen
 from worker.play.rollout import play
 
 LIBRARY = "stable_baselines3"
@@ -64,10 +64,6 @@ class Rival:
     gamma: float = 0.98
     tau: float = 0.05
     seed: int = 0
-
-    def text(self) -> str:
-        """As the command line has it."""
-        return json.dumps(asdict(self))
 
 
 def label() -> str:
@@ -143,7 +139,7 @@ FOR_EVER = 10**9
 def train_rival(rival: Rival) -> dict[str, Any]:
     """What a training of Stable-Baselines3 in a process of its own came to."""
     label()
-    command = [sys.executable, "-m", "tangram_lab.benchmarks.speed.sb3", rival.text()]
+    command = [sys.executable, "-m", "tangram_lab.benchmarks.speed.sb3", json.dumps(asdict(rival))]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise TangramError(f"Stable-Baselines3 failed: {done.stderr.strip()[-500:]}")
@@ -176,38 +172,20 @@ def _speed(rival: Rival, model: Any) -> dict[str, Any]:
 
 def _until_good(rival: Rival, model: Any) -> dict[str, Any]:
     """The overlap after so many seconds of training; what the tests take does not count."""
-    watch, exam = Watch(), _exam(model)
+    exam, begun = _exam(model), 0.0
     curve: list[tuple[float, float]] = []
 
     def look(*_: object) -> bool:
-        trained = watch.seconds()
+        nonlocal begun
+        begun = begun or time.perf_counter()  # the first look is the start
+        trained = time.perf_counter() - begun
         if trained >= min(rival.seconds, LOOK_S * (len(curve) + 1)):
-            with watch.paused():
-                curve.append((trained, exam()))
+            curve.append((trained, exam()))
+            begun = time.perf_counter() - trained
         return trained < rival.seconds and not (curve and curve[-1][1] >= rival.goal)
 
     model.learn(FOR_EVER, callback=look)
     return {"curve": curve, "transitions": model.num_timesteps, "updates": model._n_updates}
-
-
-class Watch:
-    """Counts seconds from the first look at it on."""
-
-    def __init__(self) -> None:
-        self._begun: float | None = None
-
-    def seconds(self) -> float:
-        """So far, without the pauses."""
-        now = time.perf_counter()
-        self._begun = now if self._begun is None else self._begun
-        return now - self._begun
-
-    @contextmanager
-    def paused(self) -> Iterator[None]:
-        """What happens meanwhile takes no time."""
-        before = self.seconds()
-        yield
-        self._begun = time.perf_counter() - before
 
 
 def _exam(model: Any) -> Callable[[], float]:
@@ -215,16 +193,14 @@ def _exam(model: Any) -> Callable[[], float]:
     task = place(preset())
     env = task.make(AT_ONCE)
 
-    def choose(
-        corners: Floats, placed: Bools, goals: Floats, _: Generators, _past: Past
-    ) -> Singles:
-        actions: Singles = model.predict(observation(corners, placed, goals), deterministic=True)[0]
+    def choose(seen: Arrays, _past: History, _: Generators) -> Singles:
+        actions: Singles = model.predict(observation(*as_seen(seen)), deterministic=True)[0]
         return actions
 
     def exam() -> float:
         generators = evaluation_generators(TESTS)
         number = generators.__getitem__
-        played = play(env, task.spec, chooser(choose), number, TESTS, facts=True)
+        played = play(env, task.spec, choose, number, TESTS, facts=True)
         return float(np.mean(Played.of(played).overlap))
 
     return exam

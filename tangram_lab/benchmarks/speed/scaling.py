@@ -8,27 +8,21 @@ import os
 import signal
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-import zmq
-
 from tangram_core.errors import TangramError
 from tangram_lab.benchmarks.measure import Bound, Row, compared, single
 from tangram_lab.benchmarks.setups import played, preset
-from tangram_lab.benchmarks.speed.players import players, read_ages
-from tangram_lab.benchmarks.trainings import processes_of, start_training, wait_for
-from worker.status import ask_status
+from tangram_lab.benchmarks.speed.players import players
+from tangram_lab.benchmarks.trainings import numbers_of, processes_of, start_training, wait_for
 
 STAGE = "scaling"
 CORES = 8  # below which two workers share cores with the rest
 LINEAR = Bound(least=0.9)
 SAME = Bound(least=0.9)
-FRESH = Bound(most=2.0)
-PERCENTILE = 99.0
 SYNTHETIC = 64, 1000
 BATCH = 32
 PUBLISH_S = 0.5
@@ -53,14 +47,10 @@ class Run:
     Attributes:
         folder: of the run.
         more: processes beside those that name the folder.
-        windows: monotonic begin and end of what was measured.
-        period_s: between two broadcasts, which is longer where many workers make them large.
     """
 
     folder: Path
     more: list[int] = field(default_factory=list)
-    windows: list[tuple[float, float]] = field(default_factory=list)
-    period_s: float = PUBLISH_S
 
     def signal(self, number: signal.Signals) -> None:
         """To all processes of the run."""
@@ -79,8 +69,7 @@ class Run:
 
     def numbers(self) -> dict[str, float]:
         """The status of the master; it is a second old at most."""
-        with zmq.Context() as context:
-            return dict(ask_status(str(self.folder), context, PATIENCE_S).numbers)
+        return numbers_of(self.folder, PATIENCE_S)
 
     def cpu_s(self) -> float:
         """CPU time of the processes that name the folder."""
@@ -103,8 +92,6 @@ class Run:
             time.sleep(SPAN_S)
             after = self.numbers()
             end, spent = time.monotonic(), self.cpu_s() - spent
-        self.windows.append((begin, end))
-        self.period_s = max(PUBLISH_S, after["broadcast_s"])
         passed = after["elapsed_s"] - before["elapsed_s"]
         grown = {name: (after[name] - before[name]) / passed for name in names}
         return {**grown, "cpu": spent / (end - begin)}
@@ -149,7 +136,6 @@ def _synthetic(runs: int, folder: Path, count: int) -> Iterator[Row]:
             stack.enter_context(_fed(folder / f"{n}_beside_{count}", n)) for n in (1, count)
         )
         found = [(many.rates(*names), one.rates(*names)) for _ in range(runs)]
-        ages = _ages(many)
         sizes = [run.master_size() for run in (many, one)]
     case, against = f"{count:,} synthetic workers", "1 synthetic worker"
     for name, unit, bound in (
@@ -164,17 +150,8 @@ def _synthetic(runs: int, folder: Path, count: int) -> Iterator[Row]:
         [run["updates"] / run["cpu"] for run in both] for both in zip(*found, strict=True)
     )
     yield compared((STAGE, case, "updates per CPU second"), ours, against, theirs)
-    text = f"{case}, age of the weights, {PERCENTILE:g}th percentile"
-    yield single((STAGE, text, "broadcast periods"), ages, FRESH)
     for unit, ours, theirs in zip(("MiB", "descriptors"), *sizes, strict=True):
         yield compared((STAGE, f"{case}, the master's", unit), [ours], against, [theirs])
-
-
-def _ages(run: Run) -> Sequence[float]:
-    """The high percentile of each window, in broadcast periods."""
-    path = run.folder / "ages"
-    windows = [read_ages(path, *window) for window in run.windows]
-    return [float(np.percentile(ages, PERCENTILE)) / run.period_s for ages in windows if ages]
 
 
 @contextmanager
@@ -203,10 +180,10 @@ def _fed(folder: Path, count: int) -> Iterator[Run]:
     """A master of its own with so many synthetic players."""
     setup = preset()
     settings = (*ENDLESS, f"service.publish_seconds={PUBLISH_S}")
-    connect, ages = folder / "connection.json", folder / "ages"
+    connect = folder / "connection.json"
     with (
         _training(folder, count, *settings, name="master") as run,
-        players(connect, setup, played(setup, BATCH), count, ages) as pid,
+        players(connect, setup, played(setup, BATCH), count) as pid,
     ):
         run.more.append(pid)
         _settle(run, count)

@@ -13,12 +13,9 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-import zmq
-
 from tangram_lab.benchmarks.measure import Bound, Row, compared, told
 from tangram_lab.benchmarks.speed.sb3 import Rival, label, train_rival
-from tangram_lab.benchmarks.trainings import LOOK_S, PATIENCE_S, running
-from worker.status import ask_status
+from tangram_lab.benchmarks.trainings import LOOK_S, numbers_of, running
 
 # How good it gets in the same time
 
@@ -201,14 +198,9 @@ def _attention(runs: int) -> Row:
 def _pace(*settings: str) -> Numbers:
     """Transitions and updates in a second of our training, from some updates on."""
     with running(*settings, "max_updates=0", "service.eval_seconds=3600") as folder:
-        while (first := _standing(folder))["updates"] < WARM_UPDATES:
+        while (first := numbers_of(folder))["updates"] < WARM_UPDATES:
             time.sleep(LOOK_S)
         time.sleep(SPAN_S)
-        last = _standing(folder)
+        last = numbers_of(folder)
     passed = last["elapsed_s"] - first["elapsed_s"]
     return {name: (last[name] - first[name]) / passed for name in ("transitions", "updates")}
-
-
-def _standing(folder: Path) -> Numbers:
-    with zmq.Context() as context:
-        return dict(ask_status(str(folder), context, PATIENCE_S).numbers)

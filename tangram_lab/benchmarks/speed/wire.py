@@ -10,7 +10,7 @@ import json
 import multiprocessing
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from socket import gethostname
@@ -110,28 +110,14 @@ def child(target: Callable[..., None], *arguments: Any) -> Iterator[None]:
 @contextmanager
 def ours(case: Case, setup: Setup, episodes: Episodes) -> Iterator[Work]:
     """A Hub here that takes what a Client in another process sends."""
-    with connected(case, setup, episodes) as hub:
-        yield lambda: take_batches(hub)
-
-
-@contextmanager
-def connected(case: Case, setup: Setup, episodes: Episodes, workers: int = 1) -> Iterator[Hub]:
-    """A Hub that a process sends to, as one worker or as several."""
-    with opened(case.way, setup, case.keys) as (hub, folder):
-        connect = folder / "connection.json"
-        connect.write_text(json.dumps(_connection(hub, hub.keys)))
-        with child(send_batches, str(connect), setup, episodes, workers):
-            yield hub
-
-
-@contextmanager
-def opened(way: str, setup: Setup, keys: Keys | None) -> Iterator[tuple[Hub, Path]]:
-    """A Hub, and a folder that is there as long."""
     info = WelcomeInfo("bench", 0, setup.fingerprints(), setup.spec, window=WINDOW)
     with tempfile.TemporaryDirectory() as folder:
-        bind = f"{IPC}{folder}/hub" if way == UNIX else "127.0.0.1"
-        with Hub(bind, 0, info, keys=keys) as hub:
-            yield hub, Path(folder)
+        bind = f"{IPC}{folder}/hub" if case.way == UNIX else "127.0.0.1"
+        with Hub(bind, 0, info, keys=case.keys) as hub:
+            connect = Path(folder) / "connection.json"
+            connect.write_text(json.dumps(_connection(hub, hub.keys)))
+            with child(send_batches, str(connect), setup, episodes):
+                yield lambda: take_batches(hub)
 
 
 def take_batches(hub: Hub) -> int:
@@ -142,19 +128,13 @@ def take_batches(hub: Hub) -> int:
     return sum(arrival.episodes.transitions for arrival in arrivals)
 
 
-def send_batches(connect: str, setup: Setup, episodes: Episodes, workers: int) -> None:
-    """Send the same batch through each Client in turn for ever; runs in a process of its own."""
-    timing, spec = Timing(lost_s=PATIENCE_S), setup.spec
-    with ExitStack() as stack:
-        clients = [
-            Client(connect, "player", i, setup.fingerprints(), spec, window=WINDOW, timing=timing)
-            for i in range(workers)
-        ]
-        for client in clients:
-            stack.enter_context(client)
-            if not client.join():
-                raise TangramError("the hub does not let the player in")
-        while all(client.send(episodes, 0) for client in clients):
+def send_batches(connect: str, setup: Setup, episodes: Episodes) -> None:
+    """Send the same batch for ever; runs in a process of its own."""
+    timing, prints = Timing(lost_s=PATIENCE_S), setup.fingerprints()
+    with Client(connect, "player", 0, prints, setup.spec, window=WINDOW, timing=timing) as client:
+        if not client.join():
+            raise TangramError("the hub does not let the player in")
+        while client.send(episodes, 0):
             pass
 
 

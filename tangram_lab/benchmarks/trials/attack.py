@@ -17,7 +17,6 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
-import zmq
 
 from master.record.delivery import EpisodesArrived
 from master.record.journal import MAGIC, Journal, segments
@@ -27,7 +26,7 @@ from tangram_core.setup import Setup, make_setup
 from tangram_core.store.checkpoints import list_checkpoints, load_checkpoint, save_checkpoint
 from tangram_core.wire.messages import EpisodeBatch
 from tangram_lab.benchmarks.measure import show, write
-from tangram_lab.benchmarks.trainings import LOOK_S, MIB, Watched, result_of
+from tangram_lab.benchmarks.trainings import LOOK_S, MIB, numbers_of, result_of
 from tangram_lab.benchmarks.trials.attacks import BESIEGED, LIVE, OPEN_FILES
 from tangram_lab.benchmarks.trials.harms import harmed
 from tangram_lab.benchmarks.trials.target import (
@@ -217,12 +216,11 @@ def beside() -> Iterator[ProcessPoolExecutor]:
 
 def wait_for_updates(most: int, folder: Path, launcher: "subprocess.Popen[bytes]") -> None:
     """Wait until a training has done so many, or ended."""
-    with zmq.Context() as context:
-        watched, updates = Watched(folder, launcher, context), 0.0
-        while updates < most and launcher.poll() is None:
-            time.sleep(LOOK_S)
-            with suppress(TangramError):
-                updates = watched.numbers()["updates"]
+    updates = 0.0
+    while updates < most and launcher.poll() is None:
+        time.sleep(LOOK_S)
+        with suppress(TangramError):
+            updates = numbers_of(folder)["updates"]
 
 
 def run_attack(out: Path | None, folder: Path) -> int:

@@ -25,7 +25,7 @@ from tangram_core.wire.messages import PICTURE_WIDTH, EpisodeBatch, Heartbeat, S
 from tangram_core.wire.schema import MAX_COUNT, opened, seal
 from tangram_lab.benchmarks.trainings import MIB
 from tangram_lab.benchmarks.trials.chaos import Witness
-from tangram_lab.benchmarks.trials.fuzz_wire import fuzzed, resealed, valid_messages
+from tangram_lab.benchmarks.trials.forged import fuzzed, resealed, valid_messages
 from tangram_lab.benchmarks.trials.strangers import Strangers, subscribe
 from tangram_lab.benchmarks.trials.target import (
     ENDS_S,

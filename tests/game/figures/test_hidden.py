@@ -14,11 +14,12 @@ from PIL import Image
 
 import tangram_sim  # noqa: F401  # registers the environments
 from tangram_core.errors import ConfigError
+from tangram_core.task import Chooser, Env
 from tangram_game.config import EvalConfig
 from tangram_game.evaluate import evaluate_run
-from tangram_game.figures.hidden import Hidden, hide, lay, means, one_by_one, play_hidden
+from tangram_game.figures.hidden import Hidden, hide, lay, play_hidden
 from tangram_game.figures.puzzles import Figure, find_figures, play_figures
-from tangram_game.scores import RUN, score_hidden
+from tangram_game.scores import RUN, hidden_lines, hidden_means, score_hidden
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.config import RewardConfig
 from tangram_sim.geometry.areas import overlap
@@ -26,7 +27,6 @@ from tangram_sim.geometry.dissections import Dissection
 from tangram_sim.geometry.overlap import overlap_share
 from tangram_sim.sight.lens import Disturbance
 from tangram_tasks.place import Place
-from tangram_tasks.played import plain
 from tangram_tasks.rivals.baselines import exact_policy, random_policy
 from tangram_vision.silhouettes import silhouettes
 from tangram_vision.silhouettes.silhouettes import Filled, covered, fill_outline
@@ -63,7 +63,7 @@ def square(mirrored: bool = False) -> Figure:
 
 
 def exact(hidden: Hidden) -> Any:
-    return plain(exact_policy(hidden.task.layout, hidden.task.sim))
+    return lambda _: exact_policy(hidden.task.layout, hidden.task.sim)
 
 
 # What reaches the player
@@ -146,7 +146,7 @@ def test_scores_compare_areas() -> None:
     """The exact union of tokens and figure, whatever lies where."""
     made = game(OUTLINE | {"starts": "anywhere"})
     hidden = hide(made, find_figures("test", made, ["heart", "swan", "hut"]), seed=0)
-    chance = play_hidden(hidden, plain(random_policy(made.layout, hidden.task.sim)), seed=0)
+    chance = play_hidden(hidden, lambda _: random_policy(made.layout, hidden.task.sim), seed=0)
     assert 0.0 < chance.iou.max() < 0.95
     for e, figure in enumerate(hidden.figures):
         poses, flipped = made.layout.poses(chance.ends[e]), made.layout.flipped(chance.ends[e])
@@ -187,11 +187,11 @@ def test_what_was_not_filled_counts_as_nothing(monkeypatch: pytest.MonkeyPatch) 
     assert laid.seconds[1] == 0.25
     assert laid.iou[[0, 2]].min() > 0.999
     assert laid.actions_used[[0, 2]].tolist() == [7, 7]
-    scores = means(hidden, laid)
+    scores = hidden_means(hidden, laid)
     assert (scores["filled"], scores["not_filled"]) == (2, 1)
     assert scores["iou"] == pytest.approx(2 / 3, abs=1e-3)
     assert scores["share_solved_iou"] == pytest.approx(2 / 3)
-    assert [one["filled"] for one in one_by_one(hidden, laid)] == [True, False, True]
+    assert [one["filled"] for one in hidden_lines(hidden, laid)] == [True, False, True]
     assert hidden.titles == ["heart", "swan, not filled", "hut"]
 
 
@@ -274,7 +274,10 @@ def test_the_report_has_a_row_for_each_puzzle(
 def test_pictures_are_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    formula = plain(exact_policy(game(PICTURE).layout, game(PICTURE).sim))
+
+    def formula(_: Env) -> Chooser:
+        return exact_policy(game(PICTURE).layout, game(PICTURE).sim)
+
     monkeypatch.setattr("tangram_game.evaluate.policies", lambda _: {RUN: formula})
     report = evaluated(tmp_path, PICTURE, "square")
     assert report["iou"] > 0.95
@@ -292,7 +295,7 @@ def test_elsewhere_silhouettes_are_refused() -> None:
         with pytest.raises(ConfigError, match=told):
             BatchedEnv(made.layout, made.sim, RewardConfig())
         with pytest.raises(ConfigError, match=told):
-            play_figures(made, [square()], plain(random_policy(made.layout, made.sim)), 0)
+            play_figures(made, [square()], lambda _: None, 0)
     with pytest.raises(ConfigError, match=reason):
         gymnasium.make("Tangram-v0", observe="silhouette")
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tangram_agent.runs import load_run
+from tangram_core.task import Chooser, Env
 from tangram_game.config import EvalConfig
 from tangram_game.evaluate import evaluate_run
 from tangram_game.figures.methods import Learned, learned_method, together
@@ -20,7 +21,6 @@ from tangram_sim.geometry.dissections import Budget, Search, Tokens
 from tangram_sim.geometry.rings import covered_area
 from tangram_sim.puzzles.figures import library
 from tangram_sim.targets.targets import placement
-from tangram_tasks.played import plain
 from tangram_tasks.rivals.baselines import exact_policy
 from tangram_vision.silhouettes.silhouettes import Method
 from tests.game.figures.test_hidden import OUTLINE, game
@@ -65,7 +65,10 @@ def test_it_is_told_who_filled_what(
     monkeypatch.setattr("tangram_game.figures.methods.together", lambda _: method)
     made = game(OUTLINE)
     figures = find_figures("test", made, ["heart", "swan"])
-    formula = plain(exact_policy(made.layout, made.sim))
+
+    def formula(_: Env) -> Chooser:
+        return exact_policy(made.layout, made.sim)
+
     scored = score_hidden(made, figures, {RUN: formula}, 0)
     assert scored.means[RUN]["filled_by"] == {"search": 0, "beam": 0} | {by: 2}
     assert [one["filled_by"] for one in scored.puzzles] == [by, by]

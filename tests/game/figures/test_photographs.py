@@ -191,7 +191,7 @@ def test_tokens_must_lie_within_the_arena(tmp_path: Path) -> None:
     task = load_run("pretrained/square").task
     target = photo(tmp_path / "it.png", levels(task.layout, POSES[:1]))
     near = task.with_sim(arena=0.4)
-    with pytest.raises(ConfigError, match="it.png shows tokens that reach 0.262 .*only 0.2: "):
+    with pytest.raises(ConfigError, match="it.png reaches 0.262 .*only 0.2: lay "):
         read_photograph(target, near)
 
 

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tangram_game.playing import play_tests
+from tangram_core.task import Chooser, History
 from tangram_game.rivals.fitted import fitted_policy
 from tangram_sim.motion.kinematics import wrap
-from tangram_tasks.played import Played, chooser, plain, told
+from tangram_tasks.played import Played
 from tangram_tasks.rivals.baselines import exact_policy, random_policy
 from tangram_tasks.rivals.oracle import oracle_policy
 from tests.agent.builders import PAIR, SQUARE, setup
@@ -23,6 +23,13 @@ pytestmark = pytest.mark.slow
 
 GAME = {"shapes": list(SEVEN), "scale": 0.6}
 SHAPES = ("square", "small_triangle", "parallelogram")
+NOTHING = History({}, np.zeros((1, 0, 3), np.float32))
+
+
+def chosen(
+    policy: Chooser, corners: np.ndarray, placed: np.ndarray, goals: np.ndarray
+) -> np.ndarray:
+    return policy({"corners": corners, "placed": placed, "goals": goals}, NOTHING, [])
 
 
 @pytest.mark.parametrize("backend", ["kinematic", "physics"])
@@ -31,7 +38,7 @@ SHAPES = ("square", "small_triangle", "parallelogram")
 def test_the_exact_policy_scores_one(backend: str, tokens: dict, actions: int) -> None:
     made = setup(tokens, backend=backend, actions_per_token=actions).task
     with closing(FixedTests(made, 5, 5)) as tests:
-        scores = made.score(tests.play(chooser(exact_policy(made.layout, made.sim))))
+        scores = made.score(tests.play(exact_policy(made.layout, made.sim)))
     assert scores["raw_overlap_p10"] > 0.9999
     assert scores["position_error_p90"] < 1e-4
     assert scores["angle_error_deg_p90"] < 1e-2
@@ -53,8 +60,8 @@ def test_the_oracle_ends_on_its_target_in_every_world(
 ) -> None:
     made = setup({"shapes": [shape], "scale": 0.8}, **sim, actions_per_token=actions).task
     with closing(FixedTests(made, 16, 8)) as tests:
-        oracle = made.score(tests.play(told(oracle_policy)(tests.env)))
-        formula = made.score(tests.play(chooser(exact_policy(made.layout, made.sim))))
+        oracle = made.score(tests.play(oracle_policy(tests.env)))
+        formula = made.score(tests.play(exact_policy(made.layout, made.sim)))
     assert oracle["position_error_p90"] < 1e-5 * made.sim.arena
     assert oracle["angle_error_deg_p90"] < 1e-2
     short = formula["position_error_p90"] / 1e-3 / made.sim.arena
@@ -65,7 +72,7 @@ def test_worlds_that_are_tried_in_have_no_camera() -> None:
     seen = {"observe": "pictures", "pixels": 64, "disturbance": 1.0}
     made = setup(SQUARE, backend="physics", world="bullet", **seen).task
     with closing(FixedTests(made, 2, 2)) as tests:
-        assert Played.of(tests.play(told(oracle_policy)(tests.env))).camera is not None
+        assert Played.of(tests.play(oracle_policy(tests.env))).camera is not None
 
 
 @pytest.mark.parametrize(("sim", "actions"), [({"world": "delayed"}, 2), WORLDS[0]])
@@ -83,8 +90,8 @@ def test_the_oracle_puts_noisy_looks_together(tokens: dict, sim: dict[str, Any])
     made = setup(tokens, corner_noise=0.01, actions_per_token=8, starts="outside", **sim).task
     found = []
     with closing(FixedTests(made, 30, 15)) as tests:
-        for player in (told(oracle_policy), plain(exact_policy(made.layout, made.sim))):
-            played = play_tests(tests, player)
+        for player in (oracle_policy, lambda _: exact_policy(made.layout, made.sim)):
+            played = Played.of(tests.play(player(tests.env)))
             # From where the target is seen: what no policy can know is no matter here.
             ends, goals = (made.layout.poses(c) for c in (played.ends, played.episodes["goals"]))
             found.append(np.median(np.abs(ends - goals)[..., :2]))
@@ -97,8 +104,8 @@ def test_the_oracle_plays_several_tokens(sim: dict[str, Any]) -> None:
     tokens = {"shapes": ["square", "parallelogram"], "scale": 0.6}
     made = setup(tokens, **sim, world="drawn", actions_per_token=3).task
     with closing(FixedTests(made, 8, 8)) as tests:
-        oracle = made.score(tests.play(told(oracle_policy)(tests.env)))
-        formula = made.score(tests.play(chooser(exact_policy(made.layout, made.sim))))
+        oracle = made.score(tests.play(oracle_policy(tests.env)))
+        formula = made.score(tests.play(exact_policy(made.layout, made.sim)))
     assert oracle["coverage"] > 0.999
     assert formula["coverage"] < oracle["coverage"] - 0.01
 
@@ -110,7 +117,7 @@ def test_it_turns_no_further_than_the_symmetry_asks_for(shape: str) -> None:
     starts, goals = rng.uniform(-3.1, 3.1, (2, 200, 1, 3)) * [0.1, 0.1, 1.0]
     placed = np.zeros((200, 1), bool)
     policy = exact_policy(layout, made.sim)
-    actions = policy(layout.corners(starts), placed, layout.corners(goals), [])
+    actions = chosen(policy, layout.corners(starts), placed, layout.corners(goals))
     assert actions.dtype == np.float32
     symmetry = layout.shapes[0].symmetry
     assert (np.abs(actions[:, 2]) <= 1.0 / symmetry + 1e-6).all()
@@ -125,7 +132,7 @@ def test_the_exact_policy_solves_the_game(backend: str, targets: str, allow_flip
     sim = {"targets": targets, "starts": "outside", "mirrored": 0.5, "allow_flip": allow_flip}
     made = setup(GAME, backend=backend, pixels=16, **sim).task
     with closing(FixedTests(made, 8, 8)) as tests:
-        scores = made.score(tests.play(chooser(exact_policy(made.layout, made.sim))))
+        scores = made.score(tests.play(exact_policy(made.layout, made.sim)))
     assert scores["raw_overlap_p10"] > 0.999
     assert (scores["share_solved"], scores["wrong"], scores["refused"]) == (1.0, 0.0, 0.0)
     assert scores["angle_error_deg_p90"] < 0.1
@@ -138,17 +145,18 @@ def test_it_makes_room_before_it_sets_down() -> None:
     goals = np.array([[[0.6, 0.0, 0.0], [0.0, 0.6, 0.0]]])
     policy, placed = exact_policy(made.layout, made.sim), np.zeros((1, 2), bool)
     corners, wanted = made.layout.corners(starts), made.layout.corners(goals)
-    assert policy(corners, placed, wanted, [])[0, 0] > 0.0
-    assert policy(corners, np.array([[False, True]]), wanted, [])[0, 0] < 0.0
+    assert chosen(policy, corners, placed, wanted)[0, 0] > 0.0
+    assert chosen(policy, corners, np.array([[False, True]]), wanted)[0, 0] < 0.0
     free = made.layout.corners(starts - [0.0, 0.6, 0.0])
-    assert policy(free, placed, wanted, [])[0, 0] < 0.0
+    assert chosen(policy, free, placed, wanted)[0, 0] < 0.0
 
 
 def test_equal_tokens_take_the_nearer_places() -> None:
     made = setup({"shapes": ["square", "square"], "scale": 0.6}).task
     starts = made.layout.corners(np.array([[[-0.6, 0.0, 0.0], [0.6, 0.0, 0.0]]]))
     goals = made.layout.corners(np.array([[[0.5, 0.1, 0.0], [-0.5, 0.1, 0.0]]]))
-    action = exact_policy(made.layout, made.sim)(starts, np.zeros((1, 2), bool), goals, [])
+    policy, placed = exact_policy(made.layout, made.sim), np.zeros((1, 2), bool)
+    action = chosen(policy, starts, placed, goals)
     np.testing.assert_allclose(action[0, 1:], [0.05, 0.05, 0.0], atol=1e-6)
 
 
@@ -159,7 +167,7 @@ def test_chance_names_tokens_that_are_left_and_stays_in_the_arena(
     monkeypatch.setattr("tangram_sim.batch.MAX_OVERLAP", 1.0)
     made = setup(GAME, allow_flip=allow_flip, pixels=16).task
     with closing(FixedTests(made, 20, 20)) as tests:
-        played = play_tests(tests, plain(random_policy(made.layout, made.sim)))
+        played = Played.of(tests.play(random_policy(made.layout, made.sim)))
     assert not played.refused.any()
     assert played.episodes["placed"][:, -1].all()
     centres = made.layout.poses(played.ends)[..., :2]

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tangram_core.task import Chooser, History
 from tangram_sim.batch import BatchedEnv
 from tangram_sim.motion.actions import chosen_tokens
 from tangram_tasks.place import Place
-from tangram_tasks.played import Choose, chooser
 from tangram_tasks.rivals.baselines import exact_policy
 from tangram_tasks.rivals.sweeps import _shares, _swept, best_order, first_slide, sweep_policy
 from tests.agent.builders import setup
@@ -97,16 +97,17 @@ def test_the_best_order_is_that_of_all() -> None:
         assert (total, token) == (pytest.approx(cost(best)), best[0])
 
 
-def covered(made: Place, choose: Choose, starts: Any, goals: Any) -> tuple[list[int], float]:
+def covered(made: Place, choose: Chooser, starts: Any, goals: Any) -> tuple[list[int], float]:
     """The tokens that are named in turn, and what is covered in the end, in the engine."""
-    layout, named = made.layout, list[int]()
+    layout, named, nothing = made.layout, list[int](), History({}, np.zeros((1, 0, 4)))
     with closing(BatchedEnv(layout, made.sim, made.reward)) as env:
         sides = np.zeros((1, layout.tokens), np.bool_)
         env.reset([np.random.default_rng(0)], (np.array([goals], np.float64), sides))
         env._worlds[0].place(np.array(starts, np.float64))
         env._look()
         for _ in range(env.horizon):
-            actions = choose(env.seen, env.closed, env.seen_goals, [], None).astype(np.float64)
+            seen = {"corners": env.seen, "placed": env.closed, "goals": env.seen_goals}
+            actions = choose(seen, nothing, []).astype(np.float64)
             named += chosen_tokens(actions, layout.tokens).tolist()
             result = env.step(actions)
         return named, float(result.overlap[0])
@@ -133,7 +134,7 @@ def test_seven_tokens_are_laid_better_than_each_alone_and_with_two_actions_nearl
         made = setup(GAME, **SLIDE, starts="outside", actions_per_token=count).task
         with closing(FixedTests(made, 8, 8)) as tests:
             for policy in (exact_policy, sweep_policy)[count - 1 :]:
-                played = tests.play(chooser(policy(made.layout, made.sim)))
+                played = tests.play(policy(made.layout, made.sim))
                 scores.append(made.score(played)["coverage"])
     assert scores[0] + 0.1 < scores[1] < scores[2]
     assert scores[2] > 0.95

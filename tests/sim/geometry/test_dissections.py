@@ -1,14 +1,14 @@
 """Filling outlines: what can be filled is, what cannot is searched through."""
 
 import time
+from itertools import product
 
 import numpy as np
 import pytest
 import shapely
 from shapely import Polygon
 
-from tangram_core.arrays import Floats
-from tangram_lab.benchmarks.sight.silhouettes import convex_outlines
+from tangram_core.arrays import Complex, Floats
 from tangram_sim.config import SimConfig
 from tangram_sim.geometry.areas import Area, straightened
 from tangram_sim.geometry.dissections import Budget, Dissection, Laid, Search, Tokens
@@ -29,6 +29,47 @@ from tests.sim.builders import SEVEN, layout_of
 pytestmark = pytest.mark.fast
 
 LAYOUT = layout_of(*SEVEN, scale=1.0)
+
+
+def convex_outlines(side: float) -> list[Complex]:
+    """The 20 convex outlines that 16 equal right triangles with two equal sides can have.
+
+    The seven tans consist of such triangles, and fill 13 of these outlines (Wang and Hsiung, 1942).
+
+    Args:
+        side: of a square of the same area.
+
+    Returns:
+        Corners (n,) as complex numbers, counter-clockwise.
+    """
+    found: dict[tuple[tuple[int, int], ...], Complex] = {}
+    for width, height in product(range(1, 17), repeat=2):
+        # A rectangle without a triangle at each of its corners.
+        for a, b, c, d in product(range(min(width, height) + 1), repeat=4):
+            fits = a + b <= width and c + d <= width and b + c <= height and a + d <= height
+            if not fits or 2 * width * height - a * a - b * b - c * c - d * d != 16:
+                continue
+            z = np.array(
+                [a, width - b, width + 1j * b, width + 1j * (height - c)]
+                + [width - c + 1j * height, d + 1j * height, 1j * (height - d), 1j * a]
+            )
+            z = z[np.abs(z - np.roll(z, 1)) > 0.5]
+            ahead, behind = np.roll(z, -1) - z, z - np.roll(z, 1)
+            z = z[np.abs((behind.conj() * ahead).imag) > 0.5]
+            image = np.conj(z[::-1])
+            found.setdefault(min(*_readings(z), *_readings(image)), z * side / np.sqrt(8.0))
+    return list(found.values())
+
+
+def _readings(z: Complex) -> list[tuple[tuple[int, int], ...]]:
+    """Squared sides and turns of an outline, begun at each of its corners."""
+    ahead = np.roll(z, -1) - z
+    turns = np.degrees(np.angle(ahead / np.roll(ahead, 1)))
+    sides = [
+        (round(float(abs(way) ** 2)), round(float(turn)))
+        for way, turn in zip(ahead, turns, strict=True)
+    ]
+    return [(*sides[i:], *sides[:i]) for i in range(len(sides))]
 
 
 def polygon(points: Floats) -> Polygon:

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from tangram_core.seeding import evaluation_generators
-from tangram_tasks.played import Played, chooser
+from tangram_core.task import History
+from tangram_tasks.played import Played
 from tangram_tasks.rivals.baselines import position_policy, random_policy
 from tests.agent.builders import PAIR, SQUARE, setup
 from tests.worker.builders import policy
@@ -61,7 +62,7 @@ def test_the_camera_is_on_though_training_has_none() -> None:
     made = setup()
     assert not made.task.sim.pixels
     with closing(FixedTests(made.task, 20, 10)) as tests:
-        whole = tests.play(chooser(position_policy(made.task.layout, made.task.sim)))
+        whole = tests.play(position_policy(made.task.layout, made.task.sim))
     found, scores = Played.of(whole), made.task.score(whole)
     assert found.camera is not None
     np.testing.assert_allclose(found.camera, 2.0 * found.overlap - 1.0, atol=0.1)
@@ -94,7 +95,7 @@ def test_the_position_policy_solves_position_and_nothing_else(
     monkeypatch.setattr("tangram_sim.batch.MAX_OVERLAP", 1.0)
     made = setup(tokens, pixels=32, actions_per_token=actions)
     with closing(FixedTests(made.task, 10, 10)) as tests:
-        found = Played.of(tests.play(chooser(position_policy(made.task.layout, made.task.sim))))
+        found = Played.of(tests.play(position_policy(made.task.layout, made.task.sim)))
     centres = made.task.layout.bases(found.ends), made.task.layout.bases(found.goals)
     np.testing.assert_allclose(*centres, atol=1e-6)
     assert found.episodes["placed"][:, -1].all() == (tokens is PAIR or actions == 1)
@@ -106,7 +107,7 @@ def test_the_position_policy_reaches_the_plateau_of_the_paper() -> None:
     """A square on its target's centre at a uniform angle: 0.8825 raw, 0.765 scaled."""
     made = setup(pixels=16)
     with closing(FixedTests(made.task, 500, 100)) as tests:
-        found = tests.play(chooser(position_policy(made.task.layout, made.task.sim)))
+        found = tests.play(position_policy(made.task.layout, made.task.sim))
         assert made.task.score(found)["mean_reward"] == pytest.approx(0.765, abs=0.01)
 
 
@@ -114,8 +115,9 @@ def test_the_position_policy_reaches_the_plateau_of_the_paper() -> None:
 def test_the_random_policy_fills_the_action_space_from_the_episodes_generators(flip: bool) -> None:
     made = setup({"shapes": ["parallelogram"], "scale": 1.0}, allow_flip=flip)
     choose = random_policy(made.task.layout, made.task.sim)
-    nothing = np.zeros((500, 1))
-    one, two = (choose(nothing, nothing, nothing, evaluation_generators(500)) for _ in range(2))
+    seen = dict.fromkeys(("corners", "placed", "goals"), np.zeros((500, 1)))
+    none = History({}, np.zeros((500, 0, 3), np.float32))
+    one, two = (choose(seen, none, evaluation_generators(500)) for _ in range(2))
     np.testing.assert_array_equal(one, two)
     assert one.shape == (500, made.task.action_size)
     np.testing.assert_allclose(one.min(axis=0), -1.0, atol=0.05)
@@ -132,7 +134,7 @@ def test_noise_on_the_corners_is_seen_and_not_scored() -> None:
     for noise in (0.0, 0.05):
         made = setup(pixels=16, corner_noise=noise)
         with closing(FixedTests(made.task, 50, 50)) as tests:
-            found = tests.play(chooser(position_policy(made.task.layout, made.task.sim)))
+            found = tests.play(position_policy(made.task.layout, made.task.sim))
             scores.append(made.task.score(found)["position_error_median"])
     assert scores[0] == pytest.approx(0.0, abs=1e-6)
     # the mean of four corners, of token and target each: 0.1 * sqrt(2 / 4), in the plane

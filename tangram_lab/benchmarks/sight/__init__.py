@@ -1,1 +1,0 @@
-"""How exactly, surely and fast pictures and silhouettes are read. Start with `seeing.py`."""
