@@ -17,14 +17,15 @@ Options may be written as elsewhere in this project: runs=9 for --runs 9.
 examples:
   tangram-bench learner                     a table of the learner alone
   tangram-bench wire runs=9 out=wire.json   more runs, and a file with machine, versions, commit
-  tangram-bench all out=bench.json          everything, most of an hour on two cores (make bench)
+  tangram-bench all out=bench.json          wire, learner and scaling (make bench)
+  tangram-bench goals id=PandaPush-v3 minutes=60    ours and Stable-Baselines3 side by side
   tangram-bench chaos minutes=20 seed=1     random faults over a real training
   tangram-bench attack out=attack.json      every attack that is known, on real trainings
 """
 RATES = {
     "wire": "worker to master, against bare ROUTER-DEALER sockets",
     "learner": "updates, compiled or not, against Stable-Baselines3",
-    "train": "a whole training, against Stable-Baselines3 (minutes=)",
+    "goals": "a goal environment learned, against Stable-Baselines3 (id=, minutes=)",
     "scaling": "more workers, and 64 synthetic ones",
     "gpu": "updates on a GPU, against single operations there and one core",
 }
@@ -35,7 +36,6 @@ TRIALS = {
 # Option -> its bounds.
 BOUNDS = {
     "runs": (1, 10_000),
-    "seeds": (1, 1000),
     "minutes": (0.01, 1e5),
     "seed": (0, 2**63 - 1),
 }
@@ -49,14 +49,13 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     kinds = parser.add_subparsers(dest="kind", required=True)
-    for name, text in {"all": "everything below down to scaling", **RATES}.items():
+    for name, text in {"all": "wire, learner and scaling", **RATES}.items():
         one = kinds.add_parser(name, help=text, description=text)
         one.add_argument("--runs", type=int, default=5, help="measurements of each rate (5)")
         one.add_argument("--out", type=Path, help="JSON file of the results")
-        if name in ("all", "train"):
-            limit = "that a rival's training may last (5)"
-            one.add_argument("--minutes", type=float, default=5.0, help=limit)
-            one.add_argument("--seeds", type=int, default=3, help="trainings of each (3)")
+        if name == "goals":
+            one.add_argument("--id", default="FetchReach-v4", help="of gymnasium (FetchReach-v4)")
+            one.add_argument("--minutes", type=float, default=5.0, help="of each training (5)")
     for name, text in TRIALS.items():
         one = kinds.add_parser(name, help=text, description=text)
         if name == "chaos":

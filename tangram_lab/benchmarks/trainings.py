@@ -4,10 +4,7 @@ import json
 import os
 import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -52,20 +49,6 @@ def wait_for(path: Path, process: "subprocess.Popen[bytes]") -> None:
         if process.poll() is not None:
             raise TangramError(f"the training ended before {path} was there")
         time.sleep(LOOK_S)
-
-
-@contextmanager
-def running(*settings: str) -> Iterator[Path]:
-    """Our service at work; the folder of its run, which is gone afterwards."""
-    with tempfile.TemporaryDirectory(prefix="tangram-") as name:
-        folder = Path(name) / "run"
-        launcher = start_training(folder, *settings)
-        try:
-            wait_for(folder / "connection.json", launcher)
-            yield folder
-        finally:
-            launcher.terminate()
-            launcher.wait(PATIENCE_S)
 
 
 def processes_of(folder: Path) -> dict[psutil.Process, str]:

@@ -71,7 +71,7 @@ def test_a_stage_prints_a_table_and_writes_where_its_numbers_come_from(tmp_path:
     ("line", "reason"),
     [
         ("wire runs=0", "runs must be between 1 and 10000, got 0"),
-        ("train seeds=0", "seeds must be between 1 and 1000, got 0"),
+        ("goals minutes=0", "minutes must be between 0.01 and 100000, got 0"),
         ("chaos minutes=inf", "minutes must be a finite number, between 0.01 and 100000, got inf"),
         ("chaos minutes=0", "minutes must be between 0.01 and 100000, got 0"),
         ("chaos seed=-1", "seed must be between 0 and"),

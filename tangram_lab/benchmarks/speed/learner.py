@@ -15,7 +15,7 @@ from tangram_core.errors import ConfigError
 from tangram_core.setup import Setup
 from tangram_lab.benchmarks.measure import Bound, Row, Work, compare, compared, rates
 from tangram_lab.benchmarks.setups import preset, random_transitions, several, with_agent, with_sim
-from tangram_lab.benchmarks.speed.sb3 import Rival, label, make_model
+from tangram_lab.benchmarks.speed.sb3 import label, make_model
 
 BATCHES = (64, 256)
 
@@ -102,7 +102,7 @@ def _beside_theirs(runs: int) -> list[Row]:
 
     Once every transition is final, and once every second one: theirs always asks its targets.
     """
-    model = make_model(Rival(envs=STEPS, batch=BATCH, starts=FILLED))
+    model = make_model(STEPS, BATCH, FILLED)
     model.learn(FILLED)  # fills its replay with random play
     setup, rows = with_agent(preset("mlp"), batch_size=BATCH), []
     final, theirs = random_transitions(setup, BATCH), model.replay_buffer.sample(BATCH)
