@@ -1,5 +1,8 @@
 """The replay buffer: a ring over preallocated arrays."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -8,7 +11,7 @@ from tangram_core.arrays import Ints, Singles
 from tangram_core.errors import RunError
 from tangram_tasks.played import Past
 
-Array = npt.NDArray[np.generic]
+Array = npt.NDArray[Any]
 _COUNTERS = "counters"
 
 
@@ -83,7 +86,7 @@ class ReplayBuffer:
             raise ValueError("cannot sample from an empty replay buffer")
         oldest = self.added - len(self)
         rows = (oldest + generator.integers(len(self), size=size)) % self.capacity
-        return Transitions(**{name: column[rows] for name, column in self._columns.items()})  # type: ignore[arg-type]
+        return Transitions(**{name: column[rows] for name, column in self._columns.items()})
 
     def sample_episodes(
         self, count: int, steps: int, generator: np.random.Generator
@@ -125,7 +128,7 @@ class ReplayBuffer:
         columns = {name: column[rows] for name, column in self._columns.items()}
         return columns | {_COUNTERS: np.array([self.added], np.int64)}
 
-    def load_state(self, state: dict[str, Array]) -> None:
+    def load_state(self, state: Mapping[str, Array]) -> None:
         """Take over a state from `state()`.
 
         A buffer of another capacity keeps the newest transitions that fit.

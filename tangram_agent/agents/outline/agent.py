@@ -56,13 +56,16 @@ class Outline(Agent):
         return OutlineActor(cast("Fill", task), self.config, self.net)
 
     def learner(
-        self, task: Task, seed: int, device: str = "cpu", *, compiled: bool = False
+        self,
+        task: Task,
+        seed: int,
+        device: str = "cpu",
+        *,
+        compiled: bool = False,  # noqa: ARG002
     ) -> "FillLearner":
         """See `Agent.learner`."""
         from tangram_agent.agents.outline.learner import FillLearner  # noqa: PLC0415
 
-        if compiled:
-            self.check_training(compiled=True)
         return FillLearner(cast("Fill", task), self.config, self.net, seed, device)
 
     def facts(self) -> Json:

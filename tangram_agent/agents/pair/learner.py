@@ -7,7 +7,6 @@ Legend: M pairs.
 """
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -18,8 +17,7 @@ from tangram_agent.agents.pair.motion import Fit, MotionModel, Motions, motions_
 from tangram_agent.agents.pair.networks import Networks
 from tangram_agent.agents.pair.pairs import Pairs
 from tangram_agent.base.config import NetConfig
-from tangram_agent.base.ddpg import NUMBERS, Ddpg, Steps
-from tangram_agent.base.learning import read_slots, saved_slots
+from tangram_agent.base.ddpg import Ddpg, Steps
 from tangram_agent.base.types import Transitions
 from tangram_agent.nets.weights import under
 from tangram_core.agent import Streams, Tensors
@@ -49,43 +47,26 @@ class PairLearner(Ddpg):
         device: str = "cpu",
         compiled: bool = False,
     ) -> None:
-        learned = config.motion == "learned"
-        networks = Networks(task.layout, task.sim.arena, net, motion=learned)
+        networks = Networks(task.layout, task.sim.arena, net, motion=config.motion == "learned")
+        every = networks.actor, networks.critic, networks
         self.motion = networks.motion
+        others = {} if self.motion is None else {"motion": self.motion}
+        super().__init__(task, config, every, seed, device, compiled, others)
+        if task.layout.tokens > 1:  # relabelled anew for every update
+            self.relabels = ()
         if self.motion is not None:
             self.streams = (*Ddpg.streams, "motion")
-        every = networks.actor, networks.critic, networks
-        super().__init__(task, config, every, seed, device, compiled)
-        self._fit = None if self.motion is None else Fit(self.motion, screens_motions(task))
-
-    def _more_parts(self) -> dict[str, Any]:
-        motion = {} if self.motion is None else {"motion": self.motion}
-        return super()._more_parts() | motion
-
-    @property
-    def relabels(self) -> tuple[Any, ...]:
-        """None with several tokens: those are relabelled anew for every update."""
-        return () if self.task.layout.tokens > 1 else self.config.hindsight
+            self.optimisers["motion"] = Fit(self.motion, screens_motions(task))
 
     def update(self, share: float, rng: Streams) -> dict[str, float]:
         """As `Ddpg`, and one step of the model of motion.
 
         Its numbers come with motion_error and motion_noise (shares of full scale).
         """
-        self.batch = self.replay.sample(self.config.batch_size, rng["replay"])
-        steps = self.steps(self.batch, rng["hindsight"])
-        motions = None if self.motion is None else self._motions(rng["motion"])
-        return self.learn(steps, share, motions)
-
-    def learn(
-        self, steps: Steps, share: float = 0.0, motions: Motions | None = None
-    ) -> dict[str, float]:
-        """One step of all networks; see `Ddpg.learn`."""
-        values = {}
-        if self._fit is not None and motions is not None:
-            values = self._fit.step(motions.to(self.place))
-        found = self._step_all(steps, self.rates(share))
-        return self._counted(dict(zip(NUMBERS, found.unbind(), strict=True)) | values)
+        told = {}
+        if self.motion is not None:
+            told = self.optimisers["motion"].step(self._motions(rng["motion"]).to(self.place))
+        return self.learn(self.drawn(rng), share, told)
 
     def _motions(self, generator: np.random.Generator) -> Motions:
         """What whole episodes of the replay tell of the motion."""
@@ -115,10 +96,10 @@ class PairLearner(Ddpg):
         return Pairs(
             pose=self.tensor(pose),
             flipped=self.tensor(flipped),
-            token=self.index(batch.token),
+            token=self.tensor(batch.token, np.int64),
             goal=self.tensor(batch.goal),
             goal_flipped=self.tensor(batch.goal_flipped),
-            piece=self.index(batch.piece),
+            piece=self.tensor(batch.piece, np.int64),
             covered=self.tensor(batch.covered),
         )
 
@@ -128,17 +109,6 @@ class PairLearner(Ddpg):
         if critic_plays(self.task):
             return every
         return {name: one for name, one in every.items() if not name.startswith("critic.")}
-
-    def state(self) -> dict[str, Array]:
-        """With what the model of motion has seen."""
-        fit = {} if self._fit is None else saved_slots("motion", self._fit.slots)
-        return super().state() | fit
-
-    def load_state(self, state: Mapping[str, Array]) -> None:
-        """Take over a state, the model of motion's too."""
-        super().load_state(state)
-        if self._fit is not None:
-            self._fit.load(read_slots("motion", state, self.place))
 
     def load_networks(self, state: Mapping[str, Array]) -> None:
         """Take over the networks of a state, and nothing else.

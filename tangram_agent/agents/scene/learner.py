@@ -35,7 +35,7 @@ class SceneLearner(Ddpg):
         tokens = self.task.layout.tokens
         state, placed = self.tensor(batch.state), self.tensor(batch.placed)
         goal, action = self.tensor(batch.goal), self.tensor(batch.action)
-        moved = self.index(chosen_tokens(batch.action.astype(np.float64), tokens))
+        moved = self.tensor(chosen_tokens(batch.action.astype(np.float64), tokens), np.int64)
         taken = Scenes(state, placed, goal, moved)
         start = taken if tokens == 1 else Scenes(state, placed, goal, next_token(placed))
         following, flags = self.tensor(batch.next_state), self.tensor(batch.next_placed)

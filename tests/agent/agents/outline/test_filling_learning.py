@@ -180,7 +180,7 @@ def test_a_state_is_worth_the_best_that_it_can_go_on_to() -> None:
     learner, replay = learned()
     batch = replay.sample(64, np.random.default_rng(2))
     batch.ends[0] = 0
-    targets = learner.targets(batch)
+    targets = learner.values(batch)
     assert targets[0] == 0.0
     for row, ends in enumerate(batch.ends):
         wanted = 0.0
@@ -190,7 +190,9 @@ def test_a_state_is_worth_the_best_that_it_can_go_on_to() -> None:
             if end == OPEN:
                 one = batch.places.at(slice(row * MOST_PLACES + i, row * MOST_PLACES + i + 1))
                 with torch.no_grad():
-                    wanted = max(wanted, float(learner.target(Corners.of(one)).sigmoid()[0]))
+                    wanted = max(
+                        wanted, float(learner.targets["critic"](Corners.of(one)).sigmoid()[0])
+                    )
         assert float(targets[row]) == pytest.approx(wanted, abs=1e-6)
     assert {0.0, 1.0} < set(targets.tolist())
 
