@@ -53,19 +53,20 @@ class Rests:
         return np.asarray((self.part != UNUSED).any(axis=1))
 
     @staticmethod
-    def empty(count: int, corners: int, shapes: int) -> "Rests":
+    def empty(count: tuple[int, ...], corners: int, shapes: int) -> "Rests":
         """States of no corners."""
         return Rests(
-            np.zeros((count, corners, 2), np.float32),
-            np.tile(np.arange(corners, dtype=np.uint8), (count, 1)),
-            np.full((count, corners), UNUSED, np.uint8),
-            np.zeros((count, shapes), np.uint8),
+            np.zeros((*count, corners, 2), np.float32),
+            np.tile(np.arange(corners, dtype=np.uint8), (*count, 1)),
+            np.full((*count, corners), UNUSED, np.uint8),
+            np.zeros((*count, shapes), np.uint8),
         )
 
     @staticmethod
     def joined(every: list["Rests"]) -> "Rests":
         """States one after the other."""
-        return Rests(*(np.concatenate(parts) for parts in zip(*map(_parts, every), strict=True)))
+        columns = zip(*(vars(one).values() for one in every), strict=True)
+        return Rests(*map(np.concatenate, columns))
 
     def turned(self, generator: np.random.Generator) -> "Rests":
         """The same states, each turned by some eighths and half of them seen in a mirror.
@@ -84,11 +85,12 @@ class Rests:
 
     def at(self, rows: Ints | Bools | slice) -> "Rests":
         """Some of the states."""
-        return Rests(*(part[rows] for part in _parts(self)))
+        return Rests(*(part[rows] for part in vars(self).values()))
 
-
-def _parts(rests: Rests) -> tuple[AnyArray, ...]:
-    return rests.points, rests.follow, rests.part, rests.left
+    @property
+    def flat(self) -> "Rests":
+        """Rows of states (n, M), one state after the other."""
+        return Rests(*(part.reshape(-1, *part.shape[2:]) for part in vars(self).values()))
 
 
 class Filling:
@@ -161,7 +163,7 @@ class Filling:
 
     def seen(self, rest: Area, left: tuple[int, ...]) -> Rests:
         """One state; empty where it has too many corners."""
-        found = Rests.empty(1, self.corners, self.shapes)
+        found = Rests.empty((1,), self.corners, self.shapes)
         found.left[0] = left
         every = rings(rest, self._tolerance)
         if not every or sum(len(z) for z, _, _ in every) > self.corners:
