@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tangram_agent.agents.outline.config import OutlineConfig
+from tangram_agent.agents.outline.agent import OutlineConfig
 from tangram_agent.agents.outline.filling import Filling, Rests
 from tangram_agent.agents.outline.filling_replay import FILLED, OPEN, FillBatch, FillReplay
 from tangram_agent.agents.outline.values import Corners, OutlineValue

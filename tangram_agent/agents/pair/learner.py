@@ -11,8 +11,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from tangram_agent.agents.pair.actor import critic_plays
+from tangram_agent.agents.pair.agent import PairConfig
 from tangram_agent.agents.pair.batch import PairBatch, make_pairs
-from tangram_agent.agents.pair.config import PairConfig
 from tangram_agent.agents.pair.motion import Fit, MotionModel, Motions, motions_of
 from tangram_agent.agents.pair.networks import Networks
 from tangram_agent.agents.pair.pairs import Pairs

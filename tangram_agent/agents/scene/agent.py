@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, cast
 
-from tangram_agent.base.checks import check_capacity, seen_tokens
+from tangram_agent.base.agent import TokenAgent, seen_tokens
 from tangram_agent.base.config import ActorCriticConfig, NetConfig
-from tangram_core.agent import Agent, Pace
-from tangram_core.task import Json, Task
+from tangram_core.task import Task
 from tangram_tasks.place import Place
 
 if TYPE_CHECKING:  # need torch
@@ -15,27 +14,17 @@ if TYPE_CHECKING:  # need torch
 
 
 @dataclass(frozen=True)
-class SceneConfig(ActorCriticConfig, section="agent"):
-    """DDPG on whole scenes."""
-
-
-@dataclass(frozen=True)
-class Scene(Agent):
+class Scene(TokenAgent):
     """One velocity for the next token, one value of the whole scene."""
 
-    sections: ClassVar = {"agent": SceneConfig, "net": NetConfig}
+    sections: ClassVar = {"agent": ActorCriticConfig, "net": NetConfig}
 
-    config: SceneConfig
-    net: NetConfig
-
-    @property
-    def pace(self) -> Pace:
-        """As its settings say."""
-        return self.config.pace
+    config: ActorCriticConfig
 
     def check(self, task: Task) -> None:
         """It plays tokens whose target is seen."""
-        check_capacity(seen_tokens(task, "scene"), self.config.replay_capacity)
+        seen_tokens(task, "scene")
+        super().check(task)
 
     def actor(self, task: Task) -> "SceneActor":
         """See `Agent.actor`."""
@@ -50,7 +39,3 @@ class Scene(Agent):
         from tangram_agent.agents.scene.learner import SceneLearner  # noqa: PLC0415
 
         return SceneLearner(cast("Place", task), self.config, self.net, seed, device, compiled)
-
-    def facts(self) -> Json:
-        """Its preset and its network."""
-        return {"agent": self.config.name, "net": self.net.kind}
