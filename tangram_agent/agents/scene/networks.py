@@ -17,8 +17,7 @@ class ActorNet(nn.Module):
 
     def __init__(self, layout: Layout, net: NetConfig) -> None:
         super().__init__()
-        self.graph = SceneGraph(layout)
-        self.head = Head(self.graph, net, VELOCITY, at_base=True)
+        self.head = Head(SceneGraph(layout), net, VELOCITY, at_base=True)
 
     def forward(self, scenes: Scenes, features: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Velocity (M, 3) in [-1, 1] in the arena's axes, and its pre-activations (M, 3).
@@ -26,8 +25,7 @@ class ActorNet(nn.Module):
         Features are as for `Head`.
         """
         raw = self.head(scenes, features=features)
-        bounded = torch.tanh(raw)
-        return self.graph.velocity(scenes, bounded[:, :2], bounded[:, 2]), raw
+        return torch.tanh(raw), raw
 
 
 class CriticNet(nn.Module):
@@ -35,8 +33,7 @@ class CriticNet(nn.Module):
 
     def __init__(self, layout: Layout, net: NetConfig) -> None:
         super().__init__()
-        self.graph = SceneGraph(layout)
-        self.head = Head(self.graph, net, 1, at_base=False, action=VELOCITY)
+        self.head = Head(SceneGraph(layout), net, 1, at_base=False, action=VELOCITY)
 
     def forward(
         self,
