@@ -97,11 +97,12 @@ class Filler:
                 f"{goals.shape}: give rows that tangram_sim.geometry.rings.as_rows makes"
             )
         rests = [self._filling.rest(goals[b], corners[b], placed[b]) for b in range(count)]
-        every = [self._live(rests[b], self._filling.left(~placed[b])) for b in range(count)]
+        every = [
+            self._filling.places(rests[b], self._filling.left(~placed[b])) for b in range(count)
+        ]
         wanted_of = [[] if anything[b] else every[b] for b in range(count)]
         beam = 1 if len(generators) else self._beam
-        # A beam of one plays what is best now, and looks no further.
-        plans = self._plans(wanted_of, beam, 1 if beam == 1 else None)
+        plans = self._plans(wanted_of, beam)
         token, flip = np.zeros(count, np.int64), np.zeros(count, np.bool_)
         wanted, here = np.zeros((count, 3)), self._layout.poses(corners)
         sides = self._layout.flipped(corners)
@@ -118,9 +119,6 @@ class Filler:
         velocity = np.clip(velocities_of(way, self._sim), -1.0, 1.0).astype(np.float32)
         return Choice(token, flip, velocity)
 
-    def _live(self, rest: Area, left: tuple[int, ...]) -> list[Place]:
-        return [place for place in self._filling.places(rest, left) if not place.dead]
-
     def values(self, places: Sequence[Place]) -> Floats:
         """How surely what is left can be filled, as logits; a filled one is surest."""
         found = np.full(len(places), np.inf)
@@ -130,20 +128,13 @@ class Filler:
             found[still] = self._fillable(rests, [places[i].left for i in still])
         return found
 
-    def plan(self, rest: Area, left: tuple[int, ...], beam: int) -> list[Place]:
-        """The places that lead furthest, to the end, by a beam of such a width."""
-        (found,) = self._plans([self._live(rest, left)], beam)
-        return list(found)
-
-    def _plans(
-        self, every: Sequence[list[Place]], beam: int, steps: int | None = None
-    ) -> list[tuple[Place, ...]]:
+    def _plans(self, every: Sequence[list[Place]], beam: int) -> list[tuple[Place, ...]]:
         """Of each environment the places that lead furthest; none where there are none.
 
         Args:
             every: what may be laid now.
-            beam: states of each depth that are followed.
-            steps: how far; None: to the end.
+            beam: states of each depth that are followed; one plays what is best now, and looks no
+                further.
         """
         found: list[tuple[Place, ...]] = [()] * len(every)
         states = [_State(b, (one,)) for b, places in enumerate(every) for one in places]
@@ -156,12 +147,12 @@ class Filler:
                 found[b] = states[own[0]].places
                 if not found[b][-1].filled:
                     kept += [states[i] for i in own]
-            if len(kept) and len(kept[0].places) == steps:
+            if beam == 1:
                 break
             states = [
                 _State(state.row, (*state.places, place))
                 for state in kept
-                for place in self._live(state.places[-1].rest, state.places[-1].left)
+                for place in self._filling.places(state.places[-1].rest, state.places[-1].left)
             ]
         return found
 
@@ -173,7 +164,7 @@ class Filler:
         if laid is None:
             token = int(left[0]) if len(left) else 0
             return token, here[token]
-        alike = [token for token in self._filling.tokens_of(laid.shape) if not placed[token]]
+        alike = np.flatnonzero(~placed & (self._filling.shape_of == laid.shape)).tolist()
         far = [
             (bool(sides[token] != laid.flipped), float(np.hypot(*(here[token] - laid.pose)[:2])))
             for token in alike
@@ -187,7 +178,7 @@ class Filler:
             for part in polygons(rest):
                 for angle in np.arange(_ANGLES) * (2.0 * np.pi / _ANGLES):
                     pose = np.array([part.centroid.x, part.centroid.y, angle])
-                    laid.append(Laid(self._filling.shape_of(token), bool(sides[token]), pose))
+                    laid.append(Laid(int(self._filling.shape_of[token]), bool(sides[token]), pose))
                     tried.append((token, pose))
         if not tried:
             return None

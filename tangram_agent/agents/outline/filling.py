@@ -100,29 +100,22 @@ class Filling:
         tokens: K.
         corners: N.
         shapes: S.
+        shape_of: (K,) the number of each token's shape.
     """
 
     def __init__(self, layout: Layout) -> None:
         self._layout, self._tokens = layout, Tokens(layout)
         self._tolerance = TOLERANCE * self._tokens.unit
         self._search = Search(self._tokens, self._tolerance, Budget(np.inf))
-        self._shape: Ints = np.zeros(layout.tokens, np.int64)
+        self.shape_of: Ints = np.zeros(layout.tokens, np.int64)
         for shape, tokens in enumerate(self._tokens.own):
-            self._shape[list(tokens)] = shape
+            self.shape_of[list(tokens)] = shape
         self.tokens, self.shapes = layout.tokens, len(self._tokens.own)
         self.corners = layout.corner_count + layout.tokens
 
-    def shape_of(self, token: int) -> int:
-        """The number of a token's shape."""
-        return int(self._shape[token])
-
-    def tokens_of(self, shape: int) -> tuple[int, ...]:
-        """The tokens of a shape."""
-        return self._tokens.own[shape]
-
     def left(self, tokens: Bools) -> tuple[int, ...]:
         """How many of each shape there are among tokens (K,)."""
-        return tuple(np.bincount(self._shape[tokens], minlength=self.shapes).tolist())
+        return tuple(np.bincount(self.shape_of[tokens], minlength=self.shapes).tolist())
 
     def inside(self, corners: AnyArray, outline: AnyArray) -> Bools:
         """(K,) tokens with corners (V, 2) that lie in an outline (G, 2), all but for a little."""
@@ -158,8 +151,8 @@ class Filling:
         return self._search.fits(self.rest(outline, corners, laid), self.left(~laid))
 
     def places(self, rest: Area, left: tuple[int, ...]) -> list[Place]:
-        """What may be laid next, see `Search.places`."""
-        return self._search.places(rest, left)
+        """What may be laid next so that it can still be filled, see `Search.places`."""
+        return [place for place in self._search.places(rest, left) if not place.dead]
 
     def seen(self, rest: Area, left: tuple[int, ...]) -> Rests:
         """One state; empty where it has too many corners."""

@@ -136,7 +136,7 @@ class FillReplay:
         state = self._filling.seen(rest, left)
         if not state.known.all():
             return
-        places = [place for place in self._filling.places(rest, left) if not place.dead]
+        places = self._filling.places(rest, left)
         ends = np.zeros((1, MOST_PLACES), np.uint8)
         seen = [self._filling.seen(place.rest, place.left) for place in places[:MOST_PLACES]]
         for i, (place, one) in enumerate(zip(places, seen, strict=False)):
