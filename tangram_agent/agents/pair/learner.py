@@ -13,6 +13,7 @@ import numpy as np
 from tangram_agent.agents.pair.actor import critic_plays
 from tangram_agent.agents.pair.agent import PairConfig
 from tangram_agent.agents.pair.batch import PairBatch, make_pairs
+from tangram_agent.agents.pair.coverage import Lying
 from tangram_agent.agents.pair.motion import Fit, MotionModel, Motions, motions_of
 from tangram_agent.agents.pair.networks import Networks
 from tangram_agent.agents.pair.pairs import Pairs
@@ -21,7 +22,6 @@ from tangram_agent.base.ddpg import Ddpg, Steps
 from tangram_agent.base.types import Transitions
 from tangram_agent.nets.weights import under
 from tangram_core.agent import Streams, Tensors
-from tangram_core.arrays import Bools, Floats
 from tangram_core.errors import RunError
 from tangram_core.spec import Array
 from tangram_tasks.place import Place
@@ -80,26 +80,27 @@ class PairLearner(Ddpg):
 
     def steps_of(self, batch: PairBatch) -> Steps:
         """Pairs as tensors."""
-        after = self._pairs(batch, batch.after, batch.after_flipped)
+        after = self._pairs(batch, batch.after)
         return Steps(
-            view=self._pairs(batch, batch.before, batch.before_flipped),
+            view=self._pairs(batch, batch.before),
             velocity=self.tensor(batch.velocity),
             reward=self.tensor(batch.reward),
             done=self.tensor(batch.done),
-            start=self._pairs(batch, batch.start, batch.start_flipped),
+            start=self._pairs(batch, batch.start),
             follow=self.if_any_follows(batch.done, after),
             seen_after=after,
         )
 
-    def _pairs(self, batch: PairBatch, pose: Floats, flipped: Bools) -> Pairs:
+    def _pairs(self, batch: PairBatch, token: Lying) -> Pairs:
         """The pairs (M,) with their tokens where they lay at some time."""
+        piece = batch.piece
         return Pairs(
-            pose=self.tensor(pose),
-            flipped=self.tensor(flipped),
-            token=self.tensor(batch.token, np.int64),
-            goal=self.tensor(batch.goal),
-            goal_flipped=self.tensor(batch.goal_flipped),
-            piece=self.tensor(batch.piece, np.int64),
+            pose=self.tensor(token.pose),
+            flipped=self.tensor(token.flipped),
+            token=self.tensor(token.index, np.int64),
+            goal=self.tensor(piece.pose),
+            goal_flipped=self.tensor(piece.flipped),
+            piece=self.tensor(piece.index, np.int64),
             covered=self.tensor(batch.covered),
         )
 
