@@ -296,17 +296,13 @@ def _read(folder: Path, checkpoint: str | None, reward: str | None) -> Run:
         if not is_name(folder):
             raise RunError(f"no run folder {folder}: give the folder that tangram-train printed")
         source = packaged(folder)
-    if is_agent(source):
-        return _agent(source, folder, checkpoint, reward)
-    return _trained(folder, checkpoint, reward)
-
-
-def _agent(source: Traversable, folder: Path, checkpoint: str | None, reward: str | None) -> Run:
+    if not is_agent(source):
+        return _trained(folder, checkpoint, reward)
     if checkpoint is not None:
         raise RunError(f"{folder} has no checkpoint {checkpoint}: leave the checkpoint out")
-    agent = read_agent(source, folder)
-    config = _with_reward(_parse_config(agent.config, folder / CONFIG), reward)
-    return Run(folder, config, make_setup(config), agent.weights)
+    text, weights = read_agent(source, folder)
+    config = _with_reward(_parse_config(text, folder / CONFIG), reward)
+    return Run(folder, config, make_setup(config), weights)
 
 
 def _with_reward(config: dict[str, Any], name: str | None) -> dict[str, Any]:

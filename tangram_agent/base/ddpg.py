@@ -147,25 +147,11 @@ class Ddpg(TokenLearner):
 
     def blanks(self) -> Iterator[Steps]:
         """Some go on in nearly every batch of those that bootstrap; none elsewhere."""
-        blank = _blank(self.task, self.config.batch_size, done=0 if self.bootstraps else 1)
-        yield self.steps(blank, np.random.default_rng(0))
+        size = self.config.batch_size
+        columns = {name: array[:size] for name, array in self.replay.arrays.items()}
+        columns["done"] = np.full(size, not self.bootstraps, np.uint8)
+        yield self.steps(Transitions(**columns), np.random.default_rng(0))
 
     def if_any_follows(self, done: npt.NDArray[Any], follow: Any) -> Any:
         """What follows, where a target network is to be asked of it; else None."""
         return follow if self.bootstraps and not done.all() else None
-
-
-def _blank(task: Place, count: int, done: int) -> Transitions:
-    """A batch in which nothing moves, of tokens that lie in the middle."""
-    layout = task.layout
-    corners = layout.corners(np.zeros((count, layout.tokens, 3))).astype(np.float32, order="C")
-    return Transitions(
-        state=corners,
-        placed=np.zeros((count, layout.tokens), np.uint8),
-        action=np.zeros((count, task.action_size), np.float32),
-        reward=np.zeros(count, np.float32),
-        next_state=corners,
-        next_placed=np.zeros((count, layout.tokens), np.uint8),
-        done=np.full(count, done, np.uint8),
-        goal=corners,
-    )

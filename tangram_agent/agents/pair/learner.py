@@ -14,7 +14,7 @@ from tangram_agent.agents.pair.actor import critic_plays
 from tangram_agent.agents.pair.agent import PairConfig
 from tangram_agent.agents.pair.batch import PairBatch, make_pairs
 from tangram_agent.agents.pair.coverage import Lying
-from tangram_agent.agents.pair.motion import Fit, MotionModel, Motions, motions_of
+from tangram_agent.agents.pair.motion import Fit, MotionModel, motions_of
 from tangram_agent.agents.pair.networks import Networks
 from tangram_agent.agents.pair.pairs import Pairs
 from tangram_agent.base.config import NetConfig
@@ -56,23 +56,24 @@ class PairLearner(Ddpg):
             self.relabels = ()
         if self.motion is not None:
             self.streams = (*Ddpg.streams, "motion")
-            self.optimisers["motion"] = Fit(self.motion, screens_motions(task))
+            # In pictures of an exact world a motion far beside what is usual is that of a token
+            # which met others or was seen wrongly. Elsewhere it may be what that world does.
+            seen, several = task.sim.observe == "pictures", task.layout.tokens > 1
+            screened = seen and several and not task.sim.inexact
+            self.optimisers["motion"] = Fit(self.motion, screened)
 
     def update(self, share: float, rng: Streams) -> dict[str, float]:
         """As `Ddpg`, and one step of the model of motion.
 
         Its numbers come with motion_error and motion_noise (shares of full scale).
         """
-        told = {}
+        told, task, steps = {}, self.task, self.task.horizon
         if self.motion is not None:
-            told = self.optimisers["motion"].step(self._motions(rng["motion"]).to(self.place))
+            count = max(1, SEEN_MOTIONS // steps)
+            past, ends = self.replay.sample_episodes(count, steps, rng["motion"])
+            motions = motions_of(past, ends.astype(np.float64), task.layout, task.sim)
+            told = self.optimisers["motion"].step(motions.to(self.place))
         return self.learn(self.drawn(rng), share, told)
-
-    def _motions(self, generator: np.random.Generator) -> Motions:
-        """What whole episodes of the replay tell of the motion."""
-        task, steps = self.task, self.task.horizon
-        past, ends = self.replay.sample_episodes(max(1, SEEN_MOTIONS // steps), steps, generator)
-        return motions_of(past, ends.astype(np.float64), task.layout, task.sim)
 
     def steps(self, batch: Transitions, generator: np.random.Generator) -> Steps:
         """Pairs of a batch."""
@@ -129,13 +130,3 @@ class PairLearner(Ddpg):
         if self.motion is not None:
             for model in (self.motion, self.acting.get_submodule("motion")):
                 model.load_state_dict(MotionModel().state_dict())
-
-
-def screens_motions(task: Place) -> bool:
-    """Whether a motion far beside what is usual tells nothing: of an exact world in pictures.
-
-    There it is that of a token which met others or was seen wrongly. Elsewhere it may be what that
-    world does.
-    """
-    sim = task.sim
-    return sim.observe == "pictures" and task.layout.tokens > 1 and not sim.inexact

@@ -199,20 +199,16 @@ class Planner:
         return values
 
     def _best(self, scene: Scene, candidates: Candidates, pose: Tensor) -> Tensor:
-        """Index (B,) of the best candidate of each row."""
+        """Index (B,) of the best candidate of each row, valued for all pieces of the target."""
         if scene.leaves_no_choice(candidates):
             return torch.arange(len(pose))
-        # What a token covers already it gives up.
-        given_up = scene.worth[candidates.row, candidates.token]
-        return candidates.best(self._total(scene, candidates, pose) - given_up, 1)
-
-    def _total(self, scene: Scene, candidates: Candidates, pose: Tensor) -> Tensor:
-        """(M,) values of poses (M, 3) over all pieces of the target."""
         count = self._layout.tokens
         every = candidates.at(torch.arange(len(pose)).repeat_interleave(count))
         pairs = scene.pairs(replace(every, piece=torch.arange(count).repeat(len(pose))))
         values = self._valued(pairs, pose.repeat_interleave(count, dim=0))
-        return values.view(-1, count).sum(dim=1)
+        # What a token covers already it gives up.
+        given_up = scene.worth[candidates.row, candidates.token]
+        return candidates.best(values.view(-1, count).sum(dim=1) - given_up, 1)
 
 
 def _open(placed: Bools) -> Bools:
