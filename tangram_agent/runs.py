@@ -142,8 +142,9 @@ class Run:
             "desired_goal": corners,
         }
         if not isinstance(observation, Mapping) or wanted.keys() - observation.keys():
-            named = observation if isinstance(observation, Mapping) else None
-            given = f"a {type(observation).__name__}" if named is None else ", ".join(named)
+            given = f"a {type(observation).__name__}"
+            if isinstance(observation, Mapping):
+                given = ", ".join(map(str, observation))
             raise ConfigError(
                 f"an observation is a dict of {', '.join(wanted)}, got {given or 'an empty one'}: "
                 "give what reset or step returns first"

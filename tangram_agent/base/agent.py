@@ -1,6 +1,9 @@
 """What agents of tokens share, without tensors."""
 
+from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from tangram_agent.base.config import LearningConfig, NetConfig
 from tangram_core.agent import Agent, Pace
@@ -8,10 +11,13 @@ from tangram_core.errors import ConfigError
 from tangram_core.task import Json, Task
 from tangram_tasks.place import Place
 
+if TYPE_CHECKING:  # needs torch
+    from tangram_agent.base.learning import TokenLearner
+
 
 @dataclass(frozen=True)
 class TokenAgent(Agent):
-    """Its networks learn from a replay; extend it with `sections`, `actor` and `learner`."""
+    """Its networks learn from a replay; extend it with `sections`, `actor` and `learns`."""
 
     config: LearningConfig
     net: NetConfig
@@ -28,6 +34,16 @@ class TokenAgent(Agent):
             raise ConfigError(
                 f"agent.replay_capacity must hold an episode, {horizon} actions, got {capacity}"
             )
+
+    @abstractmethod
+    def learns(self) -> "Callable[[Any, Any, int, str, bool], TokenLearner]":
+        """The class of its learner: of the agent, a task, a seed, a device, and `compiled`."""
+
+    def learner(
+        self, task: Task, seed: int, device: str = "cpu", *, compiled: bool = False
+    ) -> "TokenLearner":
+        """See `Agent.learner`."""
+        return self.learns()(self, task, seed, device, compiled)
 
     def facts(self) -> Json:
         """Its preset and its network."""

@@ -166,7 +166,7 @@ class NetworkLearner(Learner):
         """
         found = self._whole(seen, self.rates(share))  # the one wait for the device is below
         values = [found, *(one[None] for one in (told or {}).values())]
-        names = *self._names[acts(seen)], *(told or {})
+        names = *self._names[getattr(seen, "acts", True)], *(told or {})
         numbers = dict(zip(names, torch.cat(values).tolist(), strict=True))
         if not all(map(math.isfinite, numbers.values())):
             listed = ", ".join(f"{name}={value:g}" for name, value in numbers.items())
@@ -185,7 +185,7 @@ class NetworkLearner(Learner):
             own = {f"{loss.part}_loss": loss.value, f"{loss.part}_gradient": norm}
             numbers |= own | dict(loss.told)
         self.follow(rates)
-        self._names[acts(seen)] = tuple(numbers)
+        self._names[getattr(seen, "acts", True)] = tuple(numbers)
         return torch.stack([one.detach() for one in numbers.values()])
 
     def prepare(self) -> None:
@@ -312,7 +312,9 @@ class TokenLearner(NetworkLearner):
     def rates(self, share: float) -> Rates:
         """Of the next update, at a used share of the budget."""
         rate = self._rates_of.critic_lr * self.rate_factor(share)
-        return Rates(rate, rate, average_so_far(self._rates_of.acting_average, self.updates))
+        # A constant 0.99 would hold the random weights of the start for hundreds of updates.
+        kept = min(self._rates_of.acting_average, self.updates / (self.updates + 9.0))
+        return Rates(rate, rate, kept)
 
     def export(self) -> Tensors:
         """A copy of the weights to play with, as a checkpoint keeps them."""
@@ -321,11 +323,6 @@ class TokenLearner(NetworkLearner):
     def broadcast(self) -> Tensors:
         """Those of them that workers need."""
         return self.export()
-
-
-def acts(seen: object) -> bool:
-    """Whether an update from this moves the actor."""
-    return bool(getattr(seen, "acts", True))
 
 
 def frozen(module: nn.Module) -> nn.Module:
@@ -352,11 +349,3 @@ def gradient_norm(gradients: Sequence[Tensor], traced: bool) -> Tensor:
     if not traced:
         return nn.utils.get_total_norm(gradients)
     return torch.stack([one.square().sum() for one in gradients]).sum().sqrt()
-
-
-def average_so_far(rho: float, updates: int) -> float:
-    """Rho of a running average after `updates` updates: smaller at first, to forget the start.
-
-    A constant 0.99 holds the random weights of the start for hundreds of updates.
-    """
-    return min(rho, updates / (updates + 9.0))

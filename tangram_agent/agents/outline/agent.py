@@ -62,15 +62,8 @@ class Outline(TokenAgent):
 
         return OutlineActor(cast("Fill", task), self.config, self.net)
 
-    def learner(
-        self,
-        task: Task,
-        seed: int,
-        device: str = "cpu",
-        *,
-        compiled: bool = False,  # noqa: ARG002
-    ) -> "FillLearner":
-        """See `Agent.learner`."""
+    def learns(self) -> "type[FillLearner]":
+        """With a value alone."""
         from tangram_agent.agents.outline.learner import FillLearner  # noqa: PLC0415
 
-        return FillLearner(cast("Fill", task), self.config, self.net, seed, device)
+        return FillLearner

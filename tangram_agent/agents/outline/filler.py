@@ -6,7 +6,6 @@ Legend: B environments, K tokens, V corners, G rows of an outline.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import shapely
@@ -30,14 +29,6 @@ from tangram_tasks.fill import Fill
 
 _ANGLES = 8  # that a token is tried at where nothing fits
 _FREE = 0.5  # of what a token may cover of others
-
-
-@dataclass(frozen=True, eq=False)
-class _State:
-    """What is left in an environment, and the places that led here from what there is now."""
-
-    row: int
-    places: tuple[Place, ...]
 
 
 class Fillable:
@@ -137,22 +128,23 @@ class Filler:
                 further.
         """
         found: list[tuple[Place, ...]] = [()] * len(every)
-        states = [_State(b, (one,)) for b, places in enumerate(every) for one in places]
+        states: list[tuple[int, tuple[Place, ...]]]
+        states = [(b, (one,)) for b, places in enumerate(every) for one in places]
         while states:
-            values = self.values([state.places[-1] for state in states])
-            kept: list[_State] = []
-            for b in {state.row for state in states}:
-                own = [i for i, state in enumerate(states) if state.row == b]
+            values = self.values([places[-1] for _, places in states])
+            kept = []
+            for b in {row for row, _ in states}:
+                own = [i for i, (row, _) in enumerate(states) if row == b]
                 own = [own[i] for i in np.argsort(-values[own], kind="stable")[:beam]]
-                found[b] = states[own[0]].places
+                found[b] = states[own[0]][1]
                 if not found[b][-1].filled:
                     kept += [states[i] for i in own]
             if beam == 1:
                 break
             states = [
-                _State(state.row, (*state.places, place))
-                for state in kept
-                for place in self._filling.places(state.places[-1].rest, state.places[-1].left)
+                (b, (*places, place))
+                for b, places in kept
+                for place in self._filling.places(places[-1].rest, places[-1].left)
             ]
         return found
 
@@ -165,11 +157,12 @@ class Filler:
             token = int(left[0]) if len(left) else 0
             return token, here[token]
         alike = np.flatnonzero(~placed & (self._filling.shape_of == laid.shape)).tolist()
-        far = [
-            (bool(sides[token] != laid.flipped), float(np.hypot(*(here[token] - laid.pose)[:2])))
-            for token in alike
-        ]
-        return alike[min(range(len(alike)), key=far.__getitem__)], laid.pose
+
+        def far(token: int) -> tuple[bool, float]:
+            way = here[token] - laid.pose
+            return bool(sides[token] != laid.flipped), float(np.hypot(*way[:2]))
+
+        return min(alike, key=far), laid.pose
 
     def _rough(self, rest: Area, corners: Floats, placed: Bools) -> Laid | None:
         """Where a token that is left covers most of what is left; None if it covers others."""

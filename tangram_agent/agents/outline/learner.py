@@ -13,11 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tangram_agent.agents.outline.agent import OutlineConfig
+from tangram_agent.agents.outline.agent import Outline
 from tangram_agent.agents.outline.filling import Filling, Rests
 from tangram_agent.agents.outline.filling_replay import FILLED, OPEN, FillBatch, FillReplay
 from tangram_agent.agents.outline.values import Corners, OutlineValue
-from tangram_agent.base.config import NetConfig
 from tangram_agent.base.learning import Loss, TokenLearner
 from tangram_agent.base.relabelling import learnable
 from tangram_core.agent import Streams
@@ -32,11 +31,10 @@ class FillLearner(TokenLearner):
     replay: FillReplay
     batch: FillBatch | None
 
-    def __init__(
-        self, task: Fill, config: OutlineConfig, net: NetConfig, seed: int, device: str = "cpu"
-    ) -> None:
-        self.config, self.polyak = config, config.polyak
-        self.value = OutlineValue(Filling(task.layout).shapes, net)
+    def __init__(self, agent: Outline, task: Fill, seed: int, device: str, _: bool = False) -> None:
+        self.config = config = agent.config
+        self.polyak = config.polyak
+        self.value = OutlineValue(Filling(task.layout).shapes, agent.net)
         learned = {"critic": self.value}
         super().__init__(config, learned, self.value, seed, device, targets=learned)
         self.replay = FillReplay(task.layout, config.replay_capacity, config.copies)

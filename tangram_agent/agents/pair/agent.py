@@ -64,10 +64,8 @@ class Pair(TokenAgent):
 
         return PairActor(cast("Place", task), self.config, self.net)
 
-    def learner(
-        self, task: Task, seed: int, device: str = "cpu", *, compiled: bool = False
-    ) -> "PairLearner":
-        """See `Agent.learner`."""
+    def learns(self) -> "type[PairLearner]":
+        """With actor and critic."""
         from tangram_agent.agents.pair.learner import PairLearner  # noqa: PLC0415
 
-        return PairLearner(cast("Place", task), self.config, self.net, seed, device, compiled)
+        return PairLearner

@@ -11,13 +11,12 @@ from collections.abc import Mapping
 import numpy as np
 
 from tangram_agent.agents.pair.actor import critic_plays
-from tangram_agent.agents.pair.agent import PairConfig
+from tangram_agent.agents.pair.agent import Pair
 from tangram_agent.agents.pair.batch import PairBatch, make_pairs
 from tangram_agent.agents.pair.coverage import Lying
 from tangram_agent.agents.pair.motion import Fit, MotionModel, motions_of
 from tangram_agent.agents.pair.networks import Networks
 from tangram_agent.agents.pair.pairs import Pairs
-from tangram_agent.base.config import NetConfig
 from tangram_agent.base.ddpg import Ddpg, Steps
 from tangram_agent.base.types import Transitions
 from tangram_agent.nets.weights import under
@@ -39,19 +38,14 @@ class PairLearner(Ddpg):
     limit = 1.0  # pre-activations beyond it are clamped
 
     def __init__(
-        self,
-        task: Place,
-        config: PairConfig,
-        net: NetConfig,
-        seed: int,
-        device: str = "cpu",
-        compiled: bool = False,
+        self, agent: Pair, task: Place, seed: int, device: str, compiled: bool = False
     ) -> None:
-        networks = Networks(task.layout, task.sim.arena, net, motion=config.motion == "learned")
+        learned, arena = agent.config.motion == "learned", task.sim.arena
+        networks = Networks(task.layout, arena, agent.net, motion=learned)
         every = networks.actor, networks.critic, networks
         self.motion = networks.motion
         others = {} if self.motion is None else {"motion": self.motion}
-        super().__init__(task, config, every, seed, device, compiled, others)
+        super().__init__(task, agent.config, every, seed, device, compiled, others)
         if task.layout.tokens > 1:  # relabelled anew for every update
             self.relabels = ()
         if self.motion is not None:

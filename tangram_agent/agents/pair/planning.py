@@ -115,12 +115,14 @@ class Planner:
             goals: (B, V, 2) of the target.
             past: what was seen of these episodes before, if anything.
         """
+        is_open: Bools = ~np.asarray(placed, np.bool_)
+        is_open[~is_open.any(axis=1), 0] = True
         with torch.no_grad():
             belief = self._belief(corners, past)
             if self._motion is not None and belief is not None and past is not None:
                 corners = self._motion.ahead(belief, corners, past, self._layout, self._sim)
             scene = self._scene(corners, goals)
-            candidates, pose = self._short_list(scene, _open(placed))
+            candidates, pose = self._short_list(scene, is_open)
             velocity, reached = self._reached(scene, candidates, pose, belief)
             best = self._best(scene, candidates, reached)
         chosen = candidates.at(best)
@@ -209,10 +211,3 @@ class Planner:
         # What a token covers already it gives up.
         given_up = scene.worth[candidates.row, candidates.token]
         return candidates.best(values.view(-1, count).sum(dim=1) - given_up, 1)
-
-
-def _open(placed: Bools) -> Bools:
-    """(B, K) tokens that may be next, at least one in each row."""
-    is_open: Bools = ~np.asarray(placed, np.bool_)
-    is_open[~is_open.any(axis=1), 0] = True
-    return is_open

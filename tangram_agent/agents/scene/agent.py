@@ -32,10 +32,8 @@ class Scene(TokenAgent):
 
         return SceneActor(cast("Place", task), self.config, self.net)
 
-    def learner(
-        self, task: Task, seed: int, device: str = "cpu", *, compiled: bool = False
-    ) -> "SceneLearner":
-        """See `Agent.learner`."""
+    def learns(self) -> "type[SceneLearner]":
+        """With actor and critic."""
         from tangram_agent.agents.scene.learner import SceneLearner  # noqa: PLC0415
 
-        return SceneLearner(cast("Place", task), self.config, self.net, seed, device, compiled)
+        return SceneLearner

@@ -3,9 +3,9 @@
 import numpy as np
 from torch import Tensor
 
+from tangram_agent.agents.scene.agent import Scene
 from tangram_agent.agents.scene.networks import ActorNet, CriticNet
 from tangram_agent.agents.scene.scenes import Scenes, next_token
-from tangram_agent.base.config import ActorCriticConfig, NetConfig
 from tangram_agent.base.ddpg import Ddpg, Steps
 from tangram_agent.base.types import Transitions
 from tangram_agent.nets.networks import VELOCITY
@@ -19,16 +19,10 @@ class SceneLearner(Ddpg):
     actor: ActorNet
 
     def __init__(
-        self,
-        task: Place,
-        config: ActorCriticConfig,
-        net: NetConfig,
-        seed: int,
-        device: str = "cpu",
-        compiled: bool = False,
+        self, agent: Scene, task: Place, seed: int, device: str, compiled: bool = False
     ) -> None:
-        actor, critic = ActorNet(task.layout, net), CriticNet(task.layout, net)
-        super().__init__(task, config, (actor, critic, actor), seed, device, compiled)
+        actor, critic = ActorNet(task.layout, agent.net), CriticNet(task.layout, agent.net)
+        super().__init__(task, agent.config, (actor, critic, actor), seed, device, compiled)
 
     def steps(self, batch: Transitions, generator: np.random.Generator) -> Steps:  # noqa: ARG002
         """Scenes of a batch."""

@@ -7,8 +7,6 @@ from torch import Tensor, nn
 
 from tangram_sim.geometry.layout import Layout
 
-PAPER_FEATURES = 4
-
 
 @dataclass(frozen=True, eq=False)
 class Scenes:
@@ -46,7 +44,7 @@ class SceneGraph(nn.Module):
     def __init__(self, layout: Layout) -> None:
         super().__init__()
         self.tokens, self.corners, self.nodes = layout.tokens, layout.corner_count, layout.nodes
-        self.features, self.inputs = PAPER_FEATURES, self.nodes * PAPER_FEATURES
+        self.features, self.inputs = 4, 4 * self.nodes
         target_flag = torch.zeros(layout.nodes)
         target_flag[layout.corner_count + layout.tokens :] = 1.0
         constants = {

@@ -13,7 +13,7 @@ import torch
 from tangram_agent.agents.scene.scenes import Scenes, next_token
 from tangram_agent.base.adam import Adam
 from tangram_agent.base.ddpg import Ddpg
-from tangram_agent.base.learning import Rates, average_so_far, polyak_update
+from tangram_agent.base.learning import Rates, polyak_update
 from tangram_core.agent import NotFiniteError
 from tangram_core.errors import RunError
 from tangram_core.setup import Setup
@@ -98,7 +98,9 @@ def test_polyak_averaging_of_eq_4() -> None:
     [(0.99, 0, 0.0), (0.99, 1, 0.1), (0.99, 9, 0.5), (0.99, 891, 0.99), (0.5, 50, 0.5), (0, 9, 0)],
 )
 def test_a_young_average_forgets_its_start(rho: float, updates: int, expected: float) -> None:
-    assert average_so_far(rho, updates) == pytest.approx(expected)
+    learner = learner_of(setup(agent=SCENE | {"acting_average": rho}))
+    learner.updates = updates
+    assert learner.rates(0.0).kept == pytest.approx(expected)
 
 
 def test_after_the_first_update_the_actor_itself_plays() -> None:
