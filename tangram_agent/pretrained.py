@@ -7,11 +7,9 @@ folders; one that lies anywhere else is read in the same way.
 
 import hashlib
 import json
-from dataclasses import dataclass
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any
 
 from tangram_core.agent import Weights
 from tangram_core.errors import RunError, WireError
@@ -24,21 +22,6 @@ CARD = "card.json"
 CARD_TEXT = "card.md"
 FORMAT = 2
 PACKAGED: Traversable = files("tangram_agent") / PREFIX
-
-
-@dataclass(frozen=True, eq=False)
-class Agent:
-    """What an agent's folder holds.
-
-    Attributes:
-        config: text of its config.yaml.
-        card: content of card.json: data, budget, seeds and scores.
-        weights: of the acting actor; their version is the number of updates.
-    """
-
-    config: str
-    card: dict[str, Any]
-    weights: Weights
 
 
 def agent_names() -> list[str]:
@@ -73,12 +56,16 @@ def packaged(run_dir: str | Path) -> Traversable:
     return PACKAGED / name
 
 
-def read_agent(folder: Traversable, shown: str | Path) -> Agent:
+def read_agent(folder: Traversable, shown: str | Path) -> tuple[str, Weights]:
     """Read an agent's folder, with every byte of its weights checked.
 
     Args:
         folder: where it lies.
         shown: what errors call it.
+
+    Returns:
+        The text of its config.yaml, and the weights of the acting actor; their version is the
+        number of updates.
 
     Raises:
         RunError: a file is missing, changed, or of another format.
@@ -96,7 +83,7 @@ def read_agent(folder: Traversable, shown: str | Path) -> Agent:
         tensors = decode_tensors(data, None)
     except WireError as error:
         raise _damaged(shown, str(error)) from None
-    return Agent(config, card, Weights(card["updates"], tensors))
+    return config, Weights(card["updates"], tensors)
 
 
 def _check_card(card: object, data: bytes, shown: str | Path) -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -50,26 +50,6 @@ ANOTHER = "train a run with it"
 Changes = Mapping[str, Mapping[str, Any]]  # section -> setting -> value
 
 
-class Stored(NamedTuple):
-    """What is read of a run, before its actor is made; see `Run`."""
-
-    folder: Path
-    config: dict[str, Any]
-    setup: Setup
-    weights: Weights
-
-    @property
-    def task(self) -> Place:
-        """The task, which is one of tokens; ConfigError if it is not."""
-        return tokens_of(self.folder, self.setup)
-
-    def made(self) -> "Run":
-        """The run with its actor."""
-        run = Run(self.folder, self.config, self.setup, self.weights)
-        _ = run.actor  # refuses weights of another network here, not where it first plays
-        return run
-
-
 @dataclass(frozen=True, eq=False)
 class Run:
     """A run that was read from its folder.
@@ -106,7 +86,11 @@ class Run:
         Raises:
             ConfigError: it is not.
         """
-        return tokens_of(self.folder, self.setup)
+        if not isinstance(self.setup.task, Place):
+            raise ConfigError(
+                f"{self.folder} plays task={self.setup.task_kind}, not tokens: name another run"
+            )
+        return self.setup.task
 
     def act(self, seen: Arrays, past: History | None = None) -> Singles:
         """Actions (B, A) in [-1, 1], exploration off.
@@ -158,12 +142,9 @@ class Run:
             "desired_goal": corners,
         }
         if not isinstance(observation, Mapping) or wanted.keys() - observation.keys():
-            kind = type(observation).__name__
-            given = (
-                ", ".join(map(str, observation))
-                if isinstance(observation, Mapping)
-                else f"a {kind}"
-            )
+            given = f"a {type(observation).__name__}"
+            if isinstance(observation, Mapping):
+                given = ", ".join(map(str, observation))
             raise ConfigError(
                 f"an observation is a dict of {', '.join(wanted)}, got {given or 'an empty one'}: "
                 "give what reset or step returns first"
@@ -199,30 +180,24 @@ class Run:
             ConfigError: a setting that the weights were trained for or that was for learning only,
                 or a value that this run cannot be played with.
         """
-        setup = _changed(self.folder, self.setup, changes)
-        if setup is self.setup:
+        given = [f"{s}.{name}={told(v)}" for s, own in changes.items() for name, v in own.items()]
+        if not given:
             return self
-        return replace(self, setup=setup)
-
-
-def _changed(folder: Path, trained: Setup, changes: Changes) -> Setup:
-    """See `Run.with_settings`."""
-    given = [f"{s}.{name}={told(v)}" for s, own in changes.items() for name, v in own.items()]
-    if not given:
-        return trained
-    config = trained.config()
-    for section, values in changes.items():
-        holds = trained.sections.get(section)
-        if holds is None:
-            raise ConfigError(f"{folder} has no settings of {section}: leave {given[0]} out")
-        if KIND in values:
-            _refuse_other(f"{section}.{KIND}", values[KIND], config[section][KIND])
-        _check_playable(holds, values)
-        config[section] |= values
-    try:
-        return make_setup(config)
-    except ConfigError as error:
-        raise ConfigError(f"{folder} with {', '.join(given)}: {error}") from None
+        config = self.setup.config()
+        for section, values in changes.items():
+            holds = self.setup.sections.get(section)
+            if holds is None:
+                raise ConfigError(
+                    f"{self.folder} has no settings of {section}: leave {given[0]} out"
+                )
+            if KIND in values:
+                _refuse_other(f"{section}.{KIND}", values[KIND], config[section][KIND])
+            _check_playable(holds, values)
+            config[section] |= values
+        try:
+            return replace(self, setup=make_setup(config))
+        except ConfigError as error:
+            raise ConfigError(f"{self.folder} with {', '.join(given)}: {error}") from None
 
 
 def _check_playable(trained: Settings, values: Mapping[str, Any]) -> None:
@@ -284,18 +259,27 @@ def load_run(run_dir: str | Path, checkpoint: str | None = None, reward: str | N
             do not fit the config.
         ConfigError: the config is not one that this version can use, or names code.
     """
-    return _read(Path(run_dir), checkpoint, reward).made()
+    return _acting(_read(Path(run_dir), checkpoint, reward))
 
 
-def tokens_of(folder: Path, setup: Setup) -> Place:
-    """The task of a run, which is one of tokens.
+def load_changed(run_dir: str | Path, changes: Changes) -> Run:
+    """A run, played with other settings; a reward that is code must be among them.
 
     Raises:
-        ConfigError: it is not.
+        TangramError: see `load_run` and `Run.with_settings`.
     """
-    if not isinstance(setup.task, Place):
-        raise ConfigError(f"{folder} plays task={setup.task_kind}, not tokens: name another run")
-    return setup.task
+    return _acting(read_changed(run_dir, changes))
+
+
+def read_changed(run_dir: str | Path, changes: Changes) -> Run:
+    """The same, read without torch: what is not asked for its actor needs none."""
+    reward = changes.get("reward", {}).get("name")
+    return _read(Path(run_dir), None, reward).with_settings(changes)
+
+
+def _acting(run: Run) -> Run:
+    _ = run.actor  # refuses weights of another network here, not where it first plays
+    return run
 
 
 def beginning(spec: EpisodeSpec, seen: Arrays) -> History:
@@ -306,39 +290,20 @@ def beginning(spec: EpisodeSpec, seen: Arrays) -> History:
     return History(moments, np.zeros((count, 0, spec.action_size), np.float32))
 
 
-def _read(folder: Path, checkpoint: str | None, reward: str | None) -> Stored:
+def _read(folder: Path, checkpoint: str | None, reward: str | None) -> Run:
     """See `load_run`."""
     source: Traversable = folder
     if not folder.is_dir():
         if not is_name(folder):
             raise RunError(f"no run folder {folder}: give the folder that tangram-train printed")
         source = packaged(folder)
-    if is_agent(source):
-        return _agent(source, folder, checkpoint, reward)
-    return _trained(folder, checkpoint, reward)
-
-
-def read_changed(run_dir: str | Path, changes: Changes) -> Stored:
-    """A run to play with other settings, read without torch; see `load_changed`."""
-    stored = _read(Path(run_dir), None, changes.get("reward", {}).get("name"))
-    return stored._replace(setup=_changed(stored.folder, stored.setup, changes))
-
-
-def load_changed(run_dir: str | Path, changes: Changes) -> Run:
-    """A run, played with other settings; a reward that is code must be among them.
-
-    Raises:
-        TangramError: see `load_run` and `Run.with_settings`.
-    """
-    return read_changed(run_dir, changes).made()
-
-
-def _agent(source: Traversable, folder: Path, checkpoint: str | None, reward: str | None) -> Stored:
+    if not is_agent(source):
+        return _trained(folder, checkpoint, reward)
     if checkpoint is not None:
         raise RunError(f"{folder} has no checkpoint {checkpoint}: leave the checkpoint out")
-    agent = read_agent(source, folder)
-    config = _with_reward(_parse_config(agent.config, folder / CONFIG), reward)
-    return Stored(folder, config, make_setup(config), agent.weights)
+    text, weights = read_agent(source, folder)
+    config = _with_reward(_parse_config(text, folder / CONFIG), reward)
+    return Run(folder, config, make_setup(config), weights)
 
 
 def _with_reward(config: dict[str, Any], name: str | None) -> dict[str, Any]:
@@ -348,7 +313,7 @@ def _with_reward(config: dict[str, Any], name: str | None) -> dict[str, Any]:
     return config | {"reward": with_given_reward(own, {} if name is None else {"name": name})}
 
 
-def _trained(folder: Path, checkpoint: str | None, reward: str | None) -> Stored:
+def _trained(folder: Path, checkpoint: str | None, reward: str | None) -> Run:
     config = _with_reward(read_config(folder / CONFIG), reward)
     checkpoints = folder / CHECKPOINTS
     path = checkpoints / checkpoint if checkpoint else newest_checkpoint(checkpoints)
@@ -364,4 +329,4 @@ def _trained(folder: Path, checkpoint: str | None, reward: str | None) -> Stored
             f"{folder / CONFIG} is not what {path.name} was trained with: its {', '.join(odd)} "
             "differ; restore the run's own config.yaml"
         )
-    return Stored(folder, config, setup, Weights(content.updates, content.arrays[ACTING]))
+    return Run(folder, config, setup, Weights(content.updates, content.arrays[ACTING]))

@@ -12,7 +12,7 @@ from conf.cli import entry, tell
 from conf.commands import Plain
 
 if TYPE_CHECKING:
-    from tangram_agent.runs import Stored
+    from tangram_agent.runs import Run
     from tangram_game.config import EvalConfig, PlayConfig
 
 
@@ -75,7 +75,7 @@ def _play(settings: Plain) -> int:
     return play_run(config, filled)
 
 
-def _check_played(run_dirs: Sequence[str], config: "EvalConfig | PlayConfig") -> list["Stored"]:
+def _check_played(run_dirs: Sequence[str], config: "EvalConfig | PlayConfig") -> list["Run"]:
     """Refuse what cannot be played before torch is loaded; returns what the runs play."""
     from tangram_agent.runs import read_changed
 

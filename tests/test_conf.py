@@ -19,7 +19,7 @@ from conf.help import choices, group_help, help_text, setting_names
 from conf.kinds import Kinds, kinds_of
 from conf.settings import PAGE, page
 from conf.sweep import check_launcher, refuse_lost_job
-from tangram_agent.agents.pair.config import PairConfig
+from tangram_agent.agents.pair.agent import PairConfig
 from tangram_agent.base.config import NetConfig
 from tangram_core.errors import ConfigError, TangramError
 from tangram_core.run.service import ServiceConfig

@@ -23,13 +23,11 @@ class Adam:
 
     def __init__(self, parameters: Sequence[Tensor]) -> None:
         self._parameters = list(parameters)
-        scalars = [parameter.new_zeros(()) for parameter in self._parameters]
-        averages = ([torch.zeros_like(one) for one in self._parameters] for _ in range(2))
-        columns = (scalars, *averages)
-        self.slots = {
-            name: [one.detach() for one in column]
-            for name, column in zip(NAMES, columns, strict=True)
-        }
+        own = [parameter.detach() for parameter in self._parameters]
+        means, squares = ([torch.zeros_like(one) for one in own] for _ in range(2))
+        self.slots = dict(
+            zip(NAMES, ([one.new_zeros(()) for one in own], means, squares), strict=True)
+        )
 
     def load(self, slots: dict[str, list[Tensor]]) -> None:
         """Take over what was kept of the same parameters; nothing is as before the first step.

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, field
 
-from tangram_core.agent import Pace
 from tangram_core.errors import ConfigError
 from tangram_core.settings import LEARNING, Settings, declared, setting
 
@@ -126,11 +125,6 @@ class LearningConfig(Settings, section="agent"):
                 f"agent.batch_size ({self.batch_size}) must not exceed "
                 f"agent.replay_capacity ({self.replay_capacity})"
             )
-
-    @property
-    def pace(self) -> Pace:
-        """How much is learned from what is played."""
-        return Pace(self.updates_per_transition, self.learning_starts)
 
 
 @dataclass(frozen=True)

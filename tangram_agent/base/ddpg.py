@@ -4,7 +4,7 @@ Legend: M views.
 """
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,18 +13,14 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from tangram_agent.base.compiling import Compiled
 from tangram_agent.base.config import ActorCriticConfig
-from tangram_agent.base.learning import NetworkLearner, Rates, frozen, polyak_update
+from tangram_agent.base.learning import Loss, Rates, TokenLearner
 from tangram_agent.base.relabelling import learnable, with_relabelled
 from tangram_agent.base.replay import ReplayBuffer
 from tangram_agent.base.types import Transitions
 from tangram_core.agent import Streams
-from tangram_core.arrays import Ints
-from tangram_core.spec import Array, Arrays, Episodes
+from tangram_core.spec import Episodes
 from tangram_tasks.place import Place
-
-NUMBERS = ("critic_loss", "q", "critic_gradient", "actor_loss", "saturation", "actor_gradient")
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,19 +48,18 @@ class Steps:
     seen_after: Any = None
 
 
-class Ddpg(NetworkLearner):
+class Ddpg(TokenLearner):
     """Actor and critic on views of tokens; an agent says what these are.
 
     Attributes:
         bootstraps: whether the critic's target counts what follows (Eq. 5): only then are there
             target networks.
-        replay: transitions played, and relabelled ones.
-        batch: of the last update.
+        relabels: the goals of hindsight that transitions are kept with.
     """
 
-    compiles = True
     advice = "lower agent.actor_lr and agent.critic_lr"
     limit = 0.0  # of pre-activations, beyond which they pay a penalty
+    replay: ReplayBuffer
 
     def __init__(
         self,
@@ -74,6 +69,7 @@ class Ddpg(NetworkLearner):
         seed: int,
         device: str,
         compiled: bool,
+        others: Mapping[str, nn.Module] | None = None,
     ) -> None:
         """Networks with the weights of a seed.
 
@@ -84,26 +80,19 @@ class Ddpg(NetworkLearner):
             seed: of the weights.
             device: where it learns.
             compiled: whether an update is compiled as a whole, see `Compiled`.
+            others: networks that are fitted otherwise.
         """
-        self.task, self.config = task, config
+        self.task, self.config, self.polyak = task, config, config.polyak
         self.bootstraps = config.gamma > 0.0 and task.horizon > 1
+        self.relabels = config.hindsight
         self.actor, self.critic, playing = networks
         learned = {"actor": self.actor, "critic": self.critic}
-        super().__init__(config, learned, playing, seed, device)
+        targets = tuple(learned) if self.bootstraps else ()
+        given = config, learned, playing, seed, device
+        super().__init__(*given, targets=targets, compiled=compiled, others=others)
         layout = task.layout
         size = layout.corner_count, layout.tokens, task.action_size
         self.replay = ReplayBuffer(config.replay_capacity, *size)
-        self.capacity = config.replay_capacity
-        self.batch: Transitions | None = None
-        self._step_all = self._all_steps
-        if compiled:
-            self._step_all = Compiled(self._all_steps, self.changed_by_update())
-
-    def _more_parts(self) -> dict[str, nn.Module]:
-        if not self.bootstraps:
-            return {}
-        self.target_actor, self.target_critic = frozen(self.actor), frozen(self.critic)
-        return {"target_actor": self.target_actor, "target_critic": self.target_critic}
 
     @abstractmethod
     def steps(self, batch: Transitions, generator: np.random.Generator) -> Steps:
@@ -114,157 +103,55 @@ class Ddpg(NetworkLearner):
         actor = self.config.actor_lr * self.rate_factor(share)
         return super().rates(share)._replace(actor=actor)
 
-    # Experience
-
     def insert(self, episodes: Episodes, rng: Streams) -> int:
         """Keep transitions as they were played, and relabelled."""
-        seen = learnable(episodes)
+        seen, task = learnable(episodes), self.task
         if seen.count:
-            self.replay.add(
-                with_relabelled(
-                    seen, self.relabels, self.task.layout, self.task.reward_of, rng["hindsight"]
-                )
-            )
+            relabelled = self.relabels, task.layout, task.reward_of, rng["hindsight"]
+            self.replay.add(with_relabelled(seen, *relabelled))
         return seen.transitions
 
-    @property
-    def relabels(self) -> tuple[Any, ...]:
-        """The goals of hindsight that transitions are kept with."""
-        return self.config.hindsight
-
-    @property
-    def kept(self) -> int:
-        """Transitions in the replay."""
-        return len(self.replay)
-
-    def memory(self) -> dict[str, Array]:
-        """The replay."""
-        return self.replay.state()
-
-    def load_memory(self, memory: Mapping[str, Array]) -> None:
-        """Take over a replay."""
-        self.replay.load_state(dict(memory))
-
-    def evidence(self) -> Arrays:
-        """The batch of the last update."""
-        return {} if self.batch is None else self.batch.arrays
-
-    # Updates
-
-    def update(self, share: float, rng: Streams) -> dict[str, float]:
-        """See `Learner.update`; its numbers are those of `learn`."""
+    def drawn(self, rng: Streams) -> Steps:
+        """What the losses see of transitions of the replay."""
         self.batch = self.replay.sample(self.config.batch_size, rng["replay"])
-        return self.learn(self.steps(self.batch, rng["hindsight"]), share)
+        return self.steps(self.batch, rng["hindsight"])
 
-    def learn(self, steps: Steps, share: float = 0.0) -> dict[str, float]:
-        """One step of all networks.
-
-        Args:
-            steps: what the losses see.
-            share: of the run's budget that is used, in [0, 1]; decides the learning rate.
-
-        Returns:
-            critic_loss, actor_loss, q (mean value of the batch's actions), saturation, and the
-            norms of the gradients, critic_gradient and actor_gradient.
-
-        Raises:
-            NotFiniteError: one of these is not finite.
-        """
-        found = self._step_all(steps, self.rates(share))
-        return self._counted(dict(zip(NUMBERS, found.unbind(), strict=True)))
-
-    def _all_steps(self, steps: Steps, rates: Rates) -> Tensor:
-        """All steps of one update, on the device alone; its `NUMBERS`."""
-        features = self.features(steps)
-        loss, q = self.critic_loss(steps, features)
-        norm = self._step("critic", loss, rates.critic)
-        value_loss, penalty = self.actor_loss(steps, features)
-        total = value_loss + self.config.saturation_penalty * penalty
-        actor_norm = self._step("actor", total, rates.actor)
-        self._follow(rates.kept)
-        every = loss, q.mean(), norm, value_loss, penalty, actor_norm
-        return torch.stack([one.detach() for one in every])
+    def losses(self, seen: Steps) -> Iterator[Loss]:
+        """The critic's, Eq. 3, then the actor's, Eq. 6: minus the value of its own actions."""
+        features = self.features(seen)
+        with torch.no_grad():
+            y = self._target(seen)
+        q = self.critic(seen.view, seen.velocity, seen.seen_after, features)
+        yield Loss("critic", (q - y).square().mean(), {"q": q.mean()})
+        velocity, raw = self.actor(seen.start, features)
+        value = -self.critic(seen.start, velocity, None, features).mean()
+        # Keeps tanh or clamp from going flat.
+        saturation = torch.relu(raw.abs() - self.limit).square().mean()
+        total = value + self.config.saturation_penalty * saturation
+        yield Loss("actor", total, {"actor_loss": value, "saturation": saturation})
 
     def features(self, steps: Steps) -> Tensor | None:  # noqa: ARG002
         """What actor and critic both see, made once; None where they see different things."""
         return None
 
-    def critic_loss(self, steps: Steps, features: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Mean squared Bellman error of Eq. 3, and the values (M,)."""
-        with torch.no_grad():
-            y = self._target(steps)
-        q = self.critic(steps.view, steps.velocity, steps.seen_after, features)
-        return (q - y).square().mean(), q
-
-    def actor_loss(self, steps: Steps, features: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Minus the value of the actor's own actions (Eq. 6), and the saturation penalty."""
-        velocity, raw = self.actor(steps.start, features)
-        q = self.critic(steps.start, velocity, None, features)
-        return -q.mean(), saturation(raw, self.limit)
-
     def _target(self, steps: Steps) -> Tensor:
-        """Eq. 5; the target networks are not asked where no transition goes on."""
+        """Y of Eq. 5, (M,); the target networks are not asked where no transition goes on.
+
+        The paper's equation lacks (1 - d), but after the end of an episode nothing can follow.
+        """
         if steps.follow is None:
             return steps.reward
-        velocity, _ = self.target_actor(steps.follow)
-        following = self.target_critic(steps.follow, velocity)
-        return critic_target(steps.reward, steps.done, following, self.config.gamma)
+        velocity, _ = self.targets["actor"](steps.follow)
+        following: Tensor = self.targets["critic"](steps.follow, velocity)
+        return steps.reward + self.config.gamma * (1.0 - steps.done) * following
 
-    def _follow(self, kept: float | Tensor) -> None:
-        """Move target networks and the acting average a little towards the networks."""
-        lists, config = self._lists, self.config
-        if self.bootstraps:
-            polyak_update(lists["target_critic"], lists["critic"], config.polyak)
-            polyak_update(lists["target_actor"], lists["actor"], config.polyak)
-        polyak_update(lists["acting"], lists["playing"], kept)
-
-    def prepare(self) -> None:
-        """Compile updates that are to be compiled: else the first ones take a minute."""
-        if not isinstance(self._step_all, Compiled):
-            return
-        # Some go on in nearly every batch of those that bootstrap; none elsewhere.
-        blank = _blank(self.task, self.config.batch_size, done=0 if self.bootstraps else 1)
-        self._step_all.prepare(self.steps(blank, np.random.default_rng(0)), self.rates(0.0))
-
-    # Tensors
+    def blanks(self) -> Iterator[Steps]:
+        """Some go on in nearly every batch of those that bootstrap; none elsewhere."""
+        size = self.config.batch_size
+        columns = {name: array[:size] for name, array in self.replay.arrays.items()}
+        columns["done"] = np.full(size, not self.bootstraps, np.uint8)
+        yield self.steps(Transitions(**columns), np.random.default_rng(0))
 
     def if_any_follows(self, done: npt.NDArray[Any], follow: Any) -> Any:
         """What follows, where a target network is to be asked of it; else None."""
         return follow if self.bootstraps and not done.all() else None
-
-    def tensor(self, column: npt.NDArray[Any]) -> Tensor:
-        """In single precision, on the device."""
-        return torch.from_numpy(np.asarray(column, np.float32)).to(self.place)
-
-    def index(self, column: Ints) -> Tensor:
-        """Of whole numbers, on the device."""
-        return torch.from_numpy(np.asarray(column, np.int64)).to(self.place)
-
-
-def critic_target(reward: Tensor, done: Tensor, next_value: Tensor, gamma: float) -> Tensor:
-    """The target y of Eq. 5, (B,).
-
-    The paper's equation lacks (1 - d), but after the end of an episode nothing can follow.
-    """
-    return reward + gamma * (1.0 - done) * next_value
-
-
-def saturation(raw: Tensor, limit: float) -> Tensor:
-    """Mean of relu(|z| - limit)^2 over pre-activations z: keeps tanh or clamp from going flat."""
-    return torch.relu(raw.abs() - limit).square().mean()
-
-
-def _blank(task: Place, count: int, done: int) -> Transitions:
-    """A batch in which nothing moves, of tokens that lie in the middle."""
-    layout = task.layout
-    corners = layout.corners(np.zeros((count, layout.tokens, 3))).astype(np.float32, order="C")
-    return Transitions(
-        state=corners,
-        placed=np.zeros((count, layout.tokens), np.uint8),
-        action=np.zeros((count, task.action_size), np.float32),
-        reward=np.zeros(count, np.float32),
-        next_state=corners,
-        next_placed=np.zeros((count, layout.tokens), np.uint8),
-        done=np.full(count, done, np.uint8),
-        goal=corners,
-    )

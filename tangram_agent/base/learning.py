@@ -1,22 +1,24 @@
-"""What all learners by gradients share: networks with their averages, optimisers and state."""
+"""What all learners by gradients share: networks, their targets, optimisers and state."""
 
 import copy
 import math
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from tangram_agent.base.adam import Adam
+from tangram_agent.base.compiling import Compiled
 from tangram_agent.base.config import LearningConfig
 from tangram_agent.nets.networks import initialise, parameter_count
 from tangram_agent.nets.weights import load_arrays, to_arrays, under
-from tangram_core.agent import Learner, NotFiniteError, Tensors
+from tangram_core.agent import Learner, NotFiniteError, Streams, Tensors
 from tangram_core.errors import RunError
-from tangram_core.spec import Array
+from tangram_core.spec import Array, Arrays
 
 _COUNTER = "updates"
 
@@ -29,115 +31,201 @@ class Rates(NamedTuple):
     kept: float | Tensor
 
 
-class NetworkLearner(Learner):
-    """Networks, their targets, optimisers and the running average that is played with.
+@dataclass(frozen=True, eq=False)
+class Loss:
+    """What one network is to make small.
 
     Attributes:
-        parts: networks by the names under which a checkpoint has them.
-        playing: what is played with.
-        acting: its running average, of which workers get what they need.
+        part: the network's name in `NetworkLearner.parts`.
+        value: () whatever it depends on, only this network moves.
+        told: numbers () for the curves.
+    """
+
+    part: str
+    value: Tensor
+    told: Mapping[str, Tensor] = field(default_factory=dict)
+
+
+class Replay(Protocol):
+    """What a learner keeps, to a checkpoint and back."""
+
+    def __len__(self) -> int: ...
+    def state(self) -> dict[str, Array]: ...  # noqa: D102
+    def load_state(self, state: Mapping[str, Array]) -> None: ...  # noqa: D102
+
+
+class Optimiser(Protocol):
+    """What moves a network, and keeps something of each step."""
+
+    slots: dict[str, list[Tensor]]
+
+    def step(self, *args: Any, **kwargs: Any) -> Any: ...  # noqa: D102
+    def load(self, slots: dict[str, list[Tensor]]) -> None: ...  # noqa: D102
+
+
+class NetworkLearner(Learner):
+    """Networks that learn by their losses, and target networks that follow them slowly.
+
+    Attributes:
+        polyak: rho of the target networks, Eq. 4.
+        delay: the actor moves in every so manieth update.
+        replay: what it learns from.
+        batch: of the last update, with `arrays`.
+        targets: frozen copies of networks, by the names of these.
+        parts: all networks, by the names under which a checkpoint has them.
+        lists: their parameters. Walking modules would take a fifth of a small network's update.
         optimisers: of the networks that learn, by their names in `parts`.
     """
 
-    advice = "lower agent.critic_lr"
+    compiles = True
+    delay = 1
+    polyak: float
+    replay: Replay
+    batch: Any = None
 
     def __init__(
         self,
-        config: LearningConfig,
         learned: Mapping[str, nn.Module],
-        playing: nn.Module,
-        seed: int,
+        targets: Iterable[str],
         device: str,
+        *,
+        compiled: bool = False,
+        others: Mapping[str, nn.Module] | None = None,
     ) -> None:
-        """Networks with the weights of a seed.
+        """Take networks as they are.
 
         Args:
-            config: rates and averages.
             learned: networks that are learned by gradients, by name.
-            playing: what is played with, made of these.
-            seed: of the weights.
+            targets: names of those that have a target network.
             device: where it learns.
+            compiled: whether an update is compiled as a whole, see `Compiled`.
+            others: networks that are fitted otherwise.
         """
-        generator = torch.Generator().manual_seed(seed)
-        for network in learned.values():
-            initialise(network, generator)
-        self._rates_of = config
-        self.place = torch.device(device)
-        self.device, self.updates = device, 0
+        self.targets = {name: frozen(learned[name]) for name in targets}
+        following = {f"target_{name}": module for name, module in self.targets.items()}
+        self.parts: dict[str, nn.Module] = {**learned, **following, **(others or {})}
+        self.place, self.device = torch.device(device), device
+        for module in self.parts.values():
+            module.to(self.place)
         self.parameters = parameter_count(*learned.values())
-        playing.to(self.place)
-        for network in learned.values():
-            network.to(self.place)
-        self.playing, self.acting = playing, frozen(playing)
-        self.parts: dict[str, nn.Module] = {**learned, **self._more_parts(), "acting": self.acting}
-        # Kept as lists: walking the modules takes a fifth of a small network's update.
-        self._lists = self.parameter_lists()
-        self.optimisers = {part: Adam(self._lists[part]) for part in learned}
+        self.lists: dict[str, list[Tensor]] = {
+            n: [*one.parameters()] for n, one in self.parts.items()
+        }
+        self.optimisers: dict[str, Optimiser] = {name: Adam(self.lists[name]) for name in learned}
+        self._names: dict[bool, tuple[str, ...]] = {}
+        self._whole: Callable[[Any, Rates], Tensor] = self.step
+        if compiled:
+            slots = [own for each in self.optimisers.values() for own in each.slots.values()]
+            changed = [one for own in (*self.lists.values(), *slots) for one in own]
+            self._whole = Compiled(self.step, changed)
 
-    def _more_parts(self) -> dict[str, nn.Module]:
-        """Networks that no gradient reaches: targets, and others that are fitted otherwise."""
-        return {}
+    # What a learner of its own says
 
-    def parameter_lists(self) -> dict[str, list[Tensor]]:
-        """Parameters by the names of `parts`, and those of `playing`."""
-        modules = self.parts | {"playing": self.playing}
-        return {name: list(module.parameters()) for name, module in modules.items()}
+    @abstractmethod
+    def drawn(self, rng: Streams) -> Any:
+        """What an update learns from, as `losses` takes it; all that is random is drawn here."""
 
-    # Steps
+    @abstractmethod
+    def losses(self, seen: Any) -> Iterator[Loss]:
+        """Yield a network's loss; it makes its step before the next one is asked for."""
 
-    def _step(self, part: str, loss: Tensor, rate: float | Tensor) -> Tensor:
-        """One step of one network, whatever else the loss depends on; its gradient's norm."""
-        gradients = torch.autograd.grad(loss, self._lists[part])
-        norm = gradient_norm(gradients, traced=isinstance(rate, Tensor))
-        self.optimisers[part].step(gradients, rate)
-        return norm
+    @abstractmethod
+    def rates(self, share: float) -> Rates:
+        """Of the next update, at a used share of the budget."""
 
-    def _counted(self, values: Mapping[str, Tensor]) -> dict[str, float]:
-        """The numbers of an update, which now counts: the one wait for the device, at its end.
+    def blanks(self) -> Iterator[Any]:
+        """What `losses` may see, one of each form, with whatever in it: to compile for it."""
+        yield from ()
+
+    def follow(self, rates: Rates) -> None:  # noqa: ARG002
+        """Move target networks a little towards their networks, Eq. 4."""
+        for name in self.targets:
+            polyak_update(self.lists[f"target_{name}"], self.lists[name], self.polyak)
+
+    # Updates
+
+    def update(self, share: float, rng: Streams) -> dict[str, float]:
+        """See `Learner.update`; its numbers are those of `learn`."""
+        return self.learn(self.drawn(rng), share)
+
+    def learn(
+        self, seen: Any, share: float = 0.0, told: Mapping[str, Tensor] | None = None
+    ) -> dict[str, float]:
+        """One step of all networks.
+
+        Args:
+            seen: what the losses see.
+            share: of the run's budget that is used, in [0, 1]; decides the learning rate.
+            told: other numbers () of this update.
+
+        Returns:
+            Of each network NAME_loss and NAME_gradient, its norm, and what its loss tells.
 
         Raises:
-            NotFiniteError: one is not finite.
+            NotFiniteError: one of these is not finite.
         """
-        numbers = dict(zip(values, torch.stack(list(values.values())).tolist(), strict=True))
-        check_finite(self.updates + 1, numbers)
+        found = self._whole(seen, self.rates(share))  # the one wait for the device is below
+        values = [found, *(one[None] for one in (told or {}).values())]
+        names = *self._names[getattr(seen, "acts", True)], *(told or {})
+        numbers = dict(zip(names, torch.cat(values).tolist(), strict=True))
+        if not all(map(math.isfinite, numbers.values())):
+            listed = ", ".join(f"{name}={value:g}" for name, value in numbers.items())
+            raise NotFiniteError(f"update {self.updates + 1} is not finite ({listed})")
         self.updates += 1
         return numbers
 
-    def rate_factor(self, share: float) -> float:
-        """By which learning rates have fallen at a used share of the budget: along a cosine."""
-        used, low = min(max(share, 0.0), 1.0), self._rates_of.lr_final
-        return low + (1.0 - low) * 0.5 * (1.0 + math.cos(math.pi * used))
+    def step(self, seen: Any, rates: Rates) -> Tensor:
+        """The whole update, on the device alone; its numbers, by the names in `_names`."""
+        numbers: dict[str, Tensor] = {}
+        for loss in self.losses(seen):
+            rate = rates.actor if loss.part == "actor" else rates.critic
+            gradients = torch.autograd.grad(loss.value, self.lists[loss.part])
+            norm = gradient_norm(gradients, traced=isinstance(rate, Tensor))
+            self.optimisers[loss.part].step(gradients, rate)
+            own = {f"{loss.part}_loss": loss.value, f"{loss.part}_gradient": norm}
+            numbers |= own | dict(loss.told)
+        self.follow(rates)
+        self._names[getattr(seen, "acts", True)] = tuple(numbers)
+        return torch.stack([one.detach() for one in numbers.values()])
 
-    def rates(self, share: float) -> Rates:
-        """Of the next update, at a used share of the budget."""
-        rate = self._rates_of.critic_lr * self.rate_factor(share)
-        return Rates(rate, rate, average_so_far(self._rates_of.acting_average, self.updates))
+    def prepare(self) -> None:
+        """Compile updates that are to be compiled: else the first ones take a minute."""
+        if isinstance(self._whole, Compiled):
+            for seen in self.blanks():
+                self._whole.prepare(seen, self.rates(0.0))
 
-    def changed_by_update(self) -> list[Tensor]:
-        """All that an update by gradients changes."""
-        parameters = [one for own in self.parts.values() for one in own.parameters()]
-        every = self.optimisers.values()
-        kept = [one for each in every for own in each.slots.values() for one in own]
-        return parameters + kept
+    def tensor(self, array: Array, dtype: type = np.float32) -> Tensor:
+        """On the device, in single precision where no other type is said."""
+        return torch.from_numpy(np.asarray(array, dtype)).to(self.place)
 
     # State
 
-    def export(self) -> Tensors:
-        """A copy of the weights to play with, as a checkpoint keeps them."""
-        return to_arrays(self.acting)
+    @property
+    def kept(self) -> int:
+        """How much there is in the replay."""
+        return len(self.replay)
 
-    def broadcast(self) -> Tensors:
-        """Those of them that workers need."""
-        return self.export()
+    def memory(self) -> dict[str, Array]:
+        """The replay."""
+        return self.replay.state()
+
+    def load_memory(self, memory: Mapping[str, Array]) -> None:
+        """Take over a replay."""
+        self.replay.load_state(memory)
+
+    def evidence(self) -> Arrays:
+        """The batch of the last update."""
+        return {} if self.batch is None else self.batch.arrays
 
     def state(self) -> dict[str, Array]:
         """Everything but the replay that the next update depends on."""
         state: dict[str, Array] = {_COUNTER: np.array([self.updates], np.int64)}
         for part, module in self.parts.items():
-            for name, value in to_arrays(module).items():
-                state[f"{part}.{name}"] = value
+            state |= {f"{part}.{name}": value for name, value in to_arrays(module).items()}
         for part, optimiser in self.optimisers.items():
-            state |= saved_slots(part, optimiser.slots)
+            for name, tensors in optimiser.slots.items():
+                for i, tensor in enumerate(tensors):
+                    state[f"{part}_optimiser.{i}.{name}"] = tensor.cpu().numpy().copy()
         return state
 
     def load_state(self, state: Mapping[str, Array]) -> None:
@@ -150,7 +238,12 @@ class NetworkLearner(Learner):
             raise RunError("learner state: no counter of updates: not a learner's checkpoint")
         self.load_networks(state)
         for part, optimiser in self.optimisers.items():
-            optimiser.load(read_slots(part, state, self.place))
+            content: dict[str, dict[int, Tensor]] = {}
+            for key, value in under(f"{part}_optimiser.", state).items():
+                i, name = key.split(".", 1)
+                content.setdefault(name, {})[int(i)] = torch.from_numpy(np.array(value))
+            slots = {n: [own[i].to(self.place) for i in sorted(own)] for n, own in content.items()}
+            optimiser.load(slots)
         self.updates = int(state[_COUNTER][0])
 
     def load_networks(self, state: Mapping[str, Array]) -> None:
@@ -163,32 +256,73 @@ class NetworkLearner(Learner):
             load_arrays(module, under(f"{part}.", state))
 
     def begin_with(self, state: Mapping[str, Array]) -> None:
-        """Take over the networks of another run."""
+        """Take over the networks of another run, and learn on with new optimisers."""
         self.load_networks(state)
 
-    @abstractmethod
-    def memory(self) -> dict[str, Array]:
-        """See `Learner.memory`."""
 
+class TokenLearner(NetworkLearner):
+    """Learns what an agent of tokens plays: a running average of its networks.
 
-def saved_slots(part: str, slots: Mapping[str, list[Tensor]]) -> dict[str, Array]:
-    """What an optimiser keeps, by the names of a checkpoint."""
-    return {
-        f"{part}_optimiser.{i}.{name}": tensor.cpu().numpy().copy()
-        for name, tensors in slots.items()
-        for i, tensor in enumerate(tensors)
-    }
+    Attributes:
+        acting: the average, of which workers get what they need.
+    """
 
+    advice = "lower agent.critic_lr"
 
-def read_slots(
-    part: str, state: Mapping[str, Array], device: torch.device
-) -> dict[str, list[Tensor]]:
-    """What an optimiser kept, from a checkpoint."""
-    content: dict[str, dict[int, Tensor]] = {}
-    for key, value in under(f"{part}_optimiser.", state).items():
-        i, name = key.split(".", 1)
-        content.setdefault(name, {})[int(i)] = torch.from_numpy(np.array(value)).to(device)
-    return {n: [one[i] for i in sorted(one)] for n, one in content.items()}
+    def __init__(
+        self,
+        config: LearningConfig,
+        learned: Mapping[str, nn.Module],
+        playing: nn.Module,
+        seed: int,
+        device: str,
+        *,
+        targets: Iterable[str] = (),
+        compiled: bool = False,
+        others: Mapping[str, nn.Module] | None = None,
+    ) -> None:
+        """Networks with the weights of a seed.
+
+        Args:
+            config: rates and averages.
+            learned: see `NetworkLearner`, as are those that are not named here.
+            playing: what is played with, made of these and of others.
+            seed: of the weights.
+            device: where it learns.
+        """
+        generator = torch.Generator().manual_seed(seed)
+        for network in learned.values():
+            initialise(network, generator)
+        self._rates_of, self.capacity = config, config.replay_capacity
+        self.acting = frozen(playing)
+        every = {**(others or {}), "acting": self.acting}
+        super().__init__(learned, targets, device, compiled=compiled, others=every)
+        self.lists["playing"] = list(playing.parameters())
+
+    def follow(self, rates: Rates) -> None:
+        """Move the running average, too."""
+        super().follow(rates)
+        polyak_update(self.lists["acting"], self.lists["playing"], rates.kept)
+
+    def rate_factor(self, share: float) -> float:
+        """By which learning rates have fallen at a used share of the budget: along a cosine."""
+        used, low = min(max(share, 0.0), 1.0), self._rates_of.lr_final
+        return low + (1.0 - low) * 0.5 * (1.0 + math.cos(math.pi * used))
+
+    def rates(self, share: float) -> Rates:
+        """Of the next update, at a used share of the budget."""
+        rate = self._rates_of.critic_lr * self.rate_factor(share)
+        # A constant 0.99 would hold the random weights of the start for hundreds of updates.
+        kept = min(self._rates_of.acting_average, self.updates / (self.updates + 9.0))
+        return Rates(rate, rate, kept)
+
+    def export(self) -> Tensors:
+        """A copy of the weights to play with, as a checkpoint keeps them."""
+        return to_arrays(self.acting)
+
+    def broadcast(self) -> Tensors:
+        """Those of them that workers need."""
+        return self.export()
 
 
 def frozen(module: nn.Module) -> nn.Module:
@@ -215,18 +349,3 @@ def gradient_norm(gradients: Sequence[Tensor], traced: bool) -> Tensor:
     if not traced:
         return nn.utils.get_total_norm(gradients)
     return torch.stack([one.square().sum() for one in gradients]).sum().sqrt()
-
-
-def average_so_far(rho: float, updates: int) -> float:
-    """Rho of a running average after `updates` updates: smaller at first, to forget the start.
-
-    A constant 0.99 holds the random weights of the start for hundreds of updates.
-    """
-    return min(rho, updates / (updates + 9.0))
-
-
-def check_finite(updates: int, numbers: Mapping[str, float]) -> None:
-    """Raise NotFiniteError unless all numbers of an update are finite."""
-    if not all(map(math.isfinite, numbers.values())):
-        listed = ", ".join(f"{name}={value:g}" for name, value in numbers.items())
-        raise NotFiniteError(f"update {updates} is not finite ({listed})")

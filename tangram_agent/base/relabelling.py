@@ -35,8 +35,18 @@ def learnable(episodes: Episodes) -> Episodes:
 
 def flatten(episodes: Episodes) -> Transitions:
     """The transitions as they were played, episode after episode."""
-    goals = np.repeat(episodes["goals"], episodes.steps, axis=0)
-    return _transitions(episodes, goals, episodes.rewards.reshape(-1))
+    size = episodes.count * episodes.steps
+    corners, placed = episodes["corners"], episodes["placed"]
+    return Transitions(
+        state=corners[:, :-1].reshape(size, *corners.shape[2:]),
+        placed=placed[:, :-1].reshape(size, -1),
+        action=episodes.actions.reshape(size, -1),
+        reward=episodes.rewards.reshape(-1),
+        next_state=corners[:, 1:].reshape(size, *corners.shape[2:]),
+        next_placed=placed[:, 1:].reshape(size, -1),
+        done=episodes.terminated.reshape(size),
+        goal=np.repeat(episodes["goals"], episodes.steps, axis=0),
+    )
 
 
 def with_relabelled(
@@ -47,20 +57,21 @@ def with_relabelled(
     generator: np.random.Generator,
 ) -> Transitions:
     """The transitions played, followed by those with every other goal, rewarded for it."""
+    played = flatten(episodes)
     goals = [
         _goals(episodes, relabel, layout, generator)
         for relabel in relabels
         for _ in range(relabel.copies)
     ]
     if not goals:
-        return flatten(episodes)
+        return played
     # The rewards for all goals at once: each call costs about as much as a hundred of them.
-    achieved = episodes["corners"][:, 1:].reshape(goals[0].shape).astype(np.float64)
-    desired = np.concatenate(goals).astype(np.float64)
-    rewards = reward(np.concatenate([achieved] * len(goals)), desired).astype(np.float32)
-    parts = zip(goals, np.split(rewards, len(goals)), strict=True)
-    relabelled = [_transitions(episodes, goal, part) for goal, part in parts]
-    return _concatenate([flatten(episodes), *relabelled])
+    achieved = np.concatenate([played.next_state] * len(goals)).astype(np.float64)
+    rewards = reward(achieved, np.concatenate(goals).astype(np.float64)).astype(np.float32)
+    every = {n: np.concatenate([part] * (1 + len(goals))) for n, part in played.arrays.items()}
+    every["goal"] = np.concatenate([played.goal, *goals])
+    every["reward"] = np.concatenate([played.reward, rewards])
+    return Transitions(**every)
 
 
 def spread(relabel: RelabelConfig) -> tuple[float, float, float]:
@@ -90,23 +101,3 @@ def _goals(
     poses = layout.poses(exact)
     poses += generator.standard_normal(poses.shape) * spread(relabel)
     return layout.corners(poses, layout.flipped(exact)).astype(np.float32)
-
-
-def _transitions(episodes: Episodes, goals: Singles, rewards: Singles) -> Transitions:
-    count, steps = episodes.count, episodes.steps
-    size = count * steps
-    return Transitions(
-        state=episodes["corners"][:, :-1].reshape(size, *episodes["corners"].shape[2:]),
-        placed=episodes["placed"][:, :-1].reshape(size, -1),
-        action=episodes.actions.reshape(size, -1),
-        reward=rewards,
-        next_state=episodes["corners"][:, 1:].reshape(size, *episodes["corners"].shape[2:]),
-        next_placed=episodes["placed"][:, 1:].reshape(size, -1),
-        done=episodes.terminated.reshape(size),
-        goal=goals,
-    )
-
-
-def _concatenate(batches: list[Transitions]) -> Transitions:
-    columns = {name: [getattr(batch, name) for batch in batches] for name in batches[0].arrays}
-    return Transitions(**{name: np.concatenate(parts) for name, parts in columns.items()})

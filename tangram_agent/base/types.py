@@ -55,8 +55,8 @@ class Transitions:
 
     @property
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Those that there are, by name."""
-        return {name: array for name, array in vars(self).items() if array is not None}
+        """All of them, by name."""
+        return dict(vars(self))
 
     @property
     def count(self) -> int:

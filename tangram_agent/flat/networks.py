@@ -7,15 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from tangram_agent.flat.config import BaseConfig
-
-
-def perceptron(inputs: int, hidden: tuple[int, ...], outputs: int, norm: bool) -> nn.Sequential:
-    """Linear layers with ReLU between, each normalised before it where `norm` says so."""
-    layers: list[nn.Module] = []
-    for size in hidden:
-        layers += [nn.Linear(inputs, size), *([nn.LayerNorm(size)] if norm else []), nn.ReLU()]
-        inputs = size
-    return nn.Sequential(*layers, nn.Linear(inputs, outputs))
+from tangram_agent.nets.networks import perceptron
 
 
 class Policy(nn.Module):

@@ -24,11 +24,8 @@ class PolicyActor(Actor):
     """A policy, and the statistics that what it sees is normalised with."""
 
     def __init__(self, policy: Policy, inputs: Inputs, uniform_share: float) -> None:
-        self._policy, self._inputs, self._uniform = (
-            policy.requires_grad_(False),
-            inputs,
-            uniform_share,
-        )
+        self._policy, self._inputs = policy.requires_grad_(False), inputs
+        self._uniform = uniform_share
         self._mean = np.zeros(inputs.size, np.float32)
         self._scale = np.ones(inputs.size, np.float32)
 

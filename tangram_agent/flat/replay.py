@@ -8,14 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tangram_agent.base.ring import Column, Ring
 from tangram_agent.flat.config import BaseConfig
 from tangram_core.agent import Streams
 from tangram_core.arrays import Bools, Ints, Singles
-from tangram_core.errors import RunError
 from tangram_core.spec import Array, Arrays, Episodes
 from tangram_core.task import Task
-
-_COUNTER = "added"
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,37 +34,24 @@ class Transitions:
     terminated: Bools
 
 
-class EpisodeReplay:
-    """The newest episodes, in a ring over preallocated arrays.
-
-    Attributes:
-        capacity: episodes kept.
-        added: episodes ever added; the next one goes to slot `added % capacity`.
-    """
+class EpisodeReplay(Ring):
+    """The newest episodes."""
 
     def __init__(self, task: Task, transitions: int) -> None:
         """Room for as many whole episodes as so many transitions make, and for one at least."""
         self._task, self._spec = task, task.spec
-        self.capacity, self.added = max(1, transitions // self._spec.horizon), 0
-        self._lost = 0  # episodes that were added and not taken over with a state
+        room = self._spec.empty(max(1, transitions // self._spec.horizon))
+        every = self._spec.every
+        super().__init__({f.name: Column(room[f.name], f.low, f.high) for f in every})
         self._moved = np.zeros(self.capacity, bool)
-        self._arrays = dict(self._spec.empty(self.capacity).arrays)
-
-    def __len__(self) -> int:
-        return min(self.added - self._lost, self.capacity)
 
     def add(self, episodes: Episodes) -> None:
         """Append episodes; the oldest make room."""
-        kept = min(episodes.count, self.capacity)
-        slots = (self.added + episodes.count - kept + np.arange(kept)) % self.capacity
-        for name, array in self._arrays.items():
-            array[slots] = episodes[name][episodes.count - kept :]
-        self.added += episodes.count
-        self._look(slots)
+        self._look(self.append(episodes.arrays))
 
     def _look(self, slots: Ints) -> None:
         """Note which episodes came to what would not have been reached at their start."""
-        achieved = self._arrays[self._spec.achieved][slots]
+        achieved = self.arrays[self._spec.achieved][slots]
         first, last = achieved[:, 0], achieved[:, -1]
         self._moved[slots] = self._task.rewards(first, last) < self._task.rewards(last, last)
 
@@ -79,9 +64,7 @@ class EpisodeReplay:
         Raises:
             ValueError: the replay is empty.
         """
-        if not len(self):
-            raise ValueError("cannot sample from an empty replay")
-        spec, arrays, task = self._spec, self._arrays, self._task
+        spec, arrays, task = self._spec, self.arrays, self._task
         rows = self._chosen(config, rng["replay"])
         steps = rng["replay"].integers(spec.horizon, size=config.batch_size)
         other = rng["hindsight"].random(config.batch_size) < config.relabel_share
@@ -106,69 +89,28 @@ class EpisodeReplay:
         Where little moves at first, most achieved goals are reached whatever is done, and teach
         nothing (after Zhao and Tresp 2018, who weigh episodes by energy).
         """
-        oldest, count = self.added - len(self), config.batch_size
-        rows = (oldest + rng.integers(len(self), size=count)) % self.capacity
-        moved = np.flatnonzero(self._moved)
+        rows, moved = self.drawn(config.batch_size, rng), np.flatnonzero(self._moved)
         if len(moved):
-            own = rng.random(count) < config.moved_share
+            own = rng.random(config.batch_size) < config.moved_share
             rows[own] = moved[rng.integers(len(moved), size=own.sum())]
         return rows
 
     def _seen(self, rows: Ints, moments: Ints, desired: Array) -> Arrays:
         """What was seen at these moments, with these goals."""
         seen = {
-            field.name: self._arrays[field.name][rows, moments]
+            field.name: self.arrays[field.name][rows, moments]
             if field.per == "moment"
-            else self._arrays[field.name][rows]
+            else self.arrays[field.name][rows]
             for field in self._spec.fields
             if field.per != "step"
         }
         return seen | {self._spec.desired: desired}
 
-    def state(self) -> dict[str, Array]:
-        """The kept episodes, as they lie (views), and the counter.
-
-        Episode n that was ever added lies at n modulo the number of those kept.
-        """
-        kept = len(self)
-        if kept < self.capacity and self._lost:  # a full ring that was given more room
-            slots = np.roll(
-                (self.added - kept + np.arange(kept)) % self.capacity, self.added % kept
-            )
-            arrays = {name: array[slots] for name, array in self._arrays.items()}
-        else:
-            arrays = {name: array[:kept] for name, array in self._arrays.items()}
-        return arrays | {_COUNTER: np.array([self.added], np.int64)}
-
     def load_state(self, state: Mapping[str, Array]) -> None:
-        """Take over a state; of more episodes than there is room for, the newest.
-
-        Raises:
-            RunError: arrays are missing, of another task, or beyond their bounds.
-        """
-        added = int(state[_COUNTER][0]) if _COUNTER in state else -1
-        kept = len(state.get("actions", ()))
-        for field in self._spec.every:
-            part, wanted = state.get(field.name), self._arrays[field.name]
-            if (
-                part is None
-                or part.shape != (kept, *wanted.shape[1:])
-                or part.dtype != wanted.dtype
-                or added < kept
-                or not ((field.low <= part) & (part <= field.high)).all()  # nor is a NaN
-            ):
-                raise RunError(
-                    f"replay state: '{field.name}' must be {wanted.dtype} "
-                    f"{(kept, *wanted.shape[1:])} within {field.low:g} and {field.high:g}: it is "
-                    "of another task, or damaged: start a new run"
-                )
-        order = np.roll(np.arange(kept), -(added % kept) if kept else 0)[-self.capacity :]
-        self.added, self._lost = added, added - len(order)
-        slots = (self._lost + np.arange(len(order))) % self.capacity
-        for name, array in self._arrays.items():
-            array[slots] = state[name][order]
+        """Take over a state, see `Ring`."""
+        super().load_state(state)
         self._moved[:] = False
-        self._look(slots)
+        self._look(self._slots())
 
 
 def later(steps: Ints, horizon: int, goals: tuple[str, ...], rng: np.random.Generator) -> Ints:

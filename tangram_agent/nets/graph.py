@@ -21,18 +21,17 @@ class Graph(Protocol):
 
     Attributes:
         tokens: K, in view.
+        corners: V, nodes before the first base.
         adjacency: (N, N) edges.
         features: F.
         inputs: numbers that a perceptron sees of a view.
     """
 
     tokens: int
+    corners: int
     adjacency: Tensor
-
-    @property
-    def features(self) -> int: ...  # noqa: D102
-    @property
-    def inputs(self) -> int: ...  # noqa: D102
+    features: int
+    inputs: int
 
     def node_features(self, view: Any, /) -> Tensor:
         """Features (M, N, F)."""
@@ -42,12 +41,6 @@ class Graph(Protocol):
 
     def base_node(self, view: Any, /) -> Tensor:
         """Node index (M,) of the base of the token that moves."""
-
-    def slot(self, view: Any, /) -> Tensor:
-        """(M,) which of the tokens in view moves."""
-
-    def velocity(self, view: Any, shift: Tensor, angle: Tensor, /) -> Tensor:
-        """The velocity (M, 3) of a shift (M, 2), as the token sees it, and a turn (M,) over pi."""
 
 
 def unit(angle: Tensor) -> Tensor:

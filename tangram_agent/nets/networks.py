@@ -63,12 +63,15 @@ class Head(nn.Module):
         Features, by `see`, may be handed in where they were made before.
         """
         seen = self.see(view) if features is None else features
+        base = self.graph.base_node(view)
+        rows = torch.arange(len(seen), device=seen.device)
         outputs: Tensor
         if not self.attends:
             outputs = self.layers(seen if action is None else torch.cat([seen, action], dim=-1))
-            return self._of_token(outputs, view)
-        base = self.graph.base_node(view)
-        rows = torch.arange(len(seen), device=seen.device)
+            if not self.at_base or self.graph.tokens == 1:
+                return outputs
+            groups = outputs.view(len(seen), self.graph.tokens, -1)
+            return groups[rows, base - self.graph.corners]
         if action is not None:
             # Other nodes than the base carry zeros there.
             appended = seen.new_zeros(*seen.shape[:2], action.shape[-1])
@@ -84,21 +87,14 @@ class Head(nn.Module):
         seen = self.graph.node_features if self.attends else self.graph.vectors
         return seen(view)
 
-    def _of_token(self, outputs: Tensor, view: Any) -> Tensor:
-        """The moving token's group of a perceptron's outputs."""
-        if not self.at_base or self.graph.tokens == 1:
-            return outputs
-        groups = outputs.view(len(outputs), self.graph.tokens, -1)
-        rows = torch.arange(len(groups), device=groups.device)
-        chosen: Tensor = groups[rows, self.graph.slot(view)]
-        return chosen
 
-
-def perceptron(inputs: int, hidden: tuple[int, ...], outputs: int) -> nn.Sequential:
-    """Linear layers with ReLU between."""
+def perceptron(
+    inputs: int, hidden: tuple[int, ...], outputs: int, norm: bool = False
+) -> nn.Sequential:
+    """Linear layers with ReLU between, each normalised before it where `norm` says so."""
     layers: list[nn.Module] = []
     for size in hidden:
-        layers += [nn.Linear(inputs, size), nn.ReLU()]
+        layers += [nn.Linear(inputs, size), *([nn.LayerNorm(size)] if norm else []), nn.ReLU()]
         inputs = size
     return nn.Sequential(*layers, nn.Linear(inputs, outputs))
 

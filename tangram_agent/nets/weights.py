@@ -1,16 +1,14 @@
 """A network's parameters as named arrays, and back."""
 
 from collections.abc import Collection, Mapping
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import nn
 
 from tangram_core.errors import RunError
+from tangram_core.spec import Array
 
-Array = npt.NDArray[Any]
 MOST = 1e6  # of a parameter's magnitude; what is learned stays far below
 
 

@@ -69,7 +69,7 @@ def test_equals_a_naive_oracle_under_random_operations(seed: int) -> None:
 @pytest.mark.parametrize(("added", "kept"), [(14, range(5, 15)), (6, range(1, 7))])
 def test_samples_every_kept_transition_alike_and_no_other(added: int, kept: range) -> None:
     replay = buffer(10)
-    with pytest.raises(ValueError, match="empty replay buffer"):
+    with pytest.raises(ValueError, match="empty replay"):
         replay.sample(1, np.random.default_rng(0))
     replay.add(numbered(1, added))
     drawn = replay.sample(2000 * len(kept), np.random.default_rng(0)).reward
@@ -82,9 +82,9 @@ def test_samples_every_kept_transition_alike_and_no_other(added: int, kept: rang
 @pytest.mark.parametrize(
     ("name", "value", "reason"),
     [
-        ("reward", np.nan, "'reward' holds numbers that are not finite"),
-        ("goal", np.inf, "'goal' holds numbers that are not finite"),
-        ("done", 2, "'done' holds flags other than 0 and 1"),
+        ("reward", np.nan, "'reward' must be float32"),
+        ("goal", np.inf, "'goal' must be float32"),
+        ("done", 2, "'done' must be uint8 .* within 0 and 1"),
     ],
 )
 def test_bad_numbers_are_found_and_not_taken_over(name: str, value: float, reason: str) -> None:
@@ -98,11 +98,11 @@ def test_bad_numbers_are_found_and_not_taken_over(name: str, value: float, reaso
         buffer(4).load_state(replay.state())
 
 
-@pytest.mark.parametrize("name", ["reward", "state", "counters", None])
+@pytest.mark.parametrize("name", ["reward", "state", "added", None])
 def test_a_state_with_a_missing_column_or_of_another_layout_is_refused(name: str | None) -> None:
     replay = buffer(4)
     replay.add(numbered(0, 2))
     state = {own: column for own, column in replay.state().items() if own != name}
     other = buffer(4) if name else ReplayBuffer(4, 4, 1, 3)
-    with pytest.raises(RunError, match="does not fit the layout"):
+    with pytest.raises(RunError, match="it is of other tokens"):
         other.load_state(state)

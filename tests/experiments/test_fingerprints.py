@@ -104,7 +104,7 @@ def fingerprint(setup: Setup, moved_by: int | None = None) -> dict[str, float]:
 
 def every_weight(trainer: Trainer) -> list[torch.Tensor]:
     """Of actor, critic and what else learns."""
-    lists = trainer.learner.parameter_lists()
+    lists = trainer.learner.lists
     return [one for name in sorted(lists) for one in lists[name]]
 
 

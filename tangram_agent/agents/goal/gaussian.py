@@ -10,7 +10,8 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from tangram_agent.flat.config import BaseConfig
-from tangram_agent.flat.networks import Policy, perceptron
+from tangram_agent.flat.networks import Policy
+from tangram_agent.nets.networks import perceptron
 
 LOWEST, HIGHEST = -5.0, 2.0  # of the logarithm of a deviation
 

@@ -5,7 +5,7 @@ Legend: B environments, G rows of an outline.
 
 import numpy as np
 
-from tangram_agent.agents.outline.config import OutlineConfig
+from tangram_agent.agents.outline.agent import OutlineConfig
 from tangram_agent.agents.outline.filler import Filler
 from tangram_agent.agents.outline.filling import Filling
 from tangram_agent.agents.outline.values import OutlineValue

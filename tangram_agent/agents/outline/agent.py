@@ -3,13 +3,11 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, cast
 
-from tangram_agent.agents.outline.config import OutlineConfig
-from tangram_agent.base.checks import check_capacity
-from tangram_agent.base.config import NetConfig
-from tangram_core.agent import Agent, Pace
+from tangram_agent.base.agent import TokenAgent
+from tangram_agent.base.config import LearningConfig, NetConfig
 from tangram_core.errors import ConfigError
-from tangram_core.settings import refuse_ignored
-from tangram_core.task import Json, Task
+from tangram_core.settings import LEARNING, refuse_ignored, setting
+from tangram_core.task import Task
 from tangram_tasks.fill import Fill
 
 if TYPE_CHECKING:  # need torch
@@ -18,18 +16,27 @@ if TYPE_CHECKING:  # need torch
 
 
 @dataclass(frozen=True)
-class Outline(Agent):
+class OutlineConfig(LearningConfig, section="agent"):
+    """Q-learning over afterstates, with hindsight."""
+
+    beam: int = setting(
+        1,
+        "exploration off: lay all tokens in thought first, and follow so many fillings of each "
+        "depth, by the values of what would be left; 1: play what is best now",
+        low=1,
+        high=32,
+    )
+    polyak: float = setting(0.99, "rho of the target network, Eq. 4", low=0, high=1, part=LEARNING)
+    copies: int = setting(6, "states of hindsight for each episode", low=1, high=64, part=LEARNING)
+
+
+@dataclass(frozen=True)
+class Outline(TokenAgent):
     """It is told of no piece of the target."""
 
     sections: ClassVar = {"agent": OutlineConfig, "net": NetConfig}
 
     config: OutlineConfig
-    net: NetConfig
-
-    @property
-    def pace(self) -> Pace:
-        """As its settings say."""
-        return self.config.pace
 
     def check(self, task: Task) -> None:
         """It fills outlines, by attention."""
@@ -37,7 +44,7 @@ class Outline(Agent):
             raise ConfigError("agent.kind=outline fills outlines: set task=fill, or another agent")
         if self.net.kind == "mlp":
             refuse_ignored("net.kind=mlp", "outlines", "set net.kind=mha")
-        check_capacity(task, self.config.replay_capacity)
+        super().check(task)
 
     def check_training(self, *, compiled: bool = False) -> None:
         """Refuse what is for play alone, and to compile."""
@@ -55,16 +62,8 @@ class Outline(Agent):
 
         return OutlineActor(cast("Fill", task), self.config, self.net)
 
-    def learner(
-        self, task: Task, seed: int, device: str = "cpu", *, compiled: bool = False
-    ) -> "FillLearner":
-        """See `Agent.learner`."""
+    def learns(self) -> "type[FillLearner]":
+        """With a value alone."""
         from tangram_agent.agents.outline.learner import FillLearner  # noqa: PLC0415
 
-        if compiled:
-            self.check_training(compiled=True)
-        return FillLearner(cast("Fill", task), self.config, self.net, seed, device)
-
-    def facts(self) -> Json:
-        """Its preset and its network."""
-        return {"agent": self.config.name, "net": self.net.kind}
+        return FillLearner

@@ -6,7 +6,6 @@ Legend: B environments, K tokens, V corners, G rows of an outline.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import shapely
@@ -30,14 +29,6 @@ from tangram_tasks.fill import Fill
 
 _ANGLES = 8  # that a token is tried at where nothing fits
 _FREE = 0.5  # of what a token may cover of others
-
-
-@dataclass(frozen=True, eq=False)
-class _State:
-    """What is left in an environment, and the places that led here from what there is now."""
-
-    row: int
-    places: tuple[Place, ...]
 
 
 class Fillable:
@@ -97,11 +88,12 @@ class Filler:
                 f"{goals.shape}: give rows that tangram_sim.geometry.rings.as_rows makes"
             )
         rests = [self._filling.rest(goals[b], corners[b], placed[b]) for b in range(count)]
-        every = [self._live(rests[b], self._filling.left(~placed[b])) for b in range(count)]
+        every = [
+            self._filling.places(rests[b], self._filling.left(~placed[b])) for b in range(count)
+        ]
         wanted_of = [[] if anything[b] else every[b] for b in range(count)]
         beam = 1 if len(generators) else self._beam
-        # A beam of one plays what is best now, and looks no further.
-        plans = self._plans(wanted_of, beam, 1 if beam == 1 else None)
+        plans = self._plans(wanted_of, beam)
         token, flip = np.zeros(count, np.int64), np.zeros(count, np.bool_)
         wanted, here = np.zeros((count, 3)), self._layout.poses(corners)
         sides = self._layout.flipped(corners)
@@ -118,9 +110,6 @@ class Filler:
         velocity = np.clip(velocities_of(way, self._sim), -1.0, 1.0).astype(np.float32)
         return Choice(token, flip, velocity)
 
-    def _live(self, rest: Area, left: tuple[int, ...]) -> list[Place]:
-        return [place for place in self._filling.places(rest, left) if not place.dead]
-
     def values(self, places: Sequence[Place]) -> Floats:
         """How surely what is left can be filled, as logits; a filled one is surest."""
         found = np.full(len(places), np.inf)
@@ -130,38 +119,32 @@ class Filler:
             found[still] = self._fillable(rests, [places[i].left for i in still])
         return found
 
-    def plan(self, rest: Area, left: tuple[int, ...], beam: int) -> list[Place]:
-        """The places that lead furthest, to the end, by a beam of such a width."""
-        (found,) = self._plans([self._live(rest, left)], beam)
-        return list(found)
-
-    def _plans(
-        self, every: Sequence[list[Place]], beam: int, steps: int | None = None
-    ) -> list[tuple[Place, ...]]:
+    def _plans(self, every: Sequence[list[Place]], beam: int) -> list[tuple[Place, ...]]:
         """Of each environment the places that lead furthest; none where there are none.
 
         Args:
             every: what may be laid now.
-            beam: states of each depth that are followed.
-            steps: how far; None: to the end.
+            beam: states of each depth that are followed; one plays what is best now, and looks no
+                further.
         """
         found: list[tuple[Place, ...]] = [()] * len(every)
-        states = [_State(b, (one,)) for b, places in enumerate(every) for one in places]
+        states: list[tuple[int, tuple[Place, ...]]]
+        states = [(b, (one,)) for b, places in enumerate(every) for one in places]
         while states:
-            values = self.values([state.places[-1] for state in states])
-            kept: list[_State] = []
-            for b in {state.row for state in states}:
-                own = [i for i, state in enumerate(states) if state.row == b]
+            values = self.values([places[-1] for _, places in states])
+            kept = []
+            for b in {row for row, _ in states}:
+                own = [i for i, (row, _) in enumerate(states) if row == b]
                 own = [own[i] for i in np.argsort(-values[own], kind="stable")[:beam]]
-                found[b] = states[own[0]].places
+                found[b] = states[own[0]][1]
                 if not found[b][-1].filled:
                     kept += [states[i] for i in own]
-            if len(kept) and len(kept[0].places) == steps:
+            if beam == 1:
                 break
             states = [
-                _State(state.row, (*state.places, place))
-                for state in kept
-                for place in self._live(state.places[-1].rest, state.places[-1].left)
+                (b, (*places, place))
+                for b, places in kept
+                for place in self._filling.places(places[-1].rest, places[-1].left)
             ]
         return found
 
@@ -173,12 +156,13 @@ class Filler:
         if laid is None:
             token = int(left[0]) if len(left) else 0
             return token, here[token]
-        alike = [token for token in self._filling.tokens_of(laid.shape) if not placed[token]]
-        far = [
-            (bool(sides[token] != laid.flipped), float(np.hypot(*(here[token] - laid.pose)[:2])))
-            for token in alike
-        ]
-        return alike[min(range(len(alike)), key=far.__getitem__)], laid.pose
+        alike = np.flatnonzero(~placed & (self._filling.shape_of == laid.shape)).tolist()
+
+        def far(token: int) -> tuple[bool, float]:
+            way = here[token] - laid.pose
+            return bool(sides[token] != laid.flipped), float(np.hypot(*way[:2]))
+
+        return min(alike, key=far), laid.pose
 
     def _rough(self, rest: Area, corners: Floats, placed: Bools) -> Laid | None:
         """Where a token that is left covers most of what is left; None if it covers others."""
@@ -187,7 +171,7 @@ class Filler:
             for part in polygons(rest):
                 for angle in np.arange(_ANGLES) * (2.0 * np.pi / _ANGLES):
                     pose = np.array([part.centroid.x, part.centroid.y, angle])
-                    laid.append(Laid(self._filling.shape_of(token), bool(sides[token]), pose))
+                    laid.append(Laid(int(self._filling.shape_of[token]), bool(sides[token]), pose))
                     tried.append((token, pose))
         if not tried:
             return None

@@ -53,19 +53,20 @@ class Rests:
         return np.asarray((self.part != UNUSED).any(axis=1))
 
     @staticmethod
-    def empty(count: int, corners: int, shapes: int) -> "Rests":
+    def empty(count: tuple[int, ...], corners: int, shapes: int) -> "Rests":
         """States of no corners."""
         return Rests(
-            np.zeros((count, corners, 2), np.float32),
-            np.tile(np.arange(corners, dtype=np.uint8), (count, 1)),
-            np.full((count, corners), UNUSED, np.uint8),
-            np.zeros((count, shapes), np.uint8),
+            np.zeros((*count, corners, 2), np.float32),
+            np.tile(np.arange(corners, dtype=np.uint8), (*count, 1)),
+            np.full((*count, corners), UNUSED, np.uint8),
+            np.zeros((*count, shapes), np.uint8),
         )
 
     @staticmethod
     def joined(every: list["Rests"]) -> "Rests":
         """States one after the other."""
-        return Rests(*(np.concatenate(parts) for parts in zip(*map(_parts, every), strict=True)))
+        columns = zip(*(vars(one).values() for one in every), strict=True)
+        return Rests(*map(np.concatenate, columns))
 
     def turned(self, generator: np.random.Generator) -> "Rests":
         """The same states, each turned by some eighths and half of them seen in a mirror.
@@ -84,11 +85,12 @@ class Rests:
 
     def at(self, rows: Ints | Bools | slice) -> "Rests":
         """Some of the states."""
-        return Rests(*(part[rows] for part in _parts(self)))
+        return Rests(*(part[rows] for part in vars(self).values()))
 
-
-def _parts(rests: Rests) -> tuple[AnyArray, ...]:
-    return rests.points, rests.follow, rests.part, rests.left
+    @property
+    def flat(self) -> "Rests":
+        """Rows of states (n, M), one state after the other."""
+        return Rests(*(part.reshape(-1, *part.shape[2:]) for part in vars(self).values()))
 
 
 class Filling:
@@ -98,29 +100,22 @@ class Filling:
         tokens: K.
         corners: N.
         shapes: S.
+        shape_of: (K,) the number of each token's shape.
     """
 
     def __init__(self, layout: Layout) -> None:
         self._layout, self._tokens = layout, Tokens(layout)
         self._tolerance = TOLERANCE * self._tokens.unit
         self._search = Search(self._tokens, self._tolerance, Budget(np.inf))
-        self._shape: Ints = np.zeros(layout.tokens, np.int64)
+        self.shape_of: Ints = np.zeros(layout.tokens, np.int64)
         for shape, tokens in enumerate(self._tokens.own):
-            self._shape[list(tokens)] = shape
+            self.shape_of[list(tokens)] = shape
         self.tokens, self.shapes = layout.tokens, len(self._tokens.own)
         self.corners = layout.corner_count + layout.tokens
 
-    def shape_of(self, token: int) -> int:
-        """The number of a token's shape."""
-        return int(self._shape[token])
-
-    def tokens_of(self, shape: int) -> tuple[int, ...]:
-        """The tokens of a shape."""
-        return self._tokens.own[shape]
-
     def left(self, tokens: Bools) -> tuple[int, ...]:
         """How many of each shape there are among tokens (K,)."""
-        return tuple(np.bincount(self._shape[tokens], minlength=self.shapes).tolist())
+        return tuple(np.bincount(self.shape_of[tokens], minlength=self.shapes).tolist())
 
     def inside(self, corners: AnyArray, outline: AnyArray) -> Bools:
         """(K,) tokens with corners (V, 2) that lie in an outline (G, 2), all but for a little."""
@@ -156,12 +151,12 @@ class Filling:
         return self._search.fits(self.rest(outline, corners, laid), self.left(~laid))
 
     def places(self, rest: Area, left: tuple[int, ...]) -> list[Place]:
-        """What may be laid next, see `Search.places`."""
-        return self._search.places(rest, left)
+        """What may be laid next so that it can still be filled, see `Search.places`."""
+        return [place for place in self._search.places(rest, left) if not place.dead]
 
     def seen(self, rest: Area, left: tuple[int, ...]) -> Rests:
         """One state; empty where it has too many corners."""
-        found = Rests.empty(1, self.corners, self.shapes)
+        found = Rests.empty((1,), self.corners, self.shapes)
         found.left[0] = left
         every = rings(rest, self._tolerance)
         if not every or sum(len(z) for z, _, _ in every) > self.corners:

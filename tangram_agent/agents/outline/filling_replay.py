@@ -8,26 +8,22 @@ that it could have gone on to.
 Legend: E episodes, T steps, n rows, M places, K tokens, N corners, S shapes.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, fields
 
 import numpy as np
-import numpy.typing as npt
 from shapely.errors import GEOSException
 
-from tangram_agent.agents.outline.filling import MOST_PLACES, UNUSED, Filling, Rests
+from tangram_agent.agents.outline.filling import MOST_PLACES, Filling, Rests
+from tangram_agent.base.ring import Column, Ring
 from tangram_agent.base.types import Flags
 from tangram_core.arrays import Bools, Ints
-from tangram_core.errors import RunError
-from tangram_core.spec import Episodes
+from tangram_core.spec import Array, Arrays, Episodes
 from tangram_sim.geometry.areas import Area
 from tangram_sim.geometry.layout import Layout
 
-Array = npt.NDArray[Any]
 OPEN, FILLED = 1, 2  # of a place; 0: there is none, or it is dead
-_COUNTERS = "counters"
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,15 +43,14 @@ class FillBatch:
     ends: Flags
 
     @property
-    def arrays(self) -> dict[str, Array]:
+    def arrays(self) -> Arrays:
         """All that it consists of, by name."""
-        states = {"filled": self.filled, "played": self.played, "places": self.places}
-        named = {f"{n}_{part}": one for n, own in states.items() for part, one in vars(own).items()}
-        return named | {"ends": self.ends}
+        states = _named("filled", self.filled) | _named("played", self.played)
+        return states | _named("places", self.places) | {"ends": self.ends}
 
 
 class FillReplay:
-    """Two rings over preallocated arrays: of states that were played and of those of hindsight.
+    """States that were played, with the places of each, and those of hindsight.
 
     Attributes:
         capacity: states kept of each.
@@ -71,15 +66,20 @@ class FillReplay:
         """
         self.capacity, self._copies = capacity, copies
         self._filling = Filling(layout)
-        size = self._filling.corners, self._filling.shapes
-        self._played = Rests.empty(self.capacity, *size)
-        self._places = Rests.empty(self.capacity * MOST_PLACES, *size)
-        self._ends = np.zeros((self.capacity, MOST_PLACES), np.uint8)
-        self._filled = Rests.empty(self.capacity, *size)
-        self._added = np.zeros(2, np.int64)  # played, filled
+        ends = Column(np.zeros((capacity, MOST_PLACES), np.uint8), 0, FILLED)
+        played = self._room("played") | self._room("places", MOST_PLACES) | {"ends": ends}
+        self._played = Ring(played, "played")
+        self._filled = Ring(self._room("filled"), "filled")
+
+    def _room(self, name: str, *each: int) -> dict[str, Column]:
+        """For so many states in each row."""
+        corners = self._filling.corners
+        empty = Rests.empty((self.capacity, *each), corners, self._filling.shapes)
+        bounds = {f"{name}_follow": (0, corners - 1)}
+        return {n: Column(part, *bounds.get(n, ())) for n, part in _named(name, empty).items()}
 
     def __len__(self) -> int:
-        return min(int(self._added.min()), self.capacity)
+        return min(len(self._played), len(self._filled))
 
     def insert(self, episodes: Episodes, generator: np.random.Generator) -> int:
         """Take in episodes as they were played, and what their tokens came to cover.
@@ -118,9 +118,7 @@ class FillReplay:
                 break  # nothing fitted any more
             rest = filling.rest(goal, corners[step], laid)
             self._add_played(rest, filling.left(~laid), solved)
-        for seen in filled:
-            _put(self._filled, int(self._added[1]) % self.capacity, seen)
-            self._added[1] += 1
+        self._filled.append(_named("filled", Rests.joined(filled)))
         return True
 
     def _hindsight(self, corners: Array, own: Ints, generator: np.random.Generator) -> list[Rests]:
@@ -138,17 +136,18 @@ class FillReplay:
         state = self._filling.seen(rest, left)
         if not state.known.all():
             return
-        row = int(self._added[0]) % self.capacity
-        places = [place for place in self._filling.places(rest, left) if not place.dead]
-        _put(self._played, row, state)
-        self._ends[row] = 0
-        for i, place in enumerate(places[:MOST_PLACES]):
-            seen = self._filling.seen(place.rest, place.left)
-            self._ends[row, i] = FILLED if place.filled else OPEN * bool(seen.known.all())
-            _put(self._places, row * MOST_PLACES + i, seen)
+        places = self._filling.places(rest, left)
+        ends = np.zeros((1, MOST_PLACES), np.uint8)
+        seen = [self._filling.seen(place.rest, place.left) for place in places[:MOST_PLACES]]
+        for i, (place, one) in enumerate(zip(places, seen, strict=False)):
+            ends[0, i] = FILLED if place.filled else OPEN * bool(one.known.all())
         if solved and places:  # no matter by which place: a state is worth its best one
-            self._ends[row, 0] = FILLED
-        self._added[0] += 1
+            ends[0, 0] = FILLED
+        more = (MOST_PLACES - len(seen),)
+        none = Rests.empty(more, self._filling.corners, self._filling.shapes)
+        each = _named("places", Rests.joined([*seen, none]))
+        row = {name: part[None] for name, part in each.items()}
+        self._played.append(_named("played", state) | row | {"ends": ends})
 
     def sample(self, size: int, generator: np.random.Generator) -> FillBatch:
         """`size` states, half of them of hindsight, drawn uniformly with replacement.
@@ -156,70 +155,33 @@ class FillReplay:
         Raises:
             ValueError: there are none of one kind.
         """
-        if not len(self):
-            raise ValueError("cannot sample from an empty replay buffer")
-        kept = np.minimum(self._added, self.capacity)
-        played = generator.integers(kept[0], size=size - size // 2)
-        filled = generator.integers(kept[1], size=size // 2)
-        places = (played[:, None] * MOST_PLACES + np.arange(MOST_PLACES)).ravel()
+        played = self._played.drawn(size - size // 2, generator)
+        filled = self._filled.drawn(size // 2, generator)
         return FillBatch(
-            self._filled.at(filled).turned(generator),
-            self._played.at(played).turned(generator),
-            self._places.at(places),
-            self._ends[played],
+            _of("filled", self._filled, filled).turned(generator),
+            _of("played", self._played, played).turned(generator),
+            _of("places", self._played, played).flat,
+            self._played.arrays["ends"][played],
         )
-
-    def _columns(self) -> Iterator[tuple[str, Array, int, int]]:
-        """Name, column, rows that a state takes in it, and which counter counts these."""
-        for name, rests, rows, counter in (
-            ("played", self._played, 1, 0),
-            ("places", self._places, MOST_PLACES, 0),
-            ("filled", self._filled, 1, 1),
-        ):
-            for part, column in vars(rests).items():
-                yield f"{name}_{part}", column, rows, counter
-        yield "ends", self._ends, 1, 0
 
     def state(self) -> dict[str, Array]:
         """The kept states and the counters, as arrays for a checkpoint (mostly views)."""
-        kept = np.minimum(self._added, self.capacity)
-        columns = {name: column[: kept[c] * n] for name, column, n, c in self._columns()}
-        return columns | {_COUNTERS: self._added.copy()}
+        return self._played.state() | self._filled.state()
 
     def load_state(self, state: Mapping[str, Array]) -> None:
-        """Take over a state from `state()`.
-
-        Raises:
-            RunError: columns are missing, of another layout, type or capacity, or hold what no
-                state has.
-        """
-        added = np.asarray(state.get(_COUNTERS, ()), np.int64)
-        if added.shape != (2,) or (added < 0).any():
-            raise RunError("replay state: no counters: not a replay of outlines")
-        kept = np.minimum(added, self.capacity)
-        for name, column, rows, counter in self._columns():
-            part, shape = state.get(name), (int(kept[counter]) * rows, *column.shape[1:])
-            if part is None or part.shape != shape or part.dtype != column.dtype:
-                raise RunError(
-                    f"replay state: '{name}' does not fit (expected {column.dtype} {shape}): was "
-                    "the checkpoint written with other tokens or another agent.replay_capacity?"
-                )
-            column[: len(part)] = part
-        self._added = added
-        self.check_valid()
+        """Take over a state, see `Ring`."""
+        self._played.load_state(state)
+        self._filled.load_state(state)
 
     def check_valid(self) -> None:
         """Raise RunError unless every kept number is finite and every index within its bounds."""
-        for rests in (self._played, self._places, self._filled):
-            used = rests.part[rests.part != UNUSED]
-            if not np.isfinite(rests.points).all():
-                raise RunError("replay buffer: corners that are not finite")
-            if max(rests.follow.max(), used.max(initial=0)) >= self._filling.corners:
-                raise RunError("replay buffer: an index beyond the corners")
-        if self._ends.max() > FILLED:
-            raise RunError("replay buffer: 'ends' holds what no place has")
+        self._played.check_valid()
+        self._filled.check_valid()
 
 
-def _put(rests: Rests, row: int, one: Rests) -> None:
-    for name, column in vars(rests).items():
-        column[row] = getattr(one, name)[0]
+def _named(name: str, rests: Rests) -> dict[str, Array]:
+    return {f"{name}_{part}": array for part, array in vars(rests).items()}
+
+
+def _of(name: str, ring: Ring, rows: Ints) -> Rests:
+    return Rests(*(ring.arrays[f"{name}_{part.name}"][rows] for part in fields(Rests)))

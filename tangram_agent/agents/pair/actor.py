@@ -5,7 +5,7 @@ Legend: B environments, K tokens, A entries of an action.
 
 import numpy as np
 
-from tangram_agent.agents.pair.config import PairConfig
+from tangram_agent.agents.pair.agent import PairConfig
 from tangram_agent.agents.pair.networks import Networks
 from tangram_agent.agents.pair.planning import Planner
 from tangram_agent.base.acting import NetworkActor

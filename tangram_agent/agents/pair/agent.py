@@ -3,12 +3,10 @@
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, ClassVar, cast
 
-from tangram_agent.agents.pair.config import PairConfig
-from tangram_agent.base.checks import check_capacity, seen_tokens
-from tangram_agent.base.config import NetConfig
-from tangram_core.agent import Agent, Pace
-from tangram_core.settings import refuse_ignored, told
-from tangram_core.task import Json, Task
+from tangram_agent.base.agent import TokenAgent, seen_tokens
+from tangram_agent.base.config import ActorCriticConfig, NetConfig
+from tangram_core.settings import NETWORK, refuse_ignored, setting, told
+from tangram_core.task import Task
 from tangram_sim.config import RewardConfig
 from tangram_tasks.place import Place
 
@@ -18,23 +16,33 @@ if TYPE_CHECKING:  # need torch
 
 
 @dataclass(frozen=True)
-class Pair(Agent):
+class PairConfig(ActorCriticConfig, section="agent"):
+    """DDPG on pairs of a token and a piece of the target."""
+
+    motion: str = setting(
+        "learned",
+        "what a command comes to: learned from the replay, and watched in each episode; or the "
+        "exact rigid motion",
+        choices=("learned", "exact"),
+        part=NETWORK,
+    )
+    reapply: int = setting(
+        2, "times that the actor is applied again to what it proposed", low=0, high=100
+    )
+
+
+@dataclass(frozen=True)
+class Pair(TokenAgent):
     """Learns the angle, too, and any number of tokens with one network."""
 
     sections: ClassVar = {"agent": PairConfig, "net": NetConfig}
 
     config: PairConfig
-    net: NetConfig
-
-    @property
-    def pace(self) -> Pace:
-        """As its settings say."""
-        return self.config.pace
 
     def check(self, task: Task) -> None:
         """It plays tokens whose target is seen; what several of them cannot use is refused."""
         place = seen_tokens(task, "pair")
-        check_capacity(place, self.config.replay_capacity)
+        super().check(task)
         if place.layout.tokens > 1:
             self._check_credit(place, f"{place.layout.tokens} tokens on pairs")
 
@@ -56,14 +64,8 @@ class Pair(Agent):
 
         return PairActor(cast("Place", task), self.config, self.net)
 
-    def learner(
-        self, task: Task, seed: int, device: str = "cpu", *, compiled: bool = False
-    ) -> "PairLearner":
-        """See `Agent.learner`."""
+    def learns(self) -> "type[PairLearner]":
+        """With actor and critic."""
         from tangram_agent.agents.pair.learner import PairLearner  # noqa: PLC0415
 
-        return PairLearner(cast("Place", task), self.config, self.net, seed, device, compiled)
-
-    def facts(self) -> Json:
-        """Its preset and its network."""
-        return {"agent": self.config.name, "net": self.net.kind}
+        return PairLearner

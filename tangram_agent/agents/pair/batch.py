@@ -11,7 +11,7 @@ from tangram_agent.agents.pair.coverage import Lying, covered_share, covering, l
 from tangram_agent.base.config import RelabelConfig
 from tangram_agent.base.relabelling import spread
 from tangram_agent.base.types import Flags, Transitions
-from tangram_core.arrays import Bools, Floats, Ints, Singles
+from tangram_core.arrays import Floats, Ints, Singles
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.motion.actions import chosen_tokens
 
@@ -27,32 +27,22 @@ class PairBatch:
     """M pairs as they were before and after an action, and what that is worth.
 
     Attributes:
-        before, after: (M, 3) poses of the token.
-        start: (M, 3) where the actor is asked from: mostly before, else where it came to, to mend
-            what it proposed itself: nobody plays that, as starts are far from targets.
-        before_flipped, after_flipped, start_flipped: (M,) whether it lay on its other side.
+        before, after: the token that moved.
+        start: where the actor is asked from: mostly before, else where it came to, to mend what it
+            proposed itself: nobody plays that, as starts are far from targets.
         velocity: (M, 3) of the action.
-        token: (M,) which moved.
-        goal: (M, 3) pose of the target's piece.
-        goal_flipped: (M,) its side.
-        piece: (M,) its index.
+        piece: of the target.
         covered: (M,) share of the piece that was covered before the action.
         reward: (M,) what the action is worth: with several tokens what the token covers newly of
             the piece, over the larger of both areas; with one the environment's reward.
         done: (M,) 1 where nothing follows.
     """
 
-    before: Floats
-    after: Floats
-    start: Floats
-    before_flipped: Bools
-    after_flipped: Bools
-    start_flipped: Bools
+    before: Lying
+    after: Lying
+    start: Lying
     velocity: Singles
-    token: Ints
-    goal: Floats
-    goal_flipped: Bools
-    piece: Ints
+    piece: Lying
     covered: Floats
     reward: Floats
     done: Flags
@@ -78,33 +68,23 @@ def make_pairs(
     before = lying(batch.state, layout, rows, token)
     after = lying(batch.next_state, layout, rows, token)
     if several:
-        strategy = _strategies(hindsight, len(rows), generator)
-        piece, covered = _played(batch, layout, rows, token, generator)
-        _Relabelled(hindsight, layout, generator).replace(piece, covered, after, strategy)
+        # One part for the goals that were played, then as many for each kind as it has copies.
+        parts = np.array([1, *(relabel.copies for relabel in hindsight)])
+        strategy = generator.choice(len(parts), size=len(rows), p=parts / parts.sum())
+        # Any piece of the goals that were played, and what others covered of it before.
+        piece = lying(batch.goal, layout, rows, generator.integers(layout.tokens, size=len(rows)))
+        table = covered_share(covering(batch.state, batch.goal, layout), layout)
+        covered = table[rows, token, piece.index]
+        _relabel(piece, covered, after, strategy, hindsight, layout, generator)
         reward, done = newly_covered(after, piece, covered, layout), np.ones(len(rows), np.uint8)
     else:
         piece, covered = lying(batch.goal, layout, rows, token), np.zeros(len(rows))
         # Most goals are where the token came to lie: else it would know them by its own turn.
         piece.pose[:, 2] += _alike(piece.index, layout, generator)
         reward, done = batch.reward.astype(np.float64), batch.done
-    again = generator.random(len(rows)) < _CORRECTED
-    start = after.instead(before, ~again)
-    return PairBatch(
-        before=before.pose,
-        after=after.pose,
-        start=start.pose,
-        before_flipped=before.flipped,
-        after_flipped=after.flipped,
-        start_flipped=start.flipped,
-        velocity=batch.action[rows, -3:],
-        token=token,
-        goal=piece.pose,
-        goal_flipped=piece.flipped,
-        piece=piece.index,
-        covered=covered,
-        reward=reward,
-        done=done,
-    )
+    start = after.instead(before, generator.random(len(rows)) >= _CORRECTED)
+    velocity = batch.action[rows, -3:]
+    return PairBatch(before, after, start, velocity, piece, covered, reward, done)
 
 
 def _alike(piece: Ints, layout: Layout, generator: np.random.Generator) -> Floats:
@@ -114,67 +94,33 @@ def _alike(piece: Ints, layout: Layout, generator: np.random.Generator) -> Float
     return turn
 
 
-def _strategies(
-    hindsight: tuple[RelabelConfig, ...], count: int, generator: np.random.Generator
-) -> Ints:
-    """(M,) 0 for the goal that was played, i for the i-th kind of hindsight."""
-    parts = np.array([1, *(relabel.copies for relabel in hindsight)])
-    return generator.choice(len(parts), size=count, p=parts / parts.sum())
+def _relabel(
+    piece: Lying,
+    covered: Floats,
+    after: Lying,
+    strategy: Ints,
+    hindsight: tuple[RelabelConfig, ...],
+    layout: Layout,
+    generator: np.random.Generator,
+) -> None:
+    """Put hindsight in the place of pieces (M,): where the token came to lie, or near.
 
-
-def _played(
-    batch: Transitions, layout: Layout, rows: Ints, token: Ints, generator: np.random.Generator
-) -> tuple[Lying, Floats]:
-    """Any piece (M,) of the goals that were played, and what others covered of it before (M,)."""
-    piece = generator.integers(layout.tokens, size=len(rows))
-    table = covering(batch.state, batch.goal, layout)
-    return lying(batch.goal, layout, rows, piece), covered_share(table, layout)[rows, token, piece]
-
-
-class _Relabelled:
-    """Goals of hindsight: pieces where the token came to lie, or near."""
-
-    def __init__(
-        self,
-        hindsight: tuple[RelabelConfig, ...],
-        layout: Layout,
-        generator: np.random.Generator,
-    ) -> None:
-        self._layout, self._generator = layout, generator
-        # One row per strategy, the goal that was played first.
-        self._spread = np.array([(0.0, 0.0, 0.0), *map(spread, hindsight)])
-
-    def replace(self, piece: Lying, covered: Floats, after: Lying, strategy: Ints) -> None:
-        """Put hindsight in the place of the pieces (M,) whose strategy is not to keep them."""
-        hind = np.flatnonzero(strategy)
-        index = self._pieces(after.index[hind], piece.index[hind])
-        piece.index[hind] = index
-        piece.pose[hind] = self._goals(after.pose[hind], index, strategy[hind])
-        piece.flipped[hind] = self._sides(after.flipped[hind], index)
-        covered[hind] = self._covered(len(hind))
-
-    def _pieces(self, token: Ints, other: Ints) -> Ints:
-        """(M,) mostly a piece of the token's own shape, else the other one."""
-        alike, counts = _same_shapes(self._layout)
-        own = alike[token, self._generator.integers(counts[token])]
-        return np.where(self._generator.random(len(token)) < _OTHER_SHAPE, other, own)
-
-    def _goals(self, after: Floats, piece: Ints, strategy: Ints) -> Floats:
-        """(M, 3) at the achieved pose or near it, at any of the turns that look alike."""
-        draw = self._generator.standard_normal(after.shape) * self._spread[strategy]
-        goal: Floats = after + draw
-        goal[:, 2] += _alike(piece, self._layout, self._generator)
-        return goal
-
-    def _sides(self, after: Bools, piece: Ints) -> Bools:
-        """(M,) mostly the token's own side, where the piece has two."""
-        other = self._generator.random(len(piece)) < _OTHER_SIDE
-        return np.asarray((after ^ other) & self._layout.chiral[piece])
-
-    def _covered(self, count: int) -> Floats:
-        """(M,) mostly nothing, else any share."""
-        share = self._generator.random(count)
-        return np.where(self._generator.random(count) < _COVERED, share, 0.0)
+    Strategy i, (M,), is its i-th kind; 0 keeps the piece. Mostly it becomes one of the token's own
+    shape and side, of which nothing is covered.
+    """
+    hind = np.flatnonzero(strategy)
+    size, token = len(hind), after.index[hind]
+    alike, counts = _same_shapes(layout)
+    own = alike[token, generator.integers(counts[token])]
+    index = np.where(generator.random(size) < _OTHER_SHAPE, piece.index[hind], own)
+    deviations = np.array([(0.0, 0.0, 0.0), *map(spread, hindsight)])[strategy[hind]]
+    pose = after.pose[hind] + generator.standard_normal((size, 3)) * deviations
+    pose[:, 2] += _alike(index, layout, generator)
+    other_side = generator.random(size) < _OTHER_SIDE
+    share = generator.random(size)
+    piece.index[hind], piece.pose[hind] = index, pose
+    piece.flipped[hind] = (after.flipped[hind] ^ other_side) & layout.chiral[index]
+    covered[hind] = np.where(generator.random(size) < _COVERED, share, 0.0)
 
 
 def _same_shapes(layout: Layout) -> tuple[Ints, Ints]:

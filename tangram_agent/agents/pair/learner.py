@@ -7,23 +7,20 @@ Legend: M pairs.
 """
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
 from tangram_agent.agents.pair.actor import critic_plays
+from tangram_agent.agents.pair.agent import Pair
 from tangram_agent.agents.pair.batch import PairBatch, make_pairs
-from tangram_agent.agents.pair.config import PairConfig
-from tangram_agent.agents.pair.motion import Fit, MotionModel, Motions, motions_of
+from tangram_agent.agents.pair.coverage import Lying
+from tangram_agent.agents.pair.motion import Fit, MotionModel, motions_of
 from tangram_agent.agents.pair.networks import Networks
 from tangram_agent.agents.pair.pairs import Pairs
-from tangram_agent.base.config import NetConfig
-from tangram_agent.base.ddpg import NUMBERS, Ddpg, Steps
-from tangram_agent.base.learning import read_slots, saved_slots
+from tangram_agent.base.ddpg import Ddpg, Steps
 from tangram_agent.base.types import Transitions
 from tangram_agent.nets.weights import under
 from tangram_core.agent import Streams, Tensors
-from tangram_core.arrays import Bools, Floats
 from tangram_core.errors import RunError
 from tangram_core.spec import Array
 from tangram_tasks.place import Place
@@ -41,57 +38,36 @@ class PairLearner(Ddpg):
     limit = 1.0  # pre-activations beyond it are clamped
 
     def __init__(
-        self,
-        task: Place,
-        config: PairConfig,
-        net: NetConfig,
-        seed: int,
-        device: str = "cpu",
-        compiled: bool = False,
+        self, agent: Pair, task: Place, seed: int, device: str, compiled: bool = False
     ) -> None:
-        learned = config.motion == "learned"
-        networks = Networks(task.layout, task.sim.arena, net, motion=learned)
+        learned, arena = agent.config.motion == "learned", task.sim.arena
+        networks = Networks(task.layout, arena, agent.net, motion=learned)
+        every = networks.actor, networks.critic, networks
         self.motion = networks.motion
+        others = {} if self.motion is None else {"motion": self.motion}
+        super().__init__(task, agent.config, every, seed, device, compiled, others)
+        if task.layout.tokens > 1:  # relabelled anew for every update
+            self.relabels = ()
         if self.motion is not None:
             self.streams = (*Ddpg.streams, "motion")
-        every = networks.actor, networks.critic, networks
-        super().__init__(task, config, every, seed, device, compiled)
-        self._fit = None if self.motion is None else Fit(self.motion, screens_motions(task))
-
-    def _more_parts(self) -> dict[str, Any]:
-        motion = {} if self.motion is None else {"motion": self.motion}
-        return super()._more_parts() | motion
-
-    @property
-    def relabels(self) -> tuple[Any, ...]:
-        """None with several tokens: those are relabelled anew for every update."""
-        return () if self.task.layout.tokens > 1 else self.config.hindsight
+            # In pictures of an exact world a motion far beside what is usual is that of a token
+            # which met others or was seen wrongly. Elsewhere it may be what that world does.
+            seen, several = task.sim.observe == "pictures", task.layout.tokens > 1
+            screened = seen and several and not task.sim.inexact
+            self.optimisers["motion"] = Fit(self.motion, screened)
 
     def update(self, share: float, rng: Streams) -> dict[str, float]:
         """As `Ddpg`, and one step of the model of motion.
 
         Its numbers come with motion_error and motion_noise (shares of full scale).
         """
-        self.batch = self.replay.sample(self.config.batch_size, rng["replay"])
-        steps = self.steps(self.batch, rng["hindsight"])
-        motions = None if self.motion is None else self._motions(rng["motion"])
-        return self.learn(steps, share, motions)
-
-    def learn(
-        self, steps: Steps, share: float = 0.0, motions: Motions | None = None
-    ) -> dict[str, float]:
-        """One step of all networks; see `Ddpg.learn`."""
-        values = {}
-        if self._fit is not None and motions is not None:
-            values = self._fit.step(motions.to(self.place))
-        found = self._step_all(steps, self.rates(share))
-        return self._counted(dict(zip(NUMBERS, found.unbind(), strict=True)) | values)
-
-    def _motions(self, generator: np.random.Generator) -> Motions:
-        """What whole episodes of the replay tell of the motion."""
-        task, steps = self.task, self.task.horizon
-        past, ends = self.replay.sample_episodes(max(1, SEEN_MOTIONS // steps), steps, generator)
-        return motions_of(past, ends.astype(np.float64), task.layout, task.sim)
+        told, task, steps = {}, self.task, self.task.horizon
+        if self.motion is not None:
+            count = max(1, SEEN_MOTIONS // steps)
+            past, ends = self.replay.sample_episodes(count, steps, rng["motion"])
+            motions = motions_of(past, ends.astype(np.float64), task.layout, task.sim)
+            told = self.optimisers["motion"].step(motions.to(self.place))
+        return self.learn(self.drawn(rng), share, told)
 
     def steps(self, batch: Transitions, generator: np.random.Generator) -> Steps:
         """Pairs of a batch."""
@@ -99,26 +75,27 @@ class PairLearner(Ddpg):
 
     def steps_of(self, batch: PairBatch) -> Steps:
         """Pairs as tensors."""
-        after = self._pairs(batch, batch.after, batch.after_flipped)
+        after = self._pairs(batch, batch.after)
         return Steps(
-            view=self._pairs(batch, batch.before, batch.before_flipped),
+            view=self._pairs(batch, batch.before),
             velocity=self.tensor(batch.velocity),
             reward=self.tensor(batch.reward),
             done=self.tensor(batch.done),
-            start=self._pairs(batch, batch.start, batch.start_flipped),
+            start=self._pairs(batch, batch.start),
             follow=self.if_any_follows(batch.done, after),
             seen_after=after,
         )
 
-    def _pairs(self, batch: PairBatch, pose: Floats, flipped: Bools) -> Pairs:
+    def _pairs(self, batch: PairBatch, token: Lying) -> Pairs:
         """The pairs (M,) with their tokens where they lay at some time."""
+        piece = batch.piece
         return Pairs(
-            pose=self.tensor(pose),
-            flipped=self.tensor(flipped),
-            token=self.index(batch.token),
-            goal=self.tensor(batch.goal),
-            goal_flipped=self.tensor(batch.goal_flipped),
-            piece=self.index(batch.piece),
+            pose=self.tensor(token.pose),
+            flipped=self.tensor(token.flipped),
+            token=self.tensor(token.index, np.int64),
+            goal=self.tensor(piece.pose),
+            goal_flipped=self.tensor(piece.flipped),
+            piece=self.tensor(piece.index, np.int64),
             covered=self.tensor(batch.covered),
         )
 
@@ -128,17 +105,6 @@ class PairLearner(Ddpg):
         if critic_plays(self.task):
             return every
         return {name: one for name, one in every.items() if not name.startswith("critic.")}
-
-    def state(self) -> dict[str, Array]:
-        """With what the model of motion has seen."""
-        fit = {} if self._fit is None else saved_slots("motion", self._fit.slots)
-        return super().state() | fit
-
-    def load_state(self, state: Mapping[str, Array]) -> None:
-        """Take over a state, the model of motion's too."""
-        super().load_state(state)
-        if self._fit is not None:
-            self._fit.load(read_slots("motion", state, self.place))
 
     def load_networks(self, state: Mapping[str, Array]) -> None:
         """Take over the networks of a state, and nothing else.
@@ -158,13 +124,3 @@ class PairLearner(Ddpg):
         if self.motion is not None:
             for model in (self.motion, self.acting.get_submodule("motion")):
                 model.load_state_dict(MotionModel().state_dict())
-
-
-def screens_motions(task: Place) -> bool:
-    """Whether a motion far beside what is usual tells nothing: of an exact world in pictures.
-
-    There it is that of a token which met others or was seen wrongly. Elsewhere it may be what that
-    world does.
-    """
-    sim = task.sim
-    return sim.observe == "pictures" and task.layout.tokens > 1 and not sim.inexact

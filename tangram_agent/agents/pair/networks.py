@@ -34,7 +34,7 @@ class ActorNet(nn.Module):
         Features are as for `Head`.
         """
         raw = self.head(pairs, features=features)
-        angle = torch.atan2(raw[:, 3], raw[:, 2]) / self.graph.symmetry_of(pairs) / math.pi
+        angle = torch.atan2(raw[:, 3], raw[:, 2]) / self.graph.symmetry[pairs.token] / math.pi
         return self.graph.velocity(pairs, raw[:, :2].clamp(-1.0, 1.0), angle), raw[:, :2]
 
 

@@ -68,9 +68,11 @@ class PairGraph(nn.Module):
 
     def __init__(self, layout: Layout, arena: float) -> None:
         super().__init__()
-        self.arena = arena
+        self._full_scale = arena, arena, math.pi
         self.corners = int(layout.padded_corners.shape[1])
         self.nodes = 2 * self.corners + 1
+        self.features = 9 + _ANGLES + 2 * _KINDS
+        self.inputs = 2 * (1 + 2 * self.corners) + _ANGLES + 2 * _KINDS + 4
         constants = {
             "body": torch.as_tensor(layout.body[layout.padded_corners], dtype=torch.float32),
             "symmetry": torch.tensor([float(shape.symmetry) for shape in layout.shapes]),
@@ -85,27 +87,9 @@ class PairGraph(nn.Module):
         for name, value in constants.items():
             self.register_buffer(name, value, persistent=False)
 
-    @property
-    def features(self) -> int:
-        """F."""
-        return 9 + _ANGLES + 2 * _KINDS
-
-    @property
-    def inputs(self) -> int:
-        """Numbers that a perceptron sees of a pair."""
-        return 2 * (1 + 2 * self.corners) + _ANGLES + 2 * _KINDS + 4
-
     def base_node(self, pairs: Pairs) -> Tensor:
         """Node index (M,) of the token's base."""
         return torch.full_like(pairs.token, self.corners)
-
-    def slot(self, pairs: Pairs) -> Tensor:
-        """(M,) which of the tokens in view moves: there is one."""
-        return torch.zeros_like(pairs.token)
-
-    def symmetry_of(self, pairs: Pairs) -> Tensor:
-        """(M,) symmetry order of the token."""
-        return self.symmetry[pairs.token]
 
     def relation(self, pairs: Pairs) -> tuple[Tensor, Tensor, Tensor]:
         """The piece as its token sees it.
@@ -114,32 +98,20 @@ class PairGraph(nn.Module):
             (M, 2) where its centre is, (M,) its angle, and (M,) 1 where it lies on the other side
             than the token.
         """
-        place, angle = self._seen(pairs, pairs.goal)
+        # Through the mirror y and angles change their sign.
+        sign = _signs(pairs.flipped)
+        shift = turn_back(pairs.goal[:, :2] - pairs.pose[:, :2], unit(pairs.pose[:, 2]))
+        place, angle = _mirrored(shift, sign), sign * (pairs.goal[:, 2] - pairs.pose[:, 2])
         # A shape that is its own mirror image is, through the mirror, turned by a known angle.
         chiral = self.chiral[pairs.piece]
         angle = angle + pairs.flipped * (1.0 - chiral) * self.mirror[pairs.piece]
         return place, angle, chiral * (pairs.flipped - pairs.goal_flipped).abs()
 
-    def _seen(self, pairs: Pairs, to: Tensor) -> tuple[Tensor, Tensor]:
-        """The shift (M, 2) and the turn (M,) to poses (M, 3) as tokens see them.
-
-        Through the mirror y and angles change their sign.
-        """
-        sign = _signs(pairs.flipped)
-        shift = turn_back(to[:, :2] - pairs.pose[:, :2], unit(pairs.pose[:, 2]))
-        return _mirrored(shift, sign), sign * (to[:, 2] - pairs.pose[:, 2])
-
-    def _to_arena(self, pairs: Pairs, vectors: Tensor) -> Tensor:
-        """Vectors (M, ..., 2) as tokens see them, in the arena's axes."""
-        apart = (...,) + (None,) * (vectors.dim() - 2)
-        sign, heading = _signs(pairs.flipped), unit(pairs.pose[:, 2])
-        by = heading.view(len(heading), *[1] * (vectors.dim() - 2), 2)
-        return turn(_mirrored(vectors, sign[apart]), by)
-
     def velocity(self, pairs: Pairs, shift: Tensor, angle: Tensor) -> Tensor:
         """The velocity (M, 3) of a shift (M, 2), as the token sees it, and a turn (M,) over pi."""
-        shift, angle = self._to_arena(pairs, shift), _signs(pairs.flipped) * angle
-        return torch.cat([shift, angle[:, None]], dim=-1).clamp(-1.0, 1.0)
+        sign = _signs(pairs.flipped)
+        shift = turn(_mirrored(shift, sign), unit(pairs.pose[:, 2]))
+        return torch.cat([shift, (sign * angle)[:, None]], dim=-1).clamp(-1.0, 1.0)
 
     def moved(self, pairs: Pairs, velocity: Tensor) -> Pairs:
         """The pairs after the exact rigid motion of a velocity (M, 3), as the simulation has it."""
@@ -150,10 +122,6 @@ class PairGraph(nn.Module):
         way = to - pairs.pose
         turned = torch.remainder(way[:, 2:] + math.pi, 2.0 * math.pi) - math.pi
         return torch.cat([way[:, :2], turned], dim=-1) / way.new_tensor(self._full_scale)
-
-    @property
-    def _full_scale(self) -> tuple[float, float, float]:
-        return self.arena, self.arena, math.pi
 
     def vectors(self, pairs: Pairs) -> Tensor:
         """(M, inputs): a pair in one row, without nodes."""

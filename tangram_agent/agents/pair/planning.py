@@ -17,6 +17,7 @@ from tangram_agent.agents.pair.coverage import covered_share, covering, worths
 from tangram_agent.agents.pair.motion import Belief, motions_of
 from tangram_agent.agents.pair.networks import Networks
 from tangram_agent.agents.pair.pairs import PairGraph, Pairs
+from tangram_agent.base.acting import tensor
 from tangram_agent.base.types import Choice
 from tangram_core.arrays import Bools, Floats, Singles
 from tangram_sim.motion.actions import velocities_of
@@ -48,17 +49,13 @@ class Candidates:
 
     def best(self, value: Tensor, most: int) -> Tensor:
         """Indices (M',) of the best of each row by a value (M,), row after row."""
-        table, first = self._table(value)
-        best = table.topk(min(most, table.shape[1]), dim=1)
-        return (best.indices + first[:, None])[best.values > -torch.inf]
-
-    def _table(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        """Values (M,) row by row, (B, L), filled up with -inf, and where each row begins, (B,)."""
+        # Values row by row, (B, L), filled up with -inf, and where each row begins, (B,).
         counts = torch.bincount(self.row)
         first = counts.cumsum(0) - counts
         table = torch.full((len(counts), int(counts.max())), -torch.inf)
         table[self.row, torch.arange(len(self.row)) - first[self.row]] = value
-        return table, first
+        best = table.topk(min(most, table.shape[1]), dim=1)
+        return (best.indices + first[:, None])[best.values > -torch.inf]
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +82,7 @@ class Scene:
         """The pairs (M,) of candidates; a token that is turned over has changed its side."""
         return Pairs(
             pose=self.pose[c.row, c.token],
-            flipped=self._side(c),
+            flipped=(self.flipped[c.row, c.token] - c.flip).abs(),
             token=c.token,
             goal=self.goal[c.row, c.piece],
             goal_flipped=self.goal_flipped[c.row, c.piece],
@@ -96,9 +93,6 @@ class Scene:
     def leaves_no_choice(self, candidates: Candidates) -> bool:
         """Whether each environment has one candidate, so that nobody need say which is better."""
         return len(candidates.row) == len(self.pose)
-
-    def _side(self, c: Candidates) -> Tensor:
-        return (self.flipped[c.row, c.token] - c.flip).abs()
 
 
 class Planner:
@@ -111,11 +105,7 @@ class Planner:
         self._turns_over = task.layout.chiral & task.sim.allow_flip
 
     def choose(
-        self,
-        corners: Floats,
-        placed: Bools,
-        goals: Floats,
-        past: Past | None = None,
+        self, corners: Floats, placed: Bools, goals: Floats, past: Past | None = None
     ) -> Choice:
         """What to play; where all tokens are placed, some action of the first one.
 
@@ -125,12 +115,14 @@ class Planner:
             goals: (B, V, 2) of the target.
             past: what was seen of these episodes before, if anything.
         """
+        is_open: Bools = ~np.asarray(placed, np.bool_)
+        is_open[~is_open.any(axis=1), 0] = True
         with torch.no_grad():
             belief = self._belief(corners, past)
             if self._motion is not None and belief is not None and past is not None:
                 corners = self._motion.ahead(belief, corners, past, self._layout, self._sim)
             scene = self._scene(corners, goals)
-            candidates, pose = self._short_list(scene, _open(placed))
+            candidates, pose = self._short_list(scene, is_open)
             velocity, reached = self._reached(scene, candidates, pose, belief)
             best = self._best(scene, candidates, reached)
         chosen = candidates.at(best)
@@ -161,23 +153,22 @@ class Planner:
     ) -> tuple[Tensor, Tensor]:
         """Commands (M, 3) that take tokens to poses (M, 3), and the poses that they come to."""
         pairs = scene.pairs(candidates)
-        way = self._graph.way(pairs, pose)
-        if self._motion is None or belief is None:
-            return way.clamp(-1.0, 1.0), pose
-        own = belief.at(candidates.row)
-        command = self._motion.command(own, way)
+        own = None if belief is None else belief.at(candidates.row)
+        command = self._command(self._graph.way(pairs, pose), own)
+        if self._motion is None or own is None:
+            return command, pose
         return command, self._graph.moved(pairs, self._motion.predict(own, command)[0]).pose
 
     def _scene(self, corners: Floats, goals: Floats) -> Scene:
         layout = self._layout
         covered = covering(corners, goals, layout)
         return Scene(
-            pose=as_tensor(layout.poses(corners)),
-            flipped=as_tensor(layout.flipped(corners)),
-            goal=as_tensor(layout.poses(goals)),
-            goal_flipped=as_tensor(layout.flipped(goals)),
-            covered=as_tensor(covered_share(covered, layout)),
-            worth=as_tensor(worths(covered, layout)),
+            pose=tensor(layout.poses(corners)),
+            flipped=tensor(layout.flipped(corners)),
+            goal=tensor(layout.poses(goals)),
+            goal_flipped=tensor(layout.flipped(goals)),
+            covered=tensor(covered_share(covered, layout)),
+            worth=tensor(worths(covered, layout)),
         )
 
     def _short_list(self, scene: Scene, is_open: Bools) -> tuple[Candidates, Tensor]:
@@ -210,29 +201,13 @@ class Planner:
         return values
 
     def _best(self, scene: Scene, candidates: Candidates, pose: Tensor) -> Tensor:
-        """Index (B,) of the best candidate of each row."""
+        """Index (B,) of the best candidate of each row, valued for all pieces of the target."""
         if scene.leaves_no_choice(candidates):
             return torch.arange(len(pose))
-        # What a token covers already it gives up.
-        given_up = scene.worth[candidates.row, candidates.token]
-        return candidates.best(self._total(scene, candidates, pose) - given_up, 1)
-
-    def _total(self, scene: Scene, candidates: Candidates, pose: Tensor) -> Tensor:
-        """(M,) values of poses (M, 3) over all pieces of the target."""
         count = self._layout.tokens
         every = candidates.at(torch.arange(len(pose)).repeat_interleave(count))
         pairs = scene.pairs(replace(every, piece=torch.arange(count).repeat(len(pose))))
         values = self._valued(pairs, pose.repeat_interleave(count, dim=0))
-        return values.view(-1, count).sum(dim=1)
-
-
-def _open(placed: Bools) -> Bools:
-    """(B, K) tokens that may be next, at least one in each row."""
-    is_open: Bools = ~np.asarray(placed, np.bool_)
-    is_open[~is_open.any(axis=1), 0] = True
-    return is_open
-
-
-def as_tensor(array: Floats | Bools) -> Tensor:
-    """A copy in single precision."""
-    return torch.from_numpy(np.array(array, np.float32))
+        # What a token covers already it gives up.
+        given_up = scene.worth[candidates.row, candidates.token]
+        return candidates.best(values.view(-1, count).sum(dim=1) - given_up, 1)

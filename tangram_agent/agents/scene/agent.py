@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, cast
 
-from tangram_agent.base.checks import check_capacity, seen_tokens
+from tangram_agent.base.agent import TokenAgent, seen_tokens
 from tangram_agent.base.config import ActorCriticConfig, NetConfig
-from tangram_core.agent import Agent, Pace
-from tangram_core.task import Json, Task
+from tangram_core.task import Task
 from tangram_tasks.place import Place
 
 if TYPE_CHECKING:  # need torch
@@ -17,27 +16,17 @@ if TYPE_CHECKING:  # need torch
 
 
 @dataclass(frozen=True)
-class SceneConfig(ActorCriticConfig, section="agent"):
-    """DDPG on whole scenes."""
-
-
-@dataclass(frozen=True)
-class Scene(Agent):
+class Scene(TokenAgent):
     """One velocity for the next token, one value of the whole scene."""
 
-    sections: ClassVar = {"agent": SceneConfig, "net": NetConfig}
+    sections: ClassVar = {"agent": ActorCriticConfig, "net": NetConfig}
 
-    config: SceneConfig
-    net: NetConfig
-
-    @property
-    def pace(self) -> Pace:
-        """As its settings say."""
-        return self.config.pace
+    config: ActorCriticConfig
 
     def check(self, task: Task) -> None:
         """It plays tokens whose target is seen."""
-        check_capacity(seen_tokens(task, "scene"), self.config.replay_capacity)
+        seen_tokens(task, "scene")
+        super().check(task)
 
     def actor(self, task: Task) -> "SceneActor":
         """See `Agent.actor`."""
@@ -46,22 +35,14 @@ class Scene(Agent):
         place = cast("Place", task)
         return SceneActor(place, self.config, self.networks(place.layout)[0])
 
-    def learner(
-        self, task: Task, seed: int, device: str = "cpu", *, compiled: bool = False
-    ) -> "SceneLearner":
-        """See `Agent.learner`."""
-        from tangram_agent.agents.scene.learner import SceneLearner  # noqa: PLC0415
-
-        place = cast("Place", task)
-        networks = self.networks(place.layout)
-        return SceneLearner(place, self.config, networks, seed, device, compiled)
-
     def networks(self, layout: "Layout") -> "tuple[ActorNet, CriticNet]":
         """Actor and critic, with whatever weights; another kind of them overrides this."""
         from tangram_agent.agents.scene.networks import ActorNet, CriticNet  # noqa: PLC0415
 
         return ActorNet(layout, self.net), CriticNet(layout, self.net)
 
-    def facts(self) -> Json:
-        """Its preset and its network."""
-        return {"agent": self.config.name, "net": self.net.kind}
+    def learns(self) -> "type[SceneLearner]":
+        """With actor and critic."""
+        from tangram_agent.agents.scene.learner import SceneLearner  # noqa: PLC0415
+
+        return SceneLearner

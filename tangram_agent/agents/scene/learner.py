@@ -3,9 +3,9 @@
 import numpy as np
 from torch import Tensor
 
-from tangram_agent.agents.scene.networks import ActorNet, CriticNet
+from tangram_agent.agents.scene.agent import Scene
+from tangram_agent.agents.scene.networks import ActorNet
 from tangram_agent.agents.scene.scenes import Scenes, next_token
-from tangram_agent.base.config import ActorCriticConfig
 from tangram_agent.base.ddpg import Ddpg, Steps
 from tangram_agent.base.types import Transitions
 from tangram_agent.nets.networks import VELOCITY
@@ -19,23 +19,17 @@ class SceneLearner(Ddpg):
     actor: ActorNet
 
     def __init__(
-        self,
-        task: Place,
-        config: ActorCriticConfig,
-        networks: tuple[ActorNet, CriticNet],
-        seed: int,
-        device: str = "cpu",
-        compiled: bool = False,
+        self, agent: Scene, task: Place, seed: int, device: str, compiled: bool = False
     ) -> None:
-        actor, critic = networks
-        super().__init__(task, config, (actor, critic, actor), seed, device, compiled)
+        actor, critic = agent.networks(task.layout)
+        super().__init__(task, agent.config, (actor, critic, actor), seed, device, compiled)
 
     def steps(self, batch: Transitions, generator: np.random.Generator) -> Steps:  # noqa: ARG002
         """Scenes of a batch."""
         tokens = self.task.layout.tokens
         state, placed = self.tensor(batch.state), self.tensor(batch.placed)
         goal, action = self.tensor(batch.goal), self.tensor(batch.action)
-        moved = self.index(chosen_tokens(batch.action.astype(np.float64), tokens))
+        moved = self.tensor(chosen_tokens(batch.action.astype(np.float64), tokens), np.int64)
         taken = Scenes(state, placed, goal, moved)
         start = taken if tokens == 1 else Scenes(state, placed, goal, next_token(placed))
         following, flags = self.tensor(batch.next_state), self.tensor(batch.next_placed)

@@ -21,8 +21,7 @@ class ActorNet(nn.Module):
     def __init__(self, layout: Layout, net: NetConfig, head: Callable[..., Any] = Head) -> None:
         """Make it of layers that are made and called as `Head` is."""
         super().__init__()
-        self.graph = SceneGraph(layout)
-        self.head = head(self.graph, net, VELOCITY, at_base=True)
+        self.head = head(SceneGraph(layout), net, VELOCITY, at_base=True)
 
     def forward(self, scenes: Scenes, features: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Velocity (M, 3) in [-1, 1] in the arena's axes, and its pre-activations (M, 3).
@@ -30,8 +29,7 @@ class ActorNet(nn.Module):
         Features are as for `Head`.
         """
         raw = self.head(scenes, features=features)
-        bounded = torch.tanh(raw)
-        return self.graph.velocity(scenes, bounded[:, :2], bounded[:, 2]), raw
+        return torch.tanh(raw), raw
 
 
 class CriticNet(nn.Module):
@@ -40,8 +38,7 @@ class CriticNet(nn.Module):
     def __init__(self, layout: Layout, net: NetConfig, head: Callable[..., Any] = Head) -> None:
         """Make it of layers that are made and called as `Head` is."""
         super().__init__()
-        self.graph = SceneGraph(layout)
-        self.head = head(self.graph, net, 1, at_base=False, action=VELOCITY)
+        self.head = head(SceneGraph(layout), net, 1, at_base=False, action=VELOCITY)
 
     def forward(
         self,

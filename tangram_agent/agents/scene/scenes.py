@@ -7,8 +7,6 @@ from torch import Tensor, nn
 
 from tangram_sim.geometry.layout import Layout
 
-PAPER_FEATURES = 4
-
 
 @dataclass(frozen=True, eq=False)
 class Scenes:
@@ -45,8 +43,8 @@ class SceneGraph(nn.Module):
 
     def __init__(self, layout: Layout) -> None:
         super().__init__()
-        self.tokens, self.corner_count = layout.tokens, layout.corner_count
-        self.nodes = layout.nodes
+        self.tokens, self.corners, self.nodes = layout.tokens, layout.corner_count, layout.nodes
+        self.features, self.inputs = 4, 4 * self.nodes
         target_flag = torch.zeros(layout.nodes)
         target_flag[layout.corner_count + layout.tokens :] = 1.0
         constants = {
@@ -58,40 +56,19 @@ class SceneGraph(nn.Module):
         for name, value in constants.items():
             self.register_buffer(name, value, persistent=False)
 
-    @property
-    def features(self) -> int:
-        """F."""
-        return PAPER_FEATURES
-
-    @property
-    def inputs(self) -> int:
-        """Numbers that a perceptron sees of a scene."""
-        return self.nodes * PAPER_FEATURES
-
     def base_node(self, scenes: Scenes) -> Tensor:
         """Node index (M,) of the base of the token that moves."""
-        return self.corner_count + scenes.token
-
-    def slot(self, scenes: Scenes) -> Tensor:
-        """(M,) which of the K tokens in view moves."""
-        return scenes.token
+        return self.corners + scenes.token
 
     def node_features(self, scenes: Scenes) -> Tensor:
         """Features (M, N, F): position, whether it is the target's, whether it is placed."""
         corners, goal = scenes.corners, scenes.goal
         positions = torch.cat([corners, self.base_weights @ corners, goal], dim=1)
-        return torch.cat([positions, self._flags(scenes.placed)], dim=-1)
+        flags = torch.cat([scenes.placed[:, self.token_of_corner], scenes.placed], dim=1)
+        flags = nn.functional.pad(flags, (0, self.corners), value=1.0)
+        target = self.target_flag.expand_as(flags)
+        return torch.cat([positions, torch.stack([target, flags], dim=-1)], dim=-1)
 
     def vectors(self, scenes: Scenes) -> Tensor:
         """(M, inputs): the features of all nodes in one row."""
         return self.node_features(scenes).flatten(1)
-
-    def _flags(self, placed: Tensor) -> Tensor:
-        """Whether a node is the target's, and whether it is placed: (M, N, 2)."""
-        flags = torch.cat([placed[:, self.token_of_corner], placed], dim=1)
-        flags = nn.functional.pad(flags, (0, self.corner_count), value=1.0)
-        return torch.stack([self.target_flag.expand_as(flags), flags], dim=-1)
-
-    def velocity(self, _: Scenes, shift: Tensor, angle: Tensor) -> Tensor:
-        """The velocity (M, 3) of a shift (M, 2) and a turn (M,) over pi."""
-        return torch.cat([shift, angle[:, None]], dim=-1).clamp(-1.0, 1.0)

@@ -203,8 +203,6 @@ def test_what_cannot_be_compiled_is_refused(monkeypatch: pytest.MonkeyPatch) -> 
     check_compiling(ServiceConfig())
     with pytest.raises(ConfigError, match="compile=true changes nothing with agent.kind=outline"):
         outline_setup().agent.check_training(compiled=True)  # before there is a folder of the run
-    with pytest.raises(ConfigError, match="compile=true changes nothing with agent.kind=outline"):
-        learner_of(outline_setup(), compiled=True)
     monkeypatch.setenv("CXX", "no-such-compiler")
     with pytest.raises(ConfigError, match="no-such-compiler is not found: install g"):
         check_compiling(wanted)

@@ -12,8 +12,8 @@ import torch
 
 from tangram_agent.agents.scene.scenes import Scenes, next_token
 from tangram_agent.base.adam import Adam
-from tangram_agent.base.ddpg import Ddpg, critic_target, saturation
-from tangram_agent.base.learning import Rates, average_so_far, polyak_update
+from tangram_agent.base.ddpg import Ddpg
+from tangram_agent.base.learning import Rates, polyak_update
 from tangram_core.agent import NotFiniteError
 from tangram_core.errors import RunError
 from tangram_core.setup import Setup
@@ -69,7 +69,7 @@ def scaled(learner: Ddpg, parts: Iterable[str], factor: float) -> Ddpg:
     """The learner with every weight of some parts multiplied."""
     with torch.no_grad():
         for part in parts:
-            for parameter in getattr(learner, part).parameters():
+            for parameter in learner.parts[part].parameters():
                 parameter.mul_(factor)
     return learner
 
@@ -81,12 +81,6 @@ def copied(learner: Ddpg) -> dict[str, Any]:
 def largest_change(before: dict[str, Any], after: dict[str, Any], part: str) -> float:
     names = [name for name in before if name.startswith(f"{part}.")]
     return max(float(np.abs(before[name] - after[name]).max()) for name in names)
-
-
-def test_the_target_of_eq_5_with_the_end_of_an_episode() -> None:
-    reward, done = torch.tensor([1.0, -0.5, 0.25]), torch.tensor([0.0, 1.0, 0.0])
-    y = critic_target(reward, done, torch.tensor([2.0, 100.0, -1.0]), gamma=0.5)
-    assert y.tolist() == [2.0, -0.5, -0.25]
 
 
 def test_polyak_averaging_of_eq_4() -> None:
@@ -104,7 +98,9 @@ def test_polyak_averaging_of_eq_4() -> None:
     [(0.99, 0, 0.0), (0.99, 1, 0.1), (0.99, 9, 0.5), (0.99, 891, 0.99), (0.5, 50, 0.5), (0, 9, 0)],
 )
 def test_a_young_average_forgets_its_start(rho: float, updates: int, expected: float) -> None:
-    assert average_so_far(rho, updates) == pytest.approx(expected)
+    learner = learner_of(setup(agent=SCENE | {"acting_average": rho}))
+    learner.updates = updates
+    assert learner.rates(0.0).kept == pytest.approx(expected)
 
 
 def test_after_the_first_update_the_actor_itself_plays() -> None:
@@ -112,11 +108,6 @@ def test_after_the_first_update_the_actor_itself_plays() -> None:
     learn(learner, random_transitions(setup(), 16, done=None))
     pairs = zip(learner.acting.parameters(), learner.actor.parameters(), strict=True)
     assert all(torch.equal(average, own) for average, own in pairs)
-
-
-def test_saturation_counts_what_lies_beyond_the_limit() -> None:
-    raw = torch.tensor([[0.0, 2.0], [-3.0, 4.0]])
-    assert saturation(raw, 2.0).item() == pytest.approx((1 + 4) / 4)
 
 
 @pytest.mark.parametrize(
@@ -135,10 +126,13 @@ def test_the_critic_loss_is_the_mean_squared_bellman_error(agent: dict[str, Any]
     assert 0 < batch.done.sum() < 6
     steps = learner.steps(batch, np.random.default_rng(0))
     assert steps.follow is not None
-    follow = learner.target_critic(steps.follow, learner.target_actor(steps.follow)[0])
+    actor, critic = learner.targets["actor"], learner.targets["critic"]
+    follow = critic(steps.follow, actor(steps.follow)[0])
     y = torch.from_numpy(batch.reward) + 0.9 * follow * (1 - torch.from_numpy(batch.done))
-    loss, q = learner.critic_loss(steps)
-    assert loss.item() == pytest.approx((q - y).square().mean().item(), rel=1e-5)
+    q = learner.critic(steps.view, steps.velocity, steps.seen_after)
+    loss = next(learner.losses(steps))
+    assert loss.value.item() == pytest.approx((q - y).square().mean().item(), rel=1e-5)
+    assert loss.told["q"].item() == pytest.approx(q.mean().item(), rel=1e-5)
     if made.agent_kind != "pair":  # those move their tokens on before they are valued
         torch.testing.assert_close(q, learner.critic(steps.view, torch.from_numpy(batch.action)))
 
@@ -148,9 +142,11 @@ def test_the_actor_loss_is_minus_the_value_of_its_actions() -> None:
     learner = learner_of(made)
     steps = learner.steps(random_transitions(made, 6), np.random.default_rng(0))
     velocity, raw = learner.actor(steps.start)
-    loss, penalty = learner.actor_loss(steps)
-    assert loss.item() == pytest.approx(-learner.critic(steps.start, velocity).mean().item(), 1e-6)
+    _, loss = learner.losses(steps)
+    value, penalty = loss.told["actor_loss"], loss.told["saturation"]
+    assert value.item() == pytest.approx(-learner.critic(steps.start, velocity).mean().item(), 1e-6)
     assert penalty.item() == pytest.approx(raw.square().mean().item())
+    assert loss.value.item() == pytest.approx((value + penalty).item())
 
 
 def test_the_token_that_moved_is_valued_and_the_next_one_is_asked() -> None:
@@ -176,7 +172,7 @@ def test_target_networks_are_there_where_something_bootstraps(
     made = setup(agent=agent | {"kind": kind}, actions_per_token=actions)
     learner = learner_of(made)
     assert learner.bootstraps == there
-    assert hasattr(learner, "target_actor") == there
+    assert ("actor" in learner.targets) == there
     assert any(name.startswith("target_critic.") for name in learner.state()) == there
 
 
@@ -231,7 +227,8 @@ def test_the_penalty_counts_by_its_weight() -> None:
         with torch.no_grad():
             learner.critic.head.readout.weight.zero_()
         steps = learner.steps(random_transitions(made, 16), np.random.default_rng(0))
-        norms.append(learner._all_steps(steps, Rates(0.0, 0.0, 0.0))[-1].item())
+        numbers = learner.step(steps, Rates(0.0, 0.0, 0.0)).tolist()
+        norms.append(numbers[learner._names[True].index("actor_gradient")])
     assert norms[1] == pytest.approx(2.0 * norms[0], rel=1e-5)
     assert norms[0] > 0.0
 

@@ -4,14 +4,12 @@ It refuses to mix with the CPU, as a GPU does, and to give a value to the host. 
 the wrong device, or an update that waits for the device on its way, ends in an error here.
 """
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
 
 from tangram_agent.agents.pair.motion import Fit, MotionModel
-from tangram_agent.base.ddpg import NUMBERS, Ddpg, Steps
+from tangram_agent.base.ddpg import Ddpg, Steps
 from tangram_core.setup import Setup
 from tests.agent.agents.outline.outlines import outline_setup
 from tests.agent.agents.outline.test_filling_learning import episode
@@ -43,8 +41,8 @@ ENDS = [(case, done) for case in CASES for done in ([None] if case[0] == "pairs"
 def test_an_update_stays_on_its_device(case: tuple[str, str], done: int | None) -> None:
     made = CASES[case]()
     learner = learner_of(made, 0, META)
-    numbers = learner._step_all(steps_of(learner, made, done), learner.rates(0.5))
-    assert (numbers.device.type, len(numbers)) == (META, len(NUMBERS))
+    numbers = learner._whole(steps_of(learner, made, done), learner.rates(0.5))
+    assert (numbers.device.type, len(numbers)) == (META, 6)
 
 
 @pytest.mark.slow
@@ -55,8 +53,8 @@ def test_a_traced_update_stays_on_its_device(
     monkeypatch.setattr("torch._inductor.standalone_compile", lambda graph, *_, **__: graph)
     made = CASES[case]()
     learner = learner_of(made, 0, META, compiled=True)
-    numbers = learner._step_all(steps_of(learner, made, None), learner.rates(0.5))
-    assert (numbers.device.type, len(numbers)) == (META, len(NUMBERS))
+    numbers = learner._whole(steps_of(learner, made, None), learner.rates(0.5))
+    assert (numbers.device.type, len(numbers)) == (META, 6)
 
 
 @pytest.mark.fast
@@ -73,8 +71,8 @@ def test_learning_what_can_be_filled_stays_on_its_device() -> None:
     made = outline_setup(agent={"replay_capacity": 8, "batch_size": 8})
     learner, generator = learner_of(made, 0, META), np.random.default_rng(0)
     learner.insert(episode([9.0, 9.0, 0.0]), {"hindsight": generator})
-    found = learner._step_value(learner.replay.sample(8, generator), learner.rates(0.5))
-    assert {one.device.type for one in found.values()} == {META}
+    numbers = learner.step(learner.replay.sample(8, generator), learner.rates(0.5))
+    assert (numbers.device.type, len(numbers)) == (META, 3)
 
 
 @pytest.mark.fast
@@ -84,7 +82,7 @@ def test_the_device_refuses_what_these_tests_are_for() -> None:
     away, here = learner_of(made, 0, META), learner_of(made, 0)
     steps = steps_of(away, made, None)
     with pytest.raises(REFUSED, match="device|meta"):
-        here.critic_loss(steps)
-    loss: Any = away.critic_loss(steps)[0]
+        next(here.losses(steps))
+    loss = next(away.losses(steps))
     with pytest.raises(REFUSED, match="meta"):
-        loss.item()
+        loss.value.item()

@@ -5,7 +5,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from tangram_core.errors import RunError, WireError
+from tangram_core.errors import WireError
 from tangram_core.setup import Setup
 from tangram_core.spec import Episodes
 from tangram_core.wire.messages import EpisodeBatch, decode_from_worker
@@ -73,12 +73,15 @@ def test_a_trainer_goes_on_from_its_state_bit_by_bit() -> None:
             assert (other.state()[0][file][name] == array).all(), (file, name)
 
 
-def test_a_replay_of_another_size_is_refused() -> None:
-    arrays, counters = trainer(MADE).state()
-    smaller = outline_setup(agent={"replay_capacity": 32, "batch_size": 8})
-    arrays["replay"]["counters"][:] = 40
-    with pytest.raises(RunError, match=r"agent\.replay_capacity"):
-        trainer(smaller).load_state(arrays, counters)
+def test_a_replay_of_another_size_keeps_the_newest() -> None:
+    one = trainer(MADE)
+    one.insert(rolled_out(MADE))
+    smaller = trainer(outline_setup(agent={"replay_capacity": 8, "batch_size": 8}))
+    smaller.load_state(*one.state())
+    kept, found = (made.learner.memory() for made in (one, smaller))
+    assert len(kept["ends"]) > len(found["ends"]) == 8
+    assert (found["played"], found["filled"]) == (kept["played"], kept["filled"])
+    assert sorted(found["ends"].tolist()) == sorted(kept["ends"][-8:].tolist())
 
 
 def test_outlines_travel_and_other_sizes_are_refused() -> None:

@@ -90,7 +90,7 @@ def test_targets_stay_within_what_rewards_add_up_to() -> None:
 @pytest.mark.parametrize("algorithm", ["ddpg", "td3", "sac"])
 def test_what_terminates_is_worth_its_reward(algorithm: str) -> None:
     made = learner(replace(SMALL, algorithm=algorithm))
-    batch = made.batch(streams(made))
+    batch = made.drawn(streams(made))
     ended = replace(batch, goes_on=torch.zeros_like(batch.goes_on))
     with torch.no_grad():
         assert torch.equal(made._target(ended), batch.rewards)

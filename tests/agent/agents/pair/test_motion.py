@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from tangram_agent.agents.pair.learner import screens_motions
 from tangram_agent.agents.pair.motion import Fit, MotionModel, Motions, features, motions_of
 from tangram_agent.base.replay import ReplayBuffer
 from tangram_agent.base.types import Transitions
@@ -258,7 +257,7 @@ def test_motions_are_screened_only_where_the_world_is_exact_and_seen(
     tokens: dict, sim: dict, screened: bool
 ) -> None:
     made = setup(tokens, {"motion": "learned"}, **{"observe": "pictures", "pixels": 64} | sim)
-    assert screens_motions(made.task) == screened
+    assert learner_of(made).optimisers["motion"]._screened == screened
 
 
 def test_what_lies_still_in_pictures_was_refused() -> None:

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from tangram_agent.agents.pair.batch import PairBatch, make_pairs
+from tangram_agent.agents.pair.coverage import Lying
 from tangram_agent.agents.pair.learner import PairLearner
 from tangram_agent.agents.pair.pairs import Pairs
 from tangram_agent.base.types import Transitions
@@ -39,23 +40,23 @@ def test_the_losses_by_hand(case: str) -> None:
     made = seven(**CASES[case])
     learner = learner_of(made, 0)
     batch = pairs_in(made, transitions(made, 8, 0))
-    t = {name: torch.from_numpy(np.asarray(c, np.float32)) for name, c in vars(batch).items()}
-    for name in ("token", "piece"):
-        t[name] = t[name].long()
     steps, own, still = learner.steps_of(batch), learner.acting, torch.zeros(64, 3)
 
-    def pairs_of(when: str) -> Pairs:
-        columns = ("token", "goal", "goal_flipped", "piece", "covered")
-        return Pairs(t[when], t[f"{when}_flipped"], *(t[name] for name in columns))
+    def of(lying: Lying) -> tuple[torch.Tensor, ...]:
+        pose, flipped = (torch.from_numpy(one).float() for one in (lying.pose, lying.flipped))
+        return pose, flipped, torch.from_numpy(lying.index)
 
-    value = own.critic(pairs_of("after"), still)
-    loss, q = learner.critic_loss(steps)
-    expected = (value - t["reward"]).square().mean().item()
-    assert loss.item() == pytest.approx(expected, rel=1e-6)
-    np.testing.assert_allclose(q.detach(), value, atol=1e-6)
-    start = pairs_of("start")
+    def pairs_of(token: Lying) -> Pairs:
+        return Pairs(*of(token), *of(batch.piece), torch.from_numpy(batch.covered).float())
+
+    value = own.critic(pairs_of(batch.after), still)
+    critic_loss, actor_loss = learner.losses(steps)
+    expected = (value - torch.from_numpy(batch.reward).float()).square().mean().item()
+    assert critic_loss.value.item() == pytest.approx(expected, rel=1e-6)
+    assert critic_loss.told["q"].item() == pytest.approx(value.mean().item(), rel=1e-5)
+    start = pairs_of(batch.start)
     velocity, raw = own.actor(start)
-    gain, penalty = learner.actor_loss(steps)
+    gain, penalty = (actor_loss.told[name] for name in ("actor_loss", "saturation"))
     assert gain.item() == pytest.approx(-own.critic(start, velocity).mean().item(), rel=1e-5)
     assert penalty.item() == pytest.approx(torch.relu(raw.abs() - 1.0).square().mean().item())
 

@@ -1,13 +1,13 @@
 """Pairs out of transitions: which goals they have, and that their labels are exact."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from tangram_agent.agents.pair.batch import PairBatch, make_pairs
-from tangram_agent.agents.pair.coverage import Lying, covered_share, covering, newly_covered
+from tangram_agent.agents.pair.coverage import covered_share, covering, newly_covered
 from tangram_agent.base.types import Transitions
 from tangram_sim.geometry.layout import Layout
 from tangram_sim.motion.actions import chosen_tokens
@@ -38,35 +38,37 @@ def made_pairs(hindsight: list[dict[str, Any]], seed: int = 0) -> PairBatch:
 
 def is_played(pairs: PairBatch) -> np.ndarray:
     """Which pairs have the piece of the goal that was played."""
-    goals = LAYOUT.poses(EXACT["goal"])[ROWS, pairs.piece]
-    played: np.ndarray = np.isclose(goals, pairs.goal).all(axis=1)
+    goals = LAYOUT.poses(EXACT["goal"])[ROWS, pairs.piece.index]
+    played: np.ndarray = np.isclose(goals, pairs.piece.pose).all(axis=1)
     return played
 
 
 def turn_gap(pairs: PairBatch) -> np.ndarray:
     """The angle between token and piece, at the nearest of the turns that look alike."""
-    order = SYMMETRY[pairs.piece]
-    gap: np.ndarray = np.angle(np.exp(1j * order * (pairs.goal - pairs.after)[:, 2])) / order
+    order = SYMMETRY[pairs.piece.index]
+    gap: np.ndarray = (
+        np.angle(np.exp(1j * order * (pairs.piece.pose - pairs.after.pose)[:, 2])) / order
+    )
     return gap
 
 
 def check_ends(pairs: PairBatch, layout: Layout, batch: Transitions, token: Any) -> None:
     """Poses and sides before and after the action are those of the token that moved."""
-    rows = np.repeat(np.arange(COUNT), len(pairs.token) // COUNT)
-    for name, corners in (("before", batch.state), ("after", batch.next_state)):
+    rows = np.repeat(np.arange(COUNT), len(pairs.after.index) // COUNT)
+    for lying, corners in ((pairs.before, batch.state), (pairs.after, batch.next_state)):
         exact = corners.astype(np.float64)
-        np.testing.assert_allclose(vars(pairs)[name], layout.poses(exact)[rows, token])
+        np.testing.assert_allclose(lying.pose, layout.poses(exact)[rows, token])
         sides = layout.flipped(exact)[rows, token]
-        np.testing.assert_array_equal(vars(pairs)[f"{name}_flipped"], sides)
+        np.testing.assert_array_equal(lying.flipped, sides)
 
 
 def test_the_token_that_moved_before_and_after() -> None:
     pairs = made_pairs([FINAL])
     token = chosen_tokens(EXACT["action"], 7)[ROWS]
-    np.testing.assert_array_equal(pairs.token, token)
+    np.testing.assert_array_equal(pairs.after.index, token)
     check_ends(pairs, LAYOUT, BATCH, token)
-    assert pairs.before_flipped.any()
-    assert pairs.after_flipped.any()
+    assert pairs.before.flipped.any()
+    assert pairs.after.flipped.any()
 
 
 @pytest.mark.parametrize(
@@ -78,12 +80,12 @@ def test_the_share_of_goals_that_were_played(hindsight: list[Any], share: float)
 
 def test_played_pairs_have_any_piece_and_its_exact_covered_share() -> None:
     pairs = made_pairs([])
-    counts = np.bincount(pairs.piece, minlength=7) / len(ROWS)
+    counts = np.bincount(pairs.piece.index, minlength=7) / len(ROWS)
     np.testing.assert_allclose(counts, 1 / 7, atol=0.05)
-    sides = LAYOUT.flipped(EXACT["goal"])[ROWS, pairs.piece]
-    np.testing.assert_array_equal(pairs.goal_flipped, sides)
+    sides = LAYOUT.flipped(EXACT["goal"])[ROWS, pairs.piece.index]
+    np.testing.assert_array_equal(pairs.piece.flipped, sides)
     table = covering(BATCH.state, BATCH.goal, LAYOUT)
-    expected = covered_share(table, LAYOUT)[ROWS, pairs.token, pairs.piece]
+    expected = covered_share(table, LAYOUT)[ROWS, pairs.after.index, pairs.piece.index]
     np.testing.assert_allclose(pairs.covered, expected)
     assert 0.05 < (expected > 0.1).mean() < 0.95
 
@@ -91,9 +93,7 @@ def test_played_pairs_have_any_piece_and_its_exact_covered_share() -> None:
 @pytest.mark.parametrize("hindsight", [[], [FINAL, NEAR]])
 def test_values_are_what_is_newly_covered(hindsight: list[Any]) -> None:
     pairs = made_pairs(hindsight)
-    token = Lying(pairs.token, pairs.after, pairs.after_flipped)
-    piece = Lying(pairs.piece, pairs.goal, pairs.goal_flipped)
-    expected = newly_covered(token, piece, pairs.covered, LAYOUT)
+    expected = newly_covered(pairs.after, pairs.piece, pairs.covered, LAYOUT)
     np.testing.assert_array_equal(pairs.reward, expected)
     assert 0.0 <= pairs.reward.min() <= pairs.reward.max() <= 1.0
 
@@ -101,16 +101,16 @@ def test_values_are_what_is_newly_covered(hindsight: list[Any]) -> None:
 def test_hindsight_is_where_the_token_came_to_lie_and_mostly_a_piece_of_its_shape() -> None:
     pairs = made_pairs([FINAL])
     hind = ~is_played(pairs)
-    np.testing.assert_array_equal(pairs.goal[hind, :2], pairs.after[hind, :2])
+    np.testing.assert_array_equal(pairs.piece.pose[hind, :2], pairs.after.pose[hind, :2])
     np.testing.assert_allclose(turn_gap(pairs)[hind], 0.0, atol=1e-9)
-    own = NAMES[pairs.piece] == NAMES[pairs.token]
+    own = NAMES[pairs.piece.index] == NAMES[pairs.after.index]
     # Any shape in 15 %, a part of which is the token's own.
     assert own[hind].mean() == pytest.approx(1 - 0.15 * 38 / 49, abs=0.03)
     partly = pairs.covered[hind][pairs.covered[hind] > 0.0]
     assert len(partly) / hind.sum() == pytest.approx(0.3, abs=0.06)
     # Any share, whatever the goal that was played had.
     np.testing.assert_allclose([partly.mean(), partly.std()], [0.5, 12**-0.5], atol=0.06)
-    exact = own & hind & (pairs.covered == 0.0) & (pairs.after_flipped == pairs.goal_flipped)
+    exact = own & hind & (pairs.covered == 0.0) & (pairs.after.flipped == pairs.piece.flipped)
     np.testing.assert_allclose(pairs.reward[exact], 1.0)
     assert exact.sum() > 100
 
@@ -118,17 +118,17 @@ def test_hindsight_is_where_the_token_came_to_lie_and_mostly_a_piece_of_its_shap
 def test_equal_shapes_and_the_turns_that_look_alike_are_all_drawn() -> None:
     pairs = made_pairs([FINAL])
     hind = ~is_played(pairs)
-    equal = hind & np.isin(pairs.token, (0, 1))
-    assert np.bincount(pairs.piece[equal])[:2].min() > 0.3 * equal.sum()
+    equal = hind & np.isin(pairs.after.index, (0, 1))
+    assert np.bincount(pairs.piece.index[equal])[:2].min() > 0.3 * equal.sum()
     for piece, symmetry in enumerate(SYMMETRY):
-        gap = (pairs.goal - pairs.after)[hind & (pairs.piece == piece), 2]
+        gap = (pairs.piece.pose - pairs.after.pose)[hind & (pairs.piece.index == piece), 2]
         assert set(np.round(gap / (2.0 * np.pi / symmetry), 6)) == set(range(symmetry))
 
 
 def test_near_misses_have_the_spread_that_is_set() -> None:
     pairs = made_pairs([NEAR])
     near = ~is_played(pairs)
-    gap = np.column_stack([(pairs.goal - pairs.after)[:, :2], turn_gap(pairs)])[near]
+    gap = np.column_stack([(pairs.piece.pose - pairs.after.pose)[:, :2], turn_gap(pairs)])[near]
     np.testing.assert_allclose(gap.mean(axis=0), 0.0, atol=0.04)
     # With four turns that look alike the largest misses are nearer to another one.
     np.testing.assert_allclose(gap.std(axis=0), [0.05, 0.05, 0.29], rtol=0.1)
@@ -136,29 +136,34 @@ def test_near_misses_have_the_spread_that_is_set() -> None:
 
 def test_sides_of_hindsight_are_mostly_the_tokens_own() -> None:
     pairs = made_pairs([FINAL])
-    hind = ~is_played(pairs) & (pairs.token == PARALLELOGRAM) & (pairs.piece == PARALLELOGRAM)
-    same = pairs.goal_flipped[hind] == pairs.after_flipped[hind]
+    hind = (
+        ~is_played(pairs)
+        & (pairs.after.index == PARALLELOGRAM)
+        & (pairs.piece.index == PARALLELOGRAM)
+    )
+    same = pairs.piece.flipped[hind] == pairs.after.flipped[hind]
     assert 0.75 < same.mean() < 1.0
-    assert not pairs.goal_flipped[pairs.piece != PARALLELOGRAM].any()
+    assert not pairs.piece.flipped[pairs.piece.index != PARALLELOGRAM].any()
 
 
 def test_the_same_generator_gives_the_same_pairs_and_the_transitions_stay() -> None:
     before = {name: column.copy() for name, column in BATCH.arrays.items()}
     one, again, other = (made_pairs([FINAL, NEAR], seed) for seed in (3, 3, 4))
-    for name, column in vars(one).items():
-        np.testing.assert_array_equal(column, vars(again)[name])
-    assert not np.array_equal(one.goal, other.goal)
+    np.testing.assert_equal(asdict(one), asdict(again))
+    assert not np.array_equal(one.piece.pose, other.piece.pose)
     for name, column in BATCH.arrays.items():
         np.testing.assert_array_equal(column, before[name])
 
 
 def test_a_quarter_of_the_pairs_is_asked_from_where_the_action_ended() -> None:
     pairs = made_pairs([FINAL, NEAR])
-    again = (pairs.start == pairs.after).all(axis=1) & (pairs.start != pairs.before).any(axis=1)
+    again = (pairs.start.pose == pairs.after.pose).all(axis=1) & (
+        pairs.start.pose != pairs.before.pose
+    ).any(axis=1)
     assert again.mean() == pytest.approx(0.25, abs=0.05)
-    np.testing.assert_array_equal(pairs.start[~again], pairs.before[~again])
-    sides = np.where(again, pairs.after_flipped, pairs.before_flipped)
-    np.testing.assert_array_equal(pairs.start_flipped, sides)
+    np.testing.assert_array_equal(pairs.start.pose[~again], pairs.before.pose[~again])
+    sides = np.where(again, pairs.after.flipped, pairs.before.flipped)
+    np.testing.assert_array_equal(pairs.start.flipped, sides)
 
 
 @pytest.mark.parametrize("shape", ["square", "parallelogram", "large_triangle"])
@@ -175,9 +180,9 @@ def test_one_tokens_pairs_are_the_transitions_with_their_reward(shape: str) -> N
     np.testing.assert_array_equal(pairs.velocity, batch.action)
     assert not pairs.covered.any()
     goals, sides = layout.poses(batch.goal.astype(np.float64)), layout.flipped(batch.goal)
-    np.testing.assert_array_equal(pairs.goal_flipped, sides[:, 0])
-    np.testing.assert_array_equal(pairs.goal[:, :2], goals[:, 0, :2])
+    np.testing.assert_array_equal(pairs.piece.flipped, sides[:, 0])
+    np.testing.assert_array_equal(pairs.piece.pose[:, :2], goals[:, 0, :2])
     order = layout.shapes[0].symmetry
-    turns = (pairs.goal - goals[:, 0])[:, 2] * order / (2.0 * np.pi)
+    turns = (pairs.piece.pose - goals[:, 0])[:, 2] * order / (2.0 * np.pi)
     assert set(np.round(turns, 9)) == set(range(order))
     check_ends(pairs, layout, batch, 0)

@@ -23,7 +23,7 @@ def networks(made: Setup, seed: int = 0) -> tuple[SceneGraph, ActorNet, CriticNe
     generator = torch.Generator().manual_seed(seed)
     initialise(actor, generator)
     initialise(critic, generator)
-    return actor.graph, actor, critic
+    return actor.head.graph, actor, critic
 
 
 def inputs(made: Setup, count: int = 5) -> Scenes:
