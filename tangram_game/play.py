@@ -65,10 +65,31 @@ def play_run(config: PlayConfig, silhouette: Shown | None = None) -> int:
     """
     torch.set_num_threads(1)
     (run_dir,) = config.run_dirs
-    show = make_show(load_changed(run_dir, config.changes), config, silhouette)
-    save_picture(config.out, _frames(show, config.out))
-    Console(highlight=False).print(f"{config.out}: {show.told()}", markup=False, soft_wrap=True)
+    run = load_changed(run_dir, config.changes)
+    figures = (config.puzzle, config.target, config.silhouette)
+    if isinstance(run.setup.task, Place) or figures != (None, None, None):
+        show = make_show(run, config, silhouette)
+        frames, line = _frames(show, config.out), show.told()
+    else:
+        frames, line = [_drawn(run, config)], plural(config.episodes, "episode")
+    save_picture(config.out, frames)
+    Console(highlight=False).print(f"{config.out}: {line}", markup=False, soft_wrap=True)
     return 0
+
+
+def _drawn(run: Run, config: PlayConfig) -> Image.Image:
+    """Episodes of a task that is not of tokens, as it draws them itself."""
+    task = run.setup.task
+    with closing(
+        FixedTests(task, config.episodes, run.actor.at_once, role="play", seed=config.seed)
+    ) as tests:
+        picture = task.draw(tests.play(greedy(run.actor)))
+    if picture is None:
+        raise ConfigError(
+            f"{run.folder} plays task={run.setup.task_kind}, which draws no pictures: "
+            f"tangram-eval run_dir={run.folder} scores it"
+        )
+    return Image.fromarray(picture)
 
 
 def make_show(run: Run, config: PlayConfig, silhouette: Shown | None = None) -> Show:

@@ -96,15 +96,15 @@ def show_result(
     console.print()
     console.print(table)
     console.print()
-    paths = [("run folder", str(folder.path))]
-    if folder.picture.exists():
-        paths.append(("picture", str(folder.picture)))
     curves, where = _installed("tensorboard"), shlex.quote(str(folder.tensorboard))
-    watch = {"run_dir": folder.path, "out": "play.gif", **code}
-    paths += [
-        ("curves", f"{curves} --logdir {where}"),
-        ("watch it play", command_line("tangram-play", watch)),
-    ]
+    paths = [("run folder", str(folder.path)), ("curves", f"{curves} --logdir {where}")]
+    run = {"run_dir": folder.path}
+    if folder.picture.exists():  # so it can be drawn
+        paths.insert(1, ("picture", str(folder.picture)))
+        watch = command_line("tangram-play", {**run, "out": "play.gif", **code})
+        paths.append(("watch it play", watch))
+    else:
+        paths.append(("score it", command_line("tangram-eval", {**run, **code})))
     if go_on and result["ended_by"].startswith("SIG"):
         paths.append(("go on", go_on))
     for name, text in paths:

@@ -25,6 +25,12 @@ TRAININGS = [
     ((SETS,), ("sim=kinematic", "agent.learning_starts=32")),
     ((POINT, TD3), ("agent.learning_starts=40", "agent.hidden=[16]")),
 ]
+DRAWS = """
+
+class Point(Point):
+    def draw(self, played):
+        return np.zeros((8, 8, 3), np.uint8)
+"""
 
 
 @pytest.mark.parametrize(("own", "more"), TRAININGS)
@@ -37,7 +43,10 @@ def test_the_examples_train_through_a_master_and_two_workers(
     for one in own:
         role, _, path = one.partition("=")
         source, _, name = path.rpartition(":")
-        code.append(override(role, f"{shutil.copy(source, mine)}:{name}"))
+        copy = Path(shutil.copy(source, mine))
+        if role == "task":
+            copy.write_text(copy.read_text() + DRAWS)
+        code.append(override(role, f"{copy}:{name}"))
     with ExitStack() as stack:
         settings = (f"run_dir={folder}", *FEW, *more, *code)
         master = stack.enter_context(started("tangram-master", *settings, cwd=folder))
@@ -50,12 +59,14 @@ def test_the_examples_train_through_a_master_and_two_workers(
     assert json.loads((folder / "result.json").read_text())["updates"] == 3
     for one in own:
         role, _, path = one.partition("=")
-        source = Path(path.rpartition(":")[0])
-        assert (folder / f"{role}_{source.name}").read_bytes() == source.read_bytes()
+        file = Path(path.rpartition(":")[0]).name
+        assert (folder / f"{role}_{file}").read_bytes() == (mine / file).read_bytes()
     told = refused("tangram-eval", f"run_dir={folder}", cwd=folder)
     assert "which is not loaded unless you name it" in told
     scored = run_here("tangram-eval", f"run_dir={folder}", "episodes=2", *code, cwd=folder)
     assert "this run" in scored
+    run_here("tangram-play", f"run_dir={folder}", "out=a.png", "episodes=2", *code, cwd=folder)
+    assert (folder / "a.png").stat().st_size
 
 
 LINES = [line.replace("reward=", "{role}=") for line in READ if "eval" not in line]

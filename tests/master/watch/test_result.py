@@ -55,9 +55,14 @@ def test_the_final_table(
     show_result(shown, folder, RESULT | change, {}, "tangram-train r")
     assert all(word in text(shown) for word in words)
     assert not any(word in text(shown) for word in without)
-    assert f"tangram-play run_dir={folder.path} out=play.gif" in text(shown)
+    assert f"tangram-eval run_dir={folder.path}" in text(shown)
     assert f"tensorboard --logdir {folder.path}/tensorboard" in text(shown)
     assert "test_episodes.png" not in text(shown)
+    folder.path.mkdir()
+    folder.picture.touch()
+    show_result(shown, folder, RESULT | change, {})
+    assert f"tangram-play run_dir={folder.path} out=play.gif" in text(shown)
+    assert "test_episodes.png" in text(shown)
 
 
 @pytest.mark.parametrize(("launched", "name"), [(True, "tangram-train"), (False, "tangram-master")])
@@ -82,6 +87,8 @@ def test_commands_that_are_shown_can_be_pasted(
     commands = Path(sys.executable).parent
     monkeypatch.setenv("PATH", str(commands) if active else str(tmp_path))
     shown, folder = screen(), RunFolder(tmp_path / "it's a=run")
+    folder.path.mkdir()
+    folder.picture.touch()
     show_result(shown, folder, RESULT, {})
     curves, play = (shlex.split(line) for line in text(shown).splitlines()[-2:])
     assert curves[-1] == str(folder.tensorboard)
